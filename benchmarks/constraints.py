@@ -89,7 +89,7 @@ def measure(name, scene, start, batch, rounds):
         error = float(np.abs(np.asarray(program(*inputs)) - want).max() / np.abs(want).max())
         print(f"{name}, {method}: accelerations differ from Pinocchio's by {error:.1e} of the largest", flush=True)
         calls[method] = lambda program=program: jax.block_until_ready(program(*inputs))
-    times = timing.interleaved(calls, rounds)
+    times = timing.time_interleaved(calls, rounds)
     cores = len(os.sched_getaffinity(0))
     rows = []
     for method in built:

@@ -48,20 +48,20 @@ SERIES = np.concatenate([np.stack([graded(r) for r in RATIOS]), [[1.0] * 5 + [0.
 _Q = np.array([0.3, -0.2, 0.4, 0.1, -0.3, 0.2])
 _V = np.array([0.5, -0.3, 0.2, 0.6, -0.4, 0.1])
 MASSES = (
-    "A light link that carries a heavy one is left with eps times the ratio of the masses: 1e8 leaves eight "
-    "digits in float64; in float32 1e4 leaves three and 1e8 none. `forward_dynamics` returns an acceleration and "
-    "no code; `constrained_dynamics` of a scene, without constraints too, and `simulate` have one. Use float64; give "
-    "light links the armature that their motors have; leave out a body of no consequence. A joint that moves no "
-    "inertia is refused when the model is built; made so afterwards, it gives NaN and the code `dt_min_reached`."
+    "A light link that carries a heavy one loses eps times the mass ratio: a ratio of 1e8 leaves eight digits in "
+    "float64; in float32 1e4 leaves three and 1e8 none. `forward_dynamics` returns an acceleration and no code. "
+    "`simulate` and `constrained_dynamics` (of any scene) have codes. Use float64, give light links the armature of "
+    "their motors, and leave out bodies of no consequence. A joint that moves no inertia is refused when the model is"
+    " built. If it arises later, it gives NaN and the code `dt_min_reached`."
 )
 LINKS_ADVICE = (
-    "Nothing. Energies are relative to the total weight times 1 m. The gradient is that of a sum over all positions and "
-    "velocities with respect to a common rate of the joints."
+    "Nothing. Energies are relative to the total weight times 1 m. The gradient is that of a sum over all positions "
+    "and velocities with respect to a common rate of the joints."
 )
 TWINS = (
-    "`atol` is in the units of the state: an error of 1e-8 m is coarse for a slide of 1e-6 m and below rounding "
-    "for one of 1e6 m. Scale `atol` with the mechanism, or choose units in which it has size one. Angles need "
-    "nothing, and fixed steps know no units."
+    "`atol` is in the units of the state: an error of 1e-8 m is coarse for a slide of 1e-6 m and below rounding for "
+    "one of 1e6 m. Scale `atol` with the mechanism, or choose units in which it has size one. Angles and fixed steps "
+    "need nothing."
 )
 
 

@@ -346,23 +346,23 @@ MILLION_STATE = {"float64": 1e-6, "float32": 1e-2}
 MILLION_ENERGY = {"float64": 1e-8, "float32": 1e-2}
 RATES = "Nothing."
 TURNS = (
-    "An angle of n turns is rounded to 6 n eps: after 1e6 turns 1e-9 rad in float64, and half a radian in "
-    "float32. Adaptive steps refuse to start beyond 150 turns in float32 (3.5e6 in float64). Subtract the whole "
-    "turns; nothing but springs and limits depends on them. A quaternion has no such limit."
+    "An angle of n turns is rounded to 6 n eps: after 1e6 turns to 1e-9 rad in float64, and to half a radian in "
+    "float32. Adaptive steps refuse starts beyond 150 turns in float32 (3.5e6 in float64). Subtract whole turns; only"
+    " springs and limits depend on them. A quaternion has no such limit."
 )
-GRAVITY = "Nothing; `atol` and the span in s belong to the time scale sqrt(l/g)."
+GRAVITY = "Nothing. Choose `atol` and the span in s by the time scale sqrt(l/g)."
 STEPS = (
-    "Fixed steps that are too long end with `coarse_steps`, from an estimate that overrates the error somewhat, or, where the "
-    "state overflows, with `nonfinite_state`. Take a shorter step, or adaptive ones, which keep to the limit by "
-    "themselves. The limit divided by the fastest rate sqrt(k/m) or c/m of the mechanism is the longest step."
+    "Fixed steps that are too long end with `coarse_steps`, from an estimate that slightly exceeds the error, or with"
+    " `nonfinite_state` where the state overflows. Use a shorter step, or adaptive steps, which respect the limit. "
+    "The longest step is the limit divided by the fastest rate sqrt(k/m) or c/m of the mechanism."
 )
 CHAOS = (
-    "Errors grow as the motion makes any difference grow, whatever the method: one digit less of the start or of "
-    "the tolerance shortens by ln(10)/rate the time for which the state is known. Energy is kept all the same. "
-    "Gradients grow with it: take short spans."
+    "Errors grow like any difference in a chaotic motion, whatever the method: one digit less of the start or of the "
+    "tolerance shortens the time for which the state is known by ln(10)/rate. The energy error stays small. Gradients"
+    " grow too: use short time spans."
 )
 MILLION = (
-    "Take adaptive steps or a shorter step where the phase matters: the energy error of RK4 grows in proportion to time "
-    "and the phase with its square. In float32 the rounding of each step adds up as well: after 1e6 steps the state is "
-    "off by a tenth, and `coarse_steps` says so."
+    "Use adaptive steps or a shorter step where the phase matters: the energy error of RK4 grows in proportion to "
+    "time, and the phase error with its square. In float32 the rounding errors of the steps add up: after 1e6 steps "
+    "the state is off by a tenth, and the code is `coarse_steps`."
 )

@@ -270,24 +270,24 @@ def starts(dtypes, gradient):
 
 
 FLAT = (
-    "Adaptive steps in float64 pass the position where the rows lose rank, by every method. On the spot rounding decides "
-    "on which of two ways the mechanism leaves; a run whose steps end there, as float32 makes likely, ends with "
-    "`dt_min_reached` or `max_steps_reached`: take float64, or fixed steps. In float32 these are off by up to 1e-2 "
-    "without a code, so ask for outputs=('energy', 'work'). Gradients through the position itself are those of the steps taken."
+    "Adaptive steps in float64 pass the position where the rows lose rank, with every method. Exactly there, rounding"
+    " decides on which of two branches the mechanism leaves. A run whose steps end there, which is likely in float32,"
+    " ends with `dt_min_reached` or `max_steps_reached`: use float64, or fixed steps. In float32 fixed steps are off "
+    "by up to 1e-2 without a code: check outputs=('energy', 'work'). Gradients through the position are those of the "
+    "steps taken."
 )
 PLANES = (
-    "Rows at an angle below `rank_tol` (1e-9 in float64, 1e-4 in float32) count as one row, because rows that "
-    "really depend on each other differ by as much when a loop is open by rounding; the other direction is then "
-    "free, with a residual of the angle times the way. `constrained_dynamics(...).rank` says how many rows "
-    "counted. If they are meant as two, write the two directions as rows of their own, or give "
-    "jd.Projected(rank_tol=1e-14): accelerations are then off by eps over the angle, so that below 1e-10 rad adaptive "
-    "steps become short, up to `max_steps_reached`."
+    "Rows at an angle below `rank_tol` (1e-9 in float64, 1e-4 in float32) count as one row, because dependent rows "
+    "differ by as much when a loop is open by rounding. The other direction is then free, with a residual of the "
+    "angle times the distance moved. `constrained_dynamics(...).rank` is the number of rows counted. If two rows are "
+    "meant, write the two directions as separate rows, or use jd.Projected(rank_tol=1e-14). Accelerations are then "
+    "off by eps over the angle, so that below 1e-10 rad adaptive steps become short, up to `max_steps_reached`."
 )
-BASES = "Take jd.Reduced() without indices, which continues its basis, or method='projected'."
+BASES = "Use jd.Reduced() without indices, which continues its basis smoothly, or method='projected'."
 GRASPS = (
-    "Acceleration and contact forces stay right when the points come to a line: what is lost is control about it, "
-    "which the least singular value of `grasp_map` shows. A finger close to its reach ends with `singular_basis`; "
-    "`constrained_dynamics` goes on."
+    "Accelerations and contact forces stay correct when the points approach a line. What is lost is control about the"
+    " line, which the least singular value of `grasp_map` shows. A finger close to its reach ends with "
+    "`singular_basis`; `constrained_dynamics` continues."
 )
 STARTS = (
     "Start from jd.assemble(scene, q, v). A start that is open by more than rounding (5e-7 in float64, 2e-3 in "

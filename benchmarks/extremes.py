@@ -22,7 +22,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from benchmarks.timing import chosen_names
-from jaxdyn.compile.jax_adapter import known_options
+from jaxdyn.compile.jax_adapter import select_options
 from jaxdyn.constraints.codes import CODES, code_of
 
 DTYPES = ("float64", "float32")
@@ -117,7 +117,7 @@ def name_of(code) -> str:
 
 def quick(function):
     """Compiled fast: no time is measured here."""
-    options = known_options({"xla_backend_optimization_level": 0, "xla_cpu_use_fusion_emitters": False})
+    options = select_options({"xla_backend_optimization_level": 0, "xla_cpu_use_fusion_emitters": False})
     return jax.jit(function, compiler_options=options)
 
 

@@ -26,8 +26,8 @@ import numpy as np  # noqa: E402
 from benchmarks.identify_franka import panda, recorded, samples  # noqa: E402
 from benchmarks.identify_robots import ROOT, kuka, kuka_log, kuka_samples  # noqa: E402
 from jaxdyn import identify  # noqa: E402
-from jaxdyn.identify.logs import as_measured  # noqa: E402
-from jaxdyn.identify.spectra import vibration  # noqa: E402
+from jaxdyn.identify.logs import filter_like_log  # noqa: E402
+from jaxdyn.identify.workflows.spectra import vibration  # noqa: E402
 
 CUTOFFS = (3.5, 5.0, 6.5, 8.0, 10.0, 15.0, 20.0)
 COMMON = 2.5
@@ -51,8 +51,8 @@ def cutoffs(data: Path) -> None:
             residual = fit.torques(test) - test.tau
             below = (
                 100
-                * np.linalg.norm(as_measured(low, residual))
-                / np.linalg.norm(as_measured(low, np.asarray(test.tau)))
+                * np.linalg.norm(filter_like_log(low, residual))
+                / np.linalg.norm(filter_like_log(low, np.asarray(test.tau)))
             )
             mark = " auto" if cutoff == round(chosen, 2) else ""
             share = 100 * vibration(test, residual)[0]
@@ -71,7 +71,7 @@ def delays(data: Path) -> None:
     model, (train, test) = panda(), identify.split(recorded(data), 0.7)
     for delay in (0.0, "auto"):
         fit = identify.fit_robot(model, train, identify.TERMS, v_s=0.01, prior=1.0, robust=None, delay=delay)
-        print(f"delay {delay}: {fit.fit.error(fit.aligned(test)):.2f} %")
+        print(f"delay {delay}: {fit.fit.error(fit.align(test)):.2f} %")
         if fit.delays is not None:
             half = fit.delays.factor * fit.delays.std
             print(", ".join(f"{1e3 * d:.1f} +- {1e3 * h:.1f}" for d, h in zip(fit.delays.seconds, half, strict=True)))

@@ -6,7 +6,7 @@ from typing import NamedTuple
 import jax
 from jax.extend.core import ClosedJaxpr, Jaxpr
 
-from jaxdyn.compile.graph import inlined
+from jaxdyn.compile.graph import inline
 
 # What is carried out for some samples alone, as a second solution of rows that depend on each other, is left out.
 _NOT_ALWAYS = ("cond", "while")
@@ -26,7 +26,7 @@ def operations(function: Callable, *args) -> Operations | None:
     """Of the kernels that function(*args) calls outside of branches; None where it calls none, as without llvmlite."""
     computed: dict[str, int] = {}
     for program in _programs(jax.make_jaxpr(function)(*args).jaxpr):
-        for op, count in inlined(program).counts().items():
+        for op, count in inline(program).counts().items():
             computed[op] = computed.get(op, 0) + count
     if not computed:
         return None

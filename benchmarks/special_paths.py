@@ -22,7 +22,7 @@ from jax import lax
 import jaxdyn as jd
 from benchmarks import first_calls, timing
 from benchmarks.first_calls import CLOCKS
-from jaxdyn.compile import constants, expand, kernel, rows
+from jaxdyn.compile import batch, constants, expand, primitive
 from jaxdyn.simulation.solvers import driver
 
 CALLS = 20  # in a round
@@ -61,20 +61,20 @@ def without_loop() -> None:
 def without_rows() -> None:
     """Rows of save points go one by one."""
     for module in list(sys.modules.values()):
-        if module is not rows and getattr(module, "map_rows", None) is rows.map_rows:
+        if module is not batch and getattr(module, "map_rows", None) is batch.map_rows:
             module.map_rows = lax.map  # pyright: ignore[reportAttributeAccessIssue]
 
 
 def without_shared() -> None:
     """What samples share is computed by each block of them."""
-    patched: Any = kernel
-    patched.divided = lambda *_: None
+    patched: Any = primitive
+    patched.split_program = lambda *_: None
 
 
 def without_constants() -> None:
     """Known arrays are computed by JAX."""
     patched: Any = expand
-    patched.computed = constants.bound
+    patched.evaluate_known = constants.bind_known
 
 
 CASES: dict[str, tuple[Callable[[], None], dict[str, Callable[[], Callable]]]] = {

@@ -39,12 +39,16 @@ from jaxdyn.control.following import follow as follow
 from jaxdyn.control.inverse_kinematics import inverse_kinematics as inverse_kinematics
 from jaxdyn.control.legs import LeggedDynamics as LeggedDynamics
 from jaxdyn.control.legs import underactuated_inverse_dynamics as underactuated_inverse_dynamics
+from jaxdyn.dynamics.articulated_bodies import ArticulatedBodies as ArticulatedBodies
+from jaxdyn.dynamics.articulated_bodies import articulated_bodies as articulated_bodies
 from jaxdyn.dynamics.base_twists import base_twists as base_twists
 from jaxdyn.dynamics.base_twists import link_adjoints as link_adjoints
 from jaxdyn.dynamics.centroidal import center_of_mass as center_of_mass
 from jaxdyn.dynamics.centroidal import centroidal_momentum as centroidal_momentum
 from jaxdyn.dynamics.centroidal import centroidal_momentum_matrix as centroidal_momentum_matrix
 from jaxdyn.dynamics.centroidal import com_jacobian as com_jacobian
+from jaxdyn.dynamics.com_dynamics import ComDynamics as ComDynamics
+from jaxdyn.dynamics.com_dynamics import com_dynamics as com_dynamics
 from jaxdyn.dynamics.frame_motion import frame_acceleration as frame_acceleration
 from jaxdyn.dynamics.frame_motion import frame_jacobian as frame_jacobian
 from jaxdyn.dynamics.frame_motion import frame_velocity as frame_velocity

@@ -20,7 +20,7 @@ import numpy as np
 from jax import monitoring
 
 import jaxdyn as jd
-from jaxdyn.identify import minimise
+from jaxdyn.identify import optax_steps
 
 jax.config.update("jax_enable_x64", True)
 COLLECTIVES = "all-reduce|all-gather|all-to-all|reduce-scatter|collective-permute|collective-broadcast"
@@ -165,7 +165,7 @@ def compare_fits(*names):
         "slopes": partial(parameters, **options),
         "torque": partial(parameters, error="torque", method="lbfgs", steps=2),
     }
-    evaluate, programs = minimise._evaluate, []
+    evaluate, programs = optax_steps._evaluate, []
 
     def noted(*args):
         programs.append(evaluate.lower(*args).compile()) if not programs else None
@@ -173,9 +173,9 @@ def compare_fits(*names):
 
     for name in names:
         one = fits[name]()
-        minimise._evaluate = noted
+        optax_steps._evaluate = noted
         many = fits[name](devices=jax.devices())
-        minimise._evaluate = evaluate
+        optax_steps._evaluate = evaluate
         calls = exchanged(programs.pop().compiled) if programs else {}
         history = [np.asarray(computed.history).tolist() for computed in (one, many)]
         print(json.dumps({"name": name, "calls": calls, "history": history}))

@@ -50,8 +50,8 @@ def test_delays_are_found_to_their_intervals():
     assert np.all(off <= fit.delays.factor * fit.delays.std) and off.max() < 1e-3
     assert np.all(fit.delays.std < 1e-3) and np.all(fit.delays.squares[1].sum(0) < fit.delays.squares[0].sum(0))
     plain = identify.fit_robot(arm(), logs, **GIVEN)
-    assert plain.delays is None and plain.aligned(test) is test
-    assert fit.fit.error(fit.aligned(test)) < 0.3 * plain.fit.error(test)
+    assert plain.delays is None and plain.align(test) is test
+    assert fit.fit.error(fit.align(test)) < 0.3 * plain.fit.error(test)
     x = identify.nominal_parameters(arm())
     x[20:] = NUMBERS
     # Friction turns round faster than these samples tell, so nearness is what is asked; intervals: below, with slower friction.
@@ -80,7 +80,7 @@ def test_intervals_know_that_delays_were_fitted_too():
     np.testing.assert_array_equal(spread.std[-2:], fit.delays.std)
     seen = fit.intervals.base.std / given.intervals.base.std
 
-    aligned, base = fit.aligned(log), fit.intervals.combinations
+    aligned, base = fit.align(log), fit.intervals.combinations
     rows = identify.regressor(arm(), aligned.q, aligned.v, aligned.a, v_s=0.5)[..., base.independent]
     slopes = np.gradient(rows @ base.values(fit.fit.vector), aligned.t, axis=0)
     wide = np.concatenate([rows, slopes[:, :, None] * np.eye(2)], axis=2)

@@ -87,7 +87,7 @@ def twice(scene):
 def test_stages_at_once_are_those_in_turn(case, monkeypatch):
     """All steps in one kernel, a kernel a step, its stages in turn, and without kernels; a batch and one sample."""
     one, vs = batch(*CASES[case]())
-    taken, looped, run, run_loop = [], [], driver.run, driver.run_loop
+    taken, looped, kernel, run_loop = [], [], driver.kernel, driver.run_loop
 
     def counted(*args):
         computed = run_loop(*args)
@@ -99,20 +99,26 @@ def test_stages_at_once_are_those_in_turn(case, monkeypatch):
     assert all(looped) and looped
     monkeypatch.setattr(driver, "run_loop", lambda *_: None)
 
-    def noted(function, *args, **options):
-        computed = run(function, *args, **options)
-        if function is driver._advance:
-            taken.append(computed[0] is not None)
-        return computed
+    def refuse(*_):
+        taken.append(False)
+        raise AssertionError("a step is no kernel")
 
-    monkeypatch.setattr(driver, "run", noted)
+    def noted(function, **options):
+        if function is driver._advance:
+            taken.append(True)
+            options["fallback"] = refuse
+        return kernel(function, **options)
+
+    monkeypatch.setattr(driver, "kernel", noted)
     computed = quick(jax.vmap(one))(vs)
     assert all(taken) and taken
-    monkeypatch.setattr(
-        driver,
-        "run",
-        lambda f, *args, **options: (None, True) if f is driver._advance else run(f, *args, **options),
-    )
+
+    def without(function, **options):
+        if function is not driver._advance:
+            return kernel(function, **options)
+        return lambda *args, where: options["fallback"](*args)
+
+    monkeypatch.setattr(driver, "kernel", without)
     in_turn = quick(jax.vmap(one))(vs)
     with jd.compilation("plain"):
         plain = quick(jax.vmap(one))(vs)

@@ -13,6 +13,7 @@ from jax import monitoring
 import jaxdyn as jd
 from jaxdyn import compile as backend
 from jaxdyn.compile import ahead, calls, objects, target
+from jaxdyn.compile.repair import compute_where
 
 pytestmark = pytest.mark.native
 
@@ -36,7 +37,7 @@ least = options("least")
 
 
 def native(function):
-    return lambda *args: backend.run(lambda _, *args: function(*args), (), *args)
+    return lambda *args: backend.kernel(lambda _, *args: function(*args))((), *args)
 
 
 def is_made(before: set, count: int = 1) -> list[bool]:
@@ -66,7 +67,7 @@ def test_code_is_made_while_the_rest_is_traced():
         return y
 
     x = jnp.arange(3.0)
-    np.testing.assert_allclose(backend.compiled(function)(x), jnp.sin(x) * 1.17171, rtol=1e-15)
+    np.testing.assert_allclose(backend.entry_point(function)(x), jnp.sin(x) * 1.17171, rtol=1e-15)
     assert seen == [True]
 
 
@@ -74,7 +75,7 @@ def test_code_is_made_while_the_rest_is_traced():
 def test_code_is_not_made_ahead_for_a_program_that_others_call(batched, monkeypatch):
     """Under `jax.jit`, and in a batch, nobody knows yet what is called."""
     monkeypatch.setattr(target, "make_ahead", lambda number: pytest.fail("made ahead"))
-    function = backend.compiled(native(lambda x: jnp.sin(x) * 1.27272 + float(batched)))
+    function = backend.entry_point(native(lambda x: jnp.sin(x) * 1.27272 + float(batched)))
     x = jnp.arange(6.0).reshape(2, 3)
     computed = jax.vmap(function)(x) if batched else jax.jit(function)(x[0])
     np.testing.assert_allclose(computed, jnp.sin(x if batched else x[0]) * 1.27272 + float(batched), rtol=1e-15)
@@ -83,10 +84,10 @@ def test_code_is_not_made_ahead_for_a_program_that_others_call(batched, monkeypa
 def test_code_of_a_way_that_is_hardly_taken_is_not_made_ahead():
     def function(x):
         careful = native(lambda x: jnp.sin(x) * 1.37373)
-        return backend.recompute_unless(jnp.all(x > 0), careful, jnp.cos(x), (x,))
+        return compute_where(~jnp.all(x > 0), careful, jnp.cos(x), (x,))
 
     before, x = set(target._kernels), 1 + jnp.arange(3.0)
-    repaired = backend.compiled(function)
+    repaired = backend.entry_point(function)
     np.testing.assert_allclose(repaired(x), jnp.cos(x), rtol=1e-15)
     assert is_made(before) == [False]
     np.testing.assert_allclose(repaired(-x), jnp.sin(-x) * 1.37373, rtol=1e-15)
@@ -104,23 +105,23 @@ def test_no_thread_outlives_the_call_and_the_collector_stays_on():
         seen.append((gc.isenabled(), len(set(threading.enumerate()) - before)))
         return x
 
-    backend.compiled(function)(jnp.arange(3.0))
+    backend.entry_point(function)(jnp.arange(3.0))
     assert seen == [(True, 1)]
     assert not [x for x in set(threading.enumerate()) - before if "jaxdyn" in x.name]
 
 
 def test_an_error_of_the_other_thread_is_told_to_who_calls(monkeypatch):
     """It is made again when it is called: first it fails there too, then not any more."""
-    fails, made = [True], objects._compiled
+    fails, made = [True], objects._compile
 
     def failing(text):
         if fails[0]:
             raise MemoryError("no room")
         return made(text)
 
-    monkeypatch.setattr(objects, "_compiled", failing)
+    monkeypatch.setattr(objects, "_compile", failing)
     monkeypatch.setattr(objects, "_read", lambda key: None)
-    function = backend.compiled(native(lambda x: jnp.sin(x) * 1.47474))
+    function = backend.entry_point(native(lambda x: jnp.sin(x) * 1.47474))
     x = jnp.arange(3.0)
     with pytest.raises(jax.errors.JaxRuntimeError, match="could not be compiled"):
         jax.block_until_ready(function(x))
@@ -139,7 +140,7 @@ def test_the_environment_turns_both_off(usual, monkeypatch):
         seen.append(ahead.is_active())
         return native(lambda x: jnp.sin(x) * 1.67676)(x)
 
-    np.testing.assert_allclose(backend.compiled(function)(jnp.ones(2)), np.sin(1) * 1.67676, rtol=1e-15)
+    np.testing.assert_allclose(backend.entry_point(function)(jnp.ones(2)), np.sin(1) * 1.67676, rtol=1e-15)
     assert set(seen) == {False} and calls.quick_options() is None
 
 
@@ -151,9 +152,9 @@ def test_both_ways_agree(request):
         return jd.constrained_dynamics(scene, q, v, jnp.zeros(scene.nv)).acceleration
 
     q, v = jnp.asarray([0.4, 0.3, -0.5])[: scene.nv], jnp.zeros(scene.nv)
-    quick = backend.compiled(function)(q, v)
+    quick = backend.entry_point(function)(q, v)
     request.getfixturevalue("usual")
-    np.testing.assert_allclose(backend.compiled(lambda q, v: function(q, v))(q, v), quick, rtol=1e-13, atol=1e-13)
+    np.testing.assert_allclose(backend.entry_point(lambda q, v: function(q, v))(q, v), quick, rtol=1e-13, atol=1e-13)
 
 
 # --- code that compiles fast and runs slowly ---
@@ -166,7 +167,7 @@ def test_the_least_optimisation_gives_other_code_and_the_same_numbers(request):
 
     def torque(scale):  # of a program of its own for each scale
         scaled = model.replace(gravity=model.gravity * scale)
-        return np.asarray(backend.compiled(native(lambda q: jd.gravity_force(scaled, q)))(q))
+        return np.asarray(backend.entry_point(native(lambda q: jd.gravity_force(scaled, q)))(q))
 
     one, key = torque(1.0), objects.Code(text, stored=False).key
     request.getfixturevalue("least")
@@ -179,7 +180,7 @@ def test_the_least_optimisation_gives_other_code_and_the_same_numbers(request):
 def test_options_that_do_not_exist_are_refused(monkeypatch):
     monkeypatch.setenv("JAXDYN_COMPILATION_OPTIONS", "fast")
     with pytest.raises(ValueError, match="JAXDYN_COMPILATION_OPTIONS is 'fast'; choose from 'usual', 'least'"):
-        backend.compiled(native(lambda x: jnp.sin(x)))(jnp.ones(2))
+        backend.entry_point(native(lambda x: jnp.sin(x)))(jnp.ones(2))
 
 
 # --- what is called outside of any trace ---

@@ -14,7 +14,7 @@ import pytest
 from xla_options import QUICK
 
 from jaxdyn import se2, se3, so3
-from jaxdyn.compile.jax_adapter import known_options
+from jaxdyn.compile.jax_adapter import select_options
 from jaxdyn.lie import series as _series
 
 GROUPS = {"so3": so3, "se3": se3, "se2": se2}
@@ -30,7 +30,7 @@ LOG_ANGLES = [theta for theta in ANGLES if theta <= PI]
 AXES = [(2, -3, 6), (6, 2, -3), (-2, 6, 3), (1, 0, 0), (0, 1, 0), (0, 0, 1), (0, 0, -1)]
 
 # These tests compile much and run little, so the compiler is told to hurry.
-HURRY = QUICK | known_options({"xla_llvm_disable_expensive_passes": True})
+HURRY = QUICK | select_options({"xla_llvm_disable_expensive_passes": True})
 jit = functools.partial(jax.jit, compiler_options=HURRY)
 
 
@@ -530,6 +530,7 @@ def public_calls(name, x, y):
     if name == "so3":
         q, p = so3.quat_exp(x), so3.quat_exp(y)
         out |= {"quat_exp": q, "quat_log": so3.quat_log(q), "quat_multiply": so3.quat_multiply(q, p)}
+        out |= {f: getattr(so3, f)(x) for f in ("euler_to_matrix", "euler_body_jacobian", "euler_spatial_jacobian")}
         out |= {f: getattr(so3, f)(q) for f in ("quat_conjugate", "quat_to_matrix", "quat_normalize")}
         out |= {"matrix_to_quat": so3.matrix_to_quat(t), "quat_rotate": so3.quat_rotate(q, y), "cross": so3.cross(x, y)}
     else:

@@ -10,12 +10,13 @@ import pinocchio as pin
 import pytest
 from jax.flatten_util import ravel_pytree
 from pinocchio_bridge import to_pinocchio
+from scipy.interpolate import CubicSpline
 from scipy.signal import butter, filtfilt
 
 from jaxdyn import identify, inertia, robots
 from jaxdyn.identify.chart import make_chart
-from jaxdyn.identify.feasible import Problem, placed, torque_loss
-from jaxdyn.identify.interior import STRETCHES, Linear
+from jaxdyn.identify.feasible import Problem, move_origin, torque_loss
+from jaxdyn.identify.interior import LOG_CHOLESKY_BASIS, LinearChart
 from jaxdyn.identify.regression import condense
 from jaxdyn.io.urdf import load_urdf
 from jaxdyn.model.builder import ModelBuilder
@@ -241,7 +242,9 @@ def test_bad_arguments_raise(arm, iiwa_log):
 def test_every_point_of_the_chart_is_feasible(wrong_iiwa):
     chart, point = make_chart(wrong_iiwa, identify.TERMS, 0.01, "full", *[np.ones(7)] * 3)
     generator = np.random.default_rng(0)
-    np.testing.assert_allclose(chart.fitted(wrong_iiwa, point)[0].inertias, wrong_iiwa.inertias, rtol=1e-12, atol=1e-14)
+    np.testing.assert_allclose(
+        chart.model_at(wrong_iiwa, point)[0].inertias, wrong_iiwa.inertias, rtol=1e-12, atol=1e-14
+    )
     far = generator.normal(size=(200, 7, 10))
     bodies = jax.jit(jax.vmap(chart.inertias))(far).reshape(-1, 10)
     assert np.linalg.eigvalsh(pseudo_inertias(bodies)).min() > 0
@@ -302,15 +305,15 @@ def test_the_linear_map_on_the_host_is_the_chart(wrong_iiwa):
     for kind, size in (("full", 10), ("fixed", 0)):
         chart, point = make_chart(wrong_iiwa, ("viscous", "offset"), 0.01, kind, *[np.ones(7)] * 3)
         bent = 0.2 * np.triu(np.random.default_rng(1).normal(size=chart.origin.shape)) + np.eye(4)
-        chart, point = placed(chart, bent, np.asarray(point.s))
-        linear, s = Linear(chart), np.asarray(point.s)
+        chart, point = move_origin(chart, bent, np.asarray(point.s))
+        linear, s = LinearChart(chart), np.asarray(point.s)
         y, unflatten = ravel_pytree(point)
         np.testing.assert_allclose(linear.at(bent, s), chart.parameters(point), rtol=1e-12, atol=1e-14)
         slopes = jax.jit(jax.jacfwd(lambda y, f=unflatten, chart=chart: chart.parameters(f(y))))(y)
-        np.testing.assert_allclose(linear.slopes_at(bent, s), slopes, rtol=1e-11, atol=1e-13)
-        assert linear.slopes(bent).shape == (7 * (size > 0), 10, size)
+        np.testing.assert_allclose(linear.jacobian_at(bent, s), slopes, rtol=1e-11, atol=1e-13)
+        assert linear.body_jacobians(bent).shape == (7 * (size > 0), 10, size)
     factor = np.asarray(jax.jit(jax.jacfwd(inertia.log_cholesky_factor))(np.zeros(10))).transpose(2, 0, 1)
-    np.testing.assert_allclose(STRETCHES, factor + factor.transpose(0, 2, 1), atol=1e-15)
+    np.testing.assert_allclose(LOG_CHOLESKY_BASIS, factor + factor.transpose(0, 2, 1), atol=1e-15)
 
 
 # --- feasible fits by torque error ------------------------------------------------------------------------------------
@@ -466,8 +469,13 @@ def test_franka_feasible_fit_on_held_out_data(franka, method):
     # The prediction is inverse dynamics and the friction law, low-passed as the log is; the regressor says the same.
     columns = np.array(identify.regressor(model, test.q, test.v, test.a))
     coulomb = slice(10 * model.nb + model.nv, 10 * model.nb + 2 * model.nv)
-    rate = (len(test) - 1) / (test.t[-1] - test.t[0])
-    columns[:, :, coulomb] = filtfilt(*butter(4, 2 * test.cutoff / rate), columns[:, :, coulomb], axis=0)
+    # Friction jumps: it is evaluated on eight times the samples before the low-pass, with three of its periods beyond the ends.
+    fine = np.arange(8 * (len(test) - 1) + 1) / 8
+    v = CubicSpline(np.arange(len(test)), test.v)(fine)
+    rate = 8 * (len(test) - 1) / (test.t[-1] - test.t[0])
+    ends = int(3 * rate / test.cutoff)
+    friction = filtfilt(*butter(4, 2 * test.cutoff / rate), np.tanh(v / fit.friction.v_s), axis=0, padlen=ends)[::8]
+    columns[:, np.arange(model.nv), np.arange(coulomb.start, coulomb.stop)] = friction
     by_regressor = columns @ fit.vector
     np.testing.assert_allclose(fit.torques(test), by_regressor, atol=1e-10 * np.abs(by_regressor).max())
     assert fit.summary(train, test).count("torque error") == 2

@@ -24,15 +24,15 @@ def moved(scene, q0, v0, motors, size=2.0):
 def test_a_four_bar_is_completed_from_its_crank():
     scene = jd.scenes.four_bar()
     q, v, tau = moved(scene, *jd.scenes.four_bar.start(), (0,), size=20.0)
-    log = jd.identify.completed(scene, T, {"1": (q[:, 0], v[:, 0])}, tau, q[0] + np.array([0.0, 0.1, -0.1]))
+    log = jd.identify.complete_log(scene, T, {"1": (q[:, 0], v[:, 0])}, tau, q[0] + np.array([0.0, 0.1, -0.1]))
     np.testing.assert_allclose(log.q, q, atol=1e-8)
     np.testing.assert_allclose(log.v, v, atol=1e-7)
     with pytest.raises(ValueError, match="cannot be assembled at sample 3"):
         closed = q[:, 0].copy()
         closed[3:] = np.nan
-        jd.identify.completed(scene, T, {"1": (closed, v[:, 0])}, tau, q[0])
+        jd.identify.complete_log(scene, T, {"1": (closed, v[:, 0])}, tau, q[0])
     with pytest.raises(ValueError, match="scene has no constraints"):
-        jd.identify.completed(scene.system, T, {"1": (q[:, 0], v[:, 0])}, tau, q[0])
+        jd.identify.complete_log(scene.system, T, {"1": (q[:, 0], v[:, 0])}, tau, q[0])
 
 
 def computed(scene, log, parameters, observed, **options):
@@ -45,7 +45,7 @@ def test_energy_tells_the_coupler_of_a_four_bar():
     q0, v0 = jd.scenes.four_bar.start()
     q, v, tau = moved(jd.scenes.four_bar(), q0, v0, (0,), size=20.0)
     wrong = jd.scenes.four_bar(masses=(1.0, 2.0, 2.5))
-    log = jd.identify.completed(wrong, T, {"1": (q[:, 0], v[:, 0])}, tau, q[0])
+    log = jd.identify.complete_log(wrong, T, {"1": (q[:, 0], v[:, 0])}, tau, q[0])
     tree = jd.identify.Parameters(wrong).inertias(["coupler"], shape="mass", metric=None)
     fit = jd.identify.fit_parameters(wrong, log, tree, error="energy", horizon=10)
     # The trapezoidal rule over 25 ms.
@@ -57,7 +57,7 @@ def test_a_four_bar_by_its_crank_alone():
     q0, v0 = jd.scenes.four_bar.start()
     q, v, tau = moved(jd.scenes.four_bar(), q0, v0, (0,), size=20.0)
     wrong = jd.scenes.four_bar(masses=(1.0, 2.0, 2.5))
-    log = jd.identify.completed(wrong, T, {"1": (q[:, 0], v[:, 0])}, tau, q[0])
+    log = jd.identify.complete_log(wrong, T, {"1": (q[:, 0], v[:, 0])}, tau, q[0])
     tree = jd.identify.Parameters(wrong).inertias(["coupler"], shape="mass", metric=None)
     fit = computed(wrong, log, tree, ["1"])
     np.testing.assert_allclose(fit.system.system.inertias[1, 0], 3.0, rtol=1e-5)
@@ -73,12 +73,12 @@ def test_link_lengths_of_a_four_bar_by_two_encoders():
         lambda numbers: jd.scenes.four_bar(lengths=(1.0, *numbers["lengths"], 3.5)), {"lengths": jnp.array([2.9, 2.6])}
     )
     measured = {"1": (q[:, 0], v[:, 0]), "3": (q[:, 2], v[:, 2])}
-    log = jd.identify.completed(links.scene, T, measured, tau, q[0])
+    log = jd.identify.complete_log(links.scene, T, measured, tau, q[0])
     # What was measured is not moved onto the constraints of wrong lengths.
     np.testing.assert_array_equal(log.q[:, [0, 2]], q[:, [0, 2]])
     np.testing.assert_array_equal(log.v[:, [0, 2]], v[:, [0, 2]])
     tree = jd.identify.Parameters(links).positive(lambda links: links.numbers["lengths"])
-    fit = found(links, log, tree, ["1", "3"])
+    fit = computed(links, log, tree, ["1", "3"])
     np.testing.assert_allclose(fit.values, [3.0, 2.5], rtol=1e-5)
     assert fit.result == "converged" and (fit.deviation < 1e-3).all()
 
@@ -90,7 +90,7 @@ def test_a_redundant_manipulator_by_its_base_joints():
     q, v, tau = moved(jd.scenes.parallel_manipulator(), q0, v0, (0, 2, 4))
     wrong = jd.scenes.parallel_manipulator(mass=0.8)
     measured = {name: (q[:, i], v[:, i]) for name, i in (("a1", 0), ("b1", 2), ("c1", 4))}
-    log = jd.identify.completed(wrong, T, measured, tau, q[0])
+    log = jd.identify.complete_log(wrong, T, measured, tau, q[0])
     np.testing.assert_allclose(log.q, q, atol=1e-6)
     tree = jd.identify.Parameters(wrong).inertias(shape="mass", metric=None)
     fit = computed(wrong, log, tree, ["a1", "b1", "c1"])
@@ -107,7 +107,7 @@ def test_a_rolling_disk_by_its_two_angles():
     q, v, tau = moved(true, *jd.scenes.rolling_disk.start(), (2, 3), size=0.5)
     wrong = jd.scenes.rolling_disk(steer_inertia=0.2, roll_inertia=0.1)
     guess = q[0] * np.array([0.0, 0.0, 1.0, 1.0])
-    log = jd.identify.completed(wrong, T, {2: (q[:, 2], v[:, 2]), 3: (q[:, 3], v[:, 3])}, tau, guess)
+    log = jd.identify.complete_log(wrong, T, {2: (q[:, 2], v[:, 2]), 3: (q[:, 3], v[:, 3])}, tau, guess)
     parameters = jd.identify.Parameters(wrong).positive(
         lambda s: [s.system.parameters["steer"], s.system.parameters["roll"]]
     )
@@ -123,7 +123,7 @@ def test_a_hand_by_its_fingers_alone():
     q, v, tau = moved(true, q0, v0, (0, 1, 2, 3), size=0.05)
     wrong = jd.scenes.hand_with_bar(mu=None, gravity=0.0, mass=0.3)
     names = ("finger1_1_joint", "finger1_2_joint", "finger2_1_joint")
-    log = jd.identify.completed(wrong, T, {name: (q[:, i], v[:, i]) for i, name in enumerate(names)}, tau, q[0])
+    log = jd.identify.complete_log(wrong, T, {name: (q[:, i], v[:, i]) for i, name in enumerate(names)}, tau, q[0])
     np.testing.assert_allclose(log.q, q, atol=1e-7)
     tree = jd.identify.Parameters(wrong).inertias(["bar"], shape="mass", metric=None)
     fit = computed(wrong, log, tree, names)

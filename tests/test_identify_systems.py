@@ -12,8 +12,7 @@ from jaxdyn import identify, scenes
 from jaxdyn.dynamics import quantities as dynamics
 from jaxdyn.forces.elements import JointDamping
 from jaxdyn.identify.chart import check_bodies
-from jaxdyn.identify.jackknife import block_groups
-from jaxdyn.identify.whiteness import stretches
+from jaxdyn.identify.uncertainty import block_groups, effective_sample_size
 from jaxdyn.model.builder import ModelBuilder
 from jaxdyn.simulation.run import simulate
 from jaxdyn.systems.lagrangian import LagrangianSystem
@@ -177,7 +176,7 @@ def test_deviations_count_errors_that_last(oscillation):
     A = np.stack([-np.sin(3 * t), a, -np.ones_like(t), q, v], axis=1)
     best, (rest,) = np.linalg.lstsq(A, tau, rcond=None)[:2]
     edges = np.linspace(0, 81, 21).astype(int)  # twenty blocks, some of which make a group
-    parts = block_groups(20, stretches([(A @ best - tau)[:, None]]))
+    parts = block_groups(20, effective_sample_size([(A @ best - tau)[:, None]]))
     groups = [np.arange(edges[part[0]], edges[part[-1] + 1]) for part in parts]
     without = [np.linalg.lstsq(np.delete(A, group, 0), np.delete(tau, group), rcond=None)[0] for group in groups]
     scatter = np.sqrt(
@@ -357,7 +356,7 @@ def test_bad_choices_are_refused(swung, oscillation):
         ),
         "method is 'bfgs'": fit(oscillator(), free=parameters, method="bfgs"),
         "initial is 'guessed'": fit(oscillator(), free=parameters, initial="guessed"),
-        "the scene has 1 constraints, whose forces the torques do not tell": fit(
+        "the scene has 1 constraints, whose forces cannot be identified from torques": fit(
             rod, swung, positive=lambda s: s.system.parameters["mass"], error="torque"
         ),
         "the log has no a": fit(

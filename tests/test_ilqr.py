@@ -143,31 +143,31 @@ def test_cart_pole_swings_up(second_order):
 
 def test_arm_reaches_places_in_a_batch():
     """A UR5 from rest; each sample of a batch is the solution alone, whatever the others need."""
-    # Without the inertia of its rotors the last joint turns by hundreds of rad/s under next to no torque.
-    model = robots.ur5().replace(armature=jnp.full(6, 0.1))
-    step, tip = controlled(model, 0.05, range(6)), model.body_names[-1]
+    model = robots.ur5()
+    # Steps that are short against the time constants of the light wrist: the iterations do not converge with 50 ms.
+    step, tip = controlled(model, 0.02, range(6)), model.body_names[-1]
     q0 = jnp.array([0.3, -1.2, 1.4, 0.2, 0.5, 0.0])
-    us = jnp.broadcast_to(gravity_force(model, q0), (15, 6))
+    hold = gravity_force(model, q0)
+    us = jnp.broadcast_to(hold, (30, 6))
 
     def solve(goal):
         return ilqr(
             step,
-            lambda x, u, k: 1e-5 * u @ u + 1e-2 * x[1] @ x[1],
+            lambda x, u, k: 1e-4 * (u - hold) @ (u - hold) + 0.01 * x[1] @ x[1],
             lambda x: 1e4 * jnp.sum((frame_pose(model, x[0], tip)[:3, 3] - goal) ** 2) + 0.1 * jnp.sum(x[1] ** 2),
             (q0, jnp.zeros(6)),
             us,
-            iterations=60,
+            iterations=40,
         )
 
     start = frame_pose(model, q0, tip)[:3, 3]
     goals = start[None] + 0.1 * jnp.asarray(np.random.default_rng(2).normal(size=(3, 3)))
     batch, one = jax.jit(jax.vmap(solve))(goals), jax.jit(solve)(goals[1])
-    # Kernels of one sample and of a batch round differently, which the iterations amplify.
-    assert_close(batch.costs[1][:4], one.costs[:4], 1e-8)
+    assert batch.success.all() and one.success
+    # Kernels of one sample and of a batch round differently, which the iterations amplify until they converge.
     np.testing.assert_allclose(batch.cost[1], one.cost, rtol=1e-6)
-    assert bool(batch.success.all())
     ends = jax.vmap(lambda q: frame_pose(model, q, tip)[:3, 3])(batch.xs[0][:, -1])
-    assert np.abs(ends - goals).max() < 1e-3
+    assert np.abs(ends - goals).max() < 1e-3 and np.all(batch.cost < 1e-3 * batch.costs[:, 0])
 
 
 def test_car_with_rolling_wheels():

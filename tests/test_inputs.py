@@ -25,6 +25,7 @@ NU, WRENCH = [3], [[1, 2, 3, 4, 5, 6], [6, 5, 4, 3, 2, 1]]
 
 OF_BODIES = {
     "aba": (jd.aba, Q, V, A),
+    "articulated_bodies": (lambda m, q, v, a: jd.articulated_bodies(m, q, v, a).biases, Q, V, A),
     "body_jacobian": (lambda m, q: jd.body_jacobian(m, q, BODY), Q),
     "center_of_mass": (jd.center_of_mass, Q),
     "centroidal_momentum": (jd.centroidal_momentum, Q, V),

@@ -21,7 +21,7 @@ from jax.extend.core import Primitive
 
 import jaxdyn as jd
 from jaxdyn import compile as backend
-from jaxdyn.compile import expand, jax_adapter, kernel, mode, target
+from jaxdyn.compile import expand, jax_adapter, kernels, mode, target
 from jaxdyn.compile.trial import run_trial
 
 ADAPTER = Path(jax_adapter.__file__)
@@ -191,7 +191,7 @@ def test_options_that_xla_does_not_have_are_left_out_and_said_once(caplog):
     options = {"xla_backend_optimization_level": 1, "xla_cpu_no_such_option": True}
     with caplog.at_level(logging.DEBUG, "jaxdyn"):
         for _ in range(2):
-            assert jax_adapter.known_options(options) == {"xla_backend_optimization_level": 1}
+            assert jax_adapter.select_options(options) == {"xla_backend_optimization_level": 1}
     assert [(x.levelno, x.getMessage()) for x in caplog.records if x.name == "jaxdyn"] == [
         (logging.DEBUG, "jaxdyn: XLA has no compiler option xla_cpu_no_such_option, which is left out")
     ]
@@ -201,7 +201,7 @@ def test_options_that_xla_does_not_have_are_left_out_and_said_once(caplog):
 
 
 def test_the_installed_version_is_tested():
-    assert jax_adapter.is_tested() and jax_adapter.reason_against_kernels() is None
+    assert jax_adapter.is_version_known() and jax_adapter.reason_against_kernels() is None
 
 
 @pytest.fixture
@@ -226,7 +226,7 @@ def sums(known, x):
 
 def results(function, x):
     """Values and derivatives, of one sample and of a batch."""
-    value, slope = functools.partial(backend.run, function, ()), lambda x: jax.grad(lambda x: value(x)[0])(x)
+    value, slope = functools.partial(backend.kernel(function), ()), lambda x: jax.grad(lambda x: value(x)[0])(x)
     return [value(x), slope(x), jax.jit(jax.vmap(value))(jnp.stack([x, 2 * x])), jax.jit(jax.vmap(slope))(x[None])]
 
 
@@ -246,7 +246,7 @@ X = jnp.asarray([0.3, -0.4, 0.9])
 
 
 def uses_kernels(function) -> bool:
-    return "jaxdyn_kernel" in str(jax.make_jaxpr(functools.partial(backend.run, function, ()))(X))
+    return "jaxdyn_kernel" in str(jax.make_jaxpr(functools.partial(backend.kernel(function), ()))(X))
 
 
 def test_a_new_version_in_which_nothing_has_changed_has_kernels(future):
@@ -282,7 +282,7 @@ def test_a_renamed_parameter_leaves_a_function_to_jax(future, renamed):
 
 def test_a_renamed_parameter_is_an_error_on_a_tested_version(renamed):
     with pytest.raises(KeyError, match="num_consts"):
-        backend.run(fresh(sums), (), X)
+        backend.kernel(fresh(sums))((), X)
 
 
 def test_an_error_of_the_users_function_stays_what_it_is(future):
@@ -292,7 +292,7 @@ def test_an_error_of_the_users_function_stays_what_it_is(future):
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")
         with pytest.raises(ZeroDivisionError, match="of the user"):
-            backend.run(wrong, (), X)
+            backend.kernel(wrong)((), X)
 
 
 NEW = Primitive("quite_new")
@@ -305,7 +305,7 @@ def test_a_new_primitive_leaves_a_function_to_jax(future):
     def function(known, x):
         return NEW.bind(jnp.sin(x))
 
-    np.testing.assert_allclose(backend.run(function, (), X), jnp.sin(X) + 1, rtol=1e-15)
+    np.testing.assert_allclose(backend.kernel(function)((), X), jnp.sin(X) + 1, rtol=1e-15)
     assert not uses_kernels(function)
 
 
@@ -364,13 +364,13 @@ def test_a_call_that_cannot_be_lowered_is_left_to_jax(future, monkeypatch):
     assert_right(function, X, computed)
     monkeypatch.setattr(jax, "__version_info__", (0, 12, 0))
     with pytest.raises(TypeError, match="unexpected argument"):
-        jax.jit(functools.partial(backend.run, lambda known, x: jnp.cos(x), ()))(X)
+        jax.jit(functools.partial(backend.kernel(lambda known, x: jnp.cos(x)), ()))(X)
 
 
 def test_wrong_numbers_leave_everything_to_jax(future, monkeypatch):
     """As those of jax 0.10.2 were."""
-    rule = kernel.shaped_results
-    monkeypatch.setattr("jaxdyn.compile.trial.shaped_results", lambda *args: [2 * x for x in rule(*args)])
+    rule = kernels.call_program
+    monkeypatch.setattr("jaxdyn.compile.trial.call_program", lambda *args: [2 * x for x in rule(*args)])
     with one_warning("a kernel gives other numbers than JAX"):
         assert mode.current() == "plain"
 

@@ -11,7 +11,7 @@ import jaxdyn
 
 PACKAGE = Path(jaxdyn.__file__).parent
 # Rooms that are not done yet; the list is to be emptied.
-NOT_YET = {"constraints", "simulation", "compile", "identify", "scale", "export"}
+NOT_YET = {"constraints", "simulation", "scale", "export"}
 OPENINGS = set("What Which Whether How Where Of That Who Whoever As So".split())
 PARTICIPLE = re.compile(
     r"(\w*ed|told|built|made|drawn|shown|begun|taken|given|kept|held|written|cut|found|chosen|driven|known|said|seen|met|put"
@@ -20,9 +20,11 @@ PARTICIPLE = re.compile(
 # Terms of the field, and names that are deprecated in this release.
 TERMS = """generalized_force applied_force reduced_dynamics constrained_dynamics constrained_inverse_dynamics
     underactuated_inverse_dynamics closed_form
+    articulated_bodies
     coordinated_lifting closed_ring quadruped left_jacobian left_jacobian_inverse unconstrained constrained named_frame
     signed_distance displaced converged_reference published_state time_interleaved embed""".split()
-DEPRECATED = "followed followed_rate limited moved placed wanted_force wanted_forces".split()
+DEPRECATED = """followed followed_rate limited moved placed wanted_force wanted_forces completed bounded tied aligned named scaled
+    told""".split()
 # Protocol of constraints and names of other rooms that are not done yet.
 OTHERS = "declared".split()
 # Left column of the glossary, as far as a help text could have it.

@@ -63,7 +63,7 @@ def fitted(path=None, *, method="adam", start=(0.5, 2.9, 0.0), **options):
 @pytest.mark.parametrize(
     ("method", "least", "points"), [("adam", 5, 41), pytest.param("gauss-newton", 3, 6, marks=pytest.mark.slow)]
 )
-def test_a_killed_fit_goes_on_to_the_same_numbers(tmp_path, method, least, points):
+def test_a_killed_fit_resumes_to_the_same_numbers(tmp_path, method, least, points):
     path, root = tmp_path / "fit.ckpt", str(Path(__file__).parent.parent)
     run = subprocess.Popen(
         [sys.executable, "-c", _SCRIPT, str(path), root, method], env=os.environ | {"PYTHONPATH": root}
@@ -90,7 +90,7 @@ def _steps(path):
 
 
 @pytest.mark.parametrize("method", ["gauss-newton", "levenberg-marquardt", "lbfgs"])
-def test_a_stopped_fit_goes_on_to_the_same_numbers(tmp_path, method):
+def test_a_stopped_fit_resumes_to_the_same_numbers(tmp_path, method):
     path = tmp_path / "fit.ckpt"
     start = dict(method=method, start=(0.2, 2.6, 0.9), steps=12)
     part = fitted(path, callback=lambda step, *_: step == 3, **start)
@@ -111,7 +111,7 @@ def test_checkpoints_of_others_and_halves_are_refused(tmp_path):
     whole = path.read_bytes()
     for half in (whole[: len(whole) // 2], whole[:-1], whole[:-1] + b"x", b"", b"{}\n"):
         path.write_bytes(half)
-        with pytest.raises(ValueError, match="is no whole checkpoint"):
+        with pytest.raises(ValueError, match="is no complete checkpoint"):
             fitted(path, **quick)
     assert len(fitted(path, resume=False, **quick).history) == 3
     assert [p.name for p in tmp_path.iterdir()] == ["fit.ckpt"]

@@ -56,6 +56,37 @@ def test_reference_has_every_export():
     assert not missing and recursions <= {name.rpartition(".")[2] for name in listed}, sorted(missing)
 
 
+DOCUMENT_FUNCTIONS = """aba articulated_bodies base_twists com_dynamics com_jacobian constrained_dynamics involutive link_adjoints
+    mass_matrix_sqrt newton_euler_matrices projections RollingModel spurious_terms underactuated_inverse_dynamics
+    contact.contact_coordinates contact.montana control.ContactCoordinates control.GaugeInvariant control.GraspForce
+    control.HybridForce control.WholeBody geometry.arnold_form geometry.covariant_derivative grasp.forces_for_wrench
+    grasp.hand_dynamics grasp.hand_motions grasp.hold scenes.coordinated_lifting scenes.rough_disk_and_link scenes.sphere_arm
+    so3.euler_body_jacobian so3.euler_spatial_jacobian""".split()
+
+
+def test_functions_of_the_documents_exist():
+    """Every function that the page on equations names, and all that its table and "In jaxdyn" lines have to name."""
+    text = (ROOT / "docs/equations.md").read_text()
+    table = text.partition("## 14. ")[2]
+    named, in_table = (set(re.findall(r"`jd\.([\w.]+)`", part)) for part in (text, table))
+    missing = []
+    for name in named:
+        value = jd
+        for part in name.split("."):
+            value = getattr(value, part, None)
+        missing += [name] if value is None else []
+    assert not missing, missing
+    lines = "".join(re.findall(r"\*\*In jaxdyn:\*\*.*?\n\n", text, re.S))
+    in_lines = set(re.findall(r"`jd\.([\w.]+)`", lines))
+    assert not set(DOCUMENT_FUNCTIONS) - in_lines, set(DOCUMENT_FUNCTIONS) - in_lines
+    assert not set(DOCUMENT_FUNCTIONS) - in_table, set(DOCUMENT_FUNCTIONS) - in_table
+    # Each erratum is met on the way, but those of notation alone.
+    errata = set(re.findall(r'id="(e\d+)"', text))
+    ranges = re.findall(r"\(#e(\d+)\)-\[E(\d+)\]", table)
+    cited = set(re.findall(r"\(#(e\d+)\)", table)) | {f"e{n}" for a, b in ranges for n in range(int(a), int(b) + 1)}
+    assert not errata - cited, sorted(errata - cited)
+
+
 # Rooms of the package, which Python leaves in its namespace, are none of these.
 GROUPS = "contact control geometry grasp identify inertia plot robots scenes sensors se2 se3 so3 solvers".split()
 
@@ -242,7 +273,7 @@ def test_recipe_operational_space():
 @pytest.mark.slow
 def test_recipe_parallel_robot():
     names = recipe("A parallel robot from code")
-    assert names["freedom"] == 2
+    assert names["mobility"] == 2
     assert np.abs(names["held"].acceleration).max() < 1e-10
     assert np.abs(names["fall"].constraint_residual).max() < 1e-10
     # The motor's bearing transmits the motor's torque about its axis.

@@ -60,9 +60,9 @@ def tree(scene):
         ["link1", "link2"], metric="affine", total=5.0, ellipsoids={"link2": ((0.15, 0, 0), (0.4, 0.3, 0.3))}
     )
     whole = whole.positive(lambda s: s.forces[0], rows=None)
-    whole = whole.bounded(lambda s: s.system.lower, -2.0, 2.0) if np.isfinite(model.lower).all() else whole
+    whole = whole.bound(lambda s: s.system.lower, -2.0, 2.0) if np.isfinite(model.lower).all() else whole
     whole = whole.poses(lambda s: s.system.home, rows=["link1"], std=0.01)
-    whole = whole.tied(lambda s: s.system.frame_poses, lambda s: s.system.home, rows=["link2"], to_rows=["link1"])
+    whole = whole.tie(lambda s: s.system.frame_poses, lambda s: s.system.home, rows=["link2"], to_rows=["link1"])
     return whole.directions(lambda s: s.system.gravity, std=0.1).directions(lambda s: s.system.screws, rows=["link2"])
 
 
@@ -130,6 +130,22 @@ def test_logarithm_of_a_matrix_with_equal_eigenvalues():
         difference, slope, back = compute(matrix, step + step.T)
         np.testing.assert_allclose(slope, difference, atol=1e-4)  # differences of second order, 1/0.1^3 h^2
         np.testing.assert_allclose(back, matrix, atol=1e-13)
+
+
+def test_jacobi_eigenvectors():
+    """Against LAPACK on the host, in a batch, with equal eigenvalues and entries of all sizes."""
+    generator = np.random.default_rng(0)
+    matrices = generator.normal(size=(50, 4, 4)) * 10.0 ** generator.uniform(-6, 6, (50, 1, 1))
+    matrices = np.concatenate([matrices @ np.swapaxes(matrices, 1, 2), np.eye(4)[None], np.zeros((1, 4, 4))])
+    values, vectors = map(np.asarray, jax.jit(jax.vmap(distances.jacobi_eigenvectors))(matrices))
+    size = np.maximum(np.linalg.norm(matrices, axis=(1, 2)), 1e-300)
+    np.testing.assert_allclose(
+        np.sort(values) / size[:, None], np.linalg.eigvalsh(matrices) / size[:, None], atol=1e-14
+    )
+    back = np.einsum("nij,nj,nkj->nik", vectors, values, vectors)
+    np.testing.assert_allclose(back / size[:, None, None], matrices / size[:, None, None], atol=1e-14)
+    lowered = jax.jit(jax.vmap(distances.symmetric_log)).lower(matrices[:50]).as_text()
+    assert "lapack" not in lowered
 
 
 def test_barrier_residual_has_one_branch():
@@ -206,7 +222,7 @@ def test_geometry_gravity_and_sensors_are_found_together(log):
     points = (
         jd.identify.Parameters(measured)
         .positive(lambda m: m.torque_gain)
-        .bounded(lambda m: m.delay, -0.05, 0.05)
+        .bound(lambda m: m.delay, -0.05, 0.05)
         .free(lambda m: m.position_bias, rows=[1, 2])
         .poses(lambda m: m.scene.system.home, rows=["link1"], std=1.0)
         .directions(lambda m: m.scene.system.gravity)

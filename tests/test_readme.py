@@ -12,10 +12,10 @@ def test_example_of_the_readme_runs(tmp_path, monkeypatch):
     assert (tmp_path / "four_bar.png").stat().st_size > 10_000
     # Save points stand between steps: the energy (84 J) is that of the dense output.
     assert np.abs(names["motion"].constraint_residual).max() < 1e-10 and np.ptp(names["motion"].energy) < 1e-6 * 84
-    assert names["weights"].shape == (100, 3) and names["slopes"].shape == (100, 3, 3, 10)
+    assert names["weights"].shape == (100, 3) and names["jacobians"].shape == (100, 3, 3, 10)
     # The weight is linear in the ten numbers of each body.
     inertias = names["scene"].system.inertias
-    np.testing.assert_allclose(jnp.einsum("ncbk,bk->nc", names["slopes"], inertias), names["weights"], atol=1e-10)
+    np.testing.assert_allclose(jnp.einsum("ncbk,bk->nc", names["jacobians"], inertias), names["weights"], atol=1e-10)
 
 
 def test_examples_of_the_first_steps_run():
@@ -45,7 +45,7 @@ def test_examples_of_the_section_on_events_run():
     np.testing.assert_allclose(events.time[0], np.sqrt(0.8 / 9.81), rtol=1e-9)
     # Rolling keeps 5/7 of the velocity.
     np.testing.assert_allclose(names["motion"].q[-1, 0], 2 * (events.time[0] + 5 / 7 * (2 - events.time[0])), rtol=1e-7)
-    assert np.isfinite(names["slope"]) and names["slope"] != 0
+    assert np.isfinite(names["derivative"]) and names["derivative"] != 0
 
 
 @pytest.mark.slow

@@ -50,6 +50,8 @@ ELSEWHERE = {
 }
 # Examples of docstrings that are not run here, for the same reasons.
 NOT_RUN = {
+    "DryFriction": "test_friction_scenes",
+    "control.ContactCoordinates": "test_contact_laws",
     "RollingModel": "test_rolling_surfaces",
     "contact.RollingModel": "test_rolling_surfaces",
     "control.WholeBody": "test_whole_body",
@@ -80,40 +82,43 @@ motions = jd.grasp.hand_motions(grasp, q)
 nu = jnp.zeros(motions.object.shape[1] + motions.internal.shape[1])
 """
 # What readers of a docstring have in hand: the names that its example takes.
-NAMES = {
-    "DryFriction": "system = jd.MetricSystem(lambda q: jnp.eye(1), 1)",
-    "JointStops": "robot = model",
-    "PiecewiseForce": "system = model",
-    "ModelBuilder": "from jaxdyn import ModelBuilder",
-    "compilation": TWO,
-    "control.GraspForce": """
+NAMES = (
+    {
+        "JointStops": "robot = model",
+        "PiecewiseForce": "system = model",
+        "ModelBuilder": "from jaxdyn import ModelBuilder",
+        "compilation": TWO,
+        "control.GraspForce": """
 grasp = jd.scenes.hand_with_ball(mass=0.2)
 q0, v0 = jd.scenes.hand_with_ball.start(twist=(0.0,) * 6)
 q_object, ts = q0[grasp.system.topology.q_slices[-1]], jnp.linspace(0.0, 0.01, 2)
 """,
-    "frame_acceleration": ARM,
-    "grasp.hand_dynamics": MOTIONS,
-    "grasp.hand_motions": MOTIONS,
-    "identify.Measured": """
+        "frame_acceleration": ARM,
+        "grasp.hand_dynamics": MOTIONS,
+        "grasp.hand_motions": MOTIONS,
+        "identify.Measured": """
 scene = jd.Scene(model, forces=[jd.JointDamping([0.3, 0.3])])
 log = jd.identify.Log(log.t, log.q, log.v, log.a, log.tau / np.array([11.0, 8.5]))
 """,
-    "involutive": "q = q_disk",
-    "join": "arm, box = model, free",
-    "model_couplings": "model = plain",
-    "workspace_dynamics": ARM,
-} | dict.fromkeys(
-    (
-        "LieGroup",
-        "Sampled",
-        "Variational",
-        "control.ComputedTorque",
-        "simulate",
-        "solvers.LieGroup",
-        "stepper",
-        "stiffness",
-    ),
-    TWO,
+        "involutive": "q = q_disk",
+        "join": "arm, box = model, free",
+        "joint_wrench": "zero = still",
+        "model_couplings": "model = plain",
+        "workspace_dynamics": ARM,
+    }
+    | dict.fromkeys(
+        (
+            "LieGroup",
+            "Sampled",
+            "Variational",
+            "control.ComputedTorque",
+            "simulate",
+            "solvers.LieGroup",
+            "stiffness",
+        ),
+        TWO,
+    )
+    | {"stepper": TWO + "gain = jnp.eye(2)"}
 )
 
 

@@ -11,8 +11,7 @@ from jax import lax
 from pinocchio_bridge import quick
 
 import jaxdyn as jd
-from jaxdyn.compile import map_rows
-from jaxdyn.compile.rows import AT_ONCE
+from jaxdyn.compile.batch import AT_ONCE, map_rows
 
 pytestmark = pytest.mark.native
 

@@ -10,8 +10,8 @@ import pytest
 from pinocchio_bridge import quick
 
 import jaxdyn as jd
+from jaxdyn import compile as backend
 from jaxdyn.compile import shared
-from jaxdyn.compile.kernel import run
 
 pytestmark = pytest.mark.native
 
@@ -36,7 +36,7 @@ def test_numbers_that_do_not_vary(monkeypatch, least):
     monkeypatch.setattr(shared, "MIN_SHARED_OPERATIONS", least)
 
     def compute(a, b):
-        return run(numbers, a, b, static=(least,))
+        return backend.kernel(numbers, static=1)(least, a, b)
 
     def batch(a, b):
         return jax.vmap(lambda b: compute(a, b))(b)

@@ -6,14 +6,14 @@ installed XLA does not have are left out: a compiler option would be refused, an
 `python tests/xla_options.py` prints the flags of whole test runs.
 """
 
-from jaxdyn.compile.jax_adapter import known_options
+from jaxdyn.compile.jax_adapter import select_options
 
-QUICK = known_options({"xla_backend_optimization_level": 0, "xla_cpu_use_fusion_emitters": False})
+QUICK = select_options({"xla_backend_optimization_level": 0, "xla_cpu_use_fusion_emitters": False})
 
 
 def flags(**more) -> str:
     """The same as XLA_FLAGS, for processes that a test starts."""
-    return " ".join(f"--{name}={str(value).lower()}" for name, value in (QUICK | known_options(more)).items())
+    return " ".join(f"--{name}={str(value).lower()}" for name, value in (QUICK | select_options(more)).items())
 
 
 if __name__ == "__main__":

@@ -26,9 +26,9 @@ from jaxdyn.cli.repair import load_for_repair
 from jaxdyn.identify import EXTRA, TERMS, Fit, LeastSquares, Log, RobotFit
 from jaxdyn.identify.identifiability import base_terms
 from jaxdyn.identify.regression import log_regressor
-from jaxdyn.identify.spectra import vibration
-from jaxdyn.identify.suspicions import at_rest, suspicions
 from jaxdyn.identify.threads import on_one_thread
+from jaxdyn.identify.workflows.log_checks import check_log_content, check_rest
+from jaxdyn.identify.workflows.spectra import vibration
 from jaxdyn.io import save_urdf
 from jaxdyn.io.files import write_text
 from jaxdyn.model.builder import inertia_report, repair_inertias
@@ -94,7 +94,7 @@ def _add_advanced(data, fit, several: dict[str, Any]) -> None:
     data.add_argument(
         "--every", type=whole, metavar="N", help="keep one of N samples (default: 15 per period of --cutoff)"
     )
-    data.add_argument("--trim", type=whole, metavar="N", help="samples to drop at each end (default: 25 * --every)")
+    data.add_argument("--trim", type=whole, metavar="N", help="samples to drop at each end (default: 38 * --every)")
     data.add_argument("--filtered", action="store_true", help="the logs are filtered already")
     data.add_argument(
         "--unwrap", choices=("auto", "yes", "no"), default="auto", help="angles that jump by turns (default: auto)"
@@ -168,13 +168,13 @@ def run(args: argparse.Namespace) -> None:
     if args.payload_mass is not None:
         empty = logs if test_paths else [identify.split(log, args.train)[0] for log in logs]
         gains = find_gains(model, empty, loaded, options, args)
-        logs, loaded = ([gains.scaled(log) for log in group] for group in (logs, loaded))
+        logs, loaded = ([gains.scale(log) for log in group] for group in (logs, loaded))
 
     watch = Stopwatch()
     if test_paths:
         final = judge = make_fit(model, logs, options, args)
         tests = [filter_log(raw_log(model, path, args), path, args, cutoff) for path in test_paths]
-        tests = tests if gains is None else [gains.scaled(log) for log in tests]
+        tests = tests if gains is None else [gains.scale(log) for log in tests]
         test_names, trained = names[len(logs) :], logs
     else:
         trained, tests = (list(part) for part in zip(*(identify.split(log, args.train) for log in logs), strict=True))
@@ -242,7 +242,7 @@ def _extra_torques(result: RobotFit | Fit) -> dict[str, dict[str, float]]:
     model = fit.model
     named: dict[str, Any] = {"offset": fit.friction.offset, "v_s": np.full(model.nv, float(fit.friction.v_s))}
     if fit.extra is not None:
-        for name, values in fit.extra.named.items():
+        for name, values in fit.extra.by_term.items():
             group = np.array(values).reshape(-1, model.nv)
             named |= {f"{name}{k + 1 if len(group) > 1 else ''}": row for k, row in enumerate(group)}
     places = {
@@ -276,7 +276,7 @@ def _outcome(result: RobotFit | Fit | LeastSquares) -> str:
 def _evaluate(model: Model, result, names: list[str], logs: list[Log]) -> list[Evaluation]:
     nominal = identify.nominal_parameters(model)
     fit = result.fit if isinstance(result, RobotFit) else result
-    logs = [result.aligned(log) for log in logs] if isinstance(result, RobotFit) else logs
+    logs = [result.align(log) for log in logs] if isinstance(result, RobotFit) else logs
     return [
         Evaluation(name, log, fit.torques(log), log_regressor(model, log) @ nominal)
         for name, log in zip(names, logs, strict=True)
@@ -287,9 +287,11 @@ def _warnings(findings: Findings) -> list[str]:
     lines = []
     labels, _ = coordinate_labels(findings.model)
     for one in (*findings.final, *(findings.tests if not findings.is_refit else ())):
-        lines += [f"{one.name}: {line}" for line in suspicions(findings.model, one.log, labels)]
+        lines += [f"{one.name}: {line}" for line in check_log_content(findings.model, one.log, labels)]
         # Residuals are checked too: drift at rest points to friction or offsets that the model lacks.
-        lines += [f"{one.name}: {line}" for line in at_rest(one.log, one.predicted - np.asarray(one.log.tau), labels)]
+        lines += [
+            f"{one.name}: {line}" for line in check_rest(one.log, one.predicted - np.asarray(one.log.tau), labels)
+        ]
         share, edge = vibration(one.log, one.predicted - np.asarray(one.log.tau))
         if share > _VIBRATES and (one.log.cutoff is None or edge < one.log.cutoff):
             fix = f"low-pass it at {edge:.2g} Hz" if one.log.cutoff is None else f"try --cutoff {edge:.2g}"

@@ -9,7 +9,7 @@ import numpy as np
 from jaxdyn import identify
 from jaxdyn.cli.common import number
 from jaxdyn.identify import Log
-from jaxdyn.identify.jumps import repair_log
+from jaxdyn.identify.workflows.log_repair import repair_log
 from jaxdyn.io.logs import read_log
 from jaxdyn.model.tree import Model
 
@@ -108,8 +108,8 @@ def filter_log(raw: Log, path: str, args, cutoff: float | None) -> Log:
         assert cutoff is not None
     # 15 samples per cut-off period: more would be correlated by the filter and add no information.
     every = max(1, int(rate / (15 * cutoff))) if args.every is None else args.every
-    # The filter's transient at the ends lasts about one and a half periods of the cut-off.
-    trim = 25 * every if args.trim is None else args.trim
+    # Accelerations are within half a per cent of their size from two and a half periods of the cut-off away from the ends.
+    trim = 38 * every if args.trim is None else args.trim
     if every < 1 or trim < 0:
         raise ValueError(f"--every is {every}, --trim is {trim}; give --every of at least 1 and --trim of at least 0")
     try:

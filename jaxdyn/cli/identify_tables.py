@@ -61,7 +61,7 @@ def _joint_table(findings: Findings) -> str:
     header = ["joint", "unit", "torque rms", "error rms", "viscous", "coulomb", "offset", "rotor inertia"]
     extra = findings.result.fit.extra if isinstance(findings.result, RobotFit) else None
     if extra is not None:
-        for name, values in extra.named.items():
+        for name, values in extra.by_term.items():
             group = np.array(values).reshape(-1, findings.model.nv)
             header += [name if len(group) == 1 else f"{name} {k + 1}" for k in range(len(group))]
             columns += list(group)
@@ -142,7 +142,7 @@ def gains_text(gains: DriveGains, labels) -> str:
         f"{label} {short(float(g))} +- {short(float(h), 2)}"
         for label, g, h in zip(labels, gains.gains, half, strict=True)
     )
-    rest = [label for label in labels if label not in gains.told]
+    rest = [label for label in labels if label not in gains.identifiable]
     line = f"Drive gains, torque = gain * logged value, from the known payload: {cells}"
     if rest:
         line += f"\nHardly identifiable from the payload, near the others' median: gains of {', '.join(rest)}"

@@ -1,6 +1,7 @@
-"""Machine code that is made before it is called: by a thread, while Python traces on and XLA compiles.
+"""Native code compiled in advance: by a thread, while Python traces on and XLA compiles.
 
-LLVM lets other threads of Python run. The thread belongs to one call from outside, which waits for it before it returns.
+LLVM releases Python's lock while it compiles. The thread belongs to one call from outside, which waits for it before it returns,
+so that no thread outlives the call and none is left at the end of the process.
 """
 
 import contextlib
@@ -8,6 +9,7 @@ import contextvars
 from collections.abc import Callable, Iterator
 from concurrent.futures import ThreadPoolExecutor
 
+# A context variable, not a global: two threads of the user may trace at the same time.
 _worker: contextvars.ContextVar["_Worker | None"] = contextvars.ContextVar("jaxdyn_worker", default=None)
 
 
@@ -23,7 +25,8 @@ class _Worker:
         self.executor.submit(make)
 
     def end(self) -> None:
-        if self.executor is not None:  # whoever calls a kernel that has no code yet makes it
+        if self.executor is not None:
+            # Tasks that have not begun are dropped: a kernel without code is compiled by its first call.
             self.executor.shutdown(wait=True, cancel_futures=True)
 
 
@@ -44,12 +47,15 @@ def worker(is_wanted: bool = True) -> Iterator[None]:
 
 
 def is_active() -> bool:
-    """Whether what is traced is called as soon as it is compiled."""
+    """Decide whether kernels that are traced now are called as soon as XLA has compiled the program."""
     return _worker.get() is not None
 
 
 def make_later(make: Callable) -> None:
-    """Call `make()` in the thread of the context. An error is met again, and raised, by whoever calls the kernel."""
+    """Call `make()` in the thread of the context.
+
+    An error here is dropped: the first call of the kernel compiles it once more, and raises the error there.
+    """
     current = _worker.get()
     assert current is not None
     current.submit(make)

@@ -1,4 +1,4 @@
-"""Functions that are called outside of any trace, compiled once for all numbers."""
+"""Entry points: functions that users call outside of any trace, compiled once per shape."""
 
 import functools
 from collections.abc import Callable
@@ -8,22 +8,25 @@ import equinox as eqx
 import jax
 
 from jaxdyn.compile import ahead, mode
-from jaxdyn.compile.jax_adapter import known_options
-from jaxdyn.compile.known import is_concrete, is_staged
+from jaxdyn.compile.jax_adapter import function_of as function_of
+from jaxdyn.compile.jax_adapter import select_options
+from jaxdyn.compile.known import is_concrete, is_tracing
 
 
-def compiled(function: Callable) -> Callable:
-    """`function`, compiled once per shape, its arrays being inputs; within a trace as it is, where a nested `jit` would hide what
-    is known."""
+def entry_point(function: Callable) -> Callable:
+    """Compile a function that users call once per shape, its arrays being operands; a decorator.
+
+    Within a trace it is the function as it stands: a nested `jit` would hide the values of known arrays.
+    """
 
     usual = eqx.filter_jit(function)
     quick = functools.cache(lambda: _jit(function, compiler_options=quick_options()))
 
     @functools.wraps(function)
     def call(*args):
-        if is_staged():
+        if is_tracing():
             return function(*args)
-        # JAX takes options for a program that stands in no transformation.
+        # JAX refuses compiler options under a transformation such as `grad`, whose arguments are traced.
         if not (_is_glue(jax.default_backend()) and is_concrete(args)):
             return usual(*args)
         with ahead.worker(not mode.wants_usual_options()):
@@ -49,7 +52,7 @@ def quick_options() -> dict[str, Any] | None:
     """
     if mode.wants_usual_options():
         return None
-    return known_options(_LEAST if mode.wants_least_optimisation() else _QUICK)
+    return select_options(_LEAST if mode.wants_least_optimisation() else _QUICK)
 
 
 def glue_options(platform: str) -> dict[str, Any] | None:

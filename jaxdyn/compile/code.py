@@ -2,10 +2,10 @@
 
 A kernel is `void kernel(ptr data, i64 n, i64 begin, i64 end)`: `data` points to the arguments, first those that have a row of
 numbers per sample, then those that are uniform, one row for all samples, and then to the results; samples begin .. end - 1 of n
-are computed, W at a time. Where fewer are left than W, the last sample stands in the other lanes.
+are computed, W at a time. Where fewer than W remain, the last sample fills the other elements of the vectors.
 
 A subprogram is a function of the same name wherever its text is the same, so that it is compiled once for all kernels that call
-it: `void called(ptr ..., ptr ...)` with the arrays of its inputs, then of its outputs, each entry with its W lanes. A row of one
+it: `void called(ptr ..., ptr ...)` with the arrays of its inputs, then of its outputs, each entry for W samples. A row of one
 sample is such an array: it is passed on without a copy.
 """
 
@@ -14,7 +14,9 @@ from collections.abc import Callable, Sequence
 from jaxdyn.compile.llvm import Emitter
 from jaxdyn.compile.program import COMPARISONS, FLOATS, Array, Constant, Program, kind_of
 
-MIN_SHARED_OPERATIONS = 2000  # operations of a program of one sample, beside which those of a call do not count
+# A program of one sample with at least so many operations is compiled once for all kernels that contain it: the copies of a
+# call's arguments are few against them.
+MIN_SHARED_OPERATIONS = 2000
 _ALIGNED = 64  # bytes
 ATTRIBUTES = (
     "attributes #0 = { nounwind }",
@@ -33,6 +35,7 @@ class Body:
         self.e, self.program, self.load, self.array = e, program, load, array
         self.names: list = [None] * len(program.operations)  # of inputs, those that have been read
         self.parts: dict[int, list[int]] = {}  # of each call, the entries of its outputs that are needed
+        # A subprogram that is called again finds its arrays at the same place: entries that have not changed stay there.
         self.regions: dict[Program, int] = {}  # where in %in and %out the arrays of a subprogram begin
         self.bytes = 0
         self.passed: dict[int, str] = {}  # what stands in %in, which subprograms do not change
@@ -41,7 +44,7 @@ class Body:
                 self.parts.setdefault(args[0], []).append(args[1].value)
 
     def name(self, i: int) -> str:
-        """Of operation i."""
+        """Name of operation i; inputs are loaded where they are first read."""
         if self.names[i] is None:
             _, kind, args = self.program.operations[i]
             self.names[i] = self.load(*args, kind)
@@ -79,7 +82,7 @@ class Body:
         at, first, pointers = self.regions[called], 0, []
         for array in called.inputs:
             entries = given[first : first + array.size]
-            pointers.append(self._passed_on(entries, array) or self._copied(entries, array, at))
+            pointers.append(self._input_pointer(entries, array) or self._copy_entries(entries, array, at))
             at, first = at + bytes_of(array, self.e.width), first + array.size
         outputs = []
         for array in called.outputs:
@@ -92,17 +95,18 @@ class Body:
             first += size
         return results
 
-    def _passed_on(self, entries, array: Array) -> str | None:
+    def _input_pointer(self, entries, array: Array) -> str | None:
         """The pointer to an input of this program that these entries are."""
         operations = self.program.operations
         if any(type(x) is Constant or operations[x].op != "input" for x in entries) or not entries:
             return None
         place = operations[entries[0]].args[0]
+        # Only a whole input in its order is passed on as it is; a slice of one would need another layout for W samples.
         whole = [(place, k) for k in range(self.program.inputs[place].size)]
         same = whole == [operations[x].args for x in entries] and self.program.inputs[place].dtype == array.dtype
         return self.array(place) if same else None
 
-    def _copied(self, entries, array: Array, at: int) -> str:
+    def _copy_entries(self, entries, array: Array, at: int) -> str:
         """A pointer to memory with these entries."""
         kind, pointer = kind_of(array.dtype), self._place(at)
         for k, x in enumerate(entries):
@@ -113,14 +117,15 @@ class Body:
         return pointer
 
     def _place(self, at: int) -> str:
-        return self.e.put(f"getelementptr i8, ptr %passed, i64 {at}")
+        return self.e.emit(f"getelementptr i8, ptr %passed, i64 {at}")
 
-    def allocated(self) -> list[str]:
+    def allocations(self) -> list[str]:
         """Memory for what is passed."""
         return [f"  %passed = alloca [{self.bytes} x i8], align {_ALIGNED}"] if self.bytes else []
 
 
 def bytes_of(array: Array, width: int) -> int:
+    """Bytes of an array for W samples, rounded up to whole cache lines: vector loads are aligned."""
     return -(-array.size * array.dtype.itemsize * width // _ALIGNED) * _ALIGNED
 
 
@@ -150,12 +155,13 @@ def subprogram_ir(called: Program, width: int) -> str:
 
 
 def calls_itself(program: Program, width: int) -> bool:
-    """Whether a kernel is a call of its program as a subprogram, whose code other kernels have too."""
+    """Decide whether a kernel is a call of its program as a subprogram, whose code other kernels share."""
     return width == 1 and program.cost >= MIN_SHARED_OPERATIONS and not program.subprograms
 
 
 def varying_first(uniform: Sequence[bool]) -> list[int]:
-    """The order in which a kernel takes the arguments of its program. (XLA divides a call as its first argument is divided.)"""
+    """The order in which a kernel takes the arguments of its program."""
+    # XLA partitions a call as its first argument is partitioned, which so is one of the batch.
     return sorted(range(len(uniform)), key=lambda i: uniform[i])
 
 
@@ -174,6 +180,7 @@ def kernel_ir(program: Program, width: int, uniform: Sequence[bool]) -> str:
         if uniform[place]:
             return e.load_for_all(place, entry, kind)
         first = entry - entry % width
+        # A tile is W vector loads and their transpose. It pays where at least half of its entries are read.
         wanted = [(place, k) in entries for k in range(first, first + width)]
         if width == 1 or kind not in FLOATS or first + width > arrays[place].size or 2 * sum(wanted) < width:
             return e.load(rows[place], entry, kind)
@@ -186,19 +193,20 @@ def kernel_ir(program: Program, width: int, uniform: Sequence[bool]) -> str:
         return None if width > 1 else rows[place][0] if place in rows else f"%a{place}"
 
     body = Body(e, program, load, array)
+    # The kernel of one sample of a large program is a call: the same code serves as a subprogram of steps and rollouts.
     if calls_itself(program, width):
         _write_call(e, program, [str(array(i)) for i in range(len(arrays))])
     else:
         for i, (row, output) in enumerate(zip(body.results(), program.outputs, strict=True)):
             e.store_array(rows[count + i], kind_of(output.dtype), row)
-    # Arguments that are not read are not in the code, but the handler checks their sizes: they are part of what is hashed.
+    # Arguments that are not read are not in the code, but the handler checks their sizes, so that the hash covers them.
     sizes = " ".join(
         f"{'same' if i < count and uniform[i] else 'each'}:{x.size}x{x.dtype}" for i, x in enumerate(arrays)
     )
-    return framed(e, f"{count} {sizes}", uniform, len(program.outputs), body.allocated())
+    return wrap_kernel(e, f"{count} {sizes}", uniform, len(program.outputs), body.allocations())
 
 
-def framed(e: Emitter, title: str, uniform: Sequence[bool], outputs: int, allocated: Sequence[str]) -> str:
+def wrap_kernel(e: Emitter, title: str, uniform: Sequence[bool], outputs: int, allocations: Sequence[str]) -> str:
     """The text of a whole kernel around the lines that `e` holds for the W samples from %base on, which may have labels.
 
     `uniform` says which arguments are the same for all samples; so many `outputs` follow them. `title` is a comment on top, and
@@ -212,7 +220,7 @@ def framed(e: Emitter, title: str, uniform: Sequence[bool], outputs: int, alloca
             f"; {title}",
             "define void @kernel(ptr %data, i64 %n, i64 %begin, i64 %end) #0 {",
             "entry:",
-            *allocated,
+            *allocations,
             *pointers,
             "  %last = sub i64 %n, 1",
             "  %some = icmp ult i64 %begin, %end",

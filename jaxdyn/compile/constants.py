@@ -21,7 +21,7 @@ _NUMPY_REDUCTIONS: dict[str, Callable] = {
 }  # fmt: skip
 
 
-def of_nothing(name: str, dtype):
+def empty_reduction(name: str, dtype):
     """A reduction of no entries."""
     if name in ("reduce_max", "reduce_min"):
         if dtype.kind == "b":
@@ -31,19 +31,20 @@ def of_nothing(name: str, dtype):
     return name in ("reduce_prod", "reduce_and")
 
 
-def converted(x: np.ndarray, dtype) -> np.ndarray:
+def convert_known(x: np.ndarray, dtype) -> np.ndarray:
     """An array as one of a dtype, by XLA's rules: floats that no integer is near become its ends, or zero if they are none."""
     dtype = np.dtype(dtype)
     if x.dtype.kind != "f" or dtype.kind not in "iu":
         return x.astype(dtype)
+    # NumPy's own conversion of a float that is out of range is undefined and differs between processors.
     ends = np.iinfo(dtype)
     is_low, is_high = x <= ends.min, x >= ends.max
     inside = np.where(is_low | is_high | np.isnan(x), 0, x).astype(dtype)
     return np.where(is_high, dtype.type(ends.max), np.where(is_low, dtype.type(ends.min), inside))
 
 
-def computed(eqn, args) -> np.ndarray:
-    """An operation on known arrays; by numpy where that does the same, as JAX would compile it first."""
+def evaluate_known(eqn, args) -> np.ndarray:
+    """An operation on known arrays; by NumPy where that does the same, as JAX would compile it for each new shape."""
     name, out = eqn.primitive.name, eqn.outvars[0].aval
     with np.errstate(all="ignore"):
         if name in _NUMPY and not (name in _OTHER_OF_INTEGERS and out.dtype.kind in "iu"):
@@ -51,16 +52,17 @@ def computed(eqn, args) -> np.ndarray:
         if name == "div" and out.dtype.kind == "f":
             return np.asarray(args[0] / args[1], out.dtype)
         if name in _NUMPY_REDUCTIONS and not args[0].size:
-            return np.full(out.shape, of_nothing(name, out.dtype), out.dtype)
+            return np.full(out.shape, empty_reduction(name, out.dtype), out.dtype)
         if name in _NUMPY_REDUCTIONS:
             return np.asarray(_NUMPY_REDUCTIONS[name](args[0], axis=tuple(eqn.params["axes"]))).astype(out.dtype)
         if name == "iota":
             return np.indices(out.shape)[eqn.params["dimension"]].astype(out.dtype)
-    return bound(eqn, args)
+    return bind_known(eqn, args)
 
 
-def bound(eqn, args) -> np.ndarray:
+def bind_known(eqn, args) -> np.ndarray:
     """The same by JAX itself."""
+    # The expansion may run within a user's trace, which must not see this operation.
     with jax.ensure_compile_time_eval():
         value = eqn.primitive.bind(*args, **eqn.params)
     if eqn.primitive.multiple_results:

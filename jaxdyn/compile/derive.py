@@ -10,7 +10,8 @@ from typing import Any
 
 import numpy as np
 
-from jaxdyn.compile.graph import Graph, inlined, is_number, objects
+from jaxdyn.compile.graph import Graph, inline
+from jaxdyn.compile.number import is_number, objects
 from jaxdyn.compile.program import FLOATS, Constant, Program
 
 
@@ -25,7 +26,8 @@ def tangent(program: Program, moving: Sequence[bool]) -> Program:
 
 
 def _tangent(program: Program, moving: tuple[bool, ...]) -> Program:
-    program, graph = inlined(program), Graph()
+    # A subprogram has no derivative of its own: called ones are written out, so that the tangent shares their numbers.
+    program, graph = inline(program), Graph()
     arrays = [*program.inputs, *(x for x, varies in zip(program.inputs, moving, strict=True) if varies)]
     entries = [graph.inputs(place, array) for place, array in enumerate(arrays)]
     primal, steps = entries[: len(moving)], iter(entries[len(moving) :])
@@ -40,6 +42,7 @@ def _tangent(program: Program, moving: tuple[bool, ...]) -> Program:
             continue
         given = [(0.0 if type(x) is Constant else changes[x]) for x in operation.args]
         operands = [x.value if type(x) is Constant else values[x] for x in operation.args]
+        # Integers and bools do not change, nor do numbers whose operands do not: most of a tangent is left out here.
         varies = operation.kind in FLOATS and any(is_number(x) or x != 0 for x in given)
         changes.append(_change(graph, operation.op, operation.kind, value, operands, given) if varies else 0.0)
     rows, outputs = [], [array for array in program.outputs if array.dtype.kind == "f"]
@@ -60,29 +63,11 @@ def _change(g: Graph, op: str, kind: str, value, x: list, d: list):
     if op == "mul":
         return g.add(g.mul(d[0], x[1]), g.mul(x[0], d[1]))
     if op == "div":
+        # (dx - y dz)/z with one reciprocal, which other quotients by z share: a division costs as much as ten products.
         inverse = g.div(1.0, x[1])
         return g.mul(g.sub(d[0], g.mul(value, d[1])), inverse)
-    if op == "select":
-        return g.select(x[0], d[1], d[2], kind)
-    # Ties are decided as JAX decides them: a maximum of two gives each half, one of several gives all that are largest the same
-    # share, and a number on a bound of its range does not move. Nothing moves a maximum that is not a number.
-    if op in ("max", "min"):
-        words = ("gt", "lt") if op == "max" else ("lt", "gt")
-        first, second = (g.compare(word, x[0], x[1]) for word in words)
-        chosen = g.select(first, g.select(second, 0.0, d[1], kind), d[0], kind)
-        return g.select(g.compare("eq", x[0], x[1]), chosen, g.mul(0.5, g.add(d[0], d[1])), kind)
-    if op in ("reduce_max", "reduce_min"):
-        hits = [g.compare("eq", entry, value) for entry in x]
-        total = functools.reduce(g.add, [g.select(hit, 0.0, step, kind) for hit, step in zip(hits, d, strict=True)])
-        return g.div(total, functools.reduce(g.add, [g.convert(hit, kind) for hit in hits]))
-    if op == "clamp":
-        low, inner, high = x
-        is_below = g.both(g.compare("gt", low, inner), g.compare("lt", low, high))
-        is_inside = g.both(g.compare("gt", inner, low), g.compare("lt", inner, high))
-        flags = is_below, is_inside, g.compare("lt", high, inner)
-        return functools.reduce(g.add, [g.select(flag, 0.0, step, kind) for flag, step in zip(flags, d, strict=True)])
-    if op == "abs":
-        return g.select(g.compare("ge", x[0], 0.0), g.neg(d[0]), d[0], kind)
+    if op in _CHOICES:
+        return _choice_change(g, op, kind, value, x, d)
     if op == "convert":
         return g.convert(d[0], kind)
     if op in _PARTIAL:
@@ -102,12 +87,43 @@ def _change(g: Graph, op: str, kind: str, value, x: list, d: list):
         by_second = g.mul(g.div(x[0], square), d[1]) if is_number(d[1]) or d[1] != 0 else 0.0
         return g.sub(by_first, by_second)
     if op == "rem":
+        # x - trunc(x/y) y, where the truncated quotient is constant almost everywhere.
         quotient = g.div(x[0], x[1])
         whole = g.select(
             g.compare("lt", quotient, 0.0), g.function("floor", quotient), g.function("ceil", quotient), kind
         )
         return g.sub(d[0], g.mul(whole, d[1]))
     return 0.0  # floor, ceil, round, sign, stop_gradient
+
+
+_CHOICES = "select", "max", "min", "reduce_max", "reduce_min", "clamp", "abs"
+
+
+def _choice_change(g: Graph, op: str, kind: str, value, x: list, d: list):
+    """`_change` of operations that take one of their operands."""
+    if op == "select":
+        return g.select(x[0], d[1], d[2], kind)
+    # Ties are decided as JAX decides them: a maximum of two gives each half, one of several gives all that are largest the same
+    # share, and a number on a bound of its range does not move. Nothing moves a maximum that is not a number.
+    if op in ("max", "min"):
+        words = ("gt", "lt") if op == "max" else ("lt", "gt")
+        first, second = (g.compare(word, x[0], x[1]) for word in words)
+        chosen = g.select(first, g.select(second, 0.0, d[1], kind), d[0], kind)
+        return g.select(g.compare("eq", x[0], x[1]), chosen, g.mul(0.5, g.add(d[0], d[1])), kind)
+    if op in ("reduce_max", "reduce_min"):
+        # JAX's rule too: the mean over all entries that equal the result. A chain of maxima would halve it at each tie.
+        hits = [g.compare("eq", entry, value) for entry in x]
+        total = functools.reduce(g.add, [g.select(hit, 0.0, step, kind) for hit, step in zip(hits, d, strict=True)])
+        return g.div(total, functools.reduce(g.add, [g.convert(hit, kind) for hit in hits]))
+    if op == "clamp":
+        # Strict comparisons, as in JAX: on a bound neither the number nor the bound moves the result.
+        low, inner, high = x
+        is_below = g.both(g.compare("gt", low, inner), g.compare("lt", low, high))
+        is_inside = g.both(g.compare("gt", inner, low), g.compare("lt", inner, high))
+        flags = is_below, is_inside, g.compare("lt", high, inner)
+        return functools.reduce(g.add, [g.select(flag, 0.0, step, kind) for flag, step in zip(flags, d, strict=True)])
+    # "abs": at zero JAX takes the derivative of x.
+    return g.select(g.compare("ge", x[0], 0.0), g.neg(d[0]), d[0], kind)
 
 
 _PARTIAL: dict[str, Callable[..., Any]] = {
@@ -130,7 +146,7 @@ _PARTIAL: dict[str, Callable[..., Any]] = {
 }
 
 
-def transposed(program: Program, linear: Sequence[bool], given: Sequence[bool]) -> Program:
+def transpose(program: Program, linear: Sequence[bool], given: Sequence[bool]) -> Program:
     """The transpose of a program that is linear in some of its inputs together.
 
     Of the other inputs, and of the cotangents of those outputs that are `given`, to the cotangents of the `linear` inputs.
@@ -138,18 +154,20 @@ def transposed(program: Program, linear: Sequence[bool], given: Sequence[bool]) 
     key = ("transposed", tuple(linear), tuple(given))
     if key not in program.derived:
         with np.errstate(all="ignore"):
-            program.derived[key] = _transposed(program, tuple(linear), tuple(given))
+            program.derived[key] = _transpose(program, tuple(linear), tuple(given))
     return program.derived[key]
 
 
-def _transposed(program: Program, linear: tuple[bool, ...], given: tuple[bool, ...]) -> Program:
-    program, graph = inlined(program), Graph()
+def _transpose(program: Program, linear: tuple[bool, ...], given: tuple[bool, ...]) -> Program:
+    program, graph = inline(program), Graph()
     fixed = [array for array, varies in zip(program.inputs, linear, strict=True) if not varies]
     arrays = [*fixed, *(array for array, is_given in zip(program.outputs, given, strict=True) if is_given)]
     entries = [graph.inputs(place, array) for place, array in enumerate(arrays)]
+    # Fixed inputs come first, then the cotangents, as JAX's transpose rule passes them.
     operands = iter(entries[: len(fixed)])
     # The values of what is linear are not needed, and not made: their places hold None.
-    values = _values_of_the_fixed(graph, program, [None if varies else next(operands) for varies in linear])
+    values = _values_of_constants(graph, program, [None if varies else next(operands) for varies in linear])
+    # Cotangents of the operations, summed from their users: reverse order is safe, as operands precede their users.
     bar: list = [0.0] * len(program.operations)
     cotangents = iter(entries[len(fixed) :])
     for row, is_given in zip(program.results, given, strict=True):
@@ -164,6 +182,7 @@ def _transposed(program: Program, linear: tuple[bool, ...], given: tuple[bool, .
             bar[place] = graph.add(bar[place], cotangent)
 
     for i in reversed(range(len(program.operations))):
+        # A value that is there is no function of the linear inputs, and a zero cotangent passes on zeros.
         if values[i] is not None or not (is_number(bar[i]) or bar[i] != 0):
             continue
         op, kind, args = program.operations[i]
@@ -172,7 +191,7 @@ def _transposed(program: Program, linear: tuple[bool, ...], given: tuple[bool, .
             assert row is not None
             row[args[1]] = bar[i]
         else:
-            _give_back(graph, op, kind, args, values, bar[i], give, program)
+            _transpose_operation(graph, op, kind, args, values, bar[i], give, program)
     rows = [
         (objects(row, array.shape), array)
         for row, array, varies in zip(sums, program.inputs, linear, strict=True)
@@ -181,7 +200,7 @@ def _transposed(program: Program, linear: tuple[bool, ...], given: tuple[bool, .
     return graph.finish(arrays, [x[1] for x in rows], [x[0] for x in rows], name=f"transpose of {program.name}")
 
 
-def _values_of_the_fixed(graph: Graph, program: Program, inputs: list) -> list:
+def _values_of_constants(graph: Graph, program: Program, inputs: list) -> list:
     flat = [None if x is None else x.ravel().tolist() for x in inputs]
     values: list = []
     for op, kind, args in program.operations:
@@ -195,7 +214,7 @@ def _values_of_the_fixed(graph: Graph, program: Program, inputs: list) -> list:
     return values
 
 
-def _give_back(g: Graph, op: str, kind: str, args, values, c, give, program: Program) -> None:
+def _transpose_operation(g: Graph, op: str, kind: str, args, values, c, give, program: Program) -> None:
     """Hand the cotangent c of a linear operation to its operands."""
 
     def value(x):

@@ -1,9 +1,5 @@
 """Programs of numbers while they are written: what is known is folded away, and equal numbers are made once.
 
-The `Number`s of a `Graph` and known numbers are the entries of numpy arrays of objects, so that numpy's own functions move, sum
-and multiply them. Known numbers carry their type: a Python float is a float64 and a Python bool a bool, all others are scalars
-of numpy. So known integers wrap, and known float32 numbers round, as they would in XLA.
-
 Sums and products with 0, 1 and -1 are not written, and signs are moved outwards, so that they meet and cancel. Four of these
 rules change results: docs/algorithms.md lists them, and `python -m benchmarks.random_functions` compares all the rest with JAX.
 Each has its comment "Listed" here. What no output needs is dropped when a graph is finished to a `Program`.
@@ -16,6 +12,7 @@ from typing import Any
 
 import numpy as np
 
+from jaxdyn.compile.number import Number, objects, with_type
 from jaxdyn.compile.program import (
     COMPARISONS,
     FUNCTIONS,
@@ -31,49 +28,10 @@ from jaxdyn.compile.program import (
     kind_of,
 )
 
-_MADE_FOR_ONE_KEPT = 3  # numbers while a program is written, of which those that no output needs are dropped
+# Numbers that may be made for each operation that is allowed: those that no output needs are dropped at the end. Without a
+# bound a function that explodes would fill the memory before the count of operations refuses it.
+_MADE_FOR_ONE_KEPT = 3
 _LEAST_NORMAL = {"f8": 2.0**-1022, "f4": 2.0**-126}
-
-
-class Number:
-    """A number of a graph that is not known before the program runs."""
-
-    __slots__ = ("args", "graph", "kind", "op")
-
-    def __init__(self, graph: "Graph", op: str, kind: str, args: tuple):
-        self.graph, self.op, self.kind, self.args = graph, op, kind, args
-
-    def __add__(self, other):
-        return self.graph.add(self, other)
-
-    def __radd__(self, other):
-        return self.graph.add(other, self)
-
-    def __sub__(self, other):
-        return self.graph.sub(self, other)
-
-    def __rsub__(self, other):
-        return self.graph.sub(other, self)
-
-    def __mul__(self, other):
-        return self.graph.mul(self, other)
-
-    def __rmul__(self, other):
-        return self.graph.mul(other, self)
-
-    def __truediv__(self, other):
-        return self.graph.div(self, other)
-
-    def __rtruediv__(self, other):
-        return self.graph.div(other, self)
-
-    def __neg__(self):
-        return self.graph.neg(self)
-
-
-def is_number(x) -> bool:
-    """Whether x is not known before the program runs."""
-    return type(x) is Number
 
 
 class Graph:
@@ -82,6 +40,7 @@ class Graph:
     def __init__(self, most: int = 10**9):
         self.most, self.most_made = most, _MADE_FOR_ONE_KEPT * most
         self.numbers: list[Number] = []
+        # Keys are operations with their operands, by identity: equal numbers are made once.
         self.shared: dict[tuple, Number] = {}
         self.subprograms: list[Program] = []
 
@@ -127,7 +86,7 @@ class Graph:
         if type(a) is not Number:
             if type(b) is not Number:
                 return a + b
-            a, b = b, a
+            a, b = b, a  # a known operand is the second one, so that x + c and c + x are one number
         if type(b) is not Number:
             # Listed: -0.0 + 0.0 stays -0.0. Sums begin with a known zero everywhere.
             return a if b == 0 else self.make("add", a.kind, a, b)
@@ -135,6 +94,7 @@ class Graph:
             return self.sub(a, b.args[0])
         if a.op == "neg":
             return self.sub(b, a.args[0])
+        # Sums commute: one number for a + b and b + a.
         if ("add", a.kind, b, a) in self.shared:
             a, b = b, a
         return self.make("add", a.kind, a, b)
@@ -157,6 +117,7 @@ class Graph:
             return as_kind(0, a.kind)
         if a.op == "neg":
             return self.neg(self.add(a.args[0], b))
+        # y - x where x - y is there: one operation less, and the sign moves outwards.
         if ("sub", a.kind, b, a) in self.shared:
             return self.neg(self.shared["sub", a.kind, b, a])
         return self.make("sub", a.kind, a, b)
@@ -198,7 +159,7 @@ class Graph:
         """a / b, of floats."""
         if type(b) is not Number:
             if type(a) is not Number:
-                return _with_type(np.divide(a, b))  # of zero too, where Python's own division raises
+                return with_type(np.divide(a, b))  # of zero too, where Python's own division raises
             least = _LEAST_NORMAL[a.kind]
             if math.frexp(b)[0] in (0.5, -0.5) and least <= abs(b) <= 1 / least:
                 return self.mul(a, 1 / b)  # by a power of two, whose inverse is exact
@@ -215,6 +176,7 @@ class Graph:
         if exponent < 0:
             # Powers of the inverse, not the inverse of a power: the derivative of the latter is inf 0 at infinity.
             return self.power(self.div(one, a), -exponent, one)
+        # Repeated squares, as XLA expands the power.
         result: Any = None
         while exponent:
             if exponent & 1:
@@ -227,7 +189,8 @@ class Graph:
     def function(self, op: str, a):
         """One of `FUNCTIONS`."""
         if type(a) is not Number:
-            return _with_type(FUNCTIONS[op](a))
+            return with_type(FUNCTIONS[op](a))
+        # Odd and even functions of -x: the sign meets others outside, and sin(-x) and cos(-x) share the work of sin x and cos x.
         if a.op == "neg":
             if op in ("sin", "tan", "atan", "asin", "sinh", "tanh", "cbrt", "sign"):
                 return self.neg(self.function(op, a.args[0]))
@@ -238,7 +201,7 @@ class Graph:
     def function_of_two(self, op: str, a, b):
         """One of `FUNCTIONS_OF_TWO`."""
         if type(a) is not Number and type(b) is not Number:
-            return _with_type(FUNCTIONS_OF_TWO[op](a, b))
+            return with_type(FUNCTIONS_OF_TWO[op](a, b))
         # The larger of x and x is written: where x is not a number JAX's derivative of it is zero, and that of x is not.
         return self.make(op, a.kind if type(a) is Number else b.kind, a, b)
 
@@ -252,14 +215,14 @@ class Graph:
             return entries[0]
         if not any(type(x) is Number for x in entries):
             pick = FUNCTIONS_OF_TWO[op.removeprefix("reduce_")]
-            return _with_type(functools.reduce(pick, entries))
+            return with_type(functools.reduce(pick, entries))
         return self.make(op, next(x.kind for x in entries if type(x) is Number), *entries)
 
     def clamp(self, low, x, high):
         """x, or the bound that it is beyond; one operation, as JAX's derivative at a bound is not that of a maximum."""
         of = next((y for y in (low, x, high) if type(y) is Number), None)
         if of is None:
-            return _with_type(np.minimum(np.maximum(x, low), high))
+            return with_type(np.minimum(np.maximum(x, low), high))
         return self.make("clamp", of.kind, low, x, high)
 
     def compare(self, op: str, a, b):
@@ -299,7 +262,7 @@ class Graph:
         return a.args[0] if a.op == "not" else self.make("not", a.kind, a)
 
     def is_finite(self, a):
-        """Whether a is neither infinite nor not a number."""
+        """True unless a is infinite or NaN."""
         return math.isfinite(a) if type(a) is not Number else self.make("is_finite", "b1", a)
 
     def select(self, which, if_false, if_true, kind: str):
@@ -323,6 +286,7 @@ class Graph:
     ) -> Program:
         """The program of those numbers that the entries of the outputs need."""
         flat = [tuple(x.ravel().tolist()) for x in entries]
+        # Marked from the outputs backwards, with a list instead of recursion: programs are tens of thousands deep.
         live: set = set()
         waiting = [x for row in flat for x in row if type(x) is Number]
         while waiting:
@@ -333,13 +297,15 @@ class Graph:
                     waiting.extend(x for x in number.args if type(x) is Number and x not in live)
         index: dict[Number, int] = {}
         operations = []
+        # In the order of creation, where operands precede their operation. Depth first from the outputs was tried: forward
+        # dynamics of a Panda took 1.6 times as long.
         for number in self.numbers:
             if number in live:
                 index[number] = len(operations)
                 args = number.args
                 if number.op != "input":
                     args = tuple(index[x] if type(x) is Number else Constant(x) for x in args)
-                operations.append(_checked(Operation(number.op, number.kind, args), operations))
+                operations.append(_check(Operation(number.op, number.kind, args), operations))
             if len(operations) > self.most:
                 raise TooLong(f"more than {self.most} operations")
         results = [tuple(index[x] if type(x) is Number else Constant(x) for x in row) for row in flat]
@@ -353,9 +319,9 @@ class Graph:
             if operation.op == "input":
                 place, entry = operation.args
                 numbers.append(flat[place][entry])
-            elif operation.op == "call":
+            elif operation.op == "call":  # operands are the number of the subprogram, then all entries of its inputs
                 which, *given = (x.value if type(x) is Constant else numbers[x] for x in operation.args)
-                numbers.append(self._replayed_call(program.subprograms[which], given))
+                numbers.append(self._replay_call(program.subprograms[which], given))
             elif operation.op == "part":
                 call, entry = operation.args
                 numbers.append(numbers[call][entry.value])
@@ -368,7 +334,7 @@ class Graph:
         ]
         return numbers, outputs
 
-    def _replayed_call(self, program: Program, given: list) -> list:
+    def _replay_call(self, program: Program, given: list) -> list:
         ends = np.cumsum([array.size for array in program.inputs])
         parts = [
             objects(given[end - array.size : end], array.shape) for end, array in zip(ends, program.inputs, strict=True)
@@ -396,7 +362,7 @@ _BY_NAME: dict[str, Callable] = {
 }  # fmt: skip
 
 
-def _checked(operation: Operation, operations: Sequence[Operation]) -> Operation:
+def _check(operation: Operation, operations: Sequence[Operation]) -> Operation:
     """The operation. **Raises:** `NotNumbers` where its operands differ in kind, which LLVM would refuse with less grace."""
     op, kind, args = operation
     if op not in ("input", "call", "part", "convert", "is_finite"):
@@ -406,21 +372,16 @@ def _checked(operation: Operation, operations: Sequence[Operation]) -> Operation
     return operation
 
 
-def _with_type(x):
-    """A known number that numpy has computed; float64 and bool are Python's own, which are twice as fast."""
-    return x.item() if isinstance(x, (np.float64, np.bool_)) else x
-
-
 def _is_negative(x) -> bool:
     return math.copysign(1.0, x) < 0
 
 
 def _are_same(a, b) -> bool:
-    """Whether two known numbers are the same, and zeros of the same sign."""
+    """Decide whether two known numbers are equal, zeros with the same sign."""
     return type(a) is not Number and type(b) is not Number and a == b and _is_negative(a) == _is_negative(b)
 
 
-def inlined(program: Program) -> Program:
+def inline(program: Program) -> Program:
     """The same without subprograms."""
     if not program.subprograms:
         return program
@@ -428,24 +389,3 @@ def inlined(program: Program) -> Program:
     with np.errstate(all="ignore"):  # known numbers may overflow, as they do in XLA
         _, outputs = graph.replay(program, [graph.inputs(i, array) for i, array in enumerate(program.inputs)])
     return graph.finish(program.inputs, program.outputs, outputs, name=program.name)
-
-
-def objects(entries: Sequence, shape) -> np.ndarray:
-    """An array of objects."""
-    array = np.empty(len(entries), object)
-    array[:] = entries
-    return array.reshape(shape)
-
-
-def as_objects(x) -> np.ndarray:
-    """An array, known or not, as an array of objects."""
-    if isinstance(x, np.ndarray) and x.dtype == object:
-        return x
-    if isinstance(x, Number):
-        return objects([x], ())
-    x = np.asarray(x)
-    # Scalars of numpy keep their type; those that Python has too are made Python's.
-    return objects(x.ravel().tolist() if x.dtype in _OF_PYTHON else list(x.ravel()), x.shape)
-
-
-_OF_PYTHON = (np.dtype(np.float64), np.dtype(bool))

@@ -17,7 +17,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from jaxdyn.compile import mode
-from jaxdyn.compile.kernel import kernel_p, target
+from jaxdyn.compile.primitive import kernel_p, target
 from jaxdyn.compile.program import Array
 
 with contextlib.suppress(ImportError):  # no kernels without llvmlite
@@ -25,7 +25,8 @@ with contextlib.suppress(ImportError):  # no kernels without llvmlite
 
     INT, POINTER = ir.IntType(64), ir.PointerType()
 
-# Sweeps converge quadratically, six to ten serve; the bound ends those over numbers that are not finite.
+# Sweeps converge quadratically: six to ten are enough. The bound ends those over numbers that are not finite, for which the
+# test of convergence never holds.
 MAX_SWEEPS = 60
 
 
@@ -45,7 +46,7 @@ class PseudoInverse:
 
     @property
     def digest(self) -> str:
-        """As of a `Program`."""
+        """Identity of the code, as `Program.digest`."""
         return f"pseudo_inverse {self.rows} {self.columns} {self.dtype} {self.tolerance!r}"
 
     @property
@@ -54,6 +55,7 @@ class PseudoInverse:
         n, m = max(self.rows, self.columns), min(self.rows, self.columns)
         return 8 * m * m * (6 * n + 3 * m) // 2 + 1
 
+    # A vector of samples would sweep until the last one of them has converged.
     def lanes(self, samples) -> int:
         """Samples need different numbers of sweeps: one after the other."""
         return 1
@@ -66,6 +68,7 @@ class PseudoInverse:
         """The same by JAX's singular value decomposition."""
         matrix = array.reshape(*array.shape[:-1], self.rows, self.columns)
         U, s, Vt = jnp.linalg.svd(matrix, full_matrices=False)
+        # A double where: one over a dropped value would be infinite, and its product with zero NaN.
         drop = s <= self.tolerance * s[..., :1]
         inverse = jnp.where(drop, jnp.zeros_like(s), 1 / jnp.where(drop, jnp.ones_like(s), s))
         entries = jnp.matmul(
@@ -171,6 +174,7 @@ def _kernel_ir(rows: int, columns: int, dtype, tolerance: float) -> str:
     with w.loop(begin, end) as sample:
         matrix = w.at(given, (sample, n * m))
         inverse = w.at(result, (sample, n * m))
+        # The smaller side is made orthogonal: rotations of m vectors of length n >= m cost n m^2 a sweep.
         # Columns of the matrix, or its rows where there are fewer of them, one after the other.
         of_column, of_row = (1, columns) if rows >= columns else (columns, 1)
         with w.loop(zero, w.integer(m)) as p:
@@ -200,8 +204,10 @@ def _sweeps(w: _Writer, U, J, n: int, m: int) -> None:
             x, y = w.at(U, (p, n)), w.at(U, (q, n))
             alpha, beta, gamma = w.product(x, x, n), w.product(y, y, n), w.product(x, y, n)
             limit = b.fmul(w.number(eps), w.root(b.fmul(alpha, beta)))
+            # Relative to the lengths of both columns, not to the largest: that is what keeps small singular values exact.
             with b.if_then(b.fcmp_ordered(">", w.size(gamma), limit)):
                 b.store(ir.Constant(ir.IntType(1), 1), going)
+                # The smaller root of t^2 + 2 zeta t - 1: rotations by at most pi/4, with which sweeps converge.
                 zeta = b.fdiv(b.fsub(beta, alpha), b.fmul(w.number(2), gamma))
                 length = b.fadd(w.size(zeta), w.root(b.fadd(one, b.fmul(zeta, zeta))))
                 sign = b.select(b.fcmp_ordered("<", zeta, w.number(0)), w.number(-1), one)
@@ -221,6 +227,7 @@ def _write_inverse(w: _Writer, U, J, inverse, n: int, m: int, tolerance: float, 
         square = w.product(x, x, n)
         b.store(square, w.at(sizes, (p, 1)))
         so_far = w.load(largest)
+        # Written so that NaN becomes the largest, and no column is dropped for a comparison with it.
         b.store(b.select(b.fcmp_ordered("<", square, so_far), so_far, square), largest)
     limit = b.fmul(w.number(tolerance * tolerance), w.load(largest))
     with w.loop(zero, w.integer(n * m)) as k:
@@ -242,6 +249,7 @@ def pseudo_inverse_by_rotations(matrix: jax.Array, tolerance: float) -> jax.Arra
     It has no derivative: put it under a rule that gives one.
     """
     program = pseudo_inverse_program(*matrix.shape, matrix.dtype, float(tolerance))
+    # A kernel even for one matrix: LAPACK called in a batched program of XLA can wait for its own threads for ever.
     if mode.current() == "plain" or target is None:
         return program.as_operations(matrix.reshape(-1))[0].reshape(matrix.shape[::-1])
     return kernel_p.bind(matrix.reshape(-1), program=program, rows=0)[0].reshape(matrix.shape[::-1])

@@ -36,15 +36,15 @@ _trial: Callable | None = None
 _is_warned = False
 
 
-def is_tested() -> bool:
-    """Whether the tests run with this version of JAX."""
+def is_version_known() -> bool:
+    """Decide whether the tests run with this version of JAX."""
     return TESTED[0] <= tuple(jax.__version_info__[:2]) <= TESTED[1]
 
 
 def forgive(error: BaseException) -> bool:
-    """Whether to go on without a kernel after this error: never on a tested version, else after one warning."""
+    """Decide whether to continue without a kernel after an error: never on a tested version, else after one warning."""
     global _is_warned
-    if is_tested() or not isinstance(error, Exception):
+    if is_version_known() or not isinstance(error, Exception):
         return False
     if not _is_warned:
         _is_warned = True
@@ -62,7 +62,7 @@ def forgive(error: BaseException) -> bool:
 
 @contextlib.contextmanager
 def _kernels_or_none() -> Iterator[None]:
-    """Where an error is forgiven, there are no kernels in this process."""
+    """Context in which an error that is forgiven turns kernels off for this process."""
     global _against_kernels
     try:
         yield
@@ -84,9 +84,10 @@ def try_first(trial: Callable) -> None:
 def reason_against_kernels() -> str | None:
     """Why no function can be a kernel with this JAX, or None."""
     global _trial
-    if _trial is not None and _against_kernels is None and not is_tested():
-        trial, _trial = _trial, None  # the trial asks too
-        with _kernels_or_none(), ThreadPoolExecutor(1) as other:  # a thread that is in the midst of no trace
+    if _trial is not None and _against_kernels is None and not is_version_known():
+        trial, _trial = _trial, None  # the trial calls this function too
+        # A trial in the midst of a user's trace would be staged into it; another thread has no trace.
+        with _kernels_or_none(), ThreadPoolExecutor(1) as other:
             other.submit(trial).result()
     return _against_kernels
 
@@ -103,7 +104,8 @@ except ImportError as _error:
     if not forgive(_error):
         raise
     _against_kernels = f"{type(_error).__name__}: {_error}"
-    ClosedJaxpr = Literal = object  # which nothing asks for then
+    # Names for annotations and `isinstance`: without kernels no jaxpr is looked at.
+    ClosedJaxpr = Literal = object
 
 
 def define_primitive(
@@ -148,7 +150,7 @@ def define_primitive(
 
 
 def is_zero(tangent) -> bool:
-    """Whether a tangent or a cotangent is a zero that JAX has not made an array of."""
+    """Decide whether a tangent or a cotangent is JAX's symbolic zero, which is no array."""
     return type(tangent) is ad.Zero
 
 
@@ -158,7 +160,7 @@ def zero_tangent(x) -> Any:
 
 
 def is_linear(operand) -> bool:
-    """Whether an operand of a transpose rule is one to whose values the result is linear."""
+    """Decide whether the result is linear in this operand of a transpose rule."""
     return ad.is_undefined_primal(operand)
 
 
@@ -204,7 +206,7 @@ def type_like(array_type, shape: tuple, dtype, spec: Sequence) -> Any:
 
 
 def is_all_manual(mesh) -> bool:
-    """Whether all axes of a mesh are manual, so that XLA divides nothing along them."""
+    """Decide whether all axes of a mesh are manual, so that XLA partitions nothing along them."""
     return bool(mesh.axis_types) and all(kind == AxisType.Manual for kind in mesh.axis_types)
 
 
@@ -229,13 +231,13 @@ def sharding_attributes(batch_dims: int, sizes: Sequence[int], operands: Sequenc
     `sizes` are those of the independent axes; `operands` and `results` list for each array which of them its axes are.
     """
 
-    def mapped(axes):
+    def mapping(axes):
         return sdy.TensorMappingAttr.get(dim_mappings=[sdy.DimMappingAttr.get(factor_indices=[k]) for k in axes])
 
     rule = sdy.OpShardingRuleAttr.get(
         factor_sizes=list(sizes),
-        operand_mappings=[mapped(axes) for axes in operands],
-        result_mappings=[mapped(axes) for axes in results],
+        operand_mappings=[mapping(axes) for axes in operands],
+        result_mappings=[mapping(axes) for axes in results],
         is_custom=True,
     )
     return {
@@ -307,6 +309,7 @@ def _structures(header: str) -> dict[str, dict[str, int]]:
 
     Fields whose type the header does not define end a structure: what comes after them has no known offset.
     """
+    # A parser of the few forms that this header has; a compiler for C is not part of the installation.
     text = re.sub(r"//[^\n]*|/\*.*?\*/", "", header, flags=re.DOTALL)
     text = re.sub(r"_XLA_FFI_API_STRUCT_FIELD\((\w+)\)", r"void* \1", text)
     sizes = {name: (4, 4) for name in re.findall(r"typedef enum[^;{]*\{[^}]*\}\s*(\w+)\s*;", text)}
@@ -349,13 +352,14 @@ def lower_call(name: str, context, operands: Sequence, order: Sequence[int], att
 # --- compiler options ---
 
 
-def known_options(options: dict[str, Any]) -> dict[str, Any]:
+def select_options(options: dict[str, Any]) -> dict[str, Any]:
     """Those of the compiler options that the installed XLA has; each other one is logged at level debug, once."""
     return {name: value for name, value in options.items() if _is_option(name, value)}
 
 
 @functools.cache
 def _is_option(name: str, value) -> bool:
+    # XLA has no list of its options: the smallest program is compiled with each.
     try:
         jax.jit(lambda: 0.0, compiler_options={name: value})()
     except jax.errors.JaxRuntimeError:

@@ -1,4 +1,4 @@
-"""What is known while Python runs: leaves of pytrees that are not traced."""
+"""Known and traced leaves of pytrees, and functions that keep known values known."""
 
 from collections.abc import Callable
 from typing import Any, NamedTuple
@@ -12,16 +12,17 @@ from jaxdyn.compile.jax_adapter import ShapedArray, Tracer, define_primitive
 
 
 def is_concrete(*trees) -> bool:
-    """Whether every leaf is known, so that its value can be looked at."""
+    """Decide whether no leaf is traced, so that its value can be read."""
     return not any(isinstance(leaf, Tracer) for leaf in jax.tree.leaves(trees))
 
 
-def numpy_for(*trees) -> Any:
-    """numpy where every leaf is known, so that results stay known inside of traces too; jax.numpy where one is traced."""
+def array_namespace(*trees) -> Any:
+    """NumPy where no leaf is traced, else `jax.numpy`: results of known numbers then stay known inside of a trace."""
     return np if is_concrete(*trees) else jnp
 
 
-# Nothing but False, without an operand. Every call outside of a trace asks, which must not cost an operation of XLA.
+# A primitive without operands whose value is False: bound under a trace it gives a tracer. Every call outside of a trace asks,
+# which must not cost an operation of XLA.
 _asked_p = define_primitive(
     "jaxdyn_asked",
     lambda: ShapedArray((), np.dtype(bool)),
@@ -30,25 +31,25 @@ _asked_p = define_primitive(
 )
 
 
-def is_staged() -> bool:
-    """Whether a program is being traced, so that operations on known numbers are traced too."""
+def is_tracing() -> bool:
+    """Decide whether a program is being traced, so that operations on known arrays give tracers too."""
     return isinstance(lax.neg(1) if _asked_p is None else _asked_p.bind(), Tracer)
 
 
 def is_known(*trees) -> bool:
-    """Whether no number is traced, nor would be when computed with."""
-    return is_concrete(*trees) and not is_staged()
+    """Decide whether no leaf is traced and results of operations on them are known too."""
+    return is_concrete(*trees) and not is_tracing()
 
 
-def constant(tree):
-    """The tree without derivatives. Leaves that are known stay known, which an operation on them would hide within a trace."""
+def stop_gradient(tree):
+    """Stop the derivatives of a tree; `lax.stop_gradient` of a known leaf would turn it into a tracer within a trace."""
     return jax.tree.map(lambda leaf: lax.stop_gradient(leaf) if isinstance(leaf, Tracer) else leaf, tree)
 
 
 class _Leaves:
-    """Leaves that equal others if they are the same objects; held, so that no other ones come to their places.
+    """Leaves compared by identity, for keys of caches; held, so that no other object gets the identity of one of them.
 
-    Arrays of numpy, whose entries may be set, are copied and compared by what they hold.
+    NumPy arrays, whose entries may be set, are copied and compared by value.
     """
 
     def __init__(self, leaves):
@@ -82,16 +83,16 @@ class Known(NamedTuple):
         return jax.tree.unflatten(self.structure, full)
 
 
-def partition_traced(tree) -> tuple[list, Known]:
-    """The traced leaves of a tree, and all the rest of it.
+def partition_tracers(tree) -> tuple[list, Known]:
+    """The traced leaves of a tree, and the rest as a `Known`, which makes the tree of such leaves.
 
-    What jax traces as an argument it does not know. Known leaves that go around its functions in a `Known` stay known.
+    Arguments of functions that JAX traces become tracers. Known leaves that are captured in a `Known` stay known.
     """
     return partition(tree, lambda leaf: isinstance(leaf, Tracer))
 
 
 def partition(tree, is_apart: Callable) -> tuple[list, Known]:
-    """The leaves of a tree for which that is said, and all the rest of it."""
+    """The leaves of a tree for which `is_apart` holds, and the rest of it."""
     leaves, structure = jax.tree.flatten(tree)
     places = tuple(i for i, leaf in enumerate(leaves) if is_apart(leaf))
     known = _Leaves([None if i in places else leaf for i, leaf in enumerate(leaves)])

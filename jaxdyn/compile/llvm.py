@@ -18,7 +18,8 @@ _COMPARED = {"eq": "oeq", "ne": "une", "lt": "olt", "le": "ole", "gt": "ogt", "g
 _INTRINSICS = {
     "sqrt": "sqrt", "abs": "fabs", "floor": "floor", "ceil": "ceil", "round": "roundeven", "max": "maximum", "min": "minimum",
 }  # fmt: skip
-# Functions of the C library, called for one lane after the other.
+# Functions of the C library, called for one sample after the other: LLVM has no vector versions of them without a library that
+# would have to be shipped.
 _LIBRARY = {
     "tan": "tan", "asin": "asin", "acos": "acos", "atan": "atan", "sinh": "sinh", "cosh": "cosh", "tanh": "tanh", "exp": "exp",
     "exp2": "exp2", "expm1": "expm1", "log": "log", "log1p": "log1p", "cbrt": "cbrt", "pow": "pow", "atan2": "atan2",
@@ -30,7 +31,7 @@ STORES_BETWEEN_FENCES = 32
 
 
 class Emitter:
-    """Lines of LLVM IR for operations on W lanes."""
+    """Lines of LLVM IR for operations on vectors of W samples."""
 
     def __init__(self, width: int):
         self.width = width
@@ -39,7 +40,7 @@ class Emitter:
         self.count = self.stores = 0
         self.sines: dict[str, tuple[str, str]] = {}
 
-    def put(self, text: str) -> str:
+    def emit(self, text: str) -> str:
         """The name of the result of an instruction."""
         self.count += 1
         name = f"%x{self.count}"
@@ -47,11 +48,11 @@ class Emitter:
         return name
 
     def type(self, kind: str) -> str:
-        """Type of a number of all lanes."""
+        """Type of one number for all samples of a vector."""
         return _TYPES[kind] if self.width == 1 else f"<{self.width} x {_TYPES[kind]}>"
 
     def constant(self, value, kind: str) -> str:
-        """A known number in all lanes."""
+        """A known number, in every element of a vector."""
         if kind in FLOATS:
             rounded = float(np.float32(value)) if kind == "f4" else float(value)
             text = "0x" + struct.pack(">d", rounded).hex().upper()
@@ -62,24 +63,25 @@ class Emitter:
         return text if self.width == 1 else f"splat ({_TYPES[kind]} {text})"
 
     def call(self, name: str, kind: str, *args: str) -> str:
-        """An intrinsic of LLVM for all lanes at once."""
+        """Call an intrinsic of LLVM on vectors."""
         short = {"f8": "f64", "f4": "f32"}[kind]
         full = f"llvm.{name}.{short if self.width == 1 else f'v{self.width}{short}'}"
         of = self.type(kind)
         self.declared[full] = f"declare {of} @{full}({', '.join([of] * len(args))})"
-        return self.put(f"call {of} @{full}({', '.join(f'{of} {a}' for a in args)})")
+        return self.emit(f"call {of} @{full}({', '.join(f'{of} {a}' for a in args)})")
 
     def library(self, name: str, kind: str, *args: str) -> str:
-        """A function of the C library, lane by lane."""
+        """Call a function of the C library for each sample."""
+        # Attribute #1 says that the function touches no memory, so that LLVM may move it. Nobody reads the errno that it sets.
         name, scalar = (name if kind == "f8" else f"{name}f"), _TYPES[kind]
         self.declared[name] = f"declare {scalar} @{name}({', '.join([scalar] * len(args))}) #1"
         if self.width == 1:
-            return self.put(f"call {scalar} @{name}({', '.join(f'{scalar} {a}' for a in args)})")
+            return self.emit(f"call {scalar} @{name}({', '.join(f'{scalar} {a}' for a in args)})")
         result, of = "poison", self.type(kind)
-        for lane in range(self.width):
-            each = [self.put(f"extractelement {of} {a}, i32 {lane}") for a in args]
-            value = self.put(f"call {scalar} @{name}({', '.join(f'{scalar} {a}' for a in each)})")
-            result = self.put(f"insertelement {of} {result}, {scalar} {value}, i32 {lane}")
+        for element in range(self.width):
+            each = [self.emit(f"extractelement {of} {a}, i32 {element}") for a in args]
+            value = self.emit(f"call {scalar} @{name}({', '.join(f'{scalar} {a}' for a in each)})")
+            result = self.emit(f"insertelement {of} {result}, {scalar} {value}, i32 {element}")
         return result
 
     # --- operations ---
@@ -88,28 +90,30 @@ class Emitter:
         """An operation; `kind` is that of its result, `given` that of its last operand."""
         of = self.type(kind)
         if op in _FLOAT and kind in FLOATS:
-            return self.put(f"{_FLOAT[op]} contract {of} {args[0]}, {args[1]}")
+            # "contract" alone of LLVM's licences: products and sums become fused multiply-adds. "reassoc" and "nnan" would change
+            # results and drop checks of NaN.
+            return self.emit(f"{_FLOAT[op]} contract {of} {args[0]}, {args[1]}")
         if op in _INTEGER:
-            return self.put(f"{_INTEGER[op]} {of} {args[0]}, {args[1]}")
+            return self.emit(f"{_INTEGER[op]} {of} {args[0]}, {args[1]}")
         if op == "neg":
-            return self.put(
+            return self.emit(
                 f"fneg {of} {args[0]}" if kind in FLOATS else f"sub {of} {self.constant(0, kind)}, {args[0]}"
             )
         if op in COMPARISONS:
             sign = "" if op in ("eq", "ne") else ("u" if given == "b1" else "s")
             word = f"fcmp {_COMPARED[op]}" if given in FLOATS else f"icmp {sign}{op}"
-            return self.put(f"{word} {self.type(given)} {args[0]}, {args[1]}")
+            return self.emit(f"{word} {self.type(given)} {args[0]}, {args[1]}")
         if op == "not":
-            return self.put(f"xor {of} {args[0]}, {self.constant(1 if kind == 'b1' else -1, kind)}")
+            return self.emit(f"xor {of} {args[0]}, {self.constant(1 if kind == 'b1' else -1, kind)}")
         if op == "select":
-            return self.put(f"select {self.type('b1')} {args[0]}, {of} {args[2]}, {of} {args[1]}")
-        if op == "stop_gradient":
+            return self.emit(f"select {self.type('b1')} {args[0]}, {of} {args[2]}, {of} {args[1]}")
+        if op == "stop_gradient":  # for derivatives alone
             return args[0]
         if op == "convert":
             return self.convert(args[0], given, kind)
         if op == "is_finite":
             size = self.call("fabs", given, args[0])
-            return self.put(f"fcmp olt {self.type(given)} {size}, {self.constant(np.inf, given)}")
+            return self.emit(f"fcmp olt {self.type(given)} {size}, {self.constant(np.inf, given)}")
         if op in ("sin", "cos"):
             return self.sine_and_cosine(args[0], kind)[op == "cos"]
         if op == "sign" and kind in FLOATS:
@@ -121,10 +125,10 @@ class Emitter:
             low, x, high = args
             return self.operation("min", kind, (self.operation("max", kind, (x, low), kind), high), kind)
         if op in ("max", "min") and kind == "b1":
-            return self.put(f"{'or' if op == 'max' else 'and'} {of} {args[0]}, {args[1]}")
+            return self.emit(f"{'or' if op == 'max' else 'and'} {of} {args[0]}, {args[1]}")
         if op in ("max", "min") and kind not in FLOATS:
-            flag = self.put(f"icmp s{'gt' if op == 'max' else 'lt'} {of} {args[0]}, {args[1]}")
-            return self.put(f"select {self.type('b1')} {flag}, {of} {args[0]}, {of} {args[1]}")
+            flag = self.emit(f"icmp s{'gt' if op == 'max' else 'lt'} {of} {args[0]}, {args[1]}")
+            return self.emit(f"select {self.type('b1')} {flag}, {of} {args[0]}, {of} {args[1]}")
         if kind not in FLOATS:
             raise AssertionError(f"{op} of integers, which `expand` refuses")
         if op in _INTRINSICS:
@@ -136,13 +140,13 @@ class Emitter:
         if target == "b1":
             zero = self.constant(0, source)
             word = "fcmp une" if source in FLOATS else "icmp ne"
-            return self.put(f"{word} {self.type(source)} {x}, {zero}")
+            return self.emit(f"{word} {self.type(source)} {x}, {zero}")
         if source in FLOATS and target in ("i4", "i8"):  # saturated, and 0 for what is not a number, as XLA does
             to = self.type(target)
             kinds = (f"i{8 * _BYTES[target]}", f"f{8 * _BYTES[source]}")
             full = "llvm.fptosi.sat." + ".".join(kinds if self.width == 1 else (f"v{self.width}{k}" for k in kinds))
             self.declared[full] = f"declare {to} @{full}({self.type(source)})"
-            return self.put(f"call {to} @{full}({self.type(source)} {x})")
+            return self.emit(f"call {to} @{full}({self.type(source)} {x})")
         wider = _BYTES[target] > _BYTES[source]
         words = {
             "ff": "fpext" if wider else "fptrunc",
@@ -151,14 +155,14 @@ class Emitter:
             "bi": "zext",
             "ii": "sext" if wider else "trunc",
         }
-        return self.put(f"{words[source[0] + target[0]]} {self.type(source)} {x} to {self.type(target)}")
+        return self.emit(f"{words[source[0] + target[0]]} {self.type(source)} {x} to {self.type(target)}")
 
     def sign(self, x: str, kind: str) -> str:
         """-1, 0, 1, or not a number."""
         of, flag, zero = self.type(kind), self.type("b1"), self.constant(0, kind)
-        up, down = (self.put(f"fcmp {word} {of} {x}, {zero}") for word in ("ogt", "olt"))
-        low = self.put(f"select {flag} {down}, {of} {self.constant(-1, kind)}, {of} {x}")
-        return self.put(f"select {flag} {up}, {of} {self.constant(1, kind)}, {of} {low}")
+        up, down = (self.emit(f"fcmp {word} {of} {x}, {zero}") for word in ("ogt", "olt"))
+        low = self.emit(f"select {flag} {down}, {of} {self.constant(-1, kind)}, {of} {x}")
+        return self.emit(f"select {flag} {up}, {of} {self.constant(1, kind)}, {of} {low}")
 
     def sine_and_cosine(self, x: str, kind: str) -> tuple[str, str]:
         """(sin x, cos x) to about one unit in the last place, of any angle: both share the reduction of x."""
@@ -180,6 +184,7 @@ class Emitter:
                 value = add(mul(z, value), constant(coefficient))
             return value
 
+        # Sine and cosine share the reduction and both polynomials: joints need the pair, and a second function costs two selects.
         turns = self.call("roundeven", kind, mul(x, constant(2 / np.pi)))
         r = x
         for part in HALF_PI[kind]:
@@ -189,29 +194,29 @@ class Emitter:
         cosine = add(mul(mul(z, z), polynomial(COSINE[kind], z)), add(mul(z, constant(-0.5)), constant(1)))
         # The quadrant is turns modulo 4, as bits of an integer: turns + 1.5 2^52 has them at its end.
         whole, magic = ("i8", 1.5 * 2**52) if kind == "f8" else ("i4", 1.5 * 2**23)
-        bits = self.put(f"bitcast {self.type(kind)} {add(turns, constant(magic))} to {self.type(whole)}")
+        bits = self.emit(f"bitcast {self.type(kind)} {add(turns, constant(magic))} to {self.type(whole)}")
         of, flag = self.type(kind), self.type("b1")
 
         def bit(value, mask):
-            kept = self.put(f"and {self.type(whole)} {value}, {self.constant(mask, whole)}")
-            return self.put(f"icmp ne {self.type(whole)} {kept}, {self.constant(0, whole)}")
+            kept = self.emit(f"and {self.type(whole)} {value}, {self.constant(mask, whole)}")
+            return self.emit(f"icmp ne {self.type(whole)} {kept}, {self.constant(0, whole)}")
 
         odd, high = bit(bits, 1), bit(bits, 2)
-        next_bits = self.put(f"add {self.type(whole)} {bits}, {self.constant(1, whole)}")
+        next_bits = self.emit(f"add {self.type(whole)} {bits}, {self.constant(1, whole)}")
         next_high = bit(next_bits, 2)
         signed = []
         for first, second, negative in ((sine, cosine, high), (cosine, sine, next_high)):
-            value = self.put(f"select {flag} {odd}, {of} {second}, {of} {first}")
-            minus = self.put(f"fneg {of} {value}")
-            signed.append(self.put(f"select {flag} {negative}, {of} {minus}, {of} {value}"))
+            value = self.emit(f"select {flag} {odd}, {of} {second}, {of} {first}")
+            minus = self.emit(f"fneg {of} {value}")
+            signed.append(self.emit(f"select {flag} {negative}, {of} {minus}, {of} {value}"))
         self.sines[x] = self._or_far(x, kind, (signed[0], signed[1]))
         return self.sines[x]
 
     def _or_far(self, x: str, kind: str, near: tuple[str, str]) -> tuple[str, str]:
-        """The pair, or that of the C library in lanes whose angle is beyond the reduction.
+        """The pair, or that of the C library for samples whose angle is beyond the reduction.
 
-        A branch that is never taken costs a comparison. It is taken where one lane is far, and the others keep their numbers,
-        so that no sample depends on those beside it.
+        A branch that is never taken costs a comparison. It is taken where one sample is far. The others keep their numbers,
+        so that no sample depends on its neighbours in the vector.
         """
         of, flags = self.type(kind), self.type("b1")
         self.count += 1
@@ -219,16 +224,17 @@ class Emitter:
         # The label is for the two numbers that are merged below, which name the block that they come from.
         self.lines += [f"  br label %{before}", f"{before}:"]
         size = self.call("fabs", kind, x)
-        is_far = self.put(f"fcmp ogt {of} {size}, {self.constant(MAX_ANGLE[kind], kind)}")
+        is_far = self.emit(f"fcmp ogt {of} {size}, {self.constant(MAX_ANGLE[kind], kind)}")
+        # LLVM lays the rare block out of line.
         self.declared["far"] = '!0 = !{!"branch_weights", i32 1, i32 1000000}'
         self.lines += [f"  br i1 {self.any(is_far)}, label %{far}, label %{after}, !prof !0", f"{far}:"]
         pair = f"{{{of}, {of}}}"
-        both = self.put(f"call {pair} @{self._far_pair(kind)}({of} {x})")
-        exact = [self.put(f"extractvalue {pair} {both}, {k}") for k in (0, 1)]
-        chosen = [self.put(f"select {flags} {is_far}, {of} {a}, {of} {b}") for a, b in zip(exact, near, strict=True)]
+        both = self.emit(f"call {pair} @{self._far_pair(kind)}({of} {x})")
+        exact = [self.emit(f"extractvalue {pair} {both}, {k}") for k in (0, 1)]
+        chosen = [self.emit(f"select {flags} {is_far}, {of} {a}, {of} {b}") for a, b in zip(exact, near, strict=True)]
         self.lines += [f"  br label %{after}", f"{after}:"]
         sine, cosine = (
-            self.put(f"phi {of} [ {a}, %{before} ], [ {b}, %{far} ]") for a, b in zip(near, chosen, strict=True)
+            self.emit(f"phi {of} [ {a}, %{before} ], [ {b}, %{far} ]") for a, b in zip(near, chosen, strict=True)
         )
         return sine, cosine
 
@@ -236,86 +242,87 @@ class Emitter:
         """Name of a function of this module for the sine and cosine of any angle, by the C library."""
         name, of, inner = f"far_pair_{kind}_{self.width}", self.type(kind), Emitter(self.width)
         sine, cosine = (inner.library(function, kind, "%x") for function in ("sin", "cos"))
-        first = inner.put(f"insertvalue {{{of}, {of}}} poison, {of} {sine}, 0")
-        both = inner.put(f"insertvalue {{{of}, {of}}} {first}, {of} {cosine}, 1")
+        first = inner.emit(f"insertvalue {{{of}, {of}}} poison, {of} {sine}, 0")
+        both = inner.emit(f"insertvalue {{{of}, {of}}} {first}, {of} {cosine}, 1")
         head = f"define internal {{{of}, {of}}} @{name}({of} %x) noinline cold nounwind {{"
         self.declared |= inner.declared
         self.declared[name] = "\n".join([head, *inner.lines, f"  ret {{{of}, {of}}} {both}", "}"])
         return name
 
     def any(self, flags: str) -> str:
-        """Whether a flag is set in any lane."""
+        """Reduce flags: true where one is set in any element."""
         if self.width == 1:
             return flags
         name, of = f"llvm.vector.reduce.or.v{self.width}i1", self.type("b1")
         self.declared[name] = f"declare i1 @{name}({of})"
-        return self.put(f"call i1 @{name}({of} {flags})")
+        return self.emit(f"call i1 @{name}({of} {flags})")
 
     # --- memory ---
 
     def rows(self, places: Sequence[int], sizes: Sequence[int]) -> dict[int, list[str]]:
         """Pointers to the rows of arrays for the W samples from `%base` on."""
         index = []
-        for lane in range(self.width):
-            at = self.put(f"add i64 %base, {lane}")
-            inside = self.put(f"icmp ult i64 {at}, %last")
-            index.append(self.put(f"select i1 {inside}, i64 {at}, i64 %last"))
+        for element in range(self.width):
+            # Samples beyond the last one repeat it: a masked load and store would cost each block, and this costs the last alone.
+            at = self.emit(f"add i64 %base, {element}")
+            inside = self.emit(f"icmp ult i64 {at}, %last")
+            index.append(self.emit(f"select i1 {inside}, i64 {at}, i64 %last"))
         pointers = {}
         for place, size in zip(places, sizes, strict=True):
-            offsets = [self.put(f"mul i64 {i}, {size}") for i in index]
-            pointers[place] = [self.put(f"getelementptr i8, ptr %a{place}, i64 {o}") for o in offsets]
+            offsets = [self.emit(f"mul i64 {i}, {size}") for i in index]
+            pointers[place] = [self.emit(f"getelementptr i8, ptr %a{place}, i64 {o}") for o in offsets]
         return pointers
 
     def load(self, rows: Sequence[str], entry: int, kind: str) -> str:
-        """An entry of the rows of all lanes."""
+        """Load an entry of the rows of all samples."""
         of, value = self.type(kind), "poison"
-        for lane, row in enumerate(rows):
+        for element, row in enumerate(rows):
             x = self.load_one(row, entry, kind)
             if self.width == 1:
                 return x
-            value = self.put(f"insertelement {of} {value}, {_TYPES[kind]} {x}, i32 {lane}")
+            value = self.emit(f"insertelement {of} {value}, {_TYPES[kind]} {x}, i32 {element}")
         return value
 
     def load_for_all(self, place: int, entry: int, kind: str) -> str:
         """An entry of an argument that is the same for all samples.
 
-        Read in every block: as one number it is an operand of an instruction for all lanes, where a vector that is kept from
-        block to block would take as much memory as the lanes.
+        Read in every block: one number in memory is an operand of a vector instruction (a broadcast load). A vector that is kept
+        from block to block would be spilled, and takes W times the memory.
         """
         value = self.load_one(f"%a{place}", entry, kind)
         if self.width == 1:
             return value
         of = self.type(kind)
         if wants_least_optimisation():
-            # LLVM 22 at level 0 aborts where it joins these loads to their copies in all lanes ("Node is not in map!").
-            value = self.put(f"freeze {_TYPES[kind]} {value}")
-        first = self.put(f"insertelement {of} poison, {_TYPES[kind]} {value}, i32 0")
-        return self.put(f"shufflevector {of} {first}, {of} poison, <{self.width} x i32> zeroinitializer")
+            # LLVM 22 at level 0 aborts where it merges these loads with their broadcasts ("Node is not in map!").
+            value = self.emit(f"freeze {_TYPES[kind]} {value}")
+        first = self.emit(f"insertelement {of} poison, {_TYPES[kind]} {value}, i32 0")
+        return self.emit(f"shufflevector {of} {first}, {of} poison, <{self.width} x i32> zeroinitializer")
 
     def load_at(self, array: str, k: int, kind: str) -> str:
-        """Entry k, in all lanes, of an array in memory whose entries stand one after the other, each with its lanes."""
-        at = self.put(f"getelementptr i8, ptr {array}, i64 {k * _BYTES[kind] * self.width}")
+        """Load entry k of an array in memory whose entries follow each other, each with its W samples."""
+        at = self.emit(f"getelementptr i8, ptr {array}, i64 {k * _BYTES[kind] * self.width}")
         if kind != "b1":
-            return self.put(f"load {self.type(kind)}, ptr {at}")
-        wide = self.put(f"load {self.type('i1')}, ptr {at}")
-        return self.put(f"trunc {self.type('i1')} {wide} to {self.type('b1')}")
+            return self.emit(f"load {self.type(kind)}, ptr {at}")
+        wide = self.emit(f"load {self.type('i1')}, ptr {at}")
+        return self.emit(f"trunc {self.type('i1')} {wide} to {self.type('b1')}")
 
     def store_at(self, array: str, k: int, kind: str, value: str) -> None:
         """Write such an entry."""
-        at = self.put(f"getelementptr i8, ptr {array}, i64 {k * _BYTES[kind] * self.width}")
+        at = self.emit(f"getelementptr i8, ptr {array}, i64 {k * _BYTES[kind] * self.width}")
         if kind == "b1":
-            kind, value = "i1", self.put(f"zext {self.type('b1')} {value} to {self.type('i1')}")
-        self.stored(f"  store {self.type(kind)} {value}, ptr {at}")
+            kind, value = "i1", self.emit(f"zext {self.type('b1')} {value} to {self.type('i1')}")
+        self.emit_store(f"  store {self.type(kind)} {value}, ptr {at}")
 
     def load_one(self, row: str, entry: int, kind: str) -> str:
-        """An entry of the row of one lane."""
-        at = self.put(f"getelementptr i8, ptr {row}, i64 {entry * _BYTES[kind]}")
+        """Load an entry of the row of one sample."""
+        at = self.emit(f"getelementptr i8, ptr {row}, i64 {entry * _BYTES[kind]}")
         if kind != "b1":
-            return self.put(f"load {_TYPES[kind]}, ptr {at}, align {_BYTES[kind]}")
-        return self.put(f"trunc i8 {self.put(f'load i8, ptr {at}')} to i1")
+            return self.emit(f"load {_TYPES[kind]}, ptr {at}, align {_BYTES[kind]}")
+        return self.emit(f"trunc i8 {self.emit(f'load i8, ptr {at}')} to i1")
 
-    def transposed(self, square: Sequence[str], kind: str) -> list[str]:
-        """W vectors of W lanes as the rows of a matrix, and its columns: blocks of 1, 2, 4 ... entries change places."""
+    def transpose(self, square: Sequence[str], kind: str) -> list[str]:
+        """Transpose a W x W matrix of vectors: blocks of 1, 2, 4 ... entries change places, which are shuffles of two vectors."""
         square, of, distance = list(square), self.type(kind), 1
         while distance < self.width:
             for i in range(self.width):
@@ -327,41 +334,46 @@ class Emitter:
                         t + step if not t & distance else self.width + t - distance + step for t in range(self.width)
                     ]
                     indices = ", ".join(f"i32 {t}" for t in mask)
-                    square[place] = self.put(
+                    square[place] = self.emit(
                         f"shufflevector {of} {first}, {of} {second}, <{self.width} x i32> <{indices}>"
                     )
             distance *= 2
         return square
 
     def load_tile(self, rows: Sequence[str], entry: int, kind: str) -> list[str]:
-        """W entries of the rows of all lanes, from one load of each row."""
+        """Load W entries of the rows of all samples, one vector load a row, and transpose them."""
         of, loaded = self.type(kind), []
         for row in rows:
-            at = self.put(f"getelementptr i8, ptr {row}, i64 {entry * _BYTES[kind]}")
-            loaded.append(self.put(f"load {of}, ptr {at}, align {_BYTES[kind]}"))
-        return self.transposed(loaded, kind)
+            at = self.emit(f"getelementptr i8, ptr {row}, i64 {entry * _BYTES[kind]}")
+            loaded.append(self.emit(f"load {of}, ptr {at}, align {_BYTES[kind]}"))
+        return self.transpose(loaded, kind)
 
     def store_tile(self, rows: Sequence[str], entry: int, kind: str, values: Sequence[str]) -> None:
-        """Write W entries of the rows of all lanes, each row by one store."""
+        """Write W entries of the rows of all samples, one vector store a row."""
         of = self.type(kind)
         if any(value.startswith("%") for value in values):
-            lines = self.transposed(values, kind)
+            lines = self.transpose(values, kind)
         else:  # known numbers, "splat (double 0x...)": the same line for all
             known = ", ".join(value.removeprefix("splat (").removesuffix(")") for value in values)
             lines = [f"<{known}>"] * self.width
         for row, value in zip(rows, lines, strict=True):
-            at = self.put(f"getelementptr i8, ptr {row}, i64 {entry * _BYTES[kind]}")
-            self.stored(f"  store {of} {value}, ptr {at}, align {_BYTES[kind]}")
+            at = self.emit(f"getelementptr i8, ptr {row}, i64 {entry * _BYTES[kind]}")
+            self.emit_store(f"  store {of} {value}, ptr {at}, align {_BYTES[kind]}")
 
-    def stored(self, line: str) -> None:
-        """Write a store. LLVM's schedulers compare every two of them between two fences, which cost no instruction."""
+    def emit_store(self, line: str) -> None:
+        """Write a store, and now and then a fence, which costs no instruction.
+
+        LLVM's schedulers compare every two stores between two fences, which without these grows with the square of the results.
+        """
         self.lines.append(line)
         self.stores += 1
         if self.stores % STORES_BETWEEN_FENCES == 0:
             self.lines.append('  fence syncscope("singlethread") release')
 
     def store_array(self, rows: Sequence[str], kind: str, values: Sequence[str]) -> None:
-        """Write all entries of the rows of all lanes."""
+        """Write all entries of the rows of all samples."""
+        # Rows of samples are far from each other in memory: W results of W samples are transposed in registers, so that each row
+        # takes one store, not W.
         tiled = len(values) // self.width * self.width if self.width > 1 and kind in FLOATS else 0
         for entry in range(0, tiled, self.width):
             self.store_tile(rows, entry, kind, values[entry : entry + self.width])
@@ -369,15 +381,15 @@ class Emitter:
             self.store(rows, entry, kind, values[entry])
 
     def store(self, rows: Sequence[str], entry: int, kind: str, value: str) -> None:
-        """Write an entry of the rows of all lanes."""
-        for lane, row in enumerate(rows):
-            x = value if self.width == 1 else self.put(f"extractelement {self.type(kind)} {value}, i32 {lane}")
+        """Write an entry of the rows of all samples."""
+        for element, row in enumerate(rows):
+            x = value if self.width == 1 else self.emit(f"extractelement {self.type(kind)} {value}, i32 {element}")
             self.store_one(row, entry, kind, x)
 
     def store_one(self, row: str, entry: int, kind: str, value: str) -> None:
-        """Write an entry of the row of one lane."""
-        at = self.put(f"getelementptr i8, ptr {row}, i64 {entry * _BYTES[kind]}")
+        """Write an entry of the row of one sample."""
+        at = self.emit(f"getelementptr i8, ptr {row}, i64 {entry * _BYTES[kind]}")
         if kind == "b1":
-            self.stored(f"  store i8 {self.put(f'zext i1 {value} to i8')}, ptr {at}")
+            self.emit_store(f"  store i8 {self.emit(f'zext i1 {value} to i8')}, ptr {at}")
         else:
-            self.stored(f"  store {_TYPES[kind]} {value}, ptr {at}, align {_BYTES[kind]}")
+            self.emit_store(f"  store {_TYPES[kind]} {value}, ptr {at}, align {_BYTES[kind]}")

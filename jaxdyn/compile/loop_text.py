@@ -1,10 +1,10 @@
 """The text of loops (see `loops`): LLVM's intermediate representation around the programs of a turn and of a row.
 
 entry   pointers
-block   the next samples: constants and states go to memory of the lanes, rows and records are copied to the results
-turn    the program of a turn; new states where a lane takes part and is served; its records
-rows    while a lane has a row to write: the program of a row
-out     where no lane goes on: states go to the results
+block   the next samples: constants and states are copied to local memory, rows and records to the results
+turn    the program of an iteration: new states where a sample takes part and is valid; its records
+rows    while a sample has a row to write: the program of a row
+out     after the last sample of the block has ended: states are copied to the results
 """
 
 import math
@@ -15,7 +15,7 @@ from typing import Any
 import jax
 import numpy as np
 
-from jaxdyn.compile.code import Body, bytes_of, framed
+from jaxdyn.compile.code import Body, bytes_of, wrap_kernel
 from jaxdyn.compile.llvm import Emitter
 from jaxdyn.compile.program import Array, kind_of
 
@@ -30,7 +30,8 @@ class _LoopText:
         self.loop, self.width, self.e = loop, width, Emitter(width)
         self.arrays: list[Array] = [*loop.inputs, *loop.outputs]
         self.uniform = [*uniform, *[False] * len(loop.outputs)]
-        self.allocated: list[str] = []
+        # Memory is allocated in the entry block: an alloca within the loop over blocks would grow the stack each time.
+        self.allocations: list[str] = []
         self.labels = 0
         # Places among the arrays: arguments of a turn, the last of them states; times; tables; then the carry without the state.
         self.end, self.first_state = loop.end, loop.end - loop.states
@@ -52,61 +53,64 @@ class _LoopText:
         self._set_table_rows()
         turn = Body(e, loop.turn, self._load, self._array)
         results = [name for row in turn.results() for name in row]
+        # The state is stored before rows are written: their program reads the stages of this iteration, not the state.
         more = self._store_state(results)
         if loop.row is not None:
             self._rows(results)
+        # The block iterates until its last sample has ended; the state of the others is kept by selects.
         e.lines.append(f"  br i1 {e.any(more)}, label %turn, label %out")
         e.lines.append("out:")
         for k in range(loop.states):
             kind = kind_of(loop.outputs[k].dtype)
             values = [e.load_at(self._slot(self.first_state + k), i, kind) for i in range(loop.outputs[k].size)]
-            e.store_array(self.lanes[self.results + k], kind, values)
+            e.store_array(self.sample_rows[self.results + k], kind, values)
         if loop.row is not None:
-            e.store(self.lanes[self.saved_after], 0, "i4", e.load_at("%saved", 0, "i4"))
+            e.store(self.sample_rows[self.saved_after], 0, "i4", e.load_at("%saved", 0, "i4"))
         title = f"{loop.digest} {self.uniform}"
-        allocated = [*turn.allocated(), *self.allocated]
-        return framed(e, title, self.uniform[: self.results], len(loop.outputs), allocated)
+        allocations = [*turn.allocations(), *self.allocations]
+        return wrap_kernel(e, title, self.uniform[: self.results], len(loop.outputs), allocations)
 
     # --- arguments ---
 
     def _slot(self, place: int) -> str:
-        """Memory of the lanes for an argument of a turn."""
+        """Local memory for an argument of an iteration, for the W samples of the block."""
         return f"%slot{place}"
 
     def _is_direct(self, place: int) -> bool:
-        """Whether an argument is read where it stands."""
+        """Decide whether an argument is read from the caller's memory: constants of one sample, and those that all share."""
         return place < self.first_state and (self.width == 1 or self.uniform[place])
 
     def _set_up(self) -> None:
         e = self.e
         places = [i for i, same in enumerate(self.uniform) if not same]
-        self.lanes = e.rows(places, [self.arrays[i].size * self.arrays[i].dtype.itemsize for i in places])
-        self.lanes |= {i: [f"%a{i}"] * self.width for i, same in enumerate(self.uniform) if same}
+        self.sample_rows = e.rows(places, [self.arrays[i].size * self.arrays[i].dtype.itemsize for i in places])
+        self.sample_rows |= {i: [f"%a{i}"] * self.width for i, same in enumerate(self.uniform) if same}
         read = {x.args[0] for x in self.loop.turn.operations if x.op == "input"}
         for place in range(self.end):
             if self._is_direct(place) or (place not in read and place < self.first_state):
                 continue
             array = self.arrays[place]
+            # At least a cache line: a slot of zero bytes would have the address of the next one.
             size = max(64, bytes_of(array, self.width))
-            self.allocated.append(f"  {self._slot(place)} = alloca [{size} x i8], align 64")
+            self.allocations.append(f"  {self._slot(place)} = alloca [{size} x i8], align 64")
             for entry in range(array.size):
                 kind = kind_of(array.dtype)
                 e.store_at(self._slot(place), entry, kind, self._from_row(place, entry, kind))
         has_rows = self.loop.row is not None
         if has_rows:
-            self.allocated.append("  %saved = alloca [64 x i8], align 64")
+            self.allocations.append("  %saved = alloca [64 x i8], align 64")
             e.store_at("%saved", 0, "i4", self._from_row(self.saved, 0, "i4"))
         e.declared["memcpy"] = "declare void @llvm.memcpy.p0.p0.i64(ptr, ptr, i64, i1)"
         for place in range(self.saved + has_rows, self.results):
-            after = self.lanes[self.saved_after + place - self.saved]
+            after = self.sample_rows[self.saved_after + place - self.saved]
             size = self.arrays[place].size * self.arrays[place].dtype.itemsize
-            for source, target in zip(self.lanes[place], after, strict=True):
+            for source, target in zip(self.sample_rows[place], after, strict=True):
                 e.lines.append(f"  call void @llvm.memcpy.p0.p0.i64(ptr {target}, ptr {source}, i64 {size}, i1 false)")
 
     def _from_row(self, place: int, entry: int, kind: str) -> str:
         if self.uniform[place]:
             return self.e.load_for_all(place, entry, kind)
-        return self.e.load(self.lanes[place], entry, kind)
+        return self.e.load(self.sample_rows[place], entry, kind)
 
     def _set_table_rows(self) -> None:
         """Pointers to the rows of the tables that are read now."""
@@ -120,13 +124,13 @@ class _LoopText:
             place, pointers = e.load_at(self._slot(places), k, "i4"), []
             count, *shape = self.arrays[table].shape
             size = math.prod(shape) * self.arrays[table].dtype.itemsize
-            for lane in range(self.width):
-                at = e.put(f"sext i32 {self._lane(place, lane, 'i4')} to i64")
+            for element in range(self.width):
+                at = e.emit(f"sext i32 {self._element(place, element, 'i4')} to i64")
                 # As unsigned numbers what is below zero is large.
-                is_inside = e.put(f"icmp ult i64 {at}, {count}")
-                at = e.put(f"select i1 {is_inside}, i64 {at}, i64 0")
-                offset = e.put(f"mul i64 {at}, {size}")
-                pointers.append(e.put(f"getelementptr i8, ptr {self.lanes[table][lane]}, i64 {offset}"))
+                is_inside = e.emit(f"icmp ult i64 {at}, {count}")
+                at = e.emit(f"select i1 {is_inside}, i64 {at}, i64 0")
+                offset = e.emit(f"mul i64 {at}, {size}")
+                pointers.append(e.emit(f"getelementptr i8, ptr {self.sample_rows[table][element]}, i64 {offset}"))
             self.table_rows.append(pointers)
 
     def _load(self, place: int, entry: int, kind: str) -> str:
@@ -137,17 +141,17 @@ class _LoopText:
         return self.e.load_at(self._slot(place), entry, kind)
 
     def _array(self, place: int) -> str | None:
-        """An argument with the layout of a subprogram's, each entry with its lanes."""
+        """Pointer to an argument in the layout of a subprogram's."""
         if place >= self.end:
             return self.table_rows[place - self.end][0] if self.width == 1 else None
         if self._is_direct(place):
-            return self.lanes[place][0] if self.width == 1 else None
+            return self.sample_rows[place][0] if self.width == 1 else None
         return self._slot(place)
 
     # --- the results of a turn ---
 
     def _store_state(self, results: list[str]) -> str:
-        """New states and records; which lanes go on."""
+        """Store new states and records; flags of the samples that continue."""
         e, turn = self.e, self.loop.turn_places
         flag = e.type("b1")
         take = self._both(self._one(results, turn.active), results[-1])
@@ -157,7 +161,7 @@ class _LoopText:
             kind = kind_of(self.arrays[place].dtype)
             for k, i in enumerate(self.entries[out]):
                 old = e.load_at(self._slot(place), k, kind)
-                value = e.put(f"select {flag} {take}, {e.type(kind)} {results[i]}, {e.type(kind)} {old}")
+                value = e.emit(f"select {flag} {take}, {e.type(kind)} {results[i]}, {e.type(kind)} {old}")
                 after.append((self._slot(place), k, kind, value))
         for value in after:
             e.store_at(*value)
@@ -167,54 +171,56 @@ class _LoopText:
         return more
 
     def _record(self, results, index, stride: int) -> None:
-        """Rows of the records of which one turn in so many is written."""
+        """Store a row of each record, once in as many iterations as its stride."""
         e, strides = self.e, self.loop.task.strides
-        for lane in range(self.width):
-            turn = e.put(f"zext i32 {self._lane(index, lane, 'i4')} to i64")
-            is_one = self._lane(self.take, lane, "b1")
+        for element in range(self.width):
+            turn = e.emit(f"zext i32 {self._element(index, element, 'i4')} to i64")
+            is_one = self._element(self.take, element, "b1")
             place = turn
             if stride > 1:
-                place = e.put(f"udiv i64 {turn}, {stride}")
-                rest = e.put(f"urem i64 {turn}, {stride}")
-                is_one = e.put(f"and i1 {is_one}, {e.put(f'icmp eq i64 {rest}, 0')}")
+                place = e.emit(f"udiv i64 {turn}, {stride}")
+                rest = e.emit(f"urem i64 {turn}, {stride}")
+                is_one = e.emit(f"and i1 {is_one}, {e.emit(f'icmp eq i64 {rest}, 0')}")
             with_row = []
             for r, out in enumerate(self.loop.turn_places.written):
                 if strides[r] == stride:
                     with_row.append((self.records_after + r, [results[i] for i in self.entries[out]]))
-            self._write_if(is_one, lane, place, with_row)
+            self._write_if(is_one, element, place, with_row)
 
-    def _write_if(self, flag: str, lane: int, place: str, rows: list) -> None:
-        """Row number `place` of some results, in a lane with a flag."""
+    def _write_if(self, flag: str, element: int, place: str, rows: list) -> None:
+        """Row number `place` of some results, for a sample whose flag is set."""
         e = self.e
         write, on = self._label("write"), self._label("on")
         e.lines += [f"  br i1 {flag}, label %{write}, label %{on}", f"{write}:"]
         for result, values in rows:
             kind, array = kind_of(self.arrays[result].dtype), self.arrays[result]
-            offset = e.put(f"mul i64 {place}, {len(values) * array.dtype.itemsize}")
-            at = e.put(f"getelementptr i8, ptr {self.lanes[result][lane]}, i64 {offset}")
+            offset = e.emit(f"mul i64 {place}, {len(values) * array.dtype.itemsize}")
+            at = e.emit(f"getelementptr i8, ptr {self.sample_rows[result][element]}, i64 {offset}")
             for k, value in enumerate(values):
-                e.store_one(at, k, kind, self._lane(value, lane, kind))
+                e.store_one(at, k, kind, self._element(value, element, kind))
         e.lines += [f"  br label %{on}", f"{on}:"]
 
     def _rows(self, results: list[str]) -> None:
-        """Rows of times that have been passed, one for each lane at a time; ends where there are none."""
+        """Rows of times that have been passed, one for each sample at a time, until none is left."""
         e, turn = self.e, self.loop.turn_places.rows
         count = self.arrays[self.rows_after].shape[0]
         kind, flag = kind_of(self.arrays[self.times].dtype), e.type("b1")
         until = self._one(results, turn.until)
+        # A step may pass any number of save points: samples with the most of them decide how often this loop runs.
         self._begin("rows")
         saved = e.load_at("%saved", 0, "i4")
         places, times = [], []
-        for lane in range(self.width):
-            given = e.put(f"zext i32 {self._lane(saved, lane, 'i4')} to i64")
-            is_less = e.put(f"icmp ult i64 {given}, {count}")
-            places.append(e.put(f"select i1 {is_less}, i64 {given}, i64 {count - 1}"))
-            offset = e.put(f"mul i64 {places[-1]}, {self.arrays[self.times].dtype.itemsize}")
-            at = e.put(f"getelementptr i8, ptr {self.lanes[self.times][lane]}, i64 {offset}")
+        for element in range(self.width):
+            given = e.emit(f"zext i32 {self._element(saved, element, 'i4')} to i64")
+            is_less = e.emit(f"icmp ult i64 {given}, {count}")
+            # A sample that has written all rows reads the last time again, which is a valid address, and writes nothing.
+            places.append(e.emit(f"select i1 {is_less}, i64 {given}, i64 {count - 1}"))
+            offset = e.emit(f"mul i64 {places[-1]}, {self.arrays[self.times].dtype.itemsize}")
+            at = e.emit(f"getelementptr i8, ptr {self.sample_rows[self.times][element]}, i64 {offset}")
             times.append(e.load_one(at, 1, kind))
         time = self._vector(times, kind)
-        some_left = e.put(f"icmp ult {e.type('i4')} {saved}, {e.constant(count, 'i4')}")
-        is_passed = e.put(f"fcmp ole {e.type(kind)} {time}, {until}")
+        some_left = e.emit(f"icmp ult {e.type('i4')} {saved}, {e.constant(count, 'i4')}")
+        is_passed = e.emit(f"fcmp ole {e.type(kind)} {time}, {until}")
         kept = self._both(self.take, self._one(results, turn.kept))
         passed = self._both(kept, self._both(some_left, is_passed))
         e.lines.append(f"  br i1 {e.any(passed)}, label %row, label %all.passed")
@@ -225,10 +231,10 @@ class _LoopText:
             return time if place == 0 else dense[place - 1][entry]
 
         written = [name for row in Body(e, self.loop.row, load, _no_array).results() for name in row]
-        for lane in range(self.width):
-            self._write_if(self._lane(passed, lane, "b1"), lane, places[lane], [(self.rows_after, written)])
-        one = e.put(f"zext {flag} {passed} to {e.type('i4')}")
-        e.store_at("%saved", 0, "i4", e.put(f"add {e.type('i4')} {saved}, {one}"))
+        for element in range(self.width):
+            self._write_if(self._element(passed, element, "b1"), element, places[element], [(self.rows_after, written)])
+        one = e.emit(f"zext {flag} {passed} to {e.type('i4')}")
+        e.store_at("%saved", 0, "i4", e.emit(f"add {e.type('i4')} {saved}, {one}"))
         e.lines += ["  br label %rows", "all.passed:"]
 
     # --- lines ---
@@ -244,20 +250,20 @@ class _LoopText:
         return results[self.entries[out][0]]
 
     def _both(self, a: str, b: str) -> str:
-        return self.e.put(f"and {self.e.type('b1')} {a}, {b}")
+        return self.e.emit(f"and {self.e.type('b1')} {a}, {b}")
 
-    def _lane(self, value: str, lane: int, kind: str) -> str:
-        return value if self.width == 1 else self.e.put(f"extractelement {self.e.type(kind)} {value}, i32 {lane}")
+    def _element(self, value: str, element: int, kind: str) -> str:
+        return value if self.width == 1 else self.e.emit(f"extractelement {self.e.type(kind)} {value}, i32 {element}")
 
     def _vector(self, values: list[str], kind: str) -> str:
         if self.width == 1:
             return values[0]
         of, total = self.e.type(kind), "poison"
-        for lane, value in enumerate(values):
+        for element, value in enumerate(values):
             scalar = Emitter(1).type(kind)
-            total = self.e.put(f"insertelement {of} {total}, {scalar} {value}, i32 {lane}")
+            total = self.e.emit(f"insertelement {of} {total}, {scalar} {value}, i32 {element}")
         return total
 
 
 def _no_array(place: int) -> None:
-    """Of the arguments of a row none stands in memory."""
+    """The arguments of a row's program are registers: none can be passed on as a pointer."""

@@ -1,8 +1,8 @@
-"""Loops in machine code: a program of numbers that is repeated for a sample until it has ended, with rows written on the way.
+"""Native loops: a program that is repeated for a sample until it has ended, with rows written on the way.
 
-A turn of a loop of XLA's costs microseconds, and all samples of a batch wait for the last one. Here every block of lanes goes
-on by itself. What a turn does is a `Program`; the state stands in memory of the lanes; rows go to places that the numbers
-decide, which a program of numbers cannot do. `loop_text` writes the machine code.
+An iteration of XLA's `while` costs microseconds, and all samples of a batch wait for the last one. Here every block of W samples
+ends independently. An iteration is a `Program`; the state is in local memory; rows are written at places that depend on
+numbers, which a program cannot express. `loop_text` writes the code.
 """
 
 import functools
@@ -16,17 +16,19 @@ from jaxtyping import Array as Numbers
 
 from jaxdyn.compile import mode
 from jaxdyn.compile.jax_adapter import forgive, vary_alike
-from jaxdyn.compile.kernel import kernel_p, over_batch, program_of, target
-from jaxdyn.compile.known import Known, partition_traced
+from jaxdyn.compile.known import Known, partition_tracers
 from jaxdyn.compile.loop_text import loop_ir
+from jaxdyn.compile.operations import over_batch
+from jaxdyn.compile.primitive import kernel_p, target
 from jaxdyn.compile.program import Array, Constant, Program
+from jaxdyn.compile.trace import program_of
 
 
-class Turn(NamedTuple):
-    """The results of a turn of the loop.
+class Iteration(NamedTuple):
+    """The results of one iteration.
 
-    - `state`: the next one. `active`: whether the sample took part; if not, its state stays as it is. `more`: whether it goes on.
-    - `rows`: what decides about rows, if there are any. `index`: of the turn, from zero on; `written`: a row for each record.
+    - `state`: the next one. `active`: whether the sample took part; if not, its state is kept. `more`: whether it continues.
+    - `rows`: decides about rows, if there are any. `index`: number of the iteration, from zero; `written`: a row for each record.
     """
 
     state: Any
@@ -46,7 +48,7 @@ class Passed(NamedTuple):
 
 
 class Carry(NamedTuple):
-    """Where a loop is: the state, how many rows have been written (int32) and the rows (m, n), or None, and the records."""
+    """The carry of a loop: the state, the number of rows written (int32) and the rows (m, n), or None, and the records."""
 
     state: Any
     saved: Any = None
@@ -55,12 +57,13 @@ class Carry(NamedTuple):
 
 
 class Task(NamedTuple):
-    """What a loop does, by functions that are defined once, and what they are given first.
+    """The functions of a loop, each defined once, and their static arguments.
 
-    - `turn(*static, tree, constants, state, read) -> Turn`; `read`: rows of tables, at the places `state.places` (k,), int32.
-    - `otherwise(*static, tree, constants, given, carry) -> carry`: the same by JAX, for processors without machine code.
+    - `turn(*static, tree, constants, state, read) -> Iteration`; `read`: rows of tables, at the places `state.places` (k,),
+      int32.
+    - `otherwise(*static, tree, constants, given, carry) -> carry`: the same by JAX, for processors without native code.
     - `row(*of_row, None, time, *dense)`: the row (n,) of a time; None if there are none.
-    - `strides`: for each record, of how many turns one is written.
+    - `strides`: for each record, the number of iterations from one row to the next.
     """
 
     turn: Callable
@@ -72,9 +75,9 @@ class Task(NamedTuple):
 
 
 class Given(NamedTuple):
-    """Arrays that a loop reads at places that the numbers decide.
+    """Arrays that a loop reads at places that depend on its state.
 
-    - `times` (m + 1,), of which the rows belong to the last m, or None. `tables` (k, ...), each read at one of the places.
+    - `times` (m + 1,) or None: the rows belong to the last m of them. `tables` (k, ...): each is read at one of the places.
     """
 
     times: Any = None
@@ -82,11 +85,11 @@ class Given(NamedTuple):
 
 
 def run_loop(task: Task, tree, constants, given: Given, carry: Carry) -> tuple[Carry, bool] | None:
-    """Take turns until the sample has ended, or meets a turn that is not for a program of numbers (see `flags`).
+    """Iterate until the sample has ended, or an iteration is not valid (see `flags`).
 
     **Arguments:** `tree` as of `run`; `constants`, a pytree.
 
-    **Returns:** the carry, and whether there are no such turns; None where there is no such loop.
+    **Returns:** the carry, and whether every iteration is valid for certain; None where there is no native loop.
     """
     try:
         return _run_loop(task, tree, constants, given, carry)
@@ -97,12 +100,14 @@ def run_loop(task: Task, tree, constants, given: Given, carry: Carry) -> tuple[C
 
 
 def _run_loop(task: Task, tree, constants, given: Given, carry: Carry) -> tuple[Carry, bool] | None:
-    if mode.current() == "plain" or target is None or mode.is_expanding() or not target.is_supported():
+    if mode.current() == "plain" or target is None or mode.is_expanding() or not target.is_available():
         return None
+    # An iteration is traced with one row of each table; the loop itself reads rows at places that the state holds.
     given, carry = jax.tree.map(jnp.asarray, (given, carry))
     read = tuple(jnp.zeros(x.shape[1:], x.dtype) for x in given.tables)
     turn_args = constants, carry.state, read
-    leaves, expanded = program_of(task.turn, task.static, tree, turn_args, calls=True, served=True)
+    # Validity is reported always: the loop ends before an iteration that is not valid, and the caller takes it by JAX.
+    leaves, expanded = program_of(task.turn, task.static, tree, turn_args, calls=True, flags="report_always")
     if isinstance(expanded, str):
         return None
     program, structure = expanded
@@ -114,11 +119,14 @@ def _run_loop(task: Task, tree, constants, given: Given, carry: Carry) -> tuple[
         if isinstance(expanded, str):
             return None
         row = expanded[0]
-    traced, known = partition_traced(tree)
+    # The tree is split once more, as `program_of` does: the fallback needs its known leaves with the traced ones put back.
+    traced, known = partition_tracers(tree)
+    # `read` is an argument of an iteration's program, and no operand of the loop, which loads it from the tables.
     loop = _loop(task, program, row, structure, known, len(traced), _Form.of((constants, given, carry)))
     leaves = leaves[: len(leaves) - len(read)]
     after = jax.tree.leaves(carry)[len(jax.tree.leaves(carry.state)) :]
     flat = vary_alike([x.reshape(-1) for x in (*leaves, *jax.tree.leaves(given), *after)])
+    # The loop takes the place of a program in the primitive, which so batches it. It has no derivative.
     results = kernel_p.bind(*flat, program=loop, rows=0)
     return _Form.of(carry)(results), loop.always_ends
 
@@ -146,15 +154,18 @@ class Loop:
     state; its results are the carry.
     """
 
+    # Reverse mode is a loop of its own, over the records (`simulation.solvers.reverse`): JAX never differentiates this one.
     derivative = fallback = None
-    turns = 100  # of a run, by which its cost is estimated
+    # Iterations of a run are unknown. The estimate decides how many samples one thread takes at a time.
+    turns = 100
 
     def __init__(self, task: Task, turn: Program, row, structure, known: Known, count: int, form: _Form):
         self.task, self.turn, self.row, self.known, self.count, self.form = task, turn, row, known, count, form
-        self.turn_places: Turn = jax.tree.unflatten(structure, range(structure.num_leaves))
+        self.turn_places: Iteration = jax.tree.unflatten(structure, range(structure.num_leaves))
         numbered = jax.tree.unflatten(form.structure, range(len(form.arrays)))
         self.given, self.carry = numbered[1:]
         self.states = len(jax.tree.leaves(self.carry.state))
+        # Places are counted through a tree of numbers with the structure of the arrays: fields keep their names here.
         self.first_leaf = jax.tree.leaves(self.carry)[0]  # of the carry, among the form's arrays
         self.reads = len(self.given.tables)
         self.end = len(turn.inputs) - self.reads
@@ -168,24 +179,24 @@ class Loop:
 
     @property
     def always_ends(self) -> bool:
-        """Whether no turn needs more care than a program of numbers takes."""
-        served = self.turn.results[-1][0]
-        return type(served) is Constant and bool(served.value)
+        """True where no iteration can be invalid, so that the caller compiles no fallback."""
+        valid = self.turn.results[-1][0]
+        return type(valid) is Constant and bool(valid.value)
 
     @property
     def digest(self) -> str:
-        """As of a `Program`."""
+        """Identity of the code, as `Program.digest`."""
         sizes = [(x.size, x.dtype.name) for x in (*self.inputs, *self.outputs)]
         row = None if self.row is None else self.row.digest
         return f"loop {self.turn.digest} {row} {sizes} {self.task.strides} {self.turn_places} {self.given}"
 
     @property
     def cost(self) -> int:
-        """Operations of a turn."""
+        """Operations of one iteration."""
         return self.turn.cost
 
     def lanes(self, samples) -> int:
-        """As of the program of a turn."""
+        """Vector width, that of an iteration's program."""
         return target.width_of(self.turn, samples)
 
     def ir(self, width: int, uniform) -> str:
@@ -205,6 +216,7 @@ class Loop:
         return [x.reshape(-1) for x in jax.tree.leaves(carry)]
 
 
+# The same loop for the same programs: a primitive's parameters are keys of JAX's caches.
 @functools.lru_cache(maxsize=256)
 def _loop(task: Task, turn: Program, row, structure, known: Known, count: int, form: _Form) -> Loop:
     return Loop(task, turn, row, structure, known, count, form)

@@ -2,7 +2,8 @@
 
 import numpy as np
 
-from jaxdyn.compile.graph import Graph, Number, objects
+from jaxdyn.compile.graph import Graph
+from jaxdyn.compile.number import Number, objects
 
 
 def product(graph: Graph, a: np.ndarray, b: np.ndarray, zero) -> list:
@@ -26,9 +27,10 @@ def product(graph: Graph, a: np.ndarray, b: np.ndarray, zero) -> list:
 
 
 def cholesky(graph: Graph, matrix: np.ndarray) -> np.ndarray:
-    """The lower factor L of a symmetric matrix L L^T, of which the lower triangle is read."""
+    """The lower factor L of a symmetric matrix L L^T; reads the lower triangle."""
     n = matrix.shape[0]
     lower = np.full((n, n), 0.0, object)
+    # Reciprocals of the diagonal are kept: n divisions, not n^2/2, and `triangular_solve` finds the same numbers again.
     inverse = []
     for j in range(n):
         for i in range(j, n):
@@ -50,6 +52,7 @@ def triangular_solve(graph: Graph, a: np.ndarray, b: np.ndarray, lower: bool, un
     for i in range(n) if lower else reversed(range(n)):
         row = b[i].tolist()
         for k in range(i) if lower else range(i + 1, n):
+            # Known zeros of a factor are the branches of a tree.
             if type(a[i, k]) is Number or a[i, k] != 0:
                 row = [graph.sub(x, graph.mul(a[i, k], y)) for x, y in zip(row, rows[k], strict=True)]
         inverse = 1.0 if unit else graph.div(1.0, a[i, i])

@@ -1,7 +1,7 @@
-"""How functions are compiled: by native kernels where they serve, or, under `compilation("plain")`, by JAX alone.
+"""Modes of compilation: native kernels, or, under `compilation("plain")`, JAX alone.
 
-What tracing depends on are user contexts of JAX. They are part of the keys of its caches, so that a function under `jax.jit`
-is traced once in each of them: what a call gives does not depend on how the function was traced before.
+Every mode that tracing depends on is a user context of JAX. Contexts are part of the keys of JAX's caches, so that a function
+under `jax.jit` is traced once in each of them: results do not depend on how the function was traced before.
 """
 
 import contextlib
@@ -19,6 +19,7 @@ OPTIONS = ("", "usual", "least")
 # LLVM takes some 50 microseconds an operation: three seconds.
 MAX_OPERATIONS = 60_000
 
+# None: the environment decides, which is read at each use, so that a test can set it.
 _mode = jax.make_user_context(None)
 _expanding = jax.make_user_context(False)
 _rank_safe = jax.make_user_context(False)
@@ -28,13 +29,14 @@ _said: set[str] = set()
 
 def current() -> str:
     """The mode in force. **Raises:** ValueError where the environment asks for one that does not exist."""
-    asked = _mode.value or _checked(
+    # On a JAX that failed the trial "auto" is "plain" for the whole process.
+    asked = _mode.value or _check_mode(
         os.environ.get("JAXDYN_COMPILATION", "auto"), "the environment's JAXDYN_COMPILATION"
     )
     return asked if asked == "plain" or jax_adapter.reason_against_kernels() is None else "plain"
 
 
-def _checked(mode, what: str) -> str:
+def _check_mode(mode, what: str) -> str:
     if mode not in MODES:
         raise ValueError(f"{what} is {mode!r}; choose from {', '.join(map(repr, MODES))}")
     return mode
@@ -42,12 +44,12 @@ def _checked(mode, what: str) -> str:
 
 @contextlib.contextmanager
 def compilation(mode: str) -> Iterator[None]:
-    """While functions are traced inside: how they become machine code.
+    """Choose how functions that are traced inside are compiled.
 
     **Arguments:** `mode`:
 
     - "auto": native kernels on a CPU where a function is a program of single numbers, operations of JAX elsewhere.
-    - "plain": operations of JAX everywhere, which compile and run slower and serve as a witness.
+    - "plain": operations of JAX everywhere, which compile and run slower: a reference for tests.
 
     The mode counts when a function is traced, and `jax.jit` traces a function once in each mode. Without this context the
     environment variable JAXDYN_COMPILATION decides, and without that, "auto".
@@ -59,12 +61,12 @@ def compilation(mode: str) -> Iterator[None]:
         a = jd.forward_dynamics(model, q, v, tau)
     ```
     """
-    with _mode(_checked(mode, "compilation: mode")):
+    with _mode(_check_mode(mode, "compilation: mode")):
         yield
 
 
 def is_expanding() -> bool:
-    """Whether a function is traced to become a program of numbers: what it calls is traced with it."""
+    """Decide whether a function is being traced to become a program, so that kernels within it are inlined."""
     return _expanding.value
 
 
@@ -74,32 +76,32 @@ def expanding():
 
 
 def is_rank_safe() -> bool:
-    """Whether what is traced is computed again for samples that need care: the fast way has failed them already."""
+    """Decide whether the traced function computes samples again for which a kernel was not valid."""
     return _rank_safe.value
 
 
 def rank_safe(is_safe: bool = True):
-    """Context in which a function is traced for samples that need care."""
+    """Context in which a function is traced for samples for which a kernel was not valid."""
     return _rank_safe(is_safe)
 
 
 def is_row() -> bool:
-    """Whether an axis that is added to a kernel now is one of rows (see `rows`)."""
+    """Decide whether an axis that `vmap` adds to a kernel now is one of rows (see `batch.map_rows`)."""
     return _in_rows.value
 
 
 def in_rows():
-    """Context in which an axis that is added to a kernel is one of rows."""
+    """Context in which an axis that `vmap` adds to a kernel is one of rows."""
     return _in_rows(True)
 
 
 def wants_usual_options() -> bool:
-    """Whether the environment asks for compilation without what shortens a first call."""
+    """Decide whether the environment asks for XLA's usual options instead of those that shorten a first call."""
     return _options() == "usual"
 
 
 def wants_least_optimisation() -> bool:
-    """Whether the environment asks for code that compiles fast and runs slowly, as most tests do."""
+    """Decide whether the environment asks for code that compiles fast and runs slowly, as most tests do."""
     return _options() == "least"
 
 

@@ -1,9 +1,9 @@
 """Machine code from LLVM IR, kept on disk: a second start of a script compiles no kernel again.
 
 An object file is found by the hash of the IR, of LLVM's version and level, and of the processor's name and features. Files
-are written beside their final name and moved there, so that two processes that build one at once do not disturb each other;
-each ends with a checksum, and one that is damaged is built anew. Where the folder cannot be written, code is kept in memory
-alone, and that is said once.
+are written under another name and moved to their final one, so that two processes that build one at once do not disturb
+each other. Each ends with a checksum, and one that is damaged is built anew. Where the folder cannot be written, code stays in
+memory, with one warning.
 """
 
 import contextlib
@@ -34,7 +34,7 @@ def initialize() -> None:
 
 @functools.cache
 def features() -> str:
-    """Of the processor, as LLVM writes them."""
+    """Features of the processor, as LLVM writes them."""
     return llvm.get_host_cpu_features().flatten()
 
 
@@ -75,7 +75,7 @@ class Code:
             if (lines := text.count("\n")) > ANNOUNCED_LINES:
                 message = "jaxdyn: compiling %s, %d lines; the next start of this script reads it from the cache"
                 logger.warning(message, name or "a function", lines)
-            binary = _compiled(text)
+            binary = _compile(text)
             if stored:
                 _write(self.key, binary)
         # The engine is given the object file alone: it would keep the text that it compiles for as long as it lives.
@@ -84,7 +84,7 @@ class Code:
         self.engine.finalize_object()
 
     def address(self, name: str) -> int:
-        """Of a function."""
+        """Address of a function."""
         return self.engine.get_function_address(name)
 
     def publish(self, name: str, symbol: str) -> None:
@@ -99,13 +99,14 @@ def _module(text: str, machine):
     return module
 
 
-def _compiled(text: str) -> bytes:
+def _compile(text: str) -> bytes:
     """The object file of a kernel."""
     machine = target_machine()
     module = _module(text, machine)
     if wants_least_optimisation():
         return machine.emit_object(module)
     options = llvm.create_pipeline_tuning_options(speed_level=1)
+    # The text is vectors already, in one block of thousands of lines: LLVM's vectorisers would only take time.
     options.loop_vectorization = options.slp_vectorization = options.loop_unrolling = False
     builder = llvm.create_pass_builder(machine, options)
     builder.getModulePassManager().run(module, builder)
@@ -119,7 +120,7 @@ _is_off = False
 
 
 def cache_folder() -> Path:
-    """Where object files are kept: `jaxdyn` in the user's folder for caches."""
+    """Folder of the object files: `jaxdyn/kernels` in the user's folder for caches."""
     if _folder is not None:
         return _folder
     base = os.environ.get("XDG_CACHE_HOME") or os.environ.get("LOCALAPPDATA") or Path.home() / ".cache"
@@ -146,6 +147,7 @@ def _read(key: bytes) -> bytes | None:
     if hashlib.sha256(code).digest() != checksum:
         logger.warning("jaxdyn: %s is damaged and is built again", path)
         return None
+    # The time of last use, by which the folder is pruned: file systems often do not note reads.
     with contextlib.suppress(OSError):
         os.utime(path)
     return code
@@ -169,6 +171,7 @@ def _write(key: bytes, code: bytes) -> None:
             raise
         _prune(folder)
     except (OSError, RuntimeError) as error:
+        # A full disk or a read-only home must not stop a computation.
         _is_off = True
         logger.warning("jaxdyn: kernels are not kept on disk, and are compiled again at the next start: %s", error)
 

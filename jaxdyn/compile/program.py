@@ -54,10 +54,12 @@ class Program:
     - `subprograms`: what is called, written once however often it is.
     - `derivative`: None, or a function (which inputs move) -> the `Program` of the change of all outputs, of the inputs and the
       changes of those that move.
-    - `fallback`: None, or the function of which this is the program, from flat arrays of one sample to flat arrays.
+    - `fallback`: None, or the function that was traced, from flat arrays of one sample to flat arrays.
+    - `reports_validity`: whether the last output says if the sample is valid (see `flags`).
     """
 
-    turns = 1  # how often the operations are carried out
+    # Repetitions of the operations in one call, by which the cost of a `loops.Loop` is estimated.
+    turns = 1
 
     def __init__(
         self, inputs, outputs, operations, results, subprograms=(), derivative: Callable | None = None, name: str = ""
@@ -70,6 +72,8 @@ class Program:
         self.derivative = derivative
         self.name = name
         self.fallback: Callable | None = None
+        self.reports_validity = False
+        # Derivatives, transposes and kernels of this program, which live as long as it does.
         self.derived: dict = {}
 
     def __repr__(self):
@@ -78,12 +82,13 @@ class Program:
     @functools.cached_property
     def cost(self) -> int:
         """Number of operations that are carried out, without inputs and changes of sign."""
+        # Signs merge with sums and products of LLVM, and inputs are operands in memory.
         own = sum(_weight(x) for x in self.operations if x.op not in ("input", "neg", "call", "part"))
         return own + sum(self.subprograms[x.args[0].value].cost for x in self.operations if x.op == "call")
 
     @functools.cached_property
     def digest(self) -> str:
-        """Of all that its code depends on: programs of equal digests do the same."""
+        """Hash of everything that the code depends on: programs of equal digests have the same code."""
         lines = [f"{op} {kind} {args}" for op, kind, args in self.operations]
         lines += [str(x) for x in (*self.inputs, *self.outputs, *self.results)] + [x.digest for x in self.subprograms]
         return hashlib.sha256("\n".join(lines).encode()).hexdigest()
@@ -136,6 +141,14 @@ def kind_of(dtype) -> str:
     return _KINDS[np.dtype(dtype).name]
 
 
+def kind_or_refuse(dtype) -> str:
+    """`kind_of` a dtype. **Raises:** `NotNumbers` for those that programs do not have."""
+    try:
+        return kind_of(dtype)
+    except KeyError:
+        raise NotNumbers(f"numbers of {dtype}") from None
+
+
 def dtype_of(kind: str) -> np.dtype:
     """The dtype of a kind."""
     return _DTYPES[kind]
@@ -146,6 +159,7 @@ def as_kind(value, kind: str):
 
     Beyond the range of an integer a float becomes the nearest end of it, and what is not a number zero; a longer integer is cut.
     """
+    # Python's own float and bool for the two most frequent kinds, which compute twice as fast as NumPy's scalars.
     if kind == "f8":
         return float(value)
     if kind == "b1":
@@ -153,6 +167,7 @@ def as_kind(value, kind: str):
     dtype = _DTYPES[kind]
     if kind in FLOATS or not isinstance(value, (float, np.floating)):
         return np.asarray(value).astype(dtype)[()]
+    # XLA saturates, where C leaves the result undefined.
     ends = np.iinfo(dtype)
     if math.isnan(value):
         return dtype.type(0)

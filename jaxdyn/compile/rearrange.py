@@ -4,7 +4,7 @@ from collections.abc import Callable
 
 import numpy as np
 
-from jaxdyn.compile.graph import as_objects
+from jaxdyn.compile.number import as_objects
 from jaxdyn.compile.program import NotNumbers
 
 
@@ -36,6 +36,7 @@ def _split(params, args, out):
 
 def _pad(params, args, out):
     padded = np.full(out.shape, args[1].item(), args[0].dtype)
+    # Gaps between entries occur in transposes of strided slices.
     config = params["padding_config"]
     if any(low < 0 or high < 0 for low, high, _ in config):
         raise NotNumbers("padding that cuts")
@@ -48,7 +49,9 @@ def _pad(params, args, out):
     return padded
 
 
-def _places(shape, indices, window, inserted, batching, index_map, index_batching, sizes, window_dims, result_shape):
+def _flat_places(
+    shape, indices, window, inserted, batching, index_map, index_batching, sizes, window_dims, result_shape
+):
     """Flat places in an array of a shape that a gather reads, or a scatter writes, and which of them are inside.
 
     `window` lists the dimensions of the array that a window has, `inserted` and `batching` those that it has not, `sizes`
@@ -63,6 +66,7 @@ def _places(shape, indices, window, inserted, batching, index_map, index_batchin
             order[dim] = size
         return values.reshape(order)
 
+    # Flat places of all entries at once, as sums of broadcast arrays: windows of a gather have any number of dimensions.
     flat = np.zeros(result_shape, np.int64)
     inside = np.ones(result_shape, bool)
     strides = np.cumprod([1, *reversed(shape)])[:-1][::-1]
@@ -74,6 +78,7 @@ def _places(shape, indices, window, inserted, batching, index_map, index_batchin
             axis = index_batching[batching.index(dim)]
             start = np.broadcast_to(np.arange(size).reshape([-1 if i == axis else 1 for i in range(len(lead))]), lead)
         inside &= along((start >= 0) & (start <= size - sizes[dim]), others)
+        # XLA moves a window that is partly outside of the array to its edge.
         at = along(np.clip(start, 0, size - sizes[dim]), others)
         if dim in window:
             at = at + along(np.arange(sizes[dim]), [window_dims[window.index(dim)]])
@@ -81,11 +86,11 @@ def _places(shape, indices, window, inserted, batching, index_map, index_batchin
     return flat, inside
 
 
-def _kept(shape, *left_out):
+def _window_dims(shape, *left_out):
     return [i for i in range(len(shape)) if not any(i in dims for dims in left_out)]
 
 
-def _known_places(eqn, *arrays):
+def _require_known(eqn, *arrays):
     if any(x.dtype.kind == "O" for x in arrays):
         raise NotNumbers(f"{eqn.primitive.name} at a place that is not known")
 
@@ -93,13 +98,14 @@ def _known_places(eqn, *arrays):
 def gather(params, args, eqn):
     """Entries at places that are known."""
     operand, indices = args
-    _known_places(eqn, indices)
+    _require_known(eqn, indices)
     d, shape = params["dimension_numbers"], operand.shape
-    window = _kept(shape, d.collapsed_slice_dims, d.operand_batching_dims)
-    flat, inside = _places(
+    window = _window_dims(shape, d.collapsed_slice_dims, d.operand_batching_dims)
+    flat, inside = _flat_places(
         shape, indices, window, d.collapsed_slice_dims, d.operand_batching_dims, d.start_index_map,
         d.start_indices_batching_dims, params["slice_sizes"], d.offset_dims, eqn.outvars[0].aval.shape,
     )  # fmt: skip
+    # Filled entries would be NaN or the least integer: that is left to JAX.
     if not inside.all() and "fill" in str(params["mode"]).lower():
         raise NotNumbers("a gather beyond its argument")
     return [operand.reshape(-1)[flat]]
@@ -108,7 +114,7 @@ def gather(params, args, eqn):
 def dynamic_slice(params, args, eqn):
     """A part that begins at a place that is known."""
     operand, *starts = args
-    _known_places(eqn, *starts)
+    _require_known(eqn, *starts)
     sizes = params["slice_sizes"]
     at = [min(max(int(x), 0), n - m) for x, n, m in zip(starts, operand.shape, sizes, strict=True)]
     return [operand[tuple(slice(i, i + m) for i, m in zip(at, sizes, strict=True))]]
@@ -117,7 +123,7 @@ def dynamic_slice(params, args, eqn):
 def dynamic_update_slice(params, args, eqn):
     """An array with a part of it replaced, at a place that is known."""
     operand, update, *starts = args
-    _known_places(eqn, *starts)
+    _require_known(eqn, *starts)
     at = [min(max(int(x), 0), n - m) for x, n, m in zip(starts, operand.shape, update.shape, strict=True)]
     is_known = operand.dtype.kind != "O" and update.dtype.kind != "O"
     updated = operand.copy() if is_known else as_objects(operand).copy()
@@ -143,18 +149,19 @@ REARRANGEMENTS: dict[str, Callable] = {
 }
 
 
-def written(eqn, operand, indices, updates) -> list:
+def scatter_places(eqn, operand, indices, updates) -> list:
     """For each entry of the updates of a scatter, the place of the operand that it goes to, or None."""
-    _known_places(eqn, indices)
+    _require_known(eqn, indices)
     d, shape = eqn.params["dimension_numbers"], operand.shape
-    window = _kept(shape, d.inserted_window_dims, d.operand_batching_dims)
+    window = _window_dims(shape, d.inserted_window_dims, d.operand_batching_dims)
     sizes = [1] * len(shape)
     for dim, of_update in zip(window, d.update_window_dims, strict=True):
         sizes[dim] = updates.shape[of_update]
-    flat, inside = _places(
+    flat, inside = _flat_places(
         shape, indices, window, d.inserted_window_dims, d.operand_batching_dims, d.scatter_dims_to_operand_dims,
         d.scatter_indices_batching_dims, sizes, d.update_window_dims, updates.shape,
     )  # fmt: skip
+    # By name: the enumeration itself is internal to JAX.
     if "clip" in str(eqn.params["mode"]).lower():
         inside = np.ones_like(inside)
     return [place if fits else None for place, fits in zip(flat.ravel().tolist(), inside.ravel().tolist(), strict=True)]

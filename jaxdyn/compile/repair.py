@@ -1,8 +1,7 @@
-"""What only some samples of a batch need: computed when one of them does, or for those alone.
+"""Samples of a batch that a kernel cannot compute: computed again, a few at a time, without touching the others.
 
-Under `jax.vmap` a `lax.cond` whose predicate differs between samples computes both branches. A predicate that has gone
-through `any_in_batch` is one for all samples, however many `vmap`s enclose it, and the branch stays a branch. `repair_flagged`
-computes samples that need it again and leaves the others alone.
+Under `jax.vmap` a `lax.cond` whose predicate differs between samples computes both branches for all of them. Here the marked
+samples are gathered to small blocks first, and the branch is taken for as many blocks as there are.
 """
 
 import functools
@@ -14,31 +13,17 @@ from jax import lax
 from jax.custom_batching import custom_vmap
 
 from jaxdyn.compile import ahead, mode
-from jaxdyn.compile.flags import unless
+from jaxdyn.compile.batch import any_sample
+from jaxdyn.compile.flags import mark_invalid
 from jaxdyn.compile.jax_adapter import vary_alike
-from jaxdyn.compile.kernel import run
-from jaxdyn.compile.known import is_concrete, partition_traced
 
-SAMPLES_AT_ONCE = 32  # samples that are computed again together
-
-
-@custom_vmap
-def _any_of_batch(flag):
-    return flag
-
-
-@_any_of_batch.def_vmap
-def _(size, batched, flag):
-    return _any_of_batch(jnp.any(flag)), False
-
-
-def any_in_batch(flag):
-    """Whether a flag () is set for this sample or for any other one of the batch."""
-    return flag if is_concrete(flag) else _any_of_batch(flag)
+# Samples that are computed again together: they pay for the overhead of a loop of XLA, and the memory of their intermediates
+# stays small.
+SAMPLES_AT_ONCE = 32
 
 
 def rank_safe(function: Callable) -> Callable:
-    """The function, traced for samples that need care."""
+    """The function, traced for samples for which a kernel was not valid."""
 
     @functools.wraps(function)
     def call(*args):
@@ -48,32 +33,30 @@ def rank_safe(function: Callable) -> Callable:
     return call
 
 
-def recompute_unless(served, again: Callable, values, args: tuple):
-    """`values`, or again(*args), traced `rank_safe`, where a sample is not served; in a batch a few of those at a time.
+def compute_where(flag, function: Callable, values, args: tuple):
+    """function(*args), traced `rank_safe`, where the flag () is set, else `values`; in a batch a few of those samples at a time.
 
-    `served` is True where every sample is, and `again` is not in the program then; else an array (). `again` depends on nothing
-    traced but `args`. Without derivatives.
+    The function depends on nothing traced but `args`. The result has no derivative.
     """
-    return values if served is True else _one(rank_safe(again))(jnp.logical_not(served), values, args)
+    return _one(rank_safe(function))(flag, values, args)
 
 
-def repair_flagged(flag, careful: Callable, fast: Callable, values: tuple, args: tuple):
+def repair(flag, careful: Callable, fast: Callable, values: tuple, args: tuple):
     """`values` where the flag () is not set, else `careful(*args)`; in a batch only the samples that need it, a few at a time.
 
     **Arguments:**
 
-    - `careful(*args)` -> what `values` is: a pair of pytrees, of which the first is differentiated. It depends on nothing traced
-      but `args`.
-    - `fast(*args)` -> found[0], whose derivatives serve where the flag is not set.
+    - `careful(*args)` -> a pair of pytrees like `values`. The first one is differentiated. The function depends on nothing
+      traced but `args`.
+    - `fast(*args)` -> values[0], whose derivatives are right where the flag is not set.
 
-    Derivatives are those of `fast` if the flag is set in no sample of the batch, else those of `careful` for all of them: in a
-    branch, as what a singular sample makes of the other way is no number, and would reach gradients even times zero.
+    Derivatives are those of `fast` if the flag is set in no sample of the batch, else those of `careful` for all of them. They
+    are a branch, not a select: the derivative of `fast` at a flagged sample is NaN, which reaches gradients even times zero.
 
-    While a function is traced to become a program of single numbers, which has no branches, floats of flagged samples are NaN,
-    and the program knows it (`jaxdyn.compile.run(..., served=True)`).
+    Inside of a kernel, which has no branches, floats of flagged samples are marked as not valid (see `flags`).
     """
     if mode.is_expanding():
-        return jax.tree.map(lambda x: unless(flag, x) if jnp.issubdtype(x.dtype, jnp.floating) else x, values)
+        return jax.tree.map(lambda x: mark_invalid(flag, x) if jnp.issubdtype(x.dtype, jnp.floating) else x, values)
 
     @jax.custom_jvp
     def run(flag, values, args):
@@ -87,36 +70,16 @@ def repair_flagged(flag, careful: Callable, fast: Callable, values: tuple, args:
         def by(function):
             return lambda: jax.jvp(function, args, args_step)[1]
 
-        step = lax.cond(any_in_batch(flag), by(lambda *args: careful(*args)[0]), by(fast))
+        step = lax.cond(any_sample(flag), by(lambda *args: careful(*args)[0]), by(fast))
         return run(*primals), (step, plain_step)
 
     return run(flag, lax.stop_gradient(values), args)
 
 
-def run_repaired(function: Callable, tree, *args, static: tuple = ()):
-    """function(*static, tree, *args) by a kernel; samples that it cannot serve by the function itself, traced `rank_safe`.
-
-    **Arguments:** as of `run`. Only floats that the function returns are differentiated.
-    """
-    values, served = run(function, tree, *args, static=static, served=True)
-    if served is True:
-        return values
-    traced, known = partition_traced(tree)
-
-    def careful(traced, args):
-        return rank_safe(function)(*static, known(traced), *args), ()
-
-    def fast(traced, args):
-        return run(function, known(traced), *args, static=static, served=True)[0]
-
-    # Derivatives keep what a computation needs for them whether it runs or not; this one hardly ever does.
-    careful = jax.checkpoint(careful, prevent_cse=False)
-    return repair_flagged(jnp.logical_not(served), careful, fast, (values, ()), (traced, args))[0]
-
-
 def _one(careful: Callable):
-    careful = _hardly_called(careful)
+    careful = _without_worker(careful)
 
+    # `custom_vmap` sees the batch before JAX makes a select of the branch.
     @custom_vmap
     def one(flag, values, args):
         return lax.cond(flag, lambda: _like(careful(*args), values), lambda: values)
@@ -136,7 +99,9 @@ def _one(careful: Callable):
     return alike
 
 
-def _hardly_called(careful: Callable) -> Callable:
+def _without_worker(careful: Callable) -> Callable:
+    """The function, whose kernels are compiled when they are called: hardly any sample needs them."""
+
     def call(*args):
         with ahead.worker(False):
             return careful(*args)
@@ -151,6 +116,7 @@ def _many(careful: Callable, axes: list):
         size = flag.shape[0]
         # `jax.export` has sizes without a number.
         count = min(SAMPLES_AT_ONCE, size) if isinstance(size, int) else SAMPLES_AT_ONCE
+        # Padded by a block of places beyond the batch, which are read as the last sample and are not written.
         places = jnp.nonzero(flag, size=size + count, fill_value=size)[0]
 
         def repair(i, values):
@@ -170,6 +136,7 @@ def _many(careful: Callable, axes: list):
     def _(size, batched, flag, values, args):
         flag, values = jax.tree.map(lambda x, varies: _rows(x, varies, size), (flag, values), tuple(batched[:2]))
         shape = flag.shape
+        # Nested batches are one: places are counted through both, so that blocks are filled from all of them.
         flat, over = _along_one_axis(args, axes, batched[2], shape)
         flag, values = jax.tree.map(lambda x: x.reshape(-1, *x.shape[2:]), (flag, values))
         values = jax.tree.map(lambda x: x.reshape(*shape, *x.shape[1:]), _many(careful, over)(flag, values, flat))

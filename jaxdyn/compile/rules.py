@@ -5,7 +5,7 @@ from collections.abc import Callable
 import jax
 import jax.numpy as jnp
 
-from jaxdyn.compile.known import partition_traced
+from jaxdyn.compile.known import partition_tracers
 
 
 def implicit(tree, args: tuple, solve: Callable, tangent: Callable):
@@ -14,8 +14,9 @@ def implicit(tree, args: tuple, solve: Callable, tangent: Callable):
     `steps` are those of the tree's leaves and of the args, None where nothing moves. Leaves with known values stay outside of
     the differentiated function: inside it they would be traced, and a recursion could not see their zeros any more.
     """
-    unknown, known = partition_traced(tree)
+    unknown, known = partition_tracers(tree)
 
+    # With symbolic zeros the rule sees which leaves do not change: a state's derivative computes none of the model's.
     @jax.custom_jvp
     def run(traced, *args):
         return _batch_first(solve(known(traced), *args))
@@ -44,22 +45,24 @@ def _batch_first(tree):
         shape = jnp.shape(x)
         if not shape or x.dtype == jax.dtypes.float0:
             return x
+        # Two reshapes that cancel: their batching rule moves the axis of the batch to the front.
         return jnp.reshape(jnp.reshape(x, (1, *shape) if len(shape) == 1 else -1), shape)
 
     return jax.tree.map(first, tree)
 
 
-def along(function: Callable, args: tuple, steps):
+def value_and_jvp(function: Callable, args: tuple, steps):
     """function(*args), and its change for `steps` in the leaves of args, None where one does not move; None if none does."""
     base, structure = jax.tree.flatten(args)
+    # Only leaves that change are arguments of `jax.jvp`: the others stay constants, whose zeros are seen.
     moving = [i for i, step in enumerate(steps) if step is not None]
     if not moving:
         return function(*args), None
 
-    def moved(*values):
+    def at_values(*values):
         here = list(base)
         for i, value in zip(moving, values, strict=True):
             here[i] = value
         return function(*jax.tree.unflatten(structure, here))
 
-    return jax.jvp(moved, [base[i] for i in moving], [steps[i] for i in moving])
+    return jax.jvp(at_values, [base[i] for i in moving], [steps[i] for i in moving])

@@ -1,4 +1,4 @@
-"""Kernels whose batch is shared among devices: what the partitioner of XLA and the types of JAX have to be told.
+"""Kernels whose batch is sharded over devices: attributes for the partitioner of XLA, and types for JAX.
 
 Samples do not know of each other, so a call is divided along the axes of its batch and nothing is exchanged. Without the two
 attributes below XLA would gather the batch on every device around a call of machine code.
@@ -25,13 +25,14 @@ def results_of(avals: Sequence, arrays: Sequence) -> list:
     lead = () if longest is None else longest.shape[:-1]
     if longest is None or jax_adapter.mesh_of(longest) is None:
         return [ShapedArray((*lead, array.size), array.dtype) for array in arrays]
+    # Operands with the batch's axes agree along them, or leave an axis open: the first that says something decides.
     specs = [jax_adapter.spec_of(x) for x in avals if x.ndim == longest.ndim]
     along = [next((spec[k] for spec in specs if spec[k] is not None), None) for k in range(len(lead))]
     return [jax_adapter.type_like(longest, (*lead, array.size), array.dtype, (*along, None)) for array in arrays]
 
 
-def may_be_divided(avals: Sequence, lead: Sequence) -> bool:
-    """Whether XLA may divide this call; False too where its batch has a last axis of length one.
+def is_divisible(avals: Sequence, lead: Sequence) -> bool:
+    """Decide whether XLA may partition this call; False too where its batch has a last axis of length one.
 
     Such an axis is put there, as the partitioner counts batch axes from the front: the only axis of an argument that all samples
     share would be divided as if it were that of the batch; with fewer axes than the batch has, the argument is left alone. And an
@@ -50,6 +51,7 @@ def attributes(avals: Sequence, results: Sequence) -> dict | None:
         return None
     sizes = list(lead)
 
+    # The entries of each array are an axis of its own in the rule, so that nothing is ever divided along them.
     def axes(x):
         sizes.append(x.shape[-1])  # an axis of its own, which is in no other array
         return [*range(len(lead)), len(sizes) - 1] if x.ndim > 1 else [len(sizes) - 1]

@@ -1,4 +1,4 @@
-"""What depends on arguments alone that all samples of a batch share, such as the numbers of a model: computed once a call.
+"""Numbers that all samples of a batch share, such as those that depend on the model alone: computed once a call.
 
 A program is divided into one of a single sample, which computes the numbers that do not vary, and one of the batch, which reads
 those of them that it needs. Of forward dynamics of a given robot a third goes to the first.
@@ -10,37 +10,41 @@ from jaxdyn.compile.code import MIN_SHARED_OPERATIONS
 from jaxdyn.compile.program import Array, Constant, Operation, Program, dtype_of
 
 
-def divided(program, uniform: Sequence[bool]) -> tuple[Program, Program] | None:
+def split_program(program, uniform: Sequence[bool]) -> tuple[Program, Program] | None:
     """A program of the uniform inputs, in their order, and one of all inputs and the results of the first.
 
     None where too few operations would be saved to be worth a second call.
     """
     if not isinstance(program, Program) or not any(uniform):
         return None
-    key = ("divided", tuple(uniform))
+    key = ("split", tuple(uniform))
     if key not in program.derived:
-        program.derived[key] = _divided(program, uniform)
+        program.derived[key] = _split(program, uniform)
     return program.derived[key]
 
 
-def _divided(program: Program, uniform: Sequence[bool]) -> tuple[Program, Program] | None:
+def _split(program: Program, uniform: Sequence[bool]) -> tuple[Program, Program] | None:
     is_shared: list[bool] = []
     for op, _, args in program.operations:
         if op == "input":
             is_shared.append(uniform[args[0]])
         else:
+            # Subprograms stay whole: their calls belong to the batch.
             is_shared.append(op not in ("call", "part") and all(is_shared[x] for x in args if type(x) is not Constant))
     saved = sum(
         shared and x.op not in ("input", "neg") for shared, x in zip(is_shared, program.operations, strict=True)
     )
+    # Below this a second call costs more than the batch saves; for one sample nothing is saved at all.
     if saved < MIN_SHARED_OPERATIONS:
         return None
-    passed = _passed(program, is_shared)
+    # One array for each kind of number: a kernel takes few arguments, and each is checked by the handler.
+    passed = _handover(program, is_shared)
     kinds = sorted({program.operations[i].kind for i in passed})
     by_kind = [[i for i in passed if program.operations[i].kind == kind] for kind in kinds]
     arrays = [Array((len(entries),), dtype_of(kind)) for kind, entries in zip(kinds, by_kind, strict=True)]
 
     places = [i for i, same in enumerate(uniform) if same]
+    # Operations keep their order in both programs, and are numbered anew.
     first = _Renumbered()
     for i, (op, kind, args) in enumerate(program.operations):
         if is_shared[i]:
@@ -54,6 +58,7 @@ def _divided(program: Program, uniform: Sequence[bool]) -> tuple[Program, Progra
         name=f"{program.name}, of what samples share",
     )
 
+    # The second program takes all inputs, also those that only the first one reads: places of arguments stay the same.
     count, rest = len(program.inputs), _Renumbered()
     for place, (kind, entries) in enumerate(zip(kinds, by_kind, strict=True), count):
         for k, i in enumerate(entries):
@@ -73,7 +78,7 @@ def _divided(program: Program, uniform: Sequence[bool]) -> tuple[Program, Progra
     return once, each
 
 
-def _passed(program: Program, is_shared: Sequence[bool]) -> list[int]:
+def _handover(program: Program, is_shared: Sequence[bool]) -> list[int]:
     """Numbers that all samples share and that are read by what varies or are results, in the order in which they are read."""
     read = [x.args for i, x in enumerate(program.operations) if not is_shared[i] and x.op != "input"]
     numbers: dict[int, None] = {}

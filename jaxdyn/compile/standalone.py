@@ -15,11 +15,12 @@ import numpy as np
 
 from jaxdyn.compile import derive
 from jaxdyn.compile.code import ATTRIBUTES, Body
-from jaxdyn.compile.graph import Graph, inlined, objects
-from jaxdyn.compile.kernel import program_of
+from jaxdyn.compile.graph import Graph, inline
 from jaxdyn.compile.llvm import Emitter
+from jaxdyn.compile.number import objects
 from jaxdyn.compile.objects import features as host_features
 from jaxdyn.compile.program import Array, Program, kind_of
+from jaxdyn.compile.trace import program_of
 
 MAX_OPERATIONS = 2_000_000  # LLVM takes some 50 microseconds an operation, so this is two minutes
 DEGENERATE = 1  # status of a sample that needs a decision about rank, which straight-line code cannot take
@@ -82,7 +83,7 @@ def _initialize() -> None:
 def scalar_program(function: Callable, examples: Sequence[Any], name: str) -> tuple[Program, Any]:
     """The program of function(*examples) and the structure of its results.
 
-    The last output of the program says whether straight-line code can serve the sample; it is a constant where it always can.
+    The last output of the program says whether the sample is valid for straight-line code; it is a constant where it always can.
 
     **Raises:** ValueError where the function is no program of single numbers.
     """
@@ -91,13 +92,14 @@ def scalar_program(function: Callable, examples: Sequence[Any], name: str) -> tu
         return function(*args)
 
     call.__qualname__ = name
-    _, made = program_of(call, (), (), tuple(examples), most=MAX_OPERATIONS, served=True)
+    # Validity is reported always: the exported function has a status, whether samples can be invalid or not.
+    _, made = program_of(call, (), (), tuple(examples), most=MAX_OPERATIONS, flags="report_always")
     if isinstance(made, str):
         raise ValueError(
             f"function cannot be exported: it has {made}; only functions without callbacks and data-dependent loops can"
         )
     program, structure = made
-    return inlined(program), structure
+    return inline(program), structure
 
 
 def jacobian_program(program: Program, name: str) -> Program:
@@ -107,7 +109,7 @@ def jacobian_program(program: Program, name: str) -> Program:
     flag of `program`. Entries that no number of the program can make other than zero are constants.
     """
     moving = tuple(array.dtype.kind == "f" for array in program.inputs)
-    change = inlined(derive.tangent(program, moving))
+    change = inline(derive.tangent(program, moving))
     graph = Graph(MAX_OPERATIONS)
     primal = [graph.inputs(place, array) for place, array in enumerate(program.inputs)]
     varied = [array for array, moves in zip(program.inputs, moving, strict=True) if moves]
@@ -121,6 +123,7 @@ def jacobian_program(program: Program, name: str) -> Program:
             columns = graph.replay(change, [*primal, *steps])[1]
             for row, column in zip(blocks, columns, strict=True):
                 row[place][:, entry] = column.ravel()
+    # Replayed into the same graph: values that the derivatives need too are there already.
     flag = graph.replay(program, primal)[1][-1]
     arrays = [Array(block.shape, y.dtype) for y, row in zip(outputs, blocks, strict=True) for block in row]
     entries = [block for row in blocks for block in row]
@@ -138,7 +141,7 @@ class Text(NamedTuple):
 
 
 class Field(NamedTuple):
-    """Where an array of a program stands: the pointer among a function's arguments, and the offset in bytes from it."""
+    """Place of an array of a program: the pointer among a function's arguments, and the offset in bytes from it."""
 
     argument: int
     offset: int
@@ -165,7 +168,7 @@ def function_ir(
         field = inputs[place]
         base = f"%a{field.argument}"
         if field.offset:
-            base = e.put(f"getelementptr i8, ptr {base}, i64 {field.offset}")
+            base = e.emit(f"getelementptr i8, ptr {base}, i64 {field.offset}")
         return e.load_one(base, entry if places is None else int(places[place][entry]), kind)
 
     *values, flag = Body(e, program, load, lambda place: None).results()
@@ -182,7 +185,7 @@ def function_ir(
     return Text("\n".join([head, *e.lines, "  ret i32 %status", "}"]), e.declared)
 
 
-def packed_ir(name: str, arguments: int, program: Program) -> Text:
+def array_call_ir(name: str, arguments: int, program: Program) -> Text:
     """The text of `i32 name_packed(ptr block)`, which takes the pointers of `name` from an array (ctypes is slow by argument)."""
     lines, given = [], []
     for i in range(arguments + len(program.outputs) - 1):

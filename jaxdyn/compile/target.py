@@ -20,8 +20,8 @@ from jaxdyn.compile.program import FLOATS, Program, kind_of
 
 TARGET = "jaxdyn_kernel"
 SLOTS = 1 << 16
-# A chunk of a batch takes some 20 microseconds: 40 000 vector operations at 2 a nanosecond, long beside the claim of a chunk
-# (0.1 us) and short beside the wait for the last one.
+# A chunk of a batch takes some 20 microseconds: 40 000 vector operations at 2 a nanosecond. That is long against the time to
+# claim a chunk (0.1 us), and short against the wait for the last thread.
 OPERATIONS_PER_CHUNK = 40_000
 _MISSING = "jaxdyn: this program was compiled by another process, which had its kernel; trace it again here"
 _FAILED = "jaxdyn: a kernel could not be compiled; the error was logged"
@@ -44,10 +44,12 @@ class _Entry(ctypes.Structure):
     )
 
 
+# The handler finds a kernel by open addressing in this table, without a lock: an entry's hash is written last.
 _table = (_Entry * SLOTS)()
 _threads = ctypes.c_int64(1 << 30)
 _lock = threading.RLock()
-_making = threading.Lock()  # LLVM takes one program at a time
+# LLVM takes one program at a time, and two threads may call the same new kernel.
+_making = threading.Lock()
 _called: dict[str, Code] = {}  # subprograms, which other kernels call too
 _kernels: dict[int, "_Kernel"] = {}  # by number, for as long as the process may call them
 _handler: list[Code] = []
@@ -82,8 +84,8 @@ def register() -> None:
 
 
 @functools.cache
-def is_supported() -> bool:
-    """Whether kernels can be called here; if not, that is said where one is lowered."""
+def is_available() -> bool:
+    """Decide whether kernels can be called on this machine; if not, lowering one gives the warning."""
     try:
         register()
     except Unsupported:
@@ -99,15 +101,16 @@ def _architecture() -> str:
 
 @functools.cache
 def vector_bytes() -> int:
-    """Of the processor's vectors of floats."""
+    """Bytes of the processor's vector registers."""
     has = features()
     return 64 if "+avx512f" in has else 32 if "+avx," in has + "," else 16
 
 
 def width_of(program, samples: int | None) -> int:
-    """Lanes of a kernel: one for a single sample, else those of the processor's vectors."""
+    """Samples that a kernel computes in one vector: one for a single sample, else as many as a register holds."""
     if not isinstance(program, Program):
         return program.lanes(samples)
+    # Twice as many samples in float32, but only where no float64 is passed: vectors of both would have different lengths.
     kinds = {kind_of(array.dtype) for array in (*program.inputs, *program.outputs)} & set(FLOATS)
     return 1 if samples == 1 else vector_bytes() // (4 if kinds == {"f4"} else 8)
 
@@ -120,6 +123,8 @@ def kernel(program, width: int, uniform: Sequence[bool]) -> int:
         register()
         if key not in program.derived:
             content = f"{program.digest} {width} {uniform}"
+            # A hash, not a counter: a program in XLA's persistent cache finds its kernel in another process. 63 bits, as the
+            # attribute is signed; odd, as zero marks an empty slot.
             number = int.from_bytes(hashlib.sha256(content.encode()).digest()[:8], "little") >> 1 | 1
             if number not in _kernels:
                 _kernels[number] = _Kernel(number, program, width, uniform)
@@ -131,13 +136,15 @@ class _Kernel:
     """A kernel of the table; its program until there is code."""
 
     def __init__(self, number: int, program, width: int, uniform: tuple[bool, ...]):
+        # Half-full at most: searches stay short, and one that fails ends at an empty slot.
         if len(_kernels) > SLOTS // 2:
             raise Unsupported(f"more than {SLOTS // 2} kernels in one process")
         self.program: Any = program
         self.width, self.uniform = width, uniform
         self.code: Code | None = None
-        self.is_awaited = False  # whether another thread has been told to make it
+        self.is_awaited = False  # whether a worker is to compile it (see `ahead`)
         order = varying_first(uniform)
+        # The handler checks buffers against these; a negative size is one row for all samples.
         sizes = [-1 - program.inputs[i].size if uniform[i] else program.inputs[i].size for i in order]
         sizes += [array.size for array in program.outputs]
         self.sizes = (ctypes.c_int64 * len(sizes))(*sizes)
@@ -151,7 +158,7 @@ class _Kernel:
         self.entry.hash = number  # last: from here on it is found
 
     def address(self) -> int:
-        """Of its code, which is made where there is none."""
+        """Address of the code, which is compiled where there is none."""
         if self.code is None:
             with _making:
                 if self.code is None:
@@ -166,7 +173,7 @@ class _Kernel:
         text = kernel_ir(program, width, self.uniform) if is_program else program.ir(width, self.uniform)
         code = Code(text, name=program.name)
         self.entry.kernel = code.address("kernel")
-        self.code, self.program = code, None
+        self.code, self.program = code, None  # a program of a large robot takes megabytes
 
 
 def make_ahead(number: int) -> None:
@@ -186,10 +193,10 @@ def _publish(called: Program, width: int) -> None:
 
 
 def _prepare(number: int) -> int:
-    """What the handler calls for a kernel without code: its address, or zero where there is none."""
+    """Compile a kernel that is called for the first time; its address, or zero where that fails. The handler calls this."""
     try:
         return _kernels[number].address()
-    except BaseException:  # an interruption too: there is no Python above this call that could be told
+    except BaseException:  # an interruption too: no Python is above this call, to which it could be raised
         logger.exception("jaxdyn: a kernel could not be compiled")
         return 0
 
@@ -199,6 +206,7 @@ _PREPARE = ctypes.CFUNCTYPE(ctypes.c_void_p, ctypes.c_uint64)(_prepare)
 
 def call(program, arrays: Sequence[np.ndarray]) -> list[np.ndarray]:
     """The results of a program for one sample, by its kernel and without XLA; `arrays` as its inputs."""
+    # One thread and one sample: the handler, which shares a batch among XLA's threads, is not needed.
     number = kernel(program, 1, [False] * len(program.inputs))
     given = [np.ascontiguousarray(x, array.dtype) for x, array in zip(arrays, program.inputs, strict=True)]
     results = [np.empty(array.shape, array.dtype) for array in program.outputs]

@@ -47,35 +47,35 @@ COSINE = {
 
 def sine(x):
     """sin x for floats of 32 or 64 bits."""
-    r, quadrant = _reduced(x)
-    return _turned(x, *_pair(r), quadrant)
+    r, quadrant = _reduce_angle(x)
+    return _select_by_quadrant(x, *_pair(r), quadrant)
 
 
 def cosine(x):
     """cos x for floats of 32 or 64 bits."""
-    r, quadrant = _reduced(x)
-    return _turned(x, *_pair(r), quadrant + 1)
+    r, quadrant = _reduce_angle(x)
+    return _select_by_quadrant(x, *_pair(r), quadrant + 1)
 
 
 def _kind(x) -> str:
     return f"f{x.dtype.itemsize}"
 
 
-def _reduced(x):
+def _reduce_angle(x):
     """x less whole quarters of a turn, within pi/4 of zero, and their number modulo 4 as an int32."""
     number = x.dtype.type
     quarters = lax.round(x * number(2 / np.pi), lax.RoundingMethod.TO_NEAREST_EVEN)
     r = functools.reduce(lambda r, part: r - quarters * number(part), HALF_PI[_kind(x)], x)
     quadrant = (quarters - number(4) * jnp.floor(quarters * number(0.25))).astype(jnp.int32)
-    far_r, far_quadrant = _reduced_far(x)
+    far_r, far_quadrant = _reduce_far_angle(x)
     is_far = jnp.abs(x) > number(MAX_ANGLE[_kind(x)])
     return jnp.where(is_far, far_r, r), jnp.where(is_far, far_quadrant, quadrant)
 
 
-def _reduced_far(x):
-    """`_reduced` for |x| beyond MAX_ANGLE, without branches.
+def _reduce_far_angle(x):
+    """`_reduce_angle` for |x| beyond MAX_ANGLE, without branches.
 
-    x is n 2^e with an integer n, so that its quarters are n c with c = 2^e 2/pi, of which multiples of 4 do not count: a table
+    x is n 2^e with an integer n, so that its quarters are n c with c = 2^e 2/pi. Multiples of 4 do not count, so that a table
     has c modulo 4 for each e, in parts of so few bits that their products with each half of n are exact (Payne & Hanek 1983).
     """
     kind, number = _kind(x), x.dtype.type
@@ -146,7 +146,7 @@ def _pair(r):
     return r + r * z * polynomial(SINE[_kind(r)]), rest + (number(1) - number(0.5) * z)
 
 
-def _turned(x, sine, cosine, quadrant):
+def _select_by_quadrant(x, sine, cosine, quadrant):
     value = jnp.where(quadrant & 1 == 0, sine, cosine)
     # What is not finite has no quadrant.
     return jnp.where(jnp.isfinite(x), jnp.where(quadrant & 2 == 0, value, -value), x - x)

@@ -10,9 +10,10 @@ import numpy as np
 from jax import lax
 from jaxtyping import Array, Bool, Float
 
-from jaxdyn.compile import compiled, compute, constant, is_concrete, is_staged, run
+from jaxdyn.compile import entry_point, evaluate, kernel
+from jaxdyn.compile.known import is_concrete, is_tracing, stop_gradient
 from jaxdyn.constraints.base import Layout, holonomic_rows, layout, position_residual, velocity_residual
-from jaxdyn.constraints.closing import displacement_from, follow_path, nearest_configuration
+from jaxdyn.constraints.closing import follow_path, nearest_configuration
 from jaxdyn.constraints.codes import RESULTS, Outcome, name_of
 from jaxdyn.constraints.dynamics import correction
 from jaxdyn.constraints.loops import lock_joint
@@ -20,6 +21,7 @@ from jaxdyn.constraints.rank import checked_tolerance, tolerance
 from jaxdyn.constraints.selection import (
     Selection,
     keep_rows,
+    known_selection,
     most_rounding,
     opening_of_dropped,
     select_rows,
@@ -30,7 +32,7 @@ from jaxdyn.lie.so3 import _product
 from jaxdyn.model.arguments import Numbers, check_state, zeros_if_none
 from jaxdyn.model.tree import Model
 from jaxdyn.systems.scene import Scene, as_scene
-from jaxdyn.systems.system import displace
+from jaxdyn.systems.system import displace, displacement
 
 
 class Assembly(Outcome):
@@ -170,33 +172,50 @@ def _from_elsewhere(assembly: Assembly, guesses: int, assembled: Callable, scene
             return eqx.tree_at(
                 lambda found: found.distance,
                 dataclasses.replace(other, guesses=tried + 1),
-                jnp.max(jnp.abs(displacement_from(scene, q, other.q)) / sizes),
+                jnp.max(jnp.abs(displacement(scene.system, q, other.q)) / sizes),
             )
     return assembly
 
 
-@compiled
 def _assemble(locked, q, v, t, rank_tol, atol, steps, is_rounded, scene):
     """The scene `locked` closed; velocities are put on the constraints of `scene`, which is the same one if it is None."""
-    guess, whole = q, locked
-    passed = jnp.asarray(False)
-    has_positions = bool(holonomic_rows(layout(locked)).size)
     bare = Scene(locked.system, locked.constraints)
-    if has_positions:
-        fixed, start, time = constant((bare, q, t))
-        loose = tolerance(rank_tol, q) if rank_tol is not None else surely_apart(q)
-        q, passed = follow_path(fixed, start, time, loose, steps)
-    kept, rounding, _ = select_rows(bare, q, t, rank_tol, is_rounded)
+    start, passed = _follow_path(bare, q, t, rank_tol, steps)
+    selection = _selection(bare, start, t, rank_tol, is_rounded)
+    if scene is not None:
+        scene = Scene(scene.system, scene.constraints)
+        scene = keep_rows(scene, _selection(scene, start, t, rank_tol, is_rounded))
+    return _close(bare, q, start, passed, selection, v, t, rank_tol, atol, scene)
+
+
+def _selection(scene: Scene, q, t, rank_tol, is_rounded) -> Selection:
+    """The independent rows at the end of a path. Where they are known to be all, no program to choose them is compiled."""
+    if is_concrete(scene, q, t):
+        q = np.asarray(q)
+        return known_selection(scene, q, np.asarray(t, q.dtype), rank_tol, is_rounded)[0]
+    return select_rows(scene, q, t, rank_tol, is_rounded)
+
+
+@entry_point
+def _follow_path(scene, q, t, rank_tol, steps):
+    if not holonomic_rows(layout(scene)).size:
+        return q, jnp.asarray(False)
+    scene, q, t = stop_gradient((scene, q, t))
+    return follow_path(scene, q, t, tolerance(rank_tol, q) if rank_tol is not None else surely_apart(q), steps)
+
+
+@entry_point
+def _close(bare, guess, start, passed, selection, v, t, rank_tol, atol, scene):
+    """The assembly from the end of a path, which starts at the guess; `scene`: see `_assemble`."""
+    kept, rounding, _ = selection
     # Rows that contradict others are none that can be dropped: what is found is the point of least squares of all.
-    kept = jnp.where(rounding <= most_rounding(q.dtype), kept, jnp.ones_like(kept))
-    locked = keep_rows(bare, Selection(kept, rounding, jnp.zeros_like(rounding)))
-    if has_positions:
-        q = _unwind_hinges(locked, guess, nearest_configuration(locked, guess, q, t, rank_tol), t)
+    kept = jnp.where(rounding <= most_rounding(guess.dtype), kept, jnp.ones_like(kept))
+    whole, locked = bare, keep_rows(bare, Selection(kept, rounding, jnp.zeros_like(rounding)))
+    q = guess
+    if holonomic_rows(layout(locked)).size:
+        q = _unwind_hinges(locked, guess, nearest_configuration(locked, guess, start, t, rank_tol), t)
     if scene is None:
         scene = locked
-    else:
-        free = Scene(scene.system, scene.constraints)
-        scene = keep_rows(free, select_rows(free, q, t, rank_tol, is_rounded))
     v = _with_velocity(scene, q, v, t, rank_tol)
     limits = row_limits(locked, q, jnp.zeros_like(v), t, closing_tolerance(q.dtype))[0]
     phi = position_residual(locked, q, t)
@@ -207,7 +226,7 @@ def _assemble(locked, q, v, t, rank_tol, atol, steps, is_rounded, scene):
     residual = _sizes(position_residual(whole, q, t), velocity_residual(scene, q, v, t))
     good = (is_closed if atol is None else is_closed | (residual[0] <= atol)) & is_admissible
     sizes, _ = coordinate_sizes(whole.system, q.dtype)
-    moved = jnp.abs(displacement_from(whole, lax.stop_gradient(guess), lax.stop_gradient(q))) / sizes
+    moved = jnp.abs(displacement(whole.system, lax.stop_gradient(guess), lax.stop_gradient(q))) / sizes
     places = layout(whole)
     gaps = jnp.abs(position_residual(bare, q, t)) * (1 - kept)[holonomic_rows(places)]
     return Assembly(
@@ -250,7 +269,7 @@ def _with_velocity(scene, q, v, t, rank_tol):
 
 def residuals(scene: Scene, q, v, t=0.0) -> Float[Array, "2"]:
     """Largest |phi| (m or rad) and |A v - b| (m/s or rad/s) of the state q (nq,), v (nv,) at t (s): (2,)."""
-    return run(_largest_residuals, Scene(scene.system, scene.constraints), q, v, jnp.asarray(t, q.dtype))
+    return kernel(_largest_residuals)(Scene(scene.system, scene.constraints), q, v, jnp.asarray(t, q.dtype))
 
 
 def _largest_residuals(scene: Scene, q, v, t):
@@ -288,9 +307,13 @@ def _residuals_and_limits(scene, q, v, t, relative):
     return position_residual(scene, q, t), velocity_residual(scene, q, v, t), *limits
 
 
-def start_evidence(scene: Scene, q, v, t, relative: float) -> tuple[np.ndarray, float]:
-    """Largest residuals (2,), and `openness`, at a concrete state."""
+def start_openness(scene: Scene, q, v, t, relative: float) -> float:
+    """`openness` at a concrete state."""
     bare = Scene(scene.system, scene.constraints)
-    given = not is_staged()  # as in the program of a run that begins here
-    ratio = compute(largest_ratio, bare, q, v, t, static=(relative,), given=given)
-    return compute(_largest_residuals, bare, q, v, t, given=given), float(ratio)
+    # By the kernel that the program of a run that begins here has.
+    return float(evaluate(largest_ratio, bare, q, v, t, static=(relative,), is_input=not is_tracing()))
+
+
+def largest_residuals(scene: Scene, q, v, t) -> np.ndarray:
+    """Largest residuals (2,), of positions and velocities, at a concrete state."""
+    return evaluate(_largest_residuals, Scene(scene.system, scene.constraints), q, v, t)

@@ -17,7 +17,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from jaxdyn.compile import run
+from jaxdyn.compile import kernel
 from jaxdyn.lie.so3 import _product
 from jaxdyn.model.arguments import DType, Function, Number, Numbers, SystemLike, batch_hint, check_state, state_dtype
 from jaxdyn.systems.scene import Scene, as_pytree, as_scene
@@ -223,9 +223,10 @@ def nonholonomic_rows(places: Sequence[Layout]) -> np.ndarray:
 
 def position_residual(scene: Scene, q: Float[Array, " nq"], t: Any = 0.0) -> Float[Array, " nh"]:
     """phi(q, t) of all holonomic parts, stacked in the scene's order; (0,) when there are none."""
-    return run(_position_residual, scene, q, jnp.asarray(t, q.dtype))
+    return _position_residual(scene, q, jnp.asarray(t, q.dtype))
 
 
+@kernel
 def _position_residual(scene: Scene, q, t):
     parts = [part for part in _positions(scene, q, t) if part is not None]
     return jnp.concatenate(parts) if parts else jnp.zeros((0,), q.dtype)
@@ -235,9 +236,10 @@ def velocity_residual(
     scene: Scene, q: Float[Array, " nq"], v: Float[Array, " nv"], t: Any = 0.0
 ) -> Float[Array, " nc"]:
     """psi(q, v, t) = A v - b of all constraints, (nc,)."""
-    return run(_velocity_residual, scene, q, v, jnp.asarray(t, q.dtype))
+    return _velocity_residual(scene, q, v, jnp.asarray(t, q.dtype))
 
 
+@kernel
 def _velocity_residual(scene: Scene, q, v, t):
     values, rest, others = _split(scene, q, v, t)
     if rest:
@@ -259,9 +261,10 @@ def _by_functions(scene: Scene, q, v, t):
 
 def rows(scene: Scene, q: Float[Array, " nq"], v: Float[Array, " nv"], t: Any = 0.0) -> Rows:
     """A, gamma and A v - b of all constraints of the scene (see `Rows`)."""
-    return run(_rows, scene, q, v, jnp.asarray(t, q.dtype))
+    return _rows(scene, q, v, jnp.asarray(t, q.dtype))
 
 
+@kernel
 def _rows(scene: Scene, q, v, t) -> Rows:
     blocks, rest, others = _split(scene, q, v, t)
     if rest:
@@ -290,9 +293,10 @@ def constraint_jacobian(scene: Scene, q: Float[Array, " nq"], t: Numbers = 0.0) 
     q, t = check_state(scene.system, q=q, t=t)
     if not layout(scene):
         raise ValueError("the scene has no constraints; add some to have rows")
-    return run(_jacobian, scene, q, t)
+    return _jacobian(scene, q, t)
 
 
+@kernel
 def _jacobian(scene: Scene, q, t):
     blocks, rest, others = _split(scene, q, jnp.zeros((scene.nv,), q.dtype), t)
     if rest:

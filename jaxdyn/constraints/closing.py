@@ -15,7 +15,8 @@ import numpy as np
 from jax import lax
 from jaxtyping import Array
 
-from jaxdyn.compile import along, constant, implicit, pseudo_inverse_by_rotations, run
+from jaxdyn.compile import implicit, kernel, pseudo_inverse_by_rotations, value_and_jvp
+from jaxdyn.compile.known import stop_gradient
 from jaxdyn.constraints.base import constraint_jacobian, holonomic_rows, layout, position_residual
 from jaxdyn.constraints.dynamics import correction, right_inverse, whitened_rows
 from jaxdyn.constraints.rank import eps_of, sign_of_determinant, solve_square
@@ -25,7 +26,7 @@ from jaxdyn.lie.so3 import _product
 from jaxdyn.model.tree import Model, difference
 from jaxdyn.systems.mass_factor import mass_factor
 from jaxdyn.systems.scene import Scene
-from jaxdyn.systems.system import displace, retract
+from jaxdyn.systems.system import displace, displacement, retract
 
 # Longest step on the way, rad or lengths of the mechanism: within it, rows turn by less than a right angle.
 _LONGEST = 0.2
@@ -43,18 +44,13 @@ class Path(NamedTuple):
     passed_singular: Array
 
 
-def displacement_from(scene: Scene, guess, place):
-    """The displacement (nv,) from a guess to a place."""
-    return difference(scene.system, guess, place) if isinstance(scene.system, Model) else place - guess
-
-
 def _step_to_rows(scene: Scene, q, t, loose: float):
     """phi, its rows A, and their right inverse B with the shortest columns in the metric M(q).
 
     What singular values below `loose` would ask for is left out: rows that repeat others but for rounding must not decide.
     """
     held = holonomic_rows(layout(scene))
-    metric, Y = run(whitened_rows, scene, q, t)
+    metric, Y = kernel(whitened_rows)(scene, q, t)
     B = metric.unwhiten(pseudo_inverse_by_rotations(Y[:, held], loose).T)
     return position_residual(scene, q, t), constraint_jacobian(scene, q, t)[held], B
 
@@ -95,6 +91,7 @@ def follow_path(scene: Scene, guess, t, loose: float, steps: int) -> Path:
     return Path(q, passed)
 
 
+@kernel
 def _linearize_rows(scene: Scene, guess, t, e):
     """phi at a displacement e from the guess, and its derivative in e: rows times the velocity for a rate of e."""
     place = displace(scene.system, guess, e)
@@ -110,13 +107,13 @@ def slide_to_nearest(scene: Scene, guess, start, t, rank_tol):
     Steps are limited. A start on the constraints is kept where they do not come nearer; one that the path has left before an
     obstacle, such as the end of the reach, is not.
     """
-    metric, _ = run(whitened_rows, scene, guess, t)
+    metric, _ = kernel(whitened_rows)(scene, guess, t)
     sizes, _ = coordinate_sizes(scene.system, guess.dtype)
-    first = displacement_from(scene, guess, start)
+    first = displacement(scene.system, guess, start)
 
     def improve(state):
         e, _, count = state
-        phi, A = run(_linearize_rows, scene, guess, t, e)
+        phi, A = _linearize_rows(scene, guess, t, e)
         step = _product(right_inverse(metric, A, rank_tol), _product(A, e) - phi) - e
         size = jnp.max(jnp.abs(step) / sizes)
         step = step * jnp.minimum(1.0, _LONGEST / jnp.where(size > 0, size, jnp.ones_like(size)))
@@ -171,14 +168,14 @@ def nearest_configuration(scene: Scene, guess, start, t, rank_tol, solve: Callab
     solve = solve or slide
 
     def differentiable(scene, q, start, t):
-        fixed, guess, begun, frozen = constant((scene, q, start, t))
+        fixed, guess, begun, frozen = stop_gradient((scene, q, start, t))
         place = lax.stop_gradient(solve(fixed, guess, begun, frozen))
-        moved = displace(scene.system, q, _stationary(scene, q, t, displacement_from(scene, guess, place), rank_tol))
+        moved = displace(scene.system, q, _stationary(scene, q, t, displacement(scene.system, guess, place), rank_tol))
         # Going from the guess to the solution and back again costs digits that the solution itself has.
         return retract(scene.system, place + (moved - lax.stop_gradient(moved)))
 
     def tangent(scene, q, start, t, steps):
-        place, change = along(differentiable, (scene, q, start, t), steps)
+        place, change = value_and_jvp(differentiable, (scene, q, start, t), steps)
         return place, jnp.zeros_like(place) if change is None else change
 
     return implicit(scene, (guess, lax.stop_gradient(start), t), solve, tangent)

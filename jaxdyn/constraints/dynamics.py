@@ -10,11 +10,10 @@ least constraint. Its pseudo-inverse gives accelerations, multipliers and projec
 from typing import Any, NamedTuple
 
 import equinox as eqx
-import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float, Int
 
-from jaxdyn.compile import is_rank_safe, partition_traced, repair_flagged, run
+from jaxdyn.compile import kernel, mark_invalid
 from jaxdyn.constraints.base import Layout, Rows, constraint_jacobian, holonomic_rows, layout, rows
 from jaxdyn.constraints.codes import RESULTS, Outcome
 from jaxdyn.constraints.rank import (
@@ -113,28 +112,38 @@ def constrained_dynamics(
     state = q, v, tau, t
     if method != "rank_aware":
         return _by_schur(scene, *state, method=method)
-    if (places[-1].end > scene.nv and not is_selected(scene)) or is_rank_safe():
-        return _by_rank(scene, *state, rank_tol)
-    solution = run(_by_pivots, scene, *state, otherwise=_nothing)
-    if solution is None and scene.forces:
-        # Forces may be anything. The rest may be a program of numbers without them.
-        bare = Scene(scene.system, scene.constraints)
-        return constrained_dynamics(bare, q, v, applied(scene, q, v, tau, t), t, rank_tol=rank_tol)
-    return _by_rank(scene, *state, rank_tol) if solution is None else _repaired(scene, solution, state, rank_tol)
+    # Samples whose rows may depend on each other are computed by rank, and so are more rows than velocities.
+    is_wide = places[-1].end > scene.nv and not is_selected(scene)
+    a, lam, rank, result = (_by_rank if is_wide else _by_pivots)(rank_tol, scene, *state)
+    return ConstrainedDynamics(a, lam, rank, result, places)
 
 
-def _nothing(*_):
-    """Instead of a kernel that there is not."""
-    return None
+def _by_rank(rank_tol, scene: Scene, q, v, tau, t):
+    """(a, lam, rank, result) for rows that may depend on each other."""
+    metric, Y, free, wanted, gamma = kernel(_whitened)(scene, q, v, tau, t)
+    solution = _shortest_push(scene, metric, Y, free, wanted, gamma, rank_tol)
+    return solution.acceleration, solution.multipliers, solution.rank, solution.result
 
 
-def _by_pivots(scene: Scene, q, v, tau, t):
-    """(a, lam, least over largest pivot of A M^-1 A^T) without branches; NaN where M is not positive definite."""
+def _without_forces(rank_tol, scene: Scene, q, v, tau, t):
+    """`_by_pivots` where it is no kernel, or not valid."""
+    if not scene.forces:
+        return _by_rank(rank_tol, scene, q, v, tau, t)
+    # Forces may be anything that a user writes. The rest may be a kernel without them.
+    bare = Scene(scene.system, scene.constraints)
+    return _by_pivots(rank_tol, bare, q, v, applied(scene, q, v, tau, t), t)
+
+
+@kernel(static=1, fallback=_without_forces)
+def _by_pivots(rank_tol, scene: Scene, q, v, tau, t):
+    """(a, lam, rank, result) without branches; not valid where the pivots of A M^-1 A^T are too small for their errors."""
     metric, Y, free, wanted, _ = _whitened(scene, q, v, tau, t)
     normal = cholesky(regular_gram(Y) if is_selected(scene) else _product(Y.T, Y))
     lam = _refined(normal, Y, wanted)
     quality = jnp.where(metric.is_definite(), quality_of(normal), jnp.nan)
-    return metric.unwhiten(free + _product(Y, lam)), lam, quality
+    is_poor = ~(quality > least_pivot(q, rank_tol))
+    a, lam = (mark_invalid(is_poor, x) for x in (metric.unwhiten(free + _product(Y, lam)), lam))
+    return a, lam, *_judged(scene, q, quality)
 
 
 def _whitened(scene: Scene, q, v, tau, t):
@@ -144,38 +153,11 @@ def _whitened(scene: Scene, q, v, tau, t):
     return metric, Y, free, row.gamma - _product(Y.T, free), row.gamma
 
 
-def _by_rank(scene: Scene, q, v, tau, t, rank_tol) -> ConstrainedDynamics:
-    """For rows that may depend on each other."""
-    metric, Y, free, wanted, gamma = run(_whitened, scene, q, v, tau, t)
-    return _shortest_push(scene, metric, Y, free, wanted, gamma, rank_tol)
-
-
 def _judged(scene: Scene, q, quality):
     """Rank and code of rows that were taken for independent, from the ratio of their pivots."""
     rank = jnp.asarray(layout(scene)[-1].end, jnp.int32)
     result = RESULTS.where(quality > 10 * scene.nv * eps_of(q), RESULTS.successful, RESULTS.dependent_rows)  # pyright: ignore[reportArgumentType]
     return rank, RESULTS.where(jnp.isfinite(quality), result, RESULTS.singular_mass_matrix)
-
-
-def _repaired(scene: Scene, solution, state, rank_tol) -> ConstrainedDynamics:
-    """`solution` = (a, lam, quality of the rows), with the rank-aware solve for samples whose pivots are too small."""
-    a, lam, quality = solution
-    traced, known = partition_traced(scene)
-
-    def by_rank(traced, state):
-        q, v, tau, t = state
-        solution = _by_rank(known(traced), q, v, tau, t, rank_tol)
-        return (solution.acceleration, solution.multipliers), (solution.rank, solution.result)
-
-    def fast(traced, state):
-        return run(_by_pivots, known(traced), *state)[:2]
-
-    # Derivatives keep what a computation needs for them whether it runs or not; this one hardly ever does.
-    by_rank = jax.checkpoint(by_rank, prevent_cse=False)
-    flag = ~(quality > least_pivot(state[0], rank_tol))
-    start = (a, lam), _judged(scene, state[0], quality)
-    (a, lam), (rank, result) = repair_flagged(flag, by_rank, fast, start, (traced, state))
-    return ConstrainedDynamics(a, lam, rank, result, layout(scene))
 
 
 def applied(scene: Scene, q, v, tau, t) -> Array:
@@ -195,7 +177,7 @@ def _free(scene, q, v, force, t) -> ConstrainedDynamics:
 def solve_rows(scene: Scene, q, v, force, t, row: Rows, rank_tol: float | None = None) -> ConstrainedDynamics:
     """Acceleration and multipliers for rows A a = gamma that may differ from the scene's in gamma."""
     bare = Scene(scene.system)
-    metric, Y, free = run(_weighted, bare, q, v, force, t, row.A)
+    metric, Y, free = kernel(_weighted)(bare, q, v, force, t, row.A)
     return _shortest_push(scene, metric, Y, free, row.gamma - _product(Y.T, free), row.gamma, rank_tol)
 
 
@@ -238,7 +220,7 @@ def _shortest(Y, wanted, rank_tol):
 def _by_schur(scene: Scene, q, v, tau, t, *, method: str) -> ConstrainedDynamics:
     """Rows that are taken for independent: the Cholesky factor of A M^-1 A^T."""
     by_bodies = method == "range_space" and isinstance(scene.system, Model)
-    a, lam, fine, definite = run(_by_bodies if by_bodies else _by_delassus, scene, q, v, tau, t)
+    a, lam, fine, definite = kernel(_by_bodies if by_bodies else _by_delassus)(scene, q, v, tau, t)
     result = RESULTS.where(fine, RESULTS.successful, RESULTS.dependent_rows)  # pyright: ignore[reportArgumentType]
     result = RESULTS.where(definite, result, RESULTS.singular_mass_matrix)
     rank = jnp.asarray(lam.shape[0], jnp.int32)
@@ -283,7 +265,7 @@ def projections(
     """
     scene = as_scene(scene)
     q, t = check_state(scene.system, q=q, t=t)
-    metric, Y = run(whitened_rows, scene, q, t)
+    metric, Y = kernel(whitened_rows)(scene, q, t)
     inverse = pseudo_inverse(Y, tolerance(rank_tol, Y))
     kept = jnp.eye(Y.shape[0], dtype=Y.dtype) - _product(Y, inverse)
     # U^-T (1 - Y Y^+) U^T, of which the columns of U^T are found from the unit velocities.
@@ -312,7 +294,7 @@ def second_fundamental_form(
     scene = as_scene(scene)
     q, v, t = check_state(scene.system, q=q, v=v, t=t)
     coriolis = bias_force(scene.system, q, v, t) - bias_force(scene.system, q, jnp.zeros_like(v), t)
-    metric, Y = run(whitened_rows, scene, q, t)
+    metric, Y = kernel(whitened_rows)(scene, q, t)
     wanted = rows(scene, q, v, t).gamma + _product(Y.T, metric.whiten(coriolis))
     return metric.unwhiten(_product(pseudo_inverse(Y, tolerance(rank_tol, Y)).T, wanted))
 
@@ -322,7 +304,7 @@ def correction(scene: Scene, q, t, rank_tol, *, holonomic: bool) -> Array:
 
     Rows: the holonomic ones, or all.
     """
-    metric, Y = run(whitened_rows, scene, q, t)
+    metric, Y = kernel(whitened_rows)(scene, q, t)
     return _unwhitened_inverse(metric, Y[:, holonomic_rows(layout(scene))] if holonomic else Y, rank_tol)
 
 

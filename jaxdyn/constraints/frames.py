@@ -20,7 +20,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from jaxdyn.compile import is_expanding
+from jaxdyn.compile import variant
 from jaxdyn.constraints.base import Constraint
 from jaxdyn.dynamics.kinematics import BodyFrames, body_frames, take
 from jaxdyn.lie import se3, so3
@@ -119,14 +119,14 @@ class Pair(Constraint):
     @classmethod
     def grouped_position(cls, members: Sequence["Pair"], system: SystemLike, q: Float[Array, " nq"], t: Number) -> list:
         """Residuals (nh,) of each constraint, None without one."""
-        return (_positions_of if is_expanding() else _positions)(tuple(members), system, q)
+        return _positions(tuple(members), system, q)
 
     @classmethod
     def grouped_motion(
         cls, members: Sequence["Pair"], system: SystemLike, q: Float[Array, " nq"], v: Float[Array, " nv"], t: Number
     ) -> list:
         """A (r, nv), gamma (r,) and velocity (r,) of each constraint."""
-        return (_motions_of if is_expanding() else _motions)(tuple(members), system, q, v)
+        return _motions(tuple(members), system, q, v)
 
 
 def _positions_of(members: tuple[Pair, ...], system, q) -> list:
@@ -178,7 +178,9 @@ def _motions_of(members: tuple[Pair, ...], system, q, v) -> list:
 
 # A program that asks many times, as steps with projections do, traces each of these once. A nested `jit` would hide what is
 # known.
-_positions, _motions = eqx.filter_jit(_positions_of), eqx.filter_jit(_motions_of)
+# Outside of kernels they are traced once, for all calls of all constraints of a scene.
+_positions = variant(_positions_of)(eqx.filter_jit(_positions_of))
+_motions = variant(_motions_of)(eqx.filter_jit(_motions_of))
 
 
 def relative_poses(members, system, q):

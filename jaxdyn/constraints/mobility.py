@@ -3,7 +3,8 @@
 import jax.numpy as jnp
 from jaxtyping import Array, Float, Int
 
-from jaxdyn.compile import compiled, is_concrete
+from jaxdyn.compile import entry_point
+from jaxdyn.compile.known import is_concrete
 from jaxdyn.constraints.base import layout
 from jaxdyn.constraints.rank import checked_tolerance, pseudo_inverse, tolerance
 from jaxdyn.constraints.selection import scaled_rows
@@ -45,7 +46,7 @@ def degrees_of_freedom(
     return scene.nv - int(rank) if is_concrete(rank) else scene.nv - rank
 
 
-@compiled
+@entry_point
 def _rank(scene: Scene, q, t, rank_tol: float | None) -> Int[Array, ""]:
     A = scaled_rows(scene, q, t)
     return jnp.round(jnp.trace(_product(A, pseudo_inverse(A, tolerance(rank_tol, A), True)))).astype(jnp.int32)

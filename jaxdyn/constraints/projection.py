@@ -8,16 +8,7 @@ import jax
 import jax.numpy as jnp
 from jax import lax
 
-from jaxdyn.compile import (
-    along,
-    implicit,
-    is_expanding,
-    is_rank_safe,
-    partition_traced,
-    repair_flagged,
-    run,
-    run_repaired,
-)
+from jaxdyn.compile import implicit, kernel, mark_invalid, value_and_jvp, variant
 from jaxdyn.constraints.base import constraint_jacobian, holonomic_rows, layout, position_residual, velocity_residual
 from jaxdyn.constraints.dynamics import whitened_rows
 from jaxdyn.constraints.projection_derivative import LOST, Corrections, projected
@@ -51,48 +42,42 @@ def project_step(scene: Scene, q, v, t, errors: tuple = (), rank_tol: float | No
     """
 
     def project(scene, q, v, t, *errors):
-        return _projected(scene, rank_tol, q, v, t, errors)
+        return _project(scene, rank_tol, q, v, t, errors)
 
     def tangent(scene, q, v, t, *rest):
         *errors, steps = rest
 
         def again(scene, q, v, t, *errors):
-            return run_repaired(_with_derivatives, scene, q, v, t, errors, static=(rank_tol,))
+            return kernel(_with_derivatives, static=1)(rank_tol, scene, q, v, t, errors)
 
-        projected, moved = along(again, (scene, q, v, t, *errors), steps)
+        projected, moved = value_and_jvp(again, (scene, q, v, t, *errors), steps)
         return projected, jax.tree.map(jnp.zeros_like, projected) if moved is None else moved
 
     errors = lax.stop_gradient(tuple(errors))
     return implicit(Scene(scene.system, scene.constraints), (q, v, t, *errors), project, tangent)
 
 
-def _projected(scene: Scene, rank_tol, q, v, t, errors):
+def _project(scene: Scene, rank_tol, q, v, t, errors):
     """A few steps from one factorisation of the rows; where these were not enough, the next round factors them anew."""
     q = retract(scene.system, q)
-    if (layout(scene)[-1].end > scene.nv and not is_selected(scene)) or is_rank_safe():
-        return _by_rank(scene, rank_tol, q, v, t, errors)
-    projected = run(_by_pivots, scene, q, v, t, *errors, otherwise=lambda *_: None)
-    if projected is None:
-        return _by_rank(scene, rank_tol, q, v, t, errors)
-    place, speed, errors_left, more, quality = projected
-    if is_expanding():
-        quality = jnp.where(more, jnp.nan, quality)
-    else:
+    is_wide = layout(scene)[-1].end > scene.nv and not is_selected(scene)
+    return (_by_rank if is_wide else _rounds)(rank_tol, scene, q, v, t, errors)
 
-        def again(q, v, quality):
-            *projected, pivots = run(_by_pivots, scene, q, v, t, *errors)
-            return *projected, jnp.minimum(quality, pivots)
 
-        place, speed, errors_left, quality = _in_rounds(again, projected)
-    traced, known = partition_traced(scene)
+def _one_round(rank_tol, scene: Scene, q, v, t, errors):
+    *projected, more = _by_pivots(rank_tol, scene, q, v, t, errors)
+    # A kernel has no loop that ends by its numbers: samples that need another round are computed again outside of it.
+    return jax.tree.map(lambda x: mark_invalid(more, x), tuple(projected))
 
-    def careful(traced, q, v, t, errors):
-        return _by_rank(known(traced), rank_tol, q, v, t, errors), ()
 
-    flag = ~(quality > least_pivot(q, rank_tol))
-    start = ((place, speed, errors_left), ())
-    # Derivatives are given by `project_step`.
-    return repair_flagged(flag, careful, lambda *args: careful(*args)[0], start, (traced, q, v, t, errors))[0]
+@variant(_one_round)
+def _rounds(rank_tol, scene: Scene, q, v, t, errors):
+    by_kernel = kernel(_by_pivots, static=1, fallback=_by_rank_alone, derivative=False)
+
+    def again(q, v, _):
+        return *by_kernel(rank_tol, scene, q, v, t, errors), ()
+
+    return _in_rounds(again, again(q, v, ()))[:3]
 
 
 def _in_rounds(again: Callable, first):
@@ -111,19 +96,25 @@ def _in_rounds(again: Callable, first):
     return q, v, errors, anything
 
 
-def _by_rank(scene: Scene, rank_tol, q, v, t, errors):
-    """For rows that may depend on each other."""
+def _by_rank(rank_tol, scene: Scene, q, v, t, errors):
+    """(q, v, errors) for rows that may depend on each other."""
     holonomic = holonomic_rows(layout(scene))
 
     def again(q, v, _):
-        metric, Y = run(whitened_rows, scene, q, t)
+        metric, Y = kernel(whitened_rows)(scene, q, t)
         every = pseudo_inverse(Y, tolerance(rank_tol, Y))
         some = every if holonomic.size in (0, Y.shape[1]) else pseudo_inverse(Y[:, holonomic], tolerance(rank_tol, Y))
-        return *run(_moved_by_matrices, scene, q, v, t, errors, metric, every, some), ()
+        return *_moved_by_matrices(scene, q, v, t, errors, metric, every, some), ()
 
     return _in_rounds(again, again(q, v, ()))[:3]
 
 
+def _by_rank_alone(rank_tol, scene: Scene, q, v, t, errors):
+    """`_by_rank`, after which no round is left."""
+    return *_by_rank(rank_tol, scene, q, v, t, errors), jnp.zeros((), bool)
+
+
+@kernel
 def _moved_by_matrices(scene: Scene, q, v, t, errors, metric, every, some):
     """`_moved` with the pseudo-inverses of U^-1 A^T for all rows, and for those on positions."""
 
@@ -133,8 +124,8 @@ def _moved_by_matrices(scene: Scene, q, v, t, errors, metric, every, some):
     return _moved(scene, q, v, t, errors, steps(every), steps(some))
 
 
-def _by_pivots(scene: Scene, q, v, t, *errors):
-    """q, v and errors after a few steps, whether a step more would help, and the ratio of the rows' pivots."""
+def _by_pivots(rank_tol, scene: Scene, q, v, t, errors):
+    """q, v and errors after a few steps, and whether a step more would help; not valid where rows may depend on each other."""
     holonomic = holonomic_rows(layout(scene))
     metric, Y = whitened_rows(scene, q, t)
 
@@ -142,8 +133,8 @@ def _by_pivots(scene: Scene, q, v, t, *errors):
         gram = regular_gram(Y) if is_selected(scene) else _product(Y.T, Y)
         factor = cholesky(gram)
         quality = quality_of(factor)
-        if is_selected(scene) and is_expanding():
-            # Other rows may serve where these hardly do: `renew_rows`.
+        if is_selected(scene):
+            # Other rows may be independent where these hardly are: `renew_rows`.
             *kept, least = rows_of(scene, Y.dtype)
             is_poor = jnp.any(jnp.stack(kept) == 0) & ~(least_pivot_of(Y) > least)
             quality = jnp.where(is_poor, jnp.nan, quality)
@@ -155,7 +146,9 @@ def _by_pivots(scene: Scene, q, v, t, *errors):
         some, of_holonomic = steps(Y[:, holonomic])
         quality = jnp.minimum(quality, of_holonomic)
     quality = jnp.where(metric.is_definite(), quality, jnp.nan)
-    return *_moved(scene, q, v, t, errors, every, some), quality
+    *projected, more = _moved(scene, q, v, t, errors, every, some)
+    is_poor = ~(quality > least_pivot(q, rank_tol))
+    return *jax.tree.map(lambda x: mark_invalid(is_poor, x), tuple(projected)), more
 
 
 def _moved(scene: Scene, q, v, t, errors, every: Callable, some: Callable):

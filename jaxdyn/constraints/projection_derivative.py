@@ -16,7 +16,7 @@ import jax.numpy as jnp
 from jax import lax
 from jaxtyping import Array
 
-from jaxdyn.compile import along, implicit, run
+from jaxdyn.compile import implicit, kernel, value_and_jvp
 from jaxdyn.constraints.base import constraint_jacobian, holonomic_rows, layout, position_residual, velocity_residual
 from jaxdyn.constraints.dynamics import whitened_rows
 from jaxdyn.constraints.rank import LeastSquares, least_squares, tolerance
@@ -61,7 +61,7 @@ class Corrections(NamedTuple):
     @classmethod
     def at(cls, scene: Scene, q, t, rank_tol) -> "Corrections":
         held = holonomic_rows(layout(scene))
-        metric, Y = run(whitened_rows, scene, q, t)
+        metric, Y = kernel(whitened_rows)(scene, q, t)
         every = least_squares(Y, tolerance(rank_tol, Y))
         apart = held.size not in (0, Y.shape[1])
         return cls(metric, every, held, least_squares(Y[:, held], tolerance(rank_tol, Y)) if apart else every)
@@ -107,11 +107,11 @@ def _solved(rank_tol, scene: Scene, q, v, t) -> Projected:
     place, of_q, q_left, q_moved = q, jnp.zeros((0,), q.dtype), jnp.zeros((), q.dtype), jnp.ones((), q.dtype)
     if on.held.size:
         size = jnp.max(jnp.abs(q))
-        whitened, q_left, q_moved = settled(lambda x: run(_position, scene, q, t, x), on.of_held, size)
-        place = run(_place, scene, q, on.metric.unwhiten(whitened))
+        whitened, q_left, q_moved = settled(lambda x: kernel(_position)(scene, q, t, x), on.of_held, size)
+        place = kernel(_place)(scene, q, on.metric.unwhiten(whitened))
         of_q = on.of_held.multipliers(whitened)
     size = jnp.max(jnp.abs(v))
-    whitened, v_left, v_moved = settled(lambda y: run(_velocity, scene, place, v, t, y), on.every, size)
+    whitened, v_left, v_moved = settled(lambda y: kernel(_velocity)(scene, place, v, t, y), on.every, size)
     speed, of_v = v - on.metric.unwhiten(whitened), on.every.multipliers(whitened)
     return Projected(place, speed, of_q, of_v, q_left, v_left, q_moved, v_moved)
 
@@ -143,14 +143,14 @@ def _changed(rank_tol, scene: Scene, q, v, t, steps) -> tuple[Projected, Project
     y = on.by_forces(on.every, state.of_v)
 
     args = scene, q, t, state.of_q, state.of_v, x, y
-    change = along(partial(run, _forces), args, [*of_scene, dq, dt, None, None, None, None])[1]
+    change = value_and_jvp(kernel(_forces), args, [*of_scene, dq, dt, None, None, None, None])[1]
     dx, dy = (jnp.zeros_like(v),) * 2 if change is None else map(on.metric.solve, change)
 
     def closed(residual, args, given, correction, of, moved):
         """The change of a correction, and that of its multipliers, which keeps the residual at zero."""
 
         def step(whitened, _):
-            change = along(residual, args, [*given, correction + on.metric.unwhiten(whitened)])[1]
+            change = value_and_jvp(residual, args, [*given, correction + on.metric.unwhiten(whitened)])[1]
             return whitened + moved * of.shortest(change), None
 
         whitened, _ = lax.scan(step, jnp.zeros_like(v), None, length=_STEPS)
@@ -159,11 +159,11 @@ def _changed(rank_tol, scene: Scene, q, v, t, steps) -> tuple[Projected, Project
     of_q, dplace = jnp.zeros_like(state.of_q), dq
     if on.held.size:
         args = scene, q, t, x
-        dx, of_q = closed(partial(run, _position), args, [*of_scene, dq, dt], dx, on.of_held, state.q_moved)
-        dplace = along(partial(run, _place, scene), (q, x), [dq, dx])[1]
+        dx, of_q = closed(kernel(_position), args, [*of_scene, dq, dt], dx, on.of_held, state.q_moved)
+        dplace = value_and_jvp(partial(kernel(_place), scene), (q, x), [dq, dx])[1]
 
     args = scene, state.q, v, t, y
-    dy, of_v = closed(partial(run, _velocity), args, [*of_scene, dplace, dv, dt], dy, on.every, state.v_moved)
+    dy, of_v = closed(kernel(_velocity), args, [*of_scene, dplace, dv, dt], dy, on.every, state.v_moved)
     none = jnp.zeros((), v.dtype)
     dq, dv = (jnp.zeros_like(z) if d is None else d for z, d in ((q, dplace), (v, dv)))
     return state, Projected(dq, dv - dy, of_q, of_v, none, none, none, none)

@@ -8,12 +8,15 @@ import jax.numpy as jnp
 from jax import lax
 from jaxtyping import Array, Float
 
-from jaxdyn.compile import any_in_batch, is_concrete, is_expanding, pseudo_inverse_by_rotations, run, unless
+from jaxdyn.compile import batch, kernel, mark_invalid, pseudo_inverse_by_rotations, variant
+from jaxdyn.compile.known import is_concrete
 from jaxdyn.lie.so3 import _product
 from jaxdyn.systems.mass_factor import cholesky, solve_cholesky
 
-# Operations of the normal equations up to which they are written out: LLVM takes 50 to 100 microseconds for each of them.
-_MAX_ROWS_INLINE = 10_000
+# Operations of the normal equations up to which they are a kernel: LLVM takes 50 to 100 microseconds for each of them.
+_MAX_OPERATIONS = 10_000
+# Columns up to which rotations take about as long as the normal equations in blocks, and compile faster.
+_MOST_ROTATED = 40
 
 
 def checked_tolerance(rank_tol: float | None) -> float | None:
@@ -77,15 +80,40 @@ def pseudo_inverse(Y: Float[Array, "n m"], rank_tol: float, dependent: bool = Fa
         return pseudo_inverse_by_rotations(Y, rank_tol)
     if Y.shape[1] > Y.shape[0]:
         return pseudo_inverse(Y.T, rank_tol).T
-    if is_expanding():  # which has no branches: other samples are computed again
-        inverse, quality = _by_normal_equations(None, Y)
-        return unless(~(quality > least_pivot(Y, rank_tol)), inverse)
-    inverse_and_quality: Any = run(_by_normal_equations, None, Y, most=_MAX_ROWS_INLINE, otherwise=lambda *_: None)
-    if inverse_and_quality is None:
-        return pseudo_inverse_by_rotations(Y, rank_tol)
-    inverse, quality = inverse_and_quality
-    doubtful = any_in_batch(~(quality > least_pivot(Y, rank_tol)))
-    return lax.cond(doubtful, lambda: pseudo_inverse_by_rotations(Y, rank_tol), lambda: inverse)
+    return _pseudo_inverse(rank_tol, None, Y)
+
+
+def _by_rotations(rank_tol, _, Y):
+    return pseudo_inverse_by_rotations(Y, rank_tol)
+
+
+def _solve_normal_equations(rank_tol, Y):
+    """(Y^T Y)^-1 Y^T, and whether the pivots of Y^T Y say that columns may depend on each other."""
+    factor = cholesky(regular_gram(Y))
+    inverse = solve_cholesky(factor, Y.T)
+    # One step of Newton and Schulz takes the squared condition number out of the error.
+    inverse = 2 * inverse - _product(_product(inverse, Y), inverse)
+    return inverse, ~(quality_of(factor) > least_pivot(Y, rank_tol))
+
+
+def _by_normal_equations(rank_tol, _, Y):
+    inverse, is_doubtful = _solve_normal_equations(rank_tol, Y)
+    return mark_invalid(is_doubtful, inverse)
+
+
+def _by_blocks(rank_tol, _, Y):
+    inverse, is_doubtful = _solve_normal_equations(rank_tol, Y)
+    return batch.cond(is_doubtful, lambda: pseudo_inverse_by_rotations(Y, rank_tol), lambda: inverse)
+
+
+@variant(_by_normal_equations)
+def _pseudo_inverse(rank_tol, _, Y):
+    # Gram matrix, factor, two triangular solves and two products: 8 n m^2 sums and products for Y (n, m).
+    is_long = 8 * Y.shape[0] * Y.shape[1] ** 2 > _MAX_OPERATIONS
+    if Y.shape[1] > _MOST_ROTATED:
+        return _by_blocks(rank_tol, None, Y)
+    by_kernel = kernel(_by_normal_equations, static=1, fallback=_by_rotations, derivative=False)
+    return (_by_rotations if is_long else by_kernel)(rank_tol, None, Y)
 
 
 class LeastSquares(NamedTuple):
@@ -108,21 +136,15 @@ class LeastSquares(NamedTuple):
         return solve_cholesky(self.factor, _product(self.Y.T, w))
 
 
+def _least_squares_in_kernel(Y, rank_tol) -> LeastSquares:
+    factor = cholesky(regular_gram(Y))
+    return LeastSquares(Y, mark_invalid(~(quality_of(factor) > least_pivot(Y, rank_tol)), factor), None)
+
+
+@variant(_least_squares_in_kernel)
 def least_squares(Y: Float[Array, "n m"], rank_tol: float) -> LeastSquares:
-    """By Cholesky's factor in a program of numbers, in which samples with dependent columns are flagged; else by the
-    pseudo-inverse."""
-    if not is_expanding():
-        return LeastSquares(Y, None, pseudo_inverse(Y, rank_tol))
-    factor = cholesky(regular_gram(Y))
-    return LeastSquares(Y, unless(~(quality_of(factor) > least_pivot(Y, rank_tol)), factor), None)
-
-
-def _by_normal_equations(_, Y):
-    """(Y^T Y)^-1 Y^T, and the least over the largest pivot of Y^T Y."""
-    factor = cholesky(regular_gram(Y))
-    inverse = solve_cholesky(factor, Y.T)
-    # One step of Newton and Schulz takes the squared condition number out of the error.
-    return 2 * inverse - _product(_product(inverse, Y), inverse), quality_of(factor)
+    """Factor a matrix: its pseudo-inverse; in a kernel Cholesky's factor, where dependent columns make a sample invalid."""
+    return LeastSquares(Y, None, pseudo_inverse(Y, rank_tol))
 
 
 @pseudo_inverse.defjvp
@@ -143,7 +165,7 @@ def solve_square(A: Float[Array, "n n"], right: Float[Array, "n *k"]) -> Float[A
 
 def sign_of_determinant(A: Float[Array, "n n"]) -> Float[Array, ""]:
     """-1 where the determinant is negative, else 1; a constant."""
-    return run(_sign, None, lax.stop_gradient(A), otherwise=_sign_by_lapack)
+    return kernel(_sign, fallback=_sign_by_lapack)(None, lax.stop_gradient(A))
 
 
 def _sign(_, A):

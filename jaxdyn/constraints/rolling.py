@@ -18,7 +18,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from jaxdyn.compile import is_concrete
+from jaxdyn.compile.known import is_concrete
 from jaxdyn.constraints.frames import Pair
 from jaxdyn.constraints.loops import check_bodies
 from jaxdyn.lie.so3 import _product, cross

@@ -24,18 +24,9 @@ import numpy as np
 from jax import lax
 from jaxtyping import Array, Float
 
-from jaxdyn.compile import (
-    any_in_batch,
-    compiled,
-    compute,
-    constant,
-    is_concrete,
-    is_expanding,
-    is_staged,
-    pseudo_inverse_by_rotations,
-    run,
-    unless,
-)
+from jaxdyn.compile import entry_point, evaluate, kernel, mark_invalid, pseudo_inverse_by_rotations, variant
+from jaxdyn.compile.batch import cond
+from jaxdyn.compile.known import is_concrete, is_tracing, stop_gradient
 from jaxdyn.constraints.base import (
     Constraint,
     constraint_jacobian,
@@ -220,26 +211,26 @@ def select_rows(
     With `rank_tol` rows count whose pivots are above it, at this configuration. Without, see above. `is_rounded`: as of a scene.
     """
     is_rounded = scene.is_rounded if is_rounded is None else is_rounded
-    bare = constant(Scene(scene.system, scene.constraints))
-    q, t = constant((q, jnp.asarray(t, q.dtype)))
+    bare = stop_gradient(Scene(scene.system, scene.constraints))
+    q, t = stop_gradient((q, jnp.asarray(t, q.dtype)))
     count = layout(bare)[-1].end if scene.constraints else 0
     none = jnp.zeros((), q.dtype)
     every = jnp.ones((count,), q.dtype), none, none
     apart = rank_tol if rank_tol is not None else surely_apart(q)
 
     def select():
-        kept, rest = eliminate(run(scaled_rows, bare, q, t), apart, jnp.zeros_like(every[0]))
+        kept, rest = eliminate(kernel(scaled_rows)(bare, q, t), apart, jnp.zeros_like(every[0]))
         if rank_tol is None:
             kept, rest = _select_far_away(bare, q, t, kept, apart, is_rounded)
-        least = _EXCHANGED_AT * run(_pivot_of, bare, q, t, kept)
-        return kept, jnp.maximum(rest, run(_opening, bare, q, t, kept)), least
+        least = _EXCHANGED_AT * kernel(_pivot_of)(bare, q, t, kept)
+        return kept, jnp.maximum(rest, kernel(_opening)(bare, q, t, kept)), least
 
     if count == 0:
         return Selection(*every)
     if count > scene.nv:
         return Selection(*select())
-    doubtful = any_in_batch(~(run(_least_distance, bare, q, t) > apart))
-    return Selection(*lax.cond(doubtful, select, lambda: every))
+    doubtful = ~(_least_distance(bare, q, t) > apart)
+    return Selection(*cond(doubtful, select, lambda: every))
 
 
 def renew_rows(scene: Scene, q, t, is_projected: bool) -> Float[Array, " n"]:
@@ -252,25 +243,34 @@ def renew_rows(scene: Scene, q, t, is_projected: bool) -> Float[Array, " n"]:
     by the operations of JAX.
     """
     old = rows_of(scene, q.dtype)
-    if is_expanding() and is_projected:
+    whole = all_rows(scene)
+    bare, q, t = stop_gradient((Scene(whole.system, whole.constraints), q, jnp.asarray(t, q.dtype)))
+    return _renew(bare, q, t, old, is_projected)
+
+
+def _check_kept_rows(bare: Scene, q, t, old, is_projected: bool):
+    if is_projected:
         return old
     kept, least = old[:-1], old[-1]
-    whole = all_rows(scene)
-    bare, q, t = constant((Scene(whole.system, whole.constraints), q, jnp.asarray(t, q.dtype)))
+    return mark_invalid(jnp.any(kept == 0) & ~(_pivot_of(bare, q, t, kept) > least), old)
+
+
+@variant(_check_kept_rows)
+def _renew(bare: Scene, q, t, old, is_projected: bool):
+    del is_projected
+    kept, least = old[:-1], old[-1]
     dropped = jnp.any(kept == 0)
-    if is_expanding():
-        return unless(dropped & ~(_pivot_of(bare, q, t, kept) > least), old)
-    pivot = run(_pivot_of, bare, q, t, kept)
+    pivot = kernel(_pivot_of)(bare, q, t, kept)
     poor = dropped & ~(pivot > least)
 
     def choose():
-        new = eliminate(run(scaled_rows, bare, q, t), 0.0, jnp.zeros_like(kept), jnp.sum(kept))[0]
-        pivot_of_new = run(_pivot_of, bare, q, t, new)
+        new = eliminate(kernel(scaled_rows)(bare, q, t), 0.0, jnp.zeros_like(kept), jnp.sum(kept))[0]
+        pivot_of_new = kernel(_pivot_of)(bare, q, t, new)
         better = poor & ~(pivot_of_new < pivot)
         kept_next, next_pivot = jnp.where(better, new, kept), jnp.where(better, pivot_of_new, pivot)
         return jnp.where(poor, jnp.append(kept_next, _EXCHANGED_AT * next_pivot), old)
 
-    return lax.cond(any_in_batch(poor), choose, lambda: old)
+    return cond(poor, choose, lambda: old)
 
 
 def _pivot_of(scene: Scene, q, t, kept):
@@ -295,7 +295,7 @@ def may_have_redundant_rows(scene: Scene) -> bool:
         return True
     step = np.random.default_rng(0).uniform(0.1, 0.9, scene.nv).astype(state_dtype(scene.system))
     try:
-        is_coupled = np.abs(compute(_generic_rows, bare, step, given=not is_staged())) > 0
+        is_coupled = np.abs(evaluate(_generic_rows, bare, step, is_input=not is_tracing())) > 0
     except jax.errors.JAXTypeError:  # a constraint is a function that holds a traced number
         return True
     groups = np.arange(scene.nv)  # of coordinates
@@ -311,6 +311,7 @@ def _generic_rows(scene: Scene, step):
     return constraint_jacobian(scene, displace(system, start, step), jnp.zeros((), step.dtype))
 
 
+@kernel
 def _least_distance(scene: Scene, q, t):
     """Least distance of a row from the span of those before it; NaN where there is none."""
     B = scaled_rows(scene, q, t)
@@ -354,7 +355,7 @@ def _select_far_away(scene: Scene, q, t, sure, apart: float, is_rounded: bool):
 
     if held.size:
         place = retract(scene.system, lax.fori_loop(0, _NEWTON_STEPS, close, place))
-    B = run(scaled_rows, scene, place, t)
+    B = kernel(scaled_rows)(scene, place, t)
     kept, rest = eliminate(B, 2 * apart, sure)
     kept = jnp.maximum(sure, kept)  # sure rows may be less so there; they stay
     if is_rounded:
@@ -373,6 +374,7 @@ def _opening(scene: Scene, q, t, kept):
     return jnp.max(jnp.abs(position_residual(scene, q, t)) / sizes * (1 - kept)[held], initial=0.0)
 
 
+@kernel
 def _opening_rate(scene: Scene, q, v, t, kept):
     """Largest A v - b of the dropped rows over their sizes."""
     sizes = _largest_of_each(scene, row_limits(scene, q, v, t, 1.0)[1])
@@ -383,18 +385,18 @@ def opening_of_dropped(scene: Scene, q, t, v=None) -> Float[Array, ""]:
     """By which part of their size the dropped rows of a scene are open in positions, and in velocities v; a constant."""
     if not is_selected(scene):
         return jnp.zeros((), q.dtype)
-    bare, kept = constant((Scene(scene.system, all_rows(scene).constraints), kept_of(scene)))
-    kept, q, t = constant((kept.astype(q.dtype), q, jnp.asarray(t, q.dtype)))
-    opening = run(_opening, bare, q, t, kept)
-    return opening if v is None else jnp.maximum(opening, run(_opening_rate, bare, q, constant(v), t, kept))
+    bare, kept = stop_gradient((Scene(scene.system, all_rows(scene).constraints), kept_of(scene)))
+    kept, q, t = stop_gradient((kept.astype(q.dtype), q, jnp.asarray(t, q.dtype)))
+    opening = kernel(_opening)(bare, q, t, kept)
+    return opening if v is None else jnp.maximum(opening, _opening_rate(bare, q, stop_gradient(v), t, kept))
 
 
 def missed_by_dropped(scene: Scene, q, v, t, a) -> Float[Array, ""]:
     """Largest |A a - gamma| of the dropped rows of a scene, if any, over the sizes of what cancels in it; a constant."""
     if not is_selected(scene):
         return jnp.zeros((), q.dtype)
-    whole, kept = constant((Scene(scene.system, all_rows(scene).constraints), kept_of(scene)))
-    q, v, t, a = constant((q, v, jnp.asarray(t, q.dtype), a))
+    whole, kept = stop_gradient((Scene(scene.system, all_rows(scene).constraints), kept_of(scene)))
+    q, v, t, a = stop_gradient((q, v, jnp.asarray(t, q.dtype), a))
     A, gamma, _ = rows(whole, q, v, t)
     sizes = jnp.abs(gamma) + _product(jnp.abs(A), jnp.abs(a))
     sizes = sizes + jnp.max(sizes)
@@ -405,8 +407,8 @@ def missed_by_dropped(scene: Scene, q, v, t, a) -> Float[Array, ""]:
 
 def gap_of_dropped(scene: Scene, q, t) -> Float[Array, ""]:
     """Largest |phi| of the dropped rows of a scene, m or rad; a constant."""
-    bare, kept = constant((Scene(scene.system, all_rows(scene).constraints), kept_of(scene)))
-    q, t = constant((q, jnp.asarray(t, q.dtype)))
+    bare, kept = stop_gradient((Scene(scene.system, all_rows(scene).constraints), kept_of(scene)))
+    q, t = stop_gradient((q, jnp.asarray(t, q.dtype)))
     dropped = 1 - kept.astype(q.dtype)[holonomic_rows(layout(bare))]
     return jnp.max(jnp.abs(position_residual(bare, q, t)) * dropped, initial=0.0)
 
@@ -424,22 +426,29 @@ def most_rounding(dtype) -> float:
     return 10 * surely_apart(jnp.zeros((), dtype))
 
 
-def known_selection(scene: Scene, q, t, rank_tol: float | None) -> tuple[Selection, int]:
+def known_selection(
+    scene: Scene, q, t, rank_tol: float | None, is_rounded: bool | None = None
+) -> tuple[Selection, int]:
     """`select_rows` for concrete numbers, and the number of rows that are independent there."""
+    is_rounded = scene.is_rounded if is_rounded is None else is_rounded
     bare = Scene(scene.system, scene.constraints)
-    B = compute(scaled_rows, bare, q, t, given=not is_staged())
+    B = evaluate(scaled_rows, bare, q, t, is_input=not is_tracing())
+    apart = surely_apart(B) if rank_tol is None else rank_tol
+    none = np.zeros((), B.dtype)
+    every = Selection(np.ones(B.shape[0], B.dtype), none, none)  # pyright: ignore[reportArgumentType]
+    # No pivot is below the least singular value.
+    if 0 < B.shape[0] <= B.shape[1] and np.linalg.svd(B, compute_uv=False)[-1] > apart:
+        return every, B.shape[0]
     # Pivots of a QR factorisation with column exchanges are those of `eliminate`.
     pivots = _pivots(B)
-    apart = surely_apart(B) if rank_tol is None else rank_tol
     if np.sum(pivots > apart) == B.shape[0]:
-        none = np.zeros((), B.dtype)
-        return Selection(np.ones(B.shape[0], B.dtype), none, none), B.shape[0]  # pyright: ignore[reportArgumentType]
+        return every, B.shape[0]
     with jax.ensure_compile_time_eval():
-        selection = _select_compiled(bare, jnp.asarray(q), jnp.asarray(t, q.dtype), rank_tol, scene.is_rounded)
+        selection = _select_compiled(bare, jnp.asarray(q), jnp.asarray(t, q.dtype), rank_tol, is_rounded)
     return Selection(*map(np.asarray, selection)), int(np.sum(pivots > tolerance(rank_tol, B)))  # pyright: ignore[reportArgumentType]
 
 
-@compiled
+@entry_point
 def _select_compiled(scene: Scene, q, t, rank_tol, is_rounded):
     return select_rows(scene, q, t, rank_tol, is_rounded)
 
@@ -464,9 +473,10 @@ def spread_multipliers(scene: Scene, q, t, lam: Float[Array, " nc"]) -> Float[Ar
     [1; C] (1 + C^T C)^-1 lam.
     """
     kept, whole = kept_of(scene), all_rows(scene)
-    return run(_spread, Scene(whole.system, whole.constraints), q, jnp.asarray(t, q.dtype), lam, kept)
+    return _spread(Scene(whole.system, whole.constraints), q, jnp.asarray(t, q.dtype), lam, kept)
 
 
+@kernel
 def _spread(scene: Scene, q, t, lam, kept):
     A, kept = constraint_jacobian(scene, q, t), kept.astype(q.dtype)
     own = kept[:, None] * A

@@ -11,7 +11,8 @@ import numpy as np
 from jax import lax
 from jaxtyping import Array, Float
 
-from jaxdyn.compile import constant, run
+from jaxdyn.compile import kernel
+from jaxdyn.compile.known import stop_gradient
 from jaxdyn.constraints.base import constraint_jacobian, holonomic_rows, layout, position_residual, velocity_residual
 from jaxdyn.model.joints import KINDS
 from jaxdyn.model.tree import Model
@@ -72,9 +73,9 @@ def row_limits(scene: Scene, q, v, t, relative: float) -> tuple[Float[Array, " n
 
 def openness(scene: Scene, q, v, t, relative: float) -> Float[Array, ""]:
     """Largest residual over what counts as closed (see `row_limits`): at most 1 for a state on the constraints. A constant."""
-    bare = constant(Scene(scene.system, scene.constraints))
-    q, v, t = constant((q, v, jnp.asarray(t, q.dtype)))
-    return run(largest_ratio, bare, q, v, t, static=(relative,))
+    bare = stop_gradient(Scene(scene.system, scene.constraints))
+    q, v, t = stop_gradient((q, v, jnp.asarray(t, q.dtype)))
+    return kernel(largest_ratio, static=1)(relative, bare, q, v, t)
 
 
 def largest_ratio(relative: float, scene: Scene, q, v, t):

@@ -5,7 +5,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from jaxdyn.compile import is_concrete
+from jaxdyn.compile.known import is_concrete
 from jaxdyn.model.arguments import store_leaf
 
 

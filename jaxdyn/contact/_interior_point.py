@@ -19,7 +19,8 @@ import numpy as np
 from jax import lax
 from jaxtyping import Array, Bool, Int
 
-from jaxdyn.compile import any_in_batch, run
+from jaxdyn.compile import kernel
+from jaxdyn.compile.batch import any_sample
 from jaxdyn.contact import _jordan as jordan
 from jaxdyn.lie.so3 import _product
 from jaxdyn.systems.mass_factor import cholesky, solve_cholesky
@@ -117,6 +118,7 @@ def _where(condition, new, old):
     return jax.tree.map(lambda a, b: jnp.where(condition, a, b), new, old)
 
 
+@kernel(static=1)
 def _start(pattern: Pattern, _, program: Program):
     """Initial point: least-squares slacks, shifted into the cones (as in CVXOPT), with residuals and error measure."""
     program = _sparse(program, pattern)
@@ -217,6 +219,7 @@ def _is_running(state: _State, target: float):
     return (state.error > target) & ~state.infeasible & state.alive
 
 
+@kernel(static=3)
 def _iteration(pattern: Pattern, tol: float, target: float, _, program: Program, state: "_State") -> "_State":
     """Take the next step, and accept or reject it.
 
@@ -237,6 +240,7 @@ def _iteration(pattern: Pattern, tol: float, target: float, _, program: Program,
     return _State(point, residuals, error, ended, alive & (taken | ~going), steps + going.astype(steps.dtype))
 
 
+@kernel(static=1)
 def _refinement(pattern: Pattern, _, program: Program, point: Point, error, alive):
     """Take a Newton step on the equations of the projection where it lowers the residual; return residual and acceptance.
 
@@ -322,13 +326,13 @@ def solve(program: Program, pattern: Pattern, tol: float, max_steps: int) -> End
     # The kernel itself keeps samples that have ended, so that the loop has one condition for the batch.
     def going(carry):
         state, count = carry
-        return (count < max_steps) & any_in_batch(_is_running(state, target))
+        return (count < max_steps) & any_sample(_is_running(state, target))
 
     def advance(carry):
         state, count = carry
-        return run(_iteration, None, program, state, static=(pattern, tol, target)), count + 1
+        return _iteration(pattern, tol, target, None, program, state), count + 1
 
-    point, residuals, error = run(_start, None, program, static=(pattern,))
+    point, residuals, error = _start(pattern, None, program)
     none = jnp.zeros((), bool)
     begin = _State(point, residuals, error, none, ~none, jnp.zeros((), program.q.dtype))
     state, _ = lax.while_loop(going, advance, (begin, 0))
@@ -337,17 +341,17 @@ def solve(program: Program, pattern: Pattern, tol: float, max_steps: int) -> End
     # Newton's method reaches rounding in two or three steps, where interior-point scalings lose digits.
     def improving(carry):
         (_, error, alive), count = carry
-        return (count < REFINEMENTS) & any_in_batch(alive & (error > 4 * eps))
+        return (count < REFINEMENTS) & any_sample(alive & (error > 4 * eps))
 
     def refine(carry):
         refined, count = carry
-        return run(_refinement, None, program, *refined, static=(pattern,)), count + 1
+        return _refinement(pattern, None, program, *refined), count + 1
 
     # The projection may raise the residual: the first refinement is accepted up to ten times the error, and `_end` selects.
     carry = ((last, 10 * jnp.maximum(error, tol), ~infeasible), 0)
     (refined, less, _), _ = lax.while_loop(improving, refine, carry)
     rest = (program, last, error, refined, less, infeasible)
-    point, solved, infeasible = run(_end, None, *rest, static=(pattern, tol))
+    point, solved, infeasible = kernel(_end, static=2)(pattern, tol, None, *rest)
     return End(point, steps.astype(jnp.int32), solved, infeasible)
 
 
@@ -362,9 +366,10 @@ def _attach_derivative_jvp(pattern: Pattern, primals, tangents):
     program, point = primals
     # The recursion lets higher-order derivatives account for the motion of the point.
     point = attach_derivative(pattern, program, point)
-    return point, run(_tangent, None, program, point, tangents[0], static=(pattern,))
+    return point, _tangent(pattern, None, program, point, tangents[0])
 
 
+@kernel(static=1)
 def _tangent(pattern: Pattern, _, program: Program, point: Point, change: Program) -> Point:
     """Tangent of the solution for a tangent of the program."""
     program, change = _sparse(program, pattern), _sparse(change, pattern)

@@ -13,7 +13,7 @@ import equinox as eqx
 import numpy as np
 from jaxtyping import Float
 
-from jaxdyn.compile import is_concrete
+from jaxdyn.compile.known import is_concrete
 from jaxdyn.contact._checks import as_float
 from jaxdyn.contact.cones import SIDES, FrictionCone, surface_cone
 from jaxdyn.model.arguments import Checked, Numbers

@@ -24,7 +24,8 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float
 
-from jaxdyn.compile import compiled, is_concrete
+from jaxdyn.compile import entry_point
+from jaxdyn.compile.known import is_concrete
 from jaxdyn.contact._checks import as_float
 from jaxdyn.contact.surfaces import (
     Surface,
@@ -130,7 +131,7 @@ def montana(surface_o: Surface, surface_f: Surface, eta: Numbers) -> ContactKine
     return kinematics
 
 
-@compiled
+@entry_point
 def _montana(surface_o, surface_f, eta) -> ContactKinematics:
     o, f = geometry_at(surface_o, eta[:2]), geometry_at(surface_f, eta[2:4])
     turn = _turn(eta[4])

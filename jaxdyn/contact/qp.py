@@ -15,7 +15,8 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Int
 
-from jaxdyn.compile import compiled, is_concrete, is_staged
+from jaxdyn.compile import entry_point
+from jaxdyn.compile.known import is_concrete, is_tracing
 from jaxdyn.constraints.rank import pseudo_inverse, tolerance
 from jaxdyn.contact._checks import as_float
 from jaxdyn.contact._interior_point import Point, Program, attach_derivative, solve
@@ -147,7 +148,7 @@ def _pair(matrix, level, name: str, right: str, n: int, dtype):
 def _pattern(rows, A) -> bytes | None:
     """Mask of the entries of a group's rows that may be nonzero; None for all."""
     # Outside of a trace all calls share one program, without regard to zeros; equality rows mix columns.
-    known = is_staged() and is_concrete(rows) and not A.shape[0]
+    known = is_tracing() and is_concrete(rows) and not A.shape[0]
     return (np.asarray(rows) != 0).tobytes() if known else None
 
 
@@ -165,7 +166,7 @@ def _unit(sizes):
     return jnp.where(sizes > 0, 1 / jnp.where(sizes > 0, sizes, 1), 1)
 
 
-@compiled
+@entry_point
 def _solve(Q, q, G, h, A, b, cones, pattern: tuple[bytes | None, ...], tol: float, max_steps: int) -> QPSolution:
     data = [Q, q, G, A, b, *(x for pair in cones for x in pair)]
     finite = jnp.stack([jnp.isfinite(x).all() for x in data]).all() & ~jnp.isnan(h).any()

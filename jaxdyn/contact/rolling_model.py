@@ -20,7 +20,8 @@ import numpy as np
 from jax import lax
 from jaxtyping import Array, Bool, Float, PyTree
 
-from jaxdyn.compile import is_known, run
+from jaxdyn.compile import kernel
+from jaxdyn.compile.known import is_known
 from jaxdyn.constraints.frames import each, relative_motions, relative_poses
 from jaxdyn.constraints.loops import check_bodies
 from jaxdyn.contact.rolling import Rolling, RollingContact
@@ -162,7 +163,7 @@ class RollingModel(Model):
         """Configuration with the places updated for other coordinates of the joints."""
         if not self.contacts:
             return joints
-        return run(_complete_configuration, self, q, joints, otherwise=_complete_configuration)
+        return kernel(_complete_configuration, fallback=_complete_configuration)(self, q, joints)
 
     def complete_rate(
         self, q: Float[Array, " nq"], v: Float[Array, " nv"], rate: Float[Array, "..."]
@@ -170,7 +171,7 @@ class RollingModel(Model):
         """Rate dq/dt, including the places."""
         if not self.contacts:
             return rate
-        return jnp.concatenate([rate, run(_place_rates, self, q, v, otherwise=_place_rates)])
+        return jnp.concatenate([rate, kernel(_place_rates, fallback=_place_rates)(self, q, v)])
 
 
 def _complete_configuration(system: RollingModel, q, joints):

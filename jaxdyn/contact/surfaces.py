@@ -21,7 +21,8 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from jaxdyn.compile import compiled, is_concrete
+from jaxdyn.compile import entry_point
+from jaxdyn.compile.known import is_concrete
 from jaxdyn.constraints.rolling import tangents, unit_or
 from jaxdyn.contact._checks import as_float, as_number
 from jaxdyn.lie.so3 import _product, cross
@@ -305,7 +306,7 @@ def geometry_at(surface: Surface, alpha: Float[Array, "2"]) -> SurfaceGeometry:
     return SurfaceGeometry(surface.point(alpha), frame, metric, curvature, torsion, fine)
 
 
-_geometry = compiled(geometry_at)
+_geometry = entry_point(geometry_at)
 
 
 def _frame_of(surface, alpha):

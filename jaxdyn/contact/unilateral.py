@@ -12,7 +12,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from jaxdyn.compile import is_concrete
+from jaxdyn.compile.known import is_concrete
 from jaxdyn.constraints.base import Constraint, Pfaffian
 from jaxdyn.constraints.rolling import RollingSphere
 from jaxdyn.model.arguments import Checked, Function, Number, Numbers, SystemLike, as_array, pose_leaf

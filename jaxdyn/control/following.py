@@ -14,7 +14,8 @@ import numpy as np
 from jax import lax
 from jaxtyping import Array, Bool, Float
 
-from jaxdyn.compile import constant, is_concrete, pseudo_inverse_by_rotations
+from jaxdyn.compile import pseudo_inverse_by_rotations
+from jaxdyn.compile.known import is_concrete, stop_gradient
 from jaxdyn.constraints.base import constraint_jacobian, holonomic_rows, layout
 from jaxdyn.constraints.codes import Outcome
 from jaxdyn.constraints.rank import sign_of_determinant, tolerance
@@ -141,7 +142,7 @@ def _rows(targets: Mapping[str, Any]) -> dict[str, dict]:
 
 def _scaled_rows(whole: Scene, q, t: Any, factors):
     """Rows of constraints and targets in coordinates scaled by their sizes, and their pseudo-inverse; constants."""
-    whole, q = constant((whole, q))
+    whole, q = stop_gradient((whole, q))
     sizes, _ = coordinate_sizes(whole.system, q.dtype)
     R = constraint_jacobian(whole, q, t)[holonomic_rows(layout(whole))] * sizes[None]
     count = R.shape[0] - factors.size

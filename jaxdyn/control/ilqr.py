@@ -22,7 +22,7 @@ from jax import lax
 from jax.flatten_util import ravel_pytree
 from jaxtyping import Array, Float, Int, PyTree
 
-from jaxdyn.compile import is_concrete
+from jaxdyn.compile.known import is_concrete
 from jaxdyn.constraints.codes import RESULTS, Outcome
 from jaxdyn.constraints.rank import eps_of
 from jaxdyn.control.box_qp import minimize_in_box

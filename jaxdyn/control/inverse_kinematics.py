@@ -16,7 +16,8 @@ import numpy as np
 from jax import lax
 from jaxtyping import Array, Float, Int
 
-from jaxdyn.compile import compiled, constant, is_concrete
+from jaxdyn.compile import entry_point
+from jaxdyn.compile.known import is_concrete, stop_gradient
 from jaxdyn.constraints.assembly import closing_tolerance
 from jaxdyn.constraints.base import Constraint, holonomic_rows, layout, position_residual
 from jaxdyn.constraints.closing import nearest_configuration
@@ -168,7 +169,7 @@ def row_weights(rows: tuple[Constraint, ...], weights, dtype) -> Array:
     return jnp.concatenate(parts)
 
 
-@compiled
+@entry_point
 def _solve_compiled(scene, rows, guess, factors, posture, t, limits: bool, steps: int, guesses: int, atol):
     return _solve(scene, rows, guess, factors, posture, t, limits, steps, guesses, atol)
 
@@ -176,7 +177,7 @@ def _solve_compiled(scene, rows, guess, factors, posture, t, limits: bool, steps
 def _solve(scene: Scene, rows, guess, factors, posture, t, limits: bool, steps: int, guesses: int, atol):
     model = scene.system
     whole = Scene(model, (*scene.constraints, *rows))
-    fixed, start, factors, time = constant((whole, guess, factors, t))
+    fixed, start, factors, time = stop_gradient((whole, guess, factors, t))
     aims = _aims(fixed, len(scene.constraints), factors, limits, atol)
 
     if steps > 1:  # equal parts of what the guess leaves open
@@ -231,7 +232,7 @@ def _aims(whole: Scene, constraints: int, factors, limits: bool, atol) -> Aims:
     exact = jnp.asarray(np.arange(nh) < count, dtype)
     endless = jnp.full_like(model.lower, jnp.inf)
     lower, upper = (model.lower, model.upper) if limits else (-endless, endless)
-    return Aims(weights, jnp.zeros((nh,), dtype), tolerances, exact, *constant((lower, upper)))
+    return Aims(weights, jnp.zeros((nh,), dtype), tolerances, exact, *stop_gradient((lower, upper)))
 
 
 def _differentiable(whole: Scene, q, posture, t: Number, aims: Aims, constraints: int):
@@ -263,12 +264,12 @@ def _differentiable(whole: Scene, q, posture, t: Number, aims: Aims, constraints
     if posture is None:
         scene = scene_at(q, (q[at] <= lower) | (q[at] >= upper))
         return nearest_configuration(scene, q, q, t, None, solve=lambda scene, guess, start, t: start)
-    active, place, time = jnp.zeros(at.shape, bool), q, constant(t)
+    active, place, time = jnp.zeros(at.shape, bool), q, stop_gradient(t)
     guess = lax.stop_gradient(posture)
     for _ in range(
         _ACTIVE_ROUNDS if joints else 0
     ):  # joints that pass a limit on the way to the posture are held there
-        passed = nearest_configuration(constant(scene_at(place, active)), guess, q, time, None)
+        passed = nearest_configuration(stop_gradient(scene_at(place, active)), guess, q, time, None)
         active = active | beyond(passed)
         place = jnp.where(jnp.any(beyond(passed)), clip_to_limits(model, passed, aims), place)
     place = nearest_configuration(scene_at(place, active), posture, q, t, None)

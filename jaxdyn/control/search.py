@@ -20,10 +20,11 @@ from typing import NamedTuple
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jax import lax
 from jaxtyping import Array
 
-from jaxdyn.compile import Carry, Given, Task, Turn, any_in_batch, run, run_loop
+from jaxdyn.compile import kernel
+from jaxdyn.compile.batch import while_loop
+from jaxdyn.compile.loops import Carry, Given, Iteration, Task, run_loop
 from jaxdyn.constraints.base import constraint_jacobian, holonomic_rows, layout, position_residual
 from jaxdyn.constraints.rank import eps_of
 from jaxdyn.constraints.tolerances import coordinate_sizes
@@ -97,19 +98,19 @@ def search(scene: Scene, q, t, aims: Aims, guesses: int) -> tuple[Array, Array]:
     return carry.state.best, carry.state.tried
 
 
-def _turn(guesses: int, scene: Scene, constants, state: Search, _) -> Turn:
+def _turn(guesses: int, scene: Scene, constants, state: Search, _) -> Iteration:
     after = _improve(guesses, scene, constants, state)
-    return Turn(after, ~state.done, ~after.done)
+    return Iteration(after, ~state.done, ~after.done)
 
 
 def _by_turns(guesses: int, scene: Scene, constants, given: Given, carry: Carry) -> Carry:
     """All steps, as operations of JAX around kernels."""
 
     def step(state: Search) -> Search:
-        after = run(_improve, scene, constants, state, static=(guesses,), calls=True)
+        after = kernel(_improve, static=1, derivative=False)(guesses, scene, constants, state)
         return jax.tree.map(lambda new, old: jnp.where(state.done, old, new), after, state)
 
-    return Carry(lax.while_loop(lambda state: any_in_batch(~state.done), step, carry.state))
+    return Carry(while_loop(lambda state: ~state.done, step, carry.state))
 
 
 def _improve(guesses: int, scene: Scene, constants, state: Search) -> Search:

@@ -14,7 +14,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from jaxdyn.compile import run
+from jaxdyn.compile import kernel
 from jaxdyn.dynamics.kinematics import body_subspace, forward_kinematics, take
 from jaxdyn.lie import se3
 from jaxdyn.lie.so3 import _product
@@ -31,9 +31,10 @@ def base_twists(model: Model) -> Float[Array, "nv 6"]:
     Source: Murray, Li & Sastry (1994), section 3.2; EQUATIONS section 2.
     """
     check_shapes(model)
-    return run(_base_twists, model)
+    return _base_twists(model)
 
 
+@kernel
 def _base_twists(model: Model):
     home = forward_kinematics(model, neutral(model))
     return jax.vmap(se3.Ad_apply)(take(home, model.topology.dof_body), body_subspace(model))
@@ -55,9 +56,10 @@ def link_adjoints(model: Model, q: Float[Array, " nq"]) -> Float[Array, "nb nb 6
     Source: Li & Wu, Property 2; Murray, Li & Sastry (1994), eq. 4.27; EQUATIONS section 2.
     """
     (q,) = check_shapes(model, q=q)
-    return run(_link_adjoints, model, q)
+    return _link_adjoints(model, q)
 
 
+@kernel
 def _link_adjoints(model: Model, q):
     poses, home = forward_kinematics(model, q), forward_kinematics(model, neutral(model))
     # poses home^-1 is the product of the exponentials down to each body: g_i(q) = product g_i(0).

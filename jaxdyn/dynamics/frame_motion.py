@@ -3,7 +3,7 @@
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from jaxdyn.compile import run
+from jaxdyn.compile import kernel
 from jaxdyn.dynamics.kinematics import (
     body_jacobian,
     body_twists,
@@ -41,9 +41,10 @@ def frame_jacobian(
     body, offset = named_frame(model, frame)
     if body < 0:
         return jnp.zeros((6, model.nv), model.home.dtype)
-    return run(_jacobian, (kinematic_part(model), offset), q, static=(body,))
+    return _jacobian(body, (kinematic_part(model), offset), q)
 
 
+@kernel(static=1)
 def _jacobian(body: int, tree, q):
     model, offset = tree
     frame = tree_frame(model, q)
@@ -70,9 +71,10 @@ def frame_velocity(
     body, offset = named_frame(model, frame)
     if body < 0:
         return jnp.zeros((6,), model.home.dtype)
-    return run(_velocity, (kinematic_part(model), offset), q, v, static=(body,))
+    return _velocity(body, (kinematic_part(model), offset), q, v)
 
 
+@kernel(static=1)
 def _velocity(body: int, tree, q, v):
     model, offset = tree
     frame = tree_frame(model, q)
@@ -106,9 +108,10 @@ def frame_acceleration(
     body, offset = named_frame(model, frame)
     if body < 0:
         return jnp.zeros((6,), model.home.dtype)
-    return run(_acceleration, (kinematic_part(model), offset), q, v, a, static=(body,))
+    return _acceleration(body, (kinematic_part(model), offset), q, v, a)
 
 
+@kernel(static=1)
 def _acceleration(body: int, tree, q, v, a):
     model, offset = tree
     frame = tree_frame(model, q)

@@ -4,7 +4,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from jaxdyn.compile import run
+from jaxdyn.compile import kernel
 from jaxdyn.dynamics.kinematics import tree_frame
 from jaxdyn.dynamics.quantities import MAX_BODIES
 from jaxdyn.dynamics.world_frame import joint_wrenches
@@ -58,7 +58,7 @@ def joint_wrench(
     function = _in_world if axes == "world" else _in_bodies
     given = (q, v, a) if external is None else (q, v, a, external)
     # Beyond MAX_BODIES a scalar program would compile for too long.
-    wrenches = function(model, *given) if model.nb > MAX_BODIES else run(function, model, *given)
+    wrenches = function(model, *given) if model.nb > MAX_BODIES else kernel(function)(model, *given)
     return wrenches if index is None else wrenches[index]
 
 

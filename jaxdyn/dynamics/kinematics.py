@@ -19,7 +19,8 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from jaxdyn.compile import is_expanding, numpy_for, run
+from jaxdyn.compile import kernel, variant
+from jaxdyn.compile.known import array_namespace
 from jaxdyn.lie import se3
 from jaxdyn.lie.so3 import _product
 from jaxdyn.model.arguments import Given, check_shapes
@@ -97,17 +98,20 @@ def tree_frame(model: Model, q: Float[Array, " nq"]) -> TreeFrame:
     return TreeFrame(pose, origin, subspace)
 
 
+def _products_in_order(topology: Topology, pose: Float[Array, "nb 4 4"]) -> Float[Array, "nb 4 4"]:
+    """`_tree_products` with one product per body: in a kernel pointer jumping would multiply the operations by log2(depth)."""
+    products: list = []
+    for i, parent in enumerate(topology.parents):
+        products.append(pose[i] if parent < 0 else _product(products[parent], pose[i]))
+    return jnp.stack(products) if products else pose
+
+
+@variant(_products_in_order)
 def _tree_products(topology: Topology, pose: Float[Array, "nb 4 4"]) -> Float[Array, "nb 4 4"]:
     """Products of the poses of all bodies above each body, root first.
 
-    On arrays by pointer jumping, with log2(depth) products of all bodies; in scalar programs with one product per body.
+    By pointer jumping, with log2(depth) products of all bodies.
     """
-    # A scalar program runs sequentially: pointer jumping would only multiply its operations by log2(depth).
-    if is_expanding():
-        products: list = []
-        for i, parent in enumerate(topology.parents):
-            products.append(pose[i] if parent < 0 else _product(products[parent], pose[i]))
-        return jnp.stack(products) if products else pose
     # The extra row is the world: a jump beyond the root multiplies by the identity.
     world = jnp.eye(4, dtype=pose.dtype)[None]
     for table in topology.jumps:
@@ -233,9 +237,10 @@ def forward_kinematics(model: Model, q: Float[Array, " nq"]) -> Float[Array, "nb
     Source: Murray, Li & Sastry (1994), eq. 3.3; EQUATIONS section 2.
     """
     (q,) = check_shapes(model, q=q)
-    return run(_world_poses, model, q)
+    return _world_poses(model, q)
 
 
+@kernel
 def _world_poses(model: Model, q):
     frame = tree_frame(model, q)
     return _translate(frame.pose, frame.origin)
@@ -260,9 +265,10 @@ def frame_pose(model: Model, q: Float[Array, " nq"], name: str | None) -> Float[
     body, offset = named_frame(model, name)
     if body < 0:
         return jnp.asarray(offset, model.home.dtype)
-    return run(_pose_in_body, (kinematic_part(model), offset), q, static=(body,))
+    return _pose_in_body(body, (kinematic_part(model), offset), q)
 
 
+@kernel(static=1)
 def _pose_in_body(body: int, tree, q):
     model, offset = tree
     frames = body_frames(model, q, [body])
@@ -285,9 +291,10 @@ def body_jacobian(model: Model, q: Float[Array, " nq"], frame: str | None) -> Fl
     body, offset = named_frame(model, frame)
     if body < 0:
         return jnp.zeros((6, model.nv), model.home.dtype)
-    return run(_body_jacobian, (kinematic_part(model), offset), q, static=(body,))
+    return _body_jacobian(body, (kinematic_part(model), offset), q)
 
 
+@kernel(static=1)
 def _body_jacobian(body: int, tree, q):
     model, offset = tree
     frame = tree_frame(model, q)
@@ -310,9 +317,10 @@ def spatial_jacobian(model: Model, q: Float[Array, " nq"], frame: str | None) ->
     body, _ = named_frame(model, frame)
     if body < 0:
         return jnp.zeros((6, model.nv), model.home.dtype)
-    return run(_spatial_jacobian, kinematic_part(model), q, static=(body,))
+    return _spatial_jacobian(body, kinematic_part(model), q)
 
 
+@kernel(static=1)
 def _spatial_jacobian(body: int, model: Model, q):
     frame = tree_frame(model, q)
     shift = se3.from_parts(jnp.eye(3, dtype=model.home.dtype), frame.origin[body])
@@ -338,9 +346,10 @@ def jacobian_dot_v(
     body, offset = named_frame(model, frame)
     if body < 0:
         return jnp.zeros((6,), model.home.dtype)
-    return run(_jacobian_dot_v, (kinematic_part(model), offset), q, v, static=(body,))
+    return _jacobian_dot_v(body, (kinematic_part(model), offset), q, v)
 
 
+@kernel(static=1)
 def _jacobian_dot_v(body: int, tree, q, v):
     model, offset = tree
     frame = tree_frame(model, q)
@@ -376,7 +385,7 @@ def named_frame(model: Model, name: str | None) -> tuple[int, Any]:
     index = frame_index(model, name)
     # A known pose stays a numpy array with the same value in every call: compiled programs are cached by it.
     poses = model.frame_poses
-    return model.topology.frame_bodies[index], numpy_for(poses).asarray(poses)[index]
+    return model.topology.frame_bodies[index], array_namespace(poses).asarray(poses)[index]
 
 
 def _mask_path(model: Model, body: int, rows: Float[Array, "nv 6"]) -> Float[Array, "nv 6"]:

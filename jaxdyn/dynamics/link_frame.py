@@ -9,17 +9,19 @@ With A_i = Ad^-1 of the pose of link i in its parent, in block (i, parent(i)) of
 `world_frame` or `recursions`, which share only the joints' transforms and screws with this module.
 """
 
+from typing import Any
+
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from jaxdyn.compile import compiled
+from jaxdyn.compile import entry_point
 from jaxdyn.dynamics.kinematics import body_subspace, relative_poses
 from jaxdyn.lie import se3
 from jaxdyn.lie.so3 import _product
-from jaxdyn.model.arguments import check_shapes
+from jaxdyn.model.arguments import as_array, check_shapes
 from jaxdyn.model.inertia import spatial_inertia
 from jaxdyn.model.names import frame_index
 from jaxdyn.model.tree import Model
@@ -36,7 +38,8 @@ class NewtonEulerMatrices(eqx.Module):
     - `Pt` (6, 6n): body twist of the tip frame from the body twists, or None without a tip.
     - `ad_xi`, `ad_V`, `ad_V_T` (6n, 6n): blkdiag(-ad of xi_i v_i), blkdiag(-ad of V_i), blkdiag(-ad^T of V_i). The
       minus signs are part of the definition.
-    - `V0_dot` (6,): acceleration of the world, (-g, 0); zero without gravity.
+    - `V0` (6,): twist of the base; zero unless `base_twist` was given.
+    - `V0_dot` (6,): rate of `V0` less gravity, (-g, 0) for a base at rest; zero without gravity.
     - `V` (6n,): body twists.
 
     The products of these matrices are properties. Rotor inertia (armature) belongs to no link and is in none of them.
@@ -51,6 +54,7 @@ class NewtonEulerMatrices(eqx.Module):
     ad_xi: Float[Array, "n6 n6"]
     ad_V: Float[Array, "n6 n6"]
     ad_V_T: Float[Array, "n6 n6"]
+    V0: Float[Array, "6"]
     V0_dot: Float[Array, "6"]
     V: Float[Array, " n6"]
 
@@ -66,8 +70,19 @@ class NewtonEulerMatrices(eqx.Module):
         return _product(self.G, self.xi)
 
     @property
+    def bias_force(self) -> Float[Array, " nv"]:
+        """Bias force xi^T G^T (M G (P0 V0_dot + ad_xi (P0 V0 + Gamma V)) + ad_V^T M V) (nv,): the forces tau of a = 0.
+
+        C0 v + phi when the base does not move.
+        """
+        carried = _product(self.P0, self.V0) + _product(self.Gamma, self.V)
+        rates = _product(self.G, _product(self.P0, self.V0_dot) + _product(self.ad_xi, carried))
+        wrenches = _product(self.M, rates) + _product(self.ad_V_T, _product(self.M, self.V))
+        return _product(self.jacobians.T, wrenches)
+
+    @property
     def phi(self) -> Float[Array, " nv"]:
-        """Gravity force phi = xi^T G^T M G P0 V0_dot = +dV/dq (nv,)."""
+        """Gravity force phi = xi^T G^T M G P0 V0_dot (nv,); +dV/dq when the base does not move."""
         return _product(self.jacobians.T, _product(self.M, _product(self.G, _product(self.P0, self.V0_dot))))
 
     @property
@@ -84,8 +99,8 @@ class NewtonEulerMatrices(eqx.Module):
     def C0(self) -> Float[Array, "nv nv"]:
         """Coriolis matrix C0 = xi^T G^T (M G ad_xi Gamma + ad_V^T M) G xi (nv, nv), as printed by Li & Wu.
 
-        C0 v is the vector of Coriolis and centrifugal forces, but Mdot - 2 C0 is not skew. Use `Cs` where skew symmetry
-        matters.
+        C0 v is the vector of Coriolis and centrifugal forces when the base does not move (`bias_force` otherwise), but
+        Mdot - 2 C0 is not skew. Use `Cs` where skew symmetry matters.
         """
         return self._coriolis(_product(self.ad_V_T, self.M))
 
@@ -102,25 +117,48 @@ class NewtonEulerMatrices(eqx.Module):
 
 
 def newton_euler_matrices(
-    model: Model, q: Float[Array, " nq"], v: Float[Array, " nv"], *, tip: str | None = None
+    model: Model,
+    q: Float[Array, " nq"],
+    v: Float[Array, " nv"],
+    *,
+    tip: str | None = None,
+    base_twist: Float[Array, "6"] | None = None,
+    base_twist_rate: Float[Array, "6"] | None = None,
 ) -> NewtonEulerMatrices:
     """Block matrices of the Newton-Euler equations in link frames.
 
-    **Arguments:** `q` (nq,); `v` (nv,); `tip`, name of the frame where the tip wrench F_t acts, or None.
+    **Arguments:**
 
-    **Returns:** `NewtonEulerMatrices`. M(q) a + Cs v + phi + Jt^T F_t = tau, with F_t the wrench that the tip applies
-    TO its surroundings, at the tip frame's origin in its axes.
+    - `q` (nq,), `v` (nv,).
+    - `tip`: name of the frame where the tip wrench F_t acts, or None.
+    - `base_twist` V_0 (6,): body twist (v, omega) of the frame that the model calls the world, when that frame moves, as
+      on a vehicle; m/s and rad/s in its own axes. `base_twist_rate` (6,): its rate. None is zero. `model.gravity` is
+      in the axes that the base has at this instant.
+
+    **Returns:** `NewtonEulerMatrices`. M(q) a + bias_force + Jt^T F_t = tau, with F_t the wrench that the tip applies
+    TO its surroundings, at the tip frame's origin in its axes; bias_force = Cs v + phi for a base at rest.
 
     **Raises:** ValueError for shapes that do not fit, an unknown tip, or a tip fixed to the world.
 
     Source: EQUATIONS section 4; Park, Bobrow & Ploen (1995), Murray, Li & Sastry (1994) section 4.3.
     """
     q, v = check_shapes(model, q=q, v=v)
-    return _matrices(model, q, v, tip)
+    return _matrices(
+        model, q, v, _base_vector("base_twist", base_twist, q), _base_vector("base_twist_rate", base_twist_rate, q), tip
+    )
 
 
-@compiled
-def _matrices(model: Model, q, v, tip: str | None) -> NewtonEulerMatrices:
+def _base_vector(name: str, value: Any, q) -> Array | None:
+    if value is None:
+        return None
+    value = as_array(value, name, q.dtype)
+    if value.shape != (6,):
+        raise ValueError(f"{name} has shape {value.shape}; give (6,): (v, omega) of the base, linear part first")
+    return value
+
+
+@entry_point
+def _matrices(model: Model, q, v, base_twist, base_twist_rate, tip: str | None) -> NewtonEulerMatrices:
     topology, n = model.topology, model.nb
     tip_selector = None if tip is None else _tip_selector(model, tip)
     to_child = jax.vmap(lambda pose: se3.Ad(se3.inverse(pose)))(relative_poses(model, q))
@@ -134,13 +172,14 @@ def _matrices(model: Model, q, v, tip: str | None) -> NewtonEulerMatrices:
     g = _nilpotent_inverse(gamma, int(topology.depths.max(initial=1)))
 
     rates = _product(xi, v)
-    twists = _product(g, rates)
+    twists = _product(g, rates if base_twist is None else rates + _product(p0, base_twist))
     # The minus signs follow the documents' definition of the blocks, not the usual ad.
     ad_xi = -jax.vmap(se3.ad)(rates.reshape(n, 6))
     ad_v = -jax.vmap(se3.ad)(twists.reshape(n, 6))
     # The fictitious acceleration of the base replaces gravity on every body.
     at_rest = jnp.zeros((3,), model.home.dtype)
     gravity = at_rest if model.gravity is None else model.gravity
+    V0_dot = jnp.concatenate([-gravity, at_rest])
     return NewtonEulerMatrices(
         G=g,
         Gamma=gamma,
@@ -151,7 +190,8 @@ def _matrices(model: Model, q, v, tip: str | None) -> NewtonEulerMatrices:
         ad_xi=_block_diagonal(ad_xi),
         ad_V=_block_diagonal(ad_v),
         ad_V_T=_block_diagonal(ad_v.transpose(0, 2, 1)),
-        V0_dot=jnp.concatenate([-gravity, at_rest]),
+        V0=jnp.zeros_like(V0_dot) if base_twist is None else base_twist,
+        V0_dot=V0_dot if base_twist_rate is None else V0_dot + base_twist_rate,
         V=twists,
     )
 

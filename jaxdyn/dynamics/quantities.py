@@ -17,7 +17,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from jaxdyn.compile import along, implicit, native, run
+from jaxdyn.compile import implicit, kernel, value_and_jvp
 from jaxdyn.dynamics import recursions, scans, world_frame
 from jaxdyn.dynamics.kinematics import TreeFrame, body_twists, tree_frame
 from jaxdyn.dynamics.world_frame import momentum, tree_inertias
@@ -151,12 +151,12 @@ def forward_dynamics(
     # The derivative of the solve is M^-1 times that of inverse dynamics, so ABA itself is never differentiated.
     if model.nb > MAX_BODIES or model.nb == 0:
         return _solve_for_acceleration(model, q, v, tau)
-    return run(recursions.aba, model, q, v, tau, otherwise=_solve_for_acceleration, tangent=_acceleration_tangent)
+    return kernel(recursions.aba, fallback=_solve_for_acceleration, derivative=_acceleration_tangent)(model, q, v, tau)
 
 
 def _kernel_with_checks(recursion: Callable) -> Callable:
     """Compile a recursion as a kernel with checks of its arguments."""
-    by_kernel, signature = native(recursion), inspect.signature(recursion)
+    by_kernel, signature = kernel(recursion), inspect.signature(recursion)
 
     @functools.wraps(recursion)
     def call(*args, **named):
@@ -180,7 +180,7 @@ def by_recursion(recursion, matrices, model: Model, *args):
     """Evaluate recursion(model, *args) as a kernel, or by products of matrices where there is no kernel."""
     if model.nb > MAX_BODIES or model.nb == 0:
         return matrices(model, *args)
-    return run(recursion, model, *args, otherwise=matrices)
+    return kernel(recursion, fallback=matrices)(model, *args)
 
 
 def _inverse_dynamics(model: Model, q, v, a):
@@ -215,7 +215,7 @@ def _force_tangent(inverse, model, q, v, tau, steps):
     def change(a):
         # None marks a zero tangent, for which nothing is computed.
         total = jnp.zeros_like(tau) if tau_step is None else tau_step
-        _, rate = along(lambda model, q, v: inverse(model, q, v, a), (model, q, v), steps)
+        _, rate = value_and_jvp(lambda model, q, v: inverse(model, q, v, a), (model, q, v), steps)
         return total if rate is None else total - rate
 
     return change
@@ -336,9 +336,10 @@ def christoffel_symbols(model: Model | System, q: Float[Array, " nq"], t: Number
 
 def _system_quantity(system: System, name: str, *args):
     """Evaluate a quantity of a system that is no tree of bodies."""
-    return run(_method, system, *args, static=(name,))
+    return _method(name, system, *args)
 
 
+@kernel(static=1)
 def _method(name: str, system: System, *args):
     return getattr(system, name)(*args)
 

@@ -31,9 +31,10 @@ class _Links(NamedTuple):
 
 
 class Factor(NamedTuple):
-    """Factorisation of M: per body D^-1 (d, d) and D^-1 U^T (d, 6) of its articulated inertia."""
+    """Factorisation of M: per body its articulated inertia, D^-1 (d, d) and D^-1 U^T (d, 6)."""
 
     links: _Links
+    inertia: Float[Array, "nb 6 6"]
     inverse: Float[Array, "nb d d"]
     gain: Float[Array, "nb d 6"]
 
@@ -60,8 +61,8 @@ def _links(model: Model, q) -> _Links:
     return _Links(parent, down, _per_body(model, body_subspace(model)), jax.vmap(spatial_inertia)(model.inertias))
 
 
-def _wrenches(model: Model, links: _Links, v, a) -> Float[Array, "nb 6"]:
-    """Inertial wrench of each body in its own frame, gravity included: the outward pass of Newton-Euler."""
+def _wrenches(model: Model, links: _Links, v, a) -> tuple[Float[Array, "nb 6"], Float[Array, "nb 6"]]:
+    """Inertial wrench and twist rate of each body in its own frame, gravity included: the outward pass of Newton-Euler."""
     zero = jnp.zeros((model.nb + 1, 6), v.dtype)
     # Row nb is the world, accelerated against gravity, so that roots need no case of their own.
     rest = zero if model.gravity is None else zero.at[-1, :3].set(-model.gravity)
@@ -74,7 +75,7 @@ def _wrenches(model: Model, links: _Links, v, a) -> Float[Array, "nb 6"]:
         twist = _product(down, twists[parent]) + turn
         rate = _product(down, rates[parent]) + push + se3.ad_apply(twist, turn)
         wrench = _product(inertia, rate) - se3.adT_apply(twist, _product(inertia, twist))
-        return (twists.at[i].set(twist), rates.at[i].set(rate)), wrench
+        return (twists.at[i].set(twist), rates.at[i].set(rate)), (wrench, rate)
 
     each = jnp.arange(model.nb), links.parent, links.down, own_v, own_a, links.inertia
     return lax.scan(outward, (zero, rest), each)[1]
@@ -83,7 +84,7 @@ def _wrenches(model: Model, links: _Links, v, a) -> Float[Array, "nb 6"]:
 def inverse_dynamics(model: Model, q, v, a) -> Float[Array, " nv"]:
     """Inverse dynamics tau = M a + C v + N (nv,) by the recursive Newton-Euler algorithm; `a` None means zero."""
     links = _links(model, q)
-    wrenches = _wrenches(model, links, v, a)
+    wrenches, _ = _wrenches(model, links, v, a)
 
     def inward(total, link):
         i, parent, down, subspace = link
@@ -115,27 +116,32 @@ def _factorize(model: Model, links: _Links) -> Factor:
         inverse = solve_positive(_product(U, S.T) + jnp.diag(extra), jnp.eye(S.shape[0], dtype=dtype))
         gain = _product(inverse, U)
         left = inertia - _product(U.T, gain)
-        return total.at[parent].add(_product(down.T, _product(left, down))), (inverse, gain)
+        return total.at[parent].add(_product(down.T, _product(left, down))), (inertia, inverse, gain)
 
     start = jnp.concatenate([links.inertia, jnp.zeros((1, 6, 6), dtype)])
     each = jnp.arange(model.nb), links.parent, links.down, links.subspace, extra
     return Factor(links, *lax.scan(inward, start, each, reverse=True)[1])
 
 
-def _solve(model: Model, factor: Factor, tau, wrenches) -> Float[Array, " nv"]:
-    """Solve M a = tau - (generalised forces of the wrenches) by two sweeps."""
+def _residuals(model: Model, factor: Factor, tau, wrenches) -> tuple[Float[Array, "nb d"], Float[Array, "nb 6"]]:
+    """Residual joint forces tau - S^T p, and the wrench p on each body of the bodies that it carries: the inward sweep."""
     links, dtype = factor.links, tau.dtype
-    numbers = jnp.arange(model.nb)
 
     def inward(total, link):
         i, parent, down, S, gain, force = link
         left = force - _product(S, total[i])
-        return total.at[parent].add(_product(down.T, total[i] + _product(left, gain))), left
+        return total.at[parent].add(_product(down.T, total[i] + _product(left, gain))), (left, total[i])
 
     start = jnp.zeros((model.nb + 1, 6), dtype)
     start = start if wrenches is None else start.at[:-1].set(wrenches)
-    each = numbers, links.parent, links.down, links.subspace, factor.gain, _per_body(model, tau)
-    residual = lax.scan(inward, start, each, reverse=True)[1]
+    each = jnp.arange(model.nb), links.parent, links.down, links.subspace, factor.gain, _per_body(model, tau)
+    return lax.scan(inward, start, each, reverse=True)[1]
+
+
+def _solve(model: Model, factor: Factor, tau, wrenches) -> Float[Array, " nv"]:
+    """Solve M a = tau - (generalised forces of the wrenches) by two sweeps."""
+    links, dtype = factor.links, tau.dtype
+    residual, _ = _residuals(model, factor, tau, wrenches)
 
     def outward(twists, link):
         i, parent, down, S, gain, inverse, left = link
@@ -143,19 +149,29 @@ def _solve(model: Model, factor: Factor, tau, wrenches) -> Float[Array, " nv"]:
         a = _product(inverse, left) - _product(gain, twist)
         return twists.at[i].set(twist + _product(a, S)), a
 
-    each = numbers, links.parent, links.down, links.subspace, factor.gain, factor.inverse, residual
+    each = jnp.arange(model.nb), links.parent, links.down, links.subspace, factor.gain, factor.inverse, residual
     return _flat(model, lax.scan(outward, jnp.zeros((model.nb + 1, 6), dtype), each)[1])
 
 
 def forward_dynamics(model: Model, q, v, tau) -> Float[Array, " nv"]:
     """Forward dynamics a = M^-1 (tau - C v - N) (nv,) by the articulated-body algorithm."""
     links = _links(model, q)
-    return _solve(model, _factorize(model, links), tau, _wrenches(model, links, v, None))
+    return _solve(model, _factorize(model, links), tau, _wrenches(model, links, v, None)[0])
+
+
+def articulated_bodies(model: Model, q, v, tau, external) -> tuple[Float[Array, "nb 6 6"], Float[Array, "nb 6"]]:
+    """Articulated inertias A_i and biases b_i: the joint of body i transmits A_i Vdot_i + b_i."""
+    links = _links(model, q)
+    factor = _factorize(model, links)
+    wrenches, rates = _wrenches(model, links, v, None)
+    _, wrenches = _residuals(model, factor, tau, wrenches if external is None else wrenches - external)
+    # The sweeps count accelerations from those of zero joint accelerations; b_i counts from rest.
+    return factor.inertia, wrenches - jnp.einsum("bij,bj->bi", factor.inertia, rates, precision=lax.Precision.HIGHEST)
 
 
 def forward_dynamics_tangent(model: Model, q, v, tau, force_change):
     """Forward dynamics a and M^-1 times `force_change(a)` (nv,), both from one factorisation."""
     links = _links(model, q)
     factor = _factorize(model, links)
-    a = _solve(model, factor, tau, _wrenches(model, links, v, None))
+    a = _solve(model, factor, tau, _wrenches(model, links, v, None)[0])
     return a, _solve(model, factor, force_change(a), None)

@@ -20,7 +20,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float
 
-from jaxdyn.compile import compiled
+from jaxdyn.compile import entry_point
 from jaxdyn.dynamics.frame_motion import frame_jacobian
 from jaxdyn.dynamics.quantities import coriolis_matrix, gravity_force, mass_matrix
 from jaxdyn.lie.so3 import _product
@@ -108,7 +108,7 @@ class _Choice(eqx.Module):
     least: float = eqx.field(static=True)
 
 
-@compiled
+@entry_point
 def _workspace(model: Model, choice: _Choice, q, v) -> WorkspaceDynamics:
     def velocity_map(q):
         return frame_jacobian(model, q, choice.frame, axes=choice.axes)[np.array(choice.rows)]

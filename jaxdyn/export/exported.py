@@ -205,9 +205,11 @@ class Exported:
         if self.jacobian_program is not None:
             functions.append(standalone.function_ir(f"{self.name}_jacobian", self.jacobian_program, fields))
         if abi == "packed":
-            functions += [standalone.packed_ir(self.name, len(self.arguments), self.program)]
+            functions += [standalone.array_call_ir(self.name, len(self.arguments), self.program)]
             if self.jacobian_program is not None:
-                functions += [standalone.packed_ir(f"{self.name}_jacobian", len(self.arguments), self.jacobian_program)]
+                functions += [
+                    standalone.array_call_ir(f"{self.name}_jacobian", len(self.arguments), self.jacobian_program)
+                ]
         if self.batch and abi == "c":
             functions.append(batch_ir(self, lanes))
         return standalone.module_ir(*functions)

@@ -31,15 +31,15 @@ def batch_ir(exported: Any, width: int) -> Text:
         # One load and a copy to all lanes.
         value = Emitter(1)
         value.count = e.count
-        at = value.put(f"getelementptr i8, ptr %a{field.argument}, i64 {field.offset}")
+        at = value.emit(f"getelementptr i8, ptr %a{field.argument}, i64 {field.offset}")
         name = value.load_one(at, entry, kind)
         e.lines += value.lines
         e.count = value.count
         if width == 1:
             return name
         of, scalar = e.type(kind), value.type(kind)
-        first = e.put(f"insertelement {of} poison, {scalar} {name}, i32 0")
-        return e.put(f"shufflevector {of} {first}, {of} poison, <{width} x i32> zeroinitializer")
+        first = e.emit(f"insertelement {of} poison, {scalar} {name}, i32 0")
+        return e.emit(f"shufflevector {of} {first}, {of} poison, <{width} x i32> zeroinitializer")
 
     body = Body(e, program, load, lambda place: None)
     *results, flag = body.results()
@@ -49,9 +49,9 @@ def batch_ir(exported: Any, width: int) -> Text:
     if width > 1:
         name = f"llvm.vector.reduce.and.v{width}i1"
         e.declared[name] = f"declare i1 @{name}({e.type('b1')})"
-        regular = e.put(f"call i1 @{name}({e.type('b1')} {regular})")
-    code = e.put(f"select i1 {regular}, i32 0, i32 {DEGENERATE}")
-    after = e.put(f"or i32 %status, {code}")
+        regular = e.emit(f"call i1 @{name}({e.type('b1')} {regular})")
+    code = e.emit(f"select i1 {regular}, i32 0, i32 {DEGENERATE}")
+    after = e.emit(f"or i32 %status, {code}")
     pointers = [f"ptr %a{i}" for i in range(count + len(outputs))]
     text = "\n".join(
         [

@@ -3,7 +3,7 @@
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from jaxdyn.compile import compiled
+from jaxdyn.compile import entry_point
 from jaxdyn.lie import se3, so3
 from jaxdyn.lie.so3 import _product
 from jaxdyn.model.arguments import as_array, batch_hint
@@ -41,7 +41,7 @@ def arnold_form(inertia: Float[Array, "n n"], c: Float[Array, " n"], a: Float[Ar
     return _arnold_form(inertia, c, a)
 
 
-@compiled
+@entry_point
 def _arnold_form(inertia, c, a):
     # Euler's equations in momentum form; B follows by one solve with the inertia, which is never inverted.
     momentum = _product(inertia, c)

@@ -20,7 +20,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from jaxdyn.compile import is_known
+from jaxdyn.compile.known import is_known
 from jaxdyn.dynamics import quantities as dynamics
 from jaxdyn.lie.so3 import _product
 from jaxdyn.model.arguments import Checked, Function, Numbers, check_state

@@ -18,7 +18,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from jaxdyn.compile import compiled
+from jaxdyn.compile import entry_point
 from jaxdyn.dynamics.quantities import mass_matrix
 from jaxdyn.lie.so3 import _product
 from jaxdyn.model.arguments import as_array, batch_hint, check_state, check_system, state_dtype
@@ -37,7 +37,7 @@ else:
 
 def _compile_for_systems(function: Callable) -> Callable:
     """Compile `function(metric, *args)` for a system; evaluate it anew for a plain function, whose captured values may change."""
-    program = compiled(function)
+    program = entry_point(function)
 
     @functools.wraps(function)
     def call(metric, *args):

@@ -13,7 +13,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from jaxdyn.compile import is_concrete, numpy_for
+from jaxdyn.compile.known import array_namespace, is_concrete
 from jaxdyn.constraints.base import Constraint
 from jaxdyn.constraints.frames import Pair
 from jaxdyn.constraints.loops import attitude, check_bodies
@@ -137,13 +137,13 @@ def point_contacts(places: dict, *, kind: str = "hard-finger") -> list[Contact]:
         raise ValueError(f"places is {places!r}; give {{finger: (point, normal)}}")
     contacts = []
     for finger, place in places.items():
-        parts = [numpy_for(x).asarray(x, float) for x in place] if isinstance(place, (tuple, list)) else []
+        parts = [array_namespace(x).asarray(x, float) for x in place] if isinstance(place, (tuple, list)) else []
         if [x.shape for x in parts] != [(3,), (3,)]:
             raise ValueError(f"places[{finger!r}] is {place!r}; give (point (3,), normal (3,))")
         point, normal = parts
         if is_concrete(normal) and not (np.isfinite(normal).all() and normal.any()):
             raise ValueError(f"places[{finger!r}]: normal is {normal.tolist()}; give a direction into the object")
-        xp, normal = numpy_for(normal), f64.unit(normal, f"places[{finger!r}]: normal")
+        xp, normal = array_namespace(normal), f64.unit(normal, f"places[{finger!r}]: normal")
         across = f64.unit(xp.cross(normal, xp.eye(3)[xp.argmin(xp.abs(normal))]), "across")
         pose = f64.pose_of(xp.stack([across, xp.cross(normal, across), normal], 1), point)
         contacts.append(contact(kind, finger, pose))

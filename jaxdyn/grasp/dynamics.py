@@ -17,7 +17,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from jaxdyn.compile import compiled
+from jaxdyn.compile import entry_point
 from jaxdyn.constraints.base import Layout, constraint_jacobian, layout
 from jaxdyn.constraints.codes import RESULTS, Outcome
 from jaxdyn.constraints.dynamics import applied
@@ -163,7 +163,7 @@ def hand_dynamics(
     return _solve_motions(grasp, motions, q, nu, tau, t)
 
 
-@compiled
+@entry_point
 def _solve(grasp: Grasp, q, V, tau, t) -> ObjectDynamics:
     hands, objects = velocity_rows(grasp)
     A, push = jax.linearize(lambda q, t: constraint_jacobian(grasp, q, t), q, t)
@@ -184,7 +184,7 @@ def _solve(grasp: Grasp, q, V, tau, t) -> ObjectDynamics:
     return _solve_dynamics(grasp, q, V, tau, t, N, Ndot, is_regular, lambda left: -_product(inverse.T, left[hands]))
 
 
-@compiled
+@entry_point
 def _solve_motions(grasp: Grasp, motions: HandMotions, q, nu, tau, t) -> ObjectDynamics:
     place, push = jax.linearize(lambda q, t: motions.at(grasp, q, t), q, t)
     # N is linearised with its configuration, so that Ndot is exact for any basis.

@@ -13,7 +13,8 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float
 
-from jaxdyn.compile import compiled, is_known
+from jaxdyn.compile import entry_point
+from jaxdyn.compile.known import is_known
 from jaxdyn.constraints.base import Layout, constraint_jacobian, layout
 from jaxdyn.constraints.dynamics import applied
 from jaxdyn.constraints.rank import pseudo_inverse, tolerance
@@ -206,7 +207,7 @@ def hold(
     return HandForces(forces, torques, optimum.result, layout(grasp))
 
 
-@compiled
+@entry_point
 def _static(grasp: Grasp, q, t):
     """Constraint rows, and the contact wrench of static equilibrium."""
     at_rest = jnp.zeros((grasp.nv,), q.dtype)

@@ -6,7 +6,8 @@ import equinox as eqx
 import numpy as np
 from jaxtyping import Array, Float
 
-from jaxdyn.compile import compiled, is_concrete
+from jaxdyn.compile import entry_point
+from jaxdyn.compile.known import is_concrete
 from jaxdyn.constraints.base import Pfaffian, constraint_jacobian, layout
 from jaxdyn.constraints.rank import pseudo_inverse, tolerance
 from jaxdyn.contact.cones import Cones
@@ -110,7 +111,7 @@ def grasp_map(grasp: Grasp, q: Float[Array, " nq"], t: Numbers = 0.0) -> Float[A
     return _columns(grasp, q, t, grasp.object_velocities).T
 
 
-@compiled
+@entry_point
 def _columns(grasp: Grasp, q, t, columns: tuple[int, ...]) -> Float[Array, "nc k"]:
     return constraint_jacobian(grasp, q, t)[:, np.array(columns, int)]
 

@@ -10,7 +10,8 @@ import jax.numpy as jnp
 from jax import lax
 from jaxtyping import Array, Bool, Float
 
-from jaxdyn.compile import compiled, is_concrete
+from jaxdyn.compile import entry_point
+from jaxdyn.compile.known import is_concrete
 from jaxdyn.constraints.base import constraint_jacobian
 from jaxdyn.grasp.hand import Grasp, check_grasp
 from jaxdyn.grasp.motions import HandMotions, hand_motions, velocity_rows
@@ -82,7 +83,7 @@ def manipulability(
     return _measure(grasp, motions, q, length, t)
 
 
-@compiled
+@entry_point
 def _measure(grasp: Grasp, motions: HandMotions, q, length, t) -> Manipulability:
     hands, objects = velocity_rows(grasp)
     N = motions.at(grasp, q, t).N[:, : motions.object.shape[1]]

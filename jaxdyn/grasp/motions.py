@@ -17,7 +17,8 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from jaxdyn.compile import compiled, is_known
+from jaxdyn.compile import entry_point
+from jaxdyn.compile.known import is_known
 from jaxdyn.constraints.base import constraint_jacobian, layout
 from jaxdyn.constraints.rank import eps_of, pseudo_inverse, tolerance
 from jaxdyn.grasp.hand import Grasp, check_grasp
@@ -143,7 +144,7 @@ def velocity_rows(grasp: Any) -> tuple[np.ndarray, np.ndarray]:
     return np.array(grasp.hand_velocities, int), np.array(grasp.object_velocities, int)
 
 
-@compiled
+@entry_point
 def _projections(grasp: Grasp, q, t):
     """Projections 1 - B^+ B and 1 - J_h^+ J_h, and the ranks of B and J_h."""
     hands, objects = velocity_rows(grasp)

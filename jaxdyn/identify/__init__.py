@@ -1,32 +1,24 @@
-"""Parameters from measurements: least squares, and physically feasible fits by torque or by trajectory error."""
+"""Identification of parameters from logs: least squares, feasible fits of robots, and fits of any numbers of any system."""
 
-from jaxdyn.identify.construction import Construction as Construction
+from typing import Any
+
+from jaxdyn.identify import mechanisms as _mechanisms
 from jaxdyn.identify.delays import Delays as Delays
 from jaxdyn.identify.delays import shift_torques as shift_torques
-from jaxdyn.identify.exciting import Excitation as Excitation
-from jaxdyn.identify.exciting import exciting_motion as exciting_motion
 from jaxdyn.identify.feasible import fit_torques as fit_torques
-from jaxdyn.identify.friction import TERMS as TERMS
-from jaxdyn.identify.friction import Friction as Friction
-from jaxdyn.identify.gains import DriveGains as DriveGains
-from jaxdyn.identify.gains import fit_gains as fit_gains
 from jaxdyn.identify.identifiability import Identifiability as Identifiability
 from jaxdyn.identify.identifiability import identifiability as identifiability
 from jaxdyn.identify.intervals import Intervals as Intervals
-from jaxdyn.identify.jumps import LogWarning as LogWarning
+from jaxdyn.identify.linear_fit import LeastSquares as LeastSquares
+from jaxdyn.identify.linear_fit import least_squares as least_squares
 from jaxdyn.identify.logs import Log as Log
 from jaxdyn.identify.logs import split as split
-from jaxdyn.identify.mechanisms import completed as completed
+from jaxdyn.identify.mechanisms import complete_log as complete_log
 from jaxdyn.identify.parameter_tree import Parameters as Parameters
 from jaxdyn.identify.parameters import fit_parameters as fit_parameters
 from jaxdyn.identify.parameters import parameter_error as parameter_error
-from jaxdyn.identify.payload import Payload as Payload
-from jaxdyn.identify.payload import fit_payload as fit_payload
-from jaxdyn.identify.raw import from_raw as from_raw
 from jaxdyn.identify.regression import BaseParameters as BaseParameters
-from jaxdyn.identify.regression import LeastSquares as LeastSquares
 from jaxdyn.identify.regression import base_parameters as base_parameters
-from jaxdyn.identify.regression import least_squares as least_squares
 from jaxdyn.identify.regression import nominal_parameters as nominal_parameters
 from jaxdyn.identify.regression import parameter_names as parameter_names
 from jaxdyn.identify.regression import regressor as regressor
@@ -38,11 +30,82 @@ from jaxdyn.identify.result import Fit as Fit
 from jaxdyn.identify.result import ParameterFit as ParameterFit
 from jaxdyn.identify.robot import RobotFit as RobotFit
 from jaxdyn.identify.robot import fit_robot as fit_robot
+from jaxdyn.identify.sensors import Construction as Construction
 from jaxdyn.identify.sensors import Measured as Measured
-from jaxdyn.identify.spectra import Cutoff as Cutoff
-from jaxdyn.identify.spectra import choose_cutoff as choose_cutoff
 from jaxdyn.identify.torque_terms import EXTRA as EXTRA
+from jaxdyn.identify.torque_terms import TERMS as TERMS
+from jaxdyn.identify.torque_terms import Friction as Friction
 from jaxdyn.identify.torque_terms import TorqueTerm as TorqueTerm
 from jaxdyn.identify.trajectory import fit_trajectory as fit_trajectory
-from jaxdyn.identify.whiteness import Whiteness as Whiteness
-from jaxdyn.identify.whiteness import whiteness as whiteness
+from jaxdyn.identify.uncertainty import Whiteness as Whiteness
+from jaxdyn.identify.uncertainty import whiteness as whiteness
+from jaxdyn.identify.workflows.drive_gains import DriveGains as DriveGains
+from jaxdyn.identify.workflows.drive_gains import fit_gains as fit_gains
+from jaxdyn.identify.workflows.exciting_motion import Excitation as Excitation
+from jaxdyn.identify.workflows.exciting_motion import exciting_motion as exciting_motion
+from jaxdyn.identify.workflows.log_repair import LogWarning as LogWarning
+from jaxdyn.identify.workflows.payload import Payload as Payload
+from jaxdyn.identify.workflows.payload import fit_payload as fit_payload
+from jaxdyn.identify.workflows.raw_logs import from_raw as from_raw
+from jaxdyn.identify.workflows.spectra import Cutoff as Cutoff
+from jaxdyn.identify.workflows.spectra import choose_cutoff as choose_cutoff
+
+__all__ = [
+    "EXTRA",
+    "TERMS",
+    "BaseParameters",
+    "Construction",
+    "Cutoff",
+    "Delays",
+    "DriveGains",
+    "Excitation",
+    "Fit",
+    "Friction",
+    "Identifiability",
+    "Intervals",
+    "LeastSquares",
+    "Log",
+    "LogWarning",
+    "Measured",
+    "ParameterFit",
+    "Parameters",
+    "Payload",
+    "RobotFit",
+    "SampledTorque",
+    "TorqueTerm",
+    "Whiteness",
+    "base_parameters",
+    "choose_cutoff",
+    "complete_log",
+    "exciting_motion",
+    "fit_gains",
+    "fit_parameters",
+    "fit_payload",
+    "fit_robot",
+    "fit_torques",
+    "fit_trajectory",
+    "from_raw",
+    "identifiability",
+    "least_squares",
+    "nominal_parameters",
+    "parameter_error",
+    "parameter_names",
+    "regressor",
+    "rollout",
+    "shift_torques",
+    "split",
+    "torque_error",
+    "trajectory_error",
+    "whiteness",
+]
+
+
+def __dir__() -> list[str]:
+    """Names of the namespace; its modules are internal."""
+    return __all__
+
+
+def __getattr__(name: str) -> Any:
+    if name == "completed":  # the deprecated name of `complete_log`, which warns when it is called
+        return _mechanisms.completed
+    raise AttributeError(f"module {__name__!r} has no attribute {name!r}")

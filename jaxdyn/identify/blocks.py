@@ -1,6 +1,7 @@
-"""Pieces of a parameter tree: coordinates y, zero at the start, of some numbers of a system, and what they are then.
+"""Parameter blocks: maps from coordinates y, zero at the start, to some numbers of a system.
 
-A block writes its numbers into the list of the system's leaves. Every y is allowed: what a number cannot be, no y stands for.
+A block writes its numbers into the list of the system's leaves. Coordinates are unconstrained: every y gives numbers that are
+allowed (positive, within bounds, feasible inertias), so that no step of a fit can leave the allowed set.
 """
 
 import abc
@@ -18,7 +19,7 @@ from jaxdyn.lie import se3, so3
 
 
 class Block(eqx.Module):
-    """Some numbers of a system, by coordinates y (size,)."""
+    """Some numbers of a system as functions of coordinates y (size,)."""
 
     names: eqx.AbstractVar[tuple[str, ...]]
 
@@ -29,19 +30,19 @@ class Block(eqx.Module):
 
     @abc.abstractmethod
     def values(self, y: Float[Array, " size"], leaves: list) -> Float[Array, " m"]:
-        """The numbers (m,) that `names` names."""
+        """Numbers (m,) in the order of `names`."""
 
     @abc.abstractmethod
     def write(self, y: Float[Array, " size"], leaves: list) -> None:
-        """Put the numbers into the list of the system's leaves."""
+        """Write the numbers into the list of the system's leaves."""
 
     def residual(self, y: Float[Array, " size"], leaves: list) -> Float[Array, " k"]:
-        """What is known beforehand, as residuals of unit deviation (k,)."""
+        """Residuals of the prior (k,), of unit standard deviation."""
         return jnp.zeros((0,), y.dtype)
 
 
 class Numbers(Block):
-    """Entries of a leaf: x0 + unit y ("free"), x0 exp(y) ("positive"), or between bounds by a logistic function ("bounded").
+    """Entries of a leaf: x0 + unit y ("free"), x0 exp(y) ("positive"), or between bounds by a logistic function ("bound").
 
     A Gaussian prior is |root (x - mean)|^2, root^T root the inverse of its covariance.
     """
@@ -64,7 +65,7 @@ class Numbers(Block):
     def values(self, y, leaves):
         if self.kind == "positive":
             return self.origin * jnp.exp(y)
-        if self.kind == "bounded":
+        if self.kind == "bound":
             low: Any = self.lower
             span = self.upper - low
             share = (self.origin - low) / span
@@ -72,7 +73,7 @@ class Numbers(Block):
         return self.origin + self.unit * y
 
     def write(self, y, leaves):
-        _put(leaves, self.place, self.index, self.values(y, leaves))
+        _write_entries(leaves, self.place, self.index, self.values(y, leaves))
 
     def residual(self, y, leaves):
         if self.root is None:
@@ -82,7 +83,7 @@ class Numbers(Block):
 
 
 class Poses(Block):
-    """Poses T0 exp(unit y) of a leaf (..., 4, 4); the numbers are the twists (v, omega), m and rad, from where they were."""
+    """Poses T0 exp(unit y) of a leaf (..., 4, 4); the numbers are the twists (v, omega), m and rad, from the start."""
 
     names: tuple[str, ...] = eqx.field(static=True)
     place: int = eqx.field(static=True)
@@ -98,22 +99,22 @@ class Poses(Block):
         return y
 
     def write(self, y, leaves):
-        moved = jax.vmap(lambda T, twist: T @ se3.exp(twist))(self.origin, y.reshape(-1, 6))
+        poses = jax.vmap(lambda T, twist: T @ se3.exp(twist))(self.origin, y.reshape(-1, 6))
         index = (np.array(self.rows)[:, None] * 16 + np.arange(16)).reshape(-1)
-        _put(leaves, self.place, index, moved.reshape(-1))
+        _write_entries(leaves, self.place, index, poses.reshape(-1))
 
     def residual(self, y, leaves):
         return super().residual(y, leaves) if self.root is None else self.root @ y
 
 
 class Directions(Block):
-    """Vectors (3,), or screws (6,), that keep their length and turn: exp(hat(B y)), B (3, 2) across the vector."""
+    """Vectors (3,), or screws (6,), of constant length, rotated by exp(hat(B y)), B (3, 2) perpendicular to the vector."""
 
     names: tuple[str, ...] = eqx.field(static=True)
     place: int = eqx.field(static=True)
     index: tuple[int, ...] = eqx.field(static=True)
     origin: Float[Array, "m k 3"]
-    across: Float[Array, "m 3 2"]
+    normals: Float[Array, "m 3 2"]
     root: Float[Array, "m2 m2"] | None = None
 
     @property
@@ -121,21 +122,21 @@ class Directions(Block):
         return 2 * self.origin.shape[0]
 
     def values(self, y, leaves):
-        turned = jax.vmap(lambda parts, B, y: parts @ so3.exp(B @ y).T)(self.origin, self.across, y.reshape(-1, 2))
-        return turned.reshape(-1)
+        rotated = jax.vmap(lambda parts, B, y: parts @ so3.exp(B @ y).T)(self.origin, self.normals, y.reshape(-1, 2))
+        return rotated.reshape(-1)
 
     def write(self, y, leaves):
-        _put(leaves, self.place, self.index, self.values(y, leaves))
+        _write_entries(leaves, self.place, self.index, self.values(y, leaves))
 
     def residual(self, y, leaves):
         return super().residual(y, leaves) if self.root is None else self.root @ y
 
 
 class Inertias(Block):
-    """Inertias of bodies by log-Cholesky coordinates relative to the nominal ones: no y stands for an impossible body.
+    """Inertias of bodies by log-Cholesky coordinates relative to the nominal ones: every y gives a feasible body.
 
-    - `total`: the mass of all bodies of the model together, kept exactly: all that are free are made heavier by one factor.
-    - `ellipsoids` (bodies, 4, 4): Q of ellipsoids that hold the bodies, tr(P Q) > 0, or zero for a body without one.
+    - `total`: the mass of all bodies of the model together, kept exactly: all free bodies are scaled by one factor.
+    - `ellipsoids` (bodies, 4, 4): Q of ellipsoids that contain the bodies, tr(P Q) > 0, or zero for a body without one.
     - `weight`: of the distance to the nominal bodies, by `metric`.
     """
 
@@ -177,7 +178,7 @@ class Inertias(Block):
             distance = affine_residual if self.metric == "affine" else entropic_residual
             parts.append(jnp.sqrt(self.weight) * jax.vmap(distance)(U).reshape(-1))
         if self.ellipsoids is not None:
-            # tr(P Q) over its nominal value: one at the start, zero where the mass would sit on the ellipsoid.
+            # tr(P Q) over its nominal value: one at the start, zero for a mass on the ellipsoid's surface.
             factors = self.chart.factors
             P = jnp.einsum("bij,bjk,blk,bml->bim", factors, U, U, factors)
             P0 = jnp.einsum("bij,bkj->bik", factors, factors)
@@ -188,12 +189,12 @@ class Inertias(Block):
         return jnp.concatenate(parts)
 
     def coordinates(self, y) -> Coordinates:
-        """The point in the chart."""
+        """Point in the chart."""
         return Coordinates(self._theta(y), jnp.zeros((0, self.chart.nominal_terms.shape[1]), y.dtype))
 
 
 class Tied(Block):
-    """Entries that follow others: x = scale x_other + offset. They have no coordinates of their own."""
+    """Entries that are functions of others: x = scale x_other + offset. They have no coordinates of their own."""
 
     names: tuple[str, ...] = eqx.field(static=True)
     place: int = eqx.field(static=True)
@@ -211,10 +212,10 @@ class Tied(Block):
         return self.scale * leaves[self.other].reshape(-1)[np.array(self.other_index)] + self.offset
 
     def write(self, y, leaves):
-        _put(leaves, self.place, self.index, self.values(y, leaves))
+        _write_entries(leaves, self.place, self.index, self.values(y, leaves))
 
 
-def _put(leaves: list, place: int, index: Any, values: Array) -> None:
+def _write_entries(leaves: list, place: int, index: Any, values: Array) -> None:
     leaf = leaves[place]
     flat = leaf.reshape(-1).at[np.array(index)].set(values.astype(leaf.dtype))
     leaves[place] = flat.reshape(leaf.shape)

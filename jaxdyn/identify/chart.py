@@ -1,4 +1,4 @@
-"""Coordinates of all feasible models around a nominal one: what the fits search through, and what they return.
+"""Chart: unconstrained coordinates of all feasible models around a nominal one, in which the fits search.
 
 A body's pseudo-inertia is P = U0 (U U^T) U0^T with U0 the factor of the nominal body and U =
 log_cholesky_factor(theta): the nominal body, stretched, sheared, shifted and made heavier. Every theta is a physical
@@ -12,7 +12,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from jaxdyn.identify.friction import POSITIVE, TERMS, Friction, check_terms
+from jaxdyn.identify.torque_terms import POSITIVE, TERMS, Friction, check_terms
 from jaxdyn.model import float64 as _f64
 from jaxdyn.model import inertia as _inertia
 from jaxdyn.model.tree import Model
@@ -21,7 +21,7 @@ INERTIA = ("full", "mass", "fixed")
 
 
 class Coordinates(eqx.Module):
-    """A point in the chart, a pytree: `theta` (bodies, 10), (bodies, 1) or (0, 0); `s` (terms, nv)."""
+    """Point in the chart, a pytree: `theta` (bodies, 10), (bodies, 1) or (0, 0); `s` (terms, nv)."""
 
     theta: Float[Array, "bodies coordinates"]
     s: Float[Array, "terms nv"]
@@ -32,10 +32,10 @@ class Chart(eqx.Module):
 
     - `factors` (bodies, 4, 4): upper-triangular U0 of the nominal pseudo-inertias of the bodies that have mass.
       Massless bodies stay massless.
-    - `origin` (bodies, 4, 4): upper-triangular; U is origin @ log_cholesky_factor(theta), so the chart can be moved to
-      where a fit has come to. The identity at first.
+    - `origin` (bodies, 4, 4): upper-triangular; U is origin @ log_cholesky_factor(theta), so the chart can be moved along with
+      a fit. The identity at first.
     - `scale` (terms, nv): torque-sized units of the terms.
-    - `nominal_inertias` (nb, 10) and `nominal_terms` (4, nv): the model's values, kept by what is not fitted.
+    - `nominal_inertias` (nb, 10) and `nominal_terms` (4, nv): the model's values, of everything that is not fitted.
     """
 
     factors: Float[Array, "bodies 4 4"]
@@ -50,14 +50,14 @@ class Chart(eqx.Module):
 
     @eqx.filter_jit
     def relative_factors(self, theta: Float[Array, "bodies n"]) -> Float[Array, "bodies 4 4"]:
-        """U of every body, relative to the nominal one."""
+        """Factors U of every body, relative to the nominal one."""
         fill = jnp.zeros((theta.shape[0], 10 - theta.shape[1]), theta.dtype)  # "mass": alpha alone moves
         steps = jax.vmap(_inertia.log_cholesky_factor)(jnp.concatenate([theta, fill], axis=1))
         return jnp.einsum("bij,bjk->bik", self.origin, steps)
 
     @eqx.filter_jit
     def inertias(self, theta: Float[Array, "bodies n"]) -> Float[Array, "nb 10"]:
-        """The ten numbers of every body."""
+        """Ten inertial parameters of every body."""
         if not self.bodies:
             return self.nominal_inertias
         upper = jnp.einsum("bij,bjk->bik", self.factors, self.relative_factors(theta))
@@ -66,7 +66,7 @@ class Chart(eqx.Module):
 
     @eqx.filter_jit
     def term_values(self, s: Float[Array, "terms nv"]) -> Float[Array, "4 nv"]:
-        """Values of all `TERMS`: those fitted at s, the others at the model's value."""
+        """Values of all `TERMS`: fitted ones at s, others at the model's value."""
         fitted = self.scale * jnp.where(positive_terms(self.terms), s * s, s)
         rows = [
             fitted[self.terms.index(term)] if term in self.terms else self.nominal_terms[i]
@@ -80,10 +80,10 @@ class Chart(eqx.Module):
         return jnp.concatenate([self.inertias(point.theta).reshape(-1), self.term_values(point.s).reshape(-1)])
 
     @eqx.filter_jit
-    def fitted(self, model: Model, point: Coordinates) -> tuple[Model, Friction]:
-        """`model` with the inertias, armature, damping and friction of a point, and the friction law with its offset."""
+    def model_at(self, model: Model, point: Coordinates) -> tuple[Model, Friction]:
+        """Model with the inertias, armature, damping and friction of a point, and the friction law with its offset."""
         viscous, coulomb, offset, armature = self.term_values(point.s)
-        # A leaf that is absent and not fitted stays absent.
+        # A leaf that is absent and not fitted stays absent, so that no program compiles it.
         model = model.replace(
             inertias=self.inertias(point.theta),
             armature=None if model.armature is None and "armature" not in self.terms else armature,
@@ -103,14 +103,14 @@ class Chart(eqx.Module):
         return jnp.sum(upper**2) - 2 * jnp.sum(jnp.log(diagonal)) - 4.0 * len(self.bodies)
 
     @eqx.filter_jit
-    def settled(self, point: Coordinates) -> Coordinates:
-        """The point with terms below a millionth of their unit at zero, which fits approach without end."""
+    def clip_terms(self, point: Coordinates) -> Coordinates:
+        """Point with terms below a millionth of their unit set to zero, which fits approach but never reach."""
         tiny = positive_terms(self.terms) & (point.s**2 < 1e-6)
         return Coordinates(point.theta, jnp.where(tiny, jnp.zeros_like(point.s), point.s))
 
 
 def check_bodies(model) -> None:
-    """**Raises:** ValueError for a system that is no `Model`."""
+    """Check that a system has bodies. **Raises:** ValueError for a system that is no `Model`."""
     if not isinstance(model, Model):
         raise ValueError(
             f"model is a {type(model).__name__}; this fit searches the inertias of a Model's bodies: fit numbers of other "
@@ -121,7 +121,7 @@ def check_bodies(model) -> None:
 def make_chart(
     model: Model, terms, v_s, inertia: str, tau_scale, v_scale, a_scale, *, bodies=None
 ) -> tuple[Chart, Coordinates]:
-    """Chart around a model, and the point to start from: the model's own numbers, a tenth of a unit where it has none.
+    """Chart around a model, and the start in it: the model's own numbers, a tenth of a unit where it has none.
 
     `bodies`: indices of those whose inertias can change, all that have mass by default.
 
@@ -132,7 +132,7 @@ def make_chart(
     """
     terms = check_terms(terms, v_s)
     if inertia not in INERTIA:
-        raise ValueError(f"inertia is {inertia!r}; take one of {INERTIA}")
+        raise ValueError(f"inertia is {inertia!r}; give one of {INERTIA}")
     dtype = np.dtype(model.home.dtype)
     numbers = np.asarray(model.inertias, np.float64)
     massive = tuple(int(i) for i in np.flatnonzero(numbers[:, 0] > 0)) if inertia != "fixed" else ()
@@ -158,7 +158,7 @@ def make_chart(
         raise ValueError(
             f"{terms[row]} of coordinate {column} is {own[row, column]} in the model; it must not be negative"
         )
-    # Zero is a stationary point of s^2: start beside it.
+    # Zero is a stationary point of s^2, from which no gradient leads away: start near it.
     s = np.where(positive_terms(terms), np.sqrt(np.where(own > 0, own / scale, 0.1)), 0.0)
     size = {"full": 10, "mass": 1, "fixed": 0}[inertia]
     chart = Chart(
@@ -182,12 +182,12 @@ def _own_terms(model: Model) -> dict[str, Array]:
 
 
 def positive_terms(terms) -> np.ndarray:
-    """(terms, 1) of bool: which terms are zero or above."""
+    """Mask (terms, 1) of the terms that must not be negative."""
     return np.array([[term in POSITIVE] for term in terms], bool).reshape(len(terms), 1)
 
 
 def _is_feasible(matrix: np.ndarray, inertia: str) -> bool:
-    """Positive definite; rods and points (semidefinite) will do where the density alone is fitted."""
+    """Decide whether a pseudo-inertia is positive definite, or semidefinite (rods, points) where only the density is fitted."""
     values = np.linalg.eigvalsh(matrix)
     return bool(values[0] > (1e-14 if inertia == "full" else -1e-9) * values[-1])
 

@@ -1,8 +1,8 @@
-"""Checkpoints of long fits: what a fit needs to go on to the same numbers, written so that no half of one is ever read.
+"""Checkpoints and progress of long fits.
 
-A checkpoint is a line of JSON (the problem, the arrays, the checksum of what follows), then the arrays, as
-`equinox.tree_serialise_leaves` writes them. It is written beside its final name, flushed to the disk, and renamed: a
-process that is killed at any time leaves the checkpoint before, or the new one.
+A checkpoint is a line of JSON (the problem, the arrays, the checksum of the rest), then the arrays, as
+`equinox.tree_serialise_leaves` writes them. It is written next to its final name, flushed to the disk, and renamed: a
+process that is killed at any time leaves the previous checkpoint, or the new one, and never half of one.
 """
 
 import dataclasses
@@ -12,7 +12,9 @@ import json
 import os
 import pathlib
 import re
+import sys
 import time
+from collections.abc import Callable
 from typing import Any
 
 import equinox as eqx
@@ -21,13 +23,13 @@ import numpy as np
 
 from jaxdyn.model.arguments import as_path
 
-_FORMAT = 1
+_FORMAT = 2
 
 
 def fingerprint(*trees: Any) -> str:
-    """A hash of all numbers and of the structure of trees: the same in every process that builds them alike."""
+    """Hash of all numbers and of the structure of trees: the same in every process that builds them alike."""
     leaves, structure = jax.tree.flatten(trees)
-    # Functions are known by their names; where they stand in memory differs from process to process.
+    # Functions count by their names; their addresses differ from process to process.
     digest = hashlib.sha256(re.sub(r" at 0x[0-9a-f]+", "", str(structure)).encode())
     for leaf in leaves:
         if isinstance(leaf, (jax.Array, np.ndarray, float, int)):
@@ -40,7 +42,7 @@ def fingerprint(*trees: Any) -> str:
 
 @dataclasses.dataclass
 class Checkpoint:
-    """Where a fit keeps its state: `path`, the fingerprint of its `problem`, and how often, in steps or seconds."""
+    """File with the state of a fit: its `path`, the fingerprint of the `problem`, and the interval in steps or seconds."""
 
     path: pathlib.Path
     problem: str
@@ -50,9 +52,9 @@ class Checkpoint:
     _last: float = dataclasses.field(default_factory=time.monotonic)
 
     def load(self) -> dict[str, np.ndarray] | None:
-        """The arrays of the last state; None where there is none to resume from.
+        """Read the arrays of the last state; None where there is none to resume from.
 
-        **Raises:** ValueError for a checkpoint of another problem, and for a file that is no whole checkpoint.
+        **Raises:** ValueError for a checkpoint of another problem, and for a file that is no complete checkpoint.
         """
         if not (self.resume and self.path.exists()):
             return None
@@ -66,7 +68,7 @@ class Checkpoint:
         return eqx.tree_deserialise_leaves(io.BytesIO(payload), like)
 
     def save(self, step: int, state: dict[str, Any], *, last: bool = False) -> None:
-        """Write the state, if it is time to."""
+        """Write the state where the interval has passed, or `last`."""
         due = self.steps > 0 and step % self.steps == 0
         if not (last or due or time.monotonic() - self._last >= self.seconds):
             return
@@ -75,9 +77,9 @@ class Checkpoint:
 
 
 def checkpoint_at(path: Any, problem: Any, every: Any, resume: bool) -> Checkpoint | None:
-    """The checkpoint of a fit, or None without a path. `every`: steps (an integer), or seconds (a float).
+    """Checkpoint of a fit, or None without a path. `every`: steps (an integer), or seconds (a float).
 
-    **Raises:** ValueError for what is no path or no positive number.
+    **Raises:** ValueError for a path that is none, or an interval that is no positive number.
     """
     if path is None:
         return None
@@ -88,7 +90,7 @@ def checkpoint_at(path: Any, problem: Any, every: Any, resume: bool) -> Checkpoi
 
 
 def write(path: pathlib.Path, problem: str, arrays: dict[str, np.ndarray]) -> None:
-    """Write a checkpoint so that `path` holds the one before or this one, whenever the process ends."""
+    """Write a checkpoint atomically: `path` holds the previous one or this one whenever the process ends."""
     buffer = io.BytesIO()
     eqx.tree_serialise_leaves(buffer, arrays)
     payload = buffer.getvalue()
@@ -99,21 +101,21 @@ def write(path: pathlib.Path, problem: str, arrays: dict[str, np.ndarray]) -> No
         "sha256": hashlib.sha256(payload).hexdigest(),
     }
     path.parent.mkdir(parents=True, exist_ok=True)
-    beside = path.with_name(f".{path.name}.{os.getpid()}.part")
+    partial = path.with_name(f".{path.name}.{os.getpid()}.part")
     try:
-        with open(beside, "wb") as file:
+        with open(partial, "wb") as file:
             file.write(json.dumps(header).encode() + b"\n" + payload)
             file.flush()
             os.fsync(file.fileno())
-        os.replace(beside, path)
+        os.replace(partial, path)
     finally:
-        beside.unlink(missing_ok=True)
+        partial.unlink(missing_ok=True)
 
 
 def read(path: pathlib.Path) -> tuple[dict, bytes]:
-    """Header and arrays of a checkpoint.
+    """Read the header and the arrays of a checkpoint.
 
-    **Raises:** ValueError for a file that is none, or not whole.
+    **Raises:** ValueError for a file that is no complete checkpoint.
     """
     line, _, payload = path.read_bytes().partition(b"\n")
     try:
@@ -122,5 +124,52 @@ def read(path: pathlib.Path) -> tuple[dict, bytes]:
     except (ValueError, KeyError, TypeError):
         whole, header = False, {}
     if not whole:
-        raise ValueError(f"{path} is no whole checkpoint of a fit; remove it, or name another file")
+        raise ValueError(f"{path} is no complete checkpoint of a fit; remove it, or name another file")
     return header, payload
+
+
+class Watch:
+    """Progress of a fit: calls the user's function, prints, writes checkpoints, and decides whether the fit continues.
+
+    `steps`: the most steps. `callback(step, loss, point)` returns True to stop. `seconds`: of the whole fit.
+    """
+
+    def __init__(
+        self,
+        steps: int,
+        callback: Callable | None = None,
+        *,
+        checkpoint: Checkpoint | None = None,
+        show: bool = False,
+        seconds: float | None = None,
+    ):
+        self.steps, self.callback, self.checkpoint = steps, callback, checkpoint
+        self.show, self.seconds = show, seconds
+        self.started, self.first, self.printed = time.monotonic(), None, 0.0
+        self.failed: Any = None  # the point with errors that are not finite, where these ended the fit
+
+    def load(self) -> dict | None:
+        """State to resume from, if any."""
+        return None if self.checkpoint is None else self.checkpoint.load()
+
+    def continues(self, step: int, loss: float, point: Any, state: Callable[[], dict]) -> bool:
+        """Report a point; False when the fit is to stop there. `state()` gives the arrays of a checkpoint."""
+        stopped = self.callback is not None and self.callback(step, loss, point) is True
+        now = time.monotonic()
+        stopped = stopped or (self.seconds is not None and now - self.started > self.seconds)
+        if self.first is None:
+            self.first = (step, now)
+        if self.show and (now - self.printed > 0.5 or stopped):
+            self.printed = now
+            print(self.line(step, loss, now), file=sys.stderr, flush=True)
+        if self.checkpoint is not None:
+            self.checkpoint.save(step, state(), last=stopped)
+        return not stopped
+
+    def line(self, step: int, loss: float, now: float) -> str:
+        """Line of progress for a point."""
+        begin, at = self.first or (step, now)
+        left = ""
+        if step > begin:
+            left = f", at most {(now - at) / (step - begin) * (self.steps - step):.0f} s left"
+        return f"step {step} of at most {self.steps}: loss {loss:.6g}, {now - self.started:.1f} s{left}"

@@ -1,9 +1,9 @@
-"""Logs condensed to triangles: whatever a fit asks of the stacked regressor, at a cost that does not grow with the logs.
+"""Logs condensed to triangles by QR: all that a fit needs of the stacked regressor, at a cost independent of the logs' length.
 
 The rows of one torque hold the inertial columns and that torque's own terms. For each block of consecutive samples and each
 torque they are replaced by the triangle of their QR factorisation, which keeps all squares and products. Weights of torques,
-samples that are left out, and columns that are left out can then be chosen afterwards, and the error that parameters make on a
-block is known without its samples.
+samples to leave out, and columns to leave out can then be chosen afterwards, and the error of parameters on a block is known
+without its samples.
 """
 
 import dataclasses
@@ -64,23 +64,25 @@ class Blocks:
         return self.shared + self.terms * self.nv
 
     def places(self, joint: int) -> np.ndarray:
-        """Positions in x of the columns that one torque has."""
+        """Indices in x of the columns of one torque."""
         return np.concatenate([np.arange(self.shared), self.shared + joint + self.nv * np.arange(self.terms)])
 
-    def merged(self, chosen=None) -> list[np.ndarray]:
-        """One triangle for each torque, of the blocks chosen (an array of bool or of numbers; None: all)."""
-        picked = np.arange(len(self)) if chosen is None else np.arange(len(self))[chosen]
+    def merge(self, chosen=None) -> list[np.ndarray]:
+        """One triangle for each torque, of some blocks (an array of bool or of indices; None: all)."""
+        chosen_blocks = np.arange(len(self)) if chosen is None else np.arange(len(self))[chosen]
         return [
-            np.asarray(np.linalg.qr(np.concatenate([self.triangles[block][joint] for block in picked]), mode="r"))
+            np.asarray(
+                np.linalg.qr(np.concatenate([self.triangles[block][joint] for block in chosen_blocks]), mode="r")
+            )
             for joint in range(self.nv)
         ]
 
     def squares(self, x: np.ndarray, chosen=None) -> np.ndarray:
-        """Sums of squared errors (blocks, nv) that the parameters x make on the blocks chosen."""
-        picked = np.arange(len(self)) if chosen is None else np.arange(len(self))[chosen]
+        """Sums of squared errors (blocks, nv) of the parameters x on some blocks."""
+        chosen_blocks = np.arange(len(self)) if chosen is None else np.arange(len(self))[chosen]
         columns = [np.append(x[self.places(joint)], -1.0) for joint in range(self.nv)]
         return np.array(
-            [[np.sum((R @ c) ** 2) for R, c in zip(self.triangles[i], columns, strict=True)] for i in picked]
+            [[np.sum((R @ c) ** 2) for R, c in zip(self.triangles[i], columns, strict=True)] for i in chosen_blocks]
         )
 
     def torque_squares(self, chosen=None) -> np.ndarray:
@@ -106,26 +108,26 @@ class Blocks:
         return result
 
     def rows(self, weights: np.ndarray, chosen=None) -> np.ndarray:
-        """Rows [W, w] (m, p + 1) with the squares and products of the blocks chosen, each torque's times its weight."""
+        """Rows [W, w] (m, p + 1) with the squares and products of some blocks, each torque's times its weight."""
         parts = []
-        for joint, R in enumerate(self.merged(chosen)):
+        for joint, R in enumerate(self.merge(chosen)):
             part = np.zeros((len(R), self.size + 1))
             part[:, np.append(self.places(joint), self.size)] = weights[joint] * R
             parts.append(part)
         return np.concatenate(parts)
 
     def count(self, chosen=None) -> int:
-        """Number of torques measured in the blocks chosen."""
+        """Number of torques measured in some blocks."""
         samples = self.samples if chosen is None else self.samples[chosen]
         return int(samples.sum()) * self.nv
 
 
-def condensed_rows(rows: np.ndarray, count: int) -> Condensed:
+def condense_rows(rows: np.ndarray, count: int) -> Condensed:
     """`Condensed` of rows [W, w] (m, p + 1) that stand for `count` torques."""
-    return condensed_triangle(np.asarray(np.linalg.qr(rows, mode="r")), count)
+    return pad_triangle(np.asarray(np.linalg.qr(rows, mode="r")), count)
 
 
-def condensed_triangle(triangle: np.ndarray, count: int) -> Condensed:
+def pad_triangle(triangle: np.ndarray, count: int) -> Condensed:
     """`Condensed` of rows [W, w] that are a triangle (m, p + 1) already, as of `numpy.linalg.qr`."""
     p = triangle.shape[1] - 1
     triangle = np.concatenate([triangle, np.zeros((max(p + 1 - len(triangle), 0), p + 1))])
@@ -133,7 +135,7 @@ def condensed_triangle(triangle: np.ndarray, count: int) -> Condensed:
 
 
 def block_slices(lengths: Sequence[int], total: int) -> list[tuple[int, slice]]:
-    """About `total` blocks of logs of these lengths, (log, its samples): none crosses a joint, each log has one at least."""
+    """Cut logs of these lengths into about `total` blocks, (log, its samples), each within one log; a log has at least one."""
     result = []
     for which, length in enumerate(lengths):
         count = min(max(1, round(total * length / sum(lengths))), length)
@@ -155,7 +157,7 @@ def condense_blocks(
 
     **Arguments:** `logs`; `rows(which, piece)`, the regressor (n, nv, s + k nv) of some samples of a log, whose terms are
     diagonal blocks; `shared`, its number s of columns before the terms; `extra`: for each log, more terms (n, nv, k');
-    `blocks`: about how many, over all logs; `weights`: for each log, those of its torques (n, nv), ones by default.
+    `blocks`: their approximate number, over all logs; `weights`: for each log, those of its torques (n, nv), ones by default.
     """
     triangles, samples, owners = [], [], []
     for which, part in block_slices([len(log) for log in logs], blocks):

@@ -1,8 +1,7 @@
-"""Delays between the signals of positions and of torques, found with the robot's own numbers.
+"""Delays between the signals of positions and of torques, fitted together with the robot's parameters.
 
-A torque recorded late by d is tau(t) = T(t - d), with T what the robot needs. To first order that is T - d dT/dt: one column
-for each joint, with d its coefficient, whose interval comes out like every other. The logs are then shifted by what was found,
-and fitted again, until nothing is left to shift.
+A torque T recorded late by d is tau(t) = T(t - d), to first order T - d dT/dt: one column for each joint, with d its coefficient,
+whose interval follows like any other. The logs are then shifted by d and fitted again, until the shifts vanish.
 """
 
 from collections.abc import Sequence
@@ -10,29 +9,29 @@ from typing import NamedTuple
 
 import numpy as np
 
+from jaxdyn.identify.condensed_fit import Estimate, Setting
 from jaxdyn.identify.intervals import Intervals
 from jaxdyn.identify.logs import Log
-from jaxdyn.identify.one_fit import Estimate, Setting
 from jaxdyn.identify.result import Fit
 from jaxdyn.identify.robot_problem import RobotProblem
-from jaxdyn.identify.selection import folds, helped
+from jaxdyn.identify.selection import folds, improving_torques
 from jaxdyn.identify.torque_terms import TorqueTerm
 from jaxdyn.model.arguments import Numbers
 from jaxdyn.model.tree import Model
 
-# Shifts smaller than this (s) are none; the largest of one step, and how many steps are made.
+# Smallest shift (s) that counts, largest shift of one step, and most steps.
 _SMALL, _STEP, _ROUNDS = 1e-6, 0.03, 12
 # Share of a standard deviation that the last step may be.
 _SETTLED = 0.1
 
 
 class Delays(NamedTuple):
-    """How late the torques of a robot's logs are, against its positions.
+    """Delays of the torques of a robot's logs against its positions.
 
-    - `seconds` (nv,): delays, negative where torques come early; zero where a delay helped nothing.
+    - `seconds` (nv,): delays, negative where torques come early; zero where a delay lowers no error.
     - `std` (nv,): standard deviations by blocks of samples, as in `Intervals`; `factor`: a 95 % interval is plus and minus this
-      many of them. Infinite std of a delay that was given.
-    - `squares`: squared errors (folds, nv) on parts left out in turn, without the delays and with them; None for given ones.
+      many of them. A given delay has an infinite std.
+    - `squares`: squared errors (folds, nv) of folds left out in turn, without the delays and with them; None for given ones.
     """
 
     seconds: np.ndarray
@@ -42,10 +41,10 @@ class Delays(NamedTuple):
 
 
 def shift_torques(log: Log, delay: Numbers) -> Log:
-    """A log whose torques are those recorded `delay` later (s), a number or one for each torque (nv,).
+    """Shift the torques of a log: they become those recorded `delay` later (s), a number or one for each torque (nv,).
 
-    The torques are interpolated by cubic splines; samples whose torque lies beyond the ends of the log are dropped. A log that
-    went through a low-pass (`from_raw`) holds nothing that this would change: with 15 samples to a period of the cut-off the
+    The torques are interpolated by cubic splines; samples whose torque lies beyond the ends of the log are dropped. Splines
+    hardly change a log that was low-passed (`from_raw`): with 15 samples to a period of the cut-off the
     error there is 4e-4 of the amplitude.
 
     **Raises:** ValueError for delays of another shape, that are not finite, or longer than the log.
@@ -64,9 +63,11 @@ def shift_torques(log: Log, delay: Numbers) -> Log:
         raise ValueError(f"delay is {delay.tolist()} s, and the log {t[-1] - t[0]:.4g} s long; nothing is left of it")
     (inside,) = np.nonzero(kept)
     rows = slice(int(inside[0]), int(inside[-1]) + 1)
-    moved = [CubicSpline(t, column)(t[rows] + d) for column, d in zip(tau.T, delay, strict=True)]
+    shifted = [CubicSpline(t, column)(t[rows] + d) for column, d in zip(tau.T, delay, strict=True)]
     part = log[rows]
-    return Log(part.t, part.q, part.v, part.a, np.stack(moved, axis=1), joint_names=log.joint_names, cutoff=log.cutoff)
+    return Log(
+        part.t, part.q, part.v, part.a, np.stack(shifted, axis=1), joint_names=log.joint_names, cutoff=log.cutoff
+    )
 
 
 def find_delays(
@@ -81,16 +82,16 @@ def find_delays(
     inertia: str,
     blocks: int,
 ) -> Delays:
-    """Delays of all torques at a setting, from a first guess `start` (nv,); the other arguments as of `RobotProblem`.
+    """Fit the delays of all torques at a setting, from a first guess `start` (nv,); the other arguments as of `RobotProblem`.
 
-    **Raises:** ValueError where the shifts do not settle, which delays longer than the motion's quickest turns do.
+    **Raises:** ValueError where the shifts do not converge, as for delays longer than the fastest reversals of the motion.
     """
     used = tuple(term for term in extra if term.name in dict(setting.extra))
     every = tuple(range(model.nv))
     free = setting._replace(extra=(*setting.extra, (_DELAY.name, every)))
     delay = np.array(start, np.float64)
     for _ in range(_ROUNDS):
-        problem = RobotProblem(model, _shifted(logs, delay), basic, (*used, _DELAY), inertia, blocks)
+        problem = RobotProblem(model, _shift_logs(logs, delay), basic, (*used, _DELAY), inertia, blocks)
         estimate = problem.refine(free, fixed, rounds=2)
         data = problem.data(free)
         column = sum(count for name, count in data.counts.items() if name != _DELAY.name)
@@ -100,34 +101,37 @@ def find_delays(
         delay = delay + np.clip(step, -_STEP, _STEP)
     spread = problem.intervals(free, estimate, problem.result(free, estimate, data))
     std = spread.parameters.std[-model.nv :]
-    # Weights of a robust loss may keep the steps from shrinking below what no one knows anyway.
+    # Changing weights of a robust loss may keep the steps from shrinking below a small share of the standard deviation.
     if np.any(np.abs(step) >= np.maximum(_SMALL, _SETTLED * std)):
         raise ValueError(
-            f"delays do not settle; the last ones are {np.round(delay, 4).tolist()} s. Give them as numbers, or choose a "
+            f"delays do not converge; the last ones are {np.round(delay, 4).tolist()} s. Give them as numbers, or choose a "
             "lower cut-off"
         )
-    # What does not foretell parts that are left out is none. Columns of the delay itself know the torque, and are not used here.
+    # A delay must improve the prediction of left-out blocks. Its own column is made of the measured torque and would give it
+    # away: shifted logs are compared instead.
     squares = []
     for shift in (np.zeros(model.nv), delay):
-        problem = RobotProblem(model, _shifted(logs, shift), basic, used, inertia, blocks)
+        problem = RobotProblem(model, _shift_logs(logs, shift), basic, used, inertia, blocks)
         problem.refine(setting, fixed, rounds=2)
         parts, _ = folds(problem.data(setting).blocks)
-        squares.append(np.array([problem.left_out(setting, part) for part in parts]))
-    kept = np.isin(every, helped(*squares, worth=0.0))
+        squares.append(np.array([problem.validation_squares(setting, part).sum(axis=0) for part in parts]))
+    kept = np.isin(every, improving_torques(squares[0], squares[1], least=0.0))
     return Delays(np.where(kept, delay, 0.0), std, spread.factor, (squares[0], squares[1]))
 
 
 def with_delays(
     problem: RobotProblem, setting: Setting, estimate: Estimate, fit: Fit, delays: Delays
 ) -> tuple[Intervals, Delays]:
-    """Intervals of a fit to shifted logs in which the delays are unknowns like all others, and the delays with theirs.
+    """Intervals of a fit to shifted logs in which delays are unknowns like all others, and the delays with theirs.
 
-    A delay's column is the slope of the torque that the fit foretells, without the noise of the measured one's. What resembles
-    it, viscous friction above all, is then known as well as it is beside it. Delays that help nothing are taken as zero.
+    A delay's column is the time derivative of the predicted torque, without the noise of the measured one. Terms that are
+    correlated with it, viscous friction above all, get wider intervals. Delays that lower no error are zero.
     """
     kept = tuple(int(joint) for joint in np.flatnonzero(delays.seconds))
-    slopes = {id(log): -np.gradient(fit.torques(log), np.asarray(log.t, np.float64), axis=0) for log in problem.logs}
-    term = TorqueTerm(_DELAY.name, lambda log, load, v_s: slopes[id(log)])
+    derivatives = {
+        id(log): -np.gradient(fit.torques(log), np.asarray(log.t, np.float64), axis=0) for log in problem.logs
+    }
+    term = TorqueTerm(_DELAY.name, lambda log, load, v_s: derivatives[id(log)], is_smooth=True)
     wide = problem.with_term(term)
     free = setting._replace(extra=(*setting.extra, (term.name, kept)))
     spread = wide.intervals(free, estimate._replace(x=np.append(estimate.x, np.zeros(problem.model.nv))), fit)
@@ -137,12 +141,12 @@ def with_delays(
     return spread._replace(parameters=spread.parameters._replace(values=values)), delays._replace(std=std)
 
 
-def _shifted(logs: Sequence[Log], delay: np.ndarray) -> tuple[Log, ...]:
+def _shift_logs(logs: Sequence[Log], delay: np.ndarray) -> tuple[Log, ...]:
     return tuple(shift_torques(log, delay) for log in logs)
 
 
-def _slope(log: Log, load: np.ndarray, v_s: float) -> np.ndarray:
+def _negative_derivative(log: Log, load: np.ndarray, v_s: float) -> np.ndarray:
     return -np.gradient(np.asarray(log.tau, np.float64), np.asarray(log.t, np.float64), axis=0)
 
 
-_DELAY = TorqueTerm("delay", _slope)
+_DELAY = TorqueTerm("delay", _negative_derivative, is_smooth=True)

@@ -1,9 +1,10 @@
-"""Damped Gauss-Newton steps for a sum of squared errors that come in pieces, each with a start of its own.
+"""Damped Gauss-Newton steps for a sum of squared errors of log segments, each with an initial state of its own.
 
-What is searched are y (p,) and, where the starts are free too, one vector for each piece. A piece's errors depend on y and on
-its own start alone, so that the starts are eliminated piece by piece and a step costs what it costs for y.
+The unknowns are y (p,) and, where initial states are free too, one vector for each segment. The errors of a segment depend on y
+and on its own initial state alone. Initial states are therefore eliminated segment by segment, and a step costs what it costs
+for y.
 
-Source: Marquardt (1963), damping; Bock (1983), elimination of the starts.
+Source: Marquardt (1963), damping; Bock (1983), elimination of the initial states.
 """
 
 from collections.abc import Callable
@@ -14,26 +15,25 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from jaxdyn.identify.progress import Watch
-from jaxdyn.identify.regression import truncated
+from jaxdyn.identify.descent import Iterate, Method
 
 # Damping of the first step, and its bounds, in shares of the largest curvature.
-_DAMPING, _LEAST_DAMPING, _MOST_DAMPING = 1e-3, 1e-12, 1e6
+DAMPING, _LEAST_DAMPING, _MOST_DAMPING = 1e-3, 1e-12, 1e6
 # Directions with less than this share of the largest effect count as not determined.
-_RANK_TOLERANCE = 1e-6
+RANK_TOLERANCE = 1e-6
 
 
 class Unknowns(eqx.Module):
-    """What is searched: y, and corrections of the initial states of the pieces in units of their scale, or None."""
+    """Unknowns of a fit: y, and corrections of the initial states of the segments in units of their scale, or None."""
 
     y: Float[Array, " p"]
-    start: Float[Array, "pieces 2 nv"] | None
+    start: Float[Array, "segments 2 nv"] | None
 
 
-class Linear(NamedTuple):
-    """The errors near a point, at the starts that fit best: errors + rows dy, at dstart = -(offset + gain dy).
+class LinearErrors(NamedTuple):
+    """Errors near a point, at the best initial states: errors + rows dy, at dstart = -(offset + gain dy).
 
-    `errors` (n,); `rows` (n, p); `offset` (pieces, 2 nv) and `gain` (pieces, 2 nv, p) where the starts are free.
+    `errors` (n,); `rows` (n, p); `offset` (segments, 2 nv) and `gain` (segments, 2 nv, p) where initial states are free.
     """
 
     loss: float
@@ -41,25 +41,25 @@ class Linear(NamedTuple):
     rows: np.ndarray
     offset: Any = None
     gain: Any = None
-    by_starts: float = 0.0  # what the starts alone would take from the loss
-    priors: int = 0  # how many of the errors, the last ones, are those of the prior
+    start_decrease: float = 0.0  # decrease of the loss by the best initial states alone
+    priors: int = 0  # number of the errors, the last ones, that are those of the prior
     prior_weight: float = 1.0
-    start_rank: int = 0  # how many directions of the starts have an effect
+    start_rank: int = 0  # number of directions of the initial states that have an effect
 
     @property
-    def finite(self) -> bool:
-        """Whether a step can be computed from here."""
+    def is_finite(self) -> bool:
+        """True where a step can be computed from here."""
         return bool(np.isfinite(self.loss) and np.isfinite(self.rows).all())
 
     def step(self, damping: float) -> tuple[np.ndarray, float]:
-        """dy (p,), and by how much the loss should fall; `damping` in shares of the largest curvature."""
+        """Step dy (p,) and the decrease of the loss that it predicts; `damping` in shares of the largest curvature."""
         hessian, gradient = self.rows.T @ self.rows, self.rows.T @ self.errors
         size = damping * max(float(np.diag(hessian).max()), 1e-300)
         dy = -np.linalg.solve(hessian + size * np.eye(len(hessian)), gradient)
-        return dy, self.by_starts + float(dy @ (size * dy - gradient))
+        return dy, self.start_decrease + float(dy @ (size * dy - gradient))
 
-    def moved(self, estimate: Unknowns, dy: np.ndarray) -> Unknowns:
-        """The unknowns after a step."""
+    def update(self, estimate: Unknowns, dy: np.ndarray) -> Unknowns:
+        """Unknowns after a step."""
         dtype, start = estimate.y.dtype, estimate.start
         if start is not None:
             change = jnp.asarray(self.offset + self.gain @ dy, dtype)
@@ -67,87 +67,34 @@ class Linear(NamedTuple):
         return Unknowns(estimate.y + jnp.asarray(dy, dtype), start)
 
 
-def linear(errors, by_y, by_start) -> Linear:
-    """From the errors (pieces, n), and their slopes by y (pieces, n, p) and by the starts (pieces, n, 2 nv), or None.
+def eliminate_starts(errors, by_y, by_start) -> LinearErrors:
+    """Linear errors of (segments, n), with Jacobians by y (segments, n, p) and by initial states (segments, n, 2 nv), or None.
 
-    The loss is infinite where squares of the slopes are: no step could be computed from there.
+    The loss is infinite where squares of the Jacobians are: no step could be computed from there.
     """
     errors, by_y = np.asarray(errors, np.float64), np.asarray(by_y, np.float64)
     p, largest = by_y.shape[-1], max(float(np.abs(x).max(initial=0)) for x in (errors, by_y))
     if not largest < 1e150:
-        return Linear(np.inf, errors.reshape(-1), by_y.reshape(-1, p))
+        return LinearErrors(np.inf, errors.reshape(-1), by_y.reshape(-1, p))
     loss = float(np.sum(errors**2))
     if by_start is None:
-        return Linear(loss, errors.reshape(-1), by_y.reshape(-1, p))
-    # Starts of mechanisms are put on the constraints: not all of their directions have an effect.
+        return LinearErrors(loss, errors.reshape(-1), by_y.reshape(-1, p))
+    # Initial states of mechanisms are projected onto the constraints: not all of their directions have an effect.
     U, s, Vt = np.linalg.svd(np.asarray(by_start, np.float64), full_matrices=False)
-    kept = s > _RANK_TOLERANCE * s.max(axis=1, keepdims=True, initial=0.0)
-    basis, inverse = U * kept[:, None], np.swapaxes(Vt, 1, 2) / np.where(kept, s, np.inf)[:, None]
-    turned = np.swapaxes(basis, 1, 2)
-    shares, own = turned @ by_y, turned @ errors[..., None]
+    has_effect = s > RANK_TOLERANCE * s.max(axis=1, keepdims=True, initial=0.0)
+    basis, inverse = U * has_effect[:, None], np.swapaxes(Vt, 1, 2) / np.where(has_effect, s, np.inf)[:, None]
+    transpose = np.swapaxes(basis, 1, 2)
+    shares, own = transpose @ by_y, transpose @ errors[..., None]
     rest, rows = errors - (basis @ own)[..., 0], by_y - basis @ shares
     offset, gain = (inverse @ own)[..., 0], inverse @ shares
-    return Linear(
-        loss, rest.reshape(-1), rows.reshape(-1, p), offset, gain, float(np.sum(own**2)), start_rank=int(kept.sum())
+    decrease = float(np.sum(own**2))
+    return LinearErrors(
+        loss, rest.reshape(-1), rows.reshape(-1, p), offset, gain, decrease, start_rank=int(has_effect.sum())
     )
 
 
-def gauss_newton(
-    linearise: Callable[[Unknowns], Linear], estimate: Unknowns, *, tolerance: float, watch: Watch
-) -> tuple[Unknowns, Linear, np.ndarray, str]:
-    """Minimise the sum of squared errors from `estimate`, or from where the watch's checkpoint says.
-
-    A step is damped the more, the more often steps in a row failed to lower the loss; where it is not finite, too.
-
-    **Arguments:** `tolerance`: it has converged when the next step promises to lower the loss by less than this share of it;
-    `watch` is told of every point, the start included.
-
-    **Returns:** the unknowns; the errors near them; the loss at every point (steps + 1,); "converged", "max_steps",
-    "stopped", or "not_finite" where the start is.
-
-    **Raises:** ValueError for numbers that are not positive.
-    """
-    if not (watch.steps > 0 and tolerance >= 0):
-        raise ValueError(
-            f"steps={watch.steps}, tolerance={tolerance}; steps must be positive and tolerance not negative"
-        )
-    rounding = float(jnp.finfo(estimate.y.dtype).eps)
-    history, damping, kept = [], _DAMPING, watch.load()
-    if kept is not None:
-        estimate = Unknowns(jnp.asarray(kept["y"]), None if estimate.start is None else jnp.asarray(kept["start"]))
-        # The point's own loss comes again, with the same bits.
-        history, damping = kept["history"][:-1].tolist(), float(kept["damping"])
-    here = linearise(estimate)
-
-    def state():
-        kept = {"y": estimate.y, "damping": np.float64(damping), "history": np.array(history)}
-        return kept if estimate.start is None else kept | {"start": estimate.start}
-
-    while True:
-        history.append(here.loss)
-        goes_on = watch.goes_on(len(history) - 1, here.loss, estimate, state)
-        if not here.finite:
-            return estimate, here, np.array(history), "not_finite"
-        if here.loss <= (10 * rounding) ** 2:
-            return estimate, here, np.array(history), "converged"
-        if not goes_on:
-            return estimate, here, np.array(history), "stopped"
-        if len(history) > watch.steps:
-            return estimate, here, np.array(history), "max_steps"
-        while True:
-            dy, fall = here.step(damping)
-            if damping > _MOST_DAMPING or fall <= max(tolerance, 1e3 * rounding) * here.loss:
-                return estimate, here, np.array(history), "converged"
-            trial = here.moved(estimate, dy)
-            there = linearise(trial)
-            if there.finite and there.loss < here.loss:
-                break
-            damping *= 10
-        estimate, here, damping = trial, there, max(damping / 10, _LEAST_DAMPING)
-
-
-def with_prior(data: Linear, residual, rows, weight: float) -> Linear:
-    """The errors of the data and, behind them, those of the prior, whose squares count `weight` times."""
+def with_prior(data: LinearErrors, residual, rows, weight: float) -> LinearErrors:
+    """Errors of the data followed by those of the prior, whose squares count `weight` times."""
     residual, rows = (weight**0.5 * np.asarray(x, np.float64) for x in (residual, rows))
     return data._replace(
         loss=data.loss + float(residual @ residual),
@@ -158,45 +105,49 @@ def with_prior(data: Linear, residual, rows, weight: float) -> Linear:
     )
 
 
-class Determined(NamedTuple):
-    """The errors near a minimum in coordinates in which data and prior together have the curvature 1.
+class GaussNewton(Method):
+    """Gauss-Newton steps with Marquardt's damping, which grows tenfold with every trial that fails to lower the loss.
 
-    `data` (n, r), `errors` (n,): rows and errors of the data over their deviation; `prior` (k, r): rows of the prior; `numbers`
-    (m, r): slopes of numbers; `idle` (m,): which of these neither data nor prior determine.
+    **Arguments:** `linearise`, from unknowns to `LinearErrors`; `tolerance`: it has converged when the next step predicts a
+    decrease of the loss by less than this share of it; `rounding` of the unknowns.
+
+    The state of an iterate is its linear errors and the damping.
     """
 
-    data: np.ndarray
-    errors: np.ndarray
-    prior: np.ndarray
-    numbers: np.ndarray
-    idle: np.ndarray
+    def __init__(self, linearise: Callable[[Unknowns], LinearErrors], tolerance: float, rounding: float):
+        if not tolerance >= 0:
+            raise ValueError(f"tolerance is {tolerance}; it must not be negative")
+        self.linearise, self.tolerance = linearise, max(tolerance, 1e3 * rounding)
+        self.floor = (10 * rounding) ** 2
+
+    def init(self, start, kept):
+        """Linearise the start."""
+        return self._iterate(start, self.linearise(start), DAMPING if kept is None else float(kept["damping"]))
+
+    def step(self, iterate, history, best):
+        """Increase the damping until a step lowers the loss."""
+        here, damping = iterate.state
+        while True:
+            trial = propose(here, damping, self.tolerance)
+            if trial is None:
+                return iterate, "converged"
+            point = here.update(iterate.point, trial)
+            there = self.linearise(point)
+            # A trial that is not finite is one that failed, not an end: a shorter step may be finite.
+            if there.is_finite and there.loss < here.loss:
+                return self._iterate(point, there, max(damping / 10, _LEAST_DAMPING)), None
+            damping *= 10
+
+    def arrays(self, iterate):
+        """Damping."""
+        return {"damping": np.float64(iterate.state[1])}
+
+    @staticmethod
+    def _iterate(point: Unknowns, here: LinearErrors, damping: float) -> Iterate:
+        return Iterate(point, here.loss, (here, damping), here.is_finite)
 
 
-def determined(end: Linear, slopes: np.ndarray) -> Determined | None:
-    """What numbers with the slopes (m, p) by y are told by; None when the errors are not finite, or no more than the unknowns.
-
-    Errors of the data have one size, which is theirs; those of the prior the size it says.
-    """
-    if not end.finite:
-        return None
-    count = len(end.errors) - end.priors
-    data = end.rows[:count]
-    fit = truncated(data, end.errors[:count], _RANK_TOLERANCE)
-    spare = count - end.start_rank - (fit.rank if end.priors == 0 else 0)
-    if spare <= 0:
-        return None
-    noise = (max(float(np.sum(end.errors[:count] ** 2)), 1e-300) / spare) ** 0.5
-    # The prior's rows were weighed by a noise that was assumed: here by the one that is seen.
-    rows = np.concatenate([data / noise, end.rows[count:] / end.prior_weight**0.5])
-    size = np.linalg.norm(rows, axis=0)
-    size[size <= 1e-12 * size.max(initial=0.0)] = np.inf
-    _, s, Vt = np.linalg.svd(np.linalg.qr(rows / size)[1], full_matrices=True)
-    rank = int(np.sum(s > _RANK_TOLERANCE * s.max(initial=0.0)))
-    unseen = np.isinf(size)
-    scaled = slopes / np.where(unseen, 1.0, size)
-    seen = np.where(unseen[None], 0.0, scaled)
-    idle = np.linalg.norm(seen @ Vt[rank:].T, axis=1) > 1e-6 * np.linalg.norm(seen, axis=1)
-    idle |= np.abs(scaled[:, unseen]).sum(axis=1) > 0
-    turned = Vt[:rank].T / s[:rank]
-    rows = (rows / size) @ turned
-    return Determined(rows[:count], end.errors[:count] / noise, rows[count:], seen @ turned, idle)
+def propose(here: LinearErrors, damping: float, tolerance: float) -> np.ndarray | None:
+    """Step dy (p,) at a damping; None where it predicts no decrease beyond `tolerance`, or the damping has no effect left."""
+    dy, decrease = here.step(damping)
+    return None if damping > _MOST_DAMPING or decrease <= tolerance * here.loss else dy

@@ -1,33 +1,33 @@
-"""What a log can tell: rank, condition and the weakest directions in words."""
+"""Identifiability of parameters from logs: rank, condition and the least identifiable directions."""
 
 from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
 
-from jaxdyn.identify.friction import TERMS, Terms
 from jaxdyn.identify.logs import Log, as_logs
 from jaxdyn.identify.regression import BaseParameters, base_parameters, condense, free_columns
+from jaxdyn.identify.torque_terms import TERMS, Terms
 from jaxdyn.model.tree import Model
 
-# Parameters named of a direction, and the share of it below which one is left out.
+# Most parameters named of a direction, and the smallest component that is named.
 _NAMED, _SHARE = 4, 0.15
 
 
 class Direction(NamedTuple):
-    """A combination of base parameters: its singular value over the largest one, and its largest parts in words."""
+    """Combination of base parameters: its singular value over the largest one, and a text of its largest components."""
 
     strength: float
     words: str
 
 
 class Identifiability(NamedTuple):
-    """What logs can tell of a robot.
+    """Identifiability of a robot's parameters from logs.
 
-    - `base`: the combinations that torques can tell apart on any motion. `rank`: how many of them these logs excite.
+    - `base`: the identifiable combinations on any motion. `rank`: the number of them that these logs excite.
     - `condition`: of the regressor in them, columns of unit length, over the directions that are excited.
-    - `weakest`: the directions that are told worst, the worst first; those not excited at all have strength 0.
-    - `silent`: base parameters that the logs do not determine. `unidentifiable`: parameters that no motion can tell.
+    - `weakest`: the least identifiable directions, the weakest first; those not excited at all have strength 0.
+    - `silent`: base parameters that the logs do not determine. `unidentifiable`: parameters that no motion determines.
     """
 
     base: BaseParameters
@@ -38,17 +38,19 @@ class Identifiability(NamedTuple):
     unidentifiable: tuple[str, ...]
 
     def summary(self) -> str:
-        """All of it in words."""
+        """Text of the result."""
         lines = [
-            f"the logs excite {self.rank} of the {len(self.base)} combinations that torques can tell apart, condition "
+            f"the logs excite {self.rank} of {len(self.base)} identifiable combinations, condition "
             f"{self.condition:.4g}"
             + (" (well above 100: weak directions follow the prior)" if self.condition > 300 else "")
         ]
         if self.silent:
             lines.append(f"not excited by these logs: {', '.join(self.silent)}")
-        lines += [f"told worst ({d.strength:.2g} of the best): {d.words}" for d in self.weakest if d.strength > 0]
+        for d in self.weakest:
+            if d.strength > 0:
+                lines.append(f"least identifiable direction, relative singular value {d.strength:.2g}: {d.words}")
         if self.unidentifiable:
-            lines.append(f"no motion tells, and the file's values stay: {', '.join(self.unidentifiable)}")
+            lines.append(f"unidentifiable on any motion, the file's values stay: {', '.join(self.unidentifiable)}")
         return "\n".join(lines)
 
 
@@ -61,9 +63,9 @@ def identifiability(
     rcond: float = 1e-6,
     count: int = 3,
 ) -> Identifiability:
-    """What logs tell of the bodies and the terms of a model, whatever the torques in them.
+    """Identifiability of the bodies and the terms of a model from the motions of logs; their torques do not matter.
 
-    **Arguments:** as `least_squares`; `count`: how many of the weakest directions are named.
+    **Arguments:** as `least_squares`; `count`: number of the weakest directions to name.
 
     **Returns:** `Identifiability`.
 
@@ -88,7 +90,7 @@ def identifiability(
 
 
 def base_terms(terms) -> tuple[str, ...]:
-    """Those of `TERMS` among terms."""
+    """Terms that are in `TERMS`."""
     return tuple(term for term in ((terms,) if isinstance(terms, str) else terms) if term in TERMS)
 
 

@@ -1,6 +1,6 @@
 """Interior-point method for the feasible torque fit, on the host.
 
-A fit is some tens of steps with matrices of a few hundred rows, and a search for terms is some thousand steps: in numpy each
+A fit takes some tens of steps with matrices of a few hundred rows, and a search for terms some thousand steps: in NumPy each
 takes about a millisecond, and nothing is compiled.
 """
 
@@ -10,13 +10,15 @@ from typing import NamedTuple
 import numpy as np
 
 from jaxdyn.identify.chart import Chart, positive_terms
+from jaxdyn.identify.checkpoint import Watch
+from jaxdyn.identify.descent import Iterate, Method, descend
 from jaxdyn.identify.regression import free_columns
 
 _EPS = float(np.finfo(np.float64).eps)
 
 
 class TorqueProblem(NamedTuple):
-    """1/2 (|R x - d|^2 + rest) + prior D(x), squares over the variance, in the coordinates of a chart, in float64."""
+    """Convex problem 1/2 (|R x - d|^2 + rest) + prior D(x) in float64, squares over the variance, in a chart's coordinates."""
 
     chart: Chart
     R: np.ndarray
@@ -26,7 +28,7 @@ class TorqueProblem(NamedTuple):
 
 
 class Minimum(NamedTuple):
-    """Where `newton` ended: `origin` (bodies, 4, 4) and `s` (terms, nv) of the chart, losses, "converged" or why not."""
+    """Minimum by `newton`: `origin` (bodies, 4, 4) and `s` (terms, nv) of the chart, losses, and the result."""
 
     origin: np.ndarray
     s: np.ndarray
@@ -37,7 +39,7 @@ class Minimum(NamedTuple):
 class _State(NamedTuple):
     """Bodies P = A A^T relative to the nominal ones with A the `origin`, terms, and the multipliers of both.
 
-    `dual` (bodies, 4, 4): of P being positive definite, in the frame where P is 1; `slack` (n,): of terms >= 0.
+    `dual` (bodies, 4, 4): of the constraint P > 0, in the frame where P is 1; `slack` (n,): of the constraints terms >= 0.
     """
 
     origin: np.ndarray
@@ -46,7 +48,7 @@ class _State(NamedTuple):
     slack: np.ndarray
 
 
-def _stretches() -> np.ndarray:
+def _log_cholesky_basis() -> np.ndarray:
     """U + U^T (10, 4, 4) for the derivatives U of `inertia.log_cholesky_factor` at zero."""
     places = [(0, 0), (1, 1), (2, 2), (0, 1), (1, 2), (0, 2), (0, 3), (1, 3), (2, 3)]
     basis = np.zeros((10, 4, 4))
@@ -69,12 +71,12 @@ def _from_pseudo() -> np.ndarray:
     return rows
 
 
-# Traces of products of stretches are the curvature of the divergence along straight lines in x: tr(P^-1 dP P^-1 dP).
-STRETCHES, _FROM_PSEUDO = _stretches(), _from_pseudo()
+# Traces of products of these are the curvature of the divergence along straight lines in x: tr(P^-1 dP P^-1 dP).
+LOG_CHOLESKY_BASIS, _FROM_PSEUDO = _log_cholesky_basis(), _from_pseudo()
 
 
-class Linear:
-    """A chart's map from relative pseudo-inertias A A^T and terms to x, which is linear in both."""
+class LinearChart:
+    """Map of a chart from relative pseudo-inertias A A^T and terms to x, linear in both."""
 
     def __init__(self, chart: Chart):
         self.factors = np.asarray(chart.factors, np.float64)
@@ -94,24 +96,24 @@ class Linear:
         result[self.term_places] = self.scale.reshape(-1) * terms
         return result
 
-    def slopes(self, origin: np.ndarray) -> np.ndarray:
-        """Derivatives (bodies, 10, coordinates) of the ten numbers of each body by its own coordinates."""
+    def body_jacobians(self, origin: np.ndarray) -> np.ndarray:
+        """Jacobians (bodies, 10, coordinates) of the ten numbers of each body by its own coordinates."""
         upper = (self.factors @ origin)[:, None]
-        moved = upper @ STRETCHES[None, : self.count] @ np.swapaxes(upper, 2, 3)
+        moved = upper @ LOG_CHOLESKY_BASIS[None, : self.count] @ np.swapaxes(upper, 2, 3)
         return np.einsum("cij,bkij->bck", _FROM_PSEUDO, moved)
 
-    def settled(self, s: np.ndarray) -> np.ndarray:
-        """s with terms below a millionth of their unit at zero, which fits approach without end."""
+    def clip_terms(self, s: np.ndarray) -> np.ndarray:
+        """Terms s, with those below a millionth of their unit set to zero, which fits approach but never reach."""
         return np.where(self.positive.reshape(s.shape) & (s**2 < 1e-6), 0.0, s)
 
     def at(self, origin: np.ndarray, s: np.ndarray) -> np.ndarray:
-        """All parameters (p,) at s (terms, nv), whose squares the positive terms are."""
+        """All parameters (p,) at s (terms, nv); positive terms are their squares."""
         flat = s.reshape(-1)
         return self.x(origin, np.where(self.positive, flat**2, flat))
 
-    def slopes_at(self, origin: np.ndarray, s: np.ndarray) -> np.ndarray:
-        """Derivatives (p, n) of all parameters by the coordinates of the bodies, then by s."""
-        slopes = self.slopes(origin)
+    def jacobian_at(self, origin: np.ndarray, s: np.ndarray) -> np.ndarray:
+        """Jacobian (p, n) of all parameters by the coordinates of the bodies, then by s."""
+        slopes = self.body_jacobians(origin)
         count = len(slopes) * self.count
         result = np.zeros((len(self.given), count + s.size))
         for i, (places, slope) in enumerate(zip(self.places, slopes, strict=True)):
@@ -120,11 +122,67 @@ class Linear:
         result[self.term_places, count:] = np.diag(self.scale.reshape(-1) * np.where(self.positive, 2 * flat, 1.0))
         return result
 
-    def rows(self, R: np.ndarray, slopes: np.ndarray) -> np.ndarray:
-        """Derivatives (m, n) of R x by the coordinates of the bodies, then by the terms."""
-        inertial = np.matmul(np.swapaxes(R[:, self.places], 0, 1), slopes)
+    def rows(self, R: np.ndarray, jacobians: np.ndarray) -> np.ndarray:
+        """Jacobian (m, n) of R x by the coordinates of the bodies, then by the terms."""
+        inertial = np.matmul(np.swapaxes(R[:, self.places], 0, 1), jacobians)
         inertial = np.swapaxes(inertial, 0, 1).reshape(len(R), -1)
         return np.concatenate([inertial, R[:, self.term_places] * self.scale.reshape(-1)], axis=1)
+
+
+class InteriorPoint(Method):
+    """Primal-dual interior-point steps from the chart's origin and terms s (terms, nv).
+
+    The loss is min |R x - d|^2 / 2 + prior tr(P0^-1 P) with -prior log det P as a permanent barrier. The barrier starts as
+    strong as the data, so that bodies are not driven to the boundary of the feasible set, and decreases as fast as the
+    complementarity of bodies and multipliers allows: to the prior for the bodies, to zero for the terms.
+
+    **Arguments:** `tolerance`: largest excess of the final loss over the minimum; `resolution`: relative size of the smallest
+    significant change of the loss.
+
+    A point is (origin, s); the state of an iterate are bodies, terms and multipliers, and the two targets of the barrier.
+    """
+
+    floor = -np.inf  # the divergence makes losses below zero possible
+
+    def __init__(self, problem: TorqueProblem, tolerance: float, resolution: float = _EPS):
+        self.problem, self.linear = problem, LinearChart(problem.chart)
+        self.tolerance, self.resolution = tolerance, resolution
+        self.inequalities = int(self.linear.positive.sum())
+        self.least = 0.1 * tolerance / max(self.inequalities, 1)
+
+    def init(self, start, kept):
+        """Evaluate the start, with multipliers that make the barrier as strong as the data."""
+        problem, positive = self.problem, self.linear.positive
+        origin = np.asarray(problem.chart.origin, np.float64)
+        flat = np.asarray(start, np.float64).reshape(-1)
+        terms = np.where(positive, flat**2, flat)
+        count = 4 * len(origin) + max(self.inequalities, 1)
+        gap = max(problem.prior, _loss(problem, self.linear, origin, terms) / count)
+        slack = np.where(positive, gap / np.maximum(flat**2, 1e-3), 0.0)
+        state = _State(origin, terms, gap * np.broadcast_to(np.eye(4), origin.shape), slack)
+        return self._iterate(state, (gap, gap))
+
+    def step(self, iterate, history, best):
+        """Make one step, and lower the targets of the barrier."""
+        problem, (state, targets) = self.problem, iterate.state
+        try:
+            following, decrement, gaps, length = _step(problem, self.linear, state, *targets)
+        except np.linalg.LinAlgError:
+            return iterate, "not_finite"
+        if not np.isfinite(iterate.loss + decrement):
+            return iterate, "not_finite"
+        # Rounding of the loss limits the smallest decrease that is visible.
+        smallest = max(self.tolerance, 10 * self.resolution * abs(iterate.loss))
+        if targets == (problem.prior, self.least) and decrement / 2 <= smallest:
+            return iterate, "converged"
+        # Mehrotra's idea: after a long step the barrier decreases much; after a short one the iterate returns to the central path
+        # first. Below 0.02 a good step would leave the path, above 0.9 the method would stall.
+        share = min(max(0.02, (1 - length) ** 2), 0.9)
+        return self._iterate(following, (max(problem.prior, share * gaps[0]), max(self.least, share * gaps[1]))), None
+
+    def _iterate(self, state: _State, targets: tuple[float, float]) -> Iterate:
+        s = _roots(state.terms, self.linear.positive).reshape(self.linear.scale.shape)
+        return Iterate((state.origin, s), _loss(self.problem, self.linear, state.origin, state.terms), (state, targets))
 
 
 def newton(
@@ -135,67 +193,30 @@ def newton(
     callback: Callable[[int, float, np.ndarray, np.ndarray], None] | None = None,
     resolution: float = _EPS,
 ) -> Minimum:
-    """Primal-dual interior-point method from the chart's origin and terms s (terms, nv).
-
-    The loss is min |R x - d|^2 / 2 + prior tr(P0^-1 P) with -prior log det P as the barrier that stays. The barrier starts as
-    strong as the data, so that bodies are not pushed against the edge of what is feasible, and is released as fast as the
-    complementarity of bodies and multipliers allows: down to the prior for the bodies, to nothing for the terms.
-
-    **Arguments:** `tolerance`: how far above the minimum the loss may end; `callback(step, loss, origin, s)` before each step;
-    `resolution`: relative size of the smallest change of the loss that means anything.
-    """
-    linear = Linear(problem.chart)
-    history, result, prior = [], "max_steps", problem.prior
-    inequalities = int(linear.positive.sum())
-    least = 0.1 * tolerance / max(inequalities, 1)
-    origin = np.asarray(problem.chart.origin, np.float64)
-    flat = np.asarray(s, np.float64).reshape(-1)
-    terms = np.where(linear.positive, flat**2, flat)
-    gap = max(prior, _loss(problem, linear, origin, terms) / (4 * len(origin) + max(inequalities, 1)))
-    slack = np.where(linear.positive, gap / np.maximum(flat**2, 1e-3), 0.0)
-    state = _State(origin, terms, gap * np.broadcast_to(np.eye(4), origin.shape), slack)
-    targets = gap, gap
-    for step in range(steps + 1):
-        history.append(_loss(problem, linear, state.origin, state.terms))
-        if callback is not None:
-            callback(step, history[-1], state.origin, _roots(state.terms, linear.positive).reshape(s.shape))
-        try:
-            following, decrement, gaps, length = _step(problem, linear, state, *targets)
-        except np.linalg.LinAlgError:
-            decrement = np.nan
-        if not np.isfinite(history[-1] + decrement):
-            result = "not_finite"
-            break
-        # Rounding of the loss limits how small a decrease can be seen.
-        if targets == (prior, least) and decrement / 2 <= max(tolerance, 10 * resolution * abs(history[-1])):
-            result = "converged"
-            break
-        if step < steps:
-            state = following
-            # The longer the step was, the more of the barrier goes next; short steps are for getting back to the middle.
-            share = min(max(0.02, (1 - length) ** 2), 0.9)
-            targets = max(prior, share * gaps[0]), max(least, share * gaps[1])
-    s = _roots(state.terms, linear.positive).reshape(s.shape)
-    return Minimum(state.origin, s, np.array(history), result)
+    """Minimise by `InteriorPoint`; `callback(step, loss, origin, s)` before each step."""
+    report = None if callback is None else lambda step, loss, point: callback(step, loss, *point)
+    end = descend(InteriorPoint(problem, tolerance, resolution), s, Watch(steps, report))
+    origin, terms = end.last.point
+    return Minimum(origin, terms, end.history, end.result)
 
 
 def _roots(terms: np.ndarray, positive: np.ndarray) -> np.ndarray:
     return np.where(positive, np.sqrt(np.where(positive, terms, 1)), terms)
 
 
-def _loss(problem: TorqueProblem, linear: Linear, origin: np.ndarray, terms: np.ndarray) -> float:
+def _loss(problem: TorqueProblem, linear: LinearChart, origin: np.ndarray, terms: np.ndarray) -> float:
     residual = problem.R @ linear.x(origin, terms) - problem.d
     diagonal = np.diagonal(origin, axis1=1, axis2=2)
     divergence = np.sum(origin**2) - 2 * np.sum(np.log(diagonal)) - 4.0 * len(origin)
     return float(0.5 * (residual @ residual + problem.rest) + problem.prior * divergence)
 
 
-def _step(problem: TorqueProblem, linear: Linear, state: _State, weight: float, barrier: float):
+def _step(problem: TorqueProblem, linear: LinearChart, state: _State, weight: float, barrier: float):
     """One step towards P Z = weight, terms * multipliers = barrier.
 
-    Steps go straight in x and stop short of the edge, P = A (1 + h S) A^T with A the factor now: a curved step would leave
-    the narrow valley that a precise log makes. The equations are those of Newton's method on the loss with barriers, but the
-    barrier's curvature is that of the multipliers, Z S + S Z, which already know where the edge is (Helmberg, Rendl,
+    Steps are straight lines in x and stop before the boundary, P = A (1 + h S) A^T with A the present factor: a curved step would
+    leave the narrow valley of a precise log. The equations are those of Newton's method on the loss with barriers, but the
+    barrier's curvature is that of the multipliers, Z S + S Z, which have the distance to the boundary in them (Helmberg, Rendl,
     Vanderbei & Wolkowicz 1996; Nesterov & Nemirovskii 1994).
 
     **Returns:** the state after it, the decrement, mean products with the multipliers, and the length of the step.
@@ -208,15 +229,16 @@ def _step(problem: TorqueProblem, linear: Linear, state: _State, weight: float, 
     count, size = len(state.origin), linear.count
     bodies = count * size
     inverse = np.where(positive, 1 / np.where(positive, terms, 1), 0)
-    basis = STRETCHES[:size]
+    basis = LOG_CHOLESKY_BASIS[:size]
     traces = np.trace(basis, axis1=1, axis2=2)
 
-    rows = linear.rows(problem.R, linear.slopes(state.origin))
+    rows = linear.rows(problem.R, linear.body_jacobians(state.origin))
     gradient = rows.T @ (problem.R @ linear.x(state.origin, terms) - problem.d)
-    # prior tr(P0^-1 P) is what remains of the divergence without its log det.
+    # The divergence without its log det, which is the barrier, is prior tr(P0^-1 P).
     grams = np.swapaxes(state.origin, 1, 2) @ state.origin
     gradient[:bodies] += (problem.prior * np.einsum("bij,kij->bk", grams, basis) - weight * traces).reshape(-1)
     gradient[bodies:] -= barrier * inverse
+    # Gauss-Newton is exact here: R x - d is linear in the step, whose curvature the straight lines in x do not add to.
     hessian = rows.T @ rows
     products = np.einsum("kij,bjm->bkim", basis, state.dual)
     blocks = np.einsum("bkim,lmi->bkl", products, basis)
@@ -224,9 +246,11 @@ def _step(problem: TorqueProblem, linear: Linear, state: _State, weight: float, 
         own = slice(i * size, (i + 1) * size)
         hessian[own, own] += blocks[i]
     hessian[np.arange(bodies, len(hessian)), np.arange(bodies, len(hessian))] += state.slack * inverse
+    # Masses and friction coefficients differ by orders of magnitude: factored with a unit diagonal.
     diagonal = np.diagonal(hessian)
     unit = np.sqrt(np.where(diagonal > 0, diagonal, 1.0))
     scaled = hessian / unit[:, None] / unit
+    # Directions that neither log nor prior determine, such as terms at a joint that never moves, would make it singular.
     scaled[np.arange(len(unit)), np.arange(len(unit))] += 4 * _EPS
     factor = cho_factor(scaled, check_finite=False)
     direction = -cho_solve(factor, gradient / unit, check_finite=False) / unit
@@ -237,30 +261,33 @@ def _step(problem: TorqueProblem, linear: Linear, state: _State, weight: float, 
     dual_stretch = weight * np.eye(4) - state.dual - (product + np.swapaxes(product, 1, 2)) / 2
     dual_change = np.where(positive, (barrier - state.slack * change) * inverse - state.slack, 0)
 
-    length = _length(np.linalg.eigvalsh(stretch), change * inverse)
+    length = _step_to_boundary(np.linalg.eigvalsh(stretch), change * inverse)
+    # The multipliers have a step to their boundary of their own, by the eigenvalues of their change relative to them.
     roots = _upper_root(state.dual)
     relative = np.linalg.solve(roots, np.swapaxes(np.linalg.solve(roots, dual_stretch), 1, 2))
-    dual_length = _length(
+    dual_length = _step_to_boundary(
         np.linalg.eigvalsh((relative + np.swapaxes(relative, 1, 2)) / 2),
         dual_change / np.where(state.slack > 0, state.slack, 1),
     )
+    # P = A (1 + h S) A^T is refactored; the multipliers are congruent to the new frame, in which P is 1 again.
     roots = _upper_root(np.eye(4) + length * stretch)
     dual = np.swapaxes(roots, 1, 2) @ (state.dual + dual_length * dual_stretch) @ roots
-    moved = _State(state.origin @ roots, terms + length * change, dual, state.slack + dual_length * dual_change)
-    # Mean products of what must stay positive and its multipliers.
+    following = _State(state.origin @ roots, terms + length * change, dual, state.slack + dual_length * dual_change)
+    # Mean products of the positive quantities and their multipliers: zero at the solution.
     gaps = (
         float(np.trace(dual, axis1=1, axis2=2).sum()) / max(4 * count, 1),
-        float(np.sum(np.where(positive, moved.slack * moved.terms, 0))) / max(int(positive.sum()), 1),
+        float(np.sum(np.where(positive, following.slack * following.terms, 0))) / max(int(positive.sum()), 1),
     )
-    return moved, float(-(gradient @ direction)), gaps, min(length, dual_length)
+    return following, float(-(gradient @ direction)), gaps, min(length, dual_length)
 
 
-def _length(*rates: np.ndarray) -> float:
-    """Longest step up to 1 that leaves a twentieth of everything that shrinks at these rates."""
+def _step_to_boundary(*rates: np.ndarray) -> float:
+    """Step to the boundary, at most 1: it leaves a twentieth of every quantity that decreases at these rates."""
     fastest = min((float(rate.min(initial=0)) for rate in rates), default=0.0)
     return min(1.0, -0.95 / min(fastest, -0.95))
 
 
 def _upper_root(matrices: np.ndarray) -> np.ndarray:
-    """Upper-triangular U (n, 4, 4) with U U^T the matrices."""
+    """Upper-triangular factors U (n, 4, 4) with U U^T the matrices."""
+    # Reversing rows and columns turns the lower factor of LAPACK into an upper one.
     return np.linalg.cholesky(matrices[:, ::-1, ::-1])[:, ::-1, ::-1]

@@ -1,37 +1,56 @@
-"""Standard deviations that count blocks of samples, not samples, and say what the data told and what the prior.
+"""Standard deviations of a fit from blocks of samples, and the source of each number: data, prior, or neither.
 
 Residuals of a filtered log are correlated and hold what no term of the model explains, so that independent errors of single
-samples would promise far too much. Here consecutive samples form blocks, each block is left out in turn, and the scatter of what
-is then found is the uncertainty (delete-a-group jackknife). The prior's pull is counted as if the nominal bodies were off by as
-much as a prior of weight 1 believes.
+samples would promise far too much. Here consecutive samples form blocks, each block is left out in turn, and the scatter of the
+estimates is the uncertainty (delete-a-group jackknife). The prior's contribution is counted as if the nominal bodies were off by
+as much as a prior of weight 1 assumes.
+
+An interval holds for the terms of its fit. Where two terms explain the same torque, as Dahl's friction and Coulomb's do between
+reversals, the choice between them decides their values and no interval shows it: such numbers are marked as confounded.
 """
 
+from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
 
-from jaxdyn.identify.interior import STRETCHES, Linear
-from jaxdyn.identify.jackknife import block_groups, jackknife, student
-from jaxdyn.identify.one_fit import Data, Estimate, Setting
+from jaxdyn.identify.condensed_fit import Data, Estimate, Setting
+from jaxdyn.identify.interior import LOG_CHOLESKY_BASIS, LinearChart
 from jaxdyn.identify.regression import BaseParameters, base_parameters, free_columns, parameter_names
+from jaxdyn.identify.uncertainty import block_groups, jackknife, student
 from jaxdyn.model.tree import Model
 
-# Share of the variance from which on a number is called one from the prior.
+# Share of the variance above which the prior is the source of a number.
 _FROM_PRIOR = 0.5
+# Share of the variance of a number, due to extra terms, above which it is confounded with these.
+_FROM_EXTRA = 0.5
+CONFOUNDED, STILL = "confounded", "hardly moved"
 
 
 class Spread(NamedTuple):
-    """Numbers with uncertainty, all (n,): names, values, standard deviations, and the share of the variance from the prior."""
+    """Numbers with uncertainty, all (n,): names, values, standard deviations, and the share of the variance from the prior.
+
+    `marks` (n,): "confounded" or "hardly moved" where that makes a number's interval meaningless, else empty.
+    """
 
     names: tuple[str, ...]
     values: np.ndarray
     std: np.ndarray
     prior_share: np.ndarray
+    marks: np.ndarray
 
     @property
     def sources(self) -> list[str]:
-        """For each number "data" or "prior": where most of its uncertainty, hence its value, comes from; "bound" at zero."""
+        """Source of each number.
+
+        - "data" or "prior": the origin of most of its uncertainty, hence of its value;
+        - "bound": a term that the fit holds at zero;
+        - "confounded": most of its variance would vanish with the extra terms, or, for the coefficient of an extra term, most of
+          the variance of another number with it;
+        - "hardly moved": friction or rotor inertia of a joint that stood nearly still in all logs.
+        """
         source = np.where(self.prior_share > _FROM_PRIOR, "prior", "data")
+        source = np.where(self.marks != "", self.marks, source)
         return np.where(np.isfinite(self.std), source, "bound").tolist()
 
 
@@ -40,7 +59,7 @@ class Intervals(NamedTuple):
 
     - `parameters`: all of x in the order of `parameter_names`, then coefficients of extra terms. Terms that the fit holds at
       zero have no standard deviation (NaN).
-    - `base`: the combinations of inertias and terms that torques tell apart, and `combinations`, which these are.
+    - `base`: the identifiable combinations of inertias and terms, and `combinations`, their definition.
     - `factor`: a 95 % interval is the value plus and minus this many standard deviations (Student's t, blocks - 1).
     """
 
@@ -58,75 +77,110 @@ def intervals(
     estimate: Estimate,
     weights: np.ndarray,
     terms,
-    worth: float,
+    size: float,
     curved: Data | None = None,
+    still: Sequence[int] = (),
 ) -> Intervals:
-    """`Intervals` of one fit of condensed logs.
+    """Intervals of one fit of condensed logs.
 
-    With D_b the data's curvature and g_b their slope on block b, both over sigma^2, P the prior's curvature and H = sum D_b + P:
-    leaving b out moves the fit by (H - D_b)^-1 g_b. Their covariance times (B - 1) is the data's share, and
+    With D_b the data's curvature and g_b their gradient on block b, both over sigma^2, P the prior's curvature and H = sum
+    D_b + P: leaving b out moves the fit by (H - D_b)^-1 g_b. Their covariance times (B - 1) is the data's share, and
     max(prior, 1) H^-1 P H^-1 the prior's. All in the coordinates of the chart, then carried over to x.
 
-    `worth`: how many independent errors the logs hold (`stretches`), which says how long what is left out must be. `curved`: logs
-    whose curvature counts, where the loss is not made of squares: Huber's has none beyond its threshold, though it has a slope
-    there.
+    `size`: effective sample size of the errors, which determines the length of the groups left out. `curved`: logs
+    whose curvature counts, where the loss is not made of squares: Huber's has none beyond its threshold, though it has a gradient
+    there. `still`: indices of the torques whose joints hardly moved.
 
     Source: Efron (1982), the jackknife; Cameron & Miller (2015), cluster-robust inference (CR3); Huber
-    (1981), "Robust statistics", section 6.4, whose curvature is that of psi'.
+    (1981), "Robust statistics", section 6.4, whose curvature is that of psi'; Kutner, Nachtsheim, Neter & Li (2005), "Applied
+    linear statistical models", section 10.5, variance inflation.
     """
     jacobian, curvature, free = _local(data, setting, estimate)
     blocks, sigma = data.blocks, estimate.sigma
-    slopes = blocks.scores(estimate.x, weights) @ jacobian / sigma**2
+    # In the chart's coordinates, in which the prior's curvature is known and bounds are inactive or eliminated.
+    gradients = blocks.scores(estimate.x, weights) @ jacobian / sigma**2
     grams_of_curvature = (data if curved is None else curved).blocks.grams(weights)
     grams = np.einsum("pi,bpq,qj->bij", jacobian, grams_of_curvature, jacobian, optimize=True) / sigma**2
-    groups = block_groups(len(blocks), worth)
-    slopes, grams = (np.stack([x[group].sum(axis=0) for group in groups]) for x in (slopes, grams))
-    changes, inverse = jackknife(grams, slopes, curvature)
+    groups = block_groups(len(blocks), size)
+    gradients, grams = (np.stack([x[group].sum(axis=0) for group in groups]) for x in (gradients, grams))
+    changes, inverse = jackknife(grams, gradients, curvature)
     count = len(groups)
+    # A prior weaker than 1 expresses no belief that the nominal bodies are better: at least weight 1 counts.
     changes, pulled = jacobian @ changes, jacobian @ inverse @ _root(curvature) * np.sqrt(max(setting.prior, 1.0))
 
     nb, nv = model.nb, model.nv
     names = list(parameter_names(model))
-    for term, size in data.counts.items():
-        for k in range(size):
-            names += [f"{joint}.{term}{k + 1 if size > 1 else ''}" for joint in _joints(model)]
+    for term, number in data.counts.items():
+        for k in range(number):
+            names += [f"{joint}.{term}{k + 1 if number > 1 else ''}" for joint in _joints(model)]
     fitted = np.concatenate([free, np.zeros(blocks.size - len(free), bool)])
     fitted[data.places(setting.extra)] = True
     shown = np.flatnonzero(fitted | (np.arange(blocks.size) < data.basic))
-    parameters = _spread([names[i] for i in shown], estimate.x[shown], changes[shown], pulled[shown], fitted[shown])
+    # Covariances of independent errors suffice for ratios of variances, and have less scatter than those of few groups.
+    extra = data.places(setting.extra)
+    covariance = jacobian @ inverse @ jacobian.T
+    # All terms, extra ones too, are vectors of nv numbers after the inertias.
+    is_still = (np.arange(blocks.size) >= 10 * nb) & np.isin((np.arange(blocks.size) - 10 * nb) % nv, list(still))
 
     base = base_parameters(model, terms)
     columns = free_columns(nb, nv, terms)
-    # Parameters enter with both signs, so that a sum over them can vanish where none is zero.
+    combine = np.zeros((len(base), blocks.size))
+    combine[:, columns] = base.matrix
+    is_confounded = share_of_extra(np.eye(blocks.size), covariance, extra) > _FROM_EXTRA
+    for place in extra:
+        is_confounded[place] = np.any(share_of_extra(combine, covariance, np.array([place])) > _FROM_EXTRA)
+    marks = np.where(is_still, STILL, np.where(is_confounded, CONFOUNDED, ""))
+    parameters = _make_spread(
+        [names[i] for i in shown], estimate.x[shown], changes[shown], pulled[shown], fitted[shown], marks[shown]
+    )
+
+    # By absolute values: parameters enter with both signs, and a sum over them can vanish where none is zero.
     enters = np.abs(base.matrix) > 1e-9 * np.abs(base.matrix).max(axis=1, keepdims=True)
     known = np.any(enters & fitted[columns], axis=1)
     a, b = base.matrix @ changes[columns], base.matrix @ pulled[columns]
-    spread = _spread(base.names, base.values(estimate.x[columns]), a, b, known)
+    is_confounded = share_of_extra(combine, covariance, extra) > _FROM_EXTRA
+    marks = np.where(is_still[columns[base.independent]], STILL, np.where(is_confounded, CONFOUNDED, ""))
+    spread = _make_spread(base.names, base.values(estimate.x[columns]), a, b, known, marks)
     return Intervals(parameters, spread, base, a @ a.T + b @ b.T, student(count - 1))
 
 
-def _spread(names, values, changes, pulled, fitted) -> Spread:
+def share_of_extra(rows: np.ndarray, covariance: np.ndarray, extra: np.ndarray) -> np.ndarray:
+    """Shares (m,) of the variances of linear combinations `rows` (m, p) of the parameters that are due to extra terms.
+
+    The share vanishes when the extra coefficients are held fixed: c E^-1 c^T / v for the variance v of a combination, its
+    covariances c with the extra coefficients, and their covariance E. It is 1 - 1 / (variance inflation factor).
+    """
+    variance = np.einsum("ip,pq,iq->i", rows, covariance, rows)
+    if not len(extra):
+        return np.zeros(len(rows))
+    # Coefficients of a term whose column is zero have no variance: the pseudo-inverse leaves them out.
+    cross = rows @ covariance[:, extra]
+    inverse = np.linalg.pinv(covariance[np.ix_(extra, extra)], hermitian=True)
+    return np.einsum("ie,ef,if->i", cross, inverse, cross) / np.where(variance > 0, variance, np.inf)
+
+
+def _make_spread(names, values, changes, pulled, fitted, marks) -> Spread:
     from_data, from_prior = np.sum(changes**2, axis=1), np.sum(pulled**2, axis=1)
     total = from_data + from_prior
     share = np.where(total > 0, from_prior / np.where(total > 0, total, 1), 1.0)
-    return Spread(tuple(names), np.asarray(values), np.where(fitted, np.sqrt(total), np.nan), share)
+    return Spread(tuple(names), np.asarray(values), np.where(fitted, np.sqrt(total), np.nan), share, marks)
 
 
 def _local(data: Data, setting: Setting, estimate: Estimate):
-    """Slopes of x by the free coordinates, the prior's curvature in them, and which basic parameters are free at all."""
-    linear, minimum = Linear(estimate.chart), estimate.minimum
-    slopes = linear.slopes_at(minimum.origin, minimum.s)
+    """Jacobian of x by the free coordinates, the prior's curvature in them, and a mask of the free basic parameters."""
+    linear, minimum = LinearChart(estimate.chart), estimate.minimum
+    derivatives = linear.jacobian_at(minimum.origin, minimum.s)
     count, size = len(minimum.origin), linear.count
-    basis = STRETCHES[:size]
+    basis = LOG_CHOLESKY_BASIS[:size]
     prior_curvature = setting.prior * np.kron(np.eye(count), np.einsum("kij,lji->kl", basis, basis))
     bodies = count * size
-    is_free = np.ones(slopes.shape[1], bool)
-    # What is at its bound stays there.
+    is_free = np.ones(derivatives.shape[1], bool)
+    # Terms at their bound stay there: the one-sided derivative is not that of a minimum.
     is_free[bodies:] = ~(linear.positive & (minimum.s.reshape(-1) == 0))
     places = data.places(setting.extra)
     count = int(is_free.sum())
     jacobian = np.zeros((data.blocks.size, count + len(places)))
-    jacobian[: data.basic, :count] = slopes[:, is_free]
+    jacobian[: data.basic, :count] = derivatives[:, is_free]
     jacobian[places, count + np.arange(len(places))] = 1.0
     curvature = np.zeros((jacobian.shape[1],) * 2)
     curvature[:bodies, :bodies] = prior_curvature
@@ -136,6 +190,7 @@ def _local(data: Data, setting: Setting, estimate: Estimate):
 
 
 def _root(matrix: np.ndarray) -> np.ndarray:
+    # Semidefinite: coordinates without a prior have no curvature, which a Cholesky factorisation would refuse.
     values, vectors = np.linalg.eigh(matrix)
     return vectors * np.sqrt(np.maximum(values, 0))
 

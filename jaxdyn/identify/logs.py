@@ -1,6 +1,6 @@
-"""Logs: measured motion and torque, checked, and what their low-pass does to other signals."""
+"""Logs of measured motion and torque: checks, the effect of their low-pass on other signals, and the travel of joints."""
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from typing import Any
 
 import equinox as eqx
@@ -9,7 +9,14 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from jaxdyn.model.arguments import Checked, Numbers, is_concrete
+from jaxdyn.model.joints import KINDS
 from jaxdyn.model.tree import Model
+
+# Samples per sample of a log on which columns that jump are evaluated before they are low-passed.
+_REFINEMENT = 8
+# Least travel of a joint (rad, m). Friction needs some thousandths of a radian to reverse (`torque_terms.PRESLIDING`): below a
+# few times that a joint does not slide, and its torque says nothing about friction in motion.
+_TRAVEL_ANGLE, _TRAVEL_LENGTH = 0.02, 0.002
 
 
 class Log(eqx.Module):
@@ -18,7 +25,7 @@ class Log(eqx.Module):
     - `t` (n,), strictly increasing (s); `q` (n, nq) (rad, m); `v`, `a` (n, nv) (rad/s, rad/s^2; m/s, m/s^2), or None
       when they were not measured; `tau` (n, nv) (N m; N).
     - `joint_names`: names of the columns of tau, when the file gave them.
-    - `cutoff`: Hz, of the low-pass that `from_raw` sent the signals through; None for other logs.
+    - `cutoff`: Hz, of the low-pass that `from_raw` applied; None for other logs.
 
     Numpy arrays are kept as they are (a log is data of the host; float64 time stamps do not become float32); anything
     else is converted to float64. The arrays are leaves, so a log passes through `jax.vmap` and `jax.jit`.
@@ -67,14 +74,14 @@ class Log(eqx.Module):
         return self.t.shape[0]
 
     def __getitem__(self, rows) -> "Log":
-        """The samples of a slice, as a log."""
+        """Log of the samples of a slice."""
         if not isinstance(rows, slice):
             raise ValueError(f"a log is indexed by slices, got {rows!r}; one sample is log.q[i], log.v[i], ...")
         return _select(self, rows)
 
 
 def split(log: Log, fraction: float = 0.7) -> tuple[Log, Log]:
-    """The first `fraction` of the samples and the rest: train and test without a shared sample.
+    """Split a log into the first `fraction` of the samples and the rest: training and test data without a shared sample.
 
     **Raises:** ValueError when the fraction is not between 0 and 1, or one part would have no sample.
     """
@@ -85,9 +92,9 @@ def split(log: Log, fraction: float = 0.7) -> tuple[Log, Log]:
 
 
 def as_logs(log, system=None, *, needs=("v", "a")) -> tuple[Log, ...]:
-    """One log or a sequence of logs as a tuple, each checked against the system unless that is None.
+    """Tuple of one log or a sequence of logs, each checked against the system unless that is None.
 
-    **Raises:** ValueError for something else, for an empty sequence, and as `check_log`, with the log's place in the sequence.
+    **Raises:** ValueError for other types, for an empty sequence, and as `check_log`, with the log's place in the sequence.
     """
     logs = (log,) if isinstance(log, Log) else tuple(log) if isinstance(log, Sequence) else ()
     if not logs or not all(isinstance(one, Log) for one in logs):
@@ -124,27 +131,77 @@ def check_log(log: Log, system, *, needs=("v", "a")) -> None:
         )
 
 
-def as_measured(log: Log, columns: np.ndarray, order: int = 4) -> np.ndarray:
-    """Columns (n, ...) as the log's filter would have left them; as they are where the log came through none.
+def filter_like_log(log: Log, columns: np.ndarray, order: int = 4, factor: int = 1) -> np.ndarray:
+    """Columns (n, ...) as the log's low-pass would have left them; unchanged for a log that was not filtered.
 
-    Friction that jumps where a joint turns round is a torque like any other when it is measured: what predicts it must go through
-    the same low-pass as the torque, or the jump counts as an error.
+    `factor`: samples of the columns per sample of the log; every `factor`-th is returned.
     """
-    rate = (len(log) - 1) / float(log.t[-1] - log.t[0]) if len(log) > 1 else 0.0
-    shortest = 3 * (order + 1) + 1
-    if log.cutoff is None or not log.cutoff < 0.45 * rate or len(log) < shortest or not columns.size:
-        return columns
+    cutoff = log.cutoff
+    if cutoff is None or not _has_filter(log, order):
+        return columns if factor == 1 else columns[::factor]
     from scipy.signal import butter, filtfilt
 
-    numerator, denominator = butter(order, 2 * log.cutoff / rate, output="ba")  # pyright: ignore
-    return filtfilt(numerator, denominator, columns, axis=0)
+    rate = factor * _rate(log)
+    numerator, denominator = butter(order, 2 * cutoff / rate, output="ba")  # pyright: ignore
+    if not columns.size:
+        return columns[::factor]
+    padding = pad_length(rate, cutoff, len(columns))
+    return filtfilt(numerator, denominator, columns, axis=0, padlen=padding)[::factor]
+
+
+def pad_length(rate: float, cutoff: float, count: int) -> int:
+    """Samples of the extension at both ends of a signal of `count` samples before a low-pass: three periods of the cut-off.
+
+    SciPy's default, some fifteen samples, is a small part of the filter's response: accelerations of a motion that does not
+    begin at rest were then off by a third of their size two periods away from the ends.
+    """
+    return min(int(3 * rate / cutoff), count - 1)
+
+
+def low_pass_columns(log: Log, columns: Callable[[Log], np.ndarray]) -> np.ndarray:
+    """Columns (n, ...) of a function of a log, with the log's low-pass applied to them.
+
+    Friction that jumps where a joint reverses went through the low-pass with the measured torque: its column must go through the
+    same, or the jump counts as an error. The column is evaluated on a finer grid first. On the log's own samples, some fifteen in
+    a period of the cut-off, a jump is known to a sample only, and what a low-pass makes of it is off by enough for other terms
+    and robust losses to look useful.
+    """
+    if not _has_filter(log):
+        return columns(log)
+    return filter_like_log(log, columns(refine_log(log, _REFINEMENT)), factor=_REFINEMENT)
+
+
+def refine_log(log: Log, factor: int) -> Log:
+    """A log with `factor` times the samples, by cubic splines, whose every `factor`-th sample is one of the log."""
+    signals = {name: getattr(log, name) for name in ("q", "v", "a", "tau")}
+    fine: dict[str, Any] = {name: None if x is None else refine_samples(x, factor) for name, x in signals.items()}
+    t = refine_samples(np.asarray(log.t)[:, None], factor)[:, 0]
+    return Log(t, **fine, joint_names=log.joint_names, cutoff=log.cutoff)
+
+
+def refine_samples(samples: np.ndarray, factor: int) -> np.ndarray:
+    """Samples (n, k) interpolated to (n - 1) factor + 1 by cubic splines."""
+    from scipy.interpolate import CubicSpline
+
+    samples = np.asarray(samples, np.float64)
+    places = np.arange(factor * (len(samples) - 1) + 1) / factor
+    return CubicSpline(np.arange(len(samples)), samples)(places)
+
+
+def _has_filter(log: Log, order: int = 4) -> bool:
+    shortest = 3 * (order + 1) + 1
+    return log.cutoff is not None and log.cutoff < 0.45 * _rate(log) and len(log) >= shortest
+
+
+def _rate(log: Log) -> float:
+    return (len(log) - 1) / float(log.t[-1] - log.t[0]) if len(log) > 1 else 0.0
 
 
 def _as_array(value, name: str):
     if value is None or isinstance(value, jax.Array):
         return value
     value = np.asarray(value)
-    if value.dtype.kind not in "biuf":  # numpy reads texts as numbers, "1_0" as ten
+    if value.dtype.kind not in "biuf":  # NumPy parses texts as numbers, "1_0" as ten
         raise ValueError(f"{name} holds {value.dtype.name}; give real numbers")
     return value if value.dtype in (np.float32, np.float64) else value.astype(np.float64)
 
@@ -194,3 +251,32 @@ def root_mean_square(samples) -> np.ndarray:
     samples = np.asarray(samples, np.float64)
     largest = np.abs(samples).max(axis=0, initial=0)
     return largest * np.sqrt(np.mean((samples / np.where(largest > 0, largest, 1)) ** 2, axis=0))
+
+
+def travels(model: Model, log: Log) -> np.ndarray:
+    """Range of motion (nv,) of each coordinate, rad or m: of its position, or of its integrated velocity for joints with several.
+
+    The integral of a velocity is used where no coordinate of q belongs to it alone, as for quaternions.
+    """
+    q, v, t = (np.asarray(x, np.float64) for x in (log.q, log.v, log.t))
+    steps = (v[1:] + v[:-1]) / 2 * np.diff(t)[:, None]
+    path = np.concatenate([np.zeros((1, v.shape[1])), np.cumsum(steps, axis=0)])
+    slices = zip(model.topology.q_slices, model.topology.v_slices, strict=True)
+    for of_q, of_v in slices:
+        if of_q.stop - of_q.start == of_v.stop - of_v.start == 1:
+            path[:, of_v] = q[:, of_q]
+    return np.ptp(path, axis=0)
+
+
+def hardly_moving(model: Model, logs: Sequence[Log]) -> tuple[int, ...]:
+    """Indices in v of the coordinates that travel less than 0.02 rad, or 2 mm, in every log."""
+    travel = np.max([travels(model, log) for log in logs], axis=0)
+    return tuple(int(j) for j in np.flatnonzero(travel < np.where(are_angles(model), _TRAVEL_ANGLE, _TRAVEL_LENGTH)))
+
+
+def are_angles(model: Model) -> np.ndarray:
+    """Mask (nv,) of the coordinates that are angles."""
+    linear = {"prismatic": (True,), "planar": (True, True, False), "free": (True,) * 3 + (False,) * 3}
+    return ~np.concatenate(
+        [np.array(linear.get(kind, (False,) * KINDS[kind].nv), bool) for kind in model.topology.kinds]
+    )

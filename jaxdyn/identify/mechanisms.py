@@ -1,4 +1,4 @@
-"""Mechanisms of which a few joints were measured: states on the constraints next to these, and logs of the whole motion."""
+"""Mechanisms with a few measured joints: states on the constraints near a measurement, and logs of all joints."""
 
 from collections.abc import Sequence
 from typing import Any
@@ -14,20 +14,20 @@ from jaxdyn.constraints.base import layout, position_residual, rows
 from jaxdyn.constraints.codes import RESULTS
 from jaxdyn.constraints.mobility import degrees_of_freedom
 from jaxdyn.identify.logs import Log
-from jaxdyn.model.arguments import Numbers, as_array, state_dtype
+from jaxdyn.model.arguments import Numbers, as_array, state_dtype, warn
 from jaxdyn.model.names import velocity_indices
 from jaxdyn.model.tree import Model
 from jaxdyn.systems.mass_factor import solve_positive
 from jaxdyn.systems.scene import Scene, as_scene
 from jaxdyn.systems.system import SceneLike, displace, displacement
 
-# Gauss-Newton steps towards what was measured; constraints count so many times as much as a measured coordinate, and
-# staying where it is so little that only coordinates that nothing tells do.
+# Gauss-Newton steps, and the weights of constraints and of the change of all coordinates, relative to a measured one. The
+# last is so small that it determines only coordinates that neither constraints nor measurements do.
 _ROUNDS, _EXACT, _STAYS = 5, 1e2, 1e-8
 
 
-def observed_columns(system: Any, observed: Sequence[Any]) -> tuple[int, ...]:
-    """Places in v of joints by name, or of the coordinates of a system without bodies by index.
+def observation_columns(system: Any, observed: Sequence[Any]) -> tuple[int, ...]:
+    """Indices in v of joints by name, or of the coordinates of a system without bodies by index.
 
     **Raises:** ValueError for those that do not exist.
     """
@@ -42,8 +42,10 @@ def observed_columns(system: Any, observed: Sequence[Any]) -> tuple[int, ...]:
 
 
 def on_constraints(scene: Scene, q, v, t, columns: tuple[int, ...] | None) -> Assembly:
-    """The state on a scene's constraints that is nearest to (q, v): in the mass metric, or, where only the velocities `columns`
-    and their coordinates were measured, the least squares of these. The others then stay as near as the constraints let them.
+    """State on a scene's constraints nearest to (q, v).
+
+    Nearest in the mass metric; or, where only the velocities `columns` and their coordinates were measured, by least squares of
+    these, while the others change as little as the constraints allow.
     """
     if columns is None:
         return assemble(scene, q, v, t, throw=False)
@@ -61,7 +63,7 @@ def on_constraints(scene: Scene, q, v, t, columns: tuple[int, ...] | None) -> As
 
 
 def nearest_velocity(scene: Scene, q, v, t, columns: tuple[int, ...]) -> Float[Array, " nv"]:
-    """The velocity (nv,) on a scene's constraints whose `columns` are the least squares of those of v."""
+    """Velocity (nv,) on a scene's constraints whose `columns` fit those of v by least squares."""
     picked = jnp.eye(scene.nv, dtype=q.dtype)[np.array(columns)]
 
     def nearer(now, _):
@@ -73,27 +75,28 @@ def nearest_velocity(scene: Scene, q, v, t, columns: tuple[int, ...]) -> Float[A
 
 
 def _least_squares(A, picked, left):
-    """The smallest change that takes away what is left of constraints and of measured coordinates."""
+    """Smallest change that removes the residuals of constraints and of measured coordinates."""
     both = jnp.concatenate([_EXACT * A, picked])
     return solve_positive(both.T @ both + _STAYS * jnp.eye(both.shape[1], dtype=both.dtype), both.T @ left)
 
 
-def completed(scene: SceneLike, t: Numbers, measured: dict[Any, Any], tau: Numbers, guess: Numbers) -> Log:
-    """A log of all joints of a mechanism, from those that were measured and the constraints.
+def complete_log(scene: SceneLike, t: Numbers, measured: dict[Any, Any], tau: Numbers, guess: Numbers) -> Log:
+    """Log of all joints of a mechanism, from the measured joints and the constraints.
 
-    Positions of the others are those next to the ones before (the first next to `guess`) with which the constraints hold;
-    velocities are the least squares of A v = b and of the measured ones. So as many joints are needed as there are freedoms, or
-    more; with more, positions are the least squares of those measured, on the constraints.
+    Positions of the other joints satisfy the constraints and are nearest to those of the sample before (the first to `guess`);
+    velocities are the least squares of A v = b and of the measured ones. At least as many joints must be measured as the
+    mechanism has degrees of freedom; with more, positions are the least squares of the measured ones on the constraints.
 
-    **Arguments:** `scene`, with constraints; `t` (n,), s; `measured`: {joint: (q (n,), v (n,))} of joints of one freedom,
+    **Arguments:** `scene`, with constraints; `t` (n,), s; `measured`: {joint: (q (n,), v (n,))} of joints with one degree of
+    freedom,
       rad or m, by name, or by index for a system without bodies;
     `tau` (n, nv), N m or N, zero where there are no motors; `guess` (nq,): a configuration near the first one.
 
-    **Returns:** `Log` without accelerations, in which what was measured stays as it is. Pass the joints as `observed=` to
-    `fit_parameters`, which then compares them alone.
+    **Returns:** `Log` without accelerations, in which measured joints keep their measured values. Pass the joints as
+    `observed=` to `fit_parameters`, which then compares them alone.
 
-    **Raises:** ValueError for joints that do not exist or have several freedoms, wrong shapes, and for a sample at which the
-    mechanism cannot be assembled (its number and time).
+    **Raises:** ValueError for joints that do not exist or have several degrees of freedom, wrong shapes, and for a sample at
+    which the mechanism cannot be assembled (its number and time).
 
     Source: EQUATIONS section 6 (constraints as rows).
     """
@@ -102,10 +105,10 @@ def completed(scene: SceneLike, t: Numbers, measured: dict[Any, Any], tau: Numbe
     if not scene.constraints:
         raise ValueError("scene has no constraints, from which the other joints could follow; pass a mechanism")
     dtype, names = state_dtype(system), list(measured)
-    columns = observed_columns(system, names)
+    columns = observation_columns(system, names)
     places = [system.q_index(name) for name in names] if isinstance(system, Model) else list(columns)
     if not all(isinstance(place, int) for place in places) or len(columns) != len(names):
-        raise ValueError(f"measured names {names}; name joints of one freedom each")
+        raise ValueError(f"measured names {names}; name joints with one degree of freedom each")
     t = np.asarray(as_array(t, "t"), np.float64)
     motion = {name: [jnp.asarray(as_array(x, f"measured[{name!r}]", dtype)) for x in measured[name]] for name in names}
     for name, (q, v) in motion.items():
@@ -139,3 +142,9 @@ def completed(scene: SceneLike, t: Numbers, measured: dict[Any, Any], tau: Numbe
     q, v = np.array(q), np.array(v)
     q[:, np.array(places)], v[:, np.array(columns)] = positions, velocities
     return Log(t, q, v, None, np.asarray(tau, np.float64))
+
+
+def completed(scene: SceneLike, t: Numbers, measured: dict[Any, Any], tau: Numbers, guess: Numbers) -> Log:
+    """Deprecated name of `complete_log`."""
+    warn("jd.identify.completed is deprecated; call complete_log", DeprecationWarning)
+    return complete_log(scene, t, measured, tau, guess)

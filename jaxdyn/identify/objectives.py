@@ -1,6 +1,6 @@
-"""What a fit compares with a log: torques, momentum, energy, or simulated motion, open-loop or under the logged controller.
+"""Errors between a scene and a log: of torques, momentum, energy, or simulated motion, open-loop or under the logged controller.
 
-Each is a list of errors of one piece of a log, in units of `scale`. Momentum and energy are balances over a piece,
+Each is a list of errors of one segment of a log, in units of `scale`. Momentum and energy are balances over a segment,
 
     M v |_0^T     = integral of C^T v - g + f + tau           (nv,),   as dM/dt = C + C^T,
     T + V |_0^T   = integral of v . (f + tau)                 (),
@@ -21,7 +21,7 @@ from jaxtyping import Array, Float
 
 from jaxdyn.dynamics import quantities as dynamics
 from jaxdyn.identify.replay import SampledTorque, Segments, motion_errors, motion_scale, moving_scale, simulate_segment
-from jaxdyn.identify.result import needed_torque
+from jaxdyn.identify.result import inverse_torque
 from jaxdyn.identify.sensors import Measured
 from jaxdyn.systems.system import displace
 
@@ -31,8 +31,11 @@ ERRORS = ("trajectory", "torque", "momentum", "energy", "closed-loop")
 
 
 class Objective(eqx.Module):
-    """What is compared: `error`, how torques are between samples, options of `simulate`, the logged controller, and the
-    indices of the coordinates that were measured (None: all)."""
+    """Objective of a fit.
+
+    The kind of `error`, the interpolation of torques, options of `simulate`, the logged controller, and the indices of the
+    coordinates that were measured (None: all).
+    """
 
     error: str = eqx.field(static=True)
     hold: str = eqx.field(static=True)
@@ -55,14 +58,14 @@ class Objective(eqx.Module):
         return motion if self.error == "trajectory" else jnp.concatenate([motion, torque[None]])
 
     def errors(self, measured: Measured, piece: Segments, change, scale) -> Float[Array, "n k"]:
-        """Errors of one piece, a row for each sample (one row for a balance); `change` (2, nv): of its first state."""
+        """Errors of one segment, a row for each sample (one row for a balance); `change` (2, nv): of its initial state."""
         scene, system = measured.scene, measured.scene.system
-        piece = corrected(measured, piece, None if self.error in SIMULATED else self.hold)
+        piece = correct_sensors(measured, piece, None if self.error in SIMULATED else self.hold)
         if self.error == "torque":
-            tau = jax.vmap(lambda t, q, v, a: needed_torque(scene, q, v, a, t))(piece.t, piece.q, piece.v, piece.a)
-            return self._seen((tau - piece.tau) / scale[None])
+            tau = jax.vmap(lambda t, q, v, a: inverse_torque(scene, q, v, a, t))(piece.t, piece.q, piece.v, piece.a)
+            return self._select_columns((tau - piece.tau) / scale[None])
         if self.error == "momentum":
-            return self._seen((momentum_balance(scene, piece) / scale)[None])
+            return self._select_columns((momentum_balance(scene, piece) / scale)[None])
         if self.error == "energy":
             return (energy_balance(scene, piece) / scale)[None, None]
         start = None if change is None else change * scale[:2]
@@ -71,44 +74,44 @@ class Objective(eqx.Module):
         if self.error == "trajectory":
             law = SampledTorque(piece.t + measured.delay, piece.tau, self.hold)
             q, v = simulated(control=law)
-            return jnp.concatenate([self._seen(e) for e in motion_errors(system, piece, q, v, scale)], axis=1)
+            return jnp.concatenate([self._select_columns(e) for e in motion_errors(system, piece, q, v, scale)], axis=1)
         q, v, tau = simulated(control=self.control, outputs=("torque",))
         errors = [*motion_errors(system, piece, q, v, scale[:2]), (tau - piece.tau) / scale[2][None]]
-        return jnp.concatenate([self._seen(error) for error in errors], axis=1)
+        return jnp.concatenate([self._select_columns(error) for error in errors], axis=1)
 
-    def _seen(self, errors):
+    def _select_columns(self, errors):
         return errors if self.observed is None else errors[:, jnp.asarray(self.observed)]
 
 
-def corrected(measured: Measured, piece: Segments, hold: str | None) -> Segments:
-    """The motion and the torques that a piece of a log stands for; with `hold` the delayed ones at its samples."""
+def correct_sensors(measured: Measured, piece: Segments, hold: str | None) -> Segments:
+    """Correct a log segment for its sensors; with `hold` the torques are the delayed ones at its samples."""
     system = measured.scene.system
     q = jax.vmap(lambda q: displace(system, q, -measured.position_bias))(piece.q)
     tau = measured.torque_gain[None] * piece.tau + measured.torque_bias[None]
     if hold is not None and piece.tau.shape[0] > 1:
         law = SampledTorque(piece.t, tau, hold)
-        # The gradient of the instant at a sample is that of the line after it.
+        # At a sample, which is a kink, the derivative by time is that of the line after it.
         tau = jax.vmap(lambda t: law.at(t - measured.delay))(piece.t)
     return eqx.tree_at(lambda p: (p.q, p.tau), piece, (q, tau))
 
 
 def momentum_balance(scene, piece: Segments) -> Float[Array, " nv"]:
-    """M v at the end less at the start, less the impulse in between (nv,): zero for a motion of the scene."""
+    """Change of the momentum M v over a segment less the impulse (nv,): zero for a motion of the scene."""
     system = scene.system
 
-    def pushed(t, q, v, tau):
+    def force(t, q, v, tau):
         C, g = dynamics.coriolis_matrix(system, q, v, t), dynamics.gravity_force(system, q, t)
-        force = scene.applied_force(q, v, t)
-        return v @ C - g + tau + (0.0 if force is None else force)
+        applied = scene.applied_force(q, v, t)
+        return v @ C - g + tau + (0.0 if applied is None else applied)
 
-    rate = jax.vmap(pushed)(piece.t, piece.q, piece.v, piece.tau)
+    rate = jax.vmap(force)(piece.t, piece.q, piece.v, piece.tau)
     t: Any = piece.t
     momentum = [dynamics.mass_matrix(system, piece.q[i], t[i]) @ piece.v[i] for i in (0, -1)]
     return momentum[1] - momentum[0] - _integral(rate, piece.t)
 
 
 def energy_balance(scene, piece: Segments) -> Float[Array, ""]:
-    """Energy at the end less at the start, less the work in between (J): zero for a motion of the scene.
+    """Change of the energy over a segment less the work (J): zero for a motion of the scene.
 
     Constraints that do not move with time do no work, so it holds for mechanisms too.
     """

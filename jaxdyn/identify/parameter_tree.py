@@ -1,4 +1,4 @@
-"""What a fit may change of a system, a scene or a `Measured` one, and what is known of it beforehand: one tree of parameters."""
+"""Tree of the parameters that a fit may change in a system or a scene, with their priors."""
 
 from collections.abc import Iterable, Mapping, Sequence
 from typing import Any
@@ -12,10 +12,20 @@ from jaxtyping import Array, Float, PyTree
 from jaxdyn.identify.blocks import Block, Directions, Inertias, Numbers, Poses, Tied
 from jaxdyn.identify.chart import make_chart
 from jaxdyn.identify.distances import METRICS
-from jaxdyn.identify.picking import Rows, across, entries_taken, free_bodies, models_of, root_of, rows_of
+from jaxdyn.identify.picking import (
+    Rows,
+    entries_of_block,
+    find_models,
+    free_bodies,
+    leaves_with_names,
+    perpendicular_basis,
+    prior_root,
+    row_indices,
+    select,
+)
 from jaxdyn.identify.sensors import FitSystem, with_sensors
 from jaxdyn.model import float64 as f64
-from jaxdyn.model.arguments import Function, Number, state_dtype
+from jaxdyn.model.arguments import Function, Number, state_dtype, warn
 from jaxdyn.model.arguments import Numbers as Values
 from jaxdyn.model.tree import Model
 from jaxdyn.systems.scene import Scene
@@ -23,23 +33,16 @@ from jaxdyn.systems.scene import Scene
 _TEN = ("m", "mcx", "mcy", "mcz", "Ixx", "Ixy", "Iyy", "Ixz", "Iyz", "Izz")
 
 
-class _Leaf:
-    """Stands for a leaf while a user's function picks it."""
-
-    def __init__(self, place: int, name: str):
-        self.place, self.name = place, name
-
-
 class Parameters(eqx.Module):
-    """Numbers of a system that a fit may change: free, positive, bounded, turned, tied; feasible inertias; and their priors.
+    """Tree of the numbers that a fit may change: free, positive, bounded or tied; rotations; feasible inertias; and their priors.
 
     Nothing is free at first. Each method frees a leaf, or rows of it (bodies, joints), and returns a new tree.
 
     **Arguments:** `system`: a `Model`, another system, a `Scene`, a `jd.identify.Measured` scene with its sensors, or a
     `jd.identify.Construction`.
 
-    **Raises:** ValueError in each method for what is picked that is no floating-point leaf, is picked twice, or starts where
-    it is not allowed; the message names the leaf.
+    **Raises:** ValueError in each method for a selection that is no floating-point leaf, is selected twice, or starts outside
+    its bounds; the message names the leaf.
 
     ```python
     scene = jd.Scene(model, forces=[jd.JointDamping([0.1, 0.1])])
@@ -61,7 +64,7 @@ class Parameters(eqx.Module):
         self.given = system
         self.blocks = tuple(blocks)
 
-    # What can be changed.
+    # Methods that free numbers.
 
     def free(
         self,
@@ -72,7 +75,7 @@ class Parameters(eqx.Module):
         std: Values | None = None,
         covariance: Values | None = None,
     ) -> "Parameters":
-        """Numbers of any sign. `where`: a function that picks leaves, `lambda scene: scene.system.parameters["mass"]`.
+        """Free numbers of any sign. `where`: a function that selects leaves, `lambda scene: scene.system.parameters["mass"]`.
 
         `rows`: indices along the leaf's first axis, or names of bodies or joints where it has one row for each; all by
         default. A Gaussian prior: `std` (a number or one each) or `covariance` (m, m), about `mean` (where they are now).
@@ -88,10 +91,10 @@ class Parameters(eqx.Module):
         std: Values | None = None,
         covariance: Values | None = None,
     ) -> "Parameters":
-        """Numbers that stay above zero at every iterate, searched by their logarithm. Arguments as of `free`."""
+        """Free numbers that stay above zero at every iterate, by their logarithm. Arguments as of `free`."""
         return self._numbers("positive", where, rows, mean, std, covariance)
 
-    def bounded(
+    def bound(
         self,
         where: Function,
         lower: Values,
@@ -102,16 +105,16 @@ class Parameters(eqx.Module):
         std: Values | None = None,
         covariance: Values | None = None,
     ) -> "Parameters":
-        """Numbers that stay between `lower` and `upper` (numbers, or one each) at every iterate. Other arguments as of `free`."""
-        return self._numbers("bounded", where, rows, mean, std, covariance, lower, upper)
+        """Free numbers between `lower` and `upper` (numbers, or one each) at every iterate. Other arguments as of `free`."""
+        return self._numbers("bound", where, rows, mean, std, covariance, lower, upper)
 
     def directions(self, where: Function, *, rows: Rows = None, std: Values | None = None) -> "Parameters":
-        """Vectors (..., 3), or screws (..., 6), that turn and keep their length: gravity, axes of joints.
+        """Free the directions of vectors (..., 3), or screws (..., 6), of constant length: gravity, axes of joints.
 
-        `std`: of a prior on the angle from where they are, rad.
+        `std`: of a prior on the angle from the start, rad.
         """
         blocks = list(self.blocks)
-        for leaf, value, name in self._picked(where, "directions"):
+        for leaf, value, name in select(self.given, where, "directions"):
             if value.shape[-1] not in (3, 6):
                 raise ValueError(
                     f"directions picks {name} of shape {value.shape}; pick vectors (..., 3) or screws (..., 6)"
@@ -124,19 +127,19 @@ class Parameters(eqx.Module):
                 raise ValueError(
                     f"directions picks {name}, where a vector is zero: {vectors.tolist()}; name the others in rows="
                 )
-            bases = np.stack([across(axis) for axis in axes])
+            bases = np.stack([perpendicular_basis(axis) for axis in axes])
             root = None if std is None else np.eye(2 * len(vectors)) / std
             blocks.append(Directions(labels, leaf, tuple(index), *self._arrays(vectors, bases, root)))
         return self._with(blocks)
 
     def poses(self, where: Function, *, rows: Rows = None, std: Values | None = None) -> "Parameters":
-        """Poses (..., 4, 4), which stay rigid motions: home poses, frames. `std`: of a prior on all six numbers, m and rad."""
+        """Free poses (..., 4, 4) as rigid motions: home poses, frames. `std`: of a prior on all six numbers, m and rad."""
         blocks = list(self.blocks)
-        for leaf, value, name in self._picked(where, "poses"):
+        for leaf, value, name in select(self.given, where, "poses"):
             if value.shape[-2:] != (4, 4):
                 raise ValueError(f"poses picks {name} of shape {value.shape}; pick poses (..., 4, 4)")
             poses = value.reshape(-1, 4, 4)
-            chosen, labels = rows_of(self.given, name, len(poses), rows)
+            chosen, labels = row_indices(self.given, name, len(poses), rows)
             names = tuple(f"{label} {c}" for label in labels for c in ("vx", "vy", "vz", "wx", "wy", "wz"))
             root = None if std is None else np.eye(6 * len(chosen)) / std
             blocks.append(Poses(names, leaf, tuple(chosen), *self._arrays(poses[np.array(chosen)], root)))
@@ -152,21 +155,21 @@ class Parameters(eqx.Module):
         ellipsoids: Mapping[str, tuple] | None = None,
         total: float | None = None,
     ) -> "Parameters":
-        """Inertias of bodies, so that no iterate is a body that cannot exist.
+        """Free inertias of bodies, so that every iterate is physically feasible.
 
         - `bodies`: names; all that have mass by default. All other bodies are frozen.
         - `shape`: "full", all ten numbers, or "mass", the density alone (which rods and points allow too).
-        - `metric`: of the distance to where the bodies are now, which is added `weight` times: "entropic" (the log-det
+        - `metric`: of the distance to the present bodies, which is added `weight` times: "entropic" (the log-det
           divergence), "affine" (the squared affine-invariant distance), or None for none.
-        - `ellipsoids`: {body: (centre (3,), semi-axes (3,))} in the body's frame, m, that hold the body's mass.
+        - `ellipsoids`: {body: (centre (3,), semi-axes (3,))} in the body's frame, m, that contain the body's mass.
         - `total`: mass of all bodies of the model (kg), kept exactly.
 
-        **Raises:** ValueError for unknown bodies, bodies that are not feasible now, ellipsoids that do not hold them now.
+        **Raises:** ValueError for unknown bodies, bodies that are not feasible, ellipsoids that do not contain them.
         """
         model, leaf, name = self._model()
         if metric is not None and metric not in METRICS:
-            raise ValueError(f"metric is {metric!r}; take one of {METRICS}, or None")
-        chosen = None if bodies is None else rows_of(self.given, name, model.nb, list(bodies))[0]
+            raise ValueError(f"metric is {metric!r}; give one of {METRICS}, or None")
+        chosen = None if bodies is None else row_indices(self.given, name, model.nb, list(bodies))[0]
         one = np.ones(model.nv)
         chart, _ = make_chart(model, (), 0.01, shape, one, one, one, bodies=chosen)
         if chosen is not None and set(chosen) != set(chart.bodies):
@@ -183,7 +186,7 @@ class Parameters(eqx.Module):
             raise ValueError(f"weight is {weight}; give a positive number, or metric=None")
         return self._with([*self.blocks, Inertias(tuple(names), leaf, metric, chart, *parts)])
 
-    def tied(
+    def tie(
         self,
         where: Function,
         to: Function,
@@ -193,25 +196,35 @@ class Parameters(eqx.Module):
         rows: Rows = None,
         to_rows: Rows = None,
     ) -> "Parameters":
-        """Numbers that follow others: x = scale x_other + offset, entry by entry. Others may be free, or tied before."""
-        (leaf, value, name), *rest = self._picked(where, "tied")
-        (other, source, other_name), *more = self._picked(to, "to", twice=True)
+        """Make numbers functions of others: x = scale x_other + offset, entry by entry. Others may be free, or tied before."""
+        (leaf, value, name), *rest = select(self.given, where, "tie")
+        (other, source, other_name), *more = select(self.given, to, "to", twice=True)
         if rest or more:
-            raise ValueError("tied picks several leaves; tie one leaf, or rows of it, to one other")
+            raise ValueError("tie picks several leaves; tie one leaf, or rows of it, to one other")
         index, labels = self._entries(name, value, rows)
         other_index, _ = self._entries(other_name, source, to_rows)
         if len(other_index) == 1:
             other_index = other_index * len(index)
         if len(index) != len(other_index):
             raise ValueError(
-                f"tied: {name} has {len(index)} numbers and {other_name} {len(other_index)}; name rows that match"
+                f"tie: {name} has {len(index)} numbers and {other_name} {len(other_index)}; name rows that match"
             )
         if leaf == other and set(index) & set(other_index):
-            raise ValueError(f"tied: {name} would follow itself; name other rows")
+            raise ValueError(f"tie: {name} would follow itself; name other rows")
         numbers = self._arrays(np.asarray(float(scale)), np.asarray(float(offset)))
         return self._with([*self.blocks, Tied(labels, leaf, tuple(index), other, tuple(other_index), *numbers)])
 
-    # What a fit asks.
+    def bounded(self, where: Function, lower: Values, upper: Values, **options: Any) -> "Parameters":
+        """Deprecated name of `bound`."""
+        warn("Parameters.bounded is deprecated; call bound", DeprecationWarning)
+        return self.bound(where, lower, upper, **options)
+
+    def tied(self, where: Function, to: Function, **options: Any) -> "Parameters":
+        """Deprecated name of `tie`."""
+        warn("Parameters.tied is deprecated; call tie", DeprecationWarning)
+        return self.tie(where, to, **options)
+
+    # Quantities that a fit needs.
 
     @property
     def size(self) -> int:
@@ -220,7 +233,7 @@ class Parameters(eqx.Module):
 
     @property
     def names(self) -> tuple[str, ...]:
-        """Where the numbers stand, as one writes it after the system: "parameters['mass']"."""
+        """Paths of the numbers within the system, as in "parameters['mass']"."""
         return tuple(name for block in self.blocks for name in block.names)
 
     @property
@@ -234,26 +247,26 @@ class Parameters(eqx.Module):
         return state_dtype(with_sensors(self.given).scene.system)
 
     def system(self, y: Float[Array, " p"]) -> PyTree:
-        """What was given, with the numbers of y."""
+        """System as given, with the numbers of y."""
         leaves, structure = jax.tree.flatten(self.given)
-        # Leaves that nothing changes stay the same objects, by which they are known.
-        for place, leaf in _walked(self, y, None)[0].items():
+        # Frozen leaves stay the same objects, by whose identity other code recognises them.
+        for place, leaf in _apply_blocks(self, y, None)[0].items():
             leaves[place] = leaf
         return jax.tree.unflatten(structure, leaves)
 
     def scene(self, y: Float[Array, " p"]) -> Scene:
-        """The scene with the numbers of y."""
+        """Scene with the numbers of y."""
         return with_sensors(self.system(y)).scene
 
     def values(self, y: Float[Array, " p"]) -> Float[Array, " m"]:
-        """The numbers (m,) that `names` names."""
-        return _walked(self, y, "values")[1]
+        """Numbers (m,) in the order of `names`."""
+        return _apply_blocks(self, y, "values")[1]
 
     def residual(self, y: Float[Array, " p"]) -> Float[Array, " k"]:
-        """What is known beforehand, as residuals of unit deviation (k,): half of their sum of squares is -log of the prior."""
-        return _walked(self, y, "residual")[1]
+        """Residuals of the prior (k,), of unit standard deviation: half of their sum of squares is its negative logarithm."""
+        return _apply_blocks(self, y, "residual")[1]
 
-    # How it is put together.
+    # Construction.
 
     def _with(self, blocks: list[Block]) -> "Parameters":
         return Parameters(self.given, tuple(blocks))
@@ -261,23 +274,15 @@ class Parameters(eqx.Module):
     def _arrays(self, *values) -> list[Any]:
         return [None if x is None else jnp.asarray(x, self.dtype) for x in values]
 
-    def _named_leaves(self):
-        paths, structure = jax.tree_util.tree_flatten_with_path(self.given)
-        return (
-            [leaf for _, leaf in paths],
-            [jax.tree_util.keystr(path).removeprefix(".") for path, _ in paths],
-            structure,
-        )
-
     def _model(self) -> tuple[Model, int, str]:
         """The model of the system, the place of its inertias among the leaves, and their name."""
-        models = models_of(self.given)
+        models = find_models(self.given)
         if len(models) != 1:
             raise ValueError(
                 f"inertias: a {type(self.given).__name__} with {len(models)} models of bodies; free numbers of other systems "
                 "with positive= and free="
             )
-        leaves, names, _ = self._named_leaves()
+        leaves, names, _ = leaves_with_names(self.given)
         place = next(i for i, leaf in enumerate(leaves) if leaf is models[0].inertias)
         self._refuse_twice(place, names[place], "inertias")
         return models[0], place, names[place]
@@ -295,70 +300,29 @@ class Parameters(eqx.Module):
             quadrics[k, 3, :3], quadrics[k, 3, 3] = inverse @ centre, 1 - centre @ inverse @ centre
             P = f64.pseudo_inertia(np.asarray(model.inertias, np.float64)[chart.bodies[k]])
             if not np.sum(P * quadrics[k]) > 0:
-                raise ValueError(
-                    f"the ellipsoid of {body!r} does not hold the body as it is now; give larger semi-axes"
-                )
+                raise ValueError(f"the ellipsoid of {body!r} does not contain the body; give larger semi-axes")
         return quadrics
 
     def _refuse_twice(self, place: int, name: str, argument: str, index: Sequence[int] | None = None) -> None:
         for block in self.blocks:
             if block.place != place:  # pyright: ignore[reportAttributeAccessIssue]
                 continue
-            taken = entries_taken(block)
+            taken = entries_of_block(block)
             if index is None or taken is None or set(index) & set(taken):
                 raise ValueError(f"{argument} picks {name} a second time; pick every number once")
-
-    def _picked(self, where, argument: str, twice: bool = False) -> list[tuple[int, np.ndarray, str]]:
-        """The leaves that a user's function picks: place, value, name.
-
-        **Raises:** ValueError for a function that fails or gives anything else, for leaves that are no floating-point numbers.
-        """
-        leaves, names, structure = self._named_leaves()
-        kind = type(self.given).__name__
-        marked = jax.tree.unflatten(structure, [_Leaf(i, name) for i, name in enumerate(names)])
-        example = f"write e.g. {argument}=lambda system: system.parameters['mass']"
-        if not callable(where):
-            raise ValueError(f"{argument} is {where!r}; pass a function that picks leaves, {example}")
-        try:
-            entries = jax.tree.leaves(where(marked))
-        except (AttributeError, IndexError, KeyError, TypeError) as error:
-            raise ValueError(
-                f"{argument} picks nothing of this {kind} ({type(error).__name__}: {error}); {example}, of whole leaves"
-            ) from error
-        strange = [leaf for leaf in entries if not isinstance(leaf, _Leaf)]
-        if strange or not entries:
-            raise ValueError(
-                f"{argument} picks {strange[0] if strange else 'nothing'!r}, which is no leaf of this {kind}; {example}"
-            )
-        picked = []
-        for leaf in entries:
-            value = leaves[leaf.place]
-            if not eqx.is_inexact_array_like(value):
-                raise ValueError(f"{argument} picks {leaf.name}, which is {value!r} and no floating-point number")
-            if not twice and any(value is model.inertias for model in models_of(self.given)):
-                raise ValueError(
-                    f"{argument} picks {leaf.name}, the inertias of bodies, of which few choices are physical; free them by "
-                    "jd.identify.Parameters(system).inertias(...)"
-                )
-            picked.append((leaf.place, np.asarray(value, np.float64), leaf.name))
-        if len({place for place, *_ in picked}) < len(picked):
-            places = [place for place, *_ in picked]
-            name = next(name for place, _, name in picked if places.count(place) > 1)
-            raise ValueError(f"{argument} picks {name} a second time; pick every number once")
-        return picked
 
     def _entries(self, name: str, value: np.ndarray, rows) -> tuple[list[int], tuple[str, ...]]:
         """Flat indices of the entries in some rows of a leaf, and their names."""
         indices = np.arange(value.size).reshape(value.shape)
         if rows is not None:
-            indices = indices[np.array(rows_of(self.given, name, len(indices) if value.ndim else 0, rows)[0])]
+            indices = indices[np.array(row_indices(self.given, name, len(indices) if value.ndim else 0, rows)[0])]
         chosen = indices.reshape(-1).tolist()
         at = [np.unravel_index(i, value.shape) for i in chosen]
         return chosen, tuple(name + "".join(f"[{i}]" for i in index) for index in at)
 
     def _numbers(self, kind, where, rows, mean, std, covariance, lower=None, upper=None) -> "Parameters":
         tree = self
-        for place, value, name in self._picked(where, kind):
+        for place, value, name in select(self.given, where, kind):
             index, labels = tree._entries(name, value, rows)
             tree._refuse_twice(place, name, kind, index)
             origin = value.reshape(-1)[index]
@@ -367,14 +331,14 @@ class Parameters(eqx.Module):
                     f"positive picks {name}, which is {value.tolist()}; start above zero, or pick it in free"
                 )
             limits = (None, None)
-            if kind == "bounded":
+            if kind == "bound":
                 limits = tuple(np.broadcast_to(np.asarray(x, float), origin.shape) for x in (lower, upper))
                 if not ((limits[0] < origin) & (origin < limits[1])).all():
                     raise ValueError(
-                        f"bounded picks {name}, which is {origin.tolist()} and not between {lower} and {upper}; give bounds "
+                        f"bound picks {name}, which is {origin.tolist()} and not between {lower} and {upper}; give bounds "
                         "that hold where the fit starts"
                     )
-            root = root_of(std, covariance, origin.size, f"{kind} of {name}")
+            root = prior_root(std, covariance, origin.size, f"{kind} of {name}")
             if mean is not None and root is None:
                 raise ValueError(f"{kind} of {name}: mean is given without std or covariance; give one of them")
             center = (
@@ -388,10 +352,10 @@ class Parameters(eqx.Module):
         return tree
 
 
-def picked(system: Any, positive=None, free=None) -> Parameters:
-    """The tree of what `positive` and `free` pick; nothing else is free.
+def select_leaves(system: Any, positive=None, free=None) -> Parameters:
+    """Tree of the leaves that `positive` and `free` select; nothing else is free.
 
-    **Raises:** ValueError as `Parameters` says, and where nothing is picked.
+    **Raises:** ValueError as `Parameters`, and where nothing is selected.
     """
     tree = Parameters(system)
     if positive is not None:
@@ -400,16 +364,16 @@ def picked(system: Any, positive=None, free=None) -> Parameters:
 
 
 @eqx.filter_jit
-def _walked(parameters: Parameters, y, asked: str | None):
-    """The leaves with the numbers of y, by their places, and what each block says to what it is asked, one after the other."""
+def _apply_blocks(parameters: Parameters, y, method: str | None):
+    """Leaves with the numbers of y, by their places, and a method's results of all blocks, one after the other."""
     leaves = jax.tree.leaves(parameters.given)
     begin, parts = 0, [jnp.zeros((0,), y.dtype)]
     for block in parameters.blocks:
         part = y[begin : begin + block.size]
         begin += block.size
         leaves[block.place] = jnp.asarray(leaves[block.place])  # pyright: ignore[reportAttributeAccessIssue]
-        if asked is not None:
-            parts.append(getattr(block, asked)(part, leaves).astype(y.dtype))
+        if method is not None:
+            parts.append(getattr(block, method)(part, leaves).astype(y.dtype))
         block.write(part, leaves)
     places = {block.place for block in parameters.blocks}  # pyright: ignore[reportAttributeAccessIssue]
     return {place: leaves[place] for place in sorted(places)}, jnp.concatenate(parts)

@@ -1,4 +1,4 @@
-"""A fit as a function of its unknowns: errors of all pieces of the logs and of the prior, their slopes, and what made a NaN."""
+"""Errors of a fit and of its prior as functions of the unknowns, their Jacobians, and the cause where they are not finite."""
 
 import dataclasses
 from collections.abc import Sequence
@@ -12,23 +12,23 @@ import numpy as np
 from jax.flatten_util import ravel_pytree
 from jaxtyping import Array, Float
 
-from jaxdyn.identify.divided import mapped, shared_out, summed
-from jaxdyn.identify.gauss_newton import Unknowns
+from jaxdyn.identify.devices import map_by_device, shard_blocks, sum_over_devices
+from jaxdyn.identify.gauss_newton import LinearErrors, Unknowns, eliminate_starts, with_prior
 from jaxdyn.identify.logs import Log
 from jaxdyn.identify.objectives import BALANCES, SIMULATED, Objective
 from jaxdyn.identify.parameter_tree import Parameters
-from jaxdyn.identify.replay import Segments, check_spacing, segments, spaced
+from jaxdyn.identify.replay import Segments, check_spacing, segments, with_even_steps
 from jaxdyn.identify.sensors import Measured, with_sensors
 from jaxdyn.model.tree import Model
 
 
 class Problem(eqx.Module):
-    """What is minimised: the sum over all pieces of the squared errors / N, plus noise^2/N |residual of the prior|^2.
+    """Problem of a fit: minimise the sum of squared errors of all segments / N, plus noise^2/N |residual of the prior|^2.
 
-    `batches`: pieces of equal length each; `meshes`: of the devices that share those of a batch, None for one device.
+    `batches`: segments of equal length each; `meshes`: of the devices that share those of a batch, None for one device.
     """
 
-    tree: Parameters
+    tree: Any  # `Parameters`, or a tree with the same methods
     objective: Objective
     batches: tuple[Segments, ...]
     scale: Array
@@ -37,12 +37,12 @@ class Problem(eqx.Module):
 
     @property
     def count(self) -> int:
-        """Number of pieces."""
+        """Number of segments."""
         return sum(batch.t.shape[0] for batch in self.batches)
 
     @property
     def divisor(self) -> float:
-        """N: samples times coordinates; of a balance, pieces times coordinates."""
+        """N: samples times coordinates; of a balance, segments times coordinates."""
         width = 1 if self.objective.error == "energy" else self.batches[0].tau.shape[-1]
         if self.objective.observed is not None and self.objective.error != "energy":
             width = len(self.objective.observed)
@@ -56,20 +56,20 @@ class Problem(eqx.Module):
         return self.noise**2 / self.divisor
 
 
-def posed(
-    tree: Parameters,
+def pose_problem(
+    tree: Any,
     objective: Objective,
     logs: Sequence[Log],
     horizon: int | None,
     noise: float,
     devices: Sequence[Any] | None = None,
 ) -> Problem:
-    """The fit of a tree of parameters to logs, whose pieces devices share.
+    """Problem of a parameter tree and logs, whose segments are sharded over devices.
 
-    **Raises:** ValueError for a horizon that does not fit, and for logs of unequal length where pieces must have one length.
+    **Raises:** ValueError for a horizon that does not fit, and for logs of unequal length where segments must have one length.
     """
     system, scene = tree.given, with_sensors(tree.given).scene
-    # The clock of a Model starts at zero in every piece; that of anything else is the log's.
+    # The time of a Model starts at zero in every segment; that of other systems, which may depend on it, is the log's.
     bare = isinstance(system, Measured) and not (scene.forces or scene.constraints)
     restart = isinstance(scene.system if bare else system, Model) and objective.error != "closed-loop"
     cut = partial(segments, dtype=tree.dtype, restart=restart)
@@ -77,7 +77,7 @@ def posed(
         parts = [cut(log, None) for log in logs]
         flat = jax.tree.map(lambda *x: jnp.concatenate(x, axis=1), *parts)
         if not isinstance(system, Measured):
-            # Without a delay samples do not know of each other: each is a piece.
+            # Without a delay samples are independent: each is a segment.
             batches = [jax.tree.map(lambda x: x[0, :, None], flat)]
         elif len({len(log) for log in logs}) == 1:
             batches = [cut(logs, None)]
@@ -87,13 +87,13 @@ def posed(
         if horizon is None and objective.error in BALANCES:
             horizon = min(20, *(len(log) - 1 for log in logs))
         flat = cut(logs, horizon)
-        options = spaced(objective.options, flat)
+        options = with_even_steps(objective.options, flat)
         if objective.error in SIMULATED:
             check_spacing(options, devices)
         objective = dataclasses.replace(objective, options=options)
         batches = [flat]
     scale = _scale(objective, scene.system, flat)
-    shared = [shared_out(batch, devices) for batch in batches]
+    shared = [shard_blocks(batch, devices) for batch in batches]
     return Problem(tree, objective, tuple(x for x, _ in shared), scale, noise, tuple(mesh for _, mesh in shared))
 
 
@@ -102,40 +102,40 @@ def _scale(objective: Objective, system, pieces):
     return objective.scale(system, pieces)
 
 
-def gathered(problem: Problem) -> Problem:
-    """The problem on one device."""
+def on_one_device(problem: Problem) -> Problem:
+    """Copy of a problem on one device."""
     batches = jax.tree.map(lambda x: jnp.asarray(np.asarray(x), x.dtype), problem.batches)
     return dataclasses.replace(problem, batches=batches, meshes=(None,) * len(batches))
 
 
-def piece_errors(problem: Problem, divisor: float, y, change, piece: Segments) -> Float[Array, "n k"]:
-    """Errors of one piece, in shares of the whole: the loss is the sum of all their squares."""
+def segment_errors(problem: Problem, divisor: float, y, change, piece: Segments) -> Float[Array, "n k"]:
+    """Errors of one segment, scaled so that the loss is the sum of the squares of all."""
     measured = with_sensors(problem.tree.system(y))
     return problem.objective.errors(measured, piece, change, problem.scale) / divisor**0.5
 
 
-def _apart(problem: Problem) -> tuple[Problem, tuple[Segments, ...]]:
-    """What all devices know, and the pieces that are shared among them."""
+def _split_batches(problem: Problem) -> tuple[Problem, tuple[Segments, ...]]:
+    """Split a problem into what all devices hold and the segments that are sharded."""
     return eqx.tree_at(lambda problem: problem.batches, problem, ()), problem.batches
 
 
 def prior_errors(problem: Problem, y) -> Float[Array, " k"]:
-    """Errors of the prior (k,), in the same shares."""
+    """Errors of the prior (k,), in the same scale."""
     return problem.prior_weight**0.5 * problem.tree.residual(y)
 
 
 def errors_of(z, args) -> Float[Array, " n"]:
-    """All errors, those of the prior behind those of the data, at the flat unknowns."""
+    """All errors at the flat unknowns, those of the prior after those of the data."""
     problem, unknowns = args
     estimate = ravel_pytree(unknowns)[1](z)
-    (rest, batches), divisor, parts = _apart(problem), problem.divisor, []
+    (rest, batches), divisor, parts = _split_batches(problem), problem.divisor, []
 
     def rows(shared, pieces):
         problem, y = shared
-        return jax.vmap(partial(piece_errors, problem, divisor, y))(*pieces)
+        return jax.vmap(partial(segment_errors, problem, divisor, y))(*pieces)
 
     for batch, mesh in zip(batches, problem.meshes, strict=True):
-        parts.append(mapped(rows, mesh)((rest, estimate.y), (estimate.start, batch)).reshape(-1))
+        parts.append(map_by_device(rows, mesh)((rest, estimate.y), (estimate.start, batch)).reshape(-1))
     return jnp.concatenate([*parts, prior_errors(problem, estimate.y).astype(z.dtype)])
 
 
@@ -143,21 +143,21 @@ def loss_of(z, args) -> Float[Array, ""]:
     """Sum of the squares of all errors at the flat unknowns, for reverse mode."""
     problem, unknowns = args
     estimate = ravel_pytree(unknowns)[1](z)
-    (rest, batches), divisor = _apart(problem), problem.divisor
+    (rest, batches), divisor = _split_batches(problem), problem.divisor
 
     def squares(searched, known):
         (y, start), (problem, pieces) = searched, known
-        errors = jax.vmap(partial(piece_errors, problem, divisor, y))(start, pieces)
+        errors = jax.vmap(partial(segment_errors, problem, divisor, y))(start, pieces)
         return jnp.sum(errors * errors)
 
     loss = jnp.sum(prior_errors(problem, estimate.y) ** 2).astype(z.dtype)
     for batch, mesh in zip(batches, problem.meshes, strict=True):
-        loss = loss + summed(squares, mesh)((estimate.y, estimate.start), (rest, batch))
+        loss = loss + sum_over_devices(squares, mesh)((estimate.y, estimate.start), (rest, batch))
     return loss
 
 
 def forward(problem: Problem) -> Problem:
-    """The problem with simulations that can be differentiated in forward mode."""
+    """Copy of a problem whose simulations are differentiable in forward mode."""
     objective = problem.objective
     if objective.error not in SIMULATED:
         return problem
@@ -165,15 +165,42 @@ def forward(problem: Problem) -> Problem:
     return dataclasses.replace(problem, objective=objective)
 
 
-@eqx.filter_jit
-def slopes_of(problem: Problem, estimate: Unknowns):
-    """For each batch errors (pieces, n), their Jacobians by y (pieces, n, p) and by each piece's own start (pieces, n, 2 nv)
-    or None."""
-    (rest, batches), divisor = _apart(forward(problem)), problem.divisor
+def linearise(problem: Problem, estimate: Unknowns) -> LinearErrors:
+    """Linear errors near a point, those of the data followed by those of the prior."""
+    parts, prior = jacobians_at(problem, estimate)
+    return _assemble(problem, estimate, parts, prior)
+
+
+def linearise_batch(problem: Problem, estimates: Sequence[Unknowns]) -> list[LinearErrors]:
+    """Linear errors near several points, by one vectorised program."""
+    stack = jax.tree.map(lambda *leaves: jnp.stack(leaves), *estimates)
+    parts, prior = jax.tree.map(np.asarray, _jacobians_of_batch(problem, stack))
+    own = [jax.tree.map(lambda x, k=k: x[k], (parts, prior)) for k in range(len(estimates))]
+    return [_assemble(problem, estimate, *one) for estimate, one in zip(estimates, own, strict=True)]
+
+
+def _assemble(problem: Problem, estimate: Unknowns, parts, prior) -> LinearErrors:
+    if estimate.start is None:
+        errors = np.concatenate([np.reshape(errors, (1, -1)) for errors, _, _ in parts], axis=1)
+        rows = np.concatenate([np.reshape(rows, (1, -1, estimate.y.size)) for _, rows, _ in parts], axis=1)
+        data = eliminate_starts(errors, rows, None)
+    else:
+        data = eliminate_starts(*parts[0])
+    residual, by_y = prior
+    return with_prior(data, residual, by_y, problem.prior_weight)
+
+
+def _jacobians(problem: Problem, estimate: Unknowns):
+    """Errors and Jacobians of the data and of the prior.
+
+    For each batch errors (segments, n), their Jacobians by y (segments, n, p) and by each segment's own initial state
+    (segments, n, 2 nv) or None; then residuals (k,) of the prior and their Jacobian (k, p).
+    """
+    (rest, batches), divisor = _split_batches(forward(problem)), problem.divisor
 
     def one(problem, y, change, piece):
         def twice(y, change):
-            errors = piece_errors(problem, divisor, y, change, piece).reshape(-1)
+            errors = segment_errors(problem, divisor, y, change, piece).reshape(-1)
             return errors, errors
 
         return jax.jacfwd(twice, 0 if change is None else (0, 1), has_aux=True)(y, change)
@@ -183,57 +210,62 @@ def slopes_of(problem: Problem, estimate: Unknowns):
 
     parts = []
     for batch, mesh in zip(batches, problem.meshes, strict=True):
-        slopes, errors = mapped(rows, mesh)((rest, estimate.y), (estimate.start, batch))
-        by_y, by_start = (slopes, None) if estimate.start is None else (slopes[0], slopes[1].reshape(*errors.shape, -1))
+        by_unknowns, errors = map_by_device(rows, mesh)((rest, estimate.y), (estimate.start, batch))
+        by_y, by_start = by_unknowns, None
+        if estimate.start is not None:
+            by_y, by_start = by_unknowns[0], by_unknowns[1].reshape(*errors.shape, -1)
         parts.append((errors, by_y, by_start))
-    return parts
+    tree = problem.tree
+    return parts, (tree.residual(estimate.y), jax.jacfwd(tree.residual)(estimate.y))
+
+
+jacobians_at = eqx.filter_jit(_jacobians)
 
 
 @eqx.filter_jit
-def prior_slopes(tree: Parameters, y):
-    """Residuals (k,) of the prior and their slopes (k, p)."""
-    return tree.residual(y), jax.jacfwd(tree.residual)(y)
+def _jacobians_of_batch(problem: Problem, estimates: Unknowns):
+    return jax.vmap(partial(_jacobians, problem))(estimates)
 
 
 @eqx.filter_jit
-def values_and_slopes(tree: Parameters, y):
-    """The numbers (m,) and their slopes (m, p) by y."""
+def values_and_jacobian(tree: Parameters, y):
+    """Fitted numbers (m,) and their Jacobian (m, p) by y."""
     return tree.values(y), jax.jacfwd(tree.values)(y)
 
 
-def cause_of(problem: Problem, estimate: Unknowns, logs: Sequence[Log]) -> str | None:
-    """Where errors or slopes are not finite, in words: the log, the sample, the coordinate, and the parameters that do it.
+def explain_not_finite(problem: Problem, estimate: Unknowns, logs: Sequence[Log]) -> str | None:
+    """Message on errors or Jacobians that are not finite: the log, the sample, the coordinate, and the parameters at fault.
 
-    A parameter is named when the errors are finite with it where it started, all others as they are.
+    A parameter is named when the errors are finite with it at its start and all others as they are.
     """
-    problem = gathered(problem)
-    samples, before = first_samples(problem, logs), 0
-    slopes = slopes_of(problem, estimate)
-    for batch, (_, by_y, _) in zip(problem.batches, slopes, strict=True):
+    problem = on_one_device(problem)
+    samples, before = segment_starts(problem, logs), 0
+    jacobians, _ = jacobians_at(problem, estimate)
+    for batch, (_, by_y, _) in zip(problem.batches, jacobians, strict=True):
         errors = np.asarray(_errors_at(problem, batch, estimate.y, estimate.start))
         bad = ~np.isfinite(errors)
         if bad.any():
             piece, row, column = (int(i) for i in np.argwhere(bad)[0])
             log, first = samples[before + piece]
-            culprits = _culprits(problem, batch, estimate)
-            moved = f"; finite with {' or '.join(culprits)} where it started" if culprits else ""
-            return f"errors of log {log + 1} are not finite from sample {first + row} on, error {column}{moved}"
+            culprits = _parameters_to_blame(problem, batch, estimate)
+            remedy = f"; finite with {' or '.join(culprits)} where it started" if culprits else ""
+            return f"errors of log {log + 1} are not finite from sample {first + row} on, error {column}{remedy}"
         bad = ~np.isfinite(np.asarray(by_y))
         if bad.any():
             piece, row, parameter = (int(i) for i in np.argwhere(bad)[0])
             log, first = samples[before + piece]
             return (
-                f"errors of log {log + 1} have no finite slopes from sample {first + row // errors.shape[-1]} on, by "
-                f"{_name_of(problem.tree, parameter)}"
+                f"errors of log {log + 1} have no finite derivatives from sample {first + row // errors.shape[-1]} on, by "
+                f"{_parameter_name(problem.tree, parameter)}"
             )
         before += batch.t.shape[0]
     residual = np.asarray(problem.tree.residual(estimate.y))
     return None if np.isfinite(residual).all() else "the prior's residuals are not finite"
 
 
-def first_samples(problem: Problem, logs: Sequence[Log]) -> list[tuple[int, int]]:
-    """Log and first sample of every piece."""
-    # Pieces of one sample are all samples; others share their ends.
+def segment_starts(problem: Problem, logs: Sequence[Log]) -> list[tuple[int, int]]:
+    """Log and first sample of every segment."""
+    # Segments of one sample are all samples; others share their end points.
     length = problem.batches[0].t.shape[1]
     whole = len(problem.batches) > 1 or (problem.objective.error == "torque" and length > 1)
     samples = []
@@ -246,21 +278,21 @@ def first_samples(problem: Problem, logs: Sequence[Log]) -> list[tuple[int, int]
 
 @eqx.filter_jit
 def _errors_at(problem: Problem, batch: Segments, y, start):
-    rest, _ = _apart(problem)
-    return jax.vmap(partial(piece_errors, rest, problem.divisor, y))(start, batch)
+    rest, _ = _split_batches(problem)
+    return jax.vmap(partial(segment_errors, rest, problem.divisor, y))(start, batch)
 
 
-def _culprits(problem: Problem, batch: Segments, estimate: Unknowns) -> list[str]:
+def _parameters_to_blame(problem: Problem, batch: Segments, estimate: Unknowns) -> list[str]:
     names = []
     for i in range(estimate.y.size):
         if float(estimate.y[i]) != 0:
             errors = _errors_at(problem, batch, estimate.y.at[i].set(0.0), estimate.start)
             if bool(jnp.isfinite(errors).all()):
-                names.append(_name_of(problem.tree, i))
+                names.append(_parameter_name(problem.tree, i))
     return names
 
 
-def _name_of(tree: Parameters, i: int) -> str:
-    """Name of the number that the coordinate y_i changes most."""
-    slopes: Any = np.asarray(values_and_slopes(tree, tree.start)[1])[:, i]
-    return tree.names[int(np.argmax(np.abs(slopes)))]
+def _parameter_name(tree: Parameters, i: int) -> str:
+    """Name of the number with the largest derivative by the coordinate y_i."""
+    jacobian: Any = np.asarray(values_and_jacobian(tree, tree.start)[1])[:, i]
+    return tree.names[int(np.argmax(np.abs(jacobian)))]

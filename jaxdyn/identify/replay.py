@@ -1,4 +1,4 @@
-"""Logs replayed: the motion under the measured torques, simulated in segments, and how far it is from the measured one."""
+"""Replay of logs: simulation of segments under the measured torques, and its error against the measured motion."""
 
 import dataclasses
 from collections.abc import Sequence
@@ -11,10 +11,10 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from jaxdyn.identify.friction import Friction
 from jaxdyn.identify.logs import Log, as_logs
 from jaxdyn.identify.mechanisms import on_constraints
 from jaxdyn.identify.sensors import FitSystem
+from jaxdyn.identify.torque_terms import Friction
 from jaxdyn.model.arguments import Checked, Number, state_dtype
 from jaxdyn.model.tree import Model
 from jaxdyn.simulation.run import simulate
@@ -26,9 +26,9 @@ INITIAL = ("measured", "free")
 
 
 class SampledTorque(eqx.Module):
-    """A control that replays torques: linear between the samples, or held from each sample to the next ("previous").
+    """Control that replays torques: linear between the samples, or held from each sample to the next ("previous").
 
-    Fixed steps that end on the samples take held torques exactly: what jumps where a step ends is constant within it.
+    Fixed steps that end on the samples integrate held torques exactly, as these are constant within a step.
 
     `t` (n,) s; `tau` (n, nv) N m.
     """
@@ -41,7 +41,7 @@ class SampledTorque(eqx.Module):
         return self.at(t)
 
     def at(self, t: Number) -> Float[Array, " nv"]:
-        """Torque (nv,) at a time (s); before the first sample and behind the last one that of these."""
+        """Torque (nv,) at a time (s); before the first sample and after the last one that of these."""
         last = self.t.shape[0] - 2
         i = jnp.clip(jnp.searchsorted(self.t, t, side="right") - 1, 0, last)
         if self.hold == "previous":
@@ -51,9 +51,9 @@ class SampledTorque(eqx.Module):
 
 
 class Segments(eqx.Module):
-    """A log cut into segments that are simulated side by side; each starts on the last sample of the one before.
+    """Segments of a log, simulated in one batch; each starts on the last sample of the previous one.
 
-    Under `jax.vmap` it is one of them, without the first axis.
+    Under `jax.vmap` it is one segment, without the first axis.
     """
 
     t: Float[Array, "*segments n"]
@@ -64,9 +64,9 @@ class Segments(eqx.Module):
 
 
 def segments(log: Log | Sequence[Log], horizon: int | None, dtype, *, restart: bool = True) -> Segments:
-    """Cut a log, or each of several, into segments of `horizon` steps (None: one); samples left over at an end are not used.
+    """Cut a log, or each of several, into segments of `horizon` steps (None: one); remaining samples at an end are not used.
 
-    Time starts at zero in each, or goes on as in the log (`restart=False`), for systems that depend on it.
+    Time starts at zero in each, or is that of the log (`restart=False`), for systems that depend on it.
 
     **Raises:** ValueError for a log without velocities, a horizon that does not fit, or none for logs of unequal length.
     """
@@ -74,7 +74,7 @@ def segments(log: Log | Sequence[Log], horizon: int | None, dtype, *, restart: b
     lengths = sorted({len(one) for one in logs})
     if horizon is None and len(lengths) > 1:
         raise ValueError(
-            f"horizon is None, which takes logs whole, and they have {lengths[0]} to {lengths[-1]} samples; give the steps "
+            f"horizon is None, which uses whole logs, and they have {lengths[0]} to {lengths[-1]} samples; give the steps "
             "of a segment"
         )
     if any(one.a is None for one in logs):
@@ -111,12 +111,12 @@ def rollout(
 ) -> tuple[Array, Array]:
     """Simulate a log's segments with its torques from its measured states: q (segments, n, nq) and v (segments, n, nv).
 
-    `system` is a `Model`, another system or a `Scene`; `friction` a force besides its own. The other arguments are as in
+    `system` is a `Model`, another system or a `Scene`; `friction` an additional force. The other arguments are as in
     `fit_trajectory`. The time of a `Model` starts at zero in every segment, that of anything else is the log's.
     """
     check_replay(INITIAL[0], hold)
-    scene, data = replayed(system, log, horizon, friction)
-    return _rollout(scene, data, hold, spaced(simulation_options(substeps, simulation), data))
+    scene, data = scene_and_segments(system, log, horizon, friction)
+    return _rollout(scene, data, hold, with_even_steps(simulation_options(substeps, simulation), data))
 
 
 def trajectory_error(
@@ -134,18 +134,18 @@ def trajectory_error(
     100 sqrt(mean(((q_sim - q) / q_rms)^2)), and the same of v. Arguments as in `rollout`.
     """
     check_replay(INITIAL[0], hold)
-    scene, data = replayed(system, log, horizon, friction)
-    q, v = _rollout(scene, data, hold, spaced(simulation_options(substeps, simulation), data))
+    scene, data = scene_and_segments(system, log, horizon, friction)
+    q, v = _rollout(scene, data, hold, with_even_steps(simulation_options(substeps, simulation), data))
     scale = motion_scale(scene.system, data)
-    errors = _batched_errors(scene.system, data, q, v, scale)
+    errors = _segment_errors(scene.system, data, q, v, scale)
     of_q, of_v = (100 * float(jnp.sqrt(jnp.mean(error**2))) for error in errors)
     return of_q, of_v
 
 
-def replayed(
+def scene_and_segments(
     system: Any, log: Log | Sequence[Log], horizon: int | None, friction: Any = None
 ) -> tuple[Scene, Segments]:
-    """The scene of a `Model`, another system or a `Scene`, with one more force; and the log's segments for it."""
+    """Scene of a system, with one more force, and the segments of a log for it."""
     scene = as_scene(system)
     log = as_logs(log, scene.system, needs=("v",))
     if friction is not None:
@@ -154,16 +154,16 @@ def replayed(
 
 
 def check_replay(initial: str, hold: str) -> None:
-    """**Raises:** ValueError for where segments start, or torques between samples, that are none of those known."""
+    """Check the initial states of segments and the interpolation of torques. **Raises:** ValueError for unknown ones."""
     for name, value, allowed in (("initial", initial, INITIAL), ("hold", hold, HOLDS)):
         if value not in allowed:
-            raise ValueError(f"{name} is {value!r}; take one of {allowed}")
+            raise ValueError(f"{name} is {value!r}; give one of {allowed}")
 
 
 def simulation_options(substeps: int | None, simulation: dict) -> dict:
     """Options of `simulate_segment`: those of `jd.simulate`, and `substeps` between two samples unless it is None.
 
-    **Raises:** ValueError for substeps that are no positive integer, or a `stepsize` beside them.
+    **Raises:** ValueError for substeps that are no positive integer, or a `stepsize` in addition to them.
     """
     if substeps is None:
         return dict(simulation)
@@ -175,8 +175,10 @@ def simulation_options(substeps: int | None, simulation: dict) -> dict:
 
 
 def check_spacing(options: dict, devices: Any) -> None:
-    """**Raises:** ValueError for `substeps` of samples that are not evenly spaced, on several devices: diffrax's loops, which
-    make such steps, are not differentiated there."""
+    """Check that `substeps` on several devices have evenly spaced samples.
+
+    **Raises:** ValueError otherwise: diffrax's loops, which make uneven steps, are not differentiable on several devices.
+    """
     if devices is not None and "substeps" in options:
         raise ValueError(
             f"substeps is {options['substeps']}, devices are given, and the log's samples are not evenly spaced; take "
@@ -184,10 +186,10 @@ def check_spacing(options: dict, devices: Any) -> None:
         )
 
 
-def spaced(options: dict, data: Segments) -> dict:
-    """The options with fixed steps of one length in place of `substeps` where samples are evenly spaced, up to rounding.
+def with_even_steps(options: dict, data: Segments) -> dict:
+    """Options with a constant step size in place of `substeps` where samples are evenly spaced, up to rounding.
 
-    Steps end on the samples then too, and are kernels.
+    Steps then end on the samples too, and are compiled to native code.
     """
     t = np.asarray(data.t, np.float64)
     gaps, rounding = np.diff(t, axis=1), 8 * float(jnp.finfo(data.t.dtype).eps) * np.abs(t).max()
@@ -210,10 +212,10 @@ def simulate_segment(
     outputs: tuple[str, ...] = (),
     observed: tuple[int, ...] | None = None,
 ) -> tuple[Any, ...]:
-    """Motion (n, nq), (n, nv) of one segment from its first state, displaced by `change`; NaN from where it fails.
+    """Motion (n, nq), (n, nv) of one segment from its initial state, displaced by `change`; NaN from a failure on.
 
-    Under its torques, or under a `control`. `outputs`: of `jd.simulate`, which come behind. With constraints the first state
-    is put on them, next to what was `observed` (`on_constraints`).
+    Under its torques, or under a `control`. `outputs`: of `jd.simulate`, which are appended. With constraints the initial
+    state is projected onto them, near the `observed` coordinates (`on_constraints`).
     """
     t: Any = one.t
     given = dict(options)
@@ -242,13 +244,13 @@ def motion_errors(system: Any, one: Segments, q: Float[Array, "n nq"], v: Float[
 
 @eqx.filter_jit
 def motion_scale(system: Any, data: Segments) -> Float[Array, "2 nv"]:
-    """Root mean square of each coordinate's way from the first sample, and of its velocity; the largest at rest."""
+    """Root mean squares of each coordinate's displacement from the start and of its velocity; the largest for one at rest."""
     path = jax.vmap(jax.vmap(lambda q: displacement(system, data.q[0, 0], q)))(data.q)
     return jnp.stack([moving_scale(jnp.sqrt(jnp.mean(x**2, axis=(0, 1)))) for x in (path, data.v)])
 
 
 def moving_scale(scale: Float[Array, " n"]) -> Float[Array, " n"]:
-    """Sizes to divide by: as they are, the largest in place of those below a thousandth of it, one where all are zero."""
+    """Scales safe to divide by: those below a thousandth of the largest are replaced by it, and by one where all are zero."""
     largest = jnp.max(scale, keepdims=True)
     return jnp.where(scale > 1e-3 * largest, scale, jnp.where(largest > 0, largest, jnp.ones_like(largest)))
 
@@ -259,5 +261,5 @@ def _rollout(scene: Scene, data: Segments, hold: str, options: dict):
 
 
 @eqx.filter_jit
-def _batched_errors(system, data: Segments, q, v, scale):
+def _segment_errors(system, data: Segments, q, v, scale):
     return jax.vmap(lambda one, q, v: motion_errors(system, one, q, v, scale))(data, q, v)

@@ -1,4 +1,4 @@
-"""What the fits return."""
+"""Results of fits."""
 
 import abc
 from typing import Any
@@ -9,18 +9,17 @@ import jax.numpy as jnp
 import numpy as np
 
 from jaxdyn.dynamics import quantities as dynamics
-from jaxdyn.identify.friction import Friction
-from jaxdyn.identify.logs import Log, as_measured, check_log
+from jaxdyn.identify.logs import Log, check_log
 from jaxdyn.identify.regression import nominal_parameters, parameter_names, torque_error
 from jaxdyn.identify.sensors import Measured, with_sensors
-from jaxdyn.identify.torque_terms import ExtraTorque, coulomb_column
+from jaxdyn.identify.torque_terms import ExtraTorque, Friction, coulomb_column, coulomb_through_filter
 from jaxdyn.model.arguments import state_dtype
 from jaxdyn.model.tree import Model
 from jaxdyn.systems.scene import Scene
 
 
 class AbstractFit(eqx.Module):
-    """What all fits tell: how they ended, and how well what they found explains the torques of a log."""
+    """Common part of all fits: how they ended, and the errors of their torques along a log."""
 
     history: eqx.AbstractVar[np.ndarray]
     result: eqx.AbstractVar[str]
@@ -29,7 +28,7 @@ class AbstractFit(eqx.Module):
     @property
     @abc.abstractmethod
     def scene(self) -> Scene:
-        """What was found, with its forces."""
+        """Fitted scene, with its forces."""
 
     @abc.abstractmethod
     def _table(self) -> list[tuple]:
@@ -51,7 +50,7 @@ class AbstractFit(eqx.Module):
         return np.sqrt(np.mean((self.torques(log) - np.asarray(log.tau)) ** 2, axis=0))
 
     def summary(self, *logs: Log) -> str:
-        """The fit in words: how it ended, the error on each log given, and the parameters."""
+        """Summary of the fit: how it ended, the error on each log given, and the parameters."""
         system = self.scene.system
         lines = [
             f"{self.method}, {system.name if isinstance(system, Model) else type(system).__name__}: {self.result} after "
@@ -70,7 +69,7 @@ class AbstractFit(eqx.Module):
 
 
 class Fit(AbstractFit):
-    """A fitted, physically feasible model.
+    """Fitted, physically feasible model.
 
     - `model`: with the fitted inertias, armature, damping and friction. `friction`: the friction law, with its offset;
       a force for `Scene(fit.model, forces=[fit.friction])`.
@@ -94,15 +93,16 @@ class Fit(AbstractFit):
 
     @property
     def scene(self) -> Scene:
-        """The model with its friction."""
+        """Scene of the model with its friction."""
         return Scene(self.model, forces=(self.friction,))
 
     def torques(self, log: Log) -> np.ndarray:
         """Torques (n, nv) that the fitted robot needs along a log, with friction and all extra terms (N m, N)."""
         torque = super().torques(log)
         if self.as_measured:
-            column = coulomb_column(log, float(self.friction.v_s))
-            torque = torque + np.asarray(self.friction.coulomb) * (as_measured(log, column) - column)
+            v_s = float(self.friction.v_s)
+            change = coulomb_through_filter(log, v_s) - coulomb_column(log, v_s)
+            torque = torque + np.asarray(self.friction.coulomb) * change
         if self.extra is None:
             return torque
         load = np.zeros_like(torque)
@@ -122,8 +122,10 @@ class Fit(AbstractFit):
 
     @property
     def parameters(self) -> list[tuple[str, float, float]]:
-        """Rows (name, nominal, fitted). Single inertial numbers are known only as far as torques tell them apart
-        (`base_parameters`); the prior chose the rest."""
+        """Rows (name, nominal, fitted).
+
+        Of single inertial numbers only combinations are identifiable
+        (`base_parameters`); the prior determines the rest."""
         names = parameter_names(self.model)
         return list(zip(names, nominal_parameters(self.nominal).tolist(), self.vector.tolist(), strict=True))
 
@@ -132,16 +134,16 @@ class Fit(AbstractFit):
 
 
 class ParameterFit(AbstractFit):
-    """A system or a scene with fitted numbers.
+    """Fitted numbers of a system or a scene.
 
-    - `system`: the system or the scene, as given, with what was fitted; `nominal`: the same as the fit started.
-    - `names` (p,): where the fitted numbers stand, as one writes it after the system: "parameters['mass']".
-    - `deviation` (p,): standard deviation of each, infinite for what the log does not determine, None where the method finds
-      none: the larger of that for independent errors of one size, and that by groups of samples left out in turn, which are
-      stretches of a log as long as errors last, or whole logs where there are twenty or more. `factor`: a 95 % interval is plus
-      and minus this many of them (Student's t).
+    - `system`: the system or the scene with the fitted numbers; `nominal`: as given, where the fit started.
+    - `names` (p,): paths of the fitted numbers within the system, as in "parameters['mass']".
+    - `deviation` (p,): standard deviation of each, infinite for numbers that the log does not determine, None where the method
+      computes none: the larger of that for independent errors of one size, and of a delete-a-group jackknife, whose groups are
+      consecutive samples twice as long as the autocorrelation time, or whole logs where there are twenty or more. `factor`: a
+      95 % interval is plus and minus this many of them (Student's t).
     - `history` (steps,): loss before each step and at the end. `result`: "converged", "max_steps", "stopped" or "not_finite";
-      `cause` then says in which log, at which sample and by which parameters.
+      `cause` then names the log, the sample and the parameters.
     """
 
     system: Any
@@ -158,11 +160,11 @@ class ParameterFit(AbstractFit):
 
     @property
     def scene(self) -> Scene:
-        """The fitted scene; of a system, the scene of it alone."""
+        """Fitted scene; of a system, its scene without constraints and forces."""
         return with_sensors(self.system).scene
 
     def torques(self, log: Log) -> np.ndarray:
-        """Torques (n, nv) that the fitted system needs along a log, in the log's units: as its sensors would tell them."""
+        """Torques (n, nv) that the fitted system needs along a log, in the log's units: as its sensors would measure them."""
         if not isinstance(self.system, Measured):
             return super().torques(log)
         measured = self.system
@@ -171,7 +173,7 @@ class ParameterFit(AbstractFit):
 
     @property
     def parameters(self) -> list[tuple[str, float, float, float]]:
-        """Rows (name, nominal, fitted, standard deviation), the last NaN where the method finds none."""
+        """Rows (name, nominal, fitted, standard deviation), the last NaN where the method computes none."""
         deviation = np.full_like(self.values, np.nan) if self.deviation is None else self.deviation
         columns = (self.nominal_values, self.values, deviation)
         return list(zip(self.names, *(column.tolist() for column in columns), strict=True))
@@ -180,8 +182,8 @@ class ParameterFit(AbstractFit):
         return [("parameter", "nominal", "fitted", "std"), *self.parameters]
 
 
-def needed_torque(scene: Scene, q, v, a, t):
-    """tau (nv,) with which a scene without constraints moves so: that of its system, less the scene's forces."""
+def inverse_torque(scene: Scene, q, v, a, t):
+    """Torque tau (nv,) of a motion of a scene without constraints: inverse dynamics less the scene's forces."""
     tau = dynamics.inverse_dynamics(scene.system, q, v, a, t)
     force = scene.applied_force(q, v, t)
     return tau if force is None else tau - force
@@ -189,4 +191,4 @@ def needed_torque(scene: Scene, q, v, a, t):
 
 @eqx.filter_jit
 def _torques(scene: Scene, t, q, v, a):
-    return jax.vmap(lambda t, q, v, a: needed_torque(scene, q, v, a, t))(t, q, v, a)
+    return jax.vmap(lambda t, q, v, a: inverse_torque(scene, q, v, a, t))(t, q, v, a)

@@ -1,4 +1,4 @@
-"""A robot from one log or several: terms, prior and smoothing chosen by cross-validation, joints weighted by their noise."""
+"""Fit of a robot to one log or several, with cross-validated terms, prior and smoothing and weights by noise."""
 
 from collections.abc import Callable, Sequence
 
@@ -6,23 +6,22 @@ import equinox as eqx
 import numpy as np
 
 from jaxdyn.identify.chart import check_bodies
+from jaxdyn.identify.condensed_fit import Setting
 from jaxdyn.identify.delays import Delays, find_delays, shift_torques, with_delays
 from jaxdyn.identify.feasible import check_prior
-from jaxdyn.identify.friction import TERMS
 from jaxdyn.identify.intervals import Intervals
 from jaxdyn.identify.logs import Log, as_logs
-from jaxdyn.identify.one_fit import Setting
 from jaxdyn.identify.regression import check_weights
 from jaxdyn.identify.result import Fit
 from jaxdyn.identify.robot_problem import RobotProblem
 from jaxdyn.identify.selection import PRIORS, ROBUST, VELOCITIES, Choice, Search, folds, search
 from jaxdyn.identify.threads import on_one_thread
-from jaxdyn.identify.torque_terms import EXTRA, RobotTerms, split_terms
-from jaxdyn.model.arguments import Checked, Numbers
+from jaxdyn.identify.torque_terms import EXTRA, TERMS, RobotTerms, split_terms
+from jaxdyn.model.arguments import Checked, Numbers, warn
 from jaxdyn.model.tree import Model
 
 _BLOCKS = 20
-# Fits in which weights of the joints, and the torque that gears carry, are brought up to date.
+# Fits after which the weights of joints and the loads of gears are updated.
 _ROUNDS = 3
 _V_S, _PRIOR = 0.01, 1.0
 
@@ -32,11 +31,11 @@ class RobotFit(eqx.Module):
 
     - `fit`: the `Fit`, on all logs: model, friction, extra torques, `torques(log)`, `error(log)`.
     - `weights` (nv,): of each torque, one over the root mean square of its residual, of mean one; ones where not fitted.
-    - `choice`: the setting (v_s, extra terms of which joints, prior) and what was tried; no trials where all was given.
-    - `intervals`: standard deviations of all parameters and of the base parameters, each from the data or from the prior; delays
-      that were found are among the unknowns, as `joint.delay`.
-    - `terms`: those of the fit, extra ones with the numbers of their torques, as `fit_robot` takes them.
-    - `delays`: of the torques against the positions, which the logs were shifted by; None where none was asked for.
+    - `choice`: the setting (v_s, extra terms by joint, prior, loss) and all trials; none where everything was given.
+    - `intervals`: standard deviations and sources of all parameters and of the base parameters; fitted delays
+      are among the unknowns, as `joint.delay`.
+    - `terms`: those of the fit, extra ones with the indices of their torques, as arguments of `fit_robot`.
+    - `delays`: of the torques against the positions, by which the logs were shifted; None where none was requested.
     """
 
     fit: Fit
@@ -46,9 +45,14 @@ class RobotFit(eqx.Module):
     terms: tuple
     delays: Delays | None = None
 
-    def aligned(self, log: Log) -> Log:
-        """A log of this robot as the fit took it, torques shifted by the delays: what `fit.torques` and `fit.error` compare."""
+    def align(self, log: Log) -> Log:
+        """Shift the torques of a log of this robot by the delays, as for the fit, before `fit.torques` and `fit.error`."""
         return log if self.delays is None else shift_torques(log, self.delays.seconds)
+
+    def aligned(self, log: Log) -> Log:
+        """Deprecated name of `align`."""
+        warn("RobotFit.aligned is deprecated; call align", DeprecationWarning)
+        return self.align(log)
 
 
 @on_one_thread
@@ -66,27 +70,31 @@ def fit_robot(
     blocks: int = _BLOCKS,
     callback: Callable | None = None,
 ) -> RobotFit:
-    """Physically feasible inertias, friction, rotor inertia and further torque terms, as a laboratory would fit them.
+    """Fit feasible inertias, friction, rotor inertia and further torque terms, with everything not given chosen from the logs.
 
     The loss is that of `fit_torques`, with extra terms whose coefficients have a prior of the same weight: one unit of it is
-    the coefficient that makes a tenth of the joint's torque. What is "auto" is chosen by cross-validation, over logs if there
-    are three or more, else over parts of consecutive samples; then all logs are fitted together.
+    the coefficient that makes a tenth of the joint's torque. Arguments that are "auto" are chosen by cross-validation, over
+    logs if there are three or more, else over parts of consecutive samples; then all logs are fitted together.
+
+    An extra term is taken at a joint only where the errors are not white and where it lowers those of left-out parts clearly; a
+    robust loss only for errors with heavy tails, and it or another v_s only beyond the standard error of their improvement
+    (`jaxdyn.identify.selection`).
 
     **Arguments:**
 
     - `model`: nominal model, where the fit starts. `log`: one log or several with v and a; they may differ in sampling, and
-      nothing is filtered, differenced or remembered from one to the next.
-    - `terms`: names of `TERMS` and of `EXTRA`, and `TorqueTerm`s, or pairs of an extra term and the numbers of the torques that
-      have it; or "auto": all of `TERMS`, and of `EXTRA` what helps, joint
-      by joint. Springs and pre-sliding need joints with one coordinate each.
+      no filter, difference or friction state reaches from one into the next.
+    - `terms`: names of `TERMS` and of `EXTRA`, and `TorqueTerm`s, or pairs of an extra term and the indices of its
+      torques; or "auto": all of `TERMS`, and those of `EXTRA` that improve the prediction, joint by joint. Springs and
+      pre-sliding need joints with one coordinate each.
     - `v_s`: smoothing velocity of Coulomb friction (rad/s, m/s), or "auto".
     - `prior`: its weight, or "auto". `weights` (nv,): one over the noise of each torque, None for ones, or "auto": one over the
       root mean square of the residual, iterated.
-    - `robust`: errors beyond this many standard deviations of their joint's count by their size instead of its square (Huber's
-      loss): what no term explains and collisions then bend the fit less. None: all by their square; "auto": what foretells
-      left-out parts best, in squares, of these two and of 3 and 1.345.
-    - `delay`: how late torques were recorded against positions (s), a number, one for each torque (nv,), or "auto": found with
-      the fit, and kept where it lowers the errors on parts left out. Judge other logs by `RobotFit.aligned(log)` then.
+    - `robust`: threshold of Huber's loss in standard deviations of a joint's error: larger errors count by their size instead
+      of its square, so that collisions and unmodelled torques have less influence. None: squares; "auto": squares, unless 3
+      or 1.345 clearly predicts left-out parts better.
+    - `delay`: of the torques against the positions (s), a number, one for each torque (nv,), or "auto": fitted, and kept where
+      it lowers the errors on left-out parts. Compare other logs by `RobotFit.align(log)` then.
     - `inertia`: as in `fit_torques`.
     - `blocks`: consecutive samples are cut into about this many blocks, whose scatter gives the intervals.
     - `callback(trial)` is called after each setting tried, with a `jaxdyn.identify.selection.Trial`.
@@ -137,12 +145,16 @@ def fit_robot(
     trials, by = (), "given"
     if is_auto or any(isinstance(value, str) for value in (v_s, prior, robust)):
         parts, by = folds(problem.data(setting).blocks)
-        trying = Search(problem.left_out, parts, problem.torque, callback)
+        trying = Search(problem.validation_squares, parts, problem.torque, callback)
         velocities = VELOCITIES if isinstance(v_s, str) else (setting.v_s,)
         priors = PRIORS if isinstance(prior, str) else (setting.prior,)
         names = [term.name for term in extra] if is_auto else []
-        losses = ROBUST if isinstance(robust, str) else (setting.robust,)
-        setting = search(trying, setting, names, model.nv, velocities=velocities, priors=priors, losses=losses)
+        losses = (setting.robust,)
+        if isinstance(robust, str) and problem.has_outliers(setting):
+            losses = ROBUST
+        setting = search(
+            trying, setting, names, problem.torques_not_white, velocities=velocities, priors=priors, losses=losses
+        )
         trials = tuple(trying.trials.values())
     if is_found and delays is not None:  # at the setting chosen
         delays = find_delays(model, given, setting, basic, extra, fixed, delays.seconds, **finding)

@@ -1,29 +1,33 @@
-"""The logs of a robot's fit, and what is brought up to date between fits."""
+"""Logs of a robot's fit, with the weights and loads that are updated between fits."""
 
 from collections.abc import Sequence
 
 import numpy as np
 
 from jaxdyn.identify.chart import Chart, make_chart
-from jaxdyn.identify.feasible import placed, signal_sizes
+from jaxdyn.identify.condensed_fit import Data, Estimate, Setting, fit_blocks, gather
+from jaxdyn.identify.feasible import move_origin, signal_sizes
 from jaxdyn.identify.intervals import Intervals, intervals
-from jaxdyn.identify.logs import Log
-from jaxdyn.identify.one_fit import Data, Estimate, Setting, fit_condensed, gather
+from jaxdyn.identify.logs import Log, hardly_moving
 from jaxdyn.identify.regression import log_regressor
 from jaxdyn.identify.result import Fit
 from jaxdyn.identify.torque_terms import ExtraTorque, TorqueTerm
-from jaxdyn.identify.whiteness import stretches
+from jaxdyn.identify.uncertainty import effective_sample_size, is_white
 from jaxdyn.model.tree import Model
+
+# Share of errors beyond three standard deviations from which on their tails are heavy: 0.3 % of normal ones are.
+_TAIL = 0.02
 
 
 class RobotProblem:
-    """Logs, and what is brought up to date between fits: weights of joints and of single torques, torques that gears carry."""
+    """Logs of a robot, with the weights of joints and of samples and the loads of gears, which are updated between fits."""
 
     def __init__(self, model: Model, logs: tuple[Log, ...], basic, extra: tuple[TorqueTerm, ...], inertia, blocks: int):
         self.model, self.logs, self.basic, self.extra = model, logs, basic, extra
         self.inertia, self.blocks = inertia, blocks
         self.sample_weights: dict[float, list[np.ndarray]] = {}
         self.sizes, self.weights = signal_sizes(logs), np.ones(model.nv)
+        self.still = hardly_moving(model, logs)
         self.loads = [np.zeros_like(np.asarray(log.tau, np.float64)) for log in logs]
         self.torque = float(sum(np.sum(np.asarray(log.tau, np.float64) ** 2) for log in logs))
         self._data: dict[tuple, Data] = {}
@@ -39,18 +43,18 @@ class RobotProblem:
         return self._data[key]
 
     def fit(self, setting: Setting, **options) -> Estimate:
-        """One fit, of all blocks unless the options of `fit_condensed` say otherwise."""
+        """Fit all blocks, unless the options of `fit_blocks` select some."""
         v_s, data = setting.v_s, self.data(setting)
         if v_s not in self._charts:
             chart, point = make_chart(self.model, self.basic, v_s, self.inertia, *self.sizes)
             self._charts[v_s] = chart, np.asarray(point.s, np.float64)
         chart, start = self._charts[v_s]
-        return fit_condensed(chart, start, data, setting, self.sizes, self.weights, **options)
+        return fit_blocks(chart, start, data, setting, self.sizes, self.weights, **options)
 
-    def left_out(self, setting: Setting, part: np.ndarray) -> np.ndarray:
-        """Squared errors (nv,) on some blocks, of a fit to the others. No more digits than the choice needs.
+    def validation_squares(self, setting: Setting, part: np.ndarray) -> np.ndarray:
+        """Squared errors (blocks, nv) on some blocks, of a rough fit to the others.
 
-        A robust loss takes the weights of single torques from the first setting that asks for it.
+        A robust loss takes the weights of samples from the first setting that needs them.
         """
         if setting.robust is not None and setting.robust not in self.sample_weights:
             self.reweigh(setting)
@@ -59,20 +63,22 @@ class RobotProblem:
         if key not in self._rows:
             self._rows[key] = np.asarray(np.linalg.qr(blocks.rows(self.weights, rest), mode="r"))
         estimate = self.fit(setting, rows=self._rows[key], count=blocks.count(rest), is_rough=True)
-        return self.data(setting._replace(robust=None)).blocks.squares(estimate.x, part).sum(axis=0)
+        return self.data(setting._replace(robust=None)).blocks.squares(estimate.x, part)
 
     def refine(self, setting: Setting, fixed: np.ndarray | None, rounds: int) -> Estimate:
-        """Fit some times over; after each but the last, update weights and loads."""
+        """Fit several times; after each but the last, update weights and loads."""
         if fixed is not None:
             self.weights = fixed
+        # Factorised folds depend on the weights.
         self._rows = {}
         is_iterated = bool(self.extra) or fixed is None or setting.robust is not None
-        for left in reversed(range(rounds if is_iterated else 1)):
+        for remaining in reversed(range(rounds if is_iterated else 1)):
             estimate = self.fit(setting)
-            if not left:
+            if not remaining:
                 return estimate
             if fixed is None:
                 self.weights = self._new_weights(setting, estimate)
+            # Loads are torques of the fitted bodies, so columns that depend on them change with the fit.
             if any(term.needs_load for term in self.extra):
                 self.loads = [self._load(log, estimate.x) for log in self.logs]
                 self._data = {}
@@ -80,13 +86,29 @@ class RobotProblem:
                 self._weigh(setting, estimate)
         raise ValueError(f"rounds is {rounds}")
 
+    def has_outliers(self, setting: Setting) -> bool:
+        """Decide whether the errors of a least-squares fit have heavier tails than normal ones at any torque.
+
+        A robust loss is of use only then. Cross-validation cannot tell: weights of samples come from a fit to all of them, which
+        pulls the fits to parts of the logs towards it, and with few independent samples this alone lowers their errors by some
+        per cent.
+        """
+        plain = setting._replace(robust=None)
+        errors = self._errors(plain, self.fit(plain))
+        return bool(np.mean(np.abs(np.concatenate(errors)) > 3 * error_scale(errors), axis=0).max() > _TAIL)
+
+    def torques_not_white(self, setting: Setting) -> tuple[int, ...]:
+        """Indices of the torques whose errors are not white, of joints that move: where another term may explain something."""
+        errors = self._errors(setting, self.fit(setting))
+        return tuple(int(j) for j in np.flatnonzero(~is_white(self.logs, errors)) if j not in self.still)
+
     def reweigh(self, setting: Setting, rounds: int = 2) -> None:
-        """Bring the weights of single torques up to date for a setting with a robust loss."""
+        """Update the weights of samples for a setting with a robust loss."""
         for _ in range(rounds):
             self._weigh(setting, self.fit(setting))
 
-    def curved(self, setting: Setting) -> Data | None:
-        """The logs without the torques beyond the threshold of a robust loss, where it has no curvature."""
+    def curvature_data(self, setting: Setting) -> Data | None:
+        """Logs without the samples beyond the threshold of a robust loss, where it has no curvature."""
         weights = None if setting.robust is None else self.sample_weights.get(setting.robust)
         if weights is None:
             return None
@@ -95,28 +117,32 @@ class RobotProblem:
 
     def intervals(self, setting: Setting, estimate: Estimate, fit: Fit) -> Intervals:
         """Standard deviations of an estimate, which is this fit."""
-        data, curved = self.data(setting), self.curved(setting)
-        worth = stretches([fit.torques(log) - np.asarray(log.tau, np.float64) for log in self.logs])
-        return intervals(self.model, data, setting, estimate, self.weights, self.basic, worth, curved)
+        data, curved = self.data(setting), self.curvature_data(setting)
+        size = effective_sample_size([fit.torques(log) - np.asarray(log.tau, np.float64) for log in self.logs])
+        return intervals(self.model, data, setting, estimate, self.weights, self.basic, size, curved, self.still)
 
     def with_term(self, term: TorqueTerm) -> "RobotProblem":
-        """The same logs and weights with the columns of one more term, behind all others."""
+        """Copy with the columns of one more term, after all others."""
         wide = RobotProblem(self.model, self.logs, self.basic, (*self.extra, term), self.inertia, self.blocks)
         wide.weights, wide.loads, wide.sample_weights = self.weights, self.loads, self.sample_weights
         return wide
 
     def _weigh(self, setting: Setting, estimate: Estimate) -> None:
-        fit, threshold = self.result(setting, estimate, self.data(setting)), setting.robust
+        threshold = setting.robust
         assert threshold is not None
-        errors = [fit.torques(log) - np.asarray(log.tau, np.float64) for log in self.logs]
+        errors = self._errors(setting, estimate)
         self.sample_weights[threshold] = huber_weights(errors, threshold)
         self._data = {key: data for key, data in self._data.items() if key[1] != threshold}
         self._rows = {key: rows for key, rows in self._rows.items() if key[1] != threshold}
 
+    def _errors(self, setting: Setting, estimate: Estimate) -> list[np.ndarray]:
+        fit = self.result(setting, estimate, self.data(setting))
+        return [fit.torques(log) - np.asarray(log.tau, np.float64) for log in self.logs]
+
     def _new_weights(self, setting: Setting, estimate: Estimate) -> np.ndarray:
         blocks = self.data(setting).blocks
         rms = np.sqrt(blocks.squares(estimate.x).sum(axis=0) / blocks.samples.sum())
-        # A torque that is fitted exactly, or never moved, gets the largest weight of the others, not an infinite one.
+        # A torque that is fitted exactly, or constant, would get an infinite weight; it gets a large finite one.
         weights = 1 / np.maximum(rms, 1e-3 * rms.max(initial=0) or 1.0)
         return weights / weights.mean()
 
@@ -126,9 +152,9 @@ class RobotProblem:
         return log_regressor(self.model, log) @ bodies
 
     def result(self, setting: Setting, estimate: Estimate, data: Data) -> Fit:
-        """The fit as others are given."""
-        chart, point = placed(estimate.chart, estimate.minimum.origin, estimate.minimum.s)
-        model, friction = chart.fitted(self.model, point)
+        """Estimate as a `Fit`."""
+        chart, point = move_origin(estimate.chart, estimate.minimum.origin, estimate.minimum.s)
+        model, friction = chart.model_at(self.model, point)
         used = dict(setting.extra)
         coefficients = estimate.x[data.basic :].reshape(-1, self.model.nv)
         edges = dict(zip(data.counts, np.cumsum((0, *data.counts.values()))[:-1], strict=True))
@@ -151,11 +177,12 @@ class RobotProblem:
 
 
 def huber_weights(errors: Sequence[np.ndarray], threshold: float) -> list[np.ndarray]:
-    """Weights (n, nv) of each log's torques whose squares make Huber's loss: sqrt(min(1, threshold scale / |error|)).
-
-    The scale of each torque is 1.4826 times the median size of its errors over all logs, which is the standard deviation of
-    normal ones.
-    """
-    scale = 1.4826 * np.median(np.abs(np.concatenate(errors)), axis=0)
+    """Weights (n, nv) of each log's torques whose squares make Huber's loss: sqrt(min(1, threshold scale / |error|))."""
+    scale = error_scale(errors)
     limit = threshold * np.where(scale > 0, scale, np.inf)
     return [np.sqrt(np.where(np.abs(x) > limit, limit / np.maximum(np.abs(x), 1e-300), 1.0)) for x in errors]
+
+
+def error_scale(errors: Sequence[np.ndarray]) -> np.ndarray:
+    """Scale (nv,) of each torque's errors: 1.4826 times their median size, the standard deviation of normal ones."""
+    return 1.4826 * np.median(np.abs(np.concatenate(errors)), axis=0)

@@ -1,24 +1,77 @@
-"""How a scene's motion was measured: gains, biases and the delay of its sensors and drives, as numbers that a fit may change."""
+"""Systems that a fit accepts in addition to scenes: scenes with sensors and drives, and scenes built from numbers."""
 
+from collections.abc import Callable
 from typing import TYPE_CHECKING, Any, TypeAlias
 
 import equinox as eqx
+import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Float
+from jaxtyping import Array, Float, PyTree
 
-from jaxdyn.identify.construction import Construction, built
-from jaxdyn.model.arguments import Numbers, as_array, state_dtype
-from jaxdyn.systems.scene import as_scene
+from jaxdyn.model.arguments import Function, Numbers, as_array, state_dtype
+from jaxdyn.systems.scene import Scene, as_pytree, as_scene
 from jaxdyn.systems.system import SceneLike
 
+
+class Construction(eqx.Module):
+    """Scene that is built from numbers at every point of a fit: a length changes a joint, an inertia and a loop together.
+
+    **Arguments:**
+
+    - `build`: a function of the numbers that returns a `Scene`, a `Model` or another system, for example by `jd.ModelBuilder`
+      or a named scene; it is called with traced numbers. The leaves of an equinox Module are leaves of the construction.
+    - `numbers`: a pytree of floating-point numbers or arrays; `jd.identify.Parameters` frees some of them.
+
+    Pass it where `fit_parameters`, `Parameters` and `Measured` accept a scene; `scene` is that of the present numbers.
+
+    **Raises:** ValueError for a `build` that cannot be called, and numbers that are none.
+
+    ```python
+    links = jd.identify.Construction(
+        lambda numbers: jd.scenes.four_bar(lengths=(1.0, *numbers["lengths"], 3.5)), {"lengths": [3.0, 2.5]}
+    )
+    parameters = jd.identify.Parameters(links).positive(lambda links: links.numbers["lengths"])
+    ```
+    """
+
+    build: Callable[[Any], Any]
+    numbers: Any
+
+    def __init__(self, build: Function, numbers: PyTree):
+        if not callable(build):
+            raise ValueError(f"build is {build!r}; give a function of the numbers that returns a scene")
+        self.build = as_pytree(build, "build")
+        self.numbers = jax.tree.map(_number, numbers)
+
+    @property
+    def scene(self) -> Scene:
+        """Scene of the present numbers."""
+        return as_scene(self.build(self.numbers))
+
+
+def _number(value) -> Float[Array, "..."]:
+    if eqx.is_inexact_array(value):  # traced ones too
+        return jnp.asarray(value)
+    if isinstance(value, bool) or not (isinstance(value, int) or eqx.is_inexact_array_like(value)):
+        raise ValueError(f"numbers has {value!r}; give floating-point numbers or arrays")
+    return jnp.asarray(value, float)
+
+
+def build_scene(system: Any) -> Scene:
+    """Scene of a construction or of a system, or a scene as it is."""
+    return system.scene if isinstance(system, Construction) else as_scene(system)
+
+
 if TYPE_CHECKING:
-    FitSystem: TypeAlias = "SceneLike | Measured | Construction"  # what fits take
+    FitSystem: TypeAlias = "SceneLike | Measured | Construction"  # systems that fits accept
 else:
     FitSystem = Any  # `with_sensors` makes a `Measured` of it
 
 
 class Measured(eqx.Module):
-    """A scene with what stands between it and its logs. The robot moves by q and tau; the log says
+    """Scene with its sensors and drives.
+
+    The robot moves by q and tau; the log holds
 
         q_log = q + position_bias,   tau(t) = torque_gain * tau_log(t - delay) + torque_bias.
 
@@ -28,16 +81,16 @@ class Measured(eqx.Module):
     - `position_bias` (nv,), rad or m, along the joints (encoders); zero by default.
     - `torque_gain` (nv,): of a drive, N m per unit of the log (per ampere for currents; gears included); ones
       by default. `torque_bias` (nv,), N m; zero.
-    - `delay` (), s: the torque acts so much later than its samples say; zero.
+    - `delay` (), s, of the torque behind its samples; zero.
 
-    All are leaves: free them with `jd.identify.Parameters`. A gain is told apart from inertias by what is known
-    otherwise: a payload, a frozen body, the mass total.
+    All are leaves: free them with `jd.identify.Parameters`. Gains and inertias are identifiable together only with other
+    knowledge: a payload, a frozen body, the total mass.
 
     **Raises:** ValueError for arguments of other shapes.
 
     ```python
     measured = jd.identify.Measured(scene, torque_gain=[11.0, 8.5])
-    parameters = jd.identify.Parameters(measured).positive(lambda m: m.torque_gain).bounded(lambda m: m.delay, -0.02, 0.02)
+    parameters = jd.identify.Parameters(measured).positive(lambda m: m.torque_gain).bound(lambda m: m.delay, -0.02, 0.02)
     fit = jd.identify.fit_parameters(measured, log, parameters, error="torque")
     ```
     """
@@ -58,7 +111,7 @@ class Measured(eqx.Module):
         delay: Numbers = 0.0,
     ):
         self.scene = scene if isinstance(scene, Construction) else as_scene(scene)
-        own = built(scene)
+        own = build_scene(scene)
         dtype, nv = state_dtype(own.system), own.nv
         given = {
             "position_bias": (position_bias, 0.0),
@@ -76,7 +129,7 @@ class Measured(eqx.Module):
 
 
 def with_sensors(system: Any) -> Measured:
-    """A measured scene as it is, and a scene or system with ideal sensors; what is constructed is built."""
+    """Scene with sensors: a `Measured` one as it is, others with ideal sensors; a `Construction` is built."""
     if not isinstance(system, Measured):
-        return Measured(built(system))
-    return eqx.tree_at(lambda m: m.scene, system, built(system.scene), is_leaf=lambda x: x is system.scene)
+        return Measured(build_scene(system))
+    return eqx.tree_at(lambda m: m.scene, system, build_scene(system.scene), is_leaf=lambda x: x is system.scene)

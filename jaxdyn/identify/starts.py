@@ -1,17 +1,13 @@
-"""Many starts at once: all are improved side by side, here or on workers, and the best goes on."""
+"""Choice among many starts of a fit, improved in one batch here or on workers."""
 
 from typing import NamedTuple
 
-import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-import optimistix as optx
-from jax.flatten_util import ravel_pytree
 
-from jaxdyn.identify.gauss_newton import Unknowns
-from jaxdyn.identify.problem import Problem, errors_of, forward
-from jaxdyn.identify.stepwise import SOLVERS, solver_of
+from jaxdyn.identify.gauss_newton import DAMPING, Unknowns, propose
+from jaxdyn.identify.problem import Problem, linearise_batch
 from jaxdyn.tasks import DaskClient, count_workers, map_tasks
 
 _STEPS, _TOLERANCE = 20, 1e-4
@@ -20,7 +16,7 @@ _STEPS, _TOLERANCE = 20, 1e-4
 def best_start(
     problem: Problem, unknowns: Unknowns, starts: int, spread: float, seed: int, client: DaskClient | None = None
 ) -> Unknowns:
-    """The best of so many points after some steps of Levenberg and Marquardt from each, in one `jax.vmap` on each worker.
+    """Best of several points after some damped Gauss-Newton steps from each, evaluated in one `jax.vmap` on each worker.
 
     The first start is the given one; the coordinates of the others are normal with deviation `spread`.
 
@@ -32,36 +28,43 @@ def best_start(
     far = spread * jax.random.normal(jax.random.key(seed), (starts, y.size), y.dtype)
     points = y[None] + far.at[0].set(0.0)
     blocks = np.array_split(np.asarray(points), min(starts, count_workers(client)))
-    blocks = map_tasks(_Improvement(problem, unknowns), blocks, client)
-    candidates, losses = jax.tree.map(lambda *parts: jnp.concatenate(parts), *blocks)
-    losses = np.where(np.isfinite(np.asarray(losses)), np.asarray(losses), np.inf)
+    results = map_tasks(_Improvement(problem, unknowns), blocks, client)
+    candidates = [estimate for estimates, _ in results for estimate in estimates]
+    losses = np.concatenate([np.asarray(losses) for _, losses in results])
+    losses = np.where(np.isfinite(losses), losses, np.inf)
     if not np.isfinite(losses).any():
         raise ValueError(
             f"none of {starts} starts has finite errors; give a smaller spread (now {spread}), or a shorter horizon"
         )
-    return jax.tree.map(lambda x: x[int(np.argmin(losses))], candidates)
+    return jax.tree.map(jnp.asarray, candidates[int(np.argmin(losses))])
 
 
 class _Improvement(NamedTuple):
-    """From points (n, p) to what they become and their losses (n,)."""
+    """Map from points (n, p) to the improved unknowns of each and their losses."""
 
     problem: Problem
     unknowns: Unknowns
 
-    def __call__(self, points: np.ndarray):
-        with jax.numpy_dtype_promotion("standard"), jax.numpy_rank_promotion("allow"):
-            return _improve(forward(self.problem), self.unknowns, jnp.asarray(points))
-
-
-@eqx.filter_jit
-def _improve(problem: Problem, unknowns: Unknowns, points):
-    solver = solver_of(SOLVERS[0], _TOLERANCE)
-
-    def one(y):
-        z, unflatten = ravel_pytree(Unknowns(y, unknowns.start))
-        args = (problem, unknowns)
-        solution = optx.least_squares(errors_of, solver, z, args, options={"jac": "fwd"}, max_steps=_STEPS, throw=False)
-        loss = jnp.sum(errors_of(solution.value, args) ** 2)
-        return unflatten(solution.value), loss
-
-    return jax.vmap(one)(points)
+    def __call__(self, points: np.ndarray) -> tuple[list[Unknowns], list[float]]:
+        # Normal equations are solved on the host: batches of LAPACK calls within XLA can wait for each other for ever.
+        estimates = [Unknowns(jnp.asarray(y), self.unknowns.start) for y in points]
+        here = linearise_batch(self.problem, estimates)
+        damping = np.full(len(points), DAMPING)
+        for _ in range(_STEPS):
+            trials, proposed = list(estimates), []
+            for k, errors in enumerate(here):
+                dy = propose(errors, damping[k], _TOLERANCE) if errors.is_finite else None
+                if dy is not None:
+                    trials[k] = errors.update(estimates[k], dy)
+                    proposed.append(k)
+            if not proposed:
+                break
+            # All points are evaluated, so that one program of one size serves every step.
+            there = linearise_batch(self.problem, trials)
+            for k in proposed:
+                if there[k].is_finite and there[k].loss < here[k].loss:
+                    estimates[k], here[k] = trials[k], there[k]
+                    damping[k] /= 10
+                else:
+                    damping[k] *= 10
+        return estimates, [errors.loss for errors in here]

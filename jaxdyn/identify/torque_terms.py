@@ -1,40 +1,102 @@
-"""Joint torques beyond viscous and Coulomb friction: columns of the regressor, each with a coefficient for every joint.
+"""Joint torques beyond the links': friction, rotor inertia and further terms, each a column of the regressor.
+
+    viscous, coulomb, offset, armature   v, tanh(v / v_s), 1, a
 
     load        |tau_rigid| tanh(v / v_s)   Coulomb friction in proportion to the torque that the gear carries
-    dahl        z, dz/dq = (sign v - z) / z0   pre-sliding: friction that needs a way of about z0 to turn round
+    dahl        z, dz/dq = (sign v - z) / z0   pre-sliding: friction that reverses over a displacement of about z0
     asymmetric  |v|                         viscous friction that differs between the directions
     quadratic   v |v|                       friction that grows faster than the velocity
-    spring      sin q and cos q             springs and counterbalances between a link and the one before
+    spring      sin q and cos q             springs and counterbalances between a link and its parent
 
 Source: Dahl (1968), "A solid friction model"; Hamon, Gautier & Garrec (2010), load-dependent friction of geared joints.
 """
 
 import itertools
 from collections.abc import Callable, Iterable, Sequence
+from functools import partial
 from typing import TYPE_CHECKING, Any
 
 import equinox as eqx
+import jax.numpy as jnp
 import numpy as np
+from jaxtyping import Array, Float
 
-from jaxdyn.identify.friction import TERMS, check_terms
-from jaxdyn.identify.logs import Log, as_measured
+from jaxdyn.identify.logs import Log, low_pass_columns, refine_samples
+from jaxdyn.model.arguments import Number, SystemLike, warn
 
-# The way in which pre-sliding friction turns round (rad, m).
+TERMS = ("viscous", "coulomb", "offset", "armature")
+# Terms that are physical only when they are not negative.
+POSITIVE = ("viscous", "coulomb", "armature")
+
+
+if TYPE_CHECKING:
+    Terms = str | Sequence[str]  # names of `TERMS`
+else:
+    Terms = Any  # checked by `check_terms`
+
+
+class Friction(eqx.Module):
+    """Torque of a joint's friction, to be supplied by the motor: tau_f = viscous v + coulomb tanh(v / v_s) + offset.
+
+    Called as a force of a scene, `friction(system, q, v, t)`, it gives -tau_f. The offset (N m) is a constant of the
+    measurement (sensor bias, cable) or of asymmetric dry friction.
+
+    - `viscous` (nv,) N m s/rad, `coulomb` (nv,) N m, `offset` (nv,) N m; for prismatic joints N s/m, N, N.
+    - `v_s`: velocity at which the smoothed Coulomb friction has 76 % of its level (rad/s or m/s).
+    """
+
+    viscous: Float[Array, " nv"]
+    coulomb: Float[Array, " nv"]
+    offset: Float[Array, " nv"]
+    v_s: Float[Array, ""]
+
+    def torque(self, v: Float[Array, " nv"]) -> Float[Array, " nv"]:
+        """tau_f (nv,) at the velocity v (nv,)."""
+        return self.viscous * v + self.coulomb * jnp.tanh(v / self.v_s) + self.offset
+
+    def __call__(
+        self, system: SystemLike, q: Float[Array, " nq"], v: Float[Array, " nv"], t: Number
+    ) -> Float[Array, " nv"]:
+        return -self.torque(v)
+
+
+def friction_regressor(v: Float[Array, " nv"], a: Float[Array, " nv"], terms, v_s) -> Float[Array, "nv terms_nv"]:
+    """Regressor of friction and rotors, (nv, nv * len(terms)): one diagonal block per term, in the order of `terms`."""
+    columns = {"viscous": v, "coulomb": jnp.tanh(v / v_s), "offset": jnp.ones_like(v), "armature": a}
+    blocks = [jnp.diag(columns[term]) for term in terms]
+    return jnp.concatenate(blocks, axis=1) if blocks else jnp.zeros((v.shape[0], 0), v.dtype)
+
+
+def check_terms(terms: Terms, v_s: Number) -> tuple[str, ...]:
+    """Check terms, and return a tuple. **Raises:** ValueError for an unknown or repeated term, or a v_s that is not positive."""
+    terms = (terms,) if isinstance(terms, str) else tuple(terms)
+    unknown = [term for term in terms if term not in TERMS]
+    if unknown or len(set(terms)) < len(terms):
+        raise ValueError(f"terms is {terms}; give some of {TERMS}, each once")
+    if not v_s > 0:
+        raise ValueError(f"v_s is {v_s}; give a positive smoothing velocity, e.g. 0.01 rad/s")
+    return terms
+
+
+# Displacement over which pre-sliding friction reverses (rad, m).
 PRESLIDING = 0.003
 
 
 class TorqueTerm(eqx.Module):
-    """A torque that is linear in numbers of each joint: tau_j = sum over k of columns[:, j, k] coefficients[k, j].
+    """Torque that is linear in coefficients of each joint: tau_j = sum over k of columns[:, j, k] coefficients[k, j].
 
     - `name`: as in reports.
     - `columns(log, load, v_s)`: (n, nv, k) or (n, nv), from a log, the torque (n, nv) that the rigid bodies need along it
-      (N m, N) and the smoothing velocity. It may look at samples before, but belongs to one log.
+      (N m, N) and the smoothing velocity. A column may depend on earlier samples of the same log.
     - `needs_load`: whether it uses `load`, which is a zero array otherwise.
+    - `is_smooth`: whether the log's low-pass leaves it unchanged. Other terms are evaluated at eight times the samples and then
+      low-passed like the measured torque.
     """
 
     name: str = eqx.field(static=True)
     columns: Callable[[Log, np.ndarray, float], np.ndarray] = eqx.field(static=True)
     needs_load: bool = eqx.field(static=True, default=False)
+    is_smooth: bool = eqx.field(static=True, default=False)
 
     def __call__(self, log: Log, load: np.ndarray, v_s: float) -> np.ndarray:
         """The columns (n, nv, k). **Raises:** ValueError for columns of another shape, or not finite."""
@@ -49,8 +111,13 @@ class TorqueTerm(eqx.Module):
 
 
 def coulomb_column(log: Log, v_s: float) -> np.ndarray:
-    """tanh(v / v_s), (n, nv)."""
+    """Column tanh(v / v_s), (n, nv)."""
     return np.tanh(np.asarray(log.v, np.float64) / v_s)
+
+
+def coulomb_through_filter(log: Log, v_s: float) -> np.ndarray:
+    """Column tanh(v / v_s), (n, nv), low-passed like the log."""
+    return low_pass_columns(log, lambda fine: coulomb_column(fine, v_s))
 
 
 def _load(log, load, v_s):
@@ -77,7 +144,7 @@ def _dahl(log, load, v_s):
     z[0] = np.tanh(np.asarray(log.v)[0] / v_s)
     for i in range(1, len(q)):
         path = q[i] - q[i - 1]
-        # The solution along a way in one direction.
+        # Solution of the differential equation along a path in one direction.
         z[i] = np.sign(path) + (z[i - 1] - np.sign(path)) * np.exp(-np.abs(path) / PRESLIDING)
     return z
 
@@ -104,18 +171,18 @@ if TYPE_CHECKING:
     Term = str | TorqueTerm
     RobotTerms = Term | Sequence[Term | tuple[Term, Iterable[int]]]  # names of `TERMS` and `EXTRA`, and terms
 else:
-    RobotTerms = Any  # `split_terms` looks at them
+    RobotTerms = Any  # checked by `split_terms`
 
 
 def split_terms(
     terms: RobotTerms, nv: int
 ) -> tuple[tuple[str, ...], tuple[TorqueTerm, ...], tuple[tuple[str, tuple[int, ...]], ...]]:
-    """Names of `TERMS`; `TorqueTerm`s; and (name, numbers of the torques that have it) of these.
+    """Names of `TERMS`; `TorqueTerm`s; and (name, indices of its torques) of each.
 
-    `terms` are names of `TERMS` and of `EXTRA` and `TorqueTerm`s, in any order; or pairs of such an extra term and the numbers
-    of the torques that have it, instead of all.
+    `terms` are names of `TERMS` and of `EXTRA` and `TorqueTerm`s, in any order; or pairs of an extra term and the indices
+    of its torques, instead of all.
 
-    **Raises:** ValueError for an unknown or a repeated term, and for numbers that are none of a torque.
+    **Raises:** ValueError for an unknown or a repeated term, and for indices of no torque.
     """
     given = (terms,) if isinstance(terms, str | TorqueTerm) else tuple(terms)
     basic = tuple(term for term in given if isinstance(term, str) and term in TERMS)
@@ -128,7 +195,7 @@ def split_terms(
             term = EXTRA[term]
         if not isinstance(term, TorqueTerm):
             known = ", ".join((*TERMS, *EXTRA))
-            raise ValueError(f"term {term!r} is unknown; take some of {known}, or a jd.identify.TorqueTerm")
+            raise ValueError(f"term {term!r} is unknown; give some of {known}, or a jd.identify.TorqueTerm")
         joints = tuple(sorted({int(joint) for joint in joints}))
         if not joints or not 0 <= joints[0] <= joints[-1] < nv:
             raise ValueError(f"term {term.name!r} is for torques {joints}; there are {nv}, from 0 to {nv - 1}")
@@ -141,8 +208,15 @@ def split_terms(
 
 
 def term_columns(terms: Sequence[TorqueTerm], log: Log, load: np.ndarray, v_s: float) -> np.ndarray:
-    """Columns of all terms (n, nv, k) side by side."""
-    parts = [term(log, load, v_s) for term in terms]
+    """Columns of all terms (n, nv, k) side by side, low-passed like the log."""
+
+    def columns(term: TorqueTerm, fine: Log) -> np.ndarray:
+        factor = (len(fine) - 1) // max(len(log) - 1, 1)
+        return term(fine, load if len(fine) == len(log) else refine_samples(load, factor), v_s)
+
+    parts = [
+        term(log, load, v_s) if term.is_smooth else low_pass_columns(log, partial(columns, term)) for term in terms
+    ]
     return np.concatenate([np.zeros((len(log), log.nv, 0)), *parts], axis=2)
 
 
@@ -156,16 +230,22 @@ class ExtraTorque(eqx.Module):
 
     @property
     def needs_load(self) -> bool:
-        """Whether a term looks at the torque of the rigid bodies."""
+        """True where a term depends on the torque of the rigid bodies."""
         return any(term.needs_load for term in self.terms)
 
     def torque(self, log: Log, load: np.ndarray) -> np.ndarray:
         """Torque (n, nv) of all terms along a log, with the rigid bodies' torque `load` (n, nv) (N m, N)."""
-        columns = as_measured(log, term_columns(self.terms, log, load, self.v_s))
+        columns = term_columns(self.terms, log, load, self.v_s)
         return np.einsum("ijk,kj->ij", columns, self.coefficients)
 
     @property
     def named(self) -> dict[str, list]:
+        """Deprecated name of `by_term`."""
+        warn("ExtraTorque.named is deprecated; read by_term", DeprecationWarning)
+        return self.by_term
+
+    @property
+    def by_term(self) -> dict[str, list]:
         """Coefficients of each term: one list of nv numbers, or k of them."""
         edges = np.cumsum((0, *self.counts))
         parts = [self.coefficients[a:b] for a, b in itertools.pairwise(edges)]

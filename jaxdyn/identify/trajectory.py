@@ -1,5 +1,6 @@
 """Physically feasible inertias and friction by trajectory error: simulate the log and compare the motion."""
 
+import dataclasses
 from collections.abc import Callable, Sequence
 from typing import Any
 
@@ -12,45 +13,52 @@ from jaxtyping import Array, Float
 
 from jaxdyn.dynamics.quantities import mass_matrix
 from jaxdyn.identify.chart import Chart, Coordinates, check_bodies, make_chart
-from jaxdyn.identify.divided import shared_out, summed
-from jaxdyn.identify.friction import Terms, check_terms
+from jaxdyn.identify.checkpoint import Watch
+from jaxdyn.identify.descent import descend
+from jaxdyn.identify.distances import entropic_residual
+from jaxdyn.identify.gauss_newton import Unknowns
 from jaxdyn.identify.logs import Log, as_logs, root_mean_square
-from jaxdyn.identify.minimise import METHODS, Optimizer, minimise
-from jaxdyn.identify.progress import Watch
+from jaxdyn.identify.objectives import Objective
+from jaxdyn.identify.optax_steps import METHODS, GradientSteps, Optimizer
+from jaxdyn.identify.problem import Problem, loss_of, pose_problem
 from jaxdyn.identify.regression import regressor
-from jaxdyn.identify.replay import (
-    Segments,
-    check_replay,
-    check_spacing,
-    motion_errors,
-    motion_scale,
-    segments,
-    simulate_segment,
-    simulation_options,
-    spaced,
-)
+from jaxdyn.identify.replay import check_replay, simulation_options
 from jaxdyn.identify.result import Fit
+from jaxdyn.identify.torque_terms import Terms, check_terms
 from jaxdyn.model.arguments import Checked
 from jaxdyn.model.tree import Model
 from jaxdyn.systems.scene import Scene
 
 
-class _Unknowns(eqx.Module):
-    """What is searched: coordinates of the model, and corrections of the initial states (segments, 2, nv), or None."""
+class _ChartTree(eqx.Module):
+    """Parameter tree of a model's chart: its inertias and terms, with the divergence of the bodies as the prior.
 
-    point: Coordinates
-    start: Float[Array, "segments 2 nv"] | None
+    It has the methods of `jd.identify.Parameters` that a problem needs.
+    """
 
-
-class _Problem(eqx.Module):
-    model: Model
+    given: Model
     chart: Chart
-    data: Segments
-    scale: Float[Array, "2 nv"]
-    prior: Float[Array, ""]
-    hold: str = eqx.field(static=True)
-    options: Any
-    mesh: Any = eqx.field(static=True)
+    start_point: Coordinates
+
+    @property
+    def dtype(self) -> np.dtype:
+        """Floating-point type of the coordinates."""
+        return np.dtype(self.given.home.dtype)
+
+    def point(self, y: Float[Array, " p"]) -> Coordinates:
+        """Point in the chart of flat coordinates."""
+        return ravel_pytree(self.start_point)[1](y)
+
+    def system(self, y: Float[Array, " p"]) -> Scene:
+        """Scene of the model and its friction at y."""
+        model, friction = self.chart.model_at(self.given, self.point(y))
+        has_friction = self.chart.terms or model.damping is not None or model.friction is not None
+        return Scene(model, forces=(friction,) if has_friction else ())
+
+    def residual(self, y: Float[Array, " p"]) -> Float[Array, " k"]:
+        """Residuals of the prior, whose squares add up to the divergence of the bodies."""
+        U = self.chart.relative_factors(self.point(y).theta)
+        return jax.vmap(entropic_residual)(U).reshape(-1) if self.chart.bodies else jnp.zeros((0,), y.dtype)
 
 
 def fit_trajectory(
@@ -92,8 +100,8 @@ def fit_trajectory(
       as in `fit_torques`.
     - `substeps`: fixed steps between two samples (Tsit5 unless `solver` says otherwise); None: adaptive steps. Fixed
       steps end on every sample, where the torques have their kinks, and cost the same in every segment.
-    - `devices`: some of `jax.devices()`, among which the segments are shared, by as many of them as can have equally many; an
-      iteration exchanges one all-reduce. None: one device.
+    - `devices`: some of `jax.devices()`, over which the segments are sharded, as many as divide their number; an iteration
+      exchanges one all-reduce. None: one device.
     - `simulation`: options of `jd.simulate` (solver, stepsize, rtol, atol, adjoint, max_steps).
 
     **Returns:** `Fit`. Its `result` is "not_finite" when a simulation failed; the model is then the best before.
@@ -107,90 +115,63 @@ def fit_trajectory(
     terms = check_terms(terms, v_s)
     check_replay(initial, hold)
     if isinstance(method, str) and method not in METHODS:
-        raise ValueError(f"method is {method!r}; take one of {METHODS} or an optax.GradientTransformation")
+        raise ValueError(f"method is {method!r}; give one of {METHODS} or an optax.GradientTransformation")
     if not prior >= 0:
         raise ValueError(f"prior is {prior}; it must not be negative")
-    options = simulation_options(substeps, simulation)
-    dtype = np.dtype(model.home.dtype)
-    data = segments(logs, horizon, dtype)
-    options = spaced(options, data)
-    check_spacing(options, devices)
-    data, mesh = shared_out(data, devices)
     q, v, tau, a = (np.concatenate(parts) for parts in zip(*map(_signals, logs), strict=True))
     rms = [root_mean_square(x) for x in (tau, v, a)]
     chart, point = make_chart(model, terms, v_s, inertia, *rms)
-    start = jnp.zeros((data.q.shape[0], 2, model.nv), dtype) if initial == "free" else None
-    problem = _Problem(model, chart, data, motion_scale(model, data), jnp.asarray(prior, dtype), hold, options, mesh)
-    unknowns = _Unknowns(point, start)
-    y0, unflatten = ravel_pytree(unknowns)
+    tree = _ChartTree(model, chart, point)
+    objective: Any = Objective("trajectory", hold, simulation_options(substeps, simulation))
+    problem = pose_problem(tree, objective, logs, horizon, 0.0, devices)
+    # The prior's weight in a problem is noise^2 / N.
+    problem = dataclasses.replace(problem, noise=float(np.sqrt(prior * problem.divisor)))
+    start = jnp.zeros((problem.count, 2, model.nv), tree.dtype) if initial == "free" else None
+    unknowns = Unknowns(ravel_pytree(point)[0], start)
+    z0, unflatten = ravel_pytree(unknowns)
 
-    def report(step, value, y):
+    def report(step, value, z):
         if callback is not None:
-            callback(step, value, chart.fitted(model, unflatten(y).point)[0])
+            callback(step, value, chart.model_at(model, tree.point(unflatten(z).y))[0])
 
-    y, history, result = minimise(
-        _flat_loss,
-        y0,
+    method_steps = GradientSteps(
+        loss_of,
         (problem, unknowns),
         method=method,
+        steps=steps,
         learning_rate=learning_rate,
         tolerance=tolerance,
-        scaling=lambda y: _scaling(problem, unflatten(y).point, (q, v, a), y.size),
-        watch=Watch(steps, report),
+        scaling=lambda z: _scaling(problem, tree.point(unflatten(z).y), (q, v, a), z.size),
     )
-    fitted, friction = chart.fitted(model, chart.settled(unflatten(y).point))
+    end = descend(method_steps, z0, Watch(steps, report))
+    fitted, friction = chart.model_at(model, chart.clip_terms(tree.point(unflatten(end.best.point).y)))
     name = method if isinstance(method, str) else type(method).__name__
     return Fit(
         model=fitted,
         friction=friction,
         nominal=model,
-        history=history,
-        result=result,
+        history=end.history,
+        result=end.result,
         method=f"trajectory fit by {name}",
         terms=terms,
     )
 
 
 def _signals(log: Log):
-    """q, v, tau and a of a log."""
+    """Signals q, v, tau and a of a log."""
     v, t = np.asarray(log.v, np.float64), np.asarray(log.t, np.float64)
     return log.q, log.v, log.tau, np.gradient(v, t, axis=0) if log.a is None else log.a
 
 
-def _flat_loss(y, args):
-    problem, unknowns = args
-    _, unflatten = ravel_pytree(unknowns)
-    estimate = unflatten(y)
-    chart, data = problem.chart, problem.data
-    whole = data.v.size
-    # Everything but the segments is known to all devices.
-    rest = eqx.tree_at(lambda problem: problem.data, problem, None)
-
-    def squares(searched, known):
-        (point, start), (problem, data) = searched, known
-        model, friction = chart.fitted(problem.model, point)
-        has_friction = chart.terms or model.damping is not None or model.friction is not None
-        scene = Scene(model, forces=(friction,) if has_friction else ())
-
-        def errors(one, change):
-            change = None if change is None else change * problem.scale
-            q, v = simulate_segment(scene, one, change, problem.hold, problem.options)
-            return motion_errors(model, one, q, v, problem.scale)
-
-        return sum(jnp.sum(error**2) for error in jax.vmap(errors)(data, start)) / whole
-
-    error = summed(squares, problem.mesh)((estimate.point, estimate.start), (rest, data))
-    return error + problem.prior * chart.divergence(estimate.point.theta)
-
-
-def _scaling(problem: _Problem, point: Coordinates, signals, size: int) -> Float[Array, "n n"]:
-    """S with S S^T about the inverse of the Hessian of the motion error.
+def _scaling(problem: Problem, point: Coordinates, signals, size: int) -> Float[Array, "n n"]:
+    """Scaling S with S S^T about the inverse of the Hessian of the motion error.
 
     A change dx of the parameters changes the acceleration by -M^-1 Y dx at first, and the velocity by that times the time
-    since the segment began. Directions without effect are stretched at most a thousand times.
+    since the start of the segment. Directions without effect are scaled at most a thousand times.
     """
-    chart, span = problem.chart, float(problem.data.t[0, -1])
-    model, _ = chart.fitted(problem.model, point)
+    tree: Any = problem.tree
+    chart, span = tree.chart, float(problem.batches[0].t[0, -1])
+    model, _ = chart.model_at(tree.given, point)
     count = len(signals[0])
     few = np.linspace(0, count - 1, min(count, 200)).astype(int)
     q, v, a = (np.asarray(x, model.home.dtype)[few] for x in signals)
@@ -202,7 +183,7 @@ def _scaling(problem: _Problem, point: Coordinates, signals, size: int) -> Float
     values = np.maximum(values, 1e-6 * values.max(initial=1e-300))
     result = np.eye(size)
     result[: values.size, : values.size] = vectors / np.sqrt(values)
-    return jnp.asarray(result, problem.prior.dtype)
+    return jnp.asarray(result, model.home.dtype)
 
 
 @eqx.filter_jit

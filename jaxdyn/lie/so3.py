@@ -246,3 +246,65 @@ def matrix_to_quat(rotation: Matrix) -> Quaternion:
     of_yz = jnp.where(y4 >= z4, rows[2], rows[3])
     row = jnp.where(jnp.maximum(ww, x4) >= jnp.maximum(y4, z4), of_wx, of_yz)
     return quat_normalize(jnp.where(row[0] < 0.0, -row, row))
+
+
+def euler_to_matrix(angles: Vector, sequence: str = "zyz") -> Matrix:
+    """Rotation matrix of three Euler angles: R = R_a(angles[0]) R_b(angles[1]) R_c(angles[2]) for the sequence "abc".
+
+    Each rotation is about an axis that the former ones have moved: "zyx" is yaw, pitch and roll.
+
+    **Arguments:** `angles`: (3,), rad; `sequence`: three of x, y, z, neighbours different. **Returns:** (3, 3).
+
+    **Raises:** ValueError for another sequence.
+
+    Source: Murray, Li, Sastry (1994), eq. 2.19; EQUATIONS section 12.
+    """
+    first, second, third = _axis_rotations(angles, sequence)
+    return _product(_product(first, second), third)
+
+
+def euler_body_jacobian(angles: Vector, sequence: str = "zyz") -> Matrix:
+    """Matrix E(angles) of the body angular velocity: hat(E rates) = R^T dR/dt.
+
+    Its columns are the three axes in body coordinates. Torques about the axes are E^T times those in body axes.
+
+    **Arguments:** `angles`: (3,), rad; `sequence` as of `euler_to_matrix`. **Returns:** (3, 3). Singular where the first
+    and the last axis are parallel: det E = -sin(angles[1]) for "zyz".
+
+    **Raises:** ValueError for another sequence.
+
+    Source: Loparo & Vakalis, section 7.5, with errata E51 and E52; EQUATIONS section 12.
+    """
+    _, second, third = _axis_rotations(angles, sequence)
+    a, b, c = _axes(sequence, angles.dtype)
+    return jnp.stack([_product(third.T, _product(second.T, a)), _product(third.T, b), c], axis=1)
+
+
+def euler_spatial_jacobian(angles: Vector, sequence: str = "zyz") -> Matrix:
+    """Matrix E_s(angles) of the spatial angular velocity: hat(E_s rates) = (dR/dt) R^T; E_s = R E.
+
+    Its columns are the three axes in fixed coordinates.
+
+    **Arguments:** `angles`: (3,), rad; `sequence` as of `euler_to_matrix`. **Returns:** (3, 3). Singular where E is.
+
+    **Raises:** ValueError for another sequence.
+
+    Source: Loparo & Vakalis, section 7.5; EQUATIONS section 12.
+    """
+    first, second, _ = _axis_rotations(angles, sequence)
+    a, b, c = _axes(sequence, angles.dtype)
+    return jnp.stack([a, _product(first, b), _product(first, _product(second, c))], axis=1)
+
+
+def _axes(sequence: str, dtype) -> list[Vector]:
+    unit = jnp.eye(3, dtype=dtype)
+    return [unit["xyz".index(letter)] for letter in sequence]
+
+
+def _axis_rotations(angles: Vector, sequence: str) -> list[Matrix]:
+    if len(sequence) != 3 or not set(sequence) <= set("xyz") or sequence[1] in (sequence[0], sequence[2]):
+        raise ValueError(
+            f"sequence is {sequence!r}; give three of x, y, z with different neighbours, such as 'zyz' or 'zyx'"
+        )
+    # The exponential of angle times a unit axis keeps all derivatives finite.
+    return [exp(angles[i] * axis) for i, axis in enumerate(_axes(sequence, angles.dtype))]

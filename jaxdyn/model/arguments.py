@@ -14,7 +14,7 @@ import numpy as np
 from jax.typing import ArrayLike, DTypeLike
 from jaxtyping import Array, Float
 
-from jaxdyn.compile import is_concrete as is_concrete
+from jaxdyn.compile.known import is_concrete as is_concrete
 from jaxdyn.model import float64 as f64
 
 _T = TypeVar("_T")

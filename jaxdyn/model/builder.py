@@ -13,7 +13,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from jaxdyn.compile import is_concrete, numpy_for
+from jaxdyn.compile.known import array_namespace, is_concrete
 from jaxdyn.model import float64 as f64
 from jaxdyn.model import inertia as _inertia
 from jaxdyn.model.arguments import DType, Number, Numbers, store_leaf, warn_unphysical_inertias
@@ -284,18 +284,18 @@ class ModelBuilder:
 
 
 def _compose(first: f64.Values, second: f64.Values) -> f64.Values:
-    xp = numpy_for(first, second)
+    xp = array_namespace(first, second)
     return xp.asarray(first, float) @ xp.asarray(second, float)
 
 
 def _sum(one: f64.Values, other: f64.Values) -> f64.Values:
-    xp = numpy_for(one, other)
+    xp = array_namespace(one, other)
     return xp.asarray(one, float) + xp.asarray(other, float)
 
 
 def _rows(values, shape: tuple[int, ...]) -> f64.Values:
     """Stack arrays of one shape as rows; without any, an empty array of that shape."""
-    return numpy_for(values).asarray(values, float).reshape(-1, *shape)
+    return array_namespace(values).asarray(values, float).reshape(-1, *shape)
 
 
 def inertia_report(model: Model) -> list[tuple[str, str]]:
@@ -378,7 +378,7 @@ def _joint_numbers(value, size: int, kind: str, key: str, what: str) -> f64.Valu
     array = f64.numbers(value, shapes, f"{what}: {key}", finite=not limit)
     if not limit and is_concrete(array) and np.any(array < 0):
         raise ValueError(f"{what}: {key} is {value!r}; it must not be negative")
-    return numpy_for(array).broadcast_to(array, (size,))
+    return array_namespace(array).broadcast_to(array, (size,))
 
 
 def _screw(kind: str, axis, pitch, screw, what: str) -> f64.Values:
@@ -387,7 +387,7 @@ def _screw(kind: str, axis, pitch, screw, what: str) -> f64.Values:
     # A traced axis counts as given: its value cannot be compared with the default.
     turned = not is_concrete(axis) or not np.array_equal(axis, [0, 0, 1])
     pitched = not is_concrete(pitch) or bool(pitch)
-    xp = numpy_for(axis, pitch, screw)
+    xp = array_namespace(axis, pitch, screw)
     if kind not in SCREW_KINDS:
         if turned or pitched or screw is not None:
             raise ValueError(f"{what}: a {kind} joint has no axis, pitch or screw; turn its pose instead")
@@ -431,7 +431,7 @@ def _joint_leaf(moving: list[_Body], key: str, size: str, fill: float, *, always
     if not always and all(value is None for value in values):
         return None
     sizes = [getattr(KINDS[body.kind], size) for body in moving]
-    xp = numpy_for(values)
+    xp = array_namespace(values)
     parts = [xp.full(n, fill) if value is None else xp.asarray(value) for value, n in zip(values, sizes, strict=True)]
     return xp.concatenate(parts) if parts else np.zeros(0)
 

@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from jaxdyn.compile import is_concrete
+from jaxdyn.compile.known import is_concrete
 from jaxdyn.model.arguments import state_dtype
 from jaxdyn.model.joints import SCREW_KINDS
 from jaxdyn.model.text_table import short, table

@@ -11,7 +11,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from jaxdyn.compile import is_concrete, numpy_for
+from jaxdyn.compile.known import array_namespace, is_concrete
 from jaxdyn.model.joints import KINDS, SCREW_KINDS
 
 _SYMMETRIC = np.array([[0, 1, 3], [1, 2, 4], [3, 4, 5]])
@@ -59,12 +59,12 @@ def unit(axis, what: str) -> Values:
 def hat(vector: Values) -> Values:
     """Skew matrix (3, 3) with hat(a) b = a x b."""
     x, y, z = vector
-    return numpy_for(vector).array([[0.0, -z, y], [z, 0.0, -x], [-y, x, 0.0]])
+    return array_namespace(vector).array([[0.0, -z, y], [z, 0.0, -x], [-y, x, 0.0]])
 
 
 def rotation_from_rpy(rpy) -> Values:
     """Rotation R = Rz(yaw) Ry(pitch) Rx(roll) of the fixed-axis angles of URDF (rad)."""
-    xp = numpy_for(rpy)
+    xp = array_namespace(rpy)
     (cr, cp, cy), (sr, sp, sy) = xp.cos(rpy), xp.sin(rpy)
     return xp.array(
         [
@@ -90,7 +90,7 @@ def rpy_from_rotation(rotation: np.ndarray) -> np.ndarray:
 
 def pose_of(rotation, position) -> Values:
     """Pose (4, 4) of a rotation (3, 3) and a position (3,), known or traced."""
-    xp = numpy_for(rotation, position)
+    xp = array_namespace(rotation, position)
     rotation, position = xp.asarray(rotation, float), xp.asarray(position, float)
     upper = xp.concatenate([rotation, position[:, None]], axis=1)
     return xp.concatenate([upper, np.eye(4)[3:] if xp is np else jnp.eye(4)[3:]])
@@ -139,7 +139,7 @@ def adjoint(pose: Values) -> np.ndarray:
 
 def rotation_matrix(axis, angle) -> Values:
     """Rotation (3, 3) about a unit axis (3,) by an angle (rad): 1 + sin(a) hat(n) + (1 - cos(a)) hat(n)^2."""
-    xp = numpy_for(axis, angle)
+    xp = array_namespace(axis, angle)
     axis, angle = xp.asarray(axis, float), xp.asarray(angle, float)
     cross = hat(axis)
     # 1 - cos(a) as 2 sin(a/2)^2, which does not cancel for small angles.
@@ -213,10 +213,10 @@ def inertia_numbers(inertia, what: str) -> Values:
         com = numbers(inertia[1], {(3,): "(3,)"}, f"{what}: centre of mass")
         shapes = {(3, 3): "(3, 3)", (3,): "principal moments (3,)"}
         at_com = numbers(inertia[2], shapes, f"{what}: rotational inertia")
-        at_com = numpy_for(at_com).diag(at_com) if at_com.ndim == 1 else at_com
+        at_com = array_namespace(at_com).diag(at_com) if at_com.ndim == 1 else at_com
         if is_concrete(at_com) and np.abs(at_com - at_com.T).max() > _ORTHONORMAL * np.abs(at_com).max():
             raise ValueError(f"{what}: the rotational inertia {at_com.tolist()} is not symmetric")
-        xp = numpy_for(mass, com, at_com)
+        xp = array_namespace(mass, com, at_com)
         mass, com, at_com = (xp.asarray(x, float) for x in (mass, com, at_com))
         # Steiner's theorem, with the symmetric part taken row by row: an asymmetry below the tolerance is dropped.
         about_origin = at_com + mass * (com @ com * xp.eye(3) - xp.outer(com, com))
@@ -286,7 +286,7 @@ def parameters_from_pseudo(matrix: np.ndarray) -> np.ndarray:
 
 def move_inertia(pose: Values, parameters: Values) -> Values:
     """Transform ten inertial parameters from frame b to frame a by `pose` T_ab (`inertia.transform_inertia` in float64)."""
-    xp = numpy_for(pose, parameters)
+    xp = array_namespace(pose, parameters)
     pose, parameters = xp.asarray(pose, float), xp.asarray(parameters, float)
     rotation, shift = pose[:3, :3], pose[:3, 3]
     mass, first = parameters[0], rotation @ parameters[1:4]

@@ -11,7 +11,7 @@ import numpy as np
 from jax import dtypes as _dtypes
 from jaxtyping import Array, Float
 
-from jaxdyn.compile import numpy_for as _numpy_for
+from jaxdyn.compile.known import array_namespace as _numpy_for
 from jaxdyn.lie import so3
 from jaxdyn.model import float64 as _f64
 from jaxdyn.model.arguments import Checked, Number, Numbers, Row

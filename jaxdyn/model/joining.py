@@ -8,7 +8,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from jaxdyn.compile import is_concrete, numpy_for
+from jaxdyn.compile.known import array_namespace, is_concrete
 from jaxdyn.lie.so3 import _product
 from jaxdyn.model.arguments import Checked, Numbers, pose_leaf, store_leaf
 from jaxdyn.model.joints import KINDS
@@ -81,7 +81,7 @@ def _move_world(model: Model, pose) -> Model:
     pose, top = pose_leaf(pose, "pose"), model.topology
 
     def transform_attached(poses, carriers):
-        xp = numpy_for(pose, poses)
+        xp = array_namespace(pose, poses)
         poses, by = xp.asarray(poses), xp.asarray(pose, poses.dtype)
         product = by @ poses if xp is np else _product(by, poses)
         # Only rows carried by the world (-1) move; all others are relative to a body.
@@ -189,12 +189,12 @@ def _join_leaf(models, leaf: str, rows):
 
 def _as_known(leaf):
     """Convert a known leaf to numpy, so that joining compiles nothing."""
-    return numpy_for(leaf).asarray(leaf)
+    return array_namespace(leaf).asarray(leaf)
 
 
 def _concatenate(values: list, dtype, rows: Any = slice(None)) -> jax.Array:
     """Concatenate arrays of one dtype and select rows."""
-    xp = numpy_for(values)
+    xp = array_namespace(values)
     return store_leaf(xp.concatenate([xp.asarray(value, dtype) for value in values])[rows], dtype)
 
 

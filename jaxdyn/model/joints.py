@@ -22,7 +22,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from jaxdyn.compile import compiled
+from jaxdyn.compile import entry_point
 from jaxdyn.lie import se2, se3, so3
 
 
@@ -120,7 +120,7 @@ def joint_neutral(kind: str) -> np.ndarray:
     return q
 
 
-@compiled
+@entry_point
 def joint_integrate(kind: str, q: Float[Array, " nqj"], v: Float[Array, " nvj"]) -> Float[Array, " nqj"]:
     """Integrate the constant body velocity v for unit time: q exp(v), on the joint's group."""
     if kind in SCREW_KINDS:
@@ -139,7 +139,7 @@ def joint_integrate(kind: str, q: Float[Array, " nqj"], v: Float[Array, " nvj"])
     return jnp.concatenate([position, so3.quat_normalize(so3.quat_multiply(q[3:], so3.quat_exp(v[3:])))])
 
 
-@compiled
+@entry_point
 def joint_difference(kind: str, q0: Float[Array, " nqj"], q1: Float[Array, " nqj"]) -> Float[Array, " nvj"]:
     """Body velocity that moves q0 to q1 in one unit of time; the inverse of `joint_integrate`."""
     if kind in SCREW_KINDS:
@@ -161,7 +161,7 @@ def joint_difference(kind: str, q0: Float[Array, " nqj"], q1: Float[Array, " nqj
     return jnp.concatenate([so3.left_jacobian_inverse(omega) @ shift, omega])
 
 
-@compiled
+@entry_point
 def joint_rate(kind: str, q: Float[Array, " nqj"], v: Float[Array, " nvj"]) -> Float[Array, " nqj"]:
     """Time derivative of q for the body velocity v, the kinematic map qdot = H(q) v."""
     if kind in SCREW_KINDS:
@@ -177,7 +177,7 @@ def joint_rate(kind: str, q: Float[Array, " nqj"], v: Float[Array, " nvj"]) -> F
     return jnp.concatenate([so3.quat_to_matrix(q[3:]) @ v[:3], quat_rate])
 
 
-@compiled
+@entry_point
 def joint_random(
     kind: str, key: Array, lower: Array | np.ndarray, upper: Array | np.ndarray, dtype
 ) -> Float[Array, " nqj"]:

@@ -10,7 +10,8 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, PyTree
 
-from jaxdyn.compile import is_concrete, is_expanding, numpy_for
+from jaxdyn.compile import variant
+from jaxdyn.compile.known import array_namespace, is_concrete
 from jaxdyn.model.arguments import Numbers, as_array, batch_hint, check_shapes, warn, warn_unphysical_inertias
 from jaxdyn.model.description import tree_table
 from jaxdyn.model.inertia import inertial_parameters, transform_inertia
@@ -227,18 +228,8 @@ def _replace(model: Model, leaves: dict) -> Model:
     return Model(**leaves, topology=model.topology, fixed_joints=model.fixed_joints)
 
 
-def geometry(model: Model) -> tuple[Array | np.ndarray, Array | np.ndarray]:
-    """Home poses (nb, 4, 4) and screws (nb, 6) as every algorithm uses them.
-
-    Values are those of the leaves, except that screw entries which the joint's kind does not have are zero. Derivatives
-    are made unique: a change of a home pose that leaves SE(3) has no meaning, and algorithms would answer it differently,
-    so it is projected onto SE(3), by R (3 - R^T R)/2, which is R for a rotation and has the projection as its derivative.
-    """
+def _geometry(model: Model) -> tuple[Array | np.ndarray, Array | np.ndarray]:
     mask = model.topology.screw_mask
-    if is_expanding() and is_concrete(model.home, model.screws):
-        return jnp.asarray(_snap_to_integers(model.home)), jnp.asarray(
-            _snap_to_integers(model.screws) * mask.astype(model.screws.dtype)
-        )
     screws = model.screws * jnp.asarray(mask, model.screws.dtype)
     if is_concrete(model.home):
         return model.home, screws
@@ -249,6 +240,25 @@ def geometry(model: Model) -> tuple[Array | np.ndarray, Array | np.ndarray]:
     rotation = jnp.einsum("nij,njk->nik", rotation, 1.5 * jnp.eye(3, dtype=rotation.dtype)[None] - 0.5 * gram)
     last = jnp.broadcast_to(jnp.asarray(np.eye(4)[3:], rotation.dtype), (model.nb, 1, 4))
     return jnp.concatenate([jnp.concatenate([rotation, model.home[:, :3, 3:]], 2), last], 1), screws
+
+
+def _geometry_in_kernel(model: Model) -> tuple[Array | np.ndarray, Array | np.ndarray]:
+    """`_geometry`; entries of known models that rounding keeps from 0, 1 or -1 become those, which cost no operation."""
+    if not is_concrete(model.home, model.screws):
+        return _geometry(model)
+    screws = _snap_to_integers(model.screws) * model.topology.screw_mask.astype(model.screws.dtype)
+    return jnp.asarray(_snap_to_integers(model.home)), jnp.asarray(screws)
+
+
+@variant(_geometry_in_kernel)
+def geometry(model: Model) -> tuple[Array | np.ndarray, Array | np.ndarray]:
+    """Home poses (nb, 4, 4) and screws (nb, 6) as every algorithm uses them.
+
+    Values are those of the leaves, except that screw entries which the joint's kind does not have are zero. Derivatives
+    are made unique: a change of a home pose that leaves SE(3) has no meaning, and algorithms would answer it differently,
+    so it is projected onto SE(3), by R (3 - R^T R)/2, which is R for a rotation and has the projection as its derivative.
+    """
+    return _geometry(model)
 
 
 def _snap_to_integers(leaf) -> np.ndarray:
@@ -338,7 +348,7 @@ def random_configuration(model: Model, key: Array) -> Float[Array, " nq"]:
     topology = model.topology
     # One key per joint, so that a joint's sample does not depend on the kinds of the others.
     keys = jax.random.split(key, topology.nb)
-    xp = numpy_for(model.lower, model.upper)
+    xp = array_namespace(model.lower, model.upper)
     lower, upper = xp.asarray(model.lower), xp.asarray(model.upper)
     parts = []
     for i, kind in enumerate(topology.kinds):

@@ -14,7 +14,8 @@ import numpy as np
 from jax import lax
 from jaxtyping import Array, Float
 
-from jaxdyn.compile import compiled, is_known
+from jaxdyn.compile import entry_point
+from jaxdyn.compile.known import is_known
 from jaxdyn.constraints.base import constraint_jacobian, layout, velocity_residual
 from jaxdyn.constraints.rank import pseudo_inverse, sign_of_determinant, tolerance
 from jaxdyn.lie.so3 import _product
@@ -304,7 +305,7 @@ def count_dof(scene: Scene, q, t, dof: int | None = None, rank_tol: float | None
     return dof
 
 
-@compiled
+@entry_point
 def _tangent_projection(scene, q, t, rank_tol):
     """Projection 1 - A^+ A, and the rank of A."""
     A = constraint_jacobian(scene, q, t)
@@ -353,7 +354,7 @@ def least_quality(dtype) -> float:
     return float(jnp.finfo(dtype).eps) ** 0.4
 
 
-constraint_jacobian_compiled = compiled(constraint_jacobian)
+constraint_jacobian_compiled = entry_point(constraint_jacobian)
 
 
 def _affine_rows(scene, q, t):

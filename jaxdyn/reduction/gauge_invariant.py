@@ -20,7 +20,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from jaxdyn.compile import compiled
+from jaxdyn.compile import entry_point
 from jaxdyn.constraints.base import constraint_jacobian, layout, rows
 from jaxdyn.constraints.codes import RESULTS, Outcome
 from jaxdyn.constraints.dynamics import applied
@@ -110,7 +110,7 @@ def gauge_invariant(
     return _decouple(scene, q, v, tau, t, rotation, motion_rotation, dof, rank_tol)
 
 
-@compiled
+@entry_point
 def _decouple(scene, q, v, tau, t, rotation, motion_rotation, dof, rank_tol) -> GaugeInvariant:
     system, unit = scene.system, jnp.eye(scene.nv, dtype=q.dtype)
     motion = velocity_to_rate(system, q, v), jnp.ones_like(t)

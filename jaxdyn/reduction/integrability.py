@@ -9,7 +9,8 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from jaxdyn.compile import compiled, is_concrete, is_known
+from jaxdyn.compile import entry_point
+from jaxdyn.compile.known import is_concrete, is_known
 from jaxdyn.constraints.base import constraint_jacobian, holonomic_rows, layout, velocity_residual
 from jaxdyn.constraints.dynamics import tolerance
 from jaxdyn.dynamics.quantities import kinetic_energy, potential_energy
@@ -199,7 +200,7 @@ def spurious_terms(
     return terms
 
 
-@compiled
+@entry_point
 def _substitute(scene, choice: Independent, q, nu, tau, t):
     kept = np.asarray(choice.velocities, int)
     rest = np.setdiff1d(np.arange(scene.nv), kept)

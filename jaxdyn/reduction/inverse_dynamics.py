@@ -20,7 +20,8 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from jaxdyn.compile import compiled, is_concrete, run_repaired
+from jaxdyn.compile import entry_point, kernel
+from jaxdyn.compile.known import is_concrete
 from jaxdyn.constraints.base import layout, rows, velocity_residual
 from jaxdyn.constraints.codes import RESULTS, Outcome, name_of
 from jaxdyn.constraints.dynamics import applied, whitened_rows
@@ -180,10 +181,10 @@ def _weights(weights, count: int, dtype):
     return weights
 
 
-@compiled
+@entry_point
 def _solve_compiled(scene: Scene, q, v, a_independent, S, weights, t, chosen: tuple[int, ...], rank_tol):
-    v, a, torques, lam, is_determined, agrees, is_actuated, definite = run_repaired(
-        _solve, scene, q, v, a_independent, S, weights, t, static=(chosen, rank_tol)
+    v, a, torques, lam, is_determined, agrees, is_actuated, definite = kernel(_solve, static=2)(
+        chosen, rank_tol, scene, q, v, a_independent, S, weights, t
     )
     result = RESULTS.where(is_actuated, RESULTS.successful, RESULTS.underactuated)  # pyright: ignore[reportArgumentType]
     result = RESULTS.where(agrees, result, RESULTS.contradictory_rows)

@@ -14,7 +14,8 @@ from typing import Any
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from jaxdyn.compile import compiled, is_concrete, run_repaired
+from jaxdyn.compile import entry_point, kernel
+from jaxdyn.compile.known import is_concrete
 from jaxdyn.constraints.base import layout
 from jaxdyn.constraints.codes import RESULTS, Outcome
 from jaxdyn.constraints.dynamics import applied
@@ -104,7 +105,7 @@ def reduced_dynamics(
 
 def reduce(scene: Scene, choice: Basis, q, nu, tau, t) -> ReducedDynamics:
     """Solve `reduced_dynamics` in traced numbers, for a checked `Basis`."""
-    return run_repaired(_reduce, (scene, choice), q, nu, tau, t)
+    return kernel(_reduce)((scene, choice), q, nu, tau, t)
 
 
 def _reduce(given: tuple[Scene, Basis], q, nu, tau, t) -> ReducedDynamics:
@@ -127,4 +128,4 @@ def solve_in_basis(scene: Scene, motion: VelocityAndDrift, q, tau, t) -> Reduced
     return ReducedDynamics(rate, v, _product(N, rate) + drift, mass, bias, force, N, result)
 
 
-_reduce_compiled = compiled(reduce)
+_reduce_compiled = entry_point(reduce)

@@ -21,7 +21,7 @@ from jaxdyn.identify import (
 from jaxdyn.identify.identifiability import Identifiability
 from jaxdyn.identify.regression import free_columns
 from jaxdyn.identify.selection import Choice
-from jaxdyn.identify.whiteness import Whiteness, whiteness
+from jaxdyn.identify.uncertainty import Whiteness, whiteness
 from jaxdyn.model.tree import Model
 
 
@@ -159,7 +159,7 @@ def _add_robot(report: dict[str, Any], result: RobotFit, choice: Choice, model: 
             {**t.setting._asdict(), "extra": dict(t.setting.extra), "percent": t.percent} for t in choice.trials
         ],
     }
-    report["extra_terms"] = {} if extra is None else extra.named
+    report["extra_terms"] = {} if extra is None else extra.by_term
     report["weights"] = result.weights.tolist()
     report["interval_factor"] = spreads.factor
     if result.delays is not None:
@@ -184,8 +184,8 @@ def gains_content(gains: DriveGains) -> dict[str, Any]:
         "gains": gains.gains.tolist(),
         "std": gains.std.tolist(),
         "interval_factor": gains.factor,
-        "identifiable": list(gains.told),
-        "told": list(gains.told),  # former key, for one release
+        "identifiable": list(gains.identifiable),
+        "told": list(gains.identifiable),  # former key, for one release
         "percent": gains.error,
         "v_s": gains.v_s,
     }

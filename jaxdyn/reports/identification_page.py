@@ -184,7 +184,7 @@ def _friction(findings: Findings, labels: Sequence[str], units: Sequence[str]) -
     named: dict[str, Any] = {term: values.tolist() for term, values in findings.friction.items()}
     result = findings.result
     if isinstance(result, RobotFit) and result.fit.extra is not None:
-        for name, values in result.fit.extra.named.items():
+        for name, values in result.fit.extra.by_term.items():
             group = np.array(values).reshape(-1, findings.model.nv)
             named |= {name if len(group) == 1 else f"{name} {k + 1}": row.tolist() for k, row in enumerate(group)}
     sources = {}

@@ -13,7 +13,8 @@ from typing import Any
 import jax
 import numpy as np
 
-from jaxdyn.compile import compilation, function_of, glue_options
+from jaxdyn.compile import compilation
+from jaxdyn.compile.calls import function_of, glue_options
 from jaxdyn.scale.members import Members
 
 logger = logging.getLogger("jaxdyn")

@@ -7,7 +7,7 @@ from typing import Generic, ParamSpec, TypeVar
 import jax.numpy as jnp
 from jaxtyping import Array
 
-from jaxdyn.compile import is_concrete
+from jaxdyn.compile.known import is_concrete
 from jaxdyn.model.arguments import store_leaf
 from jaxdyn.systems.scene import Scene
 

@@ -6,7 +6,8 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array
 
-from jaxdyn.compile import compiled, is_concrete, numpy_for
+from jaxdyn.compile import entry_point
+from jaxdyn.compile.known import array_namespace, is_concrete
 from jaxdyn.constraints import rolling_sphere
 from jaxdyn.constraints.rank import solve_square
 from jaxdyn.contact import Sphere, montana
@@ -50,7 +51,7 @@ def _six_joints(links, masses, height, tip_radius, gravity) -> Model:
 
 def _joint_angles(pose, links, height):
     """Inverse kinematics: angles (6,) for a pose (4, 4) of the frame `tip`, with the elbow up."""
-    xp = numpy_for(pose, links, height)
+    xp = array_namespace(pose, links, height)
     pose = xp.asarray(pose, float)
     wrist = pose[:3, 3] - links[2] * pose[:3, 0]
     base = f64.pose_of(np.eye(3), (0.0, 0.0, height))
@@ -82,15 +83,15 @@ def _sphere_arm_start(
     if contact == "rolling" and is_concrete(slide, spin) and (np.any(slide) or spin):
         raise ValueError(f"slide is {slide}, spin is {spin}; a rolling contact has neither, leave them out")
     kinematics = montana(*_surfaces(radius, tip_radius), as_leaf(eta))
-    g_of = numpy_for(kinematics.g_of).asarray(kinematics.g_of)
-    pose = f64.pose_of(g_of[:3, :3], g_of[:3, 3] + numpy_for(center).asarray(center, float))
+    g_of = array_namespace(kinematics.g_of).asarray(kinematics.g_of)
+    pose = f64.pose_of(g_of[:3, :3], g_of[:3, 3] + array_namespace(center).asarray(center, float))
     q = as_state(_joint_angles(pose, links, height))
     twist = as_leaf([*slide, 0.0, *rolling, spin])
     arm = _six_joints(links, _MASSES, height, tip_radius, 0.0)
     return q, _rates_of_tip(arm, q, kinematics, twist)
 
 
-@compiled
+@entry_point
 def _rates_of_tip(arm: Model, q, kinematics, twist):
     return solve_square(body_jacobian(arm, q, "tip"), se3.Ad_apply(kinematics.finger.pose, twist))
 
@@ -162,14 +163,14 @@ def _lifting_start(
 ) -> tuple[Array, Array]:
     scene: Any = coordinated_lifting(count=count, radius=radius)
     flange = frame_pose(robots.iiwa(), as_leaf(_HOLDING), _FLANGE)
-    height = numpy_for(flange).asarray(flange)[2, 3]
+    height = array_namespace(flange).asarray(flange)[2, 3]
     q = as_state([*(_HOLDING * count), 0.0, 0.0, height, 1.0, 0.0, 0.0, 0.0])
     twist = as_leaf(twist)
     # Joint velocities of least norm that move the flanges with the plate.
     return q, _least_rates(scene, q, twist)
 
 
-@compiled
+@entry_point
 def _least_rates(scene, q, twist):
     rates = jnp.linalg.pinv(hand_jacobian(scene, q)) @ (grasp_map(scene, q).T @ twist)
     return jnp.concatenate([rates, twist])
@@ -198,7 +199,7 @@ def coordinated_lifting(
     fall = (0.0, 0.0, -gravity)
     arm = robots.iiwa(gravity=fall)
     flange = frame_pose(robots.iiwa(gravity=None), store_leaf(_HOLDING, arm.home.dtype), _FLANGE)
-    xp = numpy_for(flange, radius)
+    xp = array_namespace(flange, radius)
     flange = xp.asarray(flange)
     whole, grips = ModelBuilder("no arm", gravity=fall).build(), []
     for i in range(count):

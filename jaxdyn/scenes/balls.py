@@ -5,7 +5,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from jaxdyn.compile import numpy_for
+from jaxdyn.compile.known import array_namespace
 from jaxdyn.constraints import Holonomic, rolling_sphere
 from jaxdyn.contact.unilateral import ground_contact
 from jaxdyn.lie import so3
@@ -65,7 +65,7 @@ def ball_on_incline(
 
     vdot = (5/7) g sin(slope) e_x. Start: `velocity` (m/s) of the centre, without spin about the normal.
     """
-    xp = numpy_for(slope)
+    xp = array_namespace(slope)
     pull = (gravity * xp.sin(slope), 0.0, -gravity * xp.cos(slope))
     builder = ModelBuilder("ball on an incline", gravity=pull)
     builder.add_body("ball", None, "free", inertia.sphere(mass, radius))

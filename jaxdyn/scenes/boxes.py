@@ -6,7 +6,7 @@ import jax
 import numpy as np
 from jaxtyping import Array
 
-from jaxdyn.compile import is_concrete, numpy_for
+from jaxdyn.compile.known import array_namespace, is_concrete
 from jaxdyn.contact.cones import friction_cone, surface_cone
 from jaxdyn.contact.wrench_cones import wrench_cone
 from jaxdyn.grasp import Grasp, contact, point_contacts
@@ -47,7 +47,7 @@ def _chain(model, tip: str) -> tuple[list[int], np.ndarray]:
 
 def _tip(model, joints, offset, angles):
     """Position (3,) of a fingertip, and its Jacobian (3, n)."""
-    xp = numpy_for(angles)
+    xp = array_namespace(angles)
     pose, axes, origins = xp.eye(4), [], []
     home, screws = np.asarray(model.home, float), np.asarray(model.screws, float)
     for k, joint in enumerate(joints):
@@ -62,7 +62,7 @@ def _tip(model, joints, offset, angles):
 
 def _least(jacobian, motion):
     """Change of a finger's angles of least norm for a motion of its tip."""
-    return jacobian.T @ numpy_for(jacobian, motion).linalg.solve(jacobian @ jacobian.T, motion)
+    return jacobian.T @ array_namespace(jacobian, motion).linalg.solve(jacobian @ jacobian.T, motion)
 
 
 def _reach(model, joints, offset, guess, target):
@@ -88,7 +88,7 @@ def _cube_start(
 ) -> tuple[Array, Array]:
     model = robots.allegro()
     quaternion, rotation = _quaternion(turned)
-    xp = numpy_for(size, position, turned, twist)
+    xp = array_namespace(size, position, turned, twist)
     rotation, position, twist = xp.asarray(rotation), xp.asarray(position, float), xp.asarray(twist, float)
     angles: list[Any] = [_GUESS[int(name[6:-2])] for name in model.joint_names]
     rates: list[Any] = [0.0] * model.nv
@@ -136,7 +136,7 @@ def allegro_with_cube(*, size: Number = 0.06, mass: Number = 0.1, mu: Number = 0
 def _table_start(
     tilt: Number = 0.02, rate: Number = 0.0, height: Number = 0.025, size: Row = (0.2, 0.16, 0.24)
 ) -> tuple[Array, Array]:
-    xp = numpy_for(tilt)
+    xp = array_namespace(tilt)
     s, c = xp.sin(tilt), xp.cos(tilt)
     center = height + size[2] / 2
     place = [center * s, 0.0, center * c, xp.cos(tilt / 2), 0.0, xp.sin(tilt / 2), 0.0]
@@ -178,5 +178,5 @@ def box_on_table(
     base = contact("rigid", "table", (0.0, 0.0, -size[2] / 2), finger_pose=(0.0, 0.0, height), name="base")
     half_x, half_y = size[0] / 2, size[1] / 2
     rows = wrench_cone(half_x, half_y, mu)
-    rows = rows.at[4:].divide(numpy_for(size).maximum(half_x, half_y))
+    rows = rows.at[4:].divide(array_namespace(size).maximum(half_x, half_y))
     return Grasp(builder.build(), "box", [base], cones=surface_cone(rows))

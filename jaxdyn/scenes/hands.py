@@ -3,7 +3,7 @@
 import numpy as np
 from jaxtyping import Array
 
-from jaxdyn.compile import numpy_for
+from jaxdyn.compile.known import array_namespace
 from jaxdyn.constraints import rolling_sphere, rolling_wheel
 from jaxdyn.contact.cones import friction_cone
 from jaxdyn.grasp import Grasp, contact
@@ -23,7 +23,7 @@ _UP = np.array([0.0, 0.0, 1.0])
 
 def _rates(axes, origins, point, velocity):
     """Rates of revolute joints for a velocity of the material point of the last link at `point`."""
-    xp = numpy_for(axes, origins, point, velocity)
+    xp = array_namespace(axes, origins, point, velocity)
     columns = xp.cross(xp.asarray(axes, float), xp.asarray(point, float)[None] - xp.asarray(origins, float))
     # Columns are independent and the velocity is feasible, so that the normal equations are exact.
     return xp.linalg.solve(columns @ columns.T, columns @ xp.asarray(velocity, float))
@@ -31,7 +31,7 @@ def _rates(axes, origins, point, velocity):
 
 def _point_velocity(position, velocity, omega, point):
     """Velocity of the material point of a body at `point`."""
-    xp = numpy_for(position, velocity, omega, point)
+    xp = array_namespace(position, velocity, omega, point)
     position, velocity, omega, point = (xp.asarray(x, float) for x in (position, velocity, omega, point))
     return velocity + xp.cross(omega, point - position)
 
@@ -62,14 +62,14 @@ def _planar_hand(name, links, masses, palm, gravity):
 
 def _planar_object(center, angle, velocity):
     """Position of an object, and its velocity in the plane's axes from the body velocity (vx, vy, w)."""
-    xp = numpy_for(center, angle, velocity)
+    xp = array_namespace(center, angle, velocity)
     linear = _turn(angle) @ xp.asarray([velocity[0], velocity[1], 0.0])
     return xp.asarray([*center, 0.0]), linear, xp.asarray([0.0, 0.0, velocity[2]])
 
 
 def _planar_state(fingers, center, angle, velocity):
     """State q and v: `fingers` has base, knee, fingertip and contact point of each, `velocity` is the object's."""
-    xp = numpy_for(fingers, center, angle, velocity)
+    xp = array_namespace(fingers, center, angle, velocity)
     moving = _planar_object(center, angle, velocity)
     q, v = [], []
     for base, knee, tip, point in fingers:
@@ -88,7 +88,7 @@ def _bar_start(
     palm: Number = _PALM,
     length: Number = 0.3,
 ) -> tuple[Array, Array]:
-    xp = numpy_for(center, angle, links, palm, length)
+    xp = array_namespace(center, angle, links, palm, length)
     along = xp.asarray(_turn(angle))[:, 0]
     fingers = []
     for side in (-1.0, 1.0):
@@ -139,7 +139,7 @@ def _disk_start(
     palm: Number = _PALM,
     radius: Number = 0.1,
 ) -> tuple[Array, Array]:
-    xp = numpy_for(center, tilts, links, palm, radius)
+    xp = array_namespace(center, tilts, links, palm, radius)
     fingers = []
     for side, tilt in zip((-1.0, 1.0), tilts, strict=True):
         base, turned = xp.asarray([side * palm / 2, 0.0, 0.0]), xp.asarray(_turn(tilt))
@@ -211,7 +211,7 @@ def _spatial_hand(name, links, masses, circle, gravity):
 
 def _spatial_finger(base, links, tip, point, velocity):
     """Angles of a finger with its tip at `tip`, and rates for a velocity of its material point at `point`."""
-    xp = numpy_for(base, links, tip, point, velocity)
+    xp = array_namespace(base, links, tip, point, velocity)
     base, tip = xp.asarray(base, float), xp.asarray(tip, float)
     local = base[:3, :3].T @ (tip - base[:3, 3])
     yaw, reach = xp.arctan2(local[1], local[0]), xp.hypot(local[0], local[1])
@@ -226,7 +226,7 @@ def _spatial_finger(base, links, tip, point, velocity):
 
 def _quaternion(turned):
     """Unit quaternion and matrix of a rotation vector."""
-    xp = numpy_for(turned)
+    xp = array_namespace(turned)
     turned = xp.asarray(turned, float)
     square = turned @ turned
     # sin(a/2)/a by its series about a = 0, where the quotient has no derivative.
@@ -242,7 +242,7 @@ def _quaternion(turned):
 def _ball_state(position, turned, twist, links, circle, radius, reach, fixed):
     """State q and v: fingertips at `reach` (m) from the ball's centre, in directions fixed in the ball or in the world."""
     quaternion, rotation = _quaternion(turned)
-    xp = numpy_for(position, turned, twist, circle, reach, radius)
+    xp = array_namespace(position, turned, twist, circle, reach, radius)
     rotation, position, twist = xp.asarray(rotation), xp.asarray(position, float), xp.asarray(twist, float)
     moving = position, rotation @ twist[:3], rotation @ twist[3:]
     q, v = [], []

@@ -7,7 +7,7 @@ import equinox as eqx
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from jaxdyn.compile import is_concrete
+from jaxdyn.compile.known import is_concrete
 from jaxdyn.constraints import loop
 from jaxdyn.geometry.immersion import constrain_by_immersion
 from jaxdyn.model.arguments import Number, Row

@@ -4,7 +4,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array
 
-from jaxdyn.compile import numpy_for
+from jaxdyn.compile.known import array_namespace
 from jaxdyn.contact.unilateral import DryFriction
 from jaxdyn.forces.dissipation import SlidingFriction
 from jaxdyn.model.arguments import Checked, Number, Numbers, Row
@@ -219,7 +219,7 @@ def free_box(
     """
     numbers = box(mass, size)
     if frame is not None:
-        pose = numpy_for(frame).asarray(frame, float)
+        pose = array_namespace(frame).asarray(frame, float)
         rotation, place = pose[:3, :3], pose[:3, 3]
         numbers = displaced(numbers, -rotation.T @ place, rotation.T)
     builder = ModelBuilder("box", gravity=None if gravity is None else (0.0, 0.0, -gravity))

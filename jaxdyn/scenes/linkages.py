@@ -6,7 +6,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array
 
-from jaxdyn.compile import is_concrete, numpy_for
+from jaxdyn.compile.known import array_namespace, is_concrete
 from jaxdyn.constraints import loop
 from jaxdyn.model.arguments import Checked, Number, Numbers, Row
 from jaxdyn.model.builder import ModelBuilder
@@ -24,7 +24,7 @@ def thin_bar(mass, length):
 
 def _circles(center, radius, other, reach):
     """Intersection of two circles to the left of the line from the first centre to the second."""
-    xp = numpy_for(center, radius, other, reach)
+    xp = array_namespace(center, radius, other, reach)
     center, other = xp.asarray(center, float), xp.asarray(other, float)
     direction = other - center
     distance = xp.sqrt(direction @ direction)
@@ -40,7 +40,7 @@ def _circles(center, radius, other, reach):
 
 def _across(length, angle):
     """Velocity (2,) of the end of a link at one radian per second."""
-    xp = numpy_for(length, angle)
+    xp = array_namespace(length, angle)
     return length * xp.stack([-xp.sin(angle), xp.cos(angle)])
 
 
@@ -56,7 +56,7 @@ def _four_bar_start(
     lengths: Row = (1.0, 3.0, 2.5, 3.5), angle: Number = 1.0, rate: Number = 1.0, in_plane: bool = True
 ) -> tuple[Array, Array]:
     crank, coupler, rocker, ground = lengths
-    xp = numpy_for(lengths, angle, rate)
+    xp = array_namespace(lengths, angle, rate)
     a = crank * xp.stack([xp.cos(angle), xp.sin(angle)])
     b = _circles(a, coupler, (ground, 0.0), rocker)
     coupling, rocking = xp.arctan2(*(b - a)[::-1]), xp.arctan2(b[1], b[0] - ground)
@@ -93,7 +93,7 @@ def four_bar(
 def _slider_crank_start(
     crank: Number = 1.0, rod: Number = 2.5, angle: Number = 1.0, rate: Number = 1.0
 ) -> tuple[Array, Array]:
-    xp = numpy_for(crank, rod, angle, rate)
+    xp = array_namespace(crank, rod, angle, rate)
     lean = -xp.arcsin(crank * xp.sin(angle) / rod)
     leaning = -crank * xp.cos(angle) * rate / (rod * xp.cos(lean))
     place = crank * xp.cos(angle) + rod * xp.cos(lean)
@@ -166,7 +166,7 @@ def _parallel_start(
     bases: Row = _BASES,
     elbows: Row = (1, 1, 1),
 ) -> tuple[Array, Array]:
-    xp = numpy_for(point, velocity, length, bases)
+    xp = array_namespace(point, velocity, length, bases)
     q, v = [], []
     for base, elbow in zip(bases, elbows, strict=True):
         a = _circles(base, length, point, length) if elbow > 0 else _circles(point, length, base, length)

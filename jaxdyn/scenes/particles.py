@@ -5,7 +5,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from jaxdyn.compile import numpy_for
+from jaxdyn.compile.known import array_namespace
 from jaxdyn.constraints import Holonomic
 from jaxdyn.model.arguments import Number
 from jaxdyn.scenes._named import as_leaf, as_state, register_scene
@@ -32,7 +32,7 @@ def _scene(dimension: int, mass, length, gravity) -> Scene:
 
 
 def _plane_start(length: Number = 1.0, angle: Number = -np.pi / 2, rate: Number = 0.0) -> tuple[Array, Array]:
-    s, c = numpy_for(angle).sin(angle), numpy_for(angle).cos(angle)
+    s, c = array_namespace(angle).sin(angle), array_namespace(angle).cos(angle)
     return length * as_state([s, -c]), length * rate * as_state([c, s])
 
 
@@ -51,7 +51,7 @@ def pendulum_in_plane(*, mass: Number = 1.0, length: Number = 1.0, gravity: Numb
 def _sphere_start(
     length: Number = 1.0, theta: Number = 1.0, phi: Number = 0.0, theta_rate: Number = 0.0, phi_rate: Number = 1.0
 ) -> tuple[Array, Array]:
-    xp = numpy_for(theta, phi)
+    xp = array_namespace(theta, phi)
     s, c, sp, cp = xp.sin(theta), xp.cos(theta), xp.sin(phi), xp.cos(phi)
     q = length * jnp.asarray([s * cp, s * sp, -c])
     along = theta_rate * jnp.asarray([c * cp, c * sp, s]) + phi_rate * s * jnp.asarray([-sp, cp, 0.0])

@@ -3,7 +3,7 @@
 import numpy as np
 from jaxtyping import Array
 
-from jaxdyn.compile import is_concrete, numpy_for
+from jaxdyn.compile.known import array_namespace, is_concrete
 from jaxdyn.constraints import loop
 from jaxdyn.model import float64 as f64
 from jaxdyn.model.arguments import Checked, Number, Numbers, Row
@@ -20,7 +20,7 @@ def _disk(mass, radius, centre):
 
 
 def _sarrus_start(lengths: Row = (1.0, 0.8), height: Number = 0.9, rate: Number = 2.5) -> tuple[Array, Array]:
-    xp = numpy_for(lengths, height, rate)
+    xp = array_namespace(lengths, height, rate)
     q, v = [], []
     for k, length in enumerate(lengths):
         sine = height / (2 * length)
@@ -65,7 +65,7 @@ def sarrus(
     for uniform bars.
     """
     bar, platform = masses
-    xp = numpy_for(turn, radius)
+    xp = array_namespace(turn, radius)
     places, turns = [], []
     for angle in (0.0, turn):
         c, s, zero = xp.cos(angle), xp.sin(angle), 0.0 * xp.cos(angle)
@@ -100,7 +100,7 @@ def _hinge_platform_start(
     velocity: Row = (0.3, 0.4),
     rate: Number = 0.5,
 ) -> tuple[Array, Array]:
-    xp = numpy_for(length, radii, point, angle, velocity, rate)
+    xp = array_namespace(length, radii, point, angle, velocity, rate)
     c, s = xp.cos(angle), xp.sin(angle)
     point, velocity = xp.asarray(point, float), xp.asarray(velocity, float)
     q, v = [], []

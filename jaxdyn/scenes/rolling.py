@@ -5,7 +5,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from jaxdyn.compile import numpy_for
+from jaxdyn.compile.known import array_namespace
 from jaxdyn.constraints import Pfaffian, knife_edge, rolling_wheel
 from jaxdyn.model.arguments import Number, Row
 from jaxdyn.model.builder import ModelBuilder
@@ -37,7 +37,7 @@ def _disk(q, v, t, p):
 def _disk_start(
     radius: Number = 0.5, heading: Number = 0.0, steering: Number = 1.0, rolling: Number = 2.0
 ) -> tuple[Array, Array]:
-    xp = numpy_for(heading)
+    xp = array_namespace(heading)
     c, s = xp.cos(heading), xp.sin(heading)
     speed = radius * rolling
     return as_state([0.0, 0.0, heading, 0.0]), as_state([speed * c, speed * s, steering, rolling])
@@ -93,7 +93,7 @@ def knife_edge_on_incline(
 
     Source: Bloch (2003), section 1.6.
     """
-    xp = numpy_for(slope)
+    xp = array_namespace(slope)
     pull = (gravity * xp.sin(slope), 0.0, -gravity * xp.cos(slope))
     builder = ModelBuilder("skate", gravity=pull)
     builder.add_body("skate", None, "planar", (mass, (0.0, 0.0, 0.0), (0.0, 0.0, moment)))
@@ -103,7 +103,7 @@ def knife_edge_on_incline(
 def _coin_start(
     radius: Number = 0.05, circle: Number = 0.5, lean: Number = np.pi / 36, gravity: Number = 9.81
 ) -> tuple[Array, Array]:
-    xp = numpy_for(radius, circle, lean, gravity)
+    xp = array_namespace(radius, circle, lean, gravity)
     rho = radius / circle
     sine, cosine = xp.sin(lean), xp.cos(lean)
     spin = xp.sqrt(4 * gravity / radius * sine / ((6 - 5 * rho * sine) * rho * cosine))

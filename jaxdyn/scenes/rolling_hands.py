@@ -4,7 +4,7 @@ import jax
 import numpy as np
 from jaxtyping import Array
 
-from jaxdyn.compile import numpy_for
+from jaxdyn.compile.known import array_namespace
 from jaxdyn.contact import Ellipsoid, RollingModel, rolling_contact
 from jaxdyn.grasp import Grasp
 from jaxdyn.model import float64 as f64
@@ -31,7 +31,7 @@ _ROUNDS = 60
 
 def _support(semi_axes, normal):
     """Support point of an ellipsoid in the direction of an outward normal."""
-    xp = numpy_for(semi_axes, normal)
+    xp = array_namespace(semi_axes, normal)
     semi_axes, normal = xp.asarray(semi_axes, float), xp.asarray(normal, float)
     scaled = semi_axes * normal
     return semi_axes * scaled / xp.sqrt(scaled @ scaled)
@@ -39,7 +39,7 @@ def _support(semi_axes, normal):
 
 def _finger_state(base, links, tip_axes, point, normal, velocity):
     """Angles and rates of a finger whose ellipsoidal tip touches a moving point with a given outward normal."""
-    xp = numpy_for(base, links, tip_axes, point, normal, velocity)
+    xp = array_namespace(base, links, tip_axes, point, normal, velocity)
     base, tip_axes, point, normal, velocity = (xp.asarray(x, float) for x in (base, tip_axes, point, normal, velocity))
 
     def around(center):
@@ -68,7 +68,7 @@ def _egg_start(
     tip_semi_axes: Row = _TIP,
 ) -> tuple[Array, Array]:
     quaternion, rotation = _quaternion(turned)
-    xp = numpy_for(position, turned, twist, links, circle, semi_axes, tip_semi_axes)
+    xp = array_namespace(position, turned, twist, links, circle, semi_axes, tip_semi_axes)
     rotation, position, twist = xp.asarray(rotation), xp.asarray(position, float), xp.asarray(twist, float)
     moving = position, rotation @ twist[:3], rotation @ twist[3:]
     q, v = [], []

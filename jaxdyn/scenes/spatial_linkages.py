@@ -2,7 +2,7 @@
 
 from jaxtyping import Array
 
-from jaxdyn.compile import is_concrete, numpy_for
+from jaxdyn.compile.known import array_namespace, is_concrete
 from jaxdyn.constraints import loop
 from jaxdyn.model import float64 as f64
 from jaxdyn.model.arguments import Checked, Number, Numbers, Row
@@ -19,7 +19,7 @@ def _link(length, twist):
 
 def _second(length, twist, other):
     """Twist of the links of length `other` for a mobile linkage: a/sin(alpha) = b/sin(beta)."""
-    xp = numpy_for(length, twist, other)
+    xp = array_namespace(length, twist, other)
     sine = other * xp.sin(twist) / length
     if is_concrete(sine) and abs(sine) >= 1:
         raise ValueError(
@@ -30,14 +30,14 @@ def _second(length, twist, other):
 
 def _half_angle_product(first, second):
     """tan(q1/2) tan(q2/2) of a Bennett linkage with links of twists `first` and `second`, where q2 follows `first`."""
-    xp = numpy_for(first, second)
+    xp = array_namespace(first, second)
     return xp.sin((second + first) / 2) / xp.sin((second - first) / 2)
 
 
 def _bennett_start(
     lengths: Row = (1.0, 0.7), twist: Number = 1.1, angle: Number = 0.8, rate: Number = 1.0
 ) -> tuple[Array, Array]:
-    xp = numpy_for(lengths, twist, angle, rate)
+    xp = array_namespace(lengths, twist, angle, rate)
     # q3 = -q1 up to a turn.
     k = _half_angle_product(twist, _second(lengths[0], twist, lengths[1]))
     follower = 2 * xp.arctan2(k, xp.tan(angle / 2))
@@ -82,7 +82,7 @@ def _goldberg_start(
     lengths: Row = (1.0, 0.7, 0.5), twist: Number = 1.1, angle: Number = 1.2, rate: Number = 1.0
 ) -> tuple[Array, Array]:
     first, shared, other = _goldberg_twists(lengths, twist)
-    xp = numpy_for(lengths, twist, angle, rate)
+    xp = array_namespace(lengths, twist, angle, rate)
     one, two = _half_angle_product(first, shared), _half_angle_product(other, shared)
     second, third = 2 * xp.arctan2(one * two, xp.tan(angle / 2)), -2 * xp.arctan(xp.tan(angle / 2) / two)
     # Products and ratios of tangents of half angles are constant: q' / sin q is the same but for its sign.
@@ -132,7 +132,7 @@ def goldberg(
 def _bricard_start(
     twist: Number = 1.2, angle: Number = 0.8, rate: Number = 1.0, branch: Checked[int] = 1
 ) -> tuple[Array, Array]:
-    xp = numpy_for(twist, angle, rate)
+    xp = array_namespace(twist, angle, rate)
     c, s = xp.cos(twist), xp.sin(twist)
     # The closure is x cos(other) + y sin(other) + z = 0.
     x, y = s**2 + (1 + c**2) * xp.cos(angle), -2 * c * xp.sin(angle)

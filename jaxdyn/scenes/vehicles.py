@@ -3,7 +3,7 @@
 import numpy as np
 from jaxtyping import Array
 
-from jaxdyn.compile import numpy_for
+from jaxdyn.compile.known import array_namespace
 from jaxdyn.constraints import knife_edge, rolling_wheel
 from jaxdyn.model.arguments import Number, Row
 from jaxdyn.model.builder import ModelBuilder
@@ -24,7 +24,7 @@ def _bicycle_start(
     front_radius: Number = 0.35,
 ) -> tuple[Array, Array]:
     # The steer axis points down, so steering turns the front wheel's contact, behind the axis, to the left.
-    yaw_rate = -trail * numpy_for(tilt).cos(tilt) / wheel_base * steer_rate
+    yaw_rate = -trail * array_namespace(tilt).cos(tilt) / wheel_base * steer_rate
     q = [0.0, 0.0, rear_radius, 1.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0]
     v = [speed, -rear_radius * roll_rate, 0.0, roll_rate, 0.0, yaw_rate]
     return as_state(q), as_state([*v, speed / rear_radius, steer_rate, speed / front_radius])
@@ -59,7 +59,7 @@ def bicycle(
 
     Source: Meijaard, Papadopoulos, Ruina & Schwab (2007), table 1; there z points down.
     """
-    xp = numpy_for(wheel_base, trail, tilt, rear_radius, front_radius, rear_frame, front_frame)
+    xp = array_namespace(wheel_base, trail, tilt, rear_radius, front_radius, rear_frame, front_frame)
     hub = xp.asarray([0.0, 0.0, rear_radius])
     axis = xp.asarray([xp.sin(tilt), 0.0, -xp.cos(tilt)])
     # A point of the steer axis close to the front wheel: its foot on the ground, moved up to the height of the axle.
@@ -145,7 +145,7 @@ def _car_start(
     half_track: Number = 0.4,
     wheel_base: Number = 1.2,
 ) -> tuple[Array, Array]:
-    xp = numpy_for(steer)
+    xp = array_namespace(steer)
     yaw_rate = speed * xp.tan(steer) / wheel_base
     speed_difference = yaw_rate * half_track
     spins = [
@@ -204,7 +204,7 @@ def _snakeboard_start(
     rotor_rate: Number = 1.0,
     half_length: Number = 0.3,
 ) -> tuple[Array, Array]:
-    front, back = (numpy_for(angle).tan(angle) for angle in angles)
+    front, back = (array_namespace(angle).tan(angle) for angle in angles)
     sideways, yaw_rate = speed * (front + back) / 2, speed * (front - back) / (2 * half_length)
     return as_state([0.0, 0.0, 0.0, *angles, 0.0]), as_state([speed, sideways, yaw_rate, *rates, rotor_rate])
 

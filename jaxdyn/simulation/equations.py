@@ -11,7 +11,7 @@ import diffrax
 import jax
 import jax.numpy as jnp
 
-from jaxdyn.compile import partition_traced
+from jaxdyn.compile.known import partition_tracers
 from jaxdyn.constraints.selection import exchange_rows, renew_rows
 from jaxdyn.forces.piecewise import Pieces, fix_pieces, guards, pieces_of, values_and_levels
 from jaxdyn.simulation import contacts as unilateral
@@ -68,7 +68,7 @@ def equations(scene: Scene, control: Any, method: Method, start: dict, q0, v0, t
     system, added = scene.system, tuple(start)  # names alone, as functions of a run hold no arrays
     # diffrax compiles its arguments, which hides their values. What is known stays in closures, the rest is `args`:
     # flat, because its continuous adjoint takes no empty tuples.
-    unknown, known = partition_traced((scene, control, method))
+    unknown, known = partition_tracers((scene, control, method))
     args, count = tuple(unknown) or None, len(unknown)
 
     def given(args, y=None):

@@ -7,7 +7,8 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 
-from jaxdyn.compile import map_rows, run
+from jaxdyn.compile import kernel
+from jaxdyn.compile.batch import map_rows
 from jaxdyn.constraints.selection import (
     exchange_rows,
     gap_of_dropped,
@@ -173,7 +174,7 @@ def motion(scene: Scene, control, method: Method, numbers, options) -> Solution:
     if is_free is not None:
         failures.append((~is_free, RESULTS.no_freedom))
     if options["checks_mass"]:
-        failures.append((~run(has_definite_mass, system, q0, ts[0]), RESULTS.singular_mass_matrix))
+        failures.append((~kernel(has_definite_mass)(system, q0, ts[0]), RESULTS.singular_mass_matrix))
     if first is not None:
         failures.append((~is_regular(first), RESULTS.singular_basis))
     failures.append((nonfinite, RESULTS.nonfinite_state))

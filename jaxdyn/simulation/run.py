@@ -13,7 +13,8 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from jaxdyn.compile import compiled, is_concrete, is_known
+from jaxdyn.compile import entry_point
+from jaxdyn.compile.known import is_concrete, is_known
 from jaxdyn.constraints.selection import may_have_redundant_rows
 from jaxdyn.contact.unilateral import has_modes
 from jaxdyn.model.arguments import Numbers, as_array, state_dtype
@@ -218,12 +219,12 @@ def simulate(
     return solution
 
 
-@compiled
+@entry_point
 def _run(scene: Scene, control, method: Method, numbers, options) -> Solution:
     return motion(scene, control, method, numbers, options)
 
 
-@compiled
+@entry_point
 def _run_with_events(scene: Scene, control, method: Method, numbers, options) -> Solution:
     return hybrid.motion(scene, control, numbers, options)
 

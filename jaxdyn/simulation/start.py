@@ -5,8 +5,8 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from jaxdyn.compile import is_concrete
-from jaxdyn.constraints.assembly import open_constraints, start_evidence
+from jaxdyn.compile.known import is_concrete
+from jaxdyn.constraints.assembly import largest_residuals, open_constraints, start_openness
 from jaxdyn.constraints.base import layout
 from jaxdyn.constraints.selection import keep_rows, known_selection, most_rounding
 from jaxdyn.dynamics.quantities import mass_matrix
@@ -69,13 +69,14 @@ def checked_start(scene: Scene, method: Method, q, v, t) -> tuple[Scene, Method]
     selection, here = known_selection(scene, q, t, method.rank_tol)
     rank = int(np.sum(selection.kept))
     selected = scene if rank == len(selection.kept) else keep_rows(scene, selection)
-    residuals, ratio = start_evidence(selected, q, v, t, limit)
+    ratio = start_openness(selected, q, v, t, limit)
     if ratio <= 1 and selection.rounding > most_rounding(q.dtype):
         raise ValueError(
             f"rows of the constraints contradict each other: they depend on others, but are open by "
             f"{float(selection.rounding):.2g} of their size ({open_constraints(scene, q, v, t, limit)}); leave them out"
         )
     if not ratio <= 1:
+        residuals = largest_residuals(selected, q, v, t)
         raise ValueError(
             f"q0, v0 are not on the constraints: {open_constraints(selected, q, v, t, limit)} (position residual "
             f"{float(residuals[0]):.3g}, velocity residual {float(residuals[1]):.3g}); start from "

@@ -8,7 +8,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from jaxdyn.compile import is_concrete, partition_traced
+from jaxdyn.compile.known import is_concrete, partition_tracers
 from jaxdyn.constraints.selection import keep_rows, may_have_redundant_rows, select_rows
 from jaxdyn.contact.unilateral import has_modes
 from jaxdyn.forces.piecewise import fix_pieces, guards, pieces_of, values_and_levels
@@ -71,7 +71,7 @@ def stepper(scene: SceneLike, dt: Numbers, substeps: int = 1, remat: bool = True
     is_direct = adjoint != "reverse"
     selects_rows = bool(scene.constraints) and may_have_redundant_rows(scene)
     method, system, dtype = chosen_method(scene, "auto"), scene.system, state_dtype(scene.system)
-    unknown, known = partition_traced(scene)
+    unknown, known = partition_tracers(scene)
     length = np.asarray(seconds, dtype) if is_concrete(seconds) else jnp.asarray(seconds, dtype)
 
     def given(args):

@@ -10,7 +10,8 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from jaxdyn.compile import compiled, is_known, numpy_for
+from jaxdyn.compile import entry_point
+from jaxdyn.compile.known import array_namespace, is_known
 from jaxdyn.constraints.dynamics import constrained_dynamics
 from jaxdyn.dynamics.quantities import gravity_force, mass_matrix
 from jaxdyn.lie.so3 import _product
@@ -64,7 +65,7 @@ def _rates(values) -> tuple:
 
     What grows by itself counts as an oscillation there.
     """
-    xp = numpy_for(values)
+    xp = array_namespace(values)
     size = xp.abs(values)
     angles = xp.arctan2(xp.abs(values.imag), xp.maximum(-values.real, 0.0))
     stable = xp.interp(angles, *(xp.asarray(x, size.dtype) for x in _stable_radii()))
@@ -116,7 +117,7 @@ def stiffness(
     return Stiffness(*(store_leaf(x, matrix.dtype) for x in _rates(values)))
 
 
-@compiled
+@entry_point
 def _linearised(scene: Scene, q, v, t, control) -> Float[Array, "n n"]:
     """The matrix (2 nv, 2 nv) of d(dq, dv)/dt."""
     system, n = scene.system, scene.nv

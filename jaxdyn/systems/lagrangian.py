@@ -9,7 +9,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, PyTree
 
-from jaxdyn.compile import is_known
+from jaxdyn.compile.known import is_known
 from jaxdyn.model.arguments import Checked, Function, Number
 from jaxdyn.systems.scene import as_pytree
 from jaxdyn.systems.start import check_mass_matrix, describe_state

@@ -4,37 +4,47 @@ A tree's mass matrix has a zero for every pair of coordinates of different branc
 the first, M = U U^T with U upper triangular, it keeps them all (Featherstone 2008, section 6.5), so that programs of single
 numbers (`jaxdyn.compile`) leave them out. `MassFactor` holds U as the Cholesky factor of the matrix in reversed order.
 
-Outside of such programs, too, they are kernels: LAPACK under XLA takes a thread for each call, and two calls of a large batch at
-once can wait for each other for ever (jaxlib 0.10 to 0.12 on CPU).
+Outside of such programs, too, they are kernels, of blocks where the matrix is large: LAPACK under XLA takes a thread for each
+call, and two calls of a large batch at once can wait for each other for ever (jaxlib 0.10 to 0.12 on CPU).
 """
 
 from typing import NamedTuple
 
+import jax
 import jax.numpy as jnp
 from jax import lax
 from jax.scipy.linalg import solve_triangular
 from jaxtyping import Array, Bool, Float
 
-from jaxdyn.compile import compiled, is_expanding, run
+from jaxdyn.compile import entry_point, kernel, variant
+from jaxdyn.lie.so3 import _product
 
-# Rows of a matrix beyond which its factor is no kernel: their operations grow as the cube.
-_MOST_IN_KERNEL = 64
+# Rows of a matrix beyond which its factor is made by halves: operations of a kernel grow as the cube.
+_MOST_IN_KERNEL = 32
 
 
 def cholesky(matrix: Float[Array, "n n"]) -> Float[Array, "n n"]:
     """Lower triangular L with L L^T = matrix, of which the lower triangle is read; NaN where it is not positive definite."""
     if matrix.shape[-1] == 0:  # a model without moving bodies
         return matrix
-    # Within a program of numbers, which sees the zeros of the matrix only where it is at hand.
-    return _cholesky(None, matrix) if _stays_array(matrix) else run(_cholesky, None, matrix)
-
-
-def _stays_array(matrix) -> bool:
-    return is_expanding() or matrix.shape[-1] > _MOST_IN_KERNEL
+    return _factor(None, matrix)
 
 
 def _cholesky(_, matrix):
     return lax.linalg.cholesky(matrix, symmetrize_input=False)
+
+
+# Inside of a kernel a factor is written in its place, where the zeros of the matrix are known.
+@variant(_cholesky)
+def _factor(_, matrix):
+    n = matrix.shape[-1]
+    if n <= _MOST_IN_KERNEL:
+        return kernel(_cholesky)(None, matrix)
+    half = n // 2
+    first = cholesky(matrix[:half, :half])
+    below = solve_lower(first, matrix[half:, :half].T).T
+    second = cholesky(matrix[half:, half:] - _product(below, below.T))
+    return jnp.block([[first, jnp.zeros((half, n - half), matrix.dtype)], [below, second]])
 
 
 def is_definite(matrix: Float[Array, "n n"], factor: Float[Array, "n n"]) -> Bool[Array, ""]:
@@ -58,13 +68,29 @@ def solve_lower(
     """L^-1 right, or L^-T right."""
     if factor.shape[-1] == 0:
         return right
-    if _stays_array(factor):
-        return _solve_lower(transposed, None, factor, right)
-    return run(_solve_lower, None, factor, right, static=(transposed,))
+    return _solve(transposed, None, factor, right)
 
 
 def _solve_lower(transposed: bool, _, factor, right):
     return solve_triangular(factor, right, lower=True, trans=int(transposed))
+
+
+@variant(_solve_lower)
+def _solve(transposed: bool, _, factor, right):
+    n = factor.shape[-1]
+    if n > _MOST_IN_KERNEL:
+        half = n // 2
+        first, below, second = factor[:half, :half], factor[half:, :half], factor[half:, half:]
+        if transposed:
+            lower = solve_lower(second, right[half:], transposed=True)
+            upper = solve_lower(first, right[:half] - _product(below.T, lower), transposed=True)
+        else:
+            upper = solve_lower(first, right[:half])
+            lower = solve_lower(second, right[half:] - _product(below, upper))
+        return jnp.concatenate([upper, lower])
+    if right.ndim == 2 and right.size > _MOST_IN_KERNEL**2:  # one column at a time, as elements of a batch
+        return jax.vmap(lambda column: solve_lower(factor, column, transposed=transposed), 1, 1)(right)
+    return kernel(_solve_lower, static=1)(transposed, None, factor, right)
 
 
 def solve_cholesky(factor: Float[Array, "n n"], right: Float[Array, "n *k"]) -> Float[Array, "n *k"]:
@@ -72,7 +98,7 @@ def solve_cholesky(factor: Float[Array, "n n"], right: Float[Array, "n *k"]) -> 
     return solve_lower(factor, solve_lower(factor, right), transposed=True)
 
 
-@compiled
+@entry_point
 def solve_positive(matrix: Float[Array, "n n"], right: Float[Array, "n *k"]) -> Float[Array, "n *k"]:
     """Solve matrix^-1 right by Cholesky factorisation; NaN where the matrix is not positive definite."""
     return solve_cholesky(cholesky(matrix), right)

@@ -15,7 +15,8 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, PyTree
 
-from jaxdyn.compile import compiled, is_known, run
+from jaxdyn.compile import entry_point, kernel
+from jaxdyn.compile.known import is_known
 from jaxdyn.lie.so3 import _product
 from jaxdyn.model.arguments import Checked, Function, Number, batch_hint
 from jaxdyn.model.tree import Model, configuration_rate, difference, integrate, joint_rates, normalize
@@ -79,7 +80,7 @@ class System(eqx.Module):
         self, q: Float[Array, " nq"], v: Float[Array, " nv"], tau: Float[Array, " nv"], t: Number
     ) -> Float[Array, " nv"]:
         """Acceleration M^-1 (tau - h), (nv,)."""
-        return run(_acceleration, self, q, v, tau, t, otherwise=_acceleration)
+        return kernel(_acceleration, fallback=_acceleration)(self, q, v, tau, t)
 
     def check_start(self, q: Float[Array, " nq"], v: Float[Array, " nv"], t: Number) -> None:
         """Refuse a state from which no motion can be computed; traced states are not checked.
@@ -242,12 +243,17 @@ def rate_to_velocity(system, q: Float[Array, " nq"], rate: Float[Array, " nq"]) 
 
 def displace(system, q: Float[Array, " nq"], step: Float[Array, " nv"]) -> Float[Array, " nq"]:
     """Configuration reached from q by the displacement `step` (nv,) of any system, on the manifold of a `Model`."""
-    return integrate(system, q, step) if isinstance(system, Model) else q + step
+    if not isinstance(system, Model):
+        return q + step
+    # A kernel, as joint by joint it is hundreds of operations of JAX; dependent coordinates solve equations of their own.
+    return (integrate if has_dependent_coordinates(system) else kernel(integrate))(system, q, step)
 
 
 def displacement(system, q0: Float[Array, " nq"], q1: Float[Array, " nq"]) -> Float[Array, " nv"]:
     """Displacement (nv,) from q0 to q1 of any system, the inverse of `displace`."""
-    return difference(system, q0, q1) if isinstance(system, Model) else q1 - q0
+    if not isinstance(system, Model):
+        return q1 - q0
+    return (difference if has_dependent_coordinates(system) else kernel(difference))(system, q0, q1)
 
 
 def has_quaternions(system) -> bool:
@@ -270,7 +276,7 @@ def retract(system, q: Float[Array, " nq"]) -> Float[Array, " nq"]:
     return normalize(system, q) if needs_retraction(system) else q
 
 
-@compiled
+@entry_point
 def symbols(derivative: Float[Array, "n n n"]) -> Float[Array, "n n n"]:
     """Christoffel symbols of the first kind from dM_ij/dq_k: 1/2 (dM_ij/dq_k + dM_ik/dq_j - dM_kj/dq_i)."""
     return 0.5 * (derivative + derivative.transpose(0, 2, 1) - derivative.transpose(2, 1, 0))

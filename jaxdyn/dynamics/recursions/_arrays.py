@@ -5,7 +5,7 @@ from typing import NamedTuple
 import numpy as np
 from jax import lax
 
-from jaxdyn.compile import is_concrete
+from jaxdyn.compile.known import is_concrete
 
 
 def is_known(*arrays) -> bool:

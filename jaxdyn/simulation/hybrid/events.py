@@ -5,7 +5,7 @@ import jax
 import numpy as np
 from jaxtyping import Array, Float, Int
 
-from jaxdyn.compile import is_concrete
+from jaxdyn.compile.known import is_concrete
 
 
 class Events(eqx.Module):

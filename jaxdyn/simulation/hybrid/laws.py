@@ -12,7 +12,7 @@ import jax
 import jax.numpy as jnp
 from jax.flatten_util import ravel_pytree
 
-from jaxdyn.compile import run
+from jaxdyn.compile import kernel
 from jaxdyn.constraints.base import holonomic_rows, layout, position_residual, velocity_residual
 from jaxdyn.dynamics.quantities import mass_matrix
 from jaxdyn.forces.piecewise import Pieces, values_and_levels
@@ -94,10 +94,10 @@ def laws_of(given: Callable, elements: Elements, solver: Any, y0) -> Laws:
         mode = mode._replace(positive=mode.positive ^ switched)
 
         def judge_in(mode, slip, v):
-            return run(judge_all, unknown, mode, slip, t, q, v)
+            return kernel(judge_all)(unknown, mode, slip, t, q, v)
 
         def jump_in(mode, slip):
-            return run(jump, unknown, mode, slip, t, q, v)
+            return kernel(jump)(unknown, mode, slip, t, q, v)
 
         mode, slip, begins = at_once(elements, mode, slip, judge_in(mode, slip, v), hit)
         cones = jnp.stack([force_at(scene, one).static.astype(v.dtype) for one in elements.each])
@@ -109,7 +109,7 @@ def laws_of(given: Callable, elements: Elements, solver: Any, y0) -> Laws:
 
     def land(unknown, mode, slip, t, y):
         y = plan.structure(y)
-        jumped_state = run(jump, unknown, mode, slip, t, y["q"], y["v"])
+        jumped_state = kernel(jump)(unknown, mode, slip, t, y["q"], y["v"])
         return ravel_pytree(y | {"v": jumped_state.v})[0]
 
     def slip_of(y):

@@ -7,15 +7,14 @@ would have met. Conditions are looked at in the middle and at the end of every s
 is violated and satisfied again between them is not seen.
 """
 
-from functools import partial
 from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
-from jax import lax
 from jaxtyping import Array
 
-from jaxdyn.compile import any_in_batch, recompute_unless, run
+from jaxdyn.compile import kernel
+from jaxdyn.compile.batch import cond, while_loop
 from jaxdyn.simulation.hybrid.modes import CHANNELS, KINDS, Elements, Mode
 from jaxdyn.simulation.hybrid.transitions import Change
 from jaxdyn.simulation.solvers.driver import number_of_steps, save
@@ -120,10 +119,7 @@ def _looked_at(laws: Laws, args, t0, t1, y, step, rtol, atol):
 
 
 def _attempted(laws: Laws, *given):
-    kernel: Any = partial(run, attempt, *given, static=(laws,), calls=True, served=True)
-    outcome, served = kernel(otherwise=lambda *_: None)
-    again = partial(attempt_in_turn, laws)
-    return again(*given) if outcome is None else recompute_unless(served, again, outcome, given)
+    return kernel(attempt, static=1, fallback=attempt_in_turn, derivative=False)(laws, *given)
 
 
 def blank(elements: Elements, dtype, most: int) -> Records:
@@ -146,7 +142,7 @@ def drive(laws: Laws, unknown, ts, y0, mode, slip, rtol, atol, stepsize, max_ste
     hit = jnp.zeros((n * CHANNELS + laws.elements.switches,), bool)
     begun: Change = laws.transit(unknown, start, y0, mode, slip, hit)
     y = laws.placed(y0, begun.v, begun.slip)
-    conditions, _ = run(judged, (unknown, begun.mode), start, y, static=(laws,))
+    conditions, _ = kernel(judged, static=1)(laws, (unknown, begun.mode), start, y)
     code = jnp.where(begun.paradox, PARADOX, jnp.where(begun.settled, FINE, NO_MODE)).astype(jnp.int32)
     zero = jnp.zeros((), ts.dtype)
     first, steps = 1e-4 * (end - start), None
@@ -178,8 +174,8 @@ def drive(laws: Laws, unknown, ts, y0, mode, slip, rtol, atol, stepsize, max_ste
         kept, hit = kept & active, hit & active & kept
         saved, rows = save(laws.plan, ts, lane, after, kept, attempt[0], saved, rows)
         happens = hit.any()
-        after, records = lax.cond(
-            any_in_batch(happens),
+        after, records = cond(
+            happens,
             lambda after, records: _crossed(laws, unknown, after, records, hit, happens, most, steps),
             lambda after, records: (after, records),
             after,
@@ -188,7 +184,7 @@ def drive(laws: Laws, unknown, ts, y0, mode, slip, rtol, atol, stepsize, max_ste
         return after, saved, rows, records
 
     carry = lane, none, rows, blank(laws.elements, dtype, most)
-    lane, _, rows, records = lax.while_loop(lambda carry: any_in_batch(is_active(carry[0])), body, carry)
+    lane, _, rows, records = while_loop(lambda carry: is_active(carry[0]), body, carry)
     return rows, lane, records, begun
 
 
@@ -212,6 +208,7 @@ def _across(elements: Elements, lane: Lane) -> Lane:
     return lane._replace(mode=lane.mode._replace(positive=lane.mode.positive ^ crossed), conditions=conditions)
 
 
+@kernel(static=1)
 def _put_back(laws: Laws, args, t, y):
     """A state on the rows that act."""
     return laws.plan.ended(args, t, y, jnp.zeros_like(y))[0]
@@ -307,8 +304,8 @@ def _crossed(laws: Laws, unknown, lane: Lane, records: Records, hit, happens, mo
     y = laws.placed(lane.y, change.v, change.slip)
     if elements.each:
         # A gap is closed where it has fallen below zero by its level, which the first step behind would count as its error.
-        y = run(_put_back, (unknown, mode), lane.t, y, static=(laws,))
-    conditions, _ = run(judged, (unknown, mode), lane.t, y, static=(laws,))
+        y = _put_back(laws, (unknown, mode), lane.t, y)
+    conditions, _ = kernel(judged, static=1)(laws, (unknown, mode), lane.t, y)
     hit, switched = elements.split(hit)
     opened = hit.any(1)
     kind = jnp.where(mode.stick & ~before.stick, 2, jnp.where(before.stick & ~mode.stick, 3, 4))

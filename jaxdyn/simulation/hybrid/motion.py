@@ -9,7 +9,8 @@ import jax.numpy as jnp
 import numpy as np
 from jax import lax
 
-from jaxdyn.compile import partition_traced, run
+from jaxdyn.compile import kernel
+from jaxdyn.compile.known import partition_tracers
 from jaxdyn.constraints.base import velocity_residual
 from jaxdyn.constraints.codes import RESULTS
 from jaxdyn.dynamics.kinematics import frame_pose
@@ -82,7 +83,7 @@ def motion(scene: Scene, control, numbers, options) -> Solution:
     pieces = pieces_of(scene, (), q0, v0, ts[0], control_of)
     elements = elements_of(scene, pieces)
     eps, dtype = float(jnp.finfo(q0.dtype).eps), q0.dtype
-    unknown, known = partition_traced((scene, control))
+    unknown, known = partition_tracers((scene, control))
     unknown = tuple(unknown)
     bare = extended(scene).forces
 
@@ -168,9 +169,9 @@ def motion(scene: Scene, control, numbers, options) -> Solution:
         y, mode, t = row
         return put_back(given(unknown)[0], elements, mode, t, y, None)[0]
 
-    later = lax.map(partial(run, closed, unknown), jax.tree.map(lambda x: x[1:], (y, modes, ts)))
+    later = lax.map(partial(kernel(closed), unknown), jax.tree.map(lambda x: x[1:], (y, modes, ts)))
     y = jax.tree.map(lambda a, b: jnp.concatenate([a[:1], b]), y, later)
-    values = lax.map(partial(run, report, unknown), (y, modes, ts))
+    values = lax.map(partial(kernel(report), unknown), (y, modes, ts))
 
     codes: Any = RESULTS
     cases = faults_of_inputs(

@@ -20,7 +20,8 @@ import optimistix
 from jax import lax
 from jax.flatten_util import ravel_pytree
 
-from jaxdyn.compile import any_in_batch, run
+from jaxdyn.compile import kernel
+from jaxdyn.compile.batch import cond
 from jaxdyn.simulation.hybrid import machine
 from jaxdyn.simulation.hybrid.machine import Laws, Records
 from jaxdyn.simulation.hybrid.modes import Mode
@@ -141,7 +142,7 @@ def _replayed(how: Hybrid, moving, lane, records, begun, direct: bool):
     def taken(carry, at):
         # Most of the events that there is room for did not happen.
         happens = ~is_event[at] | happened[jnp.clip(at - saves, 0, most - 1)]
-        return lax.cond(any_in_batch(happens), piece, lambda carry, at: (carry, carry[:2]), carry, at)
+        return cond(happens, piece, lambda carry, at: (carry, carry[:2]), carry, at)
 
     def piece(carry, at):
         t, y, mode = carry
@@ -175,7 +176,7 @@ def _crossed(laws: Laws, unknown, mode: Mode, record: Records, t, known_time, y)
     hit, which = record.trigger >= 0, jnp.maximum(record.trigger, 0)
 
     def condition(t, y):
-        return run(machine.judged, (unknown, mode), t, y, static=(laws,))[0].reshape(-1)[which]
+        return kernel(machine.judged, static=1)(laws, (unknown, mode), t, y)[0].reshape(-1)[which]
 
     rate = lax.stop_gradient(laws.plan.field_of((unknown, mode), known_time, y))
     fixed = lax.stop_gradient((known_time, y))

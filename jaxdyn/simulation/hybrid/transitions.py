@@ -19,7 +19,7 @@ import numpy as np
 from jax import lax
 from jaxtyping import Array
 
-from jaxdyn.compile import any_in_batch
+from jaxdyn.compile.batch import any_sample
 from jaxdyn.simulation.hybrid.modes import Elements, Mode
 
 
@@ -139,7 +139,7 @@ def changed_mode(elements: Elements, cones, mode: Mode, slip, begins, v, jump: C
 
     def solve(wrong_of, mode, slip):
         def unfinished(carry):
-            return any_in_batch(carry[3] & (carry[2] < most))
+            return any_sample(carry[3] & (carry[2] < most))
 
         def body(carry):
             mode, slip, count, busy, _ = carry

@@ -10,7 +10,7 @@ import numpy as np
 import optimistix
 from jax.typing import ArrayLike
 
-from jaxdyn.compile import is_concrete, is_known
+from jaxdyn.compile.known import is_concrete, is_known
 from jaxdyn.model.arguments import batch_hint
 from jaxdyn.simulation.solvers.first_step import Adaptive
 from jaxdyn.simulation.solvers.fixed_steps import ErrorMonitoredSteps

@@ -18,7 +18,10 @@ from jax import lax
 from jax.flatten_util import ravel_pytree
 from jaxtyping import Array
 
-from jaxdyn.compile import Carry, Given, Passed, Task, Turn, any_in_batch, recompute_unless, run, run_loop
+from jaxdyn.compile import kernel
+from jaxdyn.compile.batch import any_sample, while_loop
+from jaxdyn.compile.loops import Carry, Given, Iteration, Passed, Task, run_loop
+from jaxdyn.compile.repair import compute_where
 from jaxdyn.simulation.solvers import reverse
 from jaxdyn.simulation.solvers.explicit import Plan, Step, projected_output, step_in_turn, whole_step
 from jaxdyn.simulation.solvers.first_step import first_step
@@ -215,10 +218,7 @@ def drive(
     eps, none = float(jnp.finfo(ts.dtype).eps), jnp.zeros((), jnp.int32)
     floor = end - _ROUNDED * eps / 2 * jnp.abs(end)
     rtol, atol = (jnp.zeros_like(start) if x is None else x for x in (rtol, atol))
-    begin: Any = partial(_begin, plan, how)
-    given = args, start, end, y0, rtol, atol
-    first, served = run(_begin, *given, static=(plan, how), calls=True, served=True)
-    rate, length, quality = recompute_unless(served, begin, first, given)
+    rate, length, quality = _begin(plan, how, args, start, end, y0, rtol, atol)
     steps = none
     if not isinstance(how, Adaptive):
         length = stepsize
@@ -262,17 +262,17 @@ def _is_active(max_steps: int, limits: _Limits, lane: _Lane):
 
 
 def _is_unfinished(max_steps: int, limits: _Limits, carry: Carry):
-    return any_in_batch(_is_active(max_steps, limits, carry.state))
+    return any_sample(_is_active(max_steps, limits, carry.state))
 
 
-def _turn(plan: Plan, how, max_steps: int, strides, args, limits: _Limits, lane: _Lane, _) -> Turn:
+def _turn(plan: Plan, how, max_steps: int, strides, args, limits: _Limits, lane: _Lane, _) -> Iteration:
     """A step, for a loop in machine code."""
     active = _is_active(max_steps, limits, lane)
     after, kept, step = _advance(plan, how, args, limits, lane, active)
     dense = lane.t, after.t, lane.y, step.raw, step.stages, step.shift
     written = reverse.row(lane.y, lane.t, lane.t_next, kept) if strides else ()
     more = _is_active(max_steps, limits, after)
-    return Turn(after, active, more, Passed(kept, after.t, dense), lane.taken, written)
+    return Iteration(after, active, more, Passed(kept, after.t, dense), lane.taken, written)
 
 
 def _by_turn(
@@ -302,21 +302,15 @@ def number_of_steps(start, end, stepsize):
 
 def _advanced(plan: Plan, how, args, limits: _Limits, lane: _Lane, active) -> tuple[_Lane, Array, Step]:
     """The lane after a step, whether that is kept, and the step; all of it one kernel where it is numbers."""
-    advance: Any = partial(run, _advance, args, limits, lane, active, static=(plan, how), calls=True, served=True)
-    advanced, served = advance(otherwise=lambda *_: None)
-
-    given = args, limits, lane, active
-    if advanced is None:
-        return _advance_in_turn(plan, how, *given)
-    served = served if served is True else served | ~active
-    return recompute_unless(served, partial(_advance_in_turn, plan, how), advanced, given)
+    advance: Any = kernel(_advance, static=2, fallback=_advance_in_turn, derivative=False)
+    return advance(plan, how, args, limits, lane, active, where=active)
 
 
 def _advanced_with_care(plan: Plan, how, args, limits: _Limits, lane: _Lane, active) -> tuple[_Lane, Array, Step]:
     """The same where machine code has failed the step of every lane that is active."""
     none, stages = jnp.zeros_like(lane.y), jnp.zeros((plan.count, lane.y.size), lane.y.dtype)
     unchanged = lane, jnp.zeros_like(active), Step(none, none, none, none, stages, none)
-    return recompute_unless(~active, partial(_advance_in_turn, plan, how), unchanged, (args, limits, lane, active))
+    return compute_where(active, partial(_advance_in_turn, plan, how), unchanged, (args, limits, lane, active))
 
 
 def _advance(plan: Plan, how, args, limits: _Limits, lane: _Lane, active):
@@ -372,13 +366,14 @@ def save(plan: Plan, ts, before: Any, after: Any, kept, step: Step, saved, rows)
         saved, rows = carry
         here, place = is_passed(saved), jnp.minimum(saved, count - 1)
         at = ts[place + 1], before.t, after.t, before.y, step.raw, step.stages, step.shift
-        row = run(projected_output, None, *at, static=(plan,))
+        row = kernel(projected_output, static=1)(plan, None, *at)
         rows = rows.at[place].set(jnp.where(here, row, rows[place]))
         return saved + here.astype(jnp.int32), rows
 
-    return lax.while_loop(lambda carry: any_in_batch(is_passed(carry[0])), body, (saved, rows))
+    return while_loop(lambda carry: is_passed(carry[0]), body, (saved, rows))
 
 
+@kernel(static=2, derivative=False)
 def _begin(plan: Plan, how, args, t0, t1, y, rtol, atol):
     """The rate of change at the start, if steps pass it on, the length of the first adaptive step, and the quality."""
     rate = plan.field_of(args, t0, y) if plan.passes_rate_on else jnp.zeros_like(y)

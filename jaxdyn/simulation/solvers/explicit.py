@@ -19,7 +19,8 @@ from jax import lax
 from jax.flatten_util import ravel_pytree
 from jaxtyping import Array, Bool, PyTree
 
-from jaxdyn.compile import along, any_in_batch, implicit, recompute_unless, run
+from jaxdyn.compile import implicit, kernel, value_and_jvp
+from jaxdyn.compile.batch import any_sample
 from jaxdyn.constraints.projection import enlarged
 from jaxdyn.model.arguments import Number
 from jaxdyn.simulation.solvers.projected import ProjectedInterpolation, ProjectedSolver
@@ -94,7 +95,7 @@ class ExplicitSteps(ProjectedSolver):
 
         def tangent(args, *rest):
             *state, steps = rest
-            results, changes = along(partial(_in_turn, plan), (args, *state), steps)
+            results, changes = value_and_jvp(partial(_in_turn, plan), (args, *state), steps)
             return results, jax.tree.map(_no_change, results) if changes is None else changes
 
         results: Any = implicit(args, state, partial(_at_once, plan), tangent)
@@ -201,20 +202,28 @@ class Plan(NamedTuple):
 def _at_once(plan: Plan, args, t0, t1, start, kept, ready):
     """The result of a step, what a projection adds to it, its error, the result before, stages, and a code."""
     # For the whole batch: a branch that differs between samples would be computed for all.
-    ready = ~any_in_batch(~ready) if plan.tableau.fsal else jnp.asarray(False)
+    ready = ~any_sample(~ready) if plan.tableau.fsal else jnp.asarray(False)
 
     dt = jnp.asarray(t1 - t0, start.dtype)
 
     def anew(y):
-        return run(_first, args, t0, t1, y, static=(plan,))
+        return kernel(_first, static=1)(plan, args, t0, t1, y)
 
     first = lax.cond(ready, lambda y: dt * kept, anew, start)
-    whole: Any = partial(run, _whole, args, t0, t1, start, first, static=(plan,), calls=True, served=True)
-    step, served = whole(otherwise=lambda *_: None)
-    if step is None:
-        return _in_turn(plan, args, t0, t1, start, kept, ready)
-    again: Any = partial(_in_turn, plan)
-    return recompute_unless(served, again, (*step, diffrax.RESULTS.successful), (args, t0, t1, start, kept, ready))
+    # Projections report success, so that the code is no result of the kernel: batched, it would meet the unbatched one of the
+    # rule in `step`, which JAX 0.10 cannot lower.
+    return *_step_or_stages(plan, args, t0, t1, start, first, kept, ready), diffrax.RESULTS.successful
+
+
+def _stages(plan: Plan, args, t0, t1, start, first, kept, ready):
+    del first  # the loop over the stages computes it
+    return _in_turn(plan, args, t0, t1, start, kept, ready)[:-1]
+
+
+@kernel(static=1, fallback=_stages, derivative=False)
+def _step_or_stages(plan: Plan, args, t0, t1, start, first, kept, ready):
+    del kept, ready
+    return _whole(plan, args, t0, t1, start, first)
 
 
 class Step(NamedTuple):
@@ -289,7 +298,7 @@ def _whole(plan: Plan, args, t0, t1, start, first):
 def _in_turn(plan: Plan, args, t0, t1, start, kept, ready):
     """The same as one loop over the stages."""
     count, none = plan.count, jnp.zeros_like(start)
-    ready = ~any_in_batch(~ready) if plan.tableau.fsal else jnp.asarray(False)
+    ready = ~any_sample(~ready) if plan.tableau.fsal else jnp.asarray(False)
     dt = jnp.asarray(t1 - t0, start.dtype)
     times, sides = (jnp.asarray(x, jnp.result_type(t0, t1)) for x in (plan.times, plan.sides))
     rows = jnp.arange(count), jnp.asarray(plan.sums.T, start.dtype), times, sides

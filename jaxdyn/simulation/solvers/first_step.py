@@ -5,7 +5,7 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 
-from jaxdyn.compile import constant
+from jaxdyn.compile.known import stop_gradient
 
 
 class Adaptive(diffrax.PIDController):
@@ -49,7 +49,7 @@ def first_step(terms, t0, t1, y0, args, order, rtol, atol, norm):
     Source: Hairer, Norsett & Wanner 1993, section II.4, with h^(order) max(d1, d2) = 0.01 replaced by a rule that is the
     same in any unit of time.
     """
-    t0, t1, y0, args = constant((t0, t1, y0, args))
+    t0, t1, y0, args = stop_gradient((t0, t1, y0, args))
     span = t1 - t0
     scale = jax.tree.map(lambda y: atol + rtol * jnp.abs(y), y0)
 

@@ -4,7 +4,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool
 
-from jaxdyn.compile import is_concrete
+from jaxdyn.compile.known import is_concrete
 from jaxdyn.model.arguments import batch_hint, check_shape
 from jaxdyn.model.tree import Model
 from jaxdyn.simulation.solvers.choice import is_fixed

@@ -13,7 +13,7 @@ import jax.numpy as jnp
 from jax import lax
 from jax.flatten_util import ravel_pytree
 
-from jaxdyn.compile import any_in_batch
+from jaxdyn.compile.batch import cond
 from jaxdyn.simulation.solvers.explicit import ExplicitSteps, Plan
 from jaxdyn.simulation.solvers.reverse import step_share
 
@@ -47,7 +47,7 @@ def repeated_rows(plan: Plan, times, kept, count, y0, args, ts, steps):
         i, (t0, t1), is_kept = row
         active = is_kept & (i < count)
         # Of the steps that may have been taken most were not; those of a batch are passed over together.
-        after = lax.cond(any_in_batch(active), advanced, lambda args, y, *_: y, args, y, i, t0, t1)
+        after = cond(active, advanced, lambda args, y, *_: y, args, y, i, t0, t1)
         return jnp.where(active, after, y), y
 
     number = jnp.arange(room, dtype=count.dtype)

@@ -15,7 +15,9 @@ import jax.numpy as jnp
 from jax import lax
 from jaxtyping import Array
 
-from jaxdyn.compile import Carry, Given, Task, Turn, any_in_batch, recompute_unless, run, run_loop, unless
+from jaxdyn.compile import kernel
+from jaxdyn.compile.batch import any_sample
+from jaxdyn.compile.loops import Carry, Given, Iteration, Task, run_loop
 from jaxdyn.simulation.solvers.explicit import Plan, projected_output, step_in_turn, whole_step
 
 KEPT = 512  # states that are kept of a run
@@ -179,14 +181,14 @@ def _places(step, first, saved):
 
 
 def _is_unfinished(ends: _Ends, carry: Carry):
-    return any_in_batch(carry.state.places[1] >= ends.first)
+    return any_sample(carry.state.places[1] >= ends.first)
 
 
 def _read(given: Given, places):
     return tuple(table[places[i]] for i, table in enumerate(given.tables))
 
 
-def _turn_back(plan: Plan, times_move, structure, args, ends: _Ends, cotangents: _Cotangents, read) -> Turn:
+def _turn_back(plan: Plan, times_move, structure, args, ends: _Ends, cotangents: _Cotangents, read) -> Iteration:
     """Through a step, or to the next one of the rows within it."""
     pull = partial(_pulled_step, plan, times_move, structure, *args)
     return _back_through_step(pull, times_move, ends, cotangents, read)
@@ -204,7 +206,7 @@ def _back_by_turns(plan: Plan, times_move, structure, args, ends: _Ends, given: 
     return lax.while_loop(partial(_is_unfinished, ends), turn, carry)
 
 
-def _back_through_step(pull, times_move: bool, ends: _Ends, cotangents: _Cotangents, read) -> Turn:
+def _back_through_step(pull, times_move: bool, ends: _Ends, cotangents: _Cotangents, read) -> Iteration:
     """A turn; pull(t0, t1, y, at, after, row) gives the cotangents of a step."""
     y, (t0, t1), kept, row, at_row, at_next = read
     step, active = cotangents.places[1], cotangents.places[1] >= ends.first
@@ -235,20 +237,20 @@ def _back_through_step(pull, times_move: bool, ends: _Ends, cotangents: _Cotange
         saved,
         _places(following, step - cotangents.places[0], saved),
     )
-    return Turn(state, active, following >= ends.first)
+    return Iteration(state, active, following >= ends.first)
 
 
-def _turn_of_replay(plan: Plan, args, ends, replay: _Replay, read) -> Turn:
+def _turn_of_replay(plan: Plan, args, ends, replay: _Replay, read) -> Iteration:
     """A step that is taken again."""
     (t0, t1), kept = read
     return _replayed_step(_result(plan, args, t0, t1, replay.y), ends, replay, kept)
 
 
-def _replayed_step(after, ends, replay: _Replay, kept) -> Turn:
+def _replayed_step(after, ends, replay: _Replay, kept) -> Iteration:
     first, last = ends
     step = replay.places[0]
     state = _Replay(jnp.where(kept, after, replay.y), replay.places + 1)
-    return Turn(state, step < last, step + 1 < last, None, step - first, (replay.y,))
+    return Iteration(state, step < last, step + 1 < last, None, step - first, (replay.y,))
 
 
 def _replay_by_turns(plan: Plan, args, ends, given: Given, carry: Carry) -> Carry:
@@ -272,12 +274,8 @@ def step_share(i, t, end, steps):
 
 
 def _pull(plan: Plan, times_move: bool, structure, fixed, free, t0, t1, y, at, after, row):
-    given = fixed, free, t0, t1, y, at, after, row
-    static = plan, times_move, structure
-    kernel: Any = partial(run, _pulled_step, *given, static=static, calls=True, served=True)
-    pulled_back, served = kernel(otherwise=lambda *_: None)
-    again = partial(_pulled_in_turn, *static)
-    return again(*given) if pulled_back is None else recompute_unless(served, again, pulled_back, given)
+    pull = kernel(_pulled_step, static=3, fallback=_pulled_in_turn, derivative=False)
+    return pull(plan, times_move, structure, fixed, free, t0, t1, y, at, after, row)
 
 
 def _pulled_step(plan: Plan, times_move, structure, fixed, free, t0, t1, y, at, after, row):
@@ -320,10 +318,7 @@ def _pulled_by(step, plan: Plan, times_move, structure, fixed, free, t0, t1, y, 
 
 def _repeated(plan: Plan, args, t0, t1, y):
     """The result of a step."""
-    kernel: Any = partial(run, _result, args, t0, t1, y, static=(plan,), calls=True, served=True)
-    result, served = kernel(otherwise=lambda *_: None)
-    again = partial(_result_in_turn, plan)
-    return again(args, t0, t1, y) if result is None else recompute_unless(served, again, result, (args, t0, t1, y))
+    return kernel(_result, static=1, fallback=_result_in_turn, derivative=False)(plan, args, t0, t1, y)
 
 
 def _result(plan: Plan, args, t0, t1, y):
@@ -345,9 +340,9 @@ class OwnProgram(NamedTuple):
         """What the function does; its arrays where it returns something beside them."""
         arrays, rest = eqx.partition(args[-1], eqx.is_array)
         del rest
-        results, served = run(_applied, arrays, args[:-1], static=(self.function,), served=True, own_program=True)
-        return results if served is True else jax.tree.map(lambda x: unless(jnp.logical_not(served), x), results)
+        return _apply(self.function, arrays, args[:-1])
 
 
-def _applied(function, args, given):
+@kernel(static=1, derivative="program")
+def _apply(function, args, given):
     return function(*given, args)

@@ -14,10 +14,10 @@ from jaxdyn.model.tree import Model
 
 
 class FourierTorque(eqx.Module):
-    """Control tau(t) = sum over k of cosine_k cos(k w t) + sine_k sin(k w t), w = 2 pi / period, plus what `carry` adds.
+    """Control tau(t) = sum over k of cosine_k cos(k w t) + sine_k sin(k w t), w = 2 pi / period, plus gravity compensation.
 
     - `cosine`, `sine` (harmonics, nv): amplitudes, N m or N. `period`: s.
-    - `carry`: a model whose weight the control also carries, tau = ... + N(q) (gravity compensation), or None.
+    - `carry`: a model whose weight the control also supports, tau = ... + N(q), or None.
     """
 
     cosine: Float[Array, "harmonics nv"]
@@ -98,7 +98,7 @@ def _falling_amplitudes(key, size, harmonics: int):
     k = jnp.arange(1, harmonics + 1, dtype=size.dtype)[:, None]
     weight = size[None] / k
     cosine, sine = jax.random.normal(key, (2, harmonics, size.shape[0]), size.dtype) * weight[None]
-    # Position and velocity of the sum vanish at t = 0: shares of both conditions are taken from all harmonics alike.
+    # Position and velocity of the sum vanish at t = 0: both conditions are distributed over all harmonics.
     cosine = cosine - jnp.mean(cosine, axis=0, keepdims=True)
     return cosine, sine - jnp.mean(k * sine, axis=0, keepdims=True) / k
 
@@ -106,7 +106,7 @@ def _falling_amplitudes(key, size, harmonics: int):
 class Tracking(eqx.Module):
     """Control that makes a model follow a motion: tau = ID(q, v, a_d + stiffness (q_d - q) + damping (v_d - v)).
 
-    - `model`: what the controller believes (it need not be the truth). `motion(t) -> (q, v, a)`.
+    - `model`: that of the controller, which need not be the truth. `motion(t) -> (q, v, a)`.
     - `stiffness` (1/s^2), `damping` (1/s) of the error.
     """
 

@@ -1,34 +1,32 @@
-"""What looks wrong with a log before anything is fitted: units, torques of motors, joints that stand still."""
+"""Checks of logs before and after a fit: units, motor torques, joints that hardly move, errors at rest."""
 
 from collections.abc import Sequence
 
 import numpy as np
 
-from jaxdyn.identify.logs import Log
+from jaxdyn.identify.logs import Log, are_angles, hardly_moving, travels
 from jaxdyn.identify.regression import log_regressor, nominal_parameters
 from jaxdyn.model.tree import Model
 
 # Angles beyond this many turns, and torques this many times off what the nominal bodies need, are worth a question.
 _TURNS, _OFF = 3.0, 20.0
-# A joint whose velocity stays below this share of the fastest one's is at rest.
-_STILL = 1e-4
 # Below this share of its own largest velocity a joint has not begun to move; from this share of the error on it is worth a word.
 _REST, _MUCH = 0.01, 0.5
 
 
-def suspicions(model: Model, log: Log, labels: Sequence[str]) -> list[str]:
-    """Sentences about a log with v and a, none where it looks as expected; `labels` of each number of v.
+def check_log_content(model: Model, log: Log, labels: Sequence[str]) -> list[str]:
+    """Warnings about a log with v and a, none where it looks as expected; `labels` of each number of v.
 
     - Angles of revolute joints beyond three turns: degrees. Joints that turn without end ("continuous") may go there.
     - Torques that are less than a twentieth, or more than twenty times, of what the nominal bodies need, at most joints where
-      these need a tenth of the largest: torques of the motors in front of the gears, or in other units.
-    - Joints that stand still, whose friction and rotors cannot be told.
+      these need a tenth of the largest: motor torques in front of the gears, or other units.
+    - Joints that hardly move, whose friction and rotor inertia are not identifiable.
     """
     lines = []
     q = np.abs(np.asarray(log.q, np.float64))
     if model.nq == model.nv:
-        turning = np.array([kind == "revolute" for kind in model.topology.kinds])
-        far = np.flatnonzero(turning & (q.max(axis=0) > _TURNS * 2 * np.pi))
+        is_revolute = np.array([kind == "revolute" for kind in model.topology.kinds])
+        far = np.flatnonzero(is_revolute & (q.max(axis=0) > _TURNS * 2 * np.pi))
         if len(far):
             names = ", ".join(labels[int(i)] for i in far)
             lines.append(
@@ -36,12 +34,12 @@ def suspicions(model: Model, log: Log, labels: Sequence[str]) -> list[str]:
             )
     needed = _rms(log_regressor(model, log) @ nominal_parameters(model))
     measured = _rms(np.asarray(log.tau, np.float64))
-    tells = (needed > 0.1 * needed.max(initial=0)) & (measured > 0)
-    ratio = measured[tells] / needed[tells]
-    names = ", ".join(label for label, told in zip(labels, tells, strict=True) if told)
+    compared = (needed > 0.1 * needed.max(initial=0)) & (measured > 0)
+    ratio = measured[compared] / needed[compared]
+    names = ", ".join(label for label, is_compared in zip(labels, compared, strict=True) if is_compared)
     if len(ratio) and np.mean(ratio < 1 / _OFF) > 0.5:
         lines.append(
-            f"torques of {names} are about 1/{1 / np.median(ratio):.0f} of what the file's bodies need: are they of the motors, "
+            f"torques of {names} are about 1/{1 / np.median(ratio):.0f} of what the file's bodies need: are they motor torques, "
             "in front of the gears, or in another unit? Joint torques in N m are expected; multiply by the gear ratios"
         )
     elif len(ratio) and np.mean(ratio > _OFF) > 0.5:
@@ -49,20 +47,25 @@ def suspicions(model: Model, log: Log, labels: Sequence[str]) -> list[str]:
             f"torques of {names} are about {np.median(ratio):.0f} times what the file's bodies need: are they in N mm or in per "
             "cent? N m are expected"
         )
-    speed = _rms(np.asarray(log.v, np.float64))
-    unmoved = [label for label, v in zip(labels, speed, strict=True) if not v > _STILL * speed.max(initial=0)]
-    if unmoved:
+    travel = travels(model, log)
+    slow = [
+        f"{labels[j]} ({travel[j]:.2g} {'rad' if angle else 'm'})"
+        for j, angle in enumerate(are_angles(model))
+        if j in hardly_moving(model, [log])
+    ]
+    if slow:
         lines.append(
-            f"{', '.join(unmoved)} stand still: their friction and rotor inertia stay near the file's, or mean nothing"
+            f"{', '.join(slow)} hardly moved: friction and rotor inertia there are not identifiable from this log; move these "
+            "joints farther"
         )
     return lines
 
 
-def at_rest(log: Log, residual: np.ndarray, labels: Sequence[str]) -> list[str]:
-    """Sentences about joints whose errors (n, nv) are for the most part those of a start at rest.
+def check_rest(log: Log, residual: np.ndarray, labels: Sequence[str]) -> list[str]:
+    """Warnings about joints whose errors (n, nv) are mostly those of a start at rest.
 
-    A joint that stands still is held by friction, whose torque is then anything within its level and depends on how the joint
-    came there. No term foretells it, least of all before the first motion of a log.
+    A joint at rest is held by friction, whose torque is then anything within its level and depends on how the joint came to rest,
+    which happened before the log. No term predicts it.
     """
     lines = []
     v, t = np.abs(np.asarray(log.v, np.float64)), np.asarray(log.t, np.float64)
@@ -74,7 +77,7 @@ def at_rest(log: Log, residual: np.ndarray, labels: Sequence[str]) -> list[str]:
         if start > 1 and share > _MUCH:
             lines.append(
                 f"{label} stands still for the first {t[start] - t[0]:.2g} s, where {100 * share:.0f} % of the power of its "
-                "error is: no term foretells friction at rest; cut the log there, or move before you record"
+                "error is: no term predicts friction at rest; cut the log there, or move before you record"
             )
     return lines
 

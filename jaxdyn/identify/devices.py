@@ -1,7 +1,7 @@
-"""Pieces of logs that are shared among devices: each computes with its own, and one sum over devices makes the loss of all.
+"""Log segments sharded over devices: each device evaluates its own segments, and one all-reduce adds up the loss.
 
-Pieces do not know of each other, as samples of a batch do not. A device adds up the losses of its own pieces and their
-derivatives; an iteration of a fit then exchanges one all-reduce, of as many numbers as there are unknowns.
+Segments are independent, like the samples of a batch. A device adds up the losses of its own segments and their gradients; an
+iteration of a fit exchanges one all-reduce of as many numbers as there are unknowns.
 """
 
 from collections.abc import Callable, Sequence
@@ -11,13 +11,13 @@ import equinox as eqx
 import jax
 from jax import lax
 
-AXIS = "pieces"
+AXIS = "segments"
 
 
-def shared_out(pieces: Any, devices: Sequence[Any] | None) -> tuple[Any, Any]:
-    """Pieces along the leading axis of arrays, on as many of the devices as can have equally many, and their mesh.
+def shard_blocks(pieces: Any, devices: Sequence[Any] | None) -> tuple[Any, Any]:
+    """Shard segments (leading axis of arrays) over as many devices as divide their number, and make the mesh of these.
 
-    None in place of the mesh where that is one device, or `devices` is None; the pieces stay where they are then.
+    The mesh is None for one device, or where `devices` is None; the segments then stay where they are.
 
     **Raises:** ValueError for no device.
     """
@@ -33,17 +33,17 @@ def shared_out(pieces: Any, devices: Sequence[Any] | None) -> tuple[Any, Any]:
     return jax.device_put(pieces, jax.NamedSharding(mesh, jax.P(AXIS))), mesh
 
 
-def mapped(function: Callable, mesh: Any) -> Callable:
-    """`function(shared, pieces)`, whose results have the axis of the pieces, by each device for its own pieces."""
+def map_by_device(function: Callable, mesh: Any) -> Callable:
+    """Map `function(shared, pieces)`, whose results have the axis of the segments, over the devices."""
     return function if mesh is None else _by_device(function, mesh, jax.P(AXIS))
 
 
-def summed(function: Callable, mesh: Any) -> Callable:
-    """The sum over devices of `function(searched, known)`, which adds up what it finds for its pieces.
+def sum_over_devices(function: Callable, mesh: Any) -> Callable:
+    """Sum over devices of `function(searched, known)`, which adds up over the segments of one device.
 
-    `searched` and `known` are pairs of pytrees: what all devices share, and what has the axis of the pieces. Derivatives are by
-    what is searched, in reverse mode and once; each device finds its own, and the sum of those that all share
-    is in the same all-reduce as the sum itself.
+    `searched` and `known` are pairs of pytrees: shared by all devices, and with the axis of the segments. Derivatives are by
+    `searched`, in reverse mode and of first order. Each device computes its own, and those by shared unknowns
+    are in the same all-reduce as the sum itself.
     """
     if mesh is None:
         return function
@@ -54,9 +54,9 @@ def summed(function: Callable, mesh: Any) -> Callable:
 
     def both(shared, pieces):
         searched, known = (shared[0], pieces[0]), (shared[1], pieces[1])
-        loss, slopes = jax.value_and_grad(function)(searched, known)
-        loss, of_all = lax.psum((loss, slopes[0]), AXIS)
-        return (loss, of_all), slopes[1]
+        loss, gradients = jax.value_and_grad(function)(searched, known)
+        loss, of_all = lax.psum((loss, gradients[0]), AXIS)
+        return (loss, of_all), gradients[1]
 
     @eqx.filter_custom_vjp
     def total(searched, known):
@@ -68,14 +68,14 @@ def summed(function: Callable, mesh: Any) -> Callable:
         return loss, (of_all, of_pieces)
 
     @total.def_bwd
-    def _(slopes, change, perturbed, searched, known):
-        return jax.tree.map(lambda slope: change * slope, slopes)
+    def _(gradients, change, perturbed, searched, known):
+        return jax.tree.map(lambda gradient: change * gradient, gradients)
 
     return total
 
 
 def _by_device(function: Callable, mesh: Any, results: Any) -> Callable:
-    """`function(shared, pieces)` in `jax.shard_map`."""
+    """Wrap `function(shared, pieces)` in `jax.shard_map`."""
 
     def call(shared, pieces):
         arrays, rest = eqx.partition((shared, pieces), eqx.is_array)
@@ -84,7 +84,7 @@ def _by_device(function: Callable, mesh: Any, results: Any) -> Callable:
             mesh=mesh,
             in_specs=(jax.P(), jax.P(AXIS)),
             out_specs=results,
-            # Whether a value is the same on all devices is not looked at: loops of simulations begin with numbers that are.
+            # The check that values agree on all devices refuses loops of simulations, which start from constants.
             check_vma=False,
         )
         return each(*arrays)

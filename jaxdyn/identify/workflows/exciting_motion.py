@@ -1,4 +1,4 @@
-"""Motions that tell parameters best: periodic, within limits, with the largest information that a gradient finds."""
+"""Exciting motions: periodic, within limits, with information about the parameters maximised by gradient descent."""
 
 from collections.abc import Callable
 from typing import NamedTuple
@@ -11,15 +11,15 @@ from jaxtyping import Array, Float
 
 from jaxdyn.dynamics.quantities import inverse_dynamics, torque_regressor
 from jaxdyn.identify.chart import check_bodies
-from jaxdyn.identify.excitation import FourierMotion, random_motion
-from jaxdyn.identify.friction import TERMS, Terms, check_terms, friction_regressor
 from jaxdyn.identify.logs import Log
 from jaxdyn.identify.regression import base_parameters, free_columns
+from jaxdyn.identify.torque_terms import TERMS, Terms, check_terms, friction_regressor
+from jaxdyn.identify.workflows.excitation import FourierMotion, random_motion
 from jaxdyn.model.arguments import Numbers
 from jaxdyn.model.tree import Model, neutral
 
 OBJECTIVES = ("logdet", "condition")
-# A joint without limits of its own turns so far, and so fast (rad, rad/s).
+# Range and speed of a joint without limits of its own (rad, rad/s).
 _TURN, _SPEED = np.pi, 2.0
 _SAMPLES, _CHECKED = 100, 1000
 
@@ -30,10 +30,10 @@ class Excitation(NamedTuple):
     - `motion`: a `FourierMotion`, called as motion(t) -> q (n,) at a time t, s; it starts and ends at rest at its centre every
       `motion.period` (s), within all limits. `jax.jvp` gives v and a; `log` samples all three with the torques.
     - `condition`: of the regressor in base parameters, columns of unit length, along it; `start_condition`: along the random
-      motion that the search began with, within the same limits.
+      motion at the start of the search, within the same limits.
     - `logdet`: natural logarithm of the determinant of the information matrix, over that of the start.
-    - `history`: of what was minimised.
-    - `used` : largest share of position, velocity and torque limits that any joint uses (at most 1).
+    - `history`: of the loss.
+    - `used`: largest share of position, velocity and torque limits that any joint uses (at most 1).
     """
 
     motion: FourierMotion
@@ -45,7 +45,7 @@ class Excitation(NamedTuple):
     used: dict[str, float]
 
     def log(self, rate: float = 100.0, periods: int = 1) -> Log:
-        """The motion at so many samples a second with the torques that the nominal model needs, for a controller or a file."""
+        """Log of the motion at so many samples a second with the torques of the nominal model, for a controller or a file."""
         period = float(self.motion.period)
         count = round(period * rate * periods) + 1
         t = np.linspace(0, period * periods, count)
@@ -62,7 +62,7 @@ class _Limits(eqx.Module):
 
 
 class _Task(eqx.Module):
-    """What the loss needs besides the motion."""
+    """Arguments of the loss other than the motion."""
 
     model: Model
     limits: _Limits
@@ -89,26 +89,28 @@ def exciting_motion(
     learning_rate: float = 0.02,
     callback: Callable[[int, float], None] | None = None,
 ) -> Excitation:
-    """A finite Fourier series of every joint that tells the base parameters best, within limits of position, velocity and torque.
+    """Optimise a finite Fourier series of every joint for the identification of the base parameters, within the robot's limits.
 
-    Of some random motions the best is improved by Adam with exact gradients of the information matrix W^T W, in which W is the
-    regressor in base parameters, rows over the torque limits and columns over their lengths along the start. What passes a limit
-    is punished by its square while searching, and at the end the amplitudes shrink until none is passed.
+    The best of some random motions is improved by Adam with exact gradients of the information matrix W^T W, where W is the
+    regressor in base parameters, rows over the torque limits and columns over their lengths along the start. Excess over a limit
+    of position, velocity or torque has a quadratic penalty during the search; at the end the amplitudes shrink until there is
+    none.
 
     **Arguments:**
 
-    - `model`: with one coordinate a joint; its own limits hold where it has them. `terms`: to be identified beside the bodies.
+    - `model`: with one coordinate a joint; its own limits hold where it has them. `terms`: to be identified with the bodies.
     - `period` (s), `harmonics` (at least 2): of the series.
     - `objective`: "logdet", the volume of all uncertainty (D-optimal), or "condition", the worst against the best direction.
-    - `margin`: share of all limits that may be used. `velocity`, `torque` (nv,): limits instead of the model's, rad/s and N m.
-    - `v_s`: smoothing velocity of Coulomb friction while searching; larger than the fit's, so that the gradient sees it.
+    - `margin`: usable share of all limits. `velocity`, `torque` (nv,): limits instead of the model's, rad/s and N m.
+    - `v_s`: smoothing velocity of Coulomb friction while searching; larger than the fit's, so that the gradient is not zero
+      almost everywhere.
     - `seed`, `starts`: of the random motions. `steps`, `learning_rate`: of Adam.
     - `callback(step, loss)`: before every step.
 
-    **Returns:** `Excitation`. Contacts with the ground, or of the robot with itself, are not looked at: look at the motion first
+    **Returns:** `Excitation`. Collisions with the ground, or of the robot with itself, are not checked: view the motion first
     (`jd.animate`).
 
-    **Raises:** ValueError for joints of several coordinates, arguments out of range, and where a limit of torque cannot even
+    **Raises:** ValueError for joints of several coordinates, arguments out of range, and where the torque limits cannot
     hold the robot at its centre.
 
     Source: Swevers et al. (1997), "Optimal robot excitation and identification"; Park (2006), "Fourier-based optimal excitation
@@ -121,7 +123,7 @@ def exciting_motion(
             f"model has nq={model.nq}, nv={model.nv}; exciting motions are for joints with one coordinate each"
         )
     if objective not in OBJECTIVES:
-        raise ValueError(f"objective is {objective!r}; take one of {OBJECTIVES}")
+        raise ValueError(f"objective is {objective!r}; give one of {OBJECTIVES}")
     for name, value, good in (
         ("period", period, period > 0),
         ("harmonics", harmonics, harmonics >= 2),
@@ -145,7 +147,7 @@ def exciting_motion(
     speed = 2 * np.pi / period * np.asarray(size)
     share = np.minimum(1.0, 0.5 * np.asarray(limits.speed) / np.where(speed > 0, speed, 1))
     motions = [random_motion(key, center, size * share, period=period, harmonics=harmonics) for key in keys]
-    motions = [_shrunk(motion, task) for motion in motions]
+    motions = [_shrink(motion, task) for motion in motions]
     lengths = [np.linalg.norm(_rows(motion, task, tuple(columns.tolist())), axis=0) for motion in motions]
     task = eqx.tree_at(lambda t: t.scale, task, jnp.asarray(np.where(lengths[0] > 0, lengths[0], 1), dtype))
     places = tuple(columns.tolist())
@@ -153,7 +155,7 @@ def exciting_motion(
     motion = motions[int(np.argmin(np.where(np.isfinite(first), first, np.inf)))]
 
     excitation, history = _descend(motion, task, places, objective, steps, learning_rate, callback)
-    excitation = _shrunk(excitation, task)
+    excitation = _shrink(excitation, task)
     before, after = (np.asarray(_rows(m, task, places), np.float64) for m in (motion, excitation))
     scale = np.asarray(task.scale, np.float64)
     ratio = [np.linalg.slogdet((W / scale).T @ (W / scale))[1] for W in (before, after)]
@@ -164,7 +166,7 @@ def exciting_motion(
         _condition(before),
         float(ratio[1] - ratio[0]),
         history,
-        _used(excitation, task),
+        _limit_shares(excitation, task),
     )
 
 
@@ -187,7 +189,7 @@ def _limits(model: Model, margin: float, velocity, torque) -> _Limits:
     for name, value in (("velocity", speed), ("torque", torque_limit), ("the range of positions", half)):
         if not np.all(value > 0):
             raise ValueError(f"{name} has limits {value.tolist()}; they must be positive")
-    # Without limits of torque, what the robot needs to stand tells the size of its torques.
+    # Without torque limits the weight sets the scale of the torques.
     if not np.isfinite(torque_limit).all():
         mass = float(np.asarray(model.inertias)[:, 0].sum())
         torque_limit = np.where(np.isfinite(torque_limit), torque_limit, 1e3 * max(mass, 1e-3))
@@ -199,8 +201,8 @@ def _amplitudes(motion: FourierMotion):
     return motion.center, motion.cosine, motion.sine
 
 
-def _moved(amplitudes, motion: FourierMotion) -> FourierMotion:
-    """The motion with other amplitudes, at rest at t = 0: shares of both conditions are taken from all harmonics alike."""
+def _with_amplitudes(amplitudes, motion: FourierMotion) -> FourierMotion:
+    """Motion with other amplitudes, at rest at t = 0: both conditions are distributed over all harmonics."""
     center, cosine, sine = amplitudes
     k = jnp.arange(1, cosine.shape[0] + 1, dtype=cosine.dtype)[:, None]
     cosine = cosine - jnp.mean(cosine, axis=0, keepdims=True)
@@ -228,8 +230,8 @@ def _rows(motion: FourierMotion, task: _Task, places: tuple[int, ...]):
 
 @eqx.filter_jit
 def _loss(amplitudes, motion: FourierMotion, task: _Task, places: tuple[int, ...], objective: str):
-    moved = _moved(amplitudes, motion)
-    W = _rows(moved, task, places) / task.scale[None]
+    changed = _with_amplitudes(amplitudes, motion)
+    W = _rows(changed, task, places) / task.scale[None]
     size = W.shape[1]
     # The floor keeps the logarithm finite where a motion does not excite a direction at all.
     floor = 1e-12 * jnp.eye(size, dtype=W.dtype)
@@ -240,7 +242,7 @@ def _loss(amplitudes, motion: FourierMotion, task: _Task, places: tuple[int, ...
         unit = W / jnp.sqrt(jnp.sum(W**2, axis=0, keepdims=True) + 1e-12)
         values = jnp.linalg.eigvalsh(unit.T @ unit + floor)
         value = 0.5 * jnp.log(values[-1] / values[0])
-    q, v, _, tau = _signals(moved, task.model, task.times)
+    q, v, _, tau = _signals(changed, task.model, task.times)
     limits = task.limits
     span = (limits.upper - limits.lower)[None]
     over = [
@@ -261,14 +263,14 @@ def _descend(motion, task, places, objective, steps, learning_rate, callback):
 
     @eqx.filter_jit
     def step(scaled, state, motion, task):
-        loss, gradient = jax.value_and_grad(lambda y: _loss(_stretched(y, span), motion, task, places, objective))(
-            scaled
-        )
+        loss, gradient = jax.value_and_grad(
+            lambda y: _loss(_scale_amplitudes(y, span), motion, task, places, objective)
+        )(scaled)
         with jax.numpy_dtype_promotion("standard"):
             change, state = optimiser.update(gradient, state)
             return loss, optax.apply_updates(scaled, change), state
 
-    scaled = _stretched(amplitudes, 1 / span)
+    scaled = _scale_amplitudes(amplitudes, 1 / span)
     state, history, best = optimiser.init(scaled), [], (np.inf, scaled)
     for number in range(steps):
         before = scaled
@@ -280,15 +282,15 @@ def _descend(motion, task, places, objective, steps, learning_rate, callback):
             best = history[-1], before
         if not np.isfinite(history[-1]):
             break
-    return _moved(_stretched(best[1], span), motion), np.array(history)
+    return _with_amplitudes(_scale_amplitudes(best[1], span), motion), np.array(history)
 
 
-def _stretched(amplitudes, span):
+def _scale_amplitudes(amplitudes, span):
     """Centre (nq,), cosines and sines (harmonics, nq) times a number for each joint."""
     return jax.tree.map(lambda x: x * (span if x.ndim == 1 else span[None]), amplitudes)
 
 
-def _used(motion: FourierMotion, task: _Task) -> dict[str, float]:
+def _limit_shares(motion: FourierMotion, task: _Task) -> dict[str, float]:
     """Largest share of each kind of limit along a fine grid."""
     times = jnp.asarray(np.arange(_CHECKED) * float(motion.period) / _CHECKED, task.times.dtype)
     q, v, _, tau = (np.asarray(x, np.float64) for x in _signals(motion, task.model, times))
@@ -305,24 +307,24 @@ def _used(motion: FourierMotion, task: _Task) -> dict[str, float]:
     return {name: float(values.max()) for name, values in sizes.items()}
 
 
-def _shrunk(motion: FourierMotion, task: _Task) -> FourierMotion:
-    """The motion with its amplitudes, and its distance from the middle, times the largest share of 1 that passes no limit."""
+def _shrink(motion: FourierMotion, task: _Task) -> FourierMotion:
+    """Scale the amplitudes, and the distance from the middle, by the largest factor up to 1 that exceeds no limit."""
     middle = (task.limits.lower + task.limits.upper) / 2
 
     def at(share):
         center = middle + share * (motion.center - middle)
         return FourierMotion(center, share * motion.cosine, share * motion.sine, motion.period)
 
-    if max(_used(motion, task).values()) <= 1:
+    if max(_limit_shares(motion, task).values()) <= 1:
         return motion
     low, high = 0.0, 1.0
-    if (used := _used(at(0.0), task))["torque"] > 1:
+    if (used := _limit_shares(at(0.0), task))["torque"] > 1:
         raise ValueError(
-            f"torque: to hold the robot at the middle of its ranges takes {used['torque']:.3g} times the limits; give larger ones"
+            f"torque: holding the robot at the middle of its ranges needs {used['torque']:.3g} times the limits; give larger ones"
         )
     for _ in range(20):
         share = (low + high) / 2
-        low, high = (share, high) if max(_used(at(share), task).values()) <= 1 else (low, share)
+        low, high = (share, high) if max(_limit_shares(at(share), task).values()) <= 1 else (low, share)
     return at(low)
 
 

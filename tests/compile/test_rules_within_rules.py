@@ -10,12 +10,12 @@ import jax.scipy.special
 import numpy as np
 import pytest
 from jax.extend.core import ClosedJaxpr, Jaxpr
-from pinocchio_bridge import assert_close, quick
+from kernel_helpers import assert_close, native, quick
 
-import jaxdyn as jd
 from jaxdyn import compile as backend
 from jaxdyn.compile import target
 from jaxdyn.compile.expand import NotNumbers, expand
+from jaxdyn.compile.repair import repair
 
 pytestmark = pytest.mark.native
 X = jnp.array([0.3, 0.62, 0.21])
@@ -52,12 +52,6 @@ def _functions() -> dict:
                 except Exception:  # other arguments than arrays, or another number of them
                     continue
     return found
-
-
-def native(function):
-    return lambda *args: backend.run(
-        lambda _, *args: function(*args), (), *args, otherwise=lambda *_: pytest.fail("no kernel")
-    )
 
 
 def _derivatives(function):
@@ -165,27 +159,6 @@ def test_rules_that_call_their_own_function():
         assert_close(value, wanted[len(word)], 1e-12, word)
 
 
-def test_energies_of_lagrangian_systems():
-    """Kinetic energy with a metric sinc q: half of the metric's second derivative. Acceleration along a rail given by a root."""
-    system = jd.LagrangianSystem(lambda q, v: 0.5 * v @ v * jnp.sinc(q[0]), 1)
-
-    def energy(x):
-        return jd.kinetic_energy(system, jnp.stack([x]), jnp.ones(1))
-
-    for second in (jax.grad(jax.grad(energy)), jax.jacfwd(jax.jacfwd(energy)), jax.hessian(energy)):
-        assert_close(second(0.0), -(np.pi**2) / 6, 1e-12)
-    # With L = v^2/2 - 9.81 h(q) the acceleration is -9.81 h', whose two derivatives are those of the height.
-    rail = jd.LagrangianSystem(lambda q, v: 0.5 * v @ v - 9.81 * _root(q)[0], 1)
-
-    def accelerate(x):
-        return jd.forward_dynamics(rail, jnp.stack([x]), jnp.ones(1), jnp.zeros(1))[0]
-
-    _, first, second, third = _root_derivatives(0.8)
-    assert_close(accelerate(0.8), -9.81 * first, 1e-12)
-    assert_close(quick(jax.grad(accelerate))(0.8), -9.81 * second, 1e-11)
-    assert_close(quick(jax.jacfwd(jax.grad(accelerate)))(0.8), -9.81 * third, 1e-10)
-
-
 def test_rules_of_kernels_that_call_functions_with_rules():
     """`tangent=` and `implicit`: the derivative of what a rule computes asks the rules of what it calls."""
 
@@ -193,7 +166,7 @@ def test_rules_of_kernels_that_call_functions_with_rules():
         return steps[0] * _root(x)
 
     def f(x):
-        return backend.run(lambda _, x: jnp.floor(x), (), x, tangent=rule).sum()
+        return backend.kernel(lambda _, x: jnp.floor(x), derivative=rule)((), x).sum()
 
     def solve(_, x):
         return _root(x)
@@ -203,7 +176,7 @@ def test_rules_of_kernels_that_call_functions_with_rules():
         return y, steps[-1] / (1 + 3 * y**2)
 
     def g(x):
-        return backend.run(lambda _, x: backend.implicit((), (x,), solve, change), (), x).sum()
+        return backend.kernel(lambda _, x: backend.implicit((), (x,), solve, change))((), x).sum()
 
     wanted = _root_derivatives(1.3)
     x = jnp.array(1.3)
@@ -218,9 +191,9 @@ def test_samples_that_are_repaired_keep_rules():
 
     def function(_, x):
         fast = jnp.sinc(x)
-        return backend.repair_flagged(x < 0.5, lambda x: (jnp.sinc(x), ()), jnp.sinc, (fast, ()), (x,))[0]
+        return repair(x < 0.5, lambda x: (jnp.sinc(x), ()), jnp.sinc, (fast, ()), (x,))[0]
 
     x = jnp.array([0.0, 0.7])
-    repaired = quick(jax.vmap(jax.grad(jax.grad(lambda x: backend.run_repaired(function, (), x)))))(x)
+    repaired = quick(jax.vmap(jax.grad(jax.grad(lambda x: backend.kernel(function)((), x)))))(x)
     assert_close(repaired, jax.vmap(jax.grad(jax.grad(jnp.sinc)))(x), 1e-12)
     assert_close(repaired[0], -(np.pi**2) / 3, 1e-12)

@@ -4,9 +4,9 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from jaxdyn.identify.jumps import repair_log
-from jaxdyn.identify.logs import Log
-from jaxdyn.identify.spectra import choose_cutoff
+from jaxdyn.identify.logs import Log, pad_length
+from jaxdyn.identify.workflows.log_repair import repair_log
+from jaxdyn.identify.workflows.spectra import choose_cutoff
 from jaxdyn.model.arguments import Checked, Numbers
 from jaxdyn.model.tree import Model
 
@@ -25,25 +25,26 @@ def from_raw(
     outliers: str = "refuse",
     model: Checked[Model | None] = None,
 ) -> Log:
-    """A log for torque fits from raw positions and torques: uniform time, low-pass without delay, numerical rates.
+    """Make a log for torque fits from raw positions and torques: uniform time, low-pass without delay, numerical rates.
 
     The samples are interpolated linearly to a uniform grid of as many samples. q is low-passed forward and backward
     (Butterworth, zero phase); v is its numerical gradient, low-passed again; a the gradient of v, low-passed again; tau
-    is low-passed the same way, so that both sides of the equation of motion went through the same filter. The filter's
-    transients at both ends are dropped, and as the signals hold nothing above the cut-off, only every few samples are
+    is low-passed the same way, so that both sides of the equation of motion have the same filter. The filter's
+    transients at both ends are dropped, and as the signals have no power above the cut-off, only every few samples are
     kept.
 
     **Arguments:**
 
     - `t` (n,) s, strictly increasing, jitter allowed; `q`, `tau` (n, nv): one coordinate per joint.
     - `cutoff`: Hz, half-power frequency of one pass; or "auto", from this log's spectra by `choose_cutoff`. Several logs of
-      a fit should go through one low-pass: choose it once for all of them, and give the number.
+      a fit should have one low-pass: choose it once for all of them, and give the number.
     - `order`: of the filter. `trim`: samples dropped at each end. `every`: keep every so-many-th sample.
-    - `unwrap`: "auto" makes angles continuous that jump by whole turns, as the velocities around tell; True, all differences
-      beyond pi, as `numpy.unwrap`; False, none. A `LogWarning` names joints and counts.
-    - `outliers`: samples of q and tau that the samples around contradict are an error, "refuse"; are interpolated, with a
+    - `unwrap`: "auto" makes angles continuous that jump by whole turns, as the neighbouring velocities show; True, all
+      differences beyond pi, as `numpy.unwrap`; False, none. A `LogWarning` names joints and counts.
+    - `outliers`: samples of q and tau that contradict their neighbours are an error, "refuse"; are interpolated, with a
       `LogWarning` that counts them, "drop"; or stay, "keep".
-    - `model`: tells which columns are angles, their joints' names and velocity limits. Without it every column of q may be one.
+    - `model`: defines the columns that are angles, their joints' names and velocity limits. Without it any column of q may be
+      one.
 
     **Returns:** `Log` with t, q, v, a, tau.
 
@@ -92,7 +93,7 @@ def from_raw(
         return np.stack([np.interp(grid, t, column) for column in x.T], axis=1)
 
     def low(x):
-        return filtfilt(numerator, denominator, x, axis=0)
+        return filtfilt(numerator, denominator, x, axis=0, padlen=pad_length(rate, cutoff, n))
 
     positions, torques = low(uniform(q)), low(uniform(tau))
     v = low(np.gradient(positions, grid, axis=0))

@@ -7,17 +7,9 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from jax import lax
-from pinocchio_bridge import quick
-
-from jaxdyn.compile import target
-from jaxdyn.compile.expand import expand
+from kernel_helpers import by_kernel, quick
 
 pytestmark = pytest.mark.native
-
-
-def by_kernel(function, *args):
-    program = expand(jax.make_jaxpr(function)(*args), 10**6)[0]
-    return target.call(program, [np.asarray(x) for x in args])
 
 
 @pytest.mark.parametrize("dtype", [np.int32, np.int64], ids=["int32", "int64"])

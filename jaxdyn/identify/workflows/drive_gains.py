@@ -1,12 +1,13 @@
-"""Gains of drives, told by a payload that is known.
+"""Gains of drives from a known payload.
 
-A drive's log holds its current, or a torque under a gain taken as right: i = tau / g. Gains and inertias scale each other, so
-that one log tells neither; a payload of known mass and centre adds a torque p in newton metres, which tells both:
+A drive's log holds its current, or a torque under an uncertain gain: i = tau / g. Gains and inertias scale each other, so that
+neither is identifiable from a robot's own logs; a payload of known mass and centre adds a known torque p (N m), and both are:
 
     i_j = (W_j x + [loaded] (p_j + Y_j I)) / g_j,
 
-with x the robot's base parameters and friction, and I the payload's rotational inertia where it is not known. All joints share
-the inertias in x, so that a joint that hardly feels the payload is told by those that do. The logs are condensed once.
+with x the robot's base parameters and friction, and I the payload's rotational inertia where it is unknown. All joints share
+the inertias in x, so that the gain of a joint with little torque from the payload is identified through the others. The logs are
+condensed once.
 """
 
 from collections.abc import Sequence
@@ -16,9 +17,7 @@ import equinox as eqx
 import numpy as np
 
 from jaxdyn.identify.condensed import Blocks
-from jaxdyn.identify.friction import TERMS, Terms, check_terms
-from jaxdyn.identify.jackknife import block_groups, jackknife, student
-from jaxdyn.identify.logs import Log, as_logs, as_measured
+from jaxdyn.identify.logs import Log, as_logs
 from jaxdyn.identify.regression import (
     base_parameters,
     condense_model,
@@ -28,42 +27,54 @@ from jaxdyn.identify.regression import (
 )
 from jaxdyn.identify.selection import VELOCITIES
 from jaxdyn.identify.threads import on_one_thread
-from jaxdyn.identify.torque_terms import coulomb_column
+from jaxdyn.identify.torque_terms import TERMS, Terms, check_terms, coulomb_through_filter
+from jaxdyn.identify.uncertainty import block_groups, jackknife, student
 from jaxdyn.model import inertia as _inertia
-from jaxdyn.model.arguments import Numbers
+from jaxdyn.model.arguments import Numbers, warn
 from jaxdyn.model.tree import Model
 
 _STEPS, _ROUNDS = 50, 3
-# Half of a 95 % interval, as a share of the gain, up to which a gain counts as told.
-_TOLD = 0.5
-# Standard deviation of the logarithm of a gain that nothing tells, about those of the others.
+# Largest half-width of a 95 % interval, as a share of the gain, of an identifiable gain.
+_IDENTIFIABLE = 0.5
+# Standard deviation of the prior of the logarithm of a gain, about the median of the others.
 _APART = 1.0
-# Errors are never trusted beyond this share of the signal, so that logs without noise stay well posed.
+# Least error as a share of the signal, so that noise-free logs stay well posed.
 _FINEST = 1e-9
-# Share of a column that others must leave of it, for it to count at all.
+# Least share of a column that is independent of the others.
 _RANK = 1e-9
 
 
 class DriveGains(eqx.Module):
     """Result of `fit_gains`.
 
-    - `gains` (nv,): torque = gain times what the log holds. `std` (nv,): standard deviations, by blocks of samples as in
+    - `gains` (nv,): torque = gain times the logged value. `std` (nv,): standard deviations, by blocks of samples as in
       `Intervals`; `factor`: a 95 % interval is plus and minus this many of them.
-    - `told`: names of the joints whose half interval is below half of the gain. The other gains are about the median of these.
-    - `error`: of what the logs hold, in per cent, over all logs. `v_s`: smoothing velocity of Coulomb friction.
+    - `identifiable`: names of the joints with a half-width below half of the gain. The other gains are about their median.
+    - `error`: of the logged values, in per cent, over all logs. `v_s`: smoothing velocity of Coulomb friction.
     """
 
     gains: np.ndarray
     std: np.ndarray
     factor: float
-    told: tuple[str, ...] = eqx.field(static=True)
+    identifiable: tuple[str, ...] = eqx.field(static=True)
     error: float
     v_s: float
 
-    def scaled(self, log: Log) -> Log:
-        """A log of these drives with torques in N m, as all fits take it."""
+    def scale(self, log: Log) -> Log:
+        """Scale a log of these drives to torques in N m, as all fits expect them."""
         tau = np.asarray(log.tau, np.float64) * self.gains
         return Log(log.t, log.q, log.v, log.a, tau, joint_names=log.joint_names, cutoff=log.cutoff)
+
+    def scaled(self, log: Log) -> Log:
+        """Deprecated name of `scale`."""
+        warn("DriveGains.scaled is deprecated; call scale", DeprecationWarning)
+        return self.scale(log)
+
+    @property
+    def told(self) -> tuple[str, ...]:
+        """Deprecated name of `identifiable`."""
+        warn("DriveGains.told is deprecated; read identifiable", DeprecationWarning)
+        return self.identifiable
 
 
 @on_one_thread
@@ -80,24 +91,24 @@ def fit_gains(
     v_s: float | str = "auto",
     blocks: int = 20,
 ) -> DriveGains:
-    """The gain of each drive, from logs without and with a payload that is known.
+    """Fit the gain of each drive from logs without and with a known payload.
 
-    Least squares over gains and base parameters together, each joint weighed by one over its error, iterated. Fit the robot
-    to `gains.scaled(log)` then.
+    Least squares over gains and base parameters together, each joint weighted by one over its error, iterated. Then fit the
+    robot to `gains.scale(log)`.
 
     **Arguments:**
 
     - `model`: the robot; its inertias do not matter. `unloaded`, `loaded`: logs with v and a, or sequences of them, with currents
-      (or torques under gains taken as right) in place of torques.
+      (or torques under uncertain gains) in place of torques.
     - `mass` (kg), `centre` (3,) (m) of the payload, in the frame of the body that holds it. `inertia` (3, 3): about the
-      centre, in axes of that frame (kg m^2); None: found too, which costs some of what the payload tells.
+      centre, in axes of that frame (kg m^2); None: fitted too, at the cost of wider intervals.
     - `body`: name of the body that holds it, the last one by default. `terms`: of friction and rotors, of `TERMS`; `v_s`:
-      smoothing velocity of Coulomb friction (rad/s, m/s), or "auto", that which leaves the least.
+      smoothing velocity of Coulomb friction (rad/s, m/s), or "auto", that of the smallest error.
     - `blocks`: consecutive samples are cut into about this many blocks, whose scatter gives the intervals.
 
     **Returns:** `DriveGains`.
 
-    **Raises:** ValueError when logs and model do not fit together, for an unknown body, and where the payload tells no gain.
+    **Raises:** ValueError when logs and model do not fit together, for an unknown body, and where the payload identifies no gain.
 
     Source: Gautier & Briot (2014), "Global identification of joint drive gains and dynamic parameters of robots", ASME Journal of
     Dynamic Systems, Measurement, and Control 136; errors here are those of the currents, which least squares over both allows.
@@ -122,25 +133,25 @@ def fit_gains(
         carried.append(np.concatenate([(columns @ known)[:, :, None], free], axis=2))
     best = None
     for velocity in VELOCITIES if isinstance(v_s, str) else (float(v_s),):
-        coulomb = [as_measured(log, coulomb_column(log, velocity)) for log in logs]
+        coulomb = [coulomb_through_filter(log, velocity) for log in logs]
         data = condense_model(model, logs, v_s=velocity, coulomb=coulomb, extra=carried, blocks=blocks)
         trial = _fit(_Problem(model, data, terms), velocity)
         if best is None or trial[0] < best[0]:
             best = trial
     assert best is not None
     _, error, gains, std, factor, velocity = best
-    is_told = factor * std < _TOLD * gains
-    if not is_told.any():
+    is_identifiable = factor * std < _IDENTIFIABLE * gains
+    if not is_identifiable.any():
         raise ValueError(
-            f"the payload of {mass:g} kg on {body} tells the gain of no joint; take a heavier one, move more joints against "
+            f"the payload of {mass:g} kg on {body} identifies the gain of no joint; use a heavier one, move more joints against "
             "gravity, or give its inertia"
         )
-    told = tuple(name for name, yes in zip(_joint_names(model), is_told, strict=True) if yes)
-    return DriveGains(gains, std, factor, told, error, velocity)
+    names = tuple(name for name, yes in zip(_joint_names(model), is_identifiable, strict=True) if yes)
+    return DriveGains(gains, std, factor, names, error, velocity)
 
 
 class _Problem:
-    """Condensed logs of nv joints, and what of their columns is an unknown of its own: base parameters and the inertia I."""
+    """Condensed logs of nv joints, with the columns of the unknowns: base parameters and the inertia I."""
 
     def __init__(self, model: Model, data: Blocks, terms):
         self.data, self.nv = data, model.nv
@@ -161,28 +172,28 @@ class _Problem:
         self.known = shared + 4
 
     def rows(self, joint: int, triangle: np.ndarray, z: np.ndarray, u: float):
-        """Errors of a joint's condensed currents at the unknowns z and the gain exp(u), and their slopes (m, size + 1)."""
+        """Errors of a joint's condensed currents at the unknowns z and the gain exp(u), and their Jacobian (m, size + 1)."""
         h, W = np.exp(-u), triangle[:, self.columns[joint]]
-        foretold = h * (W @ z[self.unknowns[joint]] + triangle[:, self.known])
-        slopes = np.zeros((len(triangle), self.size + 1))
-        slopes[:, self.unknowns[joint]] = h * W
-        slopes[:, -1] = -foretold
-        return foretold - triangle[:, -1], slopes
+        predicted = h * (W @ z[self.unknowns[joint]] + triangle[:, self.known])
+        jacobian = np.zeros((len(triangle), self.size + 1))
+        jacobian[:, self.unknowns[joint]] = h * W
+        jacobian[:, -1] = -predicted
+        return predicted - triangle[:, -1], jacobian
 
-    def linearised(self, triangles, z, u, weights):
-        """Weighted errors (m,) and slopes (m, size + nv) of all joints."""
-        errors, slopes = [], []
+    def linearise(self, triangles, z, u, weights):
+        """Weighted errors (m,) and their Jacobian (m, size + nv) of all joints."""
+        errors, jacobians = [], []
         for joint, triangle in enumerate(triangles):
             error, part = self.rows(joint, triangle, z, u[joint])
             wide = np.zeros((len(error), self.size + self.nv))
             wide[:, : self.size], wide[:, self.size + joint] = part[:, :-1], part[:, -1]
             errors.append(weights[joint] * error)
-            slopes.append(weights[joint] * wide)
-        return np.concatenate(errors), np.concatenate(slopes)
+            jacobians.append(weights[joint] * wide)
+        return np.concatenate(errors), np.concatenate(jacobians)
 
 
 class _State(NamedTuple):
-    """Unknowns beside the gains, logarithms of gains, and the weights of joints."""
+    """Unknowns other than the gains, logarithms of gains, and the weights of joints."""
 
     z: np.ndarray
     u: np.ndarray
@@ -192,27 +203,27 @@ class _State(NamedTuple):
 def _fit(problem: _Problem, v_s: float):
     """Score, error in per cent, gains, standard deviations, factor of an interval, v_s."""
     data, nv = problem.data, problem.nv
-    triangles, samples = data.merged(), int(data.samples.sum())
+    triangles, samples = data.merge(), int(data.samples.sum())
     sizes = np.array([max(float(np.linalg.norm(R[:, -1])), 1e-300) for R in triangles])
     start = _start(problem, triangles)
     state = _State(np.zeros(problem.size), start, 1 / sizes)
     rms = sizes
     for _ in range(_ROUNDS):
-        state = _descended(problem, triangles, state, start)
+        state = _descend(problem, triangles, state, start)
         rms = np.array(
             [np.linalg.norm(problem.rows(j, R, state.z, state.u[j])[0]) for j, R in enumerate(triangles)]
         ) / np.sqrt(samples)
         state = state._replace(weights=1 / np.maximum(rms, _FINEST * sizes / np.sqrt(samples)))
-    grams, slopes = [], []
+    grams, gradients = [], []
     for block in data.triangles:
-        error, J = problem.linearised(block, *state)
+        error, J = problem.linearise(block, *state)
         grams.append(J.T @ J)
-        slopes.append(J.T @ error)
-    # How long the errors of currents last is not asked.
+        gradients.append(J.T @ error)
+    # Errors of currents count as independent: groups of two blocks.
     groups = block_groups(len(data), np.inf)
     total = np.sum(grams, axis=0)
-    curvature = np.diag(_held(total, problem.size))
-    parts = [np.stack([np.sum([x[i] for i in group], axis=0) for group in groups]) for x in (grams, slopes)]
+    curvature = np.diag(_weak_prior(total, problem.size))
+    parts = [np.stack([np.sum([x[i] for i in group], axis=0) for group in groups]) for x in (grams, gradients)]
     changes, inverse = jackknife(parts[0], parts[1], curvature)
     variance = np.sum(changes**2, axis=1) + np.diag(inverse @ curvature @ inverse)
     gains = np.exp(state.u)
@@ -221,17 +232,17 @@ def _fit(problem: _Problem, v_s: float):
     return score, percent, gains, gains * np.sqrt(variance[-nv:]), student(len(groups) - 1), v_s
 
 
-def _held(gram: np.ndarray, size: int) -> np.ndarray:
-    """Curvature (n,) that holds what no data tell: a trace of each number's own, and the prior of the gains."""
-    held = 1e-12 * np.maximum(np.diag(gram), 1e-300)
-    held[size:] = 1 / _APART**2
-    return held
+def _weak_prior(gram: np.ndarray, size: int) -> np.ndarray:
+    """Curvature (n,) of a weak prior: a small share of each number's own, and the prior of the gains."""
+    prior = 1e-12 * np.maximum(np.diag(gram), 1e-300)
+    prior[size:] = 1 / _APART**2
+    return prior
 
 
 def _start(problem: _Problem, triangles) -> np.ndarray:
-    """Logarithms of the gains (nv,) by each joint alone: i_j = W_j z_j + h_j p_j is linear; where that tells none, the median.
+    """Logarithms of the gains (nv,) by the linear problem i_j = W_j z_j + h_j p_j of each joint; else the median of the others.
 
-    **Raises:** ValueError where no joint tells any.
+    **Raises:** ValueError where no joint identifies any.
     """
     logarithms = np.full(problem.nv, np.nan)
     for joint, R in enumerate(triangles):
@@ -247,26 +258,27 @@ def _start(problem: _Problem, triangles) -> np.ndarray:
                 logarithms[joint] = -np.log(h)
     if np.isnan(logarithms).all():
         raise ValueError(
-            "the payload's torque is told apart in no joint; are the loaded logs loaded, and do they move joints against gravity?"
+            "the payload's torque is not identifiable at any joint; are the loaded logs loaded, and do they move joints "
+            "against gravity?"
         )
     return np.where(np.isnan(logarithms), np.nanmedian(logarithms), logarithms)
 
 
-def _descended(problem: _Problem, triangles, state: _State, start: np.ndarray) -> _State:
-    """Gauss-Newton steps from where each is the best unknown for its gains; halved until the loss falls."""
+def _descend(problem: _Problem, triangles, state: _State, start: np.ndarray) -> _State:
+    """Make Gauss-Newton steps in unknowns and gains, the first in the unknowns alone; halved until the loss decreases."""
     z, u, weights = state
 
     def loss(z, u) -> float:
-        error, _ = problem.linearised(triangles, z, u, weights)
+        error, _ = problem.linearise(triangles, z, u, weights)
         return float(error @ error + np.sum((u - start) ** 2) / _APART**2)
 
     z, now = z.copy(), np.inf
     for step in range(_STEPS):
-        error, J = problem.linearised(triangles, z, u, weights)
-        held = np.sqrt(_held(J.T @ J, problem.size))
+        error, J = problem.linearise(triangles, z, u, weights)
+        root = np.sqrt(_weak_prior(J.T @ J, problem.size))
         pull = np.concatenate([np.zeros(problem.size), (u - start) / _APART])
-        A, b = np.concatenate([J, np.diag(held)]), np.concatenate([error, pull])
-        if step == 0:  # the unknowns beside the gains are linear
+        A, b = np.concatenate([J, np.diag(root)]), np.concatenate([error, pull])
+        if step == 0:  # the errors are linear in the unknowns at fixed gains
             A = A[:, : problem.size]
         scale = np.maximum(np.linalg.norm(A, axis=0), 1e-300)
         change = -np.linalg.lstsq(A / scale, b, rcond=_RANK)[0] / scale

@@ -6,17 +6,21 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from pinocchio_bridge import assert_close, quick
+from kernel_helpers import assert_close, quick
 
 from jaxdyn import compile as backend
-from jaxdyn.compile import any_in_batch, is_rank_safe, recompute_unless, repair_flagged
+from jaxdyn.compile import target
+from jaxdyn.compile.batch import any_sample
+from jaxdyn.compile.mode import is_rank_safe
+from jaxdyn.compile.repair import compute_where, repair
+from jaxdyn.compile.trace import program_of
 
 pytestmark = pytest.mark.native
 
 
 def test_a_flag_of_any_sample_is_one_of_the_batch():
     def pick(x):
-        return jax.lax.cond(any_in_batch(x > 2.5), lambda: x + 10, lambda: x)
+        return jax.lax.cond(any_sample(x > 2.5), lambda: x + 10, lambda: x)
 
     grid = jnp.arange(4.0).reshape(2, 2)
     assert jax.vmap(jax.vmap(pick))(grid).tolist() == [[10, 11], [12, 13]]
@@ -26,8 +30,8 @@ def test_a_flag_of_any_sample_is_one_of_the_batch():
     assert "select" not in str(jax.make_jaxpr(jax.vmap(pick))(grid[0]))
 
 
-def test_samples_that_are_not_served_are_computed_again():
-    """Only those, traced as rank-safe, with the dtypes of what is there; nothing is in the program where all are served."""
+def test_samples_that_are_not_valid_are_computed_again():
+    """Only those, traced as rank-safe, with the dtypes of the values."""
     calls, safe, size = [], [], np.arange(1.0, 4.0)
 
     def again(x):
@@ -35,8 +39,8 @@ def test_samples_that_are_not_served_are_computed_again():
         jax.debug.callback(lambda: calls.append(1))
         return {"matrix": jnp.full((2, 2), -x), "n": 7}
 
-    def one(x, served):
-        return recompute_unless(served, again, {"matrix": jnp.full((2, 2), x), "n": jnp.asarray(3)}, (x,))
+    def one(x, valid):
+        return compute_where(~jnp.asarray(valid), again, {"matrix": jnp.full((2, 2), x), "n": jnp.asarray(3)}, (x,))
 
     many = jax.jit(jax.vmap(one))
     for flags in ([False] * 3, [False, True, False]):
@@ -48,7 +52,6 @@ def test_samples_that_are_not_served_are_computed_again():
         assert computed["n"].tolist() == [7 if flag else 3 for flag in flags] and bool(calls) == any(flags)
         assert computed["n"].dtype == jnp.asarray(3).dtype
     assert safe and all(safe) and not is_rank_safe()
-    assert "callback" not in str(jax.make_jaxpr(lambda x: one(x, True))(1.0))
     alone = jax.jit(one)
     assert alone(2.0, False)["matrix"][0, 0] == -2 and alone(2.0, True)["matrix"][0, 0] == 2
 
@@ -60,7 +63,7 @@ def _root(x, scale):
     def careful(x, scale):
         return jnp.exp(0.5 * jnp.log(scale * x)), (jnp.asarray(1, jnp.int32),)
 
-    return repair_flagged(x < 1, careful, lambda x, scale: jnp.sqrt(scale * x), computed, (x, scale))
+    return repair(x < 1, careful, lambda x, scale: jnp.sqrt(scale * x), computed, (x, scale))
 
 
 @functools.cache
@@ -113,7 +116,7 @@ def test_arguments_of_both_batches_of_one_and_of_none():
 
     def repaired(x, rest):
         wrong = jax.tree.map(jnp.zeros_like, plain(x, rest))
-        return repair_flagged(jnp.asarray(True), lambda *a: (plain(*a), ()), plain, (wrong, ()), (x, rest))[0]
+        return repair(jnp.asarray(True), lambda *a: (plain(*a), ()), plain, (wrong, ()), (x, rest))[0]
 
     def nested(function):
         return jax.vmap(jax.vmap(function, (0, (None, 0, None))), (0, (0, None, None)))
@@ -126,16 +129,38 @@ def test_arguments_of_both_batches_of_one_and_of_none():
         assert_close(one, other, 1e-15)
 
 
-def test_in_a_program_of_numbers_flagged_samples_are_no_numbers():
+def test_invalid_samples_of_a_kernel():
+    """They are not numbers in the kernel, which reports them, and are computed by the function itself, or by the fallback."""
+
     def root(_, x):
         return _root(x, 1.0)
 
     x = jnp.array([0.25, 4.0])
-    (computed, (way,)), served = jax.jit(jax.vmap(lambda x: backend.run(root, (), x, served=True)))(x)
-    np.testing.assert_array_equal(computed, [np.nan, 2.0])
-    assert way.tolist() == [0, 0]
-    assert served.tolist() == [False, True]
-    # Whoever does not ask gets no program, and whoever wants all samples right gets them.
-    for run in (backend.run, backend.run_repaired):
-        computed, _ = jax.jit(jax.vmap(lambda x, run=run: run(root, (), x)))(x)
-        np.testing.assert_array_equal(computed, [0.5, 2.0])
+    program, _ = program_of(root, (), (), (x[0],), flags="report")[1]
+    assert (
+        program.reports_validity
+        and not program_of(lambda _, x: x, (), (), (x[0],), flags="report")[1][0].reports_validity
+    )
+    for sample, wanted in zip(x, ([np.nan, 0, False], [2.0, 0, True]), strict=True):
+        np.testing.assert_array_equal([y.item() for y in target.call(program, [np.asarray(sample)])], wanted)
+    assert isinstance(program_of(root, (), (), (x[0],))[1], str)
+    computed, (branch,) = jax.jit(jax.vmap(lambda x: backend.kernel(root)((), x)))(x)
+    np.testing.assert_array_equal(computed, [0.5, 2.0])
+    assert branch.tolist() == [1, 0]
+
+    def fallback(_, x):
+        return -x, (jnp.asarray(7, jnp.int32),)
+
+    for derivative in (None, False):
+        function = backend.kernel(root, fallback=fallback, derivative=derivative)
+        computed, (branch,) = jax.jit(jax.vmap(lambda x, f=function: f((), x)))(x)
+        np.testing.assert_array_equal(computed, [-0.25, 2.0])
+        assert branch.tolist() == [7, 0]
+    slope = jax.jit(jax.vmap(jax.grad(lambda x: backend.kernel(root, fallback=fallback)((), x)[0])))
+    np.testing.assert_array_equal(slope(x), [-1.0, -1.0])  # of the fallback for all, as one sample needs it
+    np.testing.assert_array_equal(slope(x[1:]), [0.25])
+    assert [float(backend.evaluate(root, (), y)[0]) for y in x] == [0.5, 2.0]
+    # A sample whose results are not needed is left as it is.
+    function = backend.kernel(root, fallback=fallback, derivative=False)
+    needed = jax.jit(jax.vmap(lambda x, where: function((), x, where=where)))(x, jnp.array([False, True]))
+    np.testing.assert_array_equal(needed[0], [np.nan, 2.0])

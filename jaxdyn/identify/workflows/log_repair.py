@@ -1,4 +1,4 @@
-"""Wrapped angles and corrupted samples of logs: found before a low-pass and differences spread them over the log."""
+"""Repair of wrapped angles and corrupted samples of logs, before a low-pass and differences spread them over the log."""
 
 from typing import NamedTuple
 
@@ -8,20 +8,20 @@ from jaxdyn.identify.logs import Log
 from jaxdyn.model.arguments import warn
 from jaxdyn.model.tree import Model
 
-# Samples at each side that say what a joint does around a sample or a jump.
+# Samples at each side that define the local motion of a joint around a sample or a jump.
 _WINDOW = 8
-# More corrupted positions in sequence than these are a motion, for all that the samples tell; a torque of two samples may be
-# friction where a joint turns round in a log of few samples a second.
+# Longest sequences of corrupted samples: more positions could be a motion; a torque of two samples may be the friction of a
+# reversal in a log of few samples a second.
 _LONGEST = {"q": 3, "tau": 1}
-# A deviation counts from this multiple of what is usual around it and in nine tenths of the column. The upper quartile of the
-# absolute values of normal noise is 1.15 of its standard deviation, so noise alone never comes near.
+# A deviation counts from this multiple of the deviations around it and of those in nine tenths of the column. The upper
+# quartile of the absolute values of normal noise is 1.15 of its standard deviation, so noise alone never comes near.
 _UNUSUAL = 15.0
 # The samples next to a corrupted one must predict each other better than it by this factor, or it is a step of the signal.
 _ISOLATED = 5.0
 # Least deviation in ranges of the column: smaller ones do not change a fit. Torques are not differentiated, and friction of a
-# recorded KUKA peaks by three ranges for a sample where a joint turns round, when one of ten samples is kept.
+# recorded KUKA peaks by three ranges for one sample at a reversal, when one of ten samples is kept.
 _LEAST = {"q": 3e-3, "tau": 5.0}
-# A standing column has no range: also a share of the widest column of the signal, and a multiple of the encoder's resolution.
+# A constant column has no range: also a share of the widest column of the signal, and a multiple of the encoder's resolution.
 _LEAST_OF_WIDEST, _RESOLUTIONS = 1e-3, 10.0
 # A jump is faster than its neighbours by the first factor, and than 99 % of the log by the second. Files have limits that are
 # too low, so one beyond the velocity limit must stand out too, though by less: both factors are halved.
@@ -120,8 +120,7 @@ def find_outliers(log: Log, model: Model | None = None) -> list[Outlier]:
             least = max(_LEAST[signal] * (high - low)[place], _LEAST_OF_WIDEST * float((high - low).max()))
             x = values[:, column]
             own = [
-                Outlier(signal, column, rows, size, False)
-                for rows, size in _find_isolated(t, x, least, _LONGEST[signal])
+                Outlier(signal, column, rows, size, False) for rows, size in _find_spikes(t, x, least, _LONGEST[signal])
             ]
             if signal == "q":
                 limit = _velocity_limit(model, column)
@@ -149,12 +148,12 @@ def _turns(t: np.ndarray, x: np.ndarray, near: bool) -> np.ndarray:
         tolerance = max(_TURN_TOLERANCE, steps[i] * max(abs(ends[0] - ends[-1]), 3 * scatter))
         whole = np.round((change[i] - steps[i] * np.mean(ends)) / (2 * np.pi))
         rest = change[i] - steps[i] * np.mean(ends) - 2 * np.pi * whole
-        # Velocities that leave more than a quarter turn open do not tell a wrap from a motion or noise.
+        # With velocities uncertain by more than a quarter turn, a wrap is not distinguishable from a motion or noise.
         turns[i] = whole if abs(rest) <= tolerance <= 0.5 * np.pi else 0.0
     return turns
 
 
-def _find_isolated(t: np.ndarray, x: np.ndarray, least: float, longest: int) -> list[tuple[range, float]]:
+def _find_spikes(t: np.ndarray, x: np.ndarray, least: float, longest: int) -> list[tuple[range, float]]:
     """Find one to `longest` samples, rows and deviation, that deviate from the line between their neighbours."""
     n = len(x)
     curvature = np.abs(x[1:-1] - _line(t[1:-1], t[:-2], x[:-2], t[2:], x[2:]))
@@ -166,7 +165,7 @@ def _find_isolated(t: np.ndarray, x: np.ndarray, least: float, longest: int) -> 
         size = np.minimum(
             *(np.abs(x[k] - _line(t[k], t[left], x[left], t[right], x[right])) for k in (first, last)),
         )
-        # What the outer neighbours predict for the inner ones without the samples between.
+        # Prediction of the inner neighbours by the outer ones, without the samples between.
         inner = np.maximum(
             np.abs(x[left] - _line(t[left], t[left - 1], x[left - 1], t[right], x[right])),
             np.abs(x[right] - _line(t[right], t[left], x[left], t[right + 1], x[right + 1])),
@@ -275,7 +274,7 @@ def _describe(log: Log, model: Model | None, one: Outlier, count: int) -> str:
 
 
 def _coordinates(log: Log, model: Model | None) -> list[int]:
-    """Columns of q that are the one coordinate of a joint."""
+    """Columns of q that are the only coordinate of a joint."""
     if model is None:
         return list(range(log.q.shape[1])) if log.q.shape[1] == log.nv else []
     if log.q.shape[1] != model.nq:

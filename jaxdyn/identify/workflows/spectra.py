@@ -1,7 +1,7 @@
-"""Spectra of logs: where the motion is, where to low-pass, and whether what a fit leaves over is vibration.
+"""Spectra of logs: band of the motion, choice of a cut-off, and vibration in the residual of a fit.
 
-Rigid bodies answer at the frequencies of the motion and their first multiples, and friction that turns round somewhat higher.
-What is far above is neither: elastic joints, drives, sensors.
+Rigid bodies respond at the frequencies of the motion and their first multiples, and friction at reversals somewhat higher.
+Power far above is neither: elastic joints, drives, sensors.
 """
 
 import itertools
@@ -12,27 +12,27 @@ import numpy as np
 
 from jaxdyn.identify.logs import Log
 
-# Share of the velocity's power that lies in the band of the motion, and how far above it the residual may still be friction's.
-# With 99.9 % instead, noise of the encoders of two recorded arms doubled the band.
+# Share of the velocity's power that defines the band of the motion, and the factor above it up to which a residual may be
+# friction's. With 99.9 % instead, noise of the encoders of two recorded arms doubled the band.
 _MOTION, _ABOVE = 0.99, 10.0
-# A low-pass closer to the motion than this takes away what rigid bodies do.
+# A low-pass closer to the motion than this factor removes rigid-body torque.
 _LEAST = 5.0
-# A joint slower than this share of the fastest one (its velocity's power) has no say in where the motion is.
+# A joint with less than this share of the fastest one's velocity power does not define the band of the motion.
 _SLOW = 1e-4
 # Vibration is a torque whose power rises this many times from one band to a higher one, to this share of the joint's power.
 _RISE, _SHARE = 10.0, 1e-4
-# Frequencies in one such band, at least, for its mean to be worth something.
+# Least number of frequencies in a band, for a meaningful mean.
 _LINES = 6
 # Highest cut-off as a share of the sampling rate.
 _SAMPLING = 0.4
 
 
 class Cutoff(NamedTuple):
-    """Where to low-pass logs, all in Hz.
+    """Cut-off of the low-pass of logs, all in Hz.
 
     - `frequency`: of the low-pass.
     - `motion`: the band of the motion: 99 % of the power of the velocity lies below.
-    - `vibration`: where the torque's power rises again, between five and ten times the motion's band; None where it does not.
+    - `vibration`: frequency at which the torque's power rises again, between five and ten times the motion's band, or None.
     """
 
     frequency: float
@@ -41,10 +41,10 @@ class Cutoff(NamedTuple):
 
 
 def choose_cutoff(logs: Log | Sequence[Log]) -> Cutoff:
-    """Cut-off frequency for raw logs, from the spectra of positions and torques.
+    """Choose the cut-off frequency of raw logs from the spectra of positions and torques.
 
-    Ten times the highest band of the motion, where rigid bodies and friction still answer. Less, down to five times, where a
-    joint's torque vibrates below that: then the band of least power in front of the vibration. No error of a fit is looked at.
+    Ten times the highest band of the motion, up to which rigid bodies and friction respond. Less, down to five times, where a
+    joint's torque vibrates below that: then the band of least power below the vibration. Errors of fits are not used.
     All logs of a fit should go through the same low-pass.
 
     **Arguments:** `logs`: one raw log or several, with t, q, tau.
@@ -58,7 +58,7 @@ def choose_cutoff(logs: Log | Sequence[Log]) -> Cutoff:
     spectra = [_Spectra.of(log) for log in logs]
     motion = max(one.motion for one in spectra)
     if not motion > 0:
-        raise ValueError("the positions do not move, so their spectrum tells no cut-off; give one in Hz")
+        raise ValueError("the positions do not move, so their spectrum determines no cut-off; give one in Hz")
     if not np.isfinite(motion):
         raise ValueError(
             "the noise of the positions is as strong as their motion, so no cut-off is chosen; give one in Hz"
@@ -72,7 +72,7 @@ def choose_cutoff(logs: Log | Sequence[Log]) -> Cutoff:
 
 
 class _Spectra(NamedTuple):
-    """Of one raw log: frequencies (Hz), power of the torques (frequencies, nv), sampling rate and band of the motion (Hz)."""
+    """Spectra of one raw log: frequencies, power of torques (frequencies, nv), sampling rate and band of the motion, in Hz."""
 
     frequency: np.ndarray
     torque: np.ndarray
@@ -93,12 +93,12 @@ class _Spectra(NamedTuple):
         grid = np.linspace(t[0], t[-1], len(t))
         q, tau = (np.stack([np.interp(grid, t, column) for column in x.T], axis=1) for x in (q, tau))
         rate = (len(t) - 1) / float(t[-1] - t[0])
-        # Rates first, then the window: a way that does not end where it began would be a jump in the spectrum.
+        # Differentiate before windowing: a path that does not end at its start would be a jump in the spectrum.
         frequency, velocity = power(np.gradient(q, grid, axis=0), rate)
         return cls(frequency, power(tau, rate)[1], rate, _motion(frequency, power(q, rate)[1], velocity))
 
     def valley(self, motion: float) -> tuple[float, float] | None:
-        """The band of least torque below a vibration between five and ten times the motion's band, and that of the vibration."""
+        """Band of least torque below a vibration between five and ten times the motion's band, and that of the vibration."""
         edges = motion * np.arange(_LEAST, _ABOVE + 1)
         inside = [(self.frequency >= a) & (self.frequency < b) for a, b in itertools.pairwise(edges)]
         if min(mask.sum() for mask in inside) < _LINES:
@@ -126,7 +126,7 @@ def motion_band(log: Log) -> float:
 def vibration(log: Log, residual: np.ndarray) -> tuple[float, float]:
     """Share of the power of a residual (n, nv) above ten times the band of the motion, and that frequency (Hz).
 
-    A low-pass at that frequency leaves it out.
+    A low-pass at that frequency removes it.
     """
     edge = _ABOVE * motion_band(log)
     frequency, errors = power(np.asarray(residual, np.float64), _rate(log))
@@ -158,12 +158,12 @@ def _band(frequency: np.ndarray, velocity: np.ndarray, slow: float) -> float:
 
 
 def _motion(frequency: np.ndarray, position: np.ndarray, velocity: np.ndarray) -> float:
-    """Band of the motion from raw positions, whose noise would have most of the velocity's power at high frequencies.
+    """Band of the motion from raw positions, whose noise dominates the velocity's power at high frequencies.
 
-    The band of the velocity is looked for below ten times itself, upwards from where the positions' power lies; infinite where
-    that leads to ten times the latter, which is noise.
+    A fixed-point iteration from the band of the positions: the band of the velocity below ten times the present one. Infinite
+    where it reaches ten times the band of the positions, which is noise.
     """
-    # Two lines are the least that the window can tell apart.
+    # Two lines are the resolution of the window.
     band = max(_band(frequency, position, _SLOW), float(frequency[2])) if position.any() else 0.0
     most = _ABOVE * band
     while band > 0:

@@ -1,4 +1,4 @@
-"""What a robot holds, from logs without it and logs with it."""
+"""Inertial parameters of a payload from logs without it and with it."""
 
 from collections.abc import Sequence
 from typing import Any
@@ -9,36 +9,35 @@ import jax.numpy as jnp
 import numpy as np
 
 from jaxdyn.identify.chart import check_bodies
-from jaxdyn.identify.condensed import Blocks, condensed_rows
+from jaxdyn.identify.condensed import Blocks, condense_rows
+from jaxdyn.identify.condensed_fit import eliminate, gather
 from jaxdyn.identify.feasible import make_problem, newton
-from jaxdyn.identify.interior import STRETCHES
-from jaxdyn.identify.jackknife import block_groups, jackknife, student
+from jaxdyn.identify.interior import LOG_CHOLESKY_BASIS
 from jaxdyn.identify.logs import Log, as_logs
-from jaxdyn.identify.one_fit import eliminate, gather
-from jaxdyn.identify.regression import log_regressor, noise_level, truncated
+from jaxdyn.identify.regression import least_squares_by_svd, log_regressor, noise_level
 from jaxdyn.identify.robot import RobotFit, fit_robot
 from jaxdyn.identify.threads import on_one_thread
 from jaxdyn.identify.torque_terms import RobotTerms, split_terms
-from jaxdyn.identify.whiteness import stretches
+from jaxdyn.identify.uncertainty import block_groups, effective_sample_size, jackknife, student
 from jaxdyn.model import float64 as _f64
 from jaxdyn.model import inertia as _inertia
 from jaxdyn.model.builder import ModelBuilder
 from jaxdyn.model.tree import Model
 
 _BLOCKS, _ROUNDS = 20, 2
-# Robot parameters are held by this share of their own columns' size: enough where no log tells them.
+# Weight that holds robot parameters, relative to the size of their columns: enough where no log determines them.
 _HOLD = 1e-7
-# A payload of unknown shape to start from: a ball of this radius (m).
+# Radius (m) of the ball from which the shape of a payload starts.
 _RADIUS = 0.1
 
 
 class Payload(eqx.Module):
     """Result of `fit_payload`.
 
-    - `inertia` (10,): m, m c, I about the origin of the body that holds it, in its frame; a body that can exist.
+    - `inertia` (10,): m, m c, I about the origin of the body that holds it, in its frame; physically feasible.
     - `mass` (kg), `centre` (3,) (m), `rotational` (3, 3) about the centre (kg m^2).
-    - `std` (10,): standard deviations of the ten numbers, by blocks of samples as in `Intervals`; what the logs do not tell has
-      the prior's. `factor`: a 95 % interval is plus and minus this many of them.
+    - `std` (10,): standard deviations of the ten numbers, by blocks of samples as in `Intervals`; numbers that the logs do not
+      determine have those of the prior. `factor`: a 95 % interval is plus and minus this many of them.
     - `body`: name of the body that holds it. `robot`: the `RobotFit` of the logs without it.
     - `error` : torque error of robot and payload along the loaded logs, in per cent; `without`: of the robot alone.
     """
@@ -78,19 +77,19 @@ def fit_payload(
     robot: RobotFit | None = None,
     **options: Any,
 ) -> Payload:
-    """The ten inertial numbers of what the last body holds in some logs and not in others.
+    """Fit the ten inertial numbers of a payload that a robot holds in some logs and not in others.
 
-    The robot's own parameters and its friction are the same in all logs and are eliminated exactly; what tells the payload is the
-    difference that it makes. To fit the loaded logs with the last body free, and to subtract, takes the robot's errors for the
-    payload's.
+    The robot's own parameters and its friction are the same in all logs and are eliminated exactly, so that the payload is
+    identified from the difference that it makes. To fit the loaded logs with the last body free, and to subtract, would attribute
+    the robot's errors to the payload.
 
     **Arguments:**
 
     - `model`: nominal robot. `unloaded`, `loaded`: logs with v and a, or sequences of them.
     - `body`: name of the body that holds the payload, the last one by default.
-    - `terms`, `options`: of `fit_robot`, for the logs without payload; `robot`: its result, where it is there already.
+    - `terms`, `options`: of `fit_robot`, for the logs without payload; `robot`: its result, if there is one already.
 
-    **Returns:** `Payload`. The prior of the payload is a ball of 0.1 m about where least squares finds its centre, with weight 1.
+    **Returns:** `Payload`. The prior of the payload is a ball of 0.1 m about the centre found by least squares, with weight 1.
 
     **Raises:** ValueError as `fit_robot`, and for an unknown body.
 
@@ -103,17 +102,17 @@ def fit_payload(
         raise ValueError(f"body is {body!r}; the bodies are {', '.join(model.body_names)}")
     number = model.body_names.index(body)
     robot = fit_robot(model, unloaded, terms, **options) if robot is None else robot
-    unloaded, loaded = (tuple(robot.aligned(log) for log in logs) for logs in (unloaded, loaded))
+    unloaded, loaded = (tuple(robot.align(log) for log in logs) for logs in (unloaded, loaded))
     setting, x = robot.choice.setting, robot.fit.vector.copy()
     _, extra, _ = split_terms(robot.terms, model.nv)
-    x[10 * model.nb : -model.nv] = 0  # the bodies and the rotors, whose torque the gears carry
+    x[10 * model.nb : -model.nv] = 0  # the bodies and the rotors, whose torque is the gears' load
     own = slice(10 * number, 10 * number + 10)
     logs, payload = (*unloaded, *loaded), np.zeros(10)
     is_loaded = np.arange(len(logs)) >= len(unloaded)
     residuals = [robot.fit.torques(log) - np.asarray(log.tau, np.float64) for log in unloaded]
 
-    def worth(payload) -> float:
-        return stretches([*residuals, *_residuals(robot, loaded, own, payload)[0]])
+    def size(payload) -> float:
+        return effective_sample_size([*residuals, *_residuals(robot, loaded, own, payload)[0]])
 
     for _ in range(_ROUNDS if extra else 1):
         loads = []
@@ -124,7 +123,7 @@ def fit_payload(
         data = gather(model, logs, setting.v_s, extra, loads, _BLOCKS)
         kept = np.concatenate([np.arange(data.basic), data.places(setting.extra)]).astype(int)
         rows = _rows(data.blocks, is_loaded, own, kept, robot.weights)
-        payload, std, factor = _solve(data.blocks, is_loaded, own, kept, robot.weights, rows, worth)
+        payload, std, factor = _solve(data.blocks, is_loaded, own, kept, robot.weights, rows, size)
     error, without = _errors(robot, loaded, own, payload)
     return Payload(payload, std, factor, body, robot, error, without)
 
@@ -138,31 +137,31 @@ def _rows(blocks: Blocks, is_loaded, own: slice, kept, weights) -> np.ndarray:
     return np.concatenate(parts)
 
 
-def _solve(blocks: Blocks, is_loaded, own: slice, kept, weights, rows, worth):
-    """The payload that can exist, standard deviations (10,) and the factor of an interval.
+def _solve(blocks: Blocks, is_loaded, own: slice, kept, weights, rows, size):
+    """Feasible payload, standard deviations (10,) and the factor of an interval.
 
-    `worth(payload)`: how many independent errors the logs hold with it (`stretches`).
+    `size(payload)`: effective sample size of the errors with it.
     """
     count = len(kept)
-    sigma = noise_level(condensed_rows(rows, blocks.count()))
+    sigma = noise_level(condense_rows(rows, blocks.count()))
     hold = _HOLD * np.maximum(np.linalg.norm(rows[:, :count], axis=0), 1e-12)
     R, robot = eliminate(rows, count, hold)
-    start = _ball(truncated(R[:, :-1], R[:, -1], 1e-6).change)
+    start = _ball(least_squares_by_svd(R[:, :-1], R[:, -1], 1e-6).change)
     builder = ModelBuilder("payload").add_body("payload", joint="free", inertia=start)
     alone = builder.build()
     table = np.zeros((len(R), 10 + 4 * alone.nv + 1))
     table[:, :10], table[:, -1] = R[:, :-1], R[:, -1]
     sizes = [np.ones(alone.nv)] * 3
-    problem, point, _ = make_problem(alone, condensed_rows(table, blocks.count()), sizes, (), 0.01, "full", 1.0, sigma)
+    problem, point, _ = make_problem(alone, condense_rows(table, blocks.count()), sizes, (), 0.01, "full", 1.0, sigma)
     chart, point, _, result = newton(alone, problem, point, 200, 1e-6)
     if result != "converged":
         raise ValueError(f"the payload's fit ended {result!r}; do the loaded logs move the robot?")
     payload = np.asarray(chart.inertias(point.theta), np.float64)[0]
 
     estimate = robot(payload)
-    # In the coordinates of the chart, where the prior's curvature is known; it also holds what no log tells.
+    # In the coordinates of the chart, where the prior's curvature is known; it also determines what no log does.
     stretch = np.asarray(jax.jacfwd(lambda theta: chart.inertias(theta)[0])(point.theta), np.float64).reshape(10, 10)
-    basis = STRETCHES
+    basis = LOG_CHOLESKY_BASIS
     curvature = np.zeros((count + 10, count + 10))
     curvature[np.arange(count), np.arange(count)] = hold**2 / sigma**2
     curvature[count:, count:] = np.einsum("kij,lji->kl", basis, basis)
@@ -174,14 +173,14 @@ def _solve(blocks: Blocks, is_loaded, own: slice, kept, weights, rows, worth):
     holding = bare.copy()
     holding[own] += payload
     scores = np.stack([blocks.scores(x, weights) for x in (bare, holding)])
-    grams, slopes = [], []
+    grams, gradients = [], []
     for i, gram in enumerate(blocks.grams(weights)):
         holds = int(is_loaded[blocks.logs[i]])
         grams.append(spreads[holds].T @ gram @ spreads[holds] / sigma**2)
-        slopes.append(scores[holds, i] @ spreads[holds] / sigma**2)
-    groups = block_groups(len(blocks), worth(payload))
+        gradients.append(scores[holds, i] @ spreads[holds] / sigma**2)
+    groups = block_groups(len(blocks), size(payload))
     summed = [
-        np.stack([np.sum([values[int(i)] for i in group], axis=0) for group in groups]) for values in (grams, slopes)
+        np.stack([np.sum([values[int(i)] for i in group], axis=0) for group in groups]) for values in (grams, gradients)
     ]
     changes, inverse = jackknife(summed[0], summed[1], curvature)
     root = np.linalg.cholesky(curvature[count:, count:])
@@ -191,7 +190,7 @@ def _solve(blocks: Blocks, is_loaded, own: slice, kept, weights, rows, worth):
 
 
 def _ball(numbers: np.ndarray) -> np.ndarray:
-    """A ball with the mass and the centre of these numbers, a light one at the origin where they are none of a body."""
+    """Ball with the mass and the centre of these numbers; a light one at the origin where they are not physical."""
     mass = float(numbers[0])
     centre = numbers[1:4] / mass if mass > 0 else np.zeros(3)
     if not mass > 0 or np.linalg.norm(centre) > 10:

@@ -1,4 +1,4 @@
-"""One feasible fit of condensed logs at a given setting, extra torque terms eliminated exactly in front of the Newton steps.
+"""Feasible fit of condensed logs at a given setting, with exact elimination of extra torque terms.
 
 The loss 1/2 |W x + E c - tau|^2 / sigma^2 + prior (D(x) + 1/2 sum (c / unit)^2) is quadratic in the coefficients c. The QR
 factorisation of [E, W, tau] with the prior's rows under E leaves a triangle of x alone, whose loss is that of the best c for x.
@@ -10,24 +10,24 @@ from typing import NamedTuple
 import numpy as np
 
 from jaxdyn.identify.chart import Chart
-from jaxdyn.identify.condensed import Blocks, condensed_rows, condensed_triangle
+from jaxdyn.identify.condensed import Blocks, condense_rows, pad_triangle
 from jaxdyn.identify.feasible import torque_noise
-from jaxdyn.identify.interior import Linear, Minimum, TorqueProblem, newton
-from jaxdyn.identify.logs import Log, as_measured, root_mean_square
+from jaxdyn.identify.interior import LinearChart, Minimum, TorqueProblem, newton
+from jaxdyn.identify.logs import Log, root_mean_square
 from jaxdyn.identify.regression import condense_model, noise_level
-from jaxdyn.identify.torque_terms import TorqueTerm, coulomb_column
+from jaxdyn.identify.torque_terms import TorqueTerm, coulomb_through_filter, term_columns
 from jaxdyn.model.tree import Model
 
-# A coefficient's unit is what makes this share of the joint's torque.
+# A unit of a coefficient makes this share of the joint's torque.
 _UNIT = 0.1
-# How close to the minimum of the loss a fit comes, and one that only tells how good a setting is.
+# Tolerance on the loss of a fit, and of one that only compares settings.
 _FINE, _ROUGH = 1e-6, 1e-2
 
 
 class Setting(NamedTuple):
-    """What a fit is told besides the logs.
+    """Setting of a fit.
 
-    `v_s`, smoothing velocity; `extra`: extra terms, (name, numbers of the torques that have it); `prior`, weight of the
+    `v_s`, smoothing velocity; `extra`: extra terms, (name, indices of its torques); `prior`, weight of the
     divergence of the bodies and of the coefficients of extra terms; `robust`: threshold of Huber's loss, None for squares.
     """
 
@@ -50,7 +50,7 @@ class Data(NamedTuple):
     units: np.ndarray
 
     def places(self, extra) -> np.ndarray:
-        """Positions in x of the coefficients of extra terms, as `Setting.extra` names them."""
+        """Indices in x of the coefficients of extra terms, as `Setting.extra` names them."""
         wanted, start, result = dict(extra), 0, []
         for name, count in self.counts.items():
             for column in range(start, start + count):
@@ -61,7 +61,7 @@ class Data(NamedTuple):
 
 
 class Estimate(NamedTuple):
-    """Result of `fit_condensed`: all parameters x, the torque noise, and where in the chart the fit ended."""
+    """Result of `fit_blocks`: all parameters x, the torque noise, and the minimum in the chart."""
 
     x: np.ndarray
     sigma: float
@@ -82,8 +82,9 @@ def gather(
 
     `weights` (n, nv) of each log: of single torques, ones by default.
     """
-    parts = [[as_measured(log, term(log, load, v_s)) for term in extra] for log, load in zip(logs, loads, strict=True)]
-    coulomb = [as_measured(log, coulomb_column(log, v_s)) for log in logs]
+    # Every candidate term is condensed once; a setting then selects columns, and needs no sample.
+    parts = [[term_columns([term], log, load, v_s) for term in extra] for log, load in zip(logs, loads, strict=True)]
+    coulomb = [coulomb_through_filter(log, v_s) for log in logs]
     counts = {term.name: part.shape[2] for term, part in zip(extra, parts[0], strict=True)}
     columns = [
         np.concatenate([np.zeros((len(log), log.nv, 0)), *part], axis=2) for log, part in zip(logs, parts, strict=True)
@@ -91,13 +92,14 @@ def gather(
     torque = root_mean_square(np.concatenate([np.asarray(log.tau) for log in logs]))
     joined = np.concatenate(columns)
     size = root_mean_square(joined.reshape(len(joined), -1)).reshape(joined.shape[1:]).T
+    # A torque that is always zero borrows the scale of the largest, so that its coefficients keep a finite unit.
     torque = np.where(torque > 0, torque, torque.max(initial=0) or 1.0)
     units = np.where(size > 0, _UNIT * torque / np.where(size > 0, size, 1), 0.0)
     data = condense_model(model, logs, v_s=v_s, coulomb=coulomb, extra=columns, blocks=blocks, weights=weights)
     return Data(data, 10 * model.nb + 4 * model.nv, counts, units)
 
 
-def fit_condensed(
+def fit_blocks(
     chart: Chart,
     start: np.ndarray,
     data: Data,
@@ -110,7 +112,7 @@ def fit_condensed(
     is_rough: bool = False,
     steps: int = 200,
 ) -> Estimate:
-    """Fit all blocks, or those that `rows` and `count` of `Blocks` were given for; `is_rough` for what only compares settings.
+    """Fit all blocks, or those that `rows` and `count` of `Blocks` were given for; `is_rough` for a comparison of settings.
 
     `chart` and `start` (terms, nv) as of `make_chart`, `sizes` as of `signal_sizes`.
     """
@@ -118,20 +120,22 @@ def fit_condensed(
     count = data.blocks.count() if count is None else count
     places = data.places(setting.extra)
     kept = np.append(np.arange(data.basic), places)
-    free = condensed_rows(rows[:, [*places, *range(data.basic), size]], count)
+    # Coefficients first, so that their elimination is the top of the triangle.
+    free = condense_rows(rows[:, [*places, *range(data.basic), size]], count)
     spare = count - free.R.shape[1]
-    # Columns that depend on others make the rest a little smaller than it is, which matters to no choice between settings.
+    # Dependent columns make this estimate a little too small, alike for all settings that are compared.
     sigma = np.sqrt(free.rest / spare) if is_rough and spare > 0 and free.rest > 0 else noise_level(free)
     rows = np.concatenate([free.R, free.d[:, None]], axis=1)
+    # The residual of all columns is one more row, so that the eliminated triangle keeps the loss and not only its minimiser.
     rows = np.concatenate([rows, np.append(np.zeros(free.R.shape[1]), np.sqrt(free.rest))[None]])
     units = data.units.reshape(-1)[places - data.basic]
     R, coefficients = eliminate(rows, len(places), np.sqrt(setting.prior) * sigma / units)
-    condensed = condensed_triangle(R, count)
+    condensed = pad_triangle(R, count)
     sigma = torque_noise(condensed, sizes, sigma or None)
     problem = TorqueProblem(chart, condensed.R / sigma, condensed.d / sigma, condensed.rest / sigma**2, setting.prior)
     minimum = newton(problem, start, steps, _ROUGH if is_rough else _FINE)
-    linear = Linear(chart)
-    minimum = minimum._replace(s=linear.settled(minimum.s))
+    linear = LinearChart(chart)
+    minimum = minimum._replace(s=linear.clip_terms(minimum.s))
     x = np.zeros(size)
     basic = linear.at(minimum.origin, minimum.s)
     x[kept] = np.append(basic, coefficients(basic))

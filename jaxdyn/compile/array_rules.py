@@ -1,0 +1,128 @@
+"""Rules for operations on arrays that need more than their entries one by one: products, choices, factors, scatters.
+
+Each takes the expansion, the parameters, the operands and the equation, and returns the results (see `expand`).
+"""
+
+import functools
+import math
+
+import numpy as np
+
+from jaxdyn.compile import matrices
+from jaxdyn.compile.number import as_objects, objects
+from jaxdyn.compile.program import NotNumbers, as_kind, kind_or_refuse
+from jaxdyn.compile.rearrange import scatter_places
+
+
+def polynomial(expansion, params, args, eqn):
+    """Horner's rule; the coefficients follow x, that of the highest power last."""
+    shape = eqn.outvars[0].aval.shape
+    x, *coefficients = (np.broadcast_to(as_objects(y), shape) for y in args)
+    add, mul = expansion.elementwise["add"], expansion.elementwise["mul"]
+    return [as_objects(functools.reduce(lambda value, c: add(mul(value, x), c), reversed(coefficients)))]
+
+
+def integer_pow(expansion, params, args, eqn):
+    """Powers by repeated squares."""
+    # Integers wrap in NumPy's power as in XLA; a negative exponent is of floats alone.
+    if args[0].dtype.kind != "O":
+        return [np.asarray(args[0] ** params["y"] if params["y"] >= 0 else 1 / args[0] ** -params["y"], args[0].dtype)]
+    one = as_kind(1, kind_or_refuse(eqn.outvars[0].aval.dtype))
+    return [objects([expansion.graph.power(x, params["y"], one) for x in args[0].ravel().tolist()], args[0].shape)]  # pyright: ignore[reportArgumentType]
+
+
+def select(expansion, params, args, eqn):
+    """A choice between two, or between any number of cases where it is known."""
+    which, *cases = args
+    out = eqn.outvars[0].aval
+    if which.dtype.kind != "O":
+        which = np.broadcast_to(which.astype(np.int32), out.shape)
+        if all(x.dtype.kind != "O" for x in cases):
+            return [np.choose(which, cases)]
+        cases = [as_objects(x) for x in cases]
+        # A known choice of unknown numbers, as masks of a topology are: nothing is written for it.
+        chosen = np.where(which == 0, cases[0], cases[1])
+        for i in range(2, len(cases)):
+            chosen = np.where(which == i, cases[i], chosen)
+        return [as_objects(chosen)]
+    if len(cases) != 2 or eqn.invars[0].aval.dtype != bool:
+        raise NotNumbers("a choice between more than two")
+    kind = kind_or_refuse(out.dtype)
+    columns = (np.broadcast_to(as_objects(x), out.shape).ravel().tolist() for x in args)
+    return [objects([expansion.graph.select(a, b, c, kind) for a, b, c in zip(*columns, strict=True)], out.shape)]
+
+
+def clamp(expansion, params, args, eqn):
+    """Entries limited to a range."""
+    low, x, high = (np.broadcast_to(as_objects(x), eqn.outvars[0].aval.shape).ravel().tolist() for x in args)
+    clamped = [expansion.graph.clamp(a, b, c) for a, b, c in zip(low, x, high, strict=True)]
+    return [objects(clamped, eqn.outvars[0].aval.shape)]
+
+
+def dot_general(expansion, params, args, eqn):
+    """Products of matrices, in which known zeros cost nothing."""
+    a, b = args
+    (sum_a, sum_b), (batch_a, batch_b) = params["dimension_numbers"]
+    out = eqn.outvars[0].aval
+    length, count = math.prod(a.shape[i] for i in sum_a), math.prod(a.shape[i] for i in batch_a)
+    rows = math.prod(n for i, n in enumerate(a.shape) if i not in (*batch_a, *sum_a))
+    columns = math.prod(n for i, n in enumerate(b.shape) if i not in (*batch_b, *sum_b))
+    # Both operands as (batch, rows, summed): one loop for all products, whatever axes they sum.
+    a = np.moveaxis(a, (*batch_a, *sum_a), (*range(len(batch_a)), *range(-len(sum_a), 0))).reshape(count, rows, length)
+    b = np.moveaxis(b, (*batch_b, *sum_b), (*range(len(batch_b)), *range(-len(sum_b), 0))).reshape(
+        count, columns, length
+    )
+    # The result may be asked for in a wider type than that of the operands, and is summed in it.
+    a, b = (expansion.as_dtype(x, out.dtype) for x in (a, b))
+    if out.dtype == bool:
+        raise NotNumbers("a product of bools")
+    if a.dtype.kind != "O" and b.dtype.kind != "O":
+        return [np.asarray(a @ b.transpose(0, 2, 1), out.dtype).reshape(out.shape)]
+    zero = as_kind(0, kind_or_refuse(out.dtype))
+    return [objects(matrices.product(expansion.graph, as_objects(a), as_objects(b), zero), out.shape)]
+
+
+def scatter(expansion, params, args, eqn):
+    """Updates at known places, written or added; those that are outside are dropped, as JAX does."""
+    operand, indices, updates = args
+    # In the order of the updates: where two of them meet, JAX leaves open which one stays, and this is the last.
+    entries, adds = as_objects(operand).ravel().tolist(), eqn.primitive.name != "scatter"
+    places = scatter_places(eqn, operand, indices, updates)
+    for value, i in zip(as_objects(updates).ravel().tolist(), places, strict=True):
+        if i is not None:
+            entries[i] = expansion.graph.add(entries[i], value) if adds else value
+    return [objects(entries, operand.shape)]
+
+
+def cumsum(expansion, params, args, eqn):
+    """Partial sums, from either end."""
+    # One sum after the other, as the partial sums are results. XLA's tree of sums rounds otherwise.
+    x = np.moveaxis(as_objects(args[0]), params["axis"], 0)
+    order = range(x.shape[0])
+    order = reversed(order) if params["reverse"] else order
+    sums, total = np.empty(x.shape, object), None
+    for i in order:
+        total = x[i] if total is None else expansion.elementwise["add"](total, x[i])
+        sums[i] = total
+    return [np.moveaxis(sums, 0, params["axis"])]
+
+
+def cholesky(expansion, params, args, eqn):
+    """Lower factors of symmetric matrices."""
+    given = as_objects(args[0]).reshape(-1, *args[0].shape[-2:])
+    return [np.stack([matrices.cholesky(expansion.graph, x) for x in given]).reshape(args[0].shape)]
+
+
+def triangular_solve(expansion, params, args, eqn):
+    """Solutions of a x = b or x a = b, always by rows of a lower or an upper matrix a."""
+    a, b = (as_objects(x) for x in args)
+    if params["transpose_a"]:
+        a = np.swapaxes(a, -1, -2)
+    # The transpose of a lower matrix is an upper one.
+    lower = params["lower"] != params["transpose_a"]
+    if not params["left_side"]:  # x a = b is a^T x^T = b^T
+        a, b, lower = np.swapaxes(a, -1, -2), np.swapaxes(b, -1, -2), not lower
+    pairs = zip(a.reshape(-1, *a.shape[-2:]), b.reshape(-1, *b.shape[-2:]), strict=True)
+    solutions = [matrices.triangular_solve(expansion.graph, x, y, lower, params["unit_diagonal"]) for x, y in pairs]
+    solutions = np.stack(solutions).reshape(b.shape)
+    return [solutions if params["left_side"] else np.swapaxes(solutions, -1, -2)]

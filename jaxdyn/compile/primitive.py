@@ -1,0 +1,253 @@
+"""The primitive of JAX that stands for a kernel, with its rules for batches, derivatives and lowering.
+
+Its operands and results are flat, (..., size): batches become leading axes of the operands, and an operand that all samples
+share stays without them. The derivative is the kernel of the program's tangent, which is linear in the steps, and the
+transpose of that is the kernel of the transposed program. So derivatives of any order, forward and reverse, under any nesting
+of `vmap`, are kernels. On a CPU the primitive is lowered to a call of native code, elsewhere to operations of JAX.
+"""
+
+import contextlib
+import functools
+import math
+
+import jax
+import jax.numpy as jnp
+from jax import lax
+
+from jaxdyn.compile import ahead, derive, jax_adapter, mode, sharding
+from jaxdyn.compile.jax_adapter import define_primitive, is_linear, is_zero, lower_function, zero_tangent
+from jaxdyn.compile.operations import as_operations, by_jax
+from jaxdyn.compile.program import NotNumbers, Program, TooLong
+from jaxdyn.compile.shared import split_program
+from jaxdyn.compile.trace import tangent_program
+
+try:
+    from jaxdyn.compile import target
+except ImportError:  # no llvmlite for this platform
+    target = None
+
+
+# --- evaluation, types, batches ---
+
+
+@functools.lru_cache(maxsize=1024)
+def _jit_kernel(program, rows: int):
+    return jax.jit(lambda *args: kernel_p.bind(*args, program=program, rows=rows))
+
+
+def _implement(*args, program, rows):
+    # Evaluation outside of a trace goes through `jit`. Under `jax.disable_jit()` that would evaluate the primitive again, and
+    # so on for ever.
+    with jax.disable_jit(False):
+        return _jit_kernel(program, rows)(*args)
+
+
+def _result_types(*avals, program, rows):
+    is_one = not any(len(x.shape) > 1 for x in avals)
+    if is_one and ahead.is_active() and not mode.is_expanding():
+        assert target is not None
+        # JAX asks for the types first, long before it lowers: LLVM works while Python traces on. An error is raised, with
+        # its message, where the kernel is lowered.
+        with contextlib.suppress(target.Unsupported):
+            target.make_ahead(target.kernel(program, target.width_of(program, 1), [False] * len(avals)))
+    return sharding.results_of(avals, program.outputs)
+
+
+def _batch(args, axes, *, program, rows):
+    """A new leading axis for operands that vary; an operand that all samples share stays one row."""
+    size = next(x.shape[axis] for x, axis in zip(args, axes, strict=True) if axis is not None)
+    batch_first = [x if axis is None else jnp.moveaxis(x, axis, 0) for x, axis in zip(args, axes, strict=True)]
+    varies = [axis is not None for axis in axes]
+    inner = max((x.shape[v:-1] for x, v in zip(batch_first, varies, strict=True)), key=len)
+    full = []
+    for x, v in zip(batch_first, varies, strict=True):
+        # Operands have all batch axes or none. One that varies along some of them alone is repeated along the others, as
+        # the handler knows two strides only: a row for each sample, or zero.
+        lead = x.shape[v:-1]
+        if not v and lead:
+            x = jnp.broadcast_to(x[None], (size, *x.shape))
+        elif v and lead != inner:
+            x = jnp.broadcast_to(x.reshape(size, *[1] * len(inner), x.shape[-1]), (size, *inner, x.shape[-1]))
+        full.append(x)
+    rows += mode.is_row() and not mode.is_expanding()
+    results = kernel_p.bind(*full, program=program, rows=rows)
+    return results, [0] * len(results)
+
+
+# --- derivatives ---
+
+
+def _jvp(primals, tangents, *, program, rows):
+    results = kernel_p.bind(*primals, program=program, rows=rows)
+    moving, steps = tuple(not is_zero(x) for x in tangents), [x for x in tangents if not is_zero(x)]
+    tangent = _tangent_or_none(program, moving)
+    if tangent is None:
+        changes = iter(_jvp_by_jax(program, moving, primals, steps))
+    else:
+        changes = iter(kernel_p.bind(*primals, *steps, program=tangent, rows=rows))
+    out = []
+    for x, array in zip(results, program.outputs, strict=True):
+        out.append(next(changes) if array.dtype.kind == "f" else zero_tangent(x))
+    return results, out
+
+
+def _tangent_or_none(program, moving: tuple[bool, ...]) -> Program | None:
+    """The tangent's program; None where there is none and JAX differentiates the function itself."""
+    try:
+        return derive.tangent(program, moving)
+    except (NotNumbers, TooLong) as reason:
+        if program.fallback is None:
+            raise
+        mode.say_once(f"the derivative of {program.name} runs on JAX's own operations: {reason}")
+    except Exception as error:
+        if program.fallback is None or not jax_adapter.forgive(error):
+            raise
+    return None
+
+
+def _jvp_by_jax(program, moving, primals, steps) -> list:
+    places = [i for i, varies in enumerate(moving) if varies]
+
+    def at_values(*values):
+        point = list(primals)
+        for i, value in zip(places, values, strict=True):
+            point[i] = value
+        results = by_jax(*point, program=program)
+        return [x for x, array in zip(results, program.outputs, strict=True) if array.dtype.kind == "f"]
+
+    return jax.jvp(at_values, [primals[i] for i in places], steps)[1]
+
+
+def _transpose_program(program: Program, linear: tuple[bool, ...], given: tuple[bool, ...]) -> Program:
+    """The transpose of a program (see `derive`), which honours the rules of the program when it is differentiated."""
+    backwards = derive.transpose(program, linear, given)
+    # Differentiating the numbers of the transpose would ignore a rule inside the program: the second derivative of a root
+    # by bisection was zero.
+    if program.derivative is not None and backwards.derivative is None:
+        avals = [jax.ShapeDtypeStruct((array.size,), array.dtype) for array in backwards.inputs]
+        backwards.derivative = functools.partial(_tangent_of_transpose, program, linear, given, backwards, avals)
+    return backwards
+
+
+def _tangent_of_transpose(program, linear, given, backwards, avals, moving) -> Program:
+    """The tangent of x, c -> L(x)^T c for a program L(x) s, linear in s, whose derivative in x is known by a rule.
+
+    It is (dL/dx dx)^T c + L(x)^T dc: the transpose of the program's tangent where x moves and s does not, plus the transpose
+    of the program itself.
+    """
+    count = linear.count(False)  # operands that are fixed, which come before the cotangents
+
+    def change(*leaves):
+        fixed, cotangents = list(leaves[:count]), list(leaves[count : len(avals)])
+        remaining = iter(leaves[len(avals) :])
+        steps = [next(remaining) if varies else None for varies in moving]
+        total = None
+        if any(moving[:count]):
+            each = iter(moving[:count])
+            first = derive.tangent(program, [False if is_linear else next(each) for is_linear in linear])
+            floats = [x.dtype.kind == "f" for x in program.outputs]
+            given_floats = [is_given for is_given, is_float in zip(given, floats, strict=True) if is_float]
+            linear_in_first = [*linear, *[False] * sum(moving[:count])]
+            by_fixed = _transpose_program(first, tuple(linear_in_first), tuple(given_floats))
+            total = kernel_p.bind(
+                *fixed, *(x for x in steps[:count] if x is not None), *cotangents, program=by_fixed, rows=0
+            )
+        if any(moving[count:]):
+            cotangent_steps = [
+                jnp.zeros_like(c) if d is None else d for c, d in zip(cotangents, steps[count:], strict=True)
+            ]
+            by_cotangents = kernel_p.bind(*fixed, *cotangent_steps, program=backwards, rows=0)
+            total = by_cotangents if total is None else [a + b for a, b in zip(total, by_cotangents, strict=True)]
+        return total
+
+    return tangent_program(change, avals, moving, flags="refuse")
+
+
+def _transpose(cotangents, *operands, program, rows):
+    linear = [is_linear(x) for x in operands]
+    given = [not is_zero(x) for x in cotangents]
+    backwards = _transpose_program(program, tuple(linear), tuple(given))
+    fixed = [x for x, varies in zip(operands, linear, strict=True) if not varies]
+    nonzero = [x for x in cotangents if not is_zero(x)]
+    results = iter(kernel_p.bind(*fixed, *nonzero, program=backwards, rows=rows))
+    out = []
+    for x, varies in zip(operands, linear, strict=True):
+        if not varies:
+            out.append(None)
+            continue
+        # There is a cotangent for each sample, also of an operand that all of them share: that one is their sum.
+        cotangent = next(results)
+        shared = cotangent.ndim - len(x.aval.shape)
+        out.append(jnp.sum(cotangent, axis=tuple(range(shared))) if shared else cotangent)
+    return out
+
+
+# --- lowering ---
+
+
+def _lower_on_cpu(ctx, *operands, program, rows):
+    try:
+        return _lower_to_call(ctx, *operands, program=program, rows=rows)
+    except Exception as error:
+        if not jax_adapter.forgive(error):
+            raise
+        return lower_function(by_jax, ctx, *operands, program=program, rows=rows)
+
+
+def _lower_to_call(ctx, *operands, program, rows):
+    # Each rewriting below lowers a function that binds the primitive again, nearer to a call that the handler knows.
+    lead = ctx.avals_out[0].shape[:-1] if ctx.avals_out else ()
+    uniform = [bool(lead) and len(x.shape) == 1 for x in ctx.avals_in]
+    if any(uniform) and not all(uniform) and len(lead) == rows:
+        # Rows go through the kernel of one sample, which is compiled already and has no notion of shared operands.
+        return lower_function(_broadcast_rows, ctx, *operands, program=program, rows=rows)
+    batch = lead[: len(lead) - rows]
+    samples = math.prod(batch) if all(isinstance(n, int) for n in batch) else None  # `jax.export` has symbolic sizes
+    if samples != 1 and target is not None and target.is_available() and split_program(program, uniform) is not None:
+        return lower_function(_call_in_two, ctx, *operands, program=program, rows=rows)
+    try:
+        assert target is not None
+        number = target.kernel(program, target.width_of(program, samples), uniform)
+    except target.Unsupported as reason:  # pyright: ignore[reportOptionalMemberAccess]
+        mode.say_once(f"functions run on JAX's own operations: {reason}")
+        return lower_function(as_operations, ctx, *operands, program=program, rows=rows)
+    if sharding.is_divisible(ctx.avals_in, lead):
+        return lower_function(_with_last_axis, ctx, *operands, program=program, rows=rows and rows + 1)
+    order = target.varying_first(uniform)
+    attributes = functools.partial(sharding.attributes, [ctx.avals_in[i] for i in order], ctx.avals_out)
+    return jax_adapter.lower_call(target.TARGET, ctx, operands, order, attributes(), program=number)
+
+
+def _with_last_axis(*args, program, rows):
+    """The call with one more batch axis, of length one (see `sharding.is_divisible`)."""
+    results = kernel_p.bind(
+        *(x if x.ndim == 1 else lax.expand_dims(x, [x.ndim - 1]) for x in args), program=program, rows=rows
+    )
+    return [lax.squeeze(x, [x.ndim - 2]) for x in results]
+
+
+def _broadcast_rows(*args, program, rows):
+    """The call with operands of its own for every row."""
+    lead = max((x.shape[:-1] for x in args), key=len)
+    return kernel_p.bind(*(jnp.broadcast_to(x, (*lead, x.shape[-1])) for x in args), program=program, rows=rows)
+
+
+def _call_in_two(*args, program, rows):
+    """The call as two, the first of the numbers that all samples share."""
+    uniform = [x.ndim == 1 for x in args]
+    once, each = split_program(program, uniform)  # pyright: ignore[reportGeneralTypeIssues]
+    shared = kernel_p.bind(*(x for x in args if x.ndim == 1), program=once, rows=0)
+    return kernel_p.bind(*args, *shared, program=each, rows=rows)
+
+
+kernel_p = define_primitive(
+    "jaxdyn_kernel",
+    _result_types,
+    multiple_results=True,
+    implement=_implement,
+    lower=as_operations,
+    lower_on_cpu=_lower_on_cpu,
+    batch=_batch,
+    jvp=_jvp,
+    transpose=_transpose,
+)

@@ -1,0 +1,179 @@
+"""From a function of one sample to its program of numbers: JAX traces it once, and the program is kept.
+
+A program belongs to the function, its static arguments, the known leaves of its tree, and the shapes of everything else.
+Its derivatives are traced when they are asked for.
+"""
+
+import functools
+from collections.abc import Callable
+
+import jax
+import jax.numpy as jnp
+
+from jaxdyn.compile import jax_adapter, mode
+from jaxdyn.compile.expand import expand
+from jaxdyn.compile.known import Known, partition_tracers
+from jaxdyn.compile.program import NotNumbers, Program, TooLong
+
+
+def program_of(
+    function: Callable,
+    static: tuple,
+    tree,
+    args: tuple,
+    *,
+    tangent: Callable | None = None,
+    most: int = mode.MAX_OPERATIONS,
+    calls: bool = False,
+    flags: str = "refuse",
+):
+    """Flat operands of a function's kernel, and (its program, the structure of its results) or the reason why there is none.
+
+    **Arguments:**
+
+    - `function(*static, tree, *args)`: pure, of one sample. `static` is hashable.
+    - `tree`: pytree whose known leaves are compiled in; its traced leaves, and all of `args`, are operands.
+    - `tangent(*static, tree, *args, steps)`: the function's derivative along `steps`, as of `kernel`.
+    - `most`: operations beyond which there is no program. `calls`: whether long functions under `jax.jit` become subprograms.
+    - `flags`: as of `expand`.
+    """
+    traced, known = partition_tracers(tree)
+    leaves, structure = jax.tree.flatten(args)
+    # Within `shard_map` operands of a primitive vary along the same axes of a mesh, or JAX refuses them.
+    leaves = jax_adapter.vary_alike([*map(jnp.asarray, (*traced, *leaves))])
+    shapes = tuple((x.shape, x.dtype) for x in leaves)
+    return leaves, trace_program(function, static, known, len(traced), structure, shapes, tangent, most, calls, flags)
+
+
+def trace_program(function, static, known: Known, count, structure, shapes, tangent=None, most=mode.MAX_OPERATIONS,
+                  calls=False, flags="refuse"):  # fmt: skip
+    """The program and the structure of its results, or the reason why there is none; `count`: traced leaves of the tree."""
+    # A trace depends on this setting too, which so is a part of the key under which the program is kept.
+    has_x64 = jax.config.read("jax_enable_x64")
+    return _trace_program(function, static, known, count, structure, shapes, tangent, most, calls, flags, has_x64)
+
+
+@functools.lru_cache(maxsize=1024)
+def _trace_program(function, static, known: Known, count, structure, shapes, tangent, most, calls, flags, has_x64):
+    del has_x64  # part of the key alone
+    avals = [jax.ShapeDtypeStruct(*shape) for shape in shapes]
+    flat = function_of_leaves(function, static, known, count, structure)
+    try:
+        with mode.expanding():
+            # Subprograms are the functions under `jit` within this one; itself it is not a call.
+            traced = _flat_function(function, static, known, count, structure) if calls else flat
+            closed, out = jax.make_jaxpr(traced, return_shape=True)(*avals)
+        program, has_rules = expand(closed, most, name_of(function), calls, flags)
+    except (NotNumbers, TooLong) as reason:
+        return str(reason)
+    except Exception as error:
+        if not jax_adapter.forgive(error):
+            raise
+        return str(error)
+    if tangent is not None:
+        rule = functools.partial(tangent, *static)
+        program.derivative = _derivative_by_rule(rule, known, count, structure, avals, flags)
+    elif has_rules:
+        program.derivative = _derivative_by_jax(flat, avals, flags)
+    program.fallback = _fallback(function, static, known, count, structure, avals, program.reports_validity)
+    return program, jax.tree.structure(out)
+
+
+def name_of(function) -> str:
+    """Name of a function for messages."""
+    return getattr(function, "__qualname__", type(function).__name__)
+
+
+@functools.lru_cache(maxsize=1024)
+def function_of_leaves(function, static, known: Known, count: int, structure):
+    """The function of its operands, flat and under `jax.jit`; JAX traces it once for all programs that it is part of."""
+    return jax.jit(_flat_function(function, static, known, count, structure))
+
+
+def _flat_function(function, static, known: Known, count: int, structure) -> Callable:
+    def flat(*leaves):
+        return function(*static, known(leaves[:count]), *jax.tree.unflatten(structure, leaves[count:]))
+
+    return flat
+
+
+def inline_call(function, static, tree, args):
+    """The function within another one that becomes a program."""
+    traced, known = partition_tracers(tree)
+    leaves, structure = jax.tree.flatten(args)
+    return function_of_leaves(function, static, known, len(traced), structure)(*traced, *leaves)
+
+
+def _fallback(function, static, known: Known, count: int, structure, avals, reports: bool) -> Callable:
+    """The function itself, from flat arrays to flat arrays, as `Program.fallback` wants it."""
+
+    def one(*flat):
+        leaves = [x.reshape(aval.shape) for x, aval in zip(flat, avals, strict=True)]
+        with mode.compilation("plain"):
+            results = function(*static, known(leaves[:count]), *jax.tree.unflatten(structure, leaves[count:]))
+        # Marks of samples that are not valid are those of a program alone. Without them every sample counts as not valid, and
+        # is computed by the fallback of `kernel`.
+        return [*(jnp.reshape(x, -1) for x in jax.tree.leaves(results)), *([jnp.zeros(1, bool)] if reports else [])]
+
+    return one
+
+
+# --- derivatives ---
+
+
+def _derivative_by_rule(tangent: Callable, known: Known, count: int, structure, avals, flags: str):
+    """The derivative of a program by a rule that is given by hand."""
+
+    def derivative(moving):
+        def change(*leaves):
+            primal, remaining = leaves[: len(avals)], iter(leaves[len(avals) :])
+            steps = [next(remaining) if varies else None for varies in moving]
+            # The rule is given steps of all leaves of the tree, and the program moves the traced ones alone.
+            tree_steps: list = [None] * known.structure.num_leaves
+            for place, step in zip(known.places, steps[:count], strict=True):
+                tree_steps[place] = step
+            args = jax.tree.unflatten(structure, primal[count:])
+            return tangent(known(primal[:count]), *args, [*tree_steps, *steps[count:]])
+
+        return tangent_program(change, avals, moving, flags)
+
+    return derivative
+
+
+def _derivative_by_jax(flat: Callable, avals, flags: str):
+    """The derivative of a program by `jax.jvp`, which asks functions within the function for their own rules."""
+
+    def derivative(moving):
+        def change(*leaves):
+            primal, steps = list(leaves[: len(avals)]), leaves[len(avals) :]
+            places = [i for i, varies in enumerate(moving) if varies]
+
+            def at_values(*values):
+                point = list(primal)
+                for i, value in zip(places, values, strict=True):
+                    point[i] = value
+                return [x for x in jax.tree.leaves(flat(*point)) if jnp.issubdtype(x.dtype, jnp.floating)]
+
+            return jax.jvp(at_values, [primal[i] for i in places], list(steps))[1]
+
+        return tangent_program(change, avals, moving, flags)
+
+    return derivative
+
+
+def tangent_program(change: Callable, avals, moving, flags: str) -> Program:
+    """The program of a tangent; NaN at flagged samples, which the program of the values reports.
+
+    A rule may call functions with rules of their own, itself included, and then the tangent is differentiated by JAX again:
+    its numbers would give the derivative of how a value is computed, where the rule says another one.
+    """
+    avals = [*avals, *(aval for aval, varies in zip(avals, moving, strict=True) if varies)]
+    with mode.expanding():
+        closed = jax.make_jaxpr(change)(*avals)
+    # A tangent has two to four times the operations of the values. The bound is there for those that explode.
+    program, has_rules = expand(
+        closed, 10 * mode.MAX_OPERATIONS, "change", flags="refuse" if flags == "refuse" else "ignore"
+    )
+    if has_rules:
+        program.derivative = _derivative_by_jax(change, avals, flags)
+    return program

@@ -1,0 +1,109 @@
+"""Equations of motion of a floating-base robot in centre-of-mass coordinates.
+
+The velocity of the base's origin is replaced by that of the centre of mass, in world axes,
+
+    nu = (cdot, omega, v_j) = T v,    T = [[J_com], [0  1]],    X = T^-1.
+
+Then X^T M X = blkdiag(m 1, M'), and X^T N = (-m g, 0): the centre of mass moves like a particle, and
+
+    m cddot = m g + f,    M' nudot' + C' nu' = tau',    nu' = (omega, v_j),    (f, tau') = X^T F,
+
+with F the generalised forces in v other than gravity.
+"""
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float
+
+from jaxdyn.compile import entry_point
+from jaxdyn.dynamics.centroidal import com_jacobian
+from jaxdyn.dynamics.quantities import coriolis_matrix, mass_matrix
+from jaxdyn.lie.so3 import _product
+from jaxdyn.model.arguments import check_shapes, is_concrete
+from jaxdyn.model.tree import Model, configuration_rate
+
+
+class ComDynamics(eqx.Module):
+    """Terms of the equations of motion in centre-of-mass coordinates (see `com_dynamics`); k = nv - 3.
+
+    - `mass` (): m, kg.
+    - `mass_matrix` (k, k): M'. It depends on the joints alone.
+    - `coriolis_matrix` (k, k): C', with dM'/dt - 2 C' skew. It does not depend on the velocity of the centre of mass.
+    - `jacobian` (nv, nv): T. `jacobian_rate` (nv, nv): dT/dt along v, so that nudot = T a + dT/dt v.
+    - `inverse` (nv, nv): X = T^-1.
+    """
+
+    mass: Float[Array, ""]
+    mass_matrix: Float[Array, "k k"]
+    coriolis_matrix: Float[Array, "k k"]
+    jacobian: Float[Array, "nv nv"]
+    jacobian_rate: Float[Array, "nv nv"]
+    inverse: Float[Array, "nv nv"]
+
+
+def com_dynamics(model: Model, q: Float[Array, " nq"], v: Float[Array, " nv"]) -> ComDynamics:
+    """Mass matrix, Coriolis matrix and velocity map in centre-of-mass coordinates of a floating base.
+
+    nu = T v = (cdot, omega, v_j): velocity of the centre of mass in world axes, angular velocity of the base in its own
+    axes, joint velocities. The equations of motion split into m cddot = m g + f and M' nudot' + C' nu' = tau' with
+    nu' = (omega, v_j) and (f, tau') = X^T F; joint torques enter tau' unchanged, and not f.
+
+    **Arguments:** `q` (nq,); `v` (nv,). The first body has a free joint and carries all others.
+
+    **Returns:** `ComDynamics`; kg, kg m^2 for pairs of rotations, m/s and rad/s for nu.
+
+    **Raises:** ValueError for shapes that do not fit, and for a model without a free base that carries all bodies, or
+    with armature on it.
+
+    ```python
+    robot = jd.robots.quadruped()
+    terms = jd.com_dynamics(robot, jd.neutral(robot), jnp.zeros(robot.nv))
+    cdot = (terms.jacobian @ jnp.ones(robot.nv))[:3]
+    ```
+
+    Source: Caron, equations of motion; Garofalo, Henze, Englsberger & Ott (2015); EQUATIONS section 11.
+    """
+    q, v = check_shapes(model, q=q, v=v)
+    topology = model.topology
+    if not model.nb or topology.kinds[0] != "free" or min(topology.parents[1:], default=0) < 0:
+        roots = [i for i, parent in enumerate(topology.parents) if parent < 0]
+        found = ", ".join(f"{model.body_names[i]!r} ({topology.kinds[i]})" for i in roots) or "no body"
+        raise ValueError(
+            f"com_dynamics: the roots of model {model.name!r} are {found}; give a model with one root, on a free joint"
+            " (floating_base=True when it is loaded)"
+        )
+    # Rotor inertia on the base would couple the centre of mass with the joints.
+    if model.armature is not None and is_concrete(model.armature) and np.any(np.asarray(model.armature[:6])):
+        raise ValueError(f"com_dynamics: armature of the base is {np.asarray(model.armature[:6])}; it must be zero")
+    return _com_dynamics(model, q, v)
+
+
+@entry_point
+def _com_dynamics(model: Model, q, v) -> ComDynamics:
+    unit = jnp.eye(model.nv, dtype=q.dtype)[3:]
+
+    def velocity_map(q):
+        return jnp.concatenate([com_jacobian(model, q), unit])
+
+    def inverse_map(q):
+        jacobian = com_jacobian(model, q)
+        # The first block is the rotation of the base, as all mass moves with it: its inverse is its transpose.
+        turn = jacobian[:, :3].T
+        return jnp.concatenate([jnp.concatenate([turn, -_product(turn, jacobian[:, 3:])], axis=1), unit])
+
+    T, T_rate = jax.jvp(velocity_map, (q,), (configuration_rate(model, q, v),))
+    # C' is evaluated with the centre of mass at rest: M' does not depend on its motion, but a Coriolis matrix may.
+    internal = _product(inverse_map(q)[:, 3:], v[3:])
+    X, X_rate = jax.jvp(inverse_map, (q,), (configuration_rate(model, q, internal),))
+    part, M = X[:, 3:], mass_matrix(model, q)
+    forces = _product(coriolis_matrix(model, q, internal), part) + _product(M, X_rate[:, 3:])
+    return ComDynamics(
+        mass=jnp.sum(model.inertias[:, 0]),
+        mass_matrix=_product(part.T, _product(M, part)),
+        coriolis_matrix=_product(part.T, forces),
+        jacobian=T,
+        jacobian_rate=T_rate,
+        inverse=X,
+    )

@@ -1,0 +1,169 @@
+"""Linear least squares on the torques: base parameters, friction and rotor inertia, with jackknife standard deviations."""
+
+from collections.abc import Sequence
+
+import equinox as eqx
+import numpy as np
+
+from jaxdyn.identify.condensed import Blocks, condense_rows
+from jaxdyn.identify.logs import Log, as_logs, check_log
+from jaxdyn.identify.regression import (
+    BaseParameters,
+    base_parameters,
+    check_weights,
+    condense_model,
+    free_columns,
+    least_squares_by_svd,
+    model_torques,
+    nominal_parameters,
+    torque_error,
+)
+from jaxdyn.identify.threads import on_one_thread
+from jaxdyn.identify.torque_terms import TERMS, Terms, check_terms
+from jaxdyn.identify.uncertainty import block_groups, effective_sample_size, jackknife, student
+from jaxdyn.model.arguments import Numbers
+from jaxdyn.model.tree import Model
+
+
+class LeastSquares(eqx.Module):
+    """Result of `least_squares`: base parameters with standard deviations, which need not be feasible.
+
+    - `base`: the combinations; `values`, `std`, `nominal` (nbase,): fitted, standard deviation, of the model given. Standard
+      deviations count blocks of consecutive samples, as in `Intervals`; `factor`: a 95 % interval is plus and minus this many.
+    - `parameters` (10 nb + 4 nv,): the x with these values that is nearest to the model's; only its combinations
+      are meaningful.
+    - `sigma`: root mean square of the (weighted) residual; `condition`: of the regressor with columns of unit length;
+      `rank`: combinations that the log excites, at most nbase.
+    - `covariance` (nbase, nbase) for independent errors of all samples, which those of a filtered log are not: use its
+      correlations, and `std` for the sizes.
+    """
+
+    base: BaseParameters
+    values: np.ndarray
+    std: np.ndarray
+    nominal: np.ndarray
+    parameters: np.ndarray
+    covariance: np.ndarray
+    sigma: float
+    condition: float
+    rank: int
+    factor: float
+    model: Model
+    terms: tuple[str, ...] = eqx.field(static=True)
+    v_s: float = eqx.field(static=True)
+
+    def torques(self, log: Log) -> np.ndarray:
+        """Torques (n, nv) that the fit predicts along a log."""
+        check_log(log, self.model)
+        return model_torques(self.model, log, self.parameters, self.v_s)
+
+    def error(self, log: Log) -> float:
+        """Torque error along a log, in per cent of the measured torque: 100 |tau_fit - tau| / |tau| over all joints."""
+        return torque_error(self.torques(log), log.tau)
+
+    def table(self) -> list[tuple[str, float, float, float]]:
+        """Rows (combination, nominal, fitted, standard deviation)."""
+        return list(zip(self.base.names, self.nominal.tolist(), self.values.tolist(), self.std.tolist(), strict=True))
+
+    def summary(self) -> str:
+        """Summary of the fit with a table."""
+        unknown = len(self.values) - self.rank
+        lines = [
+            f"linear least squares, {self.model.name}: {len(self.values)} combinations of "
+            f"{len(self.base.parameter_names)} parameters, rank {self.rank}, condition {self.condition:.4g}, "
+            f"residual {self.sigma:.4g} N m",
+        ]
+        if unknown:
+            lines.append(
+                f"the log does not excite {unknown} combinations: where std is infinite they keep the nominal value"
+            )
+        width = max(map(len, self.base.names), default=0)
+        lines.append(f"{'combination':{width}}  {'nominal':>12}  {'fitted':>12}  {'std':>12}")
+        lines += [f"{name:{width}}  {x0:12.5g}  {x:12.5g}  {s:12.3g}" for name, x0, x, s in self.table()]
+        return "\n".join(lines)
+
+
+@on_one_thread
+def least_squares(
+    model: Model,
+    log: Log | Sequence[Log],
+    terms: Terms = TERMS,
+    *,
+    v_s: float = 0.01,
+    weights: Numbers | None = None,
+    rcond: float = 1e-6,
+    blocks: int = 20,
+) -> LeastSquares:
+    """Base parameters, friction and rotor inertia by linear least squares on the torques: min |weights (W x - tau)|^2.
+
+    **Arguments:**
+
+    - `model`: geometry and nominal parameters; `log` with v and a, or several such logs.
+    - `terms`: fitted in addition to the links: tau_f = viscous v + coulomb tanh(v / v_s) + offset, and armature a.
+    - `weights` (nv,): one over the noise of each joint's torque; ones by default.
+    - `rcond`: directions whose singular value is below this times the largest are not excited by the log; along them
+      the model's values stay.
+    - `blocks`: consecutive samples are cut into about this many blocks, whose scatter gives the standard deviations.
+
+    **Returns:** `LeastSquares`.
+
+    **Raises:** ValueError when log and model do not fit together or the log has fewer rows than combinations.
+
+    Source: Atkeson, An & Hollerbach (1986); Gautier (1991).
+    """
+    terms = check_terms(terms, v_s)
+    logs = as_logs(log, model)
+    base = base_parameters(model, terms, v_s=v_s)
+    weights = check_weights(weights, model.nv)
+    parts = condense_model(model, logs, v_s=v_s, blocks=blocks)
+    condensed = condense_rows(parts.rows(weights), parts.count())
+    if condensed.rows <= len(base):
+        samples = sum(map(len, logs))
+        raise ValueError(f"the log has {samples} samples of {model.nv} torques, too few for {len(base)} combinations")
+    x0 = nominal_parameters(model)
+    columns = free_columns(model.nb, model.nv, terms)
+    # Terms that are not fitted keep the model's value and move to the right-hand side.
+    residual = condensed.d - condensed.R @ x0
+    fit = least_squares_by_svd(condensed.R[:, columns[base.independent]], residual, rcond)
+    rest = condensed.rest + fit.rest
+    sigma = float(np.sqrt(rest / (condensed.rows - fit.rank)))
+    covariance = sigma**2 * fit.half @ fit.half.T
+    places = columns[base.independent]
+    fitted = x0.copy()
+    fitted[places] += fit.change
+    size = effective_sample_size(
+        [model_torques(model, log, fitted, v_s) - np.asarray(log.tau, np.float64) for log in logs]
+    )
+    std, factor = _scatter(parts, fitted, places, fit.half, weights, size)
+    std = np.where(fit.unknown, np.inf, std)
+    nominal = base.values(x0[columns])
+    parameters = x0.copy()
+    parameters[columns] += np.linalg.pinv(base.matrix) @ fit.change
+    return LeastSquares(
+        base=base,
+        values=nominal + fit.change,
+        std=std,
+        nominal=nominal,
+        parameters=parameters,
+        covariance=covariance,
+        sigma=sigma,
+        condition=fit.condition,
+        rank=fit.rank,
+        factor=factor,
+        model=model,
+        terms=terms,
+        v_s=float(v_s),
+    )
+
+
+def _scatter(blocks: Blocks, x: np.ndarray, places, half: np.ndarray, weights, size: float) -> tuple[np.ndarray, float]:
+    """Jackknife standard deviations of x[places], and the factor of a 95 % interval.
+
+    In coordinates y with x[places] = half y, in which the Hessian of all samples is the identity.
+    """
+    groups = block_groups(len(blocks), size)
+    gradients = blocks.scores(x, weights)[:, places] @ half
+    grams = np.einsum("pi,bpq,qj->bij", half, blocks.grams(weights)[:, places][:, :, places], half, optimize=True)
+    gradients, grams = (np.stack([part[group].sum(axis=0) for group in groups]) for part in (gradients, grams))
+    changes, _ = jackknife(grams, gradients, np.zeros((half.shape[1],) * 2))
+    return np.sqrt(np.sum((half @ changes) ** 2, axis=1)), student(len(groups) - 1)
