@@ -2,7 +2,6 @@
 
 from typing import Any
 
-from jaxdyn.identify import mechanisms as _mechanisms
 from jaxdyn.identify.delays import Delays as Delays
 from jaxdyn.identify.delays import shift_torques as shift_torques
 from jaxdyn.identify.feasible import fit_torques as fit_torques
@@ -107,5 +106,7 @@ def __dir__() -> list[str]:
 
 def __getattr__(name: str) -> Any:
     if name == "completed":  # the deprecated name of `complete_log`, which warns when it is called
-        return _mechanisms.completed
+        from jaxdyn.identify.mechanisms import completed
+
+        return completed
     raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
