@@ -149,11 +149,16 @@ def fit_robot(
         velocities = VELOCITIES if isinstance(v_s, str) else (setting.v_s,)
         priors = PRIORS if isinstance(prior, str) else (setting.prior,)
         names = [term.name for term in extra] if is_auto else []
-        losses = (setting.robust,)
-        if isinstance(robust, str) and problem.has_outliers(setting):
-            losses = ROBUST
+        losses = ROBUST if isinstance(robust, str) else (setting.robust,)
         setting = search(
-            trying, setting, names, problem.torques_not_white, velocities=velocities, priors=priors, losses=losses
+            trying,
+            setting,
+            names,
+            problem.torques_not_white,
+            problem.has_outliers,
+            velocities=velocities,
+            priors=priors,
+            losses=losses,
         )
         trials = tuple(trying.trials.values())
     if is_found and delays is not None:  # at the setting chosen

@@ -28,6 +28,8 @@ from jaxdyn.identify.condensed import Blocks
 from jaxdyn.identify.condensed_fit import Setting
 
 VELOCITIES = (0.0003, 0.001, 0.003, 0.01, 0.03, 0.1)
+# Factors by which v_s is refined between two of these, in turn.
+_REFINEMENTS = (3**0.5, 3**0.25, 3**0.125)
 PRIORS = (0.1, 1.0, 10.0, 100.0, 1000.0)
 # Thresholds of Huber's loss, in standard deviations: 1.345 is the usual one, 3 leaves all but outliers alone.
 ROBUST = (None, 3.0, 1.345)
@@ -120,6 +122,7 @@ def search(
     start: Setting,
     extra: Sequence[str],
     candidates: Callable[[Setting], Sequence[int]],
+    has_outliers: Callable[[Setting], bool],
     *,
     velocities=VELOCITIES,
     priors=PRIORS,
@@ -127,10 +130,11 @@ def search(
 ) -> Setting:
     """Coordinate descent over v_s, the loss, terms joint by joint in order of their gains, the prior, v_s and the loss again.
 
-    `candidates`: from a setting to the indices of the torques that may get another term.
+    `candidates`: from a setting to the indices of the torques that may get another term; `has_outliers`: whether its errors
+    have tails for which a robust loss may help.
     """
-    setting = search.simplest(start, [start._replace(v_s=v_s) for v_s in velocities])
-    setting = _choose_loss(search, setting, losses)
+    setting = _choose_velocity(search, start, velocities)
+    setting = _choose_loss(search, setting, losses, has_outliers)
     remaining = list(extra)
     while remaining and (joints := tuple(candidates(setting))):
         trials = []
@@ -146,15 +150,28 @@ def search(
         setting = following
         remaining.remove(setting.extra[-1][0])
     setting = search.best([setting._replace(prior=prior) for prior in priors])
-    setting = search.simplest(setting, [setting._replace(v_s=v_s) for v_s in velocities])
-    return _choose_loss(search, setting, losses)
+    setting = _choose_velocity(search, setting, velocities)
+    return _choose_loss(search, setting, losses, has_outliers)
 
 
-def _choose_loss(search: Search, setting: Setting, losses) -> Setting:
-    """Squares, unless a robust loss is clearly better; the best of the losses where squares are none of them."""
+def _choose_velocity(search: Search, setting: Setting, velocities) -> Setting:
+    """The setting with another v_s where one is clearly better, refined between the values of the grid.
+
+    A value that is off by half a step of the grid leaves errors at reversals that Dahl's friction and robust losses would fit.
+    """
+    best = search.simplest(setting, [setting._replace(v_s=v_s) for v_s in velocities])
+    for step in _REFINEMENTS if best.v_s != setting.v_s else ():
+        best = search.best([best, *(best._replace(v_s=v_s) for v_s in (best.v_s * step, best.v_s / step))])
+    return best
+
+
+def _choose_loss(search: Search, setting: Setting, losses, has_outliers: Callable[[Setting], bool]) -> Setting:
+    """Squares, unless errors have heavy tails and a robust loss is clearly better; the best of losses without squares."""
     settings = [setting._replace(robust=threshold) for threshold in losses]
     plain = [one for one in settings if one.robust is None]
-    return search.simplest(plain[0], settings) if plain else search.best(settings)
+    if not plain:
+        return search.best(settings)
+    return search.simplest(plain[0], settings) if len(settings) > 1 and has_outliers(setting) else plain[0]
 
 
 def improving_torques(before: np.ndarray, after: np.ndarray, least: float = _LEAST) -> tuple[int, ...]:
