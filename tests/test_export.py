@@ -1,6 +1,7 @@
 """Exported functions: C programs, CasADi's interface, other processors and calls from NumPy, against JAX's own evaluation."""
 
 import ctypes
+import os
 import shutil
 import subprocess
 import sys
@@ -11,7 +12,7 @@ import numpy as np
 import pytest
 
 import jaxdyn as jd
-from jaxdyn.compile import standalone
+from jaxdyn.compile import object_files, standalone
 from jaxdyn.compile.objects import Code
 
 X = np.linspace(0.1, 0.7, 7)
@@ -127,7 +128,7 @@ def test_header_names_joints_units_sizes_and_stack(exported, tmp_path):
 
 
 def test_batch_over_vector_lanes_equals_single_samples(exported):
-    lanes = standalone.resolve_target("host").lanes
+    lanes = object_files.resolve_target("host").lanes
     code = Code(exported.module("c", lanes))
     for n in (0, 1, 3, 13):
         rng = np.random.default_rng(n)
@@ -159,6 +160,22 @@ def test_single_precision(tmp_path):
     run_c(tmp_path, "single")
 
 
+def test_forward_dynamics_in_single_precision(arm, exported, tmp_path):
+    single = jax.tree.map(lambda x: jnp.asarray(x, jnp.float32), arm)
+    x = [y.astype(np.float32) for y in (X, V, TAU)]
+    small = jd.export(
+        lambda q, v, tau: jd.forward_dynamics(single, q, v, tau), *x, name="small", derivatives="jacobian"
+    )
+    assert small(*x).dtype == np.float32
+    np.testing.assert_allclose(
+        small(*x), exported(X, V, TAU), rtol=1e-3
+    )  # the arm's mass matrix loses four digits of seven
+    for got, expected in zip(small.jacobian(*x), exported.jacobian(X, V, TAU), strict=True):
+        np.testing.assert_allclose(got, expected, atol=1e-3 * np.abs(expected).max())
+    small.save(tmp_path)
+    run_c(tmp_path, "small")
+
+
 def test_constrained_dynamics_and_projections(tmp_path):
     scene = jd.scenes.four_bar()
     q, v = map(np.asarray, jd.scenes.four_bar.start())
@@ -181,16 +198,146 @@ def test_constrained_dynamics_and_projections(tmp_path):
     np.testing.assert_allclose(projection @ projection, projection, atol=1e-12)
 
 
-def test_a_degenerate_sample_gives_a_status():
+def crossing():
+    """q0^2 = q1^2: two lines that cross at the origin, where the row vanishes."""
+    return jd.Scene(jd.scenes.planar_arm().system, [jd.Holonomic(lambda q, t: jnp.stack([q[0] ** 2 - q[1] ** 2]))])
+
+
+def test_samples_where_rows_lose_rank_are_computed_by_the_pseudo_inverse():
+    scene = crossing()
+
     def function(q, v, tau):
         return jd.constrained_dynamics(scene, q, v, tau).acceleration
 
-    scene = jd.Scene(jd.scenes.planar_arm().system, [jd.Holonomic(lambda q, t: jnp.stack([q[0] ** 2 - q[1] ** 2]))])
     q = np.array([0.5, 0.5])
-    exported = jd.export(function, q, q * 0, q, name="crossing")
-    assert np.isfinite(exported(q, q * 0, q)).all()
-    with pytest.raises(FloatingPointError, match="crossing: the constraints lose rank"):
-        exported(q * 0, q * 0, q)
+    exported = jd.export(function, q, q * 0, q, name="crossing", batch=True, derivatives="jacobian")
+    x, zero = jnp.asarray(q), jnp.zeros(2)
+    np.testing.assert_allclose(exported(q, q * 0, q), function(x, zero, x), rtol=1e-12)
+    # The origin: there is no row, so that the motion is free.
+    at_origin = exported(q * 0, q * 0, q)
+    np.testing.assert_allclose(at_origin, jd.forward_dynamics(scene.system, zero, zero, x), rtol=1e-12)
+    M = jd.mass_matrix(scene.system, zero)
+    np.testing.assert_allclose(exported.jacobian(q * 0, q * 0, q)[2], np.linalg.inv(M), rtol=1e-10)
+
+    rows = np.stack([q, q * 0, q, -q, q * 0]), np.zeros((5, 2)), np.tile(q, (5, 1))
+    lanes = object_files.resolve_target("host").lanes
+    code = Code(exported.module("c", lanes))
+    batch = ctypes.CFUNCTYPE(ctypes.c_int, ctypes.c_int64, *[ctypes.c_void_p] * 4)(code.address("crossing_batch"))
+    out = np.full((5, 2), np.nan)
+    assert batch(5, *(x.ctypes.data for x in (*rows, out))) == 0
+    np.testing.assert_allclose(out, [exported(*row) for row in zip(*rows, strict=True)], rtol=1e-11)
+
+
+def test_rows_that_contradict_each_other_give_a_status(tmp_path):
+    # At the origin the velocity asks for 2 v0^2 = 2 v1^2, which no acceleration changes.
+    scene, q, v = crossing(), np.zeros(2), np.array([1.0, 0.3])
+    exported = jd.export(
+        lambda q, v, tau: jd.constrained_dynamics(scene, q, v, tau).acceleration, q + 0.5, v * 0, q, name="crossing"
+    )
+    assert jd.constrained_dynamics(scene, *map(jnp.asarray, (q, v, q))).result == jd.RESULTS.contradictory_rows
+    with pytest.raises(FloatingPointError, match="crossing: no regular solution at this sample"):
+        exported(q, v, q)
+    exported.save(tmp_path)
+    assert "1 where the sample has no regular solution" in (tmp_path / "crossing.h").read_text()
+
+
+def test_results_that_are_not_finite_have_a_status(tmp_path):
+    exported = jd.export(lambda x: (jnp.log(x), 1 / x), np.zeros(2), name="f", batch=True)
+    assert np.isinf(exported(np.zeros(2))[0]).all()
+    lanes = object_files.resolve_target("host").lanes
+    code = Code(exported.module("c", lanes))
+    one, many = (
+        ctypes.CFUNCTYPE(ctypes.c_int, *kinds)(code.address(name))
+        for name, kinds in (("f", [ctypes.c_void_p] * 3), ("f_batch", [ctypes.c_int64, *[ctypes.c_void_p] * 3]))
+    )
+    x, out = np.ones((5, 2)), np.zeros((2, 5, 2))
+    assert one(x.ctypes.data, *(y.ctypes.data for y in out)) == 0
+    assert many(5, x.ctypes.data, *(y.ctypes.data for y in out)) == 0
+    for bad in (0.0, -1.0, np.nan, np.inf):
+        x[3, 1] = bad
+        assert one(x[3].ctypes.data, *(y.ctypes.data for y in out)) == 2
+        assert many(5, x.ctypes.data, *(y.ctypes.data for y in out)) == 2
+    exported.save(tmp_path)
+    run_c(tmp_path, "f")  # which expects the status at its examples
+
+
+def test_redundant_rows(tmp_path):
+    """Bennett's linkage: seven degrees of freedom of its tree, more rows than that, one freedom left."""
+    scene = jd.scenes.bennett()
+    q, v = map(np.asarray, jd.scenes.bennett.start())
+    tau = np.linspace(1, 2, scene.nv)
+
+    def function(q, v, tau):
+        return jd.constrained_dynamics(scene, q, v, tau).acceleration
+
+    exported = jd.export(function, q, v, tau, name="bennett", derivatives="jacobian", batch=True)
+    a = exported(q, v, tau)
+    np.testing.assert_allclose(a, function(*map(jnp.asarray, (q, v, tau))), rtol=1e-11, atol=1e-12)
+    # The equations themselves: rows are met, and what is left of the forces does no work on admissible velocities.
+    here, moving = jnp.asarray(q), jnp.asarray(v)
+    A = jd.constraint_jacobian(scene, here)
+    rate = jax.jvp(lambda t: jd.constraint_jacobian(scene, here + t * moving) @ moving, (0.0,), (1.0,))[1]
+    np.testing.assert_allclose(A @ a, -rate, atol=1e-9 * np.abs(rate).max())
+    left = jd.mass_matrix(scene.system, here) @ a + jd.bias_force(scene.system, here, moving) - tau
+    np.testing.assert_allclose(v @ left, 0, atol=1e-10 * np.linalg.norm(v) * np.linalg.norm(left))
+    # The derivative by tau is that of a linear function.
+    step = exported(q, v, tau + np.eye(scene.nv)[0]) - a
+    np.testing.assert_allclose(exported.jacobian(q, v, tau)[2][:, 0], step, rtol=1e-9, atol=1e-12)
+    exported.save(tmp_path)
+    run_c(tmp_path, "bennett")
+    assert undefined_symbols(tmp_path / "bennett.o") <= LIBM
+    exported.save(tmp_path, target="cortex-m7")
+    assert all(name in LIBM or name.startswith("__aeabi") for name in undefined_symbols(tmp_path / "bennett.o"))
+
+
+@pytest.mark.parametrize("constrained", [False, True], ids=["free", "constrained"])
+def test_a_step_of_an_integrator(constrained, tmp_path):
+    scene = jd.scenes.four_bar() if constrained else jd.Scene(jd.robots.ur5())
+    q, v = map(np.asarray, jd.scenes.four_bar.start()) if constrained else (X[:6], V[:6])
+    tau = np.linspace(0.5, 1, scene.nv)
+    step = jd.stepper(scene, 0.002, substeps=2)
+    exported = jd.export(lambda q, v, tau: step((q, v), tau), q, v, tau, name="step")
+    for got, expected in zip(exported(q, v, tau), step((q, v), tau), strict=True):
+        np.testing.assert_allclose(got, expected, rtol=1e-12, atol=1e-12)
+    state = q, v
+    for _ in range(50):
+        state = exported(*state, tau)
+    # The same motion by `simulate`, which steps in a loop.
+    motion = jd.simulate(scene, q, v, jnp.asarray([0.0, 0.1]), control=lambda q, v, t: jnp.asarray(tau), stepsize=0.001)
+    np.testing.assert_allclose(state[0], motion.q[-1], atol=1e-10)
+    np.testing.assert_allclose(state[1], motion.v[-1], atol=1e-9)
+    exported.save(tmp_path)
+    run_c(tmp_path, "step")
+
+
+def test_jacobians_by_columns_equal_those_that_are_written_out(arm, exported, monkeypatch, tmp_path):
+    assert isinstance(exported.derivative.program, standalone.Directions)
+    monkeypatch.setattr(standalone, "MAX_WRITTEN_OUT", 10**9)
+    written = jd.export(
+        lambda q, v, tau: jd.forward_dynamics(arm, q, v, tau), X, V, TAU, name="arm_fd", derivatives=("jacobian",)
+    )
+    for got, expected in zip(written.jacobian(X, V, TAU), exported.jacobian(X, V, TAU), strict=True):
+        np.testing.assert_allclose(got, expected, rtol=1e-11, atol=1e-12 * np.abs(expected).max())
+    written.save(tmp_path)
+    run_c(tmp_path, "arm_fd")
+    monkeypatch.setattr(standalone, "MAX_WRITTEN_OUT", 0)
+    single = [x.astype(np.float32) for x in (X, V)]
+    exported = jd.export(lambda x, y: (x * x @ y, jnp.sin(x)), *single, name="single", derivatives="jacobian")
+    by_x, by_y = exported.jacobian(*single)[0]
+    np.testing.assert_allclose(by_x[0], 2 * single[0] * single[1], rtol=1e-6)
+    np.testing.assert_allclose(by_y[0], single[0] ** 2, rtol=1e-6)
+    np.testing.assert_allclose(exported.jacobian(*single)[1][0], np.diag(np.cos(single[0])), atol=1e-6)
+
+
+def test_jax_export_says_what_to_do(arm):
+    function = jax.jit(lambda q: jd.gravity_force(arm, q))
+    with pytest.raises(
+        ValueError, match=r"within jd.compilation\('plain'\), or write an object file for C with jd.export"
+    ):
+        jax.export.export(function)(STATE[0])
+    with jd.compilation("plain"):
+        plain = jax.export.export(function)(STATE[0])
+    np.testing.assert_allclose(plain.call(STATE[0]), function(STATE[0]), rtol=1e-12, atol=1e-12)
 
 
 def test_a_lagrangian_and_a_control_law():
@@ -204,8 +351,11 @@ def test_a_lagrangian_and_a_control_law():
 # --- CasADi ---
 
 
-def test_casadi_has_exact_sparse_derivatives(tmp_path):
+@pytest.mark.parametrize("by_columns", [False, True], ids=["written out", "by columns"])
+def test_casadi_has_exact_sparse_derivatives(tmp_path, monkeypatch, by_columns):
     casadi = pytest.importorskip("casadi")
+    if by_columns:
+        monkeypatch.setattr(standalone, "MAX_WRITTEN_OUT", 0)
 
     def function(x, y):  # x acts on the first entries alone, so that half of the pattern is empty
         return jnp.stack([x[0] * x[1], jnp.sin(x[1]), y[0, 1] ** 2 + y[1, 0]]), y * 2.0
@@ -264,7 +414,7 @@ def test_every_target_compiles(exported, tmp_path, target):
 
 
 def test_baseline_of_x86_64_runs_here(exported, tmp_path):
-    if not standalone.resolve_target("host").triple.startswith("x86_64"):
+    if not object_files.resolve_target("host").triple.startswith("x86_64"):
         pytest.skip("another processor")
     exported.save(tmp_path, target="x86_64")
     run_c(tmp_path, "arm_fd")
@@ -305,6 +455,21 @@ def test_wasm_runs_in_node(exported, tmp_path):
     np.testing.assert_allclose(values, exported(X, V, TAU), rtol=1e-12, atol=1e-12)
 
 
+def test_maxima_on_cortex_m(tmp_path):
+    """LLVM aborts where it expands its own maximum of doubles there; comparisons stand in its place."""
+    exported = jd.export(lambda x: (jnp.maximum(x[0], x[1]), jnp.min(x), jnp.clip(x, 0.2, 0.5)), X, name="largest")
+    exported.save(tmp_path, target="cortex-m7")
+    assert all(name.startswith("__aeabi") for name in undefined_symbols(tmp_path / "largest.o"))
+    text = object_files._without_maximum(exported.module())
+    assert "@llvm.maximum" not in text and "@llvm.minimum" not in text
+    function = ctypes.CFUNCTYPE(ctypes.c_int, *[ctypes.c_void_p] * 4)(Code(text).address("largest"))
+    for x in (X, -X, X[::-1].copy(), np.where(X > 0.3, np.nan, X)):
+        out = [np.zeros(()), np.zeros(()), np.zeros(7)]
+        function(x.ctypes.data, *(y.ctypes.data for y in out))
+        for got, expected in zip(out, exported(x), strict=True):
+            np.testing.assert_array_equal(got, expected)
+
+
 def test_cortex_m_calls_only_what_the_runtime_has(exported, tmp_path):
     exported.save(tmp_path, target="cortex-m7")
     names = undefined_symbols(tmp_path / "arm_fd.o")
@@ -335,11 +500,34 @@ def test_cortex_m_calls_only_what_the_runtime_has(exported, tmp_path):
             {"name": "f"},
             "cannot be exported: it has a while_loop whose end is not known",
         ),
+        (lambda x: x[x > 0], (X,), {"name": "f"}, "cannot be exported: it has shapes, branches or conversions"),
+        (lambda x: x if x[0] > 0 else -x, (X,), {"name": "f"}, "cannot be exported: it has shapes, branches"),
+        (lambda x: jnp.asarray(np.sin(x)), (X,), {"name": "f"}, "cannot be exported: it has shapes, branches"),
+        (lambda x: jax.lax.complex(x, x), (X,), {"name": "f"}, "cannot be exported: it has an array of complex128"),
+        (lambda x: jnp.argsort(x), (X,), {"name": "f"}, "cannot be exported: it has sort"),
     ],
 )
 def test_refusals(function, examples, options, message):
     with pytest.raises(ValueError, match=message):
         jd.export(function, *examples, **options)
+
+
+def test_names_that_meet_others(tmp_path):
+    """Arguments with the name of the result, and with one of <math.h>."""
+    jd.export(lambda out, y0: out + y0, X, X, name="add", derivatives="jacobian").save(tmp_path)
+    run_c(tmp_path, "add")
+    jd.export(lambda a, A: a + A, X, X, name="add").save(tmp_path)
+    run_c(tmp_path, "add")
+
+
+def test_doubles_without_double_precision_are_refused():
+    jax.config.update("jax_enable_x64", False)
+    try:
+        with pytest.raises(ValueError, match=r"examples: x has dtype float64, and JAX computes in float32 here"):
+            jd.export(lambda x: 2 * x, X, name="f")
+        assert jd.export(lambda x: 2 * x, X.astype(np.float32), name="f")(X.astype(np.float32)).dtype == np.float32
+    finally:
+        jax.config.update("jax_enable_x64", True)
 
 
 def test_refusals_of_saving_and_calling(exported, tmp_path):
@@ -353,6 +541,12 @@ def test_refusals_of_saving_and_calling(exported, tmp_path):
     assert not (tmp_path / "a").exists()
     with pytest.raises(ValueError, match=r"an argument has shape \(3,\), the example had \(7,\)"):
         exported(X[:3], V, TAU)
+    os.chmod(tmp_path, 0o500)
+    if not os.access(tmp_path, os.W_OK):  # root may write everywhere
+        with pytest.raises(ValueError, match="cannot be written"):
+            exported.save(tmp_path)
+    os.chmod(tmp_path, 0o700)
+    assert sorted(x.name for x in tmp_path.iterdir()) == ["file"], "nothing is half written"
     with pytest.raises(ValueError, match="takes 3 arguments, and was given 2"):
         exported(X, V)
     with pytest.raises(ValueError, match="was exported without its Jacobian"):

@@ -12,7 +12,7 @@ import numpy as np
 
 from jaxdyn.compile.graph import Graph, inline
 from jaxdyn.compile.number import is_number, objects
-from jaxdyn.compile.program import FLOATS, Constant, Program
+from jaxdyn.compile.program import FLOATS, Constant, NotNumbers, Program
 
 
 def tangent(program: Program, moving: Sequence[bool]) -> Program:
@@ -41,6 +41,8 @@ def _tangent(program: Program, moving: tuple[bool, ...]) -> Program:
             changes.append(0.0 if row is None else row[entry])
             continue
         given = [(0.0 if type(x) is Constant else changes[x]) for x in operation.args]
+        if operation.op == "call" and any(is_number(x) or x != 0 for x in given):
+            raise NotNumbers("a pseudo-inverse without a rule for its derivative")
         operands = [x.value if type(x) is Constant else values[x] for x in operation.args]
         # Integers and bools do not change, nor do numbers whose operands do not: most of a tangent is left out here.
         varies = operation.kind in FLOATS and any(is_number(x) or x != 0 for x in given)

@@ -13,7 +13,7 @@ from typing import Any
 import jax
 import numpy as np
 
-from jaxdyn.compile import array_rules
+from jaxdyn.compile import array_rules, mode
 from jaxdyn.compile import program as numbers
 from jaxdyn.compile.constants import bind_known, convert_known, empty_reduction, evaluate_known
 from jaxdyn.compile.graph import Graph
@@ -261,7 +261,14 @@ class _Expansion:
     def _kernel(self, params, args, eqn):
         inner = params["program"]
         if not isinstance(inner, Program):  # loops and pseudo-inverses have branches
-            raise NotNumbers(inner.name)
+            if not (inner.is_called and mode.is_standalone()):
+                raise NotNumbers(inner.name)
+            # Code of its own that this program calls. A batch has leading axes.
+            self.has_rules = True
+            lead = args[0].shape[:-1]
+            rows = as_objects(args[0]).reshape(-1, inner.inputs[0].size)
+            results = [self.graph.call(inner, [row])[0].ravel() for row in rows]
+            return [np.stack(results).reshape(*lead, -1)]
         shaped = [as_objects(x).reshape(array.shape) for x, array in zip(args, inner.inputs, strict=True)]
         self.has_rules |= inner.derivative is not None
         # A kernel within this one: called where it is long, else written out.

@@ -11,6 +11,7 @@ Source: Hestenes (1958); Golub & Van Loan, Matrix Computations, section 8.6.3.
 
 import contextlib
 import functools
+import hashlib
 
 import jax
 import jax.numpy as jnp
@@ -36,18 +37,22 @@ class PseudoInverse:
     derivative = fallback = None
     subprograms = ()
     turns = 1
+    is_called = True
 
     def __init__(self, rows: int, columns: int, dtype, tolerance: float):
         self.rows, self.columns, self.dtype, self.tolerance = rows, columns, np.dtype(dtype), tolerance
         self.inputs = (Array((rows, columns), self.dtype),)
         self.outputs = (Array((columns, rows), self.dtype),)
+        self.results = (tuple(range(rows * columns)),)
         self.derived: dict = {}
         self.name = "pseudo_inverse"
 
     @property
     def digest(self) -> str:
         """Identity of the code, as `Program.digest`."""
-        return f"pseudo_inverse {self.rows} {self.columns} {self.dtype} {self.tolerance!r}"
+        # A hash, as programs that call it make its symbol from it.
+        text = f"pseudo_inverse {self.rows} {self.columns} {self.dtype} {self.tolerance!r}"
+        return hashlib.sha256(text.encode()).hexdigest()
 
     @property
     def cost(self) -> int:
@@ -63,6 +68,30 @@ class PseudoInverse:
     def ir(self, width: int, uniform) -> str:
         """The text of the kernel (see `code.kernel_ir`)."""
         return _kernel_ir(self.rows, self.columns, self.dtype, self.tolerance)
+
+    def definition(self, symbol: str) -> dict[str, str]:
+        """`void symbol(ptr matrix, ptr inverse)` of one sample, and what it declares, by names in a module's text."""
+        loops = f"{symbol}_loops"
+        text = str(_write_kernel(self.rows, self.columns, self.dtype, self.tolerance).function)
+        # Without "no-builtins" LLVM turns the loop that writes zeros into a call of memset, which bare metal may lack.
+        text = text.replace("define void", "define internal void", 1).replace('@"kernel"', f"@{loops}", 1)
+        head, brace, rest = text.partition("{")
+        call = f"""define internal void @{symbol}(ptr %a0, ptr %r0) nounwind {{
+  %data = alloca [2 x ptr]
+  store ptr %a0, ptr %data
+  %second = getelementptr ptr, ptr %data, i64 1
+  store ptr %r0, ptr %second
+  call void @{loops}(ptr %data, i64 1, i64 0, i64 1)
+  ret void
+}}"""
+        suffix = "f64" if self.dtype == np.float64 else "f32"
+        kind = "double" if self.dtype == np.float64 else "float"
+        root = f"llvm.sqrt.{suffix}"
+        return {
+            loops: f'{head} nounwind "no-builtins" {brace}{rest}',
+            symbol: call,
+            root: f"declare {kind} @{root}({kind})",
+        }
 
     def as_operations(self, array):
         """The same by JAX's singular value decomposition."""
@@ -166,6 +195,11 @@ class _Writer:
 
 
 def _kernel_ir(rows: int, columns: int, dtype, tolerance: float) -> str:
+    shapes = f"; pseudo-inverse of {rows} x {columns} {dtype} at {tolerance!r}\n"
+    return shapes + str(_write_kernel(rows, columns, dtype, tolerance).module)
+
+
+def _write_kernel(rows: int, columns: int, dtype, tolerance: float) -> "_Writer":
     n, m = max(rows, columns), min(rows, columns)
     w = _Writer(dtype)
     data, _, begin, end = w.function.args
@@ -189,8 +223,7 @@ def _kernel_ir(rows: int, columns: int, dtype, tolerance: float) -> str:
         )
     w.b.ret_void()
     w.entry.branch(w.function.blocks[1])
-    shapes = f"; pseudo-inverse of {rows} x {columns} {dtype} at {tolerance!r}\n"
-    return shapes + str(w.module)
+    return w
 
 
 def _sweeps(w: _Writer, U, J, n: int, m: int) -> None:

@@ -342,9 +342,18 @@ def register_handler(name: str, address: int) -> None:
     jax.ffi.register_ffi_target_as_batch_partitionable(name)
 
 
+_EXPORT_HINT = (
+    "machine code of jaxdyn cannot be exported by jax.export: trace the function within jd.compilation('plain'), or write an "
+    "object file for C with jd.export"
+)
+
+
 def lower_call(name: str, context, operands: Sequence, order: Sequence[int], attributes: dict | None, **static) -> Any:
     """Lower a call of a registered function with its operands in that order, within a lowering rule."""
     context = context.replace(avals_in=[context.avals_in[i] for i in order])
+    if getattr(context.module_context.lowering_parameters, "for_export", False):
+        # JAX refuses such calls with an error that shows them: the user reads there what to do.
+        attributes = {**(attributes or {}), "jaxdyn": mlir.ir_attribute(_EXPORT_HINT)}
     lower = jax.ffi.ffi_lowering(name, extra_attributes=attributes)
     return lower(context, *(operands[i] for i in order), **{key: np.int64(value) for key, value in static.items()})
 

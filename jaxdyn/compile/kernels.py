@@ -56,7 +56,11 @@ def kernel(
     @functools.wraps(function)
     def call(*args, where=None):
         given = args[:static], args[static], args[static + 1 :]
-        if derivative == "program":
+        if mode.is_expanding() and mode.is_careful() and fallback is not None:
+            # The program that is traced is the fallback of another one, so that it has no marks of its own.
+            return fallback(*args)
+        # Code without JAX is one program: others are kept by keys that do not know what they may call.
+        if derivative == "program" and not mode.is_standalone():
             return _call_own_program(function, *given)
         if mode.is_expanding():
             return inline_call(function, *given)
@@ -209,17 +213,19 @@ def evaluate(function: Callable, tree, *args, static: tuple = (), is_input: bool
         return jax.tree.map(np.asarray, function(*static, tree, *map(jnp.asarray, args)))
 
 
-def variant(inside: Callable) -> Any:
+def variant(inside: Callable, *, marks: bool = False) -> Any:
     """Choose between two functions that compute the same; a decorator of the one for JAX.
 
     **Arguments:** `inside` is traced in its place inside of kernels, as it stands. A program of numbers profits from every known
-    zero, and JAX from few operations on large arrays.
+    zero, and JAX from few operations on large arrays. `marks`: whether `inside` may mark samples as not valid; a
+    fallback that is a program itself, as in code without JAX, then takes the decorated function.
     """
 
     def decorate(outside: Callable) -> Callable:
         @functools.wraps(outside)
         def call(*args):
-            return (inside if mode.is_expanding() else outside)(*args)
+            is_inside = mode.is_expanding() and not (marks and mode.is_careful())
+            return (inside if is_inside else outside)(*args)
 
         return call
 

@@ -290,11 +290,13 @@ class Emitter:
         from block to block would be spilled, and takes W times the memory.
         """
         value = self.load_one(f"%a{place}", entry, kind)
-        if self.width == 1:
-            return value
+        return value if self.width == 1 else self.splat(value, kind)
+
+    def splat(self, value: str, kind: str) -> str:
+        """Broadcast one number to all samples."""
         of = self.type(kind)
         if wants_least_optimisation():
-            # LLVM 22 at level 0 aborts where it merges these loads with their broadcasts ("Node is not in map!").
+            # LLVM 22 at level 0 aborts where it merges loads with their broadcasts ("Node is not in map!").
             value = self.emit(f"freeze {_TYPES[kind]} {value}")
         first = self.emit(f"insertelement {of} poison, {_TYPES[kind]} {value}, i32 0")
         return self.emit(f"shufflevector {of} {first}, {of} poison, <{self.width} x i32> zeroinitializer")

@@ -156,6 +156,7 @@ class Loop:
 
     # Reverse mode is a loop of its own, over the records (`simulation.solvers.reverse`): JAX never differentiates this one.
     derivative = fallback = None
+    is_called = False
     # Iterations of a run are unknown. The estimate decides how many samples one thread takes at a time.
     turns = 100
 

@@ -24,6 +24,7 @@ _mode = jax.make_user_context(None)
 _expanding = jax.make_user_context(False)
 _rank_safe = jax.make_user_context(False)
 _in_rows = jax.make_user_context(False)
+_standalone = jax.make_user_context("")
 _said: set[str] = set()
 
 
@@ -83,6 +84,21 @@ def is_rank_safe() -> bool:
 def rank_safe(is_safe: bool = True):
     """Context in which a function is traced for samples for which a kernel was not valid."""
     return _rank_safe(is_safe)
+
+
+def is_standalone() -> bool:
+    """Decide whether a function is traced for code that runs without JAX."""
+    return bool(_standalone.value)
+
+
+def is_careful() -> bool:
+    """Decide whether a function is traced for the samples that another program of the same code marks as not valid."""
+    return _standalone.value == "careful"
+
+
+def standalone(is_careful: bool = False):
+    """Context in which a function is traced for code that runs without JAX, where no fallback of JAX computes a sample."""
+    return _standalone("careful" if is_careful else "fast")
 
 
 def is_row() -> bool:

@@ -60,6 +60,7 @@ class Program:
 
     # Repetitions of the operations in one call, by which the cost of a `loops.Loop` is estimated.
     turns = 1
+    is_called = False  # whether it has loops, so that other programs can only call it
 
     def __init__(
         self, inputs, outputs, operations, results, subprograms=(), derivative: Callable | None = None, name: str = ""

@@ -13,7 +13,7 @@ import equinox as eqx
 import jax.numpy as jnp
 from jaxtyping import Array, Float, Int
 
-from jaxdyn.compile import kernel, mark_invalid
+from jaxdyn.compile import is_standalone, kernel, mark_invalid
 from jaxdyn.constraints.base import Layout, Rows, constraint_jacobian, holonomic_rows, layout, rows
 from jaxdyn.constraints.codes import RESULTS, Outcome
 from jaxdyn.constraints.rank import (
@@ -192,7 +192,12 @@ def _shortest_push(scene: Scene, metric: MassFactor, Y, free, wanted, gamma, ran
     met = jnp.all(missed <= limit * (sizes + jnp.max(sizes)))
     result = RESULTS.where(met, RESULTS.successful, RESULTS.contradictory_rows)  # pyright: ignore[reportArgumentType]
     result = RESULTS.where(metric.is_definite(), result, RESULTS.singular_mass_matrix)
-    return ConstrainedDynamics(metric.unwhiten(free + pushed), lam, rank, result, layout(scene))
+    a = metric.unwhiten(free + pushed)
+    if is_standalone():
+        a = mark_invalid(
+            ~(met & metric.is_definite()), a
+        )  # code without JAX returns a status beside what the function returns
+    return ConstrainedDynamics(a, lam, rank, result, layout(scene))
 
 
 def _weighted(scene: Scene, q, v, force, t, A):
@@ -212,7 +217,8 @@ def _refined(factor, Y, right):
 def _shortest(Y, wanted, rank_tol):
     """lam and w = Y lam, the shortest w with Y^T w = wanted, and the rank of Y."""
 
-    inverse = pseudo_inverse(Y, tolerance(rank_tol, Y))
+    # More rows than degrees of freedom depend on each other wherever the mechanism moves.
+    inverse = pseudo_inverse(Y, tolerance(rank_tol, Y), Y.shape[1] > Y.shape[0])
     pushed = _product(inverse.T, wanted)
     return _product(inverse, pushed), pushed, jnp.round(jnp.sum(inverse * Y.T)).astype(jnp.int32)
 

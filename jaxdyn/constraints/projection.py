@@ -8,7 +8,7 @@ import jax
 import jax.numpy as jnp
 from jax import lax
 
-from jaxdyn.compile import implicit, kernel, mark_invalid, value_and_jvp, variant
+from jaxdyn.compile import implicit, is_standalone, kernel, mark_invalid, value_and_jvp, variant
 from jaxdyn.constraints.base import constraint_jacobian, holonomic_rows, layout, position_residual, velocity_residual
 from jaxdyn.constraints.dynamics import whitened_rows
 from jaxdyn.constraints.projection_derivative import LOST, Corrections, projected
@@ -70,7 +70,7 @@ def _one_round(rank_tol, scene: Scene, q, v, t, errors):
     return jax.tree.map(lambda x: mark_invalid(more, x), tuple(projected))
 
 
-@variant(_one_round)
+@variant(_one_round, marks=True)
 def _rounds(rank_tol, scene: Scene, q, v, t, errors):
     by_kernel = kernel(_by_pivots, static=1, fallback=_by_rank_alone, derivative=False)
 
@@ -83,6 +83,16 @@ def _rounds(rank_tol, scene: Scene, q, v, t, errors):
 def _in_rounds(again: Callable, first):
     """`first` = (q, v, errors, whether to go on, anything), and again(q, v, anything) until that is not, `_MOST_ROUNDS` in
     all."""
+
+    if is_standalone():
+        # A program of numbers has no loop of unknown length: all rounds are written out, and those that are needed count.
+        projected = tuple(first)
+        for _ in range(_MOST_ROUNDS - 1):
+            q, v, _, more, anything = projected
+            following = again(q, v, anything)
+            projected = jax.tree.map(lambda new, old, more=more: jnp.where(more, new, old), tuple(following), projected)
+        q, v, errors, _, anything = projected
+        return q, v, errors, anything
 
     def step(state):
         count, (q, v, _, _, more) = state

@@ -106,7 +106,7 @@ def _by_blocks(rank_tol, _, Y):
     return batch.cond(is_doubtful, lambda: pseudo_inverse_by_rotations(Y, rank_tol), lambda: inverse)
 
 
-@variant(_by_normal_equations)
+@variant(_by_normal_equations, marks=True)
 def _pseudo_inverse(rank_tol, _, Y):
     # Gram matrix, factor, two triangular solves and two products: 8 n m^2 sums and products for Y (n, m).
     is_long = 8 * Y.shape[0] * Y.shape[1] ** 2 > _MAX_OPERATIONS
@@ -141,7 +141,7 @@ def _least_squares_in_kernel(Y, rank_tol) -> LeastSquares:
     return LeastSquares(Y, mark_invalid(~(quality_of(factor) > least_pivot(Y, rank_tol)), factor), None)
 
 
-@variant(_least_squares_in_kernel)
+@variant(_least_squares_in_kernel, marks=True)
 def least_squares(Y: Float[Array, "n m"], rank_tol: float) -> LeastSquares:
     """Factor a matrix: its pseudo-inverse; in a kernel Cholesky's factor, where dependent columns make a sample invalid."""
     return LeastSquares(Y, None, pseudo_inverse(Y, rank_tol))

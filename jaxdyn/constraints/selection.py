@@ -255,7 +255,7 @@ def _check_kept_rows(bare: Scene, q, t, old, is_projected: bool):
     return mark_invalid(jnp.any(kept == 0) & ~(_pivot_of(bare, q, t, kept) > least), old)
 
 
-@variant(_check_kept_rows)
+@variant(_check_kept_rows, marks=True)
 def _renew(bare: Scene, q, t, old, is_projected: bool):
     del is_projected
     kept, least = old[:-1], old[-1]

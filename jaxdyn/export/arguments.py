@@ -14,6 +14,7 @@ from jaxdyn.model.columns import columns_of
 from jaxdyn.model.tree import Model
 
 C_TYPES = {"float64": "double", "float32": "float"}
+# Of C11 and C++20 together: the header is read by both.
 C_KEYWORDS = frozenset(
     "alignas alignof and asm auto bool break case catch char class const constexpr continue decltype default delete do double "
     "else enum "
@@ -42,7 +43,8 @@ class Argument(NamedTuple):
 
 
 def check_identifier(name: str, what: str) -> str:
-    """The name. **Raises:** ValueError unless it is an identifier of C and C++ and no keyword of theirs."""
+    """Return the name. **Raises:** ValueError unless it is an identifier of C and C++ and no keyword of theirs."""
+    # Only ASCII: compilers accept other letters, linkers of microcontrollers often do not.
     if not isinstance(name, str) or not re.fullmatch(r"[A-Za-z_]\w*", name, re.ASCII) or name in C_KEYWORDS:
         raise ValueError(
             f"{what} is {name!r}, which is no identifier of C and C++; use letters, digits and underscores, and no keyword, "
@@ -52,13 +54,14 @@ def check_identifier(name: str, what: str) -> str:
 
 
 def _identifier(text: str) -> str:
+    # Paths of pytrees are "['gain'][0]" or ".inertias": what separates their parts becomes underscores.
     name = re.sub(r"\W+", "_", text, flags=re.ASCII).strip("_") or "value"
     name = f"x{name}" if name[0].isdigit() else name
     return f"{name}_" if name in C_KEYWORDS or keyword.iskeyword(name) else name
 
 
 def arguments_of(function: Callable, examples: Sequence[Any]) -> tuple[Argument, ...]:
-    """The arguments of the C function, named as those of the Python function.
+    """Arguments of the C function, named as those of the Python function.
 
     **Raises:** ValueError for examples that are no arrays of float64 or float32.
     """
@@ -69,16 +72,18 @@ def arguments_of(function: Callable, examples: Sequence[Any]) -> tuple[Argument,
 def _parameter_names(function: Callable, count: int) -> list[str]:
     try:
         parameters = list(inspect.signature(function).parameters.values())
-    except (TypeError, ValueError):
+    except (TypeError, ValueError):  # functions of other languages have no signature
         parameters = []
     kinds = (inspect.Parameter.POSITIONAL_ONLY, inspect.Parameter.POSITIONAL_OR_KEYWORD)
     names = [_identifier(x.name) for x in parameters if x.kind in kinds][:count]
     names += [f"x{i}" for i in range(len(names), count)]
-    return names if len(set(names)) == count else [f"x{i}" for i in range(count)]
+    # Macros of sizes are upper case, so names may not differ by case alone.
+    return names if len({x.upper() for x in names}) == count else [f"x{i}" for i in range(count)]
 
 
 def _argument(name: str, example: Any) -> Argument:
     paths = jax.tree_util.tree_flatten_with_path(example)[0]
+    # An array is a pytree whose only leaf has an empty path. A list of one array is a structure with one field.
     is_structure = not (len(paths) == 1 and not paths[0][0])
     leaves, used, offset, widest = [], set(), 0, 1
     for path, value in paths:
@@ -90,10 +95,11 @@ def _argument(name: str, example: Any) -> Argument:
             )
         shape = np.shape(value)
         field = _identifier(jax.tree_util.keystr(path)) if is_structure else name
-        while field in used:
+        while field in used:  # a["b"] and a.b may become the same identifier
             field += "_"
         used.add(field)
         size = dtype.itemsize
+        # The rules by which C compilers place members: each at a multiple of its size, the whole a multiple of the widest one.
         offset, widest = -(-offset // size) * size, max(widest, size)
         leaves.append(Leaf(field, shape, dtype, offset))
         offset += size * int(np.prod(shape, dtype=int))
@@ -101,19 +107,20 @@ def _argument(name: str, example: Any) -> Argument:
 
 
 def fields_of(arguments: Sequence[Argument]) -> list[Field]:
-    """For each array, in order, the argument that holds it and its offset."""
+    """Argument and offset of each array, in the order of the program's inputs."""
     return [Field(i, leaf.offset) for i, argument in enumerate(arguments) for leaf in argument.leaves]
 
 
 def system_of(function: Callable, examples: Sequence[Any]) -> Model | None:
     """A model that the function is given or closes over, for the names of joints in comments."""
     candidates = list(examples)
+    # The names of joints are nowhere in the program, only in the model; a function that hides its model gets no comments.
     try:
         closure = inspect.getclosurevars(inspect.unwrap(getattr(function, "func", function)))
         candidates += [*closure.nonlocals.values(), *closure.globals.values()]
-    except TypeError:
+    except TypeError:  # a callable object
         pass
-    candidates += list(getattr(function, "args", ()))
+    candidates += list(getattr(function, "args", ()))  # of functools.partial
     for value in candidates:
         system = getattr(value, "system", value)
         if isinstance(system, Model):
@@ -130,6 +137,6 @@ def comment_on(name: str, size: int, system: Model | None) -> str:
         return ""
     columns = columns_of(system)
     entries, units = (getattr(columns, key) for key in _QUANTITIES[name])
-    if len(entries) != size:
+    if len(entries) != size:  # an argument of that name that is something else
         return ""
     return ", ".join(f"{entry} [{unit}]" for entry, unit in zip(entries, units, strict=True))

@@ -9,11 +9,12 @@ from typing import Any
 import jax
 import numpy as np
 
-from jaxdyn.compile.standalone import DEGENERATE, ObjectFile, Triple
+from jaxdyn.compile.object_files import ObjectFile, Triple
+from jaxdyn.compile.standalone import DEGENERATE, NOT_FINITE
 from jaxdyn.export.arguments import C_TYPES, Argument
 
 TOLERANCE = 1e-12  # of the test program, relative: other processors round fused operations otherwise
-_TOLERANCE_SINGLE = 1e-4
+_TOLERANCE_SINGLE = 1e-4  # a thousand roundings of float32, which accelerations of long chains lose
 
 
 def write_files(exported: Any, folder: Path, made: ObjectFile, target: Triple, abi: str) -> Path:
@@ -27,6 +28,7 @@ def write_files(exported: Any, folder: Path, made: ObjectFile, target: Triple, a
         contents[f"{name}.h"] = header(exported, made, target).encode()
         contents[f"{name}_test.c"] = test_program(exported).encode()
         contents["CMakeLists.txt"] = _build(name, made).encode()
+    # Written beside their final names and moved at the end: a full disk leaves no half of a header behind.
     try:
         folder.mkdir(parents=True, exist_ok=True)
         with tempfile.TemporaryDirectory(dir=folder) as place:
@@ -43,13 +45,15 @@ def write_files(exported: Any, folder: Path, made: ObjectFile, target: Triple, a
 
 
 def header(exported: Any, made: ObjectFile, target: Triple) -> str:
-    """The C header: sizes, structures, and one prototype for each function."""
+    """C header: sizes, structures, and one prototype for each function."""
     name, upper = exported.name, exported.name.upper()
     lines = [
         f"/* {name}: made by jaxdyn for {target.triple}, {target.cpu or 'generic'}.",
         " *",
         " * Functions allocate nothing, have no state and may be called from several threads at once. They return 0, or",
-        f" * {DEGENERATE} where the constraints lose rank at the sample; the results are then not defined.",
+        f" * {DEGENERATE} where the sample has no regular solution: constraint rows contradict each other, the mass matrix is",
+        " * singular, or a step cannot be completed; the results are then not defined;",
+        f" * {NOT_FINITE} where a result is infinite or not a number.",
         f" * Functions of the C library that they call: {', '.join(made.library) or 'none'}.",
         " */",
         f"#ifndef {upper}_H",
@@ -61,25 +65,46 @@ def header(exported: Any, made: ObjectFile, target: Triple) -> str:
         'extern "C" {',
         "#endif",
         "",
+        *_definitions(exported, made),
+        *_prototypes(exported),
+        "",
+        "#ifdef __cplusplus",
+        "}",
+        "#endif",
+        "",
+        "#endif",
+        "",
     ]
+    return "\n".join(lines)
+
+
+def _definitions(exported: Any, made: ObjectFile) -> list[str]:
+    """Lines with the sizes of arrays, the bytes of stack, and the structures."""
+    name, upper = exported.name, exported.name.upper()
+    lines = []
     for argument in exported.arguments:
         for leaf in argument.leaves:
             label = f"{argument.name}_{leaf.name}" if argument.is_structure else leaf.name
             lines.append(f"#define {upper}_SIZE_{label.upper()} {_size(leaf.shape)}")
-    for result, shape, _ in exported.results():
-        lines.append(f"#define {upper}_SIZE_{result.upper()} {_size(shape)}")
-    stack = {symbol: size for symbol, size in made.stack.items() if symbol.startswith(name)}
-    lines += ["", "/* Bytes of stack that each function takes at most. */"]
-    lines += [f"#define {symbol.upper()}_STACK_BYTES {size}" for symbol, size in stack.items()]
+    lines += [f"#define {upper}_SIZE_{result.upper()} {_size(shape)}" for result, shape, _ in exported.results()]
+    lines += ["", "/* Bytes of stack that each function takes at most, with those that it calls. */"]
+    lines += [f"#define {symbol.upper()}_STACK_BYTES {made.stack[symbol]}" for symbol in exported.symbols()]
     for argument in exported.arguments:
         if argument.is_structure:
             lines += ["", f"/* The arrays of the argument {argument.name}, each by rows. */", "typedef struct {"]
+            # C has no arrays without entries, so an empty one has a place that nothing reads.
             lines += [
                 f"  {C_TYPES[leaf.dtype.name]} {leaf.name}[{max(1, _size(leaf.shape))}]; /* shape {leaf.shape} */"
                 for leaf in argument.leaves
             ]
             lines += [f"}} {_type_of(name, argument)};"]
-    lines += ["", "/*", f" * {name}: arrays are stored by rows."]
+    return lines
+
+
+def _prototypes(exported: Any) -> list[str]:
+    """Lines with the prototypes, and the order and units of the entries of each argument."""
+    name = exported.name
+    lines = ["", "/*", f" * {name}: arrays are stored by rows. Results may overwrite arguments."]
     for argument in exported.arguments:
         if not argument.is_structure:
             (leaf,) = argument.leaves
@@ -87,7 +112,7 @@ def header(exported: Any, made: ObjectFile, target: Triple) -> str:
             lines.append(f" * {argument.name} {leaf.shape}" + (f": {comment}" if comment else ""))
     lines += [f" * {result} {shape}" for result, shape, _ in exported.results()]
     lines += [" */", f"int {name}({_parameters(exported, exported.results())});"]
-    if exported.jacobian_program is not None:
+    if exported.derivative is not None:
         lines += [
             "",
             "/* Derivatives: one row for each entry of the result, one column for each entry of the argument. */",
@@ -97,12 +122,11 @@ def header(exported: Any, made: ObjectFile, target: Triple) -> str:
         results = [(result, (), dtype) for result, _, dtype in exported.results()]
         lines += [
             "",
-            "/* n samples, one row of each array for each; structures are shared. The status is that of the worst sample, and",
-            " * the results of a degenerate sample are not numbers. */",
+            "/* n samples, one row of each array for each; structures are shared. The status has the bits of all samples, and",
+            " * the results of samples without a regular solution are NaN. Results may not overlap arguments. */",
             f"int {name}_batch(int64_t n, {_parameters(exported, results, is_batch=True)});",
         ]
-    lines += ["", "#ifdef __cplusplus", "}", "#endif", "", "#endif", ""]
-    return "\n".join(lines)
+    return lines
 
 
 def _size(shape: Sequence[int]) -> int:
@@ -114,6 +138,7 @@ def _type_of(name: str, argument: Argument) -> str:
 
 
 def _parameters(exported: Any, results: list, is_batch: bool = False) -> str:
+    # Sizes in brackets mean nothing to the compiler of the callee; gcc and clang warn callers of arrays that are too short.
     parameters = []
     for argument in exported.arguments:
         if argument.is_structure:
@@ -134,6 +159,7 @@ def _parameters(exported: Any, results: list, is_batch: bool = False) -> str:
 
 
 def _numbers(values: np.ndarray) -> str:
+    # Hexadecimal: every bit of a reference result reaches the C compiler.
     return (
         ", ".join(
             float(x).hex() if np.isfinite(x) else ("NAN" if np.isnan(x) else "INFINITY" if x > 0 else "-INFINITY")
@@ -144,8 +170,11 @@ def _numbers(values: np.ndarray) -> str:
 
 
 def test_program(exported: Any) -> str:
-    """A C program that compares the functions with reference results, and returns non-zero where they differ."""
+    """C program that compares the functions with reference results, and returns non-zero where they differ."""
     name = exported.name
+    data, checks = _references(exported)
+    is_single = any(dtype == np.float32 for _, _, dtype in exported.results())
+    kind = "float" if is_single else "double"
     lines = [
         f"/* Compares {name} with reference results of jaxdyn: prints the largest difference, returns 1 above the tolerance. */",
         "#include <math.h>",
@@ -153,42 +182,16 @@ def test_program(exported: Any) -> str:
         "",
         f'#include "{name}.h"',
         "",
-    ]
-    for argument, example in zip(exported.arguments, exported.examples, strict=True):
-        values = jax.tree.leaves(example)
-        if argument.is_structure:
-            inner = ",\n  ".join(f"{{{_numbers(np.asarray(x))}}}" for x in values)
-            lines.append(f"static const {_type_of(name, argument)} {argument.name} = {{\n  {inner}\n}};")
-        else:
-            kind = C_TYPES[argument.leaves[0].dtype.name]
-            lines.append(f"static const {kind} {argument.name}[] = {{{_numbers(np.asarray(values[0]))}}};")
-    calls = [(name, exported.results(), exported.evaluate())]
-    if exported.jacobian_program is not None:
-        calls.append((f"{name}_jacobian", exported.jacobian_results(), exported.evaluate("jacobian")))
-    given = ", ".join(f"&{x.name}" if x.is_structure else x.name for x in exported.arguments)
-    checks = []
-    is_single = any(dtype == np.float32 for _, _, dtype in exported.results())
-    for function, results, references in calls:
-        for (result, shape, dtype), reference in zip(results, references, strict=True):
-            kind = C_TYPES[np.dtype(dtype).name]
-            lines.append(f"static const double expected_{result}[] = {{{_numbers(reference)}}};")
-            lines.append(f"static {kind} {result}[{max(1, _size(shape))}];")
-        checks.append(f"  if ({function}({', '.join(filter(None, [given, *(x for x, _, _ in results)]))}) != 0) {{")
-        checks += [f'    printf("{function}: degenerate\\n");', "    return 1;", "  }"]
-        for result, shape, _ in results:
-            checks.append(
-                f'  worst = fmax(worst, difference("{result}", {result}, expected_{result}, {_size(shape)}));'
-            )
-    kind = "float" if is_single else "double"
-    lines += [
+        *data,
         "",
         "/* The largest difference, relative to the largest expected number. */",
         f"static double difference(const char *name, const {kind} *got, const double *expected, int size) {{",
         "  double scale = 1e-300, worst = 0;",
-        "  for (int i = 0; i < size; i++) scale = fmax(scale, fabs(expected[i]));",
+        "  for (int i = 0; i < size; i++) scale = isfinite(expected[i]) ? fmax(scale, fabs(expected[i])) : scale;",
         "  for (int i = 0; i < size; i++) {",
-        "    double apart = fabs(got[i] - expected[i]) / scale;",
-        "    if (!(apart <= worst)) worst = isnan(apart) && isnan(expected[i]) ? worst : apart;",
+        "    int is_same = got[i] == expected[i] || (isnan(got[i]) && isnan(expected[i]));",
+        "    double apart = is_same ? 0 : fabs(got[i] - expected[i]) / scale;",
+        "    if (!(apart <= worst)) worst = apart;",
         "  }",
         '  printf("%s: largest relative difference %.3g\\n", name, worst);',
         "  return isnan(worst) ? INFINITY : worst;",
@@ -205,7 +208,39 @@ def test_program(exported: Any) -> str:
     return "\n".join(lines)
 
 
+def _references(exported: Any) -> tuple[list[str], list[str]]:
+    """Lines with the arguments and the expected results, and lines that call the functions and compare."""
+    # The prefixes keep names apart from those of the C library: y0 is a Bessel function of <math.h>.
+    name, data, checks = exported.name, [], []
+    for argument, example in zip(exported.arguments, exported.examples, strict=True):
+        values = jax.tree.leaves(example)
+        if argument.is_structure:
+            inner = ",\n  ".join(f"{{{_numbers(np.asarray(x))}}}" for x in values)
+            data.append(f"static const {_type_of(name, argument)} given_{argument.name} = {{\n  {inner}\n}};")
+        else:
+            kind = C_TYPES[argument.leaves[0].dtype.name]
+            data.append(f"static const {kind} given_{argument.name}[] = {{{_numbers(np.asarray(values[0]))}}};")
+    calls = [(name, exported.results(), exported.evaluate())]
+    if exported.derivative is not None:
+        calls.append((f"{name}_jacobian", exported.jacobian_results(), exported.evaluate("jacobian")))
+    given = ", ".join(f"{'&' if x.is_structure else ''}given_{x.name}" for x in exported.arguments)
+    for function, results, references in calls:
+        for (result, shape, dtype), reference in zip(results, references, strict=True):
+            data.append(f"static const double expected_{result}[] = {{{_numbers(reference)}}};")
+            data.append(f"static {C_TYPES[np.dtype(dtype).name]} got_{result}[{max(1, _size(shape))}];")
+        passed = [given, *("got_" + x for x, _, _ in results)]
+        # A value that is not finite has a status; a Jacobian has one where the sample has no regular solution.
+        is_failed = function == name and not all(np.isfinite(x).all() for x in references)
+        checks.append(f"  if (({function}({', '.join(filter(None, passed))}) != 0) != {int(is_failed)}) {{")
+        checks += [f'    printf("{function}: unexpected status\\n");', "    return 1;", "  }"]
+        for result, shape, _ in results:
+            compared = f'difference("{result}", got_{result}, expected_{result}, {_size(shape)})'
+            checks.append(f"  worst = fmax(worst, {compared});")
+    return data, checks
+
+
 def _build(name: str, made: ObjectFile) -> str:
+    # An interface library: the object file is all there is to it, and it goes into the program that links it.
     link = f"\ntarget_link_libraries({name} INTERFACE m)" if made.library else ""
     return f"""# target_link_libraries(your_program {name}) links the functions of {name}.h.
 cmake_minimum_required(VERSION 3.16)

@@ -7,7 +7,9 @@ import diffrax
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jax.flatten_util import ravel_pytree
 
+from jaxdyn.compile import is_standalone
 from jaxdyn.compile.known import is_concrete, partition_tracers
 from jaxdyn.constraints.selection import keep_rows, may_have_redundant_rows, select_rows
 from jaxdyn.contact.unilateral import has_modes
@@ -17,6 +19,7 @@ from jaxdyn.simulation.hybrid.laws import laws_of_pieces
 from jaxdyn.simulation.hybrid.pieces import motion_in_pieces
 from jaxdyn.simulation.solvers import ExplicitSteps, driver
 from jaxdyn.simulation.solvers.driver import Drive
+from jaxdyn.simulation.solvers.explicit import whole_step
 from jaxdyn.simulation.solvers.rk4 import RK4
 from jaxdyn.simulation.start import chosen_method
 from jaxdyn.systems.scene import as_scene, check_force
@@ -114,6 +117,14 @@ def stepper(scene: SceneLike, dt: Numbers, substeps: int = 1, remat: bool = True
         if pieces.names:
             laws = laws_of_pieces(plan, pieces, switching, 4, 3)
             rows = motion_in_pieces(laws, y, args, ts, (0.0, 0.0), size, substeps, substeps + 1, EVENTS, is_direct)[0]
+        elif is_standalone():
+            # A program of numbers has no loop over steps; they are written one after the other.
+            flat = ravel_pytree(y)[0]
+            for i in range(substeps):
+                start, end = t + i * size, t + (i + 1) * size
+                rate = plan.field_of(args, start, flat) if plan.passes_rate_on else jnp.zeros_like(flat)
+                flat = whole_step(plan, args, start, end, flat, rate).projected
+            return method.to_qv(scene, plan.structure(flat), t + length)
         else:
             drive = Drive(plan, driver.Fixed(4, 3), None, None, size, substeps, substeps)
             rows = (drive.direct if is_direct else drive)(y, args, ts)[0]
