@@ -1,5 +1,8 @@
 """Identification of parameters from logs: least squares, feasible fits of robots, and fits of any numbers of any system."""
 
+from typing import Any
+
+from jaxdyn.identify import mechanisms as _mechanisms
 from jaxdyn.identify.delays import Delays as Delays
 from jaxdyn.identify.delays import shift_torques as shift_torques
 from jaxdyn.identify.feasible import fit_torques as fit_torques
@@ -11,7 +14,6 @@ from jaxdyn.identify.linear_fit import least_squares as least_squares
 from jaxdyn.identify.logs import Log as Log
 from jaxdyn.identify.logs import split as split
 from jaxdyn.identify.mechanisms import complete_log as complete_log
-from jaxdyn.identify.mechanisms import completed as completed
 from jaxdyn.identify.parameter_tree import Parameters as Parameters
 from jaxdyn.identify.parameters import fit_parameters as fit_parameters
 from jaxdyn.identify.parameters import parameter_error as parameter_error
@@ -48,7 +50,6 @@ from jaxdyn.identify.workflows.raw_logs import from_raw as from_raw
 from jaxdyn.identify.workflows.spectra import Cutoff as Cutoff
 from jaxdyn.identify.workflows.spectra import choose_cutoff as choose_cutoff
 
-# `completed` is deprecated, and not listed.
 __all__ = [
     "EXTRA",
     "TERMS",
@@ -102,3 +103,9 @@ __all__ = [
 def __dir__() -> list[str]:
     """Names of the namespace; its modules are internal."""
     return __all__
+
+
+def __getattr__(name: str) -> Any:
+    if name == "completed":  # the deprecated name of `complete_log`, which warns when it is called
+        return _mechanisms.completed
+    raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
