@@ -1,6 +1,7 @@
 """Public functions on an accelerator against the same functions on the CPU, which other tests compare with oracles.
 
-Numbers are skipped where JAX has the CPU alone; there the programs are written for a GPU, which needs none. It needs neither this folder's settings nor beartype:
+Numbers are skipped where JAX has the CPU alone; there the programs are written for a GPU, which needs none. Neither this
+folder's settings nor beartype are needed:
 `python -m pytest --noconftest tests/test_accelerator.py`.
 """
 
