@@ -2,7 +2,7 @@
 
 Numbers are skipped where JAX has the CPU alone; there the programs are written for a GPU, which needs none. Neither this
 folder's settings nor beartype are needed:
-`python -m pytest --noconftest tests/test_accelerator.py`.
+`python -m pytest --noconftest tests/package/test_accelerator.py`.
 """
 
 import re
