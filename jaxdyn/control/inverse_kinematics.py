@@ -22,7 +22,7 @@ from jaxdyn.constraints.assembly import closing_tolerance
 from jaxdyn.constraints.base import Constraint, holonomic_rows, layout, position_residual
 from jaxdyn.constraints.closing import nearest_configuration
 from jaxdyn.constraints.codes import RESULTS, Outcome, name_of
-from jaxdyn.constraints.selection import KeptRows
+from jaxdyn.constraints.redundancy import KeptRows
 from jaxdyn.constraints.tolerances import own_length
 from jaxdyn.control.search import Aims, clip_to_limits, screw_joints, search
 from jaxdyn.control.targets import as_targets, target_rows

@@ -23,7 +23,7 @@ from jaxtyping import Array, Float
 from jaxdyn.compile import entry_point
 from jaxdyn.constraints.base import constraint_jacobian, layout, rows
 from jaxdyn.constraints.codes import RESULTS, Outcome
-from jaxdyn.constraints.dynamics import applied
+from jaxdyn.constraints.dynamics import total_force
 from jaxdyn.constraints.rank import pseudo_inverse, tolerance
 from jaxdyn.dynamics.quantities import bias_force, coriolis_matrix, mass_matrix
 from jaxdyn.lie.so3 import _product
@@ -125,7 +125,7 @@ def _decouple(scene, q, v, tau, t, rotation, motion_rotation, dof, rank_tol) -> 
     C = coriolis_matrix(system, q, v, t)
     w = _product(W.T, v)
     Gamma = _product(_product(inverse, C) - Wdot.T, inverse.T)
-    u = _product(inverse, applied(scene, q, v, tau, t) - bias_force(system, q, v, t) + _product(C, v))
+    u = _product(inverse, total_force(scene, q, v, tau, t) - bias_force(system, q, v, t) + _product(C, v))
     Lambda = _product(A, inverse.T)
     # Lam = A W^-T: its rate along the motion.
     rate = _product(Adot - _product(Lambda, Wdot.T), inverse.T)
