@@ -44,7 +44,7 @@ def study(iterations=100):
         return {"x": jax.lax.fori_loop(0, iterations, lambda _, x: 3.9 * x * (1 - x), x)}
 
     reductions = {"x": jd.scale.Mean("x"), "worst": jd.scale.Worst("x", 3)}
-    return (logistic, draw), {"samples": 240, "lanes": 4, "chunk": 4, "reductions": reductions} | QUIET
+    return (logistic, draw), {"samples": 240, "batch_size": 4, "chunk": 4, "reductions": reductions} | QUIET
 
 
 SLOW = 300_000
@@ -173,7 +173,7 @@ def test_motions_are_the_same(client, tmp_path):
             control=lambda q, v, t: -gain * v,
             cost="measured",
             chunk=4,
-            lanes=4,
+            batch_size=4,
             client=client,
             devices=devices,
             **QUIET,
@@ -240,7 +240,7 @@ def logistic(x):
 if __name__ == "__main__":
     reductions = {"x": jd.scale.Mean("x"), "worst": jd.scale.Worst("x", 3)}
     with Client(sys.argv[1]) as client:
-        print(jd.scale.evaluate(logistic, draw, samples=240, lanes=4, chunk=4, out=sys.argv[2], client=client,
+        print(jd.scale.evaluate(logistic, draw, samples=240, batch_size=4, chunk=4, out=sys.argv[2], client=client,
                                 reductions=reductions, progress=False).computed)
 """
 
@@ -349,7 +349,7 @@ points = 3
 damping = { log_uniform = [0.1, 1.0] }
 [options]
 stepsize = 0.01
-lanes = 4  # one lane alone differs in the last bit under JAXDYN_COMPILATION_OPTIONS=least
+batch_size = 4  # one rollout alone differs in the last bit under JAXDYN_COMPILATION_OPTIONS=least
 [reductions]
 q = { mean = "q" }
 """
@@ -425,7 +425,7 @@ def failing(bad, times, folder):
 @pytest.mark.parametrize("where", ["here", "cluster"])
 def test_a_chunk_that_raises_is_tried_again_and_reported(client, tmp_path, where):
     client = client if where == "cluster" else None
-    options = {"chunk": 5, "lanes": 5, "out": tmp_path / "a.zarr", "client": client} | QUIET
+    options = {"chunk": 5, "batch_size": 5, "out": tmp_path / "a.zarr", "client": client} | QUIET
     starts = np.arange(40.0)
     function = failing((12.0, 33.0), 2, tmp_path)
     with pytest.raises(

@@ -23,7 +23,6 @@ from jaxdyn.model.arguments import DType, Function, Number, Numbers, SystemLike,
 from jaxdyn.systems.scene import Scene, as_pytree, as_scene
 from jaxdyn.systems.system import velocity_to_rate
 
-
 # Methods of constraints by their names up to version 0.1.
 _OLD_NAMES = {"slip": "velocity", "grouped_position": "group_positions", "grouped_motion": "group_rows"}
 
@@ -37,7 +36,9 @@ class Constraint(eqx.Module):
         super().__init_subclass__(**options)
         for old, new in _OLD_NAMES.items():
             if old in cls.__dict__:
-                warnings.warn(f"{cls.__name__}.{old} is called `{new}` now; rename it", DeprecationWarning, stacklevel=2)
+                warnings.warn(
+                    f"{cls.__name__}.{old} is called `{new}` now; rename it", DeprecationWarning, stacklevel=2
+                )
                 setattr(cls, new, cls.__dict__[old])
 
     def position(self, system: SystemLike, q: Float[Array, " nq"], t: Number) -> Array | None:
