@@ -1,8 +1,8 @@
 """Lists of independent tasks: one after another in this process, or on the workers of a Dask client.
 
 `Local` and `Cluster` have the same interface, so that callers do not distinguish them. The object whose methods tasks call is
-sent once to each worker (`worker`), with the settings of JAX that decide its results. Dask and cloudpickle are imported when a client
-is given.
+sent once to each worker (`worker`), with the settings of JAX that decide its results. Dask and cloudpickle are imported when a
+client is given.
 """
 
 from jaxdyn.tasks.cluster import Cluster as Cluster

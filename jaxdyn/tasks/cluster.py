@@ -35,8 +35,8 @@ class Cluster:
     to the others. If the scheduler dies, the client reconnects within its own `timeout`, and unfinished tasks are submitted
     again.
 
-    **Raises:** ValueError for anything but a connected client, and for a scheduler or workers with other versions of Python, Dask,
-    JAX or jaxdyn, before any task. ConnectionError where the scheduler does not come back.
+    **Raises:** ValueError for anything but a connected client, and for a scheduler or workers with other versions of Python,
+    Dask, JAX or jaxdyn, before any task. ConnectionError where the scheduler does not come back.
     """
 
     def __init__(self, client: DaskClient, retries: int = 0, mark: tuple[Path, str] | None = None):
