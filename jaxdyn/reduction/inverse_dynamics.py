@@ -121,7 +121,7 @@ def constrained_inverse_dynamics(
             f"v has shape {v.shape}, expected {(scene.nv,)} = (nv,) or {(len(chosen),)}, the independent velocities"
             f"{batch_hint(v, (1,))}"
         )
-    dynamics = _solve_compiled(
+    dynamics = _solve_by_program(
         scene, q, v, a_independent, S, _weights(weights, S.shape[1], q.dtype), t, tuple(chosen), rank_tol
     )
     concrete = is_concrete(dynamics.result)
@@ -182,7 +182,7 @@ def _weights(weights, count: int, dtype):
 
 
 @entry_point
-def _solve_compiled(scene: Scene, q, v, a_independent, S, weights, t, chosen: tuple[int, ...], rank_tol):
+def _solve_by_program(scene: Scene, q, v, a_independent, S, weights, t, chosen: tuple[int, ...], rank_tol):
     v, a, torques, lam, is_determined, agrees, is_actuated, definite = kernel(_solve, static=2)(
         chosen, rank_tol, scene, q, v, a_independent, S, weights, t
     )
