@@ -559,6 +559,21 @@ def test_starts_of_a_fit(client):
     np.testing.assert_allclose(np.abs(there.values), [1.0, 3.0], rtol=1e-6)
 
 
+def test_cross_validation_of_a_fit(client):
+    """The fits of all folds on workers: the trials of this process, in their order and to the last bit."""
+    model, t = jd.robots.chain(2), np.linspace(0.0, 8.0, 400)
+    rates, noise = np.array([1.3, 2.1]), np.random.default_rng(2).normal(size=(400, 2))
+    q, v, a = np.sin(rates * t[:, None]), rates * np.cos(rates * t[:, None]), -(rates**2) * np.sin(rates * t[:, None])
+    tau = jax.vmap(lambda *x: jd.inverse_dynamics(model, *x))(q, v, a) + 0.3 * v + 0.5 * np.tanh(v / 0.01)
+    log = jd.identify.Log(t, q, v, a, np.asarray(tau) + 0.02 * noise)
+    options = {"terms": ("viscous", "coulomb"), "robust": "auto", "weights": None}
+    here, there = (jd.identify.fit_robot(model, log, client=one, **options) for one in (None, client))
+    assert here.choice.setting == there.choice.setting and len(here.choice.trials) > 8
+    for one, other in zip(here.choice.trials, there.choice.trials, strict=True):
+        assert one.setting == other.setting
+        np.testing.assert_array_equal(one.squares, other.squares)
+
+
 def test_without_a_client_no_dask_is_imported(tmp_path, monkeypatch):
     for name in ("dask", "distributed"):
         monkeypatch.setitem(sys.modules, name, None)

@@ -10,6 +10,8 @@ from jaxdyn.tasks.cluster import DaskClient as DaskClient
 from jaxdyn.tasks.cluster import Engine as Engine
 from jaxdyn.tasks.cluster import count_workers as count_workers
 from jaxdyn.tasks.cluster import map_tasks as map_tasks
+from jaxdyn.tasks.cluster import open_engine as open_engine
+from jaxdyn.tasks.cluster import results as results
 from jaxdyn.tasks.local import Failure as Failure
 from jaxdyn.tasks.local import Local as Local
 from jaxdyn.tasks.local import attempt as attempt

@@ -279,16 +279,9 @@ def map_tasks(
 
     **Raises:** errors of the function, and those of `Cluster`.
     """
-    if client is None:
-        return [_Function(function).call(item) for item in items]
-    results = []
-    with Cluster(client, retries) as cluster:
-        cluster.send(lambda: _Function(function))
-        for _, result in cluster.map("call", items):
-            if isinstance(result, Failure):
-                raise result.error
-            results.append(result)
-    return results
+    with open_engine(client, retries) as engine:
+        engine.send(lambda: _Function(function))
+        return list(results(engine, "call", items))
 
 
 class _Function:
@@ -301,3 +294,16 @@ class _Function:
 
 
 Engine = Local | Cluster
+
+
+def open_engine(client: DaskClient | None, retries: int = 2) -> Engine:
+    """The engine of a client, or that of this process, which does not try again."""
+    return Local() if client is None else Cluster(client, retries)
+
+
+def results(engine: Engine, method: str, items: Iterable[Any]) -> Iterator[Any]:
+    """target.method(item) of each item, in order. **Raises:** the first error."""
+    for _, result in engine.map(method, items):
+        if isinstance(result, Failure):
+            raise result.error
+        yield result
