@@ -109,6 +109,7 @@ class Options(NamedTuple):
 
         **Raises:** ValueError for a number that is not one, and for `devices` of this process next to a client.
         """
+        # The former name, for one release.
         if arguments["lanes"] is not None:
             warnings.warn("lanes is deprecated; pass batch_size", DeprecationWarning, stacklevel=3)
             arguments = {**arguments, "batch_size": arguments["lanes"]}
@@ -164,9 +165,11 @@ def run_batch(
             Pipeline(options.retries) if options.client is None else Cluster(options.client, options.retries, mark)
         )
         with engine:
+            # Not larger than a chunk has to be, so that a batch is never filled up for nothing.
             most = min(BYTES // max(row_bytes, 1), -(-batch.count // (SHARES * engine.workers)))
             fixed = outputs, batch, cost, reducer, kept, path.absolute(), options.devices, options.batch_size
             engine.send(Study(*fixed, most, options.memory, engine.workers_per_host).open)
+            # On one worker, for all: they have the same program, and the store is created once.
             facts: Facts = engine.call("facts", store is None)
             description["platform"] = facts.platform
             if store is None:
@@ -207,6 +210,7 @@ def _compute_chunks(
     """Compute the missing chunks, then check those of earlier calls; returns the damaged ones."""
     failures: list[tuple[int, Failure]] = []
     is_new = not before.any()
+    # An iterator over the missing ones, not a list: 1e8 rollouts may be a million chunks.
     missing = range(store.chunks) if is_new else (int(chunk) for chunk in np.flatnonzero(~before))
 
     def results(method: str, items: Any) -> Iterator[tuple[Any, Any]]:
@@ -214,6 +218,7 @@ def _compute_chunks(
             if not isinstance(result, Failure):
                 yield item, result
                 continue
+            # All other chunks would fail in the same way.
             if isinstance(result.error, OSError) and result.error.errno in FULL:
                 raise result.error
             failures.append((item if method == "chunk" else item[0], result))

@@ -70,6 +70,7 @@ class FunctionRows(NamedTuple):
         values = {str(name): jnp.asarray(value) for name, value in values.items()}
         if {"result", "record", "partial", "rollout"} & values.keys():
             raise ValueError("function returned an array named result, record, partial or rollout; take another name")
+        # A function without codes of its own fails where a result is not finite, as a simulation that diverges.
         success = values.pop("success", None)
         if success is None:
             success = jnp.stack([jnp.isfinite(value).all() for value in values.values()]).all()

@@ -82,6 +82,7 @@ def member(parameters: PyTree, number: int, seed: int = 0) -> PyTree:
 
     **Arguments:** `parameters` and `seed` as they were passed there.
     """
+    # As in `Members.one`, which the program of a batch traces.
     if callable(parameters):
         return parameters(jax.random.fold_in(jax.random.key(seed), jnp.uint32(number)))
     return jax.tree.map(lambda x: jnp.asarray(x)[number], parameters)
@@ -89,6 +90,7 @@ def member(parameters: PyTree, number: int, seed: int = 0) -> PyTree:
 
 def digest(tree: Any) -> str:
     """Hash of the values, shapes and paths of a pytree of arrays."""
+    # With dtypes and shapes: equal bytes of other types are other inputs.
     hashed = hashlib.sha256()
     for path, leaf in jax.tree_util.tree_flatten_with_path(tree)[0]:
         array = np.ascontiguousarray(leaf)

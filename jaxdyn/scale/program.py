@@ -91,6 +91,7 @@ class Program:
         analysis = self.compiled.memory_analysis()
         if analysis is None:
             return 0
+        # XLA's figures are those of one device.
         own = analysis.temp_size_in_bytes + analysis.argument_size_in_bytes
         return len(self.devices) * (own + IN_FLIGHT * analysis.output_size_in_bytes)
 
@@ -103,6 +104,7 @@ class Traced:
 
     def __init__(self, one: Callable, members: Members):
         self._origin = one, members
+        # Tracing a scene and its integrator takes seconds, and is the largest part of the start.
         trace = jax.make_jaxpr(lambda given: one(*members.one(given)), return_shape=True)
         operations, self.shapes = trace(member_shapes(members))
         self._call = function_of(operations)
@@ -125,6 +127,7 @@ def member_shapes(members: Members) -> Any:
 
 def fingerprint(one: Callable, members: Members) -> str:
     """Hash of the computation for one member, by operations of JAX alone: equal on every machine with these versions."""
+    # Kernels contain machine code, whose bytes depend on the processor.
     with compilation("plain"):
         text = jax.jit(lambda given: one(*members.one(given))).lower(member_shapes(members)).as_text()
     return hashlib.sha256(text.encode()).hexdigest()[:16]

@@ -53,6 +53,7 @@ class Rollout:
     def _start(self, drawn: Any, row: Any) -> tuple[Any, Any, Any, Any, Any]:
         own = row.get("parameters") if drawn is None else drawn
         scene, control = self.scene(own) if self.builds else self.scene, self.control
+        # A control with parameters of the rollout has to be built with the scene.
         if isinstance(scene, tuple):
             scene, control = scene
         q0, v0 = self.states(own) if self.states else ((row | self.fixed)[name] for name in ("q0", "v0"))
@@ -159,6 +160,7 @@ def run(
             raise ValueError(f"states is {states!r}; give a pair (q0, v0), or a function of the parameters")
         for name, value in zip(("q0", "v0"), states, strict=True):
             value = np.asarray(as_array(value, name))
+            # A state for all rollouts is a constant of the program, and is not repeated for each of them.
             (named if value.ndim > 1 else fixed)[name] = value
     batch = members(named, draw, samples, seed)
 
@@ -170,6 +172,7 @@ def run(
         "scene": "built by a function" if builds else scene_lines(model),
         "outputs": list(options.get("outputs", ())),
     }
+    # Steps of a given size are equally many: nothing to measure.
     pilot = rollout.pilot if options.get("stepsize") is None else None
     units = dict(shared.units or {})
     return run_batch(lambda to: describe_motion(rollout, batch, to, units, ts), given, batch, shared, pilot)

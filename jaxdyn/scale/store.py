@@ -68,6 +68,7 @@ def check_place(path: Path) -> None:
         raise ValueError(f"out is {str(path)!r}, which is a file; name a directory")
     if not path.parent.is_dir():
         raise ValueError(f"out is {str(path)!r}: there is no directory {path.parent}")
+    # Asked before anything is computed: the first write comes after the compilation.
     place = path if path.exists() else path.parent
     if not os.access(place, os.W_OK | os.X_OK):
         raise ValueError(
@@ -85,6 +86,7 @@ class Store:
         zarr = zarr_package()
         self.path = path
         self._zarr = zarr
+        # Zarr reads its settings when an array is opened.
         with self._writing():
             try:
                 self.group = zarr.open_group(path, mode="r+")
@@ -214,6 +216,7 @@ class Store:
         with self._writing():
             for name, array in self._arrays.items():
                 array[self._place(array, chunk)] = arrays[name]
+            # The record last: a chunk without it is missing, whatever files it has.
             self._record[chunk] = self._sums(chunk)
 
     def read(self, chunk: int, names: Sequence[str]) -> dict[str, np.ndarray]:
@@ -223,6 +226,7 @@ class Store:
     def is_whole(self, chunk: int) -> bool:
         """True where all files of a finished chunk are those that were written, by their checksums."""
         try:
+            # The last bytes against the record recognise files of another run; reading them checks all other bytes.
             if not np.array_equal(np.asarray(self._record[chunk]), self._sums(chunk)):
                 return False
             for array in self._arrays.values():
@@ -254,6 +258,7 @@ class Store:
 
     def _sums(self, chunk: int) -> np.ndarray:
         """The last four bytes of each array's file, which are its CRC-32C."""
+        # The codec has put them at the end; the rest of the file is not read.
         checksums = []
         for name, array in self._arrays.items():
             with self._file(name, array, chunk).open("rb") as file:

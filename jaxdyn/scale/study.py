@@ -178,6 +178,8 @@ class Pipeline(Local):
 
     target: Computation
 
+    # Writing releases the interpreter's lock most of the time, computing nearly always: a thread is enough. One chunk ahead, so
+    # that two chunks are in memory, not more.
     def map(self, method: str, items: Iterable[Any]) -> Iterator[tuple[Any, Any]]:
         """Results in the order of the items, as in `Local`."""
         if method != "chunk":

@@ -79,6 +79,7 @@ class Cluster:
         self.client.register_plugin(self._plugin, name=self._name)
 
     def _begin(self) -> None:
+        # A cluster that scales by need has no worker yet.
         self.client.wait_for_workers(1)
         _check_versions(self.client)
         if self._plugin is not None:
@@ -133,7 +134,7 @@ class Cluster:
             key=[(group, place) for place in places],
             resources={RESOURCE: 1},
             retries=self.retries,
-            pure=False,
+            pure=False,  # keys are given, not hashes of the arguments
         )
 
     def new_group(self, method: str) -> str:

@@ -57,6 +57,7 @@ class Local:
         """target.method(item). **Raises:** its error."""
         return getattr(self.target, method)(item)
 
+    # One after another: kernels use all cores of the process by themselves.
     def map(self, method: str, items: Iterable[Any]) -> Iterator[tuple[Any, Any]]:
         """Pairs of an item and target.method(item), or the `Failure` of its last attempt, in the order of the items."""
         for item in items:

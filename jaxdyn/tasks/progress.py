@@ -15,6 +15,7 @@ class Progress:
         self.total, self.before, self.computed, self.failed = total, before, 0, 0
         self._file = sys.stderr if file is None else file
         self._shown, self._terminal = shown, self._file.isatty()
+        # A log file gets few lines, a terminal a meter that moves.
         self._every = 0.2 if self._terminal else every
         self._start = self._last = time.monotonic()
 
