@@ -21,7 +21,7 @@ from jaxdyn.constraints.rank import check_tolerance, tolerance
 from jaxdyn.constraints.redundancy import Selection, keep_rows, opening_of_redundant
 from jaxdyn.constraints.selection import clear_pivot, most_rounding, select_concrete_rows, select_rows
 from jaxdyn.constraints.tolerances import coordinate_sizes, largest_ratio, row_limits
-from jaxdyn.lie.so3 import _product
+from jaxdyn.lie.so3 import matmul
 from jaxdyn.model.arguments import Numbers, check_state, zeros_if_none
 from jaxdyn.model.tree import Model
 from jaxdyn.systems.scene import Scene, as_scene
@@ -261,7 +261,7 @@ def _with_velocity(scene, q, v, t, rank_tol):
     # Twice, so that the rounding of the first correction of a large v is corrected too.
     B = correction(scene, q, t, rank_tol, holonomic=False)
     for _ in range(2):
-        v = v - _product(B, velocity_residual(scene, q, v, t))
+        v = v - matmul(B, velocity_residual(scene, q, v, t))
     return v
 
 

@@ -25,7 +25,7 @@ from jaxdyn.compile import variant
 from jaxdyn.constraints.base import Constraint
 from jaxdyn.dynamics.kinematics import BodyFrames, body_frames, take
 from jaxdyn.lie import se3, so3
-from jaxdyn.lie.so3 import _product
+from jaxdyn.lie.so3 import matmul
 from jaxdyn.model.arguments import Number, SystemLike
 from jaxdyn.model.names import frame_index
 from jaxdyn.model.tree import Model
@@ -35,7 +35,7 @@ def frames_on(model: Model, q, bodies: Sequence[str | None], poses, v=None) -> B
     """Frames at the given poses (4, 4) in bodies or named frames (None: the world); with v, their twists too."""
     places, offsets = places_on(model, bodies, poses, q.dtype)
     frames = body_frames(model, q, places, v)
-    return frames._replace(pose=_product(frames.pose, offsets))
+    return frames._replace(pose=matmul(frames.pose, offsets))
 
 
 def places_on(model: Model, bodies: Sequence[str | None], poses, dtype) -> tuple[list[int], Float[Array, "n 4 4"]]:
@@ -45,7 +45,7 @@ def places_on(model: Model, bodies: Sequence[str | None], poses, dtype) -> tuple
         index = None if body is None else frame_index(model, body)
         places.append(-1 if index is None else model.topology.frame_bodies[index])
         if index is not None and body not in model.body_names:
-            offsets = offsets.at[k].set(_product(model.frame_poses[index].astype(dtype), offsets[k]))
+            offsets = offsets.at[k].set(matmul(model.frame_poses[index].astype(dtype), offsets[k]))
     return places, offsets
 
 
@@ -64,7 +64,7 @@ def _poses_in_a(frames: BodyFrames):
     transpose = jnp.swapaxes(frames.pose[:n, :3, :3], 1, 2)
     across = frames.origin[n:] - frames.origin[:n]
     between = frames.pose[n:, :3, 3] - frames.pose[:n, :3, 3] + across
-    return _product(transpose, frames.pose[n:, :3, :3]), _product(transpose, between[..., None])[..., 0], across
+    return matmul(transpose, frames.pose[n:, :3, :3]), matmul(transpose, between[..., None])[..., 0], across
 
 
 def _adjoints_to_a(frames: BodyFrames, across):
@@ -122,7 +122,7 @@ class Pair(Constraint):
 
         `R` (3, 3), `p` (3,): pose of frame B seen from frame A. The wrench on body A is the negative of it.
         """
-        return _product(lam, _directions(self, R, p))
+        return matmul(lam, _directions(self, R, p))
 
     @classmethod
     def group_positions(cls, members: Sequence["Pair"], system: SystemLike, q: Float[Array, " nq"], t: Number) -> list:
@@ -149,7 +149,7 @@ def _group_rows(members: tuple[Pair, ...], system, q, v) -> list:
     by_a, by_b = _adjoints_to_a(frames, across)
     assert frames.twist is not None and frames.bias is not None
     twists = jnp.stack([frames.twist, frames.bias], axis=-1)
-    of_a, of_b = _product(by_a, twists[:n]), _product(by_b, twists[n:])
+    of_a, of_b = matmul(by_a, twists[:n]), matmul(by_b, twists[n:])
     relative = of_b - of_a
     # U' of the module's text: the bracket is the second order of the logarithm of the relative motion.
     rate = relative[:, :, 1] - jax.vmap(se3.ad_apply)(of_a[:, :, 0], of_b[:, :, 0])
@@ -165,7 +165,7 @@ def _group_rows(members: tuple[Pair, ...], system, q, v) -> list:
         columns = jnp.zeros((*D.shape[:2], len(frames.coordinates)), q.dtype)
         for sign, mask, adjoint in sides:
             if mask[index].any():
-                part = _product(_product(D, take(adjoint, index)), frames.subspace.T)
+                part = matmul(matmul(D, take(adjoint, index)), frames.subspace.T)
                 columns = columns + part * jnp.asarray(sign * mask[index][:, None, :], q.dtype)
         if len(frames.coordinates) < system.nv:
             # The pass went through the bodies between the frames alone; other coordinates have columns of zeros.
@@ -194,7 +194,7 @@ def relative_motions(members, system, q, v):
     assert frames.twist is not None
     by_a, by_b = _adjoints_to_a(frames, across)
     twist_a, twist_b = frames.twist[:n, :, None], frames.twist[n:, :, None]
-    return rotation, position, (_product(by_b, twist_b) - _product(by_a, twist_a))[..., 0]
+    return rotation, position, (matmul(by_b, twist_b) - matmul(by_a, twist_a))[..., 0]
 
 
 def each(members: Sequence[Pair], function, *rows) -> list:
@@ -228,8 +228,8 @@ def displace_pose(R, p, twist):
     """
     # Not `se3.exp`, whose series and branches near zero would be differentiated twice for each row.
     hat = so3.hat(twist[3:])
-    dp, dR = twist[:3] + _product(hat, p), _product(hat, R)
-    return R + dR + 0.5 * _product(hat, dR), p + dp + 0.5 * _product(hat, dp)
+    dp, dR = twist[:3] + matmul(hat, p), matmul(hat, R)
+    return R + dR + 0.5 * matmul(hat, dR), p + dp + 0.5 * matmul(hat, dp)
 
 
 def _directions(pair: Pair, R, p) -> Float[Array, "r 6"]:
@@ -258,4 +258,4 @@ def _rates(pair: Pair, R, p, U, rate):
         parts.append(jax.jvp(lambda twist: jax.jvp(residual, (twist,), (U,))[1], (zero,), (U,))[1])
     if jax.eval_shape(pair.twist_residual, R, p, U) is not None:
         parts.append(jax.jvp(lambda twist: pair.twist_residual(*displace_pose(R, p, twist), U), (zero,), (U,))[1])
-    return D, -(_product(D, rate) + jnp.concatenate(parts)), _product(D, U)
+    return D, -(matmul(D, rate) + jnp.concatenate(parts)), matmul(D, U)

@@ -21,7 +21,7 @@ from jaxdyn.constraints.base import (
 )
 from jaxdyn.constraints.rank import eps_of
 from jaxdyn.constraints.tolerances import row_limits
-from jaxdyn.lie.so3 import _product
+from jaxdyn.lie.so3 import matmul
 from jaxdyn.model.arguments import Number, SystemLike
 from jaxdyn.systems.mass_factor import cholesky, solve_cholesky
 from jaxdyn.systems.scene import Scene
@@ -172,10 +172,10 @@ def residual_of_redundant(scene: Scene, q, v, t, a) -> Float[Array, ""]:
     whole, kept, q, t = _constants(scene, q, t)
     v, a = stop_gradient((v, a))
     A, gamma, _ = rows(whole, q, v, t)
-    sizes = jnp.abs(gamma) + _product(jnp.abs(A), jnp.abs(a))
+    sizes = jnp.abs(gamma) + matmul(jnp.abs(A), jnp.abs(a))
     sizes = sizes + jnp.max(sizes)
     some = sizes > 0
-    ratio = jnp.abs(_product(A, a) - gamma) / jnp.where(some, sizes, jnp.ones_like(sizes))
+    ratio = jnp.abs(matmul(A, a) - gamma) / jnp.where(some, sizes, jnp.ones_like(sizes))
     return jnp.max(jnp.where(some, ratio, jnp.zeros_like(ratio)) * (1 - kept))
 
 
@@ -207,10 +207,10 @@ def _distribute(scene: Scene, q, t, lam, kept):
     A, kept = constraint_jacobian(scene, q, t), kept.astype(q.dtype)
     own = kept[:, None] * A
     # Ones on the diagonal of dropped rows make the matrix regular; their right-hand sides are zero.
-    gram = _product(own, own.T) + jnp.diag(1 - kept)
-    C = solve_cholesky(cholesky(gram), _product(own, ((1 - kept)[:, None] * A).T)).T
-    shared = solve_cholesky(cholesky(jnp.eye(A.shape[0], dtype=A.dtype) + _product(C.T, C)), kept * lam)
-    return kept * shared + _product(C, shared)
+    gram = matmul(own, own.T) + jnp.diag(1 - kept)
+    C = solve_cholesky(cholesky(gram), matmul(own, ((1 - kept)[:, None] * A).T)).T
+    shared = solve_cholesky(cholesky(jnp.eye(A.shape[0], dtype=A.dtype) + matmul(C.T, C)), kept * lam)
+    return kept * shared + matmul(C, shared)
 
 
 def largest_of_each(scene: Scene, sizes) -> Array:

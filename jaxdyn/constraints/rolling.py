@@ -22,7 +22,7 @@ from jaxtyping import Array, Float
 from jaxdyn.compile.known import is_concrete
 from jaxdyn.constraints.frames import Pair
 from jaxdyn.constraints.loops import check_bodies
-from jaxdyn.lie.so3 import _product, cross
+from jaxdyn.lie.so3 import cross, matmul
 from jaxdyn.model.arguments import DType, Numbers, SystemLike, pose_leaf
 
 
@@ -90,7 +90,7 @@ class Touching(Pair):
         if not self.count:
             return jnp.sum(touch.normal * U[3:])[None] if self.spin else None
         # U is the twist at the origin of A: the material point of the body at the contact moves with v + w x point.
-        slip = _product(touch.directions, U[:3] + cross(U[3:], touch.point))
+        slip = matmul(touch.directions, U[:3] + cross(U[3:], touch.point))
         return jnp.concatenate([slip, jnp.sum(touch.normal * U[3:])[None]]) if self.spin else slip
 
 
@@ -188,7 +188,7 @@ def rolling_wheel(
 
 
 class KnifeEdge(Touching):
-    """A blade that slides along its own axis on a plane; made by `jd.knife_edge`."""
+    """A blade that slides along its own axis on a plane; made by `jd.constraints.knife_edge`."""
 
     name: str = eqx.field(static=True)
     body: str = eqx.field(static=True)

@@ -28,7 +28,7 @@ from jaxdyn.constraints.rank import eps_of, least_pivot_of, tolerance
 from jaxdyn.constraints.redundancy import Selection, all_rows, largest_of_each, largest_opening, rows_of
 from jaxdyn.constraints.tolerances import coordinate_sizes
 from jaxdyn.dynamics.quantities import mass_matrix
-from jaxdyn.lie.so3 import _product
+from jaxdyn.lie.so3 import matmul
 from jaxdyn.model.arguments import Number, state_dtype
 from jaxdyn.model.tree import Model, neutral
 from jaxdyn.systems.mass_factor import cholesky, mass_factor
@@ -76,7 +76,7 @@ def eliminate(B: Float[Array, "nc nv"], least: float, first: Float[Array, " nc"]
         pivot = lengths[row]
         along = rest[row] / jnp.where(pivot > 0, pivot, jnp.ones_like(pivot))
         is_kept = pivot > least if most is None else (pivot > least) & (jnp.sum(kept) < most)
-        rest = jnp.where(is_kept, rest - _product(rest, along)[:, None] * along[None], rest)
+        rest = jnp.where(is_kept, rest - matmul(rest, along)[:, None] * along[None], rest)
         return rest, kept.at[row].add(is_kept.astype(B.dtype))
 
     rest, kept = lax.fori_loop(0, min(B.shape), keep_next, (B, jnp.zeros_like(B[:, 0])))
@@ -198,7 +198,7 @@ def _least_distance(scene: Scene, q, t):
     """Least distance of a row from the span of those before it; NaN where a row is dependent."""
     # The diagonal of the Cholesky factor of B B^T holds these distances.
     B = unit_rows(scene, q, t)
-    return jnp.min(jnp.diagonal(cholesky(_product(B, B.T))))
+    return jnp.min(jnp.diagonal(cholesky(matmul(B, B.T))))
 
 
 def clear_pivot(like) -> float:
@@ -223,7 +223,7 @@ def _select_far_away(scene: Scene, q, t, sure, apart: float, is_rounded: bool):
     # same in every call: a random direction would make the choice of rows, and so the bits of a motion, random.
     A = sure[:, None] * constraint_jacobian(scene, q, t)
     direction = jnp.asarray(1 + np.modf(np.arange(scene.nv) * 0.618)[0], q.dtype)
-    direction = direction - _product(inverse_of(A), _product(A * sizes[None], direction))
+    direction = direction - matmul(inverse_of(A), matmul(A * sizes[None], direction))
     length = jnp.max(jnp.abs(direction))
     # A structure (no admissible direction) is tested where it is.
     moves = length > 1e-6
@@ -233,7 +233,7 @@ def _select_far_away(scene: Scene, q, t, sure, apart: float, is_rounded: bool):
     def close(_, place):
         place = retract(scene.system, place)
         A = (sure[:, None] * constraint_jacobian(scene, place, t))[held]
-        step = _product(inverse_of(A), sure[held] * position_residual(scene, place, t)) * sizes
+        step = matmul(inverse_of(A), sure[held] * position_residual(scene, place, t)) * sizes
         # A step longer than the distance itself would leave the branch.
         size = jnp.max(jnp.abs(step / sizes))
         return displace(scene.system, place, -step * jnp.minimum(1.0, _FAR / jnp.where(size > 0, size, 1.0)))
