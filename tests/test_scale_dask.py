@@ -566,7 +566,7 @@ def test_cross_validation_of_a_fit(client):
     q, v, a = np.sin(rates * t[:, None]), rates * np.cos(rates * t[:, None]), -(rates**2) * np.sin(rates * t[:, None])
     tau = jax.vmap(lambda *x: jd.inverse_dynamics(model, *x))(q, v, a) + 0.3 * v + 0.5 * np.tanh(v / 0.01)
     log = jd.identify.Log(t, q, v, a, np.asarray(tau) + 0.02 * noise)
-    options = {"terms": ("viscous", "coulomb"), "robust": "auto", "weights": None}
+    options = {"terms": ("viscous", "coulomb"), "robust": "auto", "weights": None, "inertia": "mass"}
     here, there = (jd.identify.fit_robot(model, log, client=one, **options) for one in (None, client))
     assert here.choice.setting == there.choice.setting and len(here.choice.trials) > 8
     for one, other in zip(here.choice.trials, there.choice.trials, strict=True):
