@@ -77,7 +77,7 @@ def load_mjcf(path: str | os.PathLike, *, dtype: DType | None = None) -> LoadedS
     tendons, also = tendon_forces(file, model)
     drives, idle = actuators(file, model)
     readings, unread = sensors(file, model)
-    not_taken = (*missing, *left, *also, *idle, *_unsupported(file), *unread)
+    not_taken = (*missing, *left, *also, *idle, *_elements_without_effect(file), *unread)
     warn_not_taken(path, not_taken)
     warn_of_units(path, model)
     forces = (*_joint_forces(file, model), *tendons)
@@ -199,7 +199,7 @@ def _state(file: CompiledFile, model: Model, qpos, qvel) -> tuple[np.ndarray, np
     return q, v
 
 
-def _unsupported(file: CompiledFile) -> list[str]:
+def _elements_without_effect(file: CompiledFile) -> list[str]:
     """Elements of the file that the scene does not represent, apart from constraints, tendons and actuators."""
     m, mujoco = file.m, file.mujoco
     free = [file.joints[j] for j in range(m.njnt) if m.jnt_type[j] == FREE]

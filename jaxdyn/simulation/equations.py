@@ -12,7 +12,8 @@ import jax
 import jax.numpy as jnp
 
 from jaxdyn.compile.known import partition_tracers
-from jaxdyn.constraints.selection import exchange_rows, renew_rows
+from jaxdyn.constraints.redundancy import exchange_rows
+from jaxdyn.constraints.selection import renew_rows
 from jaxdyn.forces.piecewise import Pieces, fix_pieces, guards, pieces_of, values_and_levels
 from jaxdyn.simulation import contacts as unilateral
 from jaxdyn.simulation import controls

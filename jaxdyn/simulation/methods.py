@@ -21,15 +21,15 @@ from jaxdyn.constraints.base import Rows, holonomic_rows, layout, position_resid
 from jaxdyn.constraints.codes import RESULTS
 from jaxdyn.constraints.dynamics import constrained_dynamics, solve_rows
 from jaxdyn.constraints.projection import project_state, project_step
-from jaxdyn.constraints.rank import checked_tolerance
-from jaxdyn.constraints.selection import (
-    is_selected,
-    missed_by_dropped,
+from jaxdyn.constraints.rank import check_tolerance
+from jaxdyn.constraints.redundancy import (
+    distribute_multipliers,
+    has_selection,
     most_opening,
-    most_rounding,
-    opening_of_dropped,
-    spread_multipliers,
+    opening_of_redundant,
+    residual_of_redundant,
 )
+from jaxdyn.constraints.selection import most_rounding
 from jaxdyn.constraints.tolerances import openness
 from jaxdyn.dynamics.quantities import forward_dynamics
 from jaxdyn.lie.so3 import matmul
@@ -159,7 +159,7 @@ class Multipliers(Method):
     name: ClassVar[str] = "multipliers"
 
     def __check_init__(self):
-        checked_tolerance(self.rank_tol)
+        check_tolerance(self.rank_tol)
 
     def acceleration(
         self, scene: Scene, q: Float[Array, " nq"], v: Float[Array, " nv"], t: Number, force: Float[Array, " nv"] | None
@@ -179,7 +179,7 @@ class Multipliers(Method):
         """From `constrained_dynamics`; rows that were dropped at the start may ask for something else now."""
         found = dynamics(scene, q, v, t, force, self.rank_tol)
         met = found.result != RESULTS.contradictory_rows
-        return met & (missed_by_dropped(scene, q, v, t, found.acceleration) <= most_rounding(q.dtype))
+        return met & (residual_of_redundant(scene, q, v, t, found.acceleration) <= most_rounding(q.dtype))
 
 
 class Projected(Multipliers):
@@ -429,9 +429,9 @@ def _error_of_place(scene: Scene, q, error) -> Array:
 def dynamics(scene: Scene, q, v, t, force, rank_tol: float | None = None):
     """Acceleration and multipliers at a state; `force` (nv,) is tau plus the scene's forces, or None."""
     found = constrained_dynamics(Scene(scene.system, scene.constraints), q, v, force, t, rank_tol=rank_tol)
-    if not is_selected(scene):
+    if not has_selection(scene):
         return found
-    shared = spread_multipliers(scene, q, t, found.multipliers)
+    shared = distribute_multipliers(scene, q, t, found.multipliers)
     return eqx.tree_at(lambda found: found.multipliers, found, shared)
 
 
@@ -452,4 +452,4 @@ def consistent(scene: Scene, q, v, t):
 
 def meets_dropped_rows(scene: Scene, q, v, t):
     """Whether the rows that were dropped at the start of a motion are met still."""
-    return opening_of_dropped(scene, q, t, v) <= most_opening(scene, q.dtype)
+    return opening_of_redundant(scene, q, t, v) <= most_opening(scene, q.dtype)

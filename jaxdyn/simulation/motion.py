@@ -9,16 +9,8 @@ import jax.numpy as jnp
 
 from jaxdyn.compile import kernel
 from jaxdyn.compile.batch import map_rows
-from jaxdyn.constraints.selection import (
-    exchange_rows,
-    gap_of_dropped,
-    is_selected,
-    keep_rows,
-    kept_of,
-    most_rounding,
-    rows_of,
-    select_rows,
-)
+from jaxdyn.constraints.redundancy import exchange_rows, gap_of_redundant, has_selection, keep_rows, row_mask, rows_of
+from jaxdyn.constraints.selection import most_rounding, select_rows
 from jaxdyn.contact.forces import contacts_with_cones
 from jaxdyn.model.tree import Model, neutral
 from jaxdyn.simulation import contacts as unilateral
@@ -91,7 +83,7 @@ def motion(scene: Scene, control, method: Method, numbers, options) -> Solution:
     eqx.filter_eval_shape(eqs.generalized_force, eqs.args, states, q0, v0, ts[0])
     y0 = method.start(scene, q0, v0, ts[0]) | states
     first = method.quality(scene, y0, ts[0])
-    if is_selected(scene) and not isinstance(options["solver"], Stepper):
+    if has_selection(scene) and not isinstance(options["solver"], Stepper):
         y0 = y0 | {KEPT: rows_of(scene, q0.dtype)}
     y0 = y0 | {"work": jnp.zeros((), q0.dtype)} if "work" in outputs else y0
     solver = options["solver"]
@@ -184,7 +176,7 @@ def motion(scene: Scene, control, method: Method, numbers, options) -> Solution:
             y, *state = row
             own = scene_at(y)  # rows that were exchanged on the way are as open as rounding leaves them
             met = consistent(own, *state)
-            return met & meets_dropped_rows(own, *state) if is_selected(own) else met
+            return met & meets_dropped_rows(own, *state) if has_selection(own) else met
 
         closed = map_rows(is_closed, (y, q, v, ts))
         failures.append(((result == RESULTS.successful) & ~closed.all(), RESULTS.open_constraints))
@@ -210,9 +202,9 @@ def motion(scene: Scene, control, method: Method, numbers, options) -> Solution:
     rows = jax.tree.map(lambda x: rows_where(reached, x, jnp.nan), rows)
     stats = {name: jnp.asarray(counts[name], jnp.int32) for name in COUNTS}
     stats["time_reached"] = jnp.where(good, time_reached, ts[0])
-    if is_selected(scene):
-        gaps = map_rows(lambda row: gap_of_dropped(scene_at(row[0]), *row[1:]), (y, q, ts))
-        stats["redundant_rows"] = jnp.sum(1 - kept_of(scene)).astype(jnp.int32)
+    if has_selection(scene):
+        gaps = map_rows(lambda row: gap_of_redundant(scene_at(row[0]), *row[1:]), (y, q, ts))
+        stats["redundant_rows"] = jnp.sum(1 - row_mask(scene)).astype(jnp.int32)
         stats["redundant_gap"] = jnp.max(jnp.where(reached, gaps, jnp.zeros_like(gaps)))
     if lost is not None and unilateral.can_end(scene, options["contacts"]):
         stats["lost_contact"] = jnp.where(lost.entry < count, lost.entry, -1)

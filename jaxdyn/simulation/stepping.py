@@ -11,7 +11,8 @@ from jax.flatten_util import ravel_pytree
 
 from jaxdyn.compile import is_standalone
 from jaxdyn.compile.known import is_concrete, partition_tracers
-from jaxdyn.constraints.selection import keep_rows, may_have_redundant_rows, select_rows
+from jaxdyn.constraints.redundancy import keep_rows
+from jaxdyn.constraints.selection import may_have_redundant_rows, select_rows
 from jaxdyn.contact.unilateral import has_modes
 from jaxdyn.forces.piecewise import fix_pieces, guards, pieces_of, values_and_levels
 from jaxdyn.model.arguments import Numbers, as_array, check_shape, state_dtype

@@ -671,7 +671,7 @@ def test_info_says_which_rows_repeat_others(digits, tmp_path, capsys):
     path.write_text(number.sub(lambda x: f"{float(x[0]):.{digits}g}", bennett()))
     assert main(["info", str(path)]) == 0
     text = capsys.readouterr().out
-    assert "Degrees of freedom after constraints: 1 of 3\nRows that repeat what others say" in text
+    assert "Degrees of freedom after constraints: 1 of 3\nRedundant rows, which jd.simulate leaves out" in text
     gap = float(re.search(r"hinge_\d: 3 of 5, which stay open by up to (\S+) m or rad", text)[1])
     assert 10.0 ** -(digits + 3) <= gap + 1e-16 and gap <= 10.0**-digits + 1e-14
 

@@ -96,6 +96,15 @@ def test_redundant_rows_are_said():
     assert jd.assemble(jd.scenes.four_bar(), jd.scenes.four_bar.start()[0]).redundancies() == []
 
 
+@pytest.mark.parametrize("guess", [1e308, np.inf, np.nan])
+def test_a_guess_without_end_is_refused_with_the_open_loop(guess):
+    # LAPACK's own error came first, where the path had left the finite numbers.
+    with pytest.raises(ValueError, match="not assembled: loop 'knee' open by"):
+        jd.assemble(jd.scenes.four_bar(), jnp.full(3, guess), guesses=2)
+    state = jd.assemble(jd.scenes.four_bar(), jnp.full(3, guess), guesses=1, throw=False)
+    assert state.result == jd.RESULTS.not_assembled
+
+
 BATCHES = """
     import faulthandler; faulthandler.dump_traceback_later(240, exit=True)
     import jax; jax.config.update("jax_enable_x64", True)

@@ -21,7 +21,7 @@ from jaxtyping import Array, Bool, PyTree
 
 from jaxdyn.compile import implicit, kernel, value_and_jvp
 from jaxdyn.compile.batch import any_sample
-from jaxdyn.constraints.projection import enlarged
+from jaxdyn.constraints.projection import enlarge
 from jaxdyn.model.arguments import Number
 from jaxdyn.simulation.solvers.projected import ProjectedInterpolation, ProjectedSolver
 
@@ -291,7 +291,7 @@ def _whole(plan: Plan, args, t0, t1, start, first):
     if plan.projects_before_last:
         k.append(plan.rate(args, t0, t1, projected, *points[-1]))
     if plan.project is not None:
-        error = enlarged(error + float(plan.sums[-1, -1]) * k[-1], left) if is_early else left
+        error = enlarge(error + float(plan.sums[-1, -1]) * k[-1], left) if is_early else left
     return projected, shift, error, raw, jnp.stack(k)
 
 
@@ -324,7 +324,7 @@ def _in_turn(plan: Plan, args, t0, t1, start, kept, ready):
     if not plan.projects_before_last:
         end = plan.ended(args, t1, raw, error)
     projected, shift, left, result = end
-    error = enlarged(error, left) if plan.projects_before_last and not plan.knows_error else left
+    error = enlarge(error, left) if plan.projects_before_last and not plan.knows_error else left
     return projected, shift, error, raw, k, result
 
 

@@ -10,7 +10,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, PyTree
 
-from jaxdyn.constraints.projection import enlarged
+from jaxdyn.constraints.projection import enlarge
 from jaxdyn.model.arguments import Number
 from jaxdyn.simulation.solvers.wrapped import Wrapped
 
@@ -84,7 +84,7 @@ class ProjectedSolver(Wrapped):
         shift = shift | {name: jnp.zeros_like(shift[name]) for name in self.step_constants}
         if error is not None:
             left = jax.tree.map(
-                lambda left, error, shift: enlarged(left, _unexpected(shift, error - left)), left, error, shift
+                lambda left, error, shift: enlarge(left, _unexpected(shift, error - left)), left, error, shift
             )
         return projected, shift, left, result
 
