@@ -253,7 +253,7 @@ def test_controls_of_another_number_are_refused(mixed):
     with pytest.raises(ValueError, match=r"activation has shape None, expected \(1,\).*stateful"):
         scene.actuators(scene.system, q, jnp.zeros(scene.nv), jnp.zeros(6))
     with pytest.raises(ValueError, match=r"activation has shape \(2,\), expected \(1,\)"):
-        scene.actuators.controller(scene.system, lambda q, v, t: jnp.zeros(6), jnp.zeros(2))
+        scene.actuators.drive(lambda q, v, t: jnp.zeros(6), jnp.zeros(2))
 
 
 DYNAMICS = """<general name="f" joint="h" dyntype="{0}" dynprm="0.08" gear="3" gainprm="2" ctrlrange="-1 1"/>
@@ -281,13 +281,15 @@ def test_motions_under_activations_are_those_of_mujoco(dynamics, integrator, tmp
     for _ in range(3):
         mujoco.mj_step(m, data, 400)
         theirs.append(np.concatenate([data.act, data.qpos, data.qvel]))
-    law = scene.actuators.controller(scene.system, lambda q, v, t: jnp.asarray(control), initial)
-    motion = jd.simulate(scene, jnp.zeros(2), jnp.zeros(2), 0.2 * np.arange(4), control=law, stepsize=5e-4,
-                         outputs=("control_state",))  # fmt: skip
-    np.testing.assert_allclose(motion.control_state[1:, :2], [row[:2] for row in theirs], rtol=1e-9)
-    np.testing.assert_allclose(motion.control_state[1:, 2], [0.16, 0.3, 0.3], atol=1e-3)
+    driven = jd.Scene(
+        scene.system, (), (*scene.forces, scene.actuators.drive(lambda q, v, t: jnp.asarray(control), initial))
+    )
+    zero = jnp.zeros(2)
+    motion = jd.simulate(driven, zero, zero, 0.2 * np.arange(4), stepsize=5e-4, outputs=("drive_state",))
+    np.testing.assert_allclose(motion.drive_state[1:, :2], [row[:2] for row in theirs], rtol=1e-9)
+    np.testing.assert_allclose(motion.drive_state[1:, 2], [0.16, 0.3, 0.3], atol=1e-3)
     if integrator == "RK4":
-        computed = np.hstack([motion.control_state, motion.q, motion.v])[1:]
+        computed = np.hstack([motion.drive_state, motion.q, motion.v])[1:]
         # The integrator stops within a step, which ours passes by less than a step.
         np.testing.assert_allclose(computed[:1], theirs[:1], rtol=1e-9, atol=1e-9)
         np.testing.assert_allclose(computed, theirs, rtol=1e-3, atol=1e-3)

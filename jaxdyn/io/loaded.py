@@ -14,7 +14,7 @@ from jaxdyn.model import float64 as f64
 from jaxdyn.model.arguments import Checked, Function, Number, Numbers, as_array, warn
 from jaxdyn.model.tree import Model
 from jaxdyn.sensors import Sensor
-from jaxdyn.simulation.controls import Controller
+from jaxdyn.systems.drives import DriveDynamics
 from jaxdyn.systems.scene import Force, Scene, as_pytree
 
 
@@ -47,7 +47,7 @@ class Actuators(eqx.Module):
     `effort_range`, the control to `control_range`.
 
     An actuator with dynamics has an activation w, which takes the place of u in the force: a "filter" with T dw/dt = u - w, an
-    "integrator" with dw/dt = u. At the ends of `activation_range` w stops. `controller` integrates the activations with a motion.
+    "integrator" with dw/dt = u. At the ends of `activation_range` w stops. `drive` makes a force of a scene of them.
 
     Lengths are linear in q, l = moment q, with the coordinates that have v = dq/dt; actuators at a site have no
     length (l = 0) and act with a wrench fixed in the site's frame.
@@ -123,16 +123,16 @@ class Actuators(eqx.Module):
         low, high = jnp.asarray(self.activation_range, activation.dtype).T
         return jnp.where((activation >= high) & (rate > 0) | (activation <= low) & (rate < 0), 0.0, rate)
 
-    def controller(self, system: Model, law: Function, activation: Numbers | None = None) -> "ActuatorController":
-        """Control of `jd.simulate` with law(q, v, t) -> (nu,) for the controls, and the activations as its state.
+    def drive(self, law: Function, activation: Numbers | None = None) -> "ActuatorDrive":
+        """Force of a scene under law(q, v, t) -> (nu,) for the controls, with the activations as its state.
 
-        `activation` (na,) at the start; zeros by default. `outputs=("control_state",)` are those of the motion.
+        `activation` (na,) at the start; zeros by default. `outputs=("drive_state",)` of `jd.simulate` are those of the motion.
 
         **Raises:** ValueError for a law that cannot be called, and activations of another shape.
         """
         start = np.zeros(len(self._active)) if activation is None else as_array(activation, "activation")
         initial = jnp.asarray(self._check_activation(start), float)
-        return ActuatorController(self, system, as_pytree(law, "law", "q, v, t"), initial)
+        return ActuatorDrive(self, as_pytree(law, "law", "q, v, t"), initial)
 
     @property
     def _active(self) -> list[int]:
@@ -158,28 +158,39 @@ class Actuators(eqx.Module):
         return activation
 
 
-class ActuatorController(Controller):
-    """Control by actuators under a law of their controls; the state is the activations (`Actuators.controller`)."""
+class ActuatorDrive(DriveDynamics):
+    """Actuators under a law of their controls, whose torques are added to the command (`Actuators.drive`)."""
 
     actuators: Actuators
-    system: Model
     law: Any
     initial: Float[Array, " na"]
 
-    def start(self, q: Float[Array, " nq"], v: Float[Array, " nv"], t: Float[Array, ""]) -> Float[Array, " na"]:
+    def start(self, system: Model, q: Float[Array, " nq"], v: Float[Array, " nv"], t: Number) -> Float[Array, " na"]:
         """The activations at the start."""
         return self.initial.astype(q.dtype)
 
-    def __call__(
-        self, q: Float[Array, " nq"], v: Float[Array, " nv"], t: Number, state: Any = None, multipliers: Any = None
+    def torque(
+        self,
+        system: Model,
+        q: Float[Array, " nq"],
+        v: Float[Array, " nv"],
+        t: Number,
+        state: Float[Array, " na"],
+        command: Float[Array, " nv"],
     ) -> Float[Array, " nv"]:
         """Generalised force (nv,)."""
-        return self.actuators(self.system, q, v, self.law(q, v, t), state if self.initial.size else None)
+        return command + self.actuators(system, q, v, self.law(q, v, t), state)
 
     def rate(
-        self, q: Float[Array, " nq"], v: Float[Array, " nv"], t: Number, state: Any, multipliers: Any
+        self,
+        system: Model,
+        q: Float[Array, " nq"],
+        v: Float[Array, " nv"],
+        t: Number,
+        state: Float[Array, " na"],
+        command: Float[Array, " nv"],
     ) -> Float[Array, " na"]:
-        """Rate of the activations."""
+        """Rates of the activations."""
         return self.actuators.activation_rate(self.law(q, v, t), state)
 
 

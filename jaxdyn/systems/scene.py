@@ -182,7 +182,7 @@ class Scene(eqx.Module):
 
 
 def has_drives(scene: Scene) -> bool:
-    """Whether a scene has drives with a state."""
+    """Decide whether a scene has drives with a state."""
     return any(isinstance(force, DriveDynamics) for force in scene.forces)
 
 
