@@ -69,9 +69,9 @@ class Actuators(eqx.Module):
     control_range: Float[Array, "nu 2"]
     force_range: Float[Array, "nu 2"]
     effort_range: Float[Array, "nv 2"]
-    dynamics: tuple[str | None, ...] = eqx.field(static=True, default=())
     time_constant: Float[Array, " na"] | None = None
     activation_range: Float[Array, "na 2"] | None = None
+    dynamics: tuple[str | None, ...] = eqx.field(static=True, default=(), kw_only=True)
 
     def __call__(
         self,

@@ -173,7 +173,7 @@ def _starts(file: CompiledFile, model: Model, drives) -> dict[str, Start]:
         if drives is not None and control is not None:
             places = [file.actuators.index(name) for name in drives.names]
             taken = jnp.asarray(control[m.actuator_ctrladr[places]], dtype)
-            if any(drives.dynamics):
+            if act is not None and any(drives.dynamics):
                 active = jnp.asarray(act[[m.actuator_actadr[i] for i in places if m.actuator_actnum[i]]], dtype)
         return Start(jnp.asarray(q, dtype), jnp.asarray(v, dtype), taken, active)
 

@@ -201,8 +201,8 @@ def actuators(file: CompiledFile, model: Model) -> tuple[Actuators | None, list[
         active = [i for i, kind in zip(taken, dynamics, strict=True) if kind]
         limited = m.actuator_actlimited[active].astype(bool)[:, None]
         of_active = m.actuator_dynprm[active, 0], np.where(limited, m.actuator_actrange[active], [-np.inf, np.inf])
-        leaves += [dynamics, *(jnp.asarray(x, model.home.dtype) for x in of_active)]
-    return Actuators(names, tuple(sites), tuple(int(x) for x in places), *leaves), lines
+        leaves += [jnp.asarray(x, model.home.dtype) for x in of_active]
+    return Actuators(names, tuple(sites), tuple(int(x) for x in places), *leaves, dynamics=dynamics), lines
 
 
 def _dynamics(file: CompiledFile, i: int) -> str | None:

@@ -6,13 +6,17 @@ import equinox as eqx
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from jaxdyn.forces.elements import _broadcast, _is_positive, _joint_indices, _leaf, _names
+from jaxdyn.forces.elements import _broadcast, _is_positive, _joint_indices, _leaf
 from jaxdyn.model.arguments import Checked, Number, Numbers, SystemLike
 from jaxdyn.model.builder import ModelBuilder
 from jaxdyn.model.joining import join
 from jaxdyn.model.joints import KINDS
 from jaxdyn.model.tree import Model
 from jaxdyn.systems.scene import Scene
+
+
+def _tuple(names: str | Sequence[str]) -> tuple[str, ...]:
+    return (names,) if isinstance(names, str) else tuple(names)
 
 
 class ElasticTransmission(eqx.Module):
@@ -31,8 +35,8 @@ class ElasticTransmission(eqx.Module):
     Source: Spong (1987), ASME J. Dyn. Sys. Meas. Control 109, eq. 13; De Luca & Book, Springer Handbook of Robotics, ch. 11.
     """
 
-    motors: tuple[str, ...] = eqx.field(static=True, converter=_names)
-    joints: tuple[str, ...] = eqx.field(static=True, converter=_names)
+    motors: tuple[str, ...] = eqx.field(static=True, converter=_tuple)
+    joints: tuple[str, ...] = eqx.field(static=True, converter=_tuple)
     stiffness: Float[Array, "..."] = eqx.field(converter=_leaf)
     damping: Float[Array, "..."] = eqx.field(converter=_leaf, default=0.0)
     gear: Float[Array, "..."] = eqx.field(converter=_leaf, default=1.0)
@@ -98,7 +102,7 @@ def elastic_joints(
     scene = jd.drives.elastic_joints(jd.robots.iiwa(), 1e4, 3e-5, damping=5.0, gear=100.0)
     ```
     """
-    chosen = model.joint_names if joints is None else _names(joints)
+    chosen = model.joint_names if joints is None else _tuple(joints)
     _joint_indices(model, chosen, "elastic_joints")
     kinds = dict(zip(model.joint_names, model.topology.kinds, strict=True))
     if several := [name for name in chosen if KINDS[kinds[name]].nv != 1]:
