@@ -80,7 +80,6 @@ from jaxdyn.dynamics.workspace import WorkspaceDynamics as WorkspaceDynamics
 from jaxdyn.dynamics.workspace import workspace_dynamics as workspace_dynamics
 from jaxdyn.export import Exported as Exported
 from jaxdyn.export import export as export
-from jaxdyn.forces import drives as drives
 from jaxdyn.forces.dissipation import RayleighDissipation as RayleighDissipation
 from jaxdyn.forces.dissipation import SlidingFriction as SlidingFriction
 from jaxdyn.forces.elements import CoulombFriction as CoulombFriction

@@ -8,7 +8,6 @@ import pytest
 from scipy.linalg import expm
 
 import jaxdyn as jd
-from jaxdyn import drives
 from jaxdyn.identify.replay import SampledTorque
 
 # Steps of order 8 that end on the save points.
@@ -35,7 +34,7 @@ def two_masses():
 
 def test_two_masses_on_a_spring_against_the_matrix_exponential():
     """Free oscillation, then a step of the motor's torque; closed form by exp(A t)."""
-    scene = drives.elastic_joints(wheel(), K, ROTOR, damping=D, gear=GEAR)
+    scene = jd.forces.elastic_joints(wheel(), K, ROTOR, damping=D, gear=GEAR)
     A, b = two_masses()
     ts, tau = np.linspace(0.0, 0.5, 11), 0.3
     x0 = np.array([0.1, -2.0, 0.2, 4.0])
@@ -55,7 +54,7 @@ def test_spongs_equations_of_an_arm():
     """Accelerations of two elastic joints and a rigid one, against the equations written out."""
     arm = jd.robots.chain(3)
     names = arm.joint_names
-    scene = drives.elastic_joints(
+    scene = jd.forces.elastic_joints(
         arm, [900.0, 400.0], [1e-3, 2e-3], damping=[3.0, 1.0], gear=[-80.0, 30.0], joints=(names[2], names[0])
     )
     assert scene.system.joint_names == (*names, f"{names[2]}_motor", f"{names[0]}_motor")
@@ -77,7 +76,7 @@ def lag_matrix(kind):
     return np.array([[0.0, 1.0], [-(60.0**2), -2 * 0.4 * 60.0]]), np.array([0.0, 60.0**2])
 
 
-DRIVES = {"first": drives.FirstOrder(0.03, initial=-0.5), "second": drives.SecondOrder(60.0, 0.4, initial=-0.5)}
+DRIVES = {"first": jd.forces.FirstOrderDrive(0.03, initial=-0.5), "second": jd.forces.SecondOrderDrive(60.0, 0.4, initial=-0.5)}
 
 
 @pytest.mark.parametrize("kind", DRIVES)
@@ -111,7 +110,7 @@ def test_step_response_of_a_drive(kind):
 
 
 def test_drive_of_one_joint_leaves_the_others():
-    scene = jd.Scene(jd.robots.chain(2), forces=[drives.FirstOrder(0.1, joints=jd.robots.chain(2).joint_names[1])])
+    scene = jd.Scene(jd.robots.chain(2), forces=[jd.forces.FirstOrderDrive(0.1, joints=jd.robots.chain(2).joint_names[1])])
     tau, rates = scene.drive_torque(jnp.zeros(2), jnp.zeros(2), 0.0, jnp.array([3.0, 4.0]), jnp.array([1.0]))
     np.testing.assert_allclose(tau, [3.0, 1.0])
     np.testing.assert_allclose(rates, [30.0])
@@ -122,7 +121,7 @@ def test_gradients_of_a_drive_in_both_modes_and_batches():
     t, u = 0.05, 3.0
 
     def speed(T, adjoint="reverse", stepped=True):
-        scene, zero = jd.Scene(wheel(), forces=[drives.FirstOrder(T)]), jnp.zeros(1)
+        scene, zero = jd.Scene(wheel(), forces=[jd.forces.FirstOrderDrive(T)]), jnp.zeros(1)
         if stepped:
             return jd.stepper(scene, t, substeps=40, adjoint=adjoint)((zero, zero, zero), jnp.full(1, u))[1][0]
         given = {"adjoint": adjoint, "solver": diffrax.Dopri8(), "stepsize": t / 20}
@@ -154,7 +153,7 @@ def test_torque_speed_curve_and_its_kink():
     ts, zero = jnp.array([0.0, 0.4, 1.5]), jnp.zeros(1)
 
     def run(stall):
-        limits = [drives.TorqueSpeedLimits(stall, 6.0), jd.EffortLimits(5.0)]
+        limits = [jd.forces.TorqueSpeedLimits(stall, 6.0), jd.EffortLimits(5.0)]
         scene = jd.Scene(wheel(), forces=limits)
         given = {"control": lambda q, v, t: jnp.full(1, 100.0), "outputs": ("torque",)}
         return jd.simulate(scene, zero, zero, ts, rtol=1e-11, atol=1e-11, **given)
@@ -168,7 +167,7 @@ def test_torque_speed_curve_and_its_kink():
     slope = jax.jit(jax.grad(lambda s: run(s).v[-1, 0]))(stall)
     np.testing.assert_allclose(slope, jax.grad(lambda s: limited_wheel(s, 6.0, 5.0, 1.5)[1])(8.0), rtol=1e-8)
     # Beyond the no-load speed the curve brakes, against the motion it gives more than at rest.
-    curve = drives.TorqueSpeedLimits([8.0, jnp.inf], 6.0)
+    curve = jd.forces.TorqueSpeedLimits([8.0, jnp.inf], 6.0)
     scene = jd.Scene(jd.robots.chain(2), forces=[curve])
     for v, bounds in ((9.0, (-20.0, -4.0)), (-3.0, (-4.0, 12.0))):
         for command, bound in zip((-99.0, 99.0), bounds, strict=True):
@@ -183,7 +182,7 @@ def order(error, steps):
 
 def test_stepper_ends_steps_at_kinks_of_drives():
     """Over the knee RK4 keeps its order, which would be the second across it."""
-    scene = jd.Scene(wheel(), forces=[drives.TorqueSpeedLimits(8.0, 6.0), jd.EffortLimits(5.0)])
+    scene = jd.Scene(wheel(), forces=[jd.forces.TorqueSpeedLimits(8.0, 6.0), jd.EffortLimits(5.0)])
 
     def error(substeps):
         _, v = jd.stepper(scene, 1.5, substeps)((jnp.zeros(1), jnp.zeros(1)), jnp.full(1, 100.0))
@@ -195,7 +194,7 @@ def test_stepper_ends_steps_at_kinks_of_drives():
 def test_limits_before_and_behind_a_drive():
     """Behind a first-order drive the torque is cut off from T ln(u/(u - L)) on; before it, the drive approaches the limit."""
     T, u, limit, t = 0.1, 3.0, 2.0, 0.4
-    lag, cut = drives.FirstOrder(T), jd.EffortLimits(limit)
+    lag, cut = jd.forces.FirstOrderDrive(T), jd.EffortLimits(limit)
     given = {"control": lambda q, v, t: jnp.full(1, u), "rtol": 1e-11, "atol": 1e-11}
 
     def speed(forces):
@@ -216,7 +215,7 @@ def test_limits_before_and_behind_a_drive():
     assert 3.0 < order(error, 16) < 5.0 and abs(error(32)) < 1e-5
 
 
-class VoltageDrive(drives.DriveDynamics):
+class VoltageDrive(jd.forces.DriveDynamics):
     """L di/dt = u - R i - k v, tau = k i: a drive of a user."""
 
     inductance: jax.Array
@@ -263,7 +262,7 @@ class Integral(jd.Controller):
 
 def test_controller_with_a_state_before_a_drive():
     A = np.array([[0, 1, 0, 0], [0, 0, 0, 1 / LINK], [1, 0, 0, 0], [-5 / 0.2, -3 / 0.2, -4 / 0.2, -1 / 0.2]])
-    scene, ts = jd.Scene(wheel(), forces=[drives.FirstOrder(0.2)]), np.linspace(0.0, 1.0, 5)
+    scene, ts = jd.Scene(wheel(), forces=[jd.forces.FirstOrderDrive(0.2)]), np.linspace(0.0, 1.0, 5)
     given = {
         "control": Integral(),
         "solver": diffrax.Dopri8(),
@@ -290,7 +289,7 @@ def test_constants_of_drives_are_identified():
     given = {"error": "trajectory", "substeps": 4, "noise": 1e-6}
 
     def lagged(T, d):
-        return jd.Scene(wheel(), forces=[drives.FirstOrder(T), jd.JointDamping(d)])
+        return jd.Scene(wheel(), forces=[jd.forces.FirstOrderDrive(T), jd.JointDamping(d)])
 
     def constants(scene):
         return [scene.forces[0].time_constant, scene.forces[1].coefficient]
@@ -300,7 +299,7 @@ def test_constants_of_drives_are_identified():
     np.testing.assert_allclose(fit.values, [0.06, 0.3], rtol=1e-6)
 
     def elastic(k, d):
-        return drives.elastic_joints(wheel(), k, ROTOR, damping=d, gear=GEAR)
+        return jd.forces.elastic_joints(wheel(), k, ROTOR, damping=d, gear=GEAR)
 
     log = simulated_log(elastic(40.0, 0.5), np.hstack([0 * t, 0.1 * np.sin(5.0 * t)]))
     fit = jd.identify.fit_parameters(
@@ -309,7 +308,7 @@ def test_constants_of_drives_are_identified():
     np.testing.assert_allclose(fit.values, [40.0, 0.5], rtol=1e-6)
 
 
-LAGGED = jd.Scene(wheel(), forces=[drives.FirstOrder(0.1)])
+LAGGED = jd.Scene(wheel(), forces=[jd.forces.FirstOrderDrive(0.1)])
 ZERO = jnp.zeros(1)
 MODAL = jd.Scene(wheel(), forces=[*LAGGED.forces, jd.DryFriction(0.1, 1.0)])
 REST = jd.identify.Log([0.0, 0.1, 0.2], *np.zeros((4, 3, 1)))
@@ -322,19 +321,19 @@ class WithMultipliers(Integral):
 @pytest.mark.parametrize(
     ("make", "words"),
     [
-        (lambda: drives.FirstOrder(0.0), "time_constant"),
-        (lambda: drives.SecondOrder(10.0, -1.0), "damping_ratio"),
-        (lambda: drives.SecondOrder(-10.0), "frequency"),
-        (lambda: drives.TorqueSpeedLimits(0.0, 1.0), "stall"),
-        (lambda: drives.TorqueSpeedLimits(1.0, -1.0), "no_load"),
-        (lambda: jd.Scene(wheel(), forces=[drives.TorqueSpeedLimits(1.0, 1.0)]).clip_effort(ZERO), "drive_torque"),
-        (lambda: drives.TorqueSpeedLimits([1.0, 2.0], 1.0).clip_effort(wheel(), ZERO, v=ZERO), "stall has shape"),
-        (lambda: drives.FirstOrder(0.1, joints="no").start(wheel(), ZERO, ZERO, 0.0), "'no'"),
-        (lambda: drives.ElasticTransmission(("a", "b"), "c", 1.0), "pairs"),
-        (lambda: drives.ElasticTransmission("a", "b", 1.0, gear=0.0), "gear"),
-        (lambda: drives.elastic_joints(wheel(), 1.0, 0.0), "rotor_inertia"),
-        (lambda: drives.elastic_joints(wheel(), 1.0, 1.0, joints="no"), "'no'"),
-        (lambda: drives.elastic_joints(jd.robots.quadruped(), 1.0, 1.0), "several coordinates"),
+        (lambda: jd.forces.FirstOrderDrive(0.0), "time_constant"),
+        (lambda: jd.forces.SecondOrderDrive(10.0, -1.0), "damping_ratio"),
+        (lambda: jd.forces.SecondOrderDrive(-10.0), "frequency"),
+        (lambda: jd.forces.TorqueSpeedLimits(0.0, 1.0), "stall"),
+        (lambda: jd.forces.TorqueSpeedLimits(1.0, -1.0), "no_load"),
+        (lambda: jd.Scene(wheel(), forces=[jd.forces.TorqueSpeedLimits(1.0, 1.0)]).clip_effort(ZERO), "drive_torque"),
+        (lambda: jd.forces.TorqueSpeedLimits([1.0, 2.0], 1.0).clip_effort(wheel(), ZERO, v=ZERO), "stall has shape"),
+        (lambda: jd.forces.FirstOrderDrive(0.1, joints="no").start(wheel(), ZERO, ZERO, 0.0), "'no'"),
+        (lambda: jd.forces.ElasticTransmission(("a", "b"), "c", 1.0), "pairs"),
+        (lambda: jd.forces.ElasticTransmission("a", "b", 1.0, gear=0.0), "gear"),
+        (lambda: jd.forces.elastic_joints(wheel(), 1.0, 0.0), "rotor_inertia"),
+        (lambda: jd.forces.elastic_joints(wheel(), 1.0, 1.0, joints="no"), "'no'"),
+        (lambda: jd.forces.elastic_joints(jd.robots.quadruped(), 1.0, 1.0), "several coordinates"),
         (lambda: jd.stepper(LAGGED, 0.1)((ZERO, ZERO), ZERO), "drive_state"),
         (lambda: jd.stepper(LAGGED, 0.1)((ZERO, ZERO, jnp.zeros(2)), ZERO), "z has shape"),
         (lambda: jd.stepper(wheel(), 0.1)((ZERO, ZERO, ZERO), ZERO), "3 entries"),

@@ -88,7 +88,7 @@ def test_functions_of_the_documents_exist():
 
 
 # Rooms of the package, which Python leaves in its namespace, are none of these.
-GROUPS = "contact control drives geometry grasp identify inertia plot robots scenes sensors se2 se3 so3 solvers".split()
+GROUPS = "contact control geometry grasp identify inertia plot robots scenes sensors se2 se3 so3 solvers".split()
 
 
 def exports() -> dict[str, object]:

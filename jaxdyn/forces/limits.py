@@ -190,7 +190,7 @@ class TorqueSpeedLimits(EffortLimits):
     Source: Hughes & Drury (2019), Electric Motors and Drives, section 3.5.
 
     ```python
-    scene = jd.Scene(model, forces=[jd.drives.TorqueSpeedLimits(120.0, 6.0), jd.EffortLimits(80.0)])
+    scene = jd.Scene(model, forces=[jd.forces.TorqueSpeedLimits(120.0, 6.0), jd.EffortLimits(80.0)])
     ```
     """
 

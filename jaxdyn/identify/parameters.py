@@ -157,7 +157,7 @@ def fit_parameters(
         )
     if has_drives(own) and error not in SIMULATED:
         raise ValueError(
-            f"error is {error!r}, and the scene has drives with a state (jd.drives), whose log holds commands; take "
+            f"error is {error!r}, and the scene has drives with a state (jd.forces.DriveDynamics), whose log holds commands; take "
             "error='trajectory'"
         )
     logs = as_logs(log, own.system, needs=("v", "a") if error == "torque" else ("v",))
@@ -271,7 +271,7 @@ def parameter_error(
     tree = Parameters(system)
     if has_drives(own) and error not in SIMULATED:
         raise ValueError(
-            f"error is {error!r}, and the scene has drives with a state (jd.drives), whose log holds commands; take "
+            f"error is {error!r}, and the scene has drives with a state (jd.forces.DriveDynamics), whose log holds commands; take "
             "error='trajectory'"
         )
     logs = as_logs(log, own.system, needs=("v", "a") if error == "torque" else ("v",))

@@ -107,7 +107,7 @@ def simulate(
     - `outputs`: any of "energy", "power", "work" (one more state, under the same error control), "acceleration"
       (the rate of v: of a free joint that of its body twist; `jd.frame_acceleration` gives those of frames in world axes),
       "multipliers", "constraint_residual", "contact_forces", "contact_margins", "torque" (of the control, behind drives
-      and limits), "control_state" (of a controller), "drive_state" (of `jd.drives`) and "pose:<frame>". They are computed only if
+      and limits), "control_state" (of a controller), "drive_state" (of drives) and "pose:<frame>". They are computed only if
       asked for.
     - `contacts`: of a scene with `cones`. "stop": where a contact pulls or leaves its cone (a margin below zero by more than
       rounding, eps^(1/2) of its force) the run ends, with the code `contact_lost` and the time, which is found within the
@@ -238,7 +238,7 @@ def check_drives(scene: Scene, control, solver, modal: bool) -> None:
     """
     if not has_drives(scene):
         return
-    what = "the scene has drives with a state (jd.drives)"
+    what = "the scene has drives with a state (jd.forces.DriveDynamics)"
     if modal:
         raise ValueError(f"{what} and forces with modes (jd.DryFriction, jd.UnilateralContact); leave one of them out")
     if isinstance(solver, Stepper):

@@ -33,11 +33,11 @@ ADJOINTS = ("reverse", "forward", "direct")
 def stepper(scene: SceneLike, dt: Numbers, substeps: int = 1, remat: bool = True, adjoint: str = "reverse") -> Callable:
     """A function step(state, tau, t=0.0) -> state that takes a scene dt further under a constant tau, or under a law.
 
-    The state is a pair (q (nq,), v (nv,)), or (q, v, z) of a scene with `jd.drives.DriveDynamics`, whose states z start as
+    The state is a pair (q (nq,), v (nv,)), or (q, v, z) of a scene with `jd.forces.DriveDynamics`, whose states z start as
     `scene.drive_state(q, v)`; batch it with `jax.vmap`, and go on with `jax.lax.scan`. The
     torques tau (nv,) are numbers, or a law tau(q, v, t) -> (nv,), called once at the start of the step. The
     steps are those of `jd.simulate` with `stepsize=dt/substeps`: RK4, constraints closed at the end of each, the scene's
-    forces applied (friction, stops, drives), and tau through its `jd.drives` and `jd.EffortLimits`. Where a joint meets a stop
+    forces applied (friction, stops, drives), and tau through its `jd.forces.DriveDynamics` and `jd.EffortLimits`. Where a joint meets a stop
     (`jd.JointStops`, any `jd.PiecewiseForce`) a step ends and the next one goes on to where it would have ended.
 
     **Arguments:**

@@ -20,7 +20,7 @@ class DriveDynamics(eqx.Module):
     state. Functions of one instant (`jd.constrained_dynamics`, `jd.inverse_dynamics`, ...) know torques at the joints alone.
 
     ```python
-    class VoltageDrive(jd.drives.DriveDynamics):  # L di/dt = u - R i - k v, tau = k i
+    class VoltageDrive(jd.forces.DriveDynamics):  # L di/dt = u - R i - k v, tau = k i
         inductance: jax.Array
         resistance: jax.Array
         constant: jax.Array

@@ -158,7 +158,7 @@ class Scene(eqx.Module):
         return tau
 
     def drive_state(self, q: Float[Array, " nq"], v: Float[Array, " nv"], t: Number = 0.0) -> Float[Array, " n"] | None:
-        """Start of the states of all `jd.drives.DriveDynamics` in the scene, one after the other (n,); None without any."""
+        """Start of the states of all `jd.forces.DriveDynamics` in the scene, one after the other (n,); None without any."""
         states = [force.start(self.system, q, v, t) for force in self.forces if isinstance(force, DriveDynamics)]
         return jnp.concatenate(states) if states else None
 

@@ -43,7 +43,7 @@ class _Lag(DriveDynamics):
         return error, lambda leaf: _broadcast(getattr(self, leaf), state, index.size, f"{name}: {leaf}")
 
 
-class FirstOrder(_Lag):
+class FirstOrderDrive(_Lag):
     """First-order drive: T dtau/dt = u - tau, with u the command and tau the torque at the joint.
 
     The step response is tau = u (1 - exp(-t/T)). It models a current loop of bandwidth 1/(2 pi T) Hz, and MuJoCo's
@@ -55,7 +55,7 @@ class FirstOrder(_Lag):
     **Raises:** ValueError for a T that is not positive; (when called) for unknown joints or a wrong shape.
 
     ```python
-    scene = jd.Scene(model, forces=[jd.drives.FirstOrder(0.01), jd.EffortLimits()])
+    scene = jd.Scene(model, forces=[jd.forces.FirstOrderDrive(0.01), jd.EffortLimits()])
     step = jd.stepper(scene, dt=0.002)
     state = step((q, v, scene.drive_state(q, v)), jnp.full(7, 5.0))
     ```
@@ -67,7 +67,7 @@ class FirstOrder(_Lag):
 
     def __check_init__(self):
         if not _is_positive(self.time_constant):
-            raise ValueError(f"FirstOrder: time_constant is {self.time_constant}; give positive seconds")
+            raise ValueError(f"FirstOrderDrive: time_constant is {self.time_constant}; give positive seconds")
 
     def rate(
         self,
@@ -83,18 +83,18 @@ class FirstOrder(_Lag):
         return error / leaf("time_constant")
 
 
-class SecondOrder(_Lag):
+class SecondOrderDrive(_Lag):
     """Second-order drive: tau'' + 2 zeta w tau' + w^2 tau = w^2 u, with u the command and tau the torque at the joint.
 
     The states are tau, then tau'. With zeta < 1 the step response overshoots by exp(-pi zeta/sqrt(1 - zeta^2)).
 
     **Arguments:** `frequency` w (rad/s) and `damping_ratio` zeta, positive, and `initial` torque (N m or N, with tau' = 0):
-    numbers or one per coordinate. `joints` as of `FirstOrder`.
+    numbers or one per coordinate. `joints` as of `FirstOrderDrive`.
 
     **Raises:** ValueError for numbers that are not positive; (when called) for unknown joints or a wrong shape.
 
     ```python
-    scene = jd.Scene(model, forces=[jd.drives.SecondOrder(200.0, 0.7)])
+    scene = jd.Scene(model, forces=[jd.forces.SecondOrderDrive(200.0, 0.7)])
     motion = jd.simulate(scene, q, v, jnp.linspace(0.0, 0.1, 11), outputs=("torque", "drive_state"))
     ```
     """
@@ -107,7 +107,7 @@ class SecondOrder(_Lag):
     def __check_init__(self):
         for name in ("frequency", "damping_ratio"):
             if not _is_positive(getattr(self, name)):
-                raise ValueError(f"SecondOrder: {name} is {getattr(self, name)}; give positive numbers")
+                raise ValueError(f"SecondOrderDrive: {name} is {getattr(self, name)}; give positive numbers")
 
     def start(
         self, system: SystemLike, q: Float[Array, " nq"], v: Float[Array, " nv"], t: Number

@@ -99,7 +99,7 @@ def elastic_joints(
     **Raises:** ValueError for unknown joints and those of several coordinates, and for rotors without inertia.
 
     ```python
-    scene = jd.drives.elastic_joints(jd.robots.iiwa(), 1e4, 3e-5, damping=5.0, gear=100.0)
+    scene = jd.forces.elastic_joints(jd.robots.iiwa(), 1e4, 3e-5, damping=5.0, gear=100.0)
     ```
     """
     chosen = model.joint_names if joints is None else _tuple(joints)
