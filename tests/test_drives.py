@@ -76,7 +76,10 @@ def lag_matrix(kind):
     return np.array([[0.0, 1.0], [-(60.0**2), -2 * 0.4 * 60.0]]), np.array([0.0, 60.0**2])
 
 
-DRIVES = {"first": jd.forces.FirstOrderDrive(0.03, initial=-0.5), "second": jd.forces.SecondOrderDrive(60.0, 0.4, initial=-0.5)}
+DRIVES = {
+    "first": jd.forces.FirstOrderDrive(0.03, initial=-0.5),
+    "second": jd.forces.SecondOrderDrive(60.0, 0.4, initial=-0.5),
+}
 
 
 @pytest.mark.parametrize("kind", DRIVES)
@@ -110,7 +113,9 @@ def test_step_response_of_a_drive(kind):
 
 
 def test_drive_of_one_joint_leaves_the_others():
-    scene = jd.Scene(jd.robots.chain(2), forces=[jd.forces.FirstOrderDrive(0.1, joints=jd.robots.chain(2).joint_names[1])])
+    scene = jd.Scene(
+        jd.robots.chain(2), forces=[jd.forces.FirstOrderDrive(0.1, joints=jd.robots.chain(2).joint_names[1])]
+    )
     tau, rates = scene.drive_torque(jnp.zeros(2), jnp.zeros(2), 0.0, jnp.array([3.0, 4.0]), jnp.array([1.0]))
     np.testing.assert_allclose(tau, [3.0, 1.0])
     np.testing.assert_allclose(rates, [30.0])
@@ -153,7 +158,7 @@ def test_torque_speed_curve_and_its_kink():
     ts, zero = jnp.array([0.0, 0.4, 1.5]), jnp.zeros(1)
 
     def run(stall):
-        limits = [jd.forces.TorqueSpeedLimits(stall, 6.0), jd.EffortLimits(5.0)]
+        limits = [jd.forces.TorqueSpeedLimits(stall, 6.0), jd.forces.EffortLimits(5.0)]
         scene = jd.Scene(wheel(), forces=limits)
         given = {"control": lambda q, v, t: jnp.full(1, 100.0), "outputs": ("torque",)}
         return jd.simulate(scene, zero, zero, ts, rtol=1e-11, atol=1e-11, **given)
@@ -182,7 +187,7 @@ def order(error, steps):
 
 def test_stepper_ends_steps_at_kinks_of_drives():
     """Over the knee RK4 keeps its order, which would be the second across it."""
-    scene = jd.Scene(wheel(), forces=[jd.forces.TorqueSpeedLimits(8.0, 6.0), jd.EffortLimits(5.0)])
+    scene = jd.Scene(wheel(), forces=[jd.forces.TorqueSpeedLimits(8.0, 6.0), jd.forces.EffortLimits(5.0)])
 
     def error(substeps):
         _, v = jd.stepper(scene, 1.5, substeps)((jnp.zeros(1), jnp.zeros(1)), jnp.full(1, 100.0))
@@ -194,7 +199,7 @@ def test_stepper_ends_steps_at_kinks_of_drives():
 def test_limits_before_and_behind_a_drive():
     """Behind a first-order drive the torque is cut off from T ln(u/(u - L)) on; before it, the drive approaches the limit."""
     T, u, limit, t = 0.1, 3.0, 2.0, 0.4
-    lag, cut = jd.forces.FirstOrderDrive(T), jd.EffortLimits(limit)
+    lag, cut = jd.forces.FirstOrderDrive(T), jd.forces.EffortLimits(limit)
     given = {"control": lambda q, v, t: jnp.full(1, u), "rtol": 1e-11, "atol": 1e-11}
 
     def speed(forces):
@@ -289,7 +294,7 @@ def test_constants_of_drives_are_identified():
     given = {"error": "trajectory", "substeps": 4, "noise": 1e-6}
 
     def lagged(T, d):
-        return jd.Scene(wheel(), forces=[jd.forces.FirstOrderDrive(T), jd.JointDamping(d)])
+        return jd.Scene(wheel(), forces=[jd.forces.FirstOrderDrive(T), jd.forces.JointDamping(d)])
 
     def constants(scene):
         return [scene.forces[0].time_constant, scene.forces[1].coefficient]
@@ -310,7 +315,7 @@ def test_constants_of_drives_are_identified():
 
 LAGGED = jd.Scene(wheel(), forces=[jd.forces.FirstOrderDrive(0.1)])
 ZERO = jnp.zeros(1)
-MODAL = jd.Scene(wheel(), forces=[*LAGGED.forces, jd.DryFriction(0.1, 1.0)])
+MODAL = jd.Scene(wheel(), forces=[*LAGGED.forces, jd.contact.DryFriction(0.1, 1.0)])
 REST = jd.identify.Log([0.0, 0.1, 0.2], *np.zeros((4, 3, 1)))
 
 

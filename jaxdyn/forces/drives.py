@@ -55,7 +55,7 @@ class FirstOrderDrive(_Lag):
     **Raises:** ValueError for a T that is not positive; (when called) for unknown joints or a wrong shape.
 
     ```python
-    scene = jd.Scene(model, forces=[jd.forces.FirstOrderDrive(0.01), jd.EffortLimits()])
+    scene = jd.Scene(model, forces=[jd.forces.FirstOrderDrive(0.01), jd.forces.EffortLimits()])
     step = jd.stepper(scene, dt=0.002)
     state = step((q, v, scene.drive_state(q, v)), jnp.full(7, 5.0))
     ```

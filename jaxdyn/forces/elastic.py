@@ -24,7 +24,7 @@ class ElasticTransmission(eqx.Module):
 
     theta is the motor's own angle and n the gear ratio, of one sign with the direction of rotation. It conserves the energy
     K s^2/2 and dissipates D (ds/dt)^2. Steps must resolve sqrt(K (1/I + 1/(n^2 B))), with B and I the inertias of motor and
-    link; `jd.Rodas5P` has longer ones where the elastic motion has died out.
+    link; `jd.solvers.Rodas5P` has longer ones where the elastic motion has died out.
 
     **Arguments:** `motors`, `joints`, names of joints of one coordinate, in pairs; `stiffness` K (N m/rad or N/m), `damping` D
     (N m s/rad or N s/m), `gear` n (1, or rad/m for a spindle): numbers or one per pair.

@@ -28,7 +28,7 @@ class JointStops(PiecewiseForce):
     named ones with several coordinates.
 
     ```python
-    scene = jd.Scene(robot, forces=[jd.JointStops(1e4, 50.0)])
+    scene = jd.Scene(robot, forces=[jd.forces.JointStops(1e4, 50.0)])
     ```
     """
 
@@ -179,7 +179,7 @@ class TorqueSpeedLimits(EffortLimits):
 
     A motor of resistance R and constant k at the voltage U gives tau = k (U - k v) / R: at most stall = k U_max / R at rest and
     nothing at the speed no_load = U_max / k. Beyond that speed it brakes. Against the motion it may give more than `stall`,
-    which the current limits: list `jd.EffortLimits` behind it. Like these it acts on tau, not on the scene's other forces, and
+    which the current limits: list `jd.forces.EffortLimits` behind it. Like these it acts on tau, not on the scene's other forces, and
     `jd.simulate` and `jd.stepper` end a step where a torque reaches the curve or leaves it.
 
     **Arguments:** `stall` (N m or N) and `no_load` (rad/s or m/s), at the joint (behind the gear), positive: numbers or one per
@@ -190,7 +190,7 @@ class TorqueSpeedLimits(EffortLimits):
     Source: Hughes & Drury (2019), Electric Motors and Drives, section 3.5.
 
     ```python
-    scene = jd.Scene(model, forces=[jd.forces.TorqueSpeedLimits(120.0, 6.0), jd.EffortLimits(80.0)])
+    scene = jd.Scene(model, forces=[jd.forces.TorqueSpeedLimits(120.0, 6.0), jd.forces.EffortLimits(80.0)])
     ```
     """
 

@@ -42,7 +42,7 @@ from jaxdyn.dynamics.kinematics import body_twists, sum_to_coordinates, take, tr
 from jaxdyn.dynamics.quantities import bias_force, mass_matrix
 from jaxdyn.dynamics.world_frame import momentum, tree_inertias
 from jaxdyn.lie import se2, se3, so3
-from jaxdyn.lie.so3 import _product, cross
+from jaxdyn.lie.so3 import cross, matmul
 from jaxdyn.model.joints import SCREW_KINDS
 from jaxdyn.model.tree import Model
 from jaxdyn.systems.lagrangian import LagrangianSystem
@@ -105,7 +105,7 @@ def step(scene: Scene, q, v, carried: Carried, t0, t1, generalized_force: Callab
         own, push = _slopes(system, halfway(xi), xi, middle)
         force = generalized_force(halfway(xi), xi, middle)
         push = h * (push if force is None else push + force)
-        left = carried.momentum if A is None else carried.momentum + _product(A.T, z[n:])
+        left = carried.momentum if A is None else carried.momentum + matmul(A.T, z[n:])
         arrived = _turned(system, x, left)
         return 2 * own - _gathered(system, x, left + arrived + push), _turned(system, x, arrived + push)
 
@@ -143,7 +143,7 @@ def step(scene: Scene, q, v, carried: Carried, t0, t1, generalized_force: Callab
     rows, right_inverse, spare = _rows(scene, end, t1, rank_tol)
     if right_inverse is not None:
         for _ in range(2):
-            velocity = velocity - _product(right_inverse, velocity_residual(scene, end, velocity, t1))
+            velocity = velocity - matmul(right_inverse, velocity_residual(scene, end, velocity, t1))
     return Step(end, velocity, Carried(last, xi, rows, spare), generalized_force(halfway(xi), xi, middle), solved)
 
 
@@ -170,7 +170,7 @@ def _newton(function, slope, z, n: int):
 
         def repeat(state):
             z, change, _, count = state
-            move = -_product(inverse, function(z))
+            move = -matmul(inverse, function(z))
             return z + move, size(move), change, count + 1
 
         z, change, before, _ = lax.while_loop(repeats, repeat, (z, before, before, 0))
@@ -193,7 +193,7 @@ def _slopes(system, q, v, t):
         pull, momentum = jax.grad(system.value, argnums=(0, 1))(q, v, t)
         return momentum, pull
     # M and h are all there is: dL/dq is what makes M a + h of the Euler-Lagrange equations.
-    p, rate = jax.jvp(lambda q, t: _product(mass_matrix(system, q, t), v), (q, t), (v, jnp.ones_like(t)))
+    p, rate = jax.jvp(lambda q, t: matmul(mass_matrix(system, q, t), v), (q, t), (v, jnp.ones_like(t)))
     return p, rate - bias_force(system, q, v, t)
 
 
@@ -232,12 +232,12 @@ def _velocity(system, q, p, t):
 
 def _turned(system, x, p):
     """Ad_exp(x)^T p (nv,), joint by joint."""
-    return _by_joint(system, x, p, lambda group, x, p: _product(p, group.Ad(group.exp(x))))
+    return _by_joint(system, x, p, lambda group, x, p: matmul(p, group.Ad(group.exp(x))))
 
 
 def _gathered(system, x, p):
     """J(x)^T p (nv,), J the left Jacobian of exp, joint by joint."""
-    return _by_joint(system, x, p, lambda group, x, p: _product(p, group.left_jacobian(x)))
+    return _by_joint(system, x, p, lambda group, x, p: matmul(p, group.left_jacobian(x)))
 
 
 def _by_joint(system, x, p, function):
@@ -256,5 +256,5 @@ def _rows(scene: Scene, q, t, rank_tol):
         return None, None, None
     A = constraint_jacobian(scene, q, t)
     right_inverse = correction(scene, q, t, rank_tol, holonomic=False)
-    spare = jnp.eye(A.shape[0], dtype=A.dtype) - _product(A, right_inverse)
+    spare = jnp.eye(A.shape[0], dtype=A.dtype) - matmul(A, right_inverse)
     return A, right_inverse, lax.stop_gradient(spare)

@@ -15,7 +15,7 @@ class DriveDynamics(eqx.Module):
 
         tau = torque(system, q, v, t, z, command),    dz/dt = rate(system, q, v, t, z, command).
 
-    List one among the forces of a `Scene`. Drives and `jd.EffortLimits` act in the order of the list, each on what the one
+    List one among the forces of a `Scene`. Drives and `jd.forces.EffortLimits` act in the order of the list, each on what the one
     before gives. `jd.simulate` integrates z with the motion; `jd.stepper` takes and returns it as a third entry of the
     state. Functions of one instant (`jd.constrained_dynamics`, `jd.inverse_dynamics`, ...) know torques at the joints alone.
 

@@ -16,7 +16,7 @@ from jaxdyn.compile import kernel
 from jaxdyn.constraints.base import holonomic_rows, layout, position_residual, velocity_residual
 from jaxdyn.dynamics.quantities import mass_matrix
 from jaxdyn.forces.piecewise import Pieces, values_and_levels
-from jaxdyn.lie.so3 import _product
+from jaxdyn.lie.so3 import matmul
 from jaxdyn.simulation.hybrid.dynamics import (
     StateTerms,
     by_element,
@@ -185,15 +185,15 @@ def put_back(scene: Scene, elements: Elements, mode: Mode, t, y, error):
     def change(wanted, which):
         """The least velocities that change the rows by `wanted`."""
         lam = solve_rows(terms.Y * which[None], which, (wanted * which)[:, None])[:, 0]
-        return terms.metric.unwhiten(_product(terms.Y, lam))
+        return terms.metric.unwhiten(matmul(terms.Y, lam))
 
     tangent = None
     if error is not None:
         e = rate_to_velocity(scene.system, q, error["q"])
-        e = e - change(_product(terms.row.A, e), holds)
+        e = e - change(matmul(terms.row.A, e), holds)
         tangent = error | {
             "q": velocity_to_rate(scene.system, q, e),
-            "v": error["v"] - change(_product(terms.row.A, error["v"]), active),
+            "v": error["v"] - change(matmul(terms.row.A, error["v"]), active),
         }
     blank = jnp.zeros((elements.count,), dtype)
     if holonomic.size:
@@ -209,10 +209,10 @@ def _jumped(scene: Scene, elements: Elements, mode: Mode, slip, t, q, v) -> Jump
     terms = terms_at(scene, elements, q, v, t)
     along, rebound = directions(scene, elements, jnp.zeros_like(slip), slip), rebounds(scene, elements, terms)
     after, pushed = jumped(scene, elements, mode, terms, along, v, rebound)
-    rates = _product(terms.row.A, after - v) + terms.row.velocity
+    rates = matmul(terms.row.A, after - v) + terms.row.velocity
     gap = jnp.stack([rates[one.normal] if one.opens else jnp.zeros((), v.dtype) for one in elements.each]) - rebound
     M = mass_matrix(scene.system, q, t)
-    size = jnp.max(jnp.abs(_product(M, v))) + jnp.max(jnp.abs(M)) + jnp.max(jnp.abs(pushed.multipliers))
+    size = jnp.max(jnp.abs(matmul(M, v))) + jnp.max(jnp.abs(M)) + jnp.max(jnp.abs(pushed.multipliers))
     return Jumped(after, pushed.normal, pushed.holding, by_element(elements, rates), gap, rebound, size)
 
 

@@ -48,7 +48,7 @@ def check_options(control, stepsize, solver, adjoint, outputs) -> None:
 
     **Raises:** ValueError.
     """
-    what = "the scene has forces with modes (jd.DryFriction, jd.UnilateralContact)"
+    what = "the scene has forces with modes (jd.contact.DryFriction, jd.contact.UnilateralContact)"
     if isinstance(control, (Controller, Sampled)):
         raise ValueError(f"control is a {type(control).__name__}, and {what}; give a function control(q, v, t)")
     if stepsize is not None and not is_fixed(stepsize):
@@ -58,7 +58,7 @@ def check_options(control, stepsize, solver, adjoint, outputs) -> None:
     if not isinstance(solver, diffrax.AbstractERK) or isinstance(unwrapped(solver), diffrax.AbstractWrappedSolver):
         raise ValueError(
             f"solver is {label(solver)}, and {what}, looked for within explicit steps; take diffrax.Dopri8() or Tsit5(), "
-            "or, where forces are stiff, friction without modes (jd.CoulombFriction)"
+            "or, where forces are stiff, friction without modes (jd.forces.CoulombFriction)"
         )
     if isinstance(adjoint, diffrax.BacksolveAdjoint):
         raise ValueError(f"adjoint is 'backsolve', which does not go back through events, and {what}; take 'reverse'")
