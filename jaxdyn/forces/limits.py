@@ -179,8 +179,8 @@ class TorqueSpeedLimits(EffortLimits):
 
     A motor of resistance R and constant k at the voltage U gives tau = k (U - k v) / R: at most stall = k U_max / R at rest and
     nothing at the speed no_load = U_max / k. Beyond that speed it brakes. Against the motion it may give more than `stall`,
-    which the current limits: list `jd.forces.EffortLimits` behind it. Like these it acts on tau, not on the scene's other forces, and
-    `jd.simulate` and `jd.stepper` end a step where a torque reaches the curve or leaves it.
+    which the current limits: list `jd.forces.EffortLimits` behind it. Like these it acts on tau, not on the scene's other
+    forces, and `jd.simulate` and `jd.stepper` end a step where a torque reaches the curve or leaves it.
 
     **Arguments:** `stall` (N m or N) and `no_load` (rad/s or m/s), at the joint (behind the gear), positive: numbers or one per
     velocity coordinate. Joints without a curve have an infinite `stall`.

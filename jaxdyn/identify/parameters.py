@@ -36,7 +36,6 @@ from jaxdyn.identify.starts import best_start
 from jaxdyn.identify.uncertainty import student
 from jaxdyn.model.arguments import Checked, FilePath, Function
 from jaxdyn.simulation.controls import Control
-from jaxdyn.systems.scene import has_drives
 from jaxdyn.tasks import DaskClient
 
 _GAUSS_NEWTON = "gauss-newton"
@@ -155,11 +154,6 @@ def fit_parameters(
             f"the scene has {len(own.constraints)} constraints, whose forces cannot be identified from torques; take "
             "error='trajectory' or 'energy'"
         )
-    if has_drives(own) and error not in SIMULATED:
-        raise ValueError(
-            f"error is {error!r}, and the scene has drives with a state (jd.forces.DriveDynamics), whose log holds commands; take "
-            "error='trajectory'"
-        )
     logs = as_logs(log, own.system, needs=("v", "a") if error == "torque" else ("v",))
     options = simulation_options(substeps, simulation) if error in SIMULATED else {}
     columns = None if observed is None else observation_columns(own.system, observed)
@@ -269,11 +263,6 @@ def parameter_error(
     )
     own = with_sensors(system).scene
     tree = Parameters(system)
-    if has_drives(own) and error not in SIMULATED:
-        raise ValueError(
-            f"error is {error!r}, and the scene has drives with a state (jd.forces.DriveDynamics), whose log holds commands; take "
-            "error='trajectory'"
-        )
     logs = as_logs(log, own.system, needs=("v", "a") if error == "torque" else ("v",))
     problem = pose_problem(tree, objective, logs, horizon, 1.0)
     z, _ = ravel_pytree(Unknowns(tree.start, None))

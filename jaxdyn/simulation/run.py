@@ -93,19 +93,19 @@ def simulate(
       "variational": steps of fixed length that keep the energy over long times, with a solver of their own;
       "baumgarte": violated rows are pulled back, for comparison; `jd.Baumgarte(alpha, beta)` sets how fast.
       "auto" takes "free", or "projected", which takes dependent rows and rank loss in passing and needs no choice.
-    - `solver`: any diffrax method of an `ODETerm`, `jd.solvers.Rodas5P()`, `jd.solvers.LieGroup(...)` of one of them, or a method that takes an
-      implicit and an explicit part (`diffrax.KenCarp4`): implicit are dq/dt = H v and what the scene's forces add to the
-      acceleration, explicit all the rest (inertia, gravity, `control`). Default: `RK4` for fixed steps; for adaptive
-      ones `Dopri8`, or `Rodas5P` where the scene lists forces, all inputs are concrete and `jd.stiffness` at the start says
-      that explicit steps would have to be shorter than a thousandth of the time.
+    - `solver`: any diffrax method of an `ODETerm`, `jd.solvers.Rodas5P()`, `jd.solvers.LieGroup(...)` of one of them, or a
+      method that takes an implicit and an explicit part (`diffrax.KenCarp4`): implicit are dq/dt = H v and what the scene's
+      forces add to the acceleration, explicit all the rest (inertia, gravity, `control`). Default: `RK4` for fixed steps;
+      for adaptive ones `Dopri8`, or `Rodas5P` where the scene lists forces, all inputs are concrete and `jd.stiffness` at
+      the start says that explicit steps would have to be shorter than a thousandth of the time.
     - `stepsize`: None for adaptive steps, a number (s) for fixed ones, or a diffrax step-size controller.
     - `rtol`, `atol`: local error of a step, relative to and besides the size of each entry of (q, v). Values below ten
       times the rounding error of the dtype are raised to that. With fixed steps, tolerances of an implicit solver.
     - `adjoint`: "reverse" (default) for reverse mode with checkpoints, and Hessians over it; "forward" for jvp, jacfwd and
       Hessians by forward over forward mode; "direct" for both modes, at a cost that grows with `max_steps`; "backsolve" for the
       continuous adjoint, whose gradients are approximate; or a diffrax adjoint.
-    - `outputs`: any of "energy", "power", "work" (one more state, under the same error control), "acceleration"
-      (the rate of v: of a free joint that of its body twist; `jd.dynamics.frame_acceleration` gives those of frames in world axes),
+    - `outputs`: any of "energy", "power", "work" (one more state, under the same error control), "acceleration" (the rate
+      of v: of a free joint that of its body twist; `jd.dynamics.frame_acceleration` gives those of frames in world axes),
       "multipliers", "constraint_residual", "contact_forces", "contact_margins", "torque" (of the control, behind drives
       and limits), "control_state" (of a controller), "drive_state" (of drives) and "pose:<frame>". They are computed only if
       asked for.
@@ -116,8 +116,9 @@ def simulate(
       "stop": where a joint passes one the run ends, with the code `joint_limit_passed` and the time, found within the step.
       "report": the run goes on; `stats["passed_limit"]` is the entry of q of the first limit that is passed at a save point, or
       -1, and a concrete run warns (`JointLimitWarning`).
-    - `max_events`: of a scene with forces that have modes (`jd.contact.DryFriction`, `jd.contact.UnilateralContact`), after which the run ends
-      with the code `too_many_events`. Such scenes take explicit methods with adaptive or fixed steps, which end at events.
+    - `max_events`: of a scene with forces that have modes (`jd.contact.DryFriction`, `jd.contact.UnilateralContact`), after
+      which the run ends with the code `too_many_events`. Such scenes take explicit methods with adaptive or fixed steps,
+      which end at events.
     - `progress`: show a meter (tqdm if installed, else lines of text).
     - `max_steps`: most steps to take, rejected ones included. Default: what fixed steps need; 65536 for adaptive ones,
       4096 with "direct", and where reverse mode goes through adaptive steps: it remembers where each one ends, at 8 bytes a

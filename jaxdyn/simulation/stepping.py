@@ -37,7 +37,7 @@ def stepper(scene: SceneLike, dt: Numbers, substeps: int = 1, remat: bool = True
     `scene.drive_state(q, v)`; batch it with `jax.vmap`, and go on with `jax.lax.scan`. The
     torques tau (nv,) are numbers, or a law tau(q, v, t) -> (nv,), called once at the start of the step. The
     steps are those of `jd.simulate` with `stepsize=dt/substeps`: RK4, constraints closed at the end of each, the scene's
-    forces applied (friction, stops, drives), and tau through its `jd.forces.DriveDynamics` and `jd.forces.EffortLimits`. Where a joint meets a stop
+    forces applied (friction, stops, drives), and tau through its drives and `jd.forces.EffortLimits`. Where a joint meets a stop
     (`jd.forces.JointStops`, any `jd.forces.PiecewiseForce`) a step ends and the next one goes on to where it would have ended.
 
     **Arguments:**
@@ -63,8 +63,8 @@ def stepper(scene: SceneLike, dt: Numbers, substeps: int = 1, remat: bool = True
     scene = as_scene(scene)
     if has_modes(scene):
         raise ValueError(
-            "stepper: the scene has forces with modes (jd.contact.DryFriction, jd.contact.UnilateralContact), whose events end steps; take "
-            "jd.simulate, or jd.forces.CoulombFriction in their place"
+            "stepper: the scene has forces with modes (jd.contact.DryFriction, jd.contact.UnilateralContact), "
+            "whose events end steps; take jd.simulate, or jd.forces.CoulombFriction in their place"
         )
     seconds = as_array(dt, "stepper: dt")
     if seconds.shape != () or (is_concrete(seconds) and not 0 < float(seconds) < np.inf):

@@ -6,3 +6,17 @@ from jaxdyn.simulation.solvers.projected import ProjectedSolver as ProjectedSolv
 from jaxdyn.simulation.solvers.rk4 import RK4 as RK4
 from jaxdyn.simulation.solvers.rosenbrock import Rodas5P as Rodas5P
 from jaxdyn.simulation.solvers.stepper import Stepper as Stepper
+
+__all__ = [
+    "RK4",
+    "ExplicitSteps",
+    "LieGroup",
+    "ProjectedSolver",
+    "Rodas5P",
+    "Stepper",
+]
+
+
+def __dir__() -> list[str]:
+    """Names of the namespace; its modules are internal."""
+    return __all__
