@@ -112,13 +112,18 @@ def test_step_response_of_a_drive(kind):
         np.testing.assert_allclose(np.concatenate([state[2], state[0], state[1]]), row, rtol=1e-5, atol=1e-7)
 
 
-def test_drive_of_one_joint_leaves_the_others():
-    scene = jd.Scene(
-        jd.robots.chain(2), forces=[jd.forces.FirstOrderDrive(0.1, joints=jd.robots.chain(2).joint_names[1])]
-    )
-    tau, rates = scene.drive_torque(jnp.zeros(2), jnp.zeros(2), 0.0, jnp.array([3.0, 4.0]), jnp.array([1.0]))
+def test_drives_of_named_joints():
+    """One of two joints, whose neighbour is left alone; both in another order than the model's."""
+    arm, rest, command = jd.robots.chain(2), jnp.zeros(2), jnp.array([3.0, 4.0])
+    first, second = arm.joint_names
+    scene = jd.Scene(arm, forces=[jd.forces.FirstOrderDrive(0.1, joints=second)])
+    tau, rates = scene.drive_torque(rest, rest, 0.0, command, jnp.array([1.0]))
     np.testing.assert_allclose(tau, [3.0, 1.0])
     np.testing.assert_allclose(rates, [30.0])
+    scene = jd.Scene(arm, forces=[jd.forces.FirstOrderDrive([0.1, 0.2], joints=(second, first))])
+    tau, rates = scene.drive_torque(rest, rest, 0.0, command, jnp.array([1.0, 2.0]))
+    np.testing.assert_allclose(tau, [2.0, 1.0])
+    np.testing.assert_allclose(rates, [30.0, 5.0])
 
 
 def test_gradients_of_a_drive_in_both_modes_and_batches():

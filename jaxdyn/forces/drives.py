@@ -2,6 +2,7 @@
 
 import equinox as eqx
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array, Float
 
 from jaxdyn.dynamics.kinematics import take
@@ -34,7 +35,8 @@ class _Lag(DriveDynamics):
     ) -> Float[Array, " nv"]:
         """The torques among the states, and the commands of other joints."""
         index = _joint_indices(system, self.joints, type(self).__name__).v
-        return state[: index.size] if index.size == system.nv else command.at[index].set(state[: index.size])
+        torque = state[: index.size]
+        return torque if np.array_equal(index, np.arange(system.nv)) else command.at[index].set(torque)
 
     def _error(self, system, state, command):
         """Commands less torques of the drives (n,), and a function that broadcasts a leaf to (n,)."""
