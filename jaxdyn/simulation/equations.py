@@ -24,6 +24,8 @@ from jaxdyn.systems.system import retract, velocity_to_rate
 
 # Entry of the state: which rows a step keeps, of a mechanism with rows that repeat others.
 KEPT = "kept_rows"
+# Entry of the state: the states of the scene's drives.
+DRIVES = "drives"
 
 
 class Equations(NamedTuple):
@@ -88,19 +90,25 @@ def equations(scene: Scene, control: Any, method: Method, start: dict, q0, v0, t
             force = scene.applied_force(q, v, t)
             return method.multipliers(scene, q, v, t, tau if force is None else tau + force)
 
-        return controls.torque(control, scene, y, q, v, t, multipliers)
+        tau = controls.torque(control, scene, y, q, v, t, multipliers)
+        return jnp.zeros_like(v) if tau is None and DRIVES in added else tau
+
+    def driven(args, y, q, v, t):
+        """Torque behind the scene's drives and limits, or None when there is none; the rates of the drives' states."""
+        tau = effort(args, y, q, v, t)
+        return (None, None) if tau is None else given(args, y)[0].drive_torque(q, v, t, tau, y.get(DRIVES))
 
     def torque(args, y, q, v, t):
-        """Of the control, or None when there is none."""
-        tau = effort(args, y, q, v, t)
-        return None if tau is None else given(args, y)[0].clip_effort(tau)
+        return driven(args, y, q, v, t)[0]
 
-    pieces = pieces_of(scene, start, q0, v0, t0, functools.partial(effort, args))
+    pieces = pieces_of(scene, start, q0, v0, t0, lambda y, q, v, t: (effort(args, y, q, v, t), y.get(DRIVES)))
 
     def switching(t, y, args):
         scene, _, method = given(args, y)
         q, v = method.to_qv(scene, y, t)
-        return values_and_levels(lambda q, v: guards(scene, q, v, t, effort(args, y, q, v, t)), q, v)
+
+        own = [y[DRIVES]] if DRIVES in y else []
+        return values_and_levels(lambda q, v, *own: guards(scene, q, v, t, effort(args, y, q, v, t), *own), q, v, *own)
 
     def generalized_force(args, y, q, v, t):
         """Tau plus the scene's forces, or None when there are none."""
@@ -108,9 +116,10 @@ def equations(scene: Scene, control: Any, method: Method, start: dict, q0, v0, t
         return force if tau is None else tau if force is None else tau + force
 
     def of_control(args, y, q, v, t, force):
-        """Rates of what the control adds to the state."""
+        """Rates of what the control and the drives add to the state."""
         scene, control, method = given(args, y)
-        return controls.rates(control, y, q, v, t, lambda: method.multipliers(scene, q, v, t, force))
+        rates = controls.rates(control, y, q, v, t, lambda: method.multipliers(scene, q, v, t, force))
+        return rates | ({DRIVES: driven(args, y, q, v, t)[1]} if DRIVES in y else {})
 
     # diffrax and differentiation call it in many places: it is traced once for all of them.
     @jax.jit

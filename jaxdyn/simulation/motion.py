@@ -15,7 +15,7 @@ from jaxdyn.contact.forces import contacts_with_cones
 from jaxdyn.model.tree import Model, neutral
 from jaxdyn.simulation import contacts as unilateral
 from jaxdyn.simulation import controls
-from jaxdyn.simulation.equations import KEPT, equations
+from jaxdyn.simulation.equations import DRIVES, KEPT, equations
 from jaxdyn.simulation.integration import integrate
 from jaxdyn.simulation.methods import Method, consistent, is_regular, meets_dropped_rows, start_limit
 from jaxdyn.simulation.outputs import at_save_point
@@ -77,6 +77,8 @@ def motion(scene: Scene, control, method: Method, numbers, options) -> Solution:
         check_callback(force, f"forces[{i}]", "force(system, q, v, t)", q0, v0, ts[0], first=(system,))
     controls.check_control(scene, control, q0, v0, ts[0])
     states = controls.started(control, q0, v0, ts[0])
+    if (of_drives := scene.drive_state(q0, v0, ts[0])) is not None:
+        states = states | {DRIVES: of_drives}
     added = tuple(states)  # names alone, as functions of a run hold no arrays
     options = options | {"control_ends": controls.can_end(control, q0, v0, ts[0])}
     eqs = equations(scene, control, method, states, q0, v0, ts[0], options)

@@ -11,7 +11,7 @@ from jaxdyn.model.names import frame_index
 from jaxdyn.model.tree import Model
 from jaxdyn.simulation import contacts as unilateral
 from jaxdyn.simulation import controls
-from jaxdyn.simulation.equations import Equations, power
+from jaxdyn.simulation.equations import DRIVES, Equations, power
 from jaxdyn.simulation.methods import Method
 from jaxdyn.systems.scene import Scene
 
@@ -24,6 +24,7 @@ _OUTPUTS = (
     "constraint_residual",
     "torque",
     "control_state",
+    "drive_state",
     *unilateral.OUTPUTS,
 )
 _POSE = "pose:"
@@ -68,5 +69,7 @@ def at_save_point(
         values["torque"] = jnp.zeros_like(v) if tau is None else tau
     if "control_state" in outputs:
         values["control_state"] = controls.state_of(control, of_control, q, v, t)
+    if "drive_state" in outputs:
+        values["drive_state"] = of_control.get(DRIVES)
     frames = [name.removeprefix(_POSE) for name in outputs if name.startswith(_POSE)]
     return values | {"poses": {frame: frame_pose(system, q, frame) for frame in frames}}

@@ -45,7 +45,7 @@ from jaxdyn.simulation.solvers.inputs import (
     check_turns,
 )
 from jaxdyn.simulation.start import checked_start, chosen_method, may_have_singular_mass
-from jaxdyn.systems.scene import Scene, as_scene
+from jaxdyn.systems.scene import Scene, as_scene, has_drives
 from jaxdyn.systems.system import SceneLike, System, has_dependent_coordinates
 
 
@@ -106,8 +106,9 @@ def simulate(
       continuous adjoint, whose gradients are approximate; or a diffrax adjoint.
     - `outputs`: any of "energy", "power", "work" (one more state, under the same error control), "acceleration" (the rate
       of v: of a free joint that of its body twist; `jd.dynamics.frame_acceleration` gives those of frames in world axes),
-      "multipliers", "constraint_residual", "contact_forces", "contact_margins", "torque" (of the control), "control_state"
-      (of a controller) and "pose:<frame>". They are computed only if asked for.
+      "multipliers", "constraint_residual", "contact_forces", "contact_margins", "torque" (of the control, behind drives
+      and limits), "control_state" (of a controller), "drive_state" (of drives) and "pose:<frame>". They are computed only if
+      asked for.
     - `contacts`: of a scene with `cones`. "stop": where a contact pulls or leaves its cone (a margin below zero by more than
       rounding, eps^(1/2) of its force) the run ends, with the code `contact_lost` and the time, which is found within the
       step. "report": it goes on, and contacts hold on both sides.
@@ -164,6 +165,7 @@ def simulate(
         solver = for_start(scene, controls.at_start(control, q0, v0, ts[0]), q0, v0, ts)
     solver = checked_method(method.stepper(solver, stepsize), stepsize)
     adjoint = checked_adjoint(adjoint, solver)
+    check_drives(scene, control, solver, modal)
     if isinstance(solver, Stepper) and isinstance(control, (controls.Controller, controls.Sampled)):
         raise ValueError(
             f"control is a {type(control).__name__}, whose state the steps of method 'variational' do not integrate; take "
@@ -228,6 +230,24 @@ def _run(scene: Scene, control, method: Method, numbers, options) -> Solution:
 @entry_point
 def _run_with_events(scene: Scene, control, method: Method, numbers, options) -> Solution:
     return hybrid.motion(scene, control, numbers, options)
+
+
+def check_drives(scene: Scene, control, solver, modal: bool) -> None:
+    """Refuse drives with a state where nothing integrates it.
+
+    **Raises:** ValueError.
+    """
+    if not has_drives(scene):
+        return
+    what = "the scene has drives with a state (jd.forces.DriveDynamics)"
+    if modal:
+        raise ValueError(
+            f"{what} and forces with modes (jd.contact.DryFriction, jd.contact.UnilateralContact); leave one of them out"
+        )
+    if isinstance(solver, Stepper):
+        raise ValueError(f"{what}, which the steps of method 'variational' do not integrate; take another method")
+    if isinstance(control, controls.Controller) and control.takes_multipliers:
+        raise ValueError(f"{what}, behind which multipliers do not depend on the command; use a control without them")
 
 
 def _check_system(system, q0, v0, t0) -> None:

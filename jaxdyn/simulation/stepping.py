@@ -16,6 +16,7 @@ from jaxdyn.constraints.selection import may_have_redundant_rows, select_rows
 from jaxdyn.contact.unilateral import has_modes
 from jaxdyn.forces.piecewise import fix_pieces, guards, pieces_of, values_and_levels
 from jaxdyn.model.arguments import Numbers, as_array, check_shape, state_dtype
+from jaxdyn.simulation.equations import DRIVES
 from jaxdyn.simulation.hybrid.laws import laws_of_pieces
 from jaxdyn.simulation.hybrid.pieces import motion_in_pieces
 from jaxdyn.simulation.solvers import ExplicitSteps, driver
@@ -33,10 +34,11 @@ ADJOINTS = ("reverse", "forward", "direct")
 def stepper(scene: SceneLike, dt: Numbers, substeps: int = 1, remat: bool = True, adjoint: str = "reverse") -> Callable:
     """A function step(state, tau, t=0.0) -> state that takes a scene dt further under a constant tau, or under a law.
 
-    The state is a pair (q (nq,), v (nv,)); batch it with `jax.vmap`, and go on with `jax.lax.scan`. The
+    The state is a pair (q (nq,), v (nv,)), or (q, v, z) of a scene with `jd.forces.DriveDynamics`, whose states z start as
+    `scene.drive_state(q, v)`; batch it with `jax.vmap`, and go on with `jax.lax.scan`. The
     torques tau (nv,) are numbers, or a law tau(q, v, t) -> (nv,), called once at the start of the step. The
     steps are those of `jd.simulate` with `stepsize=dt/substeps`: RK4, constraints closed at the end of each, the scene's
-    forces applied (friction, stops, drives), and tau cut off by its `jd.forces.EffortLimits`. Where a joint meets a stop
+    forces applied (friction, stops, drives), and tau through its drives and `jd.forces.EffortLimits`. Where a joint meets a stop
     (`jd.forces.JointStops`, any `jd.forces.PiecewiseForce`) a step ends and the next one goes on to where it would have ended.
 
     **Arguments:**
@@ -88,12 +90,14 @@ def stepper(scene: SceneLike, dt: Numbers, substeps: int = 1, remat: bool = True
     @jax.jit
     def field(t, y, args):
         scene, tau = given(args)
+        rates_of_drives = {}
 
         def generalized_force(q, v, t):
-            force, given = scene.applied_force(q, v, t), scene.clip_effort(tau)
+            force, (given, rates) = scene.applied_force(q, v, t), scene.drive_torque(q, v, t, tau, y.get(DRIVES))
+            rates_of_drives.update({} if rates is None else {DRIVES: rates})
             return given if force is None else given + force
 
-        return method.evaluated(scene, y, t, generalized_force)[0]
+        return method.evaluated(scene, y, t, generalized_force)[0] | rates_of_drives
 
     def project(t, y, error, args):
         scene, _ = given(args)
@@ -104,15 +108,22 @@ def stepper(scene: SceneLike, dt: Numbers, substeps: int = 1, remat: bool = True
     solver = ExplicitSteps(RK4(), corrector, method.step_constants, method.projects, field=field)
 
     def switching(t, y, args):
-        scene, _ = given(args)
-        return values_and_levels(lambda q, v: guards(scene, q, v, t, None), *method.to_qv(scene, y, t))
+        scene, tau = given(args)
+        state = (*method.to_qv(scene, y, t), *(y[name] for name in of_drives))
+        return values_and_levels(lambda q, v, *own: guards(scene, q, v, t, tau if cuts_move else None, *own), *state)
 
-    # tau is constant in a step, and so is where it is cut off.
     q, v = (jnp.zeros((n,), dtype) for n in (scene.nq, scene.nv))
-    pieces = pieces_of(scene, (), q, v, jnp.zeros((), dtype), None)
+    start = scene.drive_state(q, v)
+    of_drives = () if start is None else (DRIVES,)
+    # tau is constant in a step, and so is where it is cut off, unless drives or limits of the speed are in between.
+    cuts_move = bool(of_drives) or any(getattr(force, "of_speed", False) for force in scene.forces)
+    zero = jnp.zeros((), dtype)
+    pieces = pieces_of(
+        scene, (), q, v, zero, (lambda _, q, v, t: (v, scene.drive_state(q, v, t))) if cuts_move else None
+    )
 
-    def advance(q, v, tau, t):
-        y = method.start(scene, q, v, t)
+    def advance(q, v, tau, t, *z):
+        y = method.start(scene, q, v, t) | dict(zip(of_drives, z, strict=True))
         selection = select_rows(known(unknown), q, t, None) if selects_rows else None
         plan, args, ts, size = solver.plan(y), (unknown, tau, selection), jnp.stack([t, t + length]), length / substeps
         if pieces.names:
@@ -125,26 +136,33 @@ def stepper(scene: SceneLike, dt: Numbers, substeps: int = 1, remat: bool = True
                 start, end = t + i * size, t + (i + 1) * size
                 rate = plan.field_of(args, start, flat) if plan.passes_rate_on else jnp.zeros_like(flat)
                 flat = whole_step(plan, args, start, end, flat, rate).projected
-            return method.to_qv(scene, plan.structure(flat), t + length)
+            return whole_state(plan.structure(flat), t + length)
         else:
             drive = Drive(plan, driver.Fixed(4, 3), None, None, size, substeps, substeps)
             rows = (drive.direct if is_direct else drive)(y, args, ts)[0]
-        return method.to_qv(scene, jax.tree.map(lambda x: x[0], rows), t + length)
+        return whole_state(jax.tree.map(lambda x: x[0], rows), t + length)
+
+    def whole_state(y, t):
+        return *method.to_qv(scene, y, t), *(y[name] for name in of_drives)
 
     taken = jax.checkpoint(advance) if remat else advance
 
     def step(state, tau, t: Any = 0.0):
-        q, v = state
-        q, v = jnp.asarray(as_array(q, "q"), dtype), jnp.asarray(as_array(v, "v"), dtype)
+        if len(state) != 2 + len(of_drives):
+            names = "(q, v, z) with z = scene.drive_state(q, v) at the start" if of_drives else "(q, v)"
+            raise ValueError(f"stepper: the state has {len(state)} entries, expected {names}")
+        q, v, *z = (jnp.asarray(as_array(x, name), dtype) for x, name in zip(state, ("q", "v", "z"), strict=False))
         for name, value in (("q", q), ("v", v)):
             check_shape(system, name, value)
+        if start is not None and z[0].shape != start.shape:
+            raise ValueError(f"z has shape {z[0].shape}, expected {start.shape} as of scene.drive_state(q, v)")
         t = jnp.asarray(t, dtype)
         if not callable(tau):
-            return taken(q, v, check_force(jnp.asarray(as_array(tau, "tau"), dtype), q, scene.nv, "tau"), t)
+            return taken(q, v, check_force(jnp.asarray(as_array(tau, "tau"), dtype), q, scene.nv, "tau"), t, *z)
 
-        def under_law(q, v, t):
-            return advance(q, v, check_force(jnp.asarray(tau(q, v, t), dtype), q, scene.nv, "tau"), t)
+        def under_law(q, v, t, *z):
+            return advance(q, v, check_force(jnp.asarray(tau(q, v, t), dtype), q, scene.nv, "tau"), t, *z)
 
-        return (jax.checkpoint(under_law) if remat else under_law)(q, v, t)
+        return (jax.checkpoint(under_law) if remat else under_law)(q, v, t, *z)
 
     return step

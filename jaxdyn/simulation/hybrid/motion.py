@@ -78,7 +78,7 @@ def motion(scene: Scene, control, numbers, options) -> Solution:
     q0, v0, ts, rtol, atol, stepsize = numbers
     system, outputs = scene.system, options["outputs"]
     control_of: Any = (
-        None if control is None else lambda _, q, v, t: check_force(control(q, v, t), q, scene.nv, "control")
+        None if control is None else lambda _, q, v, t: (check_force(control(q, v, t), q, scene.nv, "control"),)
     )
     pieces = pieces_of(scene, (), q0, v0, ts[0], control_of)
     elements = elements_of(scene, pieces)
@@ -100,7 +100,7 @@ def motion(scene: Scene, control, numbers, options) -> Solution:
             force, tau = whole.applied_force(q, v, t), effort(q, v, t)
             if tau is None:
                 return force
-            tau = in_piece.clip_effort(tau)
+            tau = in_piece.drive_torque(q, v, t, tau)[0]
             return tau if force is None else tau + force
 
         return in_piece, generalized_force, lambda q, v, t: guards(scene, q, v, t, effort(q, v, t))
@@ -152,7 +152,7 @@ def motion(scene: Scene, control, numbers, options) -> Solution:
             values["energy"] = kinetic_energy(system, q, v, t) + potential_energy(system, q, t)
         if "torque" in outputs:
             tau = jnp.zeros_like(v) if control is None else check_force(control(q, v, t), q, scene.nv, "control")
-            values["torque"] = scene_.clip_effort(tau)
+            values["torque"] = scene_.drive_torque(q, v, t, tau)[0]
         if {"acceleration", "multipliers", "contact_forces"} & set(outputs):
             terms = terms_at(scene_, elements, q, v, t)
             at_time = motion_at(scene_, elements, mode, terms, y["slip"], generalized_force(q, v, t), q, v, t)
