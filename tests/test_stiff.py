@@ -321,7 +321,7 @@ def test_implicit_explicit_split():
     weights = np.linalg.solve([[1, 1], rate], [1, 0])
     np.testing.assert_allclose(solution.q[:, 0], np.exp(np.outer(times, rate)) @ weights, rtol=0, atol=1e-6)
     assert solution.success and solution.solver == "KenCarp4" and solution.stats["num_steps"] < 400
-    with pytest.raises(ValueError, match="adjoint is 'backsolve', which KenCarp4 cannot serve"):
+    with pytest.raises(ValueError, match="adjoint is 'backsolve', which KenCarp4 does not support"):
         jd.simulate(scene, [1.0], [0.0], times, solver=diffrax.KenCarp4(), adjoint="backsolve")
 
 

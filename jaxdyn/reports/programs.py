@@ -18,7 +18,7 @@ from jaxdyn.reports.case import Case
 from jaxdyn.reports.references import Reference
 from jaxdyn.simulation.run import simulate
 from jaxdyn.simulation.solvers import RK4, Rodas5P
-from jaxdyn.simulation.start import chosen_method
+from jaxdyn.simulation.start import choose_method
 from jaxdyn.systems.scene import Scene
 
 # Solvers by name; those in FIXED run with fixed steps.
@@ -53,7 +53,7 @@ class Programs:
 
     def get(self, method: str, solver: str, dtype: str = "float64", batch: int = 1) -> Program:
         """Program for a method, a solver, a dtype and a number of trajectories, compiled once."""
-        key = (chosen_method(self.scene, method).name, solver, dtype, batch)
+        key = (choose_method(self.scene, method).name, solver, dtype, batch)
         if key not in self._cache:
             self._cache[key] = self._compile(*key)
         return self._cache[key]

@@ -13,7 +13,7 @@ from jaxdyn.scale.program import Traced
 from jaxdyn.scale.reducer import QUANTITY
 from jaxdyn.scale.reductions import Reduction, quantities
 from jaxdyn.scale.store import Variable
-from jaxdyn.simulation.export import dimensions, traced_signals
+from jaxdyn.simulation.export import dimensions, signals_as_given
 
 OUTCOMES = ("successful", "failed")  # codes of functions that are no motions
 
@@ -50,7 +50,7 @@ class MotionRows(NamedTuple):
     def __call__(self, drawn: Any, row: Any) -> dict[str, Any]:
         """By their names in the store, with the quantities of reductions."""
         solution, scene, parameters = self.one(drawn, row)
-        signals = traced_signals(solution, scene)
+        signals = signals_as_given(solution, scene)
         values = {signal.key: signal.values for signal in signals}
         poses = {f"pose_{name}": pose for name, pose in solution.poses.items()}
         stats = {name: solution.stats[name] for name in ("num_steps", "time_reached")}

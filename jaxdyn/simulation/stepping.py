@@ -1,4 +1,4 @@
-"""A motion one step at a time, for learning: the steps of `simulate` with a fixed length, as a function of state and torque."""
+"""Single steps for learning: the steps of `simulate` with a fixed length, as a function of state and torque."""
 
 from collections.abc import Callable
 from typing import Any
@@ -15,37 +15,36 @@ from jaxdyn.constraints.selection import keep_rows, may_have_redundant_rows, sel
 from jaxdyn.contact.unilateral import has_modes
 from jaxdyn.forces.piecewise import fix_pieces, guards, pieces_of, values_and_levels
 from jaxdyn.model.arguments import Numbers, as_array, check_shape, state_dtype
-from jaxdyn.simulation.hybrid.laws import laws_of_pieces
-from jaxdyn.simulation.hybrid.pieces import motion_in_pieces
+from jaxdyn.simulation.hybrid.piecewise import PiecewiseSystem, piecewise_motion
 from jaxdyn.simulation.solvers import ExplicitSteps, driver
-from jaxdyn.simulation.solvers.driver import Drive
-from jaxdyn.simulation.solvers.explicit import whole_step
+from jaxdyn.simulation.solvers.driver import ExplicitRun
+from jaxdyn.simulation.solvers.explicit import take_step
 from jaxdyn.simulation.solvers.rk4 import RK4
-from jaxdyn.simulation.start import chosen_method
-from jaxdyn.systems.scene import as_scene, check_force
+from jaxdyn.simulation.start import choose_method
+from jaxdyn.systems.scene import Scene, as_scene, check_force
 from jaxdyn.systems.system import SceneLike
 
-EVENTS = 8  # of a step, at most: a force that changes its piece more often leaves it without derivatives
+EVENTS = 8  # at most in a step: a force that changes its piece more often leaves the step without derivatives
 ADJOINTS = ("reverse", "forward", "direct")
 
 
 def stepper(scene: SceneLike, dt: Numbers, substeps: int = 1, remat: bool = True, adjoint: str = "reverse") -> Callable:
-    """A function step(state, tau, t=0.0) -> state that takes a scene dt further under a constant tau, or under a law.
+    """Function step(state, tau, t=0.0) -> state that advances a scene by dt under a constant tau, or under a law.
 
-    The state is a pair (q (nq,), v (nv,)); batch it with `jax.vmap`, and go on with `jax.lax.scan`. The
+    The state is a pair (q (nq,), v (nv,)); batch it with `jax.vmap`, and repeat it with `jax.lax.scan`. The
     torques tau (nv,) are numbers, or a law tau(q, v, t) -> (nv,), called once at the start of the step. The
     steps are those of `jd.simulate` with `stepsize=dt/substeps`: RK4, constraints closed at the end of each, the scene's
-    forces applied (friction, stops, drives), and tau cut off by its `jd.EffortLimits`. Where a joint meets a stop
-    (`jd.JointStops`, any `jd.PiecewiseForce`) a step ends and the next one goes on to where it would have ended.
+    forces applied (friction, stops, drives), and tau clipped by its `jd.EffortLimits`. Where a joint meets a stop
+    (`jd.JointStops`, any `jd.PiecewiseForce`) a step ends, and the next one ends where it would have ended.
 
     **Arguments:**
 
     - `scene`: a `Scene` or `Model`. Friction that sticks and contacts that open need events, which steps of one length
       do not have: take `jd.CoulombFriction`.
     - `dt`: s; `substeps`: steps in it.
-    - `remat`: whether reverse mode keeps no more of a step than its state and tau, and computes the rest again. That costs a
+    - `remat`: if True, reverse mode keeps no more of a step than its state and tau, and computes the rest again. That costs a
       step, and a run of n steps then keeps 8 (nq + 2 nv) n bytes a sample in float64; with a law as tau, which is computed
-      again too, 8 (nq + nv) n bytes and nothing of what happens inside the law.
+      again too, 8 (nq + nv) n bytes and no intermediates of the law.
     - `adjoint`: "reverse" (default), for `jax.grad`, `jax.jacrev` and, over them, `jax.hessian`; "forward" or "direct", for
       forward mode too (`jax.jvp`, `jax.jacfwd`), in which reverse mode takes longer.
 
@@ -59,6 +58,31 @@ def stepper(scene: SceneLike, dt: Numbers, substeps: int = 1, remat: bool = True
     ```
     """
     scene = as_scene(scene)
+    seconds = _check_options(scene, dt, substeps, adjoint)
+    system, dtype = scene.system, state_dtype(scene.system)
+    length = np.asarray(seconds, dtype) if is_concrete(seconds) else jnp.asarray(seconds, dtype)
+    advance = _advance(scene, length, substeps, adjoint != "reverse")
+    by_numbers = jax.checkpoint(advance) if remat else advance
+
+    def step(state, tau, t: Any = 0.0):
+        q, v = state
+        q, v = jnp.asarray(as_array(q, "q"), dtype), jnp.asarray(as_array(v, "v"), dtype)
+        for name, value in (("q", q), ("v", v)):
+            check_shape(system, name, value)
+        t = jnp.asarray(t, dtype)
+        if not callable(tau):
+            return by_numbers(q, v, check_force(jnp.asarray(as_array(tau, "tau"), dtype), q, scene.nv, "tau"), t)
+
+        def by_law(q, v, t):
+            return advance(q, v, check_force(jnp.asarray(tau(q, v, t), dtype), q, scene.nv, "tau"), t)
+
+        return (jax.checkpoint(by_law) if remat else by_law)(q, v, t)
+
+    return step
+
+
+def _check_options(scene: Scene, dt, substeps, adjoint):
+    """Length of the step, s; ValueError for options that do not fit."""
     if has_modes(scene):
         raise ValueError(
             "stepper: the scene has forces with modes (jd.DryFriction, jd.UnilateralContact), whose events end steps; take "
@@ -71,14 +95,17 @@ def stepper(scene: SceneLike, dt: Numbers, substeps: int = 1, remat: bool = True
         raise ValueError(f"stepper: substeps is {substeps!r}; give a positive integer")
     if adjoint not in ADJOINTS:
         raise ValueError(f"stepper: adjoint is {adjoint!r}; choose one of {', '.join(ADJOINTS)}")
-    is_direct = adjoint != "reverse"
-    selects_rows = bool(scene.constraints) and may_have_redundant_rows(scene)
-    method, system, dtype = chosen_method(scene, "auto"), scene.system, state_dtype(scene.system)
-    unknown, known = partition_tracers(scene)
-    length = np.asarray(seconds, dtype) if is_concrete(seconds) else jnp.asarray(seconds, dtype)
+    return seconds
 
-    def given(args):
-        """The scene with its independent rows, in the pieces that come last if any do, and tau."""
+
+def _advance(scene: Scene, length, substeps: int, is_direct: bool) -> Callable:
+    """Function (q, v, tau, t) -> (q, v) of a step under a constant tau, of known shapes."""
+    selects_rows = bool(scene.constraints) and may_have_redundant_rows(scene)
+    method, dtype = choose_method(scene, "auto"), state_dtype(scene.system)
+    unknown, known = partition_tracers(scene)
+
+    def unpack(args):
+        """Scene with its independent rows, in the pieces of its forces if they follow, and tau."""
         unknown, tau, selection, *positive = args
         scene = known(unknown)
         scene = scene if selection is None else keep_rows(scene, selection)
@@ -86,27 +113,25 @@ def stepper(scene: SceneLike, dt: Numbers, substeps: int = 1, remat: bool = True
 
     @jax.jit
     def field(t, y, args):
-        scene, tau = given(args)
+        scene, tau = unpack(args)
 
         def generalized_force(q, v, t):
-            force, given = scene.applied_force(q, v, t), scene.clip_effort(tau)
-            return given if force is None else given + force
+            force, effort = scene.applied_force(q, v, t), scene.clip_effort(tau)
+            return effort if force is None else effort + force
 
-        return method.evaluated(scene, y, t, generalized_force)[0]
+        return method.evaluate(scene, y, t, generalized_force)[0]
 
     def project(t, y, error, args):
-        scene, _ = given(args)
-        y, error = method.stepped(scene, y, t, error)
+        y, error = method.end_step(unpack(args)[0], y, t, error)
         return y, error, diffrax.RESULTS.successful
+
+    def switching(t, y, args):
+        scene, _ = unpack(args)
+        return values_and_levels(lambda q, v: guards(scene, q, v, t, None), *method.to_qv(scene, y, t))
 
     corrector = project if method.corrects(scene) else None
     solver = ExplicitSteps(RK4(), corrector, method.step_constants, method.projects, field=field)
-
-    def switching(t, y, args):
-        scene, _ = given(args)
-        return values_and_levels(lambda q, v: guards(scene, q, v, t, None), *method.to_qv(scene, y, t))
-
-    # tau is constant in a step, and so is where it is cut off.
+    # Constant in a step, tau has its limits of effort applied in the vector field: they are no switching functions here.
     q, v = (jnp.zeros((n,), dtype) for n in (scene.nq, scene.nv))
     pieces = pieces_of(scene, (), q, v, jnp.zeros((), dtype), None)
 
@@ -115,35 +140,18 @@ def stepper(scene: SceneLike, dt: Numbers, substeps: int = 1, remat: bool = True
         selection = select_rows(known(unknown), q, t, None) if selects_rows else None
         plan, args, ts, size = solver.plan(y), (unknown, tau, selection), jnp.stack([t, t + length]), length / substeps
         if pieces.names:
-            laws = laws_of_pieces(plan, pieces, switching, 4, 3)
-            rows = motion_in_pieces(laws, y, args, ts, (0.0, 0.0), size, substeps, substeps + 1, EVENTS, is_direct)[0]
+            system = PiecewiseSystem(plan, pieces, switching)
+            rows = piecewise_motion(system, y, args, ts, 0.0, 0.0, size, substeps, substeps + 1, EVENTS, is_direct)[0]
         elif is_standalone():
-            # A program of numbers has no loop over steps; they are written one after the other.
+            # A scalar program has no loop over steps; they are written one after the other.
             flat = ravel_pytree(y)[0]
             for i in range(substeps):
                 start, end = t + i * size, t + (i + 1) * size
-                rate = plan.field_of(args, start, flat) if plan.passes_rate_on else jnp.zeros_like(flat)
-                flat = whole_step(plan, args, start, end, flat, rate).projected
+                flat = take_step(plan, args, start, end, flat, plan.first_rate(args, start, flat)).projected
             return method.to_qv(scene, plan.structure(flat), t + length)
         else:
-            drive = Drive(plan, driver.Fixed(4, 3), None, None, size, substeps, substeps)
-            rows = (drive.direct if is_direct else drive)(y, args, ts)[0]
+            run = ExplicitRun(plan, driver.FixedSteps(4, 3), None, None, size, substeps, substeps)
+            rows = (run.direct if is_direct else run)(y, args, ts)[0]
         return method.to_qv(scene, jax.tree.map(lambda x: x[0], rows), t + length)
 
-    taken = jax.checkpoint(advance) if remat else advance
-
-    def step(state, tau, t: Any = 0.0):
-        q, v = state
-        q, v = jnp.asarray(as_array(q, "q"), dtype), jnp.asarray(as_array(v, "v"), dtype)
-        for name, value in (("q", q), ("v", v)):
-            check_shape(system, name, value)
-        t = jnp.asarray(t, dtype)
-        if not callable(tau):
-            return taken(q, v, check_force(jnp.asarray(as_array(tau, "tau"), dtype), q, scene.nv, "tau"), t)
-
-        def under_law(q, v, t):
-            return advance(q, v, check_force(jnp.asarray(tau(q, v, t), dtype), q, scene.nv, "tau"), t)
-
-        return (jax.checkpoint(under_law) if remat else under_law)(q, v, t)
-
-    return step
+    return advance

@@ -9,7 +9,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import PyTree
 
-from jaxdyn.simulation.solvers.interpolation import StageInterpolation
+from jaxdyn.simulation.solvers.base import StageInterpolation
 
 _B = np.array([1 / 6, 1 / 3, 1 / 3, 1 / 6])
 
@@ -17,7 +17,8 @@ _B = np.array([1 / 6, 1 / 3, 1 / 3, 1 / 6])
 class _Interpolation(StageInterpolation):
     """Third-order continuous extension from the four stages, without a further evaluation."""
 
-    def at(self, x):
+    def at(self, t):
+        x = self.fraction(t)
         middle = x * x * (1 - 2 * x / 3)
         weights = jnp.stack([x * (1 - x * (1.5 - 2 * x / 3)), middle, middle, x * x * (2 * x / 3 - 0.5)])
         return jax.tree.map(lambda y, k: y + jnp.tensordot(weights.astype(y.dtype), k, 1), self.y0, self.k)
@@ -26,8 +27,8 @@ class _Interpolation(StageInterpolation):
 class RK4(diffrax.AbstractERK):
     """Classical Runge-Kutta method: order 4, four evaluations a step, for fixed steps.
 
-    Dense output is of order 3 (local error h^4) and keeps the global order 4. The difference from the midpoint rule, of
-    h^3, tells steps that are too long (`ErrorMonitoredSteps`); to choose them by it is not worth while.
+    Dense output is of order 3 (local error h^4) and keeps the global order 4. The error estimate is the difference from the
+    midpoint rule, of order h^3. It detects steps that are too long (`ErrorMonitoredSteps`) and is too coarse to control them.
 
     Source: Hairer, Norsett & Wanner 1993, tables II.1.2 and section II.6.
     """
@@ -45,5 +46,5 @@ class RK4(diffrax.AbstractERK):
         return 4
 
     def error_order(self, terms: PyTree) -> int:
-        """Power of h that the error estimate goes with."""
+        """Power of the step length in the error estimate."""
         return 3

@@ -1,4 +1,4 @@
-"""Methods that are given as a map from one state to the next, in diffrax's interface."""
+"""Methods defined by a map from one state to the next, in diffrax's interface."""
 
 from collections.abc import Callable
 from typing import Any, ClassVar
@@ -6,44 +6,40 @@ from typing import Any, ClassVar
 import diffrax
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Bool, PyTree
+from jaxtyping import PyTree
 
 from jaxdyn.model.arguments import Number
+from jaxdyn.simulation.solvers.base import DenseOutput, Flag, StepOutput
 
 
-class _Interpolation(diffrax.AbstractLocalInterpolation):
-    """From a step's ends: the velocity is the parabola with v0 and v1 at the ends and the mean velocity xi over the step.
+class _Interpolation(DenseOutput):
+    """Dense output from a step's ends: v is the parabola through v0 and v1 with the mean velocity over the step.
 
-    q moves along its integral, on the manifold. Other entries of the state change at a constant rate. Local errors of q
-    and v are h^4 and h^3, as those of cubic Hermite interpolation but for the error of the step.
+    q is displaced by its integral, on the manifold. Other entries of the state change at a constant rate. Local errors of q
+    and v are h^4 and h^3, those of cubic Hermite interpolation, plus the error of the step.
     """
 
-    t0: jax.Array
-    t1: jax.Array
     y0: dict
     y1: dict
     mean: jax.Array
     displace: Callable
 
-    def evaluate(self, t0, t1=None, left=True):
-        if t1 is not None:
-            return jax.tree.map(lambda a, b: a - b, self.evaluate(t1), self.evaluate(t0))
-        h = self.t1 - self.t0
-        s = (t0 - self.t0) / jnp.where(h == 0, jnp.ones_like(h), h)
-        s, h = (x.astype(self.mean.dtype) for x in (s, h))
+    def at(self, t):
+        s, h = (x.astype(self.mean.dtype) for x in (self.fraction(t), self.t1 - self.t0))
         first, last = self.y0["v"], self.y1["v"]
         y = jax.tree.map(lambda a, b: a + s * (b - a), self.y0, self.y1)
-        moved = s * (1 - s) ** 2 * first + s * s * (s - 1) * last + s * s * (3 - 2 * s) * self.mean
+        # Integral of the parabola, as a fraction of the step; its derivative is v.
+        path = s * (1 - s) ** 2 * first + s * s * (s - 1) * last + s * s * (3 - 2 * s) * self.mean
         v = (1 - s) * (1 - 3 * s) * first + s * (3 * s - 2) * last + 6 * s * (1 - s) * self.mean
-        return y | {"q": self.displace(self.y0["q"], h * moved), "v": v}
+        return y | {"q": self.displace(self.y0["q"], h * path), "v": v}
 
 
 class Stepper(diffrax.AbstractSolver):
-    """A method of order 2 that makes its steps itself; the vector field is not called. For fixed steps.
+    """A one-step map of order 2 that does not call the vector field, for fixed steps.
 
     **Arguments:**
 
-    - `begin(t0, y0, args)` -> what the first step takes beside y.
+    - `begin(t0, y0, args)` -> what the first step needs in addition to y.
     - `advance(t0, t1, y, args, carried)` -> y1, the mean velocity of the step, what is carried on, and whether it succeeded.
       y is a dictionary with "q" and "v". What these two depend on comes through `args`, so that gradients reach it.
     - `displace(q, step)` -> configuration.
@@ -56,7 +52,7 @@ class Stepper(diffrax.AbstractSolver):
 
     @property
     def interpolation_cls(self) -> Callable[..., diffrax.AbstractLocalInterpolation]:  # pyright: ignore[reportIncompatibleVariableOverride]
-        """Dense output from the step's ends and its mean velocity."""
+        """Dense output from the ends of a step and its mean velocity."""
 
         def interpolation(**given):
             return _Interpolation(displace=self.displace, **given)  # pyright: ignore[reportArgumentType]
@@ -68,7 +64,7 @@ class Stepper(diffrax.AbstractSolver):
         return 2
 
     def init(self, terms: PyTree, t0: Number, t1: Number, y0: PyTree, args: PyTree) -> PyTree:
-        """What the first step takes."""
+        """Data that the first step needs."""
         return self.begin(t0, y0, args)  # pyright: ignore[reportOptionalCall]
 
     def func(self, terms: PyTree, t0: Number, y0: PyTree, args: PyTree) -> PyTree:
@@ -76,16 +72,9 @@ class Stepper(diffrax.AbstractSolver):
         return terms.vf(t0, y0, args)
 
     def step(
-        self,
-        terms: PyTree,
-        t0: Number,
-        t1: Number,
-        y0: PyTree,
-        args: PyTree,
-        solver_state: PyTree,
-        made_jump: bool | Bool[Array, ""],
-    ) -> tuple[PyTree, PyTree, dict[str, PyTree], PyTree, diffrax.RESULTS]:
-        """One step from t0 to t1; NaN where it failed."""
+        self, terms: PyTree, t0: Number, t1: Number, y0: PyTree, args: PyTree, solver_state: PyTree, made_jump: Flag
+    ) -> StepOutput:
+        """Make one step from t0 to t1; NaN where it failed."""
         y1, mean, carried, solved = self.advance(t0, t1, y0, args, solver_state)  # pyright: ignore[reportOptionalCall]
         y1 = jax.tree.map(lambda y: jnp.where(solved, y, jnp.full_like(y, jnp.nan)), y1)
         codes: Any = diffrax.RESULTS
