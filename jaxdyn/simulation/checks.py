@@ -19,7 +19,7 @@ from jaxdyn.simulation.solvers.choice import innermost, is_step_length, label
 from jaxdyn.systems.scene import Scene
 from jaxdyn.systems.system import has_quaternions
 
-POSE = "pose:"
+POSE = "pose:"  # prefix of the output of a frame
 CONTACT_OUTPUTS = ("contact_forces", "contact_margins")
 OUTPUTS = (
     *("energy", "power", "work", "acceleration", "multipliers", "constraint_residual", "torque", "control_state"),
@@ -51,6 +51,7 @@ def check_start(scene: Scene, q0, v0) -> None:
 
 def has_unit_quaternions(system, q) -> Bool[Array, ""]:
     """True if every quaternion of q is zero or of unit length, up to the rounding of numbers in files, ()."""
+    # A quaternion of zeros is left to the check for finite numbers, which it is not when it has been normalised.
     squares = [jnp.sum(q[places] ** 2) for _, places in _quaternions(system)]
     if not squares:
         return jnp.asarray(True)

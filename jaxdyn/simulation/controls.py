@@ -197,6 +197,7 @@ def check_control(scene: Scene, control: Any, q, v, t) -> None:
 def initial_entries(control: Any, q, v, t) -> dict[str, Array]:
     """Initial values of the control's entries in the state of the equation."""
     if isinstance(control, Sampled):
+        # With no sample so far the first one is due at the start.
         start = jnp.concatenate([jnp.stack([t, jnp.zeros_like(t)]), jnp.zeros_like(v), _flat(control.state, q)])
         return {HELD: sample(control, start, q, v, t)}
     if isinstance(control, Controller) and (state := control.start(q, v, t)) is not None:

@@ -16,7 +16,8 @@ from jaxdyn.simulation.terminal_events import Conditions, contact_allowances, li
 from jaxdyn.systems.scene import Scene
 from jaxdyn.systems.system import retract, velocity_to_rate
 
-# Entry of the state of a mechanism with redundant rows: the rows that a step keeps.
+# Entry of the state of a mechanism with redundant rows: the rows that a step keeps. Rank is decided once a step, at its start on
+# the manifold: between its stages, where rows that depend on each other are open by the local error, it would change.
 KEPT = "kept_rows"
 
 
@@ -110,6 +111,7 @@ class Equations:
         q, v = method.to_qv(scene, y, t)
         rates = method.rates(scene, y, q, v, t, self.torque(args, y, q, v, t)) | {"q": jnp.zeros_like(y["q"])}
         rates = rates | ({KEPT: jnp.zeros_like(y[KEPT])} if KEPT in y else {})
+        # Controllers and the work see the whole force, although the rate of v has a share of it only.
         force = self.generalized_force(args, y, q, v, t) if self._added or "work" in y else None
         rates = rates | self._control_rates(args, y, q, v, t, force)
         return rates | {"work": power(force, v)} if "work" in y else rates
@@ -121,6 +123,7 @@ class Equations:
         rates = jax.tree.map(jnp.zeros_like, y)
         force = scene.applied_force(q, v, t)
         if force is not None:
+            # Work and the control's entries are integrated explicitly.
             by_force = {name: y[name] for name in y if name not in ("work", *self._added)}
             _, share = jax.jvp(lambda f: method.rates(scene, by_force, q, v, t, f), (jnp.zeros_like(v),), (force,))
             rates = rates | share
@@ -138,6 +141,7 @@ class Equations:
             y = y | {controls.HELD: controls.sample(control, y[controls.HELD], *method.to_qv(scene, y, t), t)}
         return y, error, diffrax.RESULTS.successful
 
+    # diffrax passes more to the condition of an event: `**_`.
     def quality(self, t, y, args, **_):
         """Quality of the method's basis."""
         scene, _, method = self.unpack(args, y)

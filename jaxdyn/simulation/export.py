@@ -95,6 +95,7 @@ def write_csv(solution: Any, path: str | os.PathLike, scene: Any) -> None:
     with path.open("w", newline="") as file:
         writer = csv.writer(file)
         writer.writerow((["rollout"] if batched else []) + header)
+        # `repr` gives the shortest text that reads back to the same number.
         for n, motion in enumerate(table):
             first = [str(n + 1)] if batched else []
             writer.writerows(first + [repr(float(x)) for x in (t, *row)] for t, row in zip(ts, motion, strict=True))

@@ -99,6 +99,7 @@ def _reason_for_crossing(
     """Reason why steps go across the kinks of forces instead of ending there, or None."""
     if not is_erk:
         return f"solver is {label(options['solver'])}; take an explicit one, such as diffrax.Dopri8()"
+    # Subclasses and wrappers, such as a clip to samples, have rules that our loops do not know.
     if type(controller) not in (Adaptive, ErrorMonitoredSteps):
         return "stepsize is a controller, or control a jd.Sampled; leave them out"
     if any(eqs.conditions):

@@ -94,7 +94,7 @@ class Method(eqx.Module):
 
     def multipliers(self, scene: Scene, q: Q, v: V, t: Number, force: Force) -> Array:
         """Constraint forces along the rows, (nc,)."""
-        return dynamics(scene, q, v, t, force).multipliers
+        return dynamics(scene, q, v, t, force, self.rank_tol).multipliers
 
     def satisfies(self, scene: Scene, q: Q, v: V, t: Number, force: Force) -> Array:
         """True if some acceleration satisfies all rows, ()."""
@@ -151,10 +151,6 @@ class Multipliers(Method):
         """Acceleration of `constrained_dynamics`."""
         return dynamics(scene, q, v, t, force, self.rank_tol).acceleration
 
-    def multipliers(self, scene: Scene, q: Q, v: V, t: Number, force: Force) -> Array:
-        """Multipliers of `constrained_dynamics`."""
-        return dynamics(scene, q, v, t, force, self.rank_tol).multipliers
-
     def satisfies(self, scene: Scene, q: Q, v: V, t: Number, force: Force) -> Array:
         """True if `constrained_dynamics` finds no contradiction, and the rows that were dropped at the start agree."""
         motion = dynamics(scene, q, v, t, force, self.rank_tol)
@@ -173,6 +169,8 @@ class Projected(Multipliers):
 
     def end_step(self, scene: Scene, y: State, t: Number, error: State | None) -> tuple[State, State | None]:
         """Project q and v onto the constraints, and the error onto their tangent space."""
+        # An error of q is the rate of a displacement: as such it is tangent or normal to the constraints, with or without
+        # quaternions.
         errors = () if error is None else (_position_error(scene, y["q"], error), error["v"])
         q, v, errors = project_step(scene, y["q"], y["v"], t, errors, self.rank_tol)
         if error is not None:
@@ -186,6 +184,7 @@ class Projected(Multipliers):
 
     def project(self, scene: Scene, q: Q, v: V, t: Number) -> tuple[Array, Array]:
         """Project by the programs that correct a step."""
+        # With errors of zero, so that it is the kernel of `end_step`, which is compiled anyway.
         none = jnp.zeros_like(v)
         return project_step(scene, q, v, t, (none, none), self.rank_tol)[:2]
 
@@ -252,6 +251,7 @@ class Reduced(Method):
         return ("frame",) if self.basis is None or isinstance(self.basis, Orthonormal) else ()
 
     def _basis(self, y):
+        # The reference is in the state: it is renewed after each step, and follows gradients and batches.
         return Orthonormal(y["frame"]) if self.step_constants else self.basis
 
     def _at(self, scene, y, q, t):
@@ -275,6 +275,7 @@ class Reduced(Method):
         self, scene: Scene, y: State, t: Number, generalized_force: ForceLaw
     ) -> tuple[State, Array | None, Array]:
         """Rate of the reduced equations, which share one factorisation of the rows with v."""
+        # v = N nu + v0 and dv/dt = N dnu/dt + drift come from one decomposition of the rows.
         q = retract(scene.system, y["q"])
         motion = velocity_and_drift(scene, self._basis(y), q, y["nu"], t)
         force = generalized_force(q, motion.v, t)

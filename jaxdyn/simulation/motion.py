@@ -9,7 +9,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array
 
-from jaxdyn.compile import kernel
+from jaxdyn.compile import entry_point, kernel
 from jaxdyn.compile.batch import map_rows
 from jaxdyn.constraints.selection import (
     exchange_rows,
@@ -56,6 +56,7 @@ class _Run(NamedTuple):
         return self.method.to_qv(scene, self.method.correct(scene, y, t), t)
 
 
+@entry_point
 def smooth_motion(scene: Scene, control, method: Method, numbers, options) -> Solution:
     """Run of `simulate`; `numbers`: q0, v0, ts, rtol, atol and the length of steps or a controller of them."""
     inputs = safe_inputs(scene.system, numbers)
@@ -67,6 +68,7 @@ def smooth_motion(scene: Scene, control, method: Method, numbers, options) -> So
         term, corrector, run.eqs, run.args, method, y0, ts, inputs.steps, options | {"solver": solver}
     )
     y = jax.tree.map(lambda start, later: jnp.concatenate([start[None], later]), y0, rows)
+    # Loops fill rows that they did not reach with infinity.
     finite = [jnp.isfinite(rows).reshape(ts.shape[0], -1).all(1) for rows in y.values()]
     reached = good & jnp.stack(finite).all(0)
     y = jax.tree.map(functools.partial(rows_where, reached), y, y0)
@@ -78,6 +80,7 @@ def smooth_motion(scene: Scene, control, method: Method, numbers, options) -> So
         reached = reached & ~(violation.happened & (ts > violation.time))
         time_reached = jnp.where(violation.happened, violation.time, time_reached)
         ends += violation.codes(run.eqs.conditions.counts(scene))
+    # Behind a state whose contact is not unique the rows are those of another motion.
     if has_dependent_coordinates(scene.system):
         follows = jnp.cumsum(~map_rows(scene.system.is_consistent, q)) == 0
         ends.insert(0, (~follows.all(), RESULTS.no_single_contact))
@@ -154,6 +157,7 @@ def _set_up(scene: Scene, control, method: Method, inputs: Inputs, options) -> t
         controls.can_end(control, *start),
     )
     eqs, args = equations(scene, control, method, entries, *start, conditions)
+    # Shapes that do not fit are reported here, with the user's function at the end of the traceback.
     eqx.filter_eval_shape(eqs.generalized_force, args, entries, *start)
     y0 = method.start(scene, *start) | entries
     if is_selected(scene) and not isinstance(options["solver"], Stepper):
@@ -185,6 +189,7 @@ def _violation(run: _Run, rows, reached, result, time_reached, last) -> Violatio
         return None
     margins, within = map_rows(lambda row: run.eqs.allowances(run.args, *row), rows), None
     if last is not None:
+        # The event has located the zero within a step, between two save points.
         q, v = run.method.to_qv(run.scene, last, time_reached)
         there = run.eqs.allowances(run.args, last, q, v, time_reached)
         within = (result == RESULTS.event_occurred, time_reached, there)

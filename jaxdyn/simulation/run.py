@@ -13,7 +13,6 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from jaxdyn.compile import entry_point
 from jaxdyn.compile.known import is_concrete, is_known
 from jaxdyn.constraints.selection import may_have_redundant_rows
 from jaxdyn.contact.unilateral import has_modes
@@ -165,7 +164,10 @@ def simulate(
     numbers: list[Any] = [jnp.asarray(x, dtype) for x in (q0, v0, ts, rtol, atol)]
     numbers.append(jnp.asarray(stepsize, dtype) if has_length else stepsize)
     concrete = is_known(scene, control, method, numbers)
-    solution = (_run_with_events if modal else _run)(scene, control, method, numbers, options)
+    if modal:
+        solution = hybrid_motion(scene, control, numbers, options)
+    else:
+        solution = smooth_motion(scene, control, method, numbers, options)
     if limits == "report":
         solution = report_limits(scene, solution, concrete)
     if throw is None:
@@ -175,16 +177,6 @@ def simulate(
     elif throw:
         solution = solution.result.error_if(solution, ~solution.success)
     return solution
-
-
-@entry_point
-def _run(scene: Scene, control, method: Method, numbers, options) -> Solution:
-    return smooth_motion(scene, control, method, numbers, options)
-
-
-@entry_point
-def _run_with_events(scene: Scene, control, method: Method, numbers, options) -> Solution:
-    return hybrid_motion(scene, control, numbers, options)
 
 
 def _prepare_start(scene: Scene, method: Method, q0, v0, ts, modal: bool) -> tuple[Scene, Method]:

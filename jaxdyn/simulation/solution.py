@@ -47,6 +47,7 @@ def rows_where(mask, rows, otherwise):
 
 def from_diffrax(result) -> Any:
     """Code of diffrax as one of `RESULTS`, by its name."""
+    # By name, because the numbers of codes differ between the two enumerations and between versions of diffrax.
     cases = [(result == getattr(diffrax.RESULTS, name), getattr(RESULTS, name)) for name in OF_DIFFRAX]
     return first_of(cases, RESULTS.internal_error)
 
@@ -188,6 +189,7 @@ def raise_failure(solution: Solution, scene: Scene, control, options) -> None:
 
 def _advice(name: str, solution: Solution, scene: Scene, control, options) -> str:
     advice = ADVICE.get(name, "try smaller steps, other tolerances, or another solver").format(**options)
+    # The scene may have become stiff on the way, so that the choice of the solver at the start has not seen it.
     if name == "max_steps_reached" and isinstance(innermost(options["solver"]), diffrax.AbstractERK):
         last = int(np.flatnonzero(np.isfinite(solution.q).all(1))[-1])
         state = solution.q[last], solution.v[last], solution.ts[last]

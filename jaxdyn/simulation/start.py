@@ -103,6 +103,7 @@ def may_have_singular_mass(system) -> bool:
         return False  # other systems are checked by their own rules
     if not is_concrete(system.inertias):
         return True
+    # Positive definite pseudo-inertias make the mass matrix positive definite, whatever the configuration.
     sizes = [np.linalg.eigvalsh(f64.pseudo_inertia(x)) for x in np.asarray(system.inertias, float)]
     return not all(least > 1e-12 * largest for least, *_, largest in sizes)
 

@@ -19,7 +19,7 @@ from jaxdyn.simulation.hybrid.piecewise import PiecewiseSystem, piecewise_motion
 from jaxdyn.simulation.solvers import ExplicitSteps, driver
 from jaxdyn.simulation.solvers.driver import ExplicitRun
 from jaxdyn.simulation.solvers.explicit import take_step
-from jaxdyn.simulation.solvers.rk4 import RK4
+from jaxdyn.simulation.solvers.fixed_steps import RK4
 from jaxdyn.simulation.start import choose_method
 from jaxdyn.systems.scene import Scene, as_scene, check_force
 from jaxdyn.systems.system import SceneLike
@@ -150,6 +150,7 @@ def _advance(scene: Scene, length, substeps: int, is_direct: bool) -> Callable:
                 flat = take_step(plan, args, start, end, flat, plan.first_rate(args, start, flat)).projected
             return method.to_qv(scene, plan.structure(flat), t + length)
         else:
+            # Orders of RK4 and of its error estimate.
             run = ExplicitRun(plan, driver.FixedSteps(4, 3), None, None, size, substeps, substeps)
             rows = (run.direct if is_direct else run)(y, args, ts)[0]
         return method.to_qv(scene, jax.tree.map(lambda x: x[0], rows), t + length)

@@ -131,6 +131,7 @@ def _linearize(scene: Scene, q, v, t, control) -> Float[Array, "n n"]:
             total = total - gravity_force(system, at, t)
         return total if control is None else total + check_force(control(at, speed, t), q, n, "control")
 
+    # The rate of v is linear in the force: its derivative by the force is M^-1, or its projection on the constraints.
     mass = mass_matrix(system, q, t)
     unit = jnp.eye(n, dtype=mass.dtype)
     if scene.constraints:

@@ -41,6 +41,7 @@ class Conditions(NamedTuple):
 def contact_allowances(scene: Scene, multipliers: Float[Array, " nc"]) -> Float[Array, " k"]:
     """Margin of each contact with a cone, plus the rounding of its force, eps^(1/2) |f|; N. Negative where it is lost."""
     contacts = contact_forces(scene, multipliers)
+    # A contact that is held exactly on its cone is not lost by rounding.
     slack = jnp.finfo(multipliers.dtype).eps ** 0.5
     return jnp.stack(
         [contacts.margins[name] + slack * jnp.sum(jnp.abs(contacts.forces[name])) for name in contacts.margins]
@@ -52,6 +53,7 @@ def limit_allowances(model: Model, q: Float[Array, " nq"]) -> Float[Array, " n"]
 
     Negative where a limit is passed, rad or m; a large number where there is none.
     """
+    # A finite number for "no limit": bisection and products of infinity would give NaN.
     none = jnp.full_like(q, float(jnp.finfo(q.dtype).max) ** 0.5)
 
     def allowance(limit, room):
@@ -124,6 +126,7 @@ def event(allowance, basis, start, dtype) -> diffrax.Event:
 class Bisection(optimistix.Bisection):
     """Bisection of a function that falls through zero, until the interval is at rounding, however steep the function is."""
 
+    # optimistix also asks for a small value of the function, which a steep one does not reach.
     def terminate(self, fn, y, args, options, state, tags):
         """Stop when the interval is small."""
         width = jnp.abs(state.upper - state.lower)

@@ -15,7 +15,8 @@ from jaxtyping import Array
 
 from jaxdyn.compile import kernel
 from jaxdyn.compile.batch import cond, while_loop
-from jaxdyn.simulation.hybrid.modes import CHANNELS, KINDS, Elements, Mode
+from jaxdyn.simulation.hybrid.modes import CHANNELS, Elements, Mode
+from jaxdyn.simulation.hybrid.records import Records, chatters, no_records, record_elements, record_switches
 from jaxdyn.simulation.hybrid.system import HybridSystem
 from jaxdyn.simulation.hybrid.transitions import Transition
 from jaxdyn.simulation.solvers.driver import number_of_steps, save
@@ -30,18 +31,6 @@ _SIMULTANEOUS, _REAL = 0.575, 0.383
 _MAX_SECANTS = 30  # iterations after which a root is bisected
 SEARCH_STEPS = 40  # attempts at most to end a step at an event
 FINE, SHORT, PARADOX, NO_MODE, CROWDED = range(5)
-
-
-class Records(NamedTuple):
-    """Records of events, a row each; the last row is for what is not kept."""
-
-    time: Array
-    name: Array  # index among `Elements.names`
-    trigger: Array  # the guard that fell to zero, -1 for an event that came with another one
-    impact: Mode
-    impact_slip: Array
-    mode: Mode  # after the event
-    slip: Array
 
 
 class RunState(NamedTuple):
@@ -77,6 +66,7 @@ class FixedGrid(NamedTuple):
 
     def to_next(self, t):
         """Length of a step from t to the next point of the grid."""
+        # A point of the grid nearer than a thousandth of a step has been reached up to rounding.
         passed = jnp.floor((t - self.start) / self.length + 1e-3)
         return self.start + (passed + 1) * self.length - t
 
@@ -116,15 +106,6 @@ def _project(system: HybridSystem, args, t, y):
     return system.plan.project_end(args, t, y, jnp.zeros_like(y))[0]
 
 
-def no_records(elements: Elements, dtype, most: int) -> Records:
-    """Records before the first event."""
-    n, none = len(elements.each), jnp.zeros((most + 1,), jnp.int32)
-    flags = jnp.zeros((most + 1, n), bool)
-    mode = Mode(flags, flags, flags, jnp.zeros((most + 1, elements.switches), bool))
-    slip = jnp.zeros((most + 1, n, 2), dtype)
-    return Records(jnp.full((most + 1,), jnp.nan, dtype), none - 1, none - 1, mode, slip, mode, slip)
-
-
 def run_events(system: HybridSystem, unknown, ts, y0, mode, rtol, atol, stepsize, max_steps: int, most: int):
     """Rows of the state at ts[1:], the state at the end, the records, and the transition at the start.
 
@@ -134,6 +115,7 @@ def run_events(system: HybridSystem, unknown, ts, y0, mode, rtol, atol, stepsize
     eps, n = float(jnp.finfo(ts.dtype).eps), len(elements.each)
     hit = jnp.zeros((n * CHANNELS + elements.switches,), bool)
     begun = system.reset(unknown, ts[0], y0, mode, system.slip(y0), hit)
+    # A short first step: the control may enlarge it tenfold with each one that is kept.
     first, grid = 1e-4 * (end - ts[0]), None
     if stepsize is not None:
         first = (end - ts[0]) / number_of_steps(ts[0], end, stepsize).astype(ts.dtype)
@@ -254,6 +236,7 @@ def _bracket(run: RunState, t1, attempt: Attempt, good, eps: float) -> _Bracket:
     value_high = jnp.where(again & before, value_high / 2, value_high)
 
     locating = (run.locating & good) | begins
+    # The root is known when a guard is zero, or when its time is, up to rounding.
     near = jnp.abs(value) <= 64 * eps
     narrow = (high_ - low) <= 4 * eps * jnp.maximum(jnp.abs(t1), run.usual)
     located = locating & (near | narrow) & ~inside
@@ -281,6 +264,7 @@ def _decide(system: HybridSystem, run: RunState, t1, end, attempt: Attempt, eps:
     next_length = jnp.where(b.located, _AFTER_EVENT * usual, next_length)
     least = 4 * eps * jnp.maximum(jnp.abs(run.t), eps)
     short = ~good & (next_length < least)
+    # Steps of fixed length have no error to keep: they fail where the state is not finite.
     if grid is not None:
         short, usual = ~good, run.usual
         next_length = jnp.where(b.locating & ~b.located, secant, grid.to_next(jnp.where(b.kept, t1, run.t)))
@@ -327,9 +311,11 @@ def _pass_event(
     lost = by_element[:, 2].any()  # of pivots: no mode follows
     rows, count = records, run.count
     if elements.switches:
-        rows, count = _record_switches(elements, run, records, switched & happens, change.slip, most)
+        rows, count = record_switches(
+            elements, run.t, run.count, before, records, switched & happens, change.slip, most
+        )
     if elements.each:
-        rows, count = _record_elements(elements, run.t, before, change, by_element, happens, rows, count, most)
+        rows, count = record_elements(elements, run.t, before, change, by_element, happens, rows, count, most)
     crowded = count > most
     code = jnp.where(change.settled, FINE, NO_MODE)
     # With switching functions alone, a motion without room for its events continues: it loses its derivatives.
@@ -337,67 +323,11 @@ def _pass_event(
     code = jnp.where(change.paradox | lost, PARADOX, code)
     loose = jnp.zeros((), bool)
     if elements.switches:
-        chatters = _chatters(elements, run, records, switched, most)
+        is_chatter = chatters(elements, run.t, run.usual, run.count, records, switched, most)
         # Steps of fixed length go across the zero from then on.
-        loose = chatters & bool(grid is not None and not elements.each)
-        code = jnp.where(chatters & ~loose, CROWDED, code)
+        loose = is_chatter & bool(grid is not None and not elements.each)
+        code = jnp.where(is_chatter & ~loose, CROWDED, code)
         count = jnp.where(loose, most + 1, count)
     code = code.astype(jnp.int32)
     after = run._replace(y=y, mode=mode, guards=guards, count=count, code=code, loose=run.loose | loose)
     return jax.tree.map(lambda a, b: jnp.where(happens, a, b), (after, rows), (run, records))
-
-
-def _record_elements(
-    elements: Elements, t, before: Mode, change: Transition, hit, happens, rows: Records, count, most: int
-):
-    """Records with a row for each element that an event has changed, and their number."""
-    mode = change.mode
-    kind = jnp.where(mode.stick & ~before.stick, 2, jnp.where(before.stick & ~mode.stick, 3, 4))
-    # A contact that is hit may let go at once.
-    hits = (mode.closed | hit[:, 0]) & ~before.closed
-    kind = jnp.where(hits, 0, jnp.where(before.closed & ~mode.closed, 1, kind))
-    differs = (mode.closed != before.closed) | (mode.stick != before.stick) | (mode.negative != before.negative)
-    changed = happens & (hit.any(1) | differs)
-    leading = jnp.argmax(hit.reshape(-1)).astype(jnp.int32)
-    # First the element whose guard it was, which carries the impact; then those that came with it.
-    order = [(i, True) for i in range(len(elements.each))] + [(i, False) for i in range(len(elements.each))]
-    for i, by_trigger in order:
-        is_row = changed[i] & ((hit.any() & (leading // CHANNELS == i)) == by_trigger)
-        place = jnp.where(is_row & (count < most), count, most)
-        row = Records(
-            t,
-            (i * len(KINDS) + kind[i]).astype(jnp.int32),
-            jnp.where(by_trigger, leading, -1).astype(jnp.int32),
-            change.impact if by_trigger else mode,
-            change.impact_slip if by_trigger else change.slip,
-            mode,
-            change.slip,
-        )
-        rows = jax.tree.map(lambda all_, one, at=place: all_.at[at].set(one), rows, row)
-        count = count + is_row.astype(jnp.int32)
-    return rows, count
-
-
-def _record_switches(elements: Elements, run: RunState, records: Records, switched, slip, most: int):
-    """Records with a row for each switching function that changed its sign, and their number."""
-    index = jnp.cumsum(switched, dtype=jnp.int32) - 1
-    places = jnp.where(switched, jnp.minimum(run.count + index, most), most)
-    # They change one after the other: the mode of a row has the changes of the rows before it and its own.
-    earlier = switched[None] & (index[None] <= index[:, None])
-    k, first = elements.switches, len(elements.each)
-    number = jnp.arange(k, dtype=jnp.int32)
-    modes, slip = jax.tree.map(lambda x: jnp.broadcast_to(x, (k, *x.shape)), (run.mode, slip))
-    modes = modes._replace(positive=modes.positive ^ earlier)
-    rows = Records(
-        jnp.broadcast_to(run.t, (k,)), first * len(KINDS) + number, first * CHANNELS + number, modes, slip, modes, slip
-    )  # fmt: skip
-    rows = jax.tree.map(lambda all_, new: all_.at[places].set(new.astype(all_.dtype)), records, rows)
-    return rows, run.count + jnp.sum(switched, dtype=jnp.int32)
-
-
-def _chatters(elements: Elements, run: RunState, records: Records, switched, most: int):
-    """True if a switching function changes back at once: on both sides of its zero the force drives the motion onto it."""
-    last = jnp.maximum(jnp.minimum(run.count, most) - 1, 0)
-    names = jnp.arange(elements.switches, dtype=jnp.int32) + len(elements.each) * len(KINDS)
-    least = 64 * float(jnp.finfo(run.t.dtype).eps) * jnp.maximum(jnp.abs(run.t), run.usual)
-    return ((names == records.name[last]) & switched).any() & (run.t - records.time[last] <= least)

@@ -10,7 +10,7 @@ import numpy as np
 from jax import lax
 from jaxtyping import Array
 
-from jaxdyn.compile import kernel
+from jaxdyn.compile import entry_point, kernel
 from jaxdyn.compile.known import partition_tracers
 from jaxdyn.constraints.base import velocity_residual
 from jaxdyn.constraints.codes import RESULTS
@@ -73,6 +73,7 @@ class _Binder:
         return in_piece, generalized_force, lambda q, v, t: guards(scene, q, v, t, self.effort(unknown, q, v, t))
 
 
+@entry_point
 def hybrid_motion(scene: Scene, control, numbers, options) -> Solution:
     """Solution of a run with modes; `numbers` are q0, v0, ts, rtol, atol, and the length of fixed steps or None."""
     for i, force in enumerate(extend(scene).forces):
@@ -88,6 +89,7 @@ def hybrid_motion(scene: Scene, control, numbers, options) -> Solution:
     eps, (rtol, atol, stepsize) = float(jnp.finfo(q0.dtype).eps), inputs.steps
     rtol, atol = (jnp.maximum(x, 10 * eps).astype(q0.dtype) for x in (rtol, atol))
 
+    # The transition at the start of the event loop settles this guess, as after an event.
     mode, slip, start_ok = _guess(scene, elements, q0, v0, ts[0])
     mode = mode._replace(positive=bind(unknown)[2](q0, v0, ts[0]) > 0)
     if scene.constraints:
@@ -158,6 +160,7 @@ def _outputs(bind: _Binder, elements: Elements, outputs, unknown, y, mode: Mode,
 def _guess(scene: Scene, elements, q, v, t):
     """Mode of a start by its position and velocity, directions of sliding, and whether no contact penetrates, ()."""
     small = float(jnp.finfo(q.dtype).eps) ** 0.6
+    # Lengths are compared with one metre and with the configuration, whichever is larger.
     gap, reach = gaps(scene, elements, q, t), 1 + jnp.max(jnp.abs(q))
     slip = by_element(elements, velocity_residual(extend(scene), q, v, t))
     speed, unit = length(slip)

@@ -20,8 +20,9 @@ from jax import lax
 from jax.flatten_util import ravel_pytree
 
 from jaxdyn.compile.batch import cond
-from jaxdyn.simulation.hybrid.event_loop import FINE, Records, guard_values, run_events
+from jaxdyn.simulation.hybrid.event_loop import FINE, guard_values, run_events
 from jaxdyn.simulation.hybrid.modes import Mode
+from jaxdyn.simulation.hybrid.records import Records
 from jaxdyn.simulation.hybrid.system import HybridSystem
 from jaxdyn.simulation.solvers import driver
 from jaxdyn.simulation.solvers.driver import ExplicitRun
@@ -86,6 +87,7 @@ def _replay(run: HybridRun, inputs, end, records, begun, direct: bool):
         record = jax.tree.map(lambda x: x[place], records)
         until = jnp.where(event, lax.stop_gradient(record.time), ts[1:][jnp.clip(at, 0, saves - 1)])
         known = ~event | (record.name >= 0)
+        # Parts of no length, of events at the same time, make no steps; nothing is known beyond the end of the run.
         advances = known & (until > t) & (until <= last)
         until = jnp.where(advances, until, t)
         integrate: Any = part_run.direct if direct else part_run
@@ -97,8 +99,10 @@ def _replay(run: HybridRun, inputs, end, records, begun, direct: bool):
         mode = jax.tree.map(lambda a, b: jnp.where(crosses, a, b), record.mode, mode)
         return (t, y, mode), (t, here)
 
+    # The start may be an impact, whose velocity follows the start.
     y = system.impact(unknown, begun.impact, begun.impact_slip, ts[0], ravel_pytree(y0)[0])
     y = system.with_slip(y, None, lax.stop_gradient(begun.slip))
+    # With a checkpoint, reverse mode keeps one state a part, and the steps of one part at a time.
     _, (times, rows) = lax.scan(jax.checkpoint(part_or_none), (ts[0], y, begun.mode), order)
     back = jnp.argsort(order)
     # A motion that continued beyond the events that there was room for has no derivative here.
@@ -123,5 +127,6 @@ def _cross(system: HybridSystem, unknown, mode: Mode, record: Records, t, known_
     late = change / lax.stop_gradient(jnp.where(is_regular, guard_rate, jnp.ones_like(guard_rate)))
     late = jnp.where(is_regular, late, jnp.zeros_like(late))
     time = jnp.where(hit, known_time - late, t)
+    # Back to the event by the rate before it: of value zero, with the derivative of the time.
     y = system.impact(unknown, record.impact, record.impact_slip, time, y - late * rate)
     return time, system.with_slip(y, None, lax.stop_gradient(record.slip))

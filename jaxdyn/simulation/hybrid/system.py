@@ -170,6 +170,7 @@ def project(scene: Scene, elements: Elements, mode: Mode, t, y, error):
     q, v = retract(scene.system, y["q"]), y["v"]
     terms = terms_at(scene, elements, q, v, t)
     holonomic = holonomic_rows(layout(whole))
+    # Masks keep the shapes of all modes: rows that do not act are multiplied by zero.
     active = elements.active(mode).astype(dtype)
     holds = jnp.zeros((elements.count,), dtype).at[holonomic].set(1.0) * active
 
@@ -202,6 +203,7 @@ def _impact(scene: Scene, elements: Elements, mode: Mode, slip, t, q, v) -> Impa
     after, reaction = impact(scene, elements, mode, terms, along, v, rebound)
     rates = _product(terms.row.A, after - v) + terms.row.velocity
     gap = jnp.stack([rates[one.normal] if one.opens else jnp.zeros((), v.dtype) for one in elements.each]) - rebound
+    # Impulses are compared with the momentum, and with that of a velocity of one: at rest they are zero up to rounding.
     M = mass_matrix(scene.system, q, t)
     size = jnp.max(jnp.abs(_product(M, v))) + jnp.max(jnp.abs(M)) + jnp.max(jnp.abs(reaction.multipliers))
     return Impact(after, reaction.normal, reaction.holding, by_element(elements, rates), gap, rebound, size)
@@ -216,6 +218,8 @@ def _contact_state(
     zero = jnp.zeros((), dtype)
     reach = 1 + jnp.max(jnp.abs(q))
     force = jnp.sum(jnp.abs(motion.normal)) + jnp.sum(jnp.abs(motion.reaction.holding))
+    # A guard is zero up to 100 roundings of the terms that cancel in it: forces of all contacts, velocities, or places. The
+    # pivots are of the size of one.
     levels, slip_size, rate_size = [], [], []
     for i, one in enumerate(elements.each):
         tangent = [speeds[k] for k in one.tangent] or [zero]

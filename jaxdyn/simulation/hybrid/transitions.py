@@ -146,6 +146,7 @@ def _solve(rough, disagreements: Callable, mode: Mode, slip):
     """
     most = 4 * rough.size + 8  # an element changes a few times at most: more changes are a cycle
 
+    # All samples of a batch iterate until the last one has ended, each masked by its own flag.
     def is_running(carry):
         return any_sample(carry[3] & (carry[2] < most))
 
@@ -169,6 +170,7 @@ def _solve(rough, disagreements: Callable, mode: Mode, slip):
         mode, slip = jax.tree.map(lambda a, b: jnp.where(busy, a, b), after, (mode, slip))
         return mode, slip, count + busy.astype(jnp.int32), busy, values
 
+    # Values of the last iteration are needed: the carry begins with zeros of their shapes.
     start = jax.eval_shape(disagreements, mode, slip)[3]
     blank = jax.tree.map(lambda x: jnp.zeros(x.shape, x.dtype), start)
     first = mode, slip, jnp.zeros((), jnp.int32), jnp.ones((), bool), blank

@@ -12,11 +12,10 @@ from jax.typing import ArrayLike
 
 from jaxdyn.compile.known import is_concrete, is_known
 from jaxdyn.model.arguments import batch_hint
+from jaxdyn.simulation.solvers.fixed_steps import RK4, Stepper
 from jaxdyn.simulation.solvers.lie import LieGroup
-from jaxdyn.simulation.solvers.rk4 import RK4
 from jaxdyn.simulation.solvers.rosenbrock import Rodas5P
 from jaxdyn.simulation.solvers.step_control import Adaptive, ErrorMonitoredSteps
-from jaxdyn.simulation.solvers.stepper import Stepper
 from jaxdyn.simulation.stiffness import Stiffness, stiffness
 from jaxdyn.systems.scene import Scene
 

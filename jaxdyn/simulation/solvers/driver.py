@@ -247,6 +247,7 @@ def _accept(plan: Plan, control, args, limits: _Limits, state: _State, active, s
         done = (state.tried + 2).astype(end.dtype) / limits.steps.astype(end.dtype)
         after = limits.start + (end - limits.start) * done
         after = jnp.where((state.tried + 2 >= limits.steps) | (after > limits.floor), end, after)
+    # What follows is masked by `active`: a trajectory that has ended keeps its state while others of the batch continue.
     kept, one = kept & active, active.astype(jnp.int32)
     quality = jnp.where(kept, plan.quality_of(args, t_next, step.projected), state.quality)
     state = _State(
@@ -300,6 +301,7 @@ def _control_step(plan: Plan, control: AdaptiveSteps, limits: _Limits, state: _S
     before, after = plan.structure(state.y), plan.structure(step.projected)
 
     def scale(y0, y1, error):
+        # As in diffrax: a result of NaN is measured by the size of the start.
         y1 = jnp.where(jnp.isnan(y1).any(), y0, y1)
         return error / (limits.atol + limits.rtol * jnp.maximum(jnp.abs(y0), jnp.abs(y1)))
 

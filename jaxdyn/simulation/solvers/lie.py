@@ -131,6 +131,7 @@ def _local_rate(kind: str, q, rate, e):
     """Rate de/dt of one joint's coordinates for dq/dt = rate at q = q0 exp(e)."""
     if kind in SCREW_KINDS:
         return rate
+    # v is the velocity in the moving frame, and de/dt = J_r(e)^-1 v.
     if kind == "planar":
         c, s = jnp.cos(q[2]), jnp.sin(q[2])
         v = jnp.stack([c * rate[0] + s * rate[1], c * rate[1] - s * rate[0], rate[2]])

@@ -73,6 +73,7 @@ def write(rows: tuple, strides: tuple[int, ...], new: tuple, index, active) -> t
     """Write the row of step `index` to a history, if the step was taken."""
 
     def one(array, value, stride):
+        # Rows that are not asked for are written beyond the end of the array, where XLA drops them.
         asked = active if stride == 1 else active & (index % stride == 0)
         return array.at[jnp.where(asked, index // stride, array.shape[0])].set(value, mode="drop")
 
@@ -162,6 +163,7 @@ def pull(plan: Plan, history: History, y0, args, ts, steps, rows, varies) -> tup
     else:
         segments = (history.count + stride - 1) // stride
 
+        # From the last segment between two kept states to the first: its steps are replayed, and then taken back.
         def segment(k, cotangents):
             s = segments - 1 - k
             first = s * stride
@@ -169,6 +171,7 @@ def pull(plan: Plan, history: History, y0, args, ts, steps, rows, varies) -> tup
             return back(first, last, replay(first, last, history.states[s]), cotangents)
 
         cotangents = lax.fori_loop(0, segments, segment, cotangents)
+    # Ends of steps follow the ends of the run, whose cotangents have been summed apart.
     of_ts = cotangents.ts.at[0].add(cotangents.start).at[-1].add(cotangents.end)
     return cotangents.after, jax.tree.unflatten(structure, cotangents.args), of_ts
 
