@@ -94,7 +94,7 @@ def fingerprint(m) -> str:
 def compare(path: Path, m) -> tuple[dict[str, float], str]:
     """Errors of one file by quantity, and in words what stands against comparing others. A scene that is refused has none."""
     try:
-        scene = quietly(jd.load_mjcf, path)
+        scene = quietly(jd.io.load_mjcf, path)
     except ValueError as error:
         return {}, str(error).removeprefix(f"{path}: ")
     errors = quietly(agreement, path, scene)
@@ -192,7 +192,7 @@ def motion_of(name: str, path: Path, scene, html: Path, duration: float) -> tupl
     residual = np.nanmax(np.abs(np.asarray(motion.constraint_residual)[:last]), axis=0)
     steps = int(motion.stats["num_steps"])
     page = html / f"{path.parent.name}_{path.stem}.html"
-    jd.save_html(page, scene, motion)
+    jd.pictures.save_html(page, scene, motion)
     fault = "" if motion.success else f"{motion.result} after {float(ts[last - 1]):.2f} s"
     if residual.max() >= CLOSED:
         fault += f" residual {residual.max():.1e}"

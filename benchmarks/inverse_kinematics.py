@@ -52,7 +52,7 @@ def delta_robot():
     with tempfile.TemporaryDirectory() as folder:
         path = Path(folder) / "delta.xml"
         path.write_text(delta())
-        scene = jd.load_mjcf(path)
+        scene = jd.io.load_mjcf(path)
     return scene, ["plate"], scene.starts["reference"].q, None
 
 

@@ -5,7 +5,7 @@
 Solo12 of example-robot-data, crouched, 18 velocities, 12 rows. Accelerations of `jd.constrained_dynamics` and of Pinocchio's
 `constraintDynamics` (three-dimensional contacts, called from Python once a sample on one core) are compared before they are
 timed, interleaved in one run. jaxdyn uses all cores: its time is multiplied by their number for the ratio per core. The
-program is `jd.underactuated_inverse_dynamics`: 12 forces in four cones, batched.
+program is `jd.control.underactuated_inverse_dynamics`: 12 forces in four cones, batched.
 """
 
 import argparse
@@ -99,7 +99,7 @@ def main(argv=None) -> None:
         return jd.constrained_dynamics(scene, q, v, tau).acceleration
 
     def program(q, v, tau):
-        computed = jd.underactuated_inverse_dynamics(model, q, v, at_rest, feet)
+        computed = jd.control.underactuated_inverse_dynamics(model, q, v, at_rest, feet)
         return computed.tau, computed.forces, computed.success
 
     ours = jax.jit(jax.vmap(accelerations))

@@ -86,7 +86,9 @@ def four_bars(samples: int, out, **options):
 
     def build(p):
         scene = jd.scenes.four_bar()
-        return jd.Scene(scene.system, scene.constraints, (jd.JointSpring(p["stiffness"] * jnp.ones(scene.nv), q),))
+        return jd.Scene(
+            scene.system, scene.constraints, (jd.forces.JointSpring(p["stiffness"] * jnp.ones(scene.nv), q),)
+        )
 
     ts = np.linspace(0.0, 0.5, 3)
     options = {"samples": samples, "out": out, "solver": diffrax.Dopri8()} | QUIET | options

@@ -39,7 +39,9 @@ class Rung(NamedTuple):
 
 def _four_bar(*, loop: bool = True, in_plane: bool = True, friction: bool = False, **parameters):
     scene = jd.scenes.four_bar(in_plane=in_plane, **parameters)
-    forces = (jd.JointDamping(jnp.full(3, 0.1)), jd.CoulombFriction(jnp.full(3, 0.05))) if friction else ()
+    forces = (
+        (jd.forces.JointDamping(jnp.full(3, 0.1)), jd.forces.CoulombFriction(jnp.full(3, 0.05))) if friction else ()
+    )
     return jd.Scene(scene.system, scene.constraints if loop else (), forces)
 
 

@@ -14,7 +14,9 @@ SAMPLES, STEPS = 1024, 400
 def kept(inside: bool, remat: bool) -> float:
     """Megabytes that the gradient in the gains needs beside its inputs, as XLA plans them."""
     model = jd.robots.iiwa()
-    step = jd.stepper(jd.Scene(model, forces=(jd.CoulombFriction(0.3, 0.05), jd.EffortLimits(50.0))), 0.01, remat=remat)
+    step = jd.stepper(
+        jd.Scene(model, forces=(jd.forces.CoulombFriction(0.3, 0.05), jd.forces.EffortLimits(50.0))), 0.01, remat=remat
+    )
 
     def loss(gains, q, v):
         def law(q, v, t):

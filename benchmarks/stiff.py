@@ -28,7 +28,7 @@ SOLVERS: dict[str, Any] = {
     "Kvaerno3": diffrax.Kvaerno3(),
     "Kvaerno5": diffrax.Kvaerno5(),
     "KenCarp4": diffrax.KenCarp4(),
-    "Rodas5P": jd.Rodas5P(),
+    "Rodas5P": jd.solvers.Rodas5P(),
     "RK4, 1 ms": jd.solvers.RK4(),
 }
 FIXED_STEP = 1e-3
@@ -108,7 +108,7 @@ def _light_arm() -> jd.Model:
 
 
 def _spring(k):
-    forces = (jd.JointSpring(k), jd.JointDamping(4 * jnp.sqrt(k)))
+    forces = (jd.forces.JointSpring(k), jd.forces.JointDamping(4 * jnp.sqrt(k)))
     return jd.Scene(_sliders((1.0,), False), forces=forces), Push(0.01 * k), np.array([0.01]), np.zeros(1)
 
 
@@ -123,7 +123,7 @@ def _spring_exact(k, ts):
 def _flexible(k):
     damping = 0.1 * jnp.sqrt(k * 0.1 / 1.1)  # a twentieth of critical
     scene = jd.Scene(
-        _sliders((0.1, 1.0), False), forces=(Between(k, damping), jd.JointDamping(jnp.asarray([0.5, 0.0])))
+        _sliders((0.1, 1.0), False), forces=(Between(k, damping), jd.forces.JointDamping(jnp.asarray([0.5, 0.0])))
     )
     return scene, Push(jnp.asarray(1.0)), np.zeros(2), np.zeros(2)
 
@@ -145,7 +145,7 @@ def _flexible_exact(k, ts):
 
 
 def _drive(kd):
-    drive = jd.Drive(100 * kd, kd, jnp.asarray(0.5), joints=("tip_joint",))
+    drive = jd.forces.Drive(100 * kd, kd, jnp.asarray(0.5), joints=("tip_joint",))
     return jd.Scene(_light_arm(), forces=(drive,)), None, np.array([0.3, 0.0]), np.zeros(2)
 
 

@@ -29,7 +29,7 @@ NOISE_Q, NOISE_V, NOISE_TAU = 1e-4, 2e-3, 0.005
 
 def rollouts(model, count: int, duration: float, progress: bool):
     """`count` motions under random torques added to gravity compensation; returns the solution and its seconds."""
-    scene = jd.Scene(model, forces=(jd.JointDamping(jnp.asarray(DAMPING)),))
+    scene = jd.Scene(model, forces=(jd.forces.JointDamping(jnp.asarray(DAMPING)),))
     torques = jax.vmap(lambda key: random_torque(key, jnp.asarray(TORQUES), carry=model))(
         jax.random.split(jax.random.key(0), count)
     )

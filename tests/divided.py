@@ -154,7 +154,7 @@ def log_of(model, phase):
 def compare_fits(*names):
     true, nominal = arm(1.2), arm(1.0)
     logs = [log_of(true, phase) for phase in (0.3, 1.1)]
-    damped = jd.Scene(true, forces=(jd.JointDamping(0.1 * jnp.ones(2)),))
+    damped = jd.Scene(true, forces=(jd.forces.JointDamping(0.1 * jnp.ones(2)),))
     options = {"horizon": 10, "substeps": 2, "steps": 2}
 
     def parameters(**more):

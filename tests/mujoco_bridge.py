@@ -144,7 +144,7 @@ def row_space(rows) -> np.ndarray:
     return right.T @ right
 
 
-def agreement(path, scene: jd.LoadedScene) -> dict[str, float]:
+def agreement(path, scene: jd.io.LoadedScene) -> dict[str, float]:
     """Errors against MuJoCo: the mass that moves; at a random state frames, M, bias, forward dynamics, springs and dampers,
     actuators; and at the reference, where loops close, those of the space that the constraints' rows span."""
     model, oracle, rng = scene.system, Oracle(path, scene.system), np.random.default_rng(1)
@@ -157,7 +157,7 @@ def agreement(path, scene: jd.LoadedScene) -> dict[str, float]:
     def ours(scene, start, step, v, tau, control):
         model = scene.system
         q = jd.integrate(model, start, 0.7 * step)
-        forces = [force for force in scene.forces if not isinstance(force, jd.CoulombFriction)]
+        forces = [force for force in scene.forces if not isinstance(force, jd.forces.CoulombFriction)]
         computed = {
             "M": jd.mass_matrix(model, q),
             "bias": jd.bias_force(model, q, v),

@@ -107,9 +107,9 @@ BATCHES = """
     angles = jnp.linspace(0.3, 1.0, 512)
     batch(lambda x: (lambda s: (s.q, s.v, s.residual, s.distance))(jd.assemble(scene, q, hold={"1": x})), angles)
     qs = jnp.broadcast_to(q, (512, 3)) + 1e-9 * angles[:, None]
-    batch(lambda q: jd.projections(scene, q), qs)
-    batch(lambda q: jd.tangent_basis(scene, q, dof=1), qs)
-    batch(lambda q: jd.second_fundamental_form(scene, q, v), qs)
+    batch(lambda q: jd.constraints.projections(scene, q), qs)
+    batch(lambda q: jd.reduction.tangent_basis(scene, q, dof=1), qs)
+    batch(lambda q: jd.constraints.second_fundamental_form(scene, q, v), qs)
     batch(lambda q: jd.constrained_dynamics(scene, q, v, method="schur").acceleration, qs)
     batch(lambda x: jd.simulate(scene, q, x * v, jnp.linspace(0, 0.1, 3), method="variational", stepsize=0.01).q, angles)
     batch(lambda x: jd.simulate(scene, q, x * v, jnp.linspace(0, 0.1, 3), method="reduced").q, angles)

@@ -522,7 +522,7 @@ def test_inertias_that_no_body_has_are_named(moments, words):
             make()
         assert len(caught) == (words is not None)
         if words:
-            assert re.match(words, str(caught[0].message)) and "jd.repair_inertias" in str(caught[0].message)
+            assert re.match(words, str(caught[0].message)) and "jd.model.repair_inertias" in str(caught[0].message)
             assert caught[0].filename == __file__
 
 

@@ -93,7 +93,7 @@ def test_info_locks_floats_and_repairs(arm, tmp_path, capsys):
     assert main(["info", str(arm), "--lock", "lift=0.1", "--repair", str(out)]) == 0
     assert "2 degrees of freedom" in capsys.readouterr().out
     repaired = jd.load_urdf(out)
-    assert jd.inertia_report(repaired) == []
+    assert jd.model.inertia_report(repaired) == []
     np.testing.assert_allclose(repaired.inertias[:, 0].sum(), 4.5, rtol=1e-12)
     # The inertia of a base that is fixed to the world is not in the model, nor in the file: such a base cannot float.
     assert main(["info", str(arm), "--floating-base"]) == 2
@@ -121,7 +121,7 @@ def test_simulate_writes_the_motion_that_the_library_computes(arm, tmp_path, cap
     model = jd.load_urdf(arm)
     q0, v0 = np.array([0.5, 0.0, 0.0]), np.array([0.1, 0.0, -0.2])
     motion = jd.simulate(
-        jd.Scene(model, forces=[jd.JointDamping()]),
+        jd.Scene(model, forces=[jd.forces.JointDamping()]),
         q0,
         v0,
         np.linspace(0, 0.2, 5),
@@ -186,7 +186,7 @@ def test_identify_the_recorded_panda_from_raw_samples(panda, franka, tmp_path, c
 
     # What was written is what was fitted to all samples: bodies that exist, and with the offsets of the report the same torques.
     fitted = jd.load_urdf(out)
-    assert jd.inertia_report(fitted) == []
+    assert jd.model.inertia_report(fitted) == []
     log = jd.identify.from_raw(t, q, tau)
     x = jd.identify.nominal_parameters(fitted)
     offset = 10 * fitted.nb + fitted.nv * jd.identify.TERMS.index("offset")
@@ -255,7 +255,7 @@ def simulated_logs(model, folder, seeds, noise=0.0, delay=0.0, gains=1.0):
 
 def test_identify_chooses_the_cutoff_and_warns_of_vibration(arm, tmp_path, capsys):
     """Raw logs of a motion up to 0.5 Hz, torques that vibrate at 9 Hz."""
-    model = jd.repair_inertias(jd.load_urdf(arm))
+    model = jd.model.repair_inertias(jd.load_urdf(arm))
     paths = []
     for seed in range(2):
         rng = np.random.default_rng(seed)
@@ -288,7 +288,7 @@ def test_identify_chooses_the_cutoff_and_warns_of_vibration(arm, tmp_path, capsy
 
 def test_identify_from_several_logs_judged_on_another(arm, tmp_path, capsys):
     """Two logs fitted, one only predicted; JSON, page and URDF; what is not asked for is not tried."""
-    truth = jd.repair_inertias(jd.load_urdf(arm))
+    truth = jd.model.repair_inertias(jd.load_urdf(arm))
     a, b, c = simulated_logs(truth, tmp_path, (0, 1, 2), noise=0.01)
     out, page, report = (tmp_path / name for name in ("fitted.urdf", "fit.html", "fit.json"))
     wrong = tmp_path / "wrong.urdf"
@@ -322,7 +322,7 @@ def test_identify_from_several_logs_judged_on_another(arm, tmp_path, capsys):
     # Quadratic and viscous friction explain the same torque in part.
     assert set(sources.values()) <= {"data", "prior", "bound", "confounded"}
     assert all(name.endswith(("viscous", "coulomb", "quadratic")) for name, x in sources.items() if x == "confounded")
-    assert jd.inertia_report(jd.load_urdf(out)) == []
+    assert jd.model.inertia_report(jd.load_urdf(out)) == []
     # Nothing outside of the page: names of XML are the only addresses.
     text = page.read_text()
     assert "<svg" in text and text.count("http") == text.count("http://www.w3.org/")
@@ -331,7 +331,7 @@ def test_identify_from_several_logs_judged_on_another(arm, tmp_path, capsys):
 
 def test_identify_from_one_file_and_the_robot_it_writes(arm, tmp_path, capsys):
     """Options of a TOML file, overruled by the command line; Pinocchio and MuJoCo read the URDF, we its offsets and terms too."""
-    truth = jd.repair_inertias(jd.load_urdf(arm))
+    truth = jd.model.repair_inertias(jd.load_urdf(arm))
     simulated_logs(truth, tmp_path, (0, 1, 2), noise=0.01)
     jd.save_urdf(truth, tmp_path / "true.urdf")
     options = {
@@ -379,7 +379,7 @@ def test_identify_from_one_file_and_the_robot_it_writes(arm, tmp_path, capsys):
 
 def test_identify_finds_delays_from_a_file_of_options(arm, tmp_path, capsys):
     """20 ms: found, printed, in both reports, judged on shifted logs, counted in a payload; given as a number, the same fit."""
-    truth = jd.repair_inertias(jd.load_urdf(arm))
+    truth = jd.model.repair_inertias(jd.load_urdf(arm))
     jd.save_urdf(truth, tmp_path / "true.urdf")
     simulated_logs(truth, tmp_path, (0, 1), noise=0.005, delay=0.02)
     held = truth.replace(inertias=truth.inertias.at[-1].add(jd.inertia.sphere(0.7, 0.05)))
@@ -419,7 +419,7 @@ def test_identify_finds_delays_from_a_file_of_options(arm, tmp_path, capsys):
 
 
 def test_identify_repairs_a_link_of_zero_inertia(arm, tmp_path, capsys):
-    truth = jd.repair_inertias(jd.load_urdf(arm))
+    truth = jd.model.repair_inertias(jd.load_urdf(arm))
     a, b = simulated_logs(truth, tmp_path, (0, 1), noise=0.01)
     path = tmp_path / "zero.urdf"
     jd.save_urdf(truth.replace(inertias=truth.inertias.at[1, 4:].set(0.0).at[2].set(0.0)), path)
@@ -432,7 +432,7 @@ def test_identify_repairs_a_link_of_zero_inertia(arm, tmp_path, capsys):
 
 
 def test_identify_a_payload(arm, tmp_path, capsys):
-    truth = jd.repair_inertias(jd.load_urdf(arm))
+    truth = jd.model.repair_inertias(jd.load_urdf(arm))
     path, report = tmp_path / "true.urdf", tmp_path / "fit.json"
     jd.save_urdf(truth, path)
     held = jd.inertia.displaced(jd.inertia.sphere(0.7, 0.05), (0.05, 0, 0.1))
@@ -454,7 +454,7 @@ def test_identify_a_payload(arm, tmp_path, capsys):
 
 def test_identify_the_gains_of_drives_from_a_known_payload(arm, tmp_path, capsys):
     """Currents of three drives; what is written is then the robot in newton metres."""
-    truth = jd.repair_inertias(jd.load_urdf(arm))
+    truth = jd.model.repair_inertias(jd.load_urdf(arm))
     jd.save_urdf(truth, tmp_path / "true.urdf")
     held = jd.inertia.displaced(jd.inertia.sphere(0.7, 0.05), (0.05, 0, 0.1))
     (tmp_path / "held").mkdir()
@@ -483,7 +483,7 @@ def test_identify_the_gains_of_drives_from_a_known_payload(arm, tmp_path, capsys
 
 
 def test_identify_chooses_for_several_logs(arm, tmp_path, capsys):
-    truth = jd.repair_inertias(jd.load_urdf(arm))
+    truth = jd.model.repair_inertias(jd.load_urdf(arm))
     a, b = simulated_logs(truth, tmp_path, (0, 1), noise=0.01)
     path = tmp_path / "true.urdf"
     jd.save_urdf(truth, path)
@@ -536,7 +536,7 @@ def test_identify_recovers_a_simulated_arm(arm, tmp_path, capsys):
 def test_identify_by_trajectory_from_a_log_taken_as_filtered(arm, tmp_path, capsys):
     """A log that the command line itself simulated, accelerations left out: the mass error of a fifth is found."""
     log, wrong, out = tmp_path / "log.csv", tmp_path / "wrong.urdf", tmp_path / "fitted.urdf"
-    model = jd.repair_inertias(jd.load_urdf(arm))
+    model = jd.model.repair_inertias(jd.load_urdf(arm))
     jd.save_urdf(model, tmp_path / "true.urdf")
     jd.save_urdf(model.replace(inertias=1.2 * model.inertias), wrong)
     motion = ["--torque", "gravity+random", "--duration", "3", "--sample", "0.01", "--friction", "0", "--seed", "2"]
@@ -650,7 +650,7 @@ def test_info_of_a_file_with_a_loop(four_bar, capsys):
     assert "The constraints can be assembled: jd.assemble finds a configuration from the reference." in text
     assert "Degrees of freedom after constraints: 1 of 3 (2 in the singular position of the reference)" in text
     assert "Actuators: motor" in text and "Named states: reference, open" in text
-    with pytest.warns(jd.NotTakenWarning):
+    with pytest.warns(jd.io.NotTakenWarning):
         scene = jd.load(four_bar)
     line = next(line for line in text.splitlines() if scene.constraints[0].name in line)
     gap = np.abs(scene.constraints[0].position(scene.system, scene.starts["open"].q, 0.0)).max()
@@ -686,16 +686,16 @@ def test_simulate_a_file_with_a_loop(four_bar, tmp_path, capsys):
     """From its keyframe, closed at the start, and closed to its end; a start that the file does not name is refused."""
     out = tmp_path / "motion.npz"
     args = ["simulate", str(four_bar), "--duration", "0.2", "--sample", "0.05", "--out", str(out)]
-    with pytest.warns(jd.NotTakenWarning):
+    with pytest.warns(jd.io.NotTakenWarning):
         assert main([*args, "--start", "open"]) == 0
     text = capsys.readouterr().out
     assert "loops assembled at the start by joint displacements of up to" in text
     assert float(text.split("at most ")[1].split(" J")[0]) < 1e-7
-    with pytest.warns(jd.NotTakenWarning):
+    with pytest.warns(jd.io.NotTakenWarning):
         scene = jd.load(four_bar)
     gaps = [np.abs(scene.constraints[0].position(scene.system, jnp.asarray(q), 0.0)).max() for q in arrays_of(out)["q"]]
     assert max(gaps) < 1e-10
-    with pytest.warns(jd.NotTakenWarning):
+    with pytest.warns(jd.io.NotTakenWarning):
         assert main([*args, "--start", "home"]) == 2
     assert "--start is 'home'; the named states are reference, open" in capsys.readouterr().err
 

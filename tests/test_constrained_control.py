@@ -133,7 +133,7 @@ def test_three_motors_of_a_parallel_manipulator():
         M, h = jd.mass_matrix(scene.system, q), jd.bias_force(scene.system, q, v)
         full = M @ laws[0].acceleration(q, v, 0.3) + h
         bend = jax.jvp(lambda q: jax.jvp(point, (q,), (v,))[1], (q,), (v,))[1]
-        return tau, moved, full, jd.projections(scene, q).P_omega, jax.jacfwd(point)(q), bend, point(q)
+        return tau, moved, full, jd.constraints.projections(scene, q).P_omega, jax.jacfwd(point)(q), bend, point(q)
 
     tau, moved, full, P_w, J, bend, place = compute(q, v)
     rate = jax.jvp(target, (0.3,), (1.0,))[1]

@@ -47,7 +47,7 @@ Q0, V0 = jnp.asarray([0.4, -0.2, 0.5]), jnp.asarray([0.3, 0.1, -0.6])
 
 def test_computed_torque_decays_as_the_gains_say(arm):
     """Against the closed form, with forces of the scene compensated; the slow rate fitted to 1 %."""
-    scene = jd.Scene(arm, forces=(jd.JointDamping(0.4),))
+    scene = jd.Scene(arm, forces=(jd.forces.JointDamping(0.4),))
     law = jd.control.ComputedTorque(scene, wave, KP, KD)
     solution = jd.simulate(scene, Q0, V0, TS, control=law, stepsize=0.005)
     errors = np.asarray(solution.q - jax.vmap(wave)(TS))
@@ -132,7 +132,7 @@ def test_stiffness_yields_and_dissipates(arm):
     law = jd.control.CartesianStiffness(arm, frame, target, K, 40.0, **given)
     q, rest = q0 + 0.1, jnp.zeros(3)
     error = jd.frame_pose(arm, q, frame)[:3, 3] - target
-    push = jd.ExternalWrench(frame, jnp.concatenate([K * error, rest]))
+    push = jd.forces.ExternalWrench(frame, jnp.concatenate([K * error, rest]))
     at_rest = jd.forward_dynamics(arm, q, rest, law(q, rest) + push(arm, q, rest, 0.0))
     np.testing.assert_allclose(at_rest, rest, atol=1e-9)  # forces of 50 N on links of 0.1 kg m^2
 

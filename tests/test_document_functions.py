@@ -78,11 +78,11 @@ def test_articulated_bodies(armature):
     model = random_tree(5, list(KINDS), armature=armature)
     q, v, tau = (x[0] for x in random_states(model, 1, 9)[:3])
     external = jnp.asarray(np.random.default_rng(4).normal(size=(model.nb, 6)))
-    bodies = quick(lambda m, *x: jd.articulated_bodies(m, *x[:-1], external=x[-1]))(model, q, v, tau, external)
+    bodies = quick(lambda m, *x: jd.dynamics.articulated_bodies(m, *x[:-1], external=x[-1]))(model, q, v, tau, external)
     a = jd.forward_dynamics(model, q, v, tau, external=external)
     m = newton_euler_matrices(model, q, v)
     rates = m.G @ (m.xi @ a + m.P0 @ m.V0_dot + m.ad_xi @ m.Gamma @ m.V)
-    transmitted = jd.joint_wrench(model, q, v, a, external=external)
+    transmitted = jd.dynamics.joint_wrench(model, q, v, a, external=external)
     got = np.einsum("bij,bj->bi", bodies.inertias, rates.reshape(-1, 6)) + bodies.biases
     assert_close(got, transmitted, 1e-10)
     assert_close(bodies.inertias, np.swapaxes(bodies.inertias, 1, 2), 1e-12)
@@ -109,19 +109,19 @@ def test_articulated_bodies(armature):
 def test_articulated_bodies_in_batches_and_without_bodies():
     model = random_tree(6, ["free", "revolute", "prismatic"])
     q, v, tau = random_states(model, 3, 2)[:3]
-    batch = quick(jax.vmap(jd.articulated_bodies, (None, 0, 0, 0)))(model, q, v, tau)
+    batch = quick(jax.vmap(jd.dynamics.articulated_bodies, (None, 0, 0, 0)))(model, q, v, tau)
     for i in range(3):
-        one = jd.articulated_bodies(model, q[i], v[i], tau[i])
+        one = jd.dynamics.articulated_bodies(model, q[i], v[i], tau[i])
         jax.tree.map(lambda x, y, i=i: assert_close(x[i], y, 1e-12), batch, one)
     none = jd.ModelBuilder("nothing").build()
-    assert jd.articulated_bodies(none, jnp.zeros(0), jnp.zeros(0), jnp.zeros(0)).inertias.shape == (0, 6, 6)
+    assert jd.dynamics.articulated_bodies(none, jnp.zeros(0), jnp.zeros(0), jnp.zeros(0)).inertias.shape == (0, 6, 6)
 
 
 @pytest.fixture(scope="module")
 def floating():
     model = random_tree(43, ["free", "revolute", "spherical", "prismatic", "revolute"], armature=False)
     q, v, tau = (x[0] for x in random_states(model, 1, 5)[:3])
-    return model, q, v, tau, jd.com_dynamics(model, q, v)
+    return model, q, v, tau, jd.dynamics.com_dynamics(model, q, v)
 
 
 def test_centre_of_mass_coordinates_decouple(floating):
@@ -150,10 +150,10 @@ def test_centre_of_mass_coordinates_decouple(floating):
 def test_centre_of_mass_coordinates_have_a_skew_rate_and_ignore_translation(floating):
     model, q, v, _, terms = floating
     flow = (configuration_rate(model, q, v),)
-    rate = jax.jvp(lambda q: jd.com_dynamics(model, q, v).mass_matrix, (q,), flow)[1]
+    rate = jax.jvp(lambda q: jd.dynamics.com_dynamics(model, q, v).mass_matrix, (q,), flow)[1]
     C = terms.coriolis_matrix
     assert_close(C + C.T, rate, 1e-10)
-    pushed = jd.com_dynamics(model, q.at[:3].add(2.0), v.at[:3].add(-3.0))
+    pushed = jd.dynamics.com_dynamics(model, q.at[:3].add(2.0), v.at[:3].add(-3.0))
     assert_close(pushed.mass_matrix, terms.mass_matrix, 1e-11)
     assert_close(pushed.coriolis_matrix, C, 1e-10)
 
@@ -162,12 +162,12 @@ def test_centre_of_mass_coordinates_in_batches_and_their_derivatives(floating):
     """A batch equals the samples, and the derivative in a mass equals the difference quotient."""
     model, *_ = floating
     q, v, _ = random_states(model, 2, 8)[:3]
-    batch = quick(jax.vmap(jd.com_dynamics, (None, 0, 0)))(model, q, v)
+    batch = quick(jax.vmap(jd.dynamics.com_dynamics, (None, 0, 0)))(model, q, v)
     for i in range(2):
-        jax.tree.map(lambda x, y, i=i: assert_close(x[i], y, 1e-11), batch, jd.com_dynamics(model, q[i], v[i]))
+        jax.tree.map(lambda x, y, i=i: assert_close(x[i], y, 1e-11), batch, jd.dynamics.com_dynamics(model, q[i], v[i]))
 
     def value(mass):
-        terms = jd.com_dynamics(model.replace(inertias=model.inertias.at[2, 0].set(mass)), q[0], v[0])
+        terms = jd.dynamics.com_dynamics(model.replace(inertias=model.inertias.at[2, 0].set(mass)), q[0], v[0])
         return jnp.sum(terms.coriolis_matrix) + jnp.sum(terms.mass_matrix)
 
     mass, step = model.inertias[2, 0], 1e-4
@@ -183,7 +183,7 @@ def test_centre_of_mass_coordinates_of_one_body():
     """In closed form: M' is the moment of inertia about the centre of mass, C' omega = omega x (I omega)."""
     model = random_tree(8, ["free"], armature=False)
     q, v, _ = (x[0] for x in random_states(model, 1, 3)[:3])
-    terms, (m, *_rest) = jd.com_dynamics(model, q, v), np.asarray(model.inertias[0])
+    terms, (m, *_rest) = jd.dynamics.com_dynamics(model, q, v), np.asarray(model.inertias[0])
     spatial = np.asarray(jd.inertia.spatial_inertia(model.inertias[0]))
     c = np.asarray(model.inertias[0, 1:4]) / m
     hat = np.asarray(so3.hat(jnp.asarray(c)))
@@ -198,12 +198,12 @@ def test_centre_of_mass_coordinates_refuse_other_trees():
     with pytest.raises(
         ValueError, match=r"com_dynamics: the roots of model .* are .*\(revolute\); give a model with one root"
     ):
-        jd.com_dynamics(arm, jnp.zeros(2), jnp.zeros(2))
+        jd.dynamics.com_dynamics(arm, jnp.zeros(2), jnp.zeros(2))
     model = random_tree(44, ["free", "revolute"])
     if model.armature is not None:
         heavy = model.replace(armature=jnp.ones(model.nv))
         with pytest.raises(ValueError, match=r"armature of the base is .*must be zero"):
-            jd.com_dynamics(heavy, jd.neutral(heavy), jnp.zeros(heavy.nv))
+            jd.dynamics.com_dynamics(heavy, jd.neutral(heavy), jnp.zeros(heavy.nv))
 
 
 @pytest.mark.parametrize("sequence", SEQUENCES)

@@ -21,7 +21,7 @@ def load(q, v, t):
 
 def block(mu=MU, static=MU_S, normal=G, **options):
     system = jd.scenes.sliding_block().system
-    return jd.Scene(system, forces=(jd.DryFriction(mu, normal, 0, static=static, **options),))
+    return jd.Scene(system, forces=(jd.contact.DryFriction(mu, normal, 0, static=static, **options),))
 
 
 def block_velocity(start, speed, sign):
@@ -88,7 +88,7 @@ def test_steps_of_fixed_length_have_gradients_through_events():
 
 
 def test_steps_of_fixed_length_that_are_too_long_say_so():
-    spring = jd.JointSpring(jnp.asarray([400.0]), jnp.asarray([0.0]))
+    spring = jd.forces.JointSpring(jnp.asarray([400.0]), jnp.asarray([0.0]))
     scene = jd.Scene(block().system, forces=(*block().forces, spring))
     coarse, fine = (
         jd.simulate(scene, [0.4], [0.0], [0.0, 3.0], stepsize=step, throw=False, max_steps=1024)
@@ -142,7 +142,7 @@ def box(mu=0.4, size=(0.4, 0.2), mass=2.0):
     builder = jd.ModelBuilder("box", gravity=(0.0, -G, 0.0))
     builder.add_body("box", None, "planar", (m, (0, 0, 0), (0.1, 0.1, m * (a * a + h * h) / 12)))
     corners = {"left": (-a / 2, -h / 2, 0), "right": (a / 2, -h / 2, 0)}
-    feet = [jd.ground_contact("box", at, mu, plane=PLANE, name=name) for name, at in corners.items()]
+    feet = [jd.contact.ground_contact("box", at, mu, plane=PLANE, name=name) for name, at in corners.items()]
     return jd.Scene(builder.build(), forces=feet)
 
 
@@ -211,7 +211,7 @@ def test_contact_lets_go_where_it_would_pull():
     builder = jd.ModelBuilder("bead", gravity=(0.0, 0.0, -G))
     builder.add_body("bead", None, "free", (1.0, (0, 0, 0), (1e-2, 1e-2, 1e-2)))
     touching = jd.rolling_sphere("bead", None, 0.1, on="sphere", surface_radius=0.9, slip=True, name="bead")
-    scene = jd.Scene(builder.build(), forces=(jd.UnilateralContact(touching),))
+    scene = jd.Scene(builder.build(), forces=(jd.contact.UnilateralContact(touching),))
     start = 0.1
     q0 = [np.sin(start), 0.0, np.cos(start), 1.0, 0.0, 0.0, 0.0]
     motion = jd.simulate(scene, q0, jnp.zeros(6), jnp.linspace(0.0, 1.5, 151), rtol=1e-10, atol=1e-10)
@@ -227,7 +227,7 @@ def rod(mu, angle, speed, end=0.3, height=0.0):
     """A slender rod of one metre and one kilogram whose end slides on the ground or at a height, not turning."""
     builder = jd.ModelBuilder("rod", gravity=(0.0, -G, 0.0))
     builder.add_body("rod", None, "planar", (1.0, (0, 0, 0), (0.0, 1 / 12, 1 / 12)))
-    tip = jd.ground_contact("rod", (-0.5, 0, 0), mu, plane=PLANE, name="tip")
+    tip = jd.contact.ground_contact("rod", (-0.5, 0, 0), mu, plane=PLANE, name="tip")
     v0 = speed * jnp.asarray([np.cos(angle), -np.sin(angle), 0.0])
     q0 = [0.0, 0.5 * np.sin(angle) + height, angle]
     return jd.simulate(jd.Scene(builder.build(), forces=[tip]), q0, v0, jnp.linspace(0, end, 4), throw=False)
@@ -317,7 +317,7 @@ def test_friction_in_proportion_to_a_multiplier_of_both_sides():
 
     def motion(sign):
         hoop = jd.Holonomic(lambda q, t: sign * (jnp.sqrt(q @ q) - 1.0), name="hoop")
-        scene = jd.Scene(system, (hoop,), (jd.DryFriction(0.3, "hoop", along),))
+        scene = jd.Scene(system, (hoop,), (jd.contact.DryFriction(0.3, "hoop", along),))
         options = {"rtol": 1e-11, "atol": 1e-11, "outputs": ("multipliers",), "throw": False}
         return jd.simulate(scene, jnp.asarray([1.0, 0.0]), jnp.asarray([0.0, 2.0]), ts, **options)
 
@@ -348,8 +348,8 @@ def test_belt_drags_a_block_along_until_the_spring_is_stronger():
     """It sticks to the belt while k x < mu_s N: to the time x_s/v_belt, and slips there."""
     k, belt = 2.0, 0.5
     along = jd.Pfaffian(lambda q, t: jnp.ones(1), lambda q, t: belt, name="belt")
-    friction = jd.DryFriction(0.2, 1.0, along, static=0.4, name="belt")
-    spring = jd.JointSpring(k, rest=jnp.zeros(1))
+    friction = jd.contact.DryFriction(0.2, 1.0, along, static=0.4, name="belt")
+    spring = jd.forces.JointSpring(k, rest=jnp.zeros(1))
     scene = jd.Scene(jd.scenes.sliding_block().system, forces=(friction, spring))
     motion = jd.simulate(scene, [0.0], [belt], jnp.linspace(0.0, 1.5, 4), **TIGHT)
     slips = 0.4 / k / belt
@@ -366,7 +366,7 @@ def test_belt_drags_a_block_along_until_the_spring_is_stronger():
 @pytest.mark.slow
 def test_float32_finds_the_same_events():
     with jax.enable_x64(False):
-        scene = jd.Scene(jd.scenes.sliding_block().system, forces=(jd.DryFriction(MU, G, 0, static=MU_S),))
+        scene = jd.Scene(jd.scenes.sliding_block().system, forces=(jd.contact.DryFriction(MU, G, 0, static=MU_S),))
         motion = jd.simulate(scene, [0.0], [2.0], jnp.linspace(0.0, 4.0, 5), control=load, rtol=1e-5, atol=1e-5)
         assert motion.q.dtype == jnp.float32 and motion.success
         assert list(motion.events.name[:4]) == ["friction: turn", "friction: stick", "friction: slip", ""]
@@ -376,15 +376,15 @@ def test_float32_finds_the_same_events():
 @pytest.mark.parametrize(
     ("make", "words"),
     [
-        (lambda: jd.DryFriction(-0.1, 1.0), "0 <= sliding"),
-        (lambda: jd.DryFriction(0.5, 1.0, static=0.4), "static"),
-        (lambda: jd.DryFriction(0.5, 1.0, -1), "along"),
-        (lambda: jd.DryFriction(0.5, 1.0, smoothing=0.0), "smoothing"),
-        (lambda: jd.UnilateralContact("lane"), "ground_contact"),
-        (lambda: jd.ground_contact("ball", radius=-1.0), "radius"),
+        (lambda: jd.contact.DryFriction(-0.1, 1.0), "0 <= sliding"),
+        (lambda: jd.contact.DryFriction(0.5, 1.0, static=0.4), "static"),
+        (lambda: jd.contact.DryFriction(0.5, 1.0, -1), "along"),
+        (lambda: jd.contact.DryFriction(0.5, 1.0, smoothing=0.0), "smoothing"),
+        (lambda: jd.contact.UnilateralContact("lane"), "ground_contact"),
+        (lambda: jd.contact.ground_contact("ball", radius=-1.0), "radius"),
         (lambda: jd.simulate(block(), [0.0], [1.0], TS, stepsize=-0.1), "stepsize"),
         (lambda: jd.simulate(block(), [0.0], [1.0], TS, stepsize=diffrax.PIDController(1e-6, 1e-6)), "stepsize"),
-        (lambda: jd.simulate(block(), [0.0], [1.0], TS, solver=jd.Rodas5P()), "solver"),
+        (lambda: jd.simulate(block(), [0.0], [1.0], TS, solver=jd.solvers.Rodas5P()), "solver"),
         (lambda: jd.simulate(block(), [0.0], [1.0], TS, adjoint="backsolve"), "adjoint"),
         (lambda: jd.simulate(block(), [0.0], [1.0], TS, outputs=("work",)), "outputs"),
         (lambda: jd.simulate(block(), [0.0], [1.0], TS, max_events=0), "max_events"),

@@ -168,7 +168,7 @@ def motion(name, **options):
         pytest.param("four_bar", {}, marks=pytest.mark.slow),
         pytest.param("car_axis", {"stepsize": 0.003}, marks=pytest.mark.slow),
         pytest.param("andrews", {}, marks=pytest.mark.slow),
-        pytest.param("double_pendulum", {"solver": jd.Rodas5P()}, marks=pytest.mark.slow),
+        pytest.param("double_pendulum", {"solver": jd.solvers.Rodas5P()}, marks=pytest.mark.slow),
         pytest.param("double_pendulum", {"method": "variational", "stepsize": 0.01}, marks=pytest.mark.slow),
     ],
 )

@@ -194,7 +194,7 @@ def test_constrained_dynamics_and_projections(tmp_path):
     exported.save(tmp_path)
     run_c(tmp_path, "four_bar")
 
-    projection = jd.export(lambda q: jd.projections(scene, q).P_T, q, name="projection")(q)
+    projection = jd.export(lambda q: jd.constraints.projections(scene, q).P_T, q, name="projection")(q)
     np.testing.assert_allclose(projection @ projection, projection, atol=1e-12)
 
 

@@ -213,7 +213,7 @@ def test_models_are_built_joined_and_repaired_without_a_program(programs):
     model = chain("known")
     both = jd.join(model, model, prefix=("left_", "right_"), pose=(0.0, 1.7, 0.0))
     flat = both.replace(inertias=np.asarray(both.inertias) * np.where(np.arange(10) < 4, 1.0, 0.1))
-    assert len(jd.inertia_report(flat)) and not jd.inertia_report(jd.repair_inertias(flat))
+    assert len(jd.model.inertia_report(flat)) and not jd.model.inertia_report(jd.model.repair_inertias(flat))
     assert programs == []
 
 

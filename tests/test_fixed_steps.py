@@ -10,7 +10,7 @@ from pinocchio_bridge import quick
 import jaxdyn as jd
 from jaxdyn.simulation.solution import RESULTS
 
-SOLVERS = {"RK4": None, "Tsit5": diffrax.Tsit5(), "Dopri8": diffrax.Dopri8(), "Rodas5P": jd.Rodas5P()}
+SOLVERS = {"RK4": None, "Tsit5": diffrax.Tsit5(), "Dopri8": diffrax.Dopri8(), "Rodas5P": jd.solvers.Rodas5P()}
 
 
 def slider():
@@ -32,7 +32,7 @@ def test_steps_that_are_too_long_are_refused(name):
     model, ts = slider(), np.linspace(0.0, 4.0, 41)
 
     def run(rate):
-        scene = jd.Scene(model, forces=(jd.JointSpring(rate**2),))
+        scene = jd.Scene(model, forces=(jd.forces.JointSpring(rate**2),))
         solution = jd.simulate(scene, jnp.ones(1), jnp.zeros(1), ts, solver=SOLVERS[name], stepsize=0.01, throw=False)
         return solution.q[:, 0], solution.result
 
@@ -52,7 +52,7 @@ def test_stiff_decay_within_the_limit_is_right():
     model = slider()
 
     def run(rate):
-        scene = jd.Scene(model, forces=(jd.JointDamping(rate),))
+        scene = jd.Scene(model, forces=(jd.forces.JointDamping(rate),))
         ts = np.linspace(0.0, 1.0, 3)
         solution = jd.simulate(scene, jnp.zeros(1), jnp.full(1, 1e-3), ts, stepsize=0.01, throw=False)
         return solution.q[-1, 0] * rate / 1e-3, solution.result
@@ -93,7 +93,7 @@ def test_steps_that_are_too_many_for_the_dtype():
 
 def test_what_to_do_is_said():
     """Contact by penalty at 1e8 N/m with steps of 1 ms, which ended at a wrong place without a word."""
-    scene = jd.Scene(slider(), forces=(jd.JointSpring(1e8), jd.JointDamping(1e4)))
+    scene = jd.Scene(slider(), forces=(jd.forces.JointSpring(1e8), jd.forces.JointDamping(1e4)))
     with pytest.raises(
         RuntimeError, match=r"stopped at t = 0.002 s of 0.002 s. The fixed steps are too long.*Fix: take a smaller"
     ):

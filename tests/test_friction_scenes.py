@@ -197,7 +197,7 @@ def test_woodpecker_has_a_periodic_motion_beside_the_published_numbers():
 def bounce(e, height=1.0, most=64, end=1.6):
     builder = jd.ModelBuilder("ball", gravity=(0.0, 0.0, -G))
     builder.add_body("ball", None, "prismatic", (1.0, (0, 0, 0), (0.1, 0.1, 0.1)), axis=(0, 0, 1))
-    scene = jd.Scene(builder.build(), forces=[jd.ground_contact("ball", restitution=e, name="floor")])
+    scene = jd.Scene(builder.build(), forces=[jd.contact.ground_contact("ball", restitution=e, name="floor")])
     start = jnp.stack([jnp.asarray(height, float)])
     return jd.simulate(scene, start, jnp.zeros(1), jnp.linspace(0.0, end, 9), max_events=most, throw=False, **TIGHT)
 
@@ -258,12 +258,12 @@ def test_mujocos_box_falls_and_slides_to_its_softness():
 
 def test_what_does_not_fit_is_refused():
     for call, words in (
-        (lambda: jd.simulate(jd.Scene(scenes.bowling_ball().system, forces=[jd.ground_contact("cube", name="lane")]),
+        (lambda: jd.simulate(jd.Scene(scenes.bowling_ball().system, forces=[jd.contact.ground_contact("cube", name="lane")]),
                              *scenes.bowling_ball.start(), [0.0, 1.0]), "'cube'"),
-        (lambda: jd.ground_contact("ball", restitution=1.2), "restitution is 1.2"),
-        (lambda: jd.gap_contact(0.5), "gap is 0.5"),
-        (lambda: jd.gap_contact(lambda q, t: q[0], friction=-1.0), "0 <= sliding"),
-        (lambda: jd.simulate(jd.Scene(scenes.pendulum().system, forces=[jd.gap_contact(lambda q, t: q)]),
+        (lambda: jd.contact.ground_contact("ball", restitution=1.2), "restitution is 1.2"),
+        (lambda: jd.contact.gap_contact(0.5), "gap is 0.5"),
+        (lambda: jd.contact.gap_contact(lambda q, t: q[0], friction=-1.0), "0 <= sliding"),
+        (lambda: jd.simulate(jd.Scene(scenes.pendulum().system, forces=[jd.contact.gap_contact(lambda q, t: q)]),
                              [0.1], [0.0], [0.0, 1.0]), "gap returned shape"),
     ):  # fmt: skip
         with pytest.raises(ValueError, match=words):

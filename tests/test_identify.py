@@ -223,7 +223,7 @@ def test_bad_arguments_raise(arm, iiwa_log):
     with pytest.raises(ValueError, match="steps=0"):
         identify.fit_torques(arm, log, method="adam", steps=0)
     rod = arm.replace(inertias=arm.inertias.at[1, 4:].set(0.0))
-    with pytest.raises(ValueError, match=r"inertia of b is not that of a solid body.*jd.repair_inertias"):
+    with pytest.raises(ValueError, match=r"inertia of b is not that of a solid body.*jd.model.repair_inertias"):
         identify.fit_torques(rod, log)
     with pytest.raises(ValueError, match=r"viscous of coordinate 1 is -0.5 in the model"):
         identify.fit_torques(arm.replace(damping=jnp.array([0.0, -0.5])), log)

@@ -18,39 +18,39 @@ from jaxdyn.simulation.solution import OF_DIFFRAX, from_diffrax
 
 ARM = jd.robots.chain(2)
 BODY = ARM.body_names[-1]
-CHAIN = jd.Scene(ARM, (jd.gear(ARM.joint_names[1], ARM.joint_names[0], 2.0),))
+CHAIN = jd.Scene(ARM, (jd.constraints.gear(ARM.joint_names[1], ARM.joint_names[0], 2.0),))
 PLANE = jd.MetricSystem(lambda q: jnp.diag(1.0 + q * q), 2)
 Q, V, A = [1, 2], [3, -1], [2, 5]
 NU, WRENCH = [3], [[1, 2, 3, 4, 5, 6], [6, 5, 4, 3, 2, 1]]
 
 OF_BODIES = {
-    "aba": (jd.aba, Q, V, A),
-    "articulated_bodies": (lambda m, q, v, a: jd.articulated_bodies(m, q, v, a).biases, Q, V, A),
+    "aba": (jd.dynamics.aba, Q, V, A),
+    "articulated_bodies": (lambda m, q, v, a: jd.dynamics.articulated_bodies(m, q, v, a).biases, Q, V, A),
     "body_jacobian": (lambda m, q: jd.body_jacobian(m, q, BODY), Q),
     "center_of_mass": (jd.center_of_mass, Q),
-    "centroidal_momentum": (jd.centroidal_momentum, Q, V),
-    "centroidal_momentum_matrix": (jd.centroidal_momentum_matrix, Q),
+    "centroidal_momentum": (jd.dynamics.centroidal_momentum, Q, V),
+    "centroidal_momentum_matrix": (jd.dynamics.centroidal_momentum_matrix, Q),
     "configuration_rate": (jd.configuration_rate, Q, V),
-    "crba": (jd.crba, Q),
+    "crba": (jd.dynamics.crba, Q),
     "difference": (jd.difference, Q, A),
     "forward_kinematics": (jd.forward_kinematics, Q),
     "frame_pose": (lambda m, q: jd.frame_pose(m, q, BODY), Q),
-    "generalized_force": (jd.generalized_force, Q, WRENCH),
+    "generalized_force": (jd.dynamics.generalized_force, Q, WRENCH),
     "integrate": (jd.integrate, Q, V),
-    "jacobian_dot_v": (lambda m, q, v: jd.jacobian_dot_v(m, q, v, BODY), Q, V),
-    "link_adjoints": (jd.link_adjoints, Q),
-    "mass_matrix_derivative": (jd.mass_matrix_derivative, Q),
-    "mass_matrix_sqrt": (jd.mass_matrix_sqrt, Q),
+    "jacobian_dot_v": (lambda m, q, v: jd.dynamics.jacobian_dot_v(m, q, v, BODY), Q, V),
+    "link_adjoints": (jd.dynamics.link_adjoints, Q),
+    "mass_matrix_derivative": (jd.dynamics.mass_matrix_derivative, Q),
+    "mass_matrix_sqrt": (jd.dynamics.mass_matrix_sqrt, Q),
     "newton_euler_matrices": (lambda m, q, v: jd.newton_euler_matrices(m, q, v).V, Q, V),
     "normalize": (jd.normalize, Q),
     "regressor": (lambda m, q, v, a: jd.identify.regressor(m, [q], [v], [a]), Q, V, A),
-    "rnea": (jd.rnea, Q, V, A),
-    "spatial_jacobian": (lambda m, q: jd.spatial_jacobian(m, q, BODY), Q),
-    "torque_regressor": (jd.torque_regressor, Q, V, A),
+    "rnea": (jd.dynamics.rnea, Q, V, A),
+    "spatial_jacobian": (lambda m, q: jd.dynamics.spatial_jacobian(m, q, BODY), Q),
+    "torque_regressor": (jd.dynamics.torque_regressor, Q, V, A),
 }
 OF_SYSTEMS = {
     "bias_force": (jd.bias_force, Q, V),
-    "christoffel_symbols": (jd.christoffel_symbols, Q),
+    "christoffel_symbols": (jd.dynamics.christoffel_symbols, Q),
     "coriolis_matrix": (jd.coriolis_matrix, Q, V),
     "forward_dynamics": (jd.forward_dynamics, Q, V, A),
     "geometry.christoffel_symbols": (jd.geometry.christoffel_symbols, Q),
@@ -71,14 +71,14 @@ OF_SCENES = {
     "constrained_dynamics": (lambda s, q, v, tau: jd.constrained_dynamics(s, q, v, tau).acceleration, Q, V, A),
     "constraint_forces": (lambda s, q, lam: list(constraint_forces(s, q, lam).values()), Q, NU),
     "constraint_jacobian": (jd.constraint_jacobian, Q),
-    "gauge_invariant": (lambda s, q, v, tau: jd.gauge_invariant(s, q, v, tau).acceleration, Q, V, A),
-    "involutive": (lambda s, q: jd.involutive(s, q).singular_values, Q),
-    "projections": (jd.projections, Q),
+    "gauge_invariant": (lambda s, q, v, tau: jd.reduction.gauge_invariant(s, q, v, tau).acceleration, Q, V, A),
+    "involutive": (lambda s, q: jd.reduction.involutive(s, q).singular_values, Q),
+    "projections": (jd.constraints.projections, Q),
     "reduced_dynamics": (lambda s, q, nu, tau: jd.reduced_dynamics(s, q, nu, tau, basis=(0,)).acceleration, Q, NU, A),
-    "second_fundamental_form": (jd.second_fundamental_form, Q, V),
+    "second_fundamental_form": (jd.constraints.second_fundamental_form, Q, V),
     "simulate": (lambda s, q, v: jd.simulate(s, q, v, [0, 1], stepsize=0.5, throw=False).v, [0, 0], [0, 0]),
     "stiffness": (jd.stiffness, Q, V),
-    "tangent_basis": (jd.tangent_basis, Q),
+    "tangent_basis": (jd.reduction.tangent_basis, Q),
 }
 TAKES = [
     *((name, ARM, *call) for name, call in (OF_BODIES | OF_SYSTEMS).items()),
@@ -194,9 +194,9 @@ def test_a_model_without_moving_bodies():
 
     @quick
     def compute():
-        masses = jd.mass_matrix(empty, none), jd.centroidal_momentum_matrix(empty, none)
+        masses = jd.mass_matrix(empty, none), jd.dynamics.centroidal_momentum_matrix(empty, none)
         energies = jd.potential_energy(empty, none), jd.kinetic_energy(empty, none, none)
-        centre, momentum = jd.center_of_mass(empty, none), jd.centroidal_momentum(empty, none, none)
+        centre, momentum = jd.center_of_mass(empty, none), jd.dynamics.centroidal_momentum(empty, none, none)
         return energies, masses, jd.forward_dynamics(empty, none, none, none), centre, momentum
 
     energies, (mass, matrix), acceleration, centre, momentum = compute()
@@ -213,7 +213,7 @@ def test_forces_that_do_not_fit_are_named():
 
 def test_paths(tmp_path, monkeypatch):
     monkeypatch.setenv("HOME", str(tmp_path))
-    for load in (jd.load_urdf, jd.load_sdf):
+    for load in (jd.load_urdf, jd.io.load_sdf):
         with pytest.raises(ValueError, match="path is None; pass the path of a file"):
             load(None)
     jd.save_urdf(ARM, "~/arm.urdf")
@@ -350,7 +350,7 @@ def test_quaternions_stand_for_their_direction():
     q, (v, tau) = jnp.asarray(rng.normal(size=model.nq)), jnp.asarray(rng.normal(size=(2, model.nv)))
     scale = jnp.ones(model.nq).at[3:7].set(3.0).at[7:11].set(0.2)
     unit = jd.normalize(model, q)
-    scene = jd.Scene(model, (jd.distance("arm", (0.1, 0, 0.2), None, (2.0, 0, 0), 1.0),))
+    scene = jd.Scene(model, (jd.constraints.distance("arm", (0.1, 0, 0.2), None, (2.0, 0, 0), 1.0),))
 
     def values(q):
         return (
@@ -377,7 +377,7 @@ def test_quaternions_stand_for_their_direction():
 def test_motions_start_from_unit_quaternions(modes):
     """Others are refused where they are known, and end with a code where they are traced, beside lanes that go on."""
     model = jd.ModelBuilder("ball").add_body("ball", joint="spherical", inertia=jd.inertia.box(1.0, (1, 2, 3))).build()
-    scene = jd.Scene(model, forces=(jd.DryFriction(0.3, normal=1.0, along=0),) if modes else ())
+    scene = jd.Scene(model, forces=(jd.contact.DryFriction(0.3, normal=1.0, along=0),) if modes else ())
     starts = jnp.asarray([[1.0, 0, 0, 0], [2.0, 0, 0, 0], [1.0002, 0, 0, 0], [0.0, 0, 0, 0], [jnp.nan, 0, 0, 0]])
     v0, options = jnp.asarray([1.0, 0.2, 0.1]), {"throw": False} | ({} if modes else {"stepsize": 0.05})
     with pytest.raises(ValueError, match="length 2 at joint 'ball_joint', expected 1; divide it by its length"):
@@ -409,7 +409,7 @@ def test_codes_of_a_batch_print_as_words():
         (lambda: jd.LagrangianSystem(lambda q: q, 1), r"lagrangian takes \(q\), but is called as \(q, v\)"),
         (lambda: jd.LagrangianSystem(lambda q, v: q, 1, parameters=1.0), r"called as \(q, v, t, parameters\)"),
         (lambda: jd.MetricSystem(lambda q, v: q, 1), r"metric takes \(q, v\), but is called as \(q\)"),
-        (lambda: jd.RayleighDissipation(lambda v: v @ v), r"called as \(q, v, t\)"),
+        (lambda: jd.forces.RayleighDissipation(lambda v: v @ v), r"called as \(q, v, t\)"),
         (lambda: hybrid(lambda q, v: q), r"task \(of position\) takes \(q, v\), but is called as \(q\)"),
         (lambda: hybrid(lambda q: q, of="velocity"), r"task \(of velocity\) takes \(q\), but is called as \(q, v\)"),
         (lambda: hybrid(lambda q: q, target=lambda t, x: x), r"target takes \(t, x\), but is called as \(t\)"),

@@ -63,7 +63,7 @@ def test_another_device_gets_operations():
 def test_exported_programs_of_a_batch_of_any_size():
     """Without kernels and with them, and where samples are solved again one by one (`kernel`'s fallback)."""
     model = jd.robots.chain(2)
-    scene = jd.Scene(model, (jd.gear(model.joint_names[1], model.joint_names[0], 2.0),))
+    scene = jd.Scene(model, (jd.constraints.gear(model.joint_names[1], model.joint_names[0], 2.0),))
 
     def both(q, v):
         return jd.forward_dynamics(model, q, v, v), jd.constrained_dynamics(scene, q, v).acceleration

@@ -62,8 +62,8 @@ def test_centre_of_mass_agrees_with_pinocchio(file):
     at = quick(
         lambda q, v: (
             jd.com_jacobian(model, q),
-            jd.centroidal_momentum_matrix(model, q),
-            jd.centroidal_momentum(model, q, v),
+            jd.dynamics.centroidal_momentum_matrix(model, q),
+            jd.dynamics.centroidal_momentum(model, q, v),
             jd.gravity_force(model, q),
         )
     )
@@ -84,7 +84,7 @@ def test_inverse_dynamics_agrees_with_pinocchio(file):
     feet, q = feet_of(file), crouched(model, file)
     rng = np.random.default_rng(0)
     v, a = (jnp.asarray(x) for x in 0.1 * rng.normal(size=(2, model.nv)))
-    legged = quick(lambda q, v, a: jd.underactuated_inverse_dynamics(model, q, v, a, feet))(q, v, a)
+    legged = quick(lambda q, v, a: jd.control.underactuated_inverse_dynamics(model, q, v, a, feet))(q, v, a)
     assert bool(legged.success)
     assert np.asarray(legged.margins).min() > -1e-6  # the tolerance of the quadratic program, forces of some 100 N
     there, data = bridge.q_to_pinocchio(q), source.createData()
@@ -152,7 +152,7 @@ def test_solo_stands_with_forces_in_its_cones(solo):
 
     @quick
     def stand(q):
-        wanted = jd.underactuated_inverse_dynamics(model, q, at_rest, at_rest, feet, preload=0.5)
+        wanted = jd.control.underactuated_inverse_dynamics(model, q, at_rest, at_rest, feet, preload=0.5)
         return wanted, jd.constrained_dynamics(scene, q, at_rest, wanted.tau)
 
     wanted, computed = stand(q)
@@ -167,7 +167,9 @@ def test_what_the_feet_cannot_carry_has_a_code(solo):
     """A wanted fall faster than free fall asks feet to pull; a limit on torques that is too low."""
     model, _, _, q, feet = solo
     at_rest, down = jnp.zeros(model.nv), jnp.zeros(model.nv).at[2].set(-15.0)
-    solve = quick(lambda a, limit: jd.underactuated_inverse_dynamics(model, q, at_rest, a, feet, effort_limit=limit))
+    solve = quick(
+        lambda a, limit: jd.control.underactuated_inverse_dynamics(model, q, at_rest, a, feet, effort_limit=limit)
+    )
     assert bool(solve(at_rest, 10.0).success)
     for a, limit in ((down, 10.0), (at_rest, 0.01)):
         solution = solve(a, limit)
@@ -180,7 +182,7 @@ def test_what_the_feet_cannot_carry_has_a_code(solo):
     np.testing.assert_allclose(missing(at_rest), 0.0, atol=1e-4)
     limited = solve(at_rest, 0.9)
     assert bool(limited.success) and np.abs(limited.tau).max() < 0.9 + 1e-6
-    flying = jd.underactuated_inverse_dynamics(model, q, at_rest, at_rest, [])
+    flying = jd.control.underactuated_inverse_dynamics(model, q, at_rest, at_rest, [])
     assert flying.result == jd.contact.RESULTS.infeasible
 
 
@@ -192,7 +194,7 @@ def test_forces_are_differentiable(solo):
 
     def torque(mu, scale):
         feet = [jd.control.foot(name, jd.contact.friction_cone("hard-finger", mu=mu)) for name in names]
-        legged = jd.underactuated_inverse_dynamics(model, q, at_rest, scale * push, feet)
+        legged = jd.control.underactuated_inverse_dynamics(model, q, at_rest, scale * push, feet)
         return jnp.sum(legged.tau**2)
 
     value = quick(torque)
@@ -208,21 +210,29 @@ def test_forces_are_differentiable(solo):
     ("call", "message"),
     [
         (
-            lambda m, q, f: jd.underactuated_inverse_dynamics(m, q, *_still(m), [jd.control.foot("no", f[0].cone)]),
+            lambda m, q, f: jd.control.underactuated_inverse_dynamics(
+                m, q, *_still(m), [jd.control.foot("no", f[0].cone)]
+            ),
             "'no'",
         ),
-        (lambda m, q, f: jd.underactuated_inverse_dynamics(m, q, *_still(m), [f[0], f[0]]), "name a frame twice"),
-        (lambda m, q, f: jd.underactuated_inverse_dynamics(m, q, *_still(m), ["FL_FOOT"]), "contacts is"),
-        (lambda m, q, f: jd.underactuated_inverse_dynamics(m, q, *_still(m), f, passive=(99,)), "passive is"),
         (
-            lambda m, q, f: jd.underactuated_inverse_dynamics(m, q, *_still(m), f, effort_limit=[1.0, 2.0]),
+            lambda m, q, f: jd.control.underactuated_inverse_dynamics(m, q, *_still(m), [f[0], f[0]]),
+            "name a frame twice",
+        ),
+        (lambda m, q, f: jd.control.underactuated_inverse_dynamics(m, q, *_still(m), ["FL_FOOT"]), "contacts is"),
+        (lambda m, q, f: jd.control.underactuated_inverse_dynamics(m, q, *_still(m), f, passive=(99,)), "passive is"),
+        (
+            lambda m, q, f: jd.control.underactuated_inverse_dynamics(m, q, *_still(m), f, effort_limit=[1.0, 2.0]),
             "effort_limit",
         ),
-        (lambda m, q, f: jd.underactuated_inverse_dynamics(m, q, *_still(m), f, force_weight=-1.0), "force_weight is"),
+        (
+            lambda m, q, f: jd.control.underactuated_inverse_dynamics(m, q, *_still(m), f, force_weight=-1.0),
+            "force_weight is",
+        ),
         (lambda m, q, f: jd.control.foot("FL_FOOT", 0.6), "cone is 0.6"),
         (lambda m, q, f: jd.control.foot("FL_FOOT", f[0].cone, ground=2 * np.eye(3)), "no rotation"),
         (
-            lambda m, q, f: jd.underactuated_inverse_dynamics(jd.robots.iiwa(), *3 * [jnp.zeros(7)], f),
+            lambda m, q, f: jd.control.underactuated_inverse_dynamics(jd.robots.iiwa(), *3 * [jnp.zeros(7)], f),
             "frame 'FL_FOOT' is not in model 'iiwa'",
         ),
     ],

@@ -54,7 +54,9 @@ def test_lanes_end_at_their_own_times(cart):
 
 
 def test_a_motion_that_goes_on_tells(cart):
-    with pytest.warns(jd.JointLimitWarning, match=r"'cart_joint' is at 1.5625, its upper limit is 1, at t = 2.5 s"):
+    with pytest.warns(
+        jd.simulation.JointLimitWarning, match=r"'cart_joint' is at 1.5625, its upper limit is 1, at t = 2.5 s"
+    ):
         told = jd.simulate(cart, [0.0], [0.0], TS, control=push, limits="report")
     assert bool(told.success) and int(told.stats["passed_limit"]) == 0
     np.testing.assert_allclose(told.q[:, 0], TS**2 / 4, atol=1e-9)

@@ -17,7 +17,7 @@ from jaxdyn.constraints.base import position_residual
 from jaxdyn.io import NotTakenWarning, load_mjcf
 
 
-def silent(path) -> jd.LoadedScene:
+def silent(path) -> jd.io.LoadedScene:
     """The scene of a file, whatever is not taken."""
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", UserWarning)  # the compiler's own too, of attributes that are to go

@@ -41,7 +41,7 @@ def tree(request):
     """A model, a configuration, and its base twists and adjoints."""
     model = random_tree(31, KINDS, parents=request.param, armature=False)
     q = random_states(model, 1, 3)[0][0]
-    return model, q, *quick(lambda m, q: (jd.base_twists(m), jd.link_adjoints(m, q)))(model, q)
+    return model, q, *quick(lambda m, q: (jd.dynamics.base_twists(m), jd.dynamics.link_adjoints(m, q)))(model, q)
 
 
 def test_adjoints_are_those_of_exponentials(tree):
@@ -71,7 +71,7 @@ def test_mass_matrix_and_its_derivative_follow(tree):
     mass, derivative, automatic = quick(
         lambda q: (
             jd.mass_matrix(model, q),
-            jd.mass_matrix_derivative(model, q),
+            jd.dynamics.mass_matrix_derivative(model, q),
             jax.jacfwd(lambda q: jd.mass_matrix(model, q))(q),
         )
     )(q)
@@ -92,7 +92,7 @@ def test_adjoints_compose_and_differentiate(tree):
     above = int(np.flatnonzero(model.topology.ancestors[last])[0])
     middle = model.topology.parents[last]
     assert_close(A[last, middle] @ A[middle, above], A[last, above], 1e-12)
-    moved = lambda q: jd.link_adjoints(model, q)[last, above] @ xi[above]  # noqa: E731
+    moved = lambda q: jd.dynamics.link_adjoints(model, q)[last, above] @ xi[above]  # noqa: E731
     forward, reverse = quick(lambda q: (jax.jacfwd(moved)(q), jax.jacrev(moved)(q)))(q)
     columns = [A[last, k] @ se3.ad_apply(A[k, above] @ xi[above], xi[k]) for k in range(model.nb)]
     assert_close(forward, np.stack(columns, 1), 1e-12)
@@ -104,7 +104,7 @@ def test_joints_of_several_freedoms(kind):
     """The body Jacobian of the last link from A_ij, with blocks of several base twists."""
     model = random_tree(5, [kind, "revolute"], parents=[-1, 0])
     q = random_states(model, 1, 4)[0][0]
-    xi, A = jd.base_twists(model), jd.link_adjoints(model, q)
+    xi, A = jd.dynamics.base_twists(model), jd.dynamics.link_adjoints(model, q)
     home = jd.forward_kinematics(model, jd.neutral(model))
     J = np.stack([A[1, i] @ x for i, x in zip(model.topology.dof_body, xi, strict=True)], 1)
     want = jd.body_jacobian(model, q, model.body_names[1])

@@ -41,7 +41,7 @@ def driven(model, t, seed=0):
 
 
 def scene_of(model):
-    return jd.Scene(model, forces=[jd.JointDamping(model.damping)])
+    return jd.Scene(model, forces=[jd.forces.JointDamping(model.damping)])
 
 
 T = np.linspace(0.0, 3.0, 91)

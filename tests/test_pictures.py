@@ -128,7 +128,7 @@ def urdf(tmp_path_factory) -> Path:
 @pytest.fixture(scope="module")
 def solids(urdf) -> Shapes:
     with pytest.warns(NotTakenWarning, match=r"gone\.stl.*no such file"):
-        return jd.shapes(urdf)
+        return jd.pictures.shapes(urdf)
 
 
 def test_solids_of_urdf(urdf, solids):
@@ -160,7 +160,7 @@ def test_solids_of_mjcf(tmp_path):
         <geom type="mesh" mesh="part" pos="0.1 0.2 0.3"/><geom type="mesh" mesh="lost" mass="0"/>
         <geom type="sphere" size="0.3" group="3"/></body></worldbody></mujoco>""")
     with pytest.warns(NotTakenWarning, match=r"lost\.stl"):
-        solids = jd.shapes(path)
+        solids = jd.pictures.shapes(path)
     assert [(shape.frame, shape.kind) for shape in solids] == [(None, "box"), ("arm", "capsule"), ("arm", "mesh")]
     assert volume(*solids[0].triangles()) == pytest.approx(8 * 0.006, rel=1e-12)
     assert solids[1].color == (0.0, 0.0, 1.0) and solids[0].color is None
@@ -179,7 +179,7 @@ def test_solids_of_sdf(tmp_path):
       <visual name='x'><geometry><cylinder><radius>0.5</radius><length>2</length></cylinder></geometry></visual>
       <visual name='y'><geometry><mesh><uri>model://m/no.dae</uri></mesh></geometry></visual></link></model></sdf>""")
     with pytest.warns(NotTakenWarning, match=r"model://m/no\.dae"):
-        solids = jd.shapes(path)
+        solids = jd.pictures.shapes(path)
     assert [shape.kind for shape in solids] == ["box", "ellipsoid", "cylinder"]
     assert solids[0].color == (0.2, 0.3, 0.4) and solids[0].opacity == 0.5
     np.testing.assert_allclose(solids[0].triangles()[0].max(0), (0.5, 1.0, 2.5))
@@ -192,17 +192,17 @@ def test_shapes_refuse_what_they_cannot_read(tmp_path):
         "<robot name='r'><link name='a'><visual><geometry>\n<box size='1 2'/></geometry></visual></link></robot>"
     )
     with pytest.raises(ValueError, match=r"robot\.urdf:2: size of <box> .* is '1 2'; give 3"):
-        jd.shapes(path)
+        jd.pictures.shapes(path)
     path.write_text("<html/>")
     with pytest.raises(ValueError, match="expected <robot>, <mujoco> or <sdf>"):
-        jd.shapes(path)
+        jd.pictures.shapes(path)
     path.write_bytes(b"solid")
     (tmp_path / "broken.stl").write_bytes(b"no mesh")
     path.write_text(
         "<robot name='r'><link name='a'><visual><geometry><mesh filename='broken.stl'/></geometry></visual></link></robot>"
     )
     with pytest.warns(NotTakenWarning, match=r"broken\.stl"):
-        assert jd.shapes(path) == ()
+        assert jd.pictures.shapes(path) == ()
 
 
 def solution_of(scene, qs, ts, **outputs) -> jd.Solution:
@@ -383,7 +383,7 @@ def test_rows_that_were_not_reached_repeat_the_last():
 def page(turning, tmp_path_factory) -> Path:
     pytest.importorskip("viser")
     path = tmp_path_factory.mktemp("page") / "turn.html"
-    jd.save_html(path, *turning)
+    jd.pictures.save_html(path, *turning)
     return path
 
 
@@ -423,11 +423,11 @@ def test_page_is_one_small_file_with_the_whole_motion(page, turning, capsys):
 def test_page_refuses(turning, tmp_path):
     scene, solution = turning
     with pytest.raises(ValueError, match=r"write to a file \.html"):
-        jd.save_html(tmp_path / "turn.txt", scene, solution)
+        jd.pictures.save_html(tmp_path / "turn.txt", scene, solution)
     with pytest.raises(ValueError, match="there is no directory"):
-        jd.save_html(tmp_path / "no" / "turn.html", scene, solution)
+        jd.pictures.save_html(tmp_path / "no" / "turn.html", scene, solution)
     with pytest.raises(ValueError, match="LagrangianSystem, which has no bodies"):
-        jd.save_html(tmp_path / "turn.html", jd.scenes.pendulum(), jnp.zeros(1))
+        jd.pictures.save_html(tmp_path / "turn.html", jd.scenes.pendulum(), jnp.zeros(1))
     with pytest.raises(ValueError, match="port is 70000; give a number"):
         jd.view(scene, solution, port=70000)
 
@@ -460,7 +460,7 @@ def test_page_of_one_configuration_in_float32(tmp_path):
     pytest.importorskip("viser")
     box = jd.inertia.box(1.0, (0.1, 0.2, 0.3))
     model = jd.ModelBuilder("box", dtype=jnp.float32).add_body("box", joint="spherical", inertia=box).build()
-    jd.save_html(tmp_path / "one.html", model, jd.neutral(model))
+    jd.pictures.save_html(tmp_path / "one.html", model, jd.neutral(model))
     assert messages_of(tmp_path / "one.html")[-1][0] == 0.0
 
 

@@ -17,7 +17,7 @@ def mass(damping):
     builder = jd.ModelBuilder("mass")
     inertia = (1.0, (0.0, 0.0, 0.0), (0.1, 0.1, 0.1))
     builder.add_body("mass", None, "prismatic", inertia, axis=(0, 0, 1), lower=0.0, upper=np.inf)
-    return jd.Scene(builder.build(), forces=[jd.JointStops(K, damping)])
+    return jd.Scene(builder.build(), forces=[jd.forces.JointStops(K, damping)])
 
 
 def thrown_back(x, damping):
@@ -94,7 +94,7 @@ def test_gradient_through_a_reversal_of_sliding_friction():
     """A block that a force of -6 N stops and pushes back: parabolas on both sides."""
 
     def run(x):
-        scene = jd.Scene(BLOCK, forces=[jd.SlidingFriction(x[1], G, 1)])
+        scene = jd.Scene(BLOCK, forces=[jd.forces.SlidingFriction(x[1], G, 1)])
         return jd.simulate(scene, [0.0], x[:1], [0.0, 1.5], control=pull).q[-1, 0]
 
     def exact(x):
@@ -118,7 +118,7 @@ def test_gradient_through_a_limit_of_effort():
     """A spring of 4 N/m by a motor of at most 2 N: a parabola from 1 m to 0.5 m, then a cosine of 2 rad/s."""
 
     def run(x):
-        scene = jd.Scene(BLOCK, forces=[jd.EffortLimits(x[1])])
+        scene = jd.Scene(BLOCK, forces=[jd.forces.EffortLimits(x[1])])
         return jd.simulate(scene, x[:1], [0.0], [0.0, 1.1], control=spring).q[-1, 0]
 
     def exact(x):
@@ -132,7 +132,7 @@ def test_gradient_through_a_limit_of_effort():
     np.testing.assert_allclose(jax.grad(run)(x), jax.grad(exact)(x), atol=1e-7)
 
 
-class Backlash(jd.PiecewiseForce):
+class Backlash(jd.forces.PiecewiseForce):
     stiffness: jax.Array
     play: jax.Array
 
@@ -169,7 +169,7 @@ def test_derivatives_across_kinks_are_refused_where_steps_cannot_end_there():
 
 def falling(e):
     system = jd.LagrangianSystem(lambda q, v: 0.5 * v @ v - G * q[0], 1)
-    return jd.Scene(system, forces=[jd.gap_contact(lambda q, t: q[0], restitution=e, name="floor")])
+    return jd.Scene(system, forces=[jd.contact.gap_contact(lambda q, t: q[0], restitution=e, name="floor")])
 
 
 def test_impact_at_the_start_is_an_event_and_a_refused_start_has_none():
@@ -198,17 +198,17 @@ def test_float32_bounces_to_rest():
 
 
 def test_friction_under_a_negative_normal_force_drives_nothing():
-    for make in (lambda n: jd.DryFriction(0.5, normal=n), lambda n: jd.SlidingFriction(0.5, n, 1)):
+    for make in (lambda n: jd.contact.DryFriction(0.5, normal=n), lambda n: jd.forces.SlidingFriction(0.5, n, 1)):
         with pytest.raises(ValueError, match=r"normal is -1\.0"):
             make(-1.0)
     with pytest.raises(ValueError, match="coefficient"):
-        jd.SlidingFriction(np.asarray(-0.5), 1.0, 1)
+        jd.forces.SlidingFriction(np.asarray(-0.5), 1.0, 1)
     q, v = jnp.zeros(1), jnp.ones(1)
-    pulls = jax.jit(lambda n: jd.SlidingFriction(0.5, n, 1)(BLOCK, q, v, 0.0))
+    pulls = jax.jit(lambda n: jd.forces.SlidingFriction(0.5, n, 1)(BLOCK, q, v, 0.0))
     np.testing.assert_array_equal(pulls(-1.0), [0.0])
     np.testing.assert_array_equal(pulls(2.0), [-1.0])
-    given = jd.SlidingFriction(0.5, lambda system, q, v, t: -1.0 - q[0], 1)
+    given = jd.forces.SlidingFriction(0.5, lambda system, q, v, t: -1.0 - q[0], 1)
     np.testing.assert_array_equal(given(BLOCK, q, v, 0.0), [0.0])
-    friction = jd.DryFriction(0.5, normal=lambda system, q, v, t: jnp.asarray(-1.0), along=0)
+    friction = jd.contact.DryFriction(0.5, normal=lambda system, q, v, t: jnp.asarray(-1.0), along=0)
     motion = jd.simulate(jd.Scene(BLOCK, forces=[friction]), q, v, [0.0, 1.0])
     np.testing.assert_allclose(motion.v[-1], 1.0, rtol=1e-12)

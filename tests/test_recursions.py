@@ -88,7 +88,7 @@ def _pad(x, fill, *, padding_config):
     return np.pad(x, [config[:2] for config in padding_config], constant_values=fill)
 
 
-def _product(a, b, *, dimension_numbers, **_):
+def matmul(a, b, *, dimension_numbers, **_):
     (over_a, over_b), (batch_a, batch_b) = dimension_numbers
     letters = iter("abcdefghijklmnop")
     one, other = [None] * a.ndim, [None] * b.ndim
@@ -101,7 +101,7 @@ def _product(a, b, *, dimension_numbers, **_):
     return np.einsum(f"{''.join(one)},{''.join(other)}->{''.join(shared + rest)}", a, b)
 
 
-RULES |= {"slice": _slice, "broadcast_in_dim": _broadcast, "pad": _pad, "dot_general": _product}
+RULES |= {"slice": _slice, "broadcast_in_dim": _broadcast, "pad": _pad, "dot_general": matmul}
 
 
 def run(function, *args):

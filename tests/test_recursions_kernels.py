@@ -60,7 +60,7 @@ def test_every_quantity_in_both_modes():
     q, v, a, tau, wrenches = (x[0] for x in random_states(model, 1, 7))
 
     def everything(q, v, a, tau, wrenches):
-        root = jd.mass_matrix_sqrt(model, q)
+        root = jd.dynamics.mass_matrix_sqrt(model, q)
         return {
             "M": jd.mass_matrix(model, q),
             "C": jd.coriolis_matrix(model, q, v),
@@ -68,13 +68,13 @@ def test_every_quantity_in_both_modes():
             "h": jd.bias_force(model, q, v),
             "tau": jd.inverse_dynamics(model, q, v, a, external=wrenches),
             "a": jd.forward_dynamics(model, q, v, tau, external=wrenches),
-            "J^T f": jd.generalized_force(model, q, wrenches),
+            "J^T f": jd.dynamics.generalized_force(model, q, wrenches),
             "T": jd.kinetic_energy(model, q, v),
             "V": jd.potential_energy(model, q),
             "c": jd.center_of_mass(model, q),
-            "momentum": jd.centroidal_momentum(model, q, v),
-            "A": jd.centroidal_momentum_matrix(model, q),
-            "Y": jd.torque_regressor(model, q, v, a),
+            "momentum": jd.dynamics.centroidal_momentum(model, q, v),
+            "A": jd.dynamics.centroidal_momentum_matrix(model, q),
+            "Y": jd.dynamics.torque_regressor(model, q, v, a),
             "W W^T": root @ root.T,
             "poses": jd.forward_kinematics(model, q),
         }
@@ -92,7 +92,10 @@ def test_known_zeros_are_left_out():
     """A robot whose numbers are known while tracing costs fewer operations than the same robot as an argument."""
     _, model, _ = load_robot("panda_description/urdf/panda.urdf", lock=("finger",))
     states = [jnp.zeros(7)] * 3
-    known, given = program_of(partial(jd.rnea, model), *states).cost, program_of(jd.rnea, model, *states).cost
+    known, given = (
+        program_of(partial(jd.dynamics.rnea, model), *states).cost,
+        program_of(jd.dynamics.rnea, model, *states).cost,
+    )
     assert known < 0.6 * given, (known, given)
 
 
@@ -103,7 +106,11 @@ def test_operations_grow_with_the_number_of_bodies():
         for n in (3, 6, 12):
             model = random_tree(6, ["revolute"] * n, parents=list(range(-1, n - 1)), armature=False)
             states = [jnp.zeros(n)] * 3
-            made = program_of(jd.aba, model, *states) if given else program_of(partial(jd.aba, model), *states)
+            made = (
+                program_of(jd.dynamics.aba, model, *states)
+                if given
+                else program_of(partial(jd.dynamics.aba, model), *states)
+            )
             costs.append(made.cost)
         assert costs[2] - costs[1] < 2.1 * (costs[1] - costs[0]), costs
 

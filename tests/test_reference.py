@@ -97,7 +97,7 @@ q_object, ts = q0[grasp.system.topology.q_slices[-1]], jnp.linspace(0.0, 0.01, 2
         "grasp.hand_dynamics": MOTIONS,
         "grasp.hand_motions": MOTIONS,
         "identify.Measured": """
-scene = jd.Scene(model, forces=[jd.JointDamping([0.3, 0.3])])
+scene = jd.Scene(model, forces=[jd.forces.JointDamping([0.3, 0.3])])
 log = jd.identify.Log(log.t, log.q, log.v, log.a, log.tau / np.array([11.0, 8.5]))
 """,
         "involutive": "q = q_disk",

@@ -54,7 +54,7 @@ def ours(model, frames):
         return {
             "poses": jd.forward_kinematics(model, q),
             "body jacobians": jnp.stack([jd.body_jacobian(model, q, name) for name in frames]),
-            "spatial jacobians": jnp.stack([jd.spatial_jacobian(model, q, name) for name in frames]),
+            "spatial jacobians": jnp.stack([jd.dynamics.spatial_jacobian(model, q, name) for name in frames]),
             "mass matrix": jd.mass_matrix(model, q),
             "C v": jd.coriolis_matrix(model, q, v) @ v,
             "bias": jd.bias_force(model, q, v),
@@ -62,8 +62,8 @@ def ours(model, frames):
             "inverse dynamics": jd.inverse_dynamics(model, q, v, a),
             "forward dynamics": jd.forward_dynamics(model, q, v, tau),
             "center of mass": jd.center_of_mass(model, q),
-            "centroidal momentum": jd.centroidal_momentum(model, q, v),
-            "regressor": jd.torque_regressor(model, q, v, a),
+            "centroidal momentum": jd.dynamics.centroidal_momentum(model, q, v),
+            "regressor": jd.dynamics.torque_regressor(model, q, v, a),
         }
 
     return at

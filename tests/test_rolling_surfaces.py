@@ -57,8 +57,8 @@ def two_bodies(surface_a, surface_b, **options):
     builder = jd.ModelBuilder("two stones", gravity=(0.0, 0.0, -9.81))
     builder.add_body("object", None, "free", (1.5, (0.02, 0.0, 0.01), (0.02, 0.03, 0.025)))
     builder.add_body("tip", None, "free", STONE)
-    touch = jd.rolling_contact("object", surface_a, "tip", surface_b, pose_a=POSE_A, pose_b=POSE_B, **options)
-    system = jd.RollingModel(builder.build(), [touch])
+    touch = jd.contact.rolling_contact("object", surface_a, "tip", surface_b, pose_a=POSE_A, pose_b=POSE_B, **options)
+    system = jd.contact.RollingModel(builder.build(), [touch])
     return jd.Scene(system, system.rows)
 
 
@@ -66,7 +66,9 @@ def one_body(surface_a, surface_b, **options):
     """A body on a surface that stands still."""
     builder = jd.ModelBuilder("a stone", gravity=(0.5, 0.2, -9.81))
     builder.add_body("stone", None, "free", STONE)
-    system = jd.RollingModel(builder.build(), [jd.rolling_contact(None, surface_a, "stone", surface_b, **options)])
+    system = jd.contact.RollingModel(
+        builder.build(), [jd.contact.rolling_contact(None, surface_a, "stone", surface_b, **options)]
+    )
     return jd.Scene(system, system.rows)
 
 
@@ -228,14 +230,16 @@ def test_rolling_reaches_all_contact_coordinates_unless_radii_are_equal(radius, 
     scene = one_body(Sphere(0.3), Sphere(radius), spin=True)
     center = (0.3 + radius) * jnp.array([0.6, -0.48, 0.64])
     q = scene.system.place(jnp.concatenate([center, jnp.array([0.5, -0.5, 0.1, 0.7])]))
-    assert jd.involutive(scene, q).ranks == ranks
+    assert jd.reduction.involutive(scene, q).ranks == ranks
 
 
 def egg_on_plane(axes):
     """An egg that rolls on a plane, its centre of mass in the middle."""
     builder = jd.ModelBuilder("egg", gravity=(0.0, 0.0, -9.81))
     builder.add_body("egg", None, "free", inertia.ellipsoid(1.0, (0.3, 0.2, 0.25)))
-    system = jd.RollingModel(builder.build(), [jd.rolling_contact(None, Plane(), "egg", Ellipsoid(axes))])
+    system = jd.contact.RollingModel(
+        builder.build(), [jd.contact.rolling_contact(None, Plane(), "egg", Ellipsoid(axes))]
+    )
     return jd.Scene(system, system.rows)
 
 
@@ -349,13 +353,18 @@ def simulated(change):
 
 
 BAD = [
-    (lambda: jd.rolling_contact(None, Plane(), "stone", Sphere(-0.1)), "radius is -0.1"),
-    (lambda: jd.rolling_contact(None, "plane", "stone", Sphere(0.1)), "surface is a str"),
-    (lambda: jd.rolling_contact(None, Plane(), "ball", Sphere(0.1), slip=True, contact=False), "leaves no rows"),
-    (lambda: jd.RollingModel(one_body(Plane(), Sphere(0.3)).system, []), "model is a RollingModel"),
-    (lambda: jd.RollingModel(scenes.sphere_arm().system, ["ball"]), "contacts is"),
+    (lambda: jd.contact.rolling_contact(None, Plane(), "stone", Sphere(-0.1)), "radius is -0.1"),
+    (lambda: jd.contact.rolling_contact(None, "plane", "stone", Sphere(0.1)), "surface is a str"),
     (
-        lambda: jd.RollingModel(scenes.sphere_arm().system, [jd.rolling_contact(None, Plane(), "stone", Sphere(0.1))]),
+        lambda: jd.contact.rolling_contact(None, Plane(), "ball", Sphere(0.1), slip=True, contact=False),
+        "leaves no rows",
+    ),
+    (lambda: jd.contact.RollingModel(one_body(Plane(), Sphere(0.3)).system, []), "model is a RollingModel"),
+    (lambda: jd.contact.RollingModel(scenes.sphere_arm().system, ["ball"]), "contacts is"),
+    (
+        lambda: jd.contact.RollingModel(
+            scenes.sphere_arm().system, [jd.contact.rolling_contact(None, Plane(), "stone", Sphere(0.1))]
+        ),
         "frame 'stone' is not in model",
     ),
     (lambda: placed_on(lambda a: jnp.stack([a[0], a[1], 5 * a @ a]), near=[[0, 0, 0, 0]]), "curvature is not positive"),

@@ -70,7 +70,9 @@ def pendulums(tmp_path_factory):
     ts = np.linspace(0.0, 0.2, 3)
 
     def build(p):
-        return jd.Scene(jd.scenes.double_pendulum().system, forces=(jd.JointDamping(jnp.stack([p["damping"]] * 2)),))
+        return jd.Scene(
+            jd.scenes.double_pendulum().system, forces=(jd.forces.JointDamping(jnp.stack([p["damping"]] * 2)),)
+        )
 
     def again():
         return jd.scale.run(
@@ -567,7 +569,9 @@ def test_a_cost_that_nobody_knows_is_measured(tmp_path):
     stiffness = np.where(np.random.default_rng(4).random(96) < 0.5, 1.0, 1e5)
 
     def build(p):
-        return jd.Scene(jd.scenes.double_pendulum().system, forces=(jd.JointSpring(p["stiffness"] * jnp.ones(2)),))
+        return jd.Scene(
+            jd.scenes.double_pendulum().system, forces=(jd.forces.JointSpring(p["stiffness"] * jnp.ones(2)),)
+        )
 
     def run(name, **options):
         start = (np.array([0.3, 0.4]), np.zeros(2))
@@ -699,7 +703,7 @@ import jaxdyn as jd
 
 def scene(p):
     system = jd.scenes.double_pendulum().system
-    return jd.Scene(system, forces=(jd.JointDamping(p["damping"] * jnp.ones(2)),))
+    return jd.Scene(system, forces=(jd.forces.JointDamping(p["damping"] * jnp.ones(2)),))
 
 def states(p):
     return p["angle"] * jnp.ones(2), p["speed"] * p["length"]

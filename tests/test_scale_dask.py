@@ -161,7 +161,7 @@ def test_motions_are_the_same(client, tmp_path):
     gain = jnp.asarray(0.3)
 
     def build(p):
-        return jd.Scene(jd.scenes.double_pendulum().system, forces=(jd.JointSpring(p["k"] * jnp.ones(2)),))
+        return jd.Scene(jd.scenes.double_pendulum().system, forces=(jd.forces.JointSpring(p["k"] * jnp.ones(2)),))
 
     def run(name, client=None, devices=None):
         return jd.scale.run(
@@ -359,7 +359,7 @@ import jaxdyn as jd
 
 def scene(p):
     system = jd.scenes.double_pendulum().system
-    return jd.Scene(system, forces=(jd.JointDamping(p["damping"] * jnp.ones(2)),))
+    return jd.Scene(system, forces=(jd.forces.JointDamping(p["damping"] * jnp.ones(2)),))
 
 def states(p):
     return 0.5 * jnp.ones(2), jnp.zeros(2)

@@ -25,7 +25,7 @@ def write(tmp_path, text: str, version: str = "1.7") -> Path:
     return path
 
 
-def silent(path, **options) -> jd.LoadedScene:
+def silent(path, **options) -> jd.io.LoadedScene:
     """The scene of a file, whatever is not taken."""
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", NotTakenWarning)
@@ -63,7 +63,7 @@ def residual(scene, constraint, q) -> float:
     return float(np.abs(constraint.pose_residual(relative[:3, :3], relative[:3, 3])).max())
 
 
-def same(a: jd.LoadedScene, b: jd.LoadedScene) -> None:
+def same(a: jd.io.LoadedScene, b: jd.io.LoadedScene) -> None:
     """The two scenes have the same mechanism."""
     assert a.system.joint_names == b.system.joint_names
     for leaf in ("home", "screws", "inertias"):
@@ -534,7 +534,7 @@ def cassie(robots_dir, name: str) -> Path:
     return path
 
 
-def check_cassie(path: Path, *, dynamics: bool = True) -> jd.LoadedScene:
+def check_cassie(path: Path, *, dynamics: bool = True) -> jd.io.LoadedScene:
     scene = silent(path, floating_base=False)
     model = scene.system
     q = jnp.asarray(np.random.default_rng(0).normal(size=model.nv))

@@ -50,10 +50,10 @@ def solved():
             model = scene.system
             J = jd.body_jacobian(model, q, "tip")
             forward = jd.constrained_dynamics(scene, q, v, J.T @ wrench)
-            twist_rate = J @ forward.acceleration + jd.jacobian_dot_v(model, q, v, "tip")
+            twist_rate = J @ forward.acceleration + jd.dynamics.jacobian_dot_v(model, q, v, "tip")
             # Twists of the tip against the sphere, in the axes of C_f: V_c = X v.
             X = se3.Ad(se3.inverse(at_contact(ETA).finger.pose)) @ J
-            P_w = jd.projections(scene, q).P_omega
+            P_w = jd.constraints.projections(scene, q).P_omega
             return {
                 "rows": jd.constraint_jacobian(scene, q) @ jnp.linalg.inv(X),
                 "twist": J @ v,
@@ -170,12 +170,12 @@ def test_rolling_reaches_all_contact_coordinates_unless_radii_are_equal():
     for tip, ranks in ((TIP, (2, 3, 5)), (RADIUS, (2, 2))):
         scene = scenes.sphere_arm(contact="rolling", tip_radius=tip)
         q, _ = scenes.sphere_arm.start(contact="rolling", tip_radius=tip)
-        assert jd.involutive(scene, q).ranks == ranks
+        assert jd.reduction.involutive(scene, q).ranks == ranks
 
 
 def test_coordinates_are_five_and_two():
     for kind, count in zip(KINDS, (5, 2), strict=True):
-        assert jd.tangent_basis(scenes.sphere_arm(contact=kind), start(kind)[0]).shape == (6, count)
+        assert jd.reduction.tangent_basis(scenes.sphere_arm(contact=kind), start(kind)[0]).shape == (6, count)
 
 
 @pytest.mark.slow

@@ -23,8 +23,11 @@ def arm():
 
 @pytest.fixture(scope="module")
 def scene():
-    drive = jd.Drive(5.0, 0.5, 0.2, joints=("2",))
-    return jd.Scene(arm(), forces=(jd.JointStops(2e3, 20.0), jd.CoulombFriction(0.3, 0.05), drive, jd.EffortLimits()))
+    drive = jd.forces.Drive(5.0, 0.5, 0.2, joints=("2",))
+    return jd.Scene(
+        arm(),
+        forces=(jd.forces.JointStops(2e3, 20.0), jd.forces.CoulombFriction(0.3, 0.05), drive, jd.forces.EffortLimits()),
+    )
 
 
 def run(scene, start, taus, **options):
@@ -108,7 +111,7 @@ def test_constraints_are_closed_after_every_step():
 
 def test_stop_holds_a_joint_and_never_pulls():
     """Rest is tau/k beyond the limit; leaving, the damper does not hold it back."""
-    model, stops = arm(), jd.JointStops(2e3, 20.0)
+    model, stops = arm(), jd.forces.JointStops(2e3, 20.0)
     q, still = np.array([0.51, 3.0]), np.zeros(2)
     push = jax.jit(lambda q, v: stops(model, q, v, 0.0))
     np.testing.assert_allclose(push(q, still), [-20.0, 0.0], rtol=1e-12)
@@ -120,7 +123,7 @@ def test_stop_holds_a_joint_and_never_pulls():
 
 
 def test_limits_cut_the_control_and_nothing_else():
-    limits, tau = jd.EffortLimits([1.0, jnp.inf]), jnp.asarray([-3.0, 50.0])
+    limits, tau = jd.forces.EffortLimits([1.0, jnp.inf]), jnp.asarray([-3.0, 50.0])
     scene = jd.Scene(arm(), forces=(limits,))
     np.testing.assert_array_equal(scene.clip_effort(tau), [-1.0, 50.0])
     np.testing.assert_array_equal(jax.jacfwd(scene.clip_effort)(tau), [[0, 0], [0, 1]])
@@ -132,14 +135,14 @@ def test_limits_cut_the_control_and_nothing_else():
     [
         (lambda: jd.stepper(arm(), 0.0), "dt"),
         (lambda: jd.stepper(arm(), 0.1, substeps=0), "substeps"),
-        (lambda: jd.stepper(jd.Scene(arm(), forces=(jd.DryFriction(0.1, 1.0),)), 0.1), "CoulombFriction"),
+        (lambda: jd.stepper(jd.Scene(arm(), forces=(jd.contact.DryFriction(0.1, 1.0),)), 0.1), "CoulombFriction"),
         (lambda: jd.stepper(arm(), 0.1)((jnp.zeros(3), jnp.zeros(2)), TAU), "q has shape"),
         (lambda: jd.stepper(arm(), 0.1)((jnp.zeros(2), jnp.zeros(2)), jnp.zeros(3)), "tau"),
         (lambda: jd.stepper(arm(), 0.1)((jnp.zeros(2), jnp.zeros(2)), lambda q, v, t: jnp.zeros(3)), "tau"),
-        (lambda: jd.JointStops(-1.0), "stiffness"),
-        (lambda: jd.JointStops(joints="9")(arm(), jnp.zeros(2), jnp.zeros(2), 0.0), "9"),
-        (lambda: jd.EffortLimits(-1.0), "negative"),
-        (lambda: jd.EffortLimits([1.0]).clip_effort(arm(), jnp.zeros(2)), "shape"),
+        (lambda: jd.forces.JointStops(-1.0), "stiffness"),
+        (lambda: jd.forces.JointStops(joints="9")(arm(), jnp.zeros(2), jnp.zeros(2), 0.0), "9"),
+        (lambda: jd.forces.EffortLimits(-1.0), "negative"),
+        (lambda: jd.forces.EffortLimits([1.0]).clip_effort(arm(), jnp.zeros(2)), "shape"),
     ],
 )
 def test_what_does_not_fit_is_refused(make, words):

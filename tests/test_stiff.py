@@ -37,7 +37,7 @@ def test_first_step_is_the_same_in_any_unit_of_time():
     @quick
     @jax.vmap
     def run(w):
-        scene = jd.Scene(model, forces=(jd.JointSpring(w * w),))
+        scene = jd.Scene(model, forces=(jd.forces.JointSpring(w * w),))
         start = jnp.ones(1), 0.5 * w[None]
         # Without atol, which is not the same for m/s in all units of time; powers of two make the numbers the same.
         return jd.simulate(scene, *start, jnp.stack([0 * w, 10 / w]), atol=1e-30, throw=False)
@@ -189,14 +189,14 @@ IMPLICIT = diffrax.Kvaerno3(root_finder=optimistix.Newton(1e-13, 1e-13))
     ("solver", "order"),
     [
         pytest.param(diffrax.Dopri5(), 5, marks=pytest.mark.slow),
-        (jd.Rodas5P(), 5),
+        (jd.solvers.Rodas5P(), 5),
         pytest.param(IMPLICIT, 3, marks=pytest.mark.slow),
     ],
     ids=["Dopri5", "Rodas5P", "Kvaerno3"],
 )
 def test_order_in_local_coordinates(ball, turned_exactly, solver, order):
     """The order is kept, at steps and between them, and quaternions are of unit length without a projection."""
-    run = quick(jax.vmap(lambda h: turned(ball, h, jd.LieGroup(solver).fitted(ball))))
+    run = quick(jax.vmap(lambda h: turned(ball, h, jd.solvers.LieGroup(solver).fitted(ball))))
     computed = np.asarray(run(jnp.asarray([1 / 10, 1 / 20, 1 / 40])))
     np.testing.assert_allclose(np.linalg.norm(computed[..., :4], axis=-1), 1, rtol=1e-14)
     error = np.abs(computed - turned_exactly).max(2)
@@ -208,7 +208,7 @@ def test_order_in_local_coordinates(ball, turned_exactly, solver, order):
 @pytest.mark.slow
 def test_gradient_of_an_implicit_step_in_local_coordinates(ball):
     """Both modes through one step of Rodas5P against differences, and finite at rest."""
-    solver, term = jd.LieGroup(jd.Rodas5P()).fitted(ball), turning(ball)
+    solver, term = jd.solvers.LieGroup(jd.solvers.Rodas5P()).fitted(ball), turning(ball)
 
     def end(z):
         y0, h = {"q": z[:4] / jnp.sqrt(jnp.sum(z[:4] ** 2)), "v": z[4:]}, jnp.asarray(0.2)
@@ -240,7 +240,7 @@ def roots(mass, damping, spring):
 
 @pytest.mark.parametrize("damping", [0.0, 3.0, 4e3])
 def test_stiffness_is_that_of_the_linear_system(damping):
-    scene = jd.Scene(slider(2.0), forces=(jd.JointSpring(200.0), jd.JointDamping(damping)))
+    scene = jd.Scene(slider(2.0), forces=(jd.forces.JointSpring(200.0), jd.forces.JointDamping(damping)))
     np.testing.assert_allclose(
         jd.stiffness(scene, [0.3], [1.0])[:2], roots(2.0, damping, 200.0), rtol=1e-10, atol=1e-12
     )
@@ -251,7 +251,7 @@ def test_stiffness_is_that_of_the_linear_system(damping):
 @pytest.mark.parametrize("damping", [0.0, 20.0, 400.0, 2e4])
 def test_steps_above_the_explicit_one_are_unstable(damping):
     """An oscillator of 1000 rad/s, undamped to overdamped, 1000 fixed steps of Dopri8 on both sides of the bound."""
-    scene = jd.Scene(slider(1.0), forces=(jd.JointSpring(1e6), jd.JointDamping(damping)))
+    scene = jd.Scene(slider(1.0), forces=(jd.forces.JointSpring(1e6), jd.forces.JointDamping(damping)))
     longest = float(jd.stiffness(scene, [0.1], [0.0]).explicit_step)
     assert 3.5 < longest * max(1e3, damping) < 5.5
 
@@ -270,7 +270,7 @@ def test_stiffness_on_constraints():
     builder = jd.ModelBuilder("pair", gravity=None)
     for name, mass in (("a", 1.0), ("b", 3.0)):
         builder.add_body(name, joint="prismatic", axis=(1, 0, 0), inertia=(mass, (0, 0, 0), (0, 0, 0)))
-    forces = (jd.JointSpring(1e4), jd.JointDamping(jnp.asarray([0.0, 5e3])))
+    forces = (jd.forces.JointSpring(1e4), jd.forces.JointDamping(jnp.asarray([0.0, 5e3])))
     scene = jd.Scene(builder.build(), (jd.Pfaffian(two_to_one),), forces)
     estimate = jd.stiffness(scene, [0.0, 0.0], [0.0, 0.0])
     # The constraint leaves two eigenvalues zero, which LAPACK gives to rounding of the largest: 1.5e3 times 2e-16.
@@ -285,7 +285,7 @@ def test_stiffness_of_odd_states():
     estimate = jd.stiffness(fixed, jnp.zeros(0), jnp.zeros(0))
     assert estimate.decay == 0 and estimate.frequency == 0 and estimate.explicit_step == np.inf
     with pytest.raises(ValueError, match=r"not finite at q = \[nan\]"):
-        jd.stiffness(jd.Scene(slider(), forces=(jd.JointSpring(np.nan),)), [np.nan], [0.0])
+        jd.stiffness(jd.Scene(slider(), forces=(jd.forces.JointSpring(np.nan),)), [np.nan], [0.0])
 
 
 def two_to_one(q, t):
@@ -314,7 +314,7 @@ def test_default_solver_and_advice_follow_stiffness():
 def test_implicit_explicit_split():
     """A released spring with twice the critical damping, decays of 3e2 to 4e3 1/s: springs and dampers are implicit."""
     k = 1e6
-    scene = jd.Scene(slider(), forces=(jd.JointSpring(k), jd.JointDamping(4 * k**0.5)))
+    scene = jd.Scene(slider(), forces=(jd.forces.JointSpring(k), jd.forces.JointDamping(4 * k**0.5)))
     times = np.array([0.0, 1e-3, 1e-2, 1.0])
     solution = quick(lambda q: jd.simulate(scene, q, jnp.zeros(1), times, solver=diffrax.KenCarp4()))(jnp.ones(1))
     rate = k**0.5 * (-2 + np.sqrt(3) * np.array([1, -1]))
@@ -332,7 +332,7 @@ def test_implicit_explicit_split():
 @pytest.mark.slow
 @pytest.mark.parametrize(
     "solver",
-    [diffrax.Dopri8(), pytest.param(jd.Rodas5P(), marks=pytest.mark.slow)],
+    [diffrax.Dopri8(), pytest.param(jd.solvers.Rodas5P(), marks=pytest.mark.slow)],
     ids=["Dopri8", "Rodas5P"],
 )
 def test_gradient_of_a_whole_motion_of_adaptive_steps(solver):
@@ -347,7 +347,7 @@ def test_gradient_of_a_whole_motion_of_adaptive_steps(solver):
     model, ts = builder.build(), np.linspace(0.0, 10.0, 11)
 
     def end(log, adjoint=None):
-        scene = jd.Scene(model, forces=(jd.JointSpring(jnp.exp(log)), jd.JointDamping(0.01)))
+        scene = jd.Scene(model, forces=(jd.forces.JointSpring(jnp.exp(log)), jd.forces.JointDamping(0.01)))
         options = {"solver": solver, "adjoint": adjoint, "max_steps": 1024, "throw": False}
         solution = jd.simulate(scene, jnp.asarray([2.5]), jnp.asarray([0.1]), ts, **options)
         return jnp.sum(solution.q * solution.v), solution.stats["num_steps"]
@@ -369,11 +369,11 @@ def test_gradient_of_a_whole_motion_of_adaptive_steps(solver):
 
 def test_transient_at_the_start_in_single_precision():
     """A start that is over within a microsecond: steps there may be shorter than the end of the run could tell apart."""
-    scene = jd.Scene(slider(), forces=(jd.JointDamping(4e6), jd.JointSpring(4e6)))
+    scene = jd.Scene(slider(), forces=(jd.forces.JointDamping(4e6), jd.forces.JointSpring(4e6)))
     single, start, ts = jax.tree.map(
         lambda x: jnp.asarray(x, jnp.float32), (scene, (1.0, 50.0), np.linspace(0, 2.0, 3))
     )
-    solution = jd.simulate(single, start[0][None], start[1][None], ts, solver=jd.Rodas5P())
+    solution = jd.simulate(single, start[0][None], start[1][None], ts, solver=jd.solvers.Rodas5P())
     assert solution.q.dtype == jnp.float32
     np.testing.assert_allclose(solution.q[:, 0], np.exp([0.0, -1.0, -2.0]), rtol=0, atol=3e-5)
 
@@ -412,7 +412,7 @@ def test_rodas_serves_at_every_stiffness():
     """Springs of 1e2 to 1e9 N/m in one program: positions and their derivatives against closed forms."""
     case = cases()["flexible_joint"]
     case = case._replace(values=case.values[[0, 1, 3, 4]])
-    run = quick(jax.vmap(program(case, jd.Rodas5P(), max_steps=1024), (0, None)))
+    run = quick(jax.vmap(program(case, jd.solvers.Rodas5P(), max_steps=1024), (0, None)))
     q, slope, steps, success, _ = run(case.values, 1e-8)
     step = 1e-3
     ends = [np.stack([case.exact(k * np.exp(n * step)) for k in case.values]) for n in (0, 1, -1, 2, -2)]

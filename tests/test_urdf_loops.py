@@ -212,7 +212,7 @@ def test_what_of_the_conventions_is_not_taken_is_named(tmp_path):
     yaml = "closed_loop: []\ntype: []\njoint_name: [b]\njoint_type: [CARDAN]\n"
     damped = "<axis><xyz>0 1 0</xyz><dynamics><damping>1</damping></dynamics></axis>"
     extra = gazebo("revolute", damped) + gazebo("gearbox").replace('"close"', '"box"')
-    with pytest.warns(jd.NotTakenWarning) as caught:
+    with pytest.warns(jd.io.NotTakenWarning) as caught:
         scene = jd.load(write(tmp_path, yaml, extra))
     for part in ("b (CARDAN)", "box (gearbox)", "damping of <gazebo> joints: close"):
         assert part in str(caught[0].message)

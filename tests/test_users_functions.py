@@ -97,7 +97,7 @@ def test_wrench_through_joints_is_that_of_pinocchio(tree, mode):
     theirs, bridge = to_pinocchio(tree)
     data = theirs.createData()
     states = random_states(tree, 3, 0)
-    wrenches = jax.jit(jax.vmap(lambda q, v, a, pull: jd.joint_wrench(tree, q, v, a, external=pull)))(
+    wrenches = jax.jit(jax.vmap(lambda q, v, a, pull: jd.dynamics.joint_wrench(tree, q, v, a, external=pull)))(
         *states[:3], states[4]
     )
     for k in range(3):
@@ -118,7 +118,7 @@ def test_part_of_the_wrench_along_the_joint_is_its_force():
     @quick
     def compute(q, v, a):
         wrenches, one, world = (
-            jd.joint_wrench(tree, q, v, a, *name, external=pulls, axes=axes)
+            jd.dynamics.joint_wrench(tree, q, v, a, *name, external=pulls, axes=axes)
             for name, axes in (((), "body"), (("j4",), "body"), ((), "world"))
         )
         tau = jd.inverse_dynamics(tree, q, v, a, external=pulls) - tree.armature * a
@@ -133,7 +133,7 @@ def test_part_of_the_wrench_along_the_joint_is_its_force():
         assert_close(world[i], np.concatenate([turns[i] @ wrenches[i, :3], turns[i] @ wrenches[i, 3:]]))
     assert_close(one, wrenches[4])
     with pytest.raises(ValueError, match="axes is 'frame'; choose from body, world"):
-        jd.joint_wrench(tree, q, v, a, axes="frame")
+        jd.dynamics.joint_wrench(tree, q, v, a, axes="frame")
 
 
 @pytest.mark.parametrize("name", ["four_bar", "rolling_coin", "bennett"])
@@ -146,11 +146,11 @@ def test_wrenches_of_constraints_on_bodies(name):
     @quick
     def compute(q, v):
         dynamics = jd.constrained_dynamics(scene, q, v)
-        pulls = jd.body_wrenches(scene, q, dynamics.multipliers)
+        pulls = jd.constraints.body_wrenches(scene, q, dynamics.multipliers)
         forces = sum(jd.constraint_forces(scene, q, dynamics.multipliers).values())
-        wrenches = jd.joint_wrench(scene.system, q, v, dynamics.acceleration, external=pulls)
+        wrenches = jd.dynamics.joint_wrench(scene.system, q, v, dynamics.acceleration, external=pulls)
         jacobians = [jd.body_jacobian(scene.system, q, name) for name in scene.system.body_names]
-        return jd.generalized_force(scene.system, q, pulls), forces, wrenches, jacobians
+        return jd.dynamics.generalized_force(scene.system, q, pulls), forces, wrenches, jacobians
 
     pulled, forces, wrenches, jacobians = jax.tree.map(np.asarray, compute(q, v))
     assert_close(pulled, forces)
@@ -210,14 +210,14 @@ def test_fixed_joints_name_frames(urdf):
 
 def test_load_takes_every_format(urdf, tmp_path, monkeypatch):
     scene = jd.load(urdf)
-    assert isinstance(scene, jd.LoadedScene) and scene.system.joint_names == ("shoulder",)
+    assert isinstance(scene, jd.io.LoadedScene) and scene.system.joint_names == ("shoulder",)
     assert float(scene.applied_force(jnp.zeros(1), jnp.ones(1))[0]) == -0.5
     assert jd.load(urdf, floating_base=True).system.nv == 7
     mjcf = '<mujoco><worldbody><body name="b"><joint name="j"/><geom size="1"/></body></worldbody></mujoco>'
     for name, text in (("a.xml", URDF), ("b.xml", mjcf), ("c.mjcf", mjcf)):
         (tmp_path / name).write_text(text)
     assert jd.load(tmp_path / "a.xml").system.joint_names == ("shoulder",)
-    with pytest.warns(jd.NotTakenWarning):
+    with pytest.warns(jd.io.NotTakenWarning):
         assert jd.load(tmp_path / "b.xml").system.joint_names == ("j",)
     with pytest.raises(ValueError, match=r"floating_base is True, but .* is MJCF"):
         jd.load(tmp_path / "c.mjcf", floating_base=True)

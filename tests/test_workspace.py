@@ -23,12 +23,12 @@ def at():
 
     @quick
     def compute(q, v, tau):
-        dynamics = jd.workspace_dynamics(ARM, "tip", q, v)
+        dynamics = jd.dynamics.workspace_dynamics(ARM, "tip", q, v)
         near = jnp.stack([jd.integrate(ARM, q, k * step * v) for k in (-2.0, -1.0, 1.0, 2.0)])
-        masses = jax.vmap(lambda q: jd.workspace_dynamics(ARM, "tip", q, v).mass_matrix)(near)
+        masses = jax.vmap(lambda q: jd.dynamics.workspace_dynamics(ARM, "tip", q, v).mass_matrix)(near)
         rate = (masses[0] - 8 * masses[1] + 8 * masses[2] - masses[3]) / (12 * step)
         acceleration = jd.forward_dynamics(ARM, q, v, tau)
-        twist_rate = dynamics.jacobian @ acceleration + jd.jacobian_dot_v(ARM, q, v, "tip")
+        twist_rate = dynamics.jacobian @ acceleration + jd.dynamics.jacobian_dot_v(ARM, q, v, "tip")
         return dynamics, rate, twist_rate, jd.coriolis_matrix(ARM, q, v)
 
     return compute(Q, V, TAU)
@@ -91,7 +91,7 @@ def test_redundant_arm_moves_its_frame_with_the_least_energy():
 
     @quick
     def compute(q, v, tau):
-        computed = jd.workspace_dynamics(arm, "iiwa_link_7", q, v, axes="world")
+        computed = jd.dynamics.workspace_dynamics(arm, "iiwa_link_7", q, v, axes="world")
         return computed, jd.mass_matrix(arm, q), jd.bias_force(arm, q, v), jd.forward_dynamics(arm, q, v, tau)
 
     computed, M, h, a = compute(q, v, tau)
@@ -126,7 +126,7 @@ def test_near_a_singularity_it_is_damped_and_says_so():
     v = jnp.array([0.3, -0.7])
 
     def heavy(angle):
-        computed = jd.workspace_dynamics(arm, "tip", elbow(angle), v, axes="world", rows=(0, 1))
+        computed = jd.dynamics.workspace_dynamics(arm, "tip", elbow(angle), v, axes="world", rows=(0, 1))
         return jnp.sum(computed.mass_matrix), computed
 
     angles = jnp.array([1.0, 0.1, 3e-4, 1e-4, 1e-9, 0.0])
@@ -152,7 +152,7 @@ def test_near_a_singularity_it_is_damped_and_says_so():
 @pytest.mark.slow
 def test_batch_gradient_and_float32():
     def felt(model, q):
-        return jnp.sum(jd.workspace_dynamics(model, "tip", q, V, rows=(0, 1, 2)).mass_matrix)
+        return jnp.sum(jd.dynamics.workspace_dynamics(model, "tip", q, V, rows=(0, 1, 2)).mass_matrix)
 
     places = jnp.stack([Q, Q + 0.1])
     values, slopes = quick(jax.vmap(jax.value_and_grad(felt, argnums=1), (None, 0)))(ARM, places)
@@ -162,18 +162,18 @@ def test_batch_gradient_and_float32():
     np.testing.assert_allclose(values[1], felt(ARM, places[1]), rtol=1e-12)
     np.testing.assert_allclose(slopes[0], (high - low) / (2 * step), atol=1e-6 * float(jnp.abs(slopes[0]).max()))
     single = jax.tree.map(lambda x: x.astype(jnp.float32), ARM)
-    rough = jd.workspace_dynamics(single, "tip", Q.astype(jnp.float32), V.astype(jnp.float32), rows=(0, 1, 2))
+    rough = jd.dynamics.workspace_dynamics(single, "tip", Q.astype(jnp.float32), V.astype(jnp.float32), rows=(0, 1, 2))
     assert rough.mass_matrix.dtype == jnp.float32
     np.testing.assert_allclose(jnp.sum(rough.mass_matrix), values[0], rtol=1e-4)
 
 
 BAD = [
-    (lambda: jd.workspace_dynamics(ARM, "hand", Q, V), "hand"),
-    (lambda: jd.workspace_dynamics(ARM, "tip", Q[:5], V), "q has shape"),
-    (lambda: jd.workspace_dynamics(ARM, "tip", Q, V, axes="tip"), "axes is 'tip'"),
-    (lambda: jd.workspace_dynamics(ARM, "tip", Q, V, rows=(0, 6)), r"rows is \(0, 6\)"),
-    (lambda: jd.workspace_dynamics(robots.chain(2), "rod_1", Q[:2], V[:2]), "at most nv = 2"),
-    (lambda: jd.workspace_dynamics(ARM, "tip", Q, V, least=2.0), "least is 2.0"),
+    (lambda: jd.dynamics.workspace_dynamics(ARM, "hand", Q, V), "hand"),
+    (lambda: jd.dynamics.workspace_dynamics(ARM, "tip", Q[:5], V), "q has shape"),
+    (lambda: jd.dynamics.workspace_dynamics(ARM, "tip", Q, V, axes="tip"), "axes is 'tip'"),
+    (lambda: jd.dynamics.workspace_dynamics(ARM, "tip", Q, V, rows=(0, 6)), r"rows is \(0, 6\)"),
+    (lambda: jd.dynamics.workspace_dynamics(robots.chain(2), "rod_1", Q[:2], V[:2]), "at most nv = 2"),
+    (lambda: jd.dynamics.workspace_dynamics(ARM, "tip", Q, V, least=2.0), "least is 2.0"),
 ]
 
 

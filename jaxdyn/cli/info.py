@@ -263,7 +263,7 @@ def _body_problems(bodies: list[tuple[str, str]]) -> str:
     if not bodies:
         return "\nInertias: every moving body has a physical inertia."
     rows = table(("body", "problem"), bodies)
-    return f"\nInertia problems ({len(bodies)}); jd.repair_inertias(scene.system) gives physical ones\n{rows}"
+    return f"\nInertia problems ({len(bodies)}); jd.model.repair_inertias(scene.system) gives physical ones\n{rows}"
 
 
 def _name_list(names: list[str]) -> str:

@@ -28,7 +28,7 @@ from jaxdyn.constraints.selection import (
     surely_apart,
 )
 from jaxdyn.constraints.tolerances import coordinate_sizes, largest_ratio, row_limits
-from jaxdyn.lie.so3 import _product
+from jaxdyn.lie.so3 import matmul
 from jaxdyn.model.arguments import Numbers, check_state, zeros_if_none
 from jaxdyn.model.tree import Model
 from jaxdyn.systems.scene import Scene, as_scene
@@ -263,7 +263,7 @@ def _with_velocity(scene, q, v, t, rank_tol):
     """v with A v = b by the least change."""
     B = correction(scene, q, t, rank_tol, holonomic=False)
     for _ in range(2):
-        v = v - _product(B, velocity_residual(scene, q, v, t))
+        v = v - matmul(B, velocity_residual(scene, q, v, t))
     return v
 
 

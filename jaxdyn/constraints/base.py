@@ -18,7 +18,7 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from jaxdyn.compile import kernel
-from jaxdyn.lie.so3 import _product
+from jaxdyn.lie.so3 import matmul
 from jaxdyn.model.arguments import DType, Function, Number, Numbers, SystemLike, batch_hint, check_state, state_dtype
 from jaxdyn.systems.scene import Scene, as_pytree, as_scene
 from jaxdyn.systems.system import velocity_to_rate
@@ -154,7 +154,7 @@ class Pfaffian(Constraint):
             raise ValueError(
                 f"constraint {self.name!r}: A returned shape {rows.shape}, expected (n, {v.shape[0]}) = (n, nv)"
             )
-        residual = _product(rows, v)
+        residual = matmul(rows, v)
         if self.b is None:
             return residual
         b = jnp.atleast_1d(jnp.asarray(self.b(*place), q.dtype))

@@ -22,7 +22,7 @@ from jaxdyn.constraints.dynamics import correction, right_inverse, whitened_rows
 from jaxdyn.constraints.rank import eps_of, sign_of_determinant, solve_square
 from jaxdyn.constraints.tolerances import coordinate_sizes
 from jaxdyn.dynamics.quantities import mass_matrix
-from jaxdyn.lie.so3 import _product
+from jaxdyn.lie.so3 import matmul
 from jaxdyn.model.tree import Model, difference
 from jaxdyn.systems.mass_factor import mass_factor
 from jaxdyn.systems.scene import Scene
@@ -68,12 +68,12 @@ def follow_path(scene: Scene, guess, t, loose: float, steps: int) -> Path:
     def improve(state):
         q, _, passed, A_before, B_before, count = state
         phi, A, B = _step_to_rows(scene, q, t, loose)
-        step = -_product(B, phi)
+        step = -matmul(B, phi)
         size = jnp.max(jnp.abs(step) / sizes)
         step = step * jnp.minimum(1.0, _LONGEST / jnp.where(size > 0, size, jnp.ones_like(size)))
         # Rows have turned over where a combination of them went through zero.
-        own = jnp.eye(phi.shape[0], dtype=phi.dtype) - _product(A_before, B_before)
-        turned = (count > 0) & (sign_of_determinant(_product(A, B_before) + own) < 0)
+        own = jnp.eye(phi.shape[0], dtype=phi.dtype) - matmul(A_before, B_before)
+        turned = (count > 0) & (sign_of_determinant(matmul(A, B_before) + own) < 0)
         is_stuck = (count >= _PATIENCE) & ((count - _PATIENCE) % (_PATIENCE // 2) == 0)
         push = 2 * _LONGEST * aside * jnp.where((count // (_PATIENCE // 2)) % 2 == 0, 1.0, -1.0).astype(guess.dtype)
         step = jnp.where(is_stuck, push * sizes, step)
@@ -97,7 +97,7 @@ def _linearize_rows(scene: Scene, guess, t, e):
     place = displace(scene.system, guess, e)
     A = constraint_jacobian(scene, place, t)[holonomic_rows(layout(scene))]
     if isinstance(scene.system, Model):
-        A = _product(A, jax.jacfwd(lambda e: difference(scene.system, place, displace(scene.system, guess, e)))(e))
+        A = matmul(A, jax.jacfwd(lambda e: difference(scene.system, place, displace(scene.system, guess, e)))(e))
     return position_residual(scene, place, t), A
 
 
@@ -114,7 +114,7 @@ def slide_to_nearest(scene: Scene, guess, start, t, rank_tol):
     def improve(state):
         e, _, count = state
         phi, A = _linearize_rows(scene, guess, t, e)
-        step = _product(right_inverse(metric, A, rank_tol), _product(A, e) - phi) - e
+        step = matmul(right_inverse(metric, A, rank_tol), matmul(A, e) - phi) - e
         size = jnp.max(jnp.abs(step) / sizes)
         step = step * jnp.minimum(1.0, _LONGEST / jnp.where(size > 0, size, jnp.ones_like(size)))
         return e + step, size, count + 1
@@ -142,7 +142,7 @@ def polish(scene: Scene, q, t, rank_tol):
 
     def improve(state):
         q, error, _, count = state
-        step = -_product(correction(scene, q, t, rank_tol, holonomic=True), position_residual(scene, q, t))
+        step = -matmul(correction(scene, q, t, rank_tol, holonomic=True), position_residual(scene, q, t))
         tried = jax.vmap(lambda s: retract(scene.system, displace(scene.system, q, s * step)))(lengths)
         errors = lax.map(size, tried)  # by the kernel of one sample
         best = jnp.argmin(jnp.where(jnp.isfinite(errors), errors, jnp.full_like(errors, jnp.inf)))
@@ -192,23 +192,23 @@ def _stationary(scene: Scene, guess, t, e, rank_tol):
     def conditions(z):
         e, lam = z[: scene.nv], z[scene.nv :]
         phi, back = jax.vjp(residual, e)
-        return jnp.concatenate([_product(mass, e) + back(lam)[0], phi])
+        return jnp.concatenate([matmul(mass, e) + back(lam)[0], phi])
 
     def solve(linear, right):
         """By the null space of A, on which the Hessian of the Lagrangian is definite; A may have dependent rows."""
         matrix = jax.jacfwd(linear)(jnp.zeros_like(right))
         H, A = matrix[: scene.nv, : scene.nv], matrix[scene.nv :, : scene.nv]
         B = right_inverse(metric, A, rank_tol)
-        null_projector = jnp.eye(scene.nv, dtype=A.dtype) - _product(B, A)
-        along = _product(B, right[scene.nv :])
-        left = right[: scene.nv] - _product(H, along)
+        null_projector = jnp.eye(scene.nv, dtype=A.dtype) - matmul(B, A)
+        along = matmul(B, right[scene.nv :])
+        left = right[: scene.nv] - matmul(H, along)
         # Across the null space M stands in for H, so that the matrix is regular.
         across = jnp.eye(scene.nv, dtype=A.dtype) - null_projector
-        whole = _product(null_projector.T, _product(H, null_projector)) + _product(across.T, _product(mass, across))
-        step = along + _product(null_projector, solve_square(whole, _product(null_projector.T, left)))
-        return jnp.concatenate([step, _product(B.T, right[: scene.nv] - _product(H, step))])
+        whole = matmul(null_projector.T, matmul(H, null_projector)) + matmul(across.T, matmul(mass, across))
+        step = along + matmul(null_projector, solve_square(whole, matmul(null_projector.T, left)))
+        return jnp.concatenate([step, matmul(B.T, right[: scene.nv] - matmul(H, step))])
 
     A = jax.jacrev(residual)(e)
-    lam = -_product(right_inverse(metric, A, rank_tol).T, _product(mass, e))
+    lam = -matmul(right_inverse(metric, A, rank_tol).T, matmul(mass, e))
     known = lax.stop_gradient(jnp.concatenate([e, lam]))
     return lax.custom_root(conditions, known, lambda conditions, known: known, solve)[: scene.nv]

@@ -28,7 +28,7 @@ from jaxdyn.constraints.rank import (
 from jaxdyn.constraints.selection import is_selected
 from jaxdyn.dynamics.quantities import bias_force, mass_matrix
 from jaxdyn.dynamics.recursions import aba_with_columns
-from jaxdyn.lie.so3 import _product
+from jaxdyn.lie.so3 import matmul
 from jaxdyn.model.arguments import Numbers, check_state, zeros_if_none
 from jaxdyn.model.tree import Model
 from jaxdyn.systems.mass_factor import MassFactor, cholesky, mass_factor, solve_cholesky
@@ -41,7 +41,7 @@ class ConstrainedDynamics(Outcome):
     """Accelerations and constraint forces of a scene.
 
     - `acceleration` (nv,), the rate of v: of a free or spherical joint that of its body twist, in axes that turn with the body
-      (`jd.frame_acceleration` gives accelerations in world axes).
+      (`jd.dynamics.frame_acceleration` gives accelerations in world axes).
     - `multipliers` (nc,), the forces of the constraints on the system along their rows, in N for rows in m and N m for rows
       in rad.
     - `rank` (): number of independent rows. `result`: one of `RESULTS`; `success`: whether it is `successful`.
@@ -138,11 +138,11 @@ def _without_forces(rank_tol, scene: Scene, q, v, tau, t):
 def _by_pivots(rank_tol, scene: Scene, q, v, tau, t):
     """(a, lam, rank, result) without branches; not valid where the pivots of A M^-1 A^T are too small for their errors."""
     metric, Y, free, wanted, _ = _whitened(scene, q, v, tau, t)
-    normal = cholesky(regular_gram(Y) if is_selected(scene) else _product(Y.T, Y))
+    normal = cholesky(regular_gram(Y) if is_selected(scene) else matmul(Y.T, Y))
     lam = _refined(normal, Y, wanted)
     quality = jnp.where(metric.is_definite(), quality_of(normal), jnp.nan)
     is_poor = ~(quality > least_pivot(q, rank_tol))
-    a, lam = (mark_invalid(is_poor, x) for x in (metric.unwhiten(free + _product(Y, lam)), lam))
+    a, lam = (mark_invalid(is_poor, x) for x in (metric.unwhiten(free + matmul(Y, lam)), lam))
     return a, lam, *_judged(scene, q, quality)
 
 
@@ -150,7 +150,7 @@ def _whitened(scene: Scene, q, v, tau, t):
     """The mass matrix's factor, Y = U^-1 A^T, U^-1 (tau + forces - h), gamma - A M^-1 (tau + forces - h), and gamma."""
     row = rows(scene, q, v, t)
     metric, Y, free = _weighted(scene, q, v, applied(scene, q, v, tau, t), t, row.A)
-    return metric, Y, free, row.gamma - _product(Y.T, free), row.gamma
+    return metric, Y, free, row.gamma - matmul(Y.T, free), row.gamma
 
 
 def _judged(scene: Scene, q, quality):
@@ -178,14 +178,14 @@ def solve_rows(scene: Scene, q, v, force, t, row: Rows, rank_tol: float | None =
     """Acceleration and multipliers for rows A a = gamma that may differ from the scene's in gamma."""
     bare = Scene(scene.system)
     metric, Y, free = kernel(_weighted)(bare, q, v, force, t, row.A)
-    return _shortest_push(scene, metric, Y, free, row.gamma - _product(Y.T, free), row.gamma, rank_tol)
+    return _shortest_push(scene, metric, Y, free, row.gamma - matmul(Y.T, free), row.gamma, rank_tol)
 
 
 def _shortest_push(scene: Scene, metric: MassFactor, Y, free, wanted, gamma, rank_tol) -> ConstrainedDynamics:
     """By Gauss's principle: what is added to the free acceleration is as short as can be."""
     lam, pushed, rank = _shortest(Y, wanted, rank_tol)
     # By Cauchy-Schwarz the residual is compared with the sizes that cancel in it.
-    missed = jnp.abs(wanted - _product(Y.T, pushed))
+    missed = jnp.abs(wanted - matmul(Y.T, pushed))
     sizes = jnp.abs(gamma) + jnp.sqrt(jnp.sum(Y * Y, 0) * (jnp.sum(free * free) + jnp.sum(pushed * pushed)))
     # Rows that count as dependent differ by as much as the rank tolerance.
     limit = max(eps_of(Y) ** 0.5, tolerance(rank_tol, Y))
@@ -211,7 +211,7 @@ def _weighted(scene: Scene, q, v, force, t, A):
 def _refined(factor, Y, right):
     """(Y^T Y)^-1 right from the Cholesky factor: one correction takes the squared condition number out of the error."""
     x = solve_cholesky(factor, right)
-    return x + solve_cholesky(factor, right - _product(Y.T, _product(Y, x)))
+    return x + solve_cholesky(factor, right - matmul(Y.T, matmul(Y, x)))
 
 
 def _shortest(Y, wanted, rank_tol):
@@ -219,8 +219,8 @@ def _shortest(Y, wanted, rank_tol):
 
     # More rows than degrees of freedom depend on each other wherever the mechanism moves.
     inverse = pseudo_inverse(Y, tolerance(rank_tol, Y), Y.shape[1] > Y.shape[0])
-    pushed = _product(inverse.T, wanted)
-    return _product(inverse, pushed), pushed, jnp.round(jnp.sum(inverse * Y.T)).astype(jnp.int32)
+    pushed = matmul(inverse.T, wanted)
+    return matmul(inverse, pushed), pushed, jnp.round(jnp.sum(inverse * Y.T)).astype(jnp.int32)
 
 
 def _by_schur(scene: Scene, q, v, tau, t, *, method: str) -> ConstrainedDynamics:
@@ -235,16 +235,16 @@ def _by_schur(scene: Scene, q, v, tau, t, *, method: str) -> ConstrainedDynamics
 
 def _by_delassus(scene: Scene, q, v, tau, t):
     metric, Y, free, wanted, _ = _whitened(scene, q, v, tau, t)
-    lam, fine = _solve_delassus(_product(Y.T, Y), wanted, scene.nv)
-    return metric.unwhiten(free + _product(Y, lam)), lam, fine, metric.is_definite()
+    lam, fine = _solve_delassus(matmul(Y.T, Y), wanted, scene.nv)
+    return metric.unwhiten(free + matmul(Y, lam)), lam, fine, metric.is_definite()
 
 
 def _by_bodies(scene: Scene, q, v, tau, t):
     """The same from a0 and X = M^-1 A^T of one articulated-body factorisation: a = a0 + X lam."""
     row, force = rows(scene, q, v, t), applied(scene, q, v, tau, t)
     free, X = aba_with_columns(scene.system, q, v, force, row.A.T)
-    lam, fine = _solve_delassus(_product(row.A, X), row.gamma - _product(row.A, free), scene.nv)
-    return free + _product(X, lam), lam, fine, jnp.isfinite(free).all()
+    lam, fine = _solve_delassus(matmul(row.A, X), row.gamma - matmul(row.A, free), scene.nv)
+    return free + matmul(X, lam), lam, fine, jnp.isfinite(free).all()
 
 
 def _solve_delassus(delassus, wanted, nv: int):
@@ -273,9 +273,9 @@ def projections(
     q, t = check_state(scene.system, q=q, t=t)
     metric, Y = kernel(whitened_rows)(scene, q, t)
     inverse = pseudo_inverse(Y, tolerance(rank_tol, Y))
-    kept = jnp.eye(Y.shape[0], dtype=Y.dtype) - _product(Y, inverse)
+    kept = jnp.eye(Y.shape[0], dtype=Y.dtype) - matmul(Y, inverse)
     # U^-T (1 - Y Y^+) U^T, of which the columns of U^T are found from the unit velocities.
-    P_T = metric.unwhiten(_product(kept, metric.momentum(jnp.eye(scene.nv, dtype=Y.dtype))))
+    P_T = metric.unwhiten(matmul(kept, metric.momentum(jnp.eye(scene.nv, dtype=Y.dtype))))
     return Projections(P_T, P_T.T)
 
 
@@ -301,8 +301,8 @@ def second_fundamental_form(
     q, v, t = check_state(scene.system, q=q, v=v, t=t)
     coriolis = bias_force(scene.system, q, v, t) - bias_force(scene.system, q, jnp.zeros_like(v), t)
     metric, Y = kernel(whitened_rows)(scene, q, t)
-    wanted = rows(scene, q, v, t).gamma + _product(Y.T, metric.whiten(coriolis))
-    return metric.unwhiten(_product(pseudo_inverse(Y, tolerance(rank_tol, Y)).T, wanted))
+    wanted = rows(scene, q, v, t).gamma + matmul(Y.T, metric.whiten(coriolis))
+    return metric.unwhiten(matmul(pseudo_inverse(Y, tolerance(rank_tol, Y)).T, wanted))
 
 
 def correction(scene: Scene, q, t, rank_tol, *, holonomic: bool) -> Array:

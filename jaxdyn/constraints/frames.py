@@ -24,7 +24,7 @@ from jaxdyn.compile import variant
 from jaxdyn.constraints.base import Constraint
 from jaxdyn.dynamics.kinematics import BodyFrames, body_frames, take
 from jaxdyn.lie import se3, so3
-from jaxdyn.lie.so3 import _product
+from jaxdyn.lie.so3 import matmul
 from jaxdyn.model.arguments import Number, SystemLike
 from jaxdyn.model.names import frame_index
 from jaxdyn.model.tree import Model
@@ -34,7 +34,7 @@ def frames_on(model: Model, q, bodies: Sequence[str | None], poses, v=None) -> B
     """Frames at the given poses (4, 4) in bodies or named frames (None: the world); with v, their twists too."""
     places, offsets = places_on(model, bodies, poses, q.dtype)
     frames = body_frames(model, q, places, v)
-    return frames._replace(pose=_product(frames.pose, offsets))
+    return frames._replace(pose=matmul(frames.pose, offsets))
 
 
 def places_on(model: Model, bodies: Sequence[str | None], poses, dtype) -> tuple[list[int], Float[Array, "n 4 4"]]:
@@ -44,7 +44,7 @@ def places_on(model: Model, bodies: Sequence[str | None], poses, dtype) -> tuple
         index = None if body is None else frame_index(model, body)
         places.append(-1 if index is None else model.topology.frame_bodies[index])
         if index is not None and body not in model.body_names:
-            offsets = offsets.at[k].set(_product(model.frame_poses[index].astype(dtype), offsets[k]))
+            offsets = offsets.at[k].set(matmul(model.frame_poses[index].astype(dtype), offsets[k]))
     return places, offsets
 
 
@@ -63,7 +63,7 @@ def _seen_from_a(frames: BodyFrames):
     turned = jnp.swapaxes(frames.pose[:n, :3, :3], 1, 2)
     across = frames.origin[n:] - frames.origin[:n]
     between = frames.pose[n:, :3, 3] - frames.pose[:n, :3, 3] + across
-    return _product(turned, frames.pose[n:, :3, :3]), _product(turned, between[..., None])[..., 0], across
+    return matmul(turned, frames.pose[n:, :3, :3]), matmul(turned, between[..., None])[..., 0], across
 
 
 class Pair(Constraint):
@@ -114,7 +114,7 @@ class Pair(Constraint):
 
         `R` (3, 3), `p` (3,): pose of frame B seen from frame A. The wrench on body A is the negative of it.
         """
-        return _product(lam, _directions(self, R, p))
+        return matmul(lam, _directions(self, R, p))
 
     @classmethod
     def grouped_position(cls, members: Sequence["Pair"], system: SystemLike, q: Float[Array, " nq"], t: Number) -> list:
@@ -153,7 +153,7 @@ def _motions_of(members: tuple[Pair, ...], system, q, v) -> list:
     by_b = inverse(frames.pose[:n].at[:, :3, 3].add(-across))
     assert frames.twist is not None and frames.bias is not None
     twists = jnp.stack([frames.twist, frames.bias], axis=-1)
-    moved_a, moved_b = _product(by_a, twists[:n]), _product(by_b, twists[n:])
+    moved_a, moved_b = matmul(by_a, twists[:n]), matmul(by_b, twists[n:])
     relative = moved_b - moved_a
     turning = relative[:, :, 1] - jax.vmap(se3.ad_apply)(moved_a[:, :, 0], moved_b[:, :, 0])
     moved_by_a, moved_by_b = frames.velocity_mask[:n], frames.velocity_mask[n:]
@@ -166,7 +166,7 @@ def _motions_of(members: tuple[Pair, ...], system, q, v) -> list:
         columns = jnp.zeros((*D.shape[:2], len(frames.coordinates)), q.dtype)
         for sign, mask, adjoint in sides:
             if mask[index].any():
-                part = _product(_product(D, take(adjoint, index)), frames.subspace.T)
+                part = matmul(matmul(D, take(adjoint, index)), frames.subspace.T)
                 columns = columns + part * jnp.asarray(sign * mask[index][:, None, :], q.dtype)
         if len(frames.coordinates) < system.nv:
             wide = jnp.zeros((*D.shape[:2], system.nv), q.dtype)
@@ -196,7 +196,7 @@ def relative_motions(members, system, q, v):
     inverse = jax.vmap(lambda pose: se3.Ad(se3.inverse(pose)))
     by_a, by_b = inverse(frames.pose[:n]), inverse(frames.pose[:n].at[:, :3, 3].add(-across))
     twist_a, twist_b = frames.twist[:n, :, None], frames.twist[n:, :, None]
-    return rotation, position, (_product(by_b, twist_b) - _product(by_a, twist_a))[..., 0]
+    return rotation, position, (matmul(by_b, twist_b) - matmul(by_a, twist_a))[..., 0]
 
 
 def each(members: Sequence[Pair], function, *rows) -> list:
@@ -228,9 +228,9 @@ def displaced(R, p, twist):
     Only first and second derivatives at twist = 0 are taken, and these are exact.
     """
     turn = so3.hat(twist[3:])
-    first = twist[:3] + _product(turn, p)
-    turned = _product(turn, R)
-    return R + turned + 0.5 * _product(turn, turned), p + first + 0.5 * _product(turn, first)
+    first = twist[:3] + matmul(turn, p)
+    turned = matmul(turn, R)
+    return R + turned + 0.5 * matmul(turn, turned), p + first + 0.5 * matmul(turn, first)
 
 
 def _directions(pair: Pair, R, p) -> Float[Array, "r 6"]:
@@ -256,4 +256,4 @@ def _rates(pair: Pair, R, p, U, bend):
         parts.append(jax.jvp(lambda twist: jax.jvp(moved, (twist,), (U,))[1], (zero,), (U,))[1])
     if jax.eval_shape(pair.twist_residual, R, p, U) is not None:
         parts.append(jax.jvp(lambda twist: pair.twist_residual(*displaced(R, p, twist), U), (zero,), (U,))[1])
-    return D, -(_product(D, bend) + jnp.concatenate(parts)), _product(D, U)
+    return D, -(matmul(D, bend) + jnp.concatenate(parts)), matmul(D, U)

@@ -173,7 +173,7 @@ def loop(
 
 
 class Distance(Pair):
-    """Two points at a fixed distance; made by `jd.distance`."""
+    """Two points at a fixed distance; made by `jd.constraints.distance`."""
 
     name: str = eqx.field(static=True)
     body_a: str | None = eqx.field(static=True)
@@ -231,7 +231,7 @@ def distance(
 
 
 class Gear(Constraint):
-    """Two joints turning in a fixed ratio; made by `jd.gear`."""
+    """Two joints turning in a fixed ratio; made by `jd.constraints.gear`."""
 
     name: str = eqx.field(static=True)
     joint_a: str = eqx.field(static=True)
@@ -269,7 +269,7 @@ def gear(joint_a: str, joint_b: str, ratio: Numbers, offset: Numbers = 0.0, *, n
 
 
 class JointLock(Constraint):
-    """A joint held at a value; made by `jd.lock_joint`."""
+    """A joint held at a value; made by `jd.constraints.lock_joint`."""
 
     name: str = eqx.field(static=True)
     joint: str = eqx.field(static=True)
@@ -309,7 +309,7 @@ def model_couplings(model: Model) -> tuple[Gear, ...]:
     """The couplings that a model records (mimic joints of a file, `add_coupling`) as constraints of a scene, one `gear` each.
 
     ```python
-    scene = jd.Scene(model, jd.model_couplings(model))
+    scene = jd.Scene(model, jd.constraints.model_couplings(model))
     ```
     """
     names = model.joint_names

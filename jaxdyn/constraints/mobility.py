@@ -8,7 +8,7 @@ from jaxdyn.compile.known import is_concrete
 from jaxdyn.constraints.base import layout
 from jaxdyn.constraints.rank import checked_tolerance, pseudo_inverse, tolerance
 from jaxdyn.constraints.selection import scaled_rows
-from jaxdyn.lie.so3 import _product
+from jaxdyn.lie.so3 import matmul
 from jaxdyn.model.arguments import Numbers, check_state
 from jaxdyn.systems.scene import Scene, as_scene
 from jaxdyn.systems.system import SceneLike
@@ -49,4 +49,4 @@ def degrees_of_freedom(
 @entry_point
 def _rank(scene: Scene, q, t, rank_tol: float | None) -> Int[Array, ""]:
     A = scaled_rows(scene, q, t)
-    return jnp.round(jnp.trace(_product(A, pseudo_inverse(A, tolerance(rank_tol, A), True)))).astype(jnp.int32)
+    return jnp.round(jnp.trace(matmul(A, pseudo_inverse(A, tolerance(rank_tol, A), True)))).astype(jnp.int32)

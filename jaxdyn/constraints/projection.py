@@ -14,7 +14,7 @@ from jaxdyn.constraints.dynamics import whitened_rows
 from jaxdyn.constraints.projection_derivative import LOST, Corrections, projected
 from jaxdyn.constraints.rank import least_pivot, least_pivot_of, pseudo_inverse, quality_of, regular_gram, tolerance
 from jaxdyn.constraints.selection import is_selected, rows_of
-from jaxdyn.lie.so3 import _product
+from jaxdyn.lie.so3 import matmul
 from jaxdyn.systems.mass_factor import cholesky, solve_cholesky
 from jaxdyn.systems.scene import Scene
 from jaxdyn.systems.system import displace, retract
@@ -129,7 +129,7 @@ def _moved_by_matrices(scene: Scene, q, v, t, errors, metric, every, some):
     """`_moved` with the pseudo-inverses of U^-1 A^T for all rows, and for those on positions."""
 
     def steps(inverse):
-        return lambda residual: metric.unwhiten(_product(inverse.T, residual))
+        return lambda residual: metric.unwhiten(matmul(inverse.T, residual))
 
     return _moved(scene, q, v, t, errors, steps(every), steps(some))
 
@@ -140,7 +140,7 @@ def _by_pivots(rank_tol, scene: Scene, q, v, t, errors):
     metric, Y = whitened_rows(scene, q, t)
 
     def steps(Y):
-        gram = regular_gram(Y) if is_selected(scene) else _product(Y.T, Y)
+        gram = regular_gram(Y) if is_selected(scene) else matmul(Y.T, Y)
         factor = cholesky(gram)
         quality = quality_of(factor)
         if is_selected(scene):
@@ -148,7 +148,7 @@ def _by_pivots(rank_tol, scene: Scene, q, v, t, errors):
             *kept, least = rows_of(scene, Y.dtype)
             is_poor = jnp.any(jnp.stack(kept) == 0) & ~(least_pivot_of(Y) > least)
             quality = jnp.where(is_poor, jnp.nan, quality)
-        return (lambda residual: metric.unwhiten(_product(Y, solve_cholesky(factor, residual)))), quality
+        return (lambda residual: metric.unwhiten(matmul(Y, solve_cholesky(factor, residual)))), quality
 
     every, quality = steps(Y)
     some = every
@@ -179,8 +179,8 @@ def _moved(scene: Scene, q, v, t, errors, every: Callable, some: Callable):
         of_place = some if holonomic.size else None
         errors = _allowed(
             errors,
-            (of_place, partial(_product, A[holonomic]), position_left),
-            (every, partial(_product, A), velocity_left),
+            (of_place, partial(matmul, A[holonomic]), position_left),
+            (every, partial(matmul, A), velocity_left),
         )
     return q, v, errors, is_open | is_slipping
 
@@ -250,7 +250,7 @@ def _with_derivatives(rank_tol, scene: Scene, q, v, t, errors):
         of_place = partial(on.shortest, on.of_held) if on.held.size else None
         errors = _allowed(
             errors,
-            (of_place, partial(_product, A[on.held]), state.q_left),
-            (partial(on.shortest, on.every), partial(_product, A), state.v_left),
+            (of_place, partial(matmul, A[on.held]), state.q_left),
+            (partial(on.shortest, on.every), partial(matmul, A), state.v_left),
         )
     return state.q, state.v, lax.stop_gradient(errors)

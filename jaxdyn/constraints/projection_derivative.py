@@ -21,7 +21,7 @@ from jaxdyn.constraints.base import constraint_jacobian, holonomic_rows, layout,
 from jaxdyn.constraints.dynamics import whitened_rows
 from jaxdyn.constraints.rank import LeastSquares, least_squares, tolerance
 from jaxdyn.dynamics.quantities import mass_matrix
-from jaxdyn.lie.so3 import _product
+from jaxdyn.lie.so3 import matmul
 from jaxdyn.systems.mass_factor import MassFactor
 from jaxdyn.systems.scene import Scene
 from jaxdyn.systems.system import displace, retract
@@ -68,7 +68,7 @@ class Corrections(NamedTuple):
 
     def by_forces(self, of: LeastSquares, multipliers):
         """M^-1 A^T times multipliers."""
-        return self.metric.unwhiten(_product(of.Y, multipliers))
+        return self.metric.unwhiten(matmul(of.Y, multipliers))
 
     def shortest(self, of: LeastSquares, residual):
         """The shortest step that changes the rows by `residual`."""
@@ -132,7 +132,7 @@ def _velocity(scene: Scene, q, v, t, y):
 def _forces(scene: Scene, q, t, of_q, of_v, x, y):
     """Of the multipliers, less those that the corrections x and y take."""
     A, M = constraint_jacobian(scene, q, t), mass_matrix(scene.system, q, t)
-    return _product(A[holonomic_rows(layout(scene))].T, of_q) - _product(M, x), _product(A.T, of_v) - _product(M, y)
+    return matmul(A[holonomic_rows(layout(scene))].T, of_q) - matmul(M, x), matmul(A.T, of_v) - matmul(M, y)
 
 
 def _changed(rank_tol, scene: Scene, q, v, t, steps) -> tuple[Projected, Projected]:

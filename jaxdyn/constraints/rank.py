@@ -10,7 +10,7 @@ from jaxtyping import Array, Float
 
 from jaxdyn.compile import batch, kernel, mark_invalid, pseudo_inverse_by_rotations, variant
 from jaxdyn.compile.known import is_concrete
-from jaxdyn.lie.so3 import _product
+from jaxdyn.lie.so3 import matmul
 from jaxdyn.systems.mass_factor import cholesky, solve_cholesky
 
 # Operations of the normal equations up to which they are a kernel: LLVM takes 50 to 100 microseconds for each of them.
@@ -48,7 +48,7 @@ def regular_gram(Y: Float[Array, "n m"]) -> Float[Array, "m m"]:
 
     Solutions with right-hand sides that are zero there, such as (Y^T Y)^-1 Y^T, are those of the other columns.
     """
-    gram = _product(Y.T, Y)
+    gram = matmul(Y.T, Y)
     squares = jnp.diagonal(gram)
     largest = jnp.max(squares)
     fill = jnp.where(largest > 0, largest, jnp.ones_like(largest))
@@ -92,7 +92,7 @@ def _solve_normal_equations(rank_tol, Y):
     factor = cholesky(regular_gram(Y))
     inverse = solve_cholesky(factor, Y.T)
     # One step of Newton and Schulz takes the squared condition number out of the error.
-    inverse = 2 * inverse - _product(_product(inverse, Y), inverse)
+    inverse = 2 * inverse - matmul(matmul(inverse, Y), inverse)
     return inverse, ~(quality_of(factor) > least_pivot(Y, rank_tol))
 
 
@@ -126,14 +126,14 @@ class LeastSquares(NamedTuple):
     def shortest(self, right):
         """The shortest w with Y^T w = right."""
         if self.factor is None:
-            return _product(self.inverse.T, right)
-        return _product(self.Y, solve_cholesky(self.factor, right))
+            return matmul(self.inverse.T, right)
+        return matmul(self.Y, solve_cholesky(self.factor, right))
 
     def multipliers(self, w):
         """The smallest x with Y x = w, for w that is a sum of columns."""
         if self.factor is None:
-            return _product(self.inverse, w)
-        return solve_cholesky(self.factor, _product(self.Y.T, w))
+            return matmul(self.inverse, w)
+        return solve_cholesky(self.factor, matmul(self.Y.T, w))
 
 
 def _least_squares_in_kernel(Y, rank_tol) -> LeastSquares:
@@ -151,16 +151,16 @@ def least_squares(Y: Float[Array, "n m"], rank_tol: float) -> LeastSquares:
 def _pseudo_inverse_jvp(rank_tol, dependent, primals, tangents):
     (Y,), (dY,) = primals, tangents
     P = pseudo_inverse(Y, rank_tol, dependent)
-    across = dY.T - _product(_product(dY.T, Y), P)  # dY^T (1 - Y P)
-    along = dY.T - _product(P, _product(Y, dY.T))  # (1 - P Y) dY^T
-    dP = -_product(_product(P, dY), P)
-    dP = dP + _product(_product(P, P.T), across) + _product(along, _product(P.T, P))
+    across = dY.T - matmul(matmul(dY.T, Y), P)  # dY^T (1 - Y P)
+    along = dY.T - matmul(P, matmul(Y, dY.T))  # (1 - P Y) dY^T
+    dP = -matmul(matmul(P, dY), P)
+    dP = dP + matmul(matmul(P, P.T), across) + matmul(along, matmul(P.T, P))
     return P, dP
 
 
 def solve_square(A: Float[Array, "n n"], right: Float[Array, "n *k"]) -> Float[Array, "n *k"]:
     """A^-1 right for a regular A, by rotations: without LAPACK, whose calls in a batch can wait for each other for ever."""
-    return _product(pseudo_inverse(A, eps_of(A), True), right)
+    return matmul(pseudo_inverse(A, eps_of(A), True), right)
 
 
 def sign_of_determinant(A: Float[Array, "n n"]) -> Float[Array, ""]:

@@ -6,7 +6,7 @@ from jaxtyping import Array, Float
 from jaxdyn.constraints.base import constraint_jacobian, layout
 from jaxdyn.constraints.frames import Pair, places_on, relative_poses
 from jaxdyn.lie import se3
-from jaxdyn.lie.so3 import _product
+from jaxdyn.lie.so3 import matmul
 from jaxdyn.model.arguments import Numbers, as_array, batch_hint, check_shapes, check_state
 from jaxdyn.systems.scene import Scene, as_scene
 
@@ -32,7 +32,7 @@ def constraint_forces(
     scene = as_scene(scene)
     A = constraint_jacobian(scene, q, t)
     multipliers = _checked_multipliers(multipliers, A.shape[0], A.dtype)
-    return {p.name: _product(A[p.start : p.end].T, multipliers[p.start : p.end]) for p in layout(scene)}
+    return {p.name: matmul(A[p.start : p.end].T, multipliers[p.start : p.end]) for p in layout(scene)}
 
 
 def constraint_wrenches(
@@ -81,8 +81,8 @@ def body_wrenches(scene: Scene, q: Float[Array, " nq"], multipliers: Float[Array
 
     ```python
     dynamics = jd.constrained_dynamics(scene, q, v)
-    pull = jd.body_wrenches(scene, q, dynamics.multipliers)
-    bearings = jd.joint_wrench(scene.system, q, v, dynamics.acceleration, external=pull)
+    pull = jd.constraints.body_wrenches(scene, q, dynamics.multipliers)
+    bearings = jd.dynamics.joint_wrench(scene.system, q, v, dynamics.acceleration, external=pull)
     ```
     """
     scene = as_scene(scene)

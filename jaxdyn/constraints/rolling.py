@@ -21,7 +21,7 @@ from jaxtyping import Array, Float
 from jaxdyn.compile.known import is_concrete
 from jaxdyn.constraints.frames import Pair
 from jaxdyn.constraints.loops import check_bodies
-from jaxdyn.lie.so3 import _product, cross
+from jaxdyn.lie.so3 import cross, matmul
 from jaxdyn.model.arguments import DType, Numbers, SystemLike, pose_leaf
 
 
@@ -88,7 +88,7 @@ class Touching(Pair):
         touch = self.touching(R, p)
         if not self.count:
             return jnp.sum(touch.normal * U[3:])[None] if self.spin else None
-        slip = _product(touch.directions, U[:3] + cross(U[3:], touch.point))
+        slip = matmul(touch.directions, U[:3] + cross(U[3:], touch.point))
         return jnp.concatenate([slip, jnp.sum(touch.normal * U[3:])[None]]) if self.spin else slip
 
 
@@ -184,7 +184,7 @@ def rolling_wheel(
 
 
 class KnifeEdge(Touching):
-    """A blade that slides along itself on a plane; made by `jd.knife_edge`."""
+    """A blade that slides along itself on a plane; made by `jd.constraints.knife_edge`."""
 
     name: str = eqx.field(static=True)
     body: str = eqx.field(static=True)

@@ -39,7 +39,7 @@ from jaxdyn.constraints.base import (
 from jaxdyn.constraints.rank import eps_of, least_pivot_of, tolerance
 from jaxdyn.constraints.tolerances import coordinate_sizes, row_limits
 from jaxdyn.dynamics.quantities import mass_matrix
-from jaxdyn.lie.so3 import _product
+from jaxdyn.lie.so3 import matmul
 from jaxdyn.model.arguments import Number, SystemLike, state_dtype
 from jaxdyn.model.tree import Model, neutral
 from jaxdyn.systems.mass_factor import cholesky, mass_factor, solve_cholesky
@@ -196,7 +196,7 @@ def eliminate(B: Float[Array, "nc nv"], least: float, first: Float[Array, " nc"]
         pivot = lengths[row]
         along = rest[row] / jnp.where(pivot > 0, pivot, jnp.ones_like(pivot))
         taken = pivot > least if most is None else (pivot > least) & (jnp.sum(kept) < most)
-        rest = jnp.where(taken, rest - _product(rest, along)[:, None] * along[None], rest)
+        rest = jnp.where(taken, rest - matmul(rest, along)[:, None] * along[None], rest)
         return rest, kept.at[row].add(taken.astype(B.dtype))
 
     rest, kept = lax.fori_loop(0, min(B.shape), keep_next, (B, jnp.zeros_like(B[:, 0])))
@@ -315,7 +315,7 @@ def _generic_rows(scene: Scene, step):
 def _least_distance(scene: Scene, q, t):
     """Least distance of a row from the span of those before it; NaN where there is none."""
     B = scaled_rows(scene, q, t)
-    return jnp.min(jnp.diagonal(cholesky(_product(B, B.T))))
+    return jnp.min(jnp.diagonal(cholesky(matmul(B, B.T))))
 
 
 def surely_apart(like) -> float:
@@ -339,7 +339,7 @@ def _select_far_away(scene: Scene, q, t, sure, apart: float, is_rounded: bool):
     # Any direction that the sure rows leave serves, as long as it moves all of the mechanism.
     A = sure[:, None] * constraint_jacobian(scene, q, t)
     direction = jnp.asarray(1 + np.modf(np.arange(scene.nv) * 0.618)[0], q.dtype)
-    direction = direction - _product(inverse_of(A), _product(A * sizes[None], direction))
+    direction = direction - matmul(inverse_of(A), matmul(A * sizes[None], direction))
     length = jnp.max(jnp.abs(direction))
     moves = length > 1e-6
     direction = jnp.where(moves, direction / jnp.where(moves, length, jnp.ones_like(length)), direction)
@@ -348,7 +348,7 @@ def _select_far_away(scene: Scene, q, t, sure, apart: float, is_rounded: bool):
     def close(_, place):
         place = retract(scene.system, place)
         A = (sure[:, None] * constraint_jacobian(scene, place, t))[held]
-        step = _product(inverse_of(A), sure[held] * position_residual(scene, place, t)) * sizes
+        step = matmul(inverse_of(A), sure[held] * position_residual(scene, place, t)) * sizes
         # A step that is longer than the way itself leaves the branch.
         size = jnp.max(jnp.abs(step / sizes))
         return displace(scene.system, place, -step * jnp.minimum(1.0, _FAR / jnp.where(size > 0, size, 1.0)))
@@ -398,10 +398,10 @@ def missed_by_dropped(scene: Scene, q, v, t, a) -> Float[Array, ""]:
     whole, kept = stop_gradient((Scene(scene.system, all_rows(scene).constraints), kept_of(scene)))
     q, v, t, a = stop_gradient((q, v, jnp.asarray(t, q.dtype), a))
     A, gamma, _ = rows(whole, q, v, t)
-    sizes = jnp.abs(gamma) + _product(jnp.abs(A), jnp.abs(a))
+    sizes = jnp.abs(gamma) + matmul(jnp.abs(A), jnp.abs(a))
     sizes = sizes + jnp.max(sizes)
     some = sizes > 0
-    ratio = jnp.abs(_product(A, a) - gamma) / jnp.where(some, sizes, jnp.ones_like(sizes))
+    ratio = jnp.abs(matmul(A, a) - gamma) / jnp.where(some, sizes, jnp.ones_like(sizes))
     return jnp.max(jnp.where(some, ratio, jnp.zeros_like(ratio)) * (1 - kept.astype(q.dtype)))
 
 
@@ -480,7 +480,7 @@ def spread_multipliers(scene: Scene, q, t, lam: Float[Array, " nc"]) -> Float[Ar
 def _spread(scene: Scene, q, t, lam, kept):
     A, kept = constraint_jacobian(scene, q, t), kept.astype(q.dtype)
     own = kept[:, None] * A
-    gram = _product(own, own.T) + jnp.diag(1 - kept)
-    C = solve_cholesky(cholesky(gram), _product(own, ((1 - kept)[:, None] * A).T)).T
-    shared = solve_cholesky(cholesky(jnp.eye(A.shape[0], dtype=A.dtype) + _product(C.T, C)), kept * lam)
-    return kept * shared + _product(C, shared)
+    gram = matmul(own, own.T) + jnp.diag(1 - kept)
+    C = solve_cholesky(cholesky(gram), matmul(own, ((1 - kept)[:, None] * A).T)).T
+    shared = solve_cholesky(cholesky(jnp.eye(A.shape[0], dtype=A.dtype) + matmul(C.T, C)), kept * lam)
+    return kept * shared + matmul(C, shared)

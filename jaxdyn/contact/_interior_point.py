@@ -22,7 +22,7 @@ from jaxtyping import Array, Bool, Int
 from jaxdyn.compile import kernel
 from jaxdyn.compile.batch import any_sample
 from jaxdyn.contact import _jordan as jordan
-from jaxdyn.lie.so3 import _product
+from jaxdyn.lie.so3 import matmul
 from jaxdyn.systems.mass_factor import cholesky, solve_cholesky
 
 # Steps of Newton's method after the interior point; it converges quadratically, in two or three.
@@ -65,12 +65,12 @@ class End(NamedTuple):
 
 def _times(G, x):
     """Product G x of each group, (k, d)."""
-    return tuple(_product(g.reshape(-1, x.shape[0]), x).reshape(g.shape[:2]) for g in G)
+    return tuple(matmul(g.reshape(-1, x.shape[0]), x).reshape(g.shape[:2]) for g in G)
 
 
 def _transpose_times(G, z, like):
     """Sum of G^T z over the groups, (n,)."""
-    parts = [_product(g.reshape(-1, g.shape[-1]).T, y.reshape(-1)) for g, y in zip(G, z, strict=True)]
+    parts = [matmul(g.reshape(-1, g.shape[-1]).T, y.reshape(-1)) for g, y in zip(G, z, strict=True)]
     return sum(parts, jnp.zeros_like(like))
 
 
@@ -90,7 +90,7 @@ def _dot(a, b, like):
 def _residuals(program: Program, point: Point):
     """Residuals Q x + q + G^T z, and G x + s - h."""
     x, s, z = point
-    stationary = _product(program.Q, x) + program.q + _transpose_times(program.G, z, x)
+    stationary = matmul(program.Q, x) + program.q + _transpose_times(program.G, z, x)
     return stationary, _zip(lambda a, b, c: a + b - c, _times(program.G, x), s, program.h)
 
 
@@ -126,8 +126,8 @@ def _start(pattern: Pattern, _, program: Program):
     rows = jnp.concatenate([g.reshape(-1, q.shape[0]) for g in G])
     level = jnp.concatenate([y.reshape(-1) for y in h])
     # x minimises x^T Q x / 2 + q^T x + |G x - h|^2 / 2.
-    factor = cholesky(Q + _product(rows.T, rows))
-    x = solve_cholesky(factor, _product(rows.T, level) - q)
+    factor = cholesky(Q + matmul(rows.T, rows))
+    x = solve_cholesky(factor, matmul(rows.T, level) - q)
     slack = _zip(lambda a, b: b - a, _times(G, x), h)
 
     def inside(groups):
@@ -149,7 +149,7 @@ def _newton(program: Program, s, z):
     # W^-1 G once: both right-hand sides of the step use the same factor.
     scaled = _zip(lambda w, g: jax.vmap(w.inverse_times, 2, 2)(g), W, G)
     rows = jnp.concatenate([g.reshape(-1, n) for g in scaled])
-    factor = cholesky(Q + _product(rows.T, rows))
+    factor = cholesky(Q + matmul(rows.T, rows))
 
     def solve(rx, rz, u, is_refined: bool = True):
         """Solve Q dx + G^T dz = -rx, G dx + ds = -rz, W dz + W^-1 ds = u; return also W^-1 ds and W dz."""
@@ -158,7 +158,7 @@ def _newton(program: Program, s, z):
         wdz = _zip(lambda a, b: a + b, _times(scaled, dx), right)
         # The normal matrix squares the condition number; one step of refinement recovers the lost digits.
         if is_refined:
-            more = solve_cholesky(factor, -rx - _product(Q, dx) - _transpose_times(scaled, wdz, rx))
+            more = solve_cholesky(factor, -rx - matmul(Q, dx) - _transpose_times(scaled, wdz, rx))
             dx, wdz = dx + more, _zip(lambda a, b: a + b, wdz, _times(scaled, more))
         wds = _zip(lambda a, b: a - b, u, wdz)
         dz, ds = (_zip(lambda w, y: w.inverse_times(y), W, wdz), _zip(lambda w, y: w.times(y), W, wds))
@@ -289,13 +289,13 @@ def _solve_projection_equations(program: Program, v, width, right_x, right_s, co
 
     weighted = _zip(lambda r, i, g: jax.vmap(lambda x: r.times(i.times(x)), 2, 2)(g), rest, inverse, G)
     rows, weighted = (jnp.concatenate([g.reshape(-1, n) for g in groups]) for groups in (G, weighted))
-    normal = Q + _product(rows.T, weighted)
+    normal = Q + matmul(rows.T, weighted)
     # A shift by rounding keeps the matrix positive definite.
     factor = cholesky(normal + jnp.diag(n * eps * jnp.diagonal(normal)))
     dx, dv = jnp.zeros_like(right_x), _zip(jnp.zeros_like, right_s)
     # Iterative refinement with residuals of the unmodified equations.
     for _ in range(1 + corrections):
-        rx = right_x - _product(Q, dx) + _transpose_times(G, times(rest, dv), dx)
+        rx = right_x - matmul(Q, dx) + _transpose_times(G, times(rest, dv), dx)
         rs = _zip(lambda r, a, b: r - a - b, right_s, _times(G, dx), times(D, dv))
         more = solve_cholesky(factor, rx + _transpose_times(G, times(rest, times(inverse, rs)), dx))
         dv = _zip(lambda a, b: a + b, dv, times(inverse, _zip(lambda r, a: r - a, rs, _times(G, more))))
@@ -374,7 +374,7 @@ def _tangent(pattern: Pattern, _, program: Program, point: Point, change: Progra
     """Tangent of the solution for a tangent of the program."""
     program, change = _sparse(program, pattern), _sparse(change, pattern)
     x, s, z = point
-    right_x = -_product(change.Q, x) - change.q - _transpose_times(change.G, z, x)
+    right_x = -matmul(change.Q, x) - change.q - _transpose_times(change.G, z, x)
     right_s = _zip(lambda a, b: b - a, _times(change.G, x), change.h)
     v = _zip(lambda a, b: a - b, s, z)
     width = width_of(x.dtype)

@@ -23,7 +23,7 @@ from jaxtyping import Array, Float
 
 from jaxdyn.contact._checks import as_float, as_number
 from jaxdyn.contact.kinds import components
-from jaxdyn.lie.so3 import _product
+from jaxdyn.lie.so3 import matmul
 from jaxdyn.model.arguments import Numbers
 
 SIDES = ("inscribed", "circumscribed")
@@ -120,9 +120,9 @@ class FrictionCone(eqx.Module):
         cone_margins = []
         second = self.second_order_rows()
         if second.shape[0]:
-            first, *rest = jnp.unstack(_product(second[0].astype(force.dtype), force))
+            first, *rest = jnp.unstack(matmul(second[0].astype(force.dtype), force))
             cone_margins.append((first - _length(rest, smoothing))[None])
-        return jnp.concatenate([*cone_margins, -_product(self.linear_rows().astype(force.dtype), force)])
+        return jnp.concatenate([*cone_margins, -matmul(self.linear_rows().astype(force.dtype), force)])
 
     def margin(self, force: Numbers, smoothing: Numbers = 0.0) -> Float[Array, ""]:
         """Least of `margins`, () : positive inside the cone, zero on its boundary, infinite for a rigid contact.

@@ -36,7 +36,7 @@ from jaxdyn.contact.surfaces import (
     surface_geometry,
 )
 from jaxdyn.lie import se3
-from jaxdyn.lie.so3 import _product
+from jaxdyn.lie.so3 import matmul
 from jaxdyn.model.arguments import Numbers
 
 
@@ -87,7 +87,7 @@ def relative_pose(surface_o: Surface, surface_f: Surface, eta: Numbers) -> Float
 
 def _pose(geometry_o, geometry_f, psi):
     turn = jnp.zeros((4, 4), psi.dtype).at[:2, :2].set(_turn(psi)).at[2, 2].set(-1).at[3, 3].set(1)
-    return _product(_product(geometry_o.pose, turn), se3.inverse(geometry_f.pose))
+    return matmul(matmul(geometry_o.pose, turn), se3.inverse(geometry_f.pose))
 
 
 def montana(surface_o: Surface, surface_f: Surface, eta: Numbers) -> ContactKinematics:
@@ -138,14 +138,14 @@ def _montana(surface_o, surface_f, eta) -> ContactKinematics:
     quarter = jnp.asarray(np.array([[0.0, -1.0], [1.0, 0.0]]), eta.dtype)
     none = jnp.zeros((2, 1), eta.dtype)
     moved_o, moved_f = o.metric, f.metric
-    top = jnp.concatenate([_product(turn, moved_o), -moved_f, none], 1)
-    turning_o = _product(turn, _product(quarter, _product(o.curvature, moved_o)))
-    turning_f = _product(quarter, _product(f.curvature, moved_f))
-    spin = jnp.concatenate([-_product(o.torsion, moved_o), -_product(f.torsion, moved_f), jnp.ones((1,), eta.dtype)])
+    top = jnp.concatenate([matmul(turn, moved_o), -moved_f, none], 1)
+    turning_o = matmul(turn, matmul(quarter, matmul(o.curvature, moved_o)))
+    turning_f = matmul(quarter, matmul(f.curvature, moved_f))
+    spin = jnp.concatenate([-matmul(o.torsion, moved_o), -matmul(f.torsion, moved_f), jnp.ones((1,), eta.dtype)])
     middle = jnp.concatenate([turning_o, -turning_f, none], 1)
     J_c = jnp.concatenate([top, jnp.zeros((1, 5), eta.dtype), middle, spin[None]])
 
-    seen = _product(turn, _product(o.curvature, turn))
+    seen = matmul(turn, matmul(o.curvature, turn))
     relative = f.curvature + seen
     strict = is_positive(relative)
     flexibility = inverse_2x2(relative, strict)
@@ -153,24 +153,22 @@ def _montana(surface_o, surface_f, eta) -> ContactKinematics:
     # Columns (vx, vy, vz, wx, wy, wz) of (-wy, wx) and of (vx, vy).
     rolled = jnp.asarray(np.array([[0, 0, 0, 0, -1, 0], [0, 0, 0, 1, 0, 0]]), eta.dtype)
     slid = jnp.asarray(np.array([[1, 0, 0, 0, 0, 0], [0, 1, 0, 0, 0, 0]]), eta.dtype)
-    along_f = _product(flexibility, rolled - _product(seen, slid))
-    along_o = _product(turn, _product(flexibility, rolled + _product(f.curvature, slid)))
+    along_f = matmul(flexibility, rolled - matmul(seen, slid))
+    along_o = matmul(turn, matmul(flexibility, rolled + matmul(f.curvature, slid)))
     spun = (
-        jnp.asarray(np.array([0, 0, 0, 0, 0, 1]), eta.dtype)
-        + _product(f.torsion, along_f)
-        + _product(o.torsion, along_o)
+        jnp.asarray(np.array([0, 0, 0, 0, 0, 1]), eta.dtype) + matmul(f.torsion, along_f) + matmul(o.torsion, along_o)
     )
     forward = jnp.concatenate(
         [
-            _product(inverse_2x2(o.metric, o.regular), along_o),
-            _product(inverse_2x2(f.metric, f.regular), along_f),
+            matmul(inverse_2x2(o.metric, o.regular), along_o),
+            matmul(inverse_2x2(f.metric, f.regular), along_f),
             spun[None],
         ]
     )
     return ContactKinematics(
         J_c=J_c,
         forward=forward,
-        J_F=_product(se3.Ad(f.pose), J_c),
+        J_F=matmul(se3.Ad(f.pose), J_c),
         relative_curvature=relative,
         strict=strict & o.regular & f.regular,
         g_of=_pose(o, f, eta[4]),

@@ -20,7 +20,7 @@ from jaxdyn.compile.known import is_concrete, is_tracing
 from jaxdyn.constraints.rank import pseudo_inverse, tolerance
 from jaxdyn.contact._checks import as_float
 from jaxdyn.contact._interior_point import Point, Program, attach_derivative, solve
-from jaxdyn.lie.so3 import _product
+from jaxdyn.lie.so3 import matmul
 from jaxdyn.model.arguments import Numbers
 from jaxdyn.systems.mass_factor import cholesky, is_definite, solve_cholesky
 
@@ -193,7 +193,7 @@ def _solve(Q, q, G, h, A, b, cones, pattern: tuple[bytes | None, ...], tol: floa
     inverse, x0 = None, jnp.zeros_like(q)
     if A.shape[0]:
         inverse = pseudo_inverse(A.T, tolerance(None, A)).T
-        x0 = _product(inverse, b)
+        x0 = matmul(inverse, b)
     shortest = [jnp.max(jnp.abs(x0)), jnp.max(jnp.abs(q))]
     shortest += [jnp.max(jnp.sqrt(jnp.sum(x[:, 1:] ** 2, 1)) - x[:, 0], initial=0) for x in levels]
     # The solution is homogeneous in (q, b, h), whose size is scaled to one.
@@ -205,14 +205,14 @@ def _solve(Q, q, G, h, A, b, cones, pattern: tuple[bytes | None, ...], tol: floa
     if inverse is not None:
         # x = x0 + P y; the term 1 - P keeps the matrix definite on the range of A^T.
         unit = jnp.eye(q.shape[0], dtype=q.dtype)
-        P = unit - _product(inverse, A)
+        P = unit - matmul(inverse, A)
         program = Program(
-            _product(P, _product(Q, P)) + unit - P,
-            _product(P, q + _product(Q, x0)),
-            tuple(_product(block, P) for block in program.G),
-            tuple(y - _product(block, x0) for block, y in zip(program.G, program.h, strict=True)),
+            matmul(P, matmul(Q, P)) + unit - P,
+            matmul(P, q + matmul(Q, x0)),
+            tuple(matmul(block, P) for block in program.G),
+            tuple(y - matmul(block, x0) for block, y in zip(program.G, program.h, strict=True)),
         )
-        met = jnp.max(jnp.abs(_product(A, x0) - b)) <= 10 * tol
+        met = jnp.max(jnp.abs(matmul(A, x0) - b)) <= 10 * tol
         result = RESULTS.where(met, result, RESULTS.infeasible)  # pyright: ignore[reportArgumentType]
     steps = jnp.zeros((), jnp.int32)
     if kept:
@@ -231,18 +231,18 @@ def _solve(Q, q, G, h, A, b, cones, pattern: tuple[bytes | None, ...], tol: floa
     finite = finite & (jnp.isfinite(point.x).all() | (result != RESULTS.successful))
     result = RESULTS.where(finite, result, RESULTS.nonfinite)  # pyright: ignore[reportArgumentType]
 
-    x = point.x if inverse is None else x0 + point.x - _product(inverse, _product(A, point.x))
+    x = point.x if inverse is None else x0 + point.x - matmul(inverse, matmul(A, point.x))
     z = [jnp.zeros_like(y) for y in levels]
     s = [jnp.ones_like(y) for y in levels]
     for i, slack, multiplier in zip(kept, point.s, point.z, strict=True):
         s[i], z[i] = slack, multiplier
     y = jnp.zeros_like(b)
     if inverse is not None:
-        gradient = _product(Q, x) + q
+        gradient = matmul(Q, x) + q
         for block, multiplier in zip(blocks, z, strict=True):
             gradient = gradient + jnp.einsum("kdn,kd->n", block, multiplier)
         # The multipliers of least norm, of all that satisfy stationarity with dependent rows.
-        y = -_product(inverse.T, gradient) * equality_scale * size
+        y = -matmul(inverse.T, gradient) * equality_scale * size
     z = [x * r[:, None] * size for x, r in zip(z, row_scales, strict=True)]
     s = [x / r[:, None] * size for x, r in zip(s, row_scales, strict=True)]
     return QPSolution(

@@ -12,12 +12,12 @@ from jaxdyn.constraints.frames import Pair, displaced
 from jaxdyn.constraints.rolling import Touching, TouchingPoint, tangents
 from jaxdyn.contact.surfaces import Surface, check_surface
 from jaxdyn.contact.touching import Patch, Steps, newton_steps, patch_at
-from jaxdyn.lie.so3 import _product, cross
+from jaxdyn.lie.so3 import cross, matmul
 from jaxdyn.model.arguments import Checked, Numbers, pose_leaf
 
 
 class RollingContact(Touching):
-    """Rolling contact of two surfaces, built by `jd.rolling_contact`. Body A carries `shape_a`, body B `shape_b`."""
+    """Rolling contact of two surfaces, built by `jd.contact.rolling_contact`. Body A carries `shape_a`, body B `shape_b`."""
 
     name: str = eqx.field(static=True)
     body: str | None = eqx.field(static=True)
@@ -50,7 +50,7 @@ class RollingContact(Touching):
         """Closest points, by one step of Newton's method from the stored places."""
         a, b = self.patches()
         steps = newton_steps(a, b, R, p)
-        point = _product(R, b.at(steps.on_b)) + p
+        point = matmul(R, b.at(steps.on_b)) + p
         # For touching surfaces, the gap along the normal of the place has the first and second derivatives of the true gap.
         gap = jnp.sum(a.normal * (point - a.at(steps.on_a)))
         normal = a.normal_at(steps.on_a)
@@ -104,7 +104,7 @@ class RollingContact(Touching):
             along = jax.jacfwd(shape.point)(alpha)[:, 0]
             from_charts.append((alpha, along / jnp.sqrt(jnp.sum(along * along))))
         (alpha_a, x_a), (alpha_b, x_b) = from_charts
-        normal, seen = self.patches()[0].normal, _product(R, x_b)
+        normal, seen = self.patches()[0].normal, matmul(R, x_b)
         # R_psi = [cos psi, -sin psi; -sin psi, -cos psi], its first column x_b in the axes x, y of A.
         y_a = cross(normal, x_a)
         psi = jnp.arctan2(-jnp.sum(seen * y_a), jnp.sum(seen * x_a))
@@ -115,7 +115,7 @@ class RollingContact(Touching):
         if self.places is None:
             raise ValueError(
                 f"rolling contact {self.name!r} is not part of a system with its places; pass it to "
-                "jd.RollingModel(model, [contact]) and use the constraints of that"
+                "jd.contact.RollingModel(model, [contact]) and use the constraints of that"
             )
         return self.places
 

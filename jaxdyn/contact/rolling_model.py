@@ -25,7 +25,7 @@ from jaxdyn.compile.known import is_known
 from jaxdyn.constraints.frames import each, relative_motions, relative_poses
 from jaxdyn.constraints.loops import check_bodies
 from jaxdyn.contact.rolling import Rolling, RollingContact
-from jaxdyn.lie.so3 import _product
+from jaxdyn.lie.so3 import matmul
 from jaxdyn.model.arguments import Checked, Number, Numbers, as_array, check_shapes, warn
 from jaxdyn.model.tree import Model
 
@@ -38,7 +38,7 @@ _STEPS_SEARCHED, _TURNS = 30, 8
 class RollingModel(Model):
     """Model with rolling contacts: q = (joints' coordinates, places of the contacts), v of the model.
 
-    **Arguments:** `model`: a `Model`; `contacts`: a list of `jd.rolling_contact(...)`.
+    **Arguments:** `model`: a `Model`; `contacts`: a list of `jd.contact.rolling_contact(...)`.
 
     Places are coordinates without chart singularities: a unit vector (3) on a sphere or an ellipsoid, (u, v) on a plane, a
     cylinder and a `Parametrised` surface. `place` computes them, `contact_coordinates` converts them to the surfaces'
@@ -48,7 +48,7 @@ class RollingModel(Model):
 
     ```python
     tip, ball = jd.contact.Sphere(0.02), jd.contact.Ellipsoid([0.1, 0.1, 0.12])
-    system = jd.RollingModel(model, [jd.rolling_contact("tip", tip, "ball", ball)])
+    system = jd.contact.RollingModel(model, [jd.contact.rolling_contact("tip", tip, "ball", ball)])
     scene = jd.Scene(system, system.rows)
     q0 = system.place(joints)
     ```
@@ -65,7 +65,7 @@ class RollingModel(Model):
         if not isinstance(model, Model) or isinstance(model, RollingModel):
             raise ValueError(f"model is a {type(model).__name__}; pass a Model, the bodies that carry the surfaces")
         if not isinstance(contacts, (tuple, list)) or not all(isinstance(one, RollingContact) for one in contacts):
-            raise ValueError(f"contacts is {contacts!r}; pass a list of jd.rolling_contact(...)")
+            raise ValueError(f"contacts is {contacts!r}; pass a list of jd.contact.rolling_contact(...)")
         for field in dataclasses.fields(Model):
             setattr(self, field.name, getattr(model, field.name))
         names = [one.name for one in contacts]
@@ -238,10 +238,10 @@ def _between(contact: RollingContact, R, p):
         place_a = a.toward(point)
         if place_a is None:
             break
-        place_b = b.toward(_product(R.T, a.point_at(place_a) - p))
+        place_b = b.toward(matmul(R.T, a.point_at(place_a) - p))
         if place_b is None:
             break
-        point = _product(R, b.point_at(place_b)) + p
+        point = matmul(R, b.point_at(place_b)) + p
     else:
         return jnp.concatenate([place_a, place_b])
     raise ValueError(

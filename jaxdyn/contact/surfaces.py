@@ -25,7 +25,7 @@ from jaxdyn.compile import entry_point
 from jaxdyn.compile.known import is_concrete
 from jaxdyn.constraints.rolling import tangents, unit_or
 from jaxdyn.contact._checks import as_float, as_number
-from jaxdyn.lie.so3 import _product, cross
+from jaxdyn.lie.so3 import cross, matmul
 from jaxdyn.model.arguments import Checked, Function, Numbers, warn
 from jaxdyn.systems.scene import as_pytree
 
@@ -145,7 +145,7 @@ class Ellipsoid(Surface):
 
     def displace(self, place: Float[Array, " n"], step: Float[Array, "2"]) -> Float[Array, " n"]:
         """Unit vector after `step` in the tangent plane of the unit sphere."""
-        return unit_or(place + _product(step, tangents(place)), place)
+        return unit_or(place + matmul(step, tangents(place)), place)
 
     def point_at(self, place: Float[Array, " n"]) -> Float[Array, "3"]:
         """Point (a, b, c) n, m."""
@@ -296,13 +296,13 @@ def geometry_at(surface: Surface, alpha: Float[Array, "2"]) -> SurfaceGeometry:
     frame, fine = _frame_of(surface, alpha)
     rates = jax.jacfwd(lambda a: _frame_of(surface, a)[0])(alpha)
     y = frame[:, 1]
-    metric = _product(frame[:, :2].T, tangents)
+    metric = matmul(frame[:, :2].T, tangents)
     # M is upper triangular: its inverse in closed form, with safe denominators.
     a, b, d = metric[0, 0], metric[0, 1], metric[1, 1]
     a, d = (jnp.where(fine, value, jnp.ones_like(value)) for value in (a, d))
     inverse = jnp.stack([jnp.stack([1 / a, -b / (a * d)]), jnp.stack([jnp.zeros_like(a), 1 / d])])
-    curvature = _product(_product(frame[:, :2].T, rates[:, 2]), inverse)
-    torsion = _product(_product(y, rates[:, 0]), inverse)
+    curvature = matmul(matmul(frame[:, :2].T, rates[:, 2]), inverse)
+    torsion = matmul(matmul(y, rates[:, 0]), inverse)
     return SurfaceGeometry(surface.point(alpha), frame, metric, curvature, torsion, fine)
 
 

@@ -24,7 +24,7 @@ from jaxtyping import Array, Bool, Float
 
 from jaxdyn.contact.montana import inverse_2x2, is_positive
 from jaxdyn.contact.surfaces import Surface
-from jaxdyn.lie.so3 import _product, cross
+from jaxdyn.lie.so3 import cross, matmul
 
 
 class Patch(NamedTuple):
@@ -41,11 +41,11 @@ class Patch(NamedTuple):
 
     def at(self, step) -> Array:
         """Point (3,) at a step, up to second order, the highest order of its derivatives in use."""
-        return self.point + _product(self.along, step) + 0.5 * _product(_product(self.bend, step), step)
+        return self.point + matmul(self.along, step) + 0.5 * matmul(matmul(self.bend, step), step)
 
     def normal_at(self, step) -> Array:
         """Normal (3,) at a step, up to first order."""
-        return self.normal + _product(self.turn, step)
+        return self.normal + matmul(self.turn, step)
 
 
 class Steps(NamedTuple):
@@ -82,22 +82,22 @@ def patch_at(surface: Surface, place) -> Patch:
 
 def newton_steps(a: Patch, b: Patch, R, p) -> Steps:
     """Take one step of Newton's method towards the closest points."""
-    d, n = _product(R, b.point) + p - a.point, _product(R, b.normal)
+    d, n = matmul(R, b.point) + p - a.point, matmul(R, b.normal)
     bend = jnp.moveaxis(a.bend, 0, -1)
-    r_d, r_n = _product(d, a.along), _product(n, a.along)
-    seen = _product(a.along.T, R)
-    d_b, d_a = _product(seen, b.along), _product(bend, d) - _product(a.along.T, a.along)
+    r_d, r_n = matmul(d, a.along), matmul(n, a.along)
+    seen = matmul(a.along.T, R)
+    d_b, d_a = matmul(seen, b.along), matmul(bend, d) - matmul(a.along.T, a.along)
     size = jnp.sum(d_b * d_b)
     determinant = d_b[0, 0] * d_b[1, 1] - d_b[0, 1] * d_b[1, 0]
     # Opposed normals, and two regular charts.
     is_regular = (jnp.sum(a.normal * n) < 0) & (jnp.abs(determinant) > 1e-6 * size)
     # Eliminating the step on B leaves a 2x2 system for the step on A, whose matrix is the relative curvature.
     back = inverse_2x2(d_b, is_regular)
-    n_over_d = _product(_product(seen, b.turn), back)
-    relative = _product(bend, n) - _product(n_over_d, d_a)
+    n_over_d = matmul(matmul(seen, b.turn), back)
+    relative = matmul(bend, n) - matmul(n_over_d, d_a)
     is_strict = is_regular & is_positive(0.5 * (relative + relative.T))
-    on_a = _product(inverse_2x2(relative, is_strict), _product(n_over_d, r_d) - r_n)
-    on_b = _product(back, -r_d - _product(d_a, on_a))
+    on_a = matmul(inverse_2x2(relative, is_strict), matmul(n_over_d, r_d) - r_n)
+    on_b = matmul(back, -r_d - matmul(d_a, on_a))
     on_a, on_b = (jnp.where(is_strict, x, jnp.zeros_like(x)) for x in (on_a, on_b))
     unit = jnp.max(jnp.sum(a.along * a.along, 0))
     residual = jnp.maximum(jnp.max(jnp.abs(r_d)), jnp.max(jnp.abs(r_n))) / jnp.sqrt(

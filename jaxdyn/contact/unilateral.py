@@ -30,7 +30,7 @@ class WithModes(eqx.Module):
         """Refuse evaluation without a mode. **Raises:** ValueError."""
         raise ValueError(
             f"{type(self).__name__} {self.name!r} has modes, which jd.simulate tracks; for a force that is a function of the "
-            "state use jd.CoulombFriction, and for bilateral contacts constraints (jd.rolling_sphere)"
+            "state use jd.forces.CoulombFriction, and for bilateral contacts constraints (jd.rolling_sphere)"
         )
 
 
@@ -57,7 +57,7 @@ class DryFriction(WithModes):
     Source: EQUATIONS section 11 and erratum E42.
 
     ```python
-    scene = jd.Scene(system, forces=[jd.DryFriction(0.3, normal=9.81, along=0, static=0.4)])
+    scene = jd.Scene(system, forces=[jd.contact.DryFriction(0.3, normal=9.81, along=0, static=0.4)])
     ```
     """
 
@@ -144,7 +144,7 @@ class UnilateralContact(WithModes):
         if not (isinstance(contact, Constraint) and contact.wrench_components() is not None):
             raise ValueError(
                 f"UnilateralContact: contact is {contact!r}; give a constraint with a gap, as jd.rolling_sphere(...), or use "
-                "jd.ground_contact(body, point, friction=0.5)"
+                "jd.contact.ground_contact(body, point, friction=0.5)"
             )
         self.contact = contact
         self.name = _check_name(contact.name if name is None else name, "UnilateralContact")
@@ -179,7 +179,7 @@ def ground_contact(
     **Raises:** ValueError for a bad pose, radius or coefficient; when used, for unknown bodies.
 
     ```python
-    feet = [jd.ground_contact(name, friction=0.7) for name in ("left_foot", "right_foot")]
+    feet = [jd.contact.ground_contact(name, friction=0.7) for name in ("left_foot", "right_foot")]
     solution = jd.simulate(jd.Scene(robot, forces=feet), q0, v0, ts)
     ```
     """
@@ -223,7 +223,7 @@ def gap_contact(
     **Raises:** ValueError for invalid functions and coefficients; when used, for shapes that do not fit.
 
     ```python
-    stop = jd.gap_contact(lambda q, t: 0.5 - q[0], restitution=0.3, name="stop")
+    stop = jd.contact.gap_contact(lambda q, t: 0.5 - q[0], restitution=0.3, name="stop")
     ```
     """
     name = _check_name(name, "gap_contact")

@@ -12,7 +12,7 @@ from jax import lax
 from jaxtyping import Array, Bool, Float
 
 from jaxdyn.constraints.rank import eps_of
-from jaxdyn.lie.so3 import _product
+from jaxdyn.lie.so3 import matmul
 from jaxdyn.systems.mass_factor import cholesky, solve_cholesky
 
 _STEPS = 40
@@ -34,10 +34,10 @@ def minimize_in_box(H: Float[Array, "n n"], g: Float[Array, " n"], lower: Array,
     rounding = 16 * eps_of(g)
 
     def value(x):
-        return 0.5 * jnp.sum(x * _product(H, x)) + jnp.sum(g * x)
+        return 0.5 * jnp.sum(x * matmul(H, x)) + jnp.sum(g * x)
 
     def free_at(x):
-        slope = g + _product(H, x)
+        slope = g + matmul(H, x)
         return slope, ~(((x <= lower) & (slope > 0)) | ((x >= upper) & (slope < 0)))
 
     def factor_of(free):
@@ -54,7 +54,7 @@ def minimize_in_box(H: Float[Array, "n n"], g: Float[Array, " n"], lower: Array,
         best = jnp.argmax(enough)  # the longest step of those that do
         y = jnp.where(jnp.any(enough), tried[best], x)
         # What is left of the slope is rounding of the sums in it, or no step leads down any more.
-        size = jnp.abs(g) + _product(jnp.abs(H), jnp.abs(y))
+        size = jnp.abs(g) + matmul(jnp.abs(H), jnp.abs(y))
         slope, free = free_at(y)
         ends = jnp.all(~free | (jnp.abs(slope) <= rounding * size)) | ~jnp.any(enough)
         return y, ~ends & jnp.isfinite(y).all(), count + 1

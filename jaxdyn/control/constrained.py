@@ -34,7 +34,7 @@ from jaxdyn.control.errors import (
 from jaxdyn.control.gains import as_matrix, gain, non_negative, times
 from jaxdyn.control.motion import torque_for
 from jaxdyn.dynamics.quantities import bias_force, coriolis_matrix, mass_matrix
-from jaxdyn.lie.so3 import _product
+from jaxdyn.lie.so3 import matmul
 from jaxdyn.model.arguments import Checked, Function, Number, Numbers, as_array, batch_hint, check_state, warn
 from jaxdyn.reduction.gauge_invariant import gauge_invariant
 from jaxdyn.simulation.controls import Controller
@@ -202,16 +202,16 @@ class HybridForce(_ForceLoop):
         t = jnp.asarray(t, q.dtype)
         tau = torque_for(self.scene, q, v, self.acceleration(q, v, t), t)
         if self.actuated is None:
-            return tau + _product(constraint_jacobian(self.scene, q, t).T, self.force_command(q, t, state))
+            return tau + matmul(constraint_jacobian(self.scene, q, t).T, self.force_command(q, t, state))
         # Projected by P_omega the constraint forces vanish, so that the motors' torques need only match along the
         # motion.
         P_omega, motors = projections(self.scene, q, t).P_omega, np.array(self.actuated, int)  # pyright: ignore[reportArgumentType]
         by_motors = P_omega[:, motors]
         inverse = pseudo_inverse(by_motors, tolerance(None, P_omega), True)
-        pushed = _product(inverse, _product(P_omega, tau))
+        pushed = matmul(inverse, matmul(P_omega, tau))
         if self.internal is not None:
             internal = self.internal.astype(q.dtype)
-            pushed = pushed + internal - _product(inverse, _product(by_motors, internal))
+            pushed = pushed + internal - matmul(inverse, matmul(by_motors, internal))
         return jnp.zeros_like(tau).at[motors].set(pushed)
 
     def _rows(self, q, v, t):
@@ -288,16 +288,16 @@ class GaugeInvariant(_ForceLoop):
         M, C = mass_matrix(system, q, t), coriolis_matrix(system, q, v, t)  # pyright: ignore[reportArgumentType]
         gauge = gauge_invariant(scene, q, v, None, t, dof=J.shape[1])  # pyright: ignore[reportArgumentType]
         # W^T J (ed + Kp e), which lies along V2.
-        eps = _product(gauge.V2.T, _product(gauge.W.T, v - along))
-        push = _product(M, change) + _product(C, along)
-        push = push - _product(gauge.W, _product(gauge.V2, times(self.kd, eps, "kd")))
-        normal = _product(gauge.Gamma_o, gauge.reduced_velocity) + _product(
+        eps = matmul(gauge.V2.T, matmul(gauge.W.T, v - along))
+        push = matmul(M, change) + matmul(C, along)
+        push = push - matmul(gauge.W, matmul(gauge.V2, times(self.kd, eps, "kd")))
+        normal = matmul(gauge.Gamma_o, gauge.reduced_velocity) + matmul(
             gauge.Lambda_r.T, self.force_command(q, t, state)
         )
         # Of `push` the part of the motion, W V2 V2^T W^-1, in the place of which the normal one stands.
-        free = _product(gauge.V2, _product(gauge.V2.T, solve_square(gauge.W, push)))
-        tau = _product(gauge.W, free + _product(gauge.V1, normal))
-        potential, force = bias_force(system, q, v, t) - _product(C, v), scene.applied_force(q, v, t)  # pyright: ignore[reportArgumentType]
+        free = matmul(gauge.V2, matmul(gauge.V2.T, solve_square(gauge.W, push)))
+        tau = matmul(gauge.W, free + matmul(gauge.V1, normal))
+        potential, force = bias_force(system, q, v, t) - matmul(C, v), scene.applied_force(q, v, t)  # pyright: ignore[reportArgumentType]
         return tau + potential if force is None else tau + potential - force
 
     def composite_error(self, q: Float[Array, " nq"], v: Float[Array, " nv"], t: Number = 0.0) -> Float[Array, " nr"]:
@@ -312,7 +312,7 @@ class GaugeInvariant(_ForceLoop):
         system = self.scene.system
         q, v, t = check_state(system, q=q, v=v, t=t)
         J, along, _ = self._reference_motion(q, v, t)
-        return _product(self._to_quasi_velocities(q, t, J.shape[1]), v - along)
+        return matmul(self._to_quasi_velocities(q, t, J.shape[1]), v - along)
 
     def equivalent_gains(
         self, q: Float[Array, " nq"], t: Number = 0.0
@@ -332,15 +332,15 @@ class GaugeInvariant(_ForceLoop):
         """
         q, t = check_state(self.scene.system, q=q, t=t)
         J, _, _ = self._reference_motion(q, jnp.zeros((self.scene.nv,), q.dtype), t)
-        B = _product(self._to_quasi_velocities(q, t, J.shape[1]), J)
+        B = matmul(self._to_quasi_velocities(q, t, J.shape[1]), J)
         kp, kd = as_matrix(self.kp, B[0], "kp"), as_matrix(self.kd, B[0], "kd")
-        turned = solve_square(B, _product(kd, B))
-        return _product(turned, kp), kp + turned
+        turned = solve_square(B, matmul(kd, B))
+        return matmul(turned, kp), kp + turned
 
     def _to_quasi_velocities(self, q, t, m: int) -> Float[Array, "nr nv"]:
         """Matrix V2^T W^T from velocities to the m quasi velocities along the constraints."""
         gauge = gauge_invariant(self.scene, q, jnp.zeros((self.scene.nv,), q.dtype), None, t, dof=m)
-        return _product(gauge.V2.T, gauge.W.T)
+        return matmul(gauge.V2.T, gauge.W.T)
 
     def _reference_motion(self, q, v, t):
         """Jacobian J (nv, nr), velocity J s for the reference rates s = xd_d - Kp e, and its rate, (nv,) each."""
@@ -367,9 +367,9 @@ class GaugeInvariant(_ForceLoop):
         inverse = pseudo_inverse(stacked, tolerance(None, stacked))
         J = inverse[:, -m:]
         s, sdot = jax.jvp(reference, (q, t), motion)
-        along = _product(J, s)
+        along = matmul(J, s)
         # d/dt of [A; T]^-1 [0; s]: the rate of the inverse enters as -inverse (turning) inverse.
-        return J, along, _product(J, sdot) - _product(inverse, _product(turning, along))
+        return J, along, matmul(J, sdot) - matmul(inverse, matmul(turning, along))
 
 
 def constrained(scene: Any) -> Scene:

@@ -8,7 +8,7 @@ from jaxdyn.contact.coordinates import contact_coordinates
 from jaxdyn.contact.surfaces import Surface, check_surface
 from jaxdyn.dynamics.kinematics import frame_pose
 from jaxdyn.lie import se3
-from jaxdyn.lie.so3 import _product
+from jaxdyn.lie.so3 import matmul
 from jaxdyn.model.arguments import Checked, Numbers, pose_leaf
 from jaxdyn.model.names import frame_index
 from jaxdyn.model.tree import Model
@@ -67,7 +67,7 @@ class ContactCoordinates(eqx.Module):
 
     def __call__(self, q: Float[Array, " nq"]) -> Float[Array, "5"]:
         """Contact coordinates eta (5,), in the units of the charts and rad."""
-        seen = _product(se3.inverse(self.pose.astype(q.dtype)), frame_pose(self.model, q, self.frame))
+        seen = matmul(se3.inverse(self.pose.astype(q.dtype)), frame_pose(self.model, q, self.frame))
         return contact_coordinates(self.object, self.finger, seen)
 
     def rolling(self, q: Float[Array, " nq"], v: Float[Array, " nv"]) -> Float[Array, "2"]:

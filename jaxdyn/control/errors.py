@@ -23,7 +23,7 @@ from jaxdyn.control.gains import times
 from jaxdyn.dynamics.kinematics import frame_pose
 from jaxdyn.dynamics.quantities import mass_matrix
 from jaxdyn.lie import so3
-from jaxdyn.lie.so3 import _product
+from jaxdyn.lie.so3 import matmul
 from jaxdyn.model.arguments import Number, Numbers, as_array, batch_hint
 from jaxdyn.model.names import frame_index
 from jaxdyn.model.tree import Model
@@ -91,7 +91,7 @@ class FrameError(Constraint):
         pose, target = frame_pose(system, q, self.frame), target_value(self.target, t, TASKS[self.task], q)
         if self.task == "position":
             return pose[:3, 3] - target
-        turned = so3.log(_product(target[:3, :3].T, pose[:3, :3]))
+        turned = so3.log(matmul(target[:3, :3].T, pose[:3, :3]))
         return turned if self.task == "orientation" else jnp.concatenate([pose[:3, 3] - target[:3, 3], turned])
 
 
@@ -152,8 +152,8 @@ def least_acceleration(system, q, t, A, wanted, start) -> Float[Array, " nv"]:
     metric = mass_factor(mass_matrix(system, q, t))
     # With M = L L^T, |a - start|_M is Euclidean in L^T a, where a pseudo-inverse gives the minimum.
     Y = metric.whiten(A.T)
-    missing = wanted - _product(A, start)
-    return start + metric.unwhiten(_product(pseudo_inverse(Y, tolerance(None, Y)).T, missing))
+    missing = wanted - matmul(A, start)
+    return start + metric.unwhiten(matmul(pseudo_inverse(Y, tolerance(None, Y)).T, missing))
 
 
 def hierarchical_acceleration(system, q, t, orders, start) -> Float[Array, " nv"]:
@@ -165,14 +165,14 @@ def hierarchical_acceleration(system, q, t, orders, start) -> Float[Array, " nv"
     free, a = jnp.eye(start.shape[0], dtype=start.dtype), start
     for A, wanted in orders:
         Y = metric.whiten(A.T)
-        left = _product(free, Y)
+        left = matmul(free, Y)
         # Rows spanned by those of higher priority leave rounding errors, which must not count as directions.
         sizes = [jnp.sum(jax.lax.stop_gradient(x) ** 2) for x in (left, Y)]
         left = jnp.where(sizes[0] > tolerance(None, Y) ** 2 * sizes[1], left, jnp.zeros_like(left))
         inverse = pseudo_inverse(left, tolerance(None, left)).T
-        a = a + metric.unwhiten(_product(inverse, wanted - _product(A, a)))
+        a = a + metric.unwhiten(matmul(inverse, wanted - matmul(A, a)))
         # inverse left^T projects on the range of `left`, so that `free` remains an orthogonal projection.
-        free = free - _product(inverse, left.T)
+        free = free - matmul(inverse, left.T)
     return a
 
 
@@ -184,7 +184,7 @@ def regularity(system, q, t, A, T) -> Float[Array, ""]:
     """
     metric = mass_factor(mass_matrix(system, q, t))
     Y, Z = metric.whiten(A.T), metric.whiten(T.T)
-    Z = Z - _product(Y, _product(pseudo_inverse(Y, tolerance(None, Y)), Z))
+    Z = Z - matmul(Y, matmul(pseudo_inverse(Y, tolerance(None, Y)), Z))
     sizes = jnp.sum(metric.whiten(T.T) ** 2, 0)
     free, least = list(Z.T), []
     # Gram-Schmidt by hand: every quotient is safe at zero, so that derivatives are finite at a singularity too.

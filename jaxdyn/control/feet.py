@@ -13,7 +13,7 @@ from jaxdyn.contact.cones import FrictionCone
 from jaxdyn.contact.kinds import wrench_basis
 from jaxdyn.dynamics.kinematics import body_jacobian, frame_pose
 from jaxdyn.lie import se3
-from jaxdyn.lie.so3 import _product
+from jaxdyn.lie.so3 import matmul
 from jaxdyn.model.arguments import Checked, Numbers, as_array, is_concrete
 from jaxdyn.model.names import frame_index
 from jaxdyn.model.tree import Model
@@ -53,15 +53,15 @@ class Foot(eqx.Module):
 
     def contact_pose(self, model: Model, q: Float[Array, " nq"]) -> Float[Array, "4 4"]:
         """Pose of the contact frame in the world."""
-        pose = _product(frame_pose(model, q, self.frame), self.pose.astype(q.dtype))
+        pose = matmul(frame_pose(model, q, self.frame), self.pose.astype(q.dtype))
         return pose if self.is_flat else pose.at[:3, :3].set(self.ground.astype(q.dtype))
 
     def jacobian(self, model: Model, q: Float[Array, " nq"]) -> Float[Array, "m nv"]:
         """Jacobian J (m, nv): velocities J v along the components of the force f, generalised force J^T f."""
-        to_contact = _product(se3.inverse(frame_pose(model, q, self.frame)), self.contact_pose(model, q))
-        twist = _product(se3.Ad(se3.inverse(to_contact)), body_jacobian(model, q, self.frame))
+        to_contact = matmul(se3.inverse(frame_pose(model, q, self.frame)), self.contact_pose(model, q))
+        twist = matmul(se3.Ad(se3.inverse(to_contact)), body_jacobian(model, q, self.frame))
         kind = "rigid" if self.cone.kind == "surface" else self.cone.kind
-        return _product(jnp.asarray(wrench_basis(kind).T, q.dtype), twist)
+        return matmul(jnp.asarray(wrench_basis(kind).T, q.dtype), twist)
 
     def hold(self, model: Model, q: Float[Array, " nq"]) -> FootConstraint:
         """Constraint that fixes the foot at its pose for q (nq,): a point, or a weld for a flat foot.

@@ -22,7 +22,7 @@ from jaxdyn.constraints.rank import sign_of_determinant, tolerance
 from jaxdyn.constraints.tolerances import coordinate_sizes
 from jaxdyn.control.inverse_kinematics import inverse_kinematics, row_weights
 from jaxdyn.control.targets import as_targets
-from jaxdyn.lie.so3 import _product
+from jaxdyn.lie.so3 import matmul
 from jaxdyn.model.arguments import Checked, Numbers, check_state
 from jaxdyn.systems.scene import Scene, as_scene
 from jaxdyn.systems.system import SceneLike, displacement
@@ -162,7 +162,7 @@ def _regularity(R, inverse, rank):
 
 
 def _changes_branch(system, before, after, R_after, R, inverse):
-    own = jnp.eye(R.shape[0], dtype=R.dtype) - _product(R, inverse)
+    own = jnp.eye(R.shape[0], dtype=R.dtype) - matmul(R, inverse)
     sizes, _ = coordinate_sizes(system, before.dtype)
-    turned = sign_of_determinant(_product(R_after, inverse) + own) < 0
+    turned = sign_of_determinant(matmul(R_after, inverse) + own) < 0
     return turned | (jnp.max(jnp.abs(displacement(system, before, after)) / sizes) > _JUMP)

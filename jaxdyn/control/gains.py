@@ -6,7 +6,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from jaxdyn.lie.so3 import _product
+from jaxdyn.lie.so3 import matmul
 from jaxdyn.model.arguments import as_array, batch_hint, is_concrete
 
 
@@ -51,7 +51,7 @@ def times(gain: Array, error: Float[Array, " n"], name: str) -> Float[Array, " n
             f"{error.shape * 2}"
         )
     gain = gain.astype(error.dtype)
-    return _product(gain, error) if gain.ndim == 2 else gain * error
+    return matmul(gain, error) if gain.ndim == 2 else gain * error
 
 
 def as_matrix(gain: Array, like: Float[Array, " n"], name: str) -> Float[Array, "n n"]:

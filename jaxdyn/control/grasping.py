@@ -24,7 +24,7 @@ from jaxdyn.control.motion import torque_for
 from jaxdyn.grasp.forces import as_preload, split_forces
 from jaxdyn.grasp.hand import Grasp, check_grasp
 from jaxdyn.grasp.motions import velocity_rows
-from jaxdyn.lie.so3 import _product
+from jaxdyn.lie.so3 import matmul
 from jaxdyn.model.arguments import Checked, Number, Numbers, batch_hint, warn
 from jaxdyn.simulation.controls import Controller
 from jaxdyn.systems.system import displacement
@@ -167,7 +167,7 @@ class GraspForce(Controller):
         push = torque_for(self.grasp, q, v, self.acceleration(q, v, t), t)
         lam = self._forces(q, t, push, state)
         Jh = -constraint_jacobian(self.grasp, q, t)[:, hands]
-        return jnp.zeros_like(push).at[hands].set(push[hands] + _product(Jh.T, lam))
+        return jnp.zeros_like(push).at[hands].set(push[hands] + matmul(Jh.T, lam))
 
     def _forces(self, q, t, push, state):
         G = constraint_jacobian(self.grasp, q, t)[:, velocity_rows(self.grasp)[1]].T

@@ -26,7 +26,7 @@ from jaxdyn.compile.known import is_concrete
 from jaxdyn.constraints.codes import RESULTS, Outcome
 from jaxdyn.constraints.rank import eps_of
 from jaxdyn.control.box_qp import minimize_in_box
-from jaxdyn.lie.so3 import _product
+from jaxdyn.lie.so3 import matmul
 from jaxdyn.model.arguments import Checked, Function, Numbers, as_array, batch_hint
 from jaxdyn.systems.mass_factor import cholesky, solve_cholesky
 from jaxdyn.systems.scene import as_pytree
@@ -283,7 +283,7 @@ def _rollout(problem: _Problem, x0, xs, us, k, K):
     def go_on(carry, row):
         x, total = carry
         x_before, u, k, K, i = row
-        u = _clip(problem, u + k + _product(K, x - x_before), i)
+        u = _clip(problem, u + k + matmul(K, x - x_before), i)
         return (problem.step(x, u), total + problem.cost(x, u, i)), (x, u)
 
     start = x0, jnp.zeros((), us.dtype)
@@ -312,8 +312,8 @@ def _backward(problem: _Problem, state: _State):
     def go_back(carry, row):
         Vx, Vxx, slope, curvature, is_definite = carry
         z, F, lz, lzz, i = row
-        Qz = lz + _product(F.T, Vx)
-        Qzz = lzz + _product(F.T, _product(Vxx, F))
+        Qz = lz + matmul(F.T, Vx)
+        Qzz = lzz + matmul(F.T, matmul(Vxx, F))
         if problem.second_order:
             Qzz = Qzz + jax.hessian(lambda z: jnp.sum(Vx * step(z)))(z)
         Qu, Quu, Qux = Qz[nx:], Qzz[nx:, nx:], Qzz[nx:, :nx]
@@ -326,10 +326,10 @@ def _backward(problem: _Problem, state: _State):
             k, free, factor = minimize_in_box(damped, Qu, problem.lower[i] - u, problem.upper[i] - u)
             K = -solve_cholesky(factor, jnp.where(free[:, None], Qux, jnp.zeros_like(Qux)))
         definite = is_definite & jnp.isfinite(factor).all() & jnp.isfinite(k).all()
-        Quuk = _product(Quu, k)
-        Vx = Qz[:nx] + _product(K.T, Quuk + Qu) + _product(Qux.T, k)
-        crossed = _product(K.T, Qux)
-        Vxx = Qzz[:nx, :nx] + _product(K.T, _product(Quu, K)) + crossed + crossed.T
+        Quuk = matmul(Quu, k)
+        Vx = Qz[:nx] + matmul(K.T, Quuk + Qu) + matmul(Qux.T, k)
+        crossed = matmul(K.T, Qux)
+        Vxx = Qzz[:nx, :nx] + matmul(K.T, matmul(Quu, K)) + crossed + crossed.T
         slope, curvature = slope + jnp.sum(k * Qu), curvature + 0.5 * jnp.sum(k * Quuk)
         return (Vx, 0.5 * (Vxx + Vxx.T), slope, curvature, definite), (k, K)
 

@@ -21,7 +21,7 @@ from jaxdyn.contact.qp import RESULTS, solve_qp
 from jaxdyn.control.feet import Foot, check_feet
 from jaxdyn.control.gains import non_negative
 from jaxdyn.dynamics.quantities import inverse_dynamics
-from jaxdyn.lie.so3 import _product
+from jaxdyn.lie.so3 import matmul
 from jaxdyn.model.arguments import Checked, Numbers, check_shapes
 from jaxdyn.model.tree import Model
 
@@ -95,7 +95,7 @@ def underactuated_inverse_dynamics(
     ```python
     feet = [jd.control.foot(name, jd.contact.friction_cone("hard-finger", mu=0.6)) for name in ("FL", "FR", "HL", "HR")]
     still = jnp.zeros(model.nv)
-    dynamics = jd.underactuated_inverse_dynamics(model, q, still, still, feet)
+    dynamics = jd.control.underactuated_inverse_dynamics(model, q, still, still, feet)
     ```
     """
     q, v, a = check_shapes(model, q=q, v=v, a=a)
@@ -113,7 +113,7 @@ def underactuated_inverse_dynamics(
     # With tau eliminated, |tau|^2 = |needed - across^T f|^2: only f remains in the program.
     J = jnp.concatenate([one.jacobian(model, q) for one in feet])
     across, along = J[:, motors], J[:, base].T
-    Q = torque_weight * _product(across, across.T) + force_weight * jnp.eye(J.shape[0], dtype=q.dtype)
+    Q = torque_weight * matmul(across, across.T) + force_weight * jnp.eye(J.shape[0], dtype=q.dtype)
     bounds = cone_bounds([one.cone for one in feet], preload, q.dtype)
     if effort_limit is not None:
         limit = as_float(effort_limit, "effort_limit", None, q.dtype)
@@ -126,14 +126,14 @@ def underactuated_inverse_dynamics(
         # |tau| <= limit with tau = needed - across^T f: two linear rows per motor.
         bounds["G"] = jnp.concatenate([rows, -across.T, across.T])
         bounds["h"] = jnp.concatenate([levels, limit - needed[motors], limit + needed[motors]])
-    linear = -torque_weight * _product(across, needed[motors])
+    linear = -torque_weight * matmul(across, needed[motors])
     optimum = solve_qp(Q, linear, A=along, b=needed[base], tol=tol, **bounds)
     # The last iterate of an infeasible program diverges, so it is replaced by the least-norm forces.
-    shortest = _product(pseudo_inverse(along.T, tolerance(None, along)).T, needed[base])
+    shortest = matmul(pseudo_inverse(along.T, tolerance(None, along)).T, needed[base])
     forces = jnp.where(optimum.result == RESULTS.infeasible, shortest, optimum.x)  # pyright: ignore[reportArgumentType]
     sizes = np.cumsum([one.size for one in feet])[:-1]
     margins = [one.cone.margin(f) for one, f in zip(feet, jnp.split(forces, sizes), strict=True)]
-    tau = (needed - _product(J.T, forces)).at[base].set(0)
+    tau = (needed - matmul(J.T, forces)).at[base].set(0)
     return LeggedDynamics(
         tau=tau,
         forces=forces,
@@ -171,9 +171,9 @@ def missing_wrench(
         return needed
     G = jnp.concatenate([one.jacobian(model, q) for one in feet])[:, base].T
     # The small term determines internal forces, which the remainder does not.
-    Q = _product(G.T, G) + 1e-6 * jnp.eye(G.shape[1], dtype=q.dtype)
+    Q = matmul(G.T, G) + 1e-6 * jnp.eye(G.shape[1], dtype=q.dtype)
     bounds = cone_bounds([one.cone for one in feet], jnp.zeros((), q.dtype), q.dtype)
-    return needed - _product(G, solve_qp(Q, -_product(G.T, needed), **bounds).x)
+    return needed - matmul(G, solve_qp(Q, -matmul(G.T, needed), **bounds).x)
 
 
 def passive_velocities(model: Model, passive: Sequence[int] | None) -> np.ndarray:

@@ -23,7 +23,7 @@ from jaxdyn.control.errors import (
 )
 from jaxdyn.control.gains import gain, non_negative, times
 from jaxdyn.dynamics.quantities import gravity_force, inverse_dynamics
-from jaxdyn.lie.so3 import _product
+from jaxdyn.lie.so3 import matmul
 from jaxdyn.model.arguments import Number, Numbers, SystemLike, state_dtype
 from jaxdyn.model.tree import Model
 from jaxdyn.systems.scene import Scene, as_scene
@@ -184,7 +184,7 @@ class CartesianStiffness(eqx.Module):
         scene, t = Scene(self.model, (self.error,)), jnp.asarray(t, q.dtype)
         row, error = rows(scene, q, v, t), position_residual(scene, q, t)
         push = times(self.stiffness, error, "stiffness") + times(self.damping, row.velocity, "damping")
-        return gravity_force(self.model, q, t) - _product(row.A.T, push) - self.joint_damping.astype(v.dtype) * v
+        return gravity_force(self.model, q, t) - matmul(row.A.T, push) - self.joint_damping.astype(v.dtype) * v
 
 
 def unconstrained(scene: Any) -> Scene:

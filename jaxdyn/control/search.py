@@ -28,7 +28,7 @@ from jaxdyn.compile.loops import Carry, Given, Iteration, Task, run_loop
 from jaxdyn.constraints.base import constraint_jacobian, holonomic_rows, layout, position_residual
 from jaxdyn.constraints.rank import eps_of
 from jaxdyn.constraints.tolerances import coordinate_sizes
-from jaxdyn.lie.so3 import _product
+from jaxdyn.lie.so3 import matmul
 from jaxdyn.model.joints import SCREW_KINDS
 from jaxdyn.model.tree import Model
 from jaxdyn.systems.mass_factor import cholesky, solve_cholesky
@@ -161,12 +161,12 @@ def _damped_step(scene: Scene, q, t, aims: Aims, r, damping):
     R = constraint_jacobian(scene, q, t)[holonomic_rows(layout(scene))] * aims.weights[:, None] * sizes[None]
 
     def shortest(R):
-        gram = _product(R, R.T)
+        gram = matmul(R, R.T)
         diagonal = jnp.diagonal(gram)
         # Rows that depend on others are met with them; rows that are zero are left out.
         rounding = 64 * eps_of(q) * (diagonal + jnp.max(diagonal)) + float(jnp.finfo(q.dtype).tiny) ** 0.5
         gram = gram + jnp.diag(rounding + damping * (1 - aims.is_exact))
-        return -_product(R.T, solve_cholesky(cholesky(gram), r))
+        return -matmul(R.T, solve_cholesky(cholesky(gram), r))
 
     step = shortest(R)
     inside = _is_inside(scene.system, q, step, aims)

@@ -18,7 +18,7 @@ from jaxdyn.constraints.frames import Pair
 from jaxdyn.constraints.rolling import tangents
 from jaxdyn.dynamics.centroidal import center_of_mass
 from jaxdyn.lie import so3
-from jaxdyn.lie.so3 import _product
+from jaxdyn.lie.so3 import matmul
 from jaxdyn.model.arguments import Number, as_array, batch_hint
 from jaxdyn.model.names import frame_index
 from jaxdyn.model.tree import Model
@@ -156,5 +156,5 @@ def _frame_along(direction, name: str) -> Float[Array, "3 3"]:
     """A rotation whose z axis is along a direction."""
     if is_concrete(direction) and not np.linalg.norm(np.asarray(direction)) > 0:
         raise ValueError(f"{name} is {np.asarray(direction)}; give a vector of some length")
-    unit = direction / jnp.sqrt(_product(direction, direction))
+    unit = direction / jnp.sqrt(matmul(direction, direction))
     return jnp.concatenate([tangents(unit), unit[None]]).T

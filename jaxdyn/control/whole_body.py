@@ -29,7 +29,7 @@ from jaxdyn.control.feet import Foot, check_feet
 from jaxdyn.control.gains import gain, non_negative
 from jaxdyn.control.legs import LeggedDynamics, missing_wrench, passive_velocities, underactuated_inverse_dynamics
 from jaxdyn.dynamics.centroidal import center_of_mass
-from jaxdyn.lie.so3 import _product
+from jaxdyn.lie.so3 import matmul
 from jaxdyn.model.arguments import Checked, Number, Numbers
 from jaxdyn.model.tree import Model
 from jaxdyn.systems.scene import Force, Scene
@@ -50,7 +50,7 @@ class CenterError(Constraint):
 class WholeBody(eqx.Module):
     """Centre of mass and attitude of the base by  edd + Kd ed + Kp e = 0, with ground forces inside their cones.
 
-    tau comes from `jd.underactuated_inverse_dynamics` for the acceleration of `acceleration(q, v, t)`. Errors decay exactly as
+    tau comes from `jd.control.underactuated_inverse_dynamics` for the acceleration of `acceleration(q, v, t)`. Errors decay exactly as
     set by the gains for an exact model, while the feet are at rest and their forces can give the acceleration. The code
     `dynamics(q, v, t).result` reports this; otherwise forces leave a cone, a simulation of `jd.control.standing`
     ends with `contact_lost`, and `missing_wrench(q, v, t)` gives the remainder. Forces of constrained feet are those of
@@ -65,7 +65,7 @@ class WholeBody(eqx.Module):
       `base`: name of a frame or body, by default the model's first body. `turn_kp`, `turn_kd`: its gains, of the error
       log(R_d^T R); by default `kp` and `kd`.
     - `posture` (nq,): equilibrium of the remaining motion, with `stiffness` (1/s^2) and `damping` (1/s), zero or positive.
-    - `preload` (), N; `torque_weight`, `force_weight`, `effort_limit`, `passive`: of `jd.underactuated_inverse_dynamics`.
+    - `preload` (), N; `torque_weight`, `force_weight`, `effort_limit`, `passive`: of `jd.control.underactuated_inverse_dynamics`.
 
     **Raises:** ValueError for gains that are not positive definite, unknown frames, no list of
     feet or an empty one, a `stiffness` without a posture; (when called) for inconsistent shapes.
@@ -154,7 +154,7 @@ class WholeBody(eqx.Module):
         """
         t = jnp.asarray(t, q.dtype)
         A, wanted = self._orders(q, v, t)[1]
-        return wanted - _product(A, self.acceleration(q, v, t))
+        return wanted - matmul(A, self.acceleration(q, v, t))
 
     def dynamics(self, q: Float[Array, " nq"], v: Float[Array, " nv"], t: Number = 0.0) -> LeggedDynamics:
         """Torques, ground forces and their margins, with `result` for their feasibility."""

@@ -45,7 +45,7 @@ def articulated_bodies(
     Source: EQUATIONS section 5 with erratum E12; Featherstone (2008), section 7.2.
 
     ```python
-    bodies = jd.articulated_bodies(model, q, v, tau)
+    bodies = jd.dynamics.articulated_bodies(model, q, v, tau)
     pivot = bodies.inertias[-1][5, 5]  # of a last joint that turns about z, without armature
     ```
     """

@@ -17,7 +17,7 @@ from jaxtyping import Array, Float
 from jaxdyn.compile import kernel
 from jaxdyn.dynamics.kinematics import body_subspace, forward_kinematics, take
 from jaxdyn.lie import se3
-from jaxdyn.lie.so3 import _product
+from jaxdyn.lie.so3 import matmul
 from jaxdyn.model.arguments import check_shapes
 from jaxdyn.model.tree import Model, neutral
 
@@ -63,10 +63,10 @@ def link_adjoints(model: Model, q: Float[Array, " nq"]) -> Float[Array, "nb nb 6
 def _link_adjoints(model: Model, q):
     poses, home = forward_kinematics(model, q), forward_kinematics(model, neutral(model))
     # poses home^-1 is the product of the exponentials down to each body: g_i(q) = product g_i(0).
-    products = _product(poses, jax.vmap(se3.inverse)(home))
+    products = matmul(poses, jax.vmap(se3.inverse)(home))
     # All pairs at once, although half of them are masked: one batched product is a shorter program than a loop over
     # paths.
-    between = jax.vmap(jax.vmap(lambda a, b: se3.Ad(_product(se3.inverse(a), b)), (None, 0)), (0, None))(
+    between = jax.vmap(jax.vmap(lambda a, b: se3.Ad(matmul(se3.inverse(a), b)), (None, 0)), (0, None))(
         products, products
     )
     return jnp.where(model.topology.ancestors[:, :, None, None], between, jnp.zeros_like(between))

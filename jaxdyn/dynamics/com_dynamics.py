@@ -20,7 +20,7 @@ from jaxtyping import Array, Float
 from jaxdyn.compile import entry_point
 from jaxdyn.dynamics.centroidal import com_jacobian
 from jaxdyn.dynamics.quantities import coriolis_matrix, mass_matrix
-from jaxdyn.lie.so3 import _product
+from jaxdyn.lie.so3 import matmul
 from jaxdyn.model.arguments import check_shapes, is_concrete
 from jaxdyn.model.tree import Model, configuration_rate
 
@@ -59,7 +59,7 @@ def com_dynamics(model: Model, q: Float[Array, " nq"], v: Float[Array, " nv"]) -
 
     ```python
     robot = jd.robots.quadruped()
-    terms = jd.com_dynamics(robot, jd.neutral(robot), jnp.zeros(robot.nv))
+    terms = jd.dynamics.com_dynamics(robot, jd.neutral(robot), jnp.zeros(robot.nv))
     cdot = (terms.jacobian @ jnp.ones(robot.nv))[:3]
     ```
 
@@ -91,18 +91,18 @@ def _com_dynamics(model: Model, q, v) -> ComDynamics:
         jacobian = com_jacobian(model, q)
         # The first block is the rotation of the base, as all mass moves with it: its inverse is its transpose.
         turn = jacobian[:, :3].T
-        return jnp.concatenate([jnp.concatenate([turn, -_product(turn, jacobian[:, 3:])], axis=1), unit])
+        return jnp.concatenate([jnp.concatenate([turn, -matmul(turn, jacobian[:, 3:])], axis=1), unit])
 
     T, T_rate = jax.jvp(velocity_map, (q,), (configuration_rate(model, q, v),))
     # C' is evaluated with the centre of mass at rest: M' does not depend on its motion, but a Coriolis matrix may.
-    internal = _product(inverse_map(q)[:, 3:], v[3:])
+    internal = matmul(inverse_map(q)[:, 3:], v[3:])
     X, X_rate = jax.jvp(inverse_map, (q,), (configuration_rate(model, q, internal),))
     part, M = X[:, 3:], mass_matrix(model, q)
-    forces = _product(coriolis_matrix(model, q, internal), part) + _product(M, X_rate[:, 3:])
+    forces = matmul(coriolis_matrix(model, q, internal), part) + matmul(M, X_rate[:, 3:])
     return ComDynamics(
         mass=jnp.sum(model.inertias[:, 0]),
-        mass_matrix=_product(part.T, _product(M, part)),
-        coriolis_matrix=_product(part.T, forces),
+        mass_matrix=matmul(part.T, matmul(M, part)),
+        coriolis_matrix=matmul(part.T, forces),
         jacobian=T,
         jacobian_rate=T_rate,
         inverse=X,

@@ -13,7 +13,7 @@ from jaxdyn.dynamics.kinematics import (
     tree_frame,
     twist_columns,
 )
-from jaxdyn.lie.so3 import _product, cross
+from jaxdyn.lie.so3 import cross, matmul
 from jaxdyn.model.arguments import check_shapes
 from jaxdyn.model.tree import Model
 
@@ -50,8 +50,8 @@ def _jacobian(body: int, tree, q):
     frame = tree_frame(model, q)
     columns = twist_columns(model, frame, body, offset, frame.subspace)
     # The body Jacobian holds both parts in the frame's axes at its origin; rotating them changes axes, not the point.
-    turn = _product(frame.pose[body], jnp.asarray(offset))[:3, :3]
-    return jnp.concatenate([_product(turn, columns[:, :3].T), _product(turn, columns[:, 3:].T)])
+    turn = matmul(frame.pose[body], jnp.asarray(offset))[:3, :3]
+    return jnp.concatenate([matmul(turn, columns[:, :3].T), matmul(turn, columns[:, 3:].T)])
 
 
 def frame_velocity(
@@ -79,7 +79,7 @@ def _velocity(body: int, tree, q, v):
     model, offset = tree
     frame = tree_frame(model, q)
     # The tree frame has the world's axes, so only the point of reference moves: v_p = v + omega x r.
-    twist, lever = body_twists(model, frame, v)[body], _product(frame.pose[body], jnp.asarray(offset))[:3, 3]
+    twist, lever = body_twists(model, frame, v)[body], matmul(frame.pose[body], jnp.asarray(offset))[:3, 3]
     return jnp.concatenate([twist[:3] + cross(twist[3:], lever), twist[3:]])
 
 
@@ -101,7 +101,7 @@ def frame_acceleration(
     Source: EQUATIONS section 2, the rate of R v_b.
 
     ```python
-    hand = jd.frame_acceleration(model, q, v, jd.forward_dynamics(model, q, v, tau), "hand")
+    hand = jd.dynamics.frame_acceleration(model, q, v, jd.forward_dynamics(model, q, v, tau), "hand")
     ```
     """
     q, v, a = check_shapes(model, q=q, v=v, a=a)
@@ -120,7 +120,7 @@ def _acceleration(body: int, tree, q, v, a):
     # The tree frame is inertial, with the world's axes: rates of twists are componentwise.
     rate = jnp.sum(twist_columns(model, frame, body, offset, rows), axis=0)
     twist = jnp.sum(twist_columns(model, frame, body, offset, frame.subspace * v[:, None]), axis=0)
-    turn = _product(frame.pose[body], jnp.asarray(offset))[:3, :3]
+    turn = matmul(frame.pose[body], jnp.asarray(offset))[:3, :3]
     # From the rate of the body twist to the acceleration of the origin: dv/dt + omega x v.
     linear = rate[:3] + cross(twist[3:], twist[:3])
-    return jnp.concatenate([_product(turn, linear[:, None])[:, 0], _product(turn, rate[3:, None])[:, 0]])
+    return jnp.concatenate([matmul(turn, linear[:, None])[:, 0], matmul(turn, rate[3:, None])[:, 0]])

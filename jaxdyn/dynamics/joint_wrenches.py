@@ -9,7 +9,7 @@ from jaxdyn.dynamics.kinematics import tree_frame
 from jaxdyn.dynamics.quantities import MAX_BODIES
 from jaxdyn.dynamics.world_frame import joint_wrenches
 from jaxdyn.lie import se3
-from jaxdyn.lie.so3 import _product
+from jaxdyn.lie.so3 import matmul
 from jaxdyn.model.arguments import check_shapes
 from jaxdyn.model.names import joint_index
 from jaxdyn.model.tree import Model
@@ -36,7 +36,7 @@ def joint_wrench(
     - `q` (nq,), `v` (nv,), `a` (nv,): the motion; a from `forward_dynamics` or `constrained_dynamics`.
     - `joint`: name of a moving joint; None: all of them.
     - `external` (nb, 6): other wrenches (f, tau) ON each body, at its frame's origin and in its axes (N, N m). Those of closed
-      loops are `jd.body_wrenches(scene, q, multipliers)`.
+      loops are `jd.constraints.body_wrenches(scene, q, multipliers)`.
     - `axes`: "body", of the frame of the body that the joint moves, or "world"; at that frame's origin in either case.
 
     **Returns:** (6,), or (nb, 6) for all joints in the order of `model.joint_names`; N, N m.
@@ -46,7 +46,7 @@ def joint_wrench(
     Source: EQUATIONS section 4, the backward recursion of Newton and Euler; `data.f` of Pinocchio after `rnea` for body axes.
 
     ```python
-    weight = jd.joint_wrench(model, q, zero, zero, model.joint_names[0])  # what the base bears at rest
+    weight = jd.dynamics.joint_wrench(model, q, zero, zero, model.joint_names[0])  # what the base bears at rest
     ```
     """
     if axes not in ("body", "world"):
@@ -71,4 +71,4 @@ def _in_world(model: Model, q, v, a, external=None):
     frame = tree_frame(model, q)
     wrenches = jax.vmap(se3.AdT_apply)(frame.pose, joint_wrenches(model, frame, v, a, external))
     turn = frame.pose[:, :3, :3]
-    return jnp.concatenate([_product(turn, wrenches[:, :3, None]), _product(turn, wrenches[:, 3:, None])], 1)[..., 0]
+    return jnp.concatenate([matmul(turn, wrenches[:, :3, None]), matmul(turn, wrenches[:, 3:, None])], 1)[..., 0]

@@ -22,7 +22,7 @@ from jaxtyping import Array, Float
 from jaxdyn.compile import kernel, variant
 from jaxdyn.compile.known import array_namespace
 from jaxdyn.lie import se3
-from jaxdyn.lie.so3 import _product
+from jaxdyn.lie.so3 import matmul
 from jaxdyn.model.arguments import Given, check_shapes
 from jaxdyn.model.joints import KINDS, SCREW_KINDS, joint_transform, screw_transform
 from jaxdyn.model.names import frame_index
@@ -63,7 +63,7 @@ def relative_poses(model: Model, q: Float[Array, " nq"]) -> Float[Array, "nb 4 4
     if not transforms:
         return home
     transforms_by_kind = transforms[0] if len(transforms) == 1 else jnp.concatenate(transforms)
-    return _product(home, take(transforms_by_kind, np.argsort(order)))
+    return matmul(home, take(transforms_by_kind, np.argsort(order)))
 
 
 def body_subspace(model: Model) -> Float[Array, "nv 6"]:
@@ -102,7 +102,7 @@ def _products_in_order(topology: Topology, pose: Float[Array, "nb 4 4"]) -> Floa
     """`_tree_products` with one product per body: in a kernel pointer jumping would multiply the operations by log2(depth)."""
     products: list = []
     for i, parent in enumerate(topology.parents):
-        products.append(pose[i] if parent < 0 else _product(products[parent], pose[i]))
+        products.append(pose[i] if parent < 0 else matmul(products[parent], pose[i]))
     return jnp.stack(products) if products else pose
 
 
@@ -115,7 +115,7 @@ def _tree_products(topology: Topology, pose: Float[Array, "nb 4 4"]) -> Float[Ar
     # The extra row is the world: a jump beyond the root multiplies by the identity.
     world = jnp.eye(4, dtype=pose.dtype)[None]
     for table in topology.jumps:
-        pose = _product(jnp.concatenate([pose, world])[table], pose)
+        pose = matmul(jnp.concatenate([pose, world])[table], pose)
     return pose
 
 
@@ -166,7 +166,7 @@ def body_frames(
     v = take(v, coordinates)
     rates = subspace_rate(model, frame, body_twists(model, frame, v))
     # One product gives the twists and their rates.
-    sums = _product(jnp.asarray(moved_by, q.dtype), jnp.concatenate([frame.subspace, rates], axis=1) * v[:, None])
+    sums = matmul(jnp.asarray(moved_by, q.dtype), jnp.concatenate([frame.subspace, rates], axis=1) * v[:, None])
     return frames._replace(twist=sums[:, :6], bias=sums[:, 6:])
 
 
@@ -217,12 +217,12 @@ def subspace_rate(model: Model, frame: TreeFrame, twists: Float[Array, "nb 6"]) 
 
 def sum_to_bodies(model: Model, rows: Float[Array, "nv n"]) -> Float[Array, "nb n"]:
     """G rows: for each body the sum of the rows of the coordinates that move it."""
-    return _product(jnp.asarray(model.topology.dof_ancestors, rows.dtype), rows)
+    return matmul(jnp.asarray(model.topology.dof_ancestors, rows.dtype), rows)
 
 
 def sum_to_coordinates(model: Model, rows: Float[Array, "nb n"]) -> Float[Array, "nv n"]:
     """G^T rows: for each velocity coordinate the sum of the rows of the bodies that it moves."""
-    return _product(jnp.asarray(model.topology.dof_ancestors.T, rows.dtype), rows)
+    return matmul(jnp.asarray(model.topology.dof_ancestors.T, rows.dtype), rows)
 
 
 def forward_kinematics(model: Model, q: Float[Array, " nq"]) -> Float[Array, "nb 4 4"]:
@@ -272,7 +272,7 @@ def frame_pose(model: Model, q: Float[Array, " nq"], name: str | None) -> Float[
 def _pose_in_body(body: int, tree, q):
     model, offset = tree
     frames = body_frames(model, q, [body])
-    return _translate(_product(frames.pose[0], jnp.asarray(offset)), frames.origin[0])
+    return _translate(matmul(frames.pose[0], jnp.asarray(offset)), frames.origin[0])
 
 
 def body_jacobian(model: Model, q: Float[Array, " nq"], frame: str | None) -> Float[Array, "6 nv"]:
@@ -398,5 +398,5 @@ def twist_columns(model: Model, tree: TreeFrame, body: int, offset: Given, rows:
     """Twists of the tree frame (one per coordinate) in the axes and at the origin of a frame at `offset` in a body."""
     if body < 0:
         return jnp.zeros_like(rows)
-    pose = _product(tree.pose[body], jnp.asarray(offset))
+    pose = matmul(tree.pose[body], jnp.asarray(offset))
     return jax.vmap(se3.Ad_inv_apply, (None, 0))(pose, _mask_path(model, body, rows))

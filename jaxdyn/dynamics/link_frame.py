@@ -20,7 +20,7 @@ from jaxtyping import Array, Float
 from jaxdyn.compile import entry_point
 from jaxdyn.dynamics.kinematics import body_subspace, relative_poses
 from jaxdyn.lie import se3
-from jaxdyn.lie.so3 import _product
+from jaxdyn.lie.so3 import matmul
 from jaxdyn.model.arguments import as_array, check_shapes
 from jaxdyn.model.inertia import spatial_inertia
 from jaxdyn.model.names import frame_index
@@ -62,12 +62,12 @@ class NewtonEulerMatrices(eqx.Module):
     def mass_matrix(self) -> Float[Array, "nv nv"]:
         """Mass matrix M(q) = xi^T G^T M G xi (nv, nv), without armature."""
         jacobian = self.jacobians
-        return _product(jacobian.T, _product(self.M, jacobian))
+        return matmul(jacobian.T, matmul(self.M, jacobian))
 
     @property
     def jacobians(self) -> Float[Array, "n6 nv"]:
         """Body Jacobians G xi (6n, nv) of all bodies, stacked."""
-        return _product(self.G, self.xi)
+        return matmul(self.G, self.xi)
 
     @property
     def bias_force(self) -> Float[Array, " nv"]:
@@ -75,15 +75,15 @@ class NewtonEulerMatrices(eqx.Module):
 
         C0 v + phi when the base does not move.
         """
-        carried = _product(self.P0, self.V0) + _product(self.Gamma, self.V)
-        rates = _product(self.G, _product(self.P0, self.V0_dot) + _product(self.ad_xi, carried))
-        wrenches = _product(self.M, rates) + _product(self.ad_V_T, _product(self.M, self.V))
-        return _product(self.jacobians.T, wrenches)
+        carried = matmul(self.P0, self.V0) + matmul(self.Gamma, self.V)
+        rates = matmul(self.G, matmul(self.P0, self.V0_dot) + matmul(self.ad_xi, carried))
+        wrenches = matmul(self.M, rates) + matmul(self.ad_V_T, matmul(self.M, self.V))
+        return matmul(self.jacobians.T, wrenches)
 
     @property
     def phi(self) -> Float[Array, " nv"]:
         """Gravity force phi = xi^T G^T M G P0 V0_dot (nv,); +dV/dq when the base does not move."""
-        return _product(self.jacobians.T, _product(self.M, _product(self.G, _product(self.P0, self.V0_dot))))
+        return matmul(self.jacobians.T, matmul(self.M, matmul(self.G, matmul(self.P0, self.V0_dot))))
 
     @property
     def Jt(self) -> Float[Array, "6 nv"]:
@@ -93,7 +93,7 @@ class NewtonEulerMatrices(eqx.Module):
         """
         if self.Pt is None:
             raise ValueError("Jt needs a tip frame, tip is None; call newton_euler_matrices(..., tip=<frame name>)")
-        return _product(self.Pt, self.jacobians)
+        return matmul(self.Pt, self.jacobians)
 
     @property
     def C0(self) -> Float[Array, "nv nv"]:
@@ -102,18 +102,18 @@ class NewtonEulerMatrices(eqx.Module):
         C0 v is the vector of Coriolis and centrifugal forces when the base does not move (`bias_force` otherwise), but
         Mdot - 2 C0 is not skew. Use `Cs` where skew symmetry matters.
         """
-        return self._coriolis(_product(self.ad_V_T, self.M))
+        return self._coriolis(matmul(self.ad_V_T, self.M))
 
     @property
     def Cs(self) -> Float[Array, "nv nv"]:
         """Coriolis matrix Cs = xi^T G^T (M G ad_xi Gamma + ad_V^T M - M ad_V) G xi (nv, nv): Cs v = C0 v, Mdot - 2 Cs skew."""
-        return self._coriolis(_product(self.ad_V_T, self.M) - _product(self.M, self.ad_V))
+        return self._coriolis(matmul(self.ad_V_T, self.M) - matmul(self.M, self.ad_V))
 
     # Cs and C0 differ by M ad_V alone, whose product with the twists V vanishes: ad_V V = 0.
     def _coriolis(self, transport):
         jacobian = self.jacobians
-        inner = _product(self.M, _product(self.G, _product(self.ad_xi, self.Gamma))) + transport
-        return _product(jacobian.T, _product(inner, jacobian))
+        inner = matmul(self.M, matmul(self.G, matmul(self.ad_xi, self.Gamma))) + transport
+        return matmul(jacobian.T, matmul(inner, jacobian))
 
 
 def newton_euler_matrices(
@@ -171,8 +171,8 @@ def _matrices(model: Model, q, v, base_twist, base_twist_rate, tip: str | None) 
     # Gamma^depth = 0, because a path from the root has at most `depth` bodies.
     g = _nilpotent_inverse(gamma, int(topology.depths.max(initial=1)))
 
-    rates = _product(xi, v)
-    twists = _product(g, rates if base_twist is None else rates + _product(p0, base_twist))
+    rates = matmul(xi, v)
+    twists = matmul(g, rates if base_twist is None else rates + matmul(p0, base_twist))
     # The minus signs follow the documents' definition of the blocks, not the usual ad.
     ad_xi = -jax.vmap(se3.ad)(rates.reshape(n, 6))
     ad_v = -jax.vmap(se3.ad)(twists.reshape(n, 6))
@@ -201,8 +201,8 @@ def _nilpotent_inverse(gamma, depth: int):
     identity = jnp.eye(gamma.shape[0], dtype=gamma.dtype)
     total, power, terms = identity + gamma, gamma, 2
     while terms < depth:
-        power = _product(power, power)
-        total = _product(total, identity + power)
+        power = matmul(power, power)
+        total = matmul(total, identity + power)
         terms *= 2
     return total
 

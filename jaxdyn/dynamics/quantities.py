@@ -21,7 +21,7 @@ from jaxdyn.compile import implicit, kernel, value_and_jvp
 from jaxdyn.dynamics import recursions, scans, world_frame
 from jaxdyn.dynamics.kinematics import TreeFrame, body_twists, tree_frame
 from jaxdyn.dynamics.world_frame import momentum, tree_inertias
-from jaxdyn.lie.so3 import _product
+from jaxdyn.lie.so3 import matmul
 from jaxdyn.model.arguments import Numbers, check_shapes, check_state
 from jaxdyn.model.tree import Model
 from jaxdyn.systems.system import System, symbols
@@ -361,6 +361,6 @@ def first_moments(model: Model, frame: TreeFrame):
     positions, for one tree.
     """
     mass = model.inertias[:, 0]
-    rotated = _product(frame.pose[:, :3, :3], model.inertias[:, 1:4, None])[..., 0]
+    rotated = matmul(frame.pose[:, :3, :3], model.inertias[:, 1:4, None])[..., 0]
     origin = frame.origin[0] if model.nb else jnp.zeros((3,), mass.dtype)
     return mass, rotated + mass[:, None] * frame.pose[:, :3, 3], origin, frame.origin - origin[None]

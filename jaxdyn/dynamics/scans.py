@@ -15,7 +15,7 @@ from jaxtyping import Array, Float, Int
 
 from jaxdyn.dynamics.kinematics import body_subspace, relative_poses
 from jaxdyn.lie import se3
-from jaxdyn.lie.so3 import _product
+from jaxdyn.lie.so3 import matmul
 from jaxdyn.model.inertia import spatial_inertia
 from jaxdyn.model.tree import Model
 from jaxdyn.systems.mass_factor import solve_positive
@@ -72,9 +72,9 @@ def _wrenches(model: Model, links: _Links, v, a) -> tuple[Float[Array, "nb 6"], 
     def outward(carry, link):
         twists, rates = carry
         i, parent, down, turn, push, inertia = link
-        twist = _product(down, twists[parent]) + turn
-        rate = _product(down, rates[parent]) + push + se3.ad_apply(twist, turn)
-        wrench = _product(inertia, rate) - se3.adT_apply(twist, _product(inertia, twist))
+        twist = matmul(down, twists[parent]) + turn
+        rate = matmul(down, rates[parent]) + push + se3.ad_apply(twist, turn)
+        wrench = matmul(inertia, rate) - se3.adT_apply(twist, matmul(inertia, twist))
         return (twists.at[i].set(twist), rates.at[i].set(rate)), (wrench, rate)
 
     each = jnp.arange(model.nb), links.parent, links.down, own_v, own_a, links.inertia
@@ -89,7 +89,7 @@ def inverse_dynamics(model: Model, q, v, a) -> Float[Array, " nv"]:
     def inward(total, link):
         i, parent, down, subspace = link
         wrench = total[i]
-        return total.at[parent].add(_product(down.T, wrench)), _product(subspace, wrench)
+        return total.at[parent].add(matmul(down.T, wrench)), matmul(subspace, wrench)
 
     # One row more for the world, which collects the roots' wrenches and is dropped.
     start = jnp.concatenate([wrenches, jnp.zeros((1, 6), v.dtype)])
@@ -112,11 +112,11 @@ def _factorize(model: Model, links: _Links) -> Factor:
     def inward(total, link):
         i, parent, down, S, extra = link
         inertia = total[i]
-        U = _product(S, inertia)
-        inverse = solve_positive(_product(U, S.T) + jnp.diag(extra), jnp.eye(S.shape[0], dtype=dtype))
-        gain = _product(inverse, U)
-        left = inertia - _product(U.T, gain)
-        return total.at[parent].add(_product(down.T, _product(left, down))), (inertia, inverse, gain)
+        U = matmul(S, inertia)
+        inverse = solve_positive(matmul(U, S.T) + jnp.diag(extra), jnp.eye(S.shape[0], dtype=dtype))
+        gain = matmul(inverse, U)
+        left = inertia - matmul(U.T, gain)
+        return total.at[parent].add(matmul(down.T, matmul(left, down))), (inertia, inverse, gain)
 
     start = jnp.concatenate([links.inertia, jnp.zeros((1, 6, 6), dtype)])
     each = jnp.arange(model.nb), links.parent, links.down, links.subspace, extra
@@ -129,8 +129,8 @@ def _residuals(model: Model, factor: Factor, tau, wrenches) -> tuple[Float[Array
 
     def inward(total, link):
         i, parent, down, S, gain, force = link
-        left = force - _product(S, total[i])
-        return total.at[parent].add(_product(down.T, total[i] + _product(left, gain))), (left, total[i])
+        left = force - matmul(S, total[i])
+        return total.at[parent].add(matmul(down.T, total[i] + matmul(left, gain))), (left, total[i])
 
     start = jnp.zeros((model.nb + 1, 6), dtype)
     start = start if wrenches is None else start.at[:-1].set(wrenches)
@@ -145,9 +145,9 @@ def _solve(model: Model, factor: Factor, tau, wrenches) -> Float[Array, " nv"]:
 
     def outward(twists, link):
         i, parent, down, S, gain, inverse, left = link
-        twist = _product(down, twists[parent])
-        a = _product(inverse, left) - _product(gain, twist)
-        return twists.at[i].set(twist + _product(a, S)), a
+        twist = matmul(down, twists[parent])
+        a = matmul(inverse, left) - matmul(gain, twist)
+        return twists.at[i].set(twist + matmul(a, S)), a
 
     each = jnp.arange(model.nb), links.parent, links.down, links.subspace, factor.gain, factor.inverse, residual
     return _flat(model, lax.scan(outward, jnp.zeros((model.nb + 1, 6), dtype), each)[1])

@@ -23,7 +23,7 @@ from jaxtyping import Array, Bool, Float
 from jaxdyn.compile import entry_point
 from jaxdyn.dynamics.frame_motion import frame_jacobian
 from jaxdyn.dynamics.quantities import coriolis_matrix, gravity_force, mass_matrix
-from jaxdyn.lie.so3 import _product
+from jaxdyn.lie.so3 import matmul
 from jaxdyn.model.arguments import check_shapes
 from jaxdyn.model.tree import Model, configuration_rate
 from jaxdyn.systems.mass_factor import mass_factor, solve_positive
@@ -82,7 +82,7 @@ def workspace_dynamics(
     a `least` outside of (0, 1).
 
     ```python
-    task = jd.workspace_dynamics(arm, "tip", q, v)
+    task = jd.dynamics.workspace_dynamics(arm, "tip", q, v)
     tau = task.jacobian.T @ (task.mass_matrix @ wanted + task.coriolis_force + task.gravity_force)
     ```
 
@@ -116,7 +116,7 @@ def _workspace(model: Model, choice: _Choice, q, v) -> WorkspaceDynamics:
     J, J_rate = jax.jvp(velocity_map, (q,), (configuration_rate(model, q, v),))
     factor = mass_factor(mass_matrix(model, q))
     whitened = factor.whiten(J.T)
-    scale, scaled = _unit_diagonal(_product(whitened.T, whitened))
+    scale, scaled = _unit_diagonal(matmul(whitened.T, whitened))
     # The scaled matrix is a Gram matrix: its least eigenvalue is negative only by
     # rounding.
     condition = jnp.maximum(jnp.linalg.eigvalsh(scaled)[0], jnp.zeros((), q.dtype))
@@ -126,13 +126,13 @@ def _workspace(model: Model, choice: _Choice, q, v) -> WorkspaceDynamics:
     mass = scale[:, None] * solve_positive(scaled + damping * unit, unit) * scale[None]
     # The two-sided scaling leaves rounding in the skew part; callers factor this matrix.
     mass = 0.5 * (mass + mass.T)
-    inverse = _product(factor.unwhiten(whitened), mass)
+    inverse = matmul(factor.unwhiten(whitened), mass)
     C = coriolis_matrix(model, q, v)
     return WorkspaceDynamics(
         mass_matrix=mass,
-        coriolis_matrix=_product(inverse.T, _product(C, inverse)) - _product(mass, _product(J_rate, inverse)),
-        coriolis_force=_product(inverse.T, _product(C, v)) - _product(mass, _product(J_rate, v)),
-        gravity_force=_product(inverse.T, gravity_force(model, q)),
+        coriolis_matrix=matmul(inverse.T, matmul(C, inverse)) - matmul(mass, matmul(J_rate, inverse)),
+        coriolis_force=matmul(inverse.T, matmul(C, v)) - matmul(mass, matmul(J_rate, v)),
+        gravity_force=matmul(inverse.T, gravity_force(model, q)),
         jacobian=J,
         jacobian_rate=J_rate,
         inverse=inverse,

@@ -24,7 +24,7 @@ from jaxdyn.dynamics.kinematics import (
     tree_frame,
 )
 from jaxdyn.lie import se3, so3
-from jaxdyn.lie.so3 import _product, cross
+from jaxdyn.lie.so3 import cross, matmul
 from jaxdyn.model.inertia import rotational_inertia, spatial_inertia, transform_inertia
 from jaxdyn.model.tree import Model
 from jaxdyn.systems.mass_factor import cholesky, solve_cholesky
@@ -43,11 +43,11 @@ def gravity_force(model: Model, q: Float[Array, " nq"]) -> Float[Array, " nv"]:
     frame = tree_frame(model, q)
     # The ten numbers are needed up to the first moment only.
     mass = model.inertias[:, :1]
-    first = _product(frame.pose[:, :3, :3], model.inertias[:, 1:4, None])[..., 0] + mass * frame.pose[:, :3, 3]
+    first = matmul(frame.pose[:, :3, :3], model.inertias[:, 1:4, None])[..., 0] + mass * frame.pose[:, :3, 3]
     moved = sum_to_coordinates(model, jnp.concatenate([mass, first], axis=1))
     gravity = model.gravity
     torque = jax.vmap(cross, (0, None))(moved[:, 1:], gravity)
-    return -(_product(frame.subspace[:, :3], gravity) * moved[:, 0] + jnp.sum(frame.subspace[:, 3:] * torque, axis=1))
+    return -(matmul(frame.subspace[:, :3], gravity) * moved[:, 0] + jnp.sum(frame.subspace[:, 3:] * torque, axis=1))
 
 
 def inverse_dynamics(
@@ -108,18 +108,18 @@ def coriolis_matrix(model: Model, q: Float[Array, " nq"], v: Float[Array, " nv"]
     twists = body_twists(model, frame, v)
     subspace, rate = frame.subspace, subspace_rate(model, frame, twists)
     inertia = jax.vmap(spatial_inertia)(tree_inertias(model, frame))
-    transport = -_product(jax.vmap(se3.ad)(twists).transpose(0, 2, 1), inertia)
+    transport = -matmul(jax.vmap(se3.ad)(twists).transpose(0, 2, 1), inertia)
     # Both matrices are summed over subtrees by one product instead of two.
     flat = jnp.concatenate([inertia.reshape(-1, 36), transport.reshape(-1, 36)], axis=1)
     moved = sum_to_coordinates(model, flat)
     inertia, transport = moved[:, :36].reshape(-1, 6, 6), moved[:, 36:].reshape(-1, 6, 6)
     # Coordinates k, l share the bodies moved by the deeper of the two: its sums stand on the row below the diagonal
     # (k deeper), on the column above it.
-    row_inertia = _product(subspace[:, None], inertia)[:, 0]
-    row_transport = _product(subspace[:, None], transport)[:, 0]
-    below = _product(row_inertia, rate.T) + _product(row_transport, subspace.T)
-    column = _product(inertia, rate[..., None])[..., 0] + _product(transport, subspace[..., None])[..., 0]
-    above = _product(subspace, column.T)
+    row_inertia = matmul(subspace[:, None], inertia)[:, 0]
+    row_transport = matmul(subspace[:, None], transport)[:, 0]
+    below = matmul(row_inertia, rate.T) + matmul(row_transport, subspace.T)
+    column = matmul(inertia, rate[..., None])[..., 0] + matmul(transport, subspace[..., None])[..., 0]
+    above = matmul(subspace, column.T)
     deeper = _descendant_mask(model)
     zero = jnp.zeros_like(below)
     return jnp.where(deeper, below, zero) + jnp.where(np.tril(deeper, -1).T, above, zero)
@@ -137,7 +137,7 @@ def torque_regressor(
     # Column k of the body Jacobian of body i, for all i and k.
     columns = jax.vmap(jax.vmap(se3.Ad_inv_apply, (None, 0)), (0, None))(frame.pose, frame.subspace)
     columns = jnp.where(model.topology.dof_ancestors[:, :, None], columns, jnp.zeros_like(columns))
-    return _product(columns, wrenches).transpose(1, 0, 2).reshape(model.nv, 10 * model.nb)
+    return matmul(columns, wrenches).transpose(1, 0, 2).reshape(model.nv, 10 * model.nb)
 
 
 def mass_matrix_derivative(model: Model, q: Float[Array, " nq"]) -> Float[Array, "nv nv nv"]:
@@ -174,7 +174,7 @@ def momentum(parameters: Float[Array, "10"], twist: Float[Array, "6"]) -> Float[
     """Spatial momentum I V = (m v + omega x h, h x v + I omega), h = m c, at the frame's origin."""
     mass, first = parameters[0], parameters[1:4]
     v, omega = twist[:3], twist[3:]
-    angular = cross(first, v) + _product(rotational_inertia(parameters), omega)
+    angular = cross(first, v) + matmul(rotational_inertia(parameters), omega)
     return jnp.concatenate([mass * v + cross(omega, first), angular])
 
 
@@ -187,7 +187,7 @@ def _mass_matrix(model: Model, frame: TreeFrame, inertias: Float[Array, "nb 10"]
     composite = sum_to_coordinates(model, inertias)
     # Only entries of ancestors are valid: elsewhere the composite inertia is that of an unrelated subtree.
     forces = jax.vmap(momentum)(composite, frame.subspace)
-    products = _product(forces, frame.subspace.T)
+    products = matmul(forces, frame.subspace.T)
     deeper = _descendant_mask(model)
     zero = jnp.zeros_like(products)
     matrix = jnp.where(deeper, products, zero) + jnp.where(np.tril(deeper, -1).T, products.T, zero)
@@ -208,7 +208,7 @@ def _accelerations(model, frame, twists, v, a) -> Float[Array, "nb 6"]:
 def joint_wrenches(model: Model, frame: TreeFrame, v, a, external) -> Float[Array, "nb 6"]:
     """Wrench through each joint, in the tree frame: the sum of the wrenches on the bodies that it carries."""
     wrenches = _body_wrenches(model, frame, tree_inertias(model, frame), v, a, external)
-    return _product(jnp.asarray(model.topology.ancestors.T, wrenches.dtype), wrenches)
+    return matmul(jnp.asarray(model.topology.ancestors.T, wrenches.dtype), wrenches)
 
 
 def _body_wrenches(model, frame, inertias, v, a, external) -> Float[Array, "nb 6"]:
@@ -234,7 +234,7 @@ def _inertial_wrench(parameters, twist, acceleration) -> Float[Array, "6"]:
     omega, alpha = twist[3:], acceleration[3:]
     point = acceleration[:3] + cross(omega, twist[:3])
     force = mass * point + cross(alpha, first) + cross(omega, cross(omega, first))
-    torque = cross(first, point) + _product(inertia, alpha) + cross(omega, _product(inertia, omega))
+    torque = cross(first, point) + matmul(inertia, alpha) + cross(omega, matmul(inertia, omega))
     return jnp.concatenate([force, torque])
 
 
@@ -243,11 +243,11 @@ def _wrench_regressor(twist, acceleration) -> Float[Array, "6 10"]:
     omega, alpha = twist[3:], acceleration[3:]
     point = acceleration[:3] + cross(omega, twist[:3])
     turn = so3.hat(omega)
-    force = jnp.concatenate([point[:, None], so3.hat(alpha) + _product(turn, turn), jnp.zeros((3, 6), twist.dtype)], 1)
+    force = jnp.concatenate([point[:, None], so3.hat(alpha) + matmul(turn, turn), jnp.zeros((3, 6), twist.dtype)], 1)
     torque = [
         jnp.zeros((3, 1), twist.dtype),
         -so3.hat(point),
-        _inertia_times(alpha) + _product(turn, _inertia_times(omega)),
+        _inertia_times(alpha) + matmul(turn, _inertia_times(omega)),
     ]
     return jnp.concatenate([force, jnp.concatenate(torque, 1)])
 

@@ -28,7 +28,7 @@ class JointStops(PiecewiseForce):
     named ones with several coordinates.
 
     ```python
-    scene = jd.Scene(robot, forces=[jd.JointStops(1e4, 50.0)])
+    scene = jd.Scene(robot, forces=[jd.forces.JointStops(1e4, 50.0)])
     ```
     """
 

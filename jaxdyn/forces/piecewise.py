@@ -28,7 +28,7 @@ class PiecewiseForce(eqx.Module):
       `positive` (n,). For a fixed `positive` it is smooth, also across the zeros of the guards.
 
     ```python
-    class Backlash(jd.PiecewiseForce):
+    class Backlash(jd.forces.PiecewiseForce):
         stiffness: jax.Array
         play: jax.Array
 

@@ -5,7 +5,7 @@ from jaxtyping import Array, Float
 
 from jaxdyn.compile import entry_point
 from jaxdyn.lie import se3, so3
-from jaxdyn.lie.so3 import _product
+from jaxdyn.lie.so3 import matmul
 from jaxdyn.model.arguments import as_array, batch_hint
 from jaxdyn.systems.mass_factor import solve_positive
 
@@ -44,6 +44,6 @@ def arnold_form(inertia: Float[Array, "n n"], c: Float[Array, " n"], a: Float[Ar
 @entry_point
 def _arnold_form(inertia, c, a):
     # Euler's equations in momentum form; B follows by one solve with the inertia, which is never inverted.
-    momentum = _product(inertia, c)
+    momentum = matmul(inertia, c)
     force = so3.cross(momentum, a) if a.shape[0] == 3 else se3.adT_apply(a, momentum)
     return solve_positive(inertia, force)

@@ -22,7 +22,7 @@ from jaxtyping import Array, Float
 
 from jaxdyn.compile.known import is_known
 from jaxdyn.dynamics import quantities as dynamics
-from jaxdyn.lie.so3 import _product
+from jaxdyn.lie.so3 import matmul
 from jaxdyn.model.arguments import Checked, Function, Numbers, check_state
 from jaxdyn.systems.scene import Scene, as_pytree, as_scene, check_force
 from jaxdyn.systems.start import describe_state
@@ -50,7 +50,7 @@ class PullBack(eqx.Module):
             _check_rank(J, s, None)
         # One index at a time: m n^k products instead of a contraction over all indices at once.
         for axis in range(value.ndim):
-            value = jnp.moveaxis(_product(jnp.moveaxis(value, axis, -1), J), -1, axis)
+            value = jnp.moveaxis(matmul(jnp.moveaxis(value, axis, -1), J), -1, axis)
         return value
 
 
@@ -131,7 +131,7 @@ class ImmersedSystem(System):
     def mass_matrix(self, s, t):
         """rho = sum of J^T M J, (m, m)."""
         jacobians = zip(self.units, *self._unit_jacobians(s, t), strict=True)
-        return _sum(_product(J.T, _product(dynamics.mass_matrix(unit, q, t), J)) for unit, q, J in jacobians)
+        return _sum(matmul(J.T, matmul(dynamics.mass_matrix(unit, q, t), J)) for unit, q, J in jacobians)
 
     def bias_force(self, s, v, t):
         """Sum of J^T (M c + h), (m,)."""
@@ -143,12 +143,12 @@ class ImmersedSystem(System):
 
     def _inverse(self, s, v, t, a):
         forces = self._unit_forces(self.motions(s, v, t), a, t)
-        return _sum(_product(motion.J.T, force) for motion, force in forces)
+        return _sum(matmul(motion.J.T, force) for motion, force in forces)
 
     def _unit_forces(self, motions, a, t):
         """Yield each unit's motion and the generalised force M (J a + c) + h that it requires."""
         for unit, motion in zip(self.units, motions, strict=True):
-            acceleration = motion.drift if a is None else motion.drift + _product(motion.J, a)
+            acceleration = motion.drift if a is None else motion.drift + matmul(motion.J, a)
             yield motion, dynamics.inverse_dynamics(unit, motion.q, motion.v, acceleration, t)
 
     def gravity_force(self, s, t):
@@ -157,7 +157,7 @@ class ImmersedSystem(System):
         if self.moving:
             return super().gravity_force(s, t)
         jacobians = zip(self.units, *self._unit_jacobians(s, t), strict=True)
-        return _sum(_product(J.T, dynamics.gravity_force(unit, q, t)) for unit, q, J in jacobians)
+        return _sum(matmul(J.T, dynamics.gravity_force(unit, q, t)) for unit, q, J in jacobians)
 
     def kinetic_energy(self, s, v, t):
         """Sum of the units' kinetic energies, (), J."""
@@ -238,7 +238,7 @@ def constrain_by_immersion(
     Source: EQUATIONS section 12.
 
     ```python
-    rod = jd.constrain_by_immersion(particle, lambda s: jnp.concatenate([jnp.sin(s), -jnp.cos(s)]), 1)
+    rod = jd.geometry.constrain_by_immersion(particle, lambda s: jnp.concatenate([jnp.sin(s), -jnp.cos(s)]), 1)
     ```
     """
     joined = isinstance(system, (tuple, list))
@@ -301,7 +301,7 @@ def reaction_force(
         applied = _add_forces(applied, force if immersed.joined else (force,), "force")
     for pulled in scene.forces:
         applied = [a + f for a, f in zip(applied, pulled.on_units(immersed, places, speeds, t), strict=True)]
-    tau = _sum(_product(m.J.T, f) for m, f in zip(motions, applied, strict=True))
+    tau = _sum(matmul(m.J.T, f) for m, f in zip(motions, applied, strict=True))
     a = dynamics.forward_dynamics(immersed, q, v, tau, t)
     reactions = tuple(
         required - f for (_, required), f in zip(immersed._unit_forces(motions, a, t), applied, strict=True)

@@ -20,7 +20,7 @@ from jaxtyping import Array, Float
 
 from jaxdyn.compile import entry_point
 from jaxdyn.dynamics.quantities import mass_matrix
-from jaxdyn.lie.so3 import _product
+from jaxdyn.lie.so3 import matmul
 from jaxdyn.model.arguments import as_array, batch_hint, check_state, check_system, state_dtype
 from jaxdyn.model.tree import Model
 from jaxdyn.systems.mass_factor import solve_positive
@@ -52,7 +52,7 @@ def flat(metric: Metric, q: Float[Array, " n"], v: Float[Array, " n"]) -> Float[
     **Arguments:** `metric` as above; `q`, `v` (n,). **Returns:** (n,).
     """
     q, v = _vectors(metric, q=q, v=v)
-    return _product(_as_function(metric)(q), v)
+    return matmul(_as_function(metric)(q), v)
 
 
 def sharp(metric: Metric, q: Float[Array, " n"], p: Float[Array, " n"]) -> Float[Array, " n"]:
@@ -103,9 +103,9 @@ def connection(
 def _connection(metric, q, v, w):
     g = _as_function(metric)
     # The three terms of the symbols as two directional derivatives and one gradient: O(1) evaluations of g, no n^3 array.
-    _, along_v = jax.jvp(lambda q: _product(g(q), w), (q,), (v,))
-    _, along_w = jax.jvp(lambda q: _product(g(q), v), (q,), (w,))
-    gradient = jax.grad(lambda q: jnp.sum(v * _product(g(q), w)))(q)
+    _, along_v = jax.jvp(lambda q: matmul(g(q), w), (q,), (v,))
+    _, along_w = jax.jvp(lambda q: matmul(g(q), v), (q,), (w,))
+    gradient = jax.grad(lambda q: jnp.sum(v * matmul(g(q), w)))(q)
     return solve_positive(g(q), 0.5 * (along_v + along_w - gradient))
 
 
@@ -181,7 +181,7 @@ def _sectional(metric, q, u, w):
     g = _as_function(metric)(q)
     curvature = jnp.einsum("ijkl,j,k,l->i", _curvature(metric, q), w, u, w)
     # Lowering the index with g makes <R(u, w) w, u> a scalar in any coordinates.
-    dot = lambda a, b: jnp.sum(a * _product(g, b))  # noqa: E731
+    dot = lambda a, b: jnp.sum(a * matmul(g, b))  # noqa: E731
     return dot(curvature, u) / (dot(u, u) * dot(w, w) - dot(u, w) ** 2)
 
 

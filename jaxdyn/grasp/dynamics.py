@@ -25,7 +25,7 @@ from jaxdyn.constraints.rank import pseudo_inverse, tolerance
 from jaxdyn.dynamics.quantities import coriolis_matrix, gravity_force, mass_matrix
 from jaxdyn.grasp.hand import Grasp, check_grasp
 from jaxdyn.grasp.motions import HandMotions, hand_motions, velocity_rows
-from jaxdyn.lie.so3 import _product
+from jaxdyn.lie.so3 import matmul
 from jaxdyn.model.arguments import Numbers, as_array, batch_hint, check_state, zeros_if_none
 from jaxdyn.reduction.bases import least_quality
 from jaxdyn.systems.mass_factor import cholesky, solve_cholesky
@@ -169,45 +169,45 @@ def _solve(grasp: Grasp, q, V, tau, t) -> ObjectDynamics:
     A, push = jax.linearize(lambda q, t: constraint_jacobian(grasp, q, t), q, t)
     Jh = -A[:, hands]
     inverse = pseudo_inverse(Jh, tolerance(None, Jh))
-    X = _product(inverse, A[:, objects])
+    X = matmul(inverse, A[:, objects])
     N = jnp.zeros((grasp.nv, objects.size), q.dtype).at[objects].set(jnp.eye(objects.size, dtype=q.dtype))
     N = N.at[hands].set(X)
-    v = _product(N, V)
+    v = matmul(N, V)
     # From J_h X = G^T: J_h Xdot = Gdot^T - J_hdot X, which is Adot N.
-    Xdot = _product(inverse, _product(push(velocity_to_rate(grasp.system, q, v), jnp.ones_like(t)), N))
+    Xdot = matmul(inverse, matmul(push(velocity_to_rate(grasp.system, q, v), jnp.ones_like(t)), N))
     Ndot = jnp.zeros_like(N).at[hands].set(Xdot)
     # The trace of J_h^+ J_h is the rank of J_h.
     whole = jnp.round(jnp.sum(inverse * Jh.T)) == hands.size
     condition = jnp.sqrt(jnp.sum(inverse * inverse) * jnp.sum(A * A))
     # The condition number that the dtype resolves: beyond it the basis N has no correct digits.
     is_regular = whole & (condition * least_quality(q.dtype) < 1)
-    return _solve_dynamics(grasp, q, V, tau, t, N, Ndot, is_regular, lambda left: -_product(inverse.T, left[hands]))
+    return _solve_dynamics(grasp, q, V, tau, t, N, Ndot, is_regular, lambda left: -matmul(inverse.T, left[hands]))
 
 
 @entry_point
 def _solve_motions(grasp: Grasp, motions: HandMotions, q, nu, tau, t) -> ObjectDynamics:
     place, push = jax.linearize(lambda q, t: motions.at(grasp, q, t), q, t)
     # N is linearised with its configuration, so that Ndot is exact for any basis.
-    v = _product(place.N, nu)
+    v = matmul(place.N, nu)
     Ndot = push(velocity_to_rate(grasp.system, q, v), jnp.ones_like(t)).N
     is_regular = place.quality > least_quality(q.dtype)
     A = constraint_jacobian(grasp, q, t)
     inverse = pseudo_inverse(A, tolerance(None, A))
-    return _solve_dynamics(grasp, q, nu, tau, t, place.N, Ndot, is_regular, lambda left: _product(inverse.T, left))
+    return _solve_dynamics(grasp, q, nu, tau, t, place.N, Ndot, is_regular, lambda left: matmul(inverse.T, left))
 
 
 def _solve_dynamics(grasp: Grasp, q, nu, tau, t, N, Ndot, is_regular, multipliers) -> ObjectDynamics:
     """Solve the equations in nu, v = N nu; `multipliers` solves A^T lam = M a + C v + g - tau (nv,)."""
-    system, v = grasp.system, _product(N, nu)
+    system, v = grasp.system, matmul(N, nu)
     M, C = mass_matrix(system, q, t), coriolis_matrix(system, q, v, t)
     gravity, force = gravity_force(system, q, t), applied(grasp, q, v, tau, t)
-    mass = _product(N.T, _product(M, N))
-    coriolis = _product(N.T, _product(C, N) + _product(M, Ndot))
-    gravity_part, force_part = _product(N.T, gravity), _product(N.T, force)
+    mass = matmul(N.T, matmul(M, N))
+    coriolis = matmul(N.T, matmul(C, N) + matmul(M, Ndot))
+    gravity_part, force_part = matmul(N.T, gravity), matmul(N.T, force)
     factor = cholesky(mass)
-    rate = solve_cholesky(factor, force_part - _product(coriolis, nu) - gravity_part)
-    a = _product(N, rate) + _product(Ndot, nu)
-    lam = multipliers(_product(M, a) + _product(C, v) + gravity - force)
+    rate = solve_cholesky(factor, force_part - matmul(coriolis, nu) - gravity_part)
+    a = matmul(N, rate) + matmul(Ndot, nu)
+    lam = multipliers(matmul(M, a) + matmul(C, v) + gravity - force)
 
     result = RESULTS.where(jnp.isfinite(factor).all(), RESULTS.successful, RESULTS.singular_mass_matrix)  # pyright: ignore[reportArgumentType]
     result = RESULTS.where(is_regular, result, RESULTS.singular_basis)

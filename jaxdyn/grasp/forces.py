@@ -28,7 +28,7 @@ from jaxdyn.contact.qp import RESULTS
 from jaxdyn.dynamics.quantities import gravity_force
 from jaxdyn.grasp.contacts import Contact
 from jaxdyn.grasp.hand import Grasp, check_grasp, grasp_map, hand_jacobian
-from jaxdyn.lie.so3 import _product
+from jaxdyn.lie.so3 import matmul
 from jaxdyn.model.arguments import Numbers, as_array, batch_hint, check_state
 from jaxdyn.reduction.bases import orthonormal, split_directions
 
@@ -79,13 +79,13 @@ def internal_force_basis(
     if reference is None:
         known = is_known(grasp, q, t)
         rank = int(jnp.round(jnp.sum(inverse * G.T))) if known else min(G.shape)
-        return split_directions(jnp.eye(G.shape[1], dtype=G.dtype) - _product(inverse, G))[:, rank:]
+        return split_directions(jnp.eye(G.shape[1], dtype=G.dtype) - matmul(inverse, G))[:, rank:]
     reference = jnp.asarray(as_array(reference, "reference", G.dtype))
     if reference.ndim != 2 or reference.shape[0] != G.shape[1]:
         raise ValueError(
             f"reference has shape {reference.shape}, expected ({G.shape[1]}, ni); use internal_force_basis(grasp, q)"
         )
-    return orthonormal(reference - _product(inverse, _product(G, reference)))[0] if reference.shape[1] else reference
+    return orthonormal(reference - matmul(inverse, matmul(G, reference)))[0] if reference.shape[1] else reference
 
 
 def normal_forces(grasp: Grasp) -> Float[np.ndarray, " nc"]:
@@ -136,7 +136,7 @@ def forces_for_wrench(
 
 def split_forces(G: Float[Array, "no nc"], wrench, preload) -> Float[Array, " nc"]:
     """Contact forces G^+ F + (1 - G^+ G) lam_0."""
-    return preload + _product(pseudo_inverse(G, tolerance(None, G)), wrench - _product(G, preload))
+    return preload + matmul(pseudo_inverse(G, tolerance(None, G)), wrench - matmul(G, preload))
 
 
 def as_preload(grasp: Grasp, preload: Any, dtype) -> Float[Array, " nc"]:
@@ -203,7 +203,7 @@ def hold(
     optimum = optimal_forces(G[:, order], wrench, [contact.cone for contact in contacts], preload=preload)
     # `order` maps the forces of the cones, in the order of components, back to the rows of the grasp.
     forces = jnp.zeros((A.shape[0],), A.dtype).at[order].set(optimum.x)
-    torques = -_product(A[:, np.array(grasp.hand_velocities, int)].T, forces)
+    torques = -matmul(A[:, np.array(grasp.hand_velocities, int)].T, forces)
     return HandForces(forces, torques, optimum.result, layout(grasp))
 
 
@@ -255,7 +255,7 @@ def joint_torques(
     lam = as_array(lam, "lam", Jh.dtype)
     if lam.shape != Jh.shape[:1]:
         raise ValueError(f"lam has shape {lam.shape}, expected {Jh.shape[:1]}{batch_hint(lam, (1,))}")
-    return _product(Jh.T, lam)
+    return matmul(Jh.T, lam)
 
 
 def _every_cone(grasp: Grasp, cones) -> tuple[ContactWithCone, ...]:

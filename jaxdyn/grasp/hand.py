@@ -13,7 +13,7 @@ from jaxdyn.constraints.rank import pseudo_inverse, tolerance
 from jaxdyn.contact.cones import Cones
 from jaxdyn.contact.forces import contacts_with_cones
 from jaxdyn.grasp.contacts import on_object
-from jaxdyn.lie.so3 import _product
+from jaxdyn.lie.so3 import matmul
 from jaxdyn.model import float64 as f64
 from jaxdyn.model.arguments import Checked, Numbers, as_array, batch_hint
 from jaxdyn.model.joining import join_all
@@ -133,7 +133,7 @@ def internal_forces(
         raise ValueError(
             f"lam has shape {lam.shape}, expected {G.shape[1:]}, one per row of the grasp{batch_hint(lam, (1,))}"
         )
-    return lam - _product(pseudo_inverse(G, tolerance(None, G)), _product(G, lam))
+    return lam - matmul(pseudo_inverse(G, tolerance(None, G)), matmul(G, lam))
 
 
 def check_grasp(grasp) -> None:

@@ -15,7 +15,7 @@ from jaxdyn.compile.known import is_concrete
 from jaxdyn.constraints.base import constraint_jacobian
 from jaxdyn.grasp.hand import Grasp, check_grasp
 from jaxdyn.grasp.motions import HandMotions, hand_motions, velocity_rows
-from jaxdyn.lie.so3 import _product
+from jaxdyn.lie.so3 import matmul
 from jaxdyn.model.arguments import Numbers, as_array, check_state
 from jaxdyn.reduction.bases import least_quality, orthonormal
 from jaxdyn.systems.mass_factor import solve_lower
@@ -103,7 +103,7 @@ def _measure(grasp: Grasp, motions: HandMotions, q, length, t) -> Manipulability
     return Manipulability(
         velocity_axes=velocity_axes,
         force_axes=force_axes,
-        directions=lax.stop_gradient(_product(along, vectors) / scale[:, None]),
+        directions=lax.stop_gradient(matmul(along, vectors) / scale[:, None]),
         sigma_min=velocity_axes[-1],
         isotropy=force_axes[0] / force_axes[-1],
         volume=jnp.prod(velocity_axes),
@@ -118,7 +118,7 @@ def _axes(X: Float[Array, "n m"]) -> tuple[Float[Array, " m"], Float[Array, "m m
     # By stationarity of singular values, |X v_i| with constant v_i has the exact first derivative, without SVD's
     # division\n# by differences of singular values.
     vectors = lax.stop_gradient(jnp.linalg.svd(lax.stop_gradient(X))[2]).T
-    square = jnp.sum(_product(X, vectors) ** 2, 0)
+    square = jnp.sum(matmul(X, vectors) ** 2, 0)
     some = square > 0
     return jnp.where(some, jnp.sqrt(jnp.where(some, square, jnp.ones_like(square))), jnp.zeros_like(square)), vectors
 

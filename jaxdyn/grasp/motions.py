@@ -22,7 +22,7 @@ from jaxdyn.compile.known import is_known
 from jaxdyn.constraints.base import constraint_jacobian, layout
 from jaxdyn.constraints.rank import eps_of, pseudo_inverse, tolerance
 from jaxdyn.grasp.hand import Grasp, check_grasp
-from jaxdyn.lie.so3 import _product
+from jaxdyn.lie.so3 import matmul
 from jaxdyn.model.arguments import Number, Numbers, check_state
 from jaxdyn.reduction.bases import Basis, Parametrization, orthonormal, split_directions
 from jaxdyn.systems.scene import Scene
@@ -56,10 +56,10 @@ class HandMotions(Basis):
         H, pivot, fits = self._object(A, Jh, seen, inverse)
         N = jnp.zeros((scene.nv, self.size(scene)), A.dtype)
         N = N.at[objects, : H.shape[1]].set(H)
-        N = N.at[hands, : H.shape[1]].set(_product(inverse, _product(seen, H)))
+        N = N.at[hands, : H.shape[1]].set(matmul(inverse, matmul(seen, H)))
         if self.internal.shape[1]:
             reference = self.internal.astype(A.dtype)
-            K, least, _ = orthonormal(reference - _product(inverse, _product(Jh, reference)))
+            K, least, _ = orthonormal(reference - matmul(inverse, matmul(Jh, reference)))
             N = N.at[hands, H.shape[1] :].set(K)
             pivot = jnp.minimum(pivot, least)
         fits = fits & (jnp.round(jnp.sum(inverse * Jh.T)) == rank)
@@ -72,7 +72,7 @@ class HandMotions(Basis):
     def _object(self, A, Jh, seen, inverse):
         """H, its least pivot, and the flag that its number of columns is that of the feasible object velocities."""
         reference = self.object.astype(A.dtype)
-        lost = seen - _product(Jh, _product(inverse, seen))
+        lost = seen - matmul(Jh, matmul(inverse, seen))
         if reference.shape[0] == reference.shape[1]:
             whole = jnp.max(jnp.abs(lost), initial=0.0) <= _negligible(A) * jnp.max(jnp.abs(A))
             return reference, jnp.ones((), A.dtype), whole
@@ -81,7 +81,7 @@ class HandMotions(Basis):
         fits = jnp.round(jnp.sum(across * lost.T)) == reference.shape[0] - reference.shape[1]
         if not reference.shape[1]:
             return reference, jnp.ones((), A.dtype), fits
-        H, pivot, _ = orthonormal(reference - _product(across, _product(lost, reference)))
+        H, pivot, _ = orthonormal(reference - matmul(across, matmul(lost, reference)))
         return H, pivot, fits
 
     def advice(self, scene: Scene, q: Float[Array, " nq"], t: Number) -> str:
@@ -151,12 +151,12 @@ def _projections(grasp: Grasp, q, t):
     A = constraint_jacobian(grasp, q, t)
     Jh, seen = -A[:, hands], A[:, objects]
     inverse = pseudo_inverse(Jh, tolerance(None, Jh), True)
-    lost = seen - _product(Jh, _product(inverse, seen))
+    lost = seen - matmul(Jh, matmul(inverse, seen))
     # Entries at rounding level are set to zero, so that they do not count as rank.
     lost = jnp.where(jnp.abs(lost) <= _negligible(A) * jnp.max(jnp.abs(A)), jnp.zeros_like(lost), lost)
     across = pseudo_inverse(lost, tolerance(None, lost), True)
-    on_object = jnp.eye(objects.size, dtype=A.dtype) - _product(across, lost)
-    on_hand = jnp.eye(hands.size, dtype=A.dtype) - _product(inverse, Jh)
+    on_object = jnp.eye(objects.size, dtype=A.dtype) - matmul(across, lost)
+    on_hand = jnp.eye(hands.size, dtype=A.dtype) - matmul(inverse, Jh)
     return on_object, on_hand, (jnp.round(jnp.sum(across * lost.T)), jnp.round(jnp.sum(inverse * Jh.T)))
 
 

@@ -142,7 +142,7 @@ def make_chart(
     if bad:
         raise ValueError(
             f"inertia of {', '.join(bad)} is not that of a solid body (pseudo-inertia not positive definite): "
-            "a feasible fit cannot start there; repair it first with jd.repair_inertias(model), give rods and points "
+            "a feasible fit cannot start there; repair it first with jd.model.repair_inertias(model), give rods and points "
             "some thickness, or fit inertia='mass' alone"
         )
     factors = np.array([_factor(P, inertia) for P in matrices]).reshape(-1, 4, 4)

@@ -45,7 +45,7 @@ class Parameters(eqx.Module):
     its bounds; the message names the leaf.
 
     ```python
-    scene = jd.Scene(model, forces=[jd.JointDamping([0.1, 0.1])])
+    scene = jd.Scene(model, forces=[jd.forces.JointDamping([0.1, 0.1])])
     parameters = (
         jd.identify.Parameters(scene)
         .inertias(bodies=["a", "b"], metric="affine", weight=1.0)

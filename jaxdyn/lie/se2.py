@@ -10,7 +10,7 @@ from jaxtyping import Array, Float
 
 from jaxdyn.lie.series import inverse_coefficient, stumpff
 
-from .so3 import _product
+from .so3 import matmul
 
 Point = Float[Array, "2"]
 Twist = Float[Array, "3"]
@@ -42,7 +42,7 @@ def apply(transform: Matrix, point: Point) -> Point:
 
     **Arguments:** `transform`: T_ab, (3, 3); `point`: (2,), m, in b. **Returns:** (2,), m, in a.
     """
-    return _product(transform[:2, :2], point) + transform[:2, 2]
+    return matmul(transform[:2, :2], point) + transform[:2, 2]
 
 
 def hat(twist: Twist) -> Matrix:
@@ -100,7 +100,7 @@ def log(transform: Matrix) -> Twist:
 def inverse(transform: Matrix) -> Matrix:
     """Inverse motion [[R^T, -R^T p], [0, 1]]. **Arguments:** `transform`: T_ab, (3, 3). **Returns:** T_ba, (3, 3)."""
     rotation = transform[:2, :2].T
-    return from_parts(rotation, -_product(rotation, transform[:2, 2]))
+    return from_parts(rotation, -matmul(rotation, transform[:2, 2]))
 
 
 def Ad(transform: Matrix) -> Matrix:
@@ -159,7 +159,7 @@ def Ad_apply(transform: Matrix, twist: Twist) -> Twist:
 
     **Arguments:** `transform`: T_ab, (3, 3); `twist`: in b, (3,). **Returns:** in a, (3,).
     """
-    v = _product(transform[:2, :2], twist[:2]) - twist[2] * _quarter_turn(transform[:2, 2])
+    v = matmul(transform[:2, :2], twist[:2]) - twist[2] * _quarter_turn(transform[:2, 2])
     return jnp.concatenate([v, twist[2:]])
 
 
@@ -169,7 +169,7 @@ def Ad_inv_apply(transform: Matrix, twist: Twist) -> Twist:
     **Arguments:** `transform`: T_ab, (3, 3); `twist`: in a, (3,). **Returns:** in b, (3,).
     """
     # Vector times matrix is R^T v without a transposed copy.
-    v = _product(twist[:2] + twist[2] * _quarter_turn(transform[:2, 2]), transform[:2, :2])
+    v = matmul(twist[:2] + twist[2] * _quarter_turn(transform[:2, 2]), transform[:2, :2])
     return jnp.concatenate([v, twist[2:]])
 
 
@@ -179,7 +179,7 @@ def AdT_apply(transform: Matrix, wrench: Twist) -> Twist:
     **Arguments:** `transform`: T_ab, (3, 3); `wrench`: in a, (3,). **Returns:** in b, (3,).
     """
     tau = wrench[2] - _area(transform[:2, 2], wrench[:2])
-    return jnp.concatenate([_product(wrench[:2], transform[:2, :2]), tau[None]])
+    return jnp.concatenate([matmul(wrench[:2], transform[:2, :2]), tau[None]])
 
 
 def Ad_inv_T_apply(transform: Matrix, wrench: Twist) -> Twist:
@@ -187,7 +187,7 @@ def Ad_inv_T_apply(transform: Matrix, wrench: Twist) -> Twist:
 
     **Arguments:** `transform`: T_ab, (3, 3); `wrench`: in b, (3,). **Returns:** in a, (3,).
     """
-    f = _product(transform[:2, :2], wrench[:2])
+    f = matmul(transform[:2, :2], wrench[:2])
     tau = wrench[2] + _area(transform[:2, 2], f)
     return jnp.concatenate([f, tau[None]])
 

@@ -14,7 +14,7 @@ from jaxtyping import Array, Float
 from jaxdyn.lie.series import inverse_coefficient, stumpff
 
 from . import so3
-from .so3 import _product, cross
+from .so3 import cross, matmul
 
 Vector = Float[Array, "3"]
 Twist = Float[Array, "6"]
@@ -43,7 +43,7 @@ def apply(transform: Matrix, point: Vector) -> Vector:
 
     **Arguments:** `transform`: T_ab, (4, 4); `point`: (3,), m, in b. **Returns:** (3,), m, in a.
     """
-    return _product(transform[:3, :3], point) + transform[:3, 3]
+    return matmul(transform[:3, :3], point) + transform[:3, 3]
 
 
 def hat(twist: Twist) -> Matrix:
@@ -103,7 +103,7 @@ def log(transform: Matrix) -> Twist:
 def inverse(transform: Matrix) -> Matrix:
     """Inverse motion [[R^T, -R^T p], [0, 1]]. **Arguments:** `transform`: T_ab, (4, 4). **Returns:** T_ba, (4, 4)."""
     rotation = transform[:3, :3].T
-    return from_parts(rotation, -_product(rotation, transform[:3, 3]))
+    return from_parts(rotation, -matmul(rotation, transform[:3, 3]))
 
 
 def Ad(transform: Matrix) -> Adjoint:
@@ -114,7 +114,7 @@ def Ad(transform: Matrix) -> Adjoint:
     Source: Murray, Li, Sastry (1994), eq. 2.58.
     """
     rotation = transform[:3, :3]
-    return _blocks(rotation, _product(so3.hat(transform[:3, 3]), rotation))
+    return _blocks(rotation, matmul(so3.hat(transform[:3, 3]), rotation))
 
 
 def ad(twist: Twist) -> Adjoint:
@@ -160,8 +160,8 @@ def Ad_apply(transform: Matrix, twist: Twist) -> Twist:
     **Arguments:** `transform`: T_ab, (4, 4); `twist`: in b, (6,). **Returns:** in a, (6,).
     """
     rotation, p = transform[:3, :3], transform[:3, 3]
-    omega = _product(rotation, twist[3:])
-    return jnp.concatenate([_product(rotation, twist[:3]) + cross(p, omega), omega])
+    omega = matmul(rotation, twist[3:])
+    return jnp.concatenate([matmul(rotation, twist[:3]) + cross(p, omega), omega])
 
 
 def Ad_inv_apply(transform: Matrix, twist: Twist) -> Twist:
@@ -172,7 +172,7 @@ def Ad_inv_apply(transform: Matrix, twist: Twist) -> Twist:
     rotation, p = transform[:3, :3], transform[:3, 3]
     v, omega = twist[:3], twist[3:]
     # Row vector times R is R^T times the vector, without a transposed copy.
-    return jnp.concatenate([_product(v - cross(p, omega), rotation), _product(omega, rotation)])
+    return jnp.concatenate([matmul(v - cross(p, omega), rotation), matmul(omega, rotation)])
 
 
 def AdT_apply(transform: Matrix, wrench: Twist) -> Twist:
@@ -182,7 +182,7 @@ def AdT_apply(transform: Matrix, wrench: Twist) -> Twist:
     """
     rotation, p = transform[:3, :3], transform[:3, 3]
     f, tau = wrench[:3], wrench[3:]
-    return jnp.concatenate([_product(f, rotation), _product(tau - cross(p, f), rotation)])
+    return jnp.concatenate([matmul(f, rotation), matmul(tau - cross(p, f), rotation)])
 
 
 def Ad_inv_T_apply(transform: Matrix, wrench: Twist) -> Twist:
@@ -191,8 +191,8 @@ def Ad_inv_T_apply(transform: Matrix, wrench: Twist) -> Twist:
     **Arguments:** `transform`: T_ab, (4, 4); `wrench`: in b, (6,). **Returns:** in a, (6,).
     """
     rotation, p = transform[:3, :3], transform[:3, 3]
-    f = _product(rotation, wrench[:3])
-    return jnp.concatenate([f, _product(rotation, wrench[3:]) + cross(p, f)])
+    f = matmul(rotation, wrench[:3])
+    return jnp.concatenate([f, matmul(rotation, wrench[3:]) + cross(p, f)])
 
 
 def ad_apply(twist: Twist, other: Twist) -> Twist:

@@ -16,7 +16,7 @@ Matrix = Float[Array, "3 3"]
 Quaternion = Float[Array, "4"]
 
 
-def _product(a: Array, b: Array) -> Array:
+def matmul(a: Array, b: Array) -> Array:
     # GPUs may round float32 products to TF32 unless asked not to.
     return jnp.matmul(a, b, precision=jax.lax.Precision.HIGHEST)
 
@@ -260,7 +260,7 @@ def euler_to_matrix(angles: Vector, sequence: str = "zyz") -> Matrix:
     Source: Murray, Li, Sastry (1994), eq. 2.19; EQUATIONS section 12.
     """
     first, second, third = _axis_rotations(angles, sequence)
-    return _product(_product(first, second), third)
+    return matmul(matmul(first, second), third)
 
 
 def euler_body_jacobian(angles: Vector, sequence: str = "zyz") -> Matrix:
@@ -277,7 +277,7 @@ def euler_body_jacobian(angles: Vector, sequence: str = "zyz") -> Matrix:
     """
     _, second, third = _axis_rotations(angles, sequence)
     a, b, c = _axes(sequence, angles.dtype)
-    return jnp.stack([_product(third.T, _product(second.T, a)), _product(third.T, b), c], axis=1)
+    return jnp.stack([matmul(third.T, matmul(second.T, a)), matmul(third.T, b), c], axis=1)
 
 
 def euler_spatial_jacobian(angles: Vector, sequence: str = "zyz") -> Matrix:
@@ -293,7 +293,7 @@ def euler_spatial_jacobian(angles: Vector, sequence: str = "zyz") -> Matrix:
     """
     first, second, _ = _axis_rotations(angles, sequence)
     a, b, c = _axes(sequence, angles.dtype)
-    return jnp.stack([a, _product(first, b), _product(first, _product(second, c))], axis=1)
+    return jnp.stack([a, matmul(first, b), matmul(first, matmul(second, c))], axis=1)
 
 
 def _axes(sequence: str, dtype) -> list[Vector]:

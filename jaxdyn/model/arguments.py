@@ -128,7 +128,7 @@ def warn_unphysical_inertias(inertias: Mapping[str, Any], places: Mapping[str, s
             faults.append(f"{place}body {name!r}: {fault}")
     if faults:
         more = f"; and {len(faults) - 5} more bodies" if len(faults) > 5 else ""
-        fix = "correct the numbers, or use jd.repair_inertias(model)"
+        fix = "correct the numbers, or use jd.model.repair_inertias(model)"
         warn(f"{'; '.join(faults[:5])}{more}. No body has such an inertia: {fix}", UserWarning)
 
 

@@ -9,7 +9,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from jaxdyn.compile.known import array_namespace, is_concrete
-from jaxdyn.lie.so3 import _product
+from jaxdyn.lie.so3 import matmul
 from jaxdyn.model.arguments import Checked, Numbers, pose_leaf, store_leaf
 from jaxdyn.model.joints import KINDS
 from jaxdyn.model.tree import Model, Topology
@@ -83,7 +83,7 @@ def _move_world(model: Model, pose) -> Model:
     def transform_attached(poses, carriers):
         xp = array_namespace(pose, poses)
         poses, by = xp.asarray(poses), xp.asarray(pose, poses.dtype)
-        product = by @ poses if xp is np else _product(by, poses)
+        product = by @ poses if xp is np else matmul(by, poses)
         # Only rows carried by the world (-1) move; all others are relative to a body.
         return store_leaf(xp.where((np.array(carriers, int) < 0)[:, None, None], product, poses), poses.dtype)
 

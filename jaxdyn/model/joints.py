@@ -107,7 +107,7 @@ def screw_transform(kind: str, screw: Float[Array, "6"], q: Float[Array, ""]) ->
     if kind != "helical":
         return se3.from_parts(rotation, jnp.zeros_like(v))
     lever = so3.cross(axis, v) / rate
-    return se3.from_parts(rotation, lever - so3._product(rotation, lever) + axis * (jnp.sum(axis * v) * q))
+    return se3.from_parts(rotation, lever - so3.matmul(rotation, lever) + axis * (jnp.sum(axis * v) * q))
 
 
 def joint_neutral(kind: str) -> np.ndarray:

@@ -40,7 +40,7 @@ def draw(
     - `scene`: a `Scene` or `Model`.
     - `q` (nq,): the configuration.
     - `ax`: matplotlib axes of projection "3d" to draw into; None creates a figure.
-    - `shapes`: solids to show, of `jd.shapes(path)`; None draws rods between joints and solids of the bodies' inertias.
+    - `shapes`: solids to show, of `jd.pictures.shapes(path)`; None draws rods between joints and solids of the bodies' inertias.
     - `multipliers` (nc,): of the scene's rows, N and N m, as the contact forces of `jd.grasp.hold`, to be drawn as arrows.
 
     **Returns:** the axes, in m, axes of the world; `ax.figure.savefig(path)` writes the picture. Blue lines are axes

@@ -26,7 +26,7 @@ _DEFAULT_GREY = (0.5, 0.5, 0.5, 1.0)  # MuJoCo's default colour of a geom
 
 
 def shapes(path: str | os.PathLike, *, arguments: Mapping[str, Any] | None = None) -> Shapes:
-    """Read the visual solids of a URDF, MJCF or SDF file, for `jd.view`, `jd.save_html` and `jd.draw`.
+    """Read the visual solids of a URDF, MJCF or SDF file, for `jd.view`, `jd.pictures.save_html` and `jd.draw`.
 
     A model holds no geometry, so the file is read again. Meshes are STL, DAE, OBJ, PLY or
     GLB files, searched at the path given in the file, `package://` and `model://` in the folders above the file and
@@ -42,8 +42,8 @@ def shapes(path: str | os.PathLike, *, arguments: Mapping[str, Any] | None = Non
     mujoco (MJCF); without trimesh, a dependency of viser, meshes are named in the warning.
 
     ```python
-    solids = jd.shapes("robot.urdf")
-    jd.save_html("robot.html", model, solution, shapes=solids)
+    solids = jd.pictures.shapes("robot.urdf")
+    jd.pictures.save_html("robot.html", model, solution, shapes=solids)
     ```
     """
     file = XmlFile(path, "robot", arguments)

@@ -56,7 +56,7 @@ def view(
     **Arguments:**
 
     - `scene`: a `Scene` or `Model`; `solution`: a result of `jd.simulate` for it, batched or not, or one configuration (nq,).
-    - `shapes`: solids to show, of `jd.shapes(path)`; None draws rods between joints and solids of the bodies' inertias.
+    - `shapes`: solids to show, of `jd.pictures.shapes(path)`; None draws rods between joints and solids of the bodies' inertias.
     - `port`: port of the page; None selects a free one. The server listens on 127.0.0.1 only.
     - `browser`: whether to open a browser; without a display only the address is printed.
     - `block`: whether to wait until Ctrl-C; by default in scripts, and not in a notebook or a prompt.
@@ -72,7 +72,7 @@ def view(
     print(f"Showing the motion at {viewer.url}")
     if browser and not _open(viewer.url):
         print(
-            "No browser could be opened; open that address in one, or write a file: jd.save_html(path, scene, solution)"
+            "No browser could be opened; open that address in one, or write a file: jd.pictures.save_html(path, scene, solution)"
         )
     if (not _interactive()) if block is None else block:
         with contextlib.suppress(KeyboardInterrupt):
@@ -101,7 +101,7 @@ def save_html(
     ```python
     scene = jd.scenes.four_bar()
     turn = jd.simulate(scene, *jd.scenes.four_bar.start(), jnp.linspace(0.0, 2.0, 51), outputs=("multipliers",))
-    jd.save_html("four_bar.html", scene, turn)
+    jd.pictures.save_html("four_bar.html", scene, turn)
     ```
     """
     path = as_path(path)

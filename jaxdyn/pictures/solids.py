@@ -55,7 +55,7 @@ class Shape:
 class Shapes(tuple[Shape, ...]):
     """Solids to draw, with descriptions of elements of a file that could not be drawn (`missing`).
 
-    Built by `jd.shapes`, or from any `Shape`s: `Shapes([Shape("tip", "box", (0.1, 0.1, 0.2))])`.
+    Built by `jd.pictures.shapes`, or from any `Shape`s: `Shapes([Shape("tip", "box", (0.1, 0.1, 0.2))])`.
     """
 
     missing: tuple[str, ...]

@@ -40,7 +40,9 @@ def all_solids(motion: Motion, shapes) -> Shapes:
     if shapes is None:
         shapes = Shapes()
     elif not isinstance(shapes, tuple | list) or not all(isinstance(item, Shape) for item in shapes):
-        raise ValueError(f"shapes is {shapes!r}; give jd.shapes(path), a list of jaxdyn.pictures.Shape, or None")
+        raise ValueError(
+            f"shapes is {shapes!r}; give jd.pictures.shapes(path), a list of jaxdyn.pictures.Shape, or None"
+        )
     shapes = shapes if isinstance(shapes, Shapes) else Shapes(shapes)
     model = motion.scene.system
     unknown = sorted(shapes.frames() - set(model.frame_names))

@@ -18,7 +18,7 @@ from jaxdyn.compile import entry_point
 from jaxdyn.compile.known import is_known
 from jaxdyn.constraints.base import constraint_jacobian, layout, velocity_residual
 from jaxdyn.constraints.rank import pseudo_inverse, sign_of_determinant, tolerance
-from jaxdyn.lie.so3 import _product
+from jaxdyn.lie.so3 import matmul
 from jaxdyn.model.arguments import Number, Numbers, batch_hint, check_state
 from jaxdyn.systems.mass_factor import cholesky, solve_cholesky, solve_lower
 from jaxdyn.systems.scene import Scene, as_pytree, as_scene
@@ -53,7 +53,7 @@ class Basis(eqx.Module):
 
         def velocity(q, t):
             parametrization = self.at(scene, q, t)
-            return _product(
+            return matmul(
                 parametrization.N, _check_columns(nu, parametrization.N)
             ) + parametrization.v0, parametrization
 
@@ -86,8 +86,8 @@ class Independent(Basis):
         A2 = A[:, rest]
         inverse = pseudo_inverse(A2, tolerance(None, A2))
         N = jnp.zeros((scene.nv, kept.size), A.dtype).at[kept].set(jnp.eye(kept.size, dtype=A.dtype))
-        N = N.at[rest].set(-_product(inverse, A[:, kept]))
-        v0 = jnp.zeros((scene.nv,), A.dtype).at[rest].set(_product(inverse, b))
+        N = N.at[rest].set(-matmul(inverse, A[:, kept]))
+        v0 = jnp.zeros((scene.nv,), A.dtype).at[rest].set(matmul(inverse, b))
         # |A2^+| |A|, an upper bound of the condition number that needs no SVD.
         size = jnp.sqrt(jnp.sum(inverse * inverse) * jnp.sum(A * A))
         # The trace of A2^+ A2 is the rank of A2.
@@ -117,7 +117,7 @@ class UserBasis(Basis):
         if N.ndim != 2 or N.shape[0] != scene.nv:
             raise ValueError(f"basis returned shape {N.shape}; return N with shape ({scene.nv}, nr) = (nv, nr)")
         inverse = pseudo_inverse(A, tolerance(None, A))
-        v0 = _product(inverse, b) if v0 is None else jnp.asarray(v0, q.dtype)
+        v0 = matmul(inverse, b) if v0 is None else jnp.asarray(v0, q.dtype)
         if v0.shape != (scene.nv,):
             raise ValueError(f"basis returned v0 with shape {v0.shape}, expected {(scene.nv,)} = (nv,)")
         # Columns are scaled to unit length, so that the quality does not depend on the units of nu.
@@ -125,7 +125,7 @@ class UserBasis(Basis):
         some = jnp.all(lengths > 0)
         pivot = _least_pivot(N / jnp.where(some, lengths, jnp.ones_like(lengths))[None])
         whole = scene.nv - jnp.round(jnp.sum(inverse * A.T)) == N.shape[1]
-        off = jnp.abs(_product(A, v0) - b)
+        off = jnp.abs(matmul(A, v0) - b)
         met = jnp.max(off) <= _rounding(A) * (jnp.max(jnp.abs(b)) + jnp.sqrt(jnp.sum(A * A) * jnp.sum(v0 * v0)))
         quality = jnp.where(some & whole & met, pivot, jnp.zeros_like(pivot))
         return Parametrization(N, v0, _tangent_only(A, N, quality))
@@ -137,7 +137,7 @@ class UserBasis(Basis):
         return (
             f"return {most} independent columns with A N = 0 and, where b != 0, a v0 with A v0 = b (rank "
             f"{np.linalg.matrix_rank(np.asarray(N))} of {N.shape[1]}, largest |A N| "
-            f"{float(jnp.max(jnp.abs(_product(A, N)))):.3g})"
+            f"{float(jnp.max(jnp.abs(matmul(A, N)))):.3g})"
         )
 
 
@@ -167,10 +167,10 @@ class Orthonormal(Basis):
         # can deadlock jaxlib 0.10.
         A = A + 0 * reference[0, 0]
         inverse = pseudo_inverse(A, tolerance(None, A))
-        N, pivot, factor = orthonormal(reference - _product(inverse, _product(A, reference)))
+        N, pivot, factor = orthonormal(reference - matmul(inverse, matmul(A, reference)))
         free = scene.nv - jnp.round(jnp.sum(inverse * A.T))
         quality = jnp.where(free == N.shape[1], pivot, jnp.zeros_like(pivot))
-        return Parametrization(N, _product(inverse, b), quality), A, inverse, factor
+        return Parametrization(N, matmul(inverse, b), quality), A, inverse, factor
 
     def along(self, scene, q, nu, t):
         """Velocity and drift, with the rate of N nu in closed form.
@@ -183,23 +183,23 @@ class Orthonormal(Basis):
         parametrization, A, inverse, factor = self._at(scene, q, t)
         N = parametrization.N
         nu = _check_columns(nu, N)
-        v = _product(N, nu) + parametrization.v0
+        v = matmul(N, nu) + parametrization.v0
         along_motion = (q, t), (velocity_to_rate(scene.system, q, v), jnp.ones_like(t))
         rate = jax.jvp(lambda q, t: constraint_jacobian(scene, q, t), *along_motion)[1]
         drift = jax.jvp(lambda q, t: self.at(scene, q, t).v0, *along_motion)[1]
-        turned, L = _product(rate, N), solve_lower(factor, _product(self.reference.astype(A.dtype).T, inverse)).T
-        Z = _product(L.T, turned)
+        turned, L = matmul(rate, N), solve_lower(factor, matmul(self.reference.astype(A.dtype).T, inverse)).T
+        Z = matmul(L.T, turned)
         Z = Z + Z.T
         U = jnp.triu(Z) - 0.5 * jnp.diag(jnp.diag(Z))
-        across = _product(rate.T, _product(L, nu))
-        across = across - _product(inverse, _product(A, across))
-        drift = drift - _product(inverse, _product(turned, nu)) - across + _product(N, _product(U, nu))
+        across = matmul(rate.T, matmul(L, nu))
+        across = across - matmul(inverse, matmul(A, across))
+        drift = drift - matmul(inverse, matmul(turned, nu)) - across + matmul(N, matmul(U, nu))
         return VelocityAndDrift(v, drift, N, parametrization.quality)
 
     def advice(self, scene, q, t):
         """Advise a reference R for which N is regular here."""
         rank = np.linalg.matrix_rank(np.asarray(constraint_jacobian_compiled(scene, q, t)), tol=1e-9)
-        return f"use jd.tangent_basis(scene, q) as reference; the rows have rank {rank} of nv = {scene.nv}"
+        return f"use jd.reduction.tangent_basis(scene, q) as reference; the rows have rank {rank} of nv = {scene.nv}"
 
 
 class FullBasis(Basis):
@@ -236,7 +236,7 @@ def as_basis(basis: BasisLike | None, scene: Scene) -> Basis:
     if not isinstance(basis, (np.ndarray, jax.Array)):
         raise ValueError(
             f"basis is {basis!r}; give a tuple of indices of independent velocities, a function N(q, t) -> (nv, nr), "
-            "or a reference matrix (nv, nr) from jd.tangent_basis"
+            "or a reference matrix (nv, nr) from jd.reduction.tangent_basis"
         )
     if basis.ndim != 2 or basis.shape[0] != scene.nv or not 0 < basis.shape[1] <= scene.nv:
         raise ValueError(f"basis has shape {basis.shape}, expected ({scene.nv}, nr) = (nv, nr)")
@@ -310,7 +310,7 @@ def _tangent_projection(scene, q, t, rank_tol):
     """Projection 1 - A^+ A, and the rank of A."""
     A = constraint_jacobian(scene, q, t)
     inverse = pseudo_inverse(A, tolerance(rank_tol, A))
-    return jnp.eye(scene.nv, dtype=A.dtype) - _product(inverse, A), jnp.round(jnp.sum(inverse * A.T))
+    return jnp.eye(scene.nv, dtype=A.dtype) - matmul(inverse, A), jnp.round(jnp.sum(inverse * A.T))
 
 
 def split_directions(projection: Float[Array, "n n"]) -> Float[Array, "n n"]:
@@ -338,15 +338,15 @@ def independent_velocities(scene: Scene, q, t: Number = 0.0) -> tuple[int, ...]:
 def orthonormal(columns: Float[Array, "n k"]) -> tuple[Float[Array, "n k"], Float[Array, ""], Float[Array, "k k"]]:
     """Orthonormalise columns X: X T^-1 with T^T T = X^T X, the least pivot of T relative to the largest, and T^T."""
     # Cholesky and not QR: no choice of signs, so that the result is smooth in X.
-    factor = cholesky(_product(columns.T, columns))
+    factor = cholesky(matmul(columns.T, columns))
     pivots = jnp.diagonal(factor)
     return solve_lower(factor, columns.T).T, jnp.min(pivots) / jnp.max(pivots), factor
 
 
 def minimal_velocity(parametrization: Parametrization, v: Float[Array, " nv"]) -> Float[Array, " nr"]:
     """Minimal velocities nu (nr,) with N nu + v0 = v for an admissible v."""
-    factor = cholesky(_product(parametrization.N.T, parametrization.N))
-    return solve_cholesky(factor, _product(parametrization.N.T, v - parametrization.v0))
+    factor = cholesky(matmul(parametrization.N.T, parametrization.N))
+    return solve_cholesky(factor, matmul(parametrization.N.T, v - parametrization.v0))
 
 
 def least_quality(dtype) -> float:
@@ -363,14 +363,14 @@ def _affine_rows(scene, q, t):
 
 def _least_pivot(columns):
     """Least pivot of the Cholesky factor of columns^T columns, 0 for dependent columns."""
-    pivot = jnp.min(jnp.diagonal(cholesky(lax.stop_gradient(_product(columns.T, columns)))))
+    pivot = jnp.min(jnp.diagonal(cholesky(lax.stop_gradient(matmul(columns.T, columns)))))
     return jnp.where(jnp.isfinite(pivot), pivot, jnp.zeros_like(pivot))
 
 
 def _tangent_only(A, N, quality):
     """Quality, or 0 where A N is nonzero beyond rounding."""
     limit = _rounding(A) * jnp.sqrt(jnp.sum(A * A) * jnp.sum(N * N))
-    return jnp.where(jnp.max(jnp.abs(_product(A, N))) <= limit, quality, jnp.zeros_like(quality))
+    return jnp.where(jnp.max(jnp.abs(matmul(A, N))) <= limit, quality, jnp.zeros_like(quality))
 
 
 def _rounding(like) -> float:

@@ -26,7 +26,7 @@ from jaxdyn.constraints.codes import RESULTS, Outcome
 from jaxdyn.constraints.dynamics import applied
 from jaxdyn.constraints.rank import pseudo_inverse, tolerance
 from jaxdyn.dynamics.quantities import bias_force, coriolis_matrix, mass_matrix
-from jaxdyn.lie.so3 import _product
+from jaxdyn.lie.so3 import matmul
 from jaxdyn.model.arguments import Numbers, batch_hint, check_state, zeros_if_none
 from jaxdyn.reduction.bases import count_dof, orthonormal, split_directions
 from jaxdyn.systems.mass_factor import cholesky, solve_lower
@@ -117,32 +117,32 @@ def _decouple(scene, q, v, tau, t, rotation, motion_rotation, dof, rank_tol) -> 
     turn = unit if rotation is None else rotation
 
     def root(q, t):
-        return _product(cholesky(mass_matrix(system, q, t)), turn)
+        return matmul(cholesky(mass_matrix(system, q, t)), turn)
 
     W, Wdot = jax.jvp(root, (q, t), motion)
     A, Adot = jax.jvp(lambda q, t: constraint_jacobian(scene, q, t), (q, t), motion)
-    inverse = _product(turn.T, solve_lower(_product(W, turn.T), unit))
+    inverse = matmul(turn.T, solve_lower(matmul(W, turn.T), unit))
     C = coriolis_matrix(system, q, v, t)
-    w = _product(W.T, v)
-    Gamma = _product(_product(inverse, C) - Wdot.T, inverse.T)
-    u = _product(inverse, applied(scene, q, v, tau, t) - bias_force(system, q, v, t) + _product(C, v))
-    Lambda = _product(A, inverse.T)
+    w = matmul(W.T, v)
+    Gamma = matmul(matmul(inverse, C) - Wdot.T, inverse.T)
+    u = matmul(inverse, applied(scene, q, v, tau, t) - bias_force(system, q, v, t) + matmul(C, v))
+    Lambda = matmul(A, inverse.T)
     # Lam = A W^-T: its rate along the motion.
-    rate = _product(Adot - _product(Lambda, Wdot.T), inverse.T)
-    wanted = rows(scene, q, v, t).gamma + _product(Lambda, _product(Wdot.T, v))
+    rate = matmul(Adot - matmul(Lambda, Wdot.T), inverse.T)
+    wanted = rows(scene, q, v, t).gamma + matmul(Lambda, matmul(Wdot.T, v))
 
     back = pseudo_inverse(Lambda, tolerance(rank_tol, Lambda))
-    null_projector = unit - _product(back, Lambda)
+    null_projector = unit - matmul(back, Lambda)
     reference = split_directions(null_projector)
     # Projecting constant references makes the bases smooth, and gives them the parallel transport V2^T V2dot = 0.
-    V1, *_ = orthonormal(_product(unit - null_projector, reference[:, : scene.nv - dof]))
-    V2, *_ = orthonormal(_product(null_projector, reference[:, scene.nv - dof :]))
-    V2 = V2 if motion_rotation is None else _product(V2, motion_rotation)
-    Lambda_r = _product(Lambda, V1)
+    V1, *_ = orthonormal(matmul(unit - null_projector, reference[:, : scene.nv - dof]))
+    V2, *_ = orthonormal(matmul(null_projector, reference[:, scene.nv - dof :]))
+    V2 = V2 if motion_rotation is None else matmul(V2, motion_rotation)
+    Lambda_r = matmul(Lambda, V1)
     # V1^T V2dot, from d/dt (Lam V2) = 0; Lam_r has independent columns and Lam_r^+ = V1^T Lam^+.
-    leaning = -_product(_product(V1.T, back), _product(rate, V2))
-    free = u - _product(Gamma, w)
-    change = _product(null_projector, free) + _product(back, wanted)
+    leaning = -matmul(matmul(V1.T, back), matmul(rate, V2))
+    free = u - matmul(Gamma, w)
+    change = matmul(null_projector, free) + matmul(back, wanted)
     rank = jnp.round(jnp.sum(back * Lambda.T))
     result = RESULTS.where(rank == scene.nv - dof, RESULTS.successful, RESULTS.singular_basis)  # pyright: ignore[reportArgumentType]
     return GaugeInvariant(
@@ -153,14 +153,14 @@ def _decouple(scene, q, v, tau, t, rotation, motion_rotation, dof, rank_tol) -> 
         force=u,
         V1=V1,
         V2=V2,
-        reduced_velocity=_product(V2.T, w),
-        Gamma_r=_product(V2.T, _product(Gamma, V2)),
-        reduced_force=_product(V2.T, u),
-        reduced_acceleration=_product(V2.T, free) + _product(leaning.T, _product(V1.T, w)),
-        Gamma_o=_product(V1.T, _product(Gamma, V2)) + leaning,
-        normal_force=_product(V1.T, u),
+        reduced_velocity=matmul(V2.T, w),
+        Gamma_r=matmul(V2.T, matmul(Gamma, V2)),
+        reduced_force=matmul(V2.T, u),
+        reduced_acceleration=matmul(V2.T, free) + matmul(leaning.T, matmul(V1.T, w)),
+        Gamma_o=matmul(V1.T, matmul(Gamma, V2)) + leaning,
+        normal_force=matmul(V1.T, u),
         Lambda_r=Lambda_r,
-        acceleration=_product(inverse.T, change - _product(Wdot.T, v)),
-        multipliers=_product(back.T, _product(back, wanted) - free),
+        acceleration=matmul(inverse.T, change - matmul(Wdot.T, v)),
+        multipliers=matmul(back.T, matmul(back, wanted) - free),
         result=result,
     )

@@ -14,7 +14,7 @@ from jaxdyn.compile.known import is_concrete, is_known
 from jaxdyn.constraints.base import constraint_jacobian, holonomic_rows, layout, velocity_residual
 from jaxdyn.constraints.dynamics import tolerance
 from jaxdyn.dynamics.quantities import kinetic_energy, potential_energy
-from jaxdyn.lie.so3 import _product
+from jaxdyn.lie.so3 import matmul
 from jaxdyn.model.arguments import Numbers, as_array, batch_hint, check_state, zeros_if_none
 from jaxdyn.reduction.bases import Independent, Orthonormal, as_basis, constraint_jacobian_compiled, tangent_basis
 from jaxdyn.reduction.minimal import reduce
@@ -55,7 +55,7 @@ def involutive(
     **Raises:** ValueError for traced numbers and scenes without constraints.
 
     ```python
-    jd.involutive(jd.scenes.rolling_disk(), q).ranks  # (2, 3, 4)
+    jd.reduction.involutive(jd.scenes.rolling_disk(), q).ranks  # (2, 3, 4)
     ```
 
     Source: Murray, Li & Sastry (1994), section 7.2; EQUATIONS section 6.
@@ -210,7 +210,7 @@ def _substitute(scene, choice: Independent, q, nu, tau, t):
         return choice.at(scene, q.at[kept].set(r), t).N
 
     def restricted_lagrangian(r, rdot):
-        return _lagrangian(scene.system, q.at[kept].set(r), _product(at(r), rdot), t)
+        return _lagrangian(scene.system, q.at[kept].set(r), matmul(at(r), rdot), t)
 
     r = q[kept]
     # The wrong equations come from the substituted Lagrangian itself, so that they do not presuppose the formula of `terms`.
@@ -220,8 +220,8 @@ def _substitute(scene, choice: Independent, q, nu, tau, t):
     # a = -N on the eliminated rows: (rate of a_i) - d/dr_i (a . rdot).
     push = jax.grad(lambda v: _lagrangian(scene.system, q, v, t))(right.velocity)[rest]
     _, along = jax.jvp(lambda r: -at(r)[rest], (r,), (nu,))
-    slope = jax.jacfwd(lambda r: -_product(at(r)[rest], nu))(r)
-    terms = _product(push, along - slope)
+    slope = jax.jacfwd(lambda r: -matmul(at(r)[rest], nu))(r)
+    terms = matmul(push, along - slope)
     rate = solve_positive(right.mass_matrix, right.force - wrong)
     value = SpuriousTerms(terms, right.bias_force, wrong, right.nu_rate, rate, right.mass_matrix)
     # Largest derivative of L and the rows with respect to s, at this velocity.

@@ -27,7 +27,7 @@ from jaxdyn.constraints.codes import RESULTS, Outcome, name_of
 from jaxdyn.constraints.dynamics import applied, whitened_rows
 from jaxdyn.constraints.rank import checked_tolerance, eps_of, pseudo_inverse, tolerance
 from jaxdyn.dynamics.quantities import bias_force, mass_matrix
-from jaxdyn.lie.so3 import _product
+from jaxdyn.lie.so3 import matmul
 from jaxdyn.model.arguments import Numbers, as_array, batch_hint, check_state
 from jaxdyn.model.names import velocity_indices
 from jaxdyn.model.tree import Model
@@ -191,7 +191,7 @@ def _solve_compiled(scene: Scene, q, v, a_independent, S, weights, t, chosen: tu
     result = RESULTS.where(is_determined, result, RESULTS.singular_basis)
     result = RESULTS.where(definite, result, RESULTS.singular_mass_matrix)
     q_dot = velocity_to_rate(scene.system, q, v)
-    return ConstrainedInverseDynamics(torques, _product(jnp.asarray(S), torques), v, a, q_dot, lam, result)
+    return ConstrainedInverseDynamics(torques, matmul(jnp.asarray(S), torques), v, a, q_dot, lam, result)
 
 
 def _solve(chosen: tuple[int, ...], rank_tol, scene: Scene, q, v, a_independent, S, weights, t):
@@ -209,19 +209,19 @@ def _solve(chosen: tuple[int, ...], rank_tol, scene: Scene, q, v, a_independent,
 
     def across(x):
         """K x, the part that is no constraint force."""
-        return x - _product(Y, _product(inverse, x))
+        return x - matmul(Y, matmul(inverse, x))
 
     Z = metric.whiten(jnp.asarray(E.T))
     free = pseudo_inverse(across(Z), tol)
 
     def complete(start, right, independent):
         """The solution x of Y^T x = right, Z^T x = independent nearest to the start, and whether there is one."""
-        x = start + _product(inverse.T, right - _product(Y.T, start))
-        x = x + _product(free.T, independent - _product(Z.T, x))
+        x = start + matmul(inverse.T, right - matmul(Y.T, start))
+        x = x + matmul(free.T, independent - matmul(Z.T, x))
         size = jnp.sqrt(jnp.sum(x * x))
         # By Cauchy-Schwarz a residual is compared with the sizes that cancel in it.
         fits = [
-            jnp.all(jnp.abs(_product(B.T, x) - wanted) <= limit * (1 + jnp.sqrt(jnp.sum(B * B, 0)) * size))
+            jnp.all(jnp.abs(matmul(B.T, x) - wanted) <= limit * (1 + jnp.sqrt(jnp.sum(B * B, 0)) * size))
             for B, wanted in ((Y, right), (Z, independent))
             if B.shape[1]
         ]
@@ -233,7 +233,7 @@ def _solve(chosen: tuple[int, ...], rank_tol, scene: Scene, q, v, a_independent,
         rest = -velocity_residual(scene, q, still, t) if has_rows else Y[0]
         x, agrees = complete(still, rest, v)
         v = metric.unwhiten(x)
-        rank = jnp.round(jnp.sum(inverse * Y.T)) + jnp.round(jnp.trace(_product(free, across(Z))))
+        rank = jnp.round(jnp.sum(inverse * Y.T)) + jnp.round(jnp.trace(matmul(free, across(Z))))
         is_determined = rank == nv
     gamma = rows(scene, q, v, t).gamma if has_rows else Y[0]
     unforced = metric.whiten(applied(scene, q, v, None, t) - bias_force(scene.system, q, v, t))
@@ -241,10 +241,10 @@ def _solve(chosen: tuple[int, ...], rank_tol, scene: Scene, q, v, a_independent,
     needed, by_motors = x - unforced, metric.whiten(jnp.asarray(S))
     # The columns of free^T span the driven motions, so that free takes out the constraint forces.
     root = 1 / jnp.sqrt(weights)
-    along = _product(free, by_motors) * root[None]
-    torques = root * _product(pseudo_inverse(along, tol), _product(free, needed))
-    rest = needed - _product(by_motors, torques)
+    along = matmul(free, by_motors) * root[None]
+    torques = root * matmul(pseudo_inverse(along, tol), matmul(free, needed))
+    rest = needed - matmul(by_motors, torques)
     sizes = jnp.sqrt(jnp.sum(needed * needed)) + jnp.sqrt(jnp.sum(unforced * unforced))
     is_actuated = jnp.all(jnp.abs(across(rest)) <= limit * sizes + eps_of(q))
-    a, lam = metric.unwhiten(x), _product(inverse, rest)
+    a, lam = metric.unwhiten(x), matmul(inverse, rest)
     return v, a, torques, lam, is_determined, agrees & fits, is_actuated, metric.is_definite()

@@ -20,7 +20,7 @@ from jaxdyn.constraints.base import layout
 from jaxdyn.constraints.codes import RESULTS, Outcome
 from jaxdyn.constraints.dynamics import applied
 from jaxdyn.dynamics.quantities import inverse_dynamics, mass_matrix
-from jaxdyn.lie.so3 import _product
+from jaxdyn.lie.so3 import matmul
 from jaxdyn.model.arguments import Numbers, as_array, batch_hint, check_state, zeros_if_none
 from jaxdyn.reduction.bases import (
     Basis,
@@ -117,15 +117,15 @@ def solve_in_basis(scene: Scene, motion: VelocityAndDrift, q, tau, t) -> Reduced
     """Solve the equations of motion in the minimal velocities of a `VelocityAndDrift`."""
     v, drift, N, quality = motion
     # Only inertia at constant nu enters the bias: inverse dynamics at the drift gives N^T (M s + h) in one pass.
-    mass = _product(N.T, _product(mass_matrix(scene.system, q, t), N))
-    bias = _product(N.T, inverse_dynamics(scene.system, q, v, drift, t))
-    force = _product(N.T, applied(scene, q, v, tau, t))
+    mass = matmul(N.T, matmul(mass_matrix(scene.system, q, t), N))
+    bias = matmul(N.T, inverse_dynamics(scene.system, q, v, drift, t))
+    force = matmul(N.T, applied(scene, q, v, tau, t))
     factor = cholesky(mass)
     rate = solve_cholesky(factor, force - bias)
     result = RESULTS.where(is_definite(mass, factor), RESULTS.successful, RESULTS.singular_mass_matrix)  # pyright: ignore[reportArgumentType]
     is_regular = jnp.abs(quality) > least_quality(q.dtype)
     result = RESULTS.where(is_regular, result, RESULTS.singular_basis)
-    return ReducedDynamics(rate, v, _product(N, rate) + drift, mass, bias, force, N, result)
+    return ReducedDynamics(rate, v, matmul(N, rate) + drift, mass, bias, force, N, result)
 
 
 _reduce_compiled = entry_point(reduce)

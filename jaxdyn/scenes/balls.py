@@ -118,7 +118,7 @@ def bowling_ball(
 
     The velocity u of the point that touches the lane keeps its direction, so that the centre moves on a parabola:
     vdot = -mu g u/|u|, with I w + m r e_z x v constant. It rolls after |u0| / (mu g (1 + m r^2/I)), at constant velocity
-    (`jd.ground_contact`, whose events say when).
+    (`jd.contact.ground_contact`, whose events say when).
 
     With `until_rolling` the friction has a formula without modes, so that all methods integrate it, up to where it rolls.
 

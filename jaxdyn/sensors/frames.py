@@ -9,7 +9,7 @@ from jaxtyping import Array, Float
 from jaxdyn.dynamics.frame_motion import frame_acceleration, frame_velocity
 from jaxdyn.dynamics.kinematics import frame_pose
 from jaxdyn.lie import so3
-from jaxdyn.lie.so3 import _product
+from jaxdyn.lie.so3 import matmul
 from jaxdyn.model.arguments import Numbers
 from jaxdyn.model.names import frame_index
 from jaxdyn.sensors.base import Motion, Noise, Sensor, as_delay, check_part
@@ -38,7 +38,7 @@ class _OnFrame(Sensor):
 
     def _turned(self, motion: Motion, vector) -> Float[Array, "3"]:
         """A vector of the world in the frame's axes."""
-        return _product(self._rotation(motion).T, vector)
+        return matmul(self._rotation(motion).T, vector)
 
     def _velocity(self, motion: Motion) -> Float[Array, "6"]:
         return frame_velocity(motion.scene.system, motion.q, motion.v, self.frame)  # pyright: ignore[reportArgumentType]
@@ -87,7 +87,7 @@ class Imu(_OnFrame):
         """Specific force, then angular velocity."""
         turn = self._rotation(motion).T
         force, omega = self._specific_force(motion), self._velocity(motion)[3:]
-        return jnp.concatenate([_product(turn, force), _product(turn, omega)])
+        return jnp.concatenate([matmul(turn, force), matmul(turn, omega)])
 
 
 class Velocimeter(_OnFrame):

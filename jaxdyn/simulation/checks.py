@@ -161,7 +161,7 @@ def check_combination(control, method: Method, solver, adjoint) -> None:
 
 def check_modal_options(control, stepsize, solver, adjoint, outputs, max_events: Any) -> None:
     """Refuse options that motions with modes do not support."""
-    what = "the scene has forces with modes (jd.DryFriction, jd.UnilateralContact)"
+    what = "the scene has forces with modes (jd.contact.DryFriction, jd.contact.UnilateralContact)"
     if isinstance(control, (Controller, Sampled)):
         raise ValueError(f"control is a {type(control).__name__}, and {what}; give a function control(q, v, t)")
     if stepsize is not None and not is_step_length(stepsize):
@@ -171,7 +171,7 @@ def check_modal_options(control, stepsize, solver, adjoint, outputs, max_events:
     if not isinstance(solver, diffrax.AbstractERK) or isinstance(innermost(solver), diffrax.AbstractWrappedSolver):
         raise ValueError(
             f"solver is {label(solver)}, and {what}, whose events are located within explicit steps; take diffrax.Dopri8() or "
-            "Tsit5(), or, where forces are stiff, friction without modes (jd.CoulombFriction)"
+            "Tsit5(), or, where forces are stiff, friction without modes (jd.forces.CoulombFriction)"
         )
     if isinstance(adjoint, diffrax.BacksolveAdjoint):
         raise ValueError(f"adjoint is 'backsolve', which does not go back through events, and {what}; take 'reverse'")
@@ -207,6 +207,6 @@ def check_limits(scene: Scene, limits: Any, modal: bool) -> None:
         )
     if limits == "stop" and modal:
         raise ValueError(
-            "limits is 'stop', which a scene whose forces have modes (jd.DryFriction, jd.UnilateralContact) does not take; pass "
+            "limits is 'stop', which a scene whose forces have modes (jd.contact.DryFriction, jd.contact.UnilateralContact) does not take; pass "
             "limits='report'"
         )

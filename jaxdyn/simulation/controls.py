@@ -25,7 +25,7 @@ from jaxtyping import Array, Float, PyTree
 from jaxdyn.compile.known import is_concrete
 from jaxdyn.constraints.base import layout
 from jaxdyn.constraints.rank import pseudo_inverse, tolerance
-from jaxdyn.lie.so3 import _product
+from jaxdyn.lie.so3 import matmul
 from jaxdyn.model.arguments import Function, Number, Numbers, as_array, state_dtype, warn
 from jaxdyn.systems.scene import Scene, as_pytree, check_callback, check_force
 
@@ -241,7 +241,7 @@ def _solve_loop(answer: Callable, none: Float[Array, " nc"]) -> Float[Array, " n
     first, push = jax.linearize(answer, none)
     unit = jnp.eye(none.shape[0], dtype=none.dtype)
     left = unit - jax.vmap(push, out_axes=1)(unit)
-    return _product(pseudo_inverse(left, tolerance(None, left)), first)
+    return matmul(pseudo_inverse(left, tolerance(None, left)), first)
 
 
 def rates(control: Any, y, q, v, t, multipliers: Callable) -> dict[str, Array]:

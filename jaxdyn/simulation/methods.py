@@ -32,7 +32,7 @@ from jaxdyn.constraints.selection import (
 )
 from jaxdyn.constraints.tolerances import openness
 from jaxdyn.dynamics.quantities import forward_dynamics
-from jaxdyn.lie.so3 import _product
+from jaxdyn.lie.so3 import matmul
 from jaxdyn.model.arguments import Number, Numbers
 from jaxdyn.reduction.bases import (
     Basis,
@@ -269,7 +269,7 @@ class Reduced(Method):
         """Configuration q, with unit quaternions, and v = N nu + v0."""
         q = retract(scene.system, y["q"])
         basis = self._at(scene, y, q, t)
-        return q, _product(basis.N, y["nu"]) + basis.v0
+        return q, matmul(basis.N, y["nu"]) + basis.v0
 
     def evaluate(
         self, scene: Scene, y: State, t: Number, generalized_force: ForceLaw

@@ -34,13 +34,13 @@ def stepper(scene: SceneLike, dt: Numbers, substeps: int = 1, remat: bool = True
     The state is a pair (q (nq,), v (nv,)); batch it with `jax.vmap`, and repeat it with `jax.lax.scan`. The
     torques tau (nv,) are numbers, or a law tau(q, v, t) -> (nv,), called once at the start of the step. The
     steps are those of `jd.simulate` with `stepsize=dt/substeps`: RK4, constraints closed at the end of each, the scene's
-    forces applied (friction, stops, drives), and tau clipped by its `jd.EffortLimits`. Where a joint meets a stop
-    (`jd.JointStops`, any `jd.PiecewiseForce`) a step ends, and the next one ends where it would have ended.
+    forces applied (friction, stops, drives), and tau clipped by its `jd.forces.EffortLimits`. Where a joint meets a stop
+    (`jd.forces.JointStops`, any `jd.forces.PiecewiseForce`) a step ends, and the next one ends where it would have ended.
 
     **Arguments:**
 
     - `scene`: a `Scene` or `Model`. Friction that sticks and contacts that open need events, which steps of one length
-      do not have: take `jd.CoulombFriction`.
+      do not have: take `jd.forces.CoulombFriction`.
     - `dt`: s; `substeps`: steps in it.
     - `remat`: if True, reverse mode keeps no more of a step than its state and tau, and computes the rest again. That costs a
       step, and a run of n steps then keeps 8 (nq + 2 nv) n bytes a sample in float64; with a law as tau, which is computed
@@ -85,8 +85,8 @@ def _check_options(scene: Scene, dt, substeps, adjoint):
     """Length of the step, s; ValueError for options that do not fit."""
     if has_modes(scene):
         raise ValueError(
-            "stepper: the scene has forces with modes (jd.DryFriction, jd.UnilateralContact), whose events end steps; take "
-            "jd.simulate, or jd.CoulombFriction in their place"
+            "stepper: the scene has forces with modes (jd.contact.DryFriction, jd.contact.UnilateralContact), whose events end steps; take "
+            "jd.simulate, or jd.forces.CoulombFriction in their place"
         )
     seconds = as_array(dt, "stepper: dt")
     if seconds.shape != () or (is_concrete(seconds) and not 0 < float(seconds) < np.inf):

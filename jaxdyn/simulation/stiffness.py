@@ -14,7 +14,7 @@ from jaxdyn.compile import entry_point
 from jaxdyn.compile.known import array_namespace, is_known
 from jaxdyn.constraints.dynamics import constrained_dynamics
 from jaxdyn.dynamics.quantities import gravity_force, mass_matrix
-from jaxdyn.lie.so3 import _product
+from jaxdyn.lie.so3 import matmul
 from jaxdyn.model.arguments import Checked, Numbers, check_state, store_leaf
 from jaxdyn.model.tree import Model
 from jaxdyn.systems.mass_factor import solve_positive
@@ -98,7 +98,7 @@ def stiffness(
     Source: Hairer & Wanner 1996, section IV.2.
 
     ```python
-    rates = jd.stiffness(jd.Scene(model, forces=(jd.JointDamping(1e3),)), q, v)
+    rates = jd.stiffness(jd.Scene(model, forces=(jd.forces.JointDamping(1e3),)), q, v)
     ```
     """
     scene = as_scene(scene)
@@ -137,9 +137,9 @@ def _linearize(scene: Scene, q, v, t, control) -> Float[Array, "n n"]:
     if scene.constraints:
         bare = Scene(system, scene.constraints)
         inverse = jax.jacfwd(lambda f: constrained_dynamics(bare, q, v, f, t).acceleration)(jnp.zeros_like(v))
-        tangent = _product(inverse, mass)
+        tangent = matmul(inverse, mass)
     else:
         inverse, tangent = solve_positive(mass, unit), unit
     by_place, by_speed = jax.jacfwd(force, (0, 1))(jnp.zeros_like(v), jnp.zeros_like(v))
-    pull = _product(inverse, jnp.concatenate([_product(by_place, tangent), _product(by_speed, tangent)], 1))
+    pull = matmul(inverse, jnp.concatenate([matmul(by_place, tangent), matmul(by_speed, tangent)], 1))
     return jnp.concatenate([jnp.concatenate([jnp.zeros_like(tangent), tangent], 1), pull])

@@ -43,7 +43,7 @@ from jaxdyn.dynamics.kinematics import body_twists, sum_to_coordinates, take, tr
 from jaxdyn.dynamics.quantities import bias_force, mass_matrix
 from jaxdyn.dynamics.world_frame import momentum, tree_inertias
 from jaxdyn.lie import se2, se3, so3
-from jaxdyn.lie.so3 import _product, cross
+from jaxdyn.lie.so3 import cross, matmul
 from jaxdyn.model.arguments import Number
 from jaxdyn.model.joints import SCREW_KINDS
 from jaxdyn.model.tree import Model
@@ -112,7 +112,7 @@ def make_step(
         own, push = _lagrangian_derivatives(system, halfway(xi), xi, middle)
         force = generalized_force(halfway(xi), xi, middle)
         push = h * (push if force is None else push + force)
-        left = carried.momentum if A is None else carried.momentum + _product(A.T, z[n:])
+        left = carried.momentum if A is None else carried.momentum + matmul(A.T, z[n:])
         arrived = _transport(system, x, left)
         return 2 * own - _pull_back(system, x, left + arrived + push), _transport(system, x, arrived + push)
 
@@ -153,7 +153,7 @@ def make_step(
     if right_inverse is not None:
         # The second projection removes the rounding of the first, which the size of the momentum sets.
         for _ in range(2):
-            velocity = velocity - _product(right_inverse, velocity_residual(scene, end, velocity, t1))
+            velocity = velocity - matmul(right_inverse, velocity_residual(scene, end, velocity, t1))
     return Step(end, velocity, Carried(last, xi, rows, spare), generalized_force(halfway(xi), xi, middle), solved)
 
 
@@ -180,7 +180,7 @@ def _newton(function, jacobian, z, n: int):
 
         def repeat(state):
             z, change, _, count = state
-            move = -_product(inverse, function(z))
+            move = -matmul(inverse, function(z))
             return z + move, size(move), change, count + 1
 
         z, change, before, _ = lax.while_loop(repeats, repeat, (z, before, before, 0))
@@ -203,7 +203,7 @@ def _lagrangian_derivatives(system, q, v, t):
         pull, momentum = jax.grad(system.value, argnums=(0, 1))(q, v, t)
         return momentum, pull
     # M and h are all there is: dL/dq is what makes M a + h of the Euler-Lagrange equations.
-    p, rate = jax.jvp(lambda q, t: _product(mass_matrix(system, q, t), v), (q, t), (v, jnp.ones_like(t)))
+    p, rate = jax.jvp(lambda q, t: matmul(mass_matrix(system, q, t), v), (q, t), (v, jnp.ones_like(t)))
     return p, rate - bias_force(system, q, v, t)
 
 
@@ -242,12 +242,12 @@ def _velocity(system, q, p, t):
 
 def _transport(system, x, p):
     """Momentum Ad_exp(x)^T p (nv,), joint by joint."""
-    return _by_joint(system, x, p, lambda group, x, p: _product(p, group.Ad(group.exp(x))))
+    return _by_joint(system, x, p, lambda group, x, p: matmul(p, group.Ad(group.exp(x))))
 
 
 def _pull_back(system, x, p):
     """Pull-back J(x)^T p (nv,), J the left Jacobian of exp, joint by joint."""
-    return _by_joint(system, x, p, lambda group, x, p: _product(p, group.left_jacobian(x)))
+    return _by_joint(system, x, p, lambda group, x, p: matmul(p, group.left_jacobian(x)))
 
 
 def _by_joint(system, x, p, function):
@@ -266,7 +266,7 @@ def _rows(scene: Scene, q, t, rank_tol):
         return None, None, None
     A = constraint_jacobian(scene, q, t)
     right_inverse = correction(scene, q, t, rank_tol, holonomic=False)
-    spare = jnp.eye(A.shape[0], dtype=A.dtype) - _product(A, right_inverse)
+    spare = jnp.eye(A.shape[0], dtype=A.dtype) - matmul(A, right_inverse)
     return A, right_inverse, lax.stop_gradient(spare)
 
 

@@ -17,7 +17,7 @@ from jax.scipy.linalg import solve_triangular
 from jaxtyping import Array, Bool, Float
 
 from jaxdyn.compile import entry_point, kernel, variant
-from jaxdyn.lie.so3 import _product
+from jaxdyn.lie.so3 import matmul
 
 # Rows of a matrix beyond which its factor is made by halves: operations of a kernel grow as the cube.
 _MOST_IN_KERNEL = 32
@@ -43,7 +43,7 @@ def _factor(_, matrix):
     half = n // 2
     first = cholesky(matrix[:half, :half])
     below = solve_lower(first, matrix[half:, :half].T).T
-    second = cholesky(matrix[half:, half:] - _product(below, below.T))
+    second = cholesky(matrix[half:, half:] - matmul(below, below.T))
     return jnp.block([[first, jnp.zeros((half, n - half), matrix.dtype)], [below, second]])
 
 
@@ -83,10 +83,10 @@ def _solve(transposed: bool, _, factor, right):
         first, below, second = factor[:half, :half], factor[half:, :half], factor[half:, half:]
         if transposed:
             lower = solve_lower(second, right[half:], transposed=True)
-            upper = solve_lower(first, right[:half] - _product(below.T, lower), transposed=True)
+            upper = solve_lower(first, right[:half] - matmul(below.T, lower), transposed=True)
         else:
             upper = solve_lower(first, right[:half])
-            lower = solve_lower(second, right[half:] - _product(below, upper))
+            lower = solve_lower(second, right[half:] - matmul(below, upper))
         return jnp.concatenate([upper, lower])
     if right.ndim == 2 and right.size > _MOST_IN_KERNEL**2:  # one column at a time, as elements of a batch
         return jax.vmap(lambda column: solve_lower(factor, column, transposed=transposed), 1, 1)(right)

@@ -17,7 +17,7 @@ from jaxtyping import Array, Float, PyTree
 
 from jaxdyn.compile import entry_point, kernel
 from jaxdyn.compile.known import is_known
-from jaxdyn.lie.so3 import _product
+from jaxdyn.lie.so3 import matmul
 from jaxdyn.model.arguments import Checked, Function, Number, batch_hint
 from jaxdyn.model.tree import Model, configuration_rate, difference, integrate, joint_rates, normalize
 from jaxdyn.systems.mass_factor import solve_positive
@@ -74,7 +74,7 @@ class System(eqx.Module):
         self, q: Float[Array, " nq"], v: Float[Array, " nv"], a: Float[Array, " nv"], t: Number
     ) -> Float[Array, " nv"]:
         """Generalised force M a + h, (nv,)."""
-        return _product(self.mass_matrix(q, t), a) + self.bias_force(q, v, t)
+        return matmul(self.mass_matrix(q, t), a) + self.bias_force(q, v, t)
 
     def forward_dynamics(
         self, q: Float[Array, " nq"], v: Float[Array, " nv"], tau: Float[Array, " nv"], t: Number
@@ -140,7 +140,7 @@ class MetricSystem(System):
         """Bias force h = dM/dt v - 1/2 d(v . M v)/dq + dV/dq, (nv,)."""
 
         def momentum(q, t):
-            return _product(self.mass_matrix(q, t), v)
+            return matmul(self.mass_matrix(q, t), v)
 
         # The derivative along the motion is M_dot v; with v held fixed, the pull-back of v is the gradient of v . M v.
         _, rate = jax.jvp(momentum, (q, t), (v, jnp.ones_like(t)))
@@ -154,7 +154,7 @@ class MetricSystem(System):
 
     def kinetic_energy(self, q: Float[Array, " nq"], v: Float[Array, " nv"], t: Number) -> Float[Array, ""]:
         """Kinetic energy v . M v / 2, (), J."""
-        return 0.5 * jnp.sum(v * _product(self.mass_matrix(q, t), v))
+        return 0.5 * jnp.sum(v * matmul(self.mass_matrix(q, t), v))
 
     def potential_energy(self, q: Float[Array, " nq"], t: Number) -> Float[Array, ""]:
         """Potential energy V as given, (), J; zero when there is none."""
@@ -210,7 +210,7 @@ class ExplicitSystem(System):
 
     def kinetic_energy(self, q: Float[Array, " nq"], v: Float[Array, " nv"], t: Number) -> Float[Array, ""]:
         """Kinetic energy v . M v / 2, (), J."""
-        return 0.5 * jnp.sum(v * _product(self.mass_matrix(q, t), v))
+        return 0.5 * jnp.sum(v * matmul(self.mass_matrix(q, t), v))
 
     def potential_energy(self, q: Float[Array, " nq"], t: Number) -> Float[Array, ""]:
         """Potential energy V as given, (), J. **Raises:** ValueError when it was not given."""

@@ -18,7 +18,7 @@ from jaxtyping import Array
 
 from jaxdyn.constraints.base import Rows, position_residual, rows
 from jaxdyn.dynamics.quantities import bias_force, mass_matrix
-from jaxdyn.lie.so3 import _product
+from jaxdyn.lie.so3 import matmul
 from jaxdyn.simulation.hybrid.modes import Elements, Mode, extend, force_at
 from jaxdyn.systems.mass_factor import MassFactor, cholesky, mass_factor, solve_cholesky
 from jaxdyn.systems.scene import Scene
@@ -108,12 +108,12 @@ def react(scene: Scene, elements: Elements, mode: Mode, terms: StateTerms, along
     sliding = slides(elements, mode)
     Z = [
         jnp.where(sliding[i], force_at(scene, elements.each[i]).coefficient.astype(dtype), 0.0)
-        * _product(along[i, : len(elements.each[i].tangent)], terms.row.A[jnp.asarray(elements.each[i].tangent)])
+        * matmul(along[i, : len(elements.each[i].tangent)], terms.row.A[jnp.asarray(elements.each[i].tangent)])
         for i in elements.frictional
     ]
     count = len(Z)
     pushes = terms.metric.whiten(jnp.stack(Z).T) if count else jnp.zeros((scene.nv, 0), dtype)
-    right = jnp.concatenate([target[:, None], _product(terms.Y.T, pushes)], 1) * active[:, None]
+    right = jnp.concatenate([target[:, None], matmul(terms.Y.T, pushes)], 1) * active[:, None]
     # Multipliers without sliding friction, and their change by each normal force of an element that slides.
     lam = solve_rows(terms.Y * active[None], active, right)
     base, by_normal = lam[:, 0], lam[:, 1:]
@@ -127,8 +127,8 @@ def react(scene: Scene, elements: Elements, mode: Mode, terms: StateTerms, along
         normal, own = _eliminate(K, pick * base[jnp.asarray(at)])
         for i, pivot in zip(elements.frictional, own, strict=True):
             pivots[i] = jnp.where(sliding[i], pivot, jnp.ones_like(pivot))
-    lam = (base + _product(by_normal, normal)) * active
-    change = terms.metric.unwhiten(_product(terms.Y, lam) - _product(pushes, normal))
+    lam = (base + matmul(by_normal, normal)) * active
+    change = terms.metric.unwhiten(matmul(terms.Y, lam) - matmul(pushes, normal))
     zero = jnp.zeros((), dtype)
     normals = [sign[i] * lam[one.normal] if one.normal >= 0 else zero for i, one in enumerate(elements.each)]
     return Reaction(lam, jnp.stack(normals), by_element(elements, lam), change, jnp.stack(pivots))
@@ -147,11 +147,11 @@ def solve_rows(Y, active, right):
     # Large enough for Cholesky's factors of dependent rows; each step of the proximal method multiplies the error by about it.
     shift = eps**0.5
     count = Y.shape[1]
-    factor = cholesky(_product(Y.T, Y) + jnp.diag(1.0 - active + shift * jnp.ones((count,), Y.dtype)))
+    factor = cholesky(matmul(Y.T, Y) + jnp.diag(1.0 - active + shift * jnp.ones((count,), Y.dtype)))
     right = right * scale[:, None]
     x = solve_cholesky(factor, right)
     for _ in range(2):
-        x = x + solve_cholesky(factor, (right - _product(Y.T, _product(Y, x))) * active[:, None])
+        x = x + solve_cholesky(factor, (right - matmul(Y.T, matmul(Y, x))) * active[:, None])
     return x * (scale * active)[:, None]
 
 
@@ -203,9 +203,9 @@ def motion_at(
         if one.normal < 0:
             prescribed[i] = normal_load(scene, one, q, v, t)
             level = jnp.where(sliding[i], force_at(scene, one).coefficient.astype(v.dtype) * prescribed[i], 0.0)
-            force = force - level * _product(along[i, : len(one.tangent)], terms.row.A[jnp.asarray(one.tangent)])
+            force = force - level * matmul(along[i, : len(one.tangent)], terms.row.A[jnp.asarray(one.tangent)])
     free = terms.metric.whiten(force - bias_force(scene.system, q, v, t))
-    reaction = react(scene, elements, mode, terms, along, terms.row.gamma - _product(terms.Y.T, free))
+    reaction = react(scene, elements, mode, terms, along, terms.row.gamma - matmul(terms.Y.T, free))
     acceleration = terms.metric.unwhiten(free) + reaction.change
     normal = jnp.stack([prescribed.get(i, reaction.normal[i]) for i in range(len(elements.each))])
     parts = terms.row.A * acceleration[None]

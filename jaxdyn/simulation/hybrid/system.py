@@ -17,7 +17,7 @@ from jaxdyn.compile import kernel
 from jaxdyn.constraints.base import holonomic_rows, layout, position_residual, velocity_residual
 from jaxdyn.dynamics.quantities import mass_matrix
 from jaxdyn.forces.piecewise import values_and_levels
-from jaxdyn.lie.so3 import _product
+from jaxdyn.lie.so3 import matmul
 from jaxdyn.simulation.hybrid.dynamics import (
     StateTerms,
     by_element,
@@ -177,15 +177,15 @@ def project(scene: Scene, elements: Elements, mode: Mode, t, y, error):
     def change(residual, mask):
         """Least velocity that changes the rows of a mask by `residual`."""
         lam = solve_rows(terms.Y * mask[None], mask, (residual * mask)[:, None])[:, 0]
-        return terms.metric.unwhiten(_product(terms.Y, lam))
+        return terms.metric.unwhiten(matmul(terms.Y, lam))
 
     tangent = None
     if error is not None:
         e = rate_to_velocity(scene.system, q, error["q"])
-        e = e - change(_product(terms.row.A, e), holds)
+        e = e - change(matmul(terms.row.A, e), holds)
         tangent = error | {
             "q": velocity_to_rate(scene.system, q, e),
-            "v": error["v"] - change(_product(terms.row.A, error["v"]), active),
+            "v": error["v"] - change(matmul(terms.row.A, error["v"]), active),
         }
     blank = jnp.zeros((elements.count,), dtype)
     if holonomic.size:
@@ -201,11 +201,11 @@ def _impact(scene: Scene, elements: Elements, mode: Mode, slip, t, q, v) -> Impa
     terms = terms_at(scene, elements, q, v, t)
     along, rebound = directions(scene, elements, jnp.zeros_like(slip), slip), rebounds(scene, elements, terms)
     after, reaction = impact(scene, elements, mode, terms, along, v, rebound)
-    rates = _product(terms.row.A, after - v) + terms.row.velocity
+    rates = matmul(terms.row.A, after - v) + terms.row.velocity
     gap = jnp.stack([rates[one.normal] if one.opens else jnp.zeros((), v.dtype) for one in elements.each]) - rebound
     # Impulses are compared with the momentum, and with that of a velocity of one: at rest they are zero up to rounding.
     M = mass_matrix(scene.system, q, t)
-    size = jnp.max(jnp.abs(_product(M, v))) + jnp.max(jnp.abs(M)) + jnp.max(jnp.abs(reaction.multipliers))
+    size = jnp.max(jnp.abs(matmul(M, v))) + jnp.max(jnp.abs(M)) + jnp.max(jnp.abs(reaction.multipliers))
     return Impact(after, reaction.normal, reaction.holding, by_element(elements, rates), gap, rebound, size)
 
 

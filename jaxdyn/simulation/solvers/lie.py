@@ -11,7 +11,7 @@ import jax.numpy as jnp
 from jaxtyping import PyTree
 
 from jaxdyn.lie import se2, se3, so3
-from jaxdyn.lie.so3 import _product
+from jaxdyn.lie.so3 import matmul
 from jaxdyn.model.arguments import Number, SystemLike
 from jaxdyn.model.joints import SCREW_KINDS, joint_integrate, joint_rate
 from jaxdyn.model.tree import Model, Topology, _per_joint
@@ -32,7 +32,7 @@ class LieGroup(Wrapped):
     Source: Munthe-Kaas, Runge-Kutta methods on Lie groups (1998); Hairer, Lubich & Wanner 2006, section IV.8.2.
 
     ```python
-    jd.simulate(model, q0, v0, ts, solver=jd.LieGroup(diffrax.Kvaerno5()))
+    jd.simulate(model, q0, v0, ts, solver=jd.solvers.LieGroup(diffrax.Kvaerno5()))
     ```
     """
 
@@ -135,10 +135,10 @@ def _local_rate(kind: str, q, rate, e):
     if kind == "planar":
         c, s = jnp.cos(q[2]), jnp.sin(q[2])
         v = jnp.stack([c * rate[0] + s * rate[1], c * rate[1] - s * rate[0], rate[2]])
-        return _product(se2.left_jacobian_inverse(-e), v)
+        return matmul(se2.left_jacobian_inverse(-e), v)
     # dq/dt = q (0, omega)/2, so that omega is the vector part of 2 q^-1 dq/dt. J_r(e) = J_l(-e).
     omega = 2 * so3.quat_multiply(so3.quat_conjugate(q[-4:]), rate[-4:])[1:]
     if kind == "spherical":
-        return _product(so3.left_jacobian_inverse(-e), omega)
-    v = jnp.concatenate([_product(so3.quat_to_matrix(q[3:]).T, rate[:3]), omega])
-    return _product(se3.left_jacobian_inverse(-e), v)
+        return matmul(so3.left_jacobian_inverse(-e), omega)
+    v = jnp.concatenate([matmul(so3.quat_to_matrix(q[3:]).T, rate[:3]), omega])
+    return matmul(se3.left_jacobian_inverse(-e), v)

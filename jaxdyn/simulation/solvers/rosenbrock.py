@@ -11,7 +11,7 @@ from jax.flatten_util import ravel_pytree
 from jax.scipy.linalg import lu_factor, lu_solve
 from jaxtyping import PyTree
 
-from jaxdyn.lie.so3 import _product
+from jaxdyn.lie.so3 import matmul
 from jaxdyn.model.arguments import Number
 from jaxdyn.simulation.solvers.base import Flag, StageInterpolation, StepOutput
 
@@ -119,13 +119,13 @@ class Rodas5P(diffrax.AbstractAdaptiveSolver):
 
         def stage(stages, row):
             i, a, c, time, rate = row
-            point = jnp.append(start + _product(a, stages), t0 + time * h)
-            right = change(point) + _product(c, stages) + rate * h * jacobian[:, -1]
+            point = jnp.append(start + matmul(a, stages), t0 + time * h)
+            right = change(point) + matmul(c, stages) + rate * h * jacobian[:, -1]
             return stages.at[i].set(lu_solve(factors, _GAMMA * right)), None
 
         # A scan rather than eight copies of the vector field: the program of a stage is compiled once.
         rows = [jnp.asarray(x, start.dtype) for x in (_A, _C, _TIME, _RATE)]
         stages, _ = jax.lax.scan(stage, jnp.zeros((8, start.size), start.dtype), (jnp.arange(8), *rows))
-        y1 = unravel(start + _product(rows[0][-1], stages) + stages[-1])
-        dense = {"y0": y0, "y1": y1, "k": jax.vmap(unravel)(_product(jnp.asarray(_H, start.dtype), stages))}
+        y1 = unravel(start + matmul(rows[0][-1], stages) + stages[-1])
+        dense = {"y0": y0, "y1": y1, "k": jax.vmap(unravel)(matmul(jnp.asarray(_H, start.dtype), stages))}
         return y1, unravel(stages[-1]), dense, None, diffrax.RESULTS.successful
