@@ -1,4 +1,4 @@
-"""For whoever has a GPU: dynamics and rollouts there with their roofline. Nothing of this has been run on one by us.
+"""Dynamics and rollouts on a GPU, with their roofline.
 
     python -m benchmarks.gpu [--batches 4096 65536] [--robots panda g1] [--steps 100]
     python -m benchmarks.gpu --count [--robots panda]
@@ -50,9 +50,12 @@ LIBRARIES = ("cublas", "cusolver", "cudnn", "cufft")
 
 
 def robot(name: str):
-    """A robot in float32."""
+    """A robot in float32, by name or from a URDF file; "floating:" before the path gives it a floating base."""
     if name == "iiwa":
         return jd.robots.iiwa(dtype=jnp.float32)
+    if name.endswith(".urdf"):
+        path = name.removeprefix("floating:")
+        return jd.load_urdf(path, floating_base=path != name, dtype=jnp.float32)
     from benchmarks.dynamics import load
 
     return load(name)[0]
@@ -198,14 +201,12 @@ def measure(names, batches, steps: int, size: int) -> None:
     is_gpu = device.platform == "gpu"
     print(f"device: {device.device_kind} ({device.platform}), float32, jax {jax.__version__}")
     if not is_gpu:
-        print(
-            "no GPU here: the figures below are those of this CPU, without roofline; on GPUs nothing has been run by us"
-        )
+        print("no GPU here: the figures below are those of this CPU, without roofline")
     else:
         operations, bandwidth = peaks(size)
         print(f"reached by a chain of multiply-adds: {operations:.3g} 1/s; by adding arrays: {bandwidth:.3g} B/s")
-    print("| robot | function | batch | us a call | samples/s | operations | bytes | roofline us | share |")
-    print("|---|---|---|---|---|---|---|---|---|")
+    print("| robot | function | batch | us a call | samples/s | operations | bytes | roofline us | share | compile s |")
+    print("|---|---|---|---|---|---|---|---|---|---|")
     for name in names:
         for label, (function, sizes) in functions(name, steps).items():
             for batch in batches:
@@ -213,14 +214,16 @@ def measure(names, batches, steps: int, size: int) -> None:
                 args = [
                     0.3 * jax.random.normal(key, (batch, n), jnp.float32) for key, n in zip(keys, sizes, strict=True)
                 ]
+                before = time.perf_counter()
                 program = jax.jit(jax.vmap(function)).lower(*args).compile()
+                compilation = time.perf_counter() - before
                 took, rest = seconds(program, *args), ["-"] * 4
                 if is_gpu:
                     cost = program.cost_analysis() or {}
                     flops, moved = cost.get("flops", 0.0), cost.get("bytes accessed", 0.0)
                     least = max(flops / operations, moved / bandwidth)
                     rest = [f"{flops:.3g}", f"{moved:.3g}", f"{1e6 * least:.3g}", f"{least / took:.2f}"]
-                row = [name, label, batch, f"{1e6 * took:.3g}", f"{batch / took:.3g}", *rest]
+                row = [name, label, batch, f"{1e6 * took:.3g}", f"{batch / took:.3g}", *rest, f"{compilation:.0f}"]
                 print("| " + " | ".join(map(str, row)) + " |", flush=True)
 
 
@@ -228,7 +231,9 @@ def main() -> None:
     """Print the tables that were asked for."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--batches", type=int, nargs="+", default=[4096, 65536])
-    parser.add_argument("--robots", nargs="+", default=["panda", "g1", "four-bar"], help="panda, g1, iiwa, four-bar")
+    parser.add_argument(
+        "--robots", nargs="+", default=["panda", "g1", "four-bar"], help="panda, g1, iiwa, four-bar, a URDF file"
+    )
     parser.add_argument("--steps", type=int, default=100, help="of a rollout")
     parser.add_argument(
         "--size", type=int, default=2**26, help="numbers in an array that measures what a device reaches"

@@ -40,8 +40,11 @@ def _maximum(x, y):
     return np.where((x == 0) & (y == 0), x + y, np.maximum(x, y))
 
 
-def evaluate(closed: ClosedJaxpr, args, met: set | None = None) -> list[np.ndarray]:
-    """The results of a jaxpr for arrays; the rules that a kernel could have applied to its numbers are added to `met`."""
+def evaluate(closed: ClosedJaxpr, args, met: set | None = None, sine_error: float = 0.0) -> list[np.ndarray]:
+    """The results of a jaxpr for arrays; the rules that a kernel could have applied to its numbers are added to `met`.
+
+    Sines and cosines are changed by `sine_error` units in the last place of one.
+    """
     jaxpr = closed.jaxpr
     values = dict(zip(jaxpr.constvars, map(np.asarray, closed.consts), strict=True))
     values.update(zip(jaxpr.invars, args, strict=True))
@@ -52,7 +55,7 @@ def evaluate(closed: ClosedJaxpr, args, met: set | None = None) -> list[np.ndarr
     with np.errstate(all="ignore"):
         for eqn in jaxpr.eqns:
             operands = [read(x) for x in eqn.invars]
-            results = _evaluate_one(eqn, operands, met)
+            results = _evaluate_one(eqn, operands, met, sine_error)
             if met is not None:
                 met |= _rules_met(eqn.primitive.name, operands, results)
             values.update(zip(eqn.outvars, results, strict=True))
@@ -81,12 +84,15 @@ def _is_finite(x) -> bool:
     return x.dtype.kind != "f" or bool(np.isfinite(x).all())
 
 
-def _evaluate_one(eqn, args, met) -> list[np.ndarray]:
+def _evaluate_one(eqn, args, met, sine_error) -> list[np.ndarray]:
     name, params = eqn.primitive.name, eqn.params
     if name in _INNER:
-        return evaluate(params[_INNER[name]], args, met)
+        return evaluate(params[_INNER[name]], args, met, sine_error)
     if name == "scan":
-        return _scan(params, args, met)
+        return _scan(params, args, met, sine_error)
+    if name in ("sin", "cos") and sine_error:
+        x = _ELEMENTWISE[name](args[0])
+        return [(x + sine_error * np.finfo(x.dtype).eps).astype(x.dtype)]
     out = eqn.outvars[0].aval
     if name in _ELEMENTWISE and not (name == "rem" and out.dtype.kind != "f"):
         return [np.asarray(_ELEMENTWISE[name](*args)).astype(out.dtype, copy=False)]
@@ -132,21 +138,21 @@ def _integer_power(x, exponent: int) -> np.ndarray:
     return power if exponent >= 0 else 1 / power
 
 
-def _scan(params, args, met) -> list[np.ndarray]:
+def _scan(params, args, met, sine_error) -> list[np.ndarray]:
     from jaxdyn.compile.jax_adapter import scan_counts
 
     constants, carried = scan_counts(params)
     carry, rows, saved = args[constants : constants + carried], args[constants + carried :], []
     order = range(params["length"])
     for i in reversed(order) if params["reverse"] else order:
-        results = evaluate(params["jaxpr"], [*args[:constants], *carry, *(x[i] for x in rows)], met)
+        results = evaluate(params["jaxpr"], [*args[:constants], *carry, *(x[i] for x in rows)], met, sine_error)
         carry = results[:carried]
         saved.append(results[carried:])
     saved = saved[::-1] if params["reverse"] else saved
     return [*carry, *(np.stack(column) for column in zip(*saved, strict=True))]
 
 
-def trace_and_evaluate(function: Callable, *args, met: set | None = None) -> list[np.ndarray]:
-    """The flat results of a function: JAX traces it, NumPy computes. `met`: as of `evaluate`."""
+def trace_and_evaluate(function: Callable, *args, met: set | None = None, sine_error: float = 0.0) -> list[np.ndarray]:
+    """The flat results of a function: JAX traces it, NumPy computes. `met`, `sine_error`: as of `evaluate`."""
     leaves = [np.asarray(x) for x in jax.tree.leaves(args)]
-    return evaluate(jax.make_jaxpr(function)(*args), leaves, met)
+    return evaluate(jax.make_jaxpr(function)(*args), leaves, met, sine_error)

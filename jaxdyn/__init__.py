@@ -1,161 +1,164 @@
 """Rigid-body dynamics in JAX: pure functions of one sample, to be batched, compiled and differentiated."""
 
-from jaxdyn import contact as contact
-from jaxdyn import control as control
-from jaxdyn import geometry as geometry
-from jaxdyn import grasp as grasp
-from jaxdyn import identify as identify
-from jaxdyn import scale as scale
-from jaxdyn import scenes as scenes
-from jaxdyn import sensors as sensors
-from jaxdyn.compile import compilation as compilation
-from jaxdyn.constraints import Holonomic as Holonomic
-from jaxdyn.constraints import Pfaffian as Pfaffian
-from jaxdyn.constraints import constraint_jacobian as constraint_jacobian
-from jaxdyn.constraints import distance as distance
-from jaxdyn.constraints import gear as gear
-from jaxdyn.constraints import knife_edge as knife_edge
-from jaxdyn.constraints import lock_joint as lock_joint
-from jaxdyn.constraints import loop as loop
-from jaxdyn.constraints import model_couplings as model_couplings
-from jaxdyn.constraints import rolling_sphere as rolling_sphere
-from jaxdyn.constraints import rolling_wheel as rolling_wheel
-from jaxdyn.constraints.assembly import assemble as assemble
-from jaxdyn.constraints.codes import RESULTS as RESULTS
-from jaxdyn.constraints.dynamics import constrained_dynamics as constrained_dynamics
-from jaxdyn.constraints.dynamics import projections as projections
-from jaxdyn.constraints.dynamics import second_fundamental_form as second_fundamental_form
-from jaxdyn.constraints.mobility import degrees_of_freedom as degrees_of_freedom
-from jaxdyn.constraints.reactions import body_wrenches as body_wrenches
-from jaxdyn.constraints.reactions import constraint_forces as constraint_forces
-from jaxdyn.constraints.reactions import constraint_wrenches as constraint_wrenches
-from jaxdyn.contact import RollingModel as RollingModel
-from jaxdyn.contact import rolling_contact as rolling_contact
-from jaxdyn.contact.unilateral import DryFriction as DryFriction
-from jaxdyn.contact.unilateral import UnilateralContact as UnilateralContact
-from jaxdyn.contact.unilateral import gap_contact as gap_contact
-from jaxdyn.contact.unilateral import ground_contact as ground_contact
-from jaxdyn.control.following import follow as follow
-from jaxdyn.control.inverse_kinematics import inverse_kinematics as inverse_kinematics
-from jaxdyn.control.legs import LeggedDynamics as LeggedDynamics
-from jaxdyn.control.legs import underactuated_inverse_dynamics as underactuated_inverse_dynamics
-from jaxdyn.dynamics.articulated_bodies import ArticulatedBodies as ArticulatedBodies
-from jaxdyn.dynamics.articulated_bodies import articulated_bodies as articulated_bodies
-from jaxdyn.dynamics.base_twists import base_twists as base_twists
-from jaxdyn.dynamics.base_twists import link_adjoints as link_adjoints
-from jaxdyn.dynamics.centroidal import center_of_mass as center_of_mass
-from jaxdyn.dynamics.centroidal import centroidal_momentum as centroidal_momentum
-from jaxdyn.dynamics.centroidal import centroidal_momentum_matrix as centroidal_momentum_matrix
-from jaxdyn.dynamics.centroidal import com_jacobian as com_jacobian
-from jaxdyn.dynamics.com_dynamics import ComDynamics as ComDynamics
-from jaxdyn.dynamics.com_dynamics import com_dynamics as com_dynamics
-from jaxdyn.dynamics.frame_motion import frame_acceleration as frame_acceleration
-from jaxdyn.dynamics.frame_motion import frame_jacobian as frame_jacobian
-from jaxdyn.dynamics.frame_motion import frame_velocity as frame_velocity
-from jaxdyn.dynamics.joint_wrenches import joint_wrench as joint_wrench
-from jaxdyn.dynamics.kinematics import body_jacobian as body_jacobian
-from jaxdyn.dynamics.kinematics import forward_kinematics as forward_kinematics
-from jaxdyn.dynamics.kinematics import frame_pose as frame_pose
-from jaxdyn.dynamics.kinematics import jacobian_dot_v as jacobian_dot_v
-from jaxdyn.dynamics.kinematics import spatial_jacobian as spatial_jacobian
-from jaxdyn.dynamics.link_frame import NewtonEulerMatrices as NewtonEulerMatrices
-from jaxdyn.dynamics.link_frame import newton_euler_matrices as newton_euler_matrices
-from jaxdyn.dynamics.quantities import aba as aba
-from jaxdyn.dynamics.quantities import bias_force as bias_force
-from jaxdyn.dynamics.quantities import christoffel_symbols as christoffel_symbols
-from jaxdyn.dynamics.quantities import coriolis_matrix as coriolis_matrix
-from jaxdyn.dynamics.quantities import crba as crba
-from jaxdyn.dynamics.quantities import forward_dynamics as forward_dynamics
-from jaxdyn.dynamics.quantities import generalized_force as generalized_force
-from jaxdyn.dynamics.quantities import gravity_force as gravity_force
-from jaxdyn.dynamics.quantities import inverse_dynamics as inverse_dynamics
-from jaxdyn.dynamics.quantities import kinetic_energy as kinetic_energy
-from jaxdyn.dynamics.quantities import mass_matrix as mass_matrix
-from jaxdyn.dynamics.quantities import mass_matrix_derivative as mass_matrix_derivative
-from jaxdyn.dynamics.quantities import mass_matrix_sqrt as mass_matrix_sqrt
-from jaxdyn.dynamics.quantities import potential_energy as potential_energy
-from jaxdyn.dynamics.quantities import rnea as rnea
-from jaxdyn.dynamics.quantities import torque_regressor as torque_regressor
-from jaxdyn.dynamics.workspace import WorkspaceDynamics as WorkspaceDynamics
-from jaxdyn.dynamics.workspace import workspace_dynamics as workspace_dynamics
-from jaxdyn.export import Exported as Exported
-from jaxdyn.export import export as export
-from jaxdyn.forces.dissipation import RayleighDissipation as RayleighDissipation
-from jaxdyn.forces.dissipation import SlidingFriction as SlidingFriction
-from jaxdyn.forces.elements import CoulombFriction as CoulombFriction
-from jaxdyn.forces.elements import Drive as Drive
-from jaxdyn.forces.elements import ExternalWrench as ExternalWrench
-from jaxdyn.forces.elements import JointDamping as JointDamping
-from jaxdyn.forces.elements import JointSpring as JointSpring
-from jaxdyn.forces.limits import EffortLimits as EffortLimits
-from jaxdyn.forces.limits import JointStops as JointStops
-from jaxdyn.forces.piecewise import PiecewiseForce as PiecewiseForce
-from jaxdyn.geometry.immersion import constrain_by_immersion as constrain_by_immersion
-from jaxdyn.geometry.immersion import reaction_force as reaction_force
-from jaxdyn.io import Actuators as Actuators
-from jaxdyn.io import LoadedScene as LoadedScene
-from jaxdyn.io import NotTakenWarning as NotTakenWarning
-from jaxdyn.io import Start as Start
-from jaxdyn.io import UnitsWarning as UnitsWarning
-from jaxdyn.io import load as load
-from jaxdyn.io import load_mjcf as load_mjcf
-from jaxdyn.io import load_sdf as load_sdf
-from jaxdyn.io import load_urdf as load_urdf
-from jaxdyn.io import read_log as read_log
-from jaxdyn.io import save_urdf as save_urdf
-from jaxdyn.io import urdf_inertia_report as urdf_inertia_report
-from jaxdyn.io import write_log as write_log
-from jaxdyn.lie import se2 as se2
-from jaxdyn.lie import se3 as se3
-from jaxdyn.lie import so3 as so3
-from jaxdyn.model import inertia as inertia
-from jaxdyn.model import robots as robots
-from jaxdyn.model.builder import ModelBuilder as ModelBuilder
-from jaxdyn.model.builder import inertia_report as inertia_report
-from jaxdyn.model.builder import repair_inertias as repair_inertias
-from jaxdyn.model.joining import join as join
-from jaxdyn.model.topology import Topology as Topology
-from jaxdyn.model.tree import Model as Model
-from jaxdyn.model.tree import configuration_rate as configuration_rate
-from jaxdyn.model.tree import difference as difference
-from jaxdyn.model.tree import integrate as integrate
-from jaxdyn.model.tree import neutral as neutral
-from jaxdyn.model.tree import normalize as normalize
-from jaxdyn.model.tree import random_configuration as random_configuration
-from jaxdyn.pictures import Shape as Shape
-from jaxdyn.pictures import Shapes as Shapes
-from jaxdyn.pictures import animate as animate
-from jaxdyn.pictures import draw as draw
-from jaxdyn.pictures import plot as plot
-from jaxdyn.pictures import save_html as save_html
-from jaxdyn.pictures import shapes as shapes
-from jaxdyn.pictures import view as view
-from jaxdyn.reduction.bases import tangent_basis as tangent_basis
-from jaxdyn.reduction.gauge_invariant import gauge_invariant as gauge_invariant
-from jaxdyn.reduction.integrability import involutive as involutive
-from jaxdyn.reduction.integrability import spurious_terms as spurious_terms
-from jaxdyn.reduction.inverse_dynamics import constrained_inverse_dynamics as constrained_inverse_dynamics
-from jaxdyn.reduction.minimal import reduced_dynamics as reduced_dynamics
-from jaxdyn.reports import report as report
-from jaxdyn.simulation import solvers as solvers
-from jaxdyn.simulation.controls import Controller as Controller
-from jaxdyn.simulation.controls import Sampled as Sampled
-from jaxdyn.simulation.methods import Baumgarte as Baumgarte
-from jaxdyn.simulation.methods import Multipliers as Multipliers
-from jaxdyn.simulation.methods import Projected as Projected
-from jaxdyn.simulation.methods import Reduced as Reduced
-from jaxdyn.simulation.run import simulate as simulate
-from jaxdyn.simulation.solution import Solution as Solution
-from jaxdyn.simulation.solvers import LieGroup as LieGroup
-from jaxdyn.simulation.solvers import Rodas5P as Rodas5P
-from jaxdyn.simulation.stepping import stepper as stepper
-from jaxdyn.simulation.stiffness import Stiffness as Stiffness
-from jaxdyn.simulation.stiffness import stiffness as stiffness
-from jaxdyn.simulation.terminal_events import JointLimitWarning as JointLimitWarning
-from jaxdyn.simulation.variational import Variational as Variational
-from jaxdyn.systems.lagrangian import LagrangianSystem as LagrangianSystem
-from jaxdyn.systems.scene import Scene as Scene
-from jaxdyn.systems.system import ExplicitSystem as ExplicitSystem
-from jaxdyn.systems.system import MetricSystem as MetricSystem
+from jaxdyn import (
+    constraints,
+    contact,
+    control,
+    dynamics,
+    forces,
+    geometry,
+    grasp,
+    identify,
+    io,
+    model,
+    pictures,
+    reduction,
+    scale,
+    scenes,
+    sensors,
+    simulation,
+)
+from jaxdyn._renamed import __getattr__ as __getattr__
+from jaxdyn.compile import compilation
+from jaxdyn.constraints import Holonomic, Pfaffian, constraint_jacobian, loop, rolling_sphere, rolling_wheel
+from jaxdyn.constraints.assembly import assemble
+from jaxdyn.constraints.codes import RESULTS
+from jaxdyn.constraints.dynamics import constrained_dynamics
+from jaxdyn.constraints.mobility import degrees_of_freedom
+from jaxdyn.constraints.reactions import constraint_forces
+from jaxdyn.control.following import follow
+from jaxdyn.control.inverse_kinematics import inverse_kinematics
+from jaxdyn.dynamics.centroidal import center_of_mass, com_jacobian
+from jaxdyn.dynamics.frame_motion import frame_jacobian, frame_velocity
+from jaxdyn.dynamics.kinematics import body_jacobian, forward_kinematics, frame_pose
+from jaxdyn.dynamics.link_frame import newton_euler_matrices
+from jaxdyn.dynamics.quantities import (
+    bias_force,
+    coriolis_matrix,
+    forward_dynamics,
+    gravity_force,
+    inverse_dynamics,
+    kinetic_energy,
+    mass_matrix,
+    potential_energy,
+)
+from jaxdyn.export import Exported, export
+from jaxdyn.io import load, load_urdf, read_log, save_urdf
+from jaxdyn.lie import se2, se3, so3
+from jaxdyn.model import inertia, robots
+from jaxdyn.model.builder import ModelBuilder
+from jaxdyn.model.joining import join
+from jaxdyn.model.tree import Model, configuration_rate, difference, integrate, neutral, normalize, random_configuration
+from jaxdyn.pictures import animate, draw, plot, view
+from jaxdyn.reduction.inverse_dynamics import constrained_inverse_dynamics
+from jaxdyn.reduction.minimal import reduced_dynamics
+from jaxdyn.reports import report
+from jaxdyn.simulation import solvers
+from jaxdyn.simulation.controls import Controller, Sampled
+from jaxdyn.simulation.methods import Baumgarte, Multipliers, Projected, Reduced
+from jaxdyn.simulation.run import simulate
+from jaxdyn.simulation.solution import Solution
+from jaxdyn.simulation.stepping import stepper
+from jaxdyn.simulation.stiffness import stiffness
+from jaxdyn.simulation.variational import Variational
+from jaxdyn.systems.lagrangian import LagrangianSystem
+from jaxdyn.systems.scene import Scene
+from jaxdyn.systems.system import ExplicitSystem, MetricSystem
 
 __version__ = "0.2.0"
+__all__ = [
+    "RESULTS",
+    "Baumgarte",
+    "Controller",
+    "ExplicitSystem",
+    "Exported",
+    "Holonomic",
+    "LagrangianSystem",
+    "MetricSystem",
+    "Model",
+    "ModelBuilder",
+    "Multipliers",
+    "Pfaffian",
+    "Projected",
+    "Reduced",
+    "Sampled",
+    "Scene",
+    "Solution",
+    "Variational",
+    "animate",
+    "assemble",
+    "bias_force",
+    "body_jacobian",
+    "center_of_mass",
+    "com_jacobian",
+    "compilation",
+    "configuration_rate",
+    "constrained_dynamics",
+    "constrained_inverse_dynamics",
+    "constraint_forces",
+    "constraint_jacobian",
+    "constraints",
+    "contact",
+    "control",
+    "coriolis_matrix",
+    "degrees_of_freedom",
+    "difference",
+    "draw",
+    "dynamics",
+    "export",
+    "follow",
+    "forces",
+    "forward_dynamics",
+    "forward_kinematics",
+    "frame_jacobian",
+    "frame_pose",
+    "frame_velocity",
+    "geometry",
+    "grasp",
+    "gravity_force",
+    "identify",
+    "inertia",
+    "integrate",
+    "inverse_dynamics",
+    "inverse_kinematics",
+    "io",
+    "join",
+    "kinetic_energy",
+    "load",
+    "load_urdf",
+    "loop",
+    "mass_matrix",
+    "model",
+    "neutral",
+    "newton_euler_matrices",
+    "normalize",
+    "pictures",
+    "plot",
+    "potential_energy",
+    "random_configuration",
+    "read_log",
+    "reduced_dynamics",
+    "reduction",
+    "report",
+    "robots",
+    "rolling_sphere",
+    "rolling_wheel",
+    "save_urdf",
+    "scale",
+    "scenes",
+    "se2",
+    "se3",
+    "sensors",
+    "simulate",
+    "simulation",
+    "so3",
+    "solvers",
+    "stepper",
+    "stiffness",
+    "view",
+]
+
+
+def __dir__() -> list[str]:
+    """Public names; the modules behind them are internal."""
+    return __all__

@@ -23,7 +23,8 @@ TERMS = """generalized_force applied_force reduced_dynamics constrained_dynamics
     articulated_bodies
     coordinated_lifting closed_ring quadruped left_jacobian left_jacobian_inverse unconstrained constrained named_frame
     signed_distance displaced converged_reference published_state time_interleaved embed""".split()
-DEPRECATED = """called followed followed_rate limited moved placed wanted_force wanted_forces completed bounded tied aligned named scaled
+DEPRECATED = """called followed followed_rate limited moved placed wanted_force wanted_forces completed bounded tied aligned
+    named scaled
     told""".split()
 # Protocol of constraints and names of other rooms that are not done yet.
 OTHERS = "declared".split()

@@ -8,6 +8,7 @@ import tomllib
 from collections.abc import Iterator
 from importlib import metadata
 from pathlib import Path
+from types import ModuleType
 
 import jax
 import jax.numpy as jnp
@@ -15,6 +16,7 @@ import numpy as np
 import pytest
 
 import jaxdyn
+from jaxdyn import _renamed
 
 PACKAGE = Path(jaxdyn.__file__).parent
 
@@ -32,6 +34,7 @@ FLOORS = (
     "pictures",
     "cli demo",
     "__main__",
+    "_renamed",
 )
 RANK = {name: rank for rank, floor in enumerate(FLOORS) for name in floor.split()}
 PROGRAMS = {"cli", "demo", "__main__"}
@@ -254,7 +257,7 @@ def public(module: str = "") -> Iterator[tuple[str, ast.AST]]:
     names = imported_as(module)
     if module and not (PACKAGE.joinpath(*module.split(".")) / "__init__.py").exists():
         names = {}  # a module that is a group by itself imports for its own use
-    for dotted in names.values():
+    for dotted in (dotted for name, dotted in names.items() if not name.startswith("_")):
         home, node = definition(dotted)
         if node is not None:
             yield home, node
@@ -329,3 +332,20 @@ def test_jitted_batch_of_40000_rows_equals_eager(dtype, rtol):
     omega = jax.random.uniform(jax.random.key(0), (40_000, 3), dtype, 0.1, 1.0)
     batched = jax.vmap(kinetic_energy)
     np.testing.assert_allclose(jax.jit(batched)(omega), batched(omega), rtol=rtol)
+
+
+def test_public_namespaces_list_their_names():
+    """`__all__` is what `dir` shows; the names that moved are found with a warning."""
+    assert dir(jaxdyn) == sorted(jaxdyn.__all__) and len(jaxdyn.__all__) <= 90
+    for name in jaxdyn.__all__:
+        namespace = getattr(jaxdyn, name)
+        if isinstance(namespace, ModuleType):
+            assert all(hasattr(namespace, each) for each in namespace.__all__), name
+            if hasattr(namespace, "__path__"):
+                assert sorted(namespace.__all__) == dir(namespace), name
+    for namespace, names in _renamed._MOVED.items():
+        for name in names.split():
+            with pytest.warns(DeprecationWarning, match=rf"jd\.{namespace}\.{name}"):
+                assert getattr(jaxdyn, name) is getattr(getattr(jaxdyn, namespace), name)
+    with pytest.raises(AttributeError, match="nonsense"):
+        _ = jaxdyn.nonsense

@@ -21,8 +21,9 @@ REFERENCE = ROOT / "docs" / "reference"
 PAGES = sorted(path.stem for path in REFERENCE.glob("*.md") if path.stem != "index")
 # What another export returns, whose example shows it.
 SHOWN_BY = {
+    "pictures.Viewer": "view",
     "control.OptimalControl": "control.ilqr",
-    "LeggedDynamics": "underactuated_inverse_dynamics",
+    "control.LeggedDynamics": "control.underactuated_inverse_dynamics",
     "identify.DriveGains": "identify.fit_gains",
     "identify.Cutoff": "identify.choose_cutoff",
     "identify.Excitation": "identify.exciting_motion",
@@ -46,19 +47,18 @@ ELSEWHERE = {
     "identify.fit_robot": "test_identify_robot",
     "identify.fit_trajectory": "test_identify",
     "plot.work_precision": "test_plots_and_tables",
-    "spurious_terms": "test_distributions",
+    "reduction.spurious_terms": "test_distributions",
 }
 # Examples of docstrings that are not run here, for the same reasons.
 NOT_RUN = {
-    "DryFriction": "test_friction_scenes",
+    "contact.DryFriction": "test_friction_scenes",
     "control.ContactCoordinates": "test_contact_laws",
-    "RollingModel": "test_rolling_surfaces",
     "contact.RollingModel": "test_rolling_surfaces",
     "control.WholeBody": "test_whole_body",
-    "ground_contact": "test_events",
+    "contact.ground_contact": "test_events",
     "identify.fit_parameters": "test_identify_systems",
     "report": "test_report",
-    "underactuated_inverse_dynamics": "test_legs",
+    "control.underactuated_inverse_dynamics": "test_legs",
 }
 ARM = """
 builder = jd.ModelBuilder("arm")
@@ -84,8 +84,8 @@ nu = jnp.zeros(motions.object.shape[1] + motions.internal.shape[1])
 # What readers of a docstring have in hand: the names that its example takes.
 NAMES = (
     {
-        "JointStops": "robot = model",
-        "PiecewiseForce": "system = model",
+        "forces.JointStops": "robot = model",
+        "forces.PiecewiseForce": "system = model",
         "ModelBuilder": "from jaxdyn import ModelBuilder",
         "compilation": TWO,
         "control.GraspForce": """
@@ -93,27 +93,26 @@ grasp = jd.scenes.hand_with_ball(mass=0.2)
 q0, v0 = jd.scenes.hand_with_ball.start(twist=(0.0,) * 6)
 q_object, ts = q0[grasp.system.topology.q_slices[-1]], jnp.linspace(0.0, 0.01, 2)
 """,
-        "frame_acceleration": ARM,
+        "dynamics.frame_acceleration": ARM,
         "grasp.hand_dynamics": MOTIONS,
         "grasp.hand_motions": MOTIONS,
         "identify.Measured": """
 scene = jd.Scene(model, forces=[jd.forces.JointDamping([0.3, 0.3])])
 log = jd.identify.Log(log.t, log.q, log.v, log.a, log.tau / np.array([11.0, 8.5]))
 """,
-        "involutive": "q = q_disk",
+        "reduction.involutive": "q = q_disk",
         "join": "arm, box = model, free",
-        "joint_wrench": "zero = still",
-        "model_couplings": "model = plain",
-        "workspace_dynamics": ARM,
+        "dynamics.joint_wrench": "zero = still",
+        "constraints.model_couplings": "model = plain",
+        "dynamics.workspace_dynamics": ARM,
     }
     | dict.fromkeys(
         (
-            "LieGroup",
+            "solvers.LieGroup",
             "Sampled",
             "Variational",
             "control.ComputedTorque",
             "simulate",
-            "solvers.LieGroup",
             "stiffness",
         ),
         TWO,
@@ -125,7 +124,8 @@ log = jd.identify.Log(log.t, log.q, log.v, log.a, log.tau / np.array([11.0, 8.5]
 def entries(page: str) -> list[tuple[str, list[str]]]:
     """The names on a page in its order, each with the blocks under it; what stands above the first is named ""."""
     parts = re.split(r"^::: jaxdyn\.(\S+)$", (REFERENCE / f"{page}.md").read_text(), flags=re.M)
-    names = ["", *(name.rpartition(".")[2] if name.startswith("dynamics.") else name for name in parts[1::2])]
+    # The recursions stand where they are written.
+    names = ["", *(re.sub(r"recursions\.\w+\.", "", name) for name in parts[1::2])]
     return [(n, re.findall(r"```python\n(.*?)```", text, re.S)) for n, text in zip(names, parts[::2], strict=True)]
 
 
@@ -173,11 +173,22 @@ def use(value, systems: list) -> None:
     faults = []
     for system in systems:
         q, v = jd.neutral(system) if isinstance(system, jd.Model) else jnp.zeros(system.nq), jnp.zeros(system.nv)
+        if isinstance(value, jd.contact.RollingContact) and type(system) is jd.Model:
+            system = jd.contact.RollingModel(system, [value])
+            value = jd.Scene(system, system.rows)
+        if isinstance(system, jd.contact.RollingModel):
+            # Unit vectors, the places of spheres; at the neutral configuration the surfaces are apart.
+            q = jnp.concatenate([q, jnp.full(system.nq - len(q), 3**-0.5)])
         try:
             if isinstance(value, jd.Scene):
                 if value.constraints:
                     jd.constraint_jacobian(value, q)
-                value.applied_force(q, v)
+                if any(
+                    isinstance(force, (jd.contact.UnilateralContact, jd.contact.DryFriction)) for force in value.forces
+                ):
+                    jd.simulate(value, q, v, [0.0, 1e-3], throw=False)  # its force has modes, which a motion tracks
+                else:
+                    value.applied_force(q, v)
             elif isinstance(value, Constraint):
                 jd.constraint_jacobian(jd.Scene(system, [value]), q)
             elif isinstance(value, Controller):
@@ -187,7 +198,7 @@ def use(value, systems: list) -> None:
                 jd.Scene(system, forces=[value]).applied_force(q, v)
             return
         except ValueError as error:
-            faults.append(f"{system}: {error}"[:300])
+            faults.append(f"{str(system).partition(':')[0]}: {error}"[:300])
     raise AssertionError(f"{value} was made, and cannot be used on any system of the page: {faults}")
 
 

@@ -210,7 +210,8 @@ class Loop:
 
     def _by_jax(self, *flat):
         first, tables = self.end - self.states, len(jax.tree.leaves(self.given))
-        traced, constants, state = flat[: self.count], flat[self.count : first], flat[first : self.end]
+        traced = [x.reshape(array.shape) for x, array in zip(flat, self.inputs[: self.count], strict=False)]
+        constants, state = flat[self.count : first], flat[first : self.end]
         given, after = flat[self.end : self.end + tables], flat[self.end + tables :]
         constants, given, carry = self.form([*constants, *given, *state, *after])
         carry = self.task.otherwise(*self.task.static, self.known(traced), constants, given, carry)

@@ -30,5 +30,50 @@ from jaxdyn.contact.surfaces import Sphere as Sphere
 from jaxdyn.contact.surfaces import Surface as Surface
 from jaxdyn.contact.surfaces import SurfaceGeometry as SurfaceGeometry
 from jaxdyn.contact.surfaces import surface_geometry as surface_geometry
+from jaxdyn.contact.unilateral import DryFriction as DryFriction
+from jaxdyn.contact.unilateral import UnilateralContact as UnilateralContact
+from jaxdyn.contact.unilateral import gap_contact as gap_contact
+from jaxdyn.contact.unilateral import ground_contact as ground_contact
 from jaxdyn.contact.wrench_cones import wrench_cone as wrench_cone
 from jaxdyn.contact.wrench_cones import wrench_cone_of_polygon as wrench_cone_of_polygon
+
+__all__ = [
+    "RESULTS",
+    "ContactForces",
+    "ContactKinematics",
+    "Cylinder",
+    "DryFriction",
+    "Ellipsoid",
+    "ForceClosure",
+    "FrictionCone",
+    "Parametrised",
+    "Plane",
+    "QPSolution",
+    "RollingContact",
+    "RollingModel",
+    "Sphere",
+    "Surface",
+    "SurfaceGeometry",
+    "UnilateralContact",
+    "contact_coordinates",
+    "contact_forces",
+    "force_closure",
+    "friction_cone",
+    "gap_contact",
+    "ground_contact",
+    "montana",
+    "optimal_forces",
+    "relative_pose",
+    "rolling_contact",
+    "solve_qp",
+    "surface_cone",
+    "surface_geometry",
+    "wrench_basis",
+    "wrench_cone",
+    "wrench_cone_of_polygon",
+]
+
+
+def __dir__() -> list[str]:
+    """Names of the namespace; its modules are internal."""
+    return __all__

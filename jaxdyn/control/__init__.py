@@ -15,9 +15,35 @@ from jaxdyn.control.feet import foot as foot
 from jaxdyn.control.grasping import GraspForce as GraspForce
 from jaxdyn.control.ilqr import OptimalControl as OptimalControl
 from jaxdyn.control.ilqr import ilqr as ilqr
+from jaxdyn.control.legs import LeggedDynamics as LeggedDynamics
 from jaxdyn.control.legs import missing_wrench as missing_wrench
+from jaxdyn.control.legs import underactuated_inverse_dynamics as underactuated_inverse_dynamics
 from jaxdyn.control.motion import CartesianStiffness as CartesianStiffness
 from jaxdyn.control.motion import ComputedTorque as ComputedTorque
 from jaxdyn.control.motion import OperationalSpace as OperationalSpace
 from jaxdyn.control.whole_body import WholeBody as WholeBody
 from jaxdyn.control.whole_body import standing as standing
+
+__all__ = [
+    "CartesianStiffness",
+    "ComputedTorque",
+    "ContactCoordinates",
+    "Foot",
+    "GaugeInvariant",
+    "GraspForce",
+    "HybridForce",
+    "LeggedDynamics",
+    "OperationalSpace",
+    "OptimalControl",
+    "WholeBody",
+    "foot",
+    "ilqr",
+    "missing_wrench",
+    "standing",
+    "underactuated_inverse_dynamics",
+]
+
+
+def __dir__() -> list[str]:
+    """Names of the namespace; its modules are internal."""
+    return __all__

@@ -50,11 +50,11 @@ class CenterError(Constraint):
 class WholeBody(eqx.Module):
     """Centre of mass and attitude of the base by  edd + Kd ed + Kp e = 0, with ground forces inside their cones.
 
-    tau comes from `jd.control.underactuated_inverse_dynamics` for the acceleration of `acceleration(q, v, t)`. Errors decay exactly as
-    set by the gains for an exact model, while the feet are at rest and their forces can give the acceleration. The code
-    `dynamics(q, v, t).result` reports this; otherwise forces leave a cone, a simulation of `jd.control.standing`
-    ends with `contact_lost`, and `missing_wrench(q, v, t)` gives the remainder. Forces of constrained feet are those of
-    the program where their rows are independent: with points, up to three of them or legs of three joints and more.
+    tau comes from `jd.control.underactuated_inverse_dynamics` for the acceleration of `acceleration(q, v, t)`. Errors decay
+    exactly as set by the gains for an exact model, while the feet are at rest and their forces can give the acceleration.
+    The code `dynamics(q, v, t).result` reports this; otherwise forces leave a cone, a simulation of `jd.control.standing`
+    ends with `contact_lost`, and `missing_wrench(q, v, t)` gives the remainder. Forces of constrained feet are those of the
+    program where their rows are independent: with points, up to three of them or legs of three joints and more.
 
     **Arguments:**
 

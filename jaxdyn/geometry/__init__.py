@@ -16,3 +16,24 @@ from jaxdyn.geometry.metric import geodesic_acceleration as geodesic_acceleratio
 from jaxdyn.geometry.metric import riemann_tensor as riemann_tensor
 from jaxdyn.geometry.metric import sectional_curvature as sectional_curvature
 from jaxdyn.geometry.metric import sharp as sharp
+
+__all__ = [
+    "arnold_form",
+    "christoffel_symbols",
+    "connection",
+    "constrain_by_immersion",
+    "covariant_derivative",
+    "covariant_rate",
+    "flat",
+    "geodesic_acceleration",
+    "pull_back",
+    "reaction_force",
+    "riemann_tensor",
+    "sectional_curvature",
+    "sharp",
+]
+
+
+def __dir__() -> list[str]:
+    """Names of the namespace; its modules are internal."""
+    return __all__

@@ -27,3 +27,35 @@ from jaxdyn.grasp.measures import Manipulability as Manipulability
 from jaxdyn.grasp.measures import manipulability as manipulability
 from jaxdyn.grasp.motions import HandMotions as HandMotions
 from jaxdyn.grasp.motions import hand_motions as hand_motions
+
+__all__ = [
+    "Contact",
+    "ContactForces",
+    "Grasp",
+    "HandForces",
+    "HandMotions",
+    "Manipulability",
+    "ObjectDynamics",
+    "contact",
+    "contact_forces",
+    "force_closure",
+    "forces_for_wrench",
+    "grasp_map",
+    "hand_dynamics",
+    "hand_jacobian",
+    "hand_motions",
+    "hold",
+    "internal_force_basis",
+    "internal_forces",
+    "joint_torques",
+    "manipulability",
+    "normal_forces",
+    "object_dynamics",
+    "point_contacts",
+    "wrench_basis",
+]
+
+
+def __dir__() -> list[str]:
+    """Names of the namespace; its modules are internal."""
+    return __all__

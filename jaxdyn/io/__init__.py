@@ -14,3 +14,25 @@ from jaxdyn.io.urdf import load_urdf as load_urdf
 from jaxdyn.io.urdf import urdf_inertia_report as urdf_inertia_report
 from jaxdyn.io.urdf_write import joint_torques as joint_torques
 from jaxdyn.io.urdf_write import save_urdf as save_urdf
+
+__all__ = [
+    "Actuators",
+    "LoadedScene",
+    "NotTakenWarning",
+    "Start",
+    "UnitsWarning",
+    "joint_torques",
+    "load",
+    "load_mjcf",
+    "load_sdf",
+    "load_urdf",
+    "read_log",
+    "save_urdf",
+    "urdf_inertia_report",
+    "write_log",
+]
+
+
+def __dir__() -> list[str]:
+    """Names of the namespace; its modules are internal."""
+    return __all__

@@ -208,3 +208,24 @@ def adT_apply(twist: Twist, wrench: Twist) -> Twist:
     """
     f = wrench[:2]
     return jnp.concatenate([-twist[2] * _quarter_turn(f), _area(f, twist[:2])[None]])
+
+
+__all__ = [
+    "Ad",
+    "AdT_apply",
+    "Ad_apply",
+    "Ad_inv_T_apply",
+    "Ad_inv_apply",
+    "ad",
+    "adT_apply",
+    "ad_apply",
+    "apply",
+    "exp",
+    "from_parts",
+    "hat",
+    "inverse",
+    "left_jacobian",
+    "left_jacobian_inverse",
+    "log",
+    "vee",
+]

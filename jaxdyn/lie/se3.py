@@ -216,3 +216,24 @@ def adT_apply(twist: Twist, wrench: Twist) -> Twist:
     v, omega = twist[:3], twist[3:]
     f, tau = wrench[:3], wrench[3:]
     return jnp.concatenate([cross(f, omega), cross(f, v) + cross(tau, omega)])
+
+
+__all__ = [
+    "Ad",
+    "AdT_apply",
+    "Ad_apply",
+    "Ad_inv_T_apply",
+    "Ad_inv_apply",
+    "ad",
+    "adT_apply",
+    "ad_apply",
+    "apply",
+    "exp",
+    "from_parts",
+    "hat",
+    "inverse",
+    "left_jacobian",
+    "left_jacobian_inverse",
+    "log",
+    "vee",
+]

@@ -17,6 +17,7 @@ Quaternion = Float[Array, "4"]
 
 
 def matmul(a: Array, b: Array) -> Array:
+    """Matrix product in the precision of its operands, batched as `jnp.matmul`."""
     # GPUs may round float32 products to TF32 unless asked not to.
     return jnp.matmul(a, b, precision=jax.lax.Precision.HIGHEST)
 
@@ -308,3 +309,28 @@ def _axis_rotations(angles: Vector, sequence: str) -> list[Matrix]:
         )
     # The exponential of angle times a unit axis keeps all derivatives finite.
     return [exp(angles[i] * axis) for i, axis in enumerate(_axes(sequence, angles.dtype))]
+
+
+__all__ = [
+    "Ad",
+    "ad",
+    "cross",
+    "euler_body_jacobian",
+    "euler_spatial_jacobian",
+    "euler_to_matrix",
+    "exp",
+    "hat",
+    "inverse",
+    "left_jacobian",
+    "left_jacobian_inverse",
+    "log",
+    "matrix_to_quat",
+    "quat_conjugate",
+    "quat_exp",
+    "quat_log",
+    "quat_multiply",
+    "quat_normalize",
+    "quat_rotate",
+    "quat_to_matrix",
+    "vee",
+]

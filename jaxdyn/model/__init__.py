@@ -2,3 +2,18 @@
 
 Imports `lie` and `compile`. Conventions: docs/conventions.md.
 """
+
+from jaxdyn.model.builder import inertia_report as inertia_report
+from jaxdyn.model.builder import repair_inertias as repair_inertias
+from jaxdyn.model.topology import Topology as Topology
+
+__all__ = [
+    "Topology",
+    "inertia_report",
+    "repair_inertias",
+]
+
+
+def __dir__() -> list[str]:
+    """Names of the namespace; its modules are internal."""
+    return __all__

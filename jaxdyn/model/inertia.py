@@ -234,3 +234,27 @@ def displaced(parameters: Numbers, position: Numbers, rotation: Numbers | None =
 def _from_moments(mass, moments) -> Array | np.ndarray:
     xp = _numpy_for(mass, moments)
     return xp.asarray([mass, 0.0, 0.0, 0.0, moments[0], 0.0, moments[1], 0.0, 0.0, moments[2]], float)
+
+
+__all__ = [
+    "box",
+    "cylinder",
+    "displaced",
+    "ellipsoid",
+    "from_log_cholesky",
+    "inertial_parameters",
+    "is_feasible",
+    "log_cholesky_factor",
+    "mass_com_inertia",
+    "nearest_feasible",
+    "parameters_from_pseudo",
+    "parameters_from_spatial",
+    "point_mass",
+    "pseudo_inertia",
+    "rod",
+    "rotational_inertia",
+    "spatial_inertia",
+    "sphere",
+    "to_log_cholesky",
+    "transform_inertia",
+]

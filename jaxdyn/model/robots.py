@@ -346,3 +346,13 @@ def random_tree(
             **axes,
         )
     return builder.build()
+
+
+__all__ = [
+    "allegro",
+    "chain",
+    "iiwa",
+    "quadruped",
+    "random_tree",
+    "ur5",
+]

@@ -163,7 +163,8 @@ class Model(eqx.Module):
     def complete_configuration(self, q: Float[Array, " nq"], joints: Array) -> Float[Array, " nq"]:
         """Configuration near q with the joint coordinates `joints`; these are all of q in a `Model`.
 
-        Subclasses may append dependent coordinates, which are functions of these defined only near q (see `jd.contact.RollingModel`).
+        Subclasses may append dependent coordinates, which are functions of these defined only near q (see
+        `jd.contact.RollingModel`).
         """
         return joints
 

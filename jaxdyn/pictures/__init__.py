@@ -15,3 +15,20 @@ from jaxdyn.pictures.page import save_html as save_html
 from jaxdyn.pictures.page import view as view
 from jaxdyn.pictures.solids import Shape as Shape
 from jaxdyn.pictures.solids import Shapes as Shapes
+
+__all__ = [
+    "Shape",
+    "Shapes",
+    "Viewer",
+    "animate",
+    "draw",
+    "plot",
+    "save_html",
+    "shapes",
+    "view",
+]
+
+
+def __dir__() -> list[str]:
+    """Names of the namespace; its modules are internal."""
+    return __all__

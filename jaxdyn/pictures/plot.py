@@ -217,3 +217,12 @@ def _title(scene, values) -> str:
 def _with_units(what: str, units: Sequence[str]) -> str:
     known = list(dict.fromkeys(unit for unit in units if unit))
     return f"{what} ({', '.join(known)})" if known else what
+
+
+__all__ = [
+    "energy",
+    "forces",
+    "residuals",
+    "states",
+    "work_precision",
+]

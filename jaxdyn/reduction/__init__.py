@@ -2,3 +2,20 @@
 
 Imports `constraints` and the layers below. Source: EQUATIONS sections 6, 7 and 9.
 """
+
+from jaxdyn.reduction.bases import tangent_basis as tangent_basis
+from jaxdyn.reduction.gauge_invariant import gauge_invariant as gauge_invariant
+from jaxdyn.reduction.integrability import involutive as involutive
+from jaxdyn.reduction.integrability import spurious_terms as spurious_terms
+
+__all__ = [
+    "gauge_invariant",
+    "involutive",
+    "spurious_terms",
+    "tangent_basis",
+]
+
+
+def __dir__() -> list[str]:
+    """Names of the namespace; its modules are internal."""
+    return __all__

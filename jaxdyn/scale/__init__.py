@@ -16,3 +16,20 @@ from jaxdyn.scale.reductions import Reduction as Reduction
 from jaxdyn.scale.reductions import Worst as Worst
 from jaxdyn.scale.run import evaluate as evaluate
 from jaxdyn.scale.run import run as run
+
+__all__ = [
+    "Histogram",
+    "Mean",
+    "Quantiles",
+    "Reduction",
+    "Run",
+    "Worst",
+    "evaluate",
+    "member",
+    "run",
+]
+
+
+def __dir__() -> list[str]:
+    """Names of the namespace; its modules are internal."""
+    return __all__

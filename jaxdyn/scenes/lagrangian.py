@@ -245,8 +245,8 @@ def sliding_block(
 ) -> Scene:
     """Block that slides on a table with Coulomb friction, m xdd = u - sign(xd) mu m g, and sticks for |u| <= `static` m g.
 
-    Without u it stops after |v0| / (mu g), v0^2 / (2 mu g) further on, where it sticks (`jd.contact.DryFriction`, whose events say
-    when). `static`: None for the coefficient of sliding.
+    Without u it stops after |v0| / (mu g), v0^2 / (2 mu g) further on, where it sticks (`jd.contact.DryFriction`, whose events
+    say when). `static`: None for the coefficient of sliding.
 
     With a `direction`, 1 or -1, it slides that way and does not stick: sign(0) is `direction`, so that all methods integrate
     it, up to where it stops (`jd.forces.SlidingFriction`).

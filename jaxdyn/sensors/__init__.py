@@ -18,3 +18,26 @@ from jaxdyn.sensors.joints import Encoder as Encoder
 from jaxdyn.sensors.joints import ForceTorque as ForceTorque
 from jaxdyn.sensors.joints import Tachometer as Tachometer
 from jaxdyn.sensors.records import record as record
+
+__all__ = [
+    "Accelerometer",
+    "ContactForce",
+    "Encoder",
+    "ForceTorque",
+    "FramePose",
+    "FrameVelocity",
+    "Gyroscope",
+    "Imu",
+    "Motion",
+    "Noise",
+    "Sensor",
+    "Tachometer",
+    "Velocimeter",
+    "measure",
+    "record",
+]
+
+
+def __dir__() -> list[str]:
+    """Names of the namespace; its modules are internal."""
+    return __all__

@@ -4,3 +4,16 @@
 `hybrid/` motion with events, `variational` steps for long motions, `stiffness` the rates of a scene. Imports `reduction`,
 `constraints` and what is below them.
 """
+
+from jaxdyn.simulation.stiffness import Stiffness as Stiffness
+from jaxdyn.simulation.terminal_events import JointLimitWarning as JointLimitWarning
+
+__all__ = [
+    "JointLimitWarning",
+    "Stiffness",
+]
+
+
+def __dir__() -> list[str]:
+    """Names of the namespace; its modules are internal."""
+    return __all__

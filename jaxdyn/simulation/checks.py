@@ -207,6 +207,6 @@ def check_limits(scene: Scene, limits: Any, modal: bool) -> None:
         )
     if limits == "stop" and modal:
         raise ValueError(
-            "limits is 'stop', which a scene whose forces have modes (jd.contact.DryFriction, jd.contact.UnilateralContact) does not take; pass "
-            "limits='report'"
+            "limits is 'stop', which a scene whose forces have modes (jd.contact.DryFriction, jd.contact.UnilateralContact) "
+            "does not take; pass limits='report'"
         )

@@ -121,7 +121,8 @@ def undifferentiable(tree, reason: str):
     @same.defjvp
     def _(primals, tangents):
         raise ValueError(
-            "simulate: a force of the scene has a kink or a jump (jd.forces.JointStops, jd.forces.EffortLimits, jd.forces.SlidingFriction, another "
+            "simulate: a force of the scene has a kink or a jump (jd.forces.JointStops, jd.forces.EffortLimits, "
+            "jd.forces.SlidingFriction, another "
             f"jd.forces.PiecewiseForce). Steps that go across it have wrong derivatives, and here they cannot end there: {reason}"
         )
 

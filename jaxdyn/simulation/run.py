@@ -83,21 +83,21 @@ def simulate(
       "variational": steps of fixed length that keep the energy over long times, with a solver of their own;
       "baumgarte": feedback of violated rows, for comparison, with the rates `jd.Baumgarte(alpha, beta)`.
       "auto" is "free", or "projected", which handles redundant rows and rank loss on the way and needs no choice.
-    - `solver`: any diffrax method of an `ODETerm`, `jd.solvers.Rodas5P()`, `jd.solvers.LieGroup(...)` of one of them, or a method that takes an
-      implicit and an explicit part (`diffrax.KenCarp4`): implicit are dq/dt = H v and the share of the scene's forces in the
-      acceleration, explicit all the rest (inertia, gravity, `control`). Default: `RK4` for fixed steps; for adaptive
-      ones `Dopri8`, or `Rodas5P` where the scene lists forces, all inputs are concrete and, by `jd.stiffness` at the start,
-      explicit steps would have to be shorter than a thousandth of the time.
+    - `solver`: any diffrax method of an `ODETerm`, `jd.solvers.Rodas5P()`, `jd.solvers.LieGroup(...)` of one of them, or a
+      method that takes an implicit and an explicit part (`diffrax.KenCarp4`): implicit are dq/dt = H v and the share of
+      the scene's forces in the acceleration, explicit all the rest (inertia, gravity, `control`). Default: `RK4` for fixed steps;
+      for adaptive ones `Dopri8`, or `Rodas5P` where the scene lists forces, all inputs are concrete and `jd.stiffness` at
+      the start says that explicit steps would have to be shorter than a thousandth of the time.
     - `stepsize`: None for adaptive steps, a number (s) for fixed ones, or a diffrax step-size controller.
     - `rtol`, `atol`: local error of a step, relative to the size of each entry of (q, v), and absolute. Values below ten
       times the rounding error of the dtype are raised to that. With fixed steps, tolerances of an implicit solver.
     - `adjoint`: "reverse" (default) for reverse mode with checkpoints, and Hessians over it; "forward" for jvp, jacfwd and
       Hessians by forward over forward mode; "direct" for both modes, at a cost that grows with `max_steps`; "backsolve" for the
       continuous adjoint, whose gradients are approximate; or a diffrax adjoint.
-    - `outputs`: any of "energy", "power", "work" (one more state, under the same error control), "acceleration"
-      (the rate of v: of a free joint that of its body twist; `jd.dynamics.frame_acceleration` gives those of frames in world axes),
-      "multipliers", "constraint_residual", "contact_forces", "contact_margins", "torque" (of the control), "control_state" (of
-      a controller) and "pose:<frame>". They are computed only if asked for.
+    - `outputs`: any of "energy", "power", "work" (one more state, under the same error control), "acceleration" (the rate
+      of v: of a free joint that of its body twist; `jd.dynamics.frame_acceleration` gives those of frames in world axes),
+      "multipliers", "constraint_residual", "contact_forces", "contact_margins", "torque" (of the control), "control_state"
+      (of a controller) and "pose:<frame>". They are computed only if asked for.
     - `contacts`: of a scene with `cones`. "stop": where a contact pulls or leaves its cone (a margin below zero by more than
       rounding, eps^(1/2) of its force) the run ends, with the code `contact_lost` and the time, which is found within the
       step. "report": it continues, with contacts that hold on both sides.
@@ -105,8 +105,9 @@ def simulate(
       "stop": where a joint passes one the run ends, with the code `joint_limit_passed` and the time, found within the step.
       "report": the run continues; `stats["passed_limit"]` is the entry of q of the first limit that is passed at a save point, or
       -1, and a concrete run warns (`JointLimitWarning`).
-    - `max_events`: of a scene with forces that have modes (`jd.contact.DryFriction`, `jd.contact.UnilateralContact`), after which the run ends
-      with the code `too_many_events`. Such scenes take explicit methods with adaptive or fixed steps, which end at events.
+    - `max_events`: of a scene with forces that have modes (`jd.contact.DryFriction`, `jd.contact.UnilateralContact`), after
+      which the run ends with the code `too_many_events`. Such scenes take explicit methods with adaptive or fixed steps,
+      which end at events.
     - `progress`: show a meter (tqdm if installed, else lines of text).
     - `max_steps`: most steps to take, rejected ones included. Default: what fixed steps need; 65536 for adaptive ones,
       4096 with "direct", and where reverse mode goes through adaptive steps: it records the end of each one, 8 bytes a step

@@ -63,8 +63,8 @@ ADVICE = {
     "bad_stepsize": "give a positive stepsize (s)",
     "bad_tolerance": "give finite rtol and atol that are not negative",
     "nonfinite_state": "take a smaller stepsize, or look for a singular mass matrix or a force that is not finite",
-    "coarse_steps": "take a smaller stepsize, or None for steps that keep a tolerance; if stiff, solver=jd.solvers.Rodas5P(); beyond "
-    "some 1e5 steps, float64",
+    "coarse_steps": "take a smaller stepsize, or None for steps that keep a tolerance; if stiff, solver=jd.solvers.Rodas5P(); "
+    "beyond some 1e5 steps, float64",
     "coarse_start": "subtract whole turns from q0, use float64, or take fixed steps",
     "singular_mass_matrix": "give massless bodies an inertia or their joints an armature, or start where every "
     "joint moves some inertia",
@@ -197,11 +197,13 @@ def _advice(name: str, solution: Solution, scene: Scene, control, options) -> st
         if rates is not None and is_stiff(rates, float(solution.ts[-1]) - float(solution.ts[0])):
             advice = (
                 f"the scene is stiff: the fastest decay is {float(rates.decay):.3g} 1/s, so explicit steps are unstable above "
-                f"{float(rates.explicit_step):.3g} s; pass solver=jd.solvers.Rodas5P(), or raise max_steps (now {options['max_steps']})"
+                f"{float(rates.explicit_step):.3g} s; pass solver=jd.solvers.Rodas5P(), or "
+                f"raise max_steps (now {options['max_steps']})"
             )
     slides = any(isinstance(force, SlidingFriction) for force in scene.forces)
     if name in ("max_steps_reached", "too_many_events") and slides:
-        return f"where a contact with jd.forces.SlidingFriction comes to rest, take jd.contact.DryFriction, which sticks; else {advice}"
+        dry = "where a contact with jd.forces.SlidingFriction comes to rest, take jd.contact.DryFriction, which sticks"
+        return f"{dry}; else {advice}"
     if name == "contact_lost":
         contact = contacts_with_cones(scene)[int(solution.stats["lost_contact"])].name
         return f"the contact is {contact!r}; {advice}"

@@ -85,8 +85,8 @@ def _check_options(scene: Scene, dt, substeps, adjoint):
     """Length of the step, s; ValueError for options that do not fit."""
     if has_modes(scene):
         raise ValueError(
-            "stepper: the scene has forces with modes (jd.contact.DryFriction, jd.contact.UnilateralContact), whose events end steps; take "
-            "jd.simulate, or jd.forces.CoulombFriction in their place"
+            "stepper: the scene has forces with modes (jd.contact.DryFriction, jd.contact.UnilateralContact), "
+            "whose events end steps; take jd.simulate, or jd.forces.CoulombFriction in their place"
         )
     seconds = as_array(dt, "stepper: dt")
     if seconds.shape != () or (is_concrete(seconds) and not 0 < float(seconds) < np.inf):

@@ -135,9 +135,9 @@ REFUSED = set(
 # Where one occurs all the same, it is refused as well.
 NOT_APPLICABLE = set(
     """after_all create_token custom_lin dce_sink device_put eq_to le_to lt_to from_edtype to_edtype get swap stage
-    tie platform_index iota random_bits random_fold_in random_gamma random_seed random_split random_wrap random_unwrap
-    random_clone rng_bit_generator rng_uniform threefry2x32 sharding_constraint axis_index all_gather all_gather_done
-    all_gather_invariant all_gather_reduced all_gather_reduced_start all_gather_start all_to_all all_to_all_done
+    program_order tie platform_index iota random_bits random_fold_in random_gamma random_seed random_split random_wrap
+    random_unwrap random_clone rng_bit_generator rng_uniform threefry2x32 sharding_constraint axis_index all_gather
+    all_gather_done all_gather_invariant all_gather_reduced all_gather_reduced_start all_gather_start all_to_all all_to_all_done
     all_to_all_start pbroadcast pbroadcast_done pbroadcast_dynamic pbroadcast_start pmax pmin ppermute ppermute_done
     ppermute_start precv preduced psend psum psum_done psum_invariant psum_invariant_start psum_start pvary
     ragged_all_to_all reduce_scatter reduce_scatter_done reduce_scatter_start unreduced_pmax unreduced_pmin
