@@ -105,7 +105,7 @@ def _advance(scene: Scene, length, substeps: int, is_direct: bool) -> Callable:
     unknown, known = partition_tracers(scene)
 
     def unpack(args):
-        """Scene with its independent rows, in the pieces of its forces if they follow, and tau."""
+        """Scene with its independent rows, with forces fixed to a piece where flags ask for it, and tau."""
         unknown, tau, selection, *positive = args
         scene = known(unknown)
         scene = scene if selection is None else keep_rows(scene, selection)

@@ -75,6 +75,11 @@ class Elements(NamedTuple):
         """Mask of the unilateral elements, (n,)."""
         return np.array([one.opens for one in self.each])
 
+    @property
+    def rough(self) -> np.ndarray:
+        """Mask of the elements that can stick, (n,)."""
+        return np.array([bool(one.tangent) and not one.smooth for one in self.each])
+
     def active(self, mode: Mode) -> Array:
         """Mask of the rows that act in a mode, (count,)."""
         rows: list[Any] = [jnp.ones((), bool)] * self.count

@@ -21,7 +21,7 @@ MIN_EVENTS = 256  # events that derivatives go through, at least
 
 
 class PiecewiseSystem(HybridSystem):
-    """System whose only modes are the pieces of its forces.
+    """System whose only modes are those of piecewise smooth forces.
 
     **Arguments:** `plan` of its steps and switching(t, y, args) -> values and rounding levels (k,); the arguments of both are
     followed by flags of the values that are positive.

@@ -114,7 +114,7 @@ def next_mode(elements: Elements, cones, mode: Mode, slip, begins, v, impact_at:
     `begins` (n,) marks elements that slide from rest, because they could not be held.
     `impact_at(mode, slip)` gives an `Impact`, `state_at(mode, slip, v)` a `ContactState`; `cones` (n,), coefficients at rest.
     """
-    opens, rough = jnp.asarray(elements.opening), _rough(elements)
+    opens, rough = jnp.asarray(elements.opening), jnp.asarray(elements.rough)
     mode = mode._replace(stick=mode.stick & rough)
     before: ContactState = state_at(mode, slip, v)
     by_velocity = partial(_disagreements_of_velocities, elements, cones, before, impact_at)
@@ -131,11 +131,6 @@ def next_mode(elements: Elements, cones, mode: Mode, slip, begins, v, impact_at:
     # Where sliding has no forces, no mode is found; where it has two, one is.
     paradox = _has_lost_pivot(final, now) | (_has_lost_pivot(resting, state_at(resting, impact_slip, v)) & ~settled)
     return Transition(impact, impact_slip, final, slip, v, hit & settled, paradox)
-
-
-def _rough(elements: Elements):
-    """Mask of the elements that can stick, (n,)."""
-    return jnp.asarray(np.array([bool(one.tangent) and not one.smooth for one in elements.each]))
 
 
 def _solve(rough, disagreements: Callable, mode: Mode, slip):
@@ -181,7 +176,7 @@ def _solve(rough, disagreements: Callable, mode: Mode, slip):
 def _disagreements_of_velocities(
     elements: Elements, cones, before: ContactState, impact_at: Callable, mode: Mode, slip
 ):
-    opens, rough = jnp.asarray(elements.opening), _rough(elements)
+    opens, rough = jnp.asarray(elements.opening), jnp.asarray(elements.rough)
     after: Impact = impact_at(mode, slip)
     small = _tolerance(after.v.dtype)
     hold, against = length(-after.holding)
@@ -200,7 +195,7 @@ def _disagreements_of_velocities(
 
 
 def _disagreements_of_forces(elements: Elements, v, state_at: Callable, mode: Mode, slip):
-    opens, rough = jnp.asarray(elements.opening), _rough(elements)
+    opens, rough = jnp.asarray(elements.opening), jnp.asarray(elements.rough)
     has_multiplier = jnp.asarray(np.array([one.normal >= 0 for one in elements.each]))
     now: ContactState = state_at(mode, slip, v)
     small = _tolerance(v.dtype)

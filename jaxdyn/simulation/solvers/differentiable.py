@@ -20,8 +20,8 @@ ROOM = 4096  # steps that are recorded where the user gives no limit: 32 kB a tr
 def run(inputs, *, term, solver, controller, event, adjoint, max_steps, progress, dt0=None, record=False):
     """diffrax's solution from one end of the save points to the other.
 
-    **Arguments:** `inputs`, what may be differentiated: the initial state, `args`, and the save points (nt,), the first of which
-    is the start; `record`: True to save the times at which steps ended too; the rest as in diffrax.
+    **Arguments:** `inputs`, what may be differentiated: the initial state, `args`, and the save points (nt,) with the start in
+    front; `record`: True to save the times at which steps ended too; the rest as in diffrax.
 
     **Returns:** rows of the state at ts[1:]; the result, the counts, the time reached and, if the time of an event is located,
     the state there; all that diffrax returned.
