@@ -323,7 +323,7 @@ def hosts(folder: Path, samples: int) -> None:
             f"| {count} | {total:.2g} | {total * flops / 1e12:.2g} | {total * bytes_each / 1e9:.2g} | {total / 1e6:.2g} | "
             f"{files_each * count / 2:.3g} |"
         )
-    print("a fit of 70 numbers: one all-reduce of 568 bytes an iteration (tests/test_sharding.py counts it)")
+    print("a fit of 70 numbers: one all-reduce of 568 bytes an iteration (tests/dynamics/test_sharding.py counts it)")
 
 
 def main() -> None:

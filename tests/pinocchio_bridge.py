@@ -14,6 +14,7 @@ import pinocchio as pin
 from scipy.spatial.transform import Rotation
 from xla_options import QUICK
 
+from jaxdyn.io import load_urdf
 from jaxdyn.model.joints import KINDS, SCREW_KINDS
 from jaxdyn.model.tree import Model, Topology
 
@@ -306,3 +307,26 @@ def _random_pose(rng, reach) -> np.ndarray:
     pose[:3, :3] = Rotation.from_rotvec(rng.normal(size=3)).as_matrix()
     pose[:3, 3] = rng.normal(size=3) * reach
     return pose
+
+
+def _paths():
+    paths = {}
+    for folder, _, files in sorted(os.walk(ROBOTS)):
+        for file in sorted(files):
+            if file.endswith(".urdf"):
+                paths.setdefault(file, os.path.join(folder, file))
+    return paths
+
+
+ROBOT_FILES = _paths()
+
+
+def load_both(file, floating):
+    """The robot on both sides, and the conversion of configurations."""
+    source = pin.buildModelFromUrdf(ROBOT_FILES[file], *([pin.JointModelFreeFlyer()] if floating else []))
+    model = load_urdf(ROBOT_FILES[file], floating_base=floating)
+    extra = [
+        joint.nq - (part.stop - part.start)
+        for joint, part in zip(list(source.joints)[1:], model.topology.q_slices, strict=True)
+    ]
+    return model, source, Bridge(model.topology.kinds, tuple(x == 1 for x in extra), np.zeros(0))

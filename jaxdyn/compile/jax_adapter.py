@@ -1,9 +1,9 @@
 """The only module of jaxdyn that depends on the version of JAX: its extension points, jaxprs, XLA's FFI and compiler options.
 
-Names of JAX that are documented little, or that have changed, are used here alone; `tests/test_jax_adapter.py` lists them, with
-the page that documents each. The versions of `TESTED` are those that the tests run with. On any other version an error while a
-function is compiled to a kernel means that JAX has changed, not that jaxdyn is wrong: the function then runs on JAX's own
-operations, and one warning names the version and the reason (`forgive`, `reason_against_kernels`).
+Names of JAX that are documented little, or that have changed, are used here alone; `tests/package/test_jax_adapter.py`
+lists them, with the page that documents each. The versions of `TESTED` are those that the tests run with. On any other
+version an error while a function is compiled to a kernel means that JAX has changed, not that jaxdyn is wrong: the function
+then runs on JAX's own operations, and one warning names the version and the reason (`forgive`, `reason_against_kernels`).
 """
 
 import contextlib

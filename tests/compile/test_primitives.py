@@ -178,7 +178,7 @@ def test_every_primitive_is_placed():
     listed = EXPANDED.keys() | CALLS | REFUSED | NOT_APPLICABLE
     unknown = INSTALLED.keys() - listed
     assert not unknown, (
-        f"primitives of jax {jax.__version__} that tests/test_primitives.py does not place: {sorted(unknown)}"
+        f"primitives of jax {jax.__version__} that tests/compile/test_primitives.py does not place: {sorted(unknown)}"
     )
     assert not EXPANDED.keys() & REFUSED and not EXPANDED.keys() & NOT_APPLICABLE and not REFUSED & NOT_APPLICABLE
 

@@ -24,7 +24,7 @@ jax.config.update("jax_enable_x64", True)
 import jax.numpy as jnp
 import jaxdyn as jd
 from jaxdyn.compile import target
-sys.path.insert(0, {tests!r})
+sys.path[:0] = {tests!r}
 from test_guard_pages import called_between_guards
 
 prepare, called = target._Kernel.address, []
@@ -87,7 +87,7 @@ def called_between_guards(address: int, program, uniform, samples: int) -> None:
 @pytest.mark.parametrize("derivatives", [False, pytest.param(True, marks=pytest.mark.slow)])
 def test_kernels_stay_within_their_buffers(request, derivatives):
     """Straight programs, those with subprograms, pseudo-inverses and loops; one lane and several, whole blocks and rests."""
-    code = PROGRAM.format(tests=str(request.path.parent), derivatives=derivatives)
+    code = PROGRAM.format(tests=[str(folder) for folder in request.path.parents[:2]], derivatives=derivatives)
     # Kernels are not XLA's, so its optimiser may be left out.
     options = {"XLA_FLAGS": flags()}
     command = [sys.executable, "-c", code]

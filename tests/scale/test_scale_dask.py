@@ -83,7 +83,7 @@ def cluster():
 @pytest.fixture
 def client(cluster):
     with distributed.Client(cluster) as one:
-        one.wait_for_workers(2)
+        one.wait_for_workers(2, timeout=120)
         yield one
 
 

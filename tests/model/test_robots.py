@@ -1,13 +1,11 @@
 """Robots of example-robot-data, read by `load_urdf`, against Pinocchio reading the same file."""
 
-import os
-
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pinocchio as pin
 import pytest
-from pinocchio_bridge import ROBOTS, Bridge, assert_close, quick, random_states
+from pinocchio_bridge import ROBOT_FILES, assert_close, load_both, quick, random_states
 
 import jaxdyn as jd
 from jaxdyn.dynamics import recursions
@@ -18,33 +16,12 @@ FEW = {"panda.urdf": False}
 REFUSED = {"ur3.urdf": "ur3.urdf", "romeo.urdf": "no inertia", "romeo_laas_small.urdf": "no inertia"}
 
 
-def _paths():
-    paths = {}
-    for folder, _, files in sorted(os.walk(ROBOTS)):
-        for file in sorted(files):
-            if file.endswith(".urdf"):
-                paths.setdefault(file, os.path.join(folder, file))
-    return paths
-
-
-PATHS = _paths()
 CASES = [
     pytest.param(file, floating, marks=() if FEW.get(file) is floating else pytest.mark.slow, id=f"{file}-{floating}")
-    for file in PATHS
+    for file in ROBOT_FILES
     if file not in REFUSED
     for floating in (False, True)
 ]
-
-
-def both(file, floating):
-    """The robot on both sides, and the conversion of configurations."""
-    source = pin.buildModelFromUrdf(PATHS[file], *([pin.JointModelFreeFlyer()] if floating else []))
-    model = jd.load_urdf(PATHS[file], floating_base=floating)
-    extra = [
-        joint.nq - (part.stop - part.start)
-        for joint, part in zip(list(source.joints)[1:], model.topology.q_slices, strict=True)
-    ]
-    return model, source, Bridge(model.topology.kinds, tuple(x == 1 for x in extra), np.zeros(0))
 
 
 def ours(model, frames):
@@ -98,7 +75,7 @@ def theirs(source, frames, q, v, a, tau):
 
 @pytest.mark.parametrize("file,floating", CASES)
 def test_agrees_with_pinocchio(file, floating):
-    model, source, bridge = both(file, floating)
+    model, source, bridge = load_both(file, floating)
     if model.nv == 0:
         pytest.skip("no joints: nothing moves")
     links = [name for name in model.frame_names if source.existFrame(name, pin.FrameType.BODY)]
@@ -122,7 +99,7 @@ def test_agrees_with_pinocchio(file, floating):
 @pytest.mark.slow
 @pytest.mark.parametrize("file,floating", [case for case in CASES])
 def test_recursion_agrees_with_pinocchio(file, floating):
-    model, source, bridge = both(file, floating)
+    model, source, bridge = load_both(file, floating)
     if model.nv == 0:
         pytest.skip("no joints: nothing moves")
     q, v, a, tau, _ = random_states(model, 5, 2)
@@ -140,7 +117,7 @@ def test_recursion_agrees_with_pinocchio(file, floating):
 
 @pytest.mark.parametrize("file", REFUSED)
 def test_refused_robots_say_why(file):
-    if file not in PATHS:
+    if file not in ROBOT_FILES:
         pytest.skip(f"{file} is not in this release of example-robot-data")
     with pytest.raises(ValueError, match=REFUSED[file]):
-        jd.load_urdf(PATHS[file])
+        jd.load_urdf(ROBOT_FILES[file])

@@ -101,7 +101,7 @@ BY_ROUNDING = {("planes", f"1e-12 rad, {way}, rank_tol 1e-14", "float64") for wa
 
 def documented():
     """Verdicts in docs/extremes.md by case, place and dtype."""
-    text = (Path(__file__).parent.parent / "docs" / "extremes.md").read_text(encoding="utf-8")
+    text = (Path(__file__).parents[2] / "docs" / "extremes.md").read_text(encoding="utf-8")
     rows = [[cell.strip() for cell in line.split("|")[1:-1]] for line in text.splitlines() if line.startswith("| ")]
     return {tuple(row[:3]): row[-1] for row in rows}
 

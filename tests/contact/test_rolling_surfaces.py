@@ -330,7 +330,7 @@ def test_a_valley_that_becomes_too_narrow_ends_the_motion():
 
 @pytest.mark.slow
 def test_the_page_on_constraints_runs():
-    page = (Path(__file__).resolve().parent.parent / "docs/constraints.md").read_text(encoding="utf-8")
+    page = (Path(__file__).resolve().parents[2] / "docs/constraints.md").read_text(encoding="utf-8")
     block = re.search(r"## Rolling of surfaces.*?```python\n(.*?)```", page, flags=re.DOTALL)
     assert block is not None
     names: dict = {}

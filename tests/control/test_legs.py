@@ -7,8 +7,7 @@ import jax.numpy as jnp
 import numpy as np
 import pinocchio as pin
 import pytest
-from pinocchio_bridge import assert_close, quick, random_states
-from test_robots import PATHS, both
+from pinocchio_bridge import ROBOT_FILES, assert_close, load_both, quick, random_states
 
 import jaxdyn as jd
 
@@ -50,14 +49,14 @@ def crouched(model, file):
 
 @pytest.fixture(scope="module")
 def solo():
-    model, source, bridge = both("solo12.urdf", True)
+    model, source, bridge = load_both("solo12.urdf", True)
     return model, source, bridge, crouched(model, "solo12.urdf"), feet_of("solo12.urdf")
 
 
 @pytest.mark.parametrize("file", CASES)
 def test_centre_of_mass_agrees_with_pinocchio(file):
     """Jacobian, momentum and its matrix at 1e-9; N = -m J^T g."""
-    model, source, bridge = both(file, True)
+    model, source, bridge = load_both(file, True)
     q, v, *_ = random_states(model, 1, 3)
     at = quick(
         lambda q, v: (
@@ -80,7 +79,7 @@ def test_centre_of_mass_agrees_with_pinocchio(file):
 @pytest.mark.parametrize("file", CASES)
 def test_inverse_dynamics_agrees_with_pinocchio(file):
     """Pinocchio's rnea under the feet's wrenches gives our torques, and none at the base; forces are in their cones."""
-    model, source, bridge = both(file, True)
+    model, source, bridge = load_both(file, True)
     feet, q = feet_of(file), crouched(model, file)
     rng = np.random.default_rng(0)
     v, a = (jnp.asarray(x) for x in 0.1 * rng.normal(size=(2, model.nv)))
@@ -106,7 +105,7 @@ def test_inverse_dynamics_agrees_with_pinocchio(file):
 @pytest.mark.parametrize("file", CASES)
 def test_standing_agrees_with_pinocchios_constraint_dynamics(file):
     """Held feet: acceleration and forces under given torques."""
-    model, source, bridge = both(file, True)
+    model, source, bridge = load_both(file, True)
     feet, q = feet_of(file), crouched(model, file)
     rng = np.random.default_rng(1)
     tau = jnp.asarray(rng.normal(size=model.nv)).at[:6].set(0.0)
@@ -248,4 +247,4 @@ def _still(model):
 
 
 def test_files_of_all_robots_are_there():
-    assert all(os.path.exists(PATHS[file]) for file in ROBOTS)
+    assert all(os.path.exists(ROBOT_FILES[file]) for file in ROBOTS)

@@ -4,10 +4,9 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from pinocchio_bridge import quick
+from pinocchio_bridge import load_both, quick
 from test_control import KD, KP, decayed
 from test_legs import crouched, feet_of
-from test_robots import both
 
 import jaxdyn as jd
 from jaxdyn import inertia
@@ -207,7 +206,7 @@ def test_bad_input_is_refused(biped, call, message):
 @pytest.mark.parametrize("file", ["solo12.urdf", "talos_reduced.urdf"])
 def test_real_robots_shift_their_weight(file):
     """Four points, or two flat feet with wrench cones: standing exact to 1e-8, the centre of mass by the closed form."""
-    model, _, _ = both(file, True)
+    model, _, _ = load_both(file, True)
     q, feet = crouched(model, file), feet_of(file)
     attitude, center = jnp.eye(3), jd.center_of_mass(model, q)
     at_rest, scene = jnp.zeros(model.nv), jd.control.standing(model, q, feet)

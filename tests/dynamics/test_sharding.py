@@ -14,7 +14,7 @@ pytestmark = pytest.mark.native
 
 
 def _run(*what: str, **environment: str) -> list:
-    command = [sys.executable, str(Path(__file__).with_name("divided.py")), *what]
+    command = [sys.executable, str(Path(__file__).parents[1] / "divided.py"), *what]
     done = subprocess.run(command, env=os.environ | environment, capture_output=True, text=True, timeout=600)
     assert done.returncode == 0, done.stderr[-2000:]
     return [json.loads(line) for line in done.stdout.splitlines()]

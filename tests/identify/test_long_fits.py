@@ -64,7 +64,7 @@ def fitted(path=None, *, method="adam", start=(0.5, 2.9, 0.0), **options):
     ("method", "least", "points"), [("adam", 5, 41), pytest.param("gauss-newton", 3, 6, marks=pytest.mark.slow)]
 )
 def test_a_killed_fit_resumes_to_the_same_numbers(tmp_path, method, least, points):
-    path, root = tmp_path / "fit.ckpt", str(Path(__file__).parent.parent)
+    path, root = tmp_path / "fit.ckpt", str(Path(__file__).parents[2])
     run = subprocess.Popen(
         [sys.executable, "-c", _SCRIPT, str(path), root, method], env=os.environ | {"PYTHONPATH": root}
     )
