@@ -171,4 +171,5 @@ class Equations:
 
     def _least_allowance(self, t, y, args):
         scene, _, method = self.unpack(args, y)
-        return jnp.min(self.allowances(args, y, *method.to_qv(scene, y, t), t))
+        q, v = method.to_qv(scene, y, t)
+        return jnp.min(self.allowances(args, y, q, v, t))

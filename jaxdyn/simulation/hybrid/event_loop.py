@@ -176,8 +176,10 @@ def _positions_and_velocities(system: HybridSystem, y) -> dict[str, Array]:
 
 def _add_errors(system: HybridSystem, origin, run: RunState, after: RunState, kept, step: Step) -> RunState:
     """Add the error of a kept step to the sum."""
-    parts = (_positions_and_velocities(system, x) for x in (origin, run.y, step.projected, step.error))
-    sums = add_error(system.order, system.error_order, *parts, *run.sums)
+    start, before, y, error = (
+        _positions_and_velocities(system, x) for x in (origin, run.y, step.projected, step.error)
+    )
+    sums = add_error(system.order, system.error_order, start, before, y, error, *run.sums)
     return after._replace(sums=jax.tree.map(lambda new, old: jnp.where(kept, new, old), sums, run.sums))
 
 

@@ -97,7 +97,7 @@ def hybrid_motion(scene: Scene, control, numbers, options) -> Solution:
     y0, most, max_steps = {"q": q0, "v": v0, "slip": slip}, options["max_events"], options["max_steps"]
     system = ModalSystem(bind, elements, options["solver"], y0)
     room = max_steps if stepsize is not None else min(max_steps, ROOM)
-    run: Any = HybridRun(system, mode, rtol, atol, stepsize, max_steps, most, room)
+    run: Any = HybridRun(system, mode, rtol, atol, stepsize, max_steps, most, room=room)
     if isinstance(options["adjoint"], (diffrax.ForwardMode, diffrax.DirectAdjoint)):
         run = run.direct
     rows, times, (end, records, begun) = run(y0, unknown, ts)

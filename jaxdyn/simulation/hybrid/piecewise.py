@@ -71,7 +71,7 @@ def piecewise_motion(
     values, _ = system.guards((unknown, mode), ts[0], flat)
     rtol, atol = (jnp.asarray(x, flat.dtype) for x in (rtol, atol))
     mode = lax.stop_gradient(mode._replace(positive=values > 0))
-    run = HybridRun(system, mode, rtol, atol, stepsize, max_steps + event_loop.SEARCH_STEPS * most, most, room)
+    run = HybridRun(system, mode, rtol, atol, stepsize, max_steps + event_loop.SEARCH_STEPS * most, most, room=room)
     rows, _, (end, _, _) = (run.direct if is_direct else run)(y0, unknown, ts)
     codes: Any = diffrax.RESULTS
     result = codes.where(end.t < ts[-1], codes.max_steps_reached, codes.successful)

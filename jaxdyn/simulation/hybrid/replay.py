@@ -32,7 +32,7 @@ from jaxdyn.simulation.solvers.integrator import Integrator, zeros_or
 class HybridRun(Integrator):
     """Integrator with events: call(y0, unknown, ts) -> rows of the state at ts[1:]; times of events; end, records and start.
 
-    Derivatives reach y0, `unknown` and ts through rows and times of events.
+    Derivatives reach y0, `unknown` and ts through rows and times of events. `room`: steps from one of these to the next.
     """
 
     system: HybridSystem = eqx.field(static=True)
@@ -42,16 +42,17 @@ class HybridRun(Integrator):
     stepsize: Any  # None for adaptive steps
     max_steps: int = eqx.field(static=True)
     most: int = eqx.field(static=True)  # events
-    room: int = eqx.field(static=True)  # steps from one event or save point to the next, at most
 
     def values(self, inputs, room):
         y0, unknown, ts = inputs
         steps = self.rtol, self.atol, self.stepsize, self.max_steps, self.most
-        rows, *facts = run_events(self.system, unknown, ts, ravel_pytree(y0)[0], self.mode, *steps)
-        return (jax.vmap(self.system.plan.structure)(rows), facts[1].time[: self.most], tuple(facts)), tuple(facts)
+        rows, end, records, begun = run_events(self.system, unknown, ts, ravel_pytree(y0)[0], self.mode, *steps)
+        facts = end, records, begun
+        return (jax.vmap(self.system.plan.structure)(rows), records.time[: self.most], facts), facts
 
     def replay(self, history, inputs, direct):
-        return _replay(self, inputs, *history, direct)
+        end, records, begun = history
+        return _replay(self, inputs, end, records, begun, direct)
 
     def weights(self, inputs, gradients, history):
         y0, _, ts = inputs
@@ -73,7 +74,7 @@ def _replay(run: HybridRun, inputs, end, records, begun, direct: bool):
     control: Any = driver.AdaptiveSteps(system.error_order, optimistix.rms_norm)
     if run.stepsize is not None:
         control = driver.FixedSteps(system.order, system.error_order)
-    part_run = ExplicitRun(plan, control, run.rtol, run.atol, run.stepsize, run.max_steps, run.room)
+    part_run = ExplicitRun(plan, control, run.rtol, run.atol, run.stepsize, run.max_steps, room=run.room)
     last = lax.stop_gradient(end.t)
 
     def part_or_none(carry, at):
