@@ -178,6 +178,68 @@ def simulate_stewart() -> Callable:
     return lambda: jd.simulate(scene, start.q, start.v, jnp.linspace(0.0, 0.1, 3)).q
 
 
+def gradient_of_legs() -> Callable:
+    """Derivative of where 256 quadrupeds on four held feet are after 50 steps by a gain of their joints."""
+    import jax
+    import jax.numpy as jnp
+
+    import jaxdyn as jd
+
+    model = jd.robots.quadruped()
+    legs = jnp.tile(jnp.array([0.0, 0.8, -1.6]), 4)
+    q = jd.neutral(model).at[7:].set(legs)
+    feet = [f"{leg}_foot" for leg in ("FL", "FR", "RL", "RR")]
+    loops = [jd.loop(foot, None, None, tuple(jd.frame_pose(model, q, foot)[:3, 3]), "spherical") for foot in feet]
+    step = jd.stepper(jd.Scene(model, loops), dt=0.005)
+
+    def place(gain, v):
+        def advance(state, _):
+            q, v = state
+            return step(state, jnp.concatenate([jnp.zeros(6), gain * (legs - q[7:]) - 2.0 * v[6:]])), None
+
+        return jnp.sum(jax.lax.scan(advance, (q, v), length=50)[0][0] ** 2)
+
+    run = jax.jit(jax.grad(lambda gain, vs: jnp.mean(jax.vmap(lambda v: place(gain, v))(vs))))
+    return lambda: run(60.0, jnp.zeros((256, model.nv)))
+
+
+def jacobian_of_step() -> Callable:
+    """Jacobian of one step of a four-bar by its state."""
+    import jax
+
+    import jaxdyn as jd
+
+    step, (q, v) = jd.stepper(jd.scenes.four_bar(), dt=0.01), jd.scenes.four_bar.start()
+    run = jax.jit(jax.jacrev(lambda q, v: step((q, v), 0.0 * v), (0, 1)))
+    return lambda: run(q, v)
+
+
+def plan_cart_pole() -> Callable:
+    """A swing-up of a cart-pole by iterated LQR with limits of the force, 40 steps."""
+    import jax
+    import jax.numpy as jnp
+
+    import jaxdyn as jd
+
+    builder = jd.ModelBuilder("cart-pole")
+    builder.add_body("cart", None, "prismatic", jd.inertia.box(1.0, (0.2, 0.2, 0.1)), axis=(1, 0, 0))
+    builder.add_body("pole", "cart", "continuous", (0.2, (0, 0, -0.5), (0.01, 0.01, 0.0)), axis=(0, 1, 0))
+    robot = builder.build()
+    advance, motors = jd.stepper(robot, dt=0.04), robot.selection_matrix(["cart_joint"])
+
+    def upright(x):
+        return 20 * (1 + jnp.cos(x[0][1])) + x[0][0] ** 2 + 0.3 * x[1] @ x[1]
+
+    run = jax.jit(
+        lambda x, us: jd.control.ilqr(
+            lambda x, u: advance(x, motors @ u),
+            lambda x, u, k: 0.01 * u @ u + 0.1 * upright(x),
+            upright, x, us, limits=(-15.0, 15.0), iterations=30,
+        ).us
+    )  # fmt: skip
+    return lambda: run((jnp.zeros(2), jnp.zeros(2)), 0.1 * jnp.ones((40, 1)))
+
+
 CASES: dict[str, tuple[str, Callable[[], Callable]]] = {
     "panda": ("forward dynamics of a Panda, under jit", lambda: accelerate(PANDA)),
     "g1": ("forward dynamics of a G1, under jit", lambda: accelerate(G1)),
@@ -189,6 +251,12 @@ CASES: dict[str, tuple[str, Callable[[], Callable]]] = {
     "stewart": ("accelerations of a Stewart platform, under jit", accelerate_stewart),
     "stewart_assembly": ("assemble a Stewart platform", assemble_stewart),
     "stewart_motion": ("simulate a Stewart platform", simulate_stewart),
+    "legs_gradient": (
+        "gradient through 50 steps of a quadruped on four held feet, batch 256, under jit",
+        gradient_of_legs,
+    ),
+    "step_jacobian": ("Jacobian of one step of a four-bar, under jit", jacobian_of_step),
+    "ilqr": ("swing-up of a cart-pole by iLQR, under jit", plan_cart_pole),
 }
 
 

@@ -8,8 +8,8 @@
   and compilation included, until the first new chunk is stored; and the same with JAX's cache of compiled programs
   (JAX_COMPILATION_CACHE_DIR), which the first process filled.
 - cores: the arm in processes that may use one core and two: seconds and efficiency, t1/(2 t2).
-- cost: four-bars whose springs are soft or stiff, adaptive steps: lane-steps that a batch waits for over steps that are needed,
-  and seconds, in the order of the numbers, by falling cost (`cost=`), and by the cost that is measured (`cost="measured"`).
+- cost: four-bars whose springs are soft or stiff, adaptive steps: steps that batches compute over steps that are needed, and
+  seconds, in the order of the numbers, by decreasing cost (`cost=`), and by the cost that is measured (`cost="measured"`).
 - workers: the arm in this process on two cores, and on a local Dask cluster of one and of two worker processes on the same two.
 - tasks: chunks of one rollout on a local cluster of two workers: milliseconds of a chunk, and memory of the client and of the
   scheduler after each tenth of them (1e5 chunks with --full, else 1e4); and the same of tasks that do nothing, ten times as many.
@@ -181,12 +181,12 @@ def cores(folder: Path, samples: int) -> None:
 
 def cost(folder: Path, samples: int) -> None:
     """Rollouts of unequal cost."""
-    lanes, known = 128, lambda p: p["stiffness"]
-    for name, by, chunk in (("number", None, lanes), ("cost", known, lanes), ("measured", "measured", 16 * lanes)):
-        run = four_bars(samples, folder / f"{name}.zarr", cost=by, lanes=lanes, chunk=chunk)
+    size, known = 128, lambda p: p["stiffness"]
+    for name, by in (("number", None), ("cost", known), ("measured", "measured")):
+        run = four_bars(samples, folder / f"{name}.zarr", cost=by, batch_size=size, chunk=16 * size)
         steps = np.asarray(run.dataset().num_steps)
         print(
-            f"cost: {samples} four-bars by {name}, {steps.min()} to {steps.max()} steps, {lanes} lanes: "
+            f"cost: {samples} four-bars by {name}, {steps.min()} to {steps.max()} steps, batches of {size}: "
             f"{run.waiting:.2f} times the mean cost, {run.seconds:.3g} s"
         )
 
@@ -231,7 +231,7 @@ def resident(pid: int | str = "self") -> float:
 
 def workers(folder: Path, samples: int) -> None:
     """One process against worker processes on the same cores; the second run finds compiled kernels and running workers."""
-    options = {"chunk": max(1, samples // 32), "lanes": min(2048, samples // 32)}
+    options = {"chunk": max(1, samples // 32), "batch_size": min(2048, samples // 32)}
     times = {0: min(arm(samples, folder / f"here{k}.zarr", **options).seconds for k in range(2))}
     for count in (1, 2):
         with cluster(count) as client:
@@ -253,7 +253,7 @@ def tasks(folder: Path, samples: int) -> None:
             small,
             out=folder / "tasks.zarr",
             chunk=1,
-            lanes=1,
+            batch_size=1,
             rows=False,
             client=client,
             **QUIET,
@@ -276,7 +276,7 @@ def tasks(folder: Path, samples: int) -> None:
 
 def kill(folder: Path, samples: int) -> None:
     """A worker killed when half is done."""
-    options = {"chunk": max(1, samples // 64), "lanes": min(1024, samples // 64)}
+    options = {"chunk": max(1, samples // 64), "batch_size": min(1024, samples // 64)}
     with cluster(2) as client:
         arm(samples, folder / "warm.zarr", client=client, **options)
         plain = arm(samples, folder / "plain.zarr", client=client, **options).seconds

@@ -19,9 +19,9 @@ import numpy as np
 
 import jaxdyn as jd
 from benchmarks.extremes import name_of
+from benchmarks.report_cases.references import car_axis
 from benchmarks.timing import chosen_names
 from jaxdyn.constraints.codes import code_of
-from jaxdyn.reports.references import car_axis
 
 SOLVERS: dict[str, Any] = {
     "Dopri8": diffrax.Dopri8(),

@@ -3,10 +3,10 @@
     python -m benchmarks.work_precision [SCENE ...] [--batch 1 1024] [--integrator projected:Dopri8] [--rounds 20] [--full]
         [--out out/work_precision]
 
-The page is that of `jaxdyn report`, with the peers of `benchmarks.peers` as dashed lines on scenes that they can do. A run
-that was interrupted goes on where it stopped. Then, for each plot: the peers' points that lie below jaxdyn's front, and the
-time at equal error relative to the best of them. A peer without a batched call
-counts in a batch with its time for one trajectory over the number of cores, as if it made perfect use of them.
+The page is that of `jaxdyn report`, for cases whose motions are known, with the peers of `benchmarks.peers` as dashed lines
+on scenes that they can do. A run that was interrupted goes on where it stopped. Then, for each plot: the peers' points that
+lie below jaxdyn's front, and the time at equal error relative to the best of them. A peer without a batched call counts in
+a batch with its time for one trajectory over the number of cores, as if it made perfect use of them.
 """
 
 import argparse
@@ -18,6 +18,7 @@ from pathlib import Path
 import jax
 
 from benchmarks import peers, timing
+from benchmarks.report_cases import cases
 from jaxdyn.model.text_table import table
 from jaxdyn.reports import Record, Report, beaten_by, report
 from jaxdyn.reports.front import TARGETS, cost_at
@@ -103,8 +104,9 @@ def main(argv=None) -> None:
     def say(line):
         print(line, flush=True)
 
+    known = cases()
     measured = report(
-        options.scenes or (None if options.full else SCENES),
+        [known[name] for name in options.scenes or (known if options.full else SCENES)],
         full=options.full,
         dtypes=("float64",),
         batches=tuple(options.batch),

@@ -114,19 +114,22 @@ class Oracle:
         rows = data.efc_J.reshape(-1, m.nv)[data.efc_type == 0]
         return self.ours(rows @ T), data.efc_pos[data.efc_type == 0]
 
-    def actuation(self, q, v, control: dict[str, float]) -> np.ndarray:
-        """Generalised force of the actuators named; all others are without force."""
+    def actuation(self, q, v, control: dict[str, float], activation) -> tuple[np.ndarray, np.ndarray]:
+        """Generalised force of the actuators named, and the rates of their activations; all others are without force."""
         m = mujoco.MjModel.from_xml_path(self.path)
-        data = mujoco.MjData(m)
+        data, active = mujoco.MjData(m), []
         for i in range(m.nactuator):
             name = m.actuator(i).name or f"actuator{i}"
             if name in control:
                 data.ctrl[m.actuator_ctrladr[i]] = control[name]
+                active += [m.actuator_actadr[i]] * int(m.actuator_actnum[i])
             else:
                 m.actuator_gainprm[i] = m.actuator_biasprm[i] = 0.0
         m.body_gravcomp[:] = 0.0  # some of it would act through the actuators
+        m.actuator_actearly[:] = 0  # a choice of MuJoCo's steps: forces by the activations at their end
+        data.act[active] = activation
         T, _ = self.set(q, v, data, m)
-        return self.ours(T.T @ data.qfrc_actuator)
+        return self.ours(T.T @ data.qfrc_actuator), data.act_dot[active]
 
 
 def error(ours, theirs, floor: float = 0.0) -> float:
@@ -152,9 +155,11 @@ def agreement(path, scene: jd.io.LoadedScene) -> dict[str, float]:
     v, tau, step = (jnp.asarray(rng.normal(size=model.nv)) for _ in range(3))
     drives = scene.actuators
     control = rng.normal(size=0 if drives is None else len(drives.names))
+    active = () if drives is None or drives.activation_range is None else np.asarray(drives.activation_range).T
+    activation = np.clip(rng.normal(size=len(active[0])), *active) if len(active) else None
 
     @quick
-    def ours(scene, start, step, v, tau, control):
+    def ours(scene, start, step, v, tau, control, activation):
         model = scene.system
         q = jd.integrate(model, start, 0.7 * step)
         forces = [force for force in scene.forces if not isinstance(force, jd.forces.CoulombFriction)]
@@ -165,11 +170,13 @@ def agreement(path, scene: jd.io.LoadedScene) -> dict[str, float]:
             "passive": sum((force(model, q, v, 0.0) for force in forces), jnp.zeros(model.nv)),
         }
         if scene.actuators is not None:
-            computed["actuation"] = scene.actuators(model, q, v, control)
+            computed["actuation"] = scene.actuators(model, q, v, control, activation)
+            if activation is not None:
+                computed["activation"] = scene.actuators.activation_rate(control, activation)
         rows = jd.constraint_jacobian(scene, start) if scene.constraints else None
         return q, jd.forward_kinematics(model, q), computed, rows
 
-    q, poses, computed, rows = ours(scene, start, step, v, tau, jnp.asarray(control))
+    q, poses, computed, rows = ours(scene, start, step, v, tau, jnp.asarray(control), activation)
     theirs = dict(zip(("M", "bias", "acceleration"), oracle.dynamics(q, v, tau), strict=True))
     frames = [model.frame_names.index(name) for name in oracle.bodies[1:]]
     bodies = np.concatenate([np.asarray(poses), np.eye(4)[None]])[np.array(model.topology.frame_bodies)[frames]]
@@ -180,7 +187,10 @@ def agreement(path, scene: jd.io.LoadedScene) -> dict[str, float]:
     errors |= {"frames": error(bodies @ np.asarray(model.frame_poses)[frames], oracle.body_poses())}
     theirs["passive"] = oracle.passive_force(q, v)
     if drives is not None:
-        theirs["actuation"] = oracle.actuation(q, v, dict(zip(drives.names, control, strict=True)))
+        given = dict(zip(drives.names, control, strict=True))
+        theirs["actuation"], theirs["activation"] = oracle.actuation(
+            q, v, given, [] if activation is None else activation
+        )
     # A bias of nothing but rounding, of a hinge that is upright, is compared with forces of a thousandth of M.
     floors = {"bias": 1e-3 * np.abs(theirs["M"]).max(initial=0.0)}
     errors |= {name: error(value, theirs[name], floors.get(name, 0.0)) for name, value in computed.items()}

@@ -77,11 +77,13 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--html", metavar="FILE", help="write a page with tables and plots, .html")
     parser.add_argument("--plot", metavar="FILE", help="plot measured and predicted torques, .png, .pdf, .svg")
     parser.add_argument("--progress", action="store_true", help="print trials and the loss while fitting")
-    _add_advanced(parser.add_argument_group("advanced: data"), parser.add_argument_group("advanced: fit"), several)
+    _add_expert_options(
+        parser.add_argument_group("advanced: data"), parser.add_argument_group("advanced: fit"), several
+    )
     add_model_options(parser, "advanced: model")
 
 
-def _add_advanced(data, fit, several: dict[str, Any]) -> None:
+def _add_expert_options(data, fit, several: dict[str, Any]) -> None:
     data.add_argument("--payload-log", **several, metavar="FILE", help="logs of the same robot with a payload")
     data.add_argument("--payload-body", metavar="LINK", help="link with the payload (default: the last)")
     data.add_argument("--payload-mass", type=real, metavar="KG", help="known payload mass: also fit drive gains")

@@ -12,7 +12,7 @@ from jaxdyn.cli.common import FILE, UNITS, add_model_options, load_scene, output
 from jaxdyn.constraints.assembly import assemble
 from jaxdyn.constraints.base import constraint_jacobian, holonomic_rows, layout, position_residual
 from jaxdyn.constraints.mobility import degrees_of_freedom
-from jaxdyn.constraints.selection import known_selection
+from jaxdyn.constraints.selection import select_concrete_rows
 from jaxdyn.io import LoadedScene, NotTakenWarning, save_urdf, urdf_inertia_report
 from jaxdyn.io.load import format_of
 from jaxdyn.io.xml_lines import XmlFile
@@ -66,7 +66,7 @@ def run(args: argparse.Namespace) -> None:
     print(constraint_lines(scene))
     if is_urdf:
         print(_problems(urdf_inertia_report(file, arguments=xacro_arguments(args)), body_problems))
-        print(_unsupported(source))
+        print(_elements_without_effect(source))
     else:
         print(_body_problems(body_problems))
     if scene.not_taken or not is_urdf:
@@ -155,20 +155,20 @@ def _closure(scene: LoadedScene, q) -> list[str]:
     lines, closed = [], []
     try:
         q = assemble(scene, q).q
-        closed = [q, *_closed_near(scene, q)]
+        closed = [q, *_assemblies_near(scene, q)]
         lines.append("The constraints can be assembled: jd.assemble finds a configuration from the reference.")
     except ValueError as error:
         lines.append(f"The constraints cannot be assembled from the reference: {error}.")
     # Decided a finite distance away from q, because files like to put linkages flat.
-    kept = known_selection(scene, np.asarray(q), 0.0, None)[0].kept
+    kept = select_concrete_rows(scene, np.asarray(q), 0.0, None)[0].kept
     freedom, here = scene.nv - int(kept.sum()), degrees_of_freedom(scene, q)
     more = f" ({here} in the singular position of the reference)" if here > freedom else ""
     lines.append(f"Degrees of freedom after constraints: {freedom} of {scene.nv}{more}")
     return lines + _repeats(scene, closed, kept)
 
 
-def _closed_near(scene: LoadedScene, q) -> list:
-    """A few closed configurations around q. Loops of files that name one pose of each body are closed in that pose."""
+def _assemblies_near(scene: LoadedScene, q) -> list:
+    """A few assembled configurations around q: loops of a file that gives one pose of each body are closed in that pose only."""
     configurations, random = [], np.random.default_rng(0)
     for _ in range(2):
         step = jnp.asarray(random.uniform(-0.1, 0.1, scene.nv), q.dtype)
@@ -189,7 +189,7 @@ def _repeats(scene: LoadedScene, closed, kept) -> list[str]:
             gap = (gaps[:, place.start : place.end] * dropped).max(initial=0.0)
             by = f", which stay open by up to {gap:.2g} m or rad" if closed else ""
             lines.append(f"  {place.name}: {count} of {len(dropped)}{by}")
-    return ["Rows that repeat what others say, and that jd.simulate leaves out", *lines] if lines else []
+    return ["Redundant rows, which jd.simulate leaves out", *lines] if lines else []
 
 
 def _gap(constraint, scene: LoadedScene, q) -> str:
@@ -270,7 +270,7 @@ def _name_list(names: list[str]) -> str:
     return f": {', '.join(names)}" if names else ""
 
 
-def _unsupported(file: XmlFile) -> str:
+def _elements_without_effect(file: XmlFile) -> str:
     """Count the elements of the file that the model does not represent."""
     counts: collections.Counter[str] = collections.Counter()
     for element in file.root:

@@ -1,25 +1,26 @@
-"""`jaxdyn report`: error against run time of scenes with known motions."""
+"""`jaxdyn report`: error against run time of scenes."""
 
 import argparse
 
+from jaxdyn import scenes
 from jaxdyn.cli.common import Stopwatch, check_least, check_memory, whole
-from jaxdyn.reports import cases, report
+from jaxdyn.reports import report
 
-HELP = "error against run time of scenes with known motions"
+HELP = "error against run time of scenes"
 DESCRIPTION = """\
-Integrate scenes with known motions by several methods, solvers, tolerances and steps; print error and run time of each
-run, and write a page with log-log plots.
+Integrate scenes of `jaxdyn.scenes` for one second by several methods, solvers, tolerances and steps; print error and run
+time of each run, and write a page with log-log plots.
 """
 EPILOG = """\
 examples:
   jaxdyn report --list
   jaxdyn report pendulum_in_plane
   jaxdyn report four_bar andrews --dtype float64 float32 --batch 1 256 --out out/report
-  jaxdyn report --full --out out/report
+  jaxdyn report four_bar --full --out out/report
 
 Without --full: the usual integrators, four tolerances each, a quarter of a minute to two minutes a scene, of which
-most is compilation. With it: every sensible integrator, in both dtypes, single and in batches, hours for all scenes; restarted
-with the same --out, it resumes.
+most is compilation. With it: every sensible integrator, in both dtypes, single and in batches; restarted with the same --out,
+it resumes.
 
 output (--out DIR):
   report.html      one page: plots, tables, the machine; needs no network
@@ -31,7 +32,7 @@ output (--out DIR):
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Add the arguments of the command."""
-    parser.add_argument("scenes", nargs="*", metavar="SCENE", help="names of scenes (see --list); all with --full")
+    parser.add_argument("scenes", nargs="*", metavar="SCENE", help="names of scenes (see --list)")
     parser.add_argument("--list", action="store_true", help="print the scenes and exit")
     parser.add_argument("--full", action="store_true", help="every sensible method and solver; resumable")
     parser.add_argument("--out", metavar="DIR", help="directory for the page, the data and the text")
@@ -49,13 +50,11 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(args: argparse.Namespace) -> int:
     """Measure, print tables, write the files."""
-    known = cases()
     if args.list:
-        width = max(map(len, known))
-        print("\n".join(f"{name:{width}}  {case.text}" for name, case in known.items()))
+        print("\n".join(scenes.names()))
         return 0
-    if not (args.scenes or args.full):
-        raise ValueError(f"no scene is named; name one of {', '.join(known)}, or give --full for all")
+    if not args.scenes:
+        raise ValueError(f"no scene is named; name one of {', '.join(scenes.names())}")
     check_least(args, batch=1, rounds=1)
     check_memory(1000.0 * max(args.batch or [1]), f"--batch {max(args.batch or [1])}")
     watch = Stopwatch()
@@ -67,7 +66,7 @@ def run(args: argparse.Namespace) -> int:
         "rounds": args.rounds,
         "out": args.out,
     }
-    result = report(args.scenes or None, full=args.full, echo=lambda line: print(line, flush=True), **options)
+    result = report(args.scenes, full=args.full, echo=lambda line: print(line, flush=True), **options)
     print(f"\n{result.table()}\n\n{len(result.records)} runs in {watch}, compilation included.")
     if args.out:
         print(f"Wrote {args.out}/report.html, .json and .txt.")

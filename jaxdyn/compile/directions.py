@@ -41,7 +41,7 @@ class Directions:
             changes.append([x.ravel().tolist() for x in graph.replay(change, [*primal, *steps])[1]])
         flag = graph.replay(program, primal)[1][-1]
         reach = _reach(graph, count)
-        needed = _needed(reach, [x for rows in changes for row in rows for x in row])
+        needed = _dependencies(reach, [x for rows in changes for row in rows for x in row])
         kept: dict[str, dict[Number, int]] = {}
         for number in needed:
             if not reach[number]:
@@ -164,7 +164,7 @@ def _reach(graph: Graph, count: int) -> dict[Number, int]:
     return reach
 
 
-def _needed(reach: dict[Number, int], results: list) -> dict[Number, None]:
+def _dependencies(reach: dict[Number, int], results: list) -> dict[Number, None]:
     """Numbers that the results need, as far as they depend on a direction, and the numbers of the point that those take."""
     needed: dict[Number, None] = {}
     waiting = [x for x in results if type(x) is Number]
@@ -187,7 +187,7 @@ def _linear_program(graph, needed, reach, kept, inputs, outputs: Sequence[Array]
             return made[x] if type(x) is Number else x
         return linear.make("input", x.kind, kinds.index(x.kind), kept[x.kind][x])
 
-    of_this = _needed(reach, [x for row in rows for x in row])
+    of_this = _dependencies(reach, [x for row in rows for x in row])
     for number in graph.numbers:
         if number in of_this and reach[number]:
             if number.op == "input":

@@ -1,4 +1,4 @@
-"""Putting a scene on its constraints: `assemble` from a rough guess."""
+"""Assembly of a scene: a state on the constraints from a rough guess."""
 
 import dataclasses
 from collections.abc import Callable, Mapping
@@ -17,16 +17,9 @@ from jaxdyn.constraints.closing import follow_path, nearest_configuration
 from jaxdyn.constraints.codes import RESULTS, Outcome, name_of
 from jaxdyn.constraints.dynamics import correction
 from jaxdyn.constraints.loops import lock_joint
-from jaxdyn.constraints.rank import checked_tolerance, tolerance
-from jaxdyn.constraints.selection import (
-    Selection,
-    keep_rows,
-    known_selection,
-    most_rounding,
-    opening_of_dropped,
-    select_rows,
-    surely_apart,
-)
+from jaxdyn.constraints.rank import check_tolerance, tolerance
+from jaxdyn.constraints.redundancy import Selection, keep_rows, opening_of_redundant
+from jaxdyn.constraints.selection import clear_pivot, most_rounding, select_concrete_rows, select_rows
 from jaxdyn.constraints.tolerances import coordinate_sizes, largest_ratio, row_limits
 from jaxdyn.lie.so3 import matmul
 from jaxdyn.model.arguments import Numbers, check_state, zeros_if_none
@@ -40,10 +33,10 @@ class Assembly(Outcome):
 
     - `q` (nq,), `v` (nv,); largest `residual` (2,) left in |phi| (m or rad) of all rows and |A v - b| of those kept; `result`.
     - `distance` (): largest change of a coordinate from the guess, rad or lengths of the mechanism.
-    - `passed_singular` (): whether the path from the guess came through a singular position, so that the branch may be another.
-    - `dropped` (nc,): 1 for rows that repeat what others say but for rounding, and `gaps` (nc,): by how much these are open, m or
-      rad; `layout`: name and place of each constraint's rows.
-    - `guesses`: how many starts were tried; 1 says that the given one led there.
+    - `passed_singular` (): whether the path from the guess passed a singular position, so that the branch may have changed.
+    - `dropped` (nc,): 1 for redundant rows, dependent but for rounding, and `gaps` (nc,): their residuals, m or rad; `layout`:
+      name and place of each constraint's rows.
+    - `guesses`: number of starts that were tried; 1 if the given one succeeded.
     """
 
     q: Float[Array, " nq"]
@@ -58,7 +51,7 @@ class Assembly(Outcome):
     guesses: int = eqx.field(static=True, default=1)
 
     def redundancies(self) -> list[str]:
-        """In words, which constraints have rows that repeat others, and by how much these stay open; of a known assembly."""
+        """Sentences on the redundant rows of each constraint and their residuals, of a concrete assembly."""
         dropped, gaps = np.asarray(self.dropped), np.asarray(self.gaps)
         lines = []
         for place in self.layout:
@@ -78,7 +71,7 @@ class Assembly(Outcome):
             f"{float(self.residual[1]):.2g} (1/s), {float(self.distance):.3g} from the guess"
         ]
         if bool(self.passed_singular):
-            words.append("the path came through a singular position: the branch may be another than that of the guess")
+            words.append("the path passed a singular position: the branch may differ from that of the guess")
         return "\n  ".join([*words, *self.redundancies()])
 
 
@@ -97,46 +90,47 @@ def assemble(
 ) -> Assembly:
     """Find q with phi(q, t) = 0 and v with A v = b from a rough guess, with the least change in the mass metric.
 
-    q minimises |q - guess| in the metric M(guess) among the configurations on the constraints: a local minimum on the branch
-    to which short steps lead that reduce all residuals together. Hinges stay within half a turn of the guess. v is the guess
-    plus the least change in the metric M(q). Rows that repeat others but for the digits of a file are left open by these digits,
-    and the others are closed to rounding (see `Assembly.dropped`).
+    q minimises |q - guess| in the metric M(guess) among the configurations on the constraints: a local minimum, on the branch
+    that is reached by short steps which reduce all residuals together. Hinges stay within half a turn of the guess. v is the
+    guess plus the least change in the metric M(q). Rows that are redundant but for the digits of a file stay open by these
+    digits; the others are closed to rounding (see `Assembly.dropped`).
 
     **Arguments:**
 
     - `q` (nq,), `v` (nv,) (None: at rest): the guess. `t`, s.
-    - `hold`: values of joints by name, as in `lock_joint`, that the configuration is to have; velocities are not held.
-    - `guesses`: how many configurations to start from, where all inputs are concrete. The first is the given one; the others,
-      tried only where it fails, lie around it at random (the same ones in every call), farther and farther away, by up to pi
+    - `hold`: values of joints by name, as in `lock_joint`, for the configuration; velocities are not held.
+    - `guesses`: number of configurations to start from, for concrete inputs. The first is the given one. The others are
+      tried only if it fails: random ones around it (the same in every call), at distances that increase up to pi
       (rad, or lengths of the mechanism).
-    - `steps`: most steps of the path from the guess, each of at most 0.2 rad or lengths of the mechanism.
-    - `atol`: m or rad; residuals of positions up to it count as closed. Where the rows cannot all be met q is then the point of
-      least squares. By default rows that are independent must close to rounding.
-    - `rank_tol`: rows count whose distance from the span of the others is above this part of their length. By default those that
-      are independent, here or a finite distance away.
+    - `steps`: maximum number of steps of the path from the guess, each of at most 0.2 rad or lengths of the mechanism.
+    - `atol`: m or rad; residuals of positions up to it count as closed. If the rows cannot all be satisfied, q is then the point
+      of least squares. By default independent rows must close to rounding.
+    - `rank_tol`: rows are independent whose distance from the span of the others is above this part of their length. By default
+      those that are independent, here or a finite distance away.
     - `throw`: raise when it fails, by default if all inputs are concrete.
 
-    **Returns:** `Assembly`. Derivatives, of any order, with respect to the guess and the scene's numbers are those of the
+    **Returns:** `Assembly`. Derivatives, of any order, with respect to the guess and the scene's parameters are those of the
     minimum, by the implicit function theorem.
 
-    **Raises:** ValueError that names the constraints that stay open and by how much, if it fails and `throw`; for joints in
+    **Raises:** ValueError that names the open constraints and their residuals, if the assembly fails and `throw`; for joints in
     `hold` that do not exist, and for less than one guess.
 
     ```python
     state = jd.assemble(jd.scenes.four_bar(), jnp.zeros(3), hold={"1": 0.5})
     ```
     """
-    scene, rank_tol = as_scene(scene), checked_tolerance(rank_tol)
+    scene, rank_tol = as_scene(scene), check_tolerance(rank_tol)
     for name, count in (("guesses", guesses), ("steps", steps)):
         if isinstance(count, bool) or not isinstance(count, int) or count < 1:
-            what = "how many configurations to start from" if name == "guesses" else "how many steps to take at most"
-            raise ValueError(f"{name} is {count!r}; give {what}, at least 1")
+            what = "configurations to start from" if name == "guesses" else "steps to make at most"
+            raise ValueError(f"{name} is {count!r}; give how many {what}, at least 1")
     if atol is not None and (not is_concrete(atol) or not 0 <= float(atol) < np.inf):
         raise ValueError(f"atol is {atol!r}; give a length (m) or an angle (rad) that is not negative, or None")
     v = zeros_if_none(v, scene.nv)
     q, v, t = check_state(scene.system, q=q, v=v, t=t)
     locked = Scene(scene.system, (*scene.constraints, *(lock_joint(*joint) for joint in (hold or {}).items())))
-    layout(locked)  # refuses joints that do not exist
+    layout(locked)  # raises for joints that do not exist
+    # Only concrete inputs allow more guesses and a message: both need to know whether the first guess has failed.
     concrete = is_concrete(locked, q, v, t)
     atol = None if atol is None else float(atol)
 
@@ -156,20 +150,21 @@ def assemble(
 
 
 def closing_tolerance(dtype) -> float:
-    """Part of the mechanism's length that counts as rounding of what has converged."""
+    """Part of the mechanism's length that counts as rounding of a converged residual."""
+    # 1e-11 in float64: some digits above eps for loops of many bodies, far below the gaps of files, which are 1e-8 or more.
     return float(jnp.finfo(dtype).eps) ** 0.7
 
 
-def _from_elsewhere(assembly: Assembly, guesses: int, assembled: Callable, scene: Scene, q) -> Assembly:
-    """The first assembly that succeeds from configurations around q, or else the first one."""
+def _from_elsewhere(assembly: Assembly, guesses: int, from_guess: Callable, scene: Scene, q) -> Assembly:
+    """The first successful assembly from configurations around q, or else the given one."""
     sizes, _ = coordinate_sizes(scene.system, q.dtype)
     chance = np.random.default_rng(0)
     for tried in range(1, guesses):
         far = np.pi * tried / (guesses - 1)
         step = jnp.asarray(chance.uniform(-far, far, scene.nv), q.dtype) * sizes
-        other = assembled(displace(scene.system, q, step))
+        other = from_guess(displace(scene.system, q, step))
         if bool(other.success):
-            return eqx.tree_at(
+            return eqx.tree_at(  # its distance is that from the user's guess
                 lambda found: found.distance,
                 dataclasses.replace(other, guesses=tried + 1),
                 jnp.max(jnp.abs(displacement(scene.system, q, other.q)) / sizes),
@@ -178,7 +173,7 @@ def _from_elsewhere(assembly: Assembly, guesses: int, assembled: Callable, scene
 
 
 def _assemble(locked, q, v, t, rank_tol, atol, steps, is_rounded, scene):
-    """The scene `locked` closed; velocities are put on the constraints of `scene`, which is the same one if it is None."""
+    """Assemble the scene `locked`; velocities satisfy the constraints of `scene`, or of `locked` if it is None."""
     bare = Scene(locked.system, locked.constraints)
     start, passed = _follow_path(bare, q, t, rank_tol, steps)
     selection = _selection(bare, start, t, rank_tol, is_rounded)
@@ -189,10 +184,11 @@ def _assemble(locked, q, v, t, rank_tol, atol, steps, is_rounded, scene):
 
 
 def _selection(scene: Scene, q, t, rank_tol, is_rounded) -> Selection:
-    """The independent rows at the end of a path. Where they are known to be all, no program to choose them is compiled."""
+    """The independent rows at the end of a path."""
+    # Concrete rows are tested by NumPy first: most scenes have no dependent rows, and compile no program to choose some.
     if is_concrete(scene, q, t):
         q = np.asarray(q)
-        return known_selection(scene, q, np.asarray(t, q.dtype), rank_tol, is_rounded)[0]
+        return select_concrete_rows(scene, q, np.asarray(t, q.dtype), rank_tol, is_rounded)[0]
     return select_rows(scene, q, t, rank_tol, is_rounded)
 
 
@@ -201,14 +197,14 @@ def _follow_path(scene, q, t, rank_tol, steps):
     if not holonomic_rows(layout(scene)).size:
         return q, jnp.asarray(False)
     scene, q, t = stop_gradient((scene, q, t))
-    return follow_path(scene, q, t, tolerance(rank_tol, q) if rank_tol is not None else surely_apart(q), steps)
+    return follow_path(scene, q, t, tolerance(rank_tol, q) if rank_tol is not None else clear_pivot(q), steps)
 
 
 @entry_point
 def _close(bare, guess, start, passed, selection, v, t, rank_tol, atol, scene):
     """The assembly from the end of a path, which starts at the guess; `scene`: see `_assemble`."""
     kept, rounding, _ = selection
-    # Rows that contradict others are none that can be dropped: what is found is the point of least squares of all.
+    # Rows that contradict the others must not be dropped in silence: all are kept, and the result is their least-squares point.
     kept = jnp.where(rounding <= most_rounding(guess.dtype), kept, jnp.ones_like(kept))
     whole, locked = bare, keep_rows(bare, Selection(kept, rounding, jnp.zeros_like(rounding)))
     q = guess
@@ -219,14 +215,14 @@ def _close(bare, guess, start, passed, selection, v, t, rank_tol, atol, scene):
     v = _with_velocity(scene, q, v, t, rank_tol)
     limits = row_limits(locked, q, jnp.zeros_like(v), t, closing_tolerance(q.dtype))[0]
     phi = position_residual(locked, q, t)
-    is_closed = jnp.all(jnp.abs(phi) <= limits) & (opening_of_dropped(locked, q, t) <= most_rounding(q.dtype))
+    is_closed = jnp.all(jnp.abs(phi) <= limits) & (opening_of_redundant(locked, q, t) <= most_rounding(q.dtype))
     is_admissible = jnp.all(
         jnp.abs(velocity_residual(scene, q, v, t)) <= row_limits(scene, q, v, t, closing_tolerance(q.dtype))[1]
     )
     residual = _sizes(position_residual(whole, q, t), velocity_residual(scene, q, v, t))
     good = (is_closed if atol is None else is_closed | (residual[0] <= atol)) & is_admissible
     sizes, _ = coordinate_sizes(whole.system, q.dtype)
-    moved = jnp.abs(displacement(whole.system, lax.stop_gradient(guess), lax.stop_gradient(q))) / sizes
+    distances = jnp.abs(displacement(whole.system, lax.stop_gradient(guess), lax.stop_gradient(q))) / sizes
     places = layout(whole)
     gaps = jnp.abs(position_residual(bare, q, t)) * (1 - kept)[holonomic_rows(places)]
     return Assembly(
@@ -234,7 +230,7 @@ def _close(bare, guess, start, passed, selection, v, t, rank_tol, atol, scene):
         v,
         residual,
         RESULTS.where(good, RESULTS.successful, RESULTS.not_assembled),  # pyright: ignore[reportArgumentType]
-        jnp.max(moved, initial=0.0),
+        jnp.max(distances, initial=0.0),
         passed,
         1 - kept,
         lax.stop_gradient(jnp.zeros_like(kept).at[holonomic_rows(places)].set(gaps)),
@@ -244,6 +240,7 @@ def _close(bare, guess, start, passed, selection, v, t, rank_tol, atol, scene):
 
 def _unwind_hinges(scene, guess, q, t):
     """q with its hinges within half a turn of the guess, where full turns make no difference to the constraints."""
+    # A gear or a mimic joint counts turns: there the residual increases, and q stays.
     if not isinstance(scene.system, Model):
         return q
     topology = scene.system.topology
@@ -261,6 +258,7 @@ def _unwind_hinges(scene, guess, q, t):
 
 def _with_velocity(scene, q, v, t, rank_tol):
     """v with A v = b by the least change."""
+    # Twice, so that the rounding of the first correction of a large v is corrected too.
     B = correction(scene, q, t, rank_tol, holonomic=False)
     for _ in range(2):
         v = v - matmul(B, velocity_residual(scene, q, v, t))
@@ -282,7 +280,7 @@ def _sizes(*parts):
 
 
 def open_constraints(scene: Scene, q, v, t: Any = 0.0, relative: float = 0.0) -> str:
-    """In words, which constraints are violated by more than `row_limits`, the worst first; for concrete states."""
+    """Sentence on the constraints violated by more than `row_limits`, the worst first; for concrete states."""
     t = jnp.asarray(t, q.dtype)
     phi, psi, *limits = (np.asarray(x) for x in _residuals_and_limits(scene, q, v, t, relative))
     residuals, first = [], 0
@@ -293,12 +291,13 @@ def open_constraints(scene: Scene, q, v, t: Any = 0.0, relative: float = 0.0) ->
             (phi, limits[0], slice(first, first + count), "open by"),
             (psi, limits[1], slice(place.start, place.end), "slips at"),
         ):
-            if np.any(np.abs(values[rows]) > most[rows]):
+            if not np.all(np.abs(values[rows]) <= most[rows]):  # NaN is open
                 size = float(np.max(np.abs(values[rows])))
                 residuals.append((size, f"{kind} {place.name!r} {words} {size:.3g}"))
         first += count
-    # Those that print alike stay in the scene's order, whatever their rounding errors.
-    return ", ".join(text for _, text in sorted(residuals, key=lambda entry: -float(f"{entry[0]:.3g}"))[:6])
+    # Sorted by the printed digits: equal ones stay in the scene's order on every machine, whatever their rounding errors.
+    residuals.sort(key=lambda entry: np.nan_to_num(-float(f"{entry[0]:.3g}"), nan=-np.inf))
+    return ", ".join(text for _, text in residuals[:6])
 
 
 @eqx.filter_jit
@@ -310,7 +309,7 @@ def _residuals_and_limits(scene, q, v, t, relative):
 def start_openness(scene: Scene, q, v, t, relative: float) -> float:
     """`openness` at a concrete state."""
     bare = Scene(scene.system, scene.constraints)
-    # By the kernel that the program of a run that begins here has.
+    # By the kernel that the program of a run uses too, so that it is compiled once.
     return float(evaluate(largest_ratio, bare, q, v, t, static=(relative,), is_input=not is_tracing()))
 
 

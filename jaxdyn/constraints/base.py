@@ -1,4 +1,4 @@
-"""What a constraint is, and the rows of all constraints of a scene: A(q, t) v = b(q, t), A a = gamma.
+"""Constraints, and the rows of all constraints of a scene: A(q, t) v = b(q, t), A a = gamma.
 
 A constraint gives up to two functions: a residual phi(q, t) that is to be zero (holonomic part), and a velocity
 residual w(q, v, t), linear in v up to a term without v, that is to be zero (nonholonomic part). Everything else follows by
@@ -23,6 +23,9 @@ from jaxdyn.model.arguments import DType, Function, Number, Numbers, SystemLike,
 from jaxdyn.systems.scene import Scene, as_pytree, as_scene
 from jaxdyn.systems.system import velocity_to_rate
 
+# Methods of constraints by their names up to version 0.1.
+_OLD_NAMES = {"slip": "velocity", "grouped_position": "group_positions", "grouped_motion": "group_rows"}
+
 
 class Constraint(eqx.Module):
     """Base of all constraints. `name` is used by errors and reports."""
@@ -31,9 +34,12 @@ class Constraint(eqx.Module):
 
     def __init_subclass__(cls, **options):
         super().__init_subclass__(**options)
-        if "slip" in cls.__dict__:  # the method's name up to version 0.1
-            warnings.warn(f"{cls.__name__}.slip is called `velocity` now; rename it", DeprecationWarning, stacklevel=2)
-            cls.velocity = cls.__dict__["slip"]
+        for old, new in _OLD_NAMES.items():
+            if old in cls.__dict__:
+                warnings.warn(
+                    f"{cls.__name__}.{old} is called `{new}` now; rename it", DeprecationWarning, stacklevel=2
+                )
+                setattr(cls, new, cls.__dict__[old])
 
     def position(self, system: SystemLike, q: Float[Array, " nq"], t: Number) -> Array | None:
         """Residual phi(q, t) (nh,) of the holonomic part, or None when there is none."""
@@ -45,6 +51,7 @@ class Constraint(eqx.Module):
 
     def sizes(self, system: SystemLike, dtype: DType) -> tuple[int, int]:
         """Numbers of holonomic and of nonholonomic rows, from shapes alone."""
+        # By abstract evaluation: nothing is computed, and a traced system is no obstacle.
         q, v = (jax.ShapeDtypeStruct((n,), dtype) for n in (system.nq, system.nv))
         t = jax.ShapeDtypeStruct((), dtype)
         holonomic = eqx.filter_eval_shape(self.position, system, q, t)
@@ -52,25 +59,28 @@ class Constraint(eqx.Module):
         return 0 if holonomic is None else holonomic.shape[0], 0 if nonholonomic is None else nonholonomic.shape[0]
 
     def wrench_components(self) -> tuple[int, ...] | None:
-        """Where the components of a contact's force (`jd.contact.wrench_basis`) stand among its multipliers, in their order.
+        """Indices of a contact's force components (`jd.contact.wrench_basis`) among its multipliers.
 
         None for a constraint that is no contact with a normal force.
         """
         return None
 
+    # A class may evaluate all of its constraints at once, because they share work: those between bodies share one pass of the
+    # kinematics. It then gives a group and the two class methods below, and its rows are not found by differentiation.
+
     def group(self) -> Hashable:
-        """Constraints whose groups are equal and not None are evaluated together, by the functions below."""
+        """Key of the constraints that are evaluated together, by the functions below; None for a constraint on its own."""
         return None
 
     @classmethod
-    def grouped_position(
+    def group_positions(
         cls, members: Sequence["Constraint"], system: SystemLike, q: Float[Array, " nq"], t: Number
     ) -> list:
         """Residuals (nh,) of each of the constraints of one group, None without a holonomic part."""
         raise NotImplementedError
 
     @classmethod
-    def grouped_motion(
+    def group_rows(
         cls,
         members: Sequence["Constraint"],
         system: SystemLike,
@@ -111,6 +121,7 @@ class Holonomic(Constraint):
     def position(self, system: SystemLike, q: Float[Array, " nq"], t: Number) -> Array | None:
         """phi(q, t), (n,)."""
         value = self.phi(system, q, t) if self.with_system else self.phi(q, t)
+        # A matrix is most often a batch that was not mapped; its rows would be summed into wrong multipliers.
         if jnp.ndim(value) > 1:
             raise ValueError(
                 f"constraint {self.name!r}: phi returned shape {jnp.shape(value)}; return a vector (n,){batch_hint(value, (1,))}"
@@ -178,7 +189,7 @@ class Rows(NamedTuple):
 
 
 class Layout(NamedTuple):
-    """Where the rows of each constraint stand: its name, and its first, first nonholonomic and past-the-last row."""
+    """Row range of one constraint: its name, and its first, first nonholonomic and past-the-last row."""
 
     name: str
     start: int
@@ -187,7 +198,7 @@ class Layout(NamedTuple):
 
 
 def layout(scene: Scene) -> tuple[Layout, ...]:
-    """Which rows belong to which constraint of the scene; names that occur twice get a number.
+    """Row ranges of the scene's constraints, in order; a name that occurs twice gets a number.
 
     **Raises:** ValueError for entries that are no constraints, and for constraints without rows.
     """
@@ -203,6 +214,7 @@ def layout(scene: Scene) -> tuple[Layout, ...]:
         if sum(sizes) == 0:
             raise ValueError(f"constraint {constraint.name!r} has no rows; remove it from the scene")
         name = constraint.name
+        # Results are dictionaries by name (`by_name`, `constraint_forces`): equal names would lose multipliers.
         while name in names:
             name = f"{constraint.name} ({i})" if name == constraint.name else f"{name}'"
         names.append(name)
@@ -251,6 +263,7 @@ def _velocity_residual(scene: Scene, q, v, t):
 
 def _by_functions(scene: Scene, q, v, t):
     """psi of constraints that are functions of q and v."""
+    # Along the motion, not by the Jacobian in q: one pass, and right where q has more entries than v (quaternions).
     motion = velocity_to_rate(scene.system, q, v), jnp.ones_like(t)
     _, rates = jax.jvp(lambda q, t: _positions(scene, q, t), (q, t), motion)
     parts: list[Any] = []
@@ -268,6 +281,7 @@ def rows(scene: Scene, q: Float[Array, " nq"], v: Float[Array, " nv"], t: Any = 
 def _rows(scene: Scene, q, v, t) -> Rows:
     blocks, rest, others = _split(scene, q, v, t)
     if rest:
+        # With a = 0 the rate of psi along the motion is Adot v - bdot, so that gamma is its negative.
         motion = velocity_to_rate(scene.system, q, v), jnp.ones_like(t)
         velocity, rate = jax.jvp(lambda q, t: _by_functions(others, q, v, t), (q, t), motion)
         A = _by_differentiation(others, q, t)
@@ -307,19 +321,20 @@ def _jacobian(scene: Scene, q, t):
 
 
 def _split(scene: Scene, q, v, t):
-    """A, gamma and velocity of the constraints that give them themselves, which ones do not, and a scene of these."""
-    layout(scene)  # refuses what is no constraint, and constraints that do not fit the system
+    """A, gamma and velocity of the constraints in groups, indices of the others, and a scene of the others."""
+    layout(scene)  # raises for entries that are no constraints, and for constraints that do not fit the system
     results: list[Any] = [None] * len(scene.constraints)
-    for places in _grouped(scene):
+    for places in _groups(scene):
         members = [scene.constraints[i] for i in places]
-        for i, value in zip(places, members[0].grouped_motion(members, scene.system, q, v, t), strict=True):
+        for i, value in zip(places, members[0].group_rows(members, scene.system, q, v, t), strict=True):
             results[i] = value
     rest = [i for i, value in enumerate(results) if value is None]
     return results, rest, Scene(scene.system, tuple(scene.constraints[i] for i in rest))
 
 
 def _by_differentiation(scene: Scene, q, t):
-    # psi is affine in v, so one mode costs a pass per row and the other one per column.
+    # psi is affine in v, so that A does not depend on where it is taken. Reverse mode costs a pass per row, forward mode one per
+    # column.
     differentiate = jax.jacrev if layout(scene)[-1].end < scene.nv else jax.jacfwd
     return differentiate(lambda v: _by_functions(scene, q, v, t))(jnp.zeros((scene.nv,), q.dtype))
 
@@ -330,15 +345,15 @@ def _positions(scene: Scene, q, t) -> list:
     for i, constraint in enumerate(scene.constraints):
         if constraint.group() is None:
             residuals[i] = constraint.position(scene.system, q, t)
-    for places in _grouped(scene):
+    for places in _groups(scene):
         members = [scene.constraints[i] for i in places]
-        for i, value in zip(places, members[0].grouped_position(members, scene.system, q, t), strict=True):
+        for i, value in zip(places, members[0].group_positions(members, scene.system, q, t), strict=True):
             residuals[i] = value
     return residuals
 
 
-def _grouped(scene: Scene):
-    """Indices of the constraints of each group."""
+def _groups(scene: Scene):
+    """Indices of the constraints of each group, in the scene's order."""
     groups: dict[Any, list[int]] = {}
     for i, constraint in enumerate(scene.constraints):
         if constraint.group() is not None:

@@ -1,4 +1,4 @@
-"""How a computation ended: one enumeration for constrained dynamics and for simulations, and its codes by name and number."""
+"""Result codes of constrained dynamics and of simulations, by name and by number."""
 
 from typing import Any
 
@@ -10,14 +10,14 @@ _names: list[str] = []
 
 
 class RESULTS(eqx.Enumeration):
-    """How a computation ended: one enumeration for constrained dynamics and for simulations."""
+    """Result codes of constrained dynamics and of simulations."""
 
     successful = "successful"
     # Of equation solvers: those of lineax and optimistix, by their names.
     max_steps_reached = "The maximum number of solver steps was reached."
     singular = "A linear solver met a singular matrix."
     breakdown = "An iterative linear solver broke down."
-    stagnation = "An iterative linear solver came no further."
+    stagnation = "An iterative linear solver stagnated."
     conlim = "A linear solver met a matrix of too large a condition number."
     nonfinite_input = "A linear solver was given NaN or infinity."
     nonlinear_max_steps_reached = "The maximum number of steps of a nonlinear solver was reached."
@@ -46,7 +46,7 @@ class RESULTS(eqx.Enumeration):
     )
     coarse_start = "The initial state has an angle of so many turns that its dtype holds too little of the rest."
     inconsistent_start = "The initial state is not on the constraints."
-    no_freedom = "The constraints remove all freedom: there is no motion."
+    no_freedom = "The constraints remove all degrees of freedom: no motion is possible."
     open_constraints = "The constraints opened, and the projection could not close them."
     contact_lost = "A contact pulled or left its friction cone."
     joint_limit_passed = "A joint passed one of its position limits."
@@ -64,28 +64,29 @@ class RESULTS(eqx.Enumeration):
     no_descent = "No step along the search direction reduces the cost."
     underactuated = "The motors cannot produce this motion."
 
-    # An enumeration of equinox does not tell its names.
+    # An enumeration of equinox does not list its names.
     _names.extend(name for name in vars() if not name.startswith("_"))
 
 
-# Their places stand for the codes in arrays and files.
+# A code in arrays and files is the index of its name: append new names at the end of `RESULTS`, or old files change meaning.
 CODES = tuple(_names)
 
 
 def code_of(result: Any) -> Array:
-    """A result, traced or batched, as its place in `CODES` (uint8)."""
+    """Index of a result, traced or batched, in `CODES` (uint8)."""
+    # An item of an enumeration is no array that could be stored; comparisons of it are.
     return jnp.argmax(jnp.stack([result == getattr(RESULTS, name) for name in CODES]), 0).astype(jnp.uint8)
 
 
 def name_of(result: Any) -> str:
-    """The name of one known result."""
+    """Name of one concrete result."""
     return CODES[int(code_of(result))]
 
 
 class Outcome(eqx.Module):
-    """What has a `result`, one of `RESULTS`."""
+    """Base of outcomes with a `result`, one of `RESULTS`."""
 
     @property
     def success(self) -> Bool[Array, "..."]:
-        """Whether `result` is `RESULTS.successful`."""
+        """True where `result` is `RESULTS.successful`."""
         return self.result == RESULTS.successful  # pyright: ignore[reportAttributeAccessIssue]

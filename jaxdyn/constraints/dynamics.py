@@ -2,7 +2,7 @@
 
 In the metric of M everything is one least-squares problem. With M = L L^T, Y = L^-1 A^T and the free acceleration
 a0 = M^-1 (tau - h), the constraint force L^-1 A^T lam is the shortest w with Y^T w = gamma - A a0: Gauss's principle of
-least constraint. Its pseudo-inverse gives accelerations, multipliers and projections, for dependent rows too:
+least constraint. The pseudo-inverse of Y gives accelerations, multipliers and projections, for dependent rows too:
 
     w = (Y^+)^T c,   lam = Y^+ w,   a = a0 + L^-T w,   P_T = L^-T (1 - Y Y^+) L^T,   c = gamma - A a0.
 """
@@ -17,7 +17,7 @@ from jaxdyn.compile import is_standalone, kernel, mark_invalid
 from jaxdyn.constraints.base import Layout, Rows, constraint_jacobian, holonomic_rows, layout, rows
 from jaxdyn.constraints.codes import RESULTS, Outcome
 from jaxdyn.constraints.rank import (
-    checked_tolerance,
+    check_tolerance,
     eps_of,
     least_pivot,
     pseudo_inverse,
@@ -25,7 +25,7 @@ from jaxdyn.constraints.rank import (
     regular_gram,
     tolerance,
 )
-from jaxdyn.constraints.selection import is_selected
+from jaxdyn.constraints.redundancy import has_selection
 from jaxdyn.dynamics.quantities import bias_force, mass_matrix
 from jaxdyn.dynamics.recursions import aba_with_columns
 from jaxdyn.lie.so3 import matmul
@@ -44,7 +44,7 @@ class ConstrainedDynamics(Outcome):
       (`jd.dynamics.frame_acceleration` gives accelerations in world axes).
     - `multipliers` (nc,), the forces of the constraints on the system along their rows, in N for rows in m and N m for rows
       in rad.
-    - `rank` (): number of independent rows. `result`: one of `RESULTS`; `success`: whether it is `successful`.
+    - `rank` (): number of independent rows. `result`: one of `RESULTS`; `success`: true where it is `successful`.
     - `layout`: name and place of each constraint's rows.
     """
 
@@ -78,7 +78,7 @@ def constrained_dynamics(
 ) -> ConstrainedDynamics:
     """Acceleration and multipliers: M a + h = tau + forces + A^T lam, A a = gamma = -(Adot v) + bdot.
 
-    The state has to satisfy the constraints (`assemble`); what it violates is not corrected here.
+    The state has to satisfy the constraints (`assemble`); violations are not corrected here.
 
     **Arguments:**
 
@@ -88,13 +88,13 @@ def constrained_dynamics(
       "range_space" is the same without ever forming M: M^-1 is applied to the k rows by the articulated bodies of a
       `Model`, in O(nb k) operations; for few rows on a large tree, in batches. Other systems take their dense M.
     - `rank_tol`: singular values of L^-1 A^T below `rank_tol` times the largest count as zero. Default eps^(4/7),
-      1.1e-9 in float64 and 1.1e-4 in float32: above the 1e-12 to 1e-10 by which rows that depend on each other differ
-      when loops are open by rounding and projection errors, below the least singular values of mechanisms that move.
+      1.1e-9 in float64 and 1.1e-4 in float32: above the 1e-12 to 1e-10 by which dependent rows differ when loops are open
+      by rounding and projection errors, below the least singular values of mechanisms that move.
 
     **Returns:** `ConstrainedDynamics`. Under "schur" and "range_space", dependent rows give the code `dependent_rows`.
 
-    Differentiable any number of times where the rank is constant; the pseudo-inverse has a rule of its own, no
-    factorisation is differentiated.
+    Differentiable any number of times where the rank is constant, by the derivative of the pseudo-inverse: no factorisation is
+    differentiated.
 
     **Raises:** ValueError for shapes that do not fit, unknown methods, and constraints of the scene that are none.
 
@@ -102,65 +102,67 @@ def constrained_dynamics(
     """
     if method not in METHODS:
         raise ValueError(f"method is {method!r}; choose from {', '.join(METHODS)}")
-    rank_tol = checked_tolerance(rank_tol)
+    rank_tol = check_tolerance(rank_tol)
     scene = as_scene(scene)
     tau = zeros_if_none(tau, scene.nv)
     q, v, tau, t = check_state(scene.system, q=q, v=v, tau=tau, t=t)
     places = layout(scene)
     if not places:
-        return _free(scene, q, v, applied(scene, q, v, tau, t), t)
+        return _free(scene, q, v, total_force(scene, q, v, tau, t), t)
     state = q, v, tau, t
     if method != "rank_aware":
         return _by_schur(scene, *state, method=method)
-    # Samples whose rows may depend on each other are computed by rank, and so are more rows than velocities.
-    is_wide = places[-1].end > scene.nv and not is_selected(scene)
+    # More rows than velocities are dependent wherever the mechanism moves: by rank at once. Else Cholesky first, and by rank the
+    # samples that it marks. Selected rows are independent by construction, and their zero rows do not count.
+    is_wide = places[-1].end > scene.nv and not has_selection(scene)
     a, lam, rank, result = (_by_rank if is_wide else _by_pivots)(rank_tol, scene, *state)
     return ConstrainedDynamics(a, lam, rank, result, places)
 
 
 def _by_rank(rank_tol, scene: Scene, q, v, tau, t):
-    """(a, lam, rank, result) for rows that may depend on each other."""
-    metric, Y, free, wanted, gamma = kernel(_whitened)(scene, q, v, tau, t)
-    solution = _shortest_push(scene, metric, Y, free, wanted, gamma, rank_tol)
+    """(a, lam, rank, result) for rows that may be dependent."""
+    metric, Y, free, wanted, gamma = kernel(_gauss_problem)(scene, q, v, tau, t)
+    solution = _constrain_acceleration(scene, metric, Y, free, wanted, gamma, rank_tol)
     return solution.acceleration, solution.multipliers, solution.rank, solution.result
 
 
 def _without_forces(rank_tol, scene: Scene, q, v, tau, t):
-    """`_by_pivots` where it is no kernel, or not valid."""
+    """Fallback of `_by_pivots`, where it cannot be a kernel or is not valid."""
     if not scene.forces:
         return _by_rank(rank_tol, scene, q, v, tau, t)
-    # Forces may be anything that a user writes. The rest may be a kernel without them.
+    # A user's force may use operations that kernels do not have. Without the forces the rest may be a kernel; they enter as tau.
     bare = Scene(scene.system, scene.constraints)
-    return _by_pivots(rank_tol, bare, q, v, applied(scene, q, v, tau, t), t)
+    return _by_pivots(rank_tol, bare, q, v, total_force(scene, q, v, tau, t), t)
 
 
 @kernel(static=1, fallback=_without_forces)
 def _by_pivots(rank_tol, scene: Scene, q, v, tau, t):
-    """(a, lam, rank, result) without branches; not valid where the pivots of A M^-1 A^T are too small for their errors."""
-    metric, Y, free, wanted, _ = _whitened(scene, q, v, tau, t)
-    normal = cholesky(regular_gram(Y) if is_selected(scene) else matmul(Y.T, Y))
-    lam = _refined(normal, Y, wanted)
+    """(a, lam, rank, result) without branches; invalid where the pivots of A M^-1 A^T are too small for their errors."""
+    metric, Y, free, wanted, _ = _gauss_problem(scene, q, v, tau, t)
+    normal = cholesky(regular_gram(Y) if has_selection(scene) else matmul(Y.T, Y))
+    lam = _solve_with_refinement(normal, Y, wanted)
     quality = jnp.where(metric.is_definite(), quality_of(normal), jnp.nan)
     is_poor = ~(quality > least_pivot(q, rank_tol))
     a, lam = (mark_invalid(is_poor, x) for x in (metric.unwhiten(free + matmul(Y, lam)), lam))
-    return a, lam, *_judged(scene, q, quality)
+    return a, lam, *_rank_and_result(scene, q, quality)
 
 
-def _whitened(scene: Scene, q, v, tau, t):
-    """The mass matrix's factor, Y = U^-1 A^T, U^-1 (tau + forces - h), gamma - A M^-1 (tau + forces - h), and gamma."""
+def _gauss_problem(scene: Scene, q, v, tau, t):
+    """Gauss's least-squares problem: the factor of M, Y = U^-1 A^T, U^-1 (tau + forces - h), gamma - A a0, and gamma."""
     row = rows(scene, q, v, t)
-    metric, Y, free = _weighted(scene, q, v, applied(scene, q, v, tau, t), t, row.A)
+    metric, Y, free = _whiten_columns(scene, q, v, total_force(scene, q, v, tau, t), t, row.A)
     return metric, Y, free, row.gamma - matmul(Y.T, free), row.gamma
 
 
-def _judged(scene: Scene, q, quality):
-    """Rank and code of rows that were taken for independent, from the ratio of their pivots."""
+def _rank_and_result(scene: Scene, q, quality):
+    """Rank and code of rows that are treated as independent, from the ratio of their pivots."""
+    # The factor of a singular matrix is wrong by about nv eps in its pivots; NaN comes from a mass matrix that is not definite.
     rank = jnp.asarray(layout(scene)[-1].end, jnp.int32)
     result = RESULTS.where(quality > 10 * scene.nv * eps_of(q), RESULTS.successful, RESULTS.dependent_rows)  # pyright: ignore[reportArgumentType]
     return rank, RESULTS.where(jnp.isfinite(quality), result, RESULTS.singular_mass_matrix)
 
 
-def applied(scene: Scene, q, v, tau, t) -> Array:
+def total_force(scene: Scene, q, v, tau, t) -> Array:
     """tau plus the scene's forces, (nv,)."""
     tau = jnp.zeros_like(v) if tau is None else check_force(tau, q, scene.nv, "tau")
     force = scene.applied_force(q, v, t)
@@ -177,13 +179,14 @@ def _free(scene, q, v, force, t) -> ConstrainedDynamics:
 def solve_rows(scene: Scene, q, v, force, t, row: Rows, rank_tol: float | None = None) -> ConstrainedDynamics:
     """Acceleration and multipliers for rows A a = gamma that may differ from the scene's in gamma."""
     bare = Scene(scene.system)
-    metric, Y, free = kernel(_weighted)(bare, q, v, force, t, row.A)
-    return _shortest_push(scene, metric, Y, free, row.gamma - matmul(Y.T, free), row.gamma, rank_tol)
+    metric, Y, free = kernel(_whiten_columns)(bare, q, v, force, t, row.A)
+    return _constrain_acceleration(scene, metric, Y, free, row.gamma - matmul(Y.T, free), row.gamma, rank_tol)
 
 
-def _shortest_push(scene: Scene, metric: MassFactor, Y, free, wanted, gamma, rank_tol) -> ConstrainedDynamics:
-    """By Gauss's principle: what is added to the free acceleration is as short as can be."""
-    lam, pushed, rank = _shortest(Y, wanted, rank_tol)
+def _constrain_acceleration(scene: Scene, metric: MassFactor, Y, free, wanted, gamma, rank_tol) -> ConstrainedDynamics:
+    """Acceleration by Gauss's principle: the shortest addition to the free one, in the metric M, that satisfies the rows."""
+    lam, pushed, rank = _min_norm_solution(Y, wanted, rank_tol)
+    # The pseudo-inverse gives the least-squares compromise of contradictory rows without saying so: the residual tells them.
     # By Cauchy-Schwarz the residual is compared with the sizes that cancel in it.
     missed = jnp.abs(wanted - matmul(Y.T, pushed))
     sizes = jnp.abs(gamma) + jnp.sqrt(jnp.sum(Y * Y, 0) * (jnp.sum(free * free) + jnp.sum(pushed * pushed)))
@@ -193,38 +196,37 @@ def _shortest_push(scene: Scene, metric: MassFactor, Y, free, wanted, gamma, ran
     result = RESULTS.where(met, RESULTS.successful, RESULTS.contradictory_rows)  # pyright: ignore[reportArgumentType]
     result = RESULTS.where(metric.is_definite(), result, RESULTS.singular_mass_matrix)
     a = metric.unwhiten(free + pushed)
-    if is_standalone():
-        a = mark_invalid(
-            ~(met & metric.is_definite()), a
-        )  # code without JAX returns a status beside what the function returns
+    if is_standalone():  # code without JAX returns a status in addition to its values
+        a = mark_invalid(~(met & metric.is_definite()), a)
     return ConstrainedDynamics(a, lam, rank, result, layout(scene))
 
 
-def _weighted(scene: Scene, q, v, force, t, A):
+def _whiten_columns(scene: Scene, q, v, force, t, A):
     """M = U U^T, Y = U^-1 A^T and U^-1 (force - h)."""
     metric = mass_factor(mass_matrix(scene.system, q, t))
+    # One triangular solve for all right-hand sides.
     columns = jnp.concatenate([A, (force - bias_force(scene.system, q, v, t))[None]]).T
     whitened = metric.whiten(columns)
     return metric, whitened[:, :-1], whitened[:, -1]
 
 
-def _refined(factor, Y, right):
-    """(Y^T Y)^-1 right from the Cholesky factor: one correction takes the squared condition number out of the error."""
+def _solve_with_refinement(factor, Y, right):
+    """(Y^T Y)^-1 right from the Cholesky factor, with one step of iterative refinement against Y."""
+    # Y^T Y squares the condition number. The residual formed with Y itself recovers those digits.
     x = solve_cholesky(factor, right)
     return x + solve_cholesky(factor, right - matmul(Y.T, matmul(Y, x)))
 
 
-def _shortest(Y, wanted, rank_tol):
+def _min_norm_solution(Y, wanted, rank_tol):
     """lam and w = Y lam, the shortest w with Y^T w = wanted, and the rank of Y."""
-
-    # More rows than degrees of freedom depend on each other wherever the mechanism moves.
+    # More rows than velocities are dependent wherever the mechanism moves: the normal equations would fail for all samples.
     inverse = pseudo_inverse(Y, tolerance(rank_tol, Y), Y.shape[1] > Y.shape[0])
     pushed = matmul(inverse.T, wanted)
     return matmul(inverse, pushed), pushed, jnp.round(jnp.sum(inverse * Y.T)).astype(jnp.int32)
 
 
 def _by_schur(scene: Scene, q, v, tau, t, *, method: str) -> ConstrainedDynamics:
-    """Rows that are taken for independent: the Cholesky factor of A M^-1 A^T."""
+    """Dynamics with independent rows, by the Cholesky factor of A M^-1 A^T."""
     by_bodies = method == "range_space" and isinstance(scene.system, Model)
     a, lam, fine, definite = kernel(_by_bodies if by_bodies else _by_delassus)(scene, q, v, tau, t)
     result = RESULTS.where(fine, RESULTS.successful, RESULTS.dependent_rows)  # pyright: ignore[reportArgumentType]
@@ -234,14 +236,14 @@ def _by_schur(scene: Scene, q, v, tau, t, *, method: str) -> ConstrainedDynamics
 
 
 def _by_delassus(scene: Scene, q, v, tau, t):
-    metric, Y, free, wanted, _ = _whitened(scene, q, v, tau, t)
+    metric, Y, free, wanted, _ = _gauss_problem(scene, q, v, tau, t)
     lam, fine = _solve_delassus(matmul(Y.T, Y), wanted, scene.nv)
     return metric.unwhiten(free + matmul(Y, lam)), lam, fine, metric.is_definite()
 
 
 def _by_bodies(scene: Scene, q, v, tau, t):
-    """The same from a0 and X = M^-1 A^T of one articulated-body factorisation: a = a0 + X lam."""
-    row, force = rows(scene, q, v, t), applied(scene, q, v, tau, t)
+    """`_by_delassus` without M: a0 and X = M^-1 A^T from one articulated-body factorisation, a = a0 + X lam."""
+    row, force = rows(scene, q, v, t), total_force(scene, q, v, tau, t)
     free, X = aba_with_columns(scene.system, q, v, force, row.A.T)
     lam, fine = _solve_delassus(matmul(row.A, X), row.gamma - matmul(row.A, free), scene.nv)
     return free + matmul(X, lam), lam, fine, jnp.isfinite(free).all()
@@ -249,9 +251,10 @@ def _by_bodies(scene: Scene, q, v, tau, t):
 
 def _solve_delassus(delassus, wanted, nv: int):
     """lam with A M^-1 A^T lam = wanted by Cholesky, and whether the rows were independent."""
+    # A X is symmetric but for rounding, which would make the solution depend on the triangle that is read.
     factor = cholesky(0.5 * (delassus + delassus.T))
     pivots = jnp.diagonal(factor)
-    # The factor's rounding error is eps times the largest entry; pivots (roots) at that level mean nothing.
+    # The rounding error of the factor is eps times the largest entry; pivots (here their roots) at that level are noise.
     fine = jnp.min(pivots) > (10 * nv * eps_of(delassus)) ** 0.5 * jnp.max(pivots)
     return solve_cholesky(factor, wanted), fine
 
@@ -271,15 +274,15 @@ def projections(
     """
     scene = as_scene(scene)
     q, t = check_state(scene.system, q=q, t=t)
-    metric, Y = kernel(whitened_rows)(scene, q, t)
+    metric, Y = kernel(whiten_rows)(scene, q, t)
     inverse = pseudo_inverse(Y, tolerance(rank_tol, Y))
     kept = jnp.eye(Y.shape[0], dtype=Y.dtype) - matmul(Y, inverse)
-    # U^-T (1 - Y Y^+) U^T, of which the columns of U^T are found from the unit velocities.
+    # U^-T (1 - Y Y^+) U^T; `momentum` of the unit velocities gives the columns of U^T.
     P_T = metric.unwhiten(matmul(kept, metric.momentum(jnp.eye(scene.nv, dtype=Y.dtype))))
     return Projections(P_T, P_T.T)
 
 
-def whitened_rows(scene: Scene, q, t):
+def whiten_rows(scene: Scene, q, t):
     """M = U U^T and Y = U^-1 A^T."""
     metric = mass_factor(mass_matrix(scene.system, q, t))
     return metric, metric.whiten(constraint_jacobian(scene, q, t).T)
@@ -288,7 +291,7 @@ def whitened_rows(scene: Scene, q, t):
 def second_fundamental_form(
     scene: Scene, q: Float[Array, " nq"], v: Float[Array, " nv"], t: Numbers = 0.0, *, rank_tol: float | None = None
 ) -> Float[Array, " nv"]:
-    """S(v, v) = (1 - P_T)(a + M^-1 C v): the covariant acceleration that the constraints prescribe.
+    """Covariant acceleration that the constraints prescribe, S(v, v) = (1 - P_T)(a + M^-1 C v).
 
     S = M^-1 A^T (A M^-1 A^T)^+ (gamma + A M^-1 C v) needs q and v alone. M S is the force, normal to the constraints,
     that keeps the motion on them.
@@ -299,8 +302,9 @@ def second_fundamental_form(
     """
     scene = as_scene(scene)
     q, v, t = check_state(scene.system, q=q, v=v, t=t)
+    # C v without C: the bias force less its value at rest.
     coriolis = bias_force(scene.system, q, v, t) - bias_force(scene.system, q, jnp.zeros_like(v), t)
-    metric, Y = kernel(whitened_rows)(scene, q, t)
+    metric, Y = kernel(whiten_rows)(scene, q, t)
     wanted = rows(scene, q, v, t).gamma + matmul(Y.T, metric.whiten(coriolis))
     return metric.unwhiten(matmul(pseudo_inverse(Y, tolerance(rank_tol, Y)).T, wanted))
 
@@ -308,16 +312,16 @@ def second_fundamental_form(
 def correction(scene: Scene, q, t, rank_tol, *, holonomic: bool) -> Array:
     """B (nv, n) such that -B r is the shortest step, in the metric M(q), that removes the residual r of the rows.
 
-    Rows: the holonomic ones, or all.
+    The rows are the holonomic ones, or all.
     """
-    metric, Y = kernel(whitened_rows)(scene, q, t)
-    return _unwhitened_inverse(metric, Y[:, holonomic_rows(layout(scene))] if holonomic else Y, rank_tol)
+    metric, Y = kernel(whiten_rows)(scene, q, t)
+    return _inverse_in_metric(metric, Y[:, holonomic_rows(layout(scene))] if holonomic else Y, rank_tol)
 
 
 def right_inverse(metric: MassFactor, A, rank_tol) -> Array:
-    """B (nv, n) with A B = 1 and columns as short as can be in the metric, for rows A (n, nv)."""
-    return _unwhitened_inverse(metric, metric.whiten(A.T), rank_tol)
+    """Right inverse B (nv, n) of rows A (n, nv), with the shortest columns in the metric."""
+    return _inverse_in_metric(metric, metric.whiten(A.T), rank_tol)
 
 
-def _unwhitened_inverse(metric, Y, rank_tol):
+def _inverse_in_metric(metric, Y, rank_tol):
     return metric.unwhiten(pseudo_inverse(Y, tolerance(rank_tol, Y)).T)

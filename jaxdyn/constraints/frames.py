@@ -1,6 +1,7 @@
 """Constraints between two frames on bodies: one pass of the kinematics gives the rows, rates and residuals of all of them.
 
-Nothing is differentiated but the few numbers of each constraint: no pass of the kinematics for each row, none for its rates.
+Only the residual of each constraint, a function of one pose, is differentiated: there is no pass of the kinematics for each row,
+and none for its rates.
 
 Let V_A and V_B be the twists of the frames in the axes of A at its origin, and a dot their rates at a = 0. Seen from A, frame
 B moves along the twist t U + t^2/2 U' with U = V_B - V_A and U' = Vdot_B - Vdot_A - [V_A, V_B], up to third order in t (Baker,
@@ -54,16 +55,23 @@ def _both_frames(members, system, q, v=None) -> BodyFrames:
     return frames_on(system, q, [body for body, _ in ends], [pose for _, pose in ends], v)
 
 
-def _seen_from_a(frames: BodyFrames):
+def _poses_in_a(frames: BodyFrames):
     """Rotations (n, 3, 3) and positions (n, 3) of frames B seen from frames A, and the displacement between their trees (n, 3).
 
     Positions are subtracted tree by tree: a robot far from the world's origin loses nothing.
     """
     n = len(frames.velocity_mask) // 2
-    turned = jnp.swapaxes(frames.pose[:n, :3, :3], 1, 2)
+    transpose = jnp.swapaxes(frames.pose[:n, :3, :3], 1, 2)
     across = frames.origin[n:] - frames.origin[:n]
     between = frames.pose[n:, :3, 3] - frames.pose[:n, :3, 3] + across
-    return matmul(turned, frames.pose[n:, :3, :3]), matmul(turned, between[..., None])[..., 0], across
+    return matmul(transpose, frames.pose[n:, :3, :3]), matmul(transpose, between[..., None])[..., 0], across
+
+
+def _adjoints_to_a(frames: BodyFrames, across):
+    """Ad(T_A)^-1 (n, 6, 6), which brings twists into frames A: from the trees of frames A, and from those of frames B."""
+    inverse = jax.vmap(lambda pose: se3.Ad(se3.inverse(pose)))
+    n = len(across)
+    return inverse(frames.pose[:n]), inverse(frames.pose[:n].at[:, :3, 3].add(-across))
 
 
 class Pair(Constraint):
@@ -76,8 +84,8 @@ class Pair(Constraint):
         """Frames A and B, each a body or frame (None: the world) and a pose (4, 4) in it."""
         raise NotImplementedError
 
-    def declared(self, system: SystemLike) -> "Pair":
-        """The constraint as it was given to the system, where its rows are known by a number alone."""
+    def resolve(self, system: SystemLike) -> "Pair":
+        """The constraint with all of its data, for one that is an index into those of the system."""
         return self
 
     def pose_residual(self, R: Float[Array, "3 3"], p: Float[Array, "3"]) -> Array | None:
@@ -89,25 +97,25 @@ class Pair(Constraint):
         return None
 
     def at(self, system: SystemLike, q: Float[Array, " nq"]) -> "Pair":
-        """The constraint with what it reads from the system and from q itself, beside the poses of its frames."""
+        """The constraint at q, for one that depends on q by more than the poses of its frames."""
         return self
 
     def structure_key(self) -> tuple:
-        """Members of one class with equal keys differ in numbers alone; they are evaluated as one batch."""
+        """Static part of the constraint: members of one class with equal keys are evaluated as one batch."""
         raise NotImplementedError
 
     def group(self) -> Hashable:
-        """All are evaluated on one pass of the kinematics."""
+        """One key for all: they share one pass of the kinematics."""
         return "pairs"
 
     def position(self, system: SystemLike, q: Float[Array, " nq"], t: Number) -> Array | None:
         """Residual of the holonomic part, (nh,)."""
-        return self.grouped_position([self], system, q, t)[0]
+        return self.group_positions([self], system, q, t)[0]
 
     def velocity(self, system: SystemLike, q: Float[Array, " nq"], v: Float[Array, " nv"], t: Number) -> Array | None:
         """Residual of the nonholonomic part, (np,)."""
         holonomic, nonholonomic = self.sizes(system, q.dtype)
-        return self.grouped_motion([self], system, q, v, t)[0][2][holonomic:] if nonholonomic else None
+        return self.group_rows([self], system, q, v, t)[0][2][holonomic:] if nonholonomic else None
 
     def wrench(self, R: Float[Array, "3 3"], p: Float[Array, "3"], lam: Float[Array, " r"]) -> Float[Array, "6"]:
         """Wrench (f, tau) (6,) on body B for the multipliers lam, at the origin and in the axes of frame A.
@@ -117,50 +125,41 @@ class Pair(Constraint):
         return matmul(lam, _directions(self, R, p))
 
     @classmethod
-    def grouped_position(cls, members: Sequence["Pair"], system: SystemLike, q: Float[Array, " nq"], t: Number) -> list:
+    def group_positions(cls, members: Sequence["Pair"], system: SystemLike, q: Float[Array, " nq"], t: Number) -> list:
         """Residuals (nh,) of each constraint, None without one."""
         return _positions(tuple(members), system, q)
 
     @classmethod
-    def grouped_motion(
+    def group_rows(
         cls, members: Sequence["Pair"], system: SystemLike, q: Float[Array, " nq"], v: Float[Array, " nv"], t: Number
     ) -> list:
         """A (r, nv), gamma (r,) and velocity (r,) of each constraint."""
         return _motions(tuple(members), system, q, v)
 
 
-def _positions_of(members: tuple[Pair, ...], system, q) -> list:
+def _group_positions(members: tuple[Pair, ...], system, q) -> list:
     members = tuple(member.at(system, q) for member in members)
-    rotation, position = relative_poses(members, system, q)
-    residuals: list = [None] * len(members)
-    for index, build, leaves in _batches(members):
-        if members[index[0]].sizes(system, q.dtype)[0]:
-            values = jax.vmap(lambda leaves, R, p, build=build: build(leaves).pose_residual(R, p))(
-                leaves, take(rotation, index), take(position, index)
-            )
-            for k, i in enumerate(index):
-                residuals[i] = values[k]
-    return residuals
+    return each(members, lambda one, R, p: one.pose_residual(R, p), *relative_poses(members, system, q))
 
 
-def _motions_of(members: tuple[Pair, ...], system, q, v) -> list:
+def _group_rows(members: tuple[Pair, ...], system, q, v) -> list:
     members = tuple(member.at(system, q) for member in members)
     frames, n = _both_frames(members, system, q, v), len(members)
-    rotation, position, across = _seen_from_a(frames)
-    inverse = jax.vmap(lambda pose: se3.Ad(se3.inverse(pose)))
-    by_a = inverse(frames.pose[:n])
-    # The same frames A, seen from the trees of frames B.
-    by_b = inverse(frames.pose[:n].at[:, :3, 3].add(-across))
+    rotation, position, across = _poses_in_a(frames)
+    by_a, by_b = _adjoints_to_a(frames, across)
     assert frames.twist is not None and frames.bias is not None
     twists = jnp.stack([frames.twist, frames.bias], axis=-1)
-    moved_a, moved_b = matmul(by_a, twists[:n]), matmul(by_b, twists[n:])
-    relative = moved_b - moved_a
-    turning = relative[:, :, 1] - jax.vmap(se3.ad_apply)(moved_a[:, :, 0], moved_b[:, :, 0])
-    moved_by_a, moved_by_b = frames.velocity_mask[:n], frames.velocity_mask[n:]
-    sides = ((1, moved_by_b & ~moved_by_a, by_b), (-1, moved_by_a & ~moved_by_b, by_a))
+    of_a, of_b = matmul(by_a, twists[:n]), matmul(by_b, twists[n:])
+    relative = of_b - of_a
+    # U' of the module's text: the bracket is the second order of the logarithm of the relative motion.
+    rate = relative[:, :, 1] - jax.vmap(se3.ad_apply)(of_a[:, :, 0], of_b[:, :, 0])
+    # Masks of coordinates, known while tracing. Those that move both frames cancel in A v to rounding only; here they are absent,
+    # so that the entries are exact zeros, and a robot's fast base leaves no noise in the rows of its gripper.
+    moves_a, moves_b = frames.velocity_mask[:n], frames.velocity_mask[n:]
+    sides = ((1, moves_b & ~moves_a, by_b), (-1, moves_a & ~moves_b, by_a))
     motions: list = [None] * n
     for index, build, leaves in _batches(members):
-        at = [take(x, index) for x in (rotation, position, relative[:, :, 0], turning)]
+        at = [take(x, index) for x in (rotation, position, relative[:, :, 0], rate)]
         rates = jax.vmap(lambda leaves, *at, build=build: _rates(build(leaves), *at))
         D, gamma, velocity = rates(leaves, *at)
         columns = jnp.zeros((*D.shape[:2], len(frames.coordinates)), q.dtype)
@@ -169,6 +168,7 @@ def _motions_of(members: tuple[Pair, ...], system, q, v) -> list:
                 part = matmul(matmul(D, take(adjoint, index)), frames.subspace.T)
                 columns = columns + part * jnp.asarray(sign * mask[index][:, None, :], q.dtype)
         if len(frames.coordinates) < system.nv:
+            # The pass went through the bodies between the frames alone; other coordinates have columns of zeros.
             wide = jnp.zeros((*D.shape[:2], system.nv), q.dtype)
             columns = wide.at[:, :, frames.coordinates].set(columns)
         for k, i in enumerate(index):
@@ -176,43 +176,42 @@ def _motions_of(members: tuple[Pair, ...], system, q, v) -> list:
     return motions
 
 
-# A program that asks many times, as steps with projections do, traces each of these once. A nested `jit` would hide what is
-# known.
-# Outside of kernels they are traced once, for all calls of all constraints of a scene.
-_positions = variant(_positions_of)(eqx.filter_jit(_positions_of))
-_motions = variant(_motions_of)(eqx.filter_jit(_motions_of))
+# Traced once for all calls of a program: a step with projections has many of them. Not in kernels, where a nested `jit` would
+# hide which numbers are constants.
+_positions = variant(_group_positions)(eqx.filter_jit(_group_positions))
+_motions = variant(_group_rows)(eqx.filter_jit(_group_rows))
 
 
 def relative_poses(members, system, q):
     """Rotations (n, 3, 3) and positions (n, 3) of frame B seen from frame A, for constraints with bodies and poses."""
-    return _seen_from_a(_both_frames(members, system, q))[:2]
+    return _poses_in_a(_both_frames(members, system, q))[:2]
 
 
 def relative_motions(members, system, q, v):
     """`relative_poses`, and the twists (n, 6) of frame B against frame A, at the origin and in the axes of A."""
     frames, n = _both_frames(members, system, q, v), len(members)
-    rotation, position, across = _seen_from_a(frames)
+    rotation, position, across = _poses_in_a(frames)
     assert frames.twist is not None
-    inverse = jax.vmap(lambda pose: se3.Ad(se3.inverse(pose)))
-    by_a, by_b = inverse(frames.pose[:n]), inverse(frames.pose[:n].at[:, :3, 3].add(-across))
+    by_a, by_b = _adjoints_to_a(frames, across)
     twist_a, twist_b = frames.twist[:n, :, None], frames.twist[n:, :, None]
     return rotation, position, (matmul(by_b, twist_b) - matmul(by_a, twist_a))[..., 0]
 
 
 def each(members: Sequence[Pair], function, *rows) -> list:
-    """function(member, row of each of `rows`) for every constraint, those that differ in numbers alone as one batch."""
-    motions: list = [None] * len(members)
+    """function(member, row of each of `rows`) for every constraint, those of equal structure as one batch."""
+    results: list = [None] * len(members)
     for index, build, leaves in _batches(members):
         values = jax.vmap(lambda leaves, *at, build=build: function(build(leaves), *at))(
             leaves, *(take(x, index) for x in rows)
         )
         for k, i in enumerate(index):
-            motions[i] = jax.tree.map(lambda x, k=k: x[k], values)
-    return motions
+            results[i] = jax.tree.map(lambda x, k=k: x[k], values)
+    return results
 
 
 def _batches(members: Sequence[Pair]):
-    """Members that differ in numbers alone: their indices, a function that makes one of them of its numbers, all numbers."""
+    """Batches of members of equal structure: their indices, a function from array leaves to a member, stacked leaves."""
+    # Eight loops of one kind are one batch of eight: the program does not grow with their number.
     sets: dict = {}
     for i, member in enumerate(members):
         sets.setdefault((type(member), member.structure_key()), []).append(i)
@@ -222,38 +221,41 @@ def _batches(members: Sequence[Pair]):
         yield np.array(places), lambda leaves, structure=structure: jax.tree.unflatten(structure, leaves), leaves
 
 
-def displaced(R, p, twist):
+def displace_pose(R, p, twist):
     """Pose of frame B after it has moved along a small twist, seen from frame A: exp(twist) up to second order.
 
     Only first and second derivatives at twist = 0 are taken, and these are exact.
     """
-    turn = so3.hat(twist[3:])
-    first = twist[:3] + matmul(turn, p)
-    turned = matmul(turn, R)
-    return R + turned + 0.5 * matmul(turn, turned), p + first + 0.5 * matmul(turn, first)
+    # Not `se3.exp`, whose series and branches near zero would be differentiated twice for each row.
+    hat = so3.hat(twist[3:])
+    dp, dR = twist[:3] + matmul(hat, p), matmul(hat, R)
+    return R + dR + 0.5 * matmul(hat, dR), p + dp + 0.5 * matmul(hat, dp)
 
 
 def _directions(pair: Pair, R, p) -> Float[Array, "r 6"]:
     """Rows D (r, 6): the rates of the residuals are D U."""
     zero = jnp.zeros((6,), p.dtype)
     residual = jax.eval_shape(pair.pose_residual, R, p)
-    parts = [] if residual is None else [jax.jacfwd(lambda twist: pair.pose_residual(*displaced(R, p, twist)))(zero)]
+    parts = (
+        [] if residual is None else [jax.jacfwd(lambda twist: pair.pose_residual(*displace_pose(R, p, twist)))(zero)]
+    )
     if jax.eval_shape(pair.twist_residual, R, p, zero) is not None:
         parts.append(jax.jacfwd(lambda U: pair.twist_residual(R, p, U))(zero))
     return jnp.concatenate(parts)
 
 
-def _rates(pair: Pair, R, p, U, bend):
-    """D (r, 6), gamma (r,) and velocity (r,) for the twist U and its rate `bend`."""
+def _rates(pair: Pair, R, p, U, rate):
+    """D (r, 6), gamma (r,) and velocity (r,) for the twist U and its rate U'."""
     zero = jnp.zeros((6,), U.dtype)
     D = _directions(pair, R, p)
     parts = []
     if jax.eval_shape(pair.pose_residual, R, p) is not None:
 
-        def moved(twist):
-            return pair.pose_residual(*displaced(R, p, twist))
+        def residual(twist):
+            return pair.pose_residual(*displace_pose(R, p, twist))
 
-        parts.append(jax.jvp(lambda twist: jax.jvp(moved, (twist,), (U,))[1], (zero,), (U,))[1])
+        # H(U, U): the second derivative along U alone, without the Hessian.
+        parts.append(jax.jvp(lambda twist: jax.jvp(residual, (twist,), (U,))[1], (zero,), (U,))[1])
     if jax.eval_shape(pair.twist_residual, R, p, U) is not None:
-        parts.append(jax.jvp(lambda twist: pair.twist_residual(*displaced(R, p, twist), U), (zero,), (U,))[1])
-    return D, -(matmul(D, bend) + jnp.concatenate(parts)), matmul(D, U)
+        parts.append(jax.jvp(lambda twist: pair.twist_residual(*displace_pose(R, p, twist), U), (zero,), (U,))[1])
+    return D, -(matmul(D, rate) + jnp.concatenate(parts)), matmul(D, U)

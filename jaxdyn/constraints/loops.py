@@ -27,26 +27,27 @@ from jaxdyn.model.names import body_index
 from jaxdyn.model.tree import Model
 
 
-def _floored(x):
-    # Only exactly upside down is the denominator zero; the residual is then huge, which is what it is to be.
+def _floor(x):
+    # Only exactly upside down is the denominator zero. The residual is then huge, as it has to be: the way back is half a turn.
     tiny = float(jnp.finfo(x.dtype).eps)
     return jnp.where(x < tiny, jnp.full_like(x, tiny), x)
 
 
 def _axis(R):
-    height = _floored(1.0 + R[2][2])
+    """Twice the tangent of half the angle between the axes z, split along x and y."""
+    height = _floor(1.0 + R[2][2])
     return 2.0 * R[0][2] / height, 2.0 * R[1][2] / height
 
 
 def attitude(R):
     """Twice the tangent of half the angle, along the axis of the rotation: three numbers."""
-    size = _floored(1.0 + R[0][0] + R[1][1] + R[2][2])
+    size = _floor(1.0 + R[0][0] + R[1][1] + R[2][2])
     return tuple(2.0 * (R[j][i] - R[i][j]) / size for i, j in ((1, 2), (2, 0), (0, 1)))
 
 
 def _turn(R):
     """Twice the tangent of half the angle about z, when that is the only angle."""
-    return ((R[1][0] - R[0][1]) / _floored(1.0 + 0.5 * (R[0][0] + R[1][1])),)
+    return ((R[1][0] - R[0][1]) / _floor(1.0 + 0.5 * (R[0][0] + R[1][1])),)
 
 
 class Kind(NamedTuple):
@@ -66,10 +67,12 @@ class Kind(NamedTuple):
         return jnp.stack([*(p[i] for i in self.slides), *(() if self.turn is None else self.turn(R))])
 
 
+# Rows by joint. A revolute loop has the two rows of `_axis` and no third one about z, which is its free motion.
 _SPATIAL = {
     "point": Kind((0, 1, 2)),
     "spherical": Kind((0, 1, 2)),
     "revolute": Kind((0, 1, 2), _axis, 2),
+    # The crosspiece holds z of A and z of B at a right angle: their product, R_22, is zero.
     "universal": Kind((0, 1, 2), lambda R: (R[2][2],), 1),
     "prismatic": Kind((0, 1), attitude, 3),
     "cylindrical": Kind((0, 1), _axis, 2),
@@ -106,7 +109,7 @@ class Loop(Pair):
         return self.kind.count, 0
 
     def ends(self):
-        """As given."""
+        """Frames A and B, each a body and a pose in it."""
         return (self.body_a, self.pose_a), (self.body_b, self.pose_b)
 
     def structure_key(self):
@@ -140,9 +143,9 @@ def loop(
     | planar             | 3    | slides in the x-y plane of A, turns about z         |
     | weld               | 6    | none                                                |
 
-    A mechanism that moves in one plane leaves three rows of a spatial joint without work to do. They do no harm
-    (`constrained_dynamics` takes dependent rows), but cost time: with `in_plane=True` only the rows within the x-y
-    plane of frame A are there: 2 for revolute and point, 3 for weld, 2 for prismatic, which then slides along x of A.
+    In a mechanism that moves in one plane, three rows of a spatial joint are redundant. They are allowed
+    (`constrained_dynamics` handles dependent rows), but cost time. With `in_plane=True` only the rows within the x-y
+    plane of frame A exist: 2 for revolute and point, 3 for weld, 2 for prismatic, which then slides along x of A.
 
     **Arguments:**
 
@@ -188,15 +191,16 @@ class Distance(Pair):
         return 1, 0
 
     def ends(self):
-        """As given."""
+        """Frames A and B, each a body and a pose in it."""
         return (self.body_a, self.pose_a), (self.body_b, self.pose_b)
 
     def structure_key(self):
-        """All are alike."""
+        """No static part: all distances are one batch."""
         return ()
 
     def pose_residual(self, R, p):
         """(|p|^2 - length^2) / (2 length), (1,), m: smooth everywhere, and the change of length to first order."""
+        # Not |p| - length, whose derivative does not exist at p = 0, where a rough guess may begin.
         length = self.length.astype(p.dtype)
         return ((jnp.sum(p**2) - length**2) / (2.0 * length))[None]
 
@@ -231,7 +235,7 @@ def distance(
 
 
 class Gear(Constraint):
-    """Two joints turning in a fixed ratio; made by `jd.constraints.gear`."""
+    """Two joints with a fixed ratio of their coordinates; made by `jd.constraints.gear`."""
 
     name: str = eqx.field(static=True)
     joint_a: str = eqx.field(static=True)
@@ -277,7 +281,7 @@ class JointLock(Constraint):
 
     def sizes(self, system: Checked[Model], dtype: DType) -> tuple[int, int]:
         """One row per degree of freedom of the joint."""
-        i = joint_index(self.name, system, self.joint)  # refuses systems without joints
+        i = joint_index(self.name, system, self.joint)  # raises for systems without joints
         kind = system.topology.kinds[i]
         if self.value.shape != (KINDS[kind].nq,):
             raise ValueError(
@@ -289,6 +293,7 @@ class JointLock(Constraint):
     def position(self, system: Model, q: Float[Array, " nq"], t: Number) -> Float[Array, " nvj"]:
         """Displacement of the joint from its value, on the joint's manifold, (nv of the joint,)."""
         i = joint_index(self.name, system, self.joint)
+        # By the manifold's difference: coordinates of a ball joint are four, its rows are three.
         return joint_difference(system.topology.kinds[i], self.value.astype(q.dtype), q[system.topology.q_slices[i]])
 
 

@@ -1,12 +1,12 @@
-"""The projection onto the constraints once more, for its derivatives: as equations that its result satisfies.
+"""Derivatives of the projection onto the constraints, by the implicit function theorem.
 
 The closest state to (q, v), in the metric M(q), is
 
     q' = q - M^-1 A^T mu,   phi(q', t) = 0;        v' = v - M^-1 A^T nu,   A(q') v' = b(q', t),
 
 with M and A taken at q, and A of the holonomic rows for q'. For fixed mu and x = M^-1 A^T mu the change of M^-1 A^T mu is
-M^-1 (dA^T mu - dM x): no factorisation is differentiated. What mu and nu change by is what keeps q' and v' on the
-constraints.
+M^-1 (dA^T mu - dM x): no factorisation is differentiated. The changes of mu and nu follow from the condition that q' and v'
+stay on the constraints.
 """
 
 from functools import partial
@@ -18,7 +18,7 @@ from jaxtyping import Array
 
 from jaxdyn.compile import implicit, kernel, value_and_jvp
 from jaxdyn.constraints.base import constraint_jacobian, holonomic_rows, layout, position_residual, velocity_residual
-from jaxdyn.constraints.dynamics import whitened_rows
+from jaxdyn.constraints.dynamics import whiten_rows
 from jaxdyn.constraints.rank import LeastSquares, least_squares, tolerance
 from jaxdyn.dynamics.quantities import mass_matrix
 from jaxdyn.lie.so3 import matmul
@@ -26,17 +26,18 @@ from jaxdyn.systems.mass_factor import MassFactor
 from jaxdyn.systems.scene import Scene
 from jaxdyn.systems.system import displace, retract
 
-# Roundings of the largest entry: residuals of that size are sums of many terms, and rise and fall by chance.
+# Rounding errors of the largest entry below which a residual says nothing: it is a sum of many terms that cancel.
 LOST = 64
-# Each step multiplies what is left by the size of the correction times the curvature of the constraints.
+# Each step multiplies the residual by the size of the correction times the curvature of the constraints. A fixed number, because
+# a scan of fixed length has derivatives of both modes and of any order.
 _STEPS = 4
 
 
-class Projected(NamedTuple):
-    """q and v on the constraints, and how they came there.
+class ClosestState(NamedTuple):
+    """State (q, v) on the constraints.
 
     - `of_q`, `of_v`: the multipliers mu, of the holonomic rows, and nu, of all rows.
-    - `q_left`, `v_left`: how far q and v are from the constraints still.
+    - `q_left`, `v_left`: remaining distances of q and v from the constraints.
     - `q_moved`, `v_moved`: one where the correction was applied, else zero.
     """
 
@@ -55,16 +56,18 @@ class Corrections(NamedTuple):
 
     metric: MassFactor
     every: LeastSquares
-    held: Any  # which rows are holonomic
-    of_held: LeastSquares
+    holonomic: Any  # indices of the holonomic rows
+    of_holonomic: LeastSquares
 
     @classmethod
     def at(cls, scene: Scene, q, t, rank_tol) -> "Corrections":
-        held = holonomic_rows(layout(scene))
-        metric, Y = kernel(whitened_rows)(scene, q, t)
+        holonomic = holonomic_rows(layout(scene))
+        metric, Y = kernel(whiten_rows)(scene, q, t)
         every = least_squares(Y, tolerance(rank_tol, Y))
-        apart = held.size not in (0, Y.shape[1])
-        return cls(metric, every, held, least_squares(Y[:, held], tolerance(rank_tol, Y)) if apart else every)
+        # One factorisation suffices where all rows are holonomic, or none is.
+        if holonomic.size in (0, Y.shape[1]):
+            return cls(metric, every, holonomic, every)
+        return cls(metric, every, holonomic, least_squares(Y[:, holonomic], tolerance(rank_tol, Y)))
 
     def by_forces(self, of: LeastSquares, multipliers):
         """M^-1 A^T times multipliers."""
@@ -75,23 +78,24 @@ class Corrections(NamedTuple):
         return self.metric.unwhiten(of.shortest(residual))
 
 
-def projected(scene: Scene, q, v, t, rank_tol: float | None) -> Projected:
-    """The state on the constraints that is closest to one nearby, as far as `_STEPS` come, with derivatives of any order.
+def closest_state(scene: Scene, q, v, t, rank_tol: float | None) -> ClosestState:
+    """The state on the constraints closest to a given one nearby, after `_STEPS` steps, with derivatives of any order.
 
-    A correction that leaves a larger residual is not applied, unless that is rounding.
+    A correction that leaves a larger residual is not applied, unless the residual is rounding.
     """
     return _closest(scene, retract(scene.system, q), v, t, rank_tol)
 
 
-def _closest(scene: Scene, q, v, t, rank_tol) -> Projected:
-    return implicit(scene, (q, v, t), partial(_solved, rank_tol), partial(_changed, rank_tol))
+def _closest(scene: Scene, q, v, t, rank_tol) -> ClosestState:
+    # The tangent calls this function again, so that derivatives of derivatives are implicit too.
+    return implicit(scene, (q, v, t), partial(_solve, rank_tol), partial(_tangent, rank_tol))
 
 
-def _solved(rank_tol, scene: Scene, q, v, t) -> Projected:
+def _solve(rank_tol, scene: Scene, q, v, t) -> ClosestState:
     on, none = Corrections.at(scene, q, t, rank_tol), jnp.zeros_like(v)
 
-    def settled(residual, of, size):
-        """The whitened correction, how far away that still is, and whether it is applied."""
+    def remove(residual, of, size):
+        """The whitened correction that removes a residual, the distance left, and whether the correction is applied."""
 
         def step(whitened, _):
             return whitened + of.shortest(residual(on.metric.unwhiten(whitened))), None
@@ -105,15 +109,15 @@ def _solved(rank_tol, scene: Scene, q, v, t) -> Projected:
         return jnp.where(applied, whitened, none), left, applied.astype(v.dtype)
 
     place, of_q, q_left, q_moved = q, jnp.zeros((0,), q.dtype), jnp.zeros((), q.dtype), jnp.ones((), q.dtype)
-    if on.held.size:
+    if on.holonomic.size:
         size = jnp.max(jnp.abs(q))
-        whitened, q_left, q_moved = settled(lambda x: kernel(_position)(scene, q, t, x), on.of_held, size)
+        whitened, q_left, q_moved = remove(lambda x: kernel(_position)(scene, q, t, x), on.of_holonomic, size)
         place = kernel(_place)(scene, q, on.metric.unwhiten(whitened))
-        of_q = on.of_held.multipliers(whitened)
+        of_q = on.of_holonomic.multipliers(whitened)
     size = jnp.max(jnp.abs(v))
-    whitened, v_left, v_moved = settled(lambda y: kernel(_velocity)(scene, place, v, t, y), on.every, size)
+    whitened, v_left, v_moved = remove(lambda y: kernel(_velocity)(scene, place, v, t, y), on.every, size)
     speed, of_v = v - on.metric.unwhiten(whitened), on.every.multipliers(whitened)
-    return Projected(place, speed, of_q, of_v, q_left, v_left, q_moved, v_moved)
+    return ClosestState(place, speed, of_q, of_v, q_left, v_left, q_moved, v_moved)
 
 
 def _place(scene: Scene, q, x):
@@ -121,7 +125,7 @@ def _place(scene: Scene, q, x):
 
 
 def _position(scene: Scene, q, t, x):
-    """Residual after a correction x."""
+    """Residual of positions after a correction x."""
     return position_residual(scene, displace(scene.system, q, -x), t)
 
 
@@ -130,26 +134,28 @@ def _velocity(scene: Scene, q, v, t, y):
 
 
 def _forces(scene: Scene, q, t, of_q, of_v, x, y):
-    """Of the multipliers, less those that the corrections x and y take."""
+    """Imbalance A^T mu - M x and A^T nu - M y of the corrections: zero in value, its derivative gives dA^T mu - dM x."""
     A, M = constraint_jacobian(scene, q, t), mass_matrix(scene.system, q, t)
     return matmul(A[holonomic_rows(layout(scene))].T, of_q) - matmul(M, x), matmul(A.T, of_v) - matmul(M, y)
 
 
-def _changed(rank_tol, scene: Scene, q, v, t, steps) -> tuple[Projected, Projected]:
-    """The projection, and its change for `steps` in the leaves of the scene, q, v and t."""
+def _tangent(rank_tol, scene: Scene, q, v, t, steps) -> tuple[ClosestState, ClosestState]:
+    """The projection, and its tangent for `steps` in the leaves of the scene, q, v and t."""
     state, on = _closest(scene, q, v, t, rank_tol), Corrections.at(scene, q, t, rank_tol)
     *of_scene, dq, dv, dt = steps
-    x = on.by_forces(on.of_held, state.of_q) if on.held.size else jnp.zeros_like(v)
+    x = on.by_forces(on.of_holonomic, state.of_q) if on.holonomic.size else jnp.zeros_like(v)
     y = on.by_forces(on.every, state.of_v)
 
+    # First for fixed multipliers, then (`tangent_of`) what the multipliers change by.
     args = scene, q, t, state.of_q, state.of_v, x, y
     change = value_and_jvp(kernel(_forces), args, [*of_scene, dq, dt, None, None, None, None])[1]
     dx, dy = (jnp.zeros_like(v),) * 2 if change is None else map(on.metric.solve, change)
 
-    def closed(residual, args, given, correction, of, moved):
-        """The change of a correction, and that of its multipliers, which keeps the residual at zero."""
+    def tangent_of(residual, args, given, correction, of, moved):
+        """Tangents of a correction and of its multipliers, so that the residual stays zero; none if it was not applied."""
 
         def step(whitened, _):
+            # As in the solution, steps with the factor at q: the derivative of the residual is taken at q'.
             change = value_and_jvp(residual, args, [*given, correction + on.metric.unwhiten(whitened)])[1]
             return whitened + moved * of.shortest(change), None
 
@@ -157,13 +163,13 @@ def _changed(rank_tol, scene: Scene, q, v, t, steps) -> tuple[Projected, Project
         return correction + on.metric.unwhiten(whitened), of.multipliers(whitened)
 
     of_q, dplace = jnp.zeros_like(state.of_q), dq
-    if on.held.size:
+    if on.holonomic.size:
         args = scene, q, t, x
-        dx, of_q = closed(kernel(_position), args, [*of_scene, dq, dt], dx, on.of_held, state.q_moved)
+        dx, of_q = tangent_of(kernel(_position), args, [*of_scene, dq, dt], dx, on.of_holonomic, state.q_moved)
         dplace = value_and_jvp(partial(kernel(_place), scene), (q, x), [dq, dx])[1]
 
     args = scene, state.q, v, t, y
-    dy, of_v = closed(kernel(_velocity), args, [*of_scene, dplace, dv, dt], dy, on.every, state.v_moved)
+    dy, of_v = tangent_of(kernel(_velocity), args, [*of_scene, dplace, dv, dt], dy, on.every, state.v_moved)
     none = jnp.zeros((), v.dtype)
     dq, dv = (jnp.zeros_like(z) if d is None else d for z, d in ((q, dplace), (v, dv)))
-    return state, Projected(dq, dv - dy, of_q, of_v, none, none, none, none)
+    return state, ClosestState(dq, dv - dy, of_q, of_v, none, none, none, none)

@@ -1,4 +1,4 @@
-"""Whether rows are independent, and pseudo-inverses of those that may not be."""
+"""Rank decisions, and pseudo-inverses of rows that may be dependent."""
 
 from functools import partial
 from typing import Any, NamedTuple
@@ -13,13 +13,13 @@ from jaxdyn.compile.known import is_concrete
 from jaxdyn.lie.so3 import matmul
 from jaxdyn.systems.mass_factor import cholesky, solve_cholesky
 
-# Operations of the normal equations up to which they are a kernel: LLVM takes 50 to 100 microseconds for each of them.
+# Operations of the normal equations up to which they are a kernel: LLVM compiles one in 50 to 100 microseconds.
 _MAX_OPERATIONS = 10_000
-# Columns up to which rotations take about as long as the normal equations in blocks, and compile faster.
-_MOST_ROTATED = 40
+# Columns up to which Jacobi rotations take about as long as the normal equations in blocks, and compile faster.
+_MAX_COLUMNS = 40
 
 
-def checked_tolerance(rank_tol: float | None) -> float | None:
+def check_tolerance(rank_tol: float | None) -> float | None:
     """The rank tolerance as a float, or None for the default. **Raises:** ValueError outside (0, 1)."""
     if rank_tol is None:
         return None
@@ -30,6 +30,8 @@ def checked_tolerance(rank_tol: float | None) -> float | None:
 
 def tolerance(rank_tol: float | None, like) -> float:
     """The rank tolerance as given, or the default for the dtype."""
+    # 1.1e-9 in float64, 1.1e-4 in float32: above the errors of projection, below the least singular values of mechanisms that
+    # move (`constrained_dynamics` has the figures).
     return eps_of(like) ** (4 / 7) if rank_tol is None else float(rank_tol)
 
 
@@ -40,17 +42,20 @@ def eps_of(like) -> float:
 
 def least_pivot(like, rank_tol: float | None) -> float:
     """Ratio of the pivots of A M^-1 A^T above which rounding cannot make the rows dependent, so that Cholesky is accurate."""
+    # Pivots are squares of singular values, hence the square. The factor of 100 keeps the fast path away from the threshold
+    # itself: samples near it are computed by the one method that applies the threshold.
     return max(eps_of(like) ** 0.4, (100 * tolerance(rank_tol, like)) ** 2)
 
 
 def regular_gram(Y: Float[Array, "n m"]) -> Float[Array, "m m"]:
-    """Y^T Y, with the largest entry of its diagonal where a column is zero: a row that was dropped.
+    """Y^T Y, with the largest entry of its diagonal in place of zeros there: a zero column is a row that was dropped.
 
     Solutions with right-hand sides that are zero there, such as (Y^T Y)^-1 Y^T, are those of the other columns.
     """
     gram = matmul(Y.T, Y)
     squares = jnp.diagonal(gram)
     largest = jnp.max(squares)
+    # The largest entry, so that the filled pivots never are the least one in `quality_of`.
     fill = jnp.where(largest > 0, largest, jnp.ones_like(largest))
     return gram + jnp.diag(jnp.where(squares == 0, fill, jnp.zeros_like(squares)))
 
@@ -69,12 +74,11 @@ def quality_of(factor):
 
 @partial(jax.custom_jvp, nondiff_argnums=(1, 2))
 def pseudo_inverse(Y: Float[Array, "n m"], rank_tol: float, dependent: bool = False) -> Float[Array, "m n"]:
-    """Moore-Penrose inverse of Y, singular values below `rank_tol` times the largest taken for zero.
+    """Moore-Penrose inverse of Y; singular values below `rank_tol` times the largest count as zero.
 
-    Values: (Y^T Y)^-1 Y^T, or the transpose of that of Y^T, where that is as good; else by singular values, of all samples
-    if one in a batch needs it; at once where the columns are known to be `dependent`. Derivative: the formula of
-    Golub & Pereyra (1973), eq. 4.12, right
-    wherever the rank is constant; no factorisation is differentiated.
+    Values: (Y^T Y)^-1 Y^T, or the transpose of that of Y^T, where that is as accurate; else by singular values, for all samples
+    of a batch if one of them needs it, and always where the columns are known to be `dependent`. Derivative: Golub & Pereyra
+    (1973), eq. 4.12, valid where the rank is constant; no factorisation is differentiated.
     """
     if dependent:
         return pseudo_inverse_by_rotations(Y, rank_tol)
@@ -88,10 +92,10 @@ def _by_rotations(rank_tol, _, Y):
 
 
 def _solve_normal_equations(rank_tol, Y):
-    """(Y^T Y)^-1 Y^T, and whether the pivots of Y^T Y say that columns may depend on each other."""
+    """(Y^T Y)^-1 Y^T, and whether the columns may be dependent, by the pivots of Y^T Y."""
     factor = cholesky(regular_gram(Y))
     inverse = solve_cholesky(factor, Y.T)
-    # One step of Newton and Schulz takes the squared condition number out of the error.
+    # The normal equations square the condition number; one Newton-Schulz step restores the accuracy of an orthogonal method.
     inverse = 2 * inverse - matmul(matmul(inverse, Y), inverse)
     return inverse, ~(quality_of(factor) > least_pivot(Y, rank_tol))
 
@@ -110,18 +114,18 @@ def _by_blocks(rank_tol, _, Y):
 def _pseudo_inverse(rank_tol, _, Y):
     # Gram matrix, factor, two triangular solves and two products: 8 n m^2 sums and products for Y (n, m).
     is_long = 8 * Y.shape[0] * Y.shape[1] ** 2 > _MAX_OPERATIONS
-    if Y.shape[1] > _MOST_ROTATED:
+    if Y.shape[1] > _MAX_COLUMNS:
         return _by_blocks(rank_tol, None, Y)
     by_kernel = kernel(_by_normal_equations, static=1, fallback=_by_rotations, derivative=False)
     return (_by_rotations if is_long else by_kernel)(rank_tol, None, Y)
 
 
 class LeastSquares(NamedTuple):
-    """The shortest vectors with given products with the columns of Y, and what takes them apart again."""
+    """Minimum-norm solutions w of Y^T w = r, and their coefficients in the columns of Y."""
 
     Y: Array
-    factor: Any  # of Y^T Y, or None
-    inverse: Any  # of Y, or None
+    factor: Any  # Cholesky factor of Y^T Y, in kernels; else None
+    inverse: Any  # pseudo-inverse of Y, elsewhere; else None
 
     def shortest(self, right):
         """The shortest w with Y^T w = right."""
@@ -143,13 +147,15 @@ def _least_squares_in_kernel(Y, rank_tol) -> LeastSquares:
 
 @variant(_least_squares_in_kernel, marks=True)
 def least_squares(Y: Float[Array, "n m"], rank_tol: float) -> LeastSquares:
-    """Factor a matrix: its pseudo-inverse; in a kernel Cholesky's factor, where dependent columns make a sample invalid."""
+    """Factor a matrix: its pseudo-inverse; in a kernel its Cholesky factor, with dependent columns marked as invalid."""
     return LeastSquares(Y, None, pseudo_inverse(Y, rank_tol))
 
 
 @pseudo_inverse.defjvp
 def _pseudo_inverse_jvp(rank_tol, dependent, primals, tangents):
     (Y,), (dY,) = primals, tangents
+    # dP = -P dY P + P P^T dY^T (1 - Y P) + (1 - P Y) dY^T P^T P. Differentiating the rotations or the SVD instead would divide
+    # by differences of singular values, which coincide in symmetric mechanisms.
     P = pseudo_inverse(Y, rank_tol, dependent)
     across = dY.T - matmul(matmul(dY.T, Y), P)  # dY^T (1 - Y P)
     along = dY.T - matmul(P, matmul(Y, dY.T))  # (1 - P Y) dY^T
@@ -159,7 +165,8 @@ def _pseudo_inverse_jvp(rank_tol, dependent, primals, tangents):
 
 
 def solve_square(A: Float[Array, "n n"], right: Float[Array, "n *k"]) -> Float[Array, "n *k"]:
-    """A^-1 right for a regular A, by rotations: without LAPACK, whose calls in a batch can wait for each other for ever."""
+    """A^-1 right for a regular A, by Jacobi rotations."""
+    # Without LAPACK: its calls from several samples of a batch can deadlock in XLA's thread pool.
     return matmul(pseudo_inverse(A, eps_of(A), True), right)
 
 
@@ -169,7 +176,8 @@ def sign_of_determinant(A: Float[Array, "n n"]) -> Float[Array, ""]:
 
 
 def _sign(_, A):
-    """By elimination; rows change places until the largest entry of a column is its pivot."""
+    """Sign by Gaussian elimination with row exchanges until the largest entry of a column is its pivot."""
+    # Kernels have no index that depends on data: the exchanges are selections between neighbours, as in a bubble sort.
     sign = jnp.ones((), A.dtype)
     rows = list(A)
     for k in range(len(rows)):

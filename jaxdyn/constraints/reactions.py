@@ -1,4 +1,4 @@
-"""What constraints do to a system: the generalised force and the wrench of each one, from the multipliers."""
+"""Generalised force and wrench of each constraint, from the multipliers."""
 
 import jax.numpy as jnp
 from jaxtyping import Array, Float
@@ -31,7 +31,7 @@ def constraint_forces(
     """
     scene = as_scene(scene)
     A = constraint_jacobian(scene, q, t)
-    multipliers = _checked_multipliers(multipliers, A.shape[0], A.dtype)
+    multipliers = _check_multipliers(multipliers, A.shape[0], A.dtype)
     return {p.name: matmul(A[p.start : p.end].T, multipliers[p.start : p.end]) for p in layout(scene)}
 
 
@@ -55,7 +55,7 @@ def constraint_wrenches(
     scene, wrenches = as_scene(scene), {}
     (q,) = check_state(scene.system, q=q)
     places = layout(scene)
-    multipliers = _checked_multipliers(multipliers, places[-1].end if places else 0, q.dtype)
+    multipliers = _check_multipliers(multipliers, places[-1].end if places else 0, q.dtype)
     for constraint, place in zip(scene.constraints, places, strict=True):
         if isinstance(constraint, Pair):
             constraint = constraint.at(scene.system, q)
@@ -94,6 +94,7 @@ def body_wrenches(scene: Scene, q: Float[Array, " nq"], multipliers: Float[Array
             continue
         constraint, wrench = constraint.at(scene.system, q), wrenches[place.name]
         rotation, position = relative_poses([constraint], scene.system, q)
+        # Action and reaction act at one point of the world: the wrench is moved from the origin of A to that of B.
         at_b = se3.AdT_apply(se3.from_parts(rotation[0], position[0]), wrench)
         ends = constraint.ends()
         bodies, poses = places_on(scene.system, [body for body, _ in ends], [pose for _, pose in ends], q.dtype)
@@ -102,7 +103,7 @@ def body_wrenches(scene: Scene, q: Float[Array, " nq"], multipliers: Float[Array
     return total
 
 
-def _checked_multipliers(multipliers, count: int, dtype) -> Array:
+def _check_multipliers(multipliers, count: int, dtype) -> Array:
     multipliers = as_array(multipliers, "multipliers", dtype)
     if multipliers.shape != (count,):
         hint = batch_hint(multipliers, (1,))

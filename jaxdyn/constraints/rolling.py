@@ -1,10 +1,11 @@
-"""Wheels, spheres and blades on surfaces: contact without slip, where the point of contact is a function of the
-configuration and the velocity of the material points that touch is linear in v.
+"""Wheels, spheres and blades that roll or slide on surfaces.
+
+The point of contact is a function of the configuration, and the velocity of the material points in contact is linear in v.
 
 A contact at the point x with normal n (from the surface to the body) has up to three kinds of rows:
 
     height   gap(q) = 0                      holonomic; left out by contact=False
-    no slip  e . (v_body(x) - v_surface(x))  for the tangential directions e that do not slip
+    no slip  e . (v_body(x) - v_surface(x))  for the tangential directions e without slip
     no spin  n . (w_body - w_surface)        only where the contact resists spinning
 
 The multipliers are then the normal force, the friction forces along e (N), and the friction torque about n (N m), on
@@ -26,7 +27,7 @@ from jaxdyn.model.arguments import DType, Numbers, SystemLike, pose_leaf
 
 
 class TouchingPoint(NamedTuple):
-    """A point of contact: where (3,), normal (3,), gap (), directions without slip (n, 3); in the surface's frame."""
+    """A contact in the surface's frame: point (3,), normal (3,), gap (), tangential directions without slip (n, 3)."""
 
     point: Array
     normal: Array
@@ -35,7 +36,7 @@ class TouchingPoint(NamedTuple):
 
 
 class Touching(Pair):
-    """A body that touches a surface. Subclasses say where, and in which directions it cannot slip."""
+    """A body in contact with a surface. Subclasses give the contact point and the directions without slip."""
 
     name: eqx.AbstractVar[str]
     body: eqx.AbstractVar[str]
@@ -62,19 +63,19 @@ class Touching(Pair):
         return touch.point, touch.normal
 
     def sizes(self, system: SystemLike, dtype: DType) -> tuple[int, int]:
-        """The height, and the rows without slip and spin."""
+        """One row for the height, and the rows of slip and spin."""
         check_bodies(self.name, system, (self.body, self.surface_body))
         return int(self.contact), self.count + int(self.spin)
 
     def wrench_components(self) -> tuple[int, ...] | None:
-        """The rows are the normal force, those that do not slip, and the torque that does not spin."""
+        """Indices of the friction forces, the normal force, and the torque of spin."""
         if not self.contact:
             return None
-        slips = self.count
-        return (*range(1, 1 + slips), 0, *((1 + slips,) if self.spin else ()))
+        # Multipliers have the normal force first (holonomic rows come first), the wrench basis has it after the friction forces.
+        return (*range(1, 1 + self.count), 0, *((1 + self.count,) if self.spin else ()))
 
     def structure_key(self) -> tuple:
-        """Which rows there are."""
+        """Kinds and number of the rows."""
         return self.contact, self.spin, self.count
 
     def pose_residual(self, R: Float[Array, "3 3"], p: Float[Array, "3"]) -> Float[Array, " nh"] | None:
@@ -88,6 +89,7 @@ class Touching(Pair):
         touch = self.touching(R, p)
         if not self.count:
             return jnp.sum(touch.normal * U[3:])[None] if self.spin else None
+        # U is the twist at the origin of A: the material point of the body at the contact moves with v + w x point.
         slip = matmul(touch.directions, U[:3] + cross(U[3:], touch.point))
         return jnp.concatenate([slip, jnp.sum(touch.normal * U[3:])[None]]) if self.spin else slip
 
@@ -99,15 +101,16 @@ def _unit(i, like):
 def unit_or(vector, fallback):
     """The unit vector along `vector`, or `fallback` (a constant) where it vanishes; no NaN in derivatives."""
     square = jnp.sum(vector * vector)
+    # The input of the root is made safe, not only its output: the derivative of the branch that is not taken is evaluated too.
     safe = square > float(jnp.finfo(vector.dtype).eps) ** 2
     length = jnp.sqrt(jnp.where(safe, square, jnp.ones_like(square)))
     return jnp.where(safe, vector / length, fallback)
 
 
 def tangents(normal):
-    """Two unit vectors (2, 3) that make a right-handed frame with the normal; smooth but for a jump at normal z = 0.
+    """Two unit vectors (2, 3) that make a right-handed frame with the normal; smooth except for a jump at normal z = 0.
 
-    The rows that a jump turns span the same plane, so accelerations do not see it.
+    At the jump the two rows turn within the plane that they span, so that accelerations are continuous.
 
     Source: Duff et al. (2017), listing 3.
     """
@@ -134,9 +137,10 @@ class RollingWheel(Touching):
 
     def touching(self, R, p):
         axis, normal = R[:, 2], _unit(2, p)
-        # Down the wheel's plane; for a wheel that lies flat there is no lowest point, and any direction is right.
+        # Down in the wheel's plane. A wheel that lies flat has no lowest point, and any direction is right.
         down = unit_or(axis[2] * axis - normal, -R[:, 0])
         point = p + self.radius.astype(p.dtype) * down
+        # Along the track, whatever the lean: perpendicular to the axle, and horizontal.
         forward = unit_or(cross(axis, normal), R[:, 1])
         directions = jnp.stack([forward, cross(normal, forward)])[: self.count]
         return TouchingPoint(point, normal, point[2], directions)
@@ -184,7 +188,7 @@ def rolling_wheel(
 
 
 class KnifeEdge(Touching):
-    """A blade that slides along itself on a plane; made by `jd.constraints.knife_edge`."""
+    """A blade that slides along its own axis on a plane; made by `jd.constraints.knife_edge`."""
 
     name: str = eqx.field(static=True)
     body: str = eqx.field(static=True)
@@ -244,7 +248,7 @@ class RollingSphere(Touching):
     count: int = eqx.field(static=True, default=2)
 
     def structure_key(self):
-        """Which rows there are, and on what."""
+        """Kinds of the rows and of the surface."""
         return self.on, self.inside, self.contact, self.spin
 
     def touching(self, R, p):
@@ -254,11 +258,13 @@ class RollingSphere(Touching):
             directions = jnp.eye(2, 3, dtype=p.dtype)
         else:
             reach = self.surface_radius.astype(p.dtype)  # pyright: ignore[reportOptionalMemberAccess]
+            # From the centre of a sphere, from the axis of a cylinder.
             away = p if self.on == "sphere" else p * jnp.asarray([1.0, 1.0, 0.0], p.dtype)
             outward = unit_or(away, _unit(0, p))
             distance = jnp.sum(outward * away)
             gap = reach - distance - radius if self.inside else distance - reach - radius
             normal = -outward if self.inside else outward
+            # Any two tangents: neither slips. On a plane they are constant, which saves their derivatives.
             directions = tangents(normal)
         return TouchingPoint(p - radius * normal, normal, gap, directions[: self.count])
 
@@ -278,9 +284,9 @@ def rolling_sphere(
     contact: bool = True,
     name: str | None = None,
 ) -> RollingSphere:
-    """A sphere that rolls without slipping on a plane, or outside or inside of a sphere or a cylinder.
+    """A sphere that rolls without slipping on a plane, or on the outside or inside of a sphere or a cylinder.
 
-    With `slip=True` it slides there instead, without friction.
+    With `slip=True` it slides without friction instead.
 
     **Arguments:**
 

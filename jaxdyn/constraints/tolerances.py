@@ -1,8 +1,8 @@
-"""When a state counts as being on its constraints: residuals against the mechanism's own length, whatever that is.
+"""Tolerances of residuals, relative to the length of the mechanism.
 
 Let s_j be the size of coordinate j: 1 for an angle, the length L of the mechanism for a distance. A row of A has the size
-a_i = max_j |A_ij| s_j in the units of its residual, m or rad, so that phi_i / a_i says by which part of L, or by which angle,
-the coordinates would have to move to close it. A mechanism scaled by a millionth has the same ratios.
+a_i = max_j |A_ij| s_j in the units of its residual, m or rad. So phi_i / a_i is the part of L, or the angle, by which
+the coordinates would have to move to close it. The ratio does not depend on the scale of the mechanism.
 """
 
 import jax
@@ -18,17 +18,19 @@ from jaxdyn.model.joints import KINDS
 from jaxdyn.model.tree import Model
 from jaxdyn.systems.scene import Scene
 
-# Rows vanish at singular positions. Below this part of a usual row their own size says nothing.
+# Rows vanish at singular positions. A row below this part of a usual one is compared with the usual one, else any residual of
+# rounding would count as open there.
 _LEAST_ROW = 1e-3
-# Numbers of rounding errors in a residual.
+# Rounding errors, of eps times the length, that a residual may hold: it is a difference of sums along two chains of bodies.
 _ROUNDING = 32
 
 
 def own_length(model: Model) -> Float[Array, ""]:
     """Length of a mechanism, m: the largest of the distances between its joints and of the radii of gyration of its bodies.
 
-    Where the mechanism stands does not count. 1 for one without any length.
+    Its place in the world does not count. 1 for a mechanism without any length.
     """
+    # Roots are measured from the first of them: a robot 1 km from the origin is not 1 km long.
     roots = np.array([parent < 0 for parent in model.topology.parents], bool)
     places, inertias = model.home[:, :3, 3], model.inertias
     mass = inertias[:, 0]
@@ -49,6 +51,7 @@ def coordinate_sizes(system, dtype) -> tuple[Float[Array, " nv"], Float[Array, "
     """
     if not isinstance(system, Model):
         return jnp.ones((system.nv,), dtype), jnp.ones((), dtype)
+    # A tolerance is a constant: derivatives of lengths through it would be derivatives of decisions.
     length = lax.stop_gradient(own_length(system)).astype(dtype)
     is_distance = np.zeros(system.nv, bool)
     for kind, place in zip(system.topology.kinds, system.topology.v_slices, strict=True):
@@ -68,6 +71,7 @@ def row_limits(scene: Scene, q, v, t, relative: float) -> tuple[Float[Array, " n
     rows = jnp.maximum(rows, _LEAST_ROW * jnp.minimum(length, jnp.ones_like(length)))
     rounding = _ROUNDING * float(jnp.finfo(q.dtype).eps) * jnp.maximum(length, jnp.ones_like(length))
     limits = relative * rows + rounding
+    # The rate of a residual carries the rounding of the velocities, however fast they are.
     return limits[holonomic_rows(layout(scene))], limits * (1.0 + jnp.max(jnp.abs(v) / sizes))
 
 
@@ -79,7 +83,7 @@ def openness(scene: Scene, q, v, t, relative: float) -> Float[Array, ""]:
 
 
 def largest_ratio(relative: float, scene: Scene, q, v, t):
-    """`openness` as a function of numbers."""
+    """`openness` as a function of one sample."""
     limits = row_limits(scene, q, v, t, relative)
     residuals = position_residual(scene, q, t), velocity_residual(scene, q, v, t)
     ratios = jax.tree.map(lambda x, limit: jnp.abs(x) / limit, residuals, limits)

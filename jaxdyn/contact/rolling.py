@@ -8,7 +8,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from jaxdyn.constraints.frames import Pair, displaced
+from jaxdyn.constraints.frames import Pair, displace_pose
 from jaxdyn.constraints.rolling import Touching, TouchingPoint, tangents
 from jaxdyn.contact.surfaces import Surface, check_surface
 from jaxdyn.contact.touching import Patch, Steps, newton_steps, patch_at
@@ -89,7 +89,7 @@ class RollingContact(Touching):
         patches = self.patches()
 
         def along(twist):
-            steps = newton_steps(*patches, *displaced(R, p, twist))
+            steps = newton_steps(*patches, *displace_pose(R, p, twist))
             return steps.on_a, steps.on_b
 
         # The rate of a converged Newton step is that of the implicit function theorem: Montana's forward equations.
@@ -136,7 +136,7 @@ class Rolling(Pair):
         contact = self._of(system)
         return contact.with_place(q[system.place_slices[self.index]]).with_patches()
 
-    def declared(self, system):
+    def resolve(self, system):
         """Contact of the system."""
         return self._of(system)
 

@@ -1,4 +1,4 @@
-"""Inverse kinematics along a path: each configuration from the one before, with what tells whether the branch was kept.
+"""Inverse kinematics along a path: each configuration from the one before, with a test that the branch was kept.
 
 The rows R of constraints and targets, weighted and in coordinates scaled by the sizes of joints, have singular values that
 count the distance from a singular position. Where a combination of rows goes through zero between two configurations, the
@@ -52,23 +52,19 @@ def follow(
     targets: Checked[Mapping[str, Any]],
     guess: Float[Array, " nq"],
     *,
-    weights: Checked[Mapping[str, Numbers] | None] = None,
-    limits: bool = True,
-    posture: Numbers | None = None,
-    steps: int = 1,
     guesses: int = 1,
-    atol: float | None = None,
     t: Numbers = 0.0,
     throw: bool | None = None,
+    **options: Any,
 ) -> Following:
     """Inverse kinematics along a path or over a grid: each configuration by `inverse_kinematics` from the one before.
 
     The first one is searched for from the guess, all others by the least change, which keeps the branch where the path has steps
     short enough; `changes_branch` says where that was lost.
 
-    **Arguments:** as of `inverse_kinematics`; every target has one row for each of its n places, such as poses (n, 4, 4) or
-    dictionaries of positions (n, 3) and directions (n, 3). `guesses` counts for the places after the first one; the first
-    is searched for from 16. A grid is followed row by row, forth and back.
+    **Arguments:** as of `inverse_kinematics`, with its further `options`; every target has one row for each of its n places, such
+    as poses (n, 4, 4) or dictionaries of positions (n, 3) and directions (n, 3). `guesses` counts for the places after the first
+    one; the first is searched for from 16. A grid is followed row by row, forth and back.
 
     **Returns:** `Following`. Derivatives are those of each configuration by its own targets.
 
@@ -101,14 +97,13 @@ def follow(
 
     rows = jax.tree.map(jnp.asarray, rows)
     first, rest = (jax.tree.map(lambda x, part=part: x[part], rows) for part in (0, slice(1, None)))
-    factors = row_weights(as_targets(scene.system, at(first)), weights, guess.dtype)
-    options = {"weights": weights, "limits": limits, "posture": posture, "atol": atol, "t": t, "throw": False}
+    factors = row_weights(as_targets(scene.system, at(first)), options.get("weights"), guess.dtype)
 
     def place(row, guess, guesses):
         """A configuration, and its rows."""
-        reached = inverse_kinematics(scene, at(row), guess, steps=steps, guesses=guesses, **options)
+        reached = inverse_kinematics(scene, at(row), guess, guesses=guesses, t=t, throw=False, **options)
         whole = Scene(scene.system, (*scene.constraints, *as_targets(scene.system, at(row))))
-        return reached, _scaled_rows(whole, lax.stop_gradient(reached.q), t, factors)
+        return reached, _unit_rows(whole, lax.stop_gradient(reached.q), t, factors)
 
     def go_on(carry, row):
         q, R, inverse = carry
@@ -140,7 +135,7 @@ def _rows(targets: Mapping[str, Any]) -> dict[str, dict]:
     return {name: dict(value) if isinstance(value, Mapping) else {"": value} for name, value in targets.items()}
 
 
-def _scaled_rows(whole: Scene, q, t: Any, factors):
+def _unit_rows(whole: Scene, q, t: Any, factors):
     """Rows of constraints and targets in coordinates scaled by their sizes, and their pseudo-inverse; constants."""
     whole, q = stop_gradient((whole, q))
     sizes, _ = coordinate_sizes(whole.system, q.dtype)

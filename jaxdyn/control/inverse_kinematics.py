@@ -22,7 +22,7 @@ from jaxdyn.constraints.assembly import closing_tolerance
 from jaxdyn.constraints.base import Constraint, holonomic_rows, layout, position_residual
 from jaxdyn.constraints.closing import nearest_configuration
 from jaxdyn.constraints.codes import RESULTS, Outcome, name_of
-from jaxdyn.constraints.selection import KeptRows
+from jaxdyn.constraints.redundancy import KeptRows
 from jaxdyn.constraints.tolerances import own_length
 from jaxdyn.control.search import Aims, clip_to_limits, screw_joints, search
 from jaxdyn.control.targets import as_targets, target_rows
@@ -133,7 +133,7 @@ def inverse_kinematics(
     if posture is not None:
         (posture,) = check_state(model, q_posture=posture)
     factors = row_weights(rows, weights, guess.dtype)
-    place = _solve_compiled(
+    place = _solve_by_program(
         Scene(model, scene.constraints), rows, guess, factors, posture, t, bool(limits), steps, guesses, atol
     )
     concrete = is_concrete(place.result)
@@ -170,7 +170,7 @@ def row_weights(rows: tuple[Constraint, ...], weights, dtype) -> Array:
 
 
 @entry_point
-def _solve_compiled(scene, rows, guess, factors, posture, t, limits: bool, steps: int, guesses: int, atol):
+def _solve_by_program(scene, rows, guess, factors, posture, t, limits: bool, steps: int, guesses: int, atol):
     return _solve(scene, rows, guess, factors, posture, t, limits, steps, guesses, atol)
 
 
@@ -190,7 +190,7 @@ def _solve(scene: Scene, rows, guess, factors, posture, t, limits: bool, steps: 
         start = lax.scan(go_on, start, parts)[0]
     q, tried = search(fixed, start, time, aims, guesses)
     q = lax.stop_gradient(q)
-    is_reached = _is_reached(fixed, q, time, aims)
+    is_reached = _reaches_targets(fixed, q, time, aims)
     q = jnp.where(is_reached, _differentiable(whole, q, posture, t, aims, len(scene.constraints)), q)
 
     values = position_residual(whole, q, t)
@@ -198,7 +198,7 @@ def _solve(scene: Scene, rows, guess, factors, posture, t, limits: bool, steps: 
     errors = values[np.flatnonzero(_is_target(scene, whole))]
     counted = jnp.where(factors > 0, jnp.abs(errors), jnp.zeros_like(errors))
     opening = jnp.max(jnp.where(exact, jnp.abs(values), jnp.zeros_like(values)), initial=0.0)
-    reached = _is_reached(fixed, lax.stop_gradient(q), time, aims)
+    reached = _reaches_targets(fixed, lax.stop_gradient(q), time, aims)
     closed = jnp.all(~exact | (jnp.abs(lax.stop_gradient(values)) <= aims.tolerances))
     result = RESULTS.where(closed, RESULTS.targets_not_reached, RESULTS.not_assembled)  # pyright: ignore[reportArgumentType]
     result = RESULTS.where(reached, RESULTS.successful, result)
@@ -211,7 +211,7 @@ def _is_target(scene: Scene, whole: Scene) -> np.ndarray:
     return np.arange(holonomic_rows(layout(whole)).size) >= count
 
 
-def _is_reached(scene: Scene, q, t, aims: Aims):
+def _reaches_targets(scene: Scene, q, t, aims: Aims):
     r = aims.weights * position_residual(scene, q, t)
     return jnp.all(jnp.abs(r) <= aims.tolerances)
 
@@ -245,7 +245,7 @@ def _differentiable(whole: Scene, q, posture, t: Number, aims: Aims, constraints
         counted = is_counted[first : first + sum(target_rows(rows[i]))].astype(q.dtype)
         none = jnp.zeros((), q.dtype)
         rows[i] = KeptRows(rows[i], counted, none, none, rows[i].name)  # pyright: ignore[reportArgumentType]
-    joints = _limited_joints(model, aims)
+    joints = _joints_with_limits(model, aims)
     at = np.asarray(joints, int)
     lower, upper = aims.lower[at], aims.upper[at]
 
@@ -284,7 +284,7 @@ def clip_rounding(q, at: np.ndarray, lower, upper):
     return q.at[at].set(jnp.where((x > upper) & (x < upper + near), upper, x))
 
 
-def _limited_joints(model: Model, aims: Aims) -> tuple[int, ...]:
+def _joints_with_limits(model: Model, aims: Aims) -> tuple[int, ...]:
     """Places in q of the joints of one degree of freedom that have limits, or may have some."""
     at_q, _ = screw_joints(model)
     if is_concrete(aims.lower, aims.upper):

@@ -118,7 +118,7 @@ def _improve(guesses: int, scene: Scene, constants, state: Search) -> Search:
     q, damping = state.q, state.damping
     r = residual(scene, q, t, aims)
     errors = jnp.sum(r * r)
-    step = _damped_step(scene, q, t, aims, r, damping * errors)
+    step = _levenberg_marquardt_step(scene, q, t, aims, r, damping * errors)
     tried = clip_to_limits(scene.system, retract(scene.system, displace(scene.system, q, step)), aims)
     left = residual(scene, tried, t, aims)
     new = jnp.sum(left * left)
@@ -155,7 +155,7 @@ def residual(scene: Scene, q, t, aims: Aims):
     return aims.weights * (position_residual(scene, q, t) - aims.shift)
 
 
-def _damped_step(scene: Scene, q, t, aims: Aims, r, damping):
+def _levenberg_marquardt_step(scene: Scene, q, t, aims: Aims, r, damping):
     """The step (nv,) of damped least squares for the residuals r, within the limits."""
     sizes, _ = coordinate_sizes(scene.system, q.dtype)
     R = constraint_jacobian(scene, q, t)[holonomic_rows(layout(scene))] * aims.weights[:, None] * sizes[None]

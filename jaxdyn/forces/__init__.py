@@ -1,10 +1,14 @@
-"""Generalised forces listed in a `Scene`: joint springs, drives and friction, and dissipation functions.
+"""Generalised forces listed in a `Scene`: springs, drives, limits and friction of joints, and dissipation functions.
 
 Imports `dynamics` and what is below it.
 """
 
 from jaxdyn.forces.dissipation import RayleighDissipation as RayleighDissipation
 from jaxdyn.forces.dissipation import SlidingFriction as SlidingFriction
+from jaxdyn.forces.drives import FirstOrderDrive as FirstOrderDrive
+from jaxdyn.forces.drives import SecondOrderDrive as SecondOrderDrive
+from jaxdyn.forces.elastic import ElasticTransmission as ElasticTransmission
+from jaxdyn.forces.elastic import elastic_joints as elastic_joints
 from jaxdyn.forces.elements import CoulombFriction as CoulombFriction
 from jaxdyn.forces.elements import Drive as Drive
 from jaxdyn.forces.elements import ExternalWrench as ExternalWrench
@@ -12,19 +16,27 @@ from jaxdyn.forces.elements import JointDamping as JointDamping
 from jaxdyn.forces.elements import JointSpring as JointSpring
 from jaxdyn.forces.limits import EffortLimits as EffortLimits
 from jaxdyn.forces.limits import JointStops as JointStops
+from jaxdyn.forces.limits import TorqueSpeedLimits as TorqueSpeedLimits
 from jaxdyn.forces.piecewise import PiecewiseForce as PiecewiseForce
+from jaxdyn.systems.drives import DriveDynamics as DriveDynamics
 
 __all__ = [
     "CoulombFriction",
     "Drive",
+    "DriveDynamics",
     "EffortLimits",
+    "ElasticTransmission",
     "ExternalWrench",
+    "FirstOrderDrive",
     "JointDamping",
     "JointSpring",
     "JointStops",
     "PiecewiseForce",
     "RayleighDissipation",
+    "SecondOrderDrive",
     "SlidingFriction",
+    "TorqueSpeedLimits",
+    "elastic_joints",
 ]
 
 

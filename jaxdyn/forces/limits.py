@@ -1,7 +1,7 @@
 """Joint limits: elastic stops at position limits, and actuator effort limits."""
 
 from collections.abc import Sequence
-from typing import Any
+from typing import Any, ClassVar
 
 import equinox as eqx
 import jax.numpy as jnp
@@ -119,6 +119,7 @@ class EffortLimits(eqx.Module):
     """
 
     limit: Float[Array, "..."] | None
+    of_speed: ClassVar[bool] = False  # whether they depend on the velocity
 
     def __init__(self, limit: Numbers | None = None):
         self.limit = None if limit is None else jnp.asarray(as_array(limit, "EffortLimits: limit"), float)
@@ -132,13 +133,16 @@ class EffortLimits(eqx.Module):
     ) -> Float[Array, " nv"]:
         return jnp.zeros_like(v)
 
-    def effort_guards(self, system: SystemLike, tau: Float[Array, " nv"]) -> Float[Array, " n"]:
-        """Switching functions tau - limit, then -limit - tau, (2 nv,): negative where tau is within its limits."""
-        limit = self._limit(system, tau)
+    def effort_guards(
+        self, system: SystemLike, tau: Float[Array, " nv"], v: Float[Array, " nv"] | None = None
+    ) -> Float[Array, " n"]:
+        """Switching functions tau - upper, then lower - tau, (2 nv,): negative where tau is within its limits."""
         # inf - inf would be NaN in a gradient; infinite limits get a constant negative guard instead.
-        bounded = jnp.isfinite(limit)
-        limit = jnp.where(bounded, limit, 0.0)
-        return jnp.concatenate([jnp.where(bounded, side * tau - limit, -1.0) for side in (1.0, -1.0)])
+        guards = []
+        for side, limit in zip((-1.0, 1.0), self._range(system, tau, v), strict=True):
+            bounded = jnp.isfinite(limit)
+            guards.insert(0, jnp.where(bounded, side * (tau - jnp.where(bounded, limit, 0.0)), -1.0))
+        return jnp.concatenate(guards)
 
     def limited(
         self, system: SystemLike, tau: Float[Array, " nv"], positive: Bool[Array, " n"] | None = None
@@ -148,24 +152,74 @@ class EffortLimits(eqx.Module):
         return self.clip_effort(system, tau, positive)
 
     def clip_effort(
-        self, system: SystemLike, tau: Float[Array, " nv"], positive: Bool[Array, " n"] | None = None
+        self,
+        system: SystemLike,
+        tau: Float[Array, " nv"],
+        positive: Bool[Array, " n"] | None = None,
+        v: Float[Array, " nv"] | None = None,
     ) -> Float[Array, " nv"]:
         """Clip tau (nv,) to the limits; `positive` (2 nv,), the signs of `effort_guards`, fixes which entries are clipped."""
-        limit = self._limit(system, tau)
+        lower, upper = self._range(system, tau, v)
         if positive is None:
-            return jnp.clip(tau, -limit, limit)
+            return jnp.clip(tau, lower, upper)
         above, below = positive.reshape(2, -1)
-        return jnp.where(above, limit, jnp.where(below, -limit, tau))
+        return jnp.where(above, upper, jnp.where(below, lower, tau))
 
-    def _limit(self, system, tau):
+    def _range(self, system, tau, v) -> tuple[Array, Array]:
+        """Least and largest torques, (nv,) each."""
         limit: Any = getattr(system, "effort_limit", None) if self.limit is None else self.limit
         if limit is None:
             raise ValueError(f"EffortLimits: a {type(system).__name__} has no effort_limit; give the limit")
-        if jnp.shape(limit) not in ((), tau.shape):
-            raise ValueError(
-                f"EffortLimits: limit has shape {jnp.shape(limit)}, expected a number or {tau.shape} = (nv,)"
-            )
-        return jnp.broadcast_to(jnp.asarray(limit, tau.dtype), tau.shape)
+        limit = _by_coordinate(limit, tau, "EffortLimits: limit")
+        return -limit, limit
+
+
+class TorqueSpeedLimits(EffortLimits):
+    """Torque-speed curve of a motor at its largest voltage: |tau + (stall / no_load) v| <= stall.
+
+    A motor of resistance R and constant k at the voltage U gives tau = k (U - k v) / R: at most stall = k U_max / R at rest and
+    nothing at the speed no_load = U_max / k. Beyond that speed it brakes. Against the motion it may give more than `stall`,
+    which the current limits: list `jd.forces.EffortLimits` behind it. Like these it acts on tau, not on the scene's other
+    forces, and `jd.simulate` and `jd.stepper` end a step where a torque reaches the curve or leaves it.
+
+    **Arguments:** `stall` (N m or N) and `no_load` (rad/s or m/s), at the joint (behind the gear), positive: numbers or one per
+    velocity coordinate. Joints without a curve have an infinite `stall`.
+
+    **Raises:** ValueError for numbers that are not positive; (when used) for a wrong shape.
+
+    Source: Hughes & Drury (2019), Electric Motors and Drives, section 3.5.
+
+    ```python
+    scene = jd.Scene(model, forces=[jd.forces.TorqueSpeedLimits(120.0, 6.0), jd.forces.EffortLimits(80.0)])
+    ```
+    """
+
+    stall: Float[Array, "..."]
+    no_load: Float[Array, "..."]
+    of_speed: ClassVar[bool] = True
+
+    def __init__(self, stall: Numbers, no_load: Numbers):
+        super().__init__()
+        for name, value in (("stall", stall), ("no_load", no_load)):
+            numbers = jnp.asarray(as_array(value, f"TorqueSpeedLimits: {name}"), float)
+            if is_concrete(numbers) and not (np.asarray(numbers) > 0).all():
+                raise ValueError(f"TorqueSpeedLimits: {name} is {value}; give positive numbers")
+            setattr(self, name, numbers)
+
+    def _range(self, system, tau, v) -> tuple[Array, Array]:
+        if v is None:
+            raise ValueError("TorqueSpeedLimits: limits depend on the speed; pass v, or call Scene.drive_torque")
+        stall = _by_coordinate(self.stall, tau, "TorqueSpeedLimits: stall")
+        bounded = jnp.isfinite(stall)
+        stall = jnp.where(bounded, stall, 1.0)
+        back = stall * v / _by_coordinate(self.no_load, tau, "TorqueSpeedLimits: no_load")
+        return jnp.where(bounded, -stall - back, -jnp.inf), jnp.where(bounded, stall - back, jnp.inf)
+
+
+def _by_coordinate(value, tau, what: str) -> Array:
+    if jnp.shape(value) not in ((), tau.shape):
+        raise ValueError(f"{what} has shape {jnp.shape(value)}, expected a number or {tau.shape} = (nv,)")
+    return jnp.broadcast_to(jnp.asarray(value, tau.dtype), tau.shape)
 
 
 def _number(value: Any, what: str, least: float, strict: bool):

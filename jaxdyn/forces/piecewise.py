@@ -15,6 +15,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
 from jaxdyn.model.arguments import Number, SystemLike
+from jaxdyn.systems.drives import pass_command
 from jaxdyn.systems.scene import Scene
 
 
@@ -78,17 +79,16 @@ class _FixedPiece(eqx.Module):
             return self.inner.force(system, q, v, t, self.positive)
         return self.inner(system, q, v, t)
 
-    def clip_effort(self, system, tau):
+    def clip_effort(self, system, tau, v=None):
         cut = getattr(self.inner, "clip_effort", None)
-        if cut is None:
-            return tau
-        return cut(system, tau) if self.of_efforts is None else cut(system, tau, self.of_efforts)
+        return tau if cut is None else cut(system, tau, self.of_efforts, v=v)
 
 
-def guards_by_force(scene: Scene, q, v, t, tau) -> list[tuple[Any, Any]]:
+def guards_by_force(scene: Scene, q, v, t, tau, state=None) -> list[tuple[Any, Any]]:
     """Switching functions of each force and of its clipping of `tau` (nv,); None where it has none.
 
-    `tau`: effort of the control before limits; None without a control, or where it does not depend on the state.
+    `tau`: effort of the control before drives and limits; None without a control, or where what is clipped does not depend on
+    the state of the motion. `state`: of the scene's drives.
     """
     rows = []
     for force in scene.forces:
@@ -99,10 +99,10 @@ def guards_by_force(scene: Scene, q, v, t, tau) -> list[tuple[Any, Any]]:
             if own.ndim != 1:
                 raise ValueError(f"{type(force).__name__}: guards gives shape {own.shape}; expected (n,)")
         if tau is not None and hasattr(force, "effort_guards"):
-            efforts = force.effort_guards(scene.system, tau)  # pyright: ignore[reportAttributeAccessIssue]
-        # Limits act one after the other: the next one sees the clipped effort.
-        if tau is not None and hasattr(force, "clip_effort"):
-            tau = force.clip_effort(scene.system, tau)  # pyright: ignore[reportAttributeAccessIssue]
+            efforts = force.effort_guards(scene.system, tau, v)  # pyright: ignore[reportAttributeAccessIssue]
+        # Drives and limits act one after the other: the next one sees the clipped effort.
+        if tau is not None:
+            tau, _, state = pass_command(force, scene.system, q, v, t, tau, state)
         rows.append((own, efforts))
     return rows
 
@@ -115,13 +115,16 @@ class Pieces(NamedTuple):
 
 
 def pieces_of(scene: Scene, y, q, v, t, tau_of: Callable | None) -> Pieces:
-    """Layout of the switching functions of a scene under a control, tau_of(y, q, v, t), at one state; None without a control."""
+    """Layout of the switching functions of a scene under a control at one state.
+
+    tau_of(y, q, v, t) is the control's effort and the state of the scene's drives; None without a control.
+    """
 
     if not any(isinstance(force, PiecewiseForce) or hasattr(force, "effort_guards") for force in scene.forces):
         return Pieces(((0, 0),) * len(scene.forces), ())
 
     def shapes(y, q, v, t):
-        return guards_by_force(scene, q, v, t, None if tau_of is None else tau_of(y, q, v, t))
+        return guards_by_force(scene, q, v, t, *((None,) if tau_of is None else tau_of(y, q, v, t)))
 
     counts, names = [], []
     # Shapes alone are needed, so nothing is computed or compiled.
@@ -131,9 +134,9 @@ def pieces_of(scene: Scene, y, q, v, t, tau_of: Callable | None) -> Pieces:
     return Pieces(tuple(counts), tuple(names))
 
 
-def guards(scene: Scene, q, v, t, tau) -> Float[Array, " n"]:
+def guards(scene: Scene, q, v, t, tau, state=None) -> Float[Array, " n"]:
     """Values of all switching functions of a scene's forces, (n,)."""
-    parts = [part for pair in guards_by_force(scene, q, v, t, tau) for part in pair if part is not None]
+    parts = [part for pair in guards_by_force(scene, q, v, t, tau, state) for part in pair if part is not None]
     return jnp.concatenate(parts) if parts else jnp.zeros((0,), q.dtype)
 
 
@@ -148,10 +151,10 @@ def fix_pieces(scene: Scene, pieces: Pieces, positive: Bool[Array, " n"]) -> Sce
     return eqx.tree_at(lambda scene: scene.forces, scene, tuple(forces))
 
 
-def values_and_levels(switching: Callable, q, v):
-    """Values of switching(q, v) (k,), and their rounding errors.
+def values_and_levels(switching: Callable, *state):
+    """Values of switching(*state) (k,), and their rounding errors.
 
-    The derivative of a function along its own argument (q, v) measures the size of the terms that cancel in it.
+    The derivative of a function along its own arguments (q, v) measures the size of the terms that cancel in it.
     """
-    values, sizes = jax.jvp(switching, (q, v), (q, v))
-    return values, jax.lax.stop_gradient(100 * float(jnp.finfo(q.dtype).eps) * (jnp.abs(sizes) + jnp.abs(values)))
+    values, sizes = jax.jvp(switching, state, state)
+    return values, jax.lax.stop_gradient(100 * float(jnp.finfo(values.dtype).eps) * (jnp.abs(sizes) + jnp.abs(values)))

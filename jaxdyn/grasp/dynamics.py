@@ -20,7 +20,7 @@ from jaxtyping import Array, Float
 from jaxdyn.compile import entry_point
 from jaxdyn.constraints.base import Layout, constraint_jacobian, layout
 from jaxdyn.constraints.codes import RESULTS, Outcome
-from jaxdyn.constraints.dynamics import applied
+from jaxdyn.constraints.dynamics import total_force
 from jaxdyn.constraints.rank import pseudo_inverse, tolerance
 from jaxdyn.dynamics.quantities import coriolis_matrix, gravity_force, mass_matrix
 from jaxdyn.grasp.hand import Grasp, check_grasp
@@ -200,7 +200,7 @@ def _solve_dynamics(grasp: Grasp, q, nu, tau, t, N, Ndot, is_regular, multiplier
     """Solve the equations in nu, v = N nu; `multipliers` solves A^T lam = M a + C v + g - tau (nv,)."""
     system, v = grasp.system, matmul(N, nu)
     M, C = mass_matrix(system, q, t), coriolis_matrix(system, q, v, t)
-    gravity, force = gravity_force(system, q, t), applied(grasp, q, v, tau, t)
+    gravity, force = gravity_force(system, q, t), total_force(grasp, q, v, tau, t)
     mass = matmul(N.T, matmul(M, N))
     coriolis = matmul(N.T, matmul(C, N) + matmul(M, Ndot))
     gravity_part, force_part = matmul(N.T, gravity), matmul(N.T, force)

@@ -16,7 +16,7 @@ from jaxtyping import Array, Bool, Float
 from jaxdyn.compile import entry_point
 from jaxdyn.compile.known import is_known
 from jaxdyn.constraints.base import Layout, constraint_jacobian, layout
-from jaxdyn.constraints.dynamics import applied
+from jaxdyn.constraints.dynamics import total_force
 from jaxdyn.constraints.rank import pseudo_inverse, tolerance
 from jaxdyn.contact.closure import ForceClosure
 from jaxdyn.contact.closure import force_closure as _closure
@@ -211,7 +211,7 @@ def hold(
 def _static(grasp: Grasp, q, t):
     """Constraint rows, and the contact wrench of static equilibrium."""
     at_rest = jnp.zeros((grasp.nv,), q.dtype)
-    force = gravity_force(grasp.system, q, t) - applied(grasp, q, at_rest, at_rest, t)
+    force = gravity_force(grasp.system, q, t) - total_force(grasp, q, at_rest, at_rest, t)
     return constraint_jacobian(grasp, q, t), force[np.array(grasp.object_velocities, int)]
 
 

@@ -20,6 +20,7 @@ from jaxdyn.identify.parameter_tree import Parameters
 from jaxdyn.identify.replay import Segments, check_spacing, segments, with_even_steps
 from jaxdyn.identify.sensors import Measured, with_sensors
 from jaxdyn.model.tree import Model
+from jaxdyn.systems.scene import has_drives
 
 
 class Problem(eqx.Module):
@@ -66,9 +67,15 @@ def pose_problem(
 ) -> Problem:
     """Problem of a parameter tree and logs, whose segments are sharded over devices.
 
-    **Raises:** ValueError for a horizon that does not fit, and for logs of unequal length where segments must have one length.
+    **Raises:** ValueError for a horizon that does not fit, for logs of unequal length where segments must have one length, and
+    for drives with a state in an error without simulation.
     """
     system, scene = tree.given, with_sensors(tree.given).scene
+    if has_drives(scene) and objective.error not in SIMULATED:
+        raise ValueError(
+            f"error is {objective.error!r}, and the scene has drives with a state (jd.forces.DriveDynamics), whose log holds "
+            "commands; take error='trajectory'"
+        )
     # The time of a Model starts at zero in every segment; that of other systems, which may depend on it, is the log's.
     bare = isinstance(system, Measured) and not (scene.forces or scene.constraints)
     restart = isinstance(scene.system if bare else system, Model) and objective.error != "closed-loop"

@@ -1,6 +1,8 @@
 """Fit of a robot to one log or several, with cross-validated terms, prior and smoothing and weights by noise."""
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
+from functools import partial
+from typing import NamedTuple
 
 import equinox as eqx
 import numpy as np
@@ -19,6 +21,7 @@ from jaxdyn.identify.threads import on_one_thread
 from jaxdyn.identify.torque_terms import EXTRA, TERMS, RobotTerms, split_terms
 from jaxdyn.model.arguments import Checked, Numbers, warn
 from jaxdyn.model.tree import Model
+from jaxdyn.tasks import DaskClient, Engine, open_engine, results
 
 _BLOCKS = 20
 # Fits after which the weights of joints and the loads of gears are updated.
@@ -68,6 +71,7 @@ def fit_robot(
     delay: Numbers | str = 0.0,
     inertia: str = "full",
     blocks: int = _BLOCKS,
+    client: DaskClient | None = None,
     callback: Callable | None = None,
 ) -> RobotFit:
     """Fit feasible inertias, friction, rotor inertia and further torque terms, with everything not given chosen from the logs.
@@ -97,6 +101,7 @@ def fit_robot(
       it lowers the errors on left-out parts. Compare other logs by `RobotFit.align(log)` then.
     - `inertia`: as in `fit_torques`.
     - `blocks`: consecutive samples are cut into about this many blocks, whose scatter gives the intervals.
+    - `client`: a `dask.distributed.Client`, whose workers share the fits of the cross-validation; the result is the same.
     - `callback(trial)` is called after each setting tried, with a `jaxdyn.identify.selection.Trial`.
 
     **Returns:** `RobotFit`.
@@ -145,21 +150,22 @@ def fit_robot(
     trials, by = (), "given"
     if is_auto or any(isinstance(value, str) for value in (v_s, prior, robust)):
         parts, by = folds(problem.data(setting).blocks)
-        trying = Search(problem.validation_squares, parts, problem.torque, callback)
         velocities = VELOCITIES if isinstance(v_s, str) else (setting.v_s,)
         priors = PRIORS if isinstance(prior, str) else (setting.prior,)
         names = [term.name for term in extra] if is_auto else []
         losses = ROBUST if isinstance(robust, str) else (setting.robust,)
-        setting = search(
-            trying,
-            setting,
-            names,
-            problem.torques_not_white,
-            problem.has_outliers,
-            velocities=velocities,
-            priors=priors,
-            losses=losses,
-        )
+        with open_engine(client) as engine:
+            trying = Search(_cross_validation(problem, engine), parts, problem.torque, callback)
+            setting = search(
+                trying,
+                setting,
+                names,
+                problem.torques_not_white,
+                problem.has_outliers,
+                velocities=velocities,
+                priors=priors,
+                losses=losses,
+            )
         trials = tuple(trying.trials.values())
     if is_found and delays is not None:  # at the setting chosen
         delays = find_delays(model, given, setting, basic, extra, fixed, delays.seconds, **finding)
@@ -175,3 +181,30 @@ def fit_robot(
     used = dict(setting.extra)
     chosen = (*basic, *((term, used[term.name]) for term in extra if term.name in used))
     return RobotFit(fit, problem.weights, Choice(setting, trials, by), spread, chosen, delays)
+
+
+class _Folds(NamedTuple):
+    """The fits of a cross-validation as tasks."""
+
+    problem: RobotProblem
+
+    @on_one_thread
+    def squares(self, pair: tuple[Setting, np.ndarray]) -> np.ndarray:
+        """Squared errors on some blocks of a fit to the others."""
+        return self.problem.validation_squares(*pair)
+
+
+def _cross_validation(problem: RobotProblem, engine: Engine) -> Callable:
+    """Function from pairs of a setting and left-out blocks to the squared errors of these, by an engine of tasks."""
+    sent = None
+
+    def squares(pairs: list[tuple[Setting, np.ndarray]]) -> Iterator[np.ndarray]:
+        nonlocal sent
+        # Weights of samples are those of the first setting with its loss: found here, so that they do not depend on the worker.
+        for setting, _ in pairs:
+            problem.weigh_samples(setting)
+        if sent != (sent := tuple(problem.sample_weights)):
+            engine.send(partial(_Folds, problem))
+        return results(engine, "squares", pairs)
+
+    return squares

@@ -57,14 +57,18 @@ class RobotProblem:
 
         A robust loss takes the weights of samples from the first setting that needs them.
         """
-        if setting.robust is not None and setting.robust not in self.sample_weights:
-            self.reweigh(setting)
+        self.weigh_samples(setting)
         blocks, key = self.data(setting).blocks, (setting.v_s, setting.robust, tuple(part.tolist()))
         rest = np.setdiff1d(np.arange(len(blocks)), part)
         if key not in self._rows:
             self._rows[key] = np.asarray(np.linalg.qr(blocks.rows(self.weights, rest), mode="r"))
         estimate = self.fit(setting, rows=self._rows[key], count=blocks.count(rest), is_rough=True)
         return self.data(setting._replace(robust=None)).blocks.squares(estimate.x, part)
+
+    def weigh_samples(self, setting: Setting) -> None:
+        """Find the weights of samples for the loss of a setting, unless they are known."""
+        if setting.robust is not None and setting.robust not in self.sample_weights:
+            self.reweigh(setting)
 
     def refine(self, setting: Setting, fixed: np.ndarray | None, rounds: int) -> Estimate:
         """Fit several times; after each but the last, update weights and loads."""

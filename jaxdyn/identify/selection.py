@@ -76,7 +76,10 @@ def folds(blocks: Blocks) -> tuple[list[np.ndarray], str]:
 
 
 class Search:
-    """Trials of settings, each once. `fit(setting, blocks)` gives squared errors (blocks, nv) of blocks that it leaves out."""
+    """Trials of settings, each once.
+
+    `fit` maps a list of pairs (setting, blocks) to their squared errors (blocks, nv), of fits to all other blocks.
+    """
 
     def __init__(self, fit: Callable, parts: Sequence[np.ndarray], torque: float, callback: Callable | None = None):
         self._fit, self._parts, self._torque, self._callback = fit, parts, torque, callback
@@ -84,16 +87,23 @@ class Search:
 
     def __call__(self, setting: Setting) -> Trial:
         """Trial of a setting, from memory if there was one."""
-        if setting not in self.trials:
-            squares = np.concatenate([self._fit(setting, part) for part in self._parts])
+        self.run([setting])
+        return self.trials[setting]
+
+    def run(self, settings: Sequence[Setting]) -> None:
+        """Run the trials of these settings that are missing, as one list of independent fits."""
+        missing = [setting for setting in dict.fromkeys(settings) if setting not in self.trials]
+        errors = iter(self._fit([(setting, part) for setting in missing for part in self._parts]))
+        for setting in missing:
+            squares = np.concatenate([next(errors) for _ in self._parts])
             trial = Trial(setting, squares, 100 * float(np.sqrt(squares.sum() / self._torque)))
             self.trials[setting] = trial
             if self._callback is not None:
                 self._callback(trial)
-        return self.trials[setting]
 
     def best(self, settings: Sequence[Setting]) -> Setting:
         """The best of some settings."""
+        self.run(settings)
         return min(settings, key=lambda setting: self(setting).score)
 
     def simplest(self, plain: Setting, settings: Sequence[Setting]) -> Setting:
@@ -138,6 +148,7 @@ def search(
     remaining = list(extra)
     while remaining and (joints := tuple(candidates(setting))):
         trials = []
+        search.run([setting, *(setting._replace(extra=(*setting.extra, (name, joints))) for name in remaining)])
         for name in remaining:
             improved = search.improving_torques(setting, setting._replace(extra=(*setting.extra, (name, joints))))
             if improved:

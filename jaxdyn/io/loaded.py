@@ -1,7 +1,7 @@
 """Contents of a file beyond the mechanism: starts, named actuators, and a list of unsupported elements."""
 
 from collections.abc import Iterable, Mapping, Sequence
-from typing import ClassVar
+from typing import Any, ClassVar
 
 import equinox as eqx
 import jax.numpy as jnp
@@ -11,10 +11,11 @@ from jaxtyping import Array, Float
 from jaxdyn.constraints.base import Constraint
 from jaxdyn.dynamics.kinematics import body_jacobian
 from jaxdyn.model import float64 as f64
-from jaxdyn.model.arguments import Checked, warn
+from jaxdyn.model.arguments import Checked, Function, Number, Numbers, as_array, warn
 from jaxdyn.model.tree import Model
 from jaxdyn.sensors import Sensor
-from jaxdyn.systems.scene import Force, Scene
+from jaxdyn.systems.drives import DriveDynamics
+from jaxdyn.systems.scene import Force, Scene, as_pytree
 
 
 class NotTakenWarning(UserWarning):
@@ -26,14 +27,15 @@ class UnitsWarning(UserWarning):
 
 
 class Start(eqx.Module):
-    """Named state of a file: `q` (nq,), `v` (nv,) in the model's coordinates, `control` (nu,) of its actuators.
+    """Named state of a file: `q` (nq,), `v` (nv,) of the model; `control` (nu,) and `activation` (na,) of its actuators.
 
-    `control` is None where the file gives none. Units as for the model: m, rad, m/s, rad/s.
+    `control` and `activation` are None where the file gives none. Units as for the model: m, rad, m/s, rad/s.
     """
 
     q: Float[Array, " nq"]
     v: Float[Array, " nv"]
     control: Float[Array, " nu"] | None = None
+    activation: Float[Array, " na"] | None = None
 
 
 class Actuators(eqx.Module):
@@ -41,8 +43,11 @@ class Actuators(eqx.Module):
 
     An actuator acts along a length l(q) with the force f = gain u + bias, where gain and bias are affine in l and its
     rate: gain = g0 + g1 l + g2 ldot, bias = b0 + b1 l + b2 ldot. That covers motors (f = g0 u), position and velocity
-    servos, dampers and general actuators without a state of their own. The force is clipped to `force_range`, the sum
-    of all at each coordinate to `effort_range`, the control to `control_range`.
+    servos, dampers and general actuators. The force is clipped to `force_range`, the sum of all at each coordinate to
+    `effort_range`, the control to `control_range`.
+
+    An actuator with dynamics has an activation w, which takes the place of u in the force: a "filter" with T dw/dt = u - w, an
+    "integrator" with dw/dt = u. At the ends of `activation_range` w stops. `drive` makes a force of a scene of them.
 
     Lengths are linear in q, l = moment q, with the coordinates that have v = dq/dt; actuators at a site have no
     length (l = 0) and act with a wrench fixed in the site's frame.
@@ -50,7 +55,8 @@ class Actuators(eqx.Module):
     **Fields:** `names` of the actuators, in the order of the controls; `moment` (nu, nv); `gain`, `bias` (nu, 3);
     `control_range`, `force_range` (nu, 2), infinite where there are none; `effort_range` (nv, 2); `sites`, for each
     actuator the name of its frame or None; `wrenches` (nu, 6), (f, tau) in the frame's axes for a unit force; `places`,
-    for each velocity coordinate its place in q, or -1 where it has none.
+    for each velocity coordinate its place in q, or -1 where it has none; `dynamics`, for each actuator "filter", "integrator" or
+    None; of those with dynamics `time_constant` T (na,), s (unused of integrators), and `activation_range` (na, 2).
     """
 
     names: tuple[str, ...] = eqx.field(static=True)
@@ -63,19 +69,29 @@ class Actuators(eqx.Module):
     control_range: Float[Array, "nu 2"]
     force_range: Float[Array, "nu 2"]
     effort_range: Float[Array, "nv 2"]
+    time_constant: Float[Array, " na"] | None = None
+    activation_range: Float[Array, "na 2"] | None = None
+    dynamics: tuple[str | None, ...] = eqx.field(static=True, default=(), kw_only=True)
 
     def __call__(
-        self, system: Model, q: Float[Array, " nq"], v: Float[Array, " nv"], control: Float[Array, " nu"]
+        self,
+        system: Model,
+        q: Float[Array, " nq"],
+        v: Float[Array, " nv"],
+        control: Float[Array, " nu"],
+        activation: Float[Array, " na"] | None = None,
     ) -> Float[Array, " nv"]:
         """Generalised force (nv,) in N m or N of the controls (nu,), in the order of `names`.
 
-        **Raises:** ValueError for controls of another shape.
+        `activation` (na,), of the actuators with dynamics; None where there are none.
+
+        **Raises:** ValueError for controls or activations of another shape.
         """
-        if jnp.shape(control) != (len(self.names),):
-            raise ValueError(
-                f"control has shape {jnp.shape(control)}, expected {(len(self.names),)}: one number for each of "
-                f"{', '.join(self.names)}"
-            )
+        control = self._clipped(control, q.dtype)
+        if self._active:
+            low, high = jnp.asarray(self.activation_range, q.dtype).T
+            active = jnp.clip(jnp.asarray(self._check_activation(activation), q.dtype), low, high)
+            control = control.at[np.array(self._active)].set(active)
         chosen = [place for place in self.places if place >= 0]
         columns = [i for i, place in enumerate(self.places) if place >= 0]
         moment = self.moment.astype(q.dtype)
@@ -86,14 +102,96 @@ class Actuators(eqx.Module):
                 # A wrench fixed in the site's frame acts by the body Jacobian; such a row depends on q.
                 rows = rows.at[i].set(self.wrenches[i].astype(q.dtype) @ body_jacobian(system, q, site))
         state = jnp.stack([jnp.ones_like(length), length, rows @ v], axis=1)
-        gain, bias, control_range, limits, force_range = (
-            x.astype(q.dtype) for x in (self.gain, self.bias, self.control_range, self.force_range, self.effort_range)
+        gain, bias, limits, force_range = (
+            x.astype(q.dtype) for x in (self.gain, self.bias, self.force_range, self.effort_range)
         )
         # MuJoCo's order: clip the control, then each force, then the sum at each coordinate.
-        control = jnp.clip(jnp.asarray(control, q.dtype), control_range[:, 0], control_range[:, 1])
         force = jnp.sum(gain * state, 1) * control + jnp.sum(bias * state, 1)
         force = jnp.clip(force, limits[:, 0], limits[:, 1])
         return jnp.clip(force @ rows, force_range[:, 0], force_range[:, 1])
+
+    def activation_rate(self, control: Float[Array, " nu"], activation: Float[Array, " na"]) -> Float[Array, " na"]:
+        """Rate of the activations (na,), zero where it would lead out of their range.
+
+        **Raises:** ValueError for controls or activations of another shape.
+        """
+        activation = jnp.asarray(self._check_activation(activation), float)
+        wanted = self._clipped(control, activation.dtype)[np.array(self._active, int)]
+        is_filter = np.array([self.dynamics[i] == "filter" for i in self._active])
+        constant = jnp.where(is_filter, jnp.asarray(self.time_constant, activation.dtype), 1.0)
+        rate = jnp.where(is_filter, wanted - activation, wanted) / constant
+        low, high = jnp.asarray(self.activation_range, activation.dtype).T
+        return jnp.where((activation >= high) & (rate > 0) | (activation <= low) & (rate < 0), 0.0, rate)
+
+    def drive(self, law: Function, activation: Numbers | None = None) -> "ActuatorDrive":
+        """Force of a scene under law(q, v, t) -> (nu,) for the controls, with the activations as its state.
+
+        `activation` (na,) at the start; zeros by default. `outputs=("drive_state",)` of `jd.simulate` are those of the motion.
+
+        **Raises:** ValueError for a law that cannot be called, and activations of another shape.
+        """
+        start = np.zeros(len(self._active)) if activation is None else as_array(activation, "activation")
+        initial = jnp.asarray(self._check_activation(start), float)
+        return ActuatorDrive(self, as_pytree(law, "law", "q, v, t"), initial)
+
+    @property
+    def _active(self) -> list[int]:
+        """Places of the actuators with dynamics among all."""
+        return [i for i, kind in enumerate(self.dynamics) if kind is not None]
+
+    def _clipped(self, control, dtype) -> Array:
+        if jnp.shape(control) != (len(self.names),):
+            raise ValueError(
+                f"control has shape {jnp.shape(control)}, expected {(len(self.names),)}: one number for each of "
+                f"{', '.join(self.names)}"
+            )
+        low, high = self.control_range.astype(dtype).T
+        return jnp.clip(jnp.asarray(control, dtype), low, high)
+
+    def _check_activation(self, activation):
+        names = [self.names[i] for i in self._active]
+        if activation is None or jnp.shape(activation) != (len(names),):
+            shape = None if activation is None else jnp.shape(activation)
+            raise ValueError(
+                f"activation has shape {shape}, expected {(len(names),)}: one number for each of {', '.join(names)}"
+            )
+        return activation
+
+
+class ActuatorDrive(DriveDynamics):
+    """Actuators under a law of their controls, whose torques are added to the command (`Actuators.drive`)."""
+
+    actuators: Actuators
+    law: Any
+    initial: Float[Array, " na"]
+
+    def start(self, system: Model, q: Float[Array, " nq"], v: Float[Array, " nv"], t: Number) -> Float[Array, " na"]:
+        """The activations at the start."""
+        return self.initial.astype(q.dtype)
+
+    def torque(
+        self,
+        system: Model,
+        q: Float[Array, " nq"],
+        v: Float[Array, " nv"],
+        t: Number,
+        state: Float[Array, " na"],
+        command: Float[Array, " nv"],
+    ) -> Float[Array, " nv"]:
+        """Generalised force (nv,)."""
+        return command + self.actuators(system, q, v, self.law(q, v, t), state)
+
+    def rate(
+        self,
+        system: Model,
+        q: Float[Array, " nq"],
+        v: Float[Array, " nv"],
+        t: Number,
+        state: Float[Array, " na"],
+        command: Float[Array, " nv"],
+    ) -> Float[Array, " na"]:
+        """Rates of the activations."""
+        return self.actuators.activation_rate(self.law(q, v, t), state)
 
 
 class LoadedScene(Scene):

@@ -42,7 +42,7 @@ def load_mjcf(path: str | os.PathLike, *, dtype: DType | None = None) -> LoadedS
     Supported are bodies with their inertias, joints (hinge, slide, ball, free; several on one body become a chain of
     massless bodies BODY_JOINT), armature, limits (as the model's `lower`, `upper`), damping, springs and dry friction
     of joints, gravity; `equality` of kind connect, weld, joint and tendon as exact constraints, where MuJoCo softens
-    them; tendons that are linear in the joints' coordinates; actuators without a state of their own; sites as frames;
+    them; tendons that are linear in the joints' coordinates; actuators, also with an integrator or a filter; sites as frames;
     keyframes as starts; sensors of frames, joints, force and torque. Every body keeps its frame of the file under its
     name. Missing names
     become "bodyN" and BODY_joint (BODY_jointK of several), names in use get an underscore appended, and a site with
@@ -60,8 +60,8 @@ def load_mjcf(path: str | os.PathLike, *, dtype: DType | None = None) -> LoadedS
     0.01 rad/s, `CoulombFriction`), `.starts` ("reference" is MuJoCo's qpos0), `.actuators`, `.sensors` (a tuple for
     `jd.sensors.measure`), `.not_taken`.
 
-    **Warns:** `NotTakenWarning` naming unsupported elements: contact geometry, muscles and other actuators with
-    a state, spatial tendons, flexible bodies, fluid forces, gravity compensation, missing mesh files, and the like.
+    **Warns:** `NotTakenWarning` naming unsupported elements: contact geometry, muscles, DC motors and user-defined
+    actuators, spatial tendons, flexible bodies, fluid forces, gravity compensation, missing mesh files, and the like.
 
     `UnitsWarning` where limits look like degrees, or lengths and inertias like millimetres.
 
@@ -77,7 +77,7 @@ def load_mjcf(path: str | os.PathLike, *, dtype: DType | None = None) -> LoadedS
     tendons, also = tendon_forces(file, model)
     drives, idle = actuators(file, model)
     readings, unread = sensors(file, model)
-    not_taken = (*missing, *left, *also, *idle, *_unsupported(file), *unread)
+    not_taken = (*missing, *left, *also, *idle, *_elements_without_effect(file), *unread)
     warn_not_taken(path, not_taken)
     warn_of_units(path, model)
     forces = (*_joint_forces(file, model), *tendons)
@@ -167,17 +167,20 @@ def _joint_forces(file: CompiledFile, model: Model) -> list:
 def _starts(file: CompiledFile, model: Model, drives) -> dict[str, Start]:
     m, dtype = file.m, model.home.dtype
 
-    def start(qpos, qvel, control=None) -> Start:
+    def start(qpos, qvel, control=None, act=None) -> Start:
         q, v = _state(file, model, qpos, qvel)
-        taken = None
+        taken = active = None
         if drives is not None and control is not None:
-            taken = jnp.asarray(control[[m.actuator_ctrladr[file.actuators.index(a)] for a in drives.names]], dtype)
-        return Start(jnp.asarray(q, dtype), jnp.asarray(v, dtype), taken)
+            places = [file.actuators.index(name) for name in drives.names]
+            taken = jnp.asarray(control[m.actuator_ctrladr[places]], dtype)
+            if act is not None and any(drives.dynamics):
+                active = jnp.asarray(act[[m.actuator_actadr[i] for i in places if m.actuator_actnum[i]]], dtype)
+        return Start(jnp.asarray(q, dtype), jnp.asarray(v, dtype), taken, active)
 
     starts = {"reference": start(m.qpos0, np.zeros(m.nv))}
     for k in range(m.nkey):
         name = file.mujoco.mj_id2name(m, file.mujoco.mjtObj.mjOBJ_KEY, k) or f"key{k}"
-        starts[name] = start(m.key_qpos[k], m.key_qvel[k], m.key_ctrl[k])
+        starts[name] = start(m.key_qpos[k], m.key_qvel[k], m.key_ctrl[k], m.key_act[k])
     return starts
 
 
@@ -199,7 +202,7 @@ def _state(file: CompiledFile, model: Model, qpos, qvel) -> tuple[np.ndarray, np
     return q, v
 
 
-def _unsupported(file: CompiledFile) -> list[str]:
+def _elements_without_effect(file: CompiledFile) -> list[str]:
     """Elements of the file that the scene does not represent, apart from constraints, tendons and actuators."""
     m, mujoco = file.m, file.mujoco
     free = [file.joints[j] for j in range(m.njnt) if m.jnt_type[j] == FREE]

@@ -136,7 +136,7 @@ def tendon_forces(file: CompiledFile, model: Model) -> tuple[list[TendonForce], 
 
 
 def actuators(file: CompiledFile, model: Model) -> tuple[Actuators | None, list[str]]:
-    """Actuators without internal state, None without any, and descriptions of the unsupported ones."""
+    """Actuators, None without any, and descriptions of the unsupported ones."""
     m, left = file.m, {}
     taken = []
     for i, name in enumerate(file.actuators):
@@ -195,14 +195,29 @@ def actuators(file: CompiledFile, model: Model) -> tuple[Actuators | None, list[
         force_range,
     )
     names = tuple(file.actuators[i] for i in taken)
-    leaves = (jnp.asarray(x, model.home.dtype) for x in numbers)
-    return Actuators(names, tuple(sites), tuple(int(x) for x in places), *leaves), lines
+    leaves = [jnp.asarray(x, model.home.dtype) for x in numbers]
+    dynamics = tuple(_dynamics(file, i) for i in taken)
+    if any(dynamics):
+        active = [i for i, kind in zip(taken, dynamics, strict=True) if kind]
+        limited = m.actuator_actlimited[active].astype(bool)[:, None]
+        of_active = m.actuator_dynprm[active, 0], np.where(limited, m.actuator_actrange[active], [-np.inf, np.inf])
+        leaves += [jnp.asarray(x, model.home.dtype) for x in of_active]
+    return Actuators(names, tuple(sites), tuple(int(x) for x in places), *leaves, dynamics=dynamics), lines
+
+
+def _dynamics(file: CompiledFile, i: int) -> str | None:
+    """Kind of an actuator's dynamics in `Actuators.dynamics`, "" for others."""
+    kinds = file.mujoco.mjtDyn
+    # The two filters have one equation; they differ in MuJoCo's steps.
+    names = {kinds.mjDYN_NONE: None, kinds.mjDYN_INTEGRATOR: "integrator"}
+    names |= {kinds.mjDYN_FILTER: "filter", kinds.mjDYN_FILTEREXACT: "filter"}
+    return {int(kind): name for kind, name in names.items()}.get(int(file.m.actuator_dyntype[i]), "")
 
 
 def _fault(file: CompiledFile, i: int) -> str:
     """Reason why an actuator is unsupported, to follow "actuators"; empty when it is supported."""
     m, mujoco = file.m, file.mujoco
-    dynamics, gain, bias = m.actuator_dyntype[i], m.actuator_gaintype[i], m.actuator_biastype[i]
+    dynamics, gain, bias = _dynamics(file, i), m.actuator_gaintype[i], m.actuator_biastype[i]
     kind, target = m.actuator_trntype[i], [int(x) for x in m.actuator_trnid[i]]
     if file.off("ACTUATION") or (m.actuator_group[i] >= 0 and m.opt.disableactuator >> m.actuator_group[i] & 1):
         return "that the file switches off"
@@ -210,8 +225,12 @@ def _fault(file: CompiledFile, i: int) -> str:
         return "of plugins"
     if gain == int(mujoco.mjtGain.mjGAIN_MUSCLE) or bias == int(mujoco.mjtBias.mjBIAS_MUSCLE):
         return "that are muscles"
-    if dynamics != int(mujoco.mjtDyn.mjDYN_NONE) or m.actuator_delay[i]:
-        return "with a state of their own or a delay"
+    if m.actuator_delay[i]:
+        return "with a delay"
+    if dynamics == "":
+        return "with dynamics other than an integrator or a filter"
+    if dynamics == "filter" and not m.actuator_dynprm[i, 0] > 0:
+        return "with a filter without a time constant"
     affine = int(mujoco.mjtGain.mjGAIN_FIXED), int(mujoco.mjtGain.mjGAIN_AFFINE)
     if gain not in affine or bias not in (int(mujoco.mjtBias.mjBIAS_NONE), int(mujoco.mjtBias.mjBIAS_AFFINE)):
         return "whose force is not affine in length and velocity"

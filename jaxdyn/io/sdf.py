@@ -77,7 +77,7 @@ def load_sdf(path: str | os.PathLike, *, floating_base: bool = True, dtype: DTyp
     tree = {edge.joint.name: edge.joint for edge in edges if edge.joint is not None}
     loops, left = _loops(file, model, cut)
     couplings, also = _couplings(file, joints, tree)
-    not_taken = (*left, *also, *_unsupported(file))
+    not_taken = (*left, *also, *_elements_without_effect(file))
     warn_not_taken(path, not_taken)
     warn_of_units(path, model)
     starts = {"reference": _start(file, model, roots)}
@@ -290,7 +290,7 @@ def _start(file: SdfFile, model: Model, roots: dict[str, str]) -> Start:
     return Start(jnp.asarray(q, model.home.dtype), jnp.zeros(model.nv, model.home.dtype))
 
 
-def _unsupported(file: SdfFile) -> list[str]:
+def _elements_without_effect(file: SdfFile) -> list[str]:
     """Elements of the file that the scene does not represent, apart from joints."""
     unused: dict[str, list[str]] = {}
     for link, (element, _) in file.links.items():

@@ -210,7 +210,7 @@ class ModelBuilder:
         the sum of the other two (`repair_inertias`).
         """
         warn_unphysical_inertias({name: body.inertia for name, body in self._bodies.items()}, self.places)
-        moving, carriers, parents, home, inertias = self._merge_fixed()
+        moving, carriers, parents, home, inertias = self._weld_bodies()
         others = [(carriers[b][0], name, _compose(carriers[b][1], pose)) for name, (b, pose) in self._frames.items()]
         fixed = [name for name, body in self._bodies.items() if body.kind == "fixed"]
         others += [(carriers[name][0], name, carriers[name][1]) for name in fixed]
@@ -252,7 +252,7 @@ class ModelBuilder:
         if parent is not None and parent not in self._bodies:
             raise ValueError(f"{name!r}: {unknown('parent', parent, self._bodies)}; add a parent before its children")
 
-    def _merge_fixed(self):
+    def _weld_bodies(self):
         """Merge fixed bodies: the moving ones in order, (index, pose) of each body's carrier, parents, homes, inertias."""
         children: dict[str | None, list[_Body]] = {}
         # In reverse, because the stack below pops the last child first; this is Pinocchio's depth-first order.

@@ -80,7 +80,7 @@ def _move_world(model: Model, pose) -> Model:
     """Model with its world at a pose: bodies and named frames attached to the world are moved."""
     pose, top = pose_leaf(pose, "pose"), model.topology
 
-    def transform_attached(poses, carriers):
+    def transform_poses(poses, carriers):
         xp = array_namespace(pose, poses)
         poses, by = xp.asarray(poses), xp.asarray(pose, poses.dtype)
         product = by @ poses if xp is np else matmul(by, poses)
@@ -88,8 +88,8 @@ def _move_world(model: Model, pose) -> Model:
         return store_leaf(xp.where((np.array(carriers, int) < 0)[:, None, None], product, poses), poses.dtype)
 
     return model.replace(
-        home=transform_attached(model.home, top.parents),
-        frame_poses=transform_attached(model.frame_poses, top.frame_bodies),
+        home=transform_poses(model.home, top.parents),
+        frame_poses=transform_poses(model.frame_poses, top.frame_bodies),
     )
 
 

@@ -98,7 +98,7 @@ def frame_poses(model: Model, poses: np.ndarray, frame: str | None) -> np.ndarra
 
 def pairs(scene: Scene) -> list[Pair]:
     """Constraints between two frames of a scene, as declared."""
-    return [one.declared(scene.system) for one in scene.constraints if isinstance(one, Pair)]
+    return [one.resolve(scene.system) for one in scene.constraints if isinstance(one, Pair)]
 
 
 def _ends(scene: Scene) -> list[tuple[str | None, np.ndarray]]:

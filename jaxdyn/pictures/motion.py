@@ -147,7 +147,7 @@ def motion_of(scene: Any, solution: Any, rows: int | None = None, most: int | No
 def _ends(motion: Motion, pair: Pair) -> tuple[np.ndarray, np.ndarray]:
     """Poses (n, nt, 4, 4) of the frames A and B of a constraint."""
     model = motion.scene.system
-    ends = pair.declared(model).ends()
+    ends = pair.resolve(model).ends()
     return tuple(frame_poses(model, motion.poses, body) @ np.asarray(pose, float) for body, pose in ends)  # pyright: ignore[reportReturnType]
 
 
@@ -175,7 +175,7 @@ def marks(motion: Motion) -> list[Mark]:
 def _contact(motion: Motion, constraint: Pair, a: np.ndarray, b: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Point (n, nt, 3) and normal (n, nt, 3) of a contact in the world."""
     model = motion.scene.system
-    if not hasattr(constraint.declared(model), "contact_point"):
+    if not hasattr(constraint.resolve(model), "contact_point"):
         return a[..., :3, 3], a[..., :3, 2]
 
     def touch(R, p, q):

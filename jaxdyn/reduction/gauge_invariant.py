@@ -23,7 +23,7 @@ from jaxtyping import Array, Float
 from jaxdyn.compile import entry_point
 from jaxdyn.constraints.base import constraint_jacobian, layout, rows
 from jaxdyn.constraints.codes import RESULTS, Outcome
-from jaxdyn.constraints.dynamics import applied
+from jaxdyn.constraints.dynamics import total_force
 from jaxdyn.constraints.rank import pseudo_inverse, tolerance
 from jaxdyn.dynamics.quantities import bias_force, coriolis_matrix, mass_matrix
 from jaxdyn.lie.so3 import matmul
@@ -125,7 +125,7 @@ def _decouple(scene, q, v, tau, t, rotation, motion_rotation, dof, rank_tol) -> 
     C = coriolis_matrix(system, q, v, t)
     w = matmul(W.T, v)
     Gamma = matmul(matmul(inverse, C) - Wdot.T, inverse.T)
-    u = matmul(inverse, applied(scene, q, v, tau, t) - bias_force(system, q, v, t) + matmul(C, v))
+    u = matmul(inverse, total_force(scene, q, v, tau, t) - bias_force(system, q, v, t) + matmul(C, v))
     Lambda = matmul(A, inverse.T)
     # Lam = A W^-T: its rate along the motion.
     rate = matmul(Adot - matmul(Lambda, Wdot.T), inverse.T)

@@ -24,8 +24,8 @@ from jaxdyn.compile import entry_point, kernel
 from jaxdyn.compile.known import is_concrete
 from jaxdyn.constraints.base import layout, rows, velocity_residual
 from jaxdyn.constraints.codes import RESULTS, Outcome, name_of
-from jaxdyn.constraints.dynamics import applied, whitened_rows
-from jaxdyn.constraints.rank import checked_tolerance, eps_of, pseudo_inverse, tolerance
+from jaxdyn.constraints.dynamics import total_force, whiten_rows
+from jaxdyn.constraints.rank import check_tolerance, eps_of, pseudo_inverse, tolerance
 from jaxdyn.dynamics.quantities import bias_force, mass_matrix
 from jaxdyn.lie.so3 import matmul
 from jaxdyn.model.arguments import Numbers, as_array, batch_hint, check_state
@@ -105,7 +105,7 @@ def constrained_inverse_dynamics(
     drive = jd.constrained_inverse_dynamics(scene, q, [1.0], [0.5], motors=["1"])  # the crank's torque
     ```
     """
-    scene, rank_tol = as_scene(scene), checked_tolerance(rank_tol)
+    scene, rank_tol = as_scene(scene), check_tolerance(rank_tol)
     q, t = check_state(scene.system, q=q, t=t)
     S, where = _motors(scene, motors, q.dtype)
     chosen = where if independent is None else _indices(scene, independent, "independent")
@@ -121,7 +121,7 @@ def constrained_inverse_dynamics(
             f"v has shape {v.shape}, expected {(scene.nv,)} = (nv,) or {(len(chosen),)}, the independent velocities"
             f"{batch_hint(v, (1,))}"
         )
-    dynamics = _solve_compiled(
+    dynamics = _solve_by_program(
         scene, q, v, a_independent, S, _weights(weights, S.shape[1], q.dtype), t, tuple(chosen), rank_tol
     )
     concrete = is_concrete(dynamics.result)
@@ -182,7 +182,7 @@ def _weights(weights, count: int, dtype):
 
 
 @entry_point
-def _solve_compiled(scene: Scene, q, v, a_independent, S, weights, t, chosen: tuple[int, ...], rank_tol):
+def _solve_by_program(scene: Scene, q, v, a_independent, S, weights, t, chosen: tuple[int, ...], rank_tol):
     v, a, torques, lam, is_determined, agrees, is_actuated, definite = kernel(_solve, static=2)(
         chosen, rank_tol, scene, q, v, a_independent, S, weights, t
     )
@@ -201,7 +201,7 @@ def _solve(chosen: tuple[int, ...], rank_tol, scene: Scene, q, v, a_independent,
     limit = max(eps_of(q) ** 0.5, tol)
     E = np.eye(nv, dtype=q.dtype)[list(chosen)]
     if has_rows:
-        metric, Y = whitened_rows(scene, q, t)
+        metric, Y = whiten_rows(scene, q, t)
         inverse = pseudo_inverse(Y, tol)
     else:
         metric, Y = mass_factor(mass_matrix(scene.system, q, t)), jnp.zeros((nv, 0), q.dtype)
@@ -236,7 +236,7 @@ def _solve(chosen: tuple[int, ...], rank_tol, scene: Scene, q, v, a_independent,
         rank = jnp.round(jnp.sum(inverse * Y.T)) + jnp.round(jnp.trace(matmul(free, across(Z))))
         is_determined = rank == nv
     gamma = rows(scene, q, v, t).gamma if has_rows else Y[0]
-    unforced = metric.whiten(applied(scene, q, v, None, t) - bias_force(scene.system, q, v, t))
+    unforced = metric.whiten(total_force(scene, q, v, None, t) - bias_force(scene.system, q, v, t))
     x, fits = complete(unforced, gamma, a_independent)
     needed, by_motors = x - unforced, metric.whiten(jnp.asarray(S))
     # The columns of free^T span the driven motions, so that free takes out the constraint forces.

@@ -18,7 +18,7 @@ from jaxdyn.compile import entry_point, kernel
 from jaxdyn.compile.known import is_concrete
 from jaxdyn.constraints.base import layout
 from jaxdyn.constraints.codes import RESULTS, Outcome
-from jaxdyn.constraints.dynamics import applied
+from jaxdyn.constraints.dynamics import total_force
 from jaxdyn.dynamics.quantities import inverse_dynamics, mass_matrix
 from jaxdyn.lie.so3 import matmul
 from jaxdyn.model.arguments import Numbers, as_array, batch_hint, check_state, zeros_if_none
@@ -119,7 +119,7 @@ def solve_in_basis(scene: Scene, motion: VelocityAndDrift, q, tau, t) -> Reduced
     # Only inertia at constant nu enters the bias: inverse dynamics at the drift gives N^T (M s + h) in one pass.
     mass = matmul(N.T, matmul(mass_matrix(scene.system, q, t), N))
     bias = matmul(N.T, inverse_dynamics(scene.system, q, v, drift, t))
-    force = matmul(N.T, applied(scene, q, v, tau, t))
+    force = matmul(N.T, total_force(scene, q, v, tau, t))
     factor = cholesky(mass)
     rate = solve_cholesky(factor, force - bias)
     result = RESULTS.where(is_definite(mass, factor), RESULTS.successful, RESULTS.singular_mass_matrix)  # pyright: ignore[reportArgumentType]

@@ -1,7 +1,8 @@
-"""Error against run time: scenes with known motions, by every sensible integrator, as records, a table and a page."""
+"""Error against run time of scenes by every sensible integrator, as records, a table and a page."""
 
-from jaxdyn.reports.cases import Case as Case
-from jaxdyn.reports.cases import cases as cases
+from jaxdyn.reports.case import Case as Case
+from jaxdyn.reports.case import Published as Published
+from jaxdyn.reports.case import Reference as Reference
 from jaxdyn.reports.front import beaten_by as beaten_by
 from jaxdyn.reports.front import pareto_front as pareto_front
 from jaxdyn.reports.front import standings as standings

@@ -1,4 +1,4 @@
-"""Cases of the report: a scene with its reference solution, measured quantities, and published results."""
+"""Cases of a report: a scene with its reference motion, measured quantities, and published results."""
 
 import inspect
 from collections.abc import Callable
@@ -7,8 +7,26 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from jaxdyn import scenes
-from jaxdyn.reports.references import Reference
+from jaxdyn.contact.unilateral import has_modes
 from jaxdyn.systems.scene import Scene
+
+# Rounding error of a closed form in double precision, in the error measure of the report.
+ROUNDING = 1e-13
+
+
+class Reference(NamedTuple):
+    """Reference motion at times `ts` (nt,): `q` (nt, nq) and `v` (nt, nv); the first row is the start.
+
+    `kind` is "closed form", "printed" or "converged"; `source` cites its origin; `error` is its own
+    error in the measure of the report: points of a work-precision plot below it are meaningless.
+    """
+
+    ts: np.ndarray
+    q: np.ndarray
+    v: np.ndarray
+    kind: str
+    source: str
+    error: float = ROUNDING
 
 
 class Published(NamedTuple):
@@ -59,3 +77,16 @@ def scene_builder(name: str, **parameters) -> Callable[[], tuple[Scene, tuple]]:
         return call_with_known(scene), (np.asarray(q), np.asarray(v))
 
     return build
+
+
+def named_case(name: str) -> Case:
+    """Case of a scene of `jd.scenes`: its default start, one second, and a converged solution as the reference.
+
+    **Raises:** ValueError for other names, and for scenes with forces that have modes, whose steps end at events.
+    """
+    if name not in scenes.names():
+        raise ValueError(f"scenes has {name!r}; give a jaxdyn.reports.Case, or choose from {', '.join(scenes.names())}")
+    if has_modes(getattr(scenes, name)()):
+        raise ValueError(f"scenes has {name!r}, whose steps end at events; a report compares steps of given lengths")
+    text = (inspect.getdoc(getattr(scenes, name)) or name).partition("\n")[0]
+    return Case(name, text, "scene", scene_builder(name), None, np.linspace(0.0, 1.0, 11), 250, conserves=False)

@@ -119,7 +119,7 @@ def figure(title: str, known: Known, records: Sequence[Record]) -> Any:
         if error == "error_path":
             ax.axvspan(ax.get_xlim()[0], max(known.error, ax.get_xlim()[0]), color="0.93", zorder=0)
         if cost == "seconds_best":
-            _draw_published(ax, known, error)
+            _draw_peers_times(ax, known, error)
     shown = {label: handle for ax in axes[0] for handle, label in zip(*ax.get_legend_handles_labels(), strict=True)}
     drawn.legend(shown.values(), shown.keys(), loc="outside lower center", ncols=3, fontsize=8, frameon=False)
     drawn.suptitle(title, fontsize=10)
@@ -157,7 +157,7 @@ def panel(ax, records, error: str, cost: str) -> None:
     ax.plot(*zip(*front, strict=True), "o", color=GREY, label="on the front", **halo)
 
 
-def _draw_published(ax, known: Known, error: str) -> None:
+def _draw_peers_times(ax, known: Known, error: str) -> None:
     for point in known.published:
         value = point["error" if error == "error_path" else "energy_error"]
         if value is not None:

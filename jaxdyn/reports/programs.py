@@ -14,8 +14,7 @@ from jaxdyn.constraints.assembly import residuals
 from jaxdyn.dynamics.quantities import kinetic_energy, potential_energy
 from jaxdyn.lie.so3 import quat_to_matrix
 from jaxdyn.model.tree import Model
-from jaxdyn.reports.case import Case
-from jaxdyn.reports.references import Reference
+from jaxdyn.reports.case import Case, Reference
 from jaxdyn.simulation.run import simulate
 from jaxdyn.simulation.solvers import RK4, Rodas5P
 from jaxdyn.simulation.start import choose_method

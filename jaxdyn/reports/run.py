@@ -9,8 +9,7 @@ from pathlib import Path
 import jax.numpy as jnp
 import numpy as np
 
-from jaxdyn.reports.case import Case
-from jaxdyn.reports.cases import cases
+from jaxdyn.reports.case import Case, named_case
 from jaxdyn.reports.journal import Journal
 from jaxdyn.reports.measure import Contestant, flop_counter, ladder, measure
 from jaxdyn.reports.page import write
@@ -49,7 +48,7 @@ def settings(case: Case, solver: str, dtype: str, *, full: bool) -> list[float]:
 
 
 def report(
-    scenes: str | Iterable[str] | None = None,
+    scenes: str | Case | Iterable[str | Case],
     *,
     full: bool = False,
     dtypes: Sequence[str] | None = None,
@@ -61,14 +60,15 @@ def report(
     echo: Callable[[str], object] | None = None,
     ways: Sequence[Sequence[str]] | None = None,
 ) -> Report:
-    """Measure error against run time of scenes with known motions, with every sensible method and solver.
+    """Measure error against run time of scenes with every sensible method and solver.
 
     Tolerances and steps are traced, so a ladder shares one compiled program. All runs of one scene, dtype and batch are
     timed interleaved; compilation is separate. float64 must be enabled, for the references.
 
     **Arguments:**
 
-    - `scenes`: a name or names of `jaxdyn.reports.cases()`; None for all.
+    - `scenes`: names of `jd.scenes`, from their default starts for one second against a converged solution; and your own, each a
+      `jaxdyn.reports.Case` with its start, its times, and its motion where it is known.
     - `full`: many methods, solvers and tolerances, in float64 and float32, one trajectory and 256 at once; else a quick
       ladder of the usual ones in float64, one trajectory.
     - `dtypes`, `batches`: values instead of these. `integrators`: pairs of a method and a solver instead of these.
@@ -166,14 +166,11 @@ def _reference_entry(prepared: Prepared) -> Known:
 
 def _check_arguments(scenes, dtypes, batches, integrators, rounds) -> list[Case]:
     """Check the arguments of `report` and return its cases."""
-    known = cases()
-    names = list(known) if scenes is None else [scenes] if isinstance(scenes, str) else list(scenes)
-    for argument, given in (("scenes", names), ("dtypes", dtypes), ("batches", batches), ("integrators", integrators)):
-        if given is not None and len(given) == 0:
+    given = (scenes,) if isinstance(scenes, str | Case) else tuple(scenes)
+    names = [case.name if isinstance(case, Case) else case for case in given]
+    for argument, values in (("scenes", names), ("dtypes", dtypes), ("batches", batches), ("integrators", integrators)):
+        if values is not None and len(values) == 0:
             raise ValueError(f"{argument} is empty; omit it for the defaults")
-    for name in names:
-        if name not in known:
-            raise ValueError(f"scenes has {name!r}; choose from {', '.join(known)}")
     for dtype in dtypes or ():
         if dtype not in ("float64", "float32"):
             raise ValueError(f"dtypes has {dtype!r}; choose from float64, float32")
@@ -189,7 +186,9 @@ def _check_arguments(scenes, dtypes, batches, integrators, rounds) -> list[Case]
         raise ValueError(f"rounds is {rounds!r}; give a positive integer")
     if jnp.zeros(()).dtype != jnp.float64:
         raise ValueError('a report needs float64; call jax.config.update("jax_enable_x64", True) first')
-    chosen = [known[name] for name in dict.fromkeys(names)]
+    if len(set(names)) < len(names):
+        raise ValueError(f"scenes have the names {', '.join(names)}; give each its own")
+    chosen = [case if isinstance(case, Case) else named_case(case) for case in given]
     for case in chosen if integrators else ():
         scene, _ = case.build()
         for method in dict(integrators or ()):

@@ -1,10 +1,10 @@
-"""From one core to a cluster: batches of any size, in blocks, on all devices, into a store from which they resume.
+"""Batch runs of any size, from one core to a cluster: chunk by chunk, on all devices, into a store from which they resume.
 
-`run` simulates (`jd.simulate` for each rollout), `evaluate` does the same for any function of one sample, `batch` is what they
-share. `members` says what each rollout is made of, `described` what a store says of its numbers, `program` compiles the
-function for all devices of a process, `study` computes a chunk, here or on a worker of Dask (`jaxdyn.tasks`), `store` keeps the
-chunks (Zarr), `lock` admits one writer, `reductions` keep what is wanted of many rollouts (`reducer`). zarr, xarray and
-filelock, of the extra `scale`, are imported where a store is opened.
+`run` simulates (`jd.simulate` for each rollout), `evaluate` does the same for any function of one sample, `batch` is their common
+part. `members` are the inputs of the rollouts, `description` names the arrays of a store, `program` compiles the function for all
+devices of a process, `study` computes a chunk, here or on a Dask worker (`jaxdyn.tasks`), `store` keeps the chunks (Zarr), `lock`
+admits one writer, `reductions` summarise many rollouts (`reducer`). zarr, xarray and filelock, of the extra `scale`, are imported
+when a store is opened.
 """
 
 from jaxdyn.scale.batch import Run as Run

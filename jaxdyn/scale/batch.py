@@ -1,21 +1,22 @@
-"""What `run` and `evaluate` share: from a function of one sample, described, to the result of a whole batch."""
+"""The common part of `run` and `evaluate`: from the description of a function of one sample to the result of a batch."""
 
+import warnings
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import jax
 import numpy as np
 
 from jaxdyn.model.arguments import Numbers, as_array, as_path
-from jaxdyn.scale.described import Described
+from jaxdyn.scale.description import Description
 from jaxdyn.scale.lock import lock_store
-from jaxdyn.scale.members import Members, digest
+from jaxdyn.scale.members import Members
 from jaxdyn.scale.reducer import Merger, Reducer
 from jaxdyn.scale.reductions import Arrays, check_reductions, describe_reductions
 from jaxdyn.scale.store import FULL, Store, check_place, full_disk, zarr_package
-from jaxdyn.scale.study import LISTED, PILOT_BATCHES, Facts, Pipeline, Study, local_devices
+from jaxdyn.scale.study import LISTED, SORTED_BATCHES, Facts, Pipeline, Study, local_devices
 from jaxdyn.tasks import Cluster, Engine, Failure, Progress, package_versions
 
 if TYPE_CHECKING:
@@ -23,28 +24,27 @@ if TYPE_CHECKING:
 
     Cost = Callable[[Any], Any] | Numbers | str | None
 else:
-    Cost = Any  # `run_batch` and `_order` look at it
+    Cost = Any  # `_cost_of` checks it
 
-MEASURED = "measured"  # of a cost that nobody has to know
-SECONDS = 2.0  # of computing to a chunk, if it may be so large
+MEASURED = "measured"  # a cost that is found by simulating
+SECONDS = 2.0  # of computing per chunk, if it may be so large
 BYTES = 2**25  # of rows in a chunk
-SHARES = 8  # chunks to a worker at least, so that all end at about the same time
-CHECKED = 64  # chunks that one task looks through
+SHARES = 8  # chunks per worker at least, so that all end at about the same time
+CHECKED = 64  # chunks that one task checks
 MOST_FAILURES = 100  # chunks that fail before no others are tried
 
 
 @dataclass(frozen=True)
 class Run:
-    """What a run gives back; the rows are in the store.
+    """Result of a run; the rows are in the store.
 
-    - `out`, its path; `samples`, rollouts in it; `chunk`, how many of them a chunk has.
-    - `codes`: how many rollouts ended with each result code, by its name. `failed`: the numbers of those that did not
-      succeed, the first 1000 in the order of the store.
+    - `out`, its path; `samples`, number of rollouts; `chunk`, rollouts per chunk.
+    - `codes`: number of rollouts that ended with each result code, by its name. `failed`: numbers of the first 1000 that failed.
     - `reductions`: the arrays of each reduction, by its name and theirs.
     - `computed`: rollouts computed in this call; `seconds`, of the loop, without compilation. `repaired`: chunks
-      of before that were not whole and were computed again. `lanes`: rollouts at once; `program_bytes`: memory of their program
-      and its results, by XLA's account. `waiting`: steps that lanes waited for, until the slowest of a batch was done, over
-      those that rollouts needed, in this call; 1 where nobody waits, NaN where no steps are counted.
+      of earlier calls that were damaged and were computed again. `batch_size`: rollouts at once; `program_bytes`: memory of their
+      program and its results, by XLA's account. `waiting`: steps that batches computed, until their slowest rollouts were done,
+      over those that the rollouts needed, in this call; 1 without any loss, NaN where no steps are counted.
     """
 
     out: Path
@@ -56,14 +56,20 @@ class Run:
     computed: int
     seconds: float
     repaired: tuple[int, ...]
-    lanes: int
+    batch_size: int
     program_bytes: int
     waiting: float
 
     @property
     def success(self) -> bool:
-        """Whether every rollout succeeded."""
+        """True if every rollout succeeded."""
         return set(self.codes) <= {"successful"}
+
+    @property
+    def lanes(self) -> int:
+        """Deprecated name of `batch_size`."""
+        warnings.warn("Run.lanes is deprecated; read batch_size", DeprecationWarning, stacklevel=2)
+        return self.batch_size
 
     def dataset(self) -> "xarray.Dataset":
         """The store as an `xarray.Dataset`, read as it is used."""
@@ -75,66 +81,79 @@ class Run:
         lines = [f"{self.out}: {self.samples} rollouts, {self.computed} of them computed in {self.seconds:.3g} s"]
         lines += [f"{count:>10} {name}" for name, count in self.codes.items()]
         if len(self.failed):
-            shown = ", ".join(map(str, self.failed[:10]))
-            lines.append(f"failed: {shown}{', ...' if len(self.failed) > 10 else ''}")
+            lines.append(f"failed: {', '.join(map(str, self.failed[:10]))}{', ...' if len(self.failed) > 10 else ''}")
         return "\n".join(lines)
 
 
-@dataclass(frozen=True)
-class Options:
+class Options(NamedTuple):
     """Options that `run` and `evaluate` share, see `run`."""
 
     out: Any
     reductions: Any
     rows: bool | Sequence[str]
     cost: Cost
+    units: Mapping[str, str] | None
     client: Any
     retries: int
     devices: Sequence[Any] | None
-    lanes: int | None
+    batch_size: int | None
     chunk: int | None
     memory: int | None
     compress: bool
     verify: bool
     progress: bool
-    units: Mapping[str, str]
+
+    @classmethod
+    def of(cls, arguments: Mapping[str, Any]) -> "Options":
+        """Options among all arguments of a function, checked.
+
+        **Raises:** ValueError for a number that is not one, and for `devices` of this process next to a client.
+        """
+        # The former name, for one release.
+        if arguments["lanes"] is not None:
+            warnings.warn("lanes is deprecated; pass batch_size", DeprecationWarning, stacklevel=3)
+            arguments = {**arguments, "batch_size": arguments["lanes"]}
+        options = cls._make(arguments[name] for name in cls._fields)
+        for name, least in (("batch_size", 1), ("chunk", 1), ("memory", 1), ("retries", 0)):
+            value = arguments[name]
+            is_given = value is not None or name == "retries"
+            if is_given and (isinstance(value, bool) or not isinstance(value, int) or value < least):
+                raise ValueError(
+                    f"{name} is {value!r}; give a whole number of at least {least}{', or None' if least else ''}"
+                )
+        if options.client is None:
+            local_devices(options.devices)
+        elif options.devices is not None:
+            raise ValueError("devices is given with client; leave it out: each worker uses all of its own")
+        return options
 
 
 def run_batch(
-    describe: Callable[[Any], Described],
-    words: dict[str, Any],
+    describe: Callable[[Any], Description],
+    identity: dict[str, Any],
     batch: Members,
     options: Options,
     pilot: Callable | None = None,
 ) -> Run:
-    """Compute a batch that `describe(reductions)` describes; `words` tell it from others, by argument.
+    """Compute a batch that `describe(reductions)` describes; `identity` distinguishes it from others, by argument.
 
     `pilot(drawn, row)` counts the steps of a short part of a rollout, for a cost that is measured.
     """
     zarr_package()
     path = as_path(options.out, "out")
     check_place(path)
-    _check_options(options)
     reductions = check_reductions(options.reductions)
     outputs = describe(reductions)
-    kept = _select_rows(outputs, options.rows)
-    if isinstance(options.cost, str):
-        if options.cost != MEASURED or pilot is None:
-            raise ValueError(
-                f"cost is {options.cost!r}; give a function of the parameters, an array of one number for each rollout, or, "
-                f"to jd.scale.run with adaptive steps, {MEASURED!r}"
-            )
-    else:
-        pilot = None
-    order = None if pilot else _order(options.cost, batch)
+    kept = _select_arrays(outputs, options.rows)
+    cost = _cost_of(options.cost, batch, pilot)
     reducer = Reducer(reductions, outputs.traced.shapes, outputs.variables)
+    # Everything that decides the bytes of the store, and nothing else: a resumed run may have other devices, batches or workers.
     description = (
         {f"version of {name}": version for name, version in package_versions().items()}
         | {"float64": bool(jax.config.read("jax_enable_x64"))}
         | batch.description()
-        | words
-        | {"order": None if order is None else digest(order), "rows stored": list(kept)}
-        | {"reductions": describe_reductions(reductions), "compression": options.compress}
+        | identity
+        | {"rows stored": list(kept), "reductions": describe_reductions(reductions), "compression": options.compress}
     )
     row_bytes = sum(_bytes(outputs.variables[name]) for name in kept)
     with full_disk(path), lock_store(path) as mark:
@@ -146,29 +165,30 @@ def run_batch(
             Pipeline(options.retries) if options.client is None else Cluster(options.client, options.retries, mark)
         )
         with engine:
-            most_lanes = min(BYTES // max(row_bytes, 1), -(-batch.count // (SHARES * engine.workers)))
-            fixed = outputs, batch, pilot, reducer, kept, order, path.absolute(), options.devices
-            study = Study(*fixed, options.lanes, most_lanes, options.memory, engine.workers_per_host)
-            engine.send(study.open)
+            # Not larger than a chunk has to be, so that a batch is never filled up for nothing.
+            most = min(BYTES // max(row_bytes, 1), -(-batch.count // (SHARES * engine.workers)))
+            fixed = outputs, batch, cost, reducer, kept, path.absolute(), options.devices, options.batch_size
+            engine.send(Study(*fixed, most, options.memory, engine.workers_per_host).open)
+            # On one worker, for all: they have the same program, and the store is created once.
             facts: Facts = engine.call("facts", store is None)
             description["platform"] = facts.platform
             if store is None:
                 variables = [outputs.variables[name] for name in kept] + reducer.variables
                 variables = [replace(one, compressed=one.compressed or options.compress) for one in variables]
-                chunk = options.chunk or _chunk_size(facts, row_bytes, batch.count, engine.workers, bool(pilot))
+                chunk = options.chunk or _chunk_size(facts, row_bytes, batch.count, engine.workers, cost is not None)
                 sizes = batch.count, min(chunk, batch.count)
-                store = Store.create(path, variables, outputs.coordinates(order), description | facts.programs, *sizes)
+                store = Store.create(path, variables, outputs.coordinates, description | facts.programs, *sizes)
             store.check(description)
-            before = store.recorded_chunks()
+            before = store.record_mask()
             meter = Progress(batch.count, store.count_rollouts(before), shown=options.progress)
             if options.client is not None and (link := options.client.dashboard_link):
                 meter.note(f"dashboard: {link}")
             merger = Merger(reducer, len(outputs.codes), LISTED)
-            repaired = _compute_all(engine, store, merger, meter, before, options)
+            repaired = _compute_chunks(engine, store, merger, meter, before, options.verify)
             meter.end()
             results = merger.results()
-            store.put({f"{name}_{part}": value for name, parts in results.items() for part, value in parts.items()})
-    needed, waited = merger.steps.tolist()
+            store.write_results({f"{name}_{part}": x for name, parts in results.items() for part, x in parts.items()})
+    needed, computed = merger.steps.tolist()
     codes = {name: int(n) for name, n in zip(outputs.codes, merger.codes, strict=True) if n}
     given = (
         path,
@@ -181,29 +201,16 @@ def run_batch(
         meter.seconds,
         tuple(repaired),
     )
-    return Run(*given, facts.lanes, facts.bytes, waited / needed if needed else float("nan"))
+    return Run(*given, facts.size, facts.bytes, computed / needed if needed else float("nan"))
 
 
-def _check_options(options: Options) -> None:
-    for name, least in (("lanes", 1), ("chunk", 1), ("memory", 1), ("retries", 0)):
-        value = getattr(options, name)
-        is_given = value is not None or name == "retries"
-        if is_given and (isinstance(value, bool) or not isinstance(value, int) or value < least):
-            raise ValueError(
-                f"{name} is {value!r}; give a whole number of at least {least}{', or None' if least else ''}"
-            )
-    if options.client is None:
-        local_devices(options.devices)
-    elif options.devices is not None:
-        raise ValueError("devices is given with client; leave it out: each worker uses all of its own")
-
-
-def _compute_all(
-    engine: Engine, store: Store, merger: Merger, meter: Progress, before: np.ndarray, options: Options
+def _compute_chunks(
+    engine: Engine, store: Store, merger: Merger, meter: Progress, before: np.ndarray, verify: bool
 ) -> list[int]:
-    """Compute the chunks that are missing, then look through those of before; returns those that were not whole."""
+    """Compute the missing chunks, then check those of earlier calls; returns the damaged ones."""
     failures: list[tuple[int, Failure]] = []
     is_new = not before.any()
+    # An iterator over the missing ones, not a list: 1e8 rollouts may be a million chunks.
     missing = range(store.chunks) if is_new else (int(chunk) for chunk in np.flatnonzero(~before))
 
     def results(method: str, items: Any) -> Iterator[tuple[Any, Any]]:
@@ -211,6 +218,7 @@ def _compute_all(
             if not isinstance(result, Failure):
                 yield item, result
                 continue
+            # All other chunks would fail in the same way.
             if isinstance(result.error, OSError) and result.error.errno in FULL:
                 raise result.error
             failures.append((item if method == "chunk" else item[0], result))
@@ -227,15 +235,14 @@ def _compute_all(
             merger.add(summary)
     repaired: list[int] = []
     if not is_new and not failures:
-        ranges = (
-            (start, before[start : start + CHECKED] & options.verify) for start in range(0, store.chunks, CHECKED)
-        )
-        for (start, _), summaries in results("check", ranges):
-            for chunk, (is_bad, summary) in enumerate(summaries, start):
+        # A resumed run merges in a second pass, over all chunks in their order: the same bits as without an interruption.
+        parts = ((start, before[start : start + CHECKED] & verify) for start in range(0, store.chunks, CHECKED))
+        for (start, _), summaries in results("check", parts):
+            for chunk, (is_damaged, summary) in enumerate(summaries, start):
                 merger.add(summary)
-                if is_bad:
+                if is_damaged:
                     repaired.append(chunk)
-                    meter.note(f"chunk {chunk} of the store was not whole: its rollouts are computed again")
+                    meter.note(f"chunk {chunk} of the store was damaged: its rollouts are computed again")
                     count(chunk, summary)
     if failures:
         meter.end()
@@ -255,41 +262,50 @@ def _chunk_error(failures: list[tuple[int, Failure]], store: Store) -> RuntimeEr
     return error
 
 
-def _chunk_size(facts: Facts, row_bytes: int, count: int, workers: int, is_measured: bool) -> int:
+def _chunk_size(facts: Facts, row_bytes: int, count: int, workers: int, is_sorted: bool) -> int:
     """Rollouts of a chunk: some seconds of work, not too many bytes, and enough chunks for each worker; whole batches."""
-    lanes = facts.lanes
-    most = BYTES / max(row_bytes * lanes, 1), count / (SHARES * workers * lanes)
+    most = BYTES / max(row_bytes * facts.size, 1), count / (SHARES * workers * facts.size)
     batches = min(SECONDS / max(facts.seconds, 1e-6), *most)
-    return max(min(lanes * max(1, int(batches)), count), PILOT_BATCHES * lanes if is_measured else 0)
+    return max(min(facts.size * max(1, int(batches)), count), SORTED_BATCHES * facts.size if is_sorted else 0)
 
 
-def _select_rows(described: Described, rows: bool | Sequence[str]) -> tuple[str, ...]:
+def _select_arrays(outputs: Description, rows: bool | Sequence[str]) -> tuple[str, ...]:
     if isinstance(rows, bool):
-        return tuple(described.variables) if rows else ("result",)
-    unknown = [name for name in rows if name not in described.variables]
+        return tuple(outputs.variables) if rows else ("result",)
+    unknown = [name for name in rows if name not in outputs.variables]
     if unknown or isinstance(rows, str):
-        raise ValueError(f"rows is {rows!r}; name some of {', '.join(described.variables)}")
+        raise ValueError(f"rows is {rows!r}; name some of {', '.join(outputs.variables)}")
     return tuple(dict.fromkeys([*rows, "result"]))
 
 
-def _order(cost: Cost, batch: Members) -> np.ndarray | None:
-    """Numbers of the rollouts by falling cost."""
-    if cost is None:
-        return None
-    if callable(cost):
+class _Cost(NamedTuple):
+    """A user's function of the parameters, as a function of a member."""
 
-        def of(given: Any) -> Any:
-            drawn, row = batch.one(given)
-            return cost(drawn if batch.draw is not None else row.get("parameters"))
+    function: Callable[[Any], Any]
+    is_drawn: bool
 
-        many, step = jax.jit(jax.vmap(of)), 2**16
-        parts = [np.arange(k, min(k + step, batch.count)) for k in range(0, batch.count, step)]
-        costs = np.concatenate([np.asarray(many(batch.inputs(part))) for part in parts])
-    else:
-        costs = np.asarray(as_array(cost, "cost"))
+    def __call__(self, drawn: Any, row: Any) -> dict[str, Any]:
+        return {"cost": self.function(drawn if self.is_drawn else row.get("parameters"))}
+
+
+def _cost_of(cost: Cost, batch: Members, pilot: Callable | None) -> Any:
+    """`Study.cost` for the option `cost`.
+
+    **Raises:** ValueError for an array of another shape, and for a text that is not "measured", or with nothing to measure.
+    """
+    if cost is None or callable(cost):
+        return cost and _Cost(cost, batch.draw is not None)
+    if isinstance(cost, str):
+        if cost == MEASURED and pilot is not None:
+            return pilot
+        raise ValueError(
+            f"cost is {cost!r}; give a function of the parameters, an array of one number for each rollout, or, "
+            f"to jd.scale.run with adaptive steps, {MEASURED!r}"
+        )
+    costs = np.asarray(as_array(cost, "cost"))
     if costs.shape != (batch.count,):
         raise ValueError(f"cost has shape {costs.shape}; give one number for each of the {batch.count} rollouts")
-    return np.argsort(-costs, kind="stable")
+    return costs
 
 
 def _bytes(variable: Any) -> int:

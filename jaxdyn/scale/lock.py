@@ -1,4 +1,4 @@
-"""One writer for each store: a lock by filelock, and a file that says who holds it."""
+"""One writer for each store: a lock by filelock, and a file that names its owner."""
 
 import contextlib
 import getpass
@@ -12,7 +12,7 @@ from pathlib import Path
 
 @contextlib.contextmanager
 def lock_store(path: Path) -> Iterator[tuple[Path, str]]:
-    """Hold the lock of a store; the file beside it that names its owner, and its text. The lock of a dead process is free.
+    """Hold the lock of a store; gives the file that names its owner, and its text. The lock of a dead process is free.
 
     **Raises:** ValueError that names the owner where another process holds it. ImportError that names the extra.
     """
@@ -20,6 +20,7 @@ def lock_store(path: Path) -> Iterator[tuple[Path, str]]:
         from filelock import FileLock, Timeout
     except ImportError as error:
         raise ImportError(f"jd.scale needs {error.name}: pip install 'jaxdyn[scale]'") from error
+    # The owner stands in a file of its own: filelock truncates the lock's file when it tries to acquire it.
     lock, owner = FileLock(f"{path}.lock"), path.with_name(f"{path.name}.owner")
     try:
         lock.acquire(timeout=0)
@@ -30,17 +31,14 @@ def lock_store(path: Path) -> Iterator[tuple[Path, str]]:
             f"out is {str(path)!r}, to which {name} is writing; wait for it, end it, or name another store"
         ) from error
     try:
-        text = f"{_identity()}\n{uuid.uuid4().hex}\n"
+        user = str(os.getuid())
+        with contextlib.suppress(KeyError, OSError):  # in a container without an entry for the user
+            user = getpass.getuser()
+        since = time.strftime("%Y-%m-%d %H:%M:%S")
+        # The random line lets workers tell this file from one of the same name on a disk of their own.
+        text = f"process {os.getpid()} of {user} on {socket.gethostname()}, since {since},\n{uuid.uuid4().hex}\n"
         owner.write_text(text, encoding="utf-8")
         yield owner, text
     finally:
         owner.unlink(missing_ok=True)
         lock.release()
-
-
-def _identity() -> str:
-    try:
-        user = getpass.getuser()
-    except (KeyError, OSError):  # in a container without an entry for the user
-        user = str(os.getuid())
-    return f"process {os.getpid()} of {user} on {socket.gethostname()}, since {time.strftime('%Y-%m-%d %H:%M:%S')},"

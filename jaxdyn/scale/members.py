@@ -1,4 +1,4 @@
-"""What the members of a batch are made of: arrays with one row for each, or draws from a seed."""
+"""Members of a batch: arrays with one row for each, or draws from a seed."""
 
 import hashlib
 from collections.abc import Callable
@@ -12,7 +12,7 @@ from jaxtyping import PyTree
 
 from jaxdyn.model.arguments import as_array
 
-MAX_MEMBERS = 2**32  # members that a key counts
+MAX_MEMBERS = 2**32  # `fold_in` takes 32 bits
 
 
 @dataclass(frozen=True)
@@ -20,8 +20,8 @@ class Members:
     """`count` members, each a pytree of its own.
 
     - `rows`: a pytree of arrays of numpy (count, ...), or None; held by every process.
-    - `draw`: a function from the key of a member to what is drawn for it, or None; nothing is held. The key of member i is
-      `jax.random.fold_in(jax.random.key(seed), i)`: what a member is depends on neither blocks nor devices nor processes.
+    - `draw`: a function from the key of a member to its parameters, or None; nothing is held. The key of member i is
+      `jax.random.fold_in(jax.random.key(seed), i)`: a member depends neither on chunks nor on devices nor on processes.
     """
 
     count: int
@@ -30,41 +30,36 @@ class Members:
     seed: int = 0
 
     def inputs(self, numbers: np.ndarray) -> dict[str, Any]:
-        """What a program takes for these members, with a leading axis."""
+        """Inputs of a program for these members, with a leading axis."""
         return {"number": numbers.astype(np.uint32), "rows": jax.tree.map(lambda x: x[numbers], self.rows)}
 
     def one(self, given: dict[str, Any]) -> tuple[Any, Any]:
-        """Traced, of one member: what was drawn (None without `draw`) and its row."""
-        drawn = None
-        if self.draw is not None:
-            drawn = self.draw(jax.random.fold_in(jax.random.key(self.seed), given["number"]))
-        return drawn, given["rows"]
+        """Draw (None without `draw`) and row of one member, traced."""
+        if self.draw is None:
+            return None, given["rows"]
+        return self.draw(jax.random.fold_in(jax.random.key(self.seed), given["number"])), given["rows"]
 
     def description(self) -> dict[str, Any]:
-        """What tells these members from others, by argument."""
-        return {
-            "samples": self.count,
-            "seed": self.seed if self.draw is not None else None,
-            "values": digest(self.rows),
-        }
+        """Identity of these members, by argument."""
+        seed = None if self.draw is None else self.seed
+        return {"samples": self.count, "seed": seed, "values": digest(self.rows)}
 
 
 def members(named: dict[str, Any], draw: Callable | None, samples: int | None, seed: int) -> Members:
-    """Members of arrays, by the argument that they are, each a pytree with equal leading axes, and of draws.
+    """Members from pytrees with equal leading axes, by the arguments that hold them, and from draws.
 
     **Raises:** ValueError for axes that differ, naming two arguments; for a draw without `samples`; for no members.
     """
-    sizes: dict[str, int] = {}
-    rows = {}
+    sizes, rows = {}, {}
     for argument, tree in named.items():
-        places = jax.tree_util.tree_flatten_with_path(tree)[0]
-        for path, leaf in places:
-            name = argument + jax.tree_util.keystr(path)
-            array = np.asarray(as_array(leaf, name))
+        paths, structure = jax.tree_util.tree_flatten_with_path(tree)
+        leaves = {argument + jax.tree_util.keystr(path): leaf for path, leaf in paths}
+        arrays = {name: np.asarray(as_array(leaf, name)) for name, leaf in leaves.items()}
+        for name, array in arrays.items():
             if array.ndim == 0:
                 raise ValueError(f"{name} is one number; give one for each rollout, or put it into the scene")
             sizes[name] = len(array)
-        rows[argument] = jax.tree.map(lambda x: np.asarray(as_array(x, "rows")), tree)
+        rows[argument] = jax.tree.unflatten(structure, arrays.values())
     if samples is not None:
         sizes["samples"] = samples
     if draw is not None and samples is None:
@@ -83,17 +78,19 @@ def members(named: dict[str, Any], draw: Callable | None, samples: int | None, s
 
 
 def member(parameters: PyTree, number: int, seed: int = 0) -> PyTree:
-    """The parameters of rollout `number`, as `jd.scale.run` and `jd.scale.evaluate` give them: to look at one again.
+    """Parameters of rollout `number` of `jd.scale.run` and `jd.scale.evaluate`, to compute it again.
 
     **Arguments:** `parameters` and `seed` as they were passed there.
     """
+    # As in `Members.one`, which the program of a batch traces.
     if callable(parameters):
         return parameters(jax.random.fold_in(jax.random.key(seed), jnp.uint32(number)))
     return jax.tree.map(lambda x: jnp.asarray(x)[number], parameters)
 
 
 def digest(tree: Any) -> str:
-    """A hash of the numbers of a pytree, their shapes and their places."""
+    """Hash of the values, shapes and paths of a pytree of arrays."""
+    # With dtypes and shapes: equal bytes of other types are other inputs.
     hashed = hashlib.sha256()
     for path, leaf in jax.tree_util.tree_flatten_with_path(tree)[0]:
         array = np.ascontiguousarray(leaf)

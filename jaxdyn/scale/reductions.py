@@ -1,9 +1,9 @@
-"""What is kept of many rollouts without their rows: means, histograms, quantiles, the worst, and what users write.
+"""Reductions of many rollouts: means, histograms, quantiles, the worst, and those that users write.
 
-A reduction works on the values of one quantity, an array of each rollout. Those of a chunk become a partial result of a fixed
-shape, which is stored with the chunk. Partial results are combined in the order of the chunks while chunks are computed, so that
-memory does not grow with their number, and a run that was interrupted, or computed by several workers, gives the same bits as one
-that was not. Rollouts that failed are left out.
+A reduction works on the values of one quantity, an array of each rollout. The values of a chunk give a partial result of a fixed
+shape, which is stored with the chunk. Partial results are combined in the order of the chunks while chunks are computed. So
+memory does not grow with their number, and a run that was interrupted, or computed by several workers, gives the same bits as
+one that was not. Failed rollouts are left out.
 """
 
 import abc
@@ -19,7 +19,7 @@ Arrays = dict[str, np.ndarray]
 
 
 class Reduction(abc.ABC):
-    """From the values of a quantity in all rollouts to a few arrays; write a subclass for your own.
+    """A map from the values of a quantity in all rollouts to a few arrays; write a subclass for your own.
 
     `quantity` is the name of an array of a rollout ("q", "energy", ...), or a function of the dictionary of them, which is
     traced: `lambda row: jnp.max(row["energy"])`. `parts` names the arrays of the result.
@@ -30,30 +30,30 @@ class Reduction(abc.ABC):
 
     @abc.abstractmethod
     def partial(self, values: np.ndarray, numbers: np.ndarray) -> Arrays:
-        """Of the rollouts of one chunk that succeeded, values (n, ...) and their numbers (n,); n may be 0.
+        """Partial result from values (n, ...) and numbers (n,) of the rollouts of a chunk that succeeded; n may be 0.
 
-        Arrays whose shapes and dtypes depend on the shape of one value alone.
+        Shapes and dtypes of its arrays may depend on the shape and dtype of one value only.
         """
 
     def combine(self, partials: Arrays) -> Arrays:
-        """Fewer partial results that merge to the same; `partials` are of chunks in their order, with a leading axis of chunks.
+        """Fewer partial results with the same merged result, from those of chunks in order, with a leading axis of chunks.
 
-        By default those that are given. One that returns a single partial result keeps the memory of long runs constant;
+        By default `partials` itself. With a single partial result the memory of long runs is constant;
         combine([combine([a, b]), c]) and combine([a, b, c]) have to be equal bit for bit.
         """
         return partials
 
     @abc.abstractmethod
     def merge(self, partials: Arrays) -> Arrays:
-        """The result, by `parts`, of the partial results of all chunks (or what `combine` made of them), with a leading axis."""
+        """Result, by `parts`, from the partial results of all chunks (combined or not), with a leading axis."""
 
 
 @dataclass(frozen=True)
 class Mean(Reduction):
-    """Mean and standard deviation (that of the sample, n - 1) of each entry, and the count of rollouts.
+    """Mean and standard deviation (of the sample, n - 1) of each entry, and the number of rollouts.
 
-    Partial sums of squares are about the chunk's own mean, and merged by the rule of Chan, Golub & LeVeque (1983), so that
-    nothing cancels. With no rollout the mean is NaN, with fewer than two the deviation.
+    The mean of no rollout is NaN, and so is the deviation of fewer than two. Source: Chan, Golub & LeVeque (1983), partial
+    sums of squares.
     """
 
     quantity: str | Callable
@@ -61,19 +61,20 @@ class Mean(Reduction):
 
     def partial(self, values: np.ndarray, numbers: np.ndarray) -> Arrays:
         """Count, mean and sum of squared deviations."""
+        # About the chunk's own mean: a difference of the sums of squares and of the mean's square would cancel.
         values = values.astype(np.float64)
         mean = values.mean(0) if len(values) else np.zeros(values.shape[1:])
         squares = ((values - mean) ** 2).sum(0)
         return {"count": np.asarray(len(values)), "mean": np.asarray(mean), "squares": np.asarray(squares)}
 
     def combine(self, partials: Arrays) -> Arrays:
-        """Chunk by chunk, into one."""
+        """One sum, chunk by chunk in order."""
         count, mean = 0, np.zeros(partials["mean"].shape[1:])
         squares = np.zeros_like(mean)
         for n, one, squares_within in zip(partials["count"], partials["mean"], partials["squares"], strict=True):
             if n == 0:
                 continue
-            if count == 0:  # exactly as it is, so that what was combined before can stand first
+            if count == 0:  # unchanged, so that a combined result in the first place gives the same bits
                 count, mean, squares = n, one, squares_within
                 continue
             total, shift = count + n, one - mean
@@ -94,8 +95,8 @@ class Mean(Reduction):
 class Histogram(Reduction):
     """Counts of each entry of the quantity in `bins` equal bins from `low` to `high`.
 
-    The result "counts" (bins + 2, ...) has what lies below `low` in front and what does not lie below `high` behind, NaN too;
-    "edges" (bins + 1,).
+    The result has "counts" (bins + 2, ...), whose first row counts values below `low`, and the last one values not below `high`
+    and NaN; and "edges" (bins + 1,).
     """
 
     quantity: str | Callable
@@ -118,6 +119,7 @@ class Histogram(Reduction):
     def partial(self, values: np.ndarray, numbers: np.ndarray) -> Arrays:
         """Counts of the chunk."""
         flat = values.reshape(len(values), math.prod(values.shape[1:]))
+        # One `bincount` over pairs (bin, entry): a loop over entries would cost more than the rollouts.
         places = np.searchsorted(self.edges, flat, side="right")
         size, width = self.bins + 2, flat.shape[1]
         counts = np.bincount((places * width + np.arange(width)).ravel(), minlength=size * width)
@@ -134,9 +136,9 @@ class Histogram(Reduction):
 
 @dataclass(frozen=True)
 class Quantiles(Histogram):
-    """Quantiles of each entry at the `probabilities`, from a histogram: wrong by at most the width of one bin.
+    """Quantiles of each entry at the `probabilities`, from a histogram, with an error of at most the width of one bin.
 
-    The result "quantiles" (probabilities, ...) is NaN where one does not lie between `low` and `high`, and without rollouts.
+    The result "quantiles" (probabilities, ...) is NaN where a quantile is not between `low` and `high`, and without rollouts.
     """
 
     probabilities: Sequence[float] = (0.05, 0.5, 0.95)
@@ -167,7 +169,7 @@ class Quantiles(Histogram):
         if total == 0:
             return np.full(len(probabilities), np.nan)
         wanted = probabilities * total
-        # The first bin up to whose end lie that many, and at least one.
+        # The first bin whose cumulative count reaches the wanted one, and is not zero.
         place = np.searchsorted(below, np.maximum(wanted, 1e-9 * total))
         inside = (place > 0) & (place <= self.bins)
         place = np.clip(place, 1, self.bins)
@@ -178,10 +180,10 @@ class Quantiles(Histogram):
 
 @dataclass(frozen=True)
 class Worst(Reduction):
-    """The `keep` rollouts with the largest (or smallest) values of a quantity that is one number, and those values.
+    """The `keep` rollouts with the largest (or smallest) values of a scalar quantity, and these values.
 
     The result has "value" (keep,), NaN where there are fewer rollouts, and "rollout" (keep,), their numbers, -1 there. Equal
-    values stand in the order of their numbers.
+    values are ordered by number.
     """
 
     quantity: str | Callable
@@ -220,7 +222,7 @@ class Worst(Reduction):
 def check_reductions(reductions: Any) -> dict[str, Reduction]:
     """The reductions by name.
 
-    **Raises:** ValueError for what is no dictionary of reductions, and for names that are no identifiers.
+    **Raises:** ValueError for anything but a dictionary of reductions, and for names that are no identifiers.
     """
     if reductions is None:
         return {}
@@ -237,7 +239,7 @@ def check_reductions(reductions: Any) -> dict[str, Reduction]:
 def quantities(reductions: Mapping[str, Reduction], rows: Mapping[str, Any]) -> dict[str, Any]:
     """The quantity of each reduction in one rollout, traced.
 
-    **Raises:** ValueError for the name of no array of a rollout.
+    **Raises:** ValueError for a name that no array of a rollout has.
     """
     arrays = {}
     for name, reduction in reductions.items():

@@ -1,4 +1,4 @@
-"""`jd.scale.run` and `jd.scale.evaluate`: many rollouts of one-sample functions, into a store that can be gone on with."""
+"""`jd.scale.run` and `jd.scale.evaluate`: resumable batch runs of functions of one sample."""
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
@@ -11,7 +11,7 @@ from jaxtyping import Array, PyTree
 from jaxdyn.model.arguments import Checked, FilePath, Numbers, as_array
 from jaxdyn.model.description import scene_lines
 from jaxdyn.scale.batch import Cost, Options, Run, run_batch
-from jaxdyn.scale.described import describe_function, describe_motion
+from jaxdyn.scale.description import describe_function, describe_motion
 from jaxdyn.scale.members import digest, members
 from jaxdyn.scale.reductions import Reduction
 from jaxdyn.scale.study import STEPS
@@ -22,16 +22,14 @@ from jaxdyn.systems.scene import as_scene
 from jaxdyn.systems.system import SceneLike
 from jaxdyn.tasks import DaskClient
 
-SHARE = 0.05  # of the times that are simulated to measure what a rollout costs
+SHARE = 0.05  # of the times, simulated to measure the cost of a rollout
 
 
 @dataclass(frozen=True, eq=False)
 class Rollout:
-    """A rollout of `run`, as a function of what is drawn for it (None where nothing is) and of its row of the arrays.
+    """A rollout of `run`, as a function of its draw (None without one) and of its row of the arrays."""
 
-    A class and no function within `run`, so that workers find its code in their own jaxdyn.
-    """
-
+    # A class, not a function within `run`: cloudpickle sends it by name, so that workers use the code of their own jaxdyn.
     scene: Any
     builds: bool
     states: Callable | None
@@ -41,36 +39,25 @@ class Rollout:
     options: dict[str, Any]
 
     def __call__(self, drawn: Any, row: Any) -> tuple[Any, Any, Any]:
-        """Its solution, scene and parameters."""
+        """Solution, scene and parameters."""
         scene, control, q0, v0, own = self._start(drawn, row)
         return simulate(scene, q0, v0, self.ts, control=control, throw=False, **self.options), scene, own
 
     def pilot(self, drawn: Any, row: Any) -> dict[str, Any]:
-        """The steps of its first part."""
+        """Number of steps of its first part, as its cost."""
         scene, control, q0, v0, _ = self._start(drawn, row)
         early = np.array([self.ts[0], self.ts[0] + SHARE * (self.ts[-1] - self.ts[0])])
         solution = simulate(scene, q0, v0, early, control=control, throw=False, **{**self.options, "outputs": ()})
-        return {STEPS: solution.stats[STEPS]}
+        return {"cost": solution.stats[STEPS]}
 
     def _start(self, drawn: Any, row: Any) -> tuple[Any, Any, Any, Any, Any]:
         own = row.get("parameters") if drawn is None else drawn
         scene, control = self.scene(own) if self.builds else self.scene, self.control
+        # A control with parameters of the rollout has to be built with the scene.
         if isinstance(scene, tuple):
             scene, control = scene
         q0, v0 = self.states(own) if self.states else ((row | self.fixed)[name] for name in ("q0", "v0"))
         return scene, control, q0, v0, own
-
-
-@dataclass(frozen=True, eq=False)
-class Sample:
-    """A sample of `evaluate`, as a function of what is drawn for it (None where nothing is) and of its row of the arrays."""
-
-    function: Callable[[Any], Mapping[str, Any]]
-
-    def __call__(self, drawn: Any, row: Any) -> tuple[Any, Any]:
-        """The arrays that its function returns, and its parameters."""
-        own = row["parameters"] if drawn is None else drawn
-        return self.function(own), own
 
 
 def run(
@@ -90,15 +77,16 @@ def run(
     client: DaskClient | None = None,
     retries: int = 2,
     devices: Sequence[Any] | None = None,
-    lanes: int | None = None,
+    batch_size: int | None = None,
     chunk: int | None = None,
     memory: int | None = None,
     compress: bool = False,
     verify: bool = True,
     progress: bool = True,
+    lanes: int | None = None,
     **options: Any,
 ) -> Run:
-    """Simulate a batch of any size, block by block, into a Zarr store; started again, it goes on where it stopped.
+    """Simulate a batch of any size, chunk by chunk, into a Zarr store; the same call resumes an interrupted run.
 
     **Arguments:**
 
@@ -107,36 +95,33 @@ def run(
       scene that become leaves).
     - `states`: a pair (q0, v0) of arrays, (nq,) and (nv,) for all rollouts or (samples, nq) and (samples, nv), or a function
       of one rollout, `states(parameters) -> (q0, v0)`.
-    - `parameters`: None; a pytree of arrays (samples, ...), one row a rollout; or a function `draw(key)` that draws those of one
-      rollout, traced: then `samples` says how many there are, and nothing is held in memory. Rollout i has the key
-      `jax.random.fold_in(jax.random.key(seed), i)`, whatever blocks, devices and workers there are; `jd.scale.member` gives
-      its parameters again.
+    - `parameters`: None; a pytree of arrays (samples, ...), one row per rollout; or a function `draw(key)` that draws those of
+      one rollout, traced. `samples` is then the number of rollouts, and nothing is held in memory. Rollout i has the key
+      `jax.random.fold_in(jax.random.key(seed), i)`, for any chunks, devices and workers (see `jd.scale.member`).
     - `ts` (nt,): save points (s), `control` and further options: as in `jd.simulate`.
-    - `out`: directory of the store. Its variables are those of `Solution.to_xarray` over "rollout" and t, with names and units;
-      `parameter_NAME`; `result`, a code whose names are its attribute flag_meanings; `num_steps` and `time_reached` (s).
-      With `cost` the coordinate `rollout` has the numbers.
-    - `reductions`: a dictionary of `jd.scale.Mean`, `Histogram`, `Quantiles`, `Worst` or your own `Reduction`. Those that failed
-      are left out of them. They are variables NAME_PART of the store.
+    - `out`: directory of the store. Its variables are those of `Solution.to_xarray` over "rollout" and t, with names and
+      units; `parameter_NAME`; `result`, a code whose names are its attribute flag_meanings; `num_steps`; `time_reached` (s).
+    - `reductions`: a dictionary of `jd.scale.Mean`, `Histogram`, `Quantiles`, `Worst` or your own `Reduction`, of the rollouts
+      that succeeded. They are variables NAME_PART of the store.
     - `rows`: True to store all arrays, False for none (codes and reductions alone), or the names of those to store.
-    - `cost`: a function `cost(parameters)` or an array (samples,): about how long a rollout takes, in any unit. Rollouts are
-      computed and stored in the order of falling cost, so that those of one batch take about equally many steps. Or "measured",
-      where nobody knows, for adaptive steps: the first twentieth of the times is simulated first, and the rollouts of a chunk
-      are computed by falling steps of that; they are stored in the order of their numbers.
+    - `cost`: an estimate of the run time of each rollout, in any unit: a function `cost(parameters)`, an array (samples,), or,
+      for adaptive steps, "measured", which simulates the first twentieth of the times. The rollouts of a chunk are computed by
+      decreasing cost, so that those of a batch take about equally many steps. Their order in the store does not change.
     - `units`: of parameters, by name.
     - `client`: a `dask.distributed.Client`, whose workers compute the chunks; without it this process does, and Dask is not
-      imported. `retries`: how often a chunk that raises is tried again; others are finished before its error is reported.
-    - `devices`: of this process, all by default; a worker uses all of its own. `lanes`: rollouts computed at once, by default
-      2048 for each device of a CPU and fewer where there are few rollouts, or where the compiled program with its results, by
-      XLA's account of it, does not fit into `memory` (bytes; by default half of what is free, shared among the workers of a
-      host). `chunk`: rollouts stored at once, and lost at most when killed; by default some two seconds' work.
+      imported. `retries`: attempts after the first for a chunk that raises; others are finished before its error is reported.
+    - `devices`: of this process, all by default; a worker uses all of its own. `batch_size`: rollouts computed at once, by
+      default 2048 for each device of a CPU and fewer where there are few rollouts, or where the compiled program with its
+      results, by XLA's account, does not fit into `memory` (bytes; by default half of the free memory, shared by the workers
+      of a host). `chunk`: rollouts stored at once, and lost at most when killed; by default two seconds of work.
     - `compress`: store arrays compressed (Zstandard); smaller, and slower.
-    - `verify`: at the end look through the chunks that an earlier call has stored, and compute again what is not whole.
-    - `progress`: show rate and time left on standard error.
+    - `verify`: at the end check the chunks of earlier calls, and compute damaged ones again.
+    - `progress`: show rate and time left on standard error. `lanes`: deprecated name of `batch_size`.
 
     **Returns:** a `Run`. A rollout that fails is a row with its code and does not raise.
 
-    Results are the same, bit for bit, whether a run was interrupted or not, and for any number of workers, devices, lanes
-    and chunks on CPUs of one kind; other kinds, and GPUs, round differently in the last bit.
+    Results are the same, bit for bit, whether a run was interrupted or not, and for any number of workers and devices and any
+    sizes of batches and chunks on CPUs of one kind; other kinds, and GPUs, round differently in the last bit.
 
     **Raises:** ValueError for arguments that do not fit; for a store of another scene, version, seed, ..., with both values; for
     one that another process writes to, with its owner; for a cluster with other versions, or whose workers do not see `out`;
@@ -159,6 +144,8 @@ def run(
     )
     ```
     """
+    # First of all, when the local variables are the arguments, whose list stands in the signatures alone.
+    shared = Options.of(locals())
     ts = np.asarray(as_array(ts, "ts"))
     check_times(ts)
     for name in ("throw", "progress"):
@@ -173,6 +160,7 @@ def run(
             raise ValueError(f"states is {states!r}; give a pair (q0, v0), or a function of the parameters")
         for name, value in zip(("q0", "v0"), states, strict=True):
             value = np.asarray(as_array(value, name))
+            # A state for all rollouts is a constant of the program, and is not repeated for each of them.
             (named if value.ndim > 1 else fixed)[name] = value
     batch = members(named, draw, samples, seed)
 
@@ -184,26 +172,10 @@ def run(
         "scene": "built by a function" if builds else scene_lines(model),
         "outputs": list(options.get("outputs", ())),
     }
-    shared = Options(
-        out,
-        reductions,
-        rows,
-        cost,
-        client,
-        retries,
-        devices,
-        lanes,
-        chunk,
-        memory,
-        compress,
-        verify,
-        progress,
-        units or {},
-    )
+    # Steps of a given size are equally many: nothing to measure.
     pilot = rollout.pilot if options.get("stepsize") is None else None
-    return run_batch(
-        lambda reducing: describe_motion(rollout, batch, reducing, shared.units, ts), given, batch, shared, pilot
-    )
+    units = dict(shared.units or {})
+    return run_batch(lambda to: describe_motion(rollout, batch, to, units, ts), given, batch, shared, pilot)
 
 
 def evaluate(
@@ -220,42 +192,26 @@ def evaluate(
     client: DaskClient | None = None,
     retries: int = 2,
     devices: Sequence[Any] | None = None,
-    lanes: int | None = None,
+    batch_size: int | None = None,
     chunk: int | None = None,
     memory: int | None = None,
     compress: bool = False,
     verify: bool = True,
     progress: bool = True,
+    lanes: int | None = None,
 ) -> Run:
-    """A function of one sample for a batch of any size, as `run` does it for motions: fits from many starts, rewards, designs.
+    """Evaluate a function of one sample for a batch of any size, as `run` simulates: fits from many starts, rewards, designs.
 
-    **Arguments:** `function(parameters)`, traced, returns a dictionary of arrays, the variables of the store; one named "success"
-    says whether the sample succeeded, and without it those fail that are not finite. `parameters` and all others: as in
-    `run`; `units` are of parameters and of variables.
+    **Arguments:** `function(parameters)`, traced, returns a dictionary of arrays, the variables of the store. One named "success"
+    is true for a sample that succeeded; without it, samples with values that are not finite fail. `parameters` and all others: as
+    in `run`; `units` are of parameters and of variables.
 
     **Returns:** a `Run`.
 
     **Raises:** ValueError for a function that returns no dictionary of arrays, and as `run` does.
     """
+    shared = Options.of(locals())
     draw = parameters if callable(parameters) else None
     batch = members({} if draw is not None else {"parameters": parameters}, draw, samples, seed)
-
-    shared = Options(
-        out,
-        reductions,
-        rows,
-        cost,
-        client,
-        retries,
-        devices,
-        lanes,
-        chunk,
-        memory,
-        compress,
-        verify,
-        progress,
-        units or {},
-    )
-    return run_batch(
-        lambda reducing: describe_function(Sample(function), batch, reducing, shared.units), {}, batch, shared
-    )
+    units = dict(shared.units or {})
+    return run_batch(lambda to: describe_function(function, batch, to, units), {}, batch, shared)

@@ -1,12 +1,12 @@
-"""The store: a Zarr group with one array for each number of a rollout, and the record of the chunks that are finished.
+"""Store of a batch: a Zarr group with one array for each quantity of a rollout, and the record of the finished chunks.
 
-    runs.zarr/            what xarray opens: rows with names and units, reductions, the description in the attributes
-      record/checksum     one row for each chunk, written when all of its arrays are: the chunk is finished
+    runs.zarr/            opened by xarray: rows with names and units, reductions, the description in the attributes
+      record/checksum     one row for each chunk, written after all of its arrays: the chunk is finished
       partial/            partial results of reductions, one row for each chunk
 
-Every chunk of every array is a file of its own that ends in a CRC-32C (Zarr's codec crc32c), and the record repeats those sums:
-a file that is missing, cut, changed, or of another run is told from the right one. Files are written under another name
-and renamed by Zarr, so that a process that is killed leaves whole files only.
+Every chunk of every array is a file of its own that ends in a CRC-32C (Zarr's codec crc32c), and the record repeats these
+checksums. So a file that is missing, truncated, changed or of another run is recognised. Zarr writes files under another name
+and renames them: a process that is killed leaves complete files only.
 """
 
 import contextlib
@@ -46,7 +46,7 @@ class Variable:
 
 
 def zarr_package() -> Any:
-    """zarr, where xarray is there too; that is imported when a result is read.
+    """The package zarr, if xarray is installed too, which is imported only when a result is read.
 
     **Raises:** ImportError that names the extra.
     """
@@ -60,7 +60,7 @@ def zarr_package() -> Any:
 
 
 def check_place(path: Path) -> None:
-    """Refuse a place where no store can be.
+    """Check that a store can be at this place.
 
     **Raises:** ValueError that names `out`, for a file, a folder that is not there, and one that cannot be written.
     """
@@ -68,6 +68,7 @@ def check_place(path: Path) -> None:
         raise ValueError(f"out is {str(path)!r}, which is a file; name a directory")
     if not path.parent.is_dir():
         raise ValueError(f"out is {str(path)!r}: there is no directory {path.parent}")
+    # Asked before anything is computed: the first write comes after the compilation.
     place = path if path.exists() else path.parent
     if not os.access(place, os.W_OK | os.X_OK):
         raise ValueError(
@@ -76,24 +77,25 @@ def check_place(path: Path) -> None:
 
 
 class Store:
-    """A store on disk, open to be written.
+    """An existing store, open for writing.
 
-    **Arguments:** `path`; `description`, what must be equal for a run to go on (see `check`).
+    **Raises:** ValueError for a directory that is no store of this format, and for a damaged one.
     """
 
     def __init__(self, path: Path):
         zarr = zarr_package()
         self.path = path
         self._zarr = zarr
+        # Zarr reads its settings when an array is opened.
         with self._writing():
             try:
                 self.group = zarr.open_group(path, mode="r+")
                 attributes = dict(self.group.attrs)
-            except (FileNotFoundError, NotADirectoryError):  # it is there, and is no group of Zarr
+            except (FileNotFoundError, NotADirectoryError):  # the path exists, but is no group of Zarr
                 attributes = {}
             except PermissionError:
                 raise
-            except Exception as error:  # zarr reads the file with few checks: JSON, keys, types
+            except Exception as error:  # zarr checks little of its file: bad JSON, keys and types raise anything
                 raise self._damage_error(error) from error
         if attributes.get("jaxdyn_store") != FORMAT:
             version = attributes.get("jaxdyn_store", "nothing")
@@ -128,59 +130,38 @@ class Store:
         count: int,
         chunk: int,
     ) -> "Store":
-        """A new store, made beside its place and moved there; where another process was first, that one's."""
+        """Make a store under another name and rename it; if another process was first, open that one's."""
         zarr = zarr_package()
         from zarr.codecs import Crc32cCodec, ZstdCodec
 
         beside = path.with_name(f"{path.name}.{uuid.uuid4().hex}.tmp")
         chunks = -(-count // chunk)
         lengths = {"rollout": (count, chunk), "chunk": (chunks, 1)}
-        stored = [one for one in variables if one.leading is not None]
-        attributes = {
-            "jaxdyn_store": FORMAT,
-            "description": dict(description),
-            "rollouts": count,
-            "chunk": chunk,
-            "arrays": [one.name for one in stored],
-            "created": time.strftime("%Y-%m-%dT%H:%M:%S%z"),
-        }
+        stored = [one.name for one in variables if one.leading is not None]
+        attributes = {"jaxdyn_store": FORMAT, "description": dict(description), "rollouts": count, "chunk": chunk}
+        attributes |= {"arrays": stored, "created": time.strftime("%Y-%m-%dT%H:%M:%S%z")}
         try:
             with _quiet():
                 group = zarr.create_group(beside, attributes=attributes)
-                for one in variables:
-                    first = [lengths[one.leading]] if one.leading else []
-                    shape = tuple(size for size, _ in first) + one.shape
-                    codecs = [ZstdCodec(), Crc32cCodec()] if one.compressed else [Crc32cCodec()]
+                record = Variable("record/checksum", (len(stored),), np.dtype(np.uint32), ("array",), "chunk")
+                for one in [*variables, record]:
+                    size, part = ((length,) for length in lengths[one.leading]) if one.leading else ((), ())
                     group.create_array(
                         one.name,
-                        shape=shape,
-                        chunks=tuple(max(1, part) for _, part in first) + tuple(max(1, n) for n in one.shape),
+                        shape=size + one.shape,
+                        chunks=tuple(max(1, n) for n in part + one.shape),
                         dtype=one.dtype,
-                        compressors=codecs,
+                        # The checksum is the last codec, so that it ends the file.
+                        compressors=[ZstdCodec(), Crc32cCodec()] if one.compressed else [Crc32cCodec()],
                         fill_value=_empty(one.dtype),
                         dimension_names=([one.leading] if one.leading else []) + list(one.dims),
                         attributes=one.attributes,
                     )
                 for name, (values, notes) in coordinates.items():
                     array = np.asarray(values)
-                    texts = array.dtype.kind in "UO"
-                    place = group.create_array(
-                        name,
-                        shape=array.shape,
-                        dtype="string" if texts else array.dtype,
-                        dimension_names=(name,),
-                        attributes=notes,
-                    )
-                    place[...] = array
-                group.create_array(
-                    "record/checksum",
-                    shape=(chunks, len(stored)),
-                    chunks=(1, len(stored)),
-                    dtype="uint32",
-                    compressors=[Crc32cCodec()],
-                    fill_value=0,
-                    dimension_names=("chunk", "array"),
-                )
+                    kind = "string" if array.dtype.kind in "UO" else array.dtype
+                    axis = {"shape": array.shape, "dtype": kind, "dimension_names": (name,), "attributes": notes}
+                    group.create_array(name, **axis)[...] = array
                 zarr.consolidate_metadata(beside)
                 try:
                     beside.rename(path)
@@ -192,7 +173,7 @@ class Store:
         return cls(path)
 
     def check(self, description: Mapping[str, Any]) -> None:
-        """Refuse to go on with a store of something else.
+        """Check that the store is of the same study, before it is resumed.
 
         **Raises:** ValueError that names the first part of the description that differs, with both values.
         """
@@ -209,33 +190,33 @@ class Store:
         return slice(chunk * self.chunk, min((chunk + 1) * self.chunk, self.count))
 
     def is_done(self, chunk: int) -> bool:
-        """Whether the chunk is recorded."""
+        """True for a finished chunk: its record exists."""
         return self._file("record/checksum", self._record, chunk).exists()
 
-    def recorded_chunks(self) -> np.ndarray:
-        """Mask of the recorded chunks (chunks,)."""
+    def record_mask(self) -> np.ndarray:
+        """Mask of the finished chunks (chunks,)."""
+        mask = np.zeros(self.chunks, bool)
         folder = self._file("record/checksum", self._record, 0).parent.parent
-        recorded = np.zeros(self.chunks, bool)
+        # One listing, not a question for each of a million chunks. The folder of a chunk exists before its file.
         with contextlib.suppress(FileNotFoundError), os.scandir(folder) as entries:
-            for entry in entries:
-                # The folder of a chunk is there before its file.
-                if entry.name.isdigit() and self.is_done(int(entry.name)):
-                    recorded[int(entry.name)] = True
-        return recorded
+            done = [int(entry.name) for entry in entries if entry.name.isdigit() and self.is_done(int(entry.name))]
+            mask[done] = True
+        return mask
 
     def count_rollouts(self, chunks: np.ndarray) -> int:
-        """Rollouts of the chunks that are marked (chunks,)."""
+        """Number of rollouts in the chunks of a mask (chunks,)."""
         last = self.count - (self.chunks - 1) * self.chunk
         return int(chunks.sum()) * self.chunk - int(chunks[-1]) * (self.chunk - last)
 
     def write(self, chunk: int, arrays: Mapping[str, np.ndarray]) -> None:
         """Write all arrays of a chunk, then its record.
 
-        **Raises:** OSError that says so where the disk is full; what was recorded before is kept.
+        **Raises:** OSError for a full disk; chunks that were finished before are kept.
         """
         with self._writing():
             for name, array in self._arrays.items():
                 array[self._place(array, chunk)] = arrays[name]
+            # The record last: a chunk without it is missing, whatever files it has.
             self._record[chunk] = self._sums(chunk)
 
     def read(self, chunk: int, names: Sequence[str]) -> dict[str, np.ndarray]:
@@ -243,28 +224,29 @@ class Store:
         return {name: np.asarray(self._arrays[name][self._place(self._arrays[name], chunk)]) for name in names}
 
     def is_whole(self, chunk: int) -> bool:
-        """Whether all files of a recorded chunk are those that were written, by their sums."""
+        """True where all files of a finished chunk are those that were written, by their checksums."""
         try:
+            # The last bytes against the record recognise files of another run; reading them checks all other bytes.
             if not np.array_equal(np.asarray(self._record[chunk]), self._sums(chunk)):
                 return False
             for array in self._arrays.values():
                 array[self._place(array, chunk)]
-        except (ValueError, OSError, RuntimeError):  # the codec's sum differs; a file is missing or cut
+        except (ValueError, OSError, RuntimeError):  # the codec's checksum differs; a file is missing or truncated
             return False
         return True
 
     def forget(self, chunk: int) -> None:
-        """Take a chunk off the record, so that it is computed again."""
+        """Remove the record of a chunk, so that it is computed again."""
         self._file("record/checksum", self._record, chunk).unlink(missing_ok=True)
 
-    def put(self, arrays: Mapping[str, np.ndarray]) -> None:
-        """Arrays of the whole: what reductions gave."""
+    def write_results(self, arrays: Mapping[str, np.ndarray]) -> None:
+        """Write the arrays without a leading axis: results of reductions."""
         with self._writing():
             for name, value in arrays.items():
                 self.group[name][...] = value
 
     def remove_leftovers(self) -> None:
-        """Files that a process was killed while writing; a task of a dead client that still writes one ends with an error."""
+        """Remove files that killed processes were writing; a task of a dead client that still writes one ends with an error."""
         for path in self.path.rglob("*.partial"):
             path.unlink(missing_ok=True)
 
@@ -276,6 +258,7 @@ class Store:
 
     def _sums(self, chunk: int) -> np.ndarray:
         """The last four bytes of each array's file, which are its CRC-32C."""
+        # The codec has put them at the end; the rest of the file is not read.
         checksums = []
         for name, array in self._arrays.items():
             with self._file(name, array, chunk).open("rb") as file:
@@ -285,16 +268,16 @@ class Store:
 
     @contextlib.contextmanager
     def _writing(self) -> Iterator[None]:
-        # A chunk of zeros or NaN is a file too: by its files one knows that it was written.
+        # By default Zarr writes no file for a chunk of fill values; here a missing file has to mean a missing chunk.
         with self._zarr.config.set({"array.write_empty_chunks": True}):
             yield
 
 
 @contextlib.contextmanager
 def full_disk(path: Path) -> Iterator[None]:
-    """Say of what the disk is full.
+    """Replace the error of a full disk by one that names the store.
 
-    **Raises:** OSError that names the store, in place of one that does not.
+    **Raises:** OSError with the same number.
     """
     try:
         yield
@@ -310,17 +293,16 @@ def full_disk(path: Path) -> Iterator[None]:
 
 @contextlib.contextmanager
 def _quiet() -> Iterator[None]:
-    """Without Zarr's warning that consolidated metadata is no part of version 3 of its format; xarray reads it."""
+    """Suppress Zarr's warning that consolidated metadata is no part of version 3 of its format; xarray reads it."""
     with warnings.catch_warnings():
         warnings.filterwarnings("ignore", message="Consolidated metadata")
         yield
 
 
 def _empty(dtype: Any) -> Any:
-    kind = np.dtype(dtype)
-    if kind.kind == "f":
-        return np.nan
-    return {"b": False, "u": np.iinfo(kind).max if kind.kind == "u" else 0}.get(kind.kind, -1)
+    """Fill value of chunks that were not computed yet: one that no result has, where the dtype has one."""
+    kind = np.dtype(dtype).kind
+    return np.nan if kind == "f" else False if kind == "b" else np.iinfo(dtype).max if kind == "u" else -1
 
 
 def _short(value: Any) -> str:

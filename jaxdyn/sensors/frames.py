@@ -36,7 +36,7 @@ class _OnFrame(Sensor):
     def _rotation(self, motion: Motion) -> Float[Array, "3 3"]:
         return frame_pose(motion.scene.system, motion.q, self.frame)[:3, :3]  # pyright: ignore[reportArgumentType]
 
-    def _turned(self, motion: Motion, vector) -> Float[Array, "3"]:
+    def _in_frame_axes(self, motion: Motion, vector) -> Float[Array, "3"]:
         """A vector of the world in the frame's axes."""
         return matmul(self._rotation(motion).T, vector)
 
@@ -63,7 +63,7 @@ class Accelerometer(_OnFrame):
 
     def read(self, motion: Motion) -> Float[Array, "3"]:
         """Specific force in the frame's axes, m/s^2."""
-        return self._turned(motion, self._specific_force(motion))
+        return self._in_frame_axes(motion, self._specific_force(motion))
 
 
 class Gyroscope(_OnFrame):
@@ -74,7 +74,7 @@ class Gyroscope(_OnFrame):
 
     def read(self, motion: Motion) -> Float[Array, "3"]:
         """Angular velocity in the frame's axes, rad/s."""
-        return self._turned(motion, self._velocity(motion)[3:])
+        return self._in_frame_axes(motion, self._velocity(motion)[3:])
 
 
 class Imu(_OnFrame):
@@ -98,7 +98,7 @@ class Velocimeter(_OnFrame):
 
     def read(self, motion: Motion) -> Float[Array, "3"]:
         """Velocity of the origin in the frame's axes, m/s."""
-        return self._turned(motion, self._velocity(motion)[:3])
+        return self._in_frame_axes(motion, self._velocity(motion)[:3])
 
 
 class FrameVelocity(_OnFrame):

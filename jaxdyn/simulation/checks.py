@@ -16,14 +16,14 @@ from jaxdyn.simulation.controls import Controller, Sampled
 from jaxdyn.simulation.methods import Method
 from jaxdyn.simulation.solvers import Stepper
 from jaxdyn.simulation.solvers.choice import innermost, is_step_length, label
-from jaxdyn.systems.scene import Scene
+from jaxdyn.systems.scene import Scene, has_drives
 from jaxdyn.systems.system import has_quaternions
 
 POSE = "pose:"  # prefix of the output of a frame
 CONTACT_OUTPUTS = ("contact_forces", "contact_margins")
 OUTPUTS = (
     *("energy", "power", "work", "acceleration", "multipliers", "constraint_residual", "torque", "control_state"),
-    *CONTACT_OUTPUTS,
+    *("drive_state", *CONTACT_OUTPUTS),
 )
 MODAL_OUTPUTS = ("energy", "acceleration", "multipliers", "contact_forces", "torque")  # of scenes with modes
 # Deviation from unit length of quaternions that a file holds to a few digits.
@@ -157,6 +157,21 @@ def check_combination(control, method: Method, solver, adjoint) -> None:
             "adjoint is 'backsolve', which cannot follow the basis of method='reduced' backwards; take 'reverse', or "
             "jd.Reduced with independent velocities or a function"
         )
+
+
+def check_drives(scene: Scene, control, solver, modal: bool) -> None:
+    """Refuse drives with a state where nothing integrates it."""
+    if not has_drives(scene):
+        return
+    what = "the scene has drives with a state (jd.forces.DriveDynamics)"
+    if modal:
+        raise ValueError(
+            f"{what} and forces with modes (jd.contact.DryFriction, jd.contact.UnilateralContact); leave one of them out"
+        )
+    if isinstance(solver, Stepper):
+        raise ValueError(f"{what}, which the steps of method 'variational' do not integrate; take another method")
+    if isinstance(control, Controller) and control.takes_multipliers:
+        raise ValueError(f"{what}, behind which multipliers do not depend on the command; use a control without them")
 
 
 def check_modal_options(control, stepsize, solver, adjoint, outputs, max_events: Any) -> None:

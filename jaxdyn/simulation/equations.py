@@ -8,7 +8,8 @@ import jax
 import jax.numpy as jnp
 
 from jaxdyn.compile.known import partition_tracers
-from jaxdyn.constraints.selection import exchange_rows, renew_rows
+from jaxdyn.constraints.redundancy import exchange_rows
+from jaxdyn.constraints.selection import renew_rows
 from jaxdyn.forces.piecewise import Pieces, fix_pieces, guards, pieces_of, values_and_levels
 from jaxdyn.simulation import controls
 from jaxdyn.simulation.methods import Method, Projected
@@ -19,6 +20,8 @@ from jaxdyn.systems.system import retract, velocity_to_rate
 # Entry of the state of a mechanism with redundant rows: the rows that a step keeps. Rank is decided once a step, at its start on
 # the manifold: between its stages, where rows that depend on each other are open by the local error, it would change.
 KEPT = "kept_rows"
+# Entry of the state: the states of the scene's drives.
+DRIVES = "drives"
 
 
 def power(force, v):
@@ -29,13 +32,13 @@ def power(force, v):
 def equations(
     scene: Scene, control: Any, method: Method, start: dict, q0, v0, t0, conditions: Conditions
 ) -> tuple["Equations", tuple | None]:
-    """Equations of a run and their arguments; `start`: the control's entries in the state, at its start (q0, v0, t0)."""
+    """Equations of a run and their arguments; `start`: entries of the control and the drives at the start (q0, v0, t0)."""
     # diffrax compiles its arguments, which hides their values. Known leaves are compiled in, the rest is `args`: flat, because
     # its continuous adjoint supports no empty tuples.
     unknown, known = partition_tracers((scene, control, method))
     args = tuple(unknown) or None
     eqs = Equations(known, len(unknown), tuple(start), conditions)
-    eqs.pieces = pieces_of(scene, start, q0, v0, t0, functools.partial(eqs.effort, args))
+    eqs.pieces = pieces_of(scene, start, q0, v0, t0, lambda y, q, v, t: (eqs.effort(args, y, q, v, t), y.get(DRIVES)))
     return eqs, args
 
 
@@ -67,19 +70,26 @@ class Equations:
         return scene, control, method
 
     def effort(self, args, y, q, v, t):
-        """Torque of the control before the limits of effort, (nv,) or None without a control."""
+        """Torque of the control before drives and limits, (nv,) or None without a control and drives."""
         scene, control, method = self.unpack(args, y)
 
         def multipliers(tau):
             force = scene.applied_force(q, v, t)
             return method.multipliers(scene, q, v, t, tau if force is None else tau + force)
 
-        return controls.torque(control, scene, y, q, v, t, multipliers)
+        tau = controls.torque(control, scene, y, q, v, t, multipliers)
+        return jnp.zeros_like(v) if tau is None and DRIVES in self._added else tau
+
+    def drive(self, args, y, q, v, t):
+        """Torque behind the scene's drives and limits, (nv,) or None without any, and the rates of the drives' states."""
+        tau = self.effort(args, y, q, v, t)
+        if tau is None:
+            return None, None
+        return self.unpack(args, y)[0].drive_torque(q, v, t, tau, y.get(DRIVES))
 
     def torque(self, args, y, q, v, t):
-        """Torque of the control, (nv,), or None without a control."""
-        tau = self.effort(args, y, q, v, t)
-        return None if tau is None else self.unpack(args, y)[0].clip_effort(tau)
+        """Torque behind the scene's drives and limits, (nv,) or None without any."""
+        return self.drive(args, y, q, v, t)[0]
 
     def generalized_force(self, args, y, q, v, t):
         """Sum of tau and the scene's forces, (nv,), or None where there are none."""
@@ -90,17 +100,23 @@ class Equations:
         """Switching functions of the scene's forces, and their rounding levels."""
         scene, _, method = self.unpack(args, y)
         q, v = method.to_qv(scene, y, t)
-        return values_and_levels(lambda q, v: guards(scene, q, v, t, self.effort(args, y, q, v, t)), q, v)
+        own = [y[DRIVES]] if DRIVES in y else []
 
-    def _control_rates(self, args, y, q, v, t, force):
+        def values(q, v, *own):
+            return guards(scene, q, v, t, self.effort(args, y, q, v, t), *own)
+
+        return values_and_levels(values, q, v, *own)
+
+    def _added_rates(self, args, y, q, v, t, force):
         scene, control, method = self.unpack(args, y)
-        return controls.rates(control, y, q, v, t, lambda: method.multipliers(scene, q, v, t, force))
+        rates = controls.rates(control, y, q, v, t, lambda: method.multipliers(scene, q, v, t, force))
+        return rates | ({DRIVES: self.drive(args, y, q, v, t)[1]} if DRIVES in y else {})
 
     def _derivative(self, t, y, args):
         scene, _, method = self.unpack(args, y)
         rates, force, v = method.evaluate(scene, y, t, functools.partial(self.generalized_force, args, y))
         if self._added:
-            rates = rates | self._control_rates(args, y, retract(scene.system, y["q"]), v, t, force)
+            rates = rates | self._added_rates(args, y, retract(scene.system, y["q"]), v, t, force)
         if KEPT in y:
             rates = rates | {KEPT: jnp.zeros_like(y[KEPT])}
         return rates | {"work": power(force, v)} if "work" in y else rates
@@ -113,7 +129,7 @@ class Equations:
         rates = rates | ({KEPT: jnp.zeros_like(y[KEPT])} if KEPT in y else {})
         # Controllers and the work see the whole force, although the rate of v has a share of it only.
         force = self.generalized_force(args, y, q, v, t) if self._added or "work" in y else None
-        rates = rates | self._control_rates(args, y, q, v, t, force)
+        rates = rates | self._added_rates(args, y, q, v, t, force)
         return rates | {"work": power(force, v)} if "work" in y else rates
 
     def _implicit_part(self, t, y, args):
@@ -123,7 +139,7 @@ class Equations:
         rates = jax.tree.map(jnp.zeros_like, y)
         force = scene.applied_force(q, v, t)
         if force is not None:
-            # Work and the control's entries are integrated explicitly.
+            # Work and the entries of the control and the drives are integrated explicitly.
             by_force = {name: y[name] for name in y if name not in ("work", *self._added)}
             _, share = jax.jvp(lambda f: method.rates(scene, by_force, q, v, t, f), (jnp.zeros_like(v),), (force,))
             rates = rates | share

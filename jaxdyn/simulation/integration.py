@@ -46,16 +46,17 @@ def integrate(term, project, eqs: Equations, args, method, y0, ts, steps, option
         "progress": progress_meter(options["progress"]),
         "dt0": dt0,
     }
+    explicit: Any = solver  # where `is_erk`
     inputs, sums, is_fixed_length = (y0, args, ts), None, is_step_length(steps[-1])
     reason = _reason_for_crossing(eqs, is_erk, controller, quality is not None, adjoint, options)
     ends_at_kinks = bool(eqs.pieces.names) and reason is None
     if eqs.pieces.names and reason is not None:
         inputs = undifferentiable(inputs, reason)
     if ends_at_kinks:
-        system = PiecewiseSystem(solver.plan(y0), eqs.pieces, eqs.switching)
+        system = PiecewiseSystem(explicit.plan(y0), eqs.pieces, eqs.switching)
         rows, facts, sums = _by_pieces(system, inputs, controller, steps, options)
     elif is_erk and not any(eqs.conditions) and _has_own_loop(controller, adjoint, options):
-        rows, facts, sums = _integrator(solver, y0, quality, controller, steps, options)(*inputs)
+        rows, facts, sums = _integrator(explicit, y0, quality, controller, steps, options)(*inputs)
     elif is_fixed_length:
         rows, facts, solution = run(inputs, **diffrax_options)
         sums = solution.controller_state[2:] if isinstance(controller, ErrorMonitoredSteps) else None
@@ -137,7 +138,8 @@ def _by_pieces(system, inputs, controller, steps, options):
         rtol, atol, stepsize = controller.rtol, controller.atol, None
         room = room if options["limit_is_given"] else min(room, ROOM)
     is_direct = isinstance(options["adjoint"], (diffrax.ForwardMode, diffrax.DirectAdjoint))
-    return piecewise_motion(system, *inputs, rtol, atol, stepsize, options["max_steps"], room, most, is_direct)
+    y0, args, ts = inputs
+    return piecewise_motion(system, y0, args, ts, rtol, atol, stepsize, options["max_steps"], room, most, is_direct)
 
 
 def _has_own_loop(controller, adjoint, options) -> bool:
@@ -153,7 +155,6 @@ def _integrator(solver: ExplicitSteps, y0, quality, controller, steps, options) 
         plan = plan._replace(quality=lambda t, y, args: _quality_or_zero(quality(t, y, args)))
     if isinstance(controller, Adaptive):
         room = most if options["limit_is_given"] else min(most, ROOM)
-        return ExplicitRun(
-            plan, driver.AdaptiveSteps(order, controller.norm), controller.rtol, controller.atol, None, most, room
-        )
-    return ExplicitRun(plan, driver.FixedSteps(solver.order(None), order), None, None, steps[-1], most, most)
+        control = driver.AdaptiveSteps(order, controller.norm)
+        return ExplicitRun(plan, control, controller.rtol, controller.atol, None, most, room=room)
+    return ExplicitRun(plan, driver.FixedSteps(solver.order(None), order), None, None, steps[-1], most, room=most)

@@ -21,15 +21,15 @@ from jaxdyn.constraints.base import Rows, holonomic_rows, layout, position_resid
 from jaxdyn.constraints.codes import RESULTS
 from jaxdyn.constraints.dynamics import constrained_dynamics, solve_rows
 from jaxdyn.constraints.projection import project_state, project_step
-from jaxdyn.constraints.rank import checked_tolerance
-from jaxdyn.constraints.selection import (
-    is_selected,
-    missed_by_dropped,
+from jaxdyn.constraints.rank import check_tolerance
+from jaxdyn.constraints.redundancy import (
+    distribute_multipliers,
+    has_selection,
     most_opening,
-    most_rounding,
-    opening_of_dropped,
-    spread_multipliers,
+    opening_of_redundant,
+    residual_of_redundant,
 )
+from jaxdyn.constraints.selection import most_rounding
 from jaxdyn.constraints.tolerances import openness
 from jaxdyn.dynamics.quantities import forward_dynamics
 from jaxdyn.lie.so3 import matmul
@@ -145,7 +145,7 @@ class Multipliers(Method):
     name: ClassVar[str] = "multipliers"
 
     def __check_init__(self):
-        checked_tolerance(self.rank_tol)
+        check_tolerance(self.rank_tol)
 
     def acceleration(self, scene: Scene, q: Q, v: V, t: Number, force: Force) -> Array:
         """Acceleration of `constrained_dynamics`."""
@@ -155,7 +155,7 @@ class Multipliers(Method):
         """True if `constrained_dynamics` finds no contradiction, and the rows that were dropped at the start agree."""
         motion = dynamics(scene, q, v, t, force, self.rank_tol)
         is_solved = motion.result != RESULTS.contradictory_rows
-        return is_solved & (missed_by_dropped(scene, q, v, t, motion.acceleration) <= most_rounding(q.dtype))
+        return is_solved & (residual_of_redundant(scene, q, v, t, motion.acceleration) <= most_rounding(q.dtype))
 
 
 class Projected(Multipliers):
@@ -325,10 +325,10 @@ def _position_error(scene: Scene, q, error) -> Array:
 def dynamics(scene: Scene, q, v, t, force, rank_tol: float | None = None):
     """Acceleration and multipliers at a state; `force` (nv,) is tau plus the scene's forces, or None."""
     motion = constrained_dynamics(Scene(scene.system, scene.constraints), q, v, force, t, rank_tol=rank_tol)
-    if not is_selected(scene):
+    if not has_selection(scene):
         return motion
     # Redundant rows share the constraint force: the one of least norm is unique.
-    shared = spread_multipliers(scene, q, t, motion.multipliers)
+    shared = distribute_multipliers(scene, q, t, motion.multipliers)
     return eqx.tree_at(lambda motion: motion.multipliers, motion, shared)
 
 
@@ -349,4 +349,4 @@ def consistent(scene: Scene, q, v, t):
 
 def satisfies_redundant_rows(scene: Scene, q, v, t):
     """True if the rows that were dropped at the start of a motion are still satisfied."""
-    return opening_of_dropped(scene, q, t, v) <= most_opening(scene, q.dtype)
+    return opening_of_redundant(scene, q, t, v) <= most_opening(scene, q.dtype)

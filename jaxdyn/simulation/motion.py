@@ -11,19 +11,11 @@ from jaxtyping import Array
 
 from jaxdyn.compile import entry_point, kernel
 from jaxdyn.compile.batch import map_rows
-from jaxdyn.constraints.selection import (
-    exchange_rows,
-    gap_of_dropped,
-    is_selected,
-    keep_rows,
-    kept_of,
-    most_rounding,
-    rows_of,
-    select_rows,
-)
+from jaxdyn.constraints.redundancy import exchange_rows, gap_of_redundant, has_selection, keep_rows, row_mask, rows_of
+from jaxdyn.constraints.selection import most_rounding, select_rows
 from jaxdyn.simulation import controls
 from jaxdyn.simulation.checks import angle_coordinates, largest_angle
-from jaxdyn.simulation.equations import KEPT, Equations, equations
+from jaxdyn.simulation.equations import DRIVES, KEPT, Equations, equations
 from jaxdyn.simulation.integration import integrate
 from jaxdyn.simulation.methods import Method, consistent, is_regular, satisfies_redundant_rows, start_limit
 from jaxdyn.simulation.outputs import at_save_point
@@ -98,7 +90,7 @@ def smooth_motion(scene: Scene, control, method: Method, numbers, options) -> So
         (nonfinite, RESULTS.nonfinite_state),
         *_faults_of_constraints(run, (y, q, v, ts), result),
     ]
-    of_control = {name: y[name] for name in (controls.STATE, controls.HELD) if name in y}
+    of_control = {name: y[name] for name in (controls.STATE, controls.HELD, DRIVES) if name in y}
 
     def outputs_of(row):
         y, *state = row
@@ -151,6 +143,8 @@ def _set_up(scene: Scene, control, method: Method, inputs: Inputs, options) -> t
         check_callback(force, f"forces[{i}]", "force(system, q, v, t)", *start, first=(scene.system,))
     controls.check_control(scene, control, *start)
     entries = controls.initial_entries(control, *start)
+    if (of_drives := scene.drive_state(*start)) is not None:
+        entries = entries | {DRIVES: of_drives}
     conditions = Conditions(
         options["contacts"] == "stop" and scene.cones is not None,
         options["limits"] == "stop",
@@ -160,7 +154,7 @@ def _set_up(scene: Scene, control, method: Method, inputs: Inputs, options) -> t
     # Shapes that do not fit are reported here, with the user's function at the end of the traceback.
     eqx.filter_eval_shape(eqs.generalized_force, args, entries, *start)
     y0 = method.start(scene, *start) | entries
-    if is_selected(scene) and not isinstance(options["solver"], Stepper):
+    if has_selection(scene) and not isinstance(options["solver"], Stepper):
         y0 = y0 | {KEPT: rows_of(scene, start[0].dtype)}
     y0 = y0 | {"work": jnp.zeros((), start[0].dtype)} if "work" in options["outputs"] else y0
     return _Run(scene, control, method, eqs, args), y0
@@ -217,7 +211,7 @@ def _faults_of_constraints(run: _Run, rows, result) -> list[tuple[Array, Any]]:
         y, *state = row
         scene = run.scene_at(y)  # rows that were exchanged on the way are open by rounding
         ok = consistent(scene, *state)
-        return ok & satisfies_redundant_rows(scene, *state) if is_selected(scene) else ok
+        return ok & satisfies_redundant_rows(scene, *state) if has_selection(scene) else ok
 
     def satisfies(row):
         force = run.eqs.generalized_force(run.args, *row)
@@ -232,10 +226,10 @@ def _faults_of_constraints(run: _Run, rows, result) -> list[tuple[Array, Any]]:
 
 def _redundancy(run: _Run, y, q, ts, reached) -> dict[str, Array]:
     """Number of rows that were dropped as redundant, and the largest of their residuals."""
-    if not is_selected(run.scene):
+    if not has_selection(run.scene):
         return {}
-    gaps = map_rows(lambda row: gap_of_dropped(run.scene_at(row[0]), *row[1:]), (y, q, ts))
+    gaps = map_rows(lambda row: gap_of_redundant(run.scene_at(row[0]), *row[1:]), (y, q, ts))
     return {
-        "redundant_rows": jnp.sum(1 - kept_of(run.scene)).astype(jnp.int32),
+        "redundant_rows": jnp.sum(1 - row_mask(run.scene)).astype(jnp.int32),
         "redundant_gap": jnp.max(jnp.where(reached, gaps, jnp.zeros_like(gaps))),
     }

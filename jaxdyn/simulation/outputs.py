@@ -10,7 +10,7 @@ from jaxdyn.dynamics.kinematics import frame_pose
 from jaxdyn.dynamics.quantities import kinetic_energy, potential_energy
 from jaxdyn.simulation import controls
 from jaxdyn.simulation.checks import CONTACT_OUTPUTS, POSE
-from jaxdyn.simulation.equations import Equations, power
+from jaxdyn.simulation.equations import DRIVES, Equations, power
 from jaxdyn.simulation.methods import Method
 from jaxdyn.systems.scene import Scene
 
@@ -27,7 +27,7 @@ def state_outputs(system, outputs, q, v, t) -> dict[str, Any]:
 def at_save_point(
     scene: Scene, control: Any, method: Method, eqs: Equations, args, outputs, q, v, t, of_control
 ) -> dict[str, Any]:
-    """Outputs at one state; `of_control`: the control's entries in the state."""
+    """Outputs at one state; `of_control`: entries of the control and the drives in the state."""
     values = state_outputs(scene.system, outputs, q, v, t)
     of_force = {"power", "acceleration", "multipliers", *CONTACT_OUTPUTS} & set(outputs)
     force = eqs.generalized_force(args, of_control, q, v, t) if of_force else None
@@ -51,4 +51,6 @@ def at_save_point(
         values["torque"] = jnp.zeros_like(v) if tau is None else tau
     if "control_state" in outputs:
         values["control_state"] = controls.state_of(control, of_control, q, v, t)
+    if "drive_state" in outputs:
+        values["drive_state"] = of_control.get(DRIVES)
     return values

@@ -96,8 +96,9 @@ def simulate(
       continuous adjoint, whose gradients are approximate; or a diffrax adjoint.
     - `outputs`: any of "energy", "power", "work" (one more state, under the same error control), "acceleration" (the rate
       of v: of a free joint that of its body twist; `jd.dynamics.frame_acceleration` gives those of frames in world axes),
-      "multipliers", "constraint_residual", "contact_forces", "contact_margins", "torque" (of the control), "control_state"
-      (of a controller) and "pose:<frame>". They are computed only if asked for.
+      "multipliers", "constraint_residual", "contact_forces", "contact_margins", "torque" (of the control, behind drives
+      and limits), "control_state" (of a controller), "drive_state" (of drives) and "pose:<frame>". They are computed only if
+      asked for.
     - `contacts`: of a scene with `cones`. "stop": where a contact pulls or leaves its cone (a margin below zero by more than
       rounding, eps^(1/2) of its force) the run ends, with the code `contact_lost` and the time, which is found within the
       step. "report": it continues, with contacts that hold on both sides.
@@ -209,6 +210,7 @@ def _choose(scene: Scene, control, method: Method, solver, stepsize, adjoint, st
         solver = solver_for_start(scene, controls.at_start(control, q0, v0, ts[0]), q0, v0, ts)
     solver = choose_solver(method.stepper(solver, stepsize), stepsize)
     adjoint = choose_adjoint(adjoint, solver)
+    checks.check_drives(scene, control, solver, modal)
     checks.check_combination(control, method, solver, adjoint)
     return solver, adjoint
 

@@ -100,9 +100,9 @@ class Solution(Outcome):
     - The requested `outputs`, others None: `energy` (nt,), kinetic plus gravitational, J; `power` (nt,), of tau and the
       scene's forces, W; `work` (nt,), its integral from the start, J; `acceleration` (nt, nv); `multipliers`
       (nt, nc); `constraint_residual` (nt, 2), the largest |phi| and |A v - b|; `torque` (nt, nv), of the control, N m or N;
-      `control_state`, rows of the controller's state, a pytree; `poses`, one array (nt, 4, 4) by name for each frame asked for
-      as "pose:<frame>"; `contact_forces` (nt, m) and `contact_margins` (nt,), by the names of the contacts that have a cone,
-      along the columns of `jd.contact.wrench_basis`, N and N m.
+      `control_state`, rows of the controller's state, a pytree; `drive_state` (nt, n), of the scene's drives; `poses`,
+      one array (nt, 4, 4) by name for each frame asked for as "pose:<frame>"; `contact_forces` (nt, m) and `contact_margins`
+      (nt,), by the names of the contacts that have a cone, along the columns of `jd.contact.wrench_basis`, N and N m.
     - `events`, of a scene with friction that sticks or contacts that open: an `Events` with `time`, `index` and `name`, else
       None. Its `contact_forces` (nt, 3) are the two components of friction and the normal force, N.
     - If the rows of the constraints were not all found independent before the run, `stats["redundant_rows"]` is the number of
@@ -124,6 +124,7 @@ class Solution(Outcome):
     constraint_residual: Float[Array, "nt 2"] | None = None
     torque: Float[Array, "nt nv"] | None = None
     control_state: Any = None
+    drive_state: Float[Array, "nt n"] | None = None
     poses: dict[str, Float[Array, "nt 4 4"]] = eqx.field(default_factory=dict)
     contact_forces: dict[str, Float[Array, "nt m"]] = eqx.field(default_factory=dict)
     contact_margins: dict[str, Float[Array, " nt"]] = eqx.field(default_factory=dict)

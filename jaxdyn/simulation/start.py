@@ -11,7 +11,8 @@ from jaxtyping import Array
 from jaxdyn.compile.known import is_concrete
 from jaxdyn.constraints.assembly import largest_residuals, open_constraints, start_openness
 from jaxdyn.constraints.base import layout
-from jaxdyn.constraints.selection import keep_rows, known_selection, most_rounding
+from jaxdyn.constraints.redundancy import keep_rows
+from jaxdyn.constraints.selection import most_rounding, select_concrete_rows
 from jaxdyn.dynamics.quantities import mass_matrix
 from jaxdyn.model import float64 as f64
 from jaxdyn.model.tree import Model, neutral
@@ -64,7 +65,7 @@ def check_constraints(scene: Scene, method: Method, q, v, t) -> tuple[Scene, Met
     at the start.
     """
     limit, t = start_limit(q.dtype), np.asarray(t, q.dtype)
-    selection, here = known_selection(scene, q, t, method.rank_tol)
+    selection, here = select_concrete_rows(scene, q, t, method.rank_tol)
     rank = int(np.sum(selection.kept))
     selected = scene if rank == len(selection.kept) else keep_rows(scene, selection)
     ratio = start_openness(selected, q, v, t, limit)

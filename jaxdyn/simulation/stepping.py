@@ -11,10 +11,12 @@ from jax.flatten_util import ravel_pytree
 
 from jaxdyn.compile import is_standalone
 from jaxdyn.compile.known import is_concrete, partition_tracers
-from jaxdyn.constraints.selection import keep_rows, may_have_redundant_rows, select_rows
+from jaxdyn.constraints.redundancy import keep_rows
+from jaxdyn.constraints.selection import may_have_redundant_rows, select_rows
 from jaxdyn.contact.unilateral import has_modes
 from jaxdyn.forces.piecewise import fix_pieces, guards, pieces_of, values_and_levels
 from jaxdyn.model.arguments import Numbers, as_array, check_shape, state_dtype
+from jaxdyn.simulation.equations import DRIVES
 from jaxdyn.simulation.hybrid.piecewise import PiecewiseSystem, piecewise_motion
 from jaxdyn.simulation.solvers import ExplicitSteps, driver
 from jaxdyn.simulation.solvers.driver import ExplicitRun
@@ -31,10 +33,11 @@ ADJOINTS = ("reverse", "forward", "direct")
 def stepper(scene: SceneLike, dt: Numbers, substeps: int = 1, remat: bool = True, adjoint: str = "reverse") -> Callable:
     """Function step(state, tau, t=0.0) -> state that advances a scene by dt under a constant tau, or under a law.
 
-    The state is a pair (q (nq,), v (nv,)); batch it with `jax.vmap`, and repeat it with `jax.lax.scan`. The
+    The state is a pair (q (nq,), v (nv,)), or (q, v, z) of a scene with `jd.forces.DriveDynamics`, whose states z start as
+    `scene.drive_state(q, v)`; batch it with `jax.vmap`, and repeat it with `jax.lax.scan`. The
     torques tau (nv,) are numbers, or a law tau(q, v, t) -> (nv,), called once at the start of the step. The
     steps are those of `jd.simulate` with `stepsize=dt/substeps`: RK4, constraints closed at the end of each, the scene's
-    forces applied (friction, stops, drives), and tau clipped by its `jd.forces.EffortLimits`. Where a joint meets a stop
+    forces applied (friction, stops, drives), and tau through its drives and `jd.forces.EffortLimits`. Where a joint meets a stop
     (`jd.forces.JointStops`, any `jd.forces.PiecewiseForce`) a step ends, and the next one ends where it would have ended.
 
     **Arguments:**
@@ -61,22 +64,26 @@ def stepper(scene: SceneLike, dt: Numbers, substeps: int = 1, remat: bool = True
     seconds = _check_options(scene, dt, substeps, adjoint)
     system, dtype = scene.system, state_dtype(scene.system)
     length = np.asarray(seconds, dtype) if is_concrete(seconds) else jnp.asarray(seconds, dtype)
-    advance = _advance(scene, length, substeps, adjoint != "reverse")
+    start, advance = _advance(scene, length, substeps, adjoint != "reverse")
     by_numbers = jax.checkpoint(advance) if remat else advance
 
     def step(state, tau, t: Any = 0.0):
-        q, v = state
-        q, v = jnp.asarray(as_array(q, "q"), dtype), jnp.asarray(as_array(v, "v"), dtype)
+        if len(state) != (2 if start is None else 3):
+            names = "(q, v)" if start is None else "(q, v, z) with z = scene.drive_state(q, v) at the start"
+            raise ValueError(f"stepper: the state has {len(state)} entries, expected {names}")
+        q, v, *z = (jnp.asarray(as_array(x, name), dtype) for x, name in zip(state, ("q", "v", "z"), strict=False))
         for name, value in (("q", q), ("v", v)):
             check_shape(system, name, value)
+        if start is not None and z[0].shape != start.shape:
+            raise ValueError(f"z has shape {z[0].shape}, expected {start.shape} as of scene.drive_state(q, v)")
         t = jnp.asarray(t, dtype)
         if not callable(tau):
-            return by_numbers(q, v, check_force(jnp.asarray(as_array(tau, "tau"), dtype), q, scene.nv, "tau"), t)
+            return by_numbers(q, v, check_force(jnp.asarray(as_array(tau, "tau"), dtype), q, scene.nv, "tau"), t, *z)
 
-        def by_law(q, v, t):
-            return advance(q, v, check_force(jnp.asarray(tau(q, v, t), dtype), q, scene.nv, "tau"), t)
+        def by_law(q, v, t, *z):
+            return advance(q, v, check_force(jnp.asarray(tau(q, v, t), dtype), q, scene.nv, "tau"), t, *z)
 
-        return (jax.checkpoint(by_law) if remat else by_law)(q, v, t)
+        return (jax.checkpoint(by_law) if remat else by_law)(q, v, t, *z)
 
     return step
 
@@ -98,8 +105,8 @@ def _check_options(scene: Scene, dt, substeps, adjoint):
     return seconds
 
 
-def _advance(scene: Scene, length, substeps: int, is_direct: bool) -> Callable:
-    """Function (q, v, tau, t) -> (q, v) of a step under a constant tau, of known shapes."""
+def _advance(scene: Scene, length, substeps: int, is_direct: bool) -> tuple[Any, Callable]:
+    """States of the scene's drives or None, and a function (q, v, tau, t, *z) -> (q, v, *z) of a step under a constant tau."""
     selects_rows = bool(scene.constraints) and may_have_redundant_rows(scene)
     method, dtype = choose_method(scene, "auto"), state_dtype(scene.system)
     unknown, known = partition_tracers(scene)
@@ -114,29 +121,39 @@ def _advance(scene: Scene, length, substeps: int, is_direct: bool) -> Callable:
     @jax.jit
     def field(t, y, args):
         scene, tau = unpack(args)
+        of_drive = {}
 
         def generalized_force(q, v, t):
-            force, effort = scene.applied_force(q, v, t), scene.clip_effort(tau)
-            return effort if force is None else effort + force
+            force, (torque, rates) = scene.applied_force(q, v, t), scene.drive_torque(q, v, t, tau, y.get(DRIVES))
+            of_drive.update({} if rates is None else {DRIVES: rates})
+            return torque if force is None else torque + force
 
-        return method.evaluate(scene, y, t, generalized_force)[0]
+        return method.evaluate(scene, y, t, generalized_force)[0] | of_drive
 
     def project(t, y, error, args):
         y, error = method.end_step(unpack(args)[0], y, t, error)
         return y, error, diffrax.RESULTS.successful
 
     def switching(t, y, args):
-        scene, _ = unpack(args)
-        return values_and_levels(lambda q, v: guards(scene, q, v, t, None), *method.to_qv(scene, y, t))
+        scene, tau = unpack(args)
+        state = (*method.to_qv(scene, y, t), *(y[name] for name in of_drives))
+        return values_and_levels(lambda q, v, *own: guards(scene, q, v, t, tau if limits_vary else None, *own), *state)
 
     corrector = project if method.corrects(scene) else None
     solver = ExplicitSteps(RK4(), corrector, method.step_constants, method.projects, field=field)
-    # Constant in a step, tau has its limits of effort applied in the vector field: they are no switching functions here.
     q, v = (jnp.zeros((n,), dtype) for n in (scene.nq, scene.nv))
-    pieces = pieces_of(scene, (), q, v, jnp.zeros((), dtype), None)
+    start = scene.drive_state(q, v)
+    of_drives = () if start is None else (DRIVES,)
+    # tau is constant in a step, and so is where it is cut off, unless drives or limits of the speed are in between.
+    limits_vary = bool(of_drives) or any(getattr(force, "of_speed", False) for force in scene.forces)
+    tau_of = (lambda _, q, v, t: (v, scene.drive_state(q, v, t))) if limits_vary else None
+    pieces = pieces_of(scene, (), q, v, jnp.zeros((), dtype), tau_of)
 
-    def advance(q, v, tau, t):
-        y = method.start(scene, q, v, t)
+    def state_of(y, t):
+        return *method.to_qv(scene, y, t), *(y[name] for name in of_drives)
+
+    def advance(q, v, tau, t, *z):
+        y = method.start(scene, q, v, t) | dict(zip(of_drives, z, strict=True))
         selection = select_rows(known(unknown), q, t, None) if selects_rows else None
         plan, args, ts, size = solver.plan(y), (unknown, tau, selection), jnp.stack([t, t + length]), length / substeps
         if pieces.names:
@@ -148,11 +165,11 @@ def _advance(scene: Scene, length, substeps: int, is_direct: bool) -> Callable:
             for i in range(substeps):
                 start, end = t + i * size, t + (i + 1) * size
                 flat = take_step(plan, args, start, end, flat, plan.first_rate(args, start, flat)).projected
-            return method.to_qv(scene, plan.structure(flat), t + length)
+            return state_of(plan.structure(flat), t + length)
         else:
             # Orders of RK4 and of its error estimate.
-            run = ExplicitRun(plan, driver.FixedSteps(4, 3), None, None, size, substeps, substeps)
+            run = ExplicitRun(plan, driver.FixedSteps(4, 3), None, None, size, substeps, room=substeps)
             rows = (run.direct if is_direct else run)(y, args, ts)[0]
-        return method.to_qv(scene, jax.tree.map(lambda x: x[0], rows), t + length)
+        return state_of(jax.tree.map(lambda x: x[0], rows), t + length)
 
-    return advance
+    return start, advance

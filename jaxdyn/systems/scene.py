@@ -14,6 +14,7 @@ from jaxtyping import Array, Float, PyTree
 
 from jaxdyn.model.arguments import Checked, Number, SystemLike, as_array, batch_hint, check_system, warn
 from jaxdyn.model.description import scene_lines
+from jaxdyn.systems.drives import DriveDynamics, pass_command
 
 if TYPE_CHECKING:
     Force = Callable[[Any, Array, Array, Array], Array]  # f(system, q, v, t) -> (nv,)
@@ -155,6 +156,34 @@ class Scene(eqx.Module):
             cut = getattr(force, "clip_effort", None)
             tau = tau if cut is None else cut(self.system, tau)
         return tau
+
+    def drive_state(self, q: Float[Array, " nq"], v: Float[Array, " nv"], t: Number = 0.0) -> Float[Array, " n"] | None:
+        """Start of the states of all `jd.forces.DriveDynamics` in the scene, one after the other (n,); None without any."""
+        states = [force.start(self.system, q, v, t) for force in self.forces if isinstance(force, DriveDynamics)]
+        return jnp.concatenate(states) if states else None
+
+    def drive_torque(
+        self,
+        q: Float[Array, " nq"],
+        v: Float[Array, " nv"],
+        t: Number,
+        command: Float[Array, " nv"],
+        state: Float[Array, " n"] | None = None,
+    ) -> tuple[Float[Array, " nv"], Float[Array, " n"] | None]:
+        """Torques (nv,) at the joints for the commands of a control, and the rates of the drives' states (None without any).
+
+        The scene's drives and effort limits act in the order of `forces`; `state` as of `drive_state`.
+        """
+        rates = []
+        for force in self.forces:
+            command, rate, state = pass_command(force, self.system, q, v, t, command, state)
+            rates += [] if rate is None else [rate]
+        return command, jnp.concatenate(rates) if rates else None
+
+
+def has_drives(scene: Scene) -> bool:
+    """Decide whether a scene has drives with a state."""
+    return any(isinstance(force, DriveDynamics) for force in scene.forces)
 
 
 def as_scene(scene: Any) -> Scene:

@@ -1,4 +1,4 @@
-"""Tasks on the workers of a Dask client: checks, a sliding window of tasks, and what becomes of them when a machine dies."""
+"""Tasks on the workers of a Dask client: checks, a sliding window of tasks, and recovery when a machine dies."""
 
 import contextlib
 import itertools
@@ -18,25 +18,25 @@ from jaxdyn.tasks.local import Failure, Local, package_versions
 if TYPE_CHECKING:
     from distributed import Client as DaskClient
 else:
-    DaskClient = Any  # Dask need not be there; `Cluster` looks at it
+    DaskClient = Any  # Dask need not be installed; `Cluster` checks the object
 
 logger = logging.getLogger("jaxdyn")
-WINDOW = 4  # tasks that a worker has or waits for: enough that it never idles, few enough that memory stays flat
+WINDOW = 4  # tasks per worker, running or waiting: enough that it never idles, few enough that memory stays flat
 LEAST_WINDOW = 16
-AHEAD = 8  # windows that tasks may run ahead of one that is not finished, whose results wait for it
+AHEAD = 8  # windows that tasks may run ahead of an unfinished one, whose place in the order their results wait for
 
 
 class Cluster:
-    """Tasks on the workers of a Dask client: methods of an object that `send` sends there; a context manager.
+    """Tasks on the workers of a Dask client: methods of an object that `send` sends to them; a context manager.
 
     **Arguments:** `retries`, of a task that raises. `mark`: a file and its text, which every worker has to see, or None.
 
-    A worker has one task at a time, so that the threads of kernels are not shared among several. Tasks of a worker that dies go
-    to the others. Where the scheduler dies the client reconnects for as long as its own `timeout` says, and unfinished tasks are
-    submitted again.
+    A worker has one task at a time, so that tasks do not compete for the threads of kernels. Tasks of a worker that dies go
+    to the others. If the scheduler dies, the client reconnects within its own `timeout`, and unfinished tasks are submitted
+    again.
 
-    **Raises:** ValueError for what is no client, and for a scheduler or workers with other versions of Python, Dask, JAX or
-    jaxdyn, before any task. ConnectionError where the scheduler does not come back.
+    **Raises:** ValueError for anything but a connected client, and for a scheduler or workers with other versions of Python,
+    Dask, JAX or jaxdyn, before any task. ConnectionError where the scheduler does not come back.
     """
 
     def __init__(self, client: DaskClient, retries: int = 0, mark: tuple[Path, str] | None = None):
@@ -48,7 +48,7 @@ class Cluster:
 
     def __enter__(self) -> "Cluster":
         try:
-            import cloudpickle  # noqa: F401 (its absence is told here)
+            import cloudpickle  # noqa: F401 (reported here if it is missing)
             from distributed import Client
         except ImportError as error:
             raise ImportError(f"client= needs {error.name}: pip install 'jaxdyn[scale]'") from error
@@ -67,7 +67,7 @@ class Cluster:
     def send(self, target: Callable[[], Any]) -> None:
         """Send `target` by cloudpickle, with the settings of JAX of this thread, to each worker, also to those that join later.
 
-        A worker calls it at its first task.
+        A worker calls it before its first task.
 
         **Raises:** ValueError for a worker that does not see the file `mark`.
         """
@@ -79,6 +79,7 @@ class Cluster:
         self.client.register_plugin(self._plugin, name=self._name)
 
     def _begin(self) -> None:
+        # A cluster that scales by need has no worker yet.
         self.client.wait_for_workers(1)
         _check_versions(self.client)
         if self._plugin is not None:
@@ -95,16 +96,16 @@ class Cluster:
         return max(Counter(address.rpartition(":")[0] for address in self.client.nthreads()).values(), default=1)
 
     def call(self, method: str, item: Any) -> Any:
-        """target.method(item) on a worker. **Raises:** what it raises there."""
+        """target.method(item) on a worker. **Raises:** its error."""
         [(_, result)] = self.map(method, [item])
         if isinstance(result, Failure):
             raise result.error
         return result
 
     def map(self, method: str, items: Iterable[Any]) -> Iterator[tuple[Any, Any]]:
-        """Each item with target.method(item), or with the `Failure` of its last attempt, in the order of the items.
+        """Pairs of an item and target.method(item), or the `Failure` of its last attempt, in the order of the items.
 
-        Items are taken and tasks submitted as results arrive: memory does not grow with their number.
+        Tasks are submitted as results arrive: memory does not grow with their number.
         """
         window = _Window(self, method, items)
         while True:
@@ -122,7 +123,7 @@ class Cluster:
                 window.submit_again()
 
     def submit(self, group: str, method: str, places: list[int], items: list[Any]) -> list[Any]:
-        """Futures of tasks; their keys are of the group and the places."""
+        """Futures of tasks, with keys (group, place)."""
         from jaxdyn.tasks.worker import RESOURCE, call_target
 
         return self.client.map(
@@ -133,11 +134,11 @@ class Cluster:
             key=[(group, place) for place in places],
             resources={RESOURCE: 1},
             retries=self.retries,
-            pure=False,
+            pure=False,  # keys are given, not hashes of the arguments
         )
 
     def new_group(self, method: str) -> str:
-        """A name that no task had."""
+        """A new name for the keys of tasks."""
         return f"{self._name}-{method}-{next(self._generation)}"
 
     def _recover(self) -> None:
@@ -158,14 +159,14 @@ class Cluster:
 
 
 class _Window:
-    """Tasks that are under way, and results that wait for one before them."""
+    """Tasks that were submitted, and results that wait for an earlier one."""
 
     def __init__(self, cluster: Cluster, method: str, items: Iterable[Any]):
         from distributed import as_completed
 
         self._cluster, self._method, self._items = cluster, method, enumerate(items)
         self._completed = as_completed()
-        # One for all tasks: the scheduler remembers each.
+        # One name for all tasks: the scheduler keeps an entry for each name.
         self._group = cluster.new_group(method)
         self._waiting: dict[int, tuple[Any, Any]] = {}  # item and future by place
         self._ready: dict[int, tuple[Any, Any]] = {}  # item and result by place
@@ -186,7 +187,7 @@ class _Window:
         return self._ready.pop(self._next - 1)
 
     def submit(self) -> None:
-        """Fill the window, when half of it is empty: a call of the scheduler costs more than a task."""
+        """Fill the window when half of it is empty: a call of the scheduler costs more than a task."""
         if time.monotonic() - self._counted > 1.0:
             self._workers, self._counted = self._cluster.workers, time.monotonic()
         size = max(LEAST_WINDOW, WINDOW * self._workers)
@@ -200,7 +201,7 @@ class _Window:
             self._add(dict(new))
 
     def submit_again(self) -> None:
-        """All that is under way, whose futures are lost."""
+        """Submit all unfinished tasks again, whose futures are lost."""
         self._completed.clear()
         self._group = self._cluster.new_group(self._method)
         lost = {place: item for place, (item, _) in self._waiting.items()}
@@ -208,7 +209,7 @@ class _Window:
         self._add(lost)
 
     def _add(self, new: dict[int, Any]) -> None:
-        # Noted first: where submitting fails they are submitted again.
+        # Recorded first: if submitting fails, they are submitted again.
         self._waiting |= {place: (item, None) for place, item in new.items()}
         futures = self._cluster.submit(self._group, self._method, list(new), list(new.values()))
         self._waiting |= {place: (new[place], future) for place, future in zip(new, futures, strict=True)}
@@ -235,7 +236,7 @@ class _Window:
 
 
 def _outages() -> tuple[type[BaseException], ...]:
-    """Errors of the client where the scheduler is gone, or where results are lost with all workers that had them."""
+    """Errors of the client if the scheduler is gone, or if results are lost with all workers that had them."""
     from concurrent.futures import CancelledError
 
     from distributed.comm.core import CommClosedError
@@ -249,11 +250,11 @@ def _check_versions(client: Any) -> None:
     found = client.get_versions(packages=names)
     own = found["client"]["packages"] | package_versions()
     places = [("the scheduler", found["scheduler"], names[:2])]
-    places += [(f"worker {address}", told, names) for address, told in found["workers"].items()]
-    for place, told, compared in places:
-        theirs = told["packages"]
+    places += [(f"worker {address}", report, names) for address, report in found["workers"].items()]
+    for place, report, compared in places:
+        theirs = report["packages"]
         for name in ["python", *compared]:
-            # What a function by value contains differs between minor versions of Python.
+            # The byte code of a function sent by value differs between minor versions of Python.
             here, there = (
                 (x.split(".")[:2] if name == "python" and x else x) for x in (own.get(name), theirs.get(name))
             )
@@ -275,20 +276,13 @@ def count_workers(client: DaskClient | None) -> int:
 def map_tasks(
     function: Callable[[Any], Any], items: Iterable[Any], client: DaskClient | None = None, *, retries: int = 2
 ) -> list[Any]:
-    """[function(item) for each item], on the workers of a Dask client where one is given; arrays come back as those of NumPy.
+    """[function(item) for each item], on the workers of a Dask client if one is given; arrays are returned as NumPy arrays.
 
-    **Raises:** what the function raises; as `Cluster`.
+    **Raises:** errors of the function, and those of `Cluster`.
     """
-    if client is None:
-        return [_Function(function).call(item) for item in items]
-    results = []
-    with Cluster(client, retries) as cluster:
-        cluster.send(lambda: _Function(function))
-        for _, result in cluster.map("call", items):
-            if isinstance(result, Failure):
-                raise result.error
-            results.append(result)
-    return results
+    with open_engine(client, retries) as engine:
+        engine.send(lambda: _Function(function))
+        return list(results(engine, "call", items))
 
 
 class _Function:
@@ -296,8 +290,21 @@ class _Function:
         self._function = function
 
     def call(self, item: Any) -> Any:
-        # A process in 32 bits, which the client may be outside of its settings, would read arrays of JAX as such.
+        # A client whose process is in 32 bits, outside of its settings in 64, would truncate arrays of JAX as it unpickles them.
         return jax.tree.map(lambda x: np.asarray(x) if isinstance(x, jax.Array) else x, self._function(item))
 
 
 Engine = Local | Cluster
+
+
+def open_engine(client: DaskClient | None, retries: int = 2) -> Engine:
+    """The engine of a client, or that of this process, which does not try again."""
+    return Local() if client is None else Cluster(client, retries)
+
+
+def results(engine: Engine, method: str, items: Iterable[Any]) -> Iterator[Any]:
+    """target.method(item) of each item, in order. **Raises:** the first error."""
+    for _, result in engine.map(method, items):
+        if isinstance(result, Failure):
+            raise result.error
+        yield result

@@ -1,4 +1,4 @@
-"""Tasks in this process, and what a task that fails leaves."""
+"""Tasks in this process, and failures of tasks."""
 
 import traceback
 from collections.abc import Callable, Iterable, Iterator
@@ -7,20 +7,20 @@ from typing import Any, NamedTuple
 
 
 class Failure(NamedTuple):
-    """A task that raised in its last attempt too: the error, and its traceback as text."""
+    """Error of a task's last attempt, and its traceback as text."""
 
     error: BaseException
     traceback: str
 
     @classmethod
     def of(cls, error: BaseException, trace: Any = None) -> "Failure":
-        """With the traceback `trace`, by default that of the error."""
+        """Failure with the traceback `trace`, by default that of the error."""
         trace = error.__traceback__ if trace is None else trace
         return cls(error, "".join(traceback.format_exception(type(error), error, trace)))
 
 
 def attempt(function: Callable, *arguments: Any, retries: int) -> Any:
-    """function(*arguments), called again up to `retries` times where it raises; a `Failure` where all attempts do."""
+    """function(*arguments), called again up to `retries` times if it raises; a `Failure` if all attempts raise."""
     for left in reversed(range(retries + 1)):
         try:
             return function(*arguments)
@@ -31,7 +31,7 @@ def attempt(function: Callable, *arguments: Any, retries: int) -> Any:
 
 
 def package_versions() -> dict[str, str]:
-    """Versions of what computes; results of others may differ."""
+    """Versions of the packages that compute; results of other versions may differ."""
     return {name: metadata.version(name) for name in ("jaxdyn", "jax", "jaxlib")}
 
 
@@ -50,14 +50,15 @@ class Local:
         pass
 
     def send(self, target: Callable[[], Any]) -> None:
-        """Have the object whose methods tasks are."""
+        """Make the object whose methods tasks call."""
         self.target: Any = target()
 
     def call(self, method: str, item: Any) -> Any:
-        """target.method(item). **Raises:** what it raises."""
+        """target.method(item). **Raises:** its error."""
         return getattr(self.target, method)(item)
 
+    # One after another: kernels use all cores of the process by themselves.
     def map(self, method: str, items: Iterable[Any]) -> Iterator[tuple[Any, Any]]:
-        """Each item with target.method(item), or with the `Failure` of its last attempt, in the order of the items."""
+        """Pairs of an item and target.method(item), or the `Failure` of its last attempt, in the order of the items."""
         for item in items:
             yield item, attempt(self.call, method, item, retries=self.retries)

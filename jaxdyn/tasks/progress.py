@@ -6,41 +6,42 @@ from typing import TextIO
 
 
 class Progress:
-    """A meter: one line that is written anew on a terminal, a line every `every` seconds elsewhere.
+    """Progress meter: one line that is rewritten on a terminal, a line every `every` seconds elsewhere.
 
-    `before`: how many of the `total` rollouts were stored before; the rate is that of those stored since the meter was made.
+    `before`: number of the `total` rollouts that were stored before; the rate is that of this call.
     """
 
     def __init__(self, total: int, before: int, *, shown: bool = True, every: float = 10.0, file: TextIO | None = None):
         self.total, self.before, self.computed, self.failed = total, before, 0, 0
         self._file = sys.stderr if file is None else file
         self._shown, self._terminal = shown, self._file.isatty()
+        # A log file gets few lines, a terminal a meter that moves.
         self._every = 0.2 if self._terminal else every
         self._start = self._last = time.monotonic()
 
     def add(self, computed: int, failed: int) -> None:
-        """Count rollouts that were stored."""
+        """Count stored rollouts."""
         self.computed += computed
         self.failed += failed
         if time.monotonic() - self._last >= self._every:
             self._write("" if self._terminal else "\n")
 
     def note(self, text: str) -> None:
-        """A line of its own."""
+        """Print a line."""
         if self._shown:
             print(f"{chr(13) if self._terminal else ''}{text}", file=self._file, flush=True)
 
     def end(self) -> None:
-        """The last line."""
+        """Print the last line."""
         self._write("\n")
 
     @property
     def seconds(self) -> float:
-        """Since the meter was made."""
+        """Seconds since the start."""
         return time.monotonic() - self._start
 
     def __str__(self) -> str:
-        # Chunks that were not whole and are computed again were counted before.
+        # Damaged chunks that are computed again were counted in `before`.
         done = min(self.before + self.computed, self.total)
         text = f"{100 * done / self.total:5.1f} %, {done} of {self.total} rollouts"
         if self.computed:

@@ -1,21 +1,53 @@
-"""The part of a Dask worker: a plugin that brings what tasks call, and the function of a task."""
+"""Dask worker: a plugin that brings the object whose methods tasks call, and the function of a task."""
 
+import asyncio
+import contextlib
 import threading
+from collections.abc import Iterator
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import cloudpickle
+import jax
 from distributed import Worker, WorkerPlugin, get_worker
 from distributed.core import Status
 
+from jaxdyn.compile import compilation, compilation_mode
 from jaxdyn.tasks.local import package_versions
-from jaxdyn.tasks.settings import Settings
 
 RESOURCE = "jaxdyn"  # of Dask: each worker has one, each task takes one
 
 
+class Settings(NamedTuple):
+    """Settings of JAX that decide the bits of a result, and the mode of compilation.
+
+    Each can be set for a thread, so that those of a worker's process, which may serve others, do not change.
+    """
+
+    enable_x64: bool
+    default_prng_impl: str
+    default_matmul_precision: Any
+    threefry_partitionable: bool
+    compilation: str
+
+    @classmethod
+    def current(cls) -> "Settings":
+        """Settings in force on this thread."""
+        config: Any = jax.config
+        return cls._make([*(getattr(config, f"jax_{name}") for name in cls._fields[:-1]), compilation_mode()])
+
+    @contextlib.contextmanager
+    def active(self) -> Iterator[None]:
+        """Put them in force on this thread."""
+        with contextlib.ExitStack() as stack:
+            for name in self._fields[:-1]:
+                stack.enter_context(getattr(jax, name)(getattr(self, name)))
+            stack.enter_context(compilation(self.compilation))
+            yield
+
+
 class TargetPlugin(WorkerPlugin):
-    """Sends an object to each worker, also to those that join later, and opens it at the first task there.
+    """An object for each worker, also for those that join later, opened before the first task there.
 
     **Arguments:** `packed`, a function without arguments by cloudpickle, which returns the object; `mark`, a file of the client
     with its text, which the worker has to see too, or None.
@@ -32,21 +64,27 @@ class TargetPlugin(WorkerPlugin):
         return self.__dict__ | {"_target": None}
 
     async def setup(self, worker: Worker) -> None:
-        """Check the worker and let it have tasks. **Raises:** ValueError that names the worker and what differs."""
+        """Check the worker and let it have tasks. **Raises:** ValueError that names the worker and the difference."""
         self.check(worker.address)
         self._address = worker.address
         self._lock = threading.Lock()
-        if RESOURCE in worker.state.total_resources:
-            return
+        if RESOURCE not in worker.state.total_resources:
+            self._start = asyncio.create_task(self._enable(worker))
+
+    async def _enable(self, worker: Worker) -> None:
+        # Tasks come when the object is open, which takes seconds of compilation. A worker that replaces a dead one would else be
+        # given the last tasks, and hold up a run that the others could have finished.
+        with contextlib.suppress(Exception):  # the first task raises it again, for the client
+            await asyncio.get_running_loop().run_in_executor(worker.executors["default"], self._open)
         await worker.set_resources(**{RESOURCE: 1})
         # The scheduler looks for workers of waiting tasks when a worker begins to run, not when it is given resources. Without
-        # this a task that waits because all workers have died would wait for ever.
+        # this, a task that waits because all workers have died would wait for ever.
         if worker.status == Status.running:
             worker.status = Status.paused
             worker.status = Status.running
 
     def check(self, address: str) -> None:
-        """**Raises:** ValueError where versions differ, and where the file of the client is not there."""
+        """**Raises:** ValueError where versions differ, and where the file of the client does not exist."""
         for name, version in package_versions().items():
             if version != self.versions[name]:
                 raise ValueError(
@@ -70,21 +108,21 @@ class TargetPlugin(WorkerPlugin):
     def call(self, method: str, item: Any) -> Any:
         """target.method(item) with the settings of the client."""
         with self.settings.active():
-            with self._lock:
-                if self._target is None:
-                    self._target = self._open()
-            return getattr(self._target, method)(item)
+            return getattr(self._open(), method)(item)
 
     def _open(self) -> Any:
-        try:
-            target = cloudpickle.loads(self.packed)
-        except ModuleNotFoundError as error:
-            raise ModuleNotFoundError(
-                f"{error.name} is a module of the client that worker {self._address} does not have; send it with "
-                f"client.upload_file('{error.name}.py'), or put its functions into the script",
-                name=error.name,
-            ) from error
-        return target()
+        with self._lock, self.settings.active():
+            if self._target is None:
+                try:
+                    target = cloudpickle.loads(self.packed)
+                except ModuleNotFoundError as error:
+                    raise ModuleNotFoundError(
+                        f"{error.name} is a module of the client that worker {self._address} does not have; send it with "
+                        f"client.upload_file('{error.name}.py'), or put its functions into the script",
+                        name=error.name,
+                    ) from error
+                self._target = target()
+            return self._target
 
 
 def call_target(name: str, method: str, item: Any) -> Any:

@@ -1,6 +1,7 @@
 """Functions that the tests of the compiler share; nothing here knows of mechanics."""
 
 import jax
+import jax.numpy as jnp
 import numpy as np
 import pytest
 
@@ -41,3 +42,28 @@ def assert_close(computed, wanted, tolerance=1e-10, label=""):
     assert np.isfinite(computed).all(), label
     error, size = np.abs(computed - wanted).max(initial=0.0), max(np.abs(wanted).max(initial=0.0), 1e-3)
     assert error <= tolerance * size, f"{label}: error {error:.3e}, size {size:.3e}"
+
+
+@jax.custom_jvp
+def root(x):
+    """y with y + y^3 = x, by bisection, whose operations have no derivative."""
+
+    def halve(_, ends):
+        low, high = ends
+        middle = 0.5 * (low + high)
+        is_high = middle + middle**3 > x
+        return jnp.where(is_high, low, middle), jnp.where(is_high, middle, high)
+
+    low, high = jax.lax.fori_loop(0, 60, halve, (jnp.full_like(x, -4.0), jnp.full_like(x, 4.0)))
+    return 0.5 * (low + high)
+
+
+root.defjvp(lambda primals, steps: (root(primals[0]), steps[0] / (1 + 3 * root(primals[0]) ** 2)))
+
+
+def root_derivatives(x):
+    """y and its three derivatives, by hand."""
+    y = np.roots([1.0, 0.0, 1.0, -x])
+    y = float(y[np.abs(y.imag) < 1e-9][0].real)
+    d = 1 + 3 * y**2
+    return y, 1 / d, -6 * y / d**3, (108 * y**2 / d - 6) / d**4

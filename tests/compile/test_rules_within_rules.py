@@ -10,7 +10,7 @@ import jax.scipy.special
 import numpy as np
 import pytest
 from jax.extend.core import ClosedJaxpr, Jaxpr
-from kernel_helpers import assert_close, native, quick
+from kernel_helpers import assert_close, native, quick, root, root_derivatives
 
 from jaxdyn import compile as backend
 from jaxdyn.compile import target
@@ -127,35 +127,10 @@ def test_closed_forms():
             assert_close(value, wanted[len(word)], 1e-9 if function is jnp.sinc else 1e-11, word)
 
 
-@jax.custom_jvp
-def _root(x):
-    """y with y + y^3 = x, by a number of halvings: its numbers say nothing of its derivative."""
-
-    def halve(_, ends):
-        low, high = ends
-        middle = 0.5 * (low + high)
-        is_high = middle + middle**3 > x
-        return jnp.where(is_high, low, middle), jnp.where(is_high, middle, high)
-
-    low, high = jax.lax.fori_loop(0, 60, halve, (jnp.full_like(x, -4.0), jnp.full_like(x, 4.0)))
-    return 0.5 * (low + high)
-
-
-_root.defjvp(lambda primals, steps: (_root(primals[0]), steps[0] / (1 + 3 * _root(primals[0]) ** 2)))
-
-
-def _root_derivatives(x):
-    """y and its three derivatives, by hand."""
-    y = np.roots([1.0, 0.0, 1.0, -x])
-    y = float(y[np.abs(y.imag) < 1e-9][0].real)
-    d = 1 + 3 * y**2
-    return y, 1 / d, -6 * y / d**3, (108 * y**2 / d - 6) / d**4
-
-
 def test_rules_that_call_their_own_function():
     """A root by the implicit function theorem, alone and within another kernel."""
-    wanted = _root_derivatives(1.3)
-    for word, value in _by_kernel(lambda x: native(_root)(x), jnp.array([1.3]), jnp.ones(1)).items():
+    wanted = root_derivatives(1.3)
+    for word, value in _by_kernel(lambda x: native(root)(x), jnp.array([1.3]), jnp.ones(1)).items():
         assert_close(value, wanted[len(word)], 1e-12, word)
 
 
@@ -163,22 +138,22 @@ def test_rules_of_kernels_that_call_functions_with_rules():
     """`tangent=` and `implicit`: the derivative of what a rule computes asks the rules of what it calls."""
 
     def rule(_, x, steps):
-        return steps[0] * _root(x)
+        return steps[0] * root(x)
 
     def f(x):
         return backend.kernel(lambda _, x: jnp.floor(x), derivative=rule)((), x).sum()
 
     def solve(_, x):
-        return _root(x)
+        return root(x)
 
     def change(_, x, steps):
-        y = _root(x)
+        y = root(x)
         return y, steps[-1] / (1 + 3 * y**2)
 
     def g(x):
         return backend.kernel(lambda _, x: backend.implicit((), (x,), solve, change))((), x).sum()
 
-    wanted = _root_derivatives(1.3)
+    wanted = root_derivatives(1.3)
     x = jnp.array(1.3)
     for shift, function in ((1, f), (0, g)):
         second = quick(lambda x, h=function: (jax.grad(h)(x), jax.grad(jax.grad(h))(x), jax.jacfwd(jax.grad(h))(x)))(x)

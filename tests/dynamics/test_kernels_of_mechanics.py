@@ -7,6 +7,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from compile.kernel_helpers import root, root_derivatives
 from pinocchio_bridge import assert_close, quick
 
 import jaxdyn as jd
@@ -123,31 +124,6 @@ def test_others_import_the_names_of_the_package_alone():
     assert not wrong, wrong
 
 
-@jax.custom_jvp
-def _root(x):
-    """y with y + y^3 = x, by a number of halvings: its numbers say nothing of its derivative."""
-
-    def halve(_, ends):
-        low, high = ends
-        middle = 0.5 * (low + high)
-        is_high = middle + middle**3 > x
-        return jnp.where(is_high, low, middle), jnp.where(is_high, middle, high)
-
-    low, high = jax.lax.fori_loop(0, 60, halve, (jnp.full_like(x, -4.0), jnp.full_like(x, 4.0)))
-    return 0.5 * (low + high)
-
-
-_root.defjvp(lambda primals, steps: (_root(primals[0]), steps[0] / (1 + 3 * _root(primals[0]) ** 2)))
-
-
-def _root_derivatives(x):
-    """y and its three derivatives, by hand."""
-    y = np.roots([1.0, 0.0, 1.0, -x])
-    y = float(y[np.abs(y.imag) < 1e-9][0].real)
-    d = 1 + 3 * y**2
-    return y, 1 / d, -6 * y / d**3, (108 * y**2 / d - 6) / d**4
-
-
 def test_energies_of_lagrangian_systems():
     """Kinetic energy with a metric sinc q: half of the metric's second derivative. Acceleration along a rail given by a root."""
     system = jd.LagrangianSystem(lambda q, v: 0.5 * v @ v * jnp.sinc(q[0]), 1)
@@ -158,12 +134,12 @@ def test_energies_of_lagrangian_systems():
     for second in (jax.grad(jax.grad(energy)), jax.jacfwd(jax.jacfwd(energy)), jax.hessian(energy)):
         assert_close(second(0.0), -(np.pi**2) / 6, 1e-12)
     # With L = v^2/2 - 9.81 h(q) the acceleration is -9.81 h', whose two derivatives are those of the height.
-    rail = jd.LagrangianSystem(lambda q, v: 0.5 * v @ v - 9.81 * _root(q)[0], 1)
+    rail = jd.LagrangianSystem(lambda q, v: 0.5 * v @ v - 9.81 * root(q)[0], 1)
 
     def accelerate(x):
         return jd.forward_dynamics(rail, jnp.stack([x]), jnp.ones(1), jnp.zeros(1))[0]
 
-    _, first, second, third = _root_derivatives(0.8)
+    _, first, second, third = root_derivatives(0.8)
     assert_close(accelerate(0.8), -9.81 * first, 1e-12)
     assert_close(quick(jax.grad(accelerate))(0.8), -9.81 * second, 1e-11)
     assert_close(quick(jax.jacfwd(jax.grad(accelerate)))(0.8), -9.81 * third, 1e-10)

@@ -642,6 +642,8 @@ def test_exciting_motion_tells_more_within_its_limits():
     assert told.rank == len(told.base) and told.condition == pytest.approx(computed.condition, rel=0.15)
     tau = identify.regressor(model, log.q, log.v, log.a)[:, :, :20] @ np.asarray(model.inertias).reshape(-1)
     np.testing.assert_allclose(log.tau, tau, atol=1e-10)
+    for own, sampled in zip(computed.motion(log.t[77]), (log.q, log.v, log.a), strict=True):
+        np.testing.assert_allclose(own, sampled[77], atol=1e-12)
 
 
 @pytest.mark.slow

@@ -74,10 +74,11 @@ MIXED = """
     <motor name="thrust" site="imu" gear="0 0 1 0.1 0 0.2"/>
     <damper name="d" joint="a" kv="2" ctrlrange="0 1"/>
     <intvelocity name="stateful" joint="a" kp="2" actrange="-1 1"/>
+    <muscle name="muscle" joint="a" lengthrange="0 1"/>
   </actuator>
   <keyframe>
     <key name="home" qpos="0 0 1 0.7 0.7 0 0.1 .1 .2 .3 1 0.1 0 0 .6" qvel="1 2 3 4 5 6 .1 .2 .3 .4 .5 .6 .8"
-         ctrl="1 2 3 4 5 6" act="0"/>
+         ctrl="1 2 3 4 5 6 7" act="0.4 0"/>
   </keyframe>
 </mujoco>
 """.replace("</worldbody>", '<site name="imu2" pos="0 0 2"/></worldbody>')
@@ -106,7 +107,8 @@ def mixed(tmp_path_factory):
 def test_every_kind_of_joint_and_part_agrees_with_mujoco(mixed):
     """Free, ball, three joints on one body, references, anchors, inertial frames, tendons, drives, equalities."""
     errors = agreement(*mixed)
-    assert {"mass", "M", "bias", "acceleration", "frames", "passive", "actuation", "rows"} == errors.keys()
+    parts = {"mass", "M", "bias", "acceleration", "frames", "passive", "actuation", "activation", "rows"}
+    assert parts == errors.keys()
     assert max(errors.values()) < 1e-12, errors
 
 
@@ -131,8 +133,9 @@ def test_keyframes_are_starts_in_our_coordinates(mixed):
     T, _ = oracle.rotation(key.qpos, np.asarray(start.v))
     np.testing.assert_allclose(np.asarray(start.q)[oracle.to_q], key.qpos, atol=1e-15)
     np.testing.assert_allclose(T @ np.asarray(start.v)[oracle.to_v], key.qvel, atol=1e-14)
-    assert scene.actuators.names == ("m1", "p1", "tm", "thrust", "d")
-    np.testing.assert_array_equal(start.control, [1, 2, 3, 4, 5])
+    assert scene.actuators.names == ("m1", "p1", "tm", "thrust", "d", "stateful")
+    np.testing.assert_array_equal(start.control, [1, 2, 3, 4, 5, 6])
+    np.testing.assert_array_equal(start.activation, [0.4])
     np.testing.assert_allclose(np.asarray(scene.starts["reference"].q)[oracle.to_q], oracle.m.qpos0, atol=1e-15)
 
 
@@ -142,7 +145,13 @@ def test_what_is_not_taken_is_named_by_a_warning(mixed):
         load_mjcf(path)
     assert len(caught) == 1
     text = str(caught[0].message)
-    for part in ("robot.xml", "stateful", "contact geometry of bodies: world, arm", "spatial tendons: cord", "off"):
+    for part in (
+        "robot.xml",
+        "muscles: muscle",
+        "contact geometry of bodies: world, arm",
+        "spatial tendons: cord",
+        "off",
+    ):
         assert part in text
     assert all(line in text for line in scene.not_taken)
 
@@ -239,8 +248,51 @@ def test_without_mujoco_the_error_says_what_to_install(tmp_path, monkeypatch):
 def test_controls_of_another_number_are_refused(mixed):
     _, scene = mixed
     q = scene.starts["reference"].q
-    with pytest.raises(ValueError, match=r"control has shape \(2,\), expected \(5,\).*m1, p1"):
+    with pytest.raises(ValueError, match=r"control has shape \(2,\), expected \(6,\).*m1, p1"):
         scene.actuators(scene.system, q, jnp.zeros(scene.nv), jnp.zeros(2))
+    with pytest.raises(ValueError, match=r"activation has shape None, expected \(1,\).*stateful"):
+        scene.actuators(scene.system, q, jnp.zeros(scene.nv), jnp.zeros(6))
+    with pytest.raises(ValueError, match=r"activation has shape \(2,\), expected \(1,\)"):
+        scene.actuators.drive(lambda q, v, t: jnp.zeros(6), jnp.zeros(2))
+
+
+DYNAMICS = """<general name="f" joint="h" dyntype="{0}" dynprm="0.08" gear="3" gainprm="2" ctrlrange="-1 1"/>
+  <general name="servo" joint="h" dyntype="{0}" dynprm="0.05" gainprm="15" biastype="affine" biasprm="0 -15 -1.5"/>
+  <intvelocity name="rate" joint="k" kp="6" kv="0.5" actrange="-0.3 0.3"/>
+  <motor name="plain" joint="k" gear="2"/>"""
+CHILD = """<body name="c" pos="0 0 -.4"><joint name="k" axis="0 1 0" damping="0.05"/>
+  <geom size="0.05" pos="0 0 -.3" mass="1"/></body></body>"""
+
+
+@pytest.mark.parametrize(("dynamics", "integrator"), [("filter", "RK4"), ("filterexact", "Euler")])
+def test_motions_under_activations_are_those_of_mujoco(dynamics, integrator, tmp_path):
+    """A filter with a gear, a position servo with a filter and damping, an integrator that reaches the end of its range.
+
+    MuJoCo's exact filter is exact in its Euler steps, for controls that are constant in a step; the motion is not.
+    """
+    body = BODY.replace("</body>", CHILD).replace("<geom ", '<geom contype="0" conaffinity="0" ')
+    option = f'<option timestep="5e-4" integrator="{integrator}"/>'
+    path = of_body(tmp_path, body, f"{option}<actuator>{DYNAMICS.format(dynamics)}</actuator>")
+    scene = load_mjcf(path)
+    control, initial = np.array([1.5, 0.4, 0.8, -0.3]), np.array([0.2, -0.1, 0.0])
+    m = mujoco.MjModel.from_xml_path(str(path))
+    data, theirs = mujoco.MjData(m), []
+    data.ctrl[:], data.act[:] = control, initial
+    for _ in range(3):
+        mujoco.mj_step(m, data, 400)
+        theirs.append(np.concatenate([data.act, data.qpos, data.qvel]))
+    driven = jd.Scene(
+        scene.system, (), (*scene.forces, scene.actuators.drive(lambda q, v, t: jnp.asarray(control), initial))
+    )
+    zero = jnp.zeros(2)
+    motion = jd.simulate(driven, zero, zero, 0.2 * np.arange(4), stepsize=5e-4, outputs=("drive_state",))
+    np.testing.assert_allclose(motion.drive_state[1:, :2], [row[:2] for row in theirs], rtol=1e-9)
+    np.testing.assert_allclose(motion.drive_state[1:, 2], [0.16, 0.3, 0.3], atol=1e-3)
+    if integrator == "RK4":
+        computed = np.hstack([motion.drive_state, motion.q, motion.v])[1:]
+        # The integrator stops within a step, which ours passes by less than a step.
+        np.testing.assert_allclose(computed[:1], theirs[:1], rtol=1e-9, atol=1e-9)
+        np.testing.assert_allclose(computed, theirs, rtol=1e-3, atol=1e-3)
 
 
 # Packages whose wheels hold MJCF files; none is a dependency. What is installed is tested.

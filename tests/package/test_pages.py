@@ -211,10 +211,16 @@ def test_pages_of_control_laws(page):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("page", ["inverse", "optimal_control", "sensors"])
-def test_pages_of_robots(page):
+@pytest.mark.parametrize("page", ["drives", "inverse", "optimal_control", "sensors"])
+def test_pages_of_robots(page, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
     names = run(f"docs/{page}.md", least=1)
     checks = {
+        "drives": lambda n: (
+            np.allclose(n["fit"].values, [0.06, 0.3], rtol=1e-3)
+            and bool(n["motion"].success)
+            and n["slopes"].shape == (2,)
+        ),
         "inverse": lambda n: n["batch"].success.mean() > 0.99 and not n["path"].changes_branch.any(),
         "optimal_control": lambda n: bool(n["plan"].success),
         "sensors": lambda n: n["log"]["wrist"].shape == (51, 6),

@@ -18,7 +18,7 @@ from benchmarks.peers.equations import EQUATIONS
 from benchmarks.peers.twins import TWINS
 from benchmarks.peers.with_mujoco import _timed
 from benchmarks.peers.with_pinocchio import slope
-from jaxdyn.reports import cases
+from benchmarks.report_cases import cases
 
 # Accelerations of Andrews' mechanism at its start, printed in the test set for IVP solvers; the others are zero.
 ANDREWS = (14222.4439199541138705911625887, -10666.8329399655854029433719415, 0.0, 0.0, 0.0, 0.0, 0.0)

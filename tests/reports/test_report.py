@@ -13,16 +13,8 @@ from scipy.integrate import solve_ivp
 from scipy.spatial.transform import Rotation
 
 import jaxdyn as jd
-from jaxdyn.cli import main
-from jaxdyn.contact.unilateral import has_modes
-from jaxdyn.reports import Record, Report, beaten_by, cases, html_page, pareto_front, standings
-from jaxdyn.reports import run as running
-from jaxdyn.reports.front import cost_at
-from jaxdyn.reports.journal import Journal
-from jaxdyn.reports.measure import Contestant, Motion, evaluations, flop_counter, ladder, measure
-from jaxdyn.reports.programs import FIXED, SOLVERS, Programs, prepare
-from jaxdyn.reports.records import Known
-from jaxdyn.reports.references import (
+from benchmarks.report_cases import cases
+from benchmarks.report_cases.references import (
     car_axis,
     coin,
     falling_table,
@@ -38,6 +30,16 @@ from jaxdyn.reports.references import (
     swing,
     windows,
 )
+from jaxdyn.cli import main
+from jaxdyn.contact.unilateral import has_modes
+from jaxdyn.reports import Record, Report, beaten_by, html_page, pareto_front, standings
+from jaxdyn.reports import run as running
+from jaxdyn.reports.case import Case, Reference
+from jaxdyn.reports.front import cost_at
+from jaxdyn.reports.journal import Journal
+from jaxdyn.reports.measure import Contestant, Motion, evaluations, flop_counter, ladder, measure
+from jaxdyn.reports.programs import FIXED, SOLVERS, Programs, prepare
+from jaxdyn.reports.records import Known
 from jaxdyn.reports.timing import time_interleaved
 from jaxdyn.simulation.solvers import RK4
 from jaxdyn.simulation.solvers.choice import choose_solver
@@ -407,13 +409,13 @@ def test_beaten_by_whom():
         beaten_by([*ours, made(1e-3, 1.0, batch=2)])
 
 
-def test_batches_above_the_largest_are_left_out(small, rungs, monkeypatch):
+def test_batches_above_the_largest_are_left_out(small, rungs):
     lines = []
-    monkeypatch.setattr(running, "cases", lambda: {"free_body": cases()["free_body"]._replace(largest=1)})
-    measured = jd.report("free_body", rounds=1, batches=(1, 64), echo=lines.append)
+    case = cases()["free_body"]._replace(largest=1)
+    measured = jd.report(case, rounds=1, batches=(1, 64), echo=lines.append)
     assert {r.batch for r in measured.records} == {1}
     assert "batches above 1 are skipped" in lines[0]
-    measured = jd.report("free_body", rounds=1, batches=(1, 4), integrators=[("free", "Tsit5")])
+    measured = jd.report([case], rounds=1, batches=(1, 4), integrators=[("free", "Tsit5")])
     assert {(r.batch, r.label) for r in measured.records} == {(1, "free, Tsit5"), (4, "free, Tsit5")}
 
 
@@ -503,7 +505,7 @@ def test_report_resumes_and_writes(small, body, rungs, tmp_path, capsys, monkeyp
 
 def test_command(small, rungs, capsys):
     assert main(["report", "--list"]) == 0
-    assert set(cases()) == {line.split()[0] for line in capsys.readouterr().out.splitlines()}
+    assert set(jd.scenes.names()) == {line.split()[0] for line in capsys.readouterr().out.splitlines()}
     assert main(["report", "free_body", "--rounds", "1"]) == 0
     text = capsys.readouterr().out
     assert "1.0e-07" in text
@@ -538,7 +540,31 @@ def test_a_journal_that_is_not_text_is_named(tmp_path):
 
 def test_nothing_to_measure_is_refused():
     with pytest.raises(ValueError, match=r"batches \[256\] leave nothing to measure of windows_40"):
-        jd.report("windows_40", batches=[256])
+        jd.report(cases()["windows_40"], batches=[256])
+
+
+def test_scenes_that_cannot_be_compared_are_refused():
+    with pytest.raises(ValueError, match="'sliding_block', whose steps end at events"):
+        jd.report("sliding_block")
+    with pytest.raises(ValueError, match="free_body, free_body; give each its own"):
+        jd.report([cases()["free_body"], "free_body"])
+
+
+def test_a_scene_of_ones_own(rungs, monkeypatch):
+    """A pendulum with its exact motion for a small angle, and without: then a converged solution is the reference."""
+    monkeypatch.setattr(running, "settings", lambda *args, **options: [1e-4, 1e-9])
+    model, ts = jd.robots.chain(1), np.linspace(0.0, 0.5, 3)
+    case = Case(
+        "mine", "A pendulum of mine", "free", lambda: (jd.Scene(model), (np.array([0.4]), np.zeros(1))), None, ts, 20
+    )
+    measured = jd.report(case, rounds=1, integrators=[("free", "Dopri8")])
+    coarse, fine = (record.error_path for record in measured.records)
+    assert fine < 1e-8 < coarse < 1e-2
+    off = case._replace(
+        reference=lambda start: Reference(ts, np.full((3, 1), 0.4), np.zeros((3, 1)), "wrong", "a guess")
+    )
+    measured = jd.report(off, rounds=1, integrators=[("free", "Dopri8")])
+    assert all(record.error_path > 0.1 for record in measured.records)
 
 
 def test_a_page_without_matplotlib_is_refused_before_the_runs(small, tmp_path, monkeypatch):

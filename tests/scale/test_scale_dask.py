@@ -44,7 +44,7 @@ def study(iterations=100):
         return {"x": jax.lax.fori_loop(0, iterations, lambda _, x: 3.9 * x * (1 - x), x)}
 
     reductions = {"x": jd.scale.Mean("x"), "worst": jd.scale.Worst("x", 3)}
-    return (logistic, draw), {"samples": 240, "lanes": 4, "chunk": 4, "reductions": reductions} | QUIET
+    return (logistic, draw), {"samples": 240, "batch_size": 4, "chunk": 4, "reductions": reductions} | QUIET
 
 
 SLOW = 300_000
@@ -173,7 +173,7 @@ def test_motions_are_the_same(client, tmp_path):
             control=lambda q, v, t: -gain * v,
             cost="measured",
             chunk=4,
-            lanes=4,
+            batch_size=4,
             client=client,
             devices=devices,
             **QUIET,
@@ -240,7 +240,7 @@ def logistic(x):
 if __name__ == "__main__":
     reductions = {"x": jd.scale.Mean("x"), "worst": jd.scale.Worst("x", 3)}
     with Client(sys.argv[1]) as client:
-        print(jd.scale.evaluate(logistic, draw, samples=240, lanes=4, chunk=4, out=sys.argv[2], client=client,
+        print(jd.scale.evaluate(logistic, draw, samples=240, batch_size=4, chunk=4, out=sys.argv[2], client=client,
                                 reductions=reductions, progress=False).computed)
 """
 
@@ -349,7 +349,7 @@ points = 3
 damping = { log_uniform = [0.1, 1.0] }
 [options]
 stepsize = 0.01
-lanes = 4  # one lane alone differs in the last bit under JAXDYN_COMPILATION_OPTIONS=least
+batch_size = 4  # one rollout alone differs in the last bit under JAXDYN_COMPILATION_OPTIONS=least
 [reductions]
 q = { mean = "q" }
 """
@@ -425,7 +425,7 @@ def failing(bad, times, folder):
 @pytest.mark.parametrize("where", ["here", "cluster"])
 def test_a_chunk_that_raises_is_tried_again_and_reported(client, tmp_path, where):
     client = client if where == "cluster" else None
-    options = {"chunk": 5, "lanes": 5, "out": tmp_path / "a.zarr", "client": client} | QUIET
+    options = {"chunk": 5, "batch_size": 5, "out": tmp_path / "a.zarr", "client": client} | QUIET
     starts = np.arange(40.0)
     function = failing((12.0, 33.0), 2, tmp_path)
     with pytest.raises(
@@ -557,6 +557,21 @@ def test_starts_of_a_fit(client):
     here, there = (jd.identify.fit_parameters(system, log, client=one, **options) for one in (None, client))
     np.testing.assert_allclose(there.values, here.values, rtol=1e-9)
     np.testing.assert_allclose(np.abs(there.values), [1.0, 3.0], rtol=1e-6)
+
+
+def test_cross_validation_of_a_fit(client):
+    """The fits of all folds on workers: the trials of this process, in their order and to the last bit."""
+    model, t = jd.robots.chain(2), np.linspace(0.0, 8.0, 400)
+    rates, noise = np.array([1.3, 2.1]), np.random.default_rng(2).normal(size=(400, 2))
+    q, v, a = np.sin(rates * t[:, None]), rates * np.cos(rates * t[:, None]), -(rates**2) * np.sin(rates * t[:, None])
+    tau = jax.vmap(lambda *x: jd.inverse_dynamics(model, *x))(q, v, a) + 0.3 * v + 0.5 * np.tanh(v / 0.01)
+    log = jd.identify.Log(t, q, v, a, np.asarray(tau) + 0.02 * noise)
+    options = {"terms": ("viscous", "coulomb"), "robust": "auto", "weights": None, "inertia": "mass"}
+    here, there = (jd.identify.fit_robot(model, log, client=one, **options) for one in (None, client))
+    assert here.choice.setting == there.choice.setting and len(here.choice.trials) > 8
+    for one, other in zip(here.choice.trials, there.choice.trials, strict=True):
+        assert one.setting == other.setting
+        np.testing.assert_array_equal(one.squares, other.squares)
 
 
 def test_without_a_client_no_dask_is_imported(tmp_path, monkeypatch):

@@ -14,7 +14,7 @@ from benchmarks.overconstrained import MECHANISMS, distance
 from jaxdyn.constraints.assembly import residuals
 from jaxdyn.constraints.base import constraint_jacobian
 from jaxdyn.constraints.dynamics import RESULTS, constrained_dynamics
-from jaxdyn.constraints.selection import known_selection
+from jaxdyn.constraints.selection import select_concrete_rows
 from jaxdyn.dynamics.quantities import kinetic_energy, potential_energy
 
 # Name, rows, rank, freedom.
@@ -55,7 +55,7 @@ def test_rank_and_freedom(name, rows, rank, freedom):
     """Starts are on the constraints, with the freedom that the mechanism has and not the one that counting joints gives."""
     one = mechanism(name)
     q, v = begin(one)
-    selection, here = known_selection(one.scene, np.asarray(q), 0.0, None)
+    selection, here = select_concrete_rows(one.scene, np.asarray(q), 0.0, None)
     assert selection.kept.shape == (rows,) and selection.kept.sum() == rank == here
     assert jd.degrees_of_freedom(one.scene, q) == freedom == one.scene.nv - rank
     assert float(jnp.max(jnp.asarray(residuals(one.scene, q, v)))) < 1e-14 * (1 + float(jnp.abs(v).max()))

@@ -8,9 +8,9 @@ import pytest
 from pinocchio_bridge import quick
 
 import jaxdyn as jd
+from benchmarks.report_cases import cases
 from jaxdyn import scenes
 from jaxdyn.constraints.base import velocity_residual
-from jaxdyn.reports.cases import cases
 from jaxdyn.simulation.solvers import driver
 from jaxdyn.simulation.solvers.explicit import ExplicitSteps
 from jaxdyn.systems.scene import Scene

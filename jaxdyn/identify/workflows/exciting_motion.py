@@ -27,8 +27,9 @@ _SAMPLES, _CHECKED = 100, 1000
 class Excitation(NamedTuple):
     """Result of `exciting_motion`.
 
-    - `motion`: a `FourierMotion`, called as motion(t) -> q (n,) at a time t, s; it starts and ends at rest at its centre every
-      `motion.period` (s), within all limits. `jax.jvp` gives v and a; `log` samples all three with the torques.
+    - `motion`: a `FourierMotion`, called as motion(t) -> (q, v, a), (nq,) each, at a time t, s: position, velocity and
+      acceleration (rad or m, per s, per s^2). It starts and ends at rest at its centre every `motion.period` (s), within all
+      limits. `log` samples it with the torques.
     - `condition`: of the regressor in base parameters, columns of unit length, along it; `start_condition`: along the random
       motion at the start of the search, within the same limits.
     - `logdet`: natural logarithm of the determinant of the information matrix, over that of the start.

@@ -67,7 +67,7 @@ class _Binder:
             force, tau = whole.applied_force(q, v, t), self.effort(unknown, q, v, t)
             if tau is None:
                 return force
-            tau = in_piece.clip_effort(tau)
+            tau = in_piece.drive_torque(q, v, t, tau)[0]
             return tau if force is None else tau + force
 
         return in_piece, generalized_force, lambda q, v, t: guards(scene, q, v, t, self.effort(unknown, q, v, t))
@@ -81,7 +81,7 @@ def hybrid_motion(scene: Scene, control, numbers, options) -> Solution:
         check_callback(force, f"forces[{i}]", "force(system, q, v, t)", *first, first=(scene.system,))
     unknown, known = partition_tracers((scene, control))
     unknown, bind = tuple(unknown), _Binder(known, scene.nv)
-    effort = None if control is None else lambda _, q, v, t: bind.effort(unknown, q, v, t)
+    effort = None if control is None else lambda _, q, v, t: (bind.effort(unknown, q, v, t),)
     bind.pieces = pieces_of(scene, (), numbers[0], numbers[1], numbers[2][0], effort)
     elements = elements_of(scene, bind.pieces)
     inputs = safe_inputs(scene.system, numbers)
@@ -144,7 +144,7 @@ def _outputs(bind: _Binder, elements: Elements, outputs, unknown, y, mode: Mode,
     values = state_outputs(scene.system, outputs, q, v, t)
     if "torque" in outputs:
         tau = bind.effort(unknown, q, v, t)
-        values["torque"] = scene.clip_effort(jnp.zeros_like(v) if tau is None else tau)
+        values["torque"] = scene.drive_torque(q, v, t, jnp.zeros_like(v) if tau is None else tau)[0]
     if {"acceleration", "multipliers", "contact_forces"} & set(outputs):
         terms = terms_at(scene, elements, q, v, t)
         motion = motion_at(scene, elements, mode, terms, y["slip"], generalized_force(q, v, t), q, v, t)

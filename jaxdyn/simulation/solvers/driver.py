@@ -59,7 +59,6 @@ class ExplicitRun(Integrator):
     atol: Any
     stepsize: Any
     max_steps: int = eqx.field(static=True)
-    room: int = eqx.field(static=True)
 
     def values(self, inputs, room):
         y0, args, ts = inputs
@@ -156,7 +155,8 @@ def _run_steps(run: ExplicitRun, y0, args, ts, max_steps: int, record: bool):
         Carry(state, none, rows, records),
     )
     if history is not None:
-        history = reverse.History(*records, state.tried)
+        states, times, kept = records
+        history = reverse.History(states, times, kept, state.tried)
     codes: Any = diffrax.RESULTS
     result = codes.where(state.t < end, codes.max_steps_reached, codes.successful)
     result = codes.where(state.failed, codes.dt_min_reached, result)

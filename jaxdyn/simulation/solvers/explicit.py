@@ -21,7 +21,7 @@ from jaxtyping import Array, PyTree
 
 from jaxdyn.compile import implicit, kernel, value_and_jvp
 from jaxdyn.compile.batch import any_sample
-from jaxdyn.constraints.projection import enlarged
+from jaxdyn.constraints.projection import enlarge
 from jaxdyn.model.arguments import Number
 from jaxdyn.simulation.solvers.base import DenseOutput, Flag, StepOutput
 from jaxdyn.simulation.solvers.projected import ProjectedInterpolation, ProjectedSolver
@@ -213,7 +213,8 @@ def take_step(plan: Plan, args, t0, t1, y, rate) -> Step:
     """Make a step from t0 to t1; `rate` is the vector field at y if the method is first-same-as-last."""
     dt = jnp.asarray(t1 - t0, y.dtype)
     if plan.scans:
-        projected, shift, error, raw, stages, _ = _scan_stages(plan, args, t0, t1, y, rate, jnp.asarray(plan.is_fsal))
+        step: Any = _scan_stages(plan, args, t0, t1, y, rate, jnp.asarray(plan.is_fsal))
+        projected, shift, error, raw, stages, _ = step
     else:
         first = dt * rate if plan.is_fsal else _first_stage(plan, args, t0, t1, y)
         projected, shift, error, raw, stages = _unroll_stages(plan, args, t0, t1, y, first)
@@ -284,7 +285,7 @@ def _unroll_stages(plan: Plan, args, t0, t1, start, first):
     if plan.projects_before_last:
         k.append(plan.stage(args, t0, t1, projected, *points[-1]))
     if plan.project is not None:
-        error = enlarged(error + float(plan.sums[-1, -1]) * k[-1], tangent) if is_early else tangent
+        error = enlarge(error + float(plan.sums[-1, -1]) * k[-1], tangent) if is_early else tangent
     return projected, shift, error, raw, jnp.stack(k)
 
 
@@ -318,7 +319,7 @@ def _scan_stages(plan: Plan, args, t0, t1, start, last, is_ready):
     if not plan.projects_before_last:
         end = plan.project_end(args, t1, raw, error)
     projected, shift, tangent, result = end
-    error = enlarged(error, tangent) if plan.projects_before_last and not plan.knows_error else tangent
+    error = enlarge(error, tangent) if plan.projects_before_last and not plan.knows_error else tangent
     return projected, shift, error, raw, k, result
 
 

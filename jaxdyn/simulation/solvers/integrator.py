@@ -16,7 +16,7 @@ class Integrator(eqx.Module):
     `pull` are those of `replay`.
     """
 
-    room: eqx.AbstractVar[int]  # steps that a history holds
+    room: int = eqx.field(static=True, kw_only=True)  # steps that a history holds
 
     def __call__(self, y0, args, ts):
         return _integrate((y0, args, ts), jax.lax.stop_gradient(self))
@@ -87,13 +87,17 @@ def _(primals, tangents):
 
 @eqx.filter_custom_jvp
 def _pull(given, history, run: Integrator, perturbed):
-    return run.pull(*given, history, perturbed)
+    inputs, weights = given
+    return run.pull(inputs, weights, history, perturbed)
 
 
 @_pull.def_jvp
 def _(primals, tangents):
     given, history, run, perturbed = primals
-    _, change = eqx.filter_jvp(
-        lambda given: run.pull_replay(*given, history, perturbed, True), (given,), (tangents[0],)
-    )
+
+    def pull(given):
+        inputs, weights = given
+        return run.pull_replay(inputs, weights, history, perturbed, True)
+
+    _, change = eqx.filter_jvp(pull, (given,), (tangents[0],))
     return _pull(*primals), change

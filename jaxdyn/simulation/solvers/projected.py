@@ -10,7 +10,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import PyTree
 
-from jaxdyn.constraints.projection import enlarged
+from jaxdyn.constraints.projection import enlarge
 from jaxdyn.model.arguments import Number
 from jaxdyn.simulation.solvers.base import DenseOutput, Flag, StepOutput, Wrapped
 
@@ -79,7 +79,7 @@ class ProjectedSolver(Wrapped):
         shift = shift | {name: jnp.zeros_like(shift[name]) for name in self.step_constants}
         if error is not None:
             tangent = jax.tree.map(
-                lambda left, error, shift: enlarged(left, _excess_shift(shift, error - left)), tangent, error, shift
+                lambda left, error, shift: enlarge(left, _excess_shift(shift, error - left)), tangent, error, shift
             )
         return projected, shift, tangent, result
 

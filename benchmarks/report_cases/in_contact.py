@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from jaxdyn.reports import references
+from benchmarks.report_cases import references
 from jaxdyn.reports.case import Case, scene_builder
 
 

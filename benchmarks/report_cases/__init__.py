@@ -1,15 +1,17 @@
-"""Scenes of a report; each case states its measurements."""
+"""Scenes with known motions for reports: closed forms, printed results, and published run times of other programs.
+
+`python -m benchmarks.work_precision` measures them.
+"""
 
 import jax.numpy as jnp
 import numpy as np
 
+from benchmarks.report_cases import references
+from benchmarks.report_cases.in_contact import in_contact
+from benchmarks.report_cases.mechanisms import mechanisms
 from jaxdyn.forces.elements import Drive
 from jaxdyn.model import robots
-from jaxdyn.reports import references
-from jaxdyn.reports.case import Case as Case
-from jaxdyn.reports.case import Published, scene_builder
-from jaxdyn.reports.cases_in_contact import in_contact
-from jaxdyn.reports.cases_of_mechanisms import mechanisms
+from jaxdyn.reports.case import Case, Published, scene_builder
 from jaxdyn.systems.scene import Scene
 
 

@@ -2,9 +2,8 @@
 
 import numpy as np
 
-from jaxdyn.reports import references
-from jaxdyn.reports.case import Case, scene_builder
-from jaxdyn.reports.references import Reference
+from benchmarks.report_cases import references
+from jaxdyn.reports.case import Case, Reference, scene_builder
 from jaxdyn.scenes.reference import ANDREWS_ORDER
 
 

@@ -6,27 +6,10 @@ on use.
 
 import itertools
 from collections.abc import Callable
-from typing import NamedTuple
 
 import numpy as np
 
-# Rounding error of a closed form in double precision, in the error measure of the report.
-ROUNDING = 1e-13
-
-
-class Reference(NamedTuple):
-    """Reference motion at times `ts` (nt,): `q` (nt, nq) and `v` (nt, nv); the first row is the start.
-
-    `kind` is "closed form", "printed" or "converged"; `source` cites its origin; `error` is its own
-    error in the measure of the report: points of a work-precision plot below it are meaningless.
-    """
-
-    ts: np.ndarray
-    q: np.ndarray
-    v: np.ndarray
-    kind: str
-    source: str
-    error: float = ROUNDING
+from jaxdyn.reports.case import ROUNDING, Reference
 
 
 def closed_form(ts, q, v, source: str, error: float = 0.0) -> Reference:

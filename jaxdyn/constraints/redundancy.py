@@ -1,0 +1,230 @@
+"""Scenes whose redundant rows are dropped: the mask of rows, how far dropped rows are open, and their multipliers."""
+
+from collections.abc import Sequence
+from typing import Any, NamedTuple
+
+import equinox as eqx
+import jax.numpy as jnp
+from jax import lax
+from jaxtyping import Array, Float
+
+from jaxdyn.compile import kernel
+from jaxdyn.compile.known import stop_gradient
+from jaxdyn.constraints.base import (
+    Constraint,
+    constraint_jacobian,
+    holonomic_rows,
+    layout,
+    position_residual,
+    rows,
+    velocity_residual,
+)
+from jaxdyn.constraints.rank import eps_of
+from jaxdyn.constraints.tolerances import row_limits
+from jaxdyn.lie.so3 import matmul
+from jaxdyn.model.arguments import Number, SystemLike
+from jaxdyn.systems.mass_factor import cholesky, solve_cholesky
+from jaxdyn.systems.scene import Scene
+
+
+class KeptRows(Constraint):
+    """A constraint whose dropped rows are zero.
+
+    `kept` (n,) is 1 for rows that stay, 0 for dropped ones; `rounding` () and `least` () as in `Selection`.
+    """
+
+    # Arrays, not static: another choice of rows in the course of a motion runs the same program. The two numbers belong to the
+    # scene; each constraint has them because a scene has no place of its own for them.
+    inner: Constraint
+    kept: Float[Array, " n"]
+    rounding: Float[Array, ""]
+    least: Float[Array, ""]
+    name: str = eqx.field(static=True)
+
+    def position(self, system: SystemLike, q: Float[Array, " nq"], t: Number) -> Array | None:
+        """Residual of the inner constraint, zero in dropped rows."""
+        return self._mask_position(self.inner.position(system, q, t))
+
+    def velocity(self, system: SystemLike, q: Float[Array, " nq"], v: Float[Array, " nv"], t: Number) -> Array | None:
+        """Residual of the inner constraint, zero in dropped rows."""
+        residual = self.inner.velocity(system, q, v, t)
+        # The nonholonomic rows of a constraint are its last ones, the holonomic rows its first ones.
+        return None if residual is None else residual * self.kept[-residual.shape[0] :].astype(q.dtype)
+
+    def sizes(self, system, dtype) -> tuple[int, int]:
+        """Numbers of rows of the inner constraint."""
+        return self.inner.sizes(system, dtype)
+
+    def wrench_components(self) -> tuple[int, ...] | None:
+        """Indices of the inner constraint."""
+        return self.inner.wrench_components()
+
+    def group(self):
+        """Key of the inner constraint's group, different from that of constraints with all rows."""
+        group = self.inner.group()
+        return None if group is None else ("kept rows", group)
+
+    def _mask_position(self, residual):
+        return None if residual is None else residual * self.kept[: residual.shape[0]].astype(residual.dtype)
+
+    @classmethod
+    def group_positions(cls, members: Sequence[Any], system, q, t) -> list:
+        """Residuals of the inner constraints, zero in dropped rows."""
+        inner = [member.inner for member in members]
+        residuals = inner[0].group_positions(inner, system, q, t)
+        return [member._mask_position(residual) for member, residual in zip(members, residuals, strict=True)]
+
+    @classmethod
+    def group_rows(cls, members: Sequence[Any], system, q, v, t) -> list:
+        """Rows of the inner constraints, zero where dropped."""
+        inner = [member.inner for member in members]
+        motions = []
+        for member, (A, gamma, velocity) in zip(members, inner[0].group_rows(inner, system, q, v, t), strict=True):
+            kept = member.kept.astype(q.dtype)
+            motions.append((kept[:, None] * A, kept * gamma, kept * velocity))
+        return motions
+
+
+class Selection(NamedTuple):
+    """The independent rows of a mechanism: `kept` (nc,), 1 or 0.
+
+    `rounding` (): the part of their size by which the dropped rows are open, or differ from combinations of the kept ones.
+    `least` (): the least pivot of the kept rows, in the metric of the mass matrix, below which they are chosen anew.
+    """
+
+    kept: Float[Array, " nc"]
+    rounding: Float[Array, ""]
+    least: Float[Array, ""]
+
+
+def keep_rows(scene: Scene, selection: Selection) -> Scene:
+    """The scene with the rows that are not kept set to zero."""
+    kept, rounding, least = map(jnp.asarray, selection)
+    constraints = tuple(
+        KeptRows(constraint, kept[place.start : place.end], rounding, least, constraint.name)  # pyright: ignore[reportArgumentType]
+        for constraint, place in zip(scene.constraints, layout(scene), strict=True)
+    )
+    return eqx.tree_at(lambda scene: scene.constraints, scene, constraints, is_leaf=lambda x: isinstance(x, tuple))
+
+
+def has_selection(scene: Scene) -> bool:
+    """True for a scene of `keep_rows`."""
+    return any(isinstance(constraint, KeptRows) for constraint in scene.constraints)
+
+
+def exchange_rows(scene: Scene, rows: Float[Array, " n"]) -> Scene:
+    """A scene of `keep_rows` with another choice of rows, in the form of `rows_of`."""
+    return keep_rows(all_rows(scene), Selection(rows[:-1], rounding_of(scene), rows[-1]))
+
+
+def all_rows(scene: Scene) -> Scene:
+    """The scene with all of its rows, before `keep_rows`."""
+    if not has_selection(scene):
+        return scene
+    constraints = tuple(c.inner if isinstance(c, KeptRows) else c for c in scene.constraints)
+    return eqx.tree_at(lambda scene: scene.constraints, scene, constraints, is_leaf=lambda x: isinstance(x, tuple))
+
+
+def row_mask(scene: Scene) -> Array:
+    """1 for rows that stay and 0 for dropped ones, (nc,), of a scene of `keep_rows`."""
+    return jnp.concatenate([c.kept for c in scene.constraints])
+
+
+def rounding_of(scene: Scene) -> Array:
+    """`Selection.rounding` of a scene of `keep_rows`."""
+    return scene.constraints[0].rounding
+
+
+def rows_of(scene: Scene, dtype) -> Float[Array, " n"]:
+    """The choice of rows as the vector that a step carries: 1 or 0 for each row, then `Selection.least`; a constant."""
+    return lax.stop_gradient(jnp.append(row_mask(scene), scene.constraints[0].least)).astype(dtype)
+
+
+def largest_opening(scene: Scene, q, t, kept):
+    """Largest phi of the dropped rows over their sizes."""
+    held = holonomic_rows(layout(scene))
+    # With zero velocities the limits of all rows are those of positions. Relative to the largest row of the constraint, because a
+    # dropped row may itself be almost zero.
+    sizes = largest_of_each(scene, row_limits(scene, q, jnp.zeros((scene.nv,), q.dtype), t, 1.0)[1])[held]
+    return jnp.max(jnp.abs(position_residual(scene, q, t)) / sizes * (1 - kept)[held], initial=0.0)
+
+
+@kernel
+def _largest_opening_rate(scene: Scene, q, v, t, kept):
+    """Largest A v - b of the dropped rows over their sizes."""
+    sizes = largest_of_each(scene, row_limits(scene, q, v, t, 1.0)[1])
+    return jnp.max(jnp.abs(velocity_residual(scene, q, v, t)) / sizes * (1 - kept), initial=0.0)
+
+
+def opening_of_redundant(scene: Scene, q, t, v=None) -> Float[Array, ""]:
+    """Part of their size by which the dropped rows of a scene are open, in positions and in velocities v; a constant."""
+    if not has_selection(scene):
+        return jnp.zeros((), q.dtype)
+    whole, kept, q, t = _constants(scene, q, t)
+    opening = kernel(largest_opening)(whole, q, t, kept)
+    return opening if v is None else jnp.maximum(opening, _largest_opening_rate(whole, q, stop_gradient(v), t, kept))
+
+
+def residual_of_redundant(scene: Scene, q, v, t, a) -> Float[Array, ""]:
+    """Largest |A a - gamma| of the dropped rows of a scene, if any, over the sizes of what cancels in it; a constant."""
+    if not has_selection(scene):
+        return jnp.zeros((), q.dtype)
+    whole, kept, q, t = _constants(scene, q, t)
+    v, a = stop_gradient((v, a))
+    A, gamma, _ = rows(whole, q, v, t)
+    sizes = jnp.abs(gamma) + matmul(jnp.abs(A), jnp.abs(a))
+    sizes = sizes + jnp.max(sizes)
+    some = sizes > 0
+    ratio = jnp.abs(matmul(A, a) - gamma) / jnp.where(some, sizes, jnp.ones_like(sizes))
+    return jnp.max(jnp.where(some, ratio, jnp.zeros_like(ratio)) * (1 - kept))
+
+
+def _constants(scene: Scene, q, t):
+    """The scene with all of its rows and without forces, the mask of kept rows, q and t: without derivatives."""
+    whole = Scene(scene.system, all_rows(scene).constraints)
+    return stop_gradient((whole, row_mask(scene).astype(q.dtype), q, jnp.asarray(t, q.dtype)))
+
+
+def gap_of_redundant(scene: Scene, q, t) -> Float[Array, ""]:
+    """Largest |phi| of the dropped rows of a scene, m or rad; a constant."""
+    whole, kept, q, t = _constants(scene, q, t)
+    return jnp.max(jnp.abs(position_residual(whole, q, t)) * (1 - kept)[holonomic_rows(layout(whole))], initial=0.0)
+
+
+def distribute_multipliers(scene: Scene, q, t, lam: Float[Array, " nc"]) -> Float[Array, " nc"]:
+    """Multipliers of least norm of all rows, with the same force as `lam` of the kept ones.
+
+    With the dropped rows as combinations A_d = C A_k of the kept ones, lam_k + C^T lam_d = lam, whose shortest solution is
+    [1; C] (1 + C^T C)^-1 lam.
+    """
+    # Without this the loads of redundant bearings would depend on the choice of rows, and jump where it changes.
+    kept, whole = row_mask(scene), all_rows(scene)
+    return _distribute(Scene(whole.system, whole.constraints), q, jnp.asarray(t, q.dtype), lam, kept)
+
+
+@kernel
+def _distribute(scene: Scene, q, t, lam, kept):
+    A, kept = constraint_jacobian(scene, q, t), kept.astype(q.dtype)
+    own = kept[:, None] * A
+    # Ones on the diagonal of dropped rows make the matrix regular; their right-hand sides are zero.
+    gram = matmul(own, own.T) + jnp.diag(1 - kept)
+    C = solve_cholesky(cholesky(gram), matmul(own, ((1 - kept)[:, None] * A).T)).T
+    shared = solve_cholesky(cholesky(jnp.eye(A.shape[0], dtype=A.dtype) + matmul(C.T, C)), kept * lam)
+    return kept * shared + matmul(C, shared)
+
+
+def largest_of_each(scene: Scene, sizes) -> Array:
+    """For each row (nc,) the largest size among the rows of its constraint, on positions or on velocities."""
+    # Apart, because their units differ: m or rad for positions, whatever the user wrote for velocities.
+    parts = []
+    for place in layout(scene):
+        for start, end in ((place.start, place.nonholonomic), (place.nonholonomic, place.end)):
+            if end > start:
+                parts.append(jnp.broadcast_to(jnp.max(sizes[start:end])[None], (end - start,)))
+    return jnp.concatenate(parts)
+
+
+def most_opening(scene: Scene, dtype):
+    """Largest opening of dropped rows along a motion: a hundred times their opening or difference at its start, plus rounding."""
+    # A hundred times, because the rounding of a file can cancel at the start: at the configuration in which it was written.
+    return 100 * rounding_of(scene) + eps_of(jnp.zeros((), dtype)) ** 0.4

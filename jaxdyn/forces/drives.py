@@ -1,0 +1,133 @@
+"""Drives whose torque follows the command with first- or second-order dynamics."""
+
+import equinox as eqx
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float
+
+from jaxdyn.dynamics.kinematics import take
+from jaxdyn.forces.elements import _broadcast, _is_positive, _joint_indices, _leaf, _names
+from jaxdyn.model.arguments import Number, SystemLike
+from jaxdyn.systems.drives import DriveDynamics
+
+
+class _Lag(DriveDynamics):
+    """Drives whose torque follows the command of some joints, all others being without delay."""
+
+    initial: eqx.AbstractVar[Array]
+    joints: eqx.AbstractVar[tuple[str, ...] | None]
+
+    def start(
+        self, system: SystemLike, q: Float[Array, " nq"], v: Float[Array, " nv"], t: Number
+    ) -> Float[Array, " n"]:
+        """Torques `initial` at rest."""
+        size = _joint_indices(system, self.joints, type(self).__name__).v.size
+        return _broadcast(self.initial, v, size, f"{type(self).__name__}: initial")
+
+    def torque(
+        self,
+        system: SystemLike,
+        q: Float[Array, " nq"],
+        v: Float[Array, " nv"],
+        t: Number,
+        state: Float[Array, " n"],
+        command: Float[Array, " nv"],
+    ) -> Float[Array, " nv"]:
+        """The torques among the states, and the commands of other joints."""
+        index = _joint_indices(system, self.joints, type(self).__name__).v
+        torque = state[: index.size]
+        return torque if np.array_equal(index, np.arange(system.nv)) else command.at[index].set(torque)
+
+    def _error(self, system, state, command):
+        """Commands less torques of the drives (n,), and a function that broadcasts a leaf to (n,)."""
+        index, name = _joint_indices(system, self.joints, type(self).__name__).v, type(self).__name__
+        error = take(command, index) - state[: index.size]
+        return error, lambda leaf: _broadcast(getattr(self, leaf), state, index.size, f"{name}: {leaf}")
+
+
+class FirstOrderDrive(_Lag):
+    """First-order drive: T dtau/dt = u - tau, with u the command and tau the torque at the joint.
+
+    The step response is tau = u (1 - exp(-t/T)). It models a current loop of bandwidth 1/(2 pi T) Hz, and MuJoCo's
+    activation `filter` of a motor.
+
+    **Arguments:** `time_constant` T (s), positive, and `initial` torque (N m or N): numbers or one per coordinate. `joints`,
+    their names, or None for all; commands of the others pass at once.
+
+    **Raises:** ValueError for a T that is not positive; (when called) for unknown joints or a wrong shape.
+
+    ```python
+    scene = jd.Scene(model, forces=[jd.forces.FirstOrderDrive(0.01), jd.forces.EffortLimits()])
+    step = jd.stepper(scene, dt=0.002)
+    state = step((q, v, scene.drive_state(q, v)), jnp.full(7, 5.0))
+    ```
+    """
+
+    time_constant: Float[Array, "..."] = eqx.field(converter=_leaf)
+    initial: Float[Array, "..."] = eqx.field(converter=_leaf, default=0.0)
+    joints: tuple[str, ...] | None = eqx.field(static=True, converter=_names, default=None)
+
+    def __check_init__(self):
+        if not _is_positive(self.time_constant):
+            raise ValueError(f"FirstOrderDrive: time_constant is {self.time_constant}; give positive seconds")
+
+    def rate(
+        self,
+        system: SystemLike,
+        q: Float[Array, " nq"],
+        v: Float[Array, " nv"],
+        t: Number,
+        state: Float[Array, " n"],
+        command: Float[Array, " nv"],
+    ) -> Float[Array, " n"]:
+        """(u - tau)/T."""
+        error, leaf = self._error(system, state, command)
+        return error / leaf("time_constant")
+
+
+class SecondOrderDrive(_Lag):
+    """Second-order drive: tau'' + 2 zeta w tau' + w^2 tau = w^2 u, with u the command and tau the torque at the joint.
+
+    The states are tau, then tau'. With zeta < 1 the step response overshoots by exp(-pi zeta/sqrt(1 - zeta^2)).
+
+    **Arguments:** `frequency` w (rad/s) and `damping_ratio` zeta, positive, and `initial` torque (N m or N, with tau' = 0):
+    numbers or one per coordinate. `joints` as of `FirstOrderDrive`.
+
+    **Raises:** ValueError for numbers that are not positive; (when called) for unknown joints or a wrong shape.
+
+    ```python
+    scene = jd.Scene(model, forces=[jd.forces.SecondOrderDrive(200.0, 0.7)])
+    motion = jd.simulate(scene, q, v, jnp.linspace(0.0, 0.1, 11), outputs=("torque", "drive_state"))
+    ```
+    """
+
+    frequency: Float[Array, "..."] = eqx.field(converter=_leaf)
+    damping_ratio: Float[Array, "..."] = eqx.field(converter=_leaf, default=1.0)
+    initial: Float[Array, "..."] = eqx.field(converter=_leaf, default=0.0)
+    joints: tuple[str, ...] | None = eqx.field(static=True, converter=_names, default=None)
+
+    def __check_init__(self):
+        for name in ("frequency", "damping_ratio"):
+            if not _is_positive(getattr(self, name)):
+                raise ValueError(f"SecondOrderDrive: {name} is {getattr(self, name)}; give positive numbers")
+
+    def start(
+        self, system: SystemLike, q: Float[Array, " nq"], v: Float[Array, " nv"], t: Number
+    ) -> Float[Array, " n"]:
+        """Torques `initial`, then their rates, zero."""
+        torque = super().start(system, q, v, t)
+        return jnp.concatenate([torque, jnp.zeros_like(torque)])
+
+    def rate(
+        self,
+        system: SystemLike,
+        q: Float[Array, " nq"],
+        v: Float[Array, " nv"],
+        t: Number,
+        state: Float[Array, " n"],
+        command: Float[Array, " nv"],
+    ) -> Float[Array, " n"]:
+        """tau', then w^2 (u - tau) - 2 zeta w tau'."""
+        error, leaf = self._error(system, state, command)
+        frequency, speed = leaf("frequency"), state[error.shape[0] :]
+        return jnp.concatenate([speed, frequency * (frequency * error - 2 * leaf("damping_ratio") * speed)])

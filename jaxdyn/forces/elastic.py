@@ -1,0 +1,119 @@
+"""Elastic joints: springs and dampers between motors and joints, and robots with a rotor for each joint."""
+
+from collections.abc import Sequence
+
+import equinox as eqx
+import jax.numpy as jnp
+from jaxtyping import Array, Float
+
+from jaxdyn.forces.elements import _broadcast, _is_positive, _joint_indices, _leaf
+from jaxdyn.model.arguments import Checked, Number, Numbers, SystemLike
+from jaxdyn.model.builder import ModelBuilder
+from jaxdyn.model.joining import join
+from jaxdyn.model.joints import KINDS
+from jaxdyn.model.tree import Model
+from jaxdyn.systems.scene import Scene
+
+
+def _tuple(names: str | Sequence[str]) -> tuple[str, ...]:
+    return (names,) if isinstance(names, str) else tuple(names)
+
+
+class ElasticTransmission(eqx.Module):
+    """Spring and damper between motors and joints: s = theta/n - q, tau = K s + D ds/dt on the joint, -tau/n on the motor.
+
+    theta is the motor's own angle and n the gear ratio, of one sign with the direction of rotation. It conserves the energy
+    K s^2/2 and dissipates D (ds/dt)^2. Steps must resolve sqrt(K (1/I + 1/(n^2 B))), with B and I the inertias of motor and
+    link; `jd.solvers.Rodas5P` has longer ones where the elastic motion has died out.
+
+    **Arguments:** `motors`, `joints`, names of joints of one coordinate, in pairs; `stiffness` K (N m/rad or N/m), `damping` D
+    (N m s/rad or N s/m), `gear` n (1, or rad/m for a spindle): numbers or one per pair.
+
+    **Raises:** ValueError for names that are no pairs, a gear ratio of zero; (when called) for unknown joints, joints of several
+    coordinates, a wrong shape.
+
+    Source: Spong (1987), ASME J. Dyn. Sys. Meas. Control 109, eq. 13; De Luca & Book, Springer Handbook of Robotics, ch. 11.
+    """
+
+    motors: tuple[str, ...] = eqx.field(static=True, converter=_tuple)
+    joints: tuple[str, ...] = eqx.field(static=True, converter=_tuple)
+    stiffness: Float[Array, "..."] = eqx.field(converter=_leaf)
+    damping: Float[Array, "..."] = eqx.field(converter=_leaf, default=0.0)
+    gear: Float[Array, "..."] = eqx.field(converter=_leaf, default=1.0)
+
+    def __check_init__(self):
+        if len(self.motors) != len(self.joints):
+            raise ValueError(
+                f"ElasticTransmission: {len(self.motors)} motors for {len(self.joints)} joints; give pairs"
+            )
+        if not _is_positive(self.gear**2):
+            raise ValueError(f"ElasticTransmission: gear is {self.gear}; give ratios that are not zero")
+
+    def __call__(
+        self, system: SystemLike, q: Float[Array, " nq"], v: Float[Array, " nv"], t: Number
+    ) -> Float[Array, " nv"]:
+        n = len(self.joints)
+        motor, joint = (_joint_indices(system, names, "ElasticTransmission") for names in (self.motors, self.joints))
+        if any(len(index) != n for index in (*motor, *joint)):
+            raise ValueError("ElasticTransmission: motors and joints have one coordinate each")
+        stiffness, damping, gear = (
+            _broadcast(value, q, n, f"ElasticTransmission: {name}")
+            for name, value in (("stiffness", self.stiffness), ("damping", self.damping), ("gear", self.gear))
+        )
+        stretch, rate = (x[a] / gear - x[b] for x, a, b in ((q, motor.q, joint.q), (v, motor.v, joint.v)))
+        tau = stiffness * stretch + damping * rate
+        return jnp.zeros_like(v).at[joint.v].add(tau).at[motor.v].add(-tau / gear)
+
+
+def elastic_joints(
+    model: Checked[Model],
+    stiffness: Numbers,
+    rotor_inertia: Numbers,
+    *,
+    damping: Numbers = 0.0,
+    gear: Numbers = 1.0,
+    joints: Checked[str | Sequence[str] | None] = None,
+    suffix: str = "_motor",
+) -> Scene:
+    """Robot with elastic joints: a scene with a rotor for each of them behind the model's coordinates, and the springs.
+
+        M(q) q'' + h(q, q') = K (theta/n - q) + D (theta'/n - q')
+        B theta'' + (K (theta/n - q) + D (theta'/n - q'))/n = tau
+
+    q = (model's q, theta), v = (model's v, theta'); torques of the motors are the last entries of tau. The kinetic energy of a
+    rotor is that of its own rotation, B theta'^2/2; its mass belongs to the link that carries it. What Spong's model neglects,
+    the coupling with that link's rotation, is of the order of 1/n: where it matters, add rotors as bodies on their links by a
+    `ModelBuilder`, and `ElasticTransmission` to the scene.
+
+    **Arguments:**
+
+    - `model`: the robot with rigid joints. Its `armature` is that of the link side: leave the rotors' out.
+    - `stiffness` K, `damping` D, `gear` n: as of `ElasticTransmission`.
+    - `rotor_inertia` B, kg m^2, about the rotor's own axis, before the gear: a number or one per joint.
+    - `joints`: names of joints of one coordinate; None for all.
+    - `suffix`: of the rotors' names behind those of the joints.
+
+    **Returns:** `Scene` of the joined model, without effort limits and joint limits of the rotors. Add forces by
+    `jd.Scene(scene.system, forces=(*scene.forces, ...))`. K, D, n are leaves of `scene.forces[0]`, B of `system.armature`.
+
+    **Raises:** ValueError for unknown joints and those of several coordinates, and for rotors without inertia.
+
+    ```python
+    scene = jd.forces.elastic_joints(jd.robots.iiwa(), 1e4, 3e-5, damping=5.0, gear=100.0)
+    ```
+    """
+    chosen = model.joint_names if joints is None else _tuple(joints)
+    _joint_indices(model, chosen, "elastic_joints")
+    kinds = dict(zip(model.joint_names, model.topology.kinds, strict=True))
+    if several := [name for name in chosen if KINDS[kinds[name]].nv != 1]:
+        raise ValueError(f"elastic_joints: {several} have several coordinates; name joints of one")
+    if not _is_positive(rotor_inertia):
+        raise ValueError(f"elastic_joints: rotor_inertia is {rotor_inertia}; give positive inertias (kg m^2)")
+    motors = tuple(f"{name}{suffix}" for name in chosen)
+    inertias = jnp.broadcast_to(jnp.asarray(rotor_inertia, float), (len(chosen),))
+    whole = model
+    for motor, inertia in zip(motors, inertias, strict=True):
+        rotor = ModelBuilder(motor, gravity=model.gravity, dtype=model.home.dtype)
+        rotor.add_body(motor, None, "continuous", joint_name=motor, armature=inertia)
+        whole = join(whole, rotor.build(), name=model.name)
+    return Scene(whole, forces=(ElasticTransmission(motors, chosen, stiffness, damping, gear),))
