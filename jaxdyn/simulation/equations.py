@@ -107,7 +107,7 @@ class Equations:
 
         return values_and_levels(values, q, v, *own)
 
-    def _added_rates(self, args, y, q, v, t, force):
+    def _extra_rates(self, args, y, q, v, t, force):
         scene, control, method = self.unpack(args, y)
         rates = controls.rates(control, y, q, v, t, lambda: method.multipliers(scene, q, v, t, force))
         return rates | ({DRIVES: self.drive(args, y, q, v, t)[1]} if DRIVES in y else {})
@@ -116,7 +116,7 @@ class Equations:
         scene, _, method = self.unpack(args, y)
         rates, force, v = method.evaluate(scene, y, t, functools.partial(self.generalized_force, args, y))
         if self._added:
-            rates = rates | self._added_rates(args, y, retract(scene.system, y["q"]), v, t, force)
+            rates = rates | self._extra_rates(args, y, retract(scene.system, y["q"]), v, t, force)
         if KEPT in y:
             rates = rates | {KEPT: jnp.zeros_like(y[KEPT])}
         return rates | {"work": power(force, v)} if "work" in y else rates
@@ -129,7 +129,7 @@ class Equations:
         rates = rates | ({KEPT: jnp.zeros_like(y[KEPT])} if KEPT in y else {})
         # Controllers and the work see the whole force, although the rate of v has a share of it only.
         force = self.generalized_force(args, y, q, v, t) if self._added or "work" in y else None
-        rates = rates | self._added_rates(args, y, q, v, t, force)
+        rates = rates | self._extra_rates(args, y, q, v, t, force)
         return rates | {"work": power(force, v)} if "work" in y else rates
 
     def _implicit_part(self, t, y, args):
