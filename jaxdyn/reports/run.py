@@ -17,7 +17,7 @@ from jaxdyn.reports.plotting import new_figure
 from jaxdyn.reports.programs import FIXED, SOLVERS, Prepared, prepare
 from jaxdyn.reports.records import Known, Record, Report
 from jaxdyn.reports.timing import commit, machine
-from jaxdyn.simulation.start import chosen_method
+from jaxdyn.simulation.start import choose_method
 
 # Contestants of other libraries for a scene, a dtype and starts (q, v, ts); see `Contestant`.
 Peers = Callable[[Prepared, str, tuple], Sequence[Contestant]]
@@ -193,7 +193,7 @@ def _check_arguments(scenes, dtypes, batches, integrators, rounds) -> list[Case]
         scene, _ = case.build()
         for method in dict(integrators or ()):
             try:
-                chosen_method(scene, method)
+                choose_method(scene, method)
             except ValueError as error:
                 raise ValueError(f"integrators has {method!r}, which {case.name} does not support: {error}") from None
     return chosen
