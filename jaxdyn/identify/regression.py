@@ -7,6 +7,7 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jax.core import Tracer
 
 from jaxdyn.dynamics import quantities as dynamics
 from jaxdyn.identify.condensed import Blocks, Condensed, condense_blocks, condense_rows
@@ -57,7 +58,7 @@ def regressor(model: Model, q: Numbers, v: Numbers, a: Numbers, *, v_s: Number =
     **Raises:** ValueError for traced arrays.
     """
     check_shapes(model)
-    if any(isinstance(x, jax.core.Tracer) for x in (q, v, a)):
+    if any(isinstance(x, Tracer) for x in (q, v, a)):
         raise ValueError(
             "q, v and a are traced; regressor takes the numbers of a log. Under jit: jd.dynamics.torque_regressor"
         )
