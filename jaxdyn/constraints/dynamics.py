@@ -137,8 +137,8 @@ def _without_kernel(rank_tol, scene: Scene, q, v, tau, t):
     """Fallback of `_by_pivots`, for scenes of which no kernel can be made and for samples that the kernel marks as invalid."""
     if not scene.forces:
         return _by_rank(rank_tol, scene, q, v, tau, t)
-    # A user's force may use operations that kernels do not have. It is evaluated here and enters as tau, so that the rest may be a
-    # kernel.
+    # A user's force may use operations that kernels do not have. It is evaluated here and enters as tau, so that the rest can be
+    # a kernel.
     bare = Scene(scene.system, scene.constraints)
     return _by_pivots(rank_tol, bare, q, v, total_force(scene, q, v, tau, t), t)
 
@@ -164,8 +164,8 @@ def _gauss_problem(scene: Scene, q, v, tau, t):
 
 def _rank_and_result(scene: Scene, q, quality):
     """Rank and code of rows that are treated as independent, from the ratio of their pivots."""
-    # Rounding makes zero pivots of a singular matrix about nv eps times the largest; the limit is ten times that. NaN marks a mass
-    # matrix that is not positive definite.
+    # Rounding makes zero pivots of a singular matrix about nv eps times the largest; the limit is ten times that. NaN marks a
+    # mass matrix that is not positive definite.
     rank = jnp.asarray(layout(scene)[-1].end, jnp.int32)
     result = RESULTS.where(quality > 10 * scene.nv * eps_of(q), RESULTS.successful, RESULTS.dependent_rows)  # pyright: ignore[reportArgumentType]
     return rank, RESULTS.where(jnp.isfinite(quality), result, RESULTS.singular_mass_matrix)
@@ -307,8 +307,8 @@ def second_fundamental_form(
 ) -> Float[Array, " nv"]:
     """Second fundamental form of the constraints, S(v, v) = (1 - P_T)(a + M^-1 C v): the normal part of covariant accelerations.
 
-    All motions through (q, v) that satisfy the constraints have it in common: S = M^-1 A^T (A M^-1 A^T)^+ (gamma + A M^-1 C v), a function of q
-    and v alone. M S is the force, normal to the constraints, that keeps the motion on them.
+    All motions through (q, v) that satisfy the constraints have it in common, because it is a function of q and v alone:
+    S = M^-1 A^T (A M^-1 A^T)^+ (gamma + A M^-1 C v). M S is the force, normal to the constraints, that keeps the motion on them.
 
     **Arguments:** `q` (nq,); `v` (nv,) with A v = b; `t`, s; `rank_tol` as in `constrained_dynamics`.
 

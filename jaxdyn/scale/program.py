@@ -75,8 +75,8 @@ class Program:
                     f"a program of {least} rollouts needs {self.bytes / 2**20:.3g} MiB, and {budget / 2**20:.3g} MiB are allowed "
                     "(memory=, or half of what is free); save fewer points or outputs, or take fewer devices"
                 )
-            # Memory is nearly proportional to the size. A tenth less makes it likely that the next program fits. Sizes are at least
-            # halved, which bounds the number of compilations.
+            # Memory is nearly proportional to the size. A tenth less makes it likely that the next program fits. Sizes are at
+            # least halved, which bounds the number of compilations.
             fitting = int(0.9 * self.size * budget / self.bytes)
             self.size = max(least, min(fitting, self.size // 2) // least * least)
         self._first: tuple[np.ndarray, Any] | None = None

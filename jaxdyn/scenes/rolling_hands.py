@@ -40,8 +40,8 @@ def _support(semi_axes, normal):
 def _finger_state(base, links, tip_axes, point, normal, velocity):
     """Angles (yaw, pitch, pitch) and their rates, of a finger whose ellipsoidal tip touches a moving point of the object.
 
-    `base` is the pose of the finger's base. `point`, `normal` and `velocity` (3,) are the contact point, the outward normal of the
-    object and the velocity of its material point there, in world axes.
+    `base` is the pose of the finger's base. `point`, `normal` and `velocity` (3,) are the contact point, the outward normal of
+    the object and the velocity of its material point there, in world axes.
     """
     xp = array_namespace(base, links, tip_axes, point, normal, velocity)
     base, tip_axes, point, normal, velocity = (xp.asarray(x, float) for x in (base, tip_axes, point, normal, velocity))
@@ -104,8 +104,8 @@ def hand_rolling_egg(
 ) -> Grasp:
     """Hand of three fingers with three joints each, whose ellipsoidal tips roll without slip on an ellipsoid.
 
-    The constraints are nonholonomic. q = (yaw, pitch and pitch of each finger, the object's free joint, the contact coordinates of
-    the three contacts: a unit vector on the fingertip and one on the object). Each contact has one holonomic row for the gap and
+    The constraints are nonholonomic. q = (yaw, pitch and pitch of each finger, the object's free joint, the coordinates of the
+    three contacts: a unit vector on the fingertip and one on the object). Each contact has one holonomic row for the gap and
     two Pfaffian rows for slip; its forces are one normal and two tangential ones. `semi_axes` and `tip_semi_axes` (m) of the
     object and of a fingertip are along the axes of their frames; the other parameters are those of `hand_with_ball`.
 
