@@ -138,7 +138,7 @@ def _choice_change(g: Graph, op: str, kind: str, value, x: list, d: list):
     return g.select(g.compare("ge", x[0], 0.0), g.neg(d[0]), d[0], kind)
 
 
-# Functions of one operand: dy/dx from y and x. Where y serves, no second function has to be evaluated.
+# Functions of one operand: dy/dx from y and x. Where y is enough, no second function has to be evaluated.
 _PARTIAL: dict[str, Callable[..., Any]] = {
     "sqrt": lambda g, y, x: g.div(0.5, y),
     "sin": lambda g, y, x: g.function("cos", x),

@@ -89,7 +89,7 @@ class DryFriction(WithModes):
             self.normal = jnp.asarray(as_array(normal, f"DryFriction {name!r}: normal"), float)
             if is_concrete(self.normal) and not (np.asarray(self.normal) >= 0).all():
                 raise ValueError(
-                    f"DryFriction {name!r}: normal is {normal}; give the radius_leaf of the normal force (N), zero or more"
+                    f"DryFriction {name!r}: normal is {normal}; give the size of the normal force (N), zero or more"
                 )
         if isinstance(along, bool) or not (callable(along) or isinstance(along, (int, Constraint))):
             raise ValueError(

@@ -115,7 +115,8 @@ class Program:
 class Traced:
     """Function `one(drawn, row) -> dict of arrays`, traced once, so that programs of several sizes do not run its Python again.
 
-    `shapes`: shapes and dtypes of the arrays of one member, by name.
+    `drawn` are the parameters that a member draws from its random key, `row` is its row of the given arrays (`Members`); either
+    may be None. `shapes`: shapes and dtypes of the arrays of one member, by name.
     """
 
     def __init__(self, one: Callable, members: Members):
