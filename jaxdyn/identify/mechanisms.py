@@ -24,9 +24,9 @@ from jaxdyn.systems.system import SceneLike, displace, displacement
 # Gauss-Newton steps of a search. `on_constraints` then projects the state by `assemble`, so that its accuracy does not depend on
 # this number.
 _ITERATIONS = 5
-# Weight of the residual of a constraint, where that of a measured coordinate has 1. A contradiction between both is divided by the
-# squares of the weights: for rows of unit size all but 1e-4 of it stays in the measured coordinates. A larger weight would cost
-# digits in the normal equations.
+# Weight of the residual of a constraint, where that of a measured coordinate has 1. A contradiction between both is divided by
+# the squares of the weights: for rows of unit size all but 1e-4 of it stays in the measured coordinates. A larger weight would
+# cost digits in the normal equations.
 _CONSTRAINT_WEIGHT = 1e2
 # Weight of the squared change of every coordinate: so small that it determines only the coordinates that neither constraints nor
 # measurements do.
