@@ -55,11 +55,12 @@ from jaxdyn.reduction.minimal import reduced_dynamics
 from jaxdyn.reports import report
 from jaxdyn.simulation import solvers
 from jaxdyn.simulation.controls import Controller, Sampled
-from jaxdyn.simulation.methods import Baumgarte, Multipliers, Projected, Reduced, Variational
+from jaxdyn.simulation.methods import Baumgarte, Multipliers, Projected, Reduced
 from jaxdyn.simulation.run import simulate
 from jaxdyn.simulation.solution import Solution
 from jaxdyn.simulation.stepping import stepper
-from jaxdyn.simulation.time_scales import stiffness
+from jaxdyn.simulation.stiffness import stiffness
+from jaxdyn.simulation.variational import Variational
 from jaxdyn.systems.lagrangian import LagrangianSystem
 from jaxdyn.systems.scene import Scene
 from jaxdyn.systems.system import ExplicitSystem, MetricSystem

@@ -7,6 +7,7 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jax.core import Tracer
 
 from jaxdyn.dynamics import quantities as dynamics
 from jaxdyn.identify.condensed import Blocks, Condensed, condense_blocks, condense_rows
@@ -53,8 +54,14 @@ def regressor(model: Model, q: Numbers, v: Numbers, a: Numbers, *, v_s: Number =
     """Rows [Y(q, v, a), friction and rotor columns] for samples (n, nq), (n, nv), (n, nv): (n, nv, 10 nb + 4 nv).
 
     Computed in the model's dtype in blocks of equal size (one compilation for logs of any length), returned in float64.
+
+    **Raises:** ValueError for traced arrays.
     """
     check_shapes(model)
+    if any(isinstance(x, Tracer) for x in (q, v, a)):
+        raise ValueError(
+            "q, v and a are traced; regressor takes the numbers of a log. Under jit: jd.dynamics.torque_regressor"
+        )
     q, v, a = (np.asarray(as_array(x, name), model.home.dtype) for name, x in (("q", q), ("v", v), ("a", a)))
     n = len(q)
     parts = []

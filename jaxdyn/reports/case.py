@@ -79,7 +79,7 @@ def scene_builder(name: str, **parameters) -> Callable[[], tuple[Scene, tuple]]:
     return build
 
 
-def named_case(name: str) -> Case:
+def case_of_scene(name: str) -> Case:
     """Case of a scene of `jd.scenes`: its default start, one second, and a converged solution as the reference.
 
     **Raises:** ValueError for other names, and for scenes with forces that have modes, whose steps end at events.

@@ -13,8 +13,8 @@ from jaxdyn.reports.programs import FIXED, SOLVERS, Prepared
 from jaxdyn.reports.records import Record
 from jaxdyn.reports.timing import time_interleaved
 from jaxdyn.simulation.methods import Method, Reduced
-from jaxdyn.simulation.solvers.explicit import passes_last_stage_on
-from jaxdyn.simulation.start import chosen_method
+from jaxdyn.simulation.solvers.explicit import keeps_fsal
+from jaxdyn.simulation.start import choose_method
 from jaxdyn.systems.scene import Scene
 
 
@@ -54,7 +54,7 @@ def ladder(
     batch = len(starts[0])
     run, seconds = prepared.programs.get(method, solver, dtype, batch)
     inputs = [jnp.asarray(x[0] if batch == 1 else x, dtype) for x in starts]
-    chosen = chosen_method(prepared.scene, method)
+    chosen = choose_method(prepared.scene, method)
 
     def motion(outputs) -> Motion:
         q, v, result, stats = outputs
@@ -85,11 +85,7 @@ def evaluations(solver: str, steps: int, scene: Scene, method: Method) -> int | 
     tableau: Any = getattr(SOLVERS[solver](), "tableau", None)
     if tableau is None or tableau.implicit:
         return None
-    saves = (
-        passes_last_stage_on(tableau, method.step_constants, method.projects)
-        if method.corrects(scene)
-        else tableau.fsal
-    )
+    saves = keeps_fsal(tableau, method.step_constants, method.projects) if method.corrects(scene) else tableau.fsal
     saved = steps - 1 if saves else 0
     return tableau.num_stages * steps - saved + 2
 
@@ -101,10 +97,10 @@ def flop_counter(prepared: Prepared, method: str, batch: int = 1) -> Callable[[M
     and repetitions of loops are not included.
     """
     scene = prepared.scene
-    chosen = chosen_method(scene, method)
+    chosen = choose_method(scene, method)
     q, v, t = (jnp.asarray(x, float) for x in (*prepared.programs.start, prepared.reference.ts[0]))
     if isinstance(chosen, Reduced):
-        chosen = chosen.fitted(scene, None)
+        chosen = chosen.for_scene(scene, None)
     state = chosen.start(scene, q, v, t)
 
     def rates(y, t):
@@ -119,7 +115,7 @@ def flop_counter(prepared: Prepared, method: str, batch: int = 1) -> Callable[[M
         return float(analysis.get("flops", 0.0)) / batch
 
     once = cost(rates)
-    again = cost(lambda y, t: chosen.corrected(scene, y, t)) if chosen.corrects(scene) else 0.0
+    again = cost(lambda y, t: chosen.correct(scene, y, t)) if chosen.corrects(scene) else 0.0
 
     def count(motion: Motion) -> float | None:
         if motion.evaluations is None or motion.steps is None:

@@ -17,7 +17,7 @@ from jaxdyn.model.tree import Model
 from jaxdyn.reports.case import Case, Reference
 from jaxdyn.simulation.run import simulate
 from jaxdyn.simulation.solvers import RK4, Rodas5P
-from jaxdyn.simulation.start import chosen_method
+from jaxdyn.simulation.start import choose_method
 from jaxdyn.systems.scene import Scene
 
 # Solvers by name; those in FIXED run with fixed steps.
@@ -52,7 +52,7 @@ class Programs:
 
     def get(self, method: str, solver: str, dtype: str = "float64", batch: int = 1) -> Program:
         """Program for a method, a solver, a dtype and a number of trajectories, compiled once."""
-        key = (chosen_method(self.scene, method).name, solver, dtype, batch)
+        key = (choose_method(self.scene, method).name, solver, dtype, batch)
         if key not in self._cache:
             self._cache[key] = self._compile(*key)
         return self._cache[key]

@@ -9,7 +9,7 @@ from pathlib import Path
 import jax.numpy as jnp
 import numpy as np
 
-from jaxdyn.reports.case import Case, named_case
+from jaxdyn.reports.case import Case, case_of_scene
 from jaxdyn.reports.journal import Journal
 from jaxdyn.reports.measure import Contestant, flop_counter, ladder, measure
 from jaxdyn.reports.page import write
@@ -17,7 +17,7 @@ from jaxdyn.reports.plotting import new_figure
 from jaxdyn.reports.programs import FIXED, SOLVERS, Prepared, prepare
 from jaxdyn.reports.records import Known, Record, Report
 from jaxdyn.reports.timing import commit, machine
-from jaxdyn.simulation.start import chosen_method
+from jaxdyn.simulation.start import choose_method
 
 # Contestants of other libraries for a scene, a dtype and starts (q, v, ts); see `Contestant`.
 Peers = Callable[[Prepared, str, tuple], Sequence[Contestant]]
@@ -188,12 +188,12 @@ def _check_arguments(scenes, dtypes, batches, integrators, rounds) -> list[Case]
         raise ValueError('a report needs float64; call jax.config.update("jax_enable_x64", True) first')
     if len(set(names)) < len(names):
         raise ValueError(f"scenes have the names {', '.join(names)}; give each its own")
-    chosen = [case if isinstance(case, Case) else named_case(case) for case in given]
+    chosen = [case if isinstance(case, Case) else case_of_scene(case) for case in given]
     for case in chosen if integrators else ():
         scene, _ = case.build()
         for method in dict(integrators or ()):
             try:
-                chosen_method(scene, method)
+                choose_method(scene, method)
             except ValueError as error:
                 raise ValueError(f"integrators has {method!r}, which {case.name} does not support: {error}") from None
     return chosen

@@ -13,7 +13,7 @@ from jaxdyn.scale.program import Traced
 from jaxdyn.scale.reducer import QUANTITY
 from jaxdyn.scale.reductions import Reduction, quantities
 from jaxdyn.scale.store import Variable
-from jaxdyn.simulation.export import dimensions, traced_signals
+from jaxdyn.simulation.export import dimensions, signals_as_given
 
 OUTCOMES = ("successful", "failed")  # codes of functions that are no motions
 
@@ -46,7 +46,7 @@ class MotionRows(NamedTuple):
     def __call__(self, drawn: Any, row: Any) -> dict[str, Any]:
         """Arrays by their names in the store, with the quantities of reductions."""
         solution, scene, parameters = self.one(drawn, row)
-        signals = traced_signals(solution, scene)
+        signals = signals_as_given(solution, scene)
         poses = {f"pose_{name}": pose for name, pose in solution.poses.items()}
         # Tracing is the only way to the names: outputs and joints are those of the scene that the user's function builds.
         self.seen.update(signals=[signal._replace(values=None) for signal in signals], poses=tuple(poses))

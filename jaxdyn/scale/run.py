@@ -15,9 +15,9 @@ from jaxdyn.scale.description import describe_function, describe_motion
 from jaxdyn.scale.members import digest, members
 from jaxdyn.scale.reductions import Reduction
 from jaxdyn.scale.study import STEPS
+from jaxdyn.simulation.checks import check_times
 from jaxdyn.simulation.controls import Control
 from jaxdyn.simulation.run import simulate
-from jaxdyn.simulation.solvers.inputs import check_times
 from jaxdyn.systems.scene import as_scene
 from jaxdyn.systems.system import SceneLike
 from jaxdyn.tasks import DaskClient

@@ -1,11 +1,12 @@
-"""Motions: `run` is `jd.simulate`, `methods` how a scene becomes an ordinary differential equation, `solvers/` the methods of
-diffrax and of our own, `hybrid/` motions with events, `variational` steps for long motions, `time_scales` how stiff a scene is.
+"""Simulation of scenes; the only room that integrates.
 
-Imports `reduction`, `constraints` and what is below them; the only room that integrates.
+`run` is `jd.simulate`, `methods` are the differential equations of a scene, `solvers/` the methods of diffrax and of our own,
+`hybrid/` motion with events, `variational` steps for long motions, `stiffness` the rates of a scene. Imports `reduction`,
+`constraints` and what is below them.
 """
 
-from jaxdyn.simulation.limits import JointLimitWarning as JointLimitWarning
-from jaxdyn.simulation.time_scales import Stiffness as Stiffness
+from jaxdyn.simulation.stiffness import Stiffness as Stiffness
+from jaxdyn.simulation.terminal_events import JointLimitWarning as JointLimitWarning
 
 __all__ = [
     "JointLimitWarning",

@@ -5,10 +5,10 @@ A plain control is tau(q, v, t). A `Controller` also has a state z, integrated w
     tau = control(q, v, t, z),    dz/dt = rate(q, v, t, z, lam),
 
 which makes the feedback of constraint forces through z free of algebraic loops: lam depends on tau, and tau on z alone. Where
-tau depends on lam itself, the loop lam = lam(tau(lam)) is linear if the law is, and is solved exactly (`_closed_loop`). A
+tau depends on lam itself, the loop lam = lam(tau(lam)) is linear if the law is, and is solved exactly (`_solve_loop`). A
 `Sampled` law is called once a period, and its torque is held in between.
 
-In the state of the equation (`Method`) the entry "control" holds z, and "held" what a sampled law holds.
+The control's entries in the state of the equation (`Method`) are "control", z, and "held", the record of a sampled law.
 """
 
 import abc
@@ -26,7 +26,7 @@ from jaxdyn.compile.known import is_concrete
 from jaxdyn.constraints.base import layout
 from jaxdyn.constraints.rank import pseudo_inverse, tolerance
 from jaxdyn.lie.so3 import matmul
-from jaxdyn.model.arguments import Function, Number, Numbers, as_array, state_dtype
+from jaxdyn.model.arguments import Function, Number, Numbers, as_array, state_dtype, warn
 from jaxdyn.systems.scene import Scene, as_pytree, check_callback, check_force
 
 STATE, HELD = "control", "held"
@@ -85,7 +85,7 @@ class Controller(eqx.Module):
         return None
 
     def allowance(self, q: Float[Array, " nq"], v: Float[Array, " nv"], t: Number) -> Float[Array, ""] | None:
-        """How far the law is from where it cannot do what it promises; None: not known, or not to be looked at.
+        """Distance of the law from where it cannot follow its task; None if that is unknown or not to be monitored.
 
         Where this number falls to zero a simulation ends, with the code `control_singular`.
         """
@@ -95,7 +95,7 @@ class Controller(eqx.Module):
 class Sampled(eqx.Module):
     """A discrete controller: the law is called at the start and after every `period`, and its torque is held in between.
 
-    It takes fixed steps (`stepsize`), of which a whole number fill a period. The outputs "torque" and "control_state" at a save
+    It needs fixed steps (`stepsize`); a whole number of them fills a period. The outputs "torque" and "control_state" at a save
     point that is a sampling instant are those before or after it, as rounding of the times decides: save between samples to
     read them. The motion does not depend on that.
 
@@ -126,9 +126,14 @@ class Sampled(eqx.Module):
             raise ValueError(f"Sampled: period is {period!r}; give one positive number (s)")
         self.period = jnp.asarray(seconds, float)
 
-    def called(self, q: Float[Array, " nq"], v: Float[Array, " nv"], t: Number, state: PyTree) -> tuple[Array, Any]:
-        """The torque and the next state."""
+    def update(self, q: Float[Array, " nq"], v: Float[Array, " nv"], t: Number, state: PyTree) -> tuple[Array, Any]:
+        """Torque and next state of the law."""
         return (self.law(q, v, t), None) if self.state is None else self.law(q, v, t, state)
+
+    def called(self, q: Float[Array, " nq"], v: Float[Array, " nv"], t: Number, state: PyTree) -> tuple[Array, Any]:
+        """Deprecated name of `update`."""
+        warn("Sampled.called is deprecated; call update", DeprecationWarning)
+        return self.update(q, v, t, state)
 
 
 def as_control(control: Any) -> Any:
@@ -148,21 +153,21 @@ def check_steps(control: Any, stepsize: Any) -> None:
         )
     if is_concrete((control.period, stepsize)):
         ratio = float(control.period) / float(np.asarray(stepsize))
-        # Of numbers as people write them: 1e-3 / 3 in six digits.
+        # Steps may be written with six digits, such as 1e-3 / 3.
         if not (ratio > 0.5 and abs(ratio - round(ratio)) < 1e-6 * ratio):
             raise ValueError(
-                f"stepsize is {float(np.asarray(stepsize)):.6g} s, of which {ratio:.6g} fill the period of the sampled control, "
-                f"{float(control.period):.6g} s; take a whole part of it"
+                f"stepsize is {float(np.asarray(stepsize)):.6g} s, and the period of the sampled control "
+                f"{float(control.period):.6g} s, which is {ratio:.6g} steps; take a whole part of it"
             )
 
 
 def can_end(control: Any, q, v, t) -> bool:
-    """Whether a control says where it ends the motion."""
+    """True if a control has an allowance, which may end the motion."""
     return isinstance(control, Controller) and eqx.filter_eval_shape(control.allowance, q, v, t) is not None
 
 
 def check_control(scene: Scene, control: Any, q, v, t) -> None:
-    """Call a control with traced numbers, as the integration will.
+    """Call a control with traced numbers, in the same way as the integration.
 
     **Raises:** ValueError for other arguments, shapes that do not fit, and states that change their structure.
     """
@@ -172,7 +177,7 @@ def check_control(scene: Scene, control: Any, q, v, t) -> None:
             control.law,
             *(named if control.state is None else ("control.law", "law(q, v, t, state)", q, v, t, control.state)),
         )
-        returned = eqx.filter_eval_shape(lambda *args: control.called(*args, _numbers(control.state, q)), q, v, t)  # pyright: ignore[reportCallIssue]
+        returned = eqx.filter_eval_shape(lambda *args: control.update(*args, _numbers(control.state, q)), q, v, t)  # pyright: ignore[reportCallIssue]
         if not (isinstance(returned, tuple) and len(returned) == 2):
             raise ValueError(f"control.law returned {returned!r}; return (tau, state)")
         check_force(jnp.zeros(jnp.shape(returned[0])), q, scene.nv, "control.law")
@@ -189,34 +194,35 @@ def check_control(scene: Scene, control: Any, q, v, t) -> None:
         check_callback(control, "control", "control(q, v, t)", q, v, t)
 
 
-def started(control: Any, q, v, t) -> dict[str, Array]:
-    """Entries of the state of the equation that the control adds."""
+def initial_entries(control: Any, q, v, t) -> dict[str, Array]:
+    """Initial values of the control's entries in the state of the equation."""
     if isinstance(control, Sampled):
+        # With no sample so far the first one is due at the start.
         start = jnp.concatenate([jnp.stack([t, jnp.zeros_like(t)]), jnp.zeros_like(v), _flat(control.state, q)])
-        return {HELD: sampled(control, start, q, v, t)}
+        return {HELD: sample(control, start, q, v, t)}
     if isinstance(control, Controller) and (state := control.start(q, v, t)) is not None:
         return {STATE: _flat(state, q)}
     return {}
 
 
-def sampled(control: Sampled, held: Float[Array, " n"], q, v, t) -> Float[Array, " n"]:
-    """What is held from t on: start of the run, number of samples, torque, and the law's state, flat."""
-    start, count, _, state = _held(control, held, v)
-    # Times of steps are sums with rounding errors.
+def sample(control: Sampled, held: Float[Array, " n"], q, v, t) -> Float[Array, " n"]:
+    """Call the law where a sample is due at t: start of the run, number of samples, torque, and the law's state, flat."""
+    start, count, _, state = _unpack(control, held, v)
+    # Times of steps are sums with rounding errors: a sample that is due by less than that is taken now.
     slack = control.period.astype(t.dtype) * float(jnp.finfo(t.dtype).eps) ** 0.4
     due = t >= start + count * control.period.astype(t.dtype) - slack
-    tau, state = control.called(q, v, t, state)
+    tau, state = control.update(q, v, t, state)
     tau = check_force(tau, q, v.shape[0], "control.law")
     fresh = jnp.concatenate([jnp.stack([start, count + 1]), tau, _flat(state, q)])
     return jnp.where(due, fresh, held)
 
 
 def torque(control: Any, scene: Scene, y, q, v, t, multipliers: Callable) -> Array | None:
-    """tau (nv,) of a control, or None without one; multipliers(tau) are the dynamics."""
+    """Torque (nv,) of a control, or None without one; multipliers(tau) are those of the dynamics."""
     if control is None:
         return None
     if isinstance(control, Sampled):
-        return _held(control, y[HELD], v)[2]
+        return _unpack(control, y[HELD], v)[2]
     if not isinstance(control, Controller):
         return check_force(control(q, v, t), q, scene.nv, "control")
     state = state_of(control, y, q, v, t)
@@ -226,11 +232,12 @@ def torque(control: Any, scene: Scene, y, q, v, t, multipliers: Callable) -> Arr
     def at(lam):
         return check_force(control(q, v, t, state, lam), q, scene.nv, "control")
 
-    return at(_closed_loop(lambda lam: multipliers(at(lam)), jnp.zeros((_count(scene),), q.dtype)))
+    return at(_solve_loop(lambda lam: multipliers(at(lam)), jnp.zeros((_count(scene),), q.dtype)))
 
 
-def _closed_loop(answer: Callable, none: Float[Array, " nc"]) -> Float[Array, " nc"]:
-    """lam = answer(lam) for an affine function."""
+def _solve_loop(answer: Callable, none: Float[Array, " nc"]) -> Float[Array, " nc"]:
+    """Solution of lam = answer(lam) for an affine function."""
+    # (1 - d answer/d lam) lam = answer(0). Redundant rows make the matrix singular; any of their multipliers will do.
     first, push = jax.linearize(answer, none)
     unit = jnp.eye(none.shape[0], dtype=none.dtype)
     left = unit - jax.vmap(push, out_axes=1)(unit)
@@ -238,7 +245,7 @@ def _closed_loop(answer: Callable, none: Float[Array, " nc"]) -> Float[Array, " 
 
 
 def rates(control: Any, y, q, v, t, multipliers: Callable) -> dict[str, Array]:
-    """Rates of the entries that the control adds; multipliers() are those of the motion."""
+    """Rates of the control's entries in the state; multipliers() are those of the motion."""
     if HELD in y:
         return {HELD: jnp.zeros_like(y[HELD])}
     if STATE not in y:
@@ -247,9 +254,9 @@ def rates(control: Any, y, q, v, t, multipliers: Callable) -> dict[str, Array]:
 
 
 def state_of(control: Any, y, q, v, t) -> Any:
-    """The controller's state in its own structure, or None."""
+    """State of the controller in its own structure, or None."""
     if HELD in y:
-        return _held(control, y[HELD], v)[3]
+        return _unpack(control, y[HELD], v)[3]
     if STATE not in y:
         return None
     like = eqx.filter_eval_shape(control.start, q, v, t)
@@ -257,20 +264,18 @@ def state_of(control: Any, y, q, v, t) -> Any:
 
 
 def at_start(control: Any, q, v, t) -> Any:
-    """The control as a function of (q, v, t) near its start, of which rates can be asked; None if there is none."""
+    """Control near its start as a function of (q, v, t), for its derivatives; None if there is no such function."""
     if isinstance(control, Sampled):
         return None
     if not isinstance(control, Controller):
         return control
-    return (
-        None
-        if control.takes_multipliers
-        else _AtStart(control, control.start(jnp.asarray(q), jnp.asarray(v), jnp.asarray(t)))
-    )
+    if control.takes_multipliers:
+        return None
+    return _AtStart(control, control.start(jnp.asarray(q), jnp.asarray(v), jnp.asarray(t)))
 
 
 class _AtStart(eqx.Module):
-    """A controller whose state is kept."""
+    """A controller with a constant state."""
 
     control: Controller
     state: Any
@@ -289,14 +294,12 @@ def _numbers(state, q):
 
 def _flat(state, q) -> Array:
     """A state as one vector, in the dtype of q."""
-    return (
-        jnp.zeros((0,), q.dtype)
-        if state is None
-        else ravel_pytree(jax.tree.map(lambda x: jnp.asarray(x, q.dtype), state))[0]
-    )
+    if state is None:
+        return jnp.zeros((0,), q.dtype)
+    return ravel_pytree(jax.tree.map(lambda x: jnp.asarray(x, q.dtype), state))[0]
 
 
-def _held(control: Sampled, held, v):
+def _unpack(control: Sampled, held, v):
     """Start of the run, number of samples, torque, and the law's state."""
     n = v.shape[0]
     state = None if control.state is None else ravel_pytree(_numbers(control.state, v))[1](held[2 + n :])
@@ -312,4 +315,4 @@ def _check_state(state, returned, name: str) -> None:
 if TYPE_CHECKING:
     Control = Callable[[Array, Array, Array], Array] | Controller | Sampled | None
 else:
-    Control = Any  # `as_control` looks at it
+    Control = Any  # `as_control` checks it

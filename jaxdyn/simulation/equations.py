@@ -1,11 +1,7 @@
-"""The differential equation of a run: rates of the state, the projection after a step, and the margins that end a run.
-
-Functions of a run hold no arrays: what is traced of scene, control and method goes through `args`.
-"""
+"""Differential equation of a run: rates of the state, the projection after a step, and the allowances that end a run."""
 
 import functools
-from collections.abc import Callable
-from typing import Any, NamedTuple
+from typing import Any
 
 import diffrax
 import jax
@@ -15,197 +11,181 @@ from jaxdyn.compile.known import partition_tracers
 from jaxdyn.constraints.redundancy import exchange_rows
 from jaxdyn.constraints.selection import renew_rows
 from jaxdyn.forces.piecewise import Pieces, fix_pieces, guards, pieces_of, values_and_levels
-from jaxdyn.simulation import contacts as unilateral
 from jaxdyn.simulation import controls
-from jaxdyn.simulation import limits as joint_limits
 from jaxdyn.simulation.methods import Method, Projected
+from jaxdyn.simulation.terminal_events import Conditions, contact_allowances, limit_allowances
 from jaxdyn.systems.scene import Scene
 from jaxdyn.systems.system import retract, velocity_to_rate
 
-# Entry of the state: which rows a step keeps, of a mechanism with rows that repeat others.
+# Entry of the state of a mechanism with redundant rows: the rows that a step keeps. Rank is decided once a step, at its start on
+# the manifold: between its stages, where rows that depend on each other are open by the local error, it would change.
 KEPT = "kept_rows"
 # Entry of the state: the states of the scene's drives.
 DRIVES = "drives"
 
 
-class Equations(NamedTuple):
-    """What diffrax and our own loops integrate.
-
-    - `args`: what is traced. `derivative(t, y, args)`, and its two parts for solvers that split it.
-    - `torque(args, y, q, v, t)` of the control and `generalized_force`, which is that plus the scene's forces, (nv,) or None.
-    - `project(t, y, error, args)` after a step; `quality` of the method's basis; `begin`, `advance` for steps of its own.
-    - `pieces`: the switching functions of the scene's forces, and switching(t, y, args) -> their values and rounding levels.
-      With which of them are positive behind the other `args`, forces keep to these pieces (`with_pieces`).
-    - `allowances(args, y, q, v, t)` of contacts, joints and the control, which can end the run;
-      `least_allowance(t, y, args)`, or None where nothing can.
-    """
-
-    args: tuple | None
-    torque: Callable
-    generalized_force: Callable
-    derivative: Callable
-    explicit_part: Callable
-    implicit_part: Callable
-    project: Callable
-    quality: Callable
-    begin: Callable
-    advance: Callable
-    pieces: Pieces
-    switching: Callable
-    allowances: Callable
-    least_allowance: Callable | None
-
-
-def with_pieces(unknown, positive) -> tuple:
-    """The arguments of equations whose forces keep to pieces."""
-    return (*(unknown or ()), positive)
-
-
 def power(force, v):
-    """Of a force (nv,) or None."""
+    """Power of a force (nv,) or None."""
     return jnp.zeros((), v.dtype) if force is None else jnp.sum(v * force)
 
 
-def equations(scene: Scene, control: Any, method: Method, start: dict, q0, v0, t0, options: dict) -> Equations:
-    """The equations of a run; `start`: what the control adds to the state, at its start (q0, v0, t0)."""
-    system, added = scene.system, tuple(start)  # names alone, as functions of a run hold no arrays
-    # diffrax compiles its arguments, which hides their values. What is known stays in closures, the rest is `args`:
-    # flat, because its continuous adjoint takes no empty tuples.
+def equations(
+    scene: Scene, control: Any, method: Method, start: dict, q0, v0, t0, conditions: Conditions
+) -> tuple["Equations", tuple | None]:
+    """Equations of a run and their arguments; `start`: entries of the control and the drives at the start (q0, v0, t0)."""
+    # diffrax compiles its arguments, which hides their values. Known leaves are compiled in, the rest is `args`: flat, because
+    # its continuous adjoint supports no empty tuples.
     unknown, known = partition_tracers((scene, control, method))
-    args, count = tuple(unknown) or None, len(unknown)
+    args = tuple(unknown) or None
+    eqs = Equations(known, len(unknown), tuple(start), conditions)
+    eqs.pieces = pieces_of(scene, start, q0, v0, t0, lambda y, q, v, t: (eqs.effort(args, y, q, v, t), y.get(DRIVES)))
+    return eqs, args
 
-    def given(args, y=None):
-        """The scene with the rows that the step from y keeps, the control and the method."""
+
+class Equations:
+    """Functions that diffrax and the library's own loops integrate.
+
+    They are keys of caches and hold no tracers: traced leaves of the scene, the control and the method are their `args`. If
+    flags follow these, the switching functions that are positive, forces keep to the pieces in between (`fix_pieces`).
+    """
+
+    pieces: Pieces
+
+    def __init__(self, known, count: int, added: tuple[str, ...], conditions: Conditions):
+        self._known, self._count, self._added, self.conditions = known, count, added, conditions
+        # diffrax and differentiation call these in many places: each is traced once for all of them.
+        self.derivative, self.explicit_part, self.implicit_part = map(
+            jax.jit, (self._derivative, self._explicit_part, self._implicit_part)
+        )
+        self.advance, self.least_allowance = jax.jit(self._advance), jax.jit(self._least_allowance)
+
+    def unpack(self, args, y=None):
+        """Scene with the rows that the step from y keeps, control and method."""
         args = args or ()
-        scene, control, method = known(args[:count])
+        scene, control, method = self._known(args[: self._count])
         if y is not None and KEPT in y:
             scene = exchange_rows(scene, y[KEPT])
-        return fix_pieces(scene, pieces, args[count]) if len(args) > count else scene, control, method
+        if len(args) > self._count:
+            scene = fix_pieces(scene, self.pieces, args[self._count])
+        return scene, control, method
 
-    def effort(args, y, q, v, t):
-        """Of the control before limits, or None when there is none."""
-        scene, control, method = given(args, y)
+    def effort(self, args, y, q, v, t):
+        """Torque of the control before drives and limits, (nv,) or None without a control and drives."""
+        scene, control, method = self.unpack(args, y)
 
         def multipliers(tau):
             force = scene.applied_force(q, v, t)
             return method.multipliers(scene, q, v, t, tau if force is None else tau + force)
 
         tau = controls.torque(control, scene, y, q, v, t, multipliers)
-        return jnp.zeros_like(v) if tau is None and DRIVES in added else tau
+        return jnp.zeros_like(v) if tau is None and DRIVES in self._added else tau
 
-    def driven(args, y, q, v, t):
-        """Torque behind the scene's drives and limits, or None when there is none; the rates of the drives' states."""
-        tau = effort(args, y, q, v, t)
-        return (None, None) if tau is None else given(args, y)[0].drive_torque(q, v, t, tau, y.get(DRIVES))
+    def drive(self, args, y, q, v, t):
+        """Torque behind the scene's drives and limits, (nv,) or None without any, and the rates of the drives' states."""
+        tau = self.effort(args, y, q, v, t)
+        if tau is None:
+            return None, None
+        return self.unpack(args, y)[0].drive_torque(q, v, t, tau, y.get(DRIVES))
 
-    def torque(args, y, q, v, t):
-        return driven(args, y, q, v, t)[0]
+    def torque(self, args, y, q, v, t):
+        """Torque behind the scene's drives and limits, (nv,) or None without any."""
+        return self.drive(args, y, q, v, t)[0]
 
-    pieces = pieces_of(scene, start, q0, v0, t0, lambda y, q, v, t: (effort(args, y, q, v, t), y.get(DRIVES)))
-
-    def switching(t, y, args):
-        scene, _, method = given(args, y)
-        q, v = method.to_qv(scene, y, t)
-
-        own = [y[DRIVES]] if DRIVES in y else []
-        return values_and_levels(lambda q, v, *own: guards(scene, q, v, t, effort(args, y, q, v, t), *own), q, v, *own)
-
-    def generalized_force(args, y, q, v, t):
-        """Tau plus the scene's forces, or None when there are none."""
-        force, tau = given(args, y)[0].applied_force(q, v, t), torque(args, y, q, v, t)
+    def generalized_force(self, args, y, q, v, t):
+        """Sum of tau and the scene's forces, (nv,), or None where there are none."""
+        force, tau = self.unpack(args, y)[0].applied_force(q, v, t), self.torque(args, y, q, v, t)
         return force if tau is None else tau if force is None else tau + force
 
-    def of_control(args, y, q, v, t, force):
-        """Rates of what the control and the drives add to the state."""
-        scene, control, method = given(args, y)
-        rates = controls.rates(control, y, q, v, t, lambda: method.multipliers(scene, q, v, t, force))
-        return rates | ({DRIVES: driven(args, y, q, v, t)[1]} if DRIVES in y else {})
+    def switching(self, t, y, args):
+        """Switching functions of the scene's forces, and their rounding levels."""
+        scene, _, method = self.unpack(args, y)
+        q, v = method.to_qv(scene, y, t)
+        own = [y[DRIVES]] if DRIVES in y else []
 
-    # diffrax and differentiation call it in many places: it is traced once for all of them.
-    @jax.jit
-    def derivative(t, y, args):
-        scene, _, method = given(args, y)
-        rates, force, v = method.evaluated(scene, y, t, functools.partial(generalized_force, args, y))
-        if added:
-            rates = rates | of_control(args, y, retract(system, y["q"]), v, t, force)
+        def values(q, v, *own):
+            return guards(scene, q, v, t, self.effort(args, y, q, v, t), *own)
+
+        return values_and_levels(values, q, v, *own)
+
+    def _extra_rates(self, args, y, q, v, t, force):
+        scene, control, method = self.unpack(args, y)
+        rates = controls.rates(control, y, q, v, t, lambda: method.multipliers(scene, q, v, t, force))
+        return rates | ({DRIVES: self.drive(args, y, q, v, t)[1]} if DRIVES in y else {})
+
+    def _derivative(self, t, y, args):
+        scene, _, method = self.unpack(args, y)
+        rates, force, v = method.evaluate(scene, y, t, functools.partial(self.generalized_force, args, y))
+        if self._added:
+            rates = rates | self._extra_rates(args, y, retract(scene.system, y["q"]), v, t, force)
         if KEPT in y:
             rates = rates | {KEPT: jnp.zeros_like(y[KEPT])}
         return rates | {"work": power(force, v)} if "work" in y else rates
 
-    @jax.jit
-    def explicit_part(t, y, args):
-        """All rates but those of `implicit_part`."""
-        scene, _, method = given(args, y)
+    def _explicit_part(self, t, y, args):
+        """All rates except those of the implicit part."""
+        scene, _, method = self.unpack(args, y)
         q, v = method.to_qv(scene, y, t)
-        rates = method.rates(scene, y, q, v, t, torque(args, y, q, v, t)) | {"q": jnp.zeros_like(y["q"])}
+        rates = method.rates(scene, y, q, v, t, self.torque(args, y, q, v, t)) | {"q": jnp.zeros_like(y["q"])}
         rates = rates | ({KEPT: jnp.zeros_like(y[KEPT])} if KEPT in y else {})
-        force = generalized_force(args, y, q, v, t) if added or "work" in y else None
-        rates = rates | of_control(args, y, q, v, t, force)
+        # Controllers and the work see the whole force, although the rate of v has a share of it only.
+        force = self.generalized_force(args, y, q, v, t) if self._added or "work" in y else None
+        rates = rates | self._extra_rates(args, y, q, v, t, force)
         return rates | {"work": power(force, v)} if "work" in y else rates
 
-    @jax.jit
-    def implicit_part(t, y, args):
-        """dq/dt = H v, and what the scene's forces add to the rates of velocity, on which they act linearly."""
-        scene, _, method = given(args, y)
+    def _implicit_part(self, t, y, args):
+        """Rate dq/dt = H v, and the share of the scene's forces in the rates of velocity, which are linear in them."""
+        scene, _, method = self.unpack(args, y)
         q, v = method.to_qv(scene, y, t)
         rates = jax.tree.map(jnp.zeros_like, y)
         force = scene.applied_force(q, v, t)
         if force is not None:
-            by_force = {name: y[name] for name in y if name not in ("work", *added)}
-            _, pushed = jax.jvp(lambda f: method.rates(scene, by_force, q, v, t, f), (jnp.zeros_like(v),), (force,))
-            rates = rates | pushed
+            # Work and the entries of the control and the drives are integrated explicitly.
+            by_force = {name: y[name] for name in y if name not in ("work", *self._added)}
+            _, share = jax.jvp(lambda f: method.rates(scene, by_force, q, v, t, f), (jnp.zeros_like(v),), (force,))
+            rates = rates | share
         return rates | {"q": velocity_to_rate(scene.system, q, v)}
 
-    def project(t, y, error, args):
-        scene, _, method = given(args, y)
-        y, error = method.stepped(scene, y, t, error)
+    def project(self, t, y, error, args):
+        """Correct the state and the error at the end of a step, and renew what is constant during the next one."""
+        scene, control, method = self.unpack(args, y)
+        y, error = method.end_step(scene, y, t, error)
         # A step that will be rejected may be too long to be projected, so failing here does not end the run.
-        y = method.continued(scene, y, t)
+        y = method.renew(scene, y, t)
         if KEPT in y:
-            y = y | {KEPT: renew_rows(scene, retract(system, y["q"]), t, isinstance(method, Projected))}
+            y = y | {KEPT: renew_rows(scene, retract(scene.system, y["q"]), t, isinstance(method, Projected))}
         if controls.HELD in y:
-            y = y | {
-                controls.HELD: controls.sampled(given(args, y)[1], y[controls.HELD], *method.to_qv(scene, y, t), t)
-            }
+            y = y | {controls.HELD: controls.sample(control, y[controls.HELD], *method.to_qv(scene, y, t), t)}
         return y, error, diffrax.RESULTS.successful
 
-    def quality(t, y, args, **_):
-        scene, _, method = given(args, y)
+    # diffrax passes more to the condition of an event: `**_`.
+    def quality(self, t, y, args, **_):
+        """Quality of the method's basis."""
+        scene, _, method = self.unpack(args, y)
         return method.quality(scene, y, t)
 
-    def begin(t, y, args):
-        scene, _, method = given(args, y)
+    def begin(self, t, y, args):
+        """Data of the first variational step."""
+        scene, _, method = self.unpack(args, y)
         return method.begin(scene, y, t)
 
-    by_contacts, by_control = unilateral.can_end(scene, options["contacts"]), options["control_ends"]
+    def _advance(self, t0, t1, y, args, carried):
+        scene, _, method = self.unpack(args, y)
+        return method.advance(scene, y, t0, t1, carried, functools.partial(self.generalized_force, args, y))
 
-    def allowances(args, y, q, v, t):
-        """How far the contacts are from being lost, the joints from their limits, and the control from where it ends."""
-        scene, control, method = given(args, y)
+    def allowances(self, args, y, q, v, t):
+        """Distances of the contacts, joints and control from the conditions that end the run."""
+        scene, control, method = self.unpack(args, y)
         margins = []
-        if by_contacts:
-            margins.append(
-                unilateral.allowances(scene, method.multipliers(scene, q, v, t, generalized_force(args, y, q, v, t)))
-            )
-        if options["limits"] == "stop":
-            margins.append(joint_limits.limit_margins(scene.system, q))
-        if by_control:
+        if self.conditions.contacts:
+            force = self.generalized_force(args, y, q, v, t)
+            margins.append(contact_allowances(scene, method.multipliers(scene, q, v, t, force)))
+        if self.conditions.limits:
+            margins.append(limit_allowances(scene.system, q))
+        if self.conditions.control:
             margins.append(control.allowance(q, v, t)[None])
         return jnp.concatenate(margins)
 
-    @jax.jit
-    def least_allowance(t, y, args):
-        scene, _, method = given(args, y)
+    def _least_allowance(self, t, y, args):
+        scene, _, method = self.unpack(args, y)
         q, v = method.to_qv(scene, y, t)
-        return jnp.min(allowances(args, y, q, v, t))
-
-    @jax.jit
-    def advance(t0, t1, y, args, carried):
-        scene, _, method = given(args, y)
-        return method.advance(scene, y, t0, t1, carried, functools.partial(generalized_force, args, y))
-
-    has_margins = by_contacts or by_control or options["limits"] == "stop"
-    return Equations(
-        args, torque, generalized_force, derivative, explicit_part, implicit_part, project, quality, begin, advance, pieces,
-        switching, allowances, least_allowance if has_margins else None,
-    )  # fmt: skip
+        return jnp.min(self.allowances(args, y, q, v, t))

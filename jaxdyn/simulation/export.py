@@ -23,15 +23,15 @@ class Signal(NamedTuple):
 
 
 def signals(solution: Any, scene: Any) -> list[Signal]:
-    """All arrays of a solution that have one row for each save point, with names and units.
+    """Arrays of a solution that have one row for each save point, with names and units.
 
     **Raises:** ValueError when the scene is not that of the solution.
     """
-    return [one._replace(values=np.asarray(one.values)) for one in traced_signals(solution, scene)]
+    return [one._replace(values=np.asarray(one.values)) for one in signals_as_given(solution, scene)]
 
 
-def traced_signals(solution: Any, scene: Any) -> list[Signal]:
-    """`signals` whose values are those of the solution as they are, so that it may be traced."""
+def signals_as_given(solution: Any, scene: Any) -> list[Signal]:
+    """Signals with the values of the solution unconverted, so that it may be traced (see `signals`)."""
     scene = as_scene(scene)
     if np.shape(solution.q)[-1:] != (scene.nq,) or np.shape(solution.v)[-1:] != (scene.nv,):
         raise ValueError(
@@ -70,15 +70,15 @@ def times(solution: Any) -> np.ndarray:
     ts = np.asarray(solution.ts)
     ts = ts.reshape(-1, ts.shape[-1])
     if (ts != ts[0]).any():
-        raise ValueError("solution.ts differs from motion to motion; write each of them on its own")
+        raise ValueError("solution.ts differs between the motions of the batch; write each of them separately")
     return ts[0]
 
 
 def write_csv(solution: Any, path: str | os.PathLike, scene: Any) -> None:
-    """See `Solution.to_csv`."""
-    path = _checked(path, ".csv")
+    """Write a solution as CSV; see `Solution.to_csv`."""
+    path = _check_path(path, ".csv")
     columns, ts = signals(solution, scene), times(solution)
-    # What reads logs takes joint names where each joint has one number, and else counts.
+    # Readers of logs expect joint names where each joint has one number, else the number of the column.
     named = columns[0].names == columns[1].names
     header, arrays = ["t [s]"], []
     for signal in columns:
@@ -95,14 +95,15 @@ def write_csv(solution: Any, path: str | os.PathLike, scene: Any) -> None:
     with path.open("w", newline="") as file:
         writer = csv.writer(file)
         writer.writerow((["rollout"] if batched else []) + header)
+        # `repr` gives the shortest text that reads back to the same number.
         for n, motion in enumerate(table):
             first = [str(n + 1)] if batched else []
             writer.writerows(first + [repr(float(x)) for x in (t, *row)] for t, row in zip(ts, motion, strict=True))
 
 
 def write_npz(solution: Any, path: str | os.PathLike, scene: Any) -> None:
-    """See `Solution.to_npz`."""
-    path = _checked(path, ".npz")
+    """Write a solution as an archive of NumPy; see `Solution.to_npz`."""
+    path = _check_path(path, ".npz")
     arrays: dict[str, np.ndarray] = {"t": times(solution)}
     units: dict[str, Any] = {"t": "s"}
     names: dict[str, list] = {}
@@ -116,13 +117,13 @@ def write_npz(solution: Any, path: str | os.PathLike, scene: Any) -> None:
 
 
 def dimensions(signal: Signal) -> tuple[str, ...]:
-    """Names of the axes of a signal behind those of a batch: time, and what its columns are."""
+    """Names of the axes of a signal behind those of a batch: time, and the kind of its columns."""
     axes = {"q": "coordinate", "v": "velocity", "a": "velocity", "tau": "velocity", "multipliers": "row"}
     return ("t", axes.get(signal.key, f"{signal.key}_part")) if signal.names else ("t",)
 
 
 def as_xarray(solution: Any, scene: Any) -> Any:
-    """See `Solution.to_xarray`."""
+    """Convert a solution to a dataset of xarray; see `Solution.to_xarray`."""
     try:
         import xarray  # pyright: ignore[reportMissingImports]
     except ImportError as error:
@@ -143,7 +144,7 @@ def as_xarray(solution: Any, scene: Any) -> Any:
     return xarray.Dataset(variables, coordinates)
 
 
-def _checked(path, suffix: str):
+def _check_path(path, suffix: str):
     path = as_path(path)
     if path.suffix.lower() != suffix:
         raise ValueError(f"path is {str(path)!r}; write to a file {suffix}")

@@ -1,17 +1,17 @@
-"""How a scene becomes an ordinary differential equation: the methods of `simulate`.
+"""Methods of `simulate`: ordinary differential equations of a scene.
 
-A method says what the state y of the equation is, how it changes, and what is done to it after a step:
+A method defines the state y of the equation, its rate, and its correction after a step:
 
     free         y = (q, v), no constraints
     multipliers  y = (q, v), accelerations with multipliers
-    projected    the same, and q and v put back on the constraints after every step
+    projected    the same, with q and v projected onto the constraints after every step
     baumgarte    the same as multipliers, with A a = gamma - 2 alpha psi - beta^2 phi
     reduced      y = (q, nu), v = N(q, t) nu + v0(q, t)
     variational  no differential equation: steps of its own, for y = (q, v)
 """
 
 from collections.abc import Callable
-from typing import Any, ClassVar
+from typing import Any, ClassVar, TypeAlias
 
 import equinox as eqx
 import jax.numpy as jnp
@@ -46,92 +46,78 @@ from jaxdyn.reduction.bases import (
     velocity_and_drift,
 )
 from jaxdyn.reduction.minimal import solve_in_basis
-from jaxdyn.simulation import variational
-from jaxdyn.simulation.solvers import Stepper
-from jaxdyn.simulation.solvers.choice import Solver, Stepsize, is_fixed
+from jaxdyn.simulation.solvers.choice import Solver, Stepsize
 from jaxdyn.systems.scene import Scene, as_pytree
 from jaxdyn.systems.system import needs_retraction, rate_to_velocity, retract, velocity_to_rate
 
-State = dict[str, Any]  # arrays, and pytrees of them, by name
+State: TypeAlias = dict[str, Any]  # arrays, and pytrees of them, by name
+Q: TypeAlias = Float[Array, " nq"]
+V: TypeAlias = Float[Array, " nv"]
+Force: TypeAlias = Float[Array, " nv"] | None
+ForceLaw: TypeAlias = Callable[[Array, Array, Number], Array | None]
 
 
 class Method(eqx.Module):
-    """How a scene is integrated. The state is a dictionary of arrays with the entry "q"."""
+    """Method of integration. The state is a dictionary of arrays with the entry "q"."""
 
     name: ClassVar[str] = "free"
     projects: ClassVar[bool] = False
     rank_tol: ClassVar[float | None] = None
 
     def stepper(self, solver: Solver, stepsize: Stepsize) -> Solver:
-        """The solver to take: the one given, or the method's own."""
+        """Solver of the run: the given one, or the method's own."""
         return solver
 
-    def start(self, scene: Scene, q: Float[Array, " nq"], v: Float[Array, " nv"], t: Number) -> State:
+    def start(self, scene: Scene, q: Q, v: V, t: Number) -> State:
         """State of the equation at (q, v)."""
         return {"q": q, "v": v}
 
     def to_qv(self, scene: Scene, y: State, t: Number) -> tuple[Array, Array]:
-        """q, with unit quaternions, and v of a state."""
+        """Configuration q, with unit quaternions, and velocity v of a state."""
         return retract(scene.system, y["q"]), y["v"]
 
-    def rates(
-        self,
-        scene: Scene,
-        y: State,
-        q: Float[Array, " nq"],
-        v: Float[Array, " nv"],
-        t: Number,
-        force: Float[Array, " nv"] | None,
-    ) -> State:
-        """dy/dt; q and v are those of `to_qv`, `force` (nv,) is tau plus the scene's forces, or None."""
+    def rates(self, scene: Scene, y: State, q: Q, v: V, t: Number, force: Force) -> State:
+        """Rate dy/dt; q and v are those of `to_qv`, `force` (nv,) is tau plus the scene's forces, or None."""
         return {"q": velocity_to_rate(scene.system, q, v), "v": self.acceleration(scene, q, v, t, force)}
 
-    def evaluated(
-        self, scene: Scene, y: State, t: Number, generalized_force: Callable[[Array, Array, Number], Array | None]
+    def evaluate(
+        self, scene: Scene, y: State, t: Number, generalized_force: ForceLaw
     ) -> tuple[State, Array | None, Array]:
-        """dy/dt with generalized_force(q, v, t) for the force; the force (nv,) or None; and v (nv,)."""
+        """Rate dy/dt under generalized_force(q, v, t); that force (nv,) or None; and v (nv,)."""
         q, v = self.to_qv(scene, y, t)
         force = generalized_force(q, v, t)
         return self.rates(scene, y, q, v, t, force), force, v
 
-    def acceleration(
-        self, scene: Scene, q: Float[Array, " nq"], v: Float[Array, " nv"], t: Number, force: Float[Array, " nv"] | None
-    ) -> Array:
+    def acceleration(self, scene: Scene, q: Q, v: V, t: Number, force: Force) -> Array:
         """Rate of v, (nv,)."""
         return forward_dynamics(scene.system, q, v, jnp.zeros_like(v) if force is None else force, t)
 
-    def multipliers(
-        self, scene: Scene, q: Float[Array, " nq"], v: Float[Array, " nv"], t: Number, force: Float[Array, " nv"] | None
-    ) -> Array:
+    def multipliers(self, scene: Scene, q: Q, v: V, t: Number, force: Force) -> Array:
         """Constraint forces along the rows, (nc,)."""
-        return dynamics(scene, q, v, t, force).multipliers
+        return dynamics(scene, q, v, t, force, self.rank_tol).multipliers
 
-    def satisfies(
-        self, scene: Scene, q: Float[Array, " nq"], v: Float[Array, " nv"], t: Number, force: Float[Array, " nv"] | None
-    ) -> Array:
-        """Whether some acceleration meets all rows, ()."""
+    def satisfies(self, scene: Scene, q: Q, v: V, t: Number, force: Force) -> Array:
+        """True if some acceleration satisfies all rows, ()."""
         return jnp.asarray(True)
 
     def corrects(self, scene: Scene) -> bool:
-        """Whether `stepped` and `corrected` change a state."""
+        """True if `end_step` and `correct` change a state."""
         return self.projects or needs_retraction(scene.system)
 
-    def corrected(self, scene: Scene, y: State, t: Number) -> State:
-        """The state put back between steps, where it is saved."""
-        return self.stepped(scene, y, t, None)[0]
+    def correct(self, scene: Scene, y: State, t: Number) -> State:
+        """Correct a state between steps, where it is saved."""
+        return self.end_step(scene, y, t, None)[0]
 
-    def onto_constraints(
-        self, scene: Scene, q: Float[Array, " nq"], v: Float[Array, " nv"], t: Number
-    ) -> tuple[Array, Array]:
-        """q and v by the least change on the constraints, where the motion starts."""
+    def project(self, scene: Scene, q: Q, v: V, t: Number) -> tuple[Array, Array]:
+        """Project the start (q, v) onto the constraints by the least change."""
         return project_state(scene, q, v, t)
 
-    def stepped(self, scene: Scene, y: State, t: Number, error: State | None) -> tuple[State, State | None]:
-        """The state put back after a step, and its estimated error (a state, or None) less what constraints remove."""
+    def end_step(self, scene: Scene, y: State, t: Number, error: State | None) -> tuple[State, State | None]:
+        """Correct the state after a step, and take from its estimated error (a state, or None) what constraints remove."""
         return y | {"q": retract(scene.system, y["q"])}, error
 
-    def continued(self, scene: Scene, y: State, t: Number) -> State:
-        """The state as the next step starts from it: entries in `step_constants` may have changed."""
+    def renew(self, scene: Scene, y: State, t: Number) -> State:
+        """Renew the entries of `step_constants` for the next step."""
         return y
 
     @property
@@ -140,7 +126,7 @@ class Method(eqx.Module):
         return ()
 
     def quality(self, scene: Scene, y: State, t: Number) -> Array | None:
-        """How far the state is from where the method fails (`Parametrization.quality`), None when it never does."""
+        """Distance of the state from where the method fails (`Parametrization.quality`), None if it never does."""
         return None
 
 
@@ -149,10 +135,10 @@ class Free(Method):
 
 
 class Multipliers(Method):
-    """Accelerations with multipliers; nothing keeps the constraints from opening as the local errors add up.
+    """Accelerations with multipliers; the constraints open as the local errors add up.
 
-    **Arguments:** `rank_tol`, as in `constrained_dynamics`. Rows that depend on each other only on the constraints, as those
-    of an overconstrained loop do, need one above what the stages of a step open: 1e-4 to 1e-6.
+    **Arguments:** `rank_tol`, as in `constrained_dynamics`. The rows of an overconstrained loop depend on each other only on
+    the constraints. They need a tolerance above the residuals at the stages of a step: 1e-4 to 1e-6.
     """
 
     rank_tol: float | None = eqx.field(static=True, default=None, kw_only=True)
@@ -161,29 +147,19 @@ class Multipliers(Method):
     def __check_init__(self):
         check_tolerance(self.rank_tol)
 
-    def acceleration(
-        self, scene: Scene, q: Float[Array, " nq"], v: Float[Array, " nv"], t: Number, force: Float[Array, " nv"] | None
-    ) -> Array:
-        """From `constrained_dynamics`."""
+    def acceleration(self, scene: Scene, q: Q, v: V, t: Number, force: Force) -> Array:
+        """Acceleration of `constrained_dynamics`."""
         return dynamics(scene, q, v, t, force, self.rank_tol).acceleration
 
-    def multipliers(
-        self, scene: Scene, q: Float[Array, " nq"], v: Float[Array, " nv"], t: Number, force: Float[Array, " nv"] | None
-    ) -> Array:
-        """From `constrained_dynamics`."""
-        return dynamics(scene, q, v, t, force, self.rank_tol).multipliers
-
-    def satisfies(
-        self, scene: Scene, q: Float[Array, " nq"], v: Float[Array, " nv"], t: Number, force: Float[Array, " nv"] | None
-    ) -> Array:
-        """From `constrained_dynamics`; rows that were dropped at the start may ask for something else now."""
-        found = dynamics(scene, q, v, t, force, self.rank_tol)
-        met = found.result != RESULTS.contradictory_rows
-        return met & (residual_of_redundant(scene, q, v, t, found.acceleration) <= most_rounding(q.dtype))
+    def satisfies(self, scene: Scene, q: Q, v: V, t: Number, force: Force) -> Array:
+        """True if `constrained_dynamics` finds no contradiction, and the rows that were dropped at the start agree."""
+        motion = dynamics(scene, q, v, t, force, self.rank_tol)
+        is_solved = motion.result != RESULTS.contradictory_rows
+        return is_solved & (residual_of_redundant(scene, q, v, t, motion.acceleration) <= most_rounding(q.dtype))
 
 
 class Projected(Multipliers):
-    """Accelerations with multipliers, and the least change, in the mass metric, back onto the constraints.
+    """Accelerations with multipliers, and projection onto the constraints by the least change in the mass metric.
 
     **Arguments:** `rank_tol`, as in `Multipliers`.
     """
@@ -191,29 +167,30 @@ class Projected(Multipliers):
     name: ClassVar[str] = "projected"
     projects: ClassVar[bool] = True
 
-    def stepped(self, scene: Scene, y: State, t: Number, error: State | None) -> tuple[State, State | None]:
-        """q and v on the constraints, quaternions of unit length; the error without its part normal to the constraints."""
-        errors = () if error is None else (_error_of_place(scene, y["q"], error), error["v"])
+    def end_step(self, scene: Scene, y: State, t: Number, error: State | None) -> tuple[State, State | None]:
+        """Project q and v onto the constraints, and the error onto their tangent space."""
+        # An error of q is the rate of a displacement: as such it is tangent or normal to the constraints, with or without
+        # quaternions.
+        errors = () if error is None else (_position_error(scene, y["q"], error), error["v"])
         q, v, errors = project_step(scene, y["q"], y["v"], t, errors, self.rank_tol)
         if error is not None:
             error = error | {"q": velocity_to_rate(scene.system, q, errors[0]), "v": errors[1]}
         return y | {"q": q, "v": v}, error
 
-    def corrected(self, scene: Scene, y: State, t: Number) -> State:
-        """q and v on the constraints."""
-        q, v = self.onto_constraints(scene, y["q"], y["v"], t)
+    def correct(self, scene: Scene, y: State, t: Number) -> State:
+        """Project q and v onto the constraints."""
+        q, v = self.project(scene, y["q"], y["v"], t)
         return y | {"q": q, "v": v}
 
-    def onto_constraints(
-        self, scene: Scene, q: Float[Array, " nq"], v: Float[Array, " nv"], t: Number
-    ) -> tuple[Array, Array]:
-        """By the programs that correct a step."""
+    def project(self, scene: Scene, q: Q, v: V, t: Number) -> tuple[Array, Array]:
+        """Project by the programs that correct a step."""
+        # With errors of zero, so that it is the kernel of `end_step`, which is compiled anyway.
         none = jnp.zeros_like(v)
         return project_step(scene, q, v, t, (none, none), self.rank_tol)[:2]
 
 
 class Baumgarte(Multipliers):
-    """Accelerations that pull violated rows back, for comparison: the pull is an error where it is not zero.
+    """Accelerations with feedback of violated rows, for comparison: where the feedback is not zero it is an error.
 
     Holonomic rows: d2 phi/dt2 + 2 alpha dphi/dt + beta^2 phi = 0. Nonholonomic rows: d psi/dt + 2 alpha psi = 0.
 
@@ -229,28 +206,26 @@ class Baumgarte(Multipliers):
     def __init__(self, alpha: Numbers = 10.0, beta: Numbers = 10.0):
         self.alpha, self.beta = jnp.asarray(alpha, float), jnp.asarray(beta, float)
 
-    def acceleration(
-        self, scene: Scene, q: Float[Array, " nq"], v: Float[Array, " nv"], t: Number, force: Float[Array, " nv"] | None
-    ) -> Array:
-        """Under the rows A a = gamma - 2 alpha psi - beta^2 phi."""
+    def acceleration(self, scene: Scene, q: Q, v: V, t: Number, force: Force) -> Array:
+        """Acceleration under the rows A a = gamma - 2 alpha psi - beta^2 phi."""
         row, holonomic = rows(scene, q, v, t), holonomic_rows(layout(scene))
         alpha, beta = self.alpha.astype(q.dtype), self.beta.astype(q.dtype)
-        wanted = row.gamma - 2 * alpha * row.velocity
-        wanted = wanted.at[holonomic].add(-(beta**2) * position_residual(scene, q, t))
+        gamma = row.gamma - 2 * alpha * row.velocity
+        gamma = gamma.at[holonomic].add(-(beta**2) * position_residual(scene, q, t))
         force = jnp.zeros_like(v) if force is None else force
-        return solve_rows(scene, q, v, force, t, Rows(row.A, wanted, row.velocity)).acceleration
+        return solve_rows(scene, q, v, force, t, Rows(row.A, gamma, row.velocity)).acceleration
 
 
 class Reduced(Method):
-    """Minimal velocities nu are integrated, and q with the velocity v = N nu + v0 that they determine.
+    """Integration of minimal velocities nu, and of q with the velocity v = N nu + v0.
 
-    Velocities satisfy the constraints by construction. For holonomic rows q is put back on them after every step.
+    Velocities satisfy the constraints by construction. For holonomic rows q is projected onto them after every step.
 
     **Arguments:**
 
-    - `basis`: what nu is, as in `reduced_dynamics`: a tuple of indices of independent velocities, or a function N(q, t).
+    - `basis`: definition of nu, as in `reduced_dynamics`: a tuple of indices of independent velocities, or a function N(q, t).
       Where N becomes singular the run ends with the code `singular_basis`. By default an orthonormal basis
-      that is continued from step to step, which serves as long as the rank of the rows is constant.
+      that is continued from step to step, which is valid as long as the rank of the rows is constant.
     - `dof`: number of minimal velocities of the default basis. By default nv less the rank of the rows on concrete
       numbers, and less their number on traced ones.
     """
@@ -261,28 +236,29 @@ class Reduced(Method):
     projects: ClassVar[bool] = True
 
     def __init__(self, basis: BasisLike | None = None, *, dof: int | None = None):
-        given = callable(basis) and not isinstance(basis, Basis)
-        self.basis = UserBasis(as_pytree(basis, "basis")) if given else basis
+        is_function = callable(basis) and not isinstance(basis, Basis)
+        self.basis = UserBasis(as_pytree(basis, "basis")) if is_function else basis
         self.dof = dof
 
-    def fitted(self, scene: Scene, dof: int | None) -> "Reduced":
-        """The method with its basis made for the scene; `dof` where it is known."""
+    def for_scene(self, scene: Scene, dof: int | None) -> "Reduced":
+        """Method with the basis of a scene; `dof` where it is known."""
         basis = None if self.basis is None else as_basis(self.basis, scene)
         return Reduced(basis, dof=dof if self.dof is None else self.dof)
 
     @property
     def step_constants(self) -> tuple[str, ...]:
-        """The reference of an orthonormal basis."""
+        """Name of the reference of an orthonormal basis."""
         return ("frame",) if self.basis is None or isinstance(self.basis, Orthonormal) else ()
 
     def _basis(self, y):
+        # The reference is in the state: it is renewed after each step, and follows gradients and batches.
         return Orthonormal(y["frame"]) if self.step_constants else self.basis
 
     def _at(self, scene, y, q, t):
         return self._basis(y).at(scene, q, t)
 
-    def start(self, scene: Scene, q: Float[Array, " nq"], v: Float[Array, " nv"], t: Number) -> State:
-        """q, nu and, for an orthonormal basis, its reference."""
+    def start(self, scene: Scene, q: Q, v: V, t: Number) -> State:
+        """State with q, nu and, for an orthonormal basis, its reference."""
         y = {"q": q}
         if self.step_constants:
             reference = tangent_basis(scene, q, t, dof=self.dof) if self.basis is None else self.basis.reference
@@ -290,30 +266,23 @@ class Reduced(Method):
         return y | {"nu": minimal_velocity(self._at(scene, y, q, t), v)}
 
     def to_qv(self, scene: Scene, y: State, t: Number) -> tuple[Array, Array]:
-        """q, with unit quaternions, and v = N nu + v0."""
+        """Configuration q, with unit quaternions, and v = N nu + v0."""
         q = retract(scene.system, y["q"])
         basis = self._at(scene, y, q, t)
         return q, matmul(basis.N, y["nu"]) + basis.v0
 
-    def evaluated(
-        self, scene: Scene, y: State, t: Number, generalized_force: Callable[[Array, Array, Number], Array | None]
+    def evaluate(
+        self, scene: Scene, y: State, t: Number, generalized_force: ForceLaw
     ) -> tuple[State, Array | None, Array]:
-        """From the reduced equations, which share one factorisation of the rows with v."""
+        """Rate of the reduced equations, which share one factorisation of the rows with v."""
+        # v = N nu + v0 and dv/dt = N dnu/dt + drift come from one decomposition of the rows.
         q = retract(scene.system, y["q"])
         motion = velocity_and_drift(scene, self._basis(y), q, y["nu"], t)
         force = generalized_force(q, motion.v, t)
         return self._rates(scene, y, motion, q, t, force), force, motion.v
 
-    def rates(
-        self,
-        scene: Scene,
-        y: State,
-        q: Float[Array, " nq"],
-        v: Float[Array, " nv"],
-        t: Number,
-        force: Float[Array, " nv"] | None,
-    ) -> State:
-        """From the reduced equations; v is found anew."""
+    def rates(self, scene: Scene, y: State, q: Q, v: V, t: Number, force: Force) -> State:
+        """Rate of the reduced equations; v is computed again."""
         return self._rates(scene, y, velocity_and_drift(scene, self._basis(y), q, y["nu"], t), q, t, force)
 
     def _rates(self, scene, y, motion, q, t, force):
@@ -321,135 +290,63 @@ class Reduced(Method):
         fixed = {name: jnp.zeros_like(y[name]) for name in self.step_constants}
         return {"q": velocity_to_rate(scene.system, q, motion.v), "nu": reduced.nu_rate} | fixed
 
-    def acceleration(
-        self, scene: Scene, q: Float[Array, " nq"], v: Float[Array, " nv"], t: Number, force: Float[Array, " nv"] | None
-    ) -> Array:
-        """Rate of v."""
+    def acceleration(self, scene: Scene, q: Q, v: V, t: Number, force: Force) -> Array:
+        """Acceleration of `constrained_dynamics`."""
         return dynamics(scene, q, v, t, force).acceleration
 
     def corrects(self, scene: Scene) -> bool:
-        """Where there are holonomic rows, quaternions, or a reference to be renewed."""
+        """True if there are holonomic rows, quaternions, or a reference to be renewed."""
         return bool(holonomic_rows(layout(scene)).size or self.step_constants or needs_retraction(scene.system))
 
-    def stepped(self, scene: Scene, y: State, t: Number, error: State | None) -> tuple[State, State | None]:
-        """q on the holonomic constraints, its error without the part normal to them; nu stays."""
+    def end_step(self, scene: Scene, y: State, t: Number, error: State | None) -> tuple[State, State | None]:
+        """Project q onto the holonomic constraints, and its error onto their tangent space; nu stays."""
         if not holonomic_rows(layout(scene)).size:
-            return super().stepped(scene, y, t, error)
-        errors = () if error is None else (_error_of_place(scene, y["q"], error),)
+            return super().end_step(scene, y, t, error)
+        errors = () if error is None else (_position_error(scene, y["q"], error),)
         q, _, errors = project_step(scene, y["q"], jnp.zeros((scene.nv,), y["q"].dtype), t, errors)
         if error is not None:
             error = error | {"q": velocity_to_rate(scene.system, q, errors[0])}
         return y | {"q": q}, error
 
-    def continued(self, scene: Scene, y: State, t: Number) -> State:
-        """N(q) as the new reference, which leaves N(q) and nu as they are."""
+    def renew(self, scene: Scene, y: State, t: Number) -> State:
+        """Take N(q) as the new reference, which changes neither N(q) nor nu."""
         return y | {"frame": self._at(scene, y, y["q"], t).N} if self.step_constants else y
 
     def quality(self, scene: Scene, y: State, t: Number) -> Array | None:
-        """Of N at the state."""
+        """Quality of N at the state."""
         return self._at(scene, y, retract(scene.system, y["q"]), t).quality
 
 
-class Variational(Multipliers):
-    """Steps of a fixed length that follow a discrete principle of d'Alembert for long motions
-    (see `jaxdyn.simulation.variational`).
-
-    Order 2. Without forces and rows on velocities the steps are symplectic: the error of the energy stays as it is after
-    a few oscillations, of the order h^2, however many steps follow, and momenta that symmetries conserve are conserved
-    to rounding. Rows on positions are closed at the end of every step, and velocities projected. For rows on velocities
-    (rolling, knife edges) the steps are those of the discrete Lagrange-d'Alembert principle, equal to their inverse with
-    -h; energy is then kept well in reversible motions and not in general.
-
-    Each step solves for its mean velocity by Newton's method, with the exact Jacobian; where that fails the run ends with
-    the code `nonlinear_divergence`. Derivatives are those of the solved equations.
-
-    **Arguments:** `rank_tol`, as in `Multipliers`.
-
-    Sources: Marsden & West (2001); Hairer, Lubich & Wanner (2006), chapters VI and VII; Cortes & Martinez (2001).
-
-    ```python
-    motion = jd.simulate(scene, q0, v0, ts, method="variational", stepsize=0.01)
-    ```
-    """
-
-    name: ClassVar[str] = "variational"
-    projects: ClassVar[bool] = True
-
-    def stepper(self, solver: Solver, stepsize: Stepsize) -> Solver:
-        """Its own. **Raises:** ValueError for another one, and for steps that are not fixed."""
-        if solver is not None:
-            raise ValueError(
-                f"solver is {type(solver).__name__}; method 'variational' makes its steps itself: leave solver out"
-            )
-        if not is_fixed(stepsize):
-            raise ValueError(
-                f"stepsize is {stepsize!r}; method 'variational' takes fixed steps, as changing ones lose what it "
-                "conserves: pass a number (s), e.g. stepsize=0.01"
-            )
-        return Stepper()
-
-    def begin(self, scene: Scene, y: State, t: Number) -> variational.Carried:
-        """What the first step takes beside y."""
-        return variational.begin(scene, *self.to_qv(scene, y, t), t, self.rank_tol)
-
-    def advance(
-        self, scene: Scene, y: State, t0: Number, t1: Number, carried: variational.Carried, generalized_force: Callable
-    ) -> tuple[State, Array, variational.Carried, Array]:
-        """y at t1, the mean velocity of the step, the state of the method, and whether the step succeeded."""
-        stepped = variational.step(scene, y["q"], y["v"], carried, t0, t1, generalized_force, self.rank_tol)
-        mean, y1 = stepped.carried.mean, {"q": stepped.q, "v": stepped.v}
-        if "work" in y:
-            done = 0.0 if stepped.force is None else (t1 - t0) * jnp.sum(stepped.force * mean)
-            y1 = y1 | {"work": y["work"] + done}
-        return y1, mean, stepped.carried, stepped.solved
-
-    def acceleration(
-        self, scene: Scene, q: Float[Array, " nq"], v: Float[Array, " nv"], t: Number, force: Float[Array, " nv"] | None
-    ) -> Array:
-        """Of the continuous motion."""
-        return (super() if scene.constraints else Free()).acceleration(scene, q, v, t, force)
-
-    def corrects(self, scene: Scene) -> bool:
-        """No: steps end on the constraints."""
-        return False
-
-    def corrected(self, scene: Scene, y: State, t: Number) -> State:
-        """Between steps: q and v on the constraints."""
-        if not scene.constraints:
-            return y
-        q, v = project_state(scene, y["q"], y["v"], t, self.rank_tol)
-        return y | {"q": q, "v": v}
-
-
-def _error_of_place(scene: Scene, q, error) -> Array:
+def _position_error(scene: Scene, q, error) -> Array:
     """Estimated error of q as a displacement (nv,)."""
     return rate_to_velocity(scene.system, retract(scene.system, q), error["q"])
 
 
 def dynamics(scene: Scene, q, v, t, force, rank_tol: float | None = None):
     """Acceleration and multipliers at a state; `force` (nv,) is tau plus the scene's forces, or None."""
-    found = constrained_dynamics(Scene(scene.system, scene.constraints), q, v, force, t, rank_tol=rank_tol)
+    motion = constrained_dynamics(Scene(scene.system, scene.constraints), q, v, force, t, rank_tol=rank_tol)
     if not has_selection(scene):
-        return found
-    shared = distribute_multipliers(scene, q, t, found.multipliers)
-    return eqx.tree_at(lambda found: found.multipliers, found, shared)
+        return motion
+    # Redundant rows share the constraint force: the one of least norm is unique.
+    shared = distribute_multipliers(scene, q, t, motion.multipliers)
+    return eqx.tree_at(lambda motion: motion.multipliers, motion, shared)
 
 
 def is_regular(quality) -> Array:
-    """Whether a quality (see `Method.quality`) is far enough from zero, also for NaN."""
+    """True if a quality (see `Method.quality`) is far enough from zero; false for NaN."""
     return jnp.abs(quality) > least_quality(quality.dtype)
 
 
 def start_limit(dtype) -> float:
-    """Part of the mechanism's length by which a start may be open: rounding of the numbers that were given."""
+    """Largest residual of a start, relative to the mechanism's length: rounding of the numbers that were given."""
     return float(jnp.finfo(dtype).eps) ** 0.4
 
 
 def consistent(scene: Scene, q, v, t):
-    """Whether a state is on the constraints but for rounding; rows that `keep_rows` has dropped are not looked at."""
+    """True if a state is on the constraints up to rounding; rows that `keep_rows` has dropped are not checked."""
     return openness(scene, q, v, t, start_limit(q.dtype)) <= 1.0
 
 
-def meets_dropped_rows(scene: Scene, q, v, t):
-    """Whether the rows that were dropped at the start of a motion are met still."""
+def satisfies_redundant_rows(scene: Scene, q, v, t):
+    """True if the rows that were dropped at the start of a motion are still satisfied."""
     return opening_of_redundant(scene, q, t, v) <= most_opening(scene, q.dtype)

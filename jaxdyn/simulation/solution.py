@@ -1,4 +1,4 @@
-"""What a simulation gives back: the motion, how it ended, and in words what to do when it ended early."""
+"""Result of a simulation: the motion, its code, and advice where it ended early."""
 
 from collections.abc import Sequence
 from typing import TYPE_CHECKING, Any
@@ -15,10 +15,10 @@ from jaxdyn.contact.forces import contacts_with_cones
 from jaxdyn.forces.dissipation import SlidingFriction
 from jaxdyn.model.arguments import FilePath
 from jaxdyn.model.description import solution_lines
+from jaxdyn.model.tree import Model
 from jaxdyn.simulation.controls import at_start
 from jaxdyn.simulation.export import as_xarray, write_csv, write_npz
-from jaxdyn.simulation.limits import joint_of
-from jaxdyn.simulation.solvers.choice import for_stiff, known_stiffness, unwrapped
+from jaxdyn.simulation.solvers.choice import find_stiffness, innermost, is_stiff
 from jaxdyn.systems.scene import Scene
 from jaxdyn.systems.system import SceneLike
 
@@ -34,31 +34,20 @@ OF_DIFFRAX = (
 
 
 def first_of(cases: Sequence[tuple[Any, Any]], otherwise: Any) -> Any:
-    """The code of the first case (condition, code) whose condition holds, else the one given."""
+    """Code of the first case (condition, code) whose condition holds, else the one given."""
     for condition, code in reversed(cases):
         otherwise = RESULTS.where(condition, code, otherwise)
     return otherwise
 
 
-def faults_of_inputs(*, in_order, fine_steps, fine_tolerances, finite_start, unit_start) -> list[tuple[Any, Any]]:
-    """Cases for `first_of` of what was given, each () bool, the one that hides the others first."""
-    codes: Any = RESULTS
-    return [
-        (~in_order, codes.unordered_times),
-        (~fine_steps, codes.bad_stepsize),
-        (~fine_tolerances, codes.bad_tolerance),
-        (~finite_start, codes.nonfinite_start),
-        (~unit_start, codes.unnormalized_start),
-    ]
-
-
-def rows_where(kept, rows, otherwise):
-    """Rows (nt, ...) where the mask (nt,) holds, elsewhere what fits their shape."""
-    return jnp.where(kept.reshape(-1, *[1] * (rows.ndim - 1)), rows, jnp.asarray(otherwise, rows.dtype))
+def rows_where(mask, rows, otherwise):
+    """Rows (nt, ...) where the mask (nt,) holds, elsewhere `otherwise`, which is broadcast."""
+    return jnp.where(mask.reshape(-1, *[1] * (rows.ndim - 1)), rows, jnp.asarray(otherwise, rows.dtype))
 
 
 def from_diffrax(result) -> Any:
-    """A code of diffrax as one of `RESULTS`, by its name."""
+    """Code of diffrax as one of `RESULTS`, by its name."""
+    # By name, because the numbers of codes differ between the two enumerations and between versions of diffrax.
     cases = [(result == getattr(diffrax.RESULTS, name), getattr(RESULTS, name)) for name in OF_DIFFRAX]
     return first_of(cases, RESULTS.internal_error)
 
@@ -82,7 +71,7 @@ ADVICE = {
     "no_freedom": "leave a constraint out, or free a joint; rows that repeat others but for more than 1e-3 need a rank_tol, "
     "as in method=jd.Projected(rank_tol=1e-2)",
     "inconsistent_start": "start from jd.assemble(scene, q0, v0)",
-    "singular_basis": "choose another basis: jd.Reduced() continues one by itself where the rank of the rows is constant; "
+    "singular_basis": "choose another basis: jd.Reduced() continues one automatically where the rank of the rows is constant; "
     "method='projected' needs none",
     "nonlinear_divergence": "take a smaller stepsize, or look for a singular mass matrix or a force that is not finite",
     "contradictory_rows": "remove a constraint, or change one that moves with time, so that some motion satisfies all of them",
@@ -90,12 +79,12 @@ ADVICE = {
     "on the way",
     "no_single_contact": "take surfaces that are more convex where they come to touch, or other starts",
     "contact_lost": "grip harder (jd.contact.optimal_forces finds forces within the cones, jd.grasp.internal_forces what "
-    "squeezes), or pass contacts='report' to go on with two-sided contacts",
-    "control_singular": "choose another task or target, or leave out the control's least_regularity to go on, where the task is "
-    "followed as near as can be",
-    "joint_limit_passed": "change the start or the control, or pass limits='report' to go on, or None",
+    "squeezes), or pass contacts='report' to continue with two-sided contacts",
+    "control_singular": "choose another task or target, or leave out the control's least_regularity to continue, with the task "
+    "followed as closely as possible",
+    "joint_limit_passed": "change the start or the control, or pass limits='report' to continue, or None",
     "too_many_events": "raise max_events (now {max_events}); where events accumulate (a body that rocks to rest, friction that "
-    "chatters) there is no more motion of rigid bodies behind that time: give friction a smoothing, or end before",
+    "chatters) rigid bodies have no motion after that time: give friction a smoothing, or end before",
     "painleve_paradox": "rigid bodies have no answer here: lower the friction, or give the contact some compliance",
     "no_contact_mode": "lower the friction, or look for contacts that press against each other",
 }
@@ -105,10 +94,10 @@ class Solution(Outcome):
     """A simulated motion; every row belongs to one save point. Rows not reached are NaN.
 
     - `ts` (nt,) in s, as given; `q` (nt, nq); `v` (nt, nv), body-fixed.
-    - `result`, a `RESULTS` code; `success` tells whether the motion was computed to its end, by steps short enough; `solver`,
-      the name of the method that was used.
+    - `result`, a `RESULTS` code; `success`, true if the motion was computed to its end, by steps short enough; `solver`, the name
+      of the method that was used.
     - `stats`: arrays `num_steps`, `num_accepted_steps`, `num_rejected_steps`, and `time_reached` (s).
-    - What `outputs` asked for, else None: `energy` (nt,), kinetic plus gravitational, J; `power` (nt,), of tau and the
+    - The requested `outputs`, others None: `energy` (nt,), kinetic plus gravitational, J; `power` (nt,), of tau and the
       scene's forces, W; `work` (nt,), its integral from the start, J; `acceleration` (nt, nv); `multipliers`
       (nt, nc); `constraint_residual` (nt, 2), the largest |phi| and |A v - b|; `torque` (nt, nv), of the control, N m or N;
       `control_state`, rows of the controller's state, a pytree; `drive_state` (nt, n), of the scene's drives; `poses`,
@@ -116,10 +105,10 @@ class Solution(Outcome):
       (nt,), by the names of the contacts that have a cone, along the columns of `jd.contact.wrench_basis`, N and N m.
     - `events`, of a scene with friction that sticks or contacts that open: an `Events` with `time`, `index` and `name`, else
       None. Its `contact_forces` (nt, 3) are the two components of friction and the normal force, N.
-    - Of a scene with constraints that were not all found independent before the run, `stats["redundant_rows"]` is how many rows
-      were dropped because they repeat what others say, and `stats["redundant_gap"]` by how much they are open, m or rad.
+    - If the rows of the constraints were not all found independent before the run, `stats["redundant_rows"]` is the number of
+      rows that were dropped as redundant, and `stats["redundant_gap"]` the largest of their residuals, m or rad.
     - With `limits`, `stats["passed_limit"]` is the entry of q that was the first to pass one of its limits, or -1.
-    - Of a scene with cones `stats["lost_contact"]` is the contact that ended the run, an index among those with a cone, or -1.
+    - With cones, `stats["lost_contact"]` is the contact that ended the run, an index among those with a cone, or -1.
     """
 
     ts: Float[Array, " nt"]
@@ -163,16 +152,16 @@ class Solution(Outcome):
         """Write the motion as an archive of NumPy: arrays `t`, `q`, `v`, `a`, `tau`, `multipliers`, `energy`, `pose_FRAME`, ...
 
         Shapes are those of the solution, batched or not. `names` and `units` are JSON texts, by array: `json.loads(str(file
-        ["names"]))["q"]`. With `torque` it is a log, as `to_csv` says.
+        ["names"]))["q"]`. With `torque` it is a log (see `to_csv`).
 
         **Arguments:** `path`, a file .npz; `scene` as in `to_csv`.
 
-        **Raises:** ValueError as `to_csv` does.
+        **Raises:** ValueError for another kind of file and for a scene that is not that of the solution.
         """
         write_npz(self, path, scene)
 
     def to_xarray(self, scene: SceneLike) -> "xarray.Dataset":
-        """The motion as an `xarray.Dataset` over `t` (s), with names as coordinates and units as attributes.
+        """Motion as an `xarray.Dataset` over `t` (s), with names as coordinates and units as attributes.
 
         **Arguments:** `scene` as in `to_csv`.
 
@@ -181,34 +170,45 @@ class Solution(Outcome):
         return as_xarray(self, scene)
 
 
+def joint_of(model: Model, entry: int) -> str:
+    """Name of the joint that an entry of q belongs to."""
+    places = zip(model.topology.q_slices, model.joint_names, strict=True)
+    return next(name for place, name in places if place.start <= entry < place.stop)
+
+
 def raise_failure(solution: Solution, scene: Scene, control, options) -> None:
+    """Raise RuntimeError with the time reached, the cause and the fix, if a concrete run failed."""
     if bool(solution.success):
         return
     name = name_of(solution.result)
     reached, end = float(solution.stats["time_reached"]), float(solution.ts[-1])
+    raise RuntimeError(
+        f"simulate stopped at t = {reached:.6g} s of {end:.6g} s. {RESULTS[solution.result]} Fix: "
+        f"{_advice(name, solution, scene, control, options)}. With throw=False, what was reached is returned."
+    )
+
+
+def _advice(name: str, solution: Solution, scene: Scene, control, options) -> str:
     advice = ADVICE.get(name, "try smaller steps, other tolerances, or another solver").format(**options)
-    if name == "max_steps_reached" and isinstance(unwrapped(options["solver"]), diffrax.AbstractERK):
+    # The scene may have become stiff on the way, so that the choice of the solver at the start has not seen it.
+    if name == "max_steps_reached" and isinstance(innermost(options["solver"]), diffrax.AbstractERK):
         last = int(np.flatnonzero(np.isfinite(solution.q).all(1))[-1])
         state = solution.q[last], solution.v[last], solution.ts[last]
-        rates = known_stiffness(scene, *state, at_start(control, *state))
-        if rates is not None and for_stiff(rates, end - float(solution.ts[0])):
+        rates = find_stiffness(scene, *state, at_start(control, *state))
+        if rates is not None and is_stiff(rates, float(solution.ts[-1]) - float(solution.ts[0])):
             advice = (
                 f"the scene is stiff: the fastest decay is {float(rates.decay):.3g} 1/s, so explicit steps are unstable above "
                 f"{float(rates.explicit_step):.3g} s; pass solver=jd.solvers.Rodas5P(), or "
                 f"raise max_steps (now {options['max_steps']})"
             )
-    if name in ("max_steps_reached", "too_many_events"):
-        if any(isinstance(force, SlidingFriction) for force in scene.forces):
-            advice = (
-                "where a contact with jd.forces.SlidingFriction comes to rest, take jd.contact.DryFriction, which sticks; "
-                f"else {advice}"
-            )
+    slides = any(isinstance(force, SlidingFriction) for force in scene.forces)
+    if name in ("max_steps_reached", "too_many_events") and slides:
+        dry = "where a contact with jd.forces.SlidingFriction comes to rest, take jd.contact.DryFriction, which sticks"
+        return f"{dry}; else {advice}"
     if name == "contact_lost":
         contact = contacts_with_cones(scene)[int(solution.stats["lost_contact"])].name
-        advice = f"the contact is {contact!r}; {advice}"
+        return f"the contact is {contact!r}; {advice}"
     if name == "joint_limit_passed":
-        advice = f"the joint is {joint_of(scene.system, int(solution.stats['passed_limit']))!r}; {advice}"
-    raise RuntimeError(
-        f"simulate stopped at t = {reached:.6g} s of {end:.6g} s. {RESULTS[solution.result]} Fix: {advice}. "
-        "With throw=False, what was reached is returned."
-    )
+        model: Any = scene.system
+        return f"the joint is {joint_of(model, int(solution.stats['passed_limit']))!r}; {advice}"
+    return advice

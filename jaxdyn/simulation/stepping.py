@@ -1,4 +1,4 @@
-"""A motion one step at a time, for learning: the steps of `simulate` with a fixed length, as a function of state and torque."""
+"""Single steps for learning: the steps of `simulate` with a fixed length, as a function of state and torque."""
 
 from collections.abc import Callable
 from typing import Any
@@ -17,38 +17,37 @@ from jaxdyn.contact.unilateral import has_modes
 from jaxdyn.forces.piecewise import fix_pieces, guards, pieces_of, values_and_levels
 from jaxdyn.model.arguments import Numbers, as_array, check_shape, state_dtype
 from jaxdyn.simulation.equations import DRIVES
-from jaxdyn.simulation.hybrid.laws import laws_of_pieces
-from jaxdyn.simulation.hybrid.pieces import motion_in_pieces
+from jaxdyn.simulation.hybrid.piecewise import PiecewiseSystem, piecewise_motion
 from jaxdyn.simulation.solvers import ExplicitSteps, driver
-from jaxdyn.simulation.solvers.driver import Drive
-from jaxdyn.simulation.solvers.explicit import whole_step
-from jaxdyn.simulation.solvers.rk4 import RK4
-from jaxdyn.simulation.start import chosen_method
-from jaxdyn.systems.scene import as_scene, check_force
+from jaxdyn.simulation.solvers.driver import ExplicitRun
+from jaxdyn.simulation.solvers.explicit import take_step
+from jaxdyn.simulation.solvers.fixed_steps import RK4
+from jaxdyn.simulation.start import choose_method
+from jaxdyn.systems.scene import Scene, as_scene, check_force
 from jaxdyn.systems.system import SceneLike
 
-EVENTS = 8  # of a step, at most: a force that changes its piece more often leaves it without derivatives
+EVENTS = 8  # at most in a step: a force that changes its piece more often leaves the step without derivatives
 ADJOINTS = ("reverse", "forward", "direct")
 
 
 def stepper(scene: SceneLike, dt: Numbers, substeps: int = 1, remat: bool = True, adjoint: str = "reverse") -> Callable:
-    """A function step(state, tau, t=0.0) -> state that takes a scene dt further under a constant tau, or under a law.
+    """Function step(state, tau, t=0.0) -> state that advances a scene by dt under a constant tau, or under a law.
 
     The state is a pair (q (nq,), v (nv,)), or (q, v, z) of a scene with `jd.forces.DriveDynamics`, whose states z start as
-    `scene.drive_state(q, v)`; batch it with `jax.vmap`, and go on with `jax.lax.scan`. The
+    `scene.drive_state(q, v)`; batch it with `jax.vmap`, and repeat it with `jax.lax.scan`. The
     torques tau (nv,) are numbers, or a law tau(q, v, t) -> (nv,), called once at the start of the step. The
     steps are those of `jd.simulate` with `stepsize=dt/substeps`: RK4, constraints closed at the end of each, the scene's
     forces applied (friction, stops, drives), and tau through its drives and `jd.forces.EffortLimits`. Where a joint meets a stop
-    (`jd.forces.JointStops`, any `jd.forces.PiecewiseForce`) a step ends and the next one goes on to where it would have ended.
+    (`jd.forces.JointStops`, any `jd.forces.PiecewiseForce`) a step ends, and the next one ends where it would have ended.
 
     **Arguments:**
 
     - `scene`: a `Scene` or `Model`. Friction that sticks and contacts that open need events, which steps of one length
       do not have: take `jd.forces.CoulombFriction`.
     - `dt`: s; `substeps`: steps in it.
-    - `remat`: whether reverse mode keeps no more of a step than its state and tau, and computes the rest again. That costs a
+    - `remat`: if True, reverse mode keeps no more of a step than its state and tau, and computes the rest again. That costs a
       step, and a run of n steps then keeps 8 (nq + 2 nv) n bytes a sample in float64; with a law as tau, which is computed
-      again too, 8 (nq + nv) n bytes and nothing of what happens inside the law.
+      again too, 8 (nq + nv) n bytes and no intermediates of the law.
     - `adjoint`: "reverse" (default), for `jax.grad`, `jax.jacrev` and, over them, `jax.hessian`; "forward" or "direct", for
       forward mode too (`jax.jvp`, `jax.jacfwd`), in which reverse mode takes longer.
 
@@ -62,6 +61,35 @@ def stepper(scene: SceneLike, dt: Numbers, substeps: int = 1, remat: bool = True
     ```
     """
     scene = as_scene(scene)
+    seconds = _check_options(scene, dt, substeps, adjoint)
+    system, dtype = scene.system, state_dtype(scene.system)
+    length = np.asarray(seconds, dtype) if is_concrete(seconds) else jnp.asarray(seconds, dtype)
+    start, advance = _advance(scene, length, substeps, adjoint != "reverse")
+    by_numbers = jax.checkpoint(advance) if remat else advance
+
+    def step(state, tau, t: Any = 0.0):
+        if len(state) != (2 if start is None else 3):
+            names = "(q, v)" if start is None else "(q, v, z) with z = scene.drive_state(q, v) at the start"
+            raise ValueError(f"stepper: the state has {len(state)} entries, expected {names}")
+        q, v, *z = (jnp.asarray(as_array(x, name), dtype) for x, name in zip(state, ("q", "v", "z"), strict=False))
+        for name, value in (("q", q), ("v", v)):
+            check_shape(system, name, value)
+        if start is not None and z[0].shape != start.shape:
+            raise ValueError(f"z has shape {z[0].shape}, expected {start.shape} as of scene.drive_state(q, v)")
+        t = jnp.asarray(t, dtype)
+        if not callable(tau):
+            return by_numbers(q, v, check_force(jnp.asarray(as_array(tau, "tau"), dtype), q, scene.nv, "tau"), t, *z)
+
+        def by_law(q, v, t, *z):
+            return advance(q, v, check_force(jnp.asarray(tau(q, v, t), dtype), q, scene.nv, "tau"), t, *z)
+
+        return (jax.checkpoint(by_law) if remat else by_law)(q, v, t, *z)
+
+    return step
+
+
+def _check_options(scene: Scene, dt, substeps, adjoint):
+    """Length of the step, s; ValueError for options that do not fit."""
     if has_modes(scene):
         raise ValueError(
             "stepper: the scene has forces with modes (jd.contact.DryFriction, jd.contact.UnilateralContact), "
@@ -74,14 +102,17 @@ def stepper(scene: SceneLike, dt: Numbers, substeps: int = 1, remat: bool = True
         raise ValueError(f"stepper: substeps is {substeps!r}; give a positive integer")
     if adjoint not in ADJOINTS:
         raise ValueError(f"stepper: adjoint is {adjoint!r}; choose one of {', '.join(ADJOINTS)}")
-    is_direct = adjoint != "reverse"
-    selects_rows = bool(scene.constraints) and may_have_redundant_rows(scene)
-    method, system, dtype = chosen_method(scene, "auto"), scene.system, state_dtype(scene.system)
-    unknown, known = partition_tracers(scene)
-    length = np.asarray(seconds, dtype) if is_concrete(seconds) else jnp.asarray(seconds, dtype)
+    return seconds
 
-    def given(args):
-        """The scene with its independent rows, in the pieces that come last if any do, and tau."""
+
+def _advance(scene: Scene, length, substeps: int, is_direct: bool) -> tuple[Any, Callable]:
+    """States of the scene's drives or None, and a function (q, v, tau, t, *z) -> (q, v, *z) of a step under a constant tau."""
+    selects_rows = bool(scene.constraints) and may_have_redundant_rows(scene)
+    method, dtype = choose_method(scene, "auto"), state_dtype(scene.system)
+    unknown, known = partition_tracers(scene)
+
+    def unpack(args):
+        """Scene with its independent rows, with forces fixed to a piece where flags ask for it, and tau."""
         unknown, tau, selection, *positive = args
         scene = known(unknown)
         scene = scene if selection is None else keep_rows(scene, selection)
@@ -89,80 +120,56 @@ def stepper(scene: SceneLike, dt: Numbers, substeps: int = 1, remat: bool = True
 
     @jax.jit
     def field(t, y, args):
-        scene, tau = given(args)
-        rates_of_drives = {}
+        scene, tau = unpack(args)
+        of_drive = {}
 
         def generalized_force(q, v, t):
-            force, (given, rates) = scene.applied_force(q, v, t), scene.drive_torque(q, v, t, tau, y.get(DRIVES))
-            rates_of_drives.update({} if rates is None else {DRIVES: rates})
-            return given if force is None else given + force
+            force, (torque, rates) = scene.applied_force(q, v, t), scene.drive_torque(q, v, t, tau, y.get(DRIVES))
+            of_drive.update({} if rates is None else {DRIVES: rates})
+            return torque if force is None else torque + force
 
-        return method.evaluated(scene, y, t, generalized_force)[0] | rates_of_drives
+        return method.evaluate(scene, y, t, generalized_force)[0] | of_drive
 
     def project(t, y, error, args):
-        scene, _ = given(args)
-        y, error = method.stepped(scene, y, t, error)
+        y, error = method.end_step(unpack(args)[0], y, t, error)
         return y, error, diffrax.RESULTS.successful
+
+    def switching(t, y, args):
+        scene, tau = unpack(args)
+        state = (*method.to_qv(scene, y, t), *(y[name] for name in of_drives))
+        return values_and_levels(lambda q, v, *own: guards(scene, q, v, t, tau if limits_vary else None, *own), *state)
 
     corrector = project if method.corrects(scene) else None
     solver = ExplicitSteps(RK4(), corrector, method.step_constants, method.projects, field=field)
-
-    def switching(t, y, args):
-        scene, tau = given(args)
-        state = (*method.to_qv(scene, y, t), *(y[name] for name in of_drives))
-        return values_and_levels(lambda q, v, *own: guards(scene, q, v, t, tau if cuts_move else None, *own), *state)
-
     q, v = (jnp.zeros((n,), dtype) for n in (scene.nq, scene.nv))
     start = scene.drive_state(q, v)
     of_drives = () if start is None else (DRIVES,)
     # tau is constant in a step, and so is where it is cut off, unless drives or limits of the speed are in between.
-    cuts_move = bool(of_drives) or any(getattr(force, "of_speed", False) for force in scene.forces)
-    zero = jnp.zeros((), dtype)
-    pieces = pieces_of(
-        scene, (), q, v, zero, (lambda _, q, v, t: (v, scene.drive_state(q, v, t))) if cuts_move else None
-    )
+    limits_vary = bool(of_drives) or any(getattr(force, "of_speed", False) for force in scene.forces)
+    tau_of = (lambda _, q, v, t: (v, scene.drive_state(q, v, t))) if limits_vary else None
+    pieces = pieces_of(scene, (), q, v, jnp.zeros((), dtype), tau_of)
+
+    def state_of(y, t):
+        return *method.to_qv(scene, y, t), *(y[name] for name in of_drives)
 
     def advance(q, v, tau, t, *z):
         y = method.start(scene, q, v, t) | dict(zip(of_drives, z, strict=True))
         selection = select_rows(known(unknown), q, t, None) if selects_rows else None
         plan, args, ts, size = solver.plan(y), (unknown, tau, selection), jnp.stack([t, t + length]), length / substeps
         if pieces.names:
-            laws = laws_of_pieces(plan, pieces, switching, 4, 3)
-            rows = motion_in_pieces(laws, y, args, ts, (0.0, 0.0), size, substeps, substeps + 1, EVENTS, is_direct)[0]
+            system = PiecewiseSystem(plan, pieces, switching)
+            rows = piecewise_motion(system, y, args, ts, 0.0, 0.0, size, substeps, substeps + 1, EVENTS, is_direct)[0]
         elif is_standalone():
-            # A program of numbers has no loop over steps; they are written one after the other.
+            # A scalar program has no loop over steps; they are written one after the other.
             flat = ravel_pytree(y)[0]
             for i in range(substeps):
                 start, end = t + i * size, t + (i + 1) * size
-                rate = plan.field_of(args, start, flat) if plan.passes_rate_on else jnp.zeros_like(flat)
-                flat = whole_step(plan, args, start, end, flat, rate).projected
-            return whole_state(plan.structure(flat), t + length)
+                flat = take_step(plan, args, start, end, flat, plan.first_rate(args, start, flat)).projected
+            return state_of(plan.structure(flat), t + length)
         else:
-            drive = Drive(plan, driver.Fixed(4, 3), None, None, size, substeps, substeps)
-            rows = (drive.direct if is_direct else drive)(y, args, ts)[0]
-        return whole_state(jax.tree.map(lambda x: x[0], rows), t + length)
+            # Orders of RK4 and of its error estimate.
+            run = ExplicitRun(plan, driver.FixedSteps(4, 3), None, None, size, substeps, room=substeps)
+            rows = (run.direct if is_direct else run)(y, args, ts)[0]
+        return state_of(jax.tree.map(lambda x: x[0], rows), t + length)
 
-    def whole_state(y, t):
-        return *method.to_qv(scene, y, t), *(y[name] for name in of_drives)
-
-    taken = jax.checkpoint(advance) if remat else advance
-
-    def step(state, tau, t: Any = 0.0):
-        if len(state) != 2 + len(of_drives):
-            names = "(q, v, z) with z = scene.drive_state(q, v) at the start" if of_drives else "(q, v)"
-            raise ValueError(f"stepper: the state has {len(state)} entries, expected {names}")
-        q, v, *z = (jnp.asarray(as_array(x, name), dtype) for x, name in zip(state, ("q", "v", "z"), strict=False))
-        for name, value in (("q", q), ("v", v)):
-            check_shape(system, name, value)
-        if start is not None and z[0].shape != start.shape:
-            raise ValueError(f"z has shape {z[0].shape}, expected {start.shape} as of scene.drive_state(q, v)")
-        t = jnp.asarray(t, dtype)
-        if not callable(tau):
-            return taken(q, v, check_force(jnp.asarray(as_array(tau, "tau"), dtype), q, scene.nv, "tau"), t, *z)
-
-        def under_law(q, v, t, *z):
-            return advance(q, v, check_force(jnp.asarray(tau(q, v, t), dtype), q, scene.nv, "tau"), t, *z)
-
-        return (jax.checkpoint(under_law) if remat else under_law)(q, v, t, *z)
-
-    return step
+    return start, advance

@@ -1,9 +1,5 @@
 """`jd.assemble` far from its guess: branch, half turns, tolerances, redundant rows, large batches."""
 
-import subprocess
-import sys
-import textwrap
-
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -103,31 +99,3 @@ def test_a_guess_without_end_is_refused_with_the_open_loop(guess):
         jd.assemble(jd.scenes.four_bar(), jnp.full(3, guess), guesses=2)
     state = jd.assemble(jd.scenes.four_bar(), jnp.full(3, guess), guesses=1, throw=False)
     assert state.result == jd.RESULTS.not_assembled
-
-
-BATCHES = """
-    import faulthandler; faulthandler.dump_traceback_later(240, exit=True)
-    import jax; jax.config.update("jax_enable_x64", True)
-    import jax.numpy as jnp, jaxdyn as jd
-    def batch(function, *args):
-        jax.block_until_ready(jax.jit(jax.vmap(function))(*args))
-    scene = jd.scenes.four_bar()
-    q, v = jd.scenes.four_bar.start()
-    angles = jnp.linspace(0.3, 1.0, 512)
-    batch(lambda x: (lambda s: (s.q, s.v, s.residual, s.distance))(jd.assemble(scene, q, hold={"1": x})), angles)
-    qs = jnp.broadcast_to(q, (512, 3)) + 1e-9 * angles[:, None]
-    batch(lambda q: jd.constraints.projections(scene, q), qs)
-    batch(lambda q: jd.reduction.tangent_basis(scene, q, dof=1), qs)
-    batch(lambda q: jd.constraints.second_fundamental_form(scene, q, v), qs)
-    batch(lambda q: jd.constrained_dynamics(scene, q, v, method="schur").acceleration, qs)
-    batch(lambda x: jd.simulate(scene, q, x * v, jnp.linspace(0, 0.1, 3), method="variational", stepsize=0.01).q, angles)
-    batch(lambda x: jd.simulate(scene, q, x * v, jnp.linspace(0, 0.1, 3), method="reduced").q, angles)
-    print("done")
-"""
-
-
-@pytest.mark.slow
-def test_batches_of_512_end():
-    """Batched calls of LAPACK within one program can wait for each other for ever: no function makes any."""
-    run = subprocess.run([sys.executable, "-c", textwrap.dedent(BATCHES)], capture_output=True, text=True, timeout=600)
-    assert run.stdout.split() == ["done"], run.stderr[-2000:]

@@ -569,3 +569,10 @@ def test_trajectory_fit_of_noisy_states(arm):
     assert np.linalg.norm(computed - true) < 0.03 * np.linalg.norm(old - true)
     assert np.abs(fit.friction.viscous).max() < 0.01
     assert max(identify.trajectory_error(fit.model, simulated_log(arm), fit.friction, substeps=2)) < 2
+
+
+def test_regressor_refuses_traced_arrays():
+    arm = robots.chain(2)
+    x = jnp.zeros((3, 2))
+    with pytest.raises(ValueError, match=r"traced.*torque_regressor"):
+        jax.jit(lambda x: identify.regressor(arm, x, x, x))(x)

@@ -377,7 +377,7 @@ def test_a_basis_that_becomes_singular_ends_the_run():
     with pytest.raises(RuntimeError, match=r"stopped at t = 0\.\d+ s of 1 s. The minimal velocities .* jd.Reduced\(\)"):
         simulate(scene, *state, ts, method=Reduced((0,)))
     with pytest.raises(
-        ValueError, match=r"basis does not serve at q0: choose other independent velocities, here \(1,\)"
+        ValueError, match=r"basis is not regular at q0: choose other independent velocities, here \(1,\)"
     ):
         simulate(scene, *scenes.pendulum_in_plane.start(), ts, method=Reduced((0,)))
     with pytest.raises(ValueError, match="cannot follow the basis"):

@@ -42,8 +42,8 @@ from jaxdyn.reports.programs import FIXED, SOLVERS, Programs, prepare
 from jaxdyn.reports.records import Known
 from jaxdyn.reports.timing import time_interleaved
 from jaxdyn.simulation.solvers import RK4
-from jaxdyn.simulation.solvers.choice import checked_method
-from jaxdyn.simulation.start import chosen_method
+from jaxdyn.simulation.solvers.choice import choose_solver
+from jaxdyn.simulation.start import choose_method
 from jaxdyn.systems.scene import Scene
 
 MOMENTS = np.array([1.0, 2.0, 3.0])
@@ -276,12 +276,12 @@ def test_evaluations_are_those_that_are_made(name, solver):
     steps = {"stepsize": 0.05} if solver == "RK4" else {"rtol": 1e-6, "atol": 1e-6}
     solution = jd.simulate(counted, *scene.start(), jnp.asarray([0.0, 1.0]), solver=method, **steps)
     jax.effects_barrier()
-    assert len(calls) == evaluations(solver, int(solution.stats["num_steps"]), scene(), chosen_method(scene(), "auto"))
+    assert len(calls) == evaluations(solver, int(solution.stats["num_steps"]), scene(), choose_method(scene(), "auto"))
 
 
 def test_evaluations_of_implicit_methods_are_not_known():
     scene = jd.scenes.pendulum_in_plane()
-    assert evaluations("Kvaerno5", 10, scene, chosen_method(scene, "auto")) is None
+    assert evaluations("Kvaerno5", 10, scene, choose_method(scene, "auto")) is None
 
 
 def test_every_way_can_be_simulated():
@@ -292,8 +292,8 @@ def test_every_way_can_be_simulated():
             pairs = running.combinations(case, bool(scene.constraints), full=full, plain=plain)
             assert len(set(pairs)) == len(pairs) >= 3
             for method, solver in pairs:
-                chosen_method(scene, method)
-                checked_method(SOLVERS[solver](), 0.1 if solver in FIXED else None)
+                choose_method(scene, method)
+                choose_solver(SOLVERS[solver](), 0.1 if solver in FIXED else None)
                 for dtype in ("float64", "float32"):
                     rungs = running.settings(case, solver, dtype, full=full)
                     assert np.all(np.diff(rungs) < 0)

@@ -248,7 +248,7 @@ def test_bad_starts_and_methods_are_refused():
         simulate(scene, q, v, ts, method="free")
     with pytest.raises(ValueError, match="scene without constraints takes 'auto' or 'free'"):
         simulate(Scene(scene.system), q, v, ts, method="projected")
-    with pytest.raises(ValueError, match="'rod', 'wall' remove all freedom: 2 independent rows for nv = 2"):
+    with pytest.raises(ValueError, match="'rod', 'wall' remove all degrees of freedom: 2 independent rows for nv = 2"):
         simulate(Scene(scene.system, (*scene.constraints, Holonomic(lambda q, t: q[1], name="wall"))), q, v, ts)
     codes = quick(lambda q: simulate(scene, q, v, jnp.asarray(ts), stepsize=0.1).result == RESULTS.inconsistent_start)
     assert [bool(codes(x * q)) for x in (0.9, 1.0)] == [True, False]

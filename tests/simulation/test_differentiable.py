@@ -10,7 +10,7 @@ import pytest
 
 import jaxdyn as jd
 from jaxdyn.simulation.solvers import differentiable
-from jaxdyn.simulation.solvers.first_step import Adaptive
+from jaxdyn.simulation.solvers.step_control import Adaptive
 
 TS = np.linspace(0.0, 6.0, 5)
 
@@ -78,8 +78,8 @@ def test_reverse_mode_takes_the_steps_of_the_forward_run(kind, solver):
     def repeated(x, r, ts):
         how = options(kind, solver, ts)
         fixed = jax.lax.stop_gradient((x, r, ts))
-        taken = differentiable._recorded(moving(*fixed), how, 4096)[2]
-        again = differentiable._again(how, taken) | {"adjoint": diffrax.ForwardMode()}
+        taken = differentiable._record(moving(*fixed), how, 4096)[2]
+        again = differentiable._repeat(how, taken) | {"adjoint": diffrax.ForwardMode()}
         return jnp.sum(WEIGHTS * differentiable.run(moving(x, r, ts), **again)[0]["x"])
 
     @jax.jit

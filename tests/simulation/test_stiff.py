@@ -196,7 +196,7 @@ IMPLICIT = diffrax.Kvaerno3(root_finder=optimistix.Newton(1e-13, 1e-13))
 )
 def test_order_in_local_coordinates(ball, turned_exactly, solver, order):
     """The order is kept, at steps and between them, and quaternions are of unit length without a projection."""
-    run = quick(jax.vmap(lambda h: turned(ball, h, jd.solvers.LieGroup(solver).fitted(ball))))
+    run = quick(jax.vmap(lambda h: turned(ball, h, jd.solvers.LieGroup(solver).for_system(ball))))
     computed = np.asarray(run(jnp.asarray([1 / 10, 1 / 20, 1 / 40])))
     np.testing.assert_allclose(np.linalg.norm(computed[..., :4], axis=-1), 1, rtol=1e-14)
     error = np.abs(computed - turned_exactly).max(2)
@@ -208,7 +208,7 @@ def test_order_in_local_coordinates(ball, turned_exactly, solver, order):
 @pytest.mark.slow
 def test_gradient_of_an_implicit_step_in_local_coordinates(ball):
     """Both modes through one step of Rodas5P against differences, and finite at rest."""
-    solver, term = jd.solvers.LieGroup(jd.solvers.Rodas5P()).fitted(ball), turning(ball)
+    solver, term = jd.solvers.LieGroup(jd.solvers.Rodas5P()).for_system(ball), turning(ball)
 
     def end(z):
         y0, h = {"q": z[:4] / jnp.sqrt(jnp.sum(z[:4] ** 2)), "v": z[4:]}, jnp.asarray(0.2)
@@ -306,7 +306,7 @@ def test_default_solver_and_advice_follow_stiffness():
         assert computed.solver == solver
         np.testing.assert_allclose(computed.q, case.exact(stiffness), rtol=0, atol=1e-10)
     with pytest.raises(
-        RuntimeError, match=r"is stiff: the fastest decay is 1.18e\+05 1/s.*above 4.38e-05 s; pass solver=jd.Ro"
+        RuntimeError, match=r"is stiff: the fastest decay is 1.18e\+05 1/s.*above 4.38e-05 s; pass solver=jd.solvers.Ro"
     ):
         run(1e9, solver=diffrax.Dopri8())
 
@@ -321,7 +321,7 @@ def test_implicit_explicit_split():
     weights = np.linalg.solve([[1, 1], rate], [1, 0])
     np.testing.assert_allclose(solution.q[:, 0], np.exp(np.outer(times, rate)) @ weights, rtol=0, atol=1e-6)
     assert solution.success and solution.solver == "KenCarp4" and solution.stats["num_steps"] < 400
-    with pytest.raises(ValueError, match="adjoint is 'backsolve', which KenCarp4 cannot serve"):
+    with pytest.raises(ValueError, match="adjoint is 'backsolve', which KenCarp4 does not support"):
         jd.simulate(scene, [1.0], [0.0], times, solver=diffrax.KenCarp4(), adjoint="backsolve")
 
 

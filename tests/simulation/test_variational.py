@@ -15,9 +15,9 @@ from jaxdyn.dynamics.quantities import kinetic_energy, potential_energy
 from jaxdyn.model.builder import ModelBuilder
 from jaxdyn.model.tree import integrate, random_configuration
 from jaxdyn.simulation import variational
-from jaxdyn.simulation.methods import Variational
 from jaxdyn.simulation.run import simulate
 from jaxdyn.simulation.solution import RESULTS
+from jaxdyn.simulation.variational import Variational
 from jaxdyn.systems.lagrangian import LagrangianSystem
 from jaxdyn.systems.scene import Scene
 from jaxdyn.systems.system import ExplicitSystem, MetricSystem, displace, displacement
@@ -40,7 +40,7 @@ def advance(scene, q, p, h, v=None):
     v = jnp.ones(scene.nv) if v is None else v
     start = variational.begin(scene, q, v, jnp.asarray(0.0), None)
     start = start if p is None else start._replace(momentum=p)
-    computed = variational.step(scene, q, v, start, jnp.asarray(0.0), h, scene.applied_force, None)
+    computed = variational.make_step(scene, q, v, start, jnp.asarray(0.0), h, scene.applied_force, None)
     return computed.q, computed.carried.momentum, computed.v, computed.solved
 
 
@@ -125,7 +125,7 @@ def test_momenta_are_conserved():
     @quick
     def run(q, v):
         def body(state, _):
-            computed = variational.step(Scene(model), *state, 0.0, jnp.asarray(0.05), lambda *_: None, None)
+            computed = variational.make_step(Scene(model), *state, 0.0, jnp.asarray(0.05), lambda *_: None, None)
             return (computed.q, computed.v, computed.carried), (total(computed.q, computed.v), computed.solved)
 
         start = variational.begin(Scene(model), q, v, 0.0, None)
@@ -259,7 +259,9 @@ def test_slopes_of_a_lagrangian():
         return kinetic_energy(model, at, v) - potential_energy(model, at)
 
     want = quick(jax.grad(lagrangian, (0, 1)))(v, jnp.zeros(model.nv))
-    for got, expected in zip(quick(lambda q, v: variational._slopes(model, q, v, 0.0))(q, v), want, strict=True):
+    for got, expected in zip(
+        quick(lambda q, v: variational._lagrangian_derivatives(model, q, v, 0.0))(q, v), want, strict=True
+    ):
         np.testing.assert_allclose(got, expected, rtol=1e-11, atol=1e-11)
 
     mass = lambda q: jnp.diag(1 + q**2)  # noqa: E731
@@ -271,7 +273,7 @@ def test_slopes_of_a_lagrangian():
     )
     q, v = jnp.array([0.3, -0.8]), jnp.array([1.1, 0.6])
     for system in systems:
-        p, pull = variational._slopes(system, q, v, jnp.asarray(0.0))
+        p, pull = variational._lagrangian_derivatives(system, q, v, jnp.asarray(0.0))
         np.testing.assert_allclose(p, (1 + q**2) * v, rtol=1e-12)
         np.testing.assert_allclose(pull, q * v * v + jnp.sin(q), rtol=1e-12)
 

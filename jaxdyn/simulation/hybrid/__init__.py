@@ -1,9 +1,9 @@
-"""Motions with modes: contacts that open and close, friction that sticks and slips.
+"""Motion with modes: contacts that open and close, friction that sticks and slips, forces that are smooth in pieces.
 
-Within a mode the motion is constrained dynamics with rows that are active or not (`modes`, `dynamics`). `machine` makes the
-steps and finds the events between modes, `transitions` says what a mode becomes, `replay` differentiates through events, and
-`motion` is what `jd.simulate` calls.
+Within a mode the motion is constrained dynamics with rows that are active or not (`modes`, `dynamics`). `system` is the hybrid
+system: flow, guards and reset maps, with the mode transitions of `transitions`. `event_loop` makes the steps and locates the
+events, `replay` differentiates through them, `motion` is the run of `jd.simulate`, and `piecewise` that of forces with kinks.
 
-The rows of all elements are always there, and the mode says by masks which ones act: one program serves all modes, and in a
-batch each lane has its own.
+The rows of all elements are always there, and the mode says by masks which ones act: all modes have one program, and each
+trajectory of a batch has its own.
 """

@@ -1,8 +1,7 @@
-"""Dynamics within a mode: constraints, contacts that are closed, friction that sticks, and friction that slides in proportion to
-multipliers.
+"""Dynamics within a mode: constraints, closed contacts, friction that sticks, and friction that slides.
 
-With Y = U^-1 A^T, M = U U^T, for the active rows A a = gamma, and sliding friction -Z N of which the normal forces N = S lam
-are multipliers themselves,
+With Y = U^-1 A^T, M = U U^T, for the active rows A a = gamma, and sliding friction -Z N whose normal forces N = S lam are
+multipliers themselves,
 
     M a + h = tau + A^T lam - Z N,    (A M^-1 A^T) lam - (A M^-1 Z) S lam = gamma - A M^-1 (tau - h).
 
@@ -20,13 +19,13 @@ from jaxtyping import Array
 from jaxdyn.constraints.base import Rows, position_residual, rows
 from jaxdyn.dynamics.quantities import bias_force, mass_matrix
 from jaxdyn.lie.so3 import matmul
-from jaxdyn.simulation.hybrid.modes import Elements, Mode, extended, force_at
+from jaxdyn.simulation.hybrid.modes import Elements, Mode, extend, force_at
 from jaxdyn.systems.mass_factor import MassFactor, cholesky, mass_factor, solve_cholesky
 from jaxdyn.systems.scene import Scene
 
 
 class StateTerms(NamedTuple):
-    """What is known of a state before its mode: rows, mass matrix, and the sliding velocities (n, 2)."""
+    """Terms of a state that do not depend on its mode: rows, mass matrix, and sliding velocities (n, 2)."""
 
     row: Rows
     metric: MassFactor
@@ -34,20 +33,19 @@ class StateTerms(NamedTuple):
     slip: Array
 
 
-class Pushed(NamedTuple):
-    """What constraints and friction do: multipliers (count,), normal forces (n,), friction that holds (n, 2), what they add to
-    the velocity's rate (nv,), and the pivots (n,) of the equations for normal forces: one without friction."""
+class Reaction(NamedTuple):
+    """Reaction of constraints and friction to a motion, as forces or as impulses."""
 
-    multipliers: Array
-    normal: Array
-    holding: Array
-    change: Array
-    pivots: Array
+    multipliers: Array  # (count,)
+    normal: Array  # normal forces (n,)
+    holding: Array  # friction of elements that stick (n, 2)
+    change: Array  # share in the rate of the velocity (nv,)
+    pivots: Array  # of the equations for the normal forces (n,): one without friction
 
 
 def terms_at(scene: Scene, elements: Elements, q, v, t) -> StateTerms:
-    """Of the scene as it is, with its elements."""
-    row = rows(extended(scene), q, v, t)
+    """Terms of a scene with its elements."""
+    row = rows(extend(scene), q, v, t)
     metric = mass_factor(mass_matrix(scene.system, q, t))
     return StateTerms(row, metric, metric.whiten(row.A.T), by_element(elements, row.velocity))
 
@@ -63,8 +61,8 @@ def by_element(elements: Elements, rowwise) -> Array:
     )
 
 
-def normal_given(scene: Scene, element, q, v, t):
-    """N of a friction whose normal force is given, zero where that is negative: such friction would drive the motion."""
+def normal_load(scene: Scene, element, q, v, t):
+    """Prescribed normal force of a friction, (), zero where it is negative: such friction would drive the motion."""
     normal: Any = force_at(scene, element).normal
     value: Any = normal(scene.system, q, v, t) if callable(normal) else normal
     if jnp.shape(value) != ():
@@ -75,12 +73,13 @@ def normal_given(scene: Scene, element, q, v, t):
 def directions(scene: Scene, elements: Elements, slip, reference) -> Array:
     """Unit vectors (n, 2) of sliding; shorter ones for friction that is smooth.
 
-    They go on smoothly through w = 0 to w < 0, as the events that end a mode there are looked for from both sides: w/|w| with
-    the sign that `reference` (n, 2) has, which for one row is constant.
+    They continue smoothly through w = 0 to w < 0, because the event that ends a mode there is bracketed from both sides: w/|w|
+    with the sign of `reference` (n, 2), which for one row is constant.
     """
     unit_vectors = []
     for i, one in enumerate(elements.each):
         w, s = slip[i], reference[i]
+        # A velocity below rounding has no direction of its own: the reference is kept.
         least = 100 * float(jnp.finfo(w.dtype).eps)
         square = jnp.sum(w * w)
         is_sliding = square > least**2
@@ -97,53 +96,55 @@ def directions(scene: Scene, elements: Elements, slip, reference) -> Array:
 
 
 def slides(elements: Elements, mode: Mode) -> list:
-    """Whether each element slides, ()."""
+    """Flag () of each element that slides."""
     free = [jnp.ones((), bool) if one.smooth else ~mode.stick[i] for i, one in enumerate(elements.each)]
     return [mode.closed[i] & free[i] for i in range(len(elements.each))]
 
 
-def push(scene: Scene, elements: Elements, mode: Mode, terms: StateTerms, along, wanted) -> Pushed:
-    """Forces that give the active rows the rates `wanted` (count,); impulses that give them velocities."""
-    dtype = wanted.dtype
+def react(scene: Scene, elements: Elements, mode: Mode, terms: StateTerms, along, target) -> Reaction:
+    """Forces that give the active rows the rates `target` (count,), or impulses that give them these velocities."""
+    dtype = target.dtype
     active = elements.active(mode).astype(dtype)
     sliding = slides(elements, mode)
     Z = [
         jnp.where(sliding[i], force_at(scene, elements.each[i]).coefficient.astype(dtype), 0.0)
         * matmul(along[i, : len(elements.each[i].tangent)], terms.row.A[jnp.asarray(elements.each[i].tangent)])
-        for i in elements.coupled
+        for i in elements.frictional
     ]
     count = len(Z)
     pushes = terms.metric.whiten(jnp.stack(Z).T) if count else jnp.zeros((scene.nv, 0), dtype)
-    right = jnp.concatenate([wanted[:, None], matmul(terms.Y.T, pushes)], 1) * active[:, None]
-    solved = solve_rows(terms.Y * active[None], active, right)
-    base, by_normal = solved[:, 0], solved[:, 1:]
+    right = jnp.concatenate([target[:, None], matmul(terms.Y.T, pushes)], 1) * active[:, None]
+    # Multipliers without sliding friction, and their change by each normal force of an element that slides.
+    lam = solve_rows(terms.Y * active[None], active, right)
+    base, by_normal = lam[:, 0], lam[:, 1:]
     sign = mode.signs(dtype)
-    at = [elements.each[i].normal for i in elements.coupled]
+    at = [elements.each[i].normal for i in elements.frictional]
     normal = jnp.zeros((0,), dtype)
     pivots = [jnp.ones((), dtype)] * len(elements.each)
     if count:
-        pick = jnp.stack([sign[i] for i in elements.coupled])
+        pick = jnp.stack([sign[i] for i in elements.frictional])
         K = jnp.eye(count, dtype=dtype) - pick[:, None] * by_normal[jnp.asarray(at)]
-        normal, own = _eliminated(K, pick * base[jnp.asarray(at)])
-        for i, pivot in zip(elements.coupled, own, strict=True):
+        normal, own = _eliminate(K, pick * base[jnp.asarray(at)])
+        for i, pivot in zip(elements.frictional, own, strict=True):
             pivots[i] = jnp.where(sliding[i], pivot, jnp.ones_like(pivot))
     lam = (base + matmul(by_normal, normal)) * active
     change = terms.metric.unwhiten(matmul(terms.Y, lam) - matmul(pushes, normal))
     zero = jnp.zeros((), dtype)
-    each = [sign[i] * lam[one.normal] if one.normal >= 0 else zero for i, one in enumerate(elements.each)]
-    return Pushed(lam, jnp.stack(each), by_element(elements, lam), change, jnp.stack(pivots))
+    normals = [sign[i] * lam[one.normal] if one.normal >= 0 else zero for i, one in enumerate(elements.each)]
+    return Reaction(lam, jnp.stack(normals), by_element(elements, lam), change, jnp.stack(pivots))
 
 
 def solve_rows(Y, active, right):
-    """x with Y^T Y x = right on the active rows, zero elsewhere; near the least norm where rows depend on each other.
+    """Solution x of Y^T Y x = right on the active rows, zero elsewhere; near the least norm where rows are dependent.
 
     Two steps of the proximal method x <- x + (G + eps)^-1 (right - G x), of rows scaled to unit length.
     """
     square, eps = jnp.sum(Y * Y, 0), float(jnp.finfo(Y.dtype).eps)
-    # What is left of a row by rounding, as of one across the plane of a plane model, is none.
+    # A row of the size of rounding is no row, as that of a direction across the plane of a planar model.
     is_row = square > eps**1.5 * jnp.max(square)
     scale = jnp.where(is_row, 1 / jnp.sqrt(jnp.where(is_row, square, jnp.ones_like(square))), 0.0)
     Y = Y * scale[None]
+    # Large enough for Cholesky's factors of dependent rows; each step of the proximal method multiplies the error by about it.
     shift = eps**0.5
     count = Y.shape[1]
     factor = cholesky(matmul(Y.T, Y) + jnp.diag(1.0 - active + shift * jnp.ones((count,), Y.dtype)))
@@ -154,8 +155,11 @@ def solve_rows(Y, active, right):
     return x * (scale * active)[:, None]
 
 
-def _eliminated(K, right):
-    """x with K x = right, and the pivots in turn."""
+def _eliminate(K, right):
+    """Solution x of K x = right, and the pivots of the elimination in order.
+
+    Without exchange of rows, because the sign of each pivot tells where friction leaves no forces.
+    """
     n, pivots = K.shape[0], []
     matrix = [K[i] for i in range(n)]
     values = [right[i] for i in range(n)]
@@ -178,43 +182,40 @@ def _eliminated(K, right):
 
 
 class Motion(NamedTuple):
-    """Accelerations (nv,), what pushes, normal forces (n,) with those that are given, and rates of the rows (count,) with the
-    size of what cancels in them."""
+    """Motion in a mode."""
 
-    acceleration: Array
-    pushed: Pushed
-    normal: Array
-    rates: Array
-    sizes: Array
+    acceleration: Array  # (nv,)
+    reaction: Reaction
+    normal: Array  # normal forces (n,), those that are prescribed included
+    rates: Array  # A a - gamma (count,)
+    sizes: Array  # sizes of the terms that cancel in these (count,)
 
 
 def motion_at(
     scene: Scene, elements: Elements, mode: Mode, terms: StateTerms, reference, generalized_force, q, v, t
 ) -> Motion:
-    """Accelerations in a mode; `generalized_force` (nv,) is tau and the forces without modes, or None."""
+    """Motion in a mode; `generalized_force` (nv,) is tau and the forces without modes, or None."""
     along = directions(scene, elements, terms.slip, reference)
     force = jnp.zeros_like(v) if generalized_force is None else generalized_force
     sliding = slides(elements, mode)
-    given = {}
+    prescribed = {}
     for i, one in enumerate(elements.each):
         if one.normal < 0:
-            given[i] = normal_given(scene, one, q, v, t)
-            level = jnp.where(sliding[i], force_at(scene, one).coefficient.astype(v.dtype) * given[i], 0.0)
+            prescribed[i] = normal_load(scene, one, q, v, t)
+            level = jnp.where(sliding[i], force_at(scene, one).coefficient.astype(v.dtype) * prescribed[i], 0.0)
             force = force - level * matmul(along[i, : len(one.tangent)], terms.row.A[jnp.asarray(one.tangent)])
     free = terms.metric.whiten(force - bias_force(scene.system, q, v, t))
-    wanted = terms.row.gamma - matmul(terms.Y.T, free)
-    pushed = push(scene, elements, mode, terms, along, wanted)
-    acceleration = terms.metric.unwhiten(free) + pushed.change
-    normal = jnp.stack([given.get(i, pushed.normal[i]) for i in range(len(elements.each))])
+    reaction = react(scene, elements, mode, terms, along, terms.row.gamma - matmul(terms.Y.T, free))
+    acceleration = terms.metric.unwhiten(free) + reaction.change
+    normal = jnp.stack([prescribed.get(i, reaction.normal[i]) for i in range(len(elements.each))])
     parts = terms.row.A * acceleration[None]
     sizes = jnp.sum(jnp.abs(parts), 1) + jnp.abs(terms.row.gamma)
-    return Motion(acceleration, pushed, normal, jnp.sum(parts, 1) - terms.row.gamma, sizes)
+    return Motion(acceleration, reaction, normal, jnp.sum(parts, 1) - terms.row.gamma, sizes)
 
 
 def gaps(scene: Scene, elements: Elements, q, t) -> Array:
-    """Of the elements that open, (n,); zero of others."""
-    whole = extended(scene)
-    residuals = position_residual(whole, q, t)
+    """Gaps of the elements that open, (n,); zero of others."""
+    residuals = position_residual(extend(scene), q, t)
     # Contacts have one row each among the residuals, behind those of the scene's own constraints.
     at, gap_of_each = residuals.shape[0] - sum(one.opens for one in elements.each), []
     for one in elements.each:
@@ -226,7 +227,7 @@ def gaps(scene: Scene, elements: Elements, q, t) -> Array:
 def rebounds(scene: Scene, elements: Elements, terms: StateTerms) -> Array:
     """Velocity of each gap (n,) after an impact by Newton's hypothesis: e times that with which it closes.
 
-    Slow ones are zero, as the flight after them would be hardly higher than the rounding of the gap.
+    Slow ones are zero: the flight after them would be hardly higher than the rounding of the gap.
     """
     zero, rates = jnp.zeros((), terms.row.velocity.dtype), []
     least = float(jnp.finfo(zero.dtype).eps) ** 0.3
@@ -239,21 +240,23 @@ def rebounds(scene: Scene, elements: Elements, terms: StateTerms) -> Array:
     return jnp.stack(rates)
 
 
-def jumped(scene: Scene, elements: Elements, mode: Mode, terms: StateTerms, along, v, rebound) -> tuple[Array, Pushed]:
-    """The velocity after impulses that end the motion of the active rows, or give gaps the velocity `rebound` (n,), and these."""
-    wanted = -terms.row.velocity
+def impact(
+    scene: Scene, elements: Elements, mode: Mode, terms: StateTerms, along, v, rebound
+) -> tuple[Array, Reaction]:
+    """Velocity after impulses that end the motion of the active rows, or give gaps the velocity `rebound` (n,); and these."""
+    target = -terms.row.velocity
     for i, one in enumerate(elements.each):
         if one.opens:
-            wanted = wanted.at[one.normal].add(rebound[i])
-    pushed = push(scene, elements, mode, terms, along, wanted)
-    return v + pushed.change, pushed
+            target = target.at[one.normal].add(rebound[i])
+    reaction = react(scene, elements, mode, terms, along, target)
+    return v + reaction.change, reaction
 
 
-def conditions(
+def element_guards(
     scene: Scene, elements: Elements, mode: Mode, terms: StateTerms, motion: Motion, reference, q, t
 ) -> Array:
-    """What a mode keeps positive, (n, CHANNELS): 1 where it asks for nothing."""
-    gap, condition_rows = gaps(scene, elements, q, t), []
+    """Guards (n, CHANNELS), which are positive while the mode holds: 1 where it has no condition."""
+    gap, rows = gaps(scene, elements, q, t), []
     one_ = jnp.ones((), q.dtype)
     for i, one in enumerate(elements.each):
         normal = one_
@@ -263,13 +266,13 @@ def conditions(
             normal = motion.normal[i]
         friction, pivot = one_, one_
         if one.tangent and not one.smooth:
-            hold = motion.pushed.holding[i]
+            hold = motion.reaction.holding[i]
             square = jnp.sum(hold * hold)
             size = jnp.sqrt(jnp.where(square > 0, square, one_)) * (square > 0).astype(q.dtype)
             margin = force_at(scene, one).static.astype(q.dtype) * motion.normal[i] - size
             friction = jnp.where(mode.stick[i], margin, jnp.sum(reference[i] * terms.slip[i]))
             friction = jnp.where(mode.closed[i], friction, one_)
         if one.tangent:
-            pivot = motion.pushed.pivots[i]
-        condition_rows.append(jnp.stack([normal, friction, pivot]))
-    return jnp.stack(condition_rows)
+            pivot = motion.reaction.pivots[i]
+        rows.append(jnp.stack([normal, friction, pivot]))
+    return jnp.stack(rows)

@@ -1,52 +1,49 @@
-"""What the elements with modes of a scene are, as rows of an extended scene, and what a mode is."""
+"""Contacts and frictions of a scene as rows of an extended scene, their modes, and the events between modes."""
 
 from typing import Any, NamedTuple
 
+import equinox as eqx
+import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array
+from jaxtyping import Array, Float, Int
 
+from jaxdyn.compile.known import is_concrete
 from jaxdyn.constraints.base import layout
 from jaxdyn.contact.unilateral import UnilateralContact, WithModes
 from jaxdyn.forces.piecewise import Pieces
 from jaxdyn.systems.scene import Scene
 
 KINDS = ("touch", "release", "stick", "slip", "turn")
-CHANNELS = 3  # conditions of an element: on its normal force or gap, on its friction, on the pivot of its equations
+CHANNELS = 3  # guards of an element: its normal force or gap, its friction, the pivot of its equations
 
 
 class Element(NamedTuple):
-    """Where an element's rows are among those of the extended scene.
-
-    `place`: its index among the scene's forces. `normal`: the row whose multiplier is its normal force, -1 where that is
-    given. `tangent`: the rows that slip. `opens`: whether it is unilateral, and `normal` its own. `smooth`: whether its friction
-    is a function of the state.
-    """
+    """A contact or friction, and its rows among those of the extended scene."""
 
     name: str
-    place: int
-    normal: int
-    tangent: tuple[int, ...]
-    opens: bool
-    smooth: bool
+    place: int  # among the scene's forces
+    normal: int  # row whose multiplier is the normal force, -1 if the force is given
+    tangent: tuple[int, ...]  # rows that slip
+    opens: bool  # true for a unilateral contact, which has a normal row of its own
+    smooth: bool  # true if the friction is a function of the state
 
 
 class Mode(NamedTuple):
-    """Of each element (n,): whether it is closed, whether it sticks, and whether its normal multiplier is negative. Of the forces
-    that are smooth in pieces: which of their switching functions are positive, (k,)."""
+    """Mode of a motion: flags of its elements (n,) and of its switching functions (k,)."""
 
     closed: Array
     stick: Array
-    negative: Array
-    positive: Array
+    negative: Array  # true where the normal multiplier is negative
+    positive: Array  # of the switching functions of piecewise smooth forces
 
     def signs(self, dtype) -> Array:
-        """Of the normal multipliers, (n,)."""
+        """Signs of the normal multipliers, (n,)."""
         return jnp.where(self.negative, -1.0, 1.0).astype(dtype)
 
 
 class Elements(NamedTuple):
-    """The elements of a scene, the number of rows of the scene's own constraints and of all, and its switching functions."""
+    """Elements of a scene, numbers of rows of its own constraints and of all, and its switching functions."""
 
     each: tuple[Element, ...]
     own: int
@@ -55,7 +52,7 @@ class Elements(NamedTuple):
 
     @property
     def names(self) -> tuple[str, ...]:
-        """Of the events: every element with every kind, then every switching function."""
+        """Names of the events: every element with every kind, then every switching function."""
         return (*(f"{one.name}: {kind}" for one in self.each for kind in KINDS), *self.pieces.names)
 
     @property
@@ -64,22 +61,27 @@ class Elements(NamedTuple):
         return len(self.pieces.names)
 
     def split(self, flat) -> tuple[Array, Array]:
-        """Conditions as (n, CHANNELS) of the elements and (k,) of the switching functions."""
+        """Split guards into those of the elements, (n, CHANNELS), and the switching functions, (k,)."""
         count = CHANNELS * len(self.each)
         return flat[:count].reshape(-1, CHANNELS), flat[count:]
 
     @property
-    def coupled(self) -> tuple[int, ...]:
-        """The elements whose friction is in proportion to a multiplier."""
+    def frictional(self) -> tuple[int, ...]:
+        """Indices of the elements whose friction is proportional to a multiplier."""
         return tuple(i for i, one in enumerate(self.each) if one.normal >= 0 and one.tangent)
 
     @property
     def opening(self) -> np.ndarray:
-        """Which elements are unilateral, (n,)."""
+        """Mask of the unilateral elements, (n,)."""
         return np.array([one.opens for one in self.each])
 
+    @property
+    def rough(self) -> np.ndarray:
+        """Mask of the elements that can stick, (n,)."""
+        return np.array([bool(one.tangent) and not one.smooth for one in self.each])
+
     def active(self, mode: Mode) -> Array:
-        """Which rows act, (count,)."""
+        """Mask of the rows that act in a mode, (count,)."""
         rows: list[Any] = [jnp.ones((), bool)] * self.count
         for i, one in enumerate(self.each):
             if one.opens:
@@ -90,12 +92,12 @@ class Elements(NamedTuple):
 
 
 def force_at(scene: Scene, element: Element) -> Any:
-    """The force of the scene that an element is."""
+    """Force of the scene that belongs to an element."""
     return scene.forces[element.place]
 
 
-def extended(scene: Scene) -> Scene:
-    """The scene with the rows of its elements behind its own, and without these forces."""
+def extend(scene: Scene) -> Scene:
+    """Scene with the rows of its elements behind its own, and without these forces."""
     return Scene(
         scene.system,
         (*scene.constraints, *(_constraint(force) for force in scene.forces if isinstance(force, WithModes))),
@@ -108,11 +110,11 @@ def _constraint(force: Any):
 
 
 def elements_of(scene: Scene, pieces: Pieces) -> Elements:
-    """The elements of a scene; `pieces`: its switching functions.
+    """Elements of a scene; `pieces`: its switching functions.
 
     **Raises:** ValueError for rows that do not fit, and constraints that are not there.
     """
-    places, own = layout(extended(scene)), len(scene.constraints)
+    places, own = layout(extend(scene)), len(scene.constraints)
     names = [place.name for place in places[:own]]
     elements, used = [], []
     chosen: list[Any] = [(i, force) for i, force in enumerate(scene.forces) if isinstance(force, WithModes)]
@@ -144,8 +146,46 @@ def elements_of(scene: Scene, pieces: Pieces) -> Elements:
             normal = places[at].start
             if places[at].end - normal > 1 and scene.constraints[at].wrench_components() is None:
                 raise ValueError(
-                    f"friction {name!r}: constraint {force.constraint!r} has {places[at].end - normal} rows, of which none is a "
-                    "normal force; name one with one row"
+                    f"friction {name!r}: constraint {force.constraint!r} has {places[at].end - normal} rows, and no "
+                    "normal force among them; name one with one row"
                 )
         elements.append(Element(name, i, normal, tangent, False, force.smoothing is not None))
     return Elements(tuple(elements), places[own].start, places[-1].end, pieces)
+
+
+class Events(eqx.Module):
+    """Events of a motion in their order, as arrays of a fixed length.
+
+    - `time` (ne,), s, NaN behind the last event; differentiable. `index` (ne,) among `names`, -1 behind the last event.
+    - `names`: "<element>: <kind>". The kinds of a contact are "touch" and "release"; those of friction "stick" and "slip". A
+      "turn" reverses the direction of sliding, or the sign of the normal force of a friction that holds on both sides.
+    - `count` (): number of events. Elements that change at the same time have one entry each, that of the guard which was
+      crossed first in front.
+    """
+
+    time: Float[Array, "*batch ne"]
+    index: Int[Array, "*batch ne"]
+    names: tuple[str, ...] = eqx.field(static=True)
+
+    @property
+    def count(self) -> Int[Array, "*batch"]:
+        """Number of events."""
+        return (self.index >= 0).sum(-1)
+
+    @property
+    def name(self) -> np.ndarray:
+        """Names (ne,) of the events, "" behind the last. **Raises:** ValueError inside `jax.jit`, which has no texts."""
+        if not is_concrete(self.index):
+            raise ValueError(
+                "events.name are texts, which a traced program does not have; take events.index and events.names"
+            )
+        return np.array([*self.names, ""], dtype=object)[np.asarray(jax.device_get(self.index))]
+
+    def times(self, name: str) -> np.ndarray:
+        """Times of the events of one name, of a single motion.
+
+        **Raises:** ValueError for an unknown name.
+        """
+        if name not in self.names:
+            raise ValueError(f"events: there is no {name!r}; choose from {list(self.names)}")
+        return np.asarray(self.time)[self.name == name]

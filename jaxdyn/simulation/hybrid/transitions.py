@@ -1,9 +1,9 @@
-"""What a mode becomes at an event: first velocities, by an impact, then forces.
+"""Mode transitions at an event: first the velocities, by an impact, then the forces.
 
-Both are problems of complementarity: what is closed must push, what is open must not be pressed in, what sticks must stay in its
-cone, what slides must not turn round. A contact that sticks and would pull slides first: then it may well push. They are solved
-by changing the first element that disagrees, one at a time, which ends for problems of one solution (Murty's rule); where it does
-not end, no mode was found.
+Both are problems of complementarity: a closed contact must push, an open one must not penetrate, an element that sticks must stay
+in its cone, and one that slides must not turn round. A contact that sticks and would pull slides first: then it may well push.
+They are solved by changing the first element that disagrees, one at a time, which ends for problems of one solution (Murty's
+rule); where it does not end, no mode was found.
 
 The impact is that of least change in the metric of M over the bodies that are kept apart, or rebound by Newton's
 hypothesis. An impulse that leaves the cone slides, against the direction of the impulse that would have held it: exact in a
@@ -11,6 +11,7 @@ plane, an approximation of the sliding direction in space.
 """
 
 from collections.abc import Callable
+from functools import partial
 from typing import NamedTuple
 
 import jax
@@ -23,85 +24,81 @@ from jaxdyn.compile.batch import any_sample
 from jaxdyn.simulation.hybrid.modes import Elements, Mode
 
 
-class Judged(NamedTuple):
-    """A state in a mode: `conditions` (n, CHANNELS) and their rounding `levels`; forces of each element and the cone at rest;
-    velocities and accelerations of slipping (n, 2) and of the gap (n,), with their sizes (n,) or ()."""
+class ContactState(NamedTuple):
+    """A state in a mode, as its guards and transitions see it; sizes are those of the terms that cancel."""
 
-    conditions: Array
-    levels: Array
-    normal: Array
-    holding: Array
-    cone: Array
-    slip: Array
-    slip_rate: Array
-    slip_size: Array
-    rate_size: Array
-    gap: Array
-    gap_velocity: Array
-    gap_rate: Array
-    gap_size: Array
-
-
-class Jumped(NamedTuple):
-    """Velocity (nv,) after an impact; impulses of each element; velocities of slipping (n, 2) after it, and of the gap (n,)
-    above the `rebound` (n,) that restitution asks for."""
-
-    v: Array
-    normal: Array
-    holding: Array
-    slip: Array
-    gap_velocity: Array
-    rebound: Array
-    size: Array
+    guards: Array  # (n, CHANNELS)
+    levels: Array  # their rounding (n, CHANNELS)
+    normal: Array  # normal forces (n,)
+    holding: Array  # friction of elements that stick (n, 2)
+    cone: Array  # largest friction at rest (n,)
+    slip: Array  # velocities of slipping (n, 2)
+    slip_rate: Array  # their rates (n, 2)
+    slip_size: Array  # (n,)
+    rate_size: Array  # (n,)
+    gap: Array  # (n,)
+    gap_velocity: Array  # (n,)
+    gap_rate: Array  # (n,)
+    gap_size: Array  # ()
 
 
-class Change(NamedTuple):
-    """A transition: the mode and directions (n, 2) of the impact, those that follow, and the velocity (nv,). Whether it was
-    found, and whether friction leaves no forces."""
+class Impact(NamedTuple):
+    """State after an impact."""
+
+    v: Array  # (nv,)
+    normal: Array  # impulses (n,)
+    holding: Array  # impulses (n, 2)
+    slip: Array  # velocities of slipping (n, 2)
+    gap_velocity: Array  # above the rebound (n,)
+    rebound: Array  # that restitution asks for (n,)
+    size: Array  # of the impulses, ()
+
+
+class Transition(NamedTuple):
+    """A transition: mode and directions (n, 2) of the impact, those that follow, and the velocity (nv,) after it."""
 
     impact: Mode
     impact_slip: Array
     mode: Mode
     slip: Array
     v: Array
-    settled: Array
-    paradox: Array
+    settled: Array  # true if a mode was found
+    paradox: Array  # true where friction leaves no forces
 
 
-def _loose(dtype) -> float:
-    """Below which velocities and gaps count as zero, in SI units and of what cancels in them."""
+def _tolerance(dtype) -> float:
+    """Size below which velocities and gaps count as zero, in SI units and relative to the terms that cancel in them."""
+    # 4e-10 in float64: above the rounding of a projected state, far below the changes at an event.
     return float(jnp.finfo(dtype).eps) ** 0.6
 
 
 def length(x):
-    """|x| of rows (n, 2), and unit vectors, e_x where x is zero."""
+    """Lengths |x| of rows (n, 2), and unit vectors, e_x where x is zero."""
     square = jnp.sum(x * x, 1)
     some = square > 0
     size = jnp.sqrt(jnp.where(some, square, jnp.ones_like(square)))
-    unit = jnp.where(some[:, None], x / size[:, None], _first(x))
+    unit = jnp.where(some[:, None], x / size[:, None], jnp.broadcast_to(jnp.asarray([1.0, 0.0], x.dtype), x.shape))
     return jnp.where(some, size, jnp.zeros_like(size)), unit
 
 
-def _first(x):
-    return jnp.broadcast_to(jnp.asarray([1.0, 0.0], x.dtype), x.shape)
-
-
-def aligned(slip, reference):
-    """Directions of slipping (n, 2) of what moves, on the side of the old ones; the old ones of what does not."""
+def align(slip, reference):
+    """Directions of slipping (n, 2) on the side of the old ones; the old ones where nothing slips."""
     size, unit = length(lax.stop_gradient(slip))
     is_sliding = size > 100 * float(jnp.finfo(slip.dtype).eps)
     forward = jnp.where(jnp.sum(unit * reference, 1) < 0, -1.0, 1.0).astype(slip.dtype)
     return lax.stop_gradient(jnp.where(is_sliding[:, None], forward[:, None] * unit, reference))
 
 
-def at_once(elements: Elements, mode: Mode, slip, judged: Judged, hit) -> tuple[Mode, Array, Array]:
-    """The mode and directions with what the conditions `hit` (n, CHANNELS) ask for, before velocities and forces are looked at;
-    which elements begin to slide."""
+def first_guess(elements: Elements, mode: Mode, slip, state: ContactState, hit) -> tuple[Mode, Array, Array]:
+    """Mode and directions after the guards `hit` (n, CHANNELS), before velocities and forces are checked.
+
+    The third result (n,) marks elements that begin to slide.
+    """
     opens = jnp.asarray(elements.opening)
     first, second = hit[:, 0], hit[:, 1]
     closes, releases = opens & first & ~mode.closed, opens & first & mode.closed
     begins, ends = second & mode.stick & mode.closed, second & ~mode.stick & mode.closed
-    _, against = length(-judged.holding)
+    _, against = length(-state.holding)
     slip = jnp.where(begins[:, None], against, slip)
     changed = mode._replace(
         closed=(mode.closed | closes) & ~releases,
@@ -111,112 +108,113 @@ def at_once(elements: Elements, mode: Mode, slip, judged: Judged, hit) -> tuple[
     return changed, slip, begins
 
 
-def changed_mode(elements: Elements, cones, mode: Mode, slip, begins, v, jump: Callable, judge: Callable) -> Change:
-    """The mode that follows, from a first guess at the velocity v (nv,).
+def next_mode(elements: Elements, cones, mode: Mode, slip, begins, v, impact_at: Callable, state_at: Callable):
+    """Transition from a first guess of the mode at the velocity v (nv,), a `Transition`.
 
-    `begins` (n,): which elements slide from rest, because they could not be held.
-    `jump(mode, slip)` and `judge(mode, slip, v)` give `Jumped` and `Judged`; `cones` (n,), coefficients at rest.
+    `begins` (n,) marks elements that slide from rest, because they could not be held.
+    `impact_at(mode, slip)` gives an `Impact`, `state_at(mode, slip, v)` a `ContactState`; `cones` (n,), coefficients at rest.
     """
-    n = len(elements.each)
-    most = 4 * n + 8
-    opens = jnp.asarray(elements.opening)
-    rough = jnp.asarray(np.array([bool(one.tangent) and not one.smooth for one in elements.each]))
+    opens, rough = jnp.asarray(elements.opening), jnp.asarray(elements.rough)
     mode = mode._replace(stick=mode.stick & rough)
-
-    def flip(state, wrong, stick_when_closing, against):
-        """Change the first element of those that disagree: (pulls, pressed in, leaves its cone, turns round, sign)."""
-        mode, slip = state
-        first = jnp.argmax(wrong.reshape(-1))
-        one = jnp.zeros(wrong.size, bool).at[first].set(True).reshape(wrong.shape) & wrong
-        pulls, pressed, leaves, turns, reverses = (one[:, k] for k in range(5))
-        slip = jnp.where(leaves[:, None], against, slip)
-        changed = mode._replace(
-            closed=(mode.closed | pressed) & ~pulls,
-            stick=(mode.stick | (pressed & stick_when_closing) | turns) & ~pulls & ~leaves & rough,
-            negative=mode.negative ^ reverses,
-        )
-        return changed, slip
-
-    def solve(wrong_of, mode, slip):
-        def unfinished(carry):
-            return any_sample(carry[3] & (carry[2] < most))
-
-        def body(carry):
-            mode, slip, count, busy, _ = carry
-            wrong, stick, against, values = wrong_of(mode, slip)
-            busy = busy & wrong.any() & (count < most)
-            after = flip((mode, slip), wrong, stick, against)
-            mode, slip = jax.tree.map(lambda a, b: jnp.where(busy, a, b), after, (mode, slip))
-            return mode, slip, count + busy.astype(jnp.int32), busy, values
-
-        start = jax.eval_shape(wrong_of, mode, slip)[3]
-        blank = jax.tree.map(lambda x: jnp.zeros(x.shape, x.dtype), start)
-        first = mode, slip, jnp.zeros((), jnp.int32), jnp.ones((), bool), blank
-        mode, slip, count, _, values = lax.while_loop(unfinished, body, first)
-        return mode, slip, count < most, values
-
-    def by_velocity(mode, slip):
-        after: Jumped = jump(mode, slip)
-        small = _loose(after.v.dtype)
-        hold, against = length(-after.holding)
-        cone = cones * jnp.where(opens, jnp.maximum(after.normal, 0.0), jnp.abs(after.normal))
-        tiny = small * after.size
-        touching = opens & (judged.gap <= small * judged.gap_size)
-        moving = jnp.sum(slip * after.slip, 1)
-        wrong = jnp.stack(
-            [
-                opens & mode.closed & ~mode.stick & (after.normal < -tiny),
-                touching & ~mode.closed & (after.gap_velocity < -small * judged.slip_size),
-                mode.closed & mode.stick & ((hold > cone + tiny) | (opens & (after.normal < -tiny))),
-                mode.closed & ~mode.stick & rough & (moving < -small * judged.slip_size),
-                jnp.zeros((n,), bool),
-            ],
-            1,
-        )
-        return wrong, jnp.ones((n,), bool), against, after
-
-    def by_force(mode, slip):
-        now: Judged = judge(mode, slip, v)
-        small = _loose(v.dtype)
-        scale = small * (jnp.sum(jnp.abs(now.normal)) + jnp.sum(jnp.abs(now.holding)))
-        hold, against = length(-now.holding)
-        speed, _ = length(now.slip)
-        at_rest = speed <= small * now.slip_size
-        resting = opens & (now.gap <= small * now.gap_size) & (jnp.abs(now.gap_velocity) <= small * now.slip_size)
-        wrong = jnp.stack(
-            [
-                opens & mode.closed & ~mode.stick & (now.normal < -scale),
-                resting & ~mode.closed & (now.gap_rate < -small * now.rate_size),
-                mode.closed & mode.stick & ((hold > now.cone + scale) | (opens & (now.normal < -scale))),
-                mode.closed
-                & ~mode.stick
-                & rough
-                & at_rest
-                & (jnp.sum(slip * now.slip_rate, 1) < -small * now.rate_size),
-                ~opens & (now.normal < -scale) & coupled,
-            ],
-            1,
-        )
-        return wrong, at_rest, against, now
-
-    coupled = jnp.asarray(np.array([one.normal >= 0 for one in elements.each]))
-    judged: Judged = judge(mode, slip, v)
-    impact, impact_slip, hit, after = solve(by_velocity, mode, slip)
+    before: ContactState = state_at(mode, slip, v)
+    by_velocity = partial(_disagreements_of_velocities, elements, cones, before, impact_at)
+    impact, impact_slip, hit, after = _solve(rough, by_velocity, mode, slip)
     v = after.v
     speed, unit = length(after.slip)
-    is_sliding = speed > _loose(v.dtype) * judged.slip_size
+    is_sliding = speed > _tolerance(v.dtype) * before.slip_size
     slip = impact_slip = lax.stop_gradient(jnp.where(is_sliding[:, None], unit, impact_slip))
     # Elements that rebound open; those that came to rest together stick if their cones allow it.
     closed = impact.closed & ~(opens & (after.rebound > 0))
     resting = impact._replace(closed=closed, stick=(impact.stick | (rough & ~is_sliding & ~begins)) & closed)
-    final, slip, settled, now = solve(by_force, resting, slip)
+    final, slip, settled, now = _solve(rough, partial(_disagreements_of_forces, elements, v, state_at), resting, slip)
     final = final._replace(stick=final.stick & final.closed)
     # Where sliding has no forces, no mode is found; where it has two, one is.
-    tried = judge(resting, impact_slip, v)
-    paradox = _left_alone(final, now) | (_left_alone(resting, tried) & ~settled)
-    return Change(impact, impact_slip, final, slip, v, hit & settled, paradox)
+    paradox = _has_lost_pivot(final, now) | (_has_lost_pivot(resting, state_at(resting, impact_slip, v)) & ~settled)
+    return Transition(impact, impact_slip, final, slip, v, hit & settled, paradox)
 
 
-def _left_alone(mode: Mode, judged: Judged):
-    """Whether the equations for forces of what slides have lost a positive pivot."""
-    return ((mode.closed & ~mode.stick)[:, None] & (judged.conditions[:, 2:] <= 0)).any()
+def _solve(rough, disagreements: Callable, mode: Mode, slip):
+    """Change the first element that disagrees until none does: mode, directions, whether that ended, and the values there.
+
+    `disagreements(mode, slip)`: flags (n, 5) of elements that pull, penetrate, leave their cones, turn round, or change the sign
+    of their normal force; those that stick when they close (n,); directions against what held (n, 2); and values.
+    """
+    most = 4 * rough.size + 8  # an element changes a few times at most: more changes are a cycle
+
+    # All samples of a batch iterate until the last one has ended, each masked by its own flag.
+    def is_running(carry):
+        return any_sample(carry[3] & (carry[2] < most))
+
+    def flip(mode, slip, wrong, sticks, against):
+        first = jnp.argmax(wrong.reshape(-1))
+        one = jnp.zeros(wrong.size, bool).at[first].set(True).reshape(wrong.shape) & wrong
+        pulls, penetrates, leaves, turns, reverses = (one[:, k] for k in range(5))
+        slip = jnp.where(leaves[:, None], against, slip)
+        changed = mode._replace(
+            closed=(mode.closed | penetrates) & ~pulls,
+            stick=(mode.stick | (penetrates & sticks) | turns) & ~pulls & ~leaves & rough,
+            negative=mode.negative ^ reverses,
+        )
+        return changed, slip
+
+    def body(carry):
+        mode, slip, count, busy, _ = carry
+        wrong, sticks, against, values = disagreements(mode, slip)
+        busy = busy & wrong.any() & (count < most)
+        after = flip(mode, slip, wrong, sticks, against)
+        mode, slip = jax.tree.map(lambda a, b: jnp.where(busy, a, b), after, (mode, slip))
+        return mode, slip, count + busy.astype(jnp.int32), busy, values
+
+    # Values of the last iteration are needed: the carry begins with zeros of their shapes.
+    start = jax.eval_shape(disagreements, mode, slip)[3]
+    blank = jax.tree.map(lambda x: jnp.zeros(x.shape, x.dtype), start)
+    first = mode, slip, jnp.zeros((), jnp.int32), jnp.ones((), bool), blank
+    mode, slip, count, _, values = lax.while_loop(is_running, body, first)
+    return mode, slip, count < most, values
+
+
+def _disagreements_of_velocities(
+    elements: Elements, cones, before: ContactState, impact_at: Callable, mode: Mode, slip
+):
+    opens, rough = jnp.asarray(elements.opening), jnp.asarray(elements.rough)
+    after: Impact = impact_at(mode, slip)
+    small = _tolerance(after.v.dtype)
+    hold, against = length(-after.holding)
+    cone = cones * jnp.where(opens, jnp.maximum(after.normal, 0.0), jnp.abs(after.normal))
+    tiny = small * after.size
+    touching = opens & (before.gap <= small * before.gap_size)
+    forward = jnp.sum(slip * after.slip, 1)
+    wrong = [
+        opens & mode.closed & ~mode.stick & (after.normal < -tiny),
+        touching & ~mode.closed & (after.gap_velocity < -small * before.slip_size),
+        mode.closed & mode.stick & ((hold > cone + tiny) | (opens & (after.normal < -tiny))),
+        mode.closed & ~mode.stick & rough & (forward < -small * before.slip_size),
+        jnp.zeros(opens.shape, bool),
+    ]
+    return jnp.stack(wrong, 1), jnp.ones(opens.shape, bool), against, after
+
+
+def _disagreements_of_forces(elements: Elements, v, state_at: Callable, mode: Mode, slip):
+    opens, rough = jnp.asarray(elements.opening), jnp.asarray(elements.rough)
+    has_multiplier = jnp.asarray(np.array([one.normal >= 0 for one in elements.each]))
+    now: ContactState = state_at(mode, slip, v)
+    small = _tolerance(v.dtype)
+    scale = small * (jnp.sum(jnp.abs(now.normal)) + jnp.sum(jnp.abs(now.holding)))
+    hold, against = length(-now.holding)
+    speed, _ = length(now.slip)
+    at_rest = speed <= small * now.slip_size
+    resting = opens & (now.gap <= small * now.gap_size) & (jnp.abs(now.gap_velocity) <= small * now.slip_size)
+    turns = jnp.sum(slip * now.slip_rate, 1) < -small * now.rate_size
+    wrong = [
+        opens & mode.closed & ~mode.stick & (now.normal < -scale),
+        resting & ~mode.closed & (now.gap_rate < -small * now.rate_size),
+        mode.closed & mode.stick & ((hold > now.cone + scale) | (opens & (now.normal < -scale))),
+        mode.closed & ~mode.stick & rough & at_rest & turns,
+        ~opens & (now.normal < -scale) & has_multiplier,
+    ]
+    return jnp.stack(wrong, 1), at_rest, against, now
+
+
+def _has_lost_pivot(mode: Mode, state: ContactState):
+    """True if the equations for the forces of elements that slide have lost a positive pivot."""
+    return ((mode.closed & ~mode.stick)[:, None] & (state.guards[:, 2:] <= 0)).any()

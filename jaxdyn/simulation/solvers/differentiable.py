@@ -1,9 +1,9 @@
-"""Reverse mode through adaptive steps: the forward run writes down when its steps end, and backwards the same ones are taken.
+"""Runs in diffrax's loop, whose reverse mode takes the steps of the forward run.
 
-diffrax takes steps anew from checkpoints. Their lengths follow from error estimates, of which the last digits depend on the
-program, and the program is another one there: a step that is refused in one and kept in the other, and the pieces that
-are put together are those of two different runs. With the ends written down nothing is left to decide. Backwards there are no
-error estimates and no refused steps either.
+diffrax recomputes steps from checkpoints. Their lengths follow from error estimates, whose last digits depend on the program,
+and the program is another one there: one may refuse a step that the other keeps, and the parts that are put together belong to
+two different runs. Here the forward run records the ends of its steps, so that nothing is left to decide on the way back, which
+has no error estimates and no refused steps either.
 """
 
 from typing import Any
@@ -14,25 +14,25 @@ import jax
 import jax.numpy as jnp
 
 COUNTS = ("num_steps", "num_accepted_steps", "num_rejected_steps")
-ROOM = 4096  # steps that are written down where the user gives no limit: 32 kB a trajectory
+ROOM = 4096  # steps that are recorded where the user gives no limit: 32 kB a trajectory
 
 
-def run(moving, *, term, solver, controller, event, adjoint, max_steps, progress, dt0=None, record=False):
+def run(inputs, *, term, solver, controller, event, adjoint, max_steps, progress, dt0=None, record=False):
     """diffrax's solution from one end of the save points to the other.
 
-    **Arguments:** `moving`, what may be differentiated: the initial state, `args`, and the save points (nt,), of which the first
-    is the start; the rest as diffrax's.
+    **Arguments:** `inputs`, what may be differentiated: the initial state, `args`, and the save points (nt,) with the start in
+    front; `record`: True to save the times at which steps ended too; the rest as in diffrax.
 
-    **Returns:** rows of the state at ts[1:]; the result, the counts, the time reached and, if the time of an event is looked
-    for, the state there; all that diffrax returned, where `record` the times at which steps ended among it.
+    **Returns:** rows of the state at ts[1:]; the result, the counts, the time reached and, if the time of an event is located,
+    the state there; all that diffrax returned.
     """
-    y0, args, ts = moving
+    y0, args, ts = inputs
     located = event is not None and event.root_finder is not None
     saves = diffrax.SubSaveAt(ts=ts[1:])
     last = diffrax.SubSaveAt(t1=True, fn=_state if located else _nothing)
     ends = (diffrax.SubSaveAt(steps=True, fn=_nothing),) if record else ()
     saveat = diffrax.SaveAt(subs=(saves, last, *ends), controller_state=True)
-    continuous = isinstance(adjoint, diffrax.BacksolveAdjoint)  # which takes save points and nothing else
+    continuous = isinstance(adjoint, diffrax.BacksolveAdjoint)  # supports save points and nothing else
     solved: Any = diffrax.diffeqsolve(
         term,
         solver,
@@ -57,69 +57,64 @@ def run(moving, *, term, solver, controller, event, adjoint, max_steps, progress
     return solved.ys[0], (solved.result, counts, solved.ts[1][0], *end), solved
 
 
-def run_adaptively(moving, options, limit_is_given: bool):
-    """`run` with adaptive steps whose ends are constants to reverse mode; without the last of what it returns."""
+def run_adaptively(inputs, options, limit_is_given: bool):
+    """Rows and facts of `run` with adaptive steps whose ends are constants to reverse mode."""
     if not isinstance(options["controller"], diffrax.AbstractAdaptiveStepSizeController):
-        return run(moving, **options)[:2]  # whose steps are given, as those of `diffrax.StepTo`
+        return run(inputs, **options)[:2]  # with steps that are given, as those of `diffrax.StepTo`
     numbers, rest = eqx.partition(options, eqx.is_array)
     options = eqx.combine(jax.lax.stop_gradient(numbers), rest)
     room = options["max_steps"] if limit_is_given else min(options["max_steps"], ROOM)
     if isinstance(options["adjoint"], diffrax.RecursiveCheckpointAdjoint):
-        return _run(moving, options, room)
+        return _run(inputs, options, room)
     if isinstance(options["adjoint"], diffrax.DirectAdjoint):
-        numbers, rest = eqx.partition(moving, eqx.is_array)
-        facts, taken = _recorded(eqx.combine(jax.lax.stop_gradient(numbers), rest), options, options["max_steps"])[1:]
-        return run(moving, **_again(options, taken))[0], facts
-    return run(moving, **options)[:2]
+        numbers, rest = eqx.partition(inputs, eqx.is_array)
+        facts, steps = _record(eqx.combine(jax.lax.stop_gradient(numbers), rest), options, options["max_steps"])[1:]
+        return run(inputs, **_repeat(options, steps))[0], facts
+    return run(inputs, **options)[:2]
 
 
 @eqx.filter_custom_vjp
-def _run(moving, options, room):
-    return run(moving, **options)[:2]
+def _run(inputs, options, room):
+    return run(inputs, **options)[:2]
 
 
 @_run.def_fwd
-def _(perturbed, moving, options, room):
-    rows, facts, taken = _recorded(moving, options, room)
-    return (rows, facts), taken
+def _(perturbed, inputs, options, room):
+    rows, facts, steps = _record(inputs, options, room)
+    return (rows, facts), steps
 
 
 @_run.def_bwd
-def _(taken, gradients, perturbed, moving, options, room):
-    return _pulled(perturbed, moving, _again(options, taken), gradients[0])
-
-
-def _pulled(perturbed, moving, options, gradients):
-    """Cotangents of what moves, by diffrax's adjoint."""
-    free, fixed = eqx.partition(moving, perturbed)
+def _(steps, gradients, perturbed, inputs, options, room):
+    free, fixed = eqx.partition(inputs, perturbed)
+    options = _repeat(options, steps)
     rows, pull = eqx.filter_vjp(lambda free: run(eqx.combine(free, fixed), **options)[0], free)
-    weights = jax.tree.map(lambda y, g: jnp.zeros_like(y) if g is None else g, rows, gradients)
-    return pull(weights)[0]
+    return pull(jax.tree.map(lambda y, g: jnp.zeros_like(y) if g is None else g, rows, gradients[0]))[0]
 
 
-def _recorded(moving, options, room):
-    """As `run`, with the controller that repeats the steps in place of diffrax's solution."""
-    changed = {"adjoint": diffrax.ForwardMode(), "max_steps": room, "record": True}
-    rows, facts, solved = run(moving, **options | changed)
-    starts, jumps = solved.ts[2], _jumps(options["controller"])
+def _record(inputs, options, room):
+    """Rows and facts of `run`, and the controller that repeats its steps."""
+    changes = {"adjoint": diffrax.ForwardMode(), "max_steps": room, "record": True}
+    rows, facts, solution = run(inputs, **options | changes)
+    starts, jumps = solution.ts[2], _jumps(options["controller"])
     ends = starts
     if jumps is not None:
         # A step ends at the number before a jump, and the next one starts at the second one after it.
         before, after = _beside(jumps, -1), _beside(_beside(jumps, 1), 1)
-        passed = (starts[:, None] > before[None]) & (starts[:, None] <= after[None])
-        ends = jnp.where(passed.any(1), before[passed.argmax(1)], starts)
-    controller = _Repeating(ends, None if jumps is None else starts, solved.stats["num_accepted_steps"])
+        is_jump = (starts[:, None] > before[None]) & (starts[:, None] <= after[None])
+        ends = jnp.where(is_jump.any(1), before[is_jump.argmax(1)], starts)
+    controller = _GivenSteps(ends, None if jumps is None else starts, solution.stats["num_accepted_steps"])
     return rows, facts, jax.lax.stop_gradient(controller)
 
 
-def _again(options, controller):
-    """What repeats these steps."""
-    changed = {"controller": controller, "max_steps": controller.ends.shape[0], "progress": diffrax.NoProgressMeter()}
-    return options | changed | {"event": None}
+def _repeat(options, controller):
+    """Options of a run that repeats steps."""
+    changes = {"controller": controller, "max_steps": controller.ends.shape[0], "progress": diffrax.NoProgressMeter()}
+    return options | changes | {"event": None}
 
 
-class _Repeating(diffrax.AbstractStepSizeController):
-    """The steps that were written down, and no other ones."""
+class _GivenSteps(diffrax.AbstractStepSizeController):
+    """Step-size control by steps that were recorded."""
 
     ends: jax.Array
     starts: jax.Array | None
@@ -139,25 +134,25 @@ class _Repeating(diffrax.AbstractStepSizeController):
         end = jnp.where(over, t1, _along(self.ends[row], t1))
         codes: Any = diffrax.RESULTS
         result = codes.where(over, codes.max_steps_reached, codes.successful)
-        # After a jump nothing of the step before serves.
+        # With jumps the state of the previous step is not valid any more.
         return True, start, end, self.starts is not None, controller_state + 1, result
 
 
 def _jumps(controller):
-    """Times before and after which a step-size control ends and begins a step, if any."""
+    """Times of jumps at which a step-size control ends and begins a step, if any."""
     if isinstance(controller, diffrax.ClipStepSizeController):
         return _jumps(controller.controller) if controller.jump_ts is None else controller.jump_ts
     return None
 
 
 def _beside(t, side: int):
-    """The next number on a side, as diffrax has it: none is denormal."""
+    """Next floating-point number on a side, as diffrax computes it: none is denormal."""
     tiny = jnp.full_like(t, side * jnp.finfo(t.dtype).tiny)
     return jnp.where(t == 0, tiny, jnp.nextafter(t, jnp.full_like(t, side * jnp.inf)))
 
 
 def _along(t, base):
-    """The time `t`, which moves with `base` where that is differentiated."""
+    """Time `t`, with the derivatives of `base`."""
     return t + (base - jax.lax.stop_gradient(base))
 
 

@@ -1,77 +1,121 @@
-"""Steps of fixed length that say when they are too long, or too many, to be believed."""
+"""Methods for fixed steps: the classical Runge-Kutta method, and maps from one state to the next."""
 
-from typing import Any
+from collections.abc import Callable
+from typing import Any, ClassVar
 
 import diffrax
-import equinox as eqx
 import jax
 import jax.numpy as jnp
+import numpy as np
+from jaxtyping import PyTree
 
-ALLOWED = 0.1  # of how far positions, or velocities, come from where they started
-_PASSED_OVER = ("frame", "held", "work")  # constants of a step, and what nothing depends on
+from jaxdyn.model.arguments import Number
+from jaxdyn.simulation.solvers.base import DenseOutput, Flag, StageInterpolation, StepOutput
+
+_B = np.array([1 / 6, 1 / 3, 1 / 3, 1 / 6])
 
 
-class ErrorMonitoredSteps(diffrax.ConstantStepSize):
-    """diffrax's fixed steps, with the sum of their error estimates. A method without an error estimate leaves the sum at zero.
+class _Interpolation(StageInterpolation):
+    """Third-order continuous extension from the four stages, without a further evaluation."""
 
-    A method of order p estimates its error in a step by some e of h^k. The estimates of embedded methods, k = p, overrate it and
-    are taken as they are. That of `RK4`, k = 3, overrates it too much; but if all moves at one rate and the step is d,
-    of h, e^2/d goes with h^5 as the error does: for y' = i y it is 3.3 times that. The rounding of a step adds eps times the
-    greatest distance of the state from its start.
+    def at(self, t):
+        x = self.fraction(t)
+        middle = x * x * (1 - 2 * x / 3)
+        weights = jnp.stack([x * (1 - x * (1.5 - 2 * x / 3)), middle, middle, x * x * (2 * x / 3 - 0.5)])
+        return jax.tree.map(lambda y, k: y + jnp.tensordot(weights.astype(y.dtype), k, 1), self.y0, self.k)
 
-    **Arguments:** `order`, p.
+
+class RK4(diffrax.AbstractERK):
+    """Classical Runge-Kutta method: order 4, four evaluations a step, for fixed steps.
+
+    Dense output is of order 3 (local error h^4) and keeps the global order 4. The error estimate is the difference from the
+    midpoint rule, of order h^3. It detects steps that are too long (`ErrorMonitoredSteps`) and is too coarse to control them.
+
+    Source: Hairer, Norsett & Wanner 1993, tables II.1.2 and section II.6.
     """
 
-    order: int | None = eqx.field(static=True)
+    tableau: ClassVar[diffrax.ButcherTableau] = diffrax.ButcherTableau(
+        a_lower=(np.array([0.5]), np.array([0.0, 0.5]), np.array([0.0, 0.0, 1.0])),
+        b_sol=_B,
+        b_error=_B - np.array([0.0, 1.0, 0.0, 0.0]),
+        c=np.array([0.5, 0.5, 1.0]),
+    )
+    interpolation_cls: ClassVar[Callable[..., _Interpolation]] = _Interpolation
 
-    def init(self, terms, t0, t1, y0: Any, dt0, args, func, error_order):
-        """End of the first step; besides diffrax's state the start, sums of errors, and how far the motion came."""
-        end, inner = super().init(terms, t0, t1, y0, dt0, args, func, error_order)
-        start = jax.lax.stop_gradient(y0)
-        return end, (inner, start, *no_sums(y0))
+    def order(self, terms: PyTree) -> int:
+        """Order of convergence."""
+        return 4
 
-    def adapt_step_size(self, t0, t1, y0, y1_candidate, args, y_error, error_order: Any, controller_state: Any):
-        """The next step, and its error added to the sum."""
-        inner, start, errors, distances = controller_state
-        *step, inner, result = super().adapt_step_size(t0, t1, y0, y1_candidate, args, y_error, error_order, inner)
-        if y_error is not None:
-            order: Any = self.order
-            errors, distances = accumulated(order, error_order, start, y0, y1_candidate, y_error, errors, distances)
-        return *step, (inner, start, errors, distances), result
-
-
-def no_sums(y):
-    """The error sum and the distance of `accumulated` before the first step."""
-    rows = _rows(y)
-    none = jnp.zeros(rows.shape[0], rows.dtype)
-    return none, none
+    def error_order(self, terms: PyTree) -> int:
+        """Power of the step length in the error estimate."""
+        return 3
 
 
-def accumulated(order, error_order, start, y0, y1, error, errors, distances):
-    """The sum of error estimates and the largest distance from the start after one more step (see `ErrorMonitoredSteps`)."""
-    start, before, after, error = (jax.lax.stop_gradient(_rows(y)) for y in (start, y0, y1, error))
-    # One reduction: for a pendulum it is as dear as its dynamics.
-    sizes = jnp.max(jnp.abs(jnp.stack([error, after - before, after - start])), -1)
-    error, moved, distance = sizes[0], sizes[1], sizes[2]
-    if error_order < order:
-        share = jnp.minimum(error / jnp.maximum(moved, jnp.finfo(moved.dtype).tiny), 1.0)
-        power = (order + 1 - error_order) / (error_order - 1)
-        error = error * (share if power == 1 else share**power)
-    distances = jnp.maximum(distances, distance)
-    return errors + error + jnp.where(
-        moved > 0, jnp.finfo(distance.dtype).eps * distances, jnp.zeros_like(distances)
-    ), distances
+class _MeanVelocityInterpolation(DenseOutput):
+    """Dense output from a step's ends: v is the parabola through v0 and v1 with the mean velocity over the step.
+
+    q is displaced by its integral, on the manifold. Other entries of the state change at a constant rate. Local errors of q
+    and v are h^4 and h^3, those of cubic Hermite interpolation, plus the error of the step.
+    """
+
+    y0: dict
+    y1: dict
+    mean: jax.Array
+    displace: Callable
+
+    def at(self, t):
+        s, h = (x.astype(self.mean.dtype) for x in (self.fraction(t), self.t1 - self.t0))
+        first, last = self.y0["v"], self.y1["v"]
+        y = jax.tree.map(lambda a, b: a + s * (b - a), self.y0, self.y1)
+        # Integral of the parabola, as a fraction of the step; its derivative is v.
+        path = s * (1 - s) ** 2 * first + s * s * (s - 1) * last + s * s * (3 - 2 * s) * self.mean
+        v = (1 - s) * (1 - 3 * s) * first + s * (3 * s - 2) * last + 6 * s * (1 - s) * self.mean
+        return y | {"q": self.displace(self.y0["q"], h * path), "v": v}
 
 
-def too_coarse(sums):
-    """Whether a motion by `ErrorMonitoredSteps` steps may be wrong by more than a tenth, (); `sums` as of `accumulated`."""
-    errors, distances = sums
-    # Below the root of eps, of what rests, all is rounding.
-    return (errors > ALLOWED * jnp.maximum(distances, jnp.sqrt(jnp.finfo(distances.dtype).eps))).any()
+class Stepper(diffrax.AbstractSolver):
+    """A one-step map of order 2 that does not call the vector field, for fixed steps.
 
+    **Arguments:**
 
-def _rows(y):
-    """Entries of a state, a row for each name, filled up with zeros."""
-    rows = [value.reshape(-1) for name, value in y.items() if name not in _PASSED_OVER]
-    longest = max(row.size for row in rows)
-    return jnp.stack([jnp.pad(row, (0, longest - row.size)) if row.size < longest else row for row in rows])
+    - `begin(t0, y0, args)` -> what the first step needs in addition to y.
+    - `advance(t0, t1, y, args, carried)` -> y1, the mean velocity of the step, what is carried on, and whether it succeeded.
+      y is a dictionary with "q" and "v". What these two depend on comes through `args`, so that gradients reach it.
+    - `displace(q, step)` -> configuration.
+    """
+
+    begin: Callable | None = None
+    advance: Callable | None = None
+    displace: Callable | None = None
+    term_structure: ClassVar = diffrax.AbstractTerm
+
+    @property
+    def interpolation_cls(self) -> Callable[..., diffrax.AbstractLocalInterpolation]:  # pyright: ignore[reportIncompatibleVariableOverride]
+        """Dense output from the ends of a step and its mean velocity."""
+
+        def interpolation(**given):
+            return _MeanVelocityInterpolation(displace=self.displace, **given)  # pyright: ignore[reportArgumentType]
+
+        return interpolation
+
+    def order(self, terms: PyTree) -> int:
+        """Order of convergence."""
+        return 2
+
+    def init(self, terms: PyTree, t0: Number, t1: Number, y0: PyTree, args: PyTree) -> PyTree:
+        """Data that the first step needs."""
+        return self.begin(t0, y0, args)  # pyright: ignore[reportOptionalCall]
+
+    def func(self, terms: PyTree, t0: Number, y0: PyTree, args: PyTree) -> PyTree:
+        """Vector field at one point."""
+        return terms.vf(t0, y0, args)
+
+    def step(
+        self, terms: PyTree, t0: Number, t1: Number, y0: PyTree, args: PyTree, solver_state: PyTree, made_jump: Flag
+    ) -> StepOutput:
+        """Make one step from t0 to t1; NaN where it failed."""
+        y1, mean, carried, solved = self.advance(t0, t1, y0, args, solver_state)  # pyright: ignore[reportOptionalCall]
+        y1 = jax.tree.map(lambda y: jnp.where(solved, y, jnp.full_like(y, jnp.nan)), y1)
+        codes: Any = diffrax.RESULTS
+        result = codes.where(solved, codes.successful, codes.nonlinear_divergence)
+        return y1, None, {"y0": y0, "y1": y1, "mean": mean}, carried, result

@@ -8,24 +8,24 @@ import diffrax
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Bool, PyTree
+from jaxtyping import PyTree
 
 from jaxdyn.lie import se2, se3, so3
 from jaxdyn.lie.so3 import matmul
 from jaxdyn.model.arguments import Number, SystemLike
 from jaxdyn.model.joints import SCREW_KINDS, joint_integrate, joint_rate
 from jaxdyn.model.tree import Model, Topology, _per_joint
-from jaxdyn.simulation.solvers.wrapped import Wrapped
+from jaxdyn.simulation.solvers.base import DenseOutput, Flag, StepOutput, Wrapped
 from jaxdyn.systems.system import has_dependent_coordinates
 
 
 class LieGroup(Wrapped):
     """A method that steps in local coordinates: q = q_k exp(e), with q_k the start of the step.
 
-    The wrapped method integrates e, one number for every velocity, from e = 0 by de/dt = J_r(e)^-1 v, J_r the right
-    Jacobian of each joint's group. So q stays on its manifold without projection, errors are those of rotations, and
-    implicit methods solve for 2 nv unknowns instead of nq + nv. The order is that of the wrapped method. For systems without
-    quaternions or planar joints the wrapped method is used as it is. A step may turn a body by less than a full turn.
+    The wrapped method integrates e (nv,) from e = 0 by de/dt = J_r(e)^-1 v, J_r the right Jacobian of each joint's group. So
+    q stays on its manifold without projection, errors are those of rotations, and implicit methods solve for 2 nv unknowns
+    instead of nq + nv. The order is that of the wrapped method, which is used directly for systems without quaternions or
+    planar joints. A step may turn a body by less than a full turn.
 
     **Arguments:** `solver`, any diffrax method that `simulate` takes. The rest is filled in by `simulate`.
 
@@ -38,7 +38,7 @@ class LieGroup(Wrapped):
 
     topology: Topology | None = eqx.field(static=True, default=None)
 
-    def fitted(self, system: SystemLike) -> diffrax.AbstractSolver:
+    def for_system(self, system: SystemLike) -> diffrax.AbstractSolver:
         """The method for a system. **Raises:** ValueError for one whose q holds more than the coordinates of joints."""
         if has_dependent_coordinates(system):
             raise ValueError(
@@ -55,28 +55,21 @@ class LieGroup(Wrapped):
         return functools.partial(_Interpolation, self.solver.interpolation_cls, self.topology)
 
     def init(self, terms: PyTree, t0: Number, t1: Number, y0: PyTree, args: PyTree) -> PyTree:
-        """State of the wrapped method."""
+        """State of the wrapped method before the first step."""
         terms, z0 = self._local(terms, y0)
         return self.solver.init(terms, t0, t1, z0, args)
 
     def step(
-        self,
-        terms: PyTree,
-        t0: Number,
-        t1: Number,
-        y0: PyTree,
-        args: PyTree,
-        solver_state: PyTree,
-        made_jump: bool | Bool[Array, ""],
-    ) -> tuple[PyTree, PyTree, dict[str, PyTree], PyTree, diffrax.RESULTS]:
-        """One step of the wrapped method in the coordinates about its start."""
+        self, terms: PyTree, t0: Number, t1: Number, y0: PyTree, args: PyTree, solver_state: PyTree, made_jump: Flag
+    ) -> StepOutput:
+        """Make one step of the wrapped method in the coordinates about its start."""
         topology: Any = self.topology
         local, z0 = self._local(terms, y0)
         # A first-same-as-last method carries the vector field in the coordinates of the step before. It is evaluated anew.
         z1, error, dense_info, solver_state, result = self.solver.step(
             local, t0, t1, z0, args, solver_state, made_jump=True
         )
-        y1 = _placed(topology, y0["q"], z1)
+        y1 = _to_manifold(topology, y0["q"], z1)
         if error is not None:
             error = error | {"q": _per_joint(topology, joint_rate, y1["q"], (error["q"], False))}
         return y1, error, {"dense_info": dense_info, "q0": y0["q"]}, solver_state, result
@@ -101,9 +94,9 @@ class _LocalTerm(diffrax.AbstractTerm):
     topology: Any = eqx.field(static=True)
 
     def vf(self, t, y, args):
-        placed = _placed(self.topology, self.q0, y)
-        rates = self.term.vf(t, placed, args)
-        return rates | {"q": _per_joint(self.topology, _local_rate, placed["q"], (rates["q"], True), (y["q"], False))}
+        state = _to_manifold(self.topology, self.q0, y)
+        rates = self.term.vf(t, state, args)
+        return rates | {"q": _per_joint(self.topology, _local_rate, state["q"], (rates["q"], True), (y["q"], False))}
 
     def contr(self, t0, t1, **kwargs):
         return self.term.contr(t0, t1, **kwargs)
@@ -112,41 +105,38 @@ class _LocalTerm(diffrax.AbstractTerm):
         return jax.tree.map(lambda x: control * x, vf)
 
 
-class _Interpolation(diffrax.AbstractLocalInterpolation):
-    """Dense output of the wrapped method, put on the manifold."""
+class _Interpolation(DenseOutput):
+    """Dense output of the wrapped method, mapped onto the manifold."""
 
-    t0: jax.Array
-    t1: jax.Array
     topology: Any = eqx.field(static=True)
     inner: Any
     q0: jax.Array
 
     def __init__(self, interpolation, topology, *, t0, t1, dense_info, q0):
-        self.t0 = t0
-        self.t1 = t1
+        self.t0, self.t1 = t0, t1
         self.topology = topology
         self.inner = interpolation(t0=t0, t1=t1, **dense_info)
         self.q0 = q0
 
-    def evaluate(self, t0, t1=None, left=True):
-        if t1 is not None:
-            return jax.tree.map(lambda a, b: a - b, self.evaluate(t1), self.evaluate(t0))
-        return _placed(self.topology, self.q0, self.inner.evaluate(t0))
+    def at(self, t):
+        return _to_manifold(self.topology, self.q0, self.inner.evaluate(t))
 
 
-def _placed(topology, q0, z):
-    """The state with q = q0 exp(e)."""
+def _to_manifold(topology, q0, z):
+    """State with q = q0 exp(e) in place of e."""
     return z | {"q": _per_joint(topology, joint_integrate, q0, (z["q"], False))}
 
 
 def _local_rate(kind: str, q, rate, e):
-    """de/dt of one joint's coordinates for dq/dt = rate at q = q0 exp(e)."""
+    """Rate de/dt of one joint's coordinates for dq/dt = rate at q = q0 exp(e)."""
     if kind in SCREW_KINDS:
         return rate
+    # v is the velocity in the moving frame, and de/dt = J_r(e)^-1 v.
     if kind == "planar":
         c, s = jnp.cos(q[2]), jnp.sin(q[2])
         v = jnp.stack([c * rate[0] + s * rate[1], c * rate[1] - s * rate[0], rate[2]])
         return matmul(se2.left_jacobian_inverse(-e), v)
+    # dq/dt = q (0, omega)/2, so that omega is the vector part of 2 q^-1 dq/dt. J_r(e) = J_l(-e).
     omega = 2 * so3.quat_multiply(so3.quat_conjugate(q[-4:]), rate[-4:])[1:]
     if kind == "spherical":
         return matmul(so3.left_jacobian_inverse(-e), omega)

@@ -1,11 +1,14 @@
-"""Reverse mode through the steps of `driver`: the forward run keeps states, and one kernel a step takes cotangents back.
+"""Reverse mode through the steps of `driver`: the forward run keeps states, and one kernel a step propagates the cotangents.
 
-The derivatives are those of the steps that were taken: when steps end is a constant but for the ends of the run, and a rate
-that a step takes over from the one before is that of the field where it begins, as it is but for the digits to which the
-coefficients of the method are known (Dopri8: 1e-10 of a derivative). Of long
-runs every second state is kept, or every third and so on, and those between are computed again, so that memory is bounded.
+The derivatives are those of the steps that were taken: the ends of steps are constants, except that they follow the ends of the
+run. The rate that a step reuses from the one before is taken for the vector field where it begins; the two differ by the digits
+to which the coefficients of the method are published (Dopri8: 1e-10 of a derivative). Of long runs every second state is kept,
+or every third and so on, and those between are computed again, so that memory is bounded.
+
+`replay_rows` takes the same steps as operations of JAX, which have derivatives of any order in both modes.
 """
 
+from collections.abc import Callable
 from functools import partial
 from typing import Any, NamedTuple
 
@@ -13,37 +16,39 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 from jax import lax
+from jax.flatten_util import ravel_pytree
 from jaxtyping import Array
 
 from jaxdyn.compile import kernel
-from jaxdyn.compile.batch import any_sample
+from jaxdyn.compile.batch import any_sample, cond
 from jaxdyn.compile.loops import Carry, Given, Iteration, Task, run_loop
-from jaxdyn.simulation.solvers.explicit import Plan, projected_output, step_in_turn, whole_step
+from jaxdyn.simulation.solvers.explicit import ExplicitSteps, Plan, by_scan, dense_output, take_step
 
-KEPT = 512  # states that are kept of a run
+# States that are kept of a run: 4 kB a number of the state in float64, which a cache holds for small mechanisms.
+KEPT = 512
 
 
 class History(NamedTuple):
-    """What a run writes down: a row for each step that was tried, and the states from which every so many of them began."""
+    """Record of a run: a row for each step that was tried, and the state at the start of each or of every so many of them."""
 
     states: Array  # (rows, n)
     times: Array  # (room, 2), from where to where
-    kept: Array  # (room,), whether the step was kept
+    kept: Array  # (room,), true for steps that were kept
     count: Array  # (), steps tried
 
     @property
     def stride(self) -> int:
-        """Steps from a state that is kept to the next one."""
+        """Number of steps from a state that is kept to the next one."""
         return _stride(self.kept.shape[0])
 
     @property
     def rows(self) -> tuple:
-        """What steps are written down in."""
+        """Arrays to which steps are written."""
         return self.states, self.times, self.kept
 
     @property
     def strides(self) -> tuple[int, ...]:
-        """For each of these, of how many steps one is written down."""
+        """Number of steps from one row to the next, for each of these."""
         return self.stride, 1, 1
 
 
@@ -52,7 +57,7 @@ def _stride(room: int) -> int:
 
 
 def blank(y0, t, room: int) -> History:
-    """Of a run of at most `room` steps before it begins."""
+    """History of a run of at most `room` steps before it begins."""
     stride = _stride(room)
     rows = -(-room // stride)
     times, kept = jnp.zeros((room, 2), t.dtype), jnp.zeros(room, bool)
@@ -60,22 +65,37 @@ def blank(y0, t, room: int) -> History:
 
 
 def row(y, t0, t1, kept) -> tuple:
-    """What is written of a step."""
+    """Row of a step."""
     return y, jnp.stack([t0, t1]), kept
 
 
-def written(rows: tuple, strides: tuple[int, ...], new: tuple, index, active) -> tuple:
-    """The rows of a history with those of the step of a number, if it was taken."""
+def write(rows: tuple, strides: tuple[int, ...], new: tuple, index, active) -> tuple:
+    """Write the row of step `index` to a history, if the step was taken."""
 
     def one(array, value, stride):
+        # Rows that are not asked for are written beyond the end of the array, where XLA drops them.
         asked = active if stride == 1 else active & (index % stride == 0)
         return array.at[jnp.where(asked, index // stride, array.shape[0])].set(value, mode="drop")
 
     return tuple(map(one, rows, new, strides))
 
 
+def run_to_end(run: Callable, otherwise: Callable, by_fallback: Callable, is_running: Callable, carry: Carry) -> Carry:
+    """Iterate by a native loop to the end.
+
+    **Arguments:** `run(carry)`, see `run_loop`; `otherwise(carry)`, an iteration where there is no native loop; `by_fallback`,
+    one that the native loop has refused, after which it continues; `is_running(carry)`.
+    """
+    after = run(carry)
+    if after is None:
+        return lax.while_loop(is_running, otherwise, carry)
+    carry, always_ends = after
+    # A loop whose iterations are all valid has ended: no code for the fallback is compiled.
+    return carry if always_ends else lax.while_loop(is_running, lambda carry: run(by_fallback(carry))[0], carry)
+
+
 class _Ends(NamedTuple):
-    """What does not change on the way back: the first step, the ends of the run, and the number of fixed steps or None."""
+    """Constants of the way back: the first step, the ends of the run, and the number of fixed steps or None."""
 
     first: Array
     start: Array
@@ -84,34 +104,30 @@ class _Ends(NamedTuple):
 
 
 class _Cotangents(NamedTuple):
-    """Cotangents on the way back.
+    """Cotangents on the way back."""
 
-    Of the state after a step, and what rows within the step gave to that of the state before it; sums of those of what does not
-    change on the way; and of the save points.
-    """
-
-    after: Array
-    before: Array
-    args: list
+    after: Array  # of the state after a step
+    before: Array  # of the state before it, the share of the rows within the step so far
+    args: list  # sums of the arguments', of the start's and of the end's
     start: Array
     end: Array
-    ts: Array
-    saved: Array  # rows of the solution whose cotangents have not been taken yet
-    places: Array  # (6,) of what is read next: state, times, flag, row, time of that row and of the one before it
+    ts: Array  # of the save points
+    saved: Array  # number of rows of the solution whose cotangents have not been added yet
+    places: Array  # (6,), where to read next: state, times, flag, row, time of that row and of the one before it
 
 
 class _Replay(NamedTuple):
-    """The way from a state that was kept, by steps that are taken again."""
+    """State of a replay from a state that was kept."""
 
     y: Array
-    places: Array  # (2,) of the times and the flag of the next step
+    places: Array  # (2,), where to read the times and the flag of the next step
 
 
-def pulled(plan: Plan, history: History, y0, args, ts, steps, rows, varies) -> tuple[Array, Any, Array]:
+def pull(plan: Plan, history: History, y0, args, ts, steps, rows, varies) -> tuple[Array, Any, Array]:
     """Cotangents of y0, of the leaves of `args` that are to have one (None elsewhere), and of ts.
 
     **Arguments:** `rows` (nt - 1, n), cotangents of the solution at ts[1:]; `steps`, the number of fixed ones, or None; `varies`:
-    which leaves of `args`, and whether the times, are to have cotangents.
+    flags of the leaves of `args`, and of the times, that are to have cotangents.
     """
     moving, times_move = varies
     free, fixed = eqx.partition(args, moving)
@@ -121,66 +137,52 @@ def pulled(plan: Plan, history: History, y0, args, ts, steps, rows, varies) -> t
     saved = jnp.asarray(ts.shape[0] - 1, jnp.int32)
 
     def back(first, last, states, cotangents: _Cotangents) -> _Cotangents:
-        """Through the steps first .. last - 1, which begin from the rows of `states`."""
+        """Go back through the steps first .. last - 1, which begin from the rows of `states`."""
         ends = _Ends(first, ts[0], ts[-1], steps)
         cotangents = cotangents._replace(places=_places(last - 1, first, cotangents.saved))
         given = Given(None, (states, history.times, history.kept, rows, ts, ts))
-        task = Task(_turn_back, _back_by_turns, static)
+        task = Task(_iterate_back, _loop_back, static)
+        once = partial(_iterate_back_in_jax, *static, (fixed, free_leaves), ends, given)
+        run = partial(run_loop, task, (fixed, free_leaves), ends, given)
+        return run_to_end(run, once, once, partial(_is_running, ends), Carry(cotangents)).state
 
-        def run_on(carry):
-            after = run_loop(task, (fixed, free_leaves), ends, given, carry)
-            return (carry, False) if after is None else after
-
-        carry, always_ends = run_on(Carry(cotangents))
-        if not always_ends:
-            turn = partial(_back_by_turn, *static, (fixed, free_leaves), ends, given)
-            carry = lax.while_loop(partial(_is_unfinished, ends), lambda carry: run_on(turn(carry))[0], carry)
-        return carry.state
-
-    def replayed(first, last, y):
+    def replay(first, last, y):
         """States from which the steps first .. last - 1 begin, (stride, n), the first of them y."""
-        state = _Replay(y, jnp.stack([first, first]))
         given = Given(None, (history.times, history.kept))
-        task = Task(_turn_of_replay, _replay_by_turns, (plan,), strides=(1,))
-        carry = Carry(state, records=(jnp.zeros((stride, y.size), y.dtype),))
+        task = Task(_iterate_replay, _replay_in_jax, (plan,), strides=(1,))
+        carry = Carry(_Replay(y, jnp.stack([first, first])), records=(jnp.zeros((stride, y.size), y.dtype),))
         after = run_loop(task, args, (first, last), given, carry)
         carry, always_ends = (carry, False) if after is None else after
-        return (carry if always_ends else _replay_by_turns(plan, args, (first, last), given, carry)).records[0]
+        return (carry if always_ends else _replay_in_jax(plan, args, (first, last), given, carry)).records[0]
 
-    zeros = [jnp.zeros_like(x) for x in free_leaves]
-    cotangents = _Cotangents(
-        jnp.zeros_like(y0),
-        jnp.zeros_like(y0),
-        zeros,
-        none,
-        none,
-        jnp.zeros_like(ts),
-        saved,
-        _places(least, least, saved),
-    )
+    zeros, nothing = [jnp.zeros_like(x) for x in free_leaves], jnp.zeros_like(y0)
+    places = _places(least, least, saved)
+    cotangents = _Cotangents(nothing, nothing, zeros, none, none, jnp.zeros_like(ts), saved, places)
     if stride == 1:
         cotangents = back(least, history.count, history.states, cotangents)
     else:
         segments = (history.count + stride - 1) // stride
 
+        # From the last segment between two kept states to the first: its steps are replayed, and then taken back.
         def segment(k, cotangents):
             s = segments - 1 - k
             first = s * stride
             last = jnp.minimum(first + stride, history.count)
-            return back(first, last, replayed(first, last, history.states[s]), cotangents)
+            return back(first, last, replay(first, last, history.states[s]), cotangents)
 
         cotangents = lax.fori_loop(0, segments, segment, cotangents)
+    # Ends of steps follow the ends of the run, whose cotangents have been summed apart.
     of_ts = cotangents.ts.at[0].add(cotangents.start).at[-1].add(cotangents.end)
     return cotangents.after, jax.tree.unflatten(structure, cotangents.args), of_ts
 
 
 def _places(step, first, saved):
-    """What is read on the way back at a step whose state stands at `step - first`."""
+    """Places to read on the way back at a step whose state is at `step - first`."""
     row = jnp.maximum(saved - 1, 0)
     return jnp.stack([step - first, step, step, row, saved, row])
 
 
-def _is_unfinished(ends: _Ends, carry: Carry):
+def _is_running(ends: _Ends, carry: Carry):
     return any_sample(carry.state.places[1] >= ends.first)
 
 
@@ -188,26 +190,27 @@ def _read(given: Given, places):
     return tuple(table[places[i]] for i, table in enumerate(given.tables))
 
 
-def _turn_back(plan: Plan, times_move, structure, args, ends: _Ends, cotangents: _Cotangents, read) -> Iteration:
-    """Through a step, or to the next one of the rows within it."""
-    pull = partial(_pulled_step, plan, times_move, structure, *args)
-    return _back_through_step(pull, times_move, ends, cotangents, read)
+def _iterate_back(plan: Plan, times_move, structure, args, ends: _Ends, cotangents: _Cotangents, read) -> Iteration:
+    """Go back through a step, or to the next row within it."""
+    pull = partial(_pull_without_loop, plan, times_move, structure, *args)
+    return _go_back(pull, times_move, ends, cotangents, read)
 
 
-def _back_by_turn(plan: Plan, times_move, structure, args, ends: _Ends, given: Given, carry: Carry) -> Carry:
-    """The same as operations of JAX around kernels."""
-    cotangents, pull = carry.state, partial(_pull, plan, times_move, structure, *args)
-    turn = _back_through_step(pull, times_move, ends, cotangents, _read(given, cotangents.places))
-    return Carry(jax.tree.map(lambda new, old: jnp.where(turn.active, new, old), turn.state, cotangents))
+def _iterate_back_in_jax(plan: Plan, times_move, structure, args, ends: _Ends, given: Given, carry: Carry) -> Carry:
+    """One iteration as operations of JAX around kernels."""
+    pull: Any = kernel(_pull_without_loop, static=3, fallback=_pull_by_scan, derivative=False)
+    cotangents, pull = carry.state, partial(pull, plan, times_move, structure, *args)
+    after = _go_back(pull, times_move, ends, cotangents, _read(given, cotangents.places))
+    return Carry(jax.tree.map(lambda new, old: jnp.where(after.active, new, old), after.state, cotangents))
 
 
-def _back_by_turns(plan: Plan, times_move, structure, args, ends: _Ends, given: Given, carry: Carry) -> Carry:
-    turn = partial(_back_by_turn, plan, times_move, structure, args, ends, given)
-    return lax.while_loop(partial(_is_unfinished, ends), turn, carry)
+def _loop_back(plan: Plan, times_move, structure, args, ends: _Ends, given: Given, carry: Carry) -> Carry:
+    once = partial(_iterate_back_in_jax, plan, times_move, structure, args, ends, given)
+    return lax.while_loop(partial(_is_running, ends), once, carry)
 
 
-def _back_through_step(pull, times_move: bool, ends: _Ends, cotangents: _Cotangents, read) -> Iteration:
-    """A turn; pull(t0, t1, y, at, after, row) gives the cotangents of a step."""
+def _go_back(pull, times_move: bool, ends: _Ends, cotangents: _Cotangents, read) -> Iteration:
+    """Add the cotangents of a step, pull(t0, t1, y, at, after, row), and choose what follows."""
     y, (t0, t1), kept, row, at_row, at_next = read
     step, active = cotangents.places[1], cotangents.places[1] >= ends.first
     kept = kept & active
@@ -215,6 +218,7 @@ def _back_through_step(pull, times_move: bool, ends: _Ends, cotangents: _Cotange
     def when(flag, x):
         return jnp.where(flag, x, jnp.zeros_like(x))
 
+    # A step with several rows is visited once for each: the last visit adds the cotangent of its end.
     here = kept & (cotangents.saved > 0) & (at_row > t0)
     row, after = when(here, row), when(kept, cotangents.after)
     at = jnp.where(here, at_row, t1)
@@ -240,75 +244,27 @@ def _back_through_step(pull, times_move: bool, ends: _Ends, cotangents: _Cotange
     return Iteration(state, active, following >= ends.first)
 
 
-def _turn_of_replay(plan: Plan, args, ends, replay: _Replay, read) -> Iteration:
-    """A step that is taken again."""
-    (t0, t1), kept = read
-    return _replayed_step(_result(plan, args, t0, t1, replay.y), ends, replay, kept)
-
-
-def _replayed_step(after, ends, replay: _Replay, kept) -> Iteration:
-    first, last = ends
-    step = replay.places[0]
-    state = _Replay(jnp.where(kept, after, replay.y), replay.places + 1)
-    return Iteration(state, step < last, step + 1 < last, None, step - first, (replay.y,))
-
-
-def _replay_by_turns(plan: Plan, args, ends, given: Given, carry: Carry) -> Carry:
-    """The same as operations of JAX around kernels."""
-
-    def turn(_, carry):
-        replay, (between,) = carry.state, carry.records
-        (t0, t1), kept = _read(given, replay.places)
-        turn = _replayed_step(_repeated(plan, args, t0, t1, replay.y), ends, replay, kept)
-        place = jnp.where(turn.active, turn.index, between.shape[0])
-        return Carry(turn.state, records=(between.at[place].set(replay.y, mode="drop"),))
-
-    return lax.fori_loop(carry.state.places[0], ends[1], turn, carry)
-
-
 def step_share(i, t, end, steps):
-    """How much of a change of the run's end the end t of step i, counted from one, follows; it follows the start by the rest."""
+    """Share of a change of the run's end in the end t of step i, counted from one; the rest of 1 is that of the start."""
     one = jnp.ones_like(t)
     share = jnp.zeros_like(t) if steps is None else jnp.where(i < 2, 0.0, i.astype(t.dtype) / steps.astype(t.dtype))
     return jnp.where(t >= end, one, share)
 
 
-def _pull(plan: Plan, times_move: bool, structure, fixed, free, t0, t1, y, at, after, row):
-    pull = kernel(_pulled_step, static=3, fallback=_pulled_in_turn, derivative=False)
-    return pull(plan, times_move, structure, fixed, free, t0, t1, y, at, after, row)
+def _pull_without_loop(plan: Plan, times_move, structure, fixed, free, t0, t1, y, at, after, row):
+    # The vector field and the projection occur in every stage: as programs of their own they are differentiated once.
+    plan = plan._replace(field=OwnProgram(plan.field), project=plan.project and OwnProgram(plan.project))
+    return _pull_step(plan, times_move, structure, fixed, free, t0, t1, y, at, after, row)
 
 
-def _pulled_step(plan: Plan, times_move, structure, fixed, free, t0, t1, y, at, after, row):
-    """Cotangents of the leaves `free`, of y, t0, t1 and at, from those of the step's result and of its row at the time `at`."""
-    programs = plan._replace(field=OwnProgram(plan.field), project=plan.project and OwnProgram(plan.project))
-    return _pulled_by(
-        partial(whole_step, programs),
-        programs,
-        times_move,
-        structure,
-        fixed,
-        free,
-        t0,
-        t1,
-        y,
-        at,
-        after,
-        row,
-    )
+def _pull_step(plan: Plan, times_move, structure, fixed, free, t0, t1, y, at, after, row):
+    """Cotangents of the leaves `free`, of y, t0, t1 and at, from those of the step's end and of its row at the time `at`."""
 
-
-def _pulled_in_turn(plan: Plan, times_move, structure, fixed, free, t0, t1, y, at, after, row):
-    """The same by JAX, as a loop over the stages."""
-    return _pulled_by(partial(step_in_turn, plan), plan, times_move, structure, fixed, free, t0, t1, y, at, after, row)
-
-
-def _pulled_by(step, plan: Plan, times_move, structure, fixed, free, t0, t1, y, at, after, row):
     def forward(free, y, *times):
         t0_, t1_, at_ = times or (t0, t1, at)
         args = eqx.combine(jax.tree.unflatten(structure, free), fixed)
-        rate = plan.field_of(args, t0_, y) if plan.passes_rate_on else jnp.zeros_like(y)
-        made = step(args, t0_, t1_, y, rate)
-        return made.projected, projected_output(plan, None, at_, t0_, t1_, y, made.raw, made.stages, made.shift)
+        step = take_step(plan, args, t0_, t1_, y, plan.first_rate(args, t0_, y))
+        return step.projected, dense_output(plan, None, at_, t0_, t1_, y, step.raw, step.stages, step.shift)
 
     times = (t0, t1, at) if times_move else ()
     _, pull = jax.vjp(forward, free, y, *times)
@@ -316,30 +272,97 @@ def _pulled_by(step, plan: Plan, times_move, structure, fixed, free, t0, t1, y, 
     return of_free, of_y, *(of_times or (jnp.zeros_like(t0),) * 3)
 
 
-def _repeated(plan: Plan, args, t0, t1, y):
-    """The result of a step."""
-    return kernel(_result, static=1, fallback=_result_in_turn, derivative=False)(plan, args, t0, t1, y)
+_pull_by_scan = by_scan(_pull_step)
 
 
-def _result(plan: Plan, args, t0, t1, y):
-    rate = plan.field_of(args, t0, y) if plan.passes_rate_on else jnp.zeros_like(y)
-    return whole_step(plan, args, t0, t1, y, rate).projected
+def _iterate_replay(plan: Plan, args, ends, replay: _Replay, read) -> Iteration:
+    """Take a step again."""
+    (t0, t1), kept = read
+    return _go_on(_end_of_step(plan, args, t0, t1, replay.y), ends, replay, kept)
 
 
-def _result_in_turn(plan: Plan, args, t0, t1, y):
-    rate = plan.field_of(args, t0, y) if plan.passes_rate_on else jnp.zeros_like(y)
-    return step_in_turn(plan, args, t0, t1, y, rate).projected
+def _go_on(after, ends, replay: _Replay, kept) -> Iteration:
+    first, last = ends
+    step = replay.places[0]
+    state = _Replay(jnp.where(kept, after, replay.y), replay.places + 1)
+    return Iteration(state, step < last, step + 1 < last, None, step - first, (replay.y,))
+
+
+def _replay_in_jax(plan: Plan, args, ends, given: Given, carry: Carry) -> Carry:
+    """Take the rest of the steps again, as operations of JAX around kernels."""
+    end_of: Any = kernel(_end_of_step, static=1, fallback=by_scan(_end_of_step), derivative=False)
+
+    def once(_, carry):
+        replay, (between,) = carry.state, carry.records
+        (t0, t1), kept = _read(given, replay.places)
+        after = _go_on(end_of(plan, args, t0, t1, replay.y), ends, replay, kept)
+        place = jnp.where(after.active, after.index, between.shape[0])
+        return Carry(after.state, records=(between.at[place].set(replay.y, mode="drop"),))
+
+    return lax.fori_loop(carry.state.places[0], ends[1], once, carry)
+
+
+def _end_of_step(plan: Plan, args, t0, t1, y):
+    return take_step(plan, args, t0, t1, y, plan.first_rate(args, t0, y)).projected
+
+
+def replay_rows(plan: Plan, history: History, y0, args, ts, steps):
+    """Rows of the state (nt - 1, n) at ts[1:] by the steps of a history; zero where the run did not come to.
+
+    **Arguments:** `y0` (n,), flat; `steps`, the number of fixed ones, or None.
+    """
+    times, kept, count, steps = lax.stop_gradient((history.times, history.kept, history.count, steps))
+    room = kept.shape[0]
+    solver = ExplicitSteps(plan.solver(), plan.project, plan.step_constants, plan.branching, field=plan.field)
+
+    def move(i, t):
+        """Time at which step i (from 1) ends or begins, which follows the ends of the run."""
+        share = step_share(i, t, lax.stop_gradient(ts[-1]), steps)
+        start, end = ts[0] - lax.stop_gradient(ts[0]), ts[-1] - lax.stop_gradient(ts[-1])
+        return t + (1 - share) * start + share * end
+
+    def step(args, y, t0, t1):
+        state = jnp.zeros_like(y), jnp.asarray(False)
+        results: Any = solver.step(None, t0, t1, plan.structure(y), args, state, True)
+        return results[0], results[2]
+
+    @jax.checkpoint
+    def end_of(args, y, i, t0, t1):
+        return ravel_pytree(step(args, y, move(i, t0), move(i + 1, t1))[0])[0]
+
+    def advance(y, row):
+        i, (t0, t1), is_kept = row
+        active = is_kept & (i < count)
+        # There is room for many more steps than were taken: the rest is skipped, together for a batch.
+        after = cond(active, end_of, lambda args, y, *_: y, args, y, i, t0, t1)
+        return jnp.where(active, after, y), y
+
+    number = jnp.arange(room, dtype=count.dtype)
+    _, states = lax.scan(advance, y0, (number, times, kept))
+    taken = kept & (number < count)
+
+    @jax.checkpoint
+    def row(args, states, t):
+        known = lax.stop_gradient(t)
+        holds = taken & (times[:, 0] < known) & (known <= times[:, 1])
+        i = jnp.argmax(holds)
+        t0, t1 = move(i, times[i, 0]), move(i + 1, times[i, 1])
+        _, dense = step(args, states[i], t0, t1)
+        inner: Any = solver.interpolation_cls(t0=t0, t1=t1, **dense)
+        at = ravel_pytree(inner.evaluate(t))[0]
+        return jnp.where(holds.any(), at, jnp.zeros_like(at))
+
+    return lax.map(partial(row, args, states), ts[1:])
 
 
 class OwnProgram(NamedTuple):
-    """A function of a plan whose derivatives are those of its own program of numbers. Equal ones share it."""
+    """A function of a plan whose derivatives are those of its own scalar program. Equal ones share it."""
 
     function: Any
 
     def __call__(self, *args):
-        """What the function does; its arrays where it returns something beside them."""
-        arrays, rest = eqx.partition(args[-1], eqx.is_array)
-        del rest
+        """Value of the function, of whose last argument the arrays are passed."""
+        arrays = eqx.filter(args[-1], eqx.is_array)
         return _apply(self.function, arrays, args[:-1])
 
 

@@ -9,14 +9,15 @@ import jax.numpy as jnp
 import numpy as np
 from jax.flatten_util import ravel_pytree
 from jax.scipy.linalg import lu_factor, lu_solve
-from jaxtyping import Array, Bool, PyTree
+from jaxtyping import PyTree
 
 from jaxdyn.lie.so3 import matmul
 from jaxdyn.model.arguments import Number
-from jaxdyn.simulation.solvers.interpolation import StageInterpolation
+from jaxdyn.simulation.solvers.base import Flag, StageInterpolation, StepOutput
 
 _GAMMA = 0.21193756319429014
-# Stage i starts from y0 + A[i] U, at t0 + c[i] h.
+# The coefficients are those of Steinebach (2023), transformed as in Hairer & Wanner 1996, eq. IV.7.25, so that a step multiplies
+# no vector by the Jacobian. Stage i starts from y0 + A[i] U, at t0 + _TIME[i] h; _C holds the C_ij of `Rodas5P`, _RATE its d_i.
 _A = np.zeros((8, 8))
 _A[1, :1] = 3.0
 _A[2, :2] = 2.849394379747939, 0.45842242204463923
@@ -64,7 +65,8 @@ _H = np.array(
 class _Interpolation(StageInterpolation):
     """The method's own dense output, of order 4."""
 
-    def at(self, x):
+    def at(self, t):
+        x = self.fraction(t)
         z = 1 - x
         return jax.tree.map(
             lambda a, b, k: z * a + x * (b + z * (k[0] + x * (k[1] + x * k[2]))), self.y0, self.y1, self.k
@@ -78,8 +80,8 @@ class Rodas5P(diffrax.AbstractAdaptiveSolver):
     y1 = y0 + sum_j A_8j U_j + U_8, with the error estimate U_8 and J = df/dy at the start. The Jacobian and df/dt come from
     forward-mode differentiation. Stiffly accurate and L-stable; nothing is iterated, so nothing can fail to converge.
 
-    The state is any pytree of floating arrays of one dtype. A step costs 9 evaluations, one derivative by each of its numbers
-    and time, and one LU factorisation.
+    The state is any pytree of floating arrays of one dtype. A step costs 9 evaluations, one derivative with respect to each
+    entry of the state and to time, and one LU factorisation.
 
     Source: Steinebach, Construction of Rosenbrock-Wanner method Rodas5P and numerical benchmarks within the Julia
     Differential Equations package (2023), in the form of Hairer & Wanner 1996, eq. IV.7.25.
@@ -93,7 +95,7 @@ class Rodas5P(diffrax.AbstractAdaptiveSolver):
         return 5
 
     def init(self, terms: PyTree, t0: Number, t1: Number, y0: PyTree, args: PyTree) -> PyTree:
-        """There is no state between steps."""
+        """No state between steps."""
         return None
 
     def func(self, terms: PyTree, t0: Number, y0: PyTree, args: PyTree) -> PyTree:
@@ -101,16 +103,9 @@ class Rodas5P(diffrax.AbstractAdaptiveSolver):
         return terms.vf(t0, y0, args)
 
     def step(
-        self,
-        terms: PyTree,
-        t0: Number,
-        t1: Number,
-        y0: PyTree,
-        args: PyTree,
-        solver_state: PyTree,
-        made_jump: bool | Bool[Array, ""],
-    ) -> tuple[PyTree, PyTree, dict[str, PyTree], PyTree, diffrax.RESULTS]:
-        """One step from t0 to t1."""
+        self, terms: PyTree, t0: Number, t1: Number, y0: PyTree, args: PyTree, solver_state: PyTree, made_jump: Flag
+    ) -> StepOutput:
+        """Make one step from t0 to t1."""
         start, unravel = ravel_pytree(y0)
         h, control = t1 - t0, terms.contr(t0, t1)
 
@@ -118,15 +113,17 @@ class Rodas5P(diffrax.AbstractAdaptiveSolver):
             """h f at (y, t)."""
             return ravel_pytree(terms.vf_prod(point[-1], unravel(point[:-1]), args, control))[0]
 
-        slope = jax.jacfwd(change)(jnp.append(start, jnp.asarray(t0, start.dtype)))
-        factors = lu_factor(jnp.eye(start.size, dtype=start.dtype) - _GAMMA * slope[:, :-1])
+        # One Jacobian with respect to (y, t): its last column is h df/dt.
+        jacobian = jax.jacfwd(change)(jnp.append(start, jnp.asarray(t0, start.dtype)))
+        factors = lu_factor(jnp.eye(start.size, dtype=start.dtype) - _GAMMA * jacobian[:, :-1])
 
         def stage(stages, row):
             i, a, c, time, rate = row
             point = jnp.append(start + matmul(a, stages), t0 + time * h)
-            right = change(point) + matmul(c, stages) + rate * h * slope[:, -1]
+            right = change(point) + matmul(c, stages) + rate * h * jacobian[:, -1]
             return stages.at[i].set(lu_solve(factors, _GAMMA * right)), None
 
+        # A scan rather than eight copies of the vector field: the program of a stage is compiled once.
         rows = [jnp.asarray(x, start.dtype) for x in (_A, _C, _TIME, _RATE)]
         stages, _ = jax.lax.scan(stage, jnp.zeros((8, start.size), start.dtype), (jnp.arange(8), *rows))
         y1 = unravel(start + matmul(rows[0][-1], stages) + stages[-1])

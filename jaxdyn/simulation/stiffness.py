@@ -1,4 +1,4 @@
-"""How stiff a scene is: the rates of its linearised motion."""
+"""Stiffness of a scene: the rates of its linearised motion."""
 
 import functools
 from collections.abc import Callable
@@ -28,11 +28,10 @@ _GROWTH = 1e-3
 class Stiffness(NamedTuple):
     """Rates of a linearised motion, and what they demand of explicit steps.
 
-    - `decay`, 1/s: the fastest at which anything dies out; `frequency`, rad/s: the fastest at which anything oscillates.
+    - `decay`, 1/s: the fastest rate of decay; `frequency`, rad/s: the fastest oscillation.
     - `explicit_step`, s: length above which steps of Dopri8 are unstable, whatever the tolerance: an eigenvalue times the step is
-      outside of the region where a step grows what it should not by less than 1e-3. Infinite where nothing moves by itself.
-      Other explicit methods are unstable earlier: RK4 from 0.54 of it on, Dopri5 and Tsit5 from 0.64 (decay) and 0.34
-      (oscillation).
+      outside the region where a step amplifies a decaying mode by less than 1e-3. Infinite where all rates are zero. Other
+      explicit methods are unstable earlier: RK4 from 0.54 of it on, Dopri5 and Tsit5 from 0.64 (decay) and 0.34 (oscillation).
     """
 
     decay: Float[Array, "..."]
@@ -63,7 +62,7 @@ def _stable_radii() -> tuple[np.ndarray, np.ndarray]:
 def _rates(values) -> tuple:
     """Fastest decay and oscillation among the eigenvalues of a motion, and the longest step of Dopri8.
 
-    What grows by itself counts as an oscillation there.
+    A growing mode counts as an oscillation for the longest step.
     """
     xp = array_namespace(values)
     size = xp.abs(values)
@@ -105,7 +104,7 @@ def stiffness(
     scene = as_scene(scene)
     control = None if control is None else as_pytree(control, "control")
     q, v, t = check_state(scene.system, q=q, v=v, t=t)
-    matrix = _linearised(scene, q, v, t, control)
+    matrix = _linearize(scene, q, v, t, control)
     if is_known(matrix):
         # All by numpy, which compiles nothing.
         known = np.asarray(matrix, float)
@@ -118,7 +117,7 @@ def stiffness(
 
 
 @entry_point
-def _linearised(scene: Scene, q, v, t, control) -> Float[Array, "n n"]:
+def _linearize(scene: Scene, q, v, t, control) -> Float[Array, "n n"]:
     """The matrix (2 nv, 2 nv) of d(dq, dv)/dt."""
     system, n = scene.system, scene.nv
     if n == 0:
@@ -132,6 +131,7 @@ def _linearised(scene: Scene, q, v, t, control) -> Float[Array, "n n"]:
             total = total - gravity_force(system, at, t)
         return total if control is None else total + check_force(control(at, speed, t), q, n, "control")
 
+    # The rate of v is linear in the force: its derivative by the force is M^-1, or its projection on the constraints.
     mass = mass_matrix(system, q, t)
     unit = jnp.eye(n, dtype=mass.dtype)
     if scene.constraints:

@@ -1,0 +1,227 @@
+"""Checks of the arguments of `simulate`. All raise ValueError with the argument, its value and the fix."""
+
+from typing import Any
+
+import diffrax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Bool
+
+from jaxdyn.compile.known import is_concrete
+from jaxdyn.contact.forces import contacts_with_cones
+from jaxdyn.model.arguments import batch_hint, check_shape
+from jaxdyn.model.names import frame_index
+from jaxdyn.model.tree import Model
+from jaxdyn.simulation.controls import Controller, Sampled
+from jaxdyn.simulation.methods import Method
+from jaxdyn.simulation.solvers import Stepper
+from jaxdyn.simulation.solvers.choice import innermost, is_step_length, label
+from jaxdyn.systems.scene import Scene, has_drives
+from jaxdyn.systems.system import has_quaternions
+
+POSE = "pose:"  # prefix of the output of a frame
+CONTACT_OUTPUTS = ("contact_forces", "contact_margins")
+OUTPUTS = (
+    *("energy", "power", "work", "acceleration", "multipliers", "constraint_residual", "torque", "control_state"),
+    *("drive_state", *CONTACT_OUTPUTS),
+)
+MODAL_OUTPUTS = ("energy", "acceleration", "multipliers", "contact_forces", "torque")  # of scenes with modes
+# Deviation from unit length of quaternions that a file holds to a few digits.
+_LENGTH_TOLERANCE = 1e-3
+
+
+def check_start(scene: Scene, q0, v0) -> None:
+    """Refuse systems that cannot move, states of a wrong shape, NaN, and quaternions that are far from unit length."""
+    if scene.nv == 0:
+        raise ValueError("the system has no coordinates (nq = nv = 0), so nothing moves; add a body with a joint")
+    for name, value in (("q0", q0), ("v0", v0)):
+        check_shape(scene.system, name, value)
+        if is_concrete(value):
+            _check_finite(name, value)
+    if not is_concrete(q0):
+        return
+    for joint, places in _quaternions(scene.system):
+        length = float(np.linalg.norm(np.asarray(q0, float)[places]))
+        if abs(length - 1) > _LENGTH_TOLERANCE:
+            raise ValueError(
+                f"q0 has a quaternion of length {length:.6g} at joint {joint!r}, expected 1; "
+                "divide it by its length (order w, x, y, z)"
+            )
+
+
+def has_unit_quaternions(system, q) -> Bool[Array, ""]:
+    """True if every quaternion of q is zero or of unit length, up to the rounding of numbers in files, ()."""
+    # A quaternion of zeros is left to the check for finite numbers, which it is not when it has been normalised.
+    squares = [jnp.sum(q[places] ** 2) for _, places in _quaternions(system)]
+    if not squares:
+        return jnp.asarray(True)
+    low, high = (1 - _LENGTH_TOLERANCE) ** 2, (1 + _LENGTH_TOLERANCE) ** 2
+    return jnp.stack([(x == 0) | ((x >= low) & (x <= high)) for x in squares]).all()
+
+
+def _quaternions(system) -> list[tuple[str, slice]]:
+    """Joints whose coordinates end with a quaternion, and its place in q."""
+    if not has_quaternions(system):
+        return []
+    top = system.topology
+    joints = zip(top.joint_names, top.kinds, top.q_slices, strict=True)
+    return [(name, slice(at.stop - 4, at.stop)) for name, kind, at in joints if kind in ("spherical", "free")]
+
+
+def largest_angle(dtype) -> float:
+    """Largest angle (rad) that adaptive steps start from: 150 turns in float32, 3.5e6 in float64.
+
+    Beyond it the angle changes by steps of sqrt(eps)/3 and more. Error estimates of the rates take them for errors of the
+    method, and shorter steps make them worse.
+    """
+    return 1 / (3 * float(jnp.finfo(dtype).eps) ** 0.5)
+
+
+def angle_coordinates(system) -> np.ndarray:
+    """Indices in q of the angles of a `Model` that repeat after a turn."""
+    if not isinstance(system, Model):
+        return np.zeros(0, int)
+    top = system.topology
+    places = zip(top.kinds, top.q_slices, strict=True)
+    return np.array([at.stop - 1 for kind, at in places if kind in ("revolute", "continuous", "planar")], int)
+
+
+def check_angles(scene: Scene, q0, dtype) -> None:
+    """Refuse angles of so many turns that their dtype holds too little of the rest."""
+    angles = angle_coordinates(scene.system)
+    sizes = np.abs(np.asarray(q0, float)[angles])
+    if sizes.size and sizes.max() > largest_angle(dtype):
+        index = int(angles[np.argmax(sizes)])
+        value, eps = float(q0[index]), float(jnp.finfo(dtype).eps)
+        raise ValueError(
+            f"q0 is {value:.6g} rad at index {index}, which {jnp.dtype(dtype).name} holds only to {eps * abs(value):.1g} rad; "
+            f"subtract the {round(value / (2 * np.pi))} whole turns, use float64, or fixed steps (stepsize=0.01)"
+        )
+
+
+def check_tolerance(name: str, value) -> None:
+    """Refuse tolerances that are not one finite number, or negative."""
+    if value.shape != ():
+        raise ValueError(f"{name} has shape {value.shape}; pass one number{batch_hint(value, ())}")
+    if is_concrete(value) and not (np.isfinite(value) and value >= 0):
+        raise ValueError(f"{name} is {value}; pass a finite number that is not negative, such as 1e-8")
+
+
+def check_times(ts) -> None:
+    """Refuse times that are fewer than two, not finite, or not increasing."""
+    if ts.ndim != 1 or ts.shape[0] < 2:
+        raise ValueError(f"ts has shape {ts.shape}; pass the start and at least one later time, (nt,) with nt >= 2")
+    if not is_concrete(ts):
+        return
+    _check_finite("ts", ts)
+    times = np.asarray(ts, float)
+    back = np.flatnonzero(np.diff(times) <= 0)
+    if back.size:
+        i = back[0]
+        raise ValueError(
+            f"ts does not increase at index {i + 1}: {times[i]} then {times[i + 1]}; sort it, drop doubles"
+        )
+
+
+def _check_finite(name: str, value) -> None:
+    bad = np.flatnonzero(~np.isfinite(np.asarray(value, float)))
+    if bad.size:
+        raise ValueError(f"{name} is {np.asarray(value)[bad[0]]} at index {bad[0]}; give finite numbers")
+
+
+def sort_outputs(scene: Scene, outputs) -> tuple[str, ...]:
+    """Names of outputs in order, each once; refuses names that are no outputs, and frames that do not exist."""
+    if isinstance(outputs, str):
+        raise ValueError(f"outputs is the string {outputs!r}; pass a tuple, e.g. outputs=({outputs!r},)")
+    for name in outputs:
+        if isinstance(name, str) and name.startswith(POSE) and isinstance(scene.system, Model):
+            frame_index(scene.system, name.removeprefix(POSE))
+        elif name not in OUTPUTS:
+            raise ValueError(f"outputs has {name!r}; choose from {', '.join(OUTPUTS)} and '{POSE}<frame>'")
+    return tuple(sorted(set(outputs)))
+
+
+def check_combination(control, method: Method, solver, adjoint) -> None:
+    """Refuse controls and adjoints that a method does not support."""
+    if isinstance(solver, Stepper) and isinstance(control, (Controller, Sampled)):
+        raise ValueError(
+            f"control is a {type(control).__name__}, whose state the steps of method 'variational' do not integrate; take "
+            "another method"
+        )
+    if isinstance(solver, Stepper) and isinstance(adjoint, diffrax.BacksolveAdjoint):
+        raise ValueError(
+            "adjoint is 'backsolve', which needs a differential equation; take 'reverse' or another method"
+        )
+    if method.step_constants and isinstance(adjoint, diffrax.BacksolveAdjoint):
+        raise ValueError(
+            "adjoint is 'backsolve', which cannot follow the basis of method='reduced' backwards; take 'reverse', or "
+            "jd.Reduced with independent velocities or a function"
+        )
+
+
+def check_drives(scene: Scene, control, solver, modal: bool) -> None:
+    """Refuse drives with a state where nothing integrates it."""
+    if not has_drives(scene):
+        return
+    what = "the scene has drives with a state (jd.forces.DriveDynamics)"
+    if modal:
+        raise ValueError(
+            f"{what} and forces with modes (jd.contact.DryFriction, jd.contact.UnilateralContact); leave one of them out"
+        )
+    if isinstance(solver, Stepper):
+        raise ValueError(f"{what}, which the steps of method 'variational' do not integrate; take another method")
+    if isinstance(control, Controller) and control.takes_multipliers:
+        raise ValueError(f"{what}, behind which multipliers do not depend on the command; use a control without them")
+
+
+def check_modal_options(control, stepsize, solver, adjoint, outputs, max_events: Any) -> None:
+    """Refuse options that motions with modes do not support."""
+    what = "the scene has forces with modes (jd.contact.DryFriction, jd.contact.UnilateralContact)"
+    if isinstance(control, (Controller, Sampled)):
+        raise ValueError(f"control is a {type(control).__name__}, and {what}; give a function control(q, v, t)")
+    if stepsize is not None and not is_step_length(stepsize):
+        raise ValueError(
+            f"stepsize is {stepsize!r}, and {what}; leave it out for steps that keep rtol and atol, or give a length (s)"
+        )
+    if not isinstance(solver, diffrax.AbstractERK) or isinstance(innermost(solver), diffrax.AbstractWrappedSolver):
+        raise ValueError(
+            f"solver is {label(solver)}, and {what}, whose events are located within explicit steps; take diffrax.Dopri8() or "
+            "Tsit5(), or, where forces are stiff, friction without modes (jd.forces.CoulombFriction)"
+        )
+    if isinstance(adjoint, diffrax.BacksolveAdjoint):
+        raise ValueError(f"adjoint is 'backsolve', which does not go back through events, and {what}; take 'reverse'")
+    for name in outputs:
+        if name not in MODAL_OUTPUTS and not name.startswith(POSE):
+            raise ValueError(
+                f"outputs has {name!r}, and {what}; choose from {', '.join(MODAL_OUTPUTS)} and 'pose:<frame>'"
+            )
+    if isinstance(max_events, bool) or not isinstance(max_events, (int, np.integer)) or max_events < 1:
+        raise ValueError(f"max_events is {max_events!r}; pass a positive integer, such as 64")
+
+
+def check_contacts(scene: Scene, contacts: str, outputs) -> None:
+    """Refuse an unknown choice, cones that do not fit, and contact forces of a scene without cones."""
+    if contacts not in ("stop", "report"):
+        raise ValueError(f"contacts is {contacts!r}; choose from 'stop', 'report'")
+    if scene.cones is not None:
+        contacts_with_cones(scene)
+    elif asked := [name for name in outputs if name in CONTACT_OUTPUTS]:
+        raise ValueError(
+            f"outputs has {asked[0]!r} and the scene has no cones; give its contacts cones, as in jd.Scene(..., "
+            "cones=jd.contact.friction_cone('hard-finger', mu=0.8))"
+        )
+
+
+def check_limits(scene: Scene, limits: Any, modal: bool) -> None:
+    """Refuse an unknown choice, limits of a system that has none, and ends at limits in a motion with modes."""
+    if limits not in ("report", "stop", None):
+        raise ValueError(f"limits is {limits!r}; choose from 'report', 'stop', None")
+    if limits is not None and not isinstance(scene.system, Model):
+        raise ValueError(
+            f"limits is {limits!r}, and a {type(scene.system).__name__} has no joint limits; pass limits=None"
+        )
+    if limits == "stop" and modal:
+        raise ValueError(
+            "limits is 'stop', which a scene whose forces have modes (jd.contact.DryFriction, jd.contact.UnilateralContact) "
+            "does not take; pass limits='report'"
+        )

@@ -1,0 +1,87 @@
+"""Records of the events of a motion, which its derivatives replay."""
+
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array
+
+from jaxdyn.simulation.hybrid.modes import CHANNELS, KINDS, Elements, Mode
+from jaxdyn.simulation.hybrid.transitions import Transition
+
+
+class Records(NamedTuple):
+    """Records of events, a row each; the last row is for what is not kept."""
+
+    time: Array
+    name: Array  # index among `Elements.names`
+    trigger: Array  # the guard that fell to zero, -1 for an event that came with another one
+    impact: Mode
+    impact_slip: Array
+    mode: Mode  # after the event
+    slip: Array
+
+
+def no_records(elements: Elements, dtype, most: int) -> Records:
+    """Records before the first event."""
+    n, none = len(elements.each), jnp.zeros((most + 1,), jnp.int32)
+    flags = jnp.zeros((most + 1, n), bool)
+    mode = Mode(flags, flags, flags, jnp.zeros((most + 1, elements.switches), bool))
+    slip = jnp.zeros((most + 1, n, 2), dtype)
+    return Records(jnp.full((most + 1,), jnp.nan, dtype), none - 1, none - 1, mode, slip, mode, slip)
+
+
+def record_elements(
+    elements: Elements, t, before: Mode, change: Transition, hit, happens, rows: Records, count, most: int
+):
+    """Records with a row for each element that an event has changed, and their number."""
+    mode = change.mode
+    kind = jnp.where(mode.stick & ~before.stick, 2, jnp.where(before.stick & ~mode.stick, 3, 4))
+    # A contact that is hit may let go at once.
+    hits = (mode.closed | hit[:, 0]) & ~before.closed
+    kind = jnp.where(hits, 0, jnp.where(before.closed & ~mode.closed, 1, kind))
+    differs = (mode.closed != before.closed) | (mode.stick != before.stick) | (mode.negative != before.negative)
+    changed = happens & (hit.any(1) | differs)
+    leading = jnp.argmax(hit.reshape(-1)).astype(jnp.int32)
+    # First the element whose guard it was, which carries the impact; then those that came with it.
+    order = [(i, True) for i in range(len(elements.each))] + [(i, False) for i in range(len(elements.each))]
+    for i, by_trigger in order:
+        is_row = changed[i] & ((hit.any() & (leading // CHANNELS == i)) == by_trigger)
+        place = jnp.where(is_row & (count < most), count, most)
+        row = Records(
+            t,
+            (i * len(KINDS) + kind[i]).astype(jnp.int32),
+            jnp.where(by_trigger, leading, -1).astype(jnp.int32),
+            change.impact if by_trigger else mode,
+            change.impact_slip if by_trigger else change.slip,
+            mode,
+            change.slip,
+        )
+        rows = jax.tree.map(lambda all_, one, at=place: all_.at[at].set(one), rows, row)
+        count = count + is_row.astype(jnp.int32)
+    return rows, count
+
+
+def record_switches(elements: Elements, t, count, mode: Mode, records: Records, switched, slip, most: int):
+    """Records with a row for each switching function that changed its sign, and their number."""
+    index = jnp.cumsum(switched, dtype=jnp.int32) - 1
+    places = jnp.where(switched, jnp.minimum(count + index, most), most)
+    # They change one after the other: the mode of a row has the changes of the rows before it and its own.
+    earlier = switched[None] & (index[None] <= index[:, None])
+    k, first = elements.switches, len(elements.each)
+    number = jnp.arange(k, dtype=jnp.int32)
+    modes, slip = jax.tree.map(lambda x: jnp.broadcast_to(x, (k, *x.shape)), (mode, slip))
+    modes = modes._replace(positive=modes.positive ^ earlier)
+    rows = Records(
+        jnp.broadcast_to(t, (k,)), first * len(KINDS) + number, first * CHANNELS + number, modes, slip, modes, slip
+    )  # fmt: skip
+    rows = jax.tree.map(lambda all_, new: all_.at[places].set(new.astype(all_.dtype)), records, rows)
+    return rows, count + jnp.sum(switched, dtype=jnp.int32)
+
+
+def chatters(elements: Elements, t, usual, count, records: Records, switched, most: int):
+    """True if a switching function changes back at once: on both sides of its zero the force drives the motion onto it."""
+    last = jnp.maximum(jnp.minimum(count, most) - 1, 0)
+    names = jnp.arange(elements.switches, dtype=jnp.int32) + len(elements.each) * len(KINDS)
+    least = 64 * float(jnp.finfo(t.dtype).eps) * jnp.maximum(jnp.abs(t), usual)
+    return ((names == records.name[last]) & switched).any() & (t - records.time[last] <= least)

@@ -1,0 +1,151 @@
+"""Terminal events of a run: contacts that leave their cones, joints that pass their limits, controls that become singular.
+
+The rows of a contact are two-sided; whether its cone admits the multipliers is tested during the motion. Each of these conditions
+has an allowance, which is negative where it is violated. The run ends at the first zero of the least allowance that a step or a
+save point shows, located by bisection of the step's dense output. A violation that begins and ends within one step is not seen.
+"""
+
+import warnings
+from typing import Any, NamedTuple
+
+import diffrax
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+import optimistix
+from jaxtyping import Array, Bool, Float, Int
+
+from jaxdyn.contact.forces import contact_forces, contacts_with_cones
+from jaxdyn.model.tree import Model
+from jaxdyn.simulation.solution import RESULTS, Solution, joint_of
+from jaxdyn.systems.scene import Scene
+
+
+class JointLimitWarning(UserWarning):
+    """A motion has passed a position limit of the model, and continues."""
+
+
+class Conditions(NamedTuple):
+    """Conditions that can end a run: those of its contacts, of its joint limits, and of its control."""
+
+    contacts: bool
+    limits: bool
+    control: bool
+
+    def counts(self, scene: Scene) -> tuple[int, int]:
+        """Numbers of allowances of contacts and of limits, in this order among all."""
+        return len(contacts_with_cones(scene)) if self.contacts else 0, 2 * scene.nq if self.limits else 0
+
+
+def contact_allowances(scene: Scene, multipliers: Float[Array, " nc"]) -> Float[Array, " k"]:
+    """Margin of each contact with a cone, plus the rounding of its force, eps^(1/2) |f|; N. Negative where it is lost."""
+    contacts = contact_forces(scene, multipliers)
+    # A contact that is held exactly on its cone is not lost by rounding.
+    slack = jnp.finfo(multipliers.dtype).eps ** 0.5
+    return jnp.stack(
+        [contacts.margins[name] + slack * jnp.sum(jnp.abs(contacts.forces[name])) for name in contacts.margins]
+    )
+
+
+def limit_allowances(model: Model, q: Float[Array, " nq"]) -> Float[Array, " n"]:
+    """Distances of q above the lower limits, then below the upper ones, plus rounding, eps^(1/2) of the limit's size.
+
+    Negative where a limit is passed, rad or m; a large number where there is none.
+    """
+    # A finite number for "no limit": bisection and products of infinity would give NaN.
+    none = jnp.full_like(q, float(jnp.finfo(q.dtype).max) ** 0.5)
+
+    def allowance(limit, room):
+        slack = jnp.finfo(q.dtype).eps ** 0.5 * jnp.maximum(jnp.abs(limit), jnp.ones_like(limit))
+        return jnp.where(jnp.isfinite(limit), room + slack, none)
+
+    lower, upper = model.lower.astype(q.dtype), model.upper.astype(q.dtype)
+    return jnp.concatenate([allowance(lower, q - lower), allowance(upper, upper - q)])
+
+
+class Violation(NamedTuple):
+    """The first violation: whether and when there was one, and the entry of the allowances, -1 for none."""
+
+    happened: Bool[Array, ""]
+    time: Float[Array, ""]
+    entry: Int[Array, ""]
+
+    def codes(self, counts: tuple[int, int]) -> list[tuple[Any, Any]]:
+        """Cases of the result, for `first_of`; `counts` as of `Conditions`."""
+        contacts, limits = counts
+        entry, codes = self.entry, RESULTS
+        return [
+            (self.happened & (entry >= contacts + limits), codes.control_singular),
+            (self.happened & (entry >= contacts) & (entry < contacts + limits), codes.joint_limit_passed),
+            (self.happened & (entry < contacts), codes.contact_lost),
+        ]
+
+    def stats(self, conditions: Conditions, counts: tuple[int, int]) -> dict[str, Array]:
+        """Index of the contact that was lost, and entry of q whose limit was passed, each -1 for none."""
+        contacts, limits = counts
+        lost = {"lost_contact": jnp.where(self.entry < contacts, self.entry, -1)} if conditions.contacts else {}
+        if conditions.limits:
+            is_limit = self.happened & (self.entry >= contacts) & (self.entry < contacts + limits)
+            place = jnp.where(is_limit, (self.entry - contacts) % (limits // 2), -1)
+            lost["passed_limit"] = place.astype(jnp.int32)
+        return lost
+
+
+def first_violation(rows: Float[Array, "nt k"], reached, ts, within) -> Violation:
+    """First negative allowance, from those at the save points and at the event that ended a step.
+
+    `within` is None, or whether there was such an event, its time and the allowances (k,) there.
+    """
+    below = reached & (rows < 0).any(1)
+    first = jnp.argmax(below)
+    violation = Violation(below.any(), ts[first], jnp.argmin(rows[first]).astype(jnp.int32))
+    if within is not None:
+        happened, time, margins = within
+        # A singular basis may have ended the step too: then no margin is near zero.
+        happened = happened & (jnp.min(margins) <= jnp.finfo(rows.dtype).eps ** 0.25 * (1 + jnp.max(jnp.abs(margins))))
+        located = Violation(happened, time, jnp.argmin(margins).astype(jnp.int32))
+        earlier = happened & ~(violation.happened & (violation.time <= time))
+        violation = jax.tree.map(lambda a, b: jnp.where(earlier, a, b), located, violation)
+    return violation._replace(entry=jnp.where(violation.happened, violation.entry, -1))
+
+
+def event(allowance, basis, start, dtype) -> diffrax.Event:
+    """Event where the least allowance falls to zero, or where the quality `basis` no longer has the sign of `start`."""
+
+    def condition(t, y, args, **_):
+        least = allowance(t, y, args)
+        if basis is not None:
+            least = jnp.where(basis(t, y, args) * start > 0, least, -jnp.ones_like(least))
+        return least.astype(float)  # the dtype of diffrax's own branches
+
+    eps = float(jnp.finfo(dtype).eps)
+    return diffrax.Event(condition, Bisection(rtol=8 * eps, atol=8 * eps, flip=True), direction=False)
+
+
+class Bisection(optimistix.Bisection):
+    """Bisection of a function that falls through zero, until the interval is at rounding, however steep the function is."""
+
+    # optimistix also asks for a small value of the function, which a steep one does not reach.
+    def terminate(self, fn, y, args, options, state, tags):
+        """Stop when the interval is small."""
+        width = jnp.abs(state.upper - state.lower)
+        return width <= self.atol + self.rtol * jnp.abs(y), optimistix.RESULTS.successful
+
+
+def report_limits(scene: Scene, solution: Solution, is_concrete: bool) -> Solution:
+    """Add `stats["passed_limit"]` to a solution; a concrete one that passes a limit warns, a traced one does not."""
+    model: Any = scene.system
+    margins = jax.vmap(limit_allowances, (None, 0))(model, solution.q)
+    below = jnp.isfinite(solution.q).all(1) & (margins < 0).any(1)
+    entry = jnp.argmin(margins[jnp.argmax(below)]) % (margins.shape[1] // 2)
+    entry = jnp.where(below.any(), entry, -1).astype(jnp.int32)
+    if is_concrete and int(entry) >= 0:
+        first, joint = int(np.argmax(np.asarray(margins < 0).any(1))), joint_of(model, int(entry))
+        lower, upper, q = (float(np.asarray(x)[int(entry)]) for x in (model.lower, model.upper, solution.q[first]))
+        side, limit = ("lower", lower) if q - lower < upper - q else ("upper", upper)
+        words = (
+            f"joint {joint!r} is at {q:.6g}, its {side} limit is {limit:.6g}, at t = {float(solution.ts[first]):.6g} s"
+        )
+        warnings.warn(f"{words}; the motion continues (limits='stop' ends it there)", JointLimitWarning, stacklevel=3)
+    return eqx.tree_at(lambda s: s.stats, solution, solution.stats | {"passed_limit": entry})
