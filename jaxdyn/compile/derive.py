@@ -1,7 +1,8 @@
-"""Derivatives of programs of numbers, which are programs of numbers again: forward, and the transpose of what is linear.
+"""Derivatives of scalar programs, which are scalar programs too: the tangent, and the transpose of a linear program.
 
-The change of every number is a sum of its partial derivatives times the changes of its operands; what does not move adds nothing.
-Reverse mode is the transpose of that program in the changes, so that values which both need are there once.
+In the tangent the change of a number is the sum of its partial derivatives times the changes of its operands. Operands that do
+not change add no terms. Reverse mode transposes the tangent with respect to the changes: the values of the original program that
+its partial derivatives need are operations of the same program, so that they are computed once.
 """
 
 import functools
@@ -16,37 +17,45 @@ from jaxdyn.compile.program import FLOATS, Constant, NotNumbers, Program
 
 
 def tangent(program: Program, moving: Sequence[bool]) -> Program:
-    """The change of the outputs that are floats, a program of all inputs and of the changes of those that move."""
+    """Tangent of a program, as a program: the change of the floating-point outputs.
+
+    Its inputs are all inputs of `program`, followed by the changes of the inputs that are `moving`.
+    """
     moving = tuple(moving)
     if moving not in program.derived:
         rule = program.derivative
-        with np.errstate(all="ignore"):  # known numbers may overflow, as they do in XLA
+        # Known numbers are folded by NumPy, which warns of overflows and NaN that XLA computes without a word.
+        with np.errstate(all="ignore"):
             program.derived[moving] = _tangent(program, moving) if rule is None else rule(moving)
     return program.derived[moving]
 
 
 def _tangent(program: Program, moving: tuple[bool, ...]) -> Program:
-    # A subprogram has no derivative of its own: called ones are written out, so that the tangent shares their numbers.
+    # Called subprograms are inlined: the tangent then shares their values instead of calling a second program that repeats them.
     program, graph = inline(program), Graph()
     arrays = [*program.inputs, *(x for x, varies in zip(program.inputs, moving, strict=True) if varies)]
-    entries = [graph.inputs(place, array) for place, array in enumerate(arrays)]
-    primal, steps = entries[: len(moving)], iter(entries[len(moving) :])
-    changes_in = [next(steps).ravel().tolist() if varies else None for varies in moving]
+    entries = [graph.inputs(index, array) for index, array in enumerate(arrays)]
+    primal, input_changes = entries[: len(moving)], iter(entries[len(moving) :])
+    changes_in = [next(input_changes).ravel().tolist() if varies else None for varies in moving]
     values, _ = graph.replay(program, primal)
-    changes: list = []
+    changes: list = []  # of each operation: a Number, or 0.0 where it does not change
     for operation, value in zip(program.operations, values, strict=True):
         if operation.op == "input":
-            place, entry = operation.args
-            row = changes_in[place]
+            index, entry = operation.args
+            row = changes_in[index]
             changes.append(0.0 if row is None else row[entry])
             continue
-        given = [(0.0 if type(x) is Constant else changes[x]) for x in operation.args]
-        if operation.op == "call" and any(is_number(x) or x != 0 for x in given):
+        operand_changes = [(0.0 if type(x) is Constant else changes[x]) for x in operation.args]
+        any_change = any(is_number(x) or x != 0 for x in operand_changes)
+        # After inlining, only subprograms with loops are still called; their derivative needs a rule.
+        if operation.op == "call" and any_change:
             raise NotNumbers("a pseudo-inverse without a rule for its derivative")
         operands = [x.value if type(x) is Constant else values[x] for x in operation.args]
-        # Integers and bools do not change, nor do numbers whose operands do not: most of a tangent is left out here.
-        varies = operation.kind in FLOATS and any(is_number(x) or x != 0 for x in given)
-        changes.append(_change(graph, operation.op, operation.kind, value, operands, given) if varies else 0.0)
+        # Integers and bools have no change. Numbers whose operands do not change have none either: this keeps tangents short.
+        varies = operation.kind in FLOATS and any_change
+        changes.append(
+            _change(graph, operation.op, operation.kind, value, operands, operand_changes) if varies else 0.0
+        )
     rows, outputs = [], [array for array in program.outputs if array.dtype.kind == "f"]
     for row, array in zip(program.results, program.outputs, strict=True):
         if array.dtype.kind == "f":
@@ -78,12 +87,13 @@ def _change(g: Graph, op: str, kind: str, value, x: list, d: list):
         by_base = g.mul(x[1], g.function_of_two("pow", x[0], g.sub(x[1], 1.0)))
         total = g.mul(by_base, d[0])
         if is_number(d[1]) or d[1] != 0:
-            # At a base of zero the power is zero or one whatever the exponent is; below zero it is no function of the exponent.
+            # d(x^y)/dy = x^y log(x). At x = 0 the power is 0 or 1 for all y >= 0, so the derivative is zero, by log(1) in the
+            # place of log(0). For x < 0 the power exists at whole y only: the NaN of the logarithm is right.
             is_zero = g.compare("eq", x[0], 0.0)
             logarithm = g.function("log", g.select(is_zero, x[0], 1.0, kind))
             total = g.add(total, g.mul(g.mul(value, logarithm), d[1]))
         return total
-    if op == "atan2":
+    if op == "atan2":  # d atan2(y, x) = (x dy - y dx)/(x^2 + y^2), with x[0] = y and x[1] = x
         square = g.add(g.mul(x[0], x[0]), g.mul(x[1], x[1]))
         by_first = g.mul(g.div(x[1], square), d[0]) if is_number(d[0]) or d[0] != 0 else 0.0
         by_second = g.mul(g.div(x[0], square), d[1]) if is_number(d[1]) or d[1] != 0 else 0.0
@@ -102,32 +112,33 @@ _CHOICES = "select", "max", "min", "reduce_max", "reduce_min", "clamp", "abs"
 
 
 def _choice_change(g: Graph, op: str, kind: str, value, x: list, d: list):
-    """`_change` of operations that take one of their operands."""
+    """`_change` of operations that return one of their operands."""
     if op == "select":
         return g.select(x[0], d[1], d[2], kind)
-    # Ties are decided as JAX decides them: a maximum of two gives each half, one of several gives all that are largest the same
-    # share, and a number on a bound of its range does not move. Nothing moves a maximum that is not a number.
+    # Ties follow the rules of JAX, so that both give the same derivative: equal operands of a maximum of two get one half each,
+    # and if the maximum is NaN, neither operand changes it.
     if op in ("max", "min"):
-        words = ("gt", "lt") if op == "max" else ("lt", "gt")
-        first, second = (g.compare(word, x[0], x[1]) for word in words)
+        comparisons = ("gt", "lt") if op == "max" else ("lt", "gt")
+        first, second = (g.compare(comparison, x[0], x[1]) for comparison in comparisons)
         chosen = g.select(first, g.select(second, 0.0, d[1], kind), d[0], kind)
         return g.select(g.compare("eq", x[0], x[1]), chosen, g.mul(0.5, g.add(d[0], d[1])), kind)
     if op in ("reduce_max", "reduce_min"):
-        # JAX's rule too: the mean over all entries that equal the result. A chain of maxima would halve it at each tie.
+        # The mean over all entries that equal the result. A chain of maxima of two would give unequal weights at a tie of three.
         hits = [g.compare("eq", entry, value) for entry in x]
         total = functools.reduce(g.add, [g.select(hit, 0.0, step, kind) for hit, step in zip(hits, d, strict=True)])
         return g.div(total, functools.reduce(g.add, [g.convert(hit, kind) for hit in hits]))
     if op == "clamp":
-        # Strict comparisons, as in JAX: on a bound neither the number nor the bound moves the result.
+        # Comparisons are strict, as in JAX: on a bound the result has the derivative zero by the number and by the bound.
         low, inner, high = x
         is_below = g.both(g.compare("gt", low, inner), g.compare("lt", low, high))
         is_inside = g.both(g.compare("gt", inner, low), g.compare("lt", inner, high))
         flags = is_below, is_inside, g.compare("lt", high, inner)
         return functools.reduce(g.add, [g.select(flag, 0.0, step, kind) for flag, step in zip(flags, d, strict=True)])
-    # "abs": at zero JAX takes the derivative of x.
+    # "abs": at zero JAX uses the derivative of +x.
     return g.select(g.compare("ge", x[0], 0.0), g.neg(d[0]), d[0], kind)
 
 
+# Functions of one operand: dy/dx from y and x. Where y is enough, no second function has to be evaluated.
 _PARTIAL: dict[str, Callable[..., Any]] = {
     "sqrt": lambda g, y, x: g.div(0.5, y),
     "sin": lambda g, y, x: g.function("cos", x),
@@ -149,9 +160,10 @@ _PARTIAL: dict[str, Callable[..., Any]] = {
 
 
 def transpose(program: Program, linear: Sequence[bool], given: Sequence[bool]) -> Program:
-    """The transpose of a program that is linear in some of its inputs together.
+    """Transpose of a program that is jointly linear in its `linear` inputs.
 
-    Of the other inputs, and of the cotangents of those outputs that are `given`, to the cotangents of the `linear` inputs.
+    Its inputs are the other inputs, followed by the cotangents of the outputs that are `given` (those of the other outputs are
+    zero). Its outputs are the cotangents of the `linear` inputs.
     """
     key = ("transposed", tuple(linear), tuple(given))
     if key not in program.derived:
@@ -164,45 +176,49 @@ def _transpose(program: Program, linear: tuple[bool, ...], given: tuple[bool, ..
     program, graph = inline(program), Graph()
     fixed = [array for array, varies in zip(program.inputs, linear, strict=True) if not varies]
     arrays = [*fixed, *(array for array, is_given in zip(program.outputs, given, strict=True) if is_given)]
-    entries = [graph.inputs(place, array) for place, array in enumerate(arrays)]
+    entries = [graph.inputs(index, array) for index, array in enumerate(arrays)]
     # Fixed inputs come first, then the cotangents, as JAX's transpose rule passes them.
     operands = iter(entries[: len(fixed)])
-    # The values of what is linear are not needed, and not made: their places hold None.
-    values = _values_of_constants(graph, program, [None if varies else next(operands) for varies in linear])
-    # Cotangents of the operations, summed from their users: reverse order is safe, as operands precede their users.
-    bar: list = [0.0] * len(program.operations)
+    # Values that depend on the linear inputs are not needed: a linear operation is transposed from its other operands alone.
+    values = _fixed_values(graph, program, [None if varies else next(operands) for varies in linear])
+    # Each cotangent is a sum over the operations that use the value. Operands precede their users, so that in reverse order the
+    # sum is complete when it is needed.
+    cotangent_of: list = [0.0] * len(program.operations)
     cotangents = iter(entries[len(fixed) :])
     for row, is_given in zip(program.results, given, strict=True):
         if is_given:
-            for place, entry in zip(row, next(cotangents).ravel().tolist(), strict=True):
-                if type(place) is not Constant:
-                    bar[place] = graph.add(bar[place], entry)
-    sums = [[0.0] * array.size if varies else None for array, varies in zip(program.inputs, linear, strict=True)]
+            for operation, entry in zip(row, next(cotangents).ravel().tolist(), strict=True):
+                if type(operation) is not Constant:
+                    cotangent_of[operation] = graph.add(cotangent_of[operation], entry)
+    input_cotangents = [
+        [0.0] * array.size if varies else None for array, varies in zip(program.inputs, linear, strict=True)
+    ]
 
-    def give(place, cotangent):
-        if type(place) is not Constant and values[place] is None:
-            bar[place] = graph.add(bar[place], cotangent)
+    def accumulate(operand, cotangent):
+        if type(operand) is not Constant and values[operand] is None:
+            cotangent_of[operand] = graph.add(cotangent_of[operand], cotangent)
 
     for i in reversed(range(len(program.operations))):
-        # A value that is there is no function of the linear inputs, and a zero cotangent passes on zeros.
-        if values[i] is not None or not (is_number(bar[i]) or bar[i] != 0):
+        # An operation with a value does not depend on the linear inputs, and one with a zero cotangent contributes nothing.
+        if values[i] is not None or not (is_number(cotangent_of[i]) or cotangent_of[i] != 0):
             continue
         op, kind, args = program.operations[i]
         if op == "input":
-            row = sums[args[0]]
+            row = input_cotangents[args[0]]
             assert row is not None
-            row[args[1]] = bar[i]
+            row[args[1]] = cotangent_of[i]
         else:
-            _transpose_operation(graph, op, kind, args, values, bar[i], give, program)
+            _transpose_operation(graph, op, kind, args, values, cotangent_of[i], accumulate, program)
     rows = [
         (objects(row, array.shape), array)
-        for row, array, varies in zip(sums, program.inputs, linear, strict=True)
+        for row, array, varies in zip(input_cotangents, program.inputs, linear, strict=True)
         if varies and row is not None
     ]
     return graph.finish(arrays, [x[1] for x in rows], [x[0] for x in rows], name=f"transpose of {program.name}")
 
 
-def _values_of_constants(graph: Graph, program: Program, inputs: list) -> list:
+def _fixed_values(graph: Graph, program: Program, inputs: list) -> list:
+    """Values of the operations that do not depend on an input given as None; None for the others."""
     flat = [None if x is None else x.ravel().tolist() for x in inputs]
     values: list = []
     for op, kind, args in program.operations:
@@ -216,33 +232,33 @@ def _values_of_constants(graph: Graph, program: Program, inputs: list) -> list:
     return values
 
 
-def _transpose_operation(g: Graph, op: str, kind: str, args, values, c, give, program: Program) -> None:
-    """Hand the cotangent c of a linear operation to its operands."""
+def _transpose_operation(g: Graph, op: str, kind: str, args, values, c, accumulate, program: Program) -> None:
+    """Add the contributions of the cotangent c of a linear operation to the cotangents of its operands."""
 
     def value(x):
         return x.value if type(x) is Constant else values[x]
 
     if op == "add":
-        give(args[0], c)
-        give(args[1], c)
+        accumulate(args[0], c)
+        accumulate(args[1], c)
     elif op == "sub":
-        give(args[0], c)
-        give(args[1], g.neg(c))
+        accumulate(args[0], c)
+        accumulate(args[1], g.neg(c))
     elif op == "neg":
-        give(args[0], g.neg(c))
+        accumulate(args[0], g.neg(c))
     elif op == "mul":
         first, second = value(args[0]), value(args[1])
         assert first is not None or second is not None, "a product of two changes is not linear"
         if first is None:
-            give(args[0], g.mul(c, second))
+            accumulate(args[0], g.mul(c, second))
         else:
-            give(args[1], g.mul(c, first))
+            accumulate(args[1], g.mul(c, first))
     elif op == "div":
-        give(args[0], g.mul(c, g.div(1.0, value(args[1]))))
+        accumulate(args[0], g.mul(c, g.div(1.0, value(args[1]))))
     elif op == "select":
-        give(args[1], g.select(value(args[0]), c, 0.0, kind))
-        give(args[2], g.select(value(args[0]), 0.0, c, kind))
+        accumulate(args[1], g.select(value(args[0]), c, 0.0, kind))
+        accumulate(args[2], g.select(value(args[0]), 0.0, c, kind))
     elif op == "convert":
-        give(args[0], g.convert(c, program.operations[args[0]].kind))
+        accumulate(args[0], g.convert(c, program.operations[args[0]].kind))
     else:
         raise AssertionError(f"{op} is not linear")

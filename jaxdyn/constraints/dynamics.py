@@ -1,10 +1,13 @@
 """Dynamics under constraints: M a + h = tau + A^T lam, A a = gamma.
 
-In the metric of M everything is one least-squares problem. With M = L L^T, Y = L^-1 A^T and the free acceleration
-a0 = M^-1 (tau - h), the constraint force L^-1 A^T lam is the shortest w with Y^T w = gamma - A a0: Gauss's principle of
-least constraint. The pseudo-inverse of Y gives accelerations, multipliers and projections, for dependent rows too:
+By Gauss's principle of least constraint this is a least-squares problem in the metric of M. Let M = U U^T (`MassFactor`),
+Y = U^-1 A^T, and a0 = M^-1 (tau - h), the acceleration without constraints. It misses the rows by the deficit c = gamma - A a0.
+The whitened constraint force w = U^-1 A^T lam is the shortest vector with Y^T w = c. The pseudo-inverse Y^+ gives
+accelerations, multipliers and projections, for dependent rows too:
 
-    w = (Y^+)^T c,   lam = Y^+ w,   a = a0 + L^-T w,   P_T = L^-T (1 - Y Y^+) L^T,   c = gamma - A a0.
+    w = (Y^+)^T c,   lam = Y^+ w,   a = a0 + U^-T w,   P_T = U^-T (1 - Y Y^+) U^T.
+
+In the code, `Y`, `w` and `deficit` are these, and `free` is the whitened acceleration without constraints, U^-1 (tau - h).
 """
 
 from typing import Any, NamedTuple
@@ -40,12 +43,11 @@ METHODS = ("rank_aware", "schur", "range_space")
 class ConstrainedDynamics(Outcome):
     """Accelerations and constraint forces of a scene.
 
-    - `acceleration` (nv,), the rate of v: of a free or spherical joint that of its body twist, in axes that turn with the body
-      (`jd.dynamics.frame_acceleration` gives accelerations in world axes).
-    - `multipliers` (nc,), the forces of the constraints on the system along their rows, in N for rows in m and N m for rows
-      in rad.
+    - `acceleration` (nv,): the rate of v. For a free or spherical joint it is the rate of the body twist, in axes that turn with
+      the body (`jd.dynamics.frame_acceleration` gives accelerations in world axes).
+    - `multipliers` (nc,): forces of the constraints on the system along their rows, in N for rows in m and N m for rows in rad.
     - `rank` (): number of independent rows. `result`: one of `RESULTS`; `success`: true where it is `successful`.
-    - `layout`: name and place of each constraint's rows.
+    - `layout`: name of each constraint and the range of its rows.
     """
 
     acceleration: Float[Array, " nv"]
@@ -60,7 +62,10 @@ class ConstrainedDynamics(Outcome):
 
 
 class Projections(NamedTuple):
-    """P_T (nv, nv) maps velocities to admissible ones; P_omega = P_T^T removes constraint forces from forces."""
+    """Projections in the metric of M: P_T (nv, nv) of velocities onto those with A v = 0, and P_omega = P_T^T of forces.
+
+    P_omega removes the constraint forces from a generalised force.
+    """
 
     P_T: Float[Array, "nv nv"]
     P_omega: Float[Array, "nv nv"]
@@ -83,20 +88,21 @@ def constrained_dynamics(
     **Arguments:**
 
     - `q` (nq,), `v` (nv,), `tau` (nv,) in N m or N (None: zero), `t` in s. The scene's forces are added to tau.
-    - `method`: "rank_aware" for any rows: where they are dependent the acceleration is still right and the multipliers
-      are those of least norm. "schur" forms A M^-1 A^T and its Cholesky factor: faster, for independent rows.
-      "range_space" is the same without ever forming M: M^-1 is applied to the k rows by the articulated bodies of a
-      `Model`, in O(nb k) operations; for few rows on a large tree, in batches. Other systems take their dense M.
-    - `rank_tol`: singular values of L^-1 A^T below `rank_tol` times the largest count as zero. Default eps^(4/7),
-      1.1e-9 in float64 and 1.1e-4 in float32: above the 1e-12 to 1e-10 by which dependent rows differ when loops are open
-      by rounding and projection errors, below the least singular values of mechanisms that move.
+    - `method`: "rank_aware" is for any rows: where they are dependent, the acceleration is still right and the multipliers are
+      those of least norm. "schur" factors A M^-1 A^T by Cholesky: faster, for independent rows. "range_space" is the same
+      without forming M: articulated bodies of a `Model` apply M^-1 to the nc rows in O(nb nc) operations, which pays for few
+      rows on a large tree of nb bodies, in batches. Systems that are no `Model` use their dense M.
+    - `rank_tol`: singular values of Y = U^-1 A^T, with M = U U^T, count as zero below `rank_tol` times the largest. The default
+      is eps^(4/7), 1.1e-9 in float64 and 1.1e-4 in float32: above the 1e-12 to 1e-10 by which dependent rows differ when loops
+      are open by rounding and projection errors, below the least singular values of mechanisms that move.
 
     **Returns:** `ConstrainedDynamics`. Under "schur" and "range_space", dependent rows give the code `dependent_rows`.
 
     Differentiable any number of times where the rank is constant, by the derivative of the pseudo-inverse: no factorisation is
     differentiated.
 
-    **Raises:** ValueError for shapes that do not fit, unknown methods, and constraints of the scene that are none.
+    **Raises:** ValueError for shapes that do not fit, unknown methods, and items of the scene's constraints that are no
+    constraints.
 
     Source: EQUATIONS section 7; Udwadia & Kalaba (1992).
     """
@@ -108,39 +114,41 @@ def constrained_dynamics(
     q, v, tau, t = check_state(scene.system, q=q, v=v, tau=tau, t=t)
     places = layout(scene)
     if not places:
-        return _free(scene, q, v, total_force(scene, q, v, tau, t), t)
+        return _unconstrained(scene, q, v, total_force(scene, q, v, tau, t), t)
     state = q, v, tau, t
     if method != "rank_aware":
         return _by_schur(scene, *state, method=method)
-    # More rows than velocities are dependent wherever the mechanism moves: by rank at once. Else Cholesky first, and by rank the
-    # samples that it marks. Selected rows are independent by construction, and their zero rows do not count.
+    # If there are more rows than velocities, they are dependent at every state, and Cholesky would fail for all samples: such
+    # scenes take the pseudo-inverse at once. Others take Cholesky, and the pseudo-inverse only for samples that Cholesky marks as
+    # invalid. A selection leaves independent rows and zeros in the place of the dropped ones, so that the count says nothing.
     is_wide = places[-1].end > scene.nv and not has_selection(scene)
     a, lam, rank, result = (_by_rank if is_wide else _by_pivots)(rank_tol, scene, *state)
     return ConstrainedDynamics(a, lam, rank, result, places)
 
 
 def _by_rank(rank_tol, scene: Scene, q, v, tau, t):
-    """(a, lam, rank, result) for rows that may be dependent."""
-    metric, Y, free, wanted, gamma = kernel(_gauss_problem)(scene, q, v, tau, t)
-    solution = _constrain_acceleration(scene, metric, Y, free, wanted, gamma, rank_tol)
+    """(a, lam, rank, result) for rows that may be dependent, by the pseudo-inverse."""
+    metric, Y, free, deficit, gamma = kernel(_gauss_problem)(scene, q, v, tau, t)
+    solution = _constrain_acceleration(scene, metric, Y, free, deficit, gamma, rank_tol)
     return solution.acceleration, solution.multipliers, solution.rank, solution.result
 
 
-def _without_forces(rank_tol, scene: Scene, q, v, tau, t):
-    """Fallback of `_by_pivots`, where it cannot be a kernel or is not valid."""
+def _without_kernel(rank_tol, scene: Scene, q, v, tau, t):
+    """Fallback of `_by_pivots`, for scenes of which no kernel can be made and for samples that the kernel marks as invalid."""
     if not scene.forces:
         return _by_rank(rank_tol, scene, q, v, tau, t)
-    # A user's force may use operations that kernels do not have. Without the forces the rest may be a kernel; they enter as tau.
+    # A user's force may use operations that kernels do not have. It is evaluated here and enters as tau, so that the rest can be
+    # a kernel.
     bare = Scene(scene.system, scene.constraints)
     return _by_pivots(rank_tol, bare, q, v, total_force(scene, q, v, tau, t), t)
 
 
-@kernel(static=1, fallback=_without_forces)
+@kernel(static=1, fallback=_without_kernel)
 def _by_pivots(rank_tol, scene: Scene, q, v, tau, t):
-    """(a, lam, rank, result) without branches; invalid where the pivots of A M^-1 A^T are too small for their errors."""
-    metric, Y, free, wanted, _ = _gauss_problem(scene, q, v, tau, t)
+    """(a, lam, rank, result) by Cholesky; samples whose least pivot of A M^-1 A^T is near its rounding error are invalid."""
+    metric, Y, free, deficit, _ = _gauss_problem(scene, q, v, tau, t)
     normal = cholesky(regular_gram(Y) if has_selection(scene) else matmul(Y.T, Y))
-    lam = _solve_with_refinement(normal, Y, wanted)
+    lam = _solve_with_refinement(normal, Y, deficit)
     quality = jnp.where(metric.is_definite(), quality_of(normal), jnp.nan)
     is_poor = ~(quality > least_pivot(q, rank_tol))
     a, lam = (mark_invalid(is_poor, x) for x in (metric.unwhiten(free + matmul(Y, lam)), lam))
@@ -148,7 +156,7 @@ def _by_pivots(rank_tol, scene: Scene, q, v, tau, t):
 
 
 def _gauss_problem(scene: Scene, q, v, tau, t):
-    """Gauss's least-squares problem: the factor of M, Y = U^-1 A^T, U^-1 (tau + forces - h), gamma - A a0, and gamma."""
+    """Gauss's least-squares problem: the factor of M, Y, the whitened free acceleration, the deficit, and gamma."""
     row = rows(scene, q, v, t)
     metric, Y, free = _whiten_columns(scene, q, v, total_force(scene, q, v, tau, t), t, row.A)
     return metric, Y, free, row.gamma - matmul(Y.T, free), row.gamma
@@ -156,7 +164,8 @@ def _gauss_problem(scene: Scene, q, v, tau, t):
 
 def _rank_and_result(scene: Scene, q, quality):
     """Rank and code of rows that are treated as independent, from the ratio of their pivots."""
-    # The factor of a singular matrix is wrong by about nv eps in its pivots; NaN comes from a mass matrix that is not definite.
+    # Rounding makes zero pivots of a singular matrix about nv eps times the largest; the limit is ten times that. NaN marks a
+    # mass matrix that is not positive definite.
     rank = jnp.asarray(layout(scene)[-1].end, jnp.int32)
     result = RESULTS.where(quality > 10 * scene.nv * eps_of(q), RESULTS.successful, RESULTS.dependent_rows)  # pyright: ignore[reportArgumentType]
     return rank, RESULTS.where(jnp.isfinite(quality), result, RESULTS.singular_mass_matrix)
@@ -169,7 +178,7 @@ def total_force(scene: Scene, q, v, tau, t) -> Array:
     return tau if force is None else tau + force
 
 
-def _free(scene, q, v, force, t) -> ConstrainedDynamics:
+def _unconstrained(scene, q, v, force, t) -> ConstrainedDynamics:
     metric = mass_factor(mass_matrix(scene.system, q, t))
     a = metric.solve(force - bias_force(scene.system, q, v, t))
     result = RESULTS.where(metric.is_definite(), RESULTS.successful, RESULTS.singular_mass_matrix)  # pyright: ignore[reportArgumentType]
@@ -177,34 +186,34 @@ def _free(scene, q, v, force, t) -> ConstrainedDynamics:
 
 
 def solve_rows(scene: Scene, q, v, force, t, row: Rows, rank_tol: float | None = None) -> ConstrainedDynamics:
-    """Acceleration and multipliers for rows A a = gamma that may differ from the scene's in gamma."""
+    """Acceleration and multipliers for rows A a = gamma, of which A is the scene's and gamma may be another."""
     bare = Scene(scene.system)
     metric, Y, free = kernel(_whiten_columns)(bare, q, v, force, t, row.A)
     return _constrain_acceleration(scene, metric, Y, free, row.gamma - matmul(Y.T, free), row.gamma, rank_tol)
 
 
-def _constrain_acceleration(scene: Scene, metric: MassFactor, Y, free, wanted, gamma, rank_tol) -> ConstrainedDynamics:
-    """Acceleration by Gauss's principle: the shortest addition to the free one, in the metric M, that satisfies the rows."""
-    lam, pushed, rank = _min_norm_solution(Y, wanted, rank_tol)
-    # The pseudo-inverse gives the least-squares compromise of contradictory rows without saying so: the residual tells them.
-    # By Cauchy-Schwarz the residual is compared with the sizes that cancel in it.
-    missed = jnp.abs(wanted - matmul(Y.T, pushed))
-    sizes = jnp.abs(gamma) + jnp.sqrt(jnp.sum(Y * Y, 0) * (jnp.sum(free * free) + jnp.sum(pushed * pushed)))
-    # Rows that count as dependent differ by as much as the rank tolerance.
+def _constrain_acceleration(scene: Scene, metric: MassFactor, Y, free, deficit, gamma, rank_tol) -> ConstrainedDynamics:
+    """Dynamics by Gauss's principle: the least change of the free acceleration, in the metric M, that satisfies the rows."""
+    lam, w, rank = _min_norm_solution(Y, deficit, rank_tol)
+    # For contradictory rows the pseudo-inverse silently returns a least-squares compromise, which leaves a residual. The residual
+    # is compared with the terms that cancel in it, whose sizes are bounded by Cauchy-Schwarz: |Y_i . w| <= |Y_i| |w|.
+    residual = jnp.abs(deficit - matmul(Y.T, w))
+    sizes = jnp.abs(gamma) + jnp.sqrt(jnp.sum(Y * Y, 0) * (jnp.sum(free * free) + jnp.sum(w * w)))
+    # Rows that count as dependent may differ by the rank tolerance, and leave a residual of that size.
     limit = max(eps_of(Y) ** 0.5, tolerance(rank_tol, Y))
-    met = jnp.all(missed <= limit * (sizes + jnp.max(sizes)))
-    result = RESULTS.where(met, RESULTS.successful, RESULTS.contradictory_rows)  # pyright: ignore[reportArgumentType]
+    are_satisfied = jnp.all(residual <= limit * (sizes + jnp.max(sizes)))
+    result = RESULTS.where(are_satisfied, RESULTS.successful, RESULTS.contradictory_rows)  # pyright: ignore[reportArgumentType]
     result = RESULTS.where(metric.is_definite(), result, RESULTS.singular_mass_matrix)
-    a = metric.unwhiten(free + pushed)
-    if is_standalone():  # code without JAX returns a status in addition to its values
-        a = mark_invalid(~(met & metric.is_definite()), a)
+    a = metric.unwhiten(free + w)
+    if is_standalone():  # exported code has no `result`; it returns a status, which invalid values set
+        a = mark_invalid(~(are_satisfied & metric.is_definite()), a)
     return ConstrainedDynamics(a, lam, rank, result, layout(scene))
 
 
 def _whiten_columns(scene: Scene, q, v, force, t, A):
-    """M = U U^T, Y = U^-1 A^T and U^-1 (force - h)."""
+    """Factor of M = U U^T, Y = U^-1 A^T, and U^-1 (force - h)."""
     metric = mass_factor(mass_matrix(scene.system, q, t))
-    # One triangular solve for all right-hand sides.
+    # One triangular solve for all right-hand sides: the rows of A and the force.
     columns = jnp.concatenate([A, (force - bias_force(scene.system, q, v, t))[None]]).T
     whitened = metric.whiten(columns)
     return metric, whitened[:, :-1], whitened[:, -1]
@@ -217,46 +226,51 @@ def _solve_with_refinement(factor, Y, right):
     return x + solve_cholesky(factor, right - matmul(Y.T, matmul(Y, x)))
 
 
-def _min_norm_solution(Y, wanted, rank_tol):
-    """lam and w = Y lam, the shortest w with Y^T w = wanted, and the rank of Y."""
-    # More rows than velocities are dependent wherever the mechanism moves: the normal equations would fail for all samples.
+def _min_norm_solution(Y, deficit, rank_tol):
+    """lam of least norm, w = Y lam, which is the shortest w with Y^T w = deficit, and the rank of Y."""
+    # More rows than velocities are always dependent: the normal equations would fail for all samples, and are not tried.
     inverse = pseudo_inverse(Y, tolerance(rank_tol, Y), Y.shape[1] > Y.shape[0])
-    pushed = matmul(inverse.T, wanted)
-    return matmul(inverse, pushed), pushed, jnp.round(jnp.sum(inverse * Y.T)).astype(jnp.int32)
+    w = matmul(inverse.T, deficit)
+    # The rank is the trace of the projection Y Y^+.
+    return matmul(inverse, w), w, jnp.round(jnp.sum(inverse * Y.T)).astype(jnp.int32)
 
 
 def _by_schur(scene: Scene, q, v, tau, t, *, method: str) -> ConstrainedDynamics:
     """Dynamics with independent rows, by the Cholesky factor of A M^-1 A^T."""
-    by_bodies = method == "range_space" and isinstance(scene.system, Model)
-    a, lam, fine, definite = kernel(_by_bodies if by_bodies else _by_delassus)(scene, q, v, tau, t)
-    result = RESULTS.where(fine, RESULTS.successful, RESULTS.dependent_rows)  # pyright: ignore[reportArgumentType]
-    result = RESULTS.where(definite, result, RESULTS.singular_mass_matrix)
+    by_tree = method == "range_space" and isinstance(scene.system, Model)
+    a, lam, independent, is_definite = kernel(_by_articulated_bodies if by_tree else _by_delassus)(scene, q, v, tau, t)
+    result = RESULTS.where(independent, RESULTS.successful, RESULTS.dependent_rows)  # pyright: ignore[reportArgumentType]
+    result = RESULTS.where(is_definite, result, RESULTS.singular_mass_matrix)
     rank = jnp.asarray(lam.shape[0], jnp.int32)
     return ConstrainedDynamics(a, lam, rank, result, layout(scene))
 
 
 def _by_delassus(scene: Scene, q, v, tau, t):
-    metric, Y, free, wanted, _ = _gauss_problem(scene, q, v, tau, t)
-    lam, fine = _solve_delassus(matmul(Y.T, Y), wanted, scene.nv)
-    return metric.unwhiten(free + matmul(Y, lam)), lam, fine, metric.is_definite()
+    """Acceleration, multipliers, whether the rows are independent, and whether M is definite."""
+    metric, Y, free, deficit, _ = _gauss_problem(scene, q, v, tau, t)
+    lam, independent = _solve_delassus(matmul(Y.T, Y), deficit, scene.nv)
+    return metric.unwhiten(free + matmul(Y, lam)), lam, independent, metric.is_definite()
 
 
-def _by_bodies(scene: Scene, q, v, tau, t):
-    """`_by_delassus` without M: a0 and X = M^-1 A^T from one articulated-body factorisation, a = a0 + X lam."""
+def _by_articulated_bodies(scene: Scene, q, v, tau, t):
+    """`_by_delassus` without M: a0 and X = M^-1 A^T from one articulated-body factorisation, a = a0 + X lam.
+
+    Here `free` is a0 itself, without whitening.
+    """
     row, force = rows(scene, q, v, t), total_force(scene, q, v, tau, t)
     free, X = aba_with_columns(scene.system, q, v, force, row.A.T)
-    lam, fine = _solve_delassus(matmul(row.A, X), row.gamma - matmul(row.A, free), scene.nv)
-    return free + matmul(X, lam), lam, fine, jnp.isfinite(free).all()
+    lam, independent = _solve_delassus(matmul(row.A, X), row.gamma - matmul(row.A, free), scene.nv)
+    return free + matmul(X, lam), lam, independent, jnp.isfinite(free).all()
 
 
-def _solve_delassus(delassus, wanted, nv: int):
-    """lam with A M^-1 A^T lam = wanted by Cholesky, and whether the rows were independent."""
-    # A X is symmetric but for rounding, which would make the solution depend on the triangle that is read.
+def _solve_delassus(delassus, deficit, nv: int):
+    """lam with A M^-1 A^T lam = deficit by Cholesky, and whether the rows were independent."""
+    # A X is symmetric up to rounding. Cholesky reads one triangle only; the mean gives both the same weight.
     factor = cholesky(0.5 * (delassus + delassus.T))
-    pivots = jnp.diagonal(factor)
-    # The rounding error of the factor is eps times the largest entry; pivots (here their roots) at that level are noise.
-    fine = jnp.min(pivots) > (10 * nv * eps_of(delassus)) ** 0.5 * jnp.max(pivots)
-    return solve_cholesky(factor, wanted), fine
+    # The same limit for pivots as in `_rank_and_result`. The factor's diagonal has their square roots.
+    roots = jnp.diagonal(factor)
+    independent = jnp.min(roots) > (10 * nv * eps_of(delassus)) ** 0.5 * jnp.max(roots)
+    return solve_cholesky(factor, deficit), independent
 
 
 def projections(
@@ -276,14 +290,14 @@ def projections(
     q, t = check_state(scene.system, q=q, t=t)
     metric, Y = kernel(whiten_rows)(scene, q, t)
     inverse = pseudo_inverse(Y, tolerance(rank_tol, Y))
-    kept = jnp.eye(Y.shape[0], dtype=Y.dtype) - matmul(Y, inverse)
+    tangential = jnp.eye(Y.shape[0], dtype=Y.dtype) - matmul(Y, inverse)
     # U^-T (1 - Y Y^+) U^T; `momentum` of the unit velocities gives the columns of U^T.
-    P_T = metric.unwhiten(matmul(kept, metric.momentum(jnp.eye(scene.nv, dtype=Y.dtype))))
+    P_T = metric.unwhiten(matmul(tangential, metric.momentum(jnp.eye(scene.nv, dtype=Y.dtype))))
     return Projections(P_T, P_T.T)
 
 
 def whiten_rows(scene: Scene, q, t):
-    """M = U U^T and Y = U^-1 A^T."""
+    """Factor of M = U U^T, and Y = U^-1 A^T."""
     metric = mass_factor(mass_matrix(scene.system, q, t))
     return metric, metric.whiten(constraint_jacobian(scene, q, t).T)
 
@@ -291,28 +305,30 @@ def whiten_rows(scene: Scene, q, t):
 def second_fundamental_form(
     scene: Scene, q: Float[Array, " nq"], v: Float[Array, " nv"], t: Numbers = 0.0, *, rank_tol: float | None = None
 ) -> Float[Array, " nv"]:
-    """Covariant acceleration that the constraints prescribe, S(v, v) = (1 - P_T)(a + M^-1 C v).
+    """Second fundamental form of the constraints, S(v, v) = (1 - P_T)(a + M^-1 C v): the normal part of covariant accelerations.
 
-    S = M^-1 A^T (A M^-1 A^T)^+ (gamma + A M^-1 C v) needs q and v alone. M S is the force, normal to the constraints,
-    that keeps the motion on them.
+    All motions through (q, v) that satisfy the constraints have it in common, because it is a function of q and v alone:
+    S = M^-1 A^T (A M^-1 A^T)^+ (gamma + A M^-1 C v). M S is the force, normal to the constraints, that keeps the motion on them.
 
-    **Arguments:** `q` (nq,); `v` (nv,), admissible. **Returns:** (nv,), an acceleration.
+    **Arguments:** `q` (nq,); `v` (nv,) with A v = b; `t`, s; `rank_tol` as in `constrained_dynamics`.
+
+    **Returns:** (nv,), an acceleration in the units of dv/dt.
 
     Source: EQUATIONS section 7 and erratum E20.
     """
     scene = as_scene(scene)
     q, v, t = check_state(scene.system, q=q, v=v, t=t)
-    # C v without C: the bias force less its value at rest.
+    # C v without forming C: the bias force h = C v + gravity, less its value at v = 0.
     coriolis = bias_force(scene.system, q, v, t) - bias_force(scene.system, q, jnp.zeros_like(v), t)
     metric, Y = kernel(whiten_rows)(scene, q, t)
-    wanted = rows(scene, q, v, t).gamma + matmul(Y.T, metric.whiten(coriolis))
-    return metric.unwhiten(matmul(pseudo_inverse(Y, tolerance(rank_tol, Y)).T, wanted))
+    deficit = rows(scene, q, v, t).gamma + matmul(Y.T, metric.whiten(coriolis))
+    return metric.unwhiten(matmul(pseudo_inverse(Y, tolerance(rank_tol, Y)).T, deficit))
 
 
 def correction(scene: Scene, q, t, rank_tol, *, holonomic: bool) -> Array:
-    """B (nv, n) such that -B r is the shortest step, in the metric M(q), that removes the residual r of the rows.
+    """Matrix B (nv, n) for a residual r (n,) of the rows: the step -B r removes it, and is the shortest in the metric M(q).
 
-    The rows are the holonomic ones, or all.
+    With `holonomic` only the rows on positions are meant, else all rows.
     """
     metric, Y = kernel(whiten_rows)(scene, q, t)
     return _inverse_in_metric(metric, Y[:, holonomic_rows(layout(scene))] if holonomic else Y, rank_tol)

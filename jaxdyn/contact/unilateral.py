@@ -1,8 +1,7 @@
 """Forces with modes: dry friction that sticks and slips, and unilateral contacts.
 
-They are listed among the forces of a scene. `jd.simulate` tracks the modes of each of them from event to event
-(`jaxdyn.simulation.hybrid`); they are no functions of the state, because at rest the force depends on the applied
-load.
+They are listed among the forces of a scene, but they are not functions of the state: at rest, friction balances the applied load,
+whatever it is. `jd.simulate` therefore tracks the mode of each from event to event (`jaxdyn.simulation.hybrid`).
 """
 
 from typing import Any
@@ -37,18 +36,18 @@ class WithModes(eqx.Module):
 class DryFriction(WithModes):
     """Coulomb friction that sticks and slips: |f| <= mu_s N at rest, f = -mu N w/|w| while it slides with velocity w.
 
-    N is a number, a function, or the magnitude of a multiplier of the scene's constraints, whose friction
-    is then solved simultaneously.
+    N is a number, a function, or the magnitude of a multiplier of the scene's constraints. In the last case friction changes the
+    multiplier that causes it, and both are solved from the same equations.
 
     **Arguments:**
 
-    - `coefficient`: mu of sliding. `static`: mu_s of rest; None for the same.
-    - `normal`: N, in N: a number, a function normal(system, q, v, t) -> (), without friction where it is negative, or the
-      name of a constraint with one row, or of a contact (its normal force).
-    - `along`: sliding velocity: the index of a velocity, a function A(q, t) -> (nv,) or (2, nv) with w = A v, or a
-      constraint with one or two rows on the velocity, as `jd.Pfaffian(A, b)` for a belt that moves.
-    - `smoothing`: v_s, m/s: instead of modes, f = -mu N tanh(|w|/v_s) w/|w|. It never sticks but creeps at the velocity
-      v_s artanh(load/(mu N)) under a load below mu N; while it slides the force is within 1 % above 2.65 v_s.
+    - `coefficient`: mu while it slides; `static`: mu_s at rest, None for the same.
+    - `normal`: N in newtons: a number; a function normal(system, q, v, t) -> (), which gives no friction where it is negative;
+      or the name of a constraint with one row, or of a contact (its normal force).
+    - `along`: the sliding velocity w: an index of v, a function A(q, t) -> (nv,) or (2, nv) with w = A v, or a constraint with
+      one or two rows on velocities, such as `jd.Pfaffian(A, b)` for a moving belt.
+    - `smoothing`: v_s, m/s. The force is then the function f = -mu N tanh(|w|/v_s) w/|w| of the state, without modes. It never
+      sticks: under a load below mu N it creeps at v_s artanh(load/(mu N)). Above 2.65 v_s it is within 1 % of mu N.
     - `name`: name of its events.
 
     **Raises:** ValueError for coefficients and normal forces that are negative, a static one below the other, an invalid
@@ -108,19 +107,19 @@ class DryFriction(WithModes):
 class UnilateralContact(WithModes):
     """Unilateral contact with Coulomb friction: open, or closed and sticking or slipping.
 
-    It closes by an impact: without restitution p is the least impulse, in the metric of the mass matrix, that prevents
-    penetration, and it lies in the friction cone. With a coefficient e of restitution the velocity of the gap after
-    the impact is at least -e times the one before (Newton's hypothesis, for each contact); restitution does not apply
-    to friction. It opens where its normal force would become negative.
+    It closes by an impact. Without restitution the impulse is the least one, in the metric of the mass matrix, that prevents
+    penetration and lies in the friction cone. With a coefficient of restitution e, the rate of the gap after the impact is at
+    least -e times the rate before it (Newton's hypothesis, for each contact); restitution does not apply to friction. The
+    contact opens where its normal force would become negative.
 
     **Arguments:**
 
-    - `contact`: a constraint with a gap and up to two rows without slip: `jd.rolling_sphere(...)`, `jd.rolling_wheel(...)`; or
-      see `ground_contact`. The gap is positive where the contact is open.
+    - `contact`: a constraint with one row for the gap (m, positive where the contact is open) and up to two rows for slip:
+      `jd.rolling_sphere(...)` or `jd.rolling_wheel(...)`. `ground_contact` and `gap_contact` make such constraints.
     - `friction`: mu while it slides; `static`: mu at rest, None for the same.
-    - `restitution`: e, from 0 to 1. Simultaneous impacts with friction and different coefficients may gain energy
-      by Newton's hypothesis. A body that bounces to rest has infinitely many impacts: rebound velocities below
-      eps^0.3 m/s (2e-5 in float64) count as zero.
+    - `restitution`: e, from 0 to 1. By Newton's hypothesis simultaneous impacts with friction and different coefficients may
+      gain energy. A body that bounces to rest has infinitely many impacts. To end the sequence, rebound velocities below
+      eps^0.3 m/s (2e-5 in float64) count as zero: the flight after them would hardly be higher than the rounding of the gap.
     - `name`: name of its events; by default that of the constraint.
 
     **Raises:** ValueError for an invalid contact or coefficients.
@@ -141,6 +140,7 @@ class UnilateralContact(WithModes):
         restitution: Numbers = 0.0,
         name: str | None = None,
     ):
+        # `wrench_components` is None for a constraint that is no contact with a normal force.
         if not (isinstance(contact, Constraint) and contact.wrench_components() is not None):
             raise ValueError(
                 f"UnilateralContact: contact is {contact!r}; give a constraint with a gap, as jd.rolling_sphere(...), or use "
@@ -172,9 +172,10 @@ def ground_contact(
 
     **Arguments:**
 
-    - `body`: body or frame; `point` (3,) in it, None for its origin, m; `radius` of a sphere about the point, m, 0 for none.
+    - `body`: name of a body or frame. `point` (3,): the contact point in its axes, m; None for its origin. `radius`: of a sphere
+      about the point, m; 0 for the point itself.
     - `friction`, `static`, `restitution`: see `UnilateralContact`.
-    - `plane`: pose of the ground in `plane_body` (None: the world), z its normal; by default the plane z = 0.
+    - `plane`: pose of the ground in `plane_body` (None: the world), with its z axis as normal; by default the plane z = 0.
 
     **Raises:** ValueError for a bad pose, radius or coefficient; when used, for unknown bodies.
 
@@ -184,23 +185,23 @@ def ground_contact(
     ```
     """
     name = f"{body} on the ground" if name is None else name
-    size = jnp.asarray(as_array(radius, f"ground_contact {name!r}: radius"), float)
-    if size.shape != () or (is_concrete(size) and not 0 <= float(size) < np.inf):
+    radius_leaf = jnp.asarray(as_array(radius, f"ground_contact {name!r}: radius"), float)
+    if radius_leaf.shape != () or (is_concrete(radius_leaf) and not 0 <= float(radius_leaf) < np.inf):
         raise ValueError(f"ground_contact {name!r}: radius is {radius}; give one number (m), 0 for a point")
-    touching = RollingSphere(
+    contact = RollingSphere(
         name=name,
         body=body,
         surface_body=plane_body,
         pose=pose_leaf(point, f"ground_contact {name!r}: point"),
         surface=pose_leaf(plane, f"ground_contact {name!r}: plane"),
-        radius=size,
+        radius=radius_leaf,
         surface_radius=None,
         on="plane",
         inside=False,
         contact=True,
         spin=False,
     )
-    return UnilateralContact(touching, friction, static=static, restitution=restitution, name=name)
+    return UnilateralContact(contact, friction, static=static, restitution=restitution, name=name)
 
 
 def gap_contact(
@@ -218,7 +219,7 @@ def gap_contact(
 
     - `gap`: gap(q, t) -> () in m, positive where the contact is open; differentiable twice.
     - `along`: A(q, t) -> (nv,) or (2, nv): the sliding velocity is A v, m/s; None without friction.
-    - `friction`, `static`, `restitution`: see `UnilateralContact`. `name`: of its events.
+    - `friction`, `static`, `restitution`: see `UnilateralContact`. `name`: name of its events.
 
     **Raises:** ValueError for invalid functions and coefficients; when used, for shapes that do not fit.
 
@@ -228,8 +229,8 @@ def gap_contact(
     """
     name = _check_name(name, "gap_contact")
     rows = None if along is None else as_pytree(along, f"gap_contact {name!r}: along")
-    touching = _Gap(gap=as_pytree(gap, f"gap_contact {name!r}: gap"), along=rows, name=name)
-    return UnilateralContact(touching, friction, static=static, restitution=restitution, name=name)
+    contact = _Gap(gap=as_pytree(gap, f"gap_contact {name!r}: gap"), along=rows, name=name)
+    return UnilateralContact(contact, friction, static=static, restitution=restitution, name=name)
 
 
 def has_modes(scene: Scene) -> bool:
@@ -257,7 +258,7 @@ class _Gap(Constraint):
     name: str = eqx.field(static=True)
 
     def wrench_components(self):
-        """Empty order of multipliers: a contact without a frame in space."""
+        """No components: the contact has a normal force, but no frame in space in which a wrench could be given."""
         return ()
 
     def position(self, system, q, t):
@@ -278,18 +279,19 @@ def _check_name(name: Any, owner: str) -> str:
 
 def _coefficients(sliding: Any, static: Any, owner: str):
     """Check sliding and static coefficients and convert them to leaves."""
-    both = [
+    coefficients = [
         jnp.asarray(as_array(x, f"{owner}: coefficient"), float)
         for x in (sliding, sliding if static is None else static)
     ]
-    if is_concrete(both):
-        mu, mu_s = (np.asarray(x) for x in both)
+    if is_concrete(coefficients):
+        mu, mu_s = (np.asarray(x) for x in coefficients)
         if not (np.isfinite(mu).all() and (mu >= 0).all() and np.isfinite(mu_s).all() and (mu_s >= mu).all()):
             raise ValueError(f"{owner}: coefficients are {mu} sliding and {mu_s} at rest; give 0 <= sliding <= static")
-    return both
+    return coefficients
 
 
 def _positive(value: Any, what: str):
+    """Check a positive velocity (m/s) and convert it to a leaf; None stays None."""
     if value is None:
         return None
     number = jnp.asarray(as_array(value, what), float)

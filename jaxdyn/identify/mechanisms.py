@@ -1,4 +1,4 @@
-"""Mechanisms with a few measured joints: states on the constraints near a measurement, and logs of all joints."""
+"""Mechanisms of which some joints are measured: the nearest states on the constraints, and logs completed by them."""
 
 from collections.abc import Sequence
 from typing import Any
@@ -21,13 +21,20 @@ from jaxdyn.systems.mass_factor import solve_positive
 from jaxdyn.systems.scene import Scene, as_scene
 from jaxdyn.systems.system import SceneLike, displace, displacement
 
-# Gauss-Newton steps, and the weights of constraints and of the change of all coordinates, relative to a measured one. The
-# last is so small that it determines only coordinates that neither constraints nor measurements do.
-_ROUNDS, _EXACT, _STAYS = 5, 1e2, 1e-8
+# Gauss-Newton steps of a search. `on_constraints` then projects the state by `assemble`, so that its accuracy does not depend on
+# this number.
+_ITERATIONS = 5
+# Weight of the residual of a constraint, where that of a measured coordinate has 1. A contradiction between both is divided by
+# the squares of the weights: for rows of unit size all but 1e-4 of it stays in the measured coordinates. A larger weight would
+# cost digits in the normal equations.
+_CONSTRAINT_WEIGHT = 1e2
+# Weight of the squared change of every coordinate: so small that it determines only the coordinates that neither constraints nor
+# measurements do.
+_REGULARISATION = 1e-8
 
 
 def observation_columns(system: Any, observed: Sequence[Any]) -> tuple[int, ...]:
-    """Indices in v of joints by name, or of the coordinates of a system without bodies by index.
+    """Indices in v of the observed joints, given by name, or of the coordinates of a system without bodies, given by index.
 
     **Raises:** ValueError for those that do not exist.
     """
@@ -42,55 +49,60 @@ def observation_columns(system: Any, observed: Sequence[Any]) -> tuple[int, ...]
 
 
 def on_constraints(scene: Scene, q, v, t, columns: tuple[int, ...] | None) -> Assembly:
-    """State on a scene's constraints nearest to (q, v).
+    """State on a scene's constraints that is nearest to (q, v).
 
-    Nearest in the mass metric; or, where only the velocities `columns` and their coordinates were measured, by least squares of
-    these, while the others change as little as the constraints allow.
+    Without `columns` the distance is that of the mass metric. `columns` are the indices in v of the measured coordinates: the
+    state then fits these by least squares, and the other coordinates change as little as the constraints allow.
     """
     if columns is None:
         return assemble(scene, q, v, t, throw=False)
 
-    def nearer(at, _):
-        step = rows(scene, at, jnp.zeros_like(v), t).A[holonomic]
-        left = jnp.concatenate([-_EXACT * position_residual(scene, at, t), displacement(scene.system, at, q)[measured]])
-        return displace(scene.system, at, _least_squares(step, picked, left)), None
+    def improve(at, _):
+        jacobian = rows(scene, at, jnp.zeros_like(v), t).A[holonomic]
+        misfit = displacement(scene.system, at, q)[measured]
+        targets = jnp.concatenate([-_CONSTRAINT_WEIGHT * position_residual(scene, at, t), misfit])
+        return displace(scene.system, at, _least_squares(jacobian, selector, targets)), None
 
     measured = np.array(columns)
-    picked = jnp.eye(scene.nv, dtype=q.dtype)[measured]
+    selector = jnp.eye(scene.nv, dtype=q.dtype)[measured]
     holonomic = np.concatenate([np.arange(place.start, place.nonholonomic) for place in layout(scene)])
-    near = lax.scan(nearer, q, None, length=_ROUNDS)[0] if len(holonomic) else q
+    near = lax.scan(improve, q, None, length=_ITERATIONS)[0] if len(holonomic) else q
     return assemble(scene, near, nearest_velocity(scene, near, v, t, columns), t, throw=False)
 
 
 def nearest_velocity(scene: Scene, q, v, t, columns: tuple[int, ...]) -> Float[Array, " nv"]:
     """Velocity (nv,) on a scene's constraints whose `columns` fit those of v by least squares."""
-    picked = jnp.eye(scene.nv, dtype=q.dtype)[np.array(columns)]
+    selector = jnp.eye(scene.nv, dtype=q.dtype)[np.array(columns)]
 
-    def nearer(now, _):
-        here = rows(scene, q, now, t)
-        left = jnp.concatenate([-_EXACT * here.velocity, (v - now)[np.array(columns)]])
-        return now + _least_squares(here.A, picked, left), None
+    # The rows are affine in v. Repetition removes the effect of the regularisation, which pulls each change towards zero.
+    def improve(estimate, _):
+        at = rows(scene, q, estimate, t)
+        targets = jnp.concatenate([-_CONSTRAINT_WEIGHT * at.velocity, (v - estimate)[np.array(columns)]])
+        return estimate + _least_squares(at.A, selector, targets), None
 
-    return lax.scan(nearer, v, None, length=_ROUNDS)[0]
+    return lax.scan(improve, v, None, length=_ITERATIONS)[0]
 
 
-def _least_squares(A, picked, left):
-    """Smallest change that removes the residuals of constraints and of measured coordinates."""
-    both = jnp.concatenate([_EXACT * A, picked])
-    return solve_positive(both.T @ both + _STAYS * jnp.eye(both.shape[1], dtype=both.dtype), both.T @ left)
+def _least_squares(A, selector, targets):
+    """Change x (nv,) of least squares for A x and x[measured] = `targets`, whose first rows have the constraints' weight."""
+    stacked = jnp.concatenate([_CONSTRAINT_WEIGHT * A, selector])
+    normal = stacked.T @ stacked + _REGULARISATION * jnp.eye(stacked.shape[1], dtype=stacked.dtype)
+    return solve_positive(normal, stacked.T @ targets)
 
 
 def complete_log(scene: SceneLike, t: Numbers, measured: dict[Any, Any], tau: Numbers, guess: Numbers) -> Log:
     """Log of all joints of a mechanism, from the measured joints and the constraints.
 
-    Positions of the other joints satisfy the constraints and are nearest to those of the sample before (the first to `guess`);
-    velocities are the least squares of A v = b and of the measured ones. At least as many joints must be measured as the
-    mechanism has degrees of freedom; with more, positions are the least squares of the measured ones on the constraints.
+    Positions of the other joints satisfy the constraints and are nearest to those of the previous sample, for the first sample to
+    `guess`. Velocities fit A v = b and the measured ones by least squares. At least as many joints must be measured as the
+    mechanism has degrees of freedom; with more, positions on the constraints fit the measured ones by least squares.
 
-    **Arguments:** `scene`, with constraints; `t` (n,), s; `measured`: {joint: (q (n,), v (n,))} of joints with one degree of
-    freedom,
-      rad or m, by name, or by index for a system without bodies;
-    `tau` (n, nv), N m or N, zero where there are no motors; `guess` (nq,): a configuration near the first one.
+    **Arguments:**
+
+    - `scene`: a scene with constraints. `t` (n,): times of the samples, s.
+    - `measured`: {joint: (q (n,), v (n,))}, rad and rad/s or m and m/s, of joints with one degree of freedom. Keys are names, or
+      indices for a system without bodies.
+    - `tau` (n, nv): N m or N, zero where there are no motors. `guess` (nq,): a configuration near the first sample.
 
     **Returns:** `Log` without accelerations, in which measured joints keep their measured values. Pass the joints as
     `observed=` to `fit_parameters`, which then compares them alone.
@@ -106,8 +118,8 @@ def complete_log(scene: SceneLike, t: Numbers, measured: dict[Any, Any], tau: Nu
         raise ValueError("scene has no constraints, from which the other joints could follow; pass a mechanism")
     dtype, names = state_dtype(system), list(measured)
     columns = observation_columns(system, names)
-    places = [system.q_index(name) for name in names] if isinstance(system, Model) else list(columns)
-    if not all(isinstance(place, int) for place in places) or len(columns) != len(names):
+    q_indices = [system.q_index(name) for name in names] if isinstance(system, Model) else list(columns)
+    if not all(isinstance(index, int) for index in q_indices) or len(columns) != len(names):
         raise ValueError(f"measured names {names}; name joints with one degree of freedom each")
     t = np.asarray(as_array(t, "t"), np.float64)
     motion = {name: [jnp.asarray(as_array(x, f"measured[{name!r}]", dtype)) for x in measured[name]] for name in names}
@@ -118,20 +130,21 @@ def complete_log(scene: SceneLike, t: Numbers, measured: dict[Any, Any], tau: Nu
     guess = jnp.asarray(as_array(guess, "guess", dtype))
     if guess.shape != (system.nq,):
         raise ValueError(f"guess has shape {guess.shape}, expected {(system.nq,)} = (nq,)")
-    exact = isinstance(system, Model) and len(names) <= degrees_of_freedom(scene, guess)
+    # No more measured joints than degrees of freedom: `assemble` can hold all of them at their measured positions.
+    can_hold = isinstance(system, Model) and len(names) <= degrees_of_freedom(scene, guess)
 
-    def follow(near, sample):
-        at, rate, time = sample
-        start = near.at[np.array(places)].set(at)
-        v = jnp.zeros((system.nv,), dtype).at[np.array(columns)].set(rate)
-        if not exact:
+    def complete_sample(previous, sample):
+        position, velocity, time = sample
+        start = previous.at[np.array(q_indices)].set(position)
+        v = jnp.zeros((system.nv,), dtype).at[np.array(columns)].set(velocity)
+        if not can_hold:
             nearest = on_constraints(scene, start, v, time, columns)
             return nearest.q, (nearest.q, nearest.v, nearest.result == RESULTS.successful)
-        held = assemble(scene, start, None, time, hold={name: at[i] for i, name in enumerate(names)}, throw=False)
+        held = assemble(scene, start, None, time, hold={name: position[i] for i, name in enumerate(names)}, throw=False)
         v = nearest_velocity(scene, held.q, v, time, columns)
         return held.q, (held.q, v, held.result == RESULTS.successful)
 
-    _, (q, v, good) = jax.jit(lambda *samples: lax.scan(follow, guess, samples))(
+    _, (q, v, good) = jax.jit(lambda *samples: lax.scan(complete_sample, guess, samples))(
         positions, velocities, jnp.asarray(t, dtype)
     )
     if not bool(good.all()):
@@ -140,7 +153,7 @@ def complete_log(scene: SceneLike, t: Numbers, measured: dict[Any, Any], tau: Nu
             f"the mechanism cannot be assembled at sample {i} (t = {t[i]:.6g} s); check measured, lengths and guess"
         )
     q, v = np.array(q), np.array(v)
-    q[:, np.array(places)], v[:, np.array(columns)] = positions, velocities
+    q[:, np.array(q_indices)], v[:, np.array(columns)] = positions, velocities
     return Log(t, q, v, None, np.asarray(tau, np.float64))
 
 

@@ -1,4 +1,4 @@
-"""Data of links and joints of a URDF file, with the format's defaults for missing attributes."""
+"""Links and joints of a URDF file as data, with the format's defaults for missing attributes."""
 
 from typing import NamedTuple
 
@@ -8,11 +8,16 @@ from jaxdyn.io.urdf_check import NUMBERS, check_elements
 from jaxdyn.io.xml_lines import XmlFile
 from jaxdyn.model import float64 as f64
 
-_MOMENTS = np.array([["ixx", "ixy", "ixz"], ["ixy", "iyy", "iyz"], ["ixz", "iyz", "izz"]])
+# Attributes of <inertia>, in the order of the entries of the matrix.
+_INERTIA_ATTRIBUTES = np.array([["ixx", "ixy", "ixz"], ["ixy", "iyy", "iyz"], ["ixz", "iyz", "izz"]])
 
 
 class Inertial(NamedTuple):
-    """Inertial data: mass (kg), inertia (3, 3) (kg m^2) and pose (4, 4) of its axes in the link; None where missing."""
+    """Inertial data of a link; None where the file has no such element.
+
+    `mass` in kg; `inertia` (3, 3) in kg m^2, about the centre of mass, in the axes of `origin`; `origin` (4, 4): pose of a frame
+    at the centre of mass, in the link's frame.
+    """
 
     mass: float | None
     inertia: np.ndarray | None
@@ -20,7 +25,7 @@ class Inertial(NamedTuple):
 
 
 class Mimic(NamedTuple):
-    """Mimic relation to a leading joint: q = multiplier q[joint] + offset."""
+    """Coupling of a joint's position q to that of another one: q = multiplier q[joint] + offset (rad or m)."""
 
     joint: str
     multiplier: float
@@ -28,7 +33,12 @@ class Mimic(NamedTuple):
 
 
 class Joint(NamedTuple):
-    """Joint data: `origin` (4, 4) of the child in the parent; `limit` and `dynamics` hold the given attributes."""
+    """Joint as the file describes it.
+
+    `origin` (4, 4): pose of the joint's frame, which is the child's at q = 0, in the parent's frame. `axis` (3,): in the joint's
+    frame, not normalised. `limit` and `dynamics`: the numeric attributes that the file has, in its units; `limit` is None
+    without the element.
+    """
 
     name: str
     type: str
@@ -42,7 +52,10 @@ class Joint(NamedTuple):
 
 
 class Parts(NamedTuple):
-    """Contents of a file: the robot's name, links and joints by name in the file's order, and file:line of each."""
+    """Contents of a file: the robot's name, its links and joints by name in the order of the file, and the line of each.
+
+    A link without inertial data is None.
+    """
 
     name: str
     links: dict[str, Inertial | None]
@@ -65,7 +78,9 @@ def _inertial(element) -> Inertial | None:
     if element is None:
         return None
     mass, inertia = element.find("mass"), element.find("inertia")
-    matrix = None if inertia is None else np.array([[float(inertia.get(key)) for key in row] for row in _MOMENTS])
+    matrix = (
+        None if inertia is None else np.array([[float(inertia.get(key)) for key in row] for row in _INERTIA_ATTRIBUTES])
+    )
     return Inertial(None if mass is None else float(mass.get("value")), matrix, _origin(element))
 
 
@@ -81,11 +96,12 @@ def _joint(element) -> Joint:
         _vector(axis, "xyz", "1 0 0"),
         None if limit is None else _numbers(limit),
         _numbers(element.find("dynamics")),
-        None if mimic is None else Mimic(mimic.get("joint"), *(float(mimic.get(*d)) for d in _MIMIC)),
+        None if mimic is None else _mimic(mimic),
     )
 
 
-_MIMIC = (("multiplier", "1"), ("offset", "0"))
+def _mimic(element) -> Mimic:
+    return Mimic(element.get("joint"), float(element.get("multiplier", "1")), float(element.get("offset", "0")))
 
 
 def _origin(element) -> np.ndarray | None:
@@ -103,7 +119,7 @@ def _vector(element, key: str, default: str) -> np.ndarray:
 
 
 def _numbers(element) -> dict[str, float]:
-    """Numeric attributes of an element."""
+    """Numeric attributes of an element, of those that the format defines (`NUMBERS`)."""
     if element is None:
         return {}
     return {key: float(element.get(key)) for key in NUMBERS[element.tag] if element.get(key) is not None}

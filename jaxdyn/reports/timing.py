@@ -1,4 +1,4 @@
-"""Interleaved timing: all contestants run in one loop, so that drifts of the machine affect all alike."""
+"""Interleaved timing: all contestants run in turn in one loop, so that drifts of the machine's speed affect all alike."""
 
 import os
 import platform
@@ -13,35 +13,40 @@ import jax
 
 
 def time_interleaved(contestants: dict, rounds: int = 20, least: float = 0.02, most: float = float("inf")) -> dict:
-    """Seconds per call of each contestant (a function of no arguments that blocks until done): "best", "median", "rounds".
+    """Seconds per call of each contestant over several rounds: {name: {"best", "median", "rounds" (their number)}}.
 
-    Calls shorter than `least` seconds are repeated within a round; a contestant that has used
-    `most` seconds drops out after three rounds.
+    **Arguments:** `contestants`: {name: a function of no arguments that returns when its computation is done}. `least` (s): calls
+    that are shorter are repeated within a round until they take this long together. `most` (s): a contestant that has used this
+    much time drops out once it has three rounds, enough for a median.
     """
     repeats, spent = {}, {}
     for name, call in contestants.items():
-        call()
+        call()  # compiles, and is not timed
         start = time.perf_counter()
         call()
         spent[name] = time.perf_counter() - start
-        repeats[name] = max(1, int(least / max(spent[name], 1e-7)))
+        repeats[name] = max(1, int(least / max(spent[name], 1e-7)))  # no call is faster than 0.1 us
     samples = {name: [] for name in contestants}
-    for count in range(rounds):
+    for index in range(rounds):
         for name, call in contestants.items():
-            if count >= 3 and spent[name] > most:
+            if index >= 3 and spent[name] > most:
                 continue
             start = time.perf_counter()
             for _ in range(repeats[name]):
                 call()
-            passed = time.perf_counter() - start
-            spent[name] += passed
-            samples[name].append(passed / repeats[name])
+            elapsed = time.perf_counter() - start
+            spent[name] += elapsed
+            samples[name].append(elapsed / repeats[name])
     return {name: {"best": min(x), "median": statistics.median(x), "rounds": len(x)} for name, x in samples.items()}
 
 
 def machine(packages: Sequence[str] = ()) -> dict:
-    """Processor, device, cores, load and versions, for the head of a report; `packages` are added to ours."""
-    processor = platform.processor()
+    """Description of the machine for the head of a report: processor, JAX's device, cores, load and versions of packages.
+
+    The load is the average over the last minute. Versions are those of jaxdyn, its main dependencies and `packages`, None for a
+    package that is not installed.
+    """
+    processor = platform.processor()  # on Linux often empty or only the architecture
     try:
         processor = next(
             line.split(":", 1)[1].strip()
@@ -66,14 +71,15 @@ def machine(packages: Sequence[str] = ()) -> dict:
 
 
 def commit() -> str | None:
-    """Commit of the package's source tree, with "+" for modified files; None outside of a repository."""
+    """Commit of the package's source tree, followed by "+" if tracked files are modified; None outside of a repository."""
 
     def git(*arguments) -> str:
         call = ["git", "-C", str(Path(__file__).parent), *arguments]
         return subprocess.run(call, capture_output=True, text=True, check=True).stdout.strip()
 
     try:
-        git("ls-files", "--error-unmatch", Path(__file__).name)  # an installation may be inside another repository
+        # An installed package may lie inside another repository, which does not track this file: git then fails.
+        git("ls-files", "--error-unmatch", Path(__file__).name)
         return git("rev-parse", "HEAD") + ("+" if git("status", "--porcelain", "--untracked-files=no") else "")
     except (OSError, subprocess.CalledProcessError):
         return None

@@ -1,7 +1,8 @@
-"""Program of a batch: a function of one member, mapped over a batch that is shared among the devices of this process.
+"""Compiled program of a batch: a function of one member, vectorised, with the batch divided among the devices of this process.
 
-Members are independent, so that a program has no communication: `jax.shard_map` gives each device its part of the batch, and a
-device that is done waits for the others only when the results are read. Processes share a store and no program.
+A member is one rollout. Members are independent, so that devices do not communicate: `jax.shard_map` gives each its part of the
+batch, and a device that has finished waits for the others only when the results are read. Each process compiles its own program;
+processes have only the store in common.
 """
 
 import contextlib
@@ -17,17 +18,23 @@ from jaxdyn.compile import compilation
 from jaxdyn.compile.calls import function_of, glue_options
 from jaxdyn.scale.members import Members
 
-BATCH = {"cpu": 2048}  # members of a device in one program: more do not run faster there
-BATCH_ELSEWHERE = 16384
-IN_FLIGHT = 3  # batches whose results are in memory at once: computed, copied, waiting to be
-SHARE = 0.5  # of the free memory, for programs and results
+# Members per device in one program. On a CPU larger batches do not run faster; other devices need more to be busy.
+MEMBERS_PER_DEVICE = {"cpu": 2048}
+MEMBERS_PER_ACCELERATOR = 16384
+# Batches whose results are in memory at once: one is computed, one copied to the host, one waits to be copied.
+IN_FLIGHT = 3
+# Fraction of the free memory that programs and results may take.
+MEMORY_FRACTION = 0.5
 
 
 class Program:
     """A function of one member, compiled for `size` members at a time on these devices.
 
-    `size` is lowered where such a program does not fit into `memory` (bytes). `is_glue`: the members are motions, which kernels
-    compute, so that XLA may spend less effort on the operations between them.
+    `size` is reduced where the program does not fit into `memory` (bytes; by default a fraction of the free memory). `is_glue`:
+    the members are motions, which are computed by kernels. What XLA compiles is then only the glue between kernels, and it is
+    told to compile it quickly.
+
+    Attributes: `size`, the members of a batch; `bytes`, the memory that it needs; `lowered`, a hash of the lowered program.
 
     **Raises:** MemoryError with the figures where not even one member for each device fits.
     """
@@ -43,14 +50,19 @@ class Program:
     ):
         self.members, self.devices = members, list(devices)
         options = glue_options(self.devices[0].platform) if is_glue else None
-        kinds = (jax.sharding.AxisType.Auto,)
-        mesh = jax.make_mesh((len(self.devices),), ("rollouts",), devices=self.devices, axis_types=kinds)
-        # No value is the same on all devices: the check for such values would find nothing.
-        shares: Any = {"mesh": mesh, "in_specs": jax.P("rollouts"), "out_specs": jax.P("rollouts"), "check_vma": False}
-        batch = jax.jit(jax.shard_map(jax.vmap(one), **shares))
-        least = len(self.devices)
+        axis_types = (jax.sharding.AxisType.Auto,)
+        mesh = jax.make_mesh((len(self.devices),), ("rollouts",), devices=self.devices, axis_types=axis_types)
+        # `check_vma` checks values that are equal on all devices. Here every value belongs to one device.
+        options_of_map: Any = {
+            "mesh": mesh,
+            "in_specs": jax.P("rollouts"),
+            "out_specs": jax.P("rollouts"),
+            "check_vma": False,
+        }
+        batch = jax.jit(jax.shard_map(jax.vmap(one), **options_of_map))
+        least = len(self.devices)  # one member for each device; sizes are multiples of it
         self.size = max(least, -(-size // least) * least)
-        budget = available_memory(self.devices) * SHARE if memory is None else memory
+        budget = available_memory(self.devices) * MEMORY_FRACTION if memory is None else memory
         while True:
             lowered = batch.lower(jax.tree.map(self._batch_shape, member_shapes(members)))
             self.lowered = hashlib.sha256(lowered.as_text().encode()).hexdigest()[:16]
@@ -63,22 +75,26 @@ class Program:
                     f"a program of {least} rollouts needs {self.bytes / 2**20:.3g} MiB, and {budget / 2**20:.3g} MiB are allowed "
                     "(memory=, or half of what is free); save fewer points or outputs, or take fewer devices"
                 )
-            # Memory is about proportional to the size; a tenth less, so that the next program fits most often.
+            # Memory is nearly proportional to the size. A tenth less makes it likely that the next program fits. Sizes are at
+            # least halved, which bounds the number of compilations.
             fitting = int(0.9 * self.size * budget / self.bytes)
             self.size = max(least, min(fitting, self.size // 2) // least * least)
         self._first: tuple[np.ndarray, Any] | None = None
 
     def start(self, numbers: np.ndarray) -> Any:
-        """Begin to compute these members, at most `size`; reading the result waits for it."""
+        """Start to compute the members with these numbers (n,), at most `size` of them.
+
+        JAX returns at once, and reading the result waits for it. Rows beyond n are copies of the last member.
+        """
         if self._first is not None and np.array_equal(self._first[0], numbers):
             return self._first[1]
-        # A last batch is filled up by repeating a member: a program of another size would be another compilation.
+        # An incomplete last batch is filled with copies: a program of another size would have to be compiled.
         return self.compiled(
             self.members.inputs(np.concatenate([numbers, np.repeat(numbers[-1:], self.size - len(numbers))]))
         )
 
     def time(self, numbers: np.ndarray, clock: Callable[[], float]) -> float:
-        """Seconds of a batch; its result is kept for the next call with these members."""
+        """Seconds that a batch takes. `start` returns the kept result when it is called with the same members."""
         before = clock()
         self._first = numbers, jax.block_until_ready(self.start(numbers))
         return clock() - before
@@ -87,24 +103,25 @@ class Program:
         return jax.ShapeDtypeStruct((self.size, *one.shape), one.dtype)
 
     def _program_bytes(self) -> int:
-        """Bytes of the program and of the results that are in memory at once, on all devices, by XLA's own account."""
+        """Bytes of the program and of the results that are in memory at once, on all devices, as XLA reports them."""
         analysis = self.compiled.memory_analysis()
         if analysis is None:
             return 0
-        # XLA's figures are those of one device.
+        # XLA reports the figures of one device.
         own = analysis.temp_size_in_bytes + analysis.argument_size_in_bytes
         return len(self.devices) * (own + IN_FLIGHT * analysis.output_size_in_bytes)
 
 
 class Traced:
-    """`one(drawn, row) -> dict of arrays`, traced once: programs of several sizes do not run its Python again.
+    """Function `one(drawn, row) -> dict of arrays`, traced once, so that programs of several sizes do not run its Python again.
 
-    `shapes`: shapes and dtypes of the arrays of one member, by name.
+    `drawn` are the parameters that a member draws from its random key, `row` is its row of the given arrays (`Members`); either
+    may be None. `shapes`: shapes and dtypes of the arrays of one member, by name.
     """
 
     def __init__(self, one: Callable, members: Members):
         self._origin = one, members
-        # Tracing a scene and its integrator takes seconds, and is the largest part of the start.
+        # Tracing a scene and its integrator takes seconds, the largest part of the time to the first result.
         trace = jax.make_jaxpr(lambda given: one(*members.one(given)), return_shape=True)
         operations, self.shapes = trace(member_shapes(members))
         self._call = function_of(operations)
@@ -126,23 +143,23 @@ def member_shapes(members: Members) -> Any:
 
 
 def fingerprint(one: Callable, members: Members) -> str:
-    """Hash of the computation for one member, by operations of JAX alone: equal on every machine with these versions."""
-    # Kernels contain machine code, whose bytes depend on the processor.
+    """Hash of the computation for one member; equal on all machines with the same versions of the packages."""
+    # Without kernels: they contain machine code, whose bytes depend on the processor.
     with compilation("plain"):
         text = jax.jit(lambda given: one(*members.one(given))).lower(member_shapes(members)).as_text()
     return hashlib.sha256(text.encode()).hexdigest()[:16]
 
 
 def default_size(devices: Sequence[Any]) -> int:
-    """Members of a batch on all devices together."""
-    return sum(BATCH.get(device.platform, BATCH_ELSEWHERE) for device in devices)
+    """Default number of members in a batch, on all devices together."""
+    return sum(MEMBERS_PER_DEVICE.get(device.platform, MEMBERS_PER_ACCELERATOR) for device in devices)
 
 
 def available_memory(devices: Sequence[Any]) -> int:
-    """Free memory, bytes: of the devices where they report it, else of the host and of the cgroup of this process."""
-    reports = [device.memory_stats() for device in devices]
-    if all(one and "bytes_limit" in one for one in reports):
-        return sum(one["bytes_limit"] - one.get("bytes_in_use", 0) for one in reports)
+    """Free memory in bytes: that of the devices if they report it, else the lesser of the host's and the process's cgroup's."""
+    all_stats = [device.memory_stats() for device in devices]
+    if all(stats and "bytes_limit" in stats for stats in all_stats):
+        return sum(stats["bytes_limit"] - stats.get("bytes_in_use", 0) for stats in all_stats)
     free = []
     with contextlib.suppress(OSError):
         lines = Path("/proc/meminfo").read_text(encoding="ascii").splitlines()
@@ -152,4 +169,4 @@ def available_memory(devices: Sequence[Any]) -> int:
             int(Path(f"/sys/fs/cgroup/memory.{name}").read_text(encoding="ascii")) for name in ("max", "current")
         )
         free.append(limit - used)
-    return min(free, default=2**31)
+    return min(free, default=2**31)  # a cautious 2 GiB on systems with neither file, such as macOS

@@ -13,7 +13,7 @@ import numpy as np
 
 from jaxdyn.scale.description import Description
 from jaxdyn.scale.members import Members
-from jaxdyn.scale.program import SHARE, Program, Traced, available_memory, default_size, fingerprint
+from jaxdyn.scale.program import MEMORY_FRACTION, Program, Traced, available_memory, default_size, fingerprint
 from jaxdyn.scale.reducer import Reducer
 from jaxdyn.scale.reductions import Arrays
 from jaxdyn.scale.store import Store
@@ -89,7 +89,7 @@ class Computation:
             size = max(min(len(devices) * LEAST_BATCH, study.members.count), size // SORTED_BATCHES)
         memory = study.memory
         if memory is None and study.sharing > 1:
-            memory = int(SHARE * available_memory(devices) / study.sharing)
+            memory = int(MEMORY_FRACTION * available_memory(devices) / study.sharing)
         batch, outputs = study.members, study.outputs
         self.program = Program(outputs.traced, batch, devices, size, memory, outputs.is_motion)
         if callable(study.cost):

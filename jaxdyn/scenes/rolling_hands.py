@@ -1,4 +1,4 @@
-"""Hands whose fingertips, smooth surfaces of any shape, roll on the object."""
+"""Hands whose fingertips roll on the object, both of them smooth surfaces."""
 
 import jax
 import numpy as np
@@ -24,13 +24,13 @@ from jaxdyn.scenes.hands import (
     _turn,
 )
 
-_EGG = (0.1, 0.09, 0.11)
-_TIP = (0.03, 0.02, 0.025)
-_ROUNDS = 60
+_EGG_SEMI_AXES = (0.1, 0.09, 0.11)  # m
+_TIP_SEMI_AXES = (0.03, 0.02, 0.025)  # m
+_ITERATIONS = 60  # of the fixed point in `_finger_state`
 
 
 def _support(semi_axes, normal):
-    """Support point of an ellipsoid in the direction of an outward normal."""
+    """Point (3,) of an ellipsoid at which its outward unit normal is `normal`, from its centre and in its axes."""
     xp = array_namespace(semi_axes, normal)
     semi_axes, normal = xp.asarray(semi_axes, float), xp.asarray(normal, float)
     scaled = semi_axes * normal
@@ -38,24 +38,31 @@ def _support(semi_axes, normal):
 
 
 def _finger_state(base, links, tip_axes, point, normal, velocity):
-    """Angles and rates of a finger whose ellipsoidal tip touches a moving point with a given outward normal."""
+    """Angles (yaw, pitch, pitch) and their rates, of a finger whose ellipsoidal tip touches a moving point of the object.
+
+    `base` is the pose of the finger's base. `point`, `normal` and `velocity` (3,) are the contact point, the outward normal of
+    the object and the velocity of its material point there, in world axes.
+    """
     xp = array_namespace(base, links, tip_axes, point, normal, velocity)
     base, tip_axes, point, normal, velocity = (xp.asarray(x, float) for x in (base, tip_axes, point, normal, velocity))
 
-    def around(center):
+    # The angles determine the orientation of the tip, and this the position of its centre, from which the angles follow: a fixed
+    # point. The tip is small against the links, so that each iteration reduces the error.
+    def iterate(center):
         (yaw, low, bend), rates = _spatial_finger(base, links, center, point, velocity)
         pitch = f64.rotation_matrix((0.0, -1.0, 0.0), low + bend)
-        turned = base[:3, :3] @ xp.asarray(_turn(yaw)) @ xp.asarray(pitch)
-        return point - turned @ _support(tip_axes, -turned.T @ normal), ([yaw, low, bend], rates)
+        rotation = base[:3, :3] @ xp.asarray(_turn(yaw)) @ xp.asarray(pitch)
+        # The outward normal of the tip at the contact is opposite to the object's.
+        return point - rotation @ _support(tip_axes, -rotation.T @ normal), ([yaw, low, bend], rates)
 
-    center = point + xp.max(tip_axes) * normal
+    center = point + xp.max(tip_axes) * normal  # outside of the object
     if xp is np:
-        for _ in range(_ROUNDS):
-            center, turn = around(center)
-        return turn
+        for _ in range(_ITERATIONS):
+            center, angles_and_rates = iterate(center)
+        return angles_and_rates
     # Each iteration is a contraction in the derivatives too, so the loop itself is differentiated.
-    center = jax.lax.scan(lambda at, _: (around(at)[0], None), center, None, length=_ROUNDS - 1)[0]
-    return around(center)[1]
+    center = jax.lax.scan(lambda at, _: (iterate(at)[0], None), center, None, length=_ITERATIONS - 1)[0]
+    return iterate(center)[1]
 
 
 def _egg_start(
@@ -64,18 +71,19 @@ def _egg_start(
     twist: Row = (0.02, -0.01, 0.02, 0.2, -0.1, 0.15),
     links: Row = _SPATIAL_LINKS,
     circle: Number = _CIRCLE,
-    semi_axes: Row = _EGG,
-    tip_semi_axes: Row = _TIP,
+    semi_axes: Row = _EGG_SEMI_AXES,
+    tip_semi_axes: Row = _TIP_SEMI_AXES,
 ) -> tuple[Array, Array]:
+    """State (q, v) of `hand_rolling_egg` from the object's position, rotation vector and body twist."""
     quaternion, rotation = _quaternion(turned)
     xp = array_namespace(position, turned, twist, links, circle, semi_axes, tip_semi_axes)
     rotation, position, twist = xp.asarray(rotation), xp.asarray(position, float), xp.asarray(twist, float)
-    moving = position, rotation @ twist[:3], rotation @ twist[3:]
+    world_motion = position, rotation @ twist[:3], rotation @ twist[3:]
     q, v = [], []
     for direction in _directions():
         normal = xp.asarray(direction)
         point = position + rotation @ _support(semi_axes, rotation.T @ normal)
-        velocity = _point_velocity(*moving, point)
+        velocity = _point_velocity(*world_motion, point)
         angles, rates = _finger_state(_base(direction, circle), links, tip_semi_axes, point, normal, velocity)
         q, v = [*q, *angles], [*v, *rates]
     scene = hand_rolling_egg(links=links, circle=circle, semi_axes=semi_axes, tip_semi_axes=tip_semi_axes)
@@ -89,18 +97,20 @@ def hand_rolling_egg(
     masses: Row = (0.1, 0.2, 0.15),
     circle: Number = _CIRCLE,
     mass: Number = 0.4,
-    semi_axes: Row = _EGG,
-    tip_semi_axes: Row = _TIP,
+    semi_axes: Row = _EGG_SEMI_AXES,
+    tip_semi_axes: Row = _TIP_SEMI_AXES,
     gravity: Number = 9.81,
     mu: Number = 0.8,
 ) -> Grasp:
-    """Hand of three fingers with three joints each, whose ellipsoidal tips roll on an ellipsoid: nonholonomic.
+    """Hand of three fingers with three joints each, whose ellipsoidal tips roll without slip on an ellipsoid.
 
-    q = (yaw, pitch and pitch of each finger, the object's free joint, the places of the three contacts: unit vectors of the
-    fingertip and of the object). Each contact has a holonomic row, the gap, and two Pfaffian ones, no slip; forces are (normal,
-    two tangential). `semi_axes`, `tip_semi_axes` of the object and of a fingertip (m), in the axes of their frames; other
-    parameters as of `hand_with_ball`. Start: the object's `position`, rotation vector and body twist; the fingers touch
-    it where its normals are horizontal.
+    The constraints are nonholonomic. q = (yaw, pitch and pitch of each finger, the object's free joint, the coordinates of the
+    three contacts: a unit vector on the fingertip and one on the object). Each contact has one holonomic row for the gap and
+    two Pfaffian rows for slip; its forces are one normal and two tangential ones. `semi_axes` and `tip_semi_axes` (m) of the
+    object and of a fingertip are along the axes of their frames; the other parameters are those of `hand_with_ball`.
+
+    Start: the object's `position` (m), rotation vector `turned` (rad) and body twist `twist`, linear part first (m/s, rad/s). The
+    fingers touch the object where its normals are horizontal.
 
     Source: Montana (1988); Murray, Li & Sastry (1994), sections 5.6 and 6.3; EQUATIONS sections 8 and 10.
     """

@@ -1,4 +1,4 @@
-"""Simulation of scenes; the only room that integrates.
+"""Simulation of scenes; the only subpackage that integrates.
 
 `run` is `jd.simulate`, `methods` are the differential equations of a scene, `solvers/` the methods of diffrax and of our own,
 `hybrid/` motion with events, `variational` steps for long motions, `stiffness` the rates of a scene. Imports `reduction`,

@@ -1,14 +1,16 @@
-"""Controls of a simulation: functions of the state, controllers with a state of their own, and sampled ones.
+"""Controls of a simulation: functions of the state, controllers with a state of their own, and sampled controllers.
 
 A plain control is tau(q, v, t). A `Controller` also has a state z, integrated with the motion:
 
     tau = control(q, v, t, z),    dz/dt = rate(q, v, t, z, lam),
 
-which makes the feedback of constraint forces through z free of algebraic loops: lam depends on tau, and tau on z alone. Where
-tau depends on lam itself, the loop lam = lam(tau(lam)) is linear if the law is, and is solved exactly (`_solve_loop`). A
-`Sampled` law is called once a period, and its torque is held in between.
+The constraint forces lam depend on tau. If they are fed back through z there is no algebraic loop, because tau depends on z and
+not on lam. If tau depends on lam directly, lam = lam(tau(lam)) has to be solved. The dynamics are affine in tau, so that this is
+a linear equation if the law is affine in lam (`_solve_affine_loop`). A `Sampled` law is called once per period, and its torque is
+held in between.
 
-The control's entries in the state of the equation (`Method`) are "control", z, and "held", the record of a sampled law.
+The state of the differential equation (`Method`) is a dictionary. A control adds "control", the state z as a vector, or "held",
+the record of a sampled law: start of the run, number of samples, torque, and the law's state.
 """
 
 import abc
@@ -29,16 +31,16 @@ from jaxdyn.lie.so3 import matmul
 from jaxdyn.model.arguments import Function, Number, Numbers, as_array, state_dtype, warn
 from jaxdyn.systems.scene import Scene, as_pytree, check_callback, check_force
 
-STATE, HELD = "control", "held"
+STATE, HELD = "control", "held"  # keys of the control's entries in the state of the equation
 
 
 class Controller(eqx.Module):
     """A control law with a state z of its own: integral action, filters, observers.
 
-    A subclass gives `start`, `__call__` and `rate`. The state is any pytree of arrays, or None for none. With
-    `takes_multipliers = True` the law is called with the multipliers lam (nc,) too, and has to be affine in them: the loop
-    lam -> tau -> lam is then solved exactly, for one evaluation of the dynamics per row more. A law that is not affine in
-    lam takes a filtered one instead: a state with dz/dt = (lam - z)/T.
+    A subclass defines `start`, `__call__` and `rate`. The state is a pytree of arrays, or None for a law without state. With
+    `takes_multipliers = True` the law also receives the multipliers lam (nc,) and has to be affine in them. The algebraic loop
+    lam -> tau -> lam is then solved exactly, at the cost of one more evaluation of the dynamics per constraint row. A law that is
+    not affine in lam can use filtered multipliers: a state with dz/dt = (lam - z)/T.
 
     ```python
     class Integral(jd.Controller):
@@ -59,7 +61,7 @@ class Controller(eqx.Module):
     takes_multipliers: ClassVar[bool] = False
 
     def start(self, q: Float[Array, " nq"], v: Float[Array, " nv"], t: Float[Array, ""]) -> PyTree:
-        """The state at the start."""
+        """State z at the start of the run, from the initial q (nq,), v (nv,) and t (s)."""
         return None
 
     @abc.abstractmethod
@@ -71,7 +73,7 @@ class Controller(eqx.Module):
         state: PyTree = None,
         multipliers: Float[Array, " nc"] | None = None,
     ) -> Float[Array, " nv"]:
-        """tau (nv,), N m or N."""
+        """Generalised forces tau (nv,), N m or N."""
 
     def rate(
         self,
@@ -81,13 +83,14 @@ class Controller(eqx.Module):
         state: PyTree,
         multipliers: Float[Array, " nc"] | None,
     ) -> PyTree:
-        """Rate of the state, of its structure. `multipliers` (nc,), under the torque that the law gives."""
+        """Time derivative dz/dt, of the structure of z. `multipliers` (nc,) are those under the torque of this law."""
         return None
 
     def allowance(self, q: Float[Array, " nq"], v: Float[Array, " nv"], t: Number) -> Float[Array, ""] | None:
-        """Distance of the law from where it cannot follow its task; None if that is unknown or not to be monitored.
+        """Margin (), positive where the law can perform its task; None for a law without such a margin.
 
-        Where this number falls to zero a simulation ends, with the code `control_singular`.
+        A simulation ends where the margin falls to zero, with the code `control_singular`. The constrained laws of
+        `jd.control` return their `regularity`, less a limit.
         """
         return None
 
@@ -95,16 +98,16 @@ class Controller(eqx.Module):
 class Sampled(eqx.Module):
     """A discrete controller: the law is called at the start and after every `period`, and its torque is held in between.
 
-    It needs fixed steps (`stepsize`); a whole number of them fills a period. The outputs "torque" and "control_state" at a save
-    point that is a sampling instant are those before or after it, as rounding of the times decides: save between samples to
-    read them. The motion does not depend on that.
+    It needs fixed steps (`stepsize`), of which a whole number fills a period. If a save point is a sampling instant, the outputs
+    "torque" and "control_state" there are the values before or after the sample, depending on the rounding of the times. To read
+    them, save between samples. The motion does not depend on that.
 
     **Arguments:**
 
-    - `law`: law(q, v, t, state) -> (tau (nv,), state); with `state=None` law(q, v, t) -> tau, as all laws of `jd.control`
-      without a state. An equinox Module carries leaves that can be differentiated and batched.
-    - `state`: that the law starts with, a pytree of arrays; the law returns the same structure.
-    - `period` (): s, positive.
+    - `law`: law(q, v, t, state) -> (tau (nv,), state); with `state=None` law(q, v, t) -> tau, the form of the laws of
+      `jd.control` without a state. The leaves of an equinox Module can be differentiated and batched.
+    - `state`: initial state of the law, a pytree of arrays. The law returns a state of the same structure.
+    - `period` (): sampling period, s, positive.
 
     **Raises:** ValueError for a law that cannot be called, and for a period that is not positive.
 
@@ -137,7 +140,7 @@ class Sampled(eqx.Module):
 
 
 def as_control(control: Any) -> Any:
-    """A control as a pytree. **Raises:** ValueError for what cannot be called."""
+    """Control as a pytree, so that its arrays are inputs of the compiled run. **Raises:** ValueError if it is not callable."""
     if control is None or isinstance(control, (Controller, Sampled)):
         return control
     return as_pytree(control, "control")
@@ -153,7 +156,7 @@ def check_steps(control: Any, stepsize: Any) -> None:
         )
     if is_concrete((control.period, stepsize)):
         ratio = float(control.period) / float(np.asarray(stepsize))
-        # Steps may be written with six digits, such as 1e-3 / 3.
+        # The relative tolerance admits steps that were written with six digits, such as 0.000333333 for a third of 1e-3.
         if not (ratio > 0.5 and abs(ratio - round(ratio)) < 1e-6 * ratio):
             raise ValueError(
                 f"stepsize is {float(np.asarray(stepsize)):.6g} s, and the period of the sampled control "
@@ -162,29 +165,26 @@ def check_steps(control: Any, stepsize: Any) -> None:
 
 
 def can_end(control: Any, q, v, t) -> bool:
-    """True if a control has an allowance, which may end the motion."""
+    """Decide whether a control has an allowance, which may end the motion."""
     return isinstance(control, Controller) and eqx.filter_eval_shape(control.allowance, q, v, t) is not None
 
 
 def check_control(scene: Scene, control: Any, q, v, t) -> None:
-    """Call a control with traced numbers, in the same way as the integration.
+    """Check the shapes of a control's results by tracing one call of it, with the arguments that the integration passes.
 
-    **Raises:** ValueError for other arguments, shapes that do not fit, and states that change their structure.
+    **Raises:** ValueError for a control that takes other arguments, shapes that do not fit, and states that change structure.
     """
     if isinstance(control, Sampled):
-        named = ("control.law", "law(q, v, t)", q, v, t)
-        check_callback(
-            control.law,
-            *(named if control.state is None else ("control.law", "law(q, v, t, state)", q, v, t, control.state)),
-        )
-        returned = eqx.filter_eval_shape(lambda *args: control.update(*args, _numbers(control.state, q)), q, v, t)  # pyright: ignore[reportCallIssue]
+        signature, extra = ("law(q, v, t)", ()) if control.state is None else ("law(q, v, t, state)", (control.state,))
+        check_callback(control.law, "control.law", signature, q, v, t, *extra)
+        returned = eqx.filter_eval_shape(lambda *args: control.update(*args, _as_arrays(control.state, q)), q, v, t)  # pyright: ignore[reportCallIssue]
         if not (isinstance(returned, tuple) and len(returned) == 2):
             raise ValueError(f"control.law returned {returned!r}; return (tau, state)")
         check_force(jnp.zeros(jnp.shape(returned[0])), q, scene.nv, "control.law")
-        _check_state(_numbers(control.state, q), returned[1], "control.law")
+        _check_state(_as_arrays(control.state, q), returned[1], "control.law")
     elif isinstance(control, Controller):
         state = eqx.filter_eval_shape(control.start, q, v, t)
-        state, count = jax.tree.map(lambda x: jnp.zeros(x.shape, q.dtype), state), _count(scene)
+        state, count = jax.tree.map(lambda x: jnp.zeros(x.shape, q.dtype), state), _row_count(scene)
         lam = (jnp.zeros((count,), q.dtype),)
         check_callback(control, "control", "control(q, v, t, state)", q, v, t, state, *lam * control.takes_multipliers)
         if state is not None:
@@ -195,9 +195,9 @@ def check_control(scene: Scene, control: Any, q, v, t) -> None:
 
 
 def initial_entries(control: Any, q, v, t) -> dict[str, Array]:
-    """Initial values of the control's entries in the state of the equation."""
+    """Initial values of the control's entries in the state of the equation; empty for a plain function."""
     if isinstance(control, Sampled):
-        # With no sample so far the first one is due at the start.
+        # The record has no samples yet, so that the first one is due at the start.
         start = jnp.concatenate([jnp.stack([t, jnp.zeros_like(t)]), jnp.zeros_like(v), _flat(control.state, q)])
         return {HELD: sample(control, start, q, v, t)}
     if isinstance(control, Controller) and (state := control.start(q, v, t)) is not None:
@@ -206,9 +206,13 @@ def initial_entries(control: Any, q, v, t) -> dict[str, Array]:
 
 
 def sample(control: Sampled, held: Float[Array, " n"], q, v, t) -> Float[Array, " n"]:
-    """Call the law where a sample is due at t: start of the run, number of samples, torque, and the law's state, flat."""
+    """Record of a sampled law after the step that ends at t: a new one if a sample is due, else `held` itself.
+
+    Its entries are the start of the run (s), the number of samples, the torque (nv,), and the law's state as a vector.
+    """
     start, count, _, state = _unpack(control, held, v)
-    # Times of steps are sums with rounding errors: a sample that is due by less than that is taken now.
+    # Times of steps are sums with rounding errors. A sample that is due within 5e-7 of a period (float64; 2e-3 in float32) is
+    # taken now: far above these errors, far below a step.
     slack = control.period.astype(t.dtype) * float(jnp.finfo(t.dtype).eps) ** 0.4
     due = t >= start + count * control.period.astype(t.dtype) - slack
     tau, state = control.update(q, v, t, state)
@@ -218,7 +222,10 @@ def sample(control: Sampled, held: Float[Array, " n"], q, v, t) -> Float[Array, 
 
 
 def torque(control: Any, scene: Scene, y, q, v, t, multipliers: Callable) -> Array | None:
-    """Torque (nv,) of a control, or None without one; multipliers(tau) are those of the dynamics."""
+    """Torque (nv,) of a control, None without a control. `multipliers`: tau (nv,) -> lam (nc,), of the constrained dynamics.
+
+    `y` is the state of the equation, of which q and v are parts.
+    """
     if control is None:
         return None
     if isinstance(control, Sampled):
@@ -229,25 +236,27 @@ def torque(control: Any, scene: Scene, y, q, v, t, multipliers: Callable) -> Arr
     if not control.takes_multipliers:
         return check_force(control(q, v, t, state), q, scene.nv, "control")
 
-    def at(lam):
+    def torque_of(lam):
         return check_force(control(q, v, t, state, lam), q, scene.nv, "control")
 
-    return at(_solve_loop(lambda lam: multipliers(at(lam)), jnp.zeros((_count(scene),), q.dtype)))
+    zero = jnp.zeros((_row_count(scene),), q.dtype)
+    return torque_of(_solve_affine_loop(lambda lam: multipliers(torque_of(lam)), zero))
 
 
-def _solve_loop(answer: Callable, none: Float[Array, " nc"]) -> Float[Array, " nc"]:
-    """Solution of lam = answer(lam) for an affine function."""
-    # (1 - d answer/d lam) lam = answer(0). Redundant rows make the matrix singular; any of their multipliers will do.
-    first, push = jax.linearize(answer, none)
-    unit = jnp.eye(none.shape[0], dtype=none.dtype)
-    left = unit - jax.vmap(push, out_axes=1)(unit)
-    return matmul(pseudo_inverse(left, tolerance(None, left)), first)
+def _solve_affine_loop(function: Callable, zero: Float[Array, " nc"]) -> Float[Array, " nc"]:
+    """Solution of lam = f(lam) for an affine function f; `zero` is its argument at the origin."""
+    # f(lam) = f(0) + F lam, so (1 - F) lam = f(0). Redundant rows can make 1 - F singular. Any solution will do, and
+    # the pseudo-inverse chooses the shortest.
+    at_zero, apply_F = jax.linearize(function, zero)
+    identity = jnp.eye(zero.shape[0], dtype=zero.dtype)
+    matrix = identity - jax.vmap(apply_F, out_axes=1)(identity)
+    return matmul(pseudo_inverse(matrix, tolerance(None, matrix)), at_zero)
 
 
 def rates(control: Any, y, q, v, t, multipliers: Callable) -> dict[str, Array]:
-    """Rates of the control's entries in the state; multipliers() are those of the motion."""
+    """Time derivatives of the control's entries in the state. multipliers() returns lam (nc,) under the control's torque."""
     if HELD in y:
-        return {HELD: jnp.zeros_like(y[HELD])}
+        return {HELD: jnp.zeros_like(y[HELD])}  # constant between samples
     if STATE not in y:
         return {}
     return {STATE: _flat(control.rate(q, v, t, state_of(control, y, q, v, t), multipliers()), q)}
@@ -264,7 +273,11 @@ def state_of(control: Any, y, q, v, t) -> Any:
 
 
 def at_start(control: Any, q, v, t) -> Any:
-    """Control near its start as a function of (q, v, t), for its derivatives; None if there is no such function."""
+    """Control as a function (q, v, t) -> tau for a linearisation at this state (`find_stiffness`).
+
+    The state of a controller is held at the value with which a run from here would start. None where tau is no function of
+    (q, v, t): for a sampled law, and for a law that uses the multipliers.
+    """
     if isinstance(control, Sampled):
         return None
     if not isinstance(control, Controller):
@@ -275,7 +288,7 @@ def at_start(control: Any, q, v, t) -> Any:
 
 
 class _AtStart(eqx.Module):
-    """A controller with a constant state."""
+    """Controller whose state is held at its initial value."""
 
     control: Controller
     state: Any
@@ -284,25 +297,25 @@ class _AtStart(eqx.Module):
         return self.control(q, v, t, self.state)
 
 
-def _count(scene: Scene) -> int:
+def _row_count(scene: Scene) -> int:
     return layout(scene)[-1].end if scene.constraints else 0
 
 
-def _numbers(state, q):
+def _as_arrays(state, q):
     return jax.tree.map(lambda x: jnp.asarray(x, state_dtype(None, q)), state)
 
 
 def _flat(state, q) -> Array:
-    """A state as one vector, in the dtype of q."""
+    """State of a law as one vector, in the dtype of q."""
     if state is None:
         return jnp.zeros((0,), q.dtype)
     return ravel_pytree(jax.tree.map(lambda x: jnp.asarray(x, q.dtype), state))[0]
 
 
 def _unpack(control: Sampled, held, v):
-    """Start of the run, number of samples, torque, and the law's state."""
+    """Entries of the record `held`: start of the run, number of samples, torque, and the law's state in its own structure."""
     n = v.shape[0]
-    state = None if control.state is None else ravel_pytree(_numbers(control.state, v))[1](held[2 + n :])
+    state = None if control.state is None else ravel_pytree(_as_arrays(control.state, v))[1](held[2 + n :])
     return held[0], held[1], held[2 : 2 + n], state
 
 
