@@ -180,7 +180,7 @@ def _transpose(program: Program, linear: tuple[bool, ...], given: tuple[bool, ..
     # Fixed inputs come first, then the cotangents, as JAX's transpose rule passes them.
     operands = iter(entries[: len(fixed)])
     # Values that depend on the linear inputs are not needed: a linear operation is transposed from its other operands alone.
-    values = _fixed_values(graph, program, [None if varies else next(operands) for varies in linear])
+    values = _coefficient_values(graph, program, [None if varies else next(operands) for varies in linear])
     # Each cotangent is a sum over the operations that use the value. Operands precede their users, so that in reverse order the
     # sum is complete when it is needed.
     cotangent_of: list = [0.0] * len(program.operations)
@@ -217,7 +217,7 @@ def _transpose(program: Program, linear: tuple[bool, ...], given: tuple[bool, ..
     return graph.finish(arrays, [x[1] for x in rows], [x[0] for x in rows], name=f"transpose of {program.name}")
 
 
-def _fixed_values(graph: Graph, program: Program, inputs: list) -> list:
+def _coefficient_values(graph: Graph, program: Program, inputs: list) -> list:
     """Values of the operations that do not depend on an input given as None; None for the others."""
     flat = [None if x is None else x.ravel().tolist() for x in inputs]
     values: list = []

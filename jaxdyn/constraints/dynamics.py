@@ -114,7 +114,7 @@ def constrained_dynamics(
     q, v, tau, t = check_state(scene.system, q=q, v=v, tau=tau, t=t)
     places = layout(scene)
     if not places:
-        return _unconstrained(scene, q, v, total_force(scene, q, v, tau, t), t)
+        return _free_dynamics(scene, q, v, total_force(scene, q, v, tau, t), t)
     state = q, v, tau, t
     if method != "rank_aware":
         return _by_schur(scene, *state, method=method)
@@ -134,7 +134,7 @@ def _by_rank(rank_tol, scene: Scene, q, v, tau, t):
 
 
 def _without_kernel(rank_tol, scene: Scene, q, v, tau, t):
-    """Fallback of `_by_pivots`, for scenes of which no kernel can be made and for samples that the kernel marks as invalid."""
+    """Fallback of `_by_pivots`, for scenes that cannot be a kernel and for samples that the kernel marks as invalid."""
     if not scene.forces:
         return _by_rank(rank_tol, scene, q, v, tau, t)
     # A user's force may use operations that kernels do not have. It is evaluated here and enters as tau, so that the rest can be
@@ -178,7 +178,7 @@ def total_force(scene: Scene, q, v, tau, t) -> Array:
     return tau if force is None else tau + force
 
 
-def _unconstrained(scene, q, v, force, t) -> ConstrainedDynamics:
+def _free_dynamics(scene, q, v, force, t) -> ConstrainedDynamics:
     metric = mass_factor(mass_matrix(scene.system, q, t))
     a = metric.solve(force - bias_force(scene.system, q, v, t))
     result = RESULTS.where(metric.is_definite(), RESULTS.successful, RESULTS.singular_mass_matrix)  # pyright: ignore[reportArgumentType]
@@ -186,7 +186,7 @@ def _unconstrained(scene, q, v, force, t) -> ConstrainedDynamics:
 
 
 def solve_rows(scene: Scene, q, v, force, t, row: Rows, rank_tol: float | None = None) -> ConstrainedDynamics:
-    """Acceleration and multipliers for rows A a = gamma, of which A is the scene's and gamma may be another."""
+    """Acceleration and multipliers for rows A a = gamma with the scene's A; gamma may differ from the scene's."""
     bare = Scene(scene.system)
     metric, Y, free = kernel(_whiten_columns)(bare, q, v, force, t, row.A)
     return _constrain_acceleration(scene, metric, Y, free, row.gamma - matmul(Y.T, free), row.gamma, rank_tol)

@@ -1,4 +1,4 @@
-"""Mechanisms of which some joints are measured: the nearest states on the constraints, and logs completed by them."""
+"""Mechanisms with only some joints measured: the nearest states on the constraints, and logs completed by them."""
 
 from collections.abc import Sequence
 from typing import Any

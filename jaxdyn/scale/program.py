@@ -31,8 +31,8 @@ class Program:
     """A function of one member, compiled for `size` members at a time on these devices.
 
     `size` is reduced where the program does not fit into `memory` (bytes; by default a fraction of the free memory). `is_glue`:
-    the members are motions, which are computed by kernels. What XLA compiles is then only the glue between kernels, and it is
-    told to compile it quickly.
+    the members are motions, which are computed by kernels. XLA then compiles only the glue between kernels, with options that make
+    this quick.
 
     Attributes: `size`, the members of a batch; `bytes`, the memory that it needs; `lowered`, a hash of the lowered program.
 
