@@ -7,13 +7,12 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jax.core import Tracer
 
 from jaxdyn.dynamics import quantities as dynamics
 from jaxdyn.identify.condensed import Blocks, Condensed, condense_blocks, condense_rows
 from jaxdyn.identify.logs import Log, as_logs
 from jaxdyn.identify.torque_terms import TERMS, Terms, check_terms, friction_regressor
-from jaxdyn.model.arguments import Number, Numbers, as_array, check_shapes
+from jaxdyn.model.arguments import Number, Numbers, as_array, check_shapes, is_concrete
 from jaxdyn.model.joints import KINDS
 from jaxdyn.model.tree import Model, integrate, neutral
 
@@ -58,7 +57,7 @@ def regressor(model: Model, q: Numbers, v: Numbers, a: Numbers, *, v_s: Number =
     **Raises:** ValueError for traced arrays.
     """
     check_shapes(model)
-    if any(isinstance(x, Tracer) for x in (q, v, a)):
+    if not is_concrete(q, v, a):
         raise ValueError(
             "q, v and a are traced; regressor takes the numbers of a log. Under jit: jd.dynamics.torque_regressor"
         )

@@ -18,7 +18,7 @@ _SCRIPT = """
 import sys, time, jax
 jax.config.update("jax_enable_x64", True)
 sys.path.insert(0, sys.argv[2])
-from tests.test_long_fits import fitted
+from tests.identify.test_long_fits import fitted
 fitted(sys.argv[1], method=sys.argv[3], callback=lambda step, loss, system: time.sleep(0.2))
 """
 

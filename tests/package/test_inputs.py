@@ -2,6 +2,8 @@
 
 # pyright: reportArgumentType=false
 
+import traceback
+
 import diffrax
 import jax
 import jax.numpy as jnp
@@ -424,3 +426,24 @@ def test_functions_of_other_arguments_are_refused_when_they_are_given(make, word
 def hybrid(task, of="position", target=(0.0,), **options):
     kd = 1.0 if of == "position" else None
     return jd.control.HybridForce(jd.scenes.four_bar(), task, target, 1.0, kd, of=of, **options)
+
+
+def _raises(q, v, t):
+    raise KeyError("of the law")
+
+
+@pytest.mark.parametrize("way", ["simulate", "stepper"])
+def test_an_error_inside_a_traced_law_is_told_in_few_lines(way):
+    """Under jit, vmap and grad the user reads the frames of his own code and of the library, and no program of JAX."""
+    arm, zero = jd.robots.chain(2), jnp.zeros(2)
+    step = jd.stepper(arm, 0.1)
+
+    def end(v):
+        if way == "simulate":
+            return jd.simulate(arm, zero, v, jnp.array([0.0, 0.1]), control=_raises).q[-1, 0]
+        return jax.lax.scan(lambda state, _: (step(state, _raises), None), (zero, v), length=3)[0][0][0]
+
+    with pytest.raises(KeyError, match="of the law") as caught:
+        jax.jit(jax.vmap(jax.grad(end)))(jnp.ones((3, 2)))
+    text = "".join(traceback.format_exception(caught.value))
+    assert len(text.splitlines()) < 100 and "{ lambda" not in text

@@ -437,7 +437,7 @@ def test_a_block_that_has_stopped_gains_no_energy():
     stop, h = 2.0 / (0.3 * G), 1e-3
     scene, (q0, v0) = scenes.sliding_block(direction=1), scenes.sliding_block.start(velocity=2.0)
     ts = jnp.asarray([0.0, 3 * stop])
-    with pytest.raises(RuntimeError, match=r"jd\.DryFriction"):
+    with pytest.raises(RuntimeError, match=r"jd\.contact\.DryFriction"):
         simulate(scene, q0, v0, ts, max_steps=500)
     solution = simulate(scene, q0, v0, ts, throw=False, max_steps=500)
     assert not bool(solution.success) and abs(float(solution.stats["time_reached"]) - stop) < 1e-3
