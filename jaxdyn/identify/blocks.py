@@ -69,6 +69,7 @@ class Numbers(Block):
             low: Any = self.lower
             span = self.upper - low
             share = (self.origin - low) / span
+            # The logit of the start is added, so that y = 0 is the start.
             return low + span * jax.nn.sigmoid(jnp.log(share) - jnp.log1p(-share) + y)
         return self.origin + self.unit * y
 
@@ -122,6 +123,7 @@ class Directions(Block):
         return 2 * self.origin.shape[0]
 
     def values(self, y, leaves):
+        # A rotation about the vector itself has no effect: a third coordinate would lose rank.
         rotated = jax.vmap(lambda parts, B, y: parts @ so3.exp(B @ y).T)(self.origin, self.normals, y.reshape(-1, 2))
         return rotated.reshape(-1)
 
@@ -161,6 +163,7 @@ class Inertias(Block):
             return inertias
         free = np.array(self.chart.bodies)
         own = jnp.sum(inertias[free, 0])
+        # One factor for all ten numbers of a body keeps it feasible.
         ratio = (self.total - (jnp.sum(inertias[:, 0]) - own)) / own
         return jnp.where(np.isin(np.arange(len(inertias)), free)[:, None], ratio * inertias, inertias)
 
@@ -184,6 +187,7 @@ class Inertias(Block):
             P0 = jnp.einsum("bij,bkj->bik", factors, factors)
             now, nominal = (jnp.einsum("bij,bji->b", x, self.ellipsoids) for x in (P, P0))
             has_mass = nominal > 0
+            # Both operands are replaced: the logarithm of 0/0 would put NaN into the gradient although its value is not used.
             share = jnp.where(has_mass, now, 1.0) / jnp.where(has_mass, nominal, 1.0)
             parts.append(jnp.sqrt(self.weight) * barrier_residual(jnp.log(share)))
         return jnp.concatenate(parts)

@@ -99,6 +99,7 @@ class Chart(eqx.Module):
         With P = U0 U U^T U0^T it is |U|^2 - 2 sum log U_ii - 4: the same in every frame and unit.
         """
         upper = self.relative_factors(theta)
+        # Factors are upper triangular: log det needs the diagonal alone, and has a simple derivative.
         diagonal = jnp.diagonal(upper, axis1=1, axis2=2)
         return jnp.sum(upper**2) - 2 * jnp.sum(jnp.log(diagonal)) - 4.0 * len(self.bodies)
 
@@ -147,6 +148,7 @@ def make_chart(
         )
     factors = np.array([_factor(P, inertia) for P in matrices]).reshape(-1, 4, 4)
     unit = 0.1 * np.asarray(tau_scale, np.float64)
+    # A torque that is always zero borrows the largest unit: a term in units of zero could not be changed.
     unit = np.where(unit > 0, unit, unit.max(initial=0.0) or 1.0)
     per = {"viscous": v_scale, "coulomb": np.ones(model.nv), "offset": np.ones(model.nv), "armature": a_scale}
     scale = np.array([unit / np.where(np.asarray(per[t]) > 0, per[t], 1.0) for t in terms]).reshape(
@@ -189,12 +191,15 @@ def positive_terms(terms) -> np.ndarray:
 def _is_feasible(matrix: np.ndarray, inertia: str) -> bool:
     """Decide whether a pseudo-inertia is positive definite, or semidefinite (rods, points) where only the density is fitted."""
     values = np.linalg.eigvalsh(matrix)
+    # Relative to the largest eigenvalue: the scale of a body's mass does not matter.
     return bool(values[0] > (1e-14 if inertia == "full" else -1e-9) * values[-1])
 
 
 def _factor(matrix: np.ndarray, inertia: str) -> np.ndarray:
     """U0 with U0 U0^T = P0: upper triangular, or any root where the density alone is fitted."""
     if inertia == "full":
+        # LAPACK's factor is lower triangular; of the reversed matrix, and reversed back, it is upper.
         return np.linalg.cholesky(matrix[::-1, ::-1])[::-1, ::-1]
     values, vectors = np.linalg.eigh(matrix)
+    # A rod's or point's pseudo-inertia is singular and has no Cholesky factor.
     return vectors * np.sqrt(np.maximum(values, 0))

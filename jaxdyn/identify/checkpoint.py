@@ -34,6 +34,7 @@ def fingerprint(*trees: Any) -> str:
     for leaf in leaves:
         if isinstance(leaf, (jax.Array, np.ndarray, float, int)):
             array = np.asarray(leaf)
+            # Type and shape count too: the same bytes may be other numbers.
             digest.update(f"{array.dtype}{array.shape}".encode() + array.tobytes())
         else:
             digest.update(re.sub(r" at 0x[0-9a-f]+", "", repr(leaf)).encode())
@@ -49,6 +50,7 @@ class Checkpoint:
     steps: int = 0
     seconds: float = 30.0
     resume: bool = True
+    # The wall clock may be set while a fit runs; a monotonic one is not.
     _last: float = dataclasses.field(default_factory=time.monotonic)
 
     def load(self) -> dict[str, np.ndarray] | None:
@@ -101,6 +103,7 @@ def write(path: pathlib.Path, problem: str, arrays: dict[str, np.ndarray]) -> No
         "sha256": hashlib.sha256(payload).hexdigest(),
     }
     path.parent.mkdir(parents=True, exist_ok=True)
+    # In the same folder, as a rename is atomic within one file system only; by process, so that two fits do not share it.
     partial = path.with_name(f".{path.name}.{os.getpid()}.part")
     try:
         with open(partial, "wb") as file:
@@ -117,6 +120,7 @@ def read(path: pathlib.Path) -> tuple[dict, bytes]:
 
     **Raises:** ValueError for a file that is no complete checkpoint.
     """
+    # json.dumps writes no line breaks, so that the first one ends the header.
     line, _, payload = path.read_bytes().partition(b"\n")
     try:
         header = json.loads(line)
@@ -154,9 +158,11 @@ class Watch:
 
     def continues(self, step: int, loss: float, point: Any, state: Callable[[], dict]) -> bool:
         """Report a point; False when the fit is to stop there. `state()` gives the arrays of a checkpoint."""
+        # Only True itself: a callback that happens to return something else does not stop the fit.
         stopped = self.callback is not None and self.callback(step, loss, point) is True
         now = time.monotonic()
         stopped = stopped or (self.seconds is not None and now - self.started > self.seconds)
+        # A resumed fit does not start at step 0: the rate counts the steps of this process alone.
         if self.first is None:
             self.first = (step, now)
         if self.show and (now - self.printed > 0.5 or stopped):

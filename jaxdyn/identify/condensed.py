@@ -80,6 +80,7 @@ class Blocks:
     def squares(self, x: np.ndarray, chosen=None) -> np.ndarray:
         """Sums of squared errors (blocks, nv) of the parameters x on some blocks."""
         chosen_blocks = np.arange(len(self)) if chosen is None else np.arange(len(self))[chosen]
+        # The triangle's last column is the torque: R [x, -1] has the length of the error W x - w.
         columns = [np.append(x[self.places(joint)], -1.0) for joint in range(self.nv)]
         return np.array(
             [[np.sum((R @ c) ** 2) for R, c in zip(self.triangles[i], columns, strict=True)] for i in chosen_blocks]
@@ -104,6 +105,7 @@ class Blocks:
         for matrix, triangles in zip(result, self.triangles, strict=True):
             for joint, R in enumerate(triangles):
                 places = self.places(joint)
+                # Torques share the inertial columns, so that their Gram matrices overlap and add up there.
                 matrix[np.ix_(places, places)] += weights[joint] ** 2 * (R[:, :-1].T @ R[:, :-1])
         return result
 
@@ -130,7 +132,9 @@ def condense_rows(rows: np.ndarray, count: int) -> Condensed:
 def pad_triangle(triangle: np.ndarray, count: int) -> Condensed:
     """`Condensed` of rows [W, w] that are a triangle (m, p + 1) already, as of `numpy.linalg.qr`."""
     p = triangle.shape[1] - 1
+    # QR of fewer rows than columns gives a trapezoid; rows of zeros change no square.
     triangle = np.concatenate([triangle, np.zeros((max(p + 1 - len(triangle), 0), p + 1))])
+    # The last diagonal entry is the length of the error that no x removes.
     return Condensed(triangle[:p, :p], triangle[:p, p], float(triangle[p, p] ** 2), count)
 
 
@@ -167,12 +171,15 @@ def condense_blocks(
             piece = slice(start, min(start + _SAMPLES, part.stop))
             log = logs[which][piece]
             W, tau = rows(which, piece), np.asarray(log.tau, np.float64)
+            # Each term is a diagonal block: a torque keeps its own column, the others are zero.
             own = W[:, :, shared:].reshape(len(log), nv, -1, nv)
             more = np.zeros((len(log), nv, 0)) if not len(extra) else extra[which][piece]
             for j in range(nv):
                 table = np.concatenate([W[:, j, :shared], own[:, j, :, j], more[:, j], tau[:, j, None]], axis=1)
+                # The torque is the last column, so that it is weighted with its row.
                 table = table if weights is None else table * weights[which][piece, j, None]
                 before = triangle_of_row[j] if triangle_of_row[j].size else np.zeros((0, table.shape[1]))
+                # Sequential QR: the triangle so far joins the next rows, so that memory does not grow with the log.
                 triangle_of_row[j] = np.asarray(np.linalg.qr(np.concatenate([before, table]), mode="r"))
         triangles.append(triangle_of_row)
         samples.append(part.stop - part.start)

@@ -54,6 +54,7 @@ class Data(NamedTuple):
         wanted, start, result = dict(extra), 0, []
         for name, count in self.counts.items():
             for column in range(start, start + count):
+                # Columns of zeros are left out: their unit is zero, and the prior divides by it.
                 places = [joint for joint in wanted.get(name, ()) if self.units[column, joint] > 0]
                 result += [self.basic + column * self.blocks.nv + joint for joint in places]
             start += count
@@ -129,12 +130,15 @@ def fit_blocks(
     # The residual of all columns is one more row, so that the eliminated triangle keeps the loss and not only its minimiser.
     rows = np.concatenate([rows, np.append(np.zeros(free.R.shape[1]), np.sqrt(free.rest))[None]])
     units = data.units.reshape(-1)[places - data.basic]
+    # Rows are in N m here: the prior's rows, sqrt(prior) c / unit in deviations, are multiplied by sigma.
     R, coefficients = eliminate(rows, len(places), np.sqrt(setting.prior) * sigma / units)
     condensed = pad_triangle(R, count)
+    # A noise-free log gives zero, which `torque_noise` replaces by a small share of the torque.
     sigma = torque_noise(condensed, sizes, sigma or None)
     problem = TorqueProblem(chart, condensed.R / sigma, condensed.d / sigma, condensed.rest / sigma**2, setting.prior)
     minimum = newton(problem, start, steps, _ROUGH if is_rough else _FINE)
     linear = LinearChart(chart)
+    # Interior points never reach a bound. Exact zeros let `intervals` recognise the terms that are held there.
     minimum = minimum._replace(s=linear.clip_terms(minimum.s))
     x = np.zeros(size)
     basic = linear.at(minimum.origin, minimum.s)
@@ -154,4 +158,5 @@ def eliminate(rows: np.ndarray, count: int, ridge: np.ndarray) -> tuple[np.ndarr
         rest = R[:count, -1] - R[:count, count:-1] @ x
         return np.linalg.solve(R[:count, :count], rest) if count else np.zeros(0)
 
+    # Rows below the coefficients' do not involve c: they are the error of the best c.
     return R[count:, count:], coefficients

@@ -58,10 +58,12 @@ def shift_torques(log: Log, delay: Numbers) -> Log:
         return log
     delay = np.broadcast_to(delay, (log.nv,))
     t, tau = np.asarray(log.t, np.float64), np.asarray(log.tau, np.float64)
+    # Beyond the ends of the log a cubic spline extrapolates, and grows without bound.
     kept = (t + delay.min() >= t[0]) & (t + delay.max() <= t[-1])
     if kept.sum() < 2:
         raise ValueError(f"delay is {delay.tolist()} s, and the log {t[-1] - t[0]:.4g} s long; nothing is left of it")
     (inside,) = np.nonzero(kept)
+    # Time increases, so that the kept samples are consecutive.
     rows = slice(int(inside[0]), int(inside[-1]) + 1)
     shifted = [CubicSpline(t, column)(t[rows] + d) for column, d in zip(tau.T, delay, strict=True)]
     part = log[rows]
@@ -94,10 +96,12 @@ def find_delays(
         problem = RobotProblem(model, _shift_logs(logs, delay), basic, (*used, _DELAY), inertia, blocks)
         estimate = problem.refine(free, fixed, rounds=2)
         data = problem.data(free)
+        # Coefficients are stored column after column, nv each; the delay's column comes after those of the other terms.
         column = sum(count for name, count in data.counts.items() if name != _DELAY.name)
         step = estimate.x[data.basic + column * model.nv :][: model.nv]
         if np.abs(step).max(initial=0) < _SMALL:
             break
+        # The first-order model holds for shifts that are short against the motion's reversals: longer steps are cut.
         delay = delay + np.clip(step, -_STEP, _STEP)
     spread = problem.intervals(free, estimate, problem.result(free, estimate, data))
     std = spread.parameters.std[-model.nv :]
@@ -112,6 +116,7 @@ def find_delays(
     squares = []
     for shift in (np.zeros(model.nv), delay):
         problem = RobotProblem(model, _shift_logs(logs, shift), basic, used, inertia, blocks)
+        # A new problem has weights of ones and no loads: folds of shifted logs are compared with weights of their own.
         problem.refine(setting, fixed, rounds=2)
         parts, _ = folds(problem.data(setting).blocks)
         squares.append(np.array([problem.validation_squares(setting, part).sum(axis=0) for part in parts]))
@@ -128,12 +133,14 @@ def with_delays(
     correlated with it, viscous friction above all, get wider intervals. Delays that lower no error are zero.
     """
     kept = tuple(int(joint) for joint in np.flatnonzero(delays.seconds))
+    # Keyed by identity: the term is called with the problem's own logs, because it is smooth.
     derivatives = {
         id(log): -np.gradient(fit.torques(log), np.asarray(log.t, np.float64), axis=0) for log in problem.logs
     }
     term = TorqueTerm(_DELAY.name, lambda log, load, v_s: derivatives[id(log)], is_smooth=True)
     wide = problem.with_term(term)
     free = setting._replace(extra=(*setting.extra, (term.name, kept)))
+    # The logs are shifted already: the delay's coefficient is zero, where the linearisation of T(t - d) is exact.
     spread = wide.intervals(free, estimate._replace(x=np.append(estimate.x, np.zeros(problem.model.nv))), fit)
     values, std = spread.parameters.values.copy(), delays.std.copy()
     values[len(values) - len(kept) :] = delays.seconds[list(kept)]
@@ -149,4 +156,5 @@ def _negative_derivative(log: Log, load: np.ndarray, v_s: float) -> np.ndarray:
     return -np.gradient(np.asarray(log.tau, np.float64), np.asarray(log.t, np.float64), axis=0)
 
 
+# The derivative of a low-passed torque has no power above the cut-off either: no refinement is needed.
 _DELAY = TorqueTerm("delay", _negative_derivative, is_smooth=True)

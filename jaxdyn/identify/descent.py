@@ -77,9 +77,11 @@ def descend(method: Method, start: Any, watch: Watch) -> Descent:
         own = {"history": np.array(history), "lowest": np.float64(best.loss)}
         return own | _leaves("point", iterate.point) | _leaves("best", best.point) | method.arrays(iterate)
 
+    # NaN compares false below: a point that failed never becomes the best one.
     while True:
         history.append(iterate.loss)
         best = iterate if iterate.loss <= best.loss else best
+        # Before all tests for the end, so that callback and checkpoint see the last point too.
         continues = watch.continues(len(history) - 1, iterate.loss, iterate.point, state)
         if not iterate.is_finite:
             watch.failed = iterate.point
@@ -95,6 +97,7 @@ def descend(method: Method, start: Any, watch: Watch) -> Descent:
             watch.failed = following.point
             return Descent(best, iterate, np.array(history), result)
         if result is not None:
+            # A method that ends without a step returns the same iterate, whose loss is in the history already.
             if following is not iterate:
                 history.append(following.loss)
                 best = following if following.loss <= best.loss else best

@@ -26,6 +26,7 @@ def shard_blocks(pieces: Any, devices: Sequence[Any] | None) -> tuple[Any, Any]:
     if not len(devices):
         raise ValueError("devices is empty; give some of jax.devices(), or None for one")
     count = len(jax.tree.leaves(pieces)[0])
+    # Shards have equal size; segments added to fill one up would count in the loss.
     most = max(n for n in range(1, len(devices) + 1) if count % n == 0)
     if most == 1:
         return pieces, None
@@ -78,6 +79,7 @@ def _by_device(function: Callable, mesh: Any, results: Any) -> Callable:
     """Wrap `function(shared, pieces)` in `jax.shard_map`."""
 
     def call(shared, pieces):
+        # shard_map accepts arrays only; functions and settings pass through the closure.
         arrays, rest = eqx.partition((shared, pieces), eqx.is_array)
         each = jax.shard_map(
             lambda *arrays: function(*eqx.combine(arrays, rest)),

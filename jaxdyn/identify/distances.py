@@ -25,7 +25,9 @@ _SWEEPS = 7
 
 def barrier_residual(x: Float[Array, "*n"]) -> Float[Array, "*n"]:
     """r with r^2 = exp(x) - x - 1 and the sign of x: smooth, x / sqrt(2) near zero, huge where exp(x) is huge or next to zero."""
+    # exp(x) - x - 1 cancels near zero. At 0.1 the remainder of the series is 3e-13.
     small = jnp.abs(x) < 0.1
+    # The unused branch must be finite too: NaN from 0/0 there would pass through `where` into the gradient.
     safe = jnp.where(small, jnp.ones_like(x), x)
     # (exp(x) - x - 1) / x^2 = 1/2 + x/6 + x^2/24 + ...
     series = 1 / 2 + x * (1 / 6 + x * (1 / 24 + x * (1 / 120 + x * (1 / 720 + x * (1 / 5040 + x / 40320)))))
@@ -41,6 +43,7 @@ def entropic_residual(U: Float[Array, "4 4"]) -> Float[Array, "10"]:
 def affine_residual(U: Float[Array, "4 4"]) -> Float[Array, "10"]:
     """Ten numbers whose squares add up to the squared affine-invariant distance of U U^T from 1."""
     logarithm = symmetric_log(U @ U.T)
+    # Entries off the diagonal occur twice in the Frobenius norm.
     return jnp.concatenate([jnp.diagonal(logarithm), np.sqrt(2.0) * logarithm[_UPPER]])
 
 
@@ -60,6 +63,7 @@ def _symmetric_log_jvp(primals, tangents):
     one, other = values[:, None], values[None, :]
     # (log a - log b) / (a - b) = atanh(x) / x * 2 / (a + b), x = (a - b) / (a + b).
     x = (one - other) / (one + other)
+    # Equal eigenvalues make the quotient 0/0, with the limit 1 / a. At 0.01 the remainder of the series is below rounding.
     small = jnp.abs(x) < 1e-2
     safe = jnp.where(small, 0.5 * jnp.ones_like(x), x)
     series = 1 + x**2 * (1 / 3 + x**2 * (1 / 5 + x**2 * (1 / 7 + x**2 / 9)))
@@ -87,6 +91,7 @@ def jacobi_eigenvectors(matrix: Float[Array, "n n"]) -> tuple[Float[Array, " n"]
         p, q = ends
         app, aqq, apq = p @ A @ p, q @ A @ q, p @ A @ q
         is_diagonal = apq == 0
+        # An entry that is zero needs no rotation; dividing by it would give NaN in the derivative.
         ratio = (aqq - app) / (2 * jnp.where(is_diagonal, jnp.ones_like(apq), apq))
         # The smaller of the two angles, whose tangent loses no digits.
         tangent = jnp.where(ratio >= 0, 1.0, -1.0) / (jnp.abs(ratio) + jnp.sqrt(ratio * ratio + 1))
@@ -98,5 +103,6 @@ def jacobi_eigenvectors(matrix: Float[Array, "n n"]) -> tuple[Float[Array, " n"]
         return (rotation.T @ A @ rotation, V @ rotation), None
 
     start = ((matrix + matrix.T) / 2, jnp.eye(n, dtype=matrix.dtype))
+    # A scan: one rotation is compiled instead of all of them.
     (diagonal, vectors), _ = lax.scan(rotate, start, jnp.asarray(rows, matrix.dtype))
     return jnp.diagonal(diagonal), vectors

@@ -191,6 +191,7 @@ def newton(model: Model, problem: Problem, point: Coordinates, steps: int, toler
             there, at = move_origin(chart, origin, s)
             callback(step, loss, there.model_at(model, at)[0])
 
+    # The host computes in float64, but R and d may have been rounded to float32.
     resolution = float(jnp.finfo(problem.R.dtype).eps)
     optimum = interior.newton(host, np.asarray(point.s), steps, tolerance, watch, resolution)
     return *move_origin(chart, optimum.origin, optimum.s), optimum.history, optimum.result
@@ -200,6 +201,7 @@ def move_origin(chart: Chart, origin: np.ndarray, s: np.ndarray) -> tuple[Chart,
     """Move the origin of a chart: the chart and the point there."""
     size = {"full": 10, "mass": 1, "fixed": 0}[chart.inertia]
     dtype = chart.factors.dtype
+    # With the origin at the fit theta is zero there; terms keep their coordinates s.
     chart = eqx.tree_at(lambda chart: chart.origin, chart, jnp.asarray(origin, dtype))
     return chart, Coordinates(jnp.zeros((len(chart.bodies), size), dtype), jnp.asarray(s, dtype))
 
@@ -217,6 +219,7 @@ def _gauss_newton_hessian(problem: Problem, point: Coordinates):
     y, unflatten = ravel_pytree(point)
     rows = problem.R @ jax.jacfwd(lambda y: problem.chart.parameters(unflatten(y)))(y)
     curvature = jax.hessian(lambda y: problem.chart.divergence(unflatten(y).theta))(y)
+    # Symmetrised, as eigh reads one triangle alone.
     return rows.T @ rows + problem.prior * (curvature + curvature.T) / 2
 
 

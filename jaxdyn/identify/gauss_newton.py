@@ -54,8 +54,10 @@ class LinearErrors(NamedTuple):
     def step(self, damping: float) -> tuple[np.ndarray, float]:
         """Step dy (p,) and the decrease of the loss that it predicts; `damping` in shares of the largest curvature."""
         hessian, gradient = self.rows.T @ self.rows, self.rows.T @ self.errors
+        # The floor keeps a Hessian of zeros solvable; its step is zero, and the fit ends.
         size = damping * max(float(np.diag(hessian).max()), 1e-300)
         dy = -np.linalg.solve(hessian + size * np.eye(len(hessian)), gradient)
+        # With H dy = -g - size dy the predicted decrease -2 g dy - dy H dy becomes dy (size dy - g), without cancellation.
         return dy, self.start_decrease + float(dy @ (size * dy - gradient))
 
     def update(self, estimate: Unknowns, dy: np.ndarray) -> Unknowns:
@@ -74,6 +76,7 @@ def eliminate_starts(errors, by_y, by_start) -> LinearErrors:
     """
     errors, by_y = np.asarray(errors, np.float64), np.asarray(by_y, np.float64)
     p, largest = by_y.shape[-1], max(float(np.abs(x).max(initial=0)) for x in (errors, by_y))
+    # Squares of larger numbers overflow float64.
     if not largest < 1e150:
         return LinearErrors(np.inf, errors.reshape(-1), by_y.reshape(-1, p))
     loss = float(np.sum(errors**2))
@@ -83,6 +86,7 @@ def eliminate_starts(errors, by_y, by_start) -> LinearErrors:
     U, s, Vt = np.linalg.svd(np.asarray(by_start, np.float64), full_matrices=False)
     has_effect = s > RANK_TOLERANCE * s.max(axis=1, keepdims=True, initial=0.0)
     basis, inverse = U * has_effect[:, None], np.swapaxes(Vt, 1, 2) / np.where(has_effect, s, np.inf)[:, None]
+    # Columns of the basis are orthonormal or zero, so that projecting onto their complement needs no inverse.
     transpose = np.swapaxes(basis, 1, 2)
     shares, own = transpose @ by_y, transpose @ errors[..., None]
     rest, rows = errors - (basis @ own)[..., 0], by_y - basis @ shares
@@ -117,11 +121,14 @@ class GaussNewton(Method):
     def __init__(self, linearise: Callable[[Unknowns], LinearErrors], tolerance: float, rounding: float):
         if not tolerance >= 0:
             raise ValueError(f"tolerance is {tolerance}; it must not be negative")
+        # A predicted decrease below rounding of the loss cannot be observed: every trial would count as failed.
         self.linearise, self.tolerance = linearise, max(tolerance, 1e3 * rounding)
+        # Errors are in units of their scale, so that their rounding appears squared in the loss.
         self.floor = (10 * rounding) ** 2
 
     def init(self, start, kept):
         """Linearise the start."""
+        # The damping is the only state besides the point; the rest is evaluated again, to the same bits.
         return self._iterate(start, self.linearise(start), DAMPING if kept is None else float(kept["damping"]))
 
     def step(self, iterate, history, best):

@@ -75,13 +75,17 @@ def identifiability(
     """
     logs = as_logs(log, model)
     base = base_parameters(model, terms, v_s=v_s)
+    # These columns are independent on a general motion, so that any loss of rank is due to the logs.
     columns = free_columns(model.nb, model.nv, base_terms(terms))[base.independent]
     A = condense(model, logs, v_s=v_s).R[:, columns]
     scale = np.linalg.norm(A, axis=0)
+    # Columns that the logs do not excite become zero; scaled to unit length, their rounding errors would count as excited.
     scale[scale <= 1e-12 * scale.max(initial=0.0)] = np.inf
     _, s, Vt = np.linalg.svd(A / scale, full_matrices=False)
     rank = int(np.sum(s > rcond * s.max(initial=0.0)))
+    # A parameter with any share in the null space is not determined, whatever its other components.
     unknown = np.sum(Vt[rank:] ** 2, axis=0) > 1e-12
+    # Singular values descend: the last ones are the weakest directions.
     order = range(len(s) - 1, max(len(s) - 1 - count, -1), -1)
     weakest = [Direction(float(s[i] / s[0]) if i < rank else 0.0, _words(Vt[i], base.names)) for i in order]
     silent = tuple(name for name, is_unknown in zip(base.names, unknown, strict=True) if is_unknown)
@@ -96,6 +100,7 @@ def base_terms(terms) -> tuple[str, ...]:
 
 def _words(direction: np.ndarray, names: Sequence[str]) -> str:
     order = [i for i in np.argsort(-np.abs(direction))[:_NAMED] if abs(direction[i]) > _SHARE]
+    # The sign of a singular vector is arbitrary: the largest component is written as positive.
     signs = np.sign(direction[order[0]]) if order else 1.0
     parts = [f"{signs * direction[i]:+.2f} {names[i]}" for i in order]
     return " ".join(parts).removeprefix("+") + (" ..." if np.sum(direction[order] ** 2) < 0.9 else "")

@@ -52,9 +52,11 @@ def _log_cholesky_basis() -> np.ndarray:
     """U + U^T (10, 4, 4) for the derivatives U of `inertia.log_cholesky_factor` at zero."""
     places = [(0, 0), (1, 1), (2, 2), (0, 1), (1, 2), (0, 2), (0, 3), (1, 3), (2, 3)]
     basis = np.zeros((10, 4, 4))
+    # The first coordinate scales the whole factor: the density of the body.
     basis[0] = np.eye(4)
     for k, place in enumerate(places, 1):
         basis[(k, *place)] = 1
+    # d(U U^T) = dU + dU^T at U = 1.
     return basis + np.swapaxes(basis, 1, 2)
 
 
@@ -66,6 +68,7 @@ def _from_pseudo() -> np.ndarray:
         rows[1 + k, k, 3] = 1
     for row, (i, j) in zip(rows[4:], ((0, 0), (0, 1), (1, 1), (0, 2), (1, 2), (2, 2)), strict=True):
         if i == j:
+            # tr(Sigma) is in every diagonal entry of tr(Sigma) 1 - Sigma.
             row[np.arange(3), np.arange(3)] = 1
         row[i, j] -= 1
     return rows
@@ -81,6 +84,7 @@ class LinearChart:
     def __init__(self, chart: Chart):
         self.factors = np.asarray(chart.factors, np.float64)
         self.scale = np.asarray(chart.scale, np.float64)
+        # "mass" uses the first of the ten log-Cholesky coordinates alone, which scales the density.
         self.bodies, self.count = np.array(chart.bodies, int), {"full": 10, "mass": 1, "fixed": 0}[chart.inertia]
         nominal = np.asarray(chart.nominal_inertias, np.float64), np.asarray(chart.nominal_terms, np.float64)
         self.given, (nb, nv) = np.concatenate([x.reshape(-1) for x in nominal]), (len(nominal[0]), nominal[1].shape[1])
@@ -91,6 +95,7 @@ class LinearChart:
     def x(self, origin: np.ndarray, terms: np.ndarray) -> np.ndarray:
         """All parameters (p,)."""
         result = self.given.copy()
+        # A body is a product of its factors, so that rounding cannot make it infeasible; a sum P + dP could be.
         upper = self.factors @ origin
         result[self.places] = np.einsum("kij,bij->bk", _FROM_PSEUDO, upper @ np.swapaxes(upper, 1, 2))
         result[self.term_places] = self.scale.reshape(-1) * terms
@@ -119,6 +124,7 @@ class LinearChart:
         for i, (places, slope) in enumerate(zip(self.places, slopes, strict=True)):
             result[places, i * self.count : (i + 1) * self.count] = slope
         flat = s.reshape(-1)
+        # Positive terms are s^2, whose derivative vanishes at the bound.
         result[self.term_places, count:] = np.diag(self.scale.reshape(-1) * np.where(self.positive, 2 * flat, 1.0))
         return result
 
@@ -148,6 +154,7 @@ class InteriorPoint(Method):
         self.problem, self.linear = problem, LinearChart(problem.chart)
         self.tolerance, self.resolution = tolerance, resolution
         self.inequalities = int(self.linear.positive.sum())
+        # A barrier mu leaves the loss about mu above the minimum for each inequality: together a tenth of the tolerance.
         self.least = 0.1 * tolerance / max(self.inequalities, 1)
 
     def init(self, start, kept):
@@ -156,9 +163,13 @@ class InteriorPoint(Method):
         origin = np.asarray(problem.chart.origin, np.float64)
         flat = np.asarray(start, np.float64).reshape(-1)
         terms = np.where(positive, flat**2, flat)
+        # Degree of the barrier: log det of a 4 x 4 matrix counts four, an inequality one.
         count = 4 * len(origin) + max(self.inequalities, 1)
+        # Not below the prior, which is the final strength of the bodies' barrier.
         gap = max(problem.prior, _loss(problem, self.linear, origin, terms) / count)
+        # On the central path terms * multipliers = gap; the floor keeps the multiplier of a term close to zero bounded.
         slack = np.where(positive, gap / np.maximum(flat**2, 1e-3), 0.0)
+        # P is 1 in its own frame, where the central path P Z = gap 1 makes Z a multiple of the identity.
         state = _State(origin, terms, gap * np.broadcast_to(np.eye(4), origin.shape), slack)
         return self._iterate(state, (gap, gap))
 
@@ -173,6 +184,7 @@ class InteriorPoint(Method):
             return iterate, "not_finite"
         # Rounding of the loss limits the smallest decrease that is visible.
         smallest = max(self.tolerance, 10 * self.resolution * abs(iterate.loss))
+        # Half of the decrement is the decrease that Newton's model predicts. It bounds the excess at the final targets alone.
         if targets == (problem.prior, self.least) and decrement / 2 <= smallest:
             return iterate, "converged"
         # Mehrotra's idea: after a long step the barrier decreases much; after a short one the iterate returns to the central path
@@ -181,6 +193,7 @@ class InteriorPoint(Method):
         return self._iterate(following, (max(problem.prior, share * gaps[0]), max(self.least, share * gaps[1]))), None
 
     def _iterate(self, state: _State, targets: tuple[float, float]) -> Iterate:
+        # The chart's coordinates are roots of positive terms; the steps themselves are straight lines in the terms.
         s = _roots(state.terms, self.linear.positive).reshape(self.linear.scale.shape)
         return Iterate((state.origin, s), _loss(self.problem, self.linear, state.origin, state.terms), (state, targets))
 
@@ -201,11 +214,13 @@ def newton(
 
 
 def _roots(terms: np.ndarray, positive: np.ndarray) -> np.ndarray:
+    # The inner `where` keeps negative offsets out of the square root.
     return np.where(positive, np.sqrt(np.where(positive, terms, 1)), terms)
 
 
 def _loss(problem: TorqueProblem, linear: LinearChart, origin: np.ndarray, terms: np.ndarray) -> float:
     residual = problem.R @ linear.x(origin, terms) - problem.d
+    # The origins are triangular: log det is a sum of logarithms, where a determinant could underflow.
     diagonal = np.diagonal(origin, axis1=1, axis2=2)
     divergence = np.sum(origin**2) - 2 * np.sum(np.log(diagonal)) - 4.0 * len(origin)
     return float(0.5 * (residual @ residual + problem.rest) + problem.prior * divergence)
@@ -230,6 +245,7 @@ def _step(problem: TorqueProblem, linear: LinearChart, state: _State, weight: fl
     bodies = count * size
     inverse = np.where(positive, 1 / np.where(positive, terms, 1), 0)
     basis = LOG_CHOLESKY_BASIS[:size]
+    # The derivative of log det P along S is tr(P^-1 S), the trace of S in the frame where P is 1.
     traces = np.trace(basis, axis1=1, axis2=2)
 
     rows = linear.rows(problem.R, linear.body_jacobians(state.origin))
@@ -240,6 +256,7 @@ def _step(problem: TorqueProblem, linear: LinearChart, state: _State, weight: fl
     gradient[bodies:] -= barrier * inverse
     # Gauss-Newton is exact here: R x - d is linear in the step, whose curvature the straight lines in x do not add to.
     hessian = rows.T @ rows
+    # Entries tr(S_k Z S_l): symmetric, positive for Z > 0, and the Hessian of -weight log det P where Z = weight 1.
     products = np.einsum("kij,bjm->bkim", basis, state.dual)
     blocks = np.einsum("bkim,lmi->bkl", products, basis)
     for i in range(count):
@@ -252,15 +269,19 @@ def _step(problem: TorqueProblem, linear: LinearChart, state: _State, weight: fl
     scaled = hessian / unit[:, None] / unit
     # Directions that neither log nor prior determine, such as terms at a joint that never moves, would make it singular.
     scaled[np.arange(len(unit)), np.arange(len(unit))] += 4 * _EPS
+    # Cholesky also tests the curvature: it fails, and ends the fit, where rounding has made the matrix indefinite.
     factor = cho_factor(scaled, check_finite=False)
     direction = -cho_solve(factor, gradient / unit, check_finite=False) / unit
 
     stretch = np.einsum("bk,kij->bij", direction[:bodies].reshape(count, size), basis)
     change = direction[bodies:]
     product = state.dual @ stretch
+    # P Z = weight 1 at P = 1, linearised: Z + dZ + (S Z + Z S) / 2 = weight 1. The symmetric part keeps dZ symmetric.
     dual_stretch = weight * np.eye(4) - state.dual - (product + np.swapaxes(product, 1, 2)) / 2
+    # terms * multipliers = barrier, linearised and divided by the terms.
     dual_change = np.where(positive, (barrier - state.slack * change) * inverse - state.slack, 0)
 
+    # 1 + h S is definite for h below -1 over the smallest eigenvalue; the relative change of terms has the same rule.
     length = _step_to_boundary(np.linalg.eigvalsh(stretch), change * inverse)
     # The multipliers have a step to their boundary of their own, by the eigenvalues of their change relative to them.
     roots = _upper_root(state.dual)
@@ -278,12 +299,14 @@ def _step(problem: TorqueProblem, linear: LinearChart, state: _State, weight: fl
         float(np.trace(dual, axis1=1, axis2=2).sum()) / max(4 * count, 1),
         float(np.sum(np.where(positive, following.slack * following.terms, 0))) / max(int(positive.sum()), 1),
     )
+    # The shorter step: the barrier may decrease much only after both were long.
     return following, float(-(gradient @ direction)), gaps, min(length, dual_length)
 
 
 def _step_to_boundary(*rates: np.ndarray) -> float:
     """Step to the boundary, at most 1: it leaves a twentieth of every quantity that decreases at these rates."""
     fastest = min((float(rate.min(initial=0)) for rate in rates), default=0.0)
+    # Rates above -0.95 allow the full step; the inner minimum also avoids a division by zero.
     return min(1.0, -0.95 / min(fastest, -0.95))
 
 

@@ -102,7 +102,9 @@ def intervals(
     grams_of_curvature = (data if curved is None else curved).blocks.grams(weights)
     grams = np.einsum("pi,bpq,qj->bij", jacobian, grams_of_curvature, jacobian, optimize=True) / sigma**2
     groups = block_groups(len(blocks), size)
+    # Scores and curvatures of blocks add, so that a group costs no new pass over the samples.
     gradients, grams = (np.stack([x[group].sum(axis=0) for group in groups]) for x in (gradients, grams))
+    # The prior is in every replicate: it is no observation that could be left out.
     changes, inverse = jackknife(grams, gradients, curvature)
     count = len(groups)
     # A prior weaker than 1 expresses no belief that the nominal bodies are better: at least weight 1 counts.
@@ -122,12 +124,14 @@ def intervals(
     # All terms, extra ones too, are vectors of nv numbers after the inertias.
     is_still = (np.arange(blocks.size) >= 10 * nb) & np.isin((np.arange(blocks.size) - 10 * nb) % nv, list(still))
 
+    # Torques determine combinations; single inertial numbers in them depend on the prior as well.
     base = base_parameters(model, terms)
     columns = free_columns(nb, nv, terms)
     combine = np.zeros((len(base), blocks.size))
     combine[:, columns] = base.matrix
     is_confounded = share_of_extra(np.eye(blocks.size), covariance, extra) > _FROM_EXTRA
     for place in extra:
+        # The share of an extra coefficient in its own variance is 1: it counts by what it takes from the base parameters instead.
         is_confounded[place] = np.any(share_of_extra(combine, covariance, np.array([place])) > _FROM_EXTRA)
     marks = np.where(is_still, STILL, np.where(is_confounded, CONFOUNDED, ""))
     parameters = _make_spread(
@@ -141,6 +145,7 @@ def intervals(
     is_confounded = share_of_extra(combine, covariance, extra) > _FROM_EXTRA
     marks = np.where(is_still[columns[base.independent]], STILL, np.where(is_confounded, CONFOUNDED, ""))
     spread = _make_spread(base.names, base.values(estimate.x[columns]), a, b, known, marks)
+    # The deviation is itself estimated from `count` groups: Student's t with count - 1 degrees of freedom, not 1.96.
     return Intervals(parameters, spread, base, a @ a.T + b @ b.T, student(count - 1))
 
 
@@ -150,6 +155,7 @@ def share_of_extra(rows: np.ndarray, covariance: np.ndarray, extra: np.ndarray) 
     The share vanishes when the extra coefficients are held fixed: c E^-1 c^T / v for the variance v of a combination, its
     covariances c with the extra coefficients, and their covariance E. It is 1 - 1 / (variance inflation factor).
     """
+    # Only the diagonal of rows covariance rows^T, without the (m, m) product.
     variance = np.einsum("ip,pq,iq->i", rows, covariance, rows)
     if not len(extra):
         return np.zeros(len(rows))
@@ -162,7 +168,9 @@ def share_of_extra(rows: np.ndarray, covariance: np.ndarray, extra: np.ndarray) 
 def _make_spread(names, values, changes, pulled, fitted, marks) -> Spread:
     from_data, from_prior = np.sum(changes**2, axis=1), np.sum(pulled**2, axis=1)
     total = from_data + from_prior
+    # A number that no free coordinate changes keeps its nominal value, so that the prior is its source.
     share = np.where(total > 0, from_prior / np.where(total > 0, total, 1), 1.0)
+    # NaN marks terms held at zero: at a bound there is no two-sided deviation.
     return Spread(tuple(names), np.asarray(values), np.where(fitted, np.sqrt(total), np.nan), share, marks)
 
 
@@ -172,6 +180,7 @@ def _local(data: Data, setting: Setting, estimate: Estimate):
     derivatives = linear.jacobian_at(minimum.origin, minimum.s)
     count, size = len(minimum.origin), linear.count
     basis = LOG_CHOLESKY_BASIS[:size]
+    # Hessian of the log-det divergence along straight lines in x, tr(S_k S_l) in the frame of the fitted body (`interior`).
     prior_curvature = setting.prior * np.kron(np.eye(count), np.einsum("kij,lji->kl", basis, basis))
     bodies = count * size
     is_free = np.ones(derivatives.shape[1], bool)
@@ -184,8 +193,10 @@ def _local(data: Data, setting: Setting, estimate: Estimate):
     jacobian[places, count + np.arange(len(places))] = 1.0
     curvature = np.zeros((jacobian.shape[1],) * 2)
     curvature[:bodies, :bodies] = prior_curvature
+    # The coefficients' prior is prior / 2 (c / unit)^2, as in `condensed_fit`.
     units = data.units.reshape(-1)[places - data.basic]
     curvature[count + np.arange(len(places)), count + np.arange(len(places))] = setting.prior / units**2
+    # A basic parameter is free where any coordinate changes it; massless bodies and terms at their bound have zero rows.
     return jacobian, curvature, np.any(jacobian[: data.basic] != 0, axis=1)
 
 

@@ -126,6 +126,7 @@ def least_squares(
     residual = condensed.d - condensed.R @ x0
     fit = least_squares_by_svd(condensed.R[:, columns[base.independent]], residual, rcond)
     rest = condensed.rest + fit.rest
+    # Directions that stay at the model's values use up no degree of freedom.
     sigma = float(np.sqrt(rest / (condensed.rows - fit.rank)))
     covariance = sigma**2 * fit.half @ fit.half.T
     places = columns[base.independent]
@@ -138,6 +139,7 @@ def least_squares(
     std = np.where(fit.unknown, np.inf, std)
     nominal = base.values(x0[columns])
     parameters = x0.copy()
+    # The pseudo-inverse is the smallest change of x that gives these combinations.
     parameters[columns] += np.linalg.pinv(base.matrix) @ fit.change
     return LeastSquares(
         base=base,
@@ -165,5 +167,6 @@ def _scatter(blocks: Blocks, x: np.ndarray, places, half: np.ndarray, weights, s
     gradients = blocks.scores(x, weights)[:, places] @ half
     grams = np.einsum("pi,bpq,qj->bij", half, blocks.grams(weights)[:, places][:, :, places], half, optimize=True)
     gradients, grams = (np.stack([part[group].sum(axis=0) for group in groups]) for part in (gradients, grams))
+    # There is no prior here: in these coordinates the groups' curvatures add up to the identity.
     changes, _ = jackknife(grams, gradients, np.zeros((half.shape[1],) * 2))
     return np.sqrt(np.sum((half @ changes) ** 2, axis=1)), student(len(groups) - 1)

@@ -141,6 +141,7 @@ def filter_like_log(log: Log, columns: np.ndarray, order: int = 4, factor: int =
         return columns if factor == 1 else columns[::factor]
     from scipy.signal import butter, filtfilt
 
+    # The refined samples have a higher rate: the cut-off stays the same in Hz.
     rate = factor * log_rate(log)
     numerator, denominator = butter(order, 2 * cutoff / rate, output="ba")  # pyright: ignore
     if not columns.size:
@@ -190,6 +191,7 @@ def refine_samples(samples: np.ndarray, factor: int) -> np.ndarray:
 
 def _has_filter(log: Log, order: int = 4) -> bool:
     shortest = 3 * (order + 1) + 1
+    # Close to Nyquist's half of the rate there is no band left to remove, and beyond it no filter can be designed.
     return log.cutoff is not None and log.cutoff < 0.45 * log_rate(log) and len(log) >= shortest
 
 
@@ -221,6 +223,7 @@ def _check_signals(signals: dict) -> None:
     for name in ("v", "a"):
         if name in signals and signals[name].shape[1] != signals["tau"].shape[1]:
             raise ValueError(f"{name} has {signals[name].shape[1]} columns, tau has {signals['tau'].shape[1]}")
+    # Traced arrays have shapes and no values that could be checked.
     if not is_concrete(signals):
         return
     for name, value in signals.items():
@@ -250,6 +253,7 @@ def _select(log: Log, rows) -> Log:
 def root_mean_square(samples) -> np.ndarray:
     """Root mean square of every column of samples (n, columns), whatever their size."""
     samples = np.asarray(samples, np.float64)
+    # Squares of large numbers would overflow: the column is divided by its largest value first.
     largest = np.abs(samples).max(axis=0, initial=0)
     return largest * np.sqrt(np.mean((samples / np.where(largest > 0, largest, 1)) ** 2, axis=0))
 

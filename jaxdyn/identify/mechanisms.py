@@ -58,6 +58,7 @@ def on_constraints(scene: Scene, q, v, t, columns: tuple[int, ...] | None) -> As
         return assemble(scene, q, v, t, throw=False)
 
     def improve(at, _):
+        # Nonholonomic rows restrict velocities alone: they have no residual of positions.
         jacobian = rows(scene, at, jnp.zeros_like(v), t).A[holonomic]
         misfit = displacement(scene.system, at, q)[measured]
         targets = jnp.concatenate([-_CONSTRAINT_WEIGHT * position_residual(scene, at, t), misfit])
@@ -87,6 +88,7 @@ def _least_squares(A, selector, targets):
     """Change x (nv,) of least squares for A x and x[measured] = `targets`, whose first rows have the constraints' weight."""
     stacked = jnp.concatenate([_CONSTRAINT_WEIGHT * A, selector])
     normal = stacked.T @ stacked + _REGULARISATION * jnp.eye(stacked.shape[1], dtype=stacked.dtype)
+    # Normal equations: they are positive definite by the regularisation, also where constraints are redundant.
     return solve_positive(normal, stacked.T @ targets)
 
 
@@ -144,6 +146,7 @@ def complete_log(scene: SceneLike, t: Numbers, measured: dict[Any, Any], tau: Nu
         v = nearest_velocity(scene, held.q, v, time, columns)
         return held.q, (held.q, v, held.result == RESULTS.successful)
 
+    # In sequence: every sample starts from the one before, which keeps the mechanism on one branch of its assembly.
     _, (q, v, good) = jax.jit(lambda *samples: lax.scan(complete_sample, guess, samples))(
         positions, velocities, jnp.asarray(t, dtype)
     )

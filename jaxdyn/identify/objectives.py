@@ -46,6 +46,7 @@ class Objective(eqx.Module):
     def scale(self, system, pieces: Segments) -> Array:
         """Units of the errors."""
         torque = moving_scale(jnp.sqrt(jnp.mean(pieces.tau**2, axis=(0, 1))))
+        # Impulse and work of a segment grow with its length, and so do the units of the balances.
         span = jnp.mean(pieces.t[:, -1] - pieces.t[:, 0])
         if self.error == "torque":
             return torque
@@ -102,6 +103,7 @@ def momentum_balance(scene, piece: Segments) -> Float[Array, " nv"]:
     def force(t, q, v, tau):
         C, g = dynamics.coriolis_matrix(system, q, v, t), dynamics.gravity_force(system, q, t)
         applied = scene.applied_force(q, v, t)
+        # v @ C is C^T v: of d(M v)/dt = dM/dt v + M a, with dM/dt = C + C^T, it is what M a = ... - C v leaves.
         return v @ C - g + tau + (0.0 if applied is None else applied)
 
     rate = jax.vmap(force)(piece.t, piece.q, piece.v, piece.tau)

@@ -98,7 +98,9 @@ class GradientSteps(Method):
     def _restore(self, start, kept) -> "_Round":
         arrays = {name: jnp.asarray(x) for name, x in kept.items()}
         path = _Path(self.loss, self.args, arrays["center"], arrays["scaling"], arrays["size"])
+        # A checkpoint holds arrays alone: structure and other leaves come from a fresh state.
         leaves, structure = jax.tree.flatten(self.optimizer.init(jnp.zeros_like(start)))
+        # Three digits in the names make their alphabetical order that of the leaves.
         own = iter([arrays[name] for name in sorted(kept) if name.startswith("optimizer_")])
         optimizer = jax.tree.unflatten(structure, [next(own) if eqx.is_array(leaf) else leaf for leaf in leaves])
         before, step = float(kept["before"]), int(kept["step"])
@@ -179,6 +181,7 @@ def _begin_path(loss: Callable, args, center, scaling):
 
 
 def _is_slow(history, tolerance) -> bool:
+    # Over ten steps: one short step is no sign of convergence.
     return history[-11] - history[-1] <= tolerance * abs(history[-1])
 
 
@@ -188,12 +191,14 @@ def _line_search(evaluate: Callable, z, value, gradient, direction):
     if not derivative < 0:  # rounding has spoilt the curvature pairs
         direction, derivative = -gradient, -float(gradient @ gradient)
     low, high, length, decrease = 0.0, np.inf, 1.0, None
+    # 40 halvings shorten the step to 1e-12: a decrease that needs less is rounding.
     for _ in range(40):
         point = z + length * direction
         trial, trial_gradient = evaluate(point)
         if not float(trial) <= float(value) + _DECREASE * length * derivative:  # NaN too
             high = length
         else:
+            # Strictly lower: within rounding the first Wolfe condition also accepts points that gain nothing.
             decrease = (point, trial, trial_gradient) if float(trial) < float(value) else decrease
             if float(trial_gradient @ direction) >= _CURVATURE * derivative:
                 break
@@ -202,6 +207,7 @@ def _line_search(evaluate: Callable, z, value, gradient, direction):
     return decrease
 
 
+# The same object for the same arguments: functions in an optimiser are static, and new ones would compile `_update` again.
 @functools.lru_cache
 def _optimizer(method: str, steps: int, learning_rate: float) -> Any:
     import optax  # here, so that importing jaxdyn does not import it

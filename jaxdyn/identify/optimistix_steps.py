@@ -25,6 +25,7 @@ class LeastSquaresSteps(Method):
 
     def __init__(self, errors: Callable, args, name: str, tolerance: float):
         kind = optx.LevenbergMarquardt if name == SOLVERS[0] else optx.Dogleg
+        # A tolerance below rounding of float64 may never be met.
         self.solver = kind(rtol=max(tolerance, 1e-14), atol=max(tolerance, 1e-14))
         self.errors, self.args = errors, args
 

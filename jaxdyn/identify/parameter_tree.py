@@ -121,6 +121,7 @@ class Parameters(eqx.Module):
                 )
             index, labels = self._entries(name, value, rows)
             vectors = value.reshape(-1)[index].reshape(-1, value.shape[-1] // 3, 3)
+            # Of a screw (v, omega) the rotation axis; that of a prismatic joint is zero, and v is its direction.
             axes = vectors[:, -1]
             axes = np.where(np.linalg.norm(axes, axis=1, keepdims=True) > 0, axes, vectors[:, 0])
             if not np.linalg.norm(axes, axis=1).all():
@@ -283,6 +284,7 @@ class Parameters(eqx.Module):
                 "with positive= and free="
             )
         leaves, names, _ = leaves_with_names(self.given)
+        # By identity: equal values may occur in other leaves.
         place = next(i for i, leaf in enumerate(leaves) if leaf is models[0].inertias)
         self._refuse_twice(place, names[place], "inertias")
         return models[0], place, names[place]
@@ -296,6 +298,7 @@ class Parameters(eqx.Module):
                 )
             k = chart.bodies.index(model.body_names.index(body))
             centre, inverse = np.asarray(centre, float), np.diag(1 / np.asarray(semi_axes, float) ** 2)
+            # With x = (r, 1) and D the inverse squares of the semi-axes, x^T Q x = 1 - (r - c)^T D (r - c), positive inside.
             quadrics[k, :3, :3], quadrics[k, :3, 3] = -inverse, inverse @ centre
             quadrics[k, 3, :3], quadrics[k, 3, 3] = inverse @ centre, 1 - centre @ inverse @ centre
             P = f64.pseudo_inertia(np.asarray(model.inertias, np.float64)[chart.bodies[k]])
@@ -346,6 +349,7 @@ class Parameters(eqx.Module):
                 if root is None
                 else np.broadcast_to(origin if mean is None else np.asarray(mean, float), origin.shape)
             )
+            # A unit of y changes a number by its own size; zero has none.
             unit = np.where(origin == 0, 1, np.abs(origin))
             numbers = self._arrays(origin, unit, *limits, center, root)
             tree = tree._with([*tree.blocks, Numbers(labels, place, tuple(index), kind, *numbers)])
@@ -368,6 +372,7 @@ def _apply_blocks(parameters: Parameters, y, method: str | None):
     """Leaves with the numbers of y, by their places, and a method's results of all blocks, one after the other."""
     leaves = jax.tree.leaves(parameters.given)
     begin, parts = 0, [jnp.zeros((0,), y.dtype)]
+    # In order: a tied block reads what the blocks before it have written.
     for block in parameters.blocks:
         part = y[begin : begin + block.size]
         begin += block.size

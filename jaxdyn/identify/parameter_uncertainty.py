@@ -29,6 +29,7 @@ def error_groups(problem: Problem, logs: Sequence[Log], errors: np.ndarray) -> n
     start = segment = 0
     for segments, samples in sizes:
         count = len(errors) * segments * samples // total // segments
+        # A balance has one row of errors for a segment, other errors one for each sample.
         rows = 1 if problem.objective.error in BALANCES else samples
         for own in errors[start : start + segments * count].reshape(segments, rows, -1):
             series[owners[segment]].append(own)
@@ -41,6 +42,7 @@ def error_groups(problem: Problem, logs: Sequence[Log], errors: np.ndarray) -> n
     slices = block_slices(kept, _BLOCKS)
     block_of_unit = np.repeat(np.arange(len(slices)), [part.stop - part.start for _, part in slices])
     repeats = [rows * width if whole else width for _, rows, width in units for _ in range(1 if whole else rows)]
+    # The order of samples within a log is needed here: the autocorrelation is one along time.
     size = effective_sample_size([np.concatenate(part) for part in series if part])
     group_of_block = np.zeros(len(slices), int)
     for number, group in enumerate(block_groups(len(slices), size)):
@@ -67,6 +69,7 @@ def standard_deviations(end: LinearErrors, jacobian: np.ndarray, groups: np.ndar
     parts = [(white.data[groups == k], white.errors[groups == k]) for k in range(groups.max(initial=0) + 1)]
     grams = np.stack([part.T @ part for part, _ in parts])
     changes, _ = jackknife(grams, np.stack([part.T @ error for part, error in parts]), curvature)
+    # Errors of the prior have the size that it states: their part needs no estimate from scatter.
     variance = np.sum((white.numbers @ changes) ** 2, axis=1) + np.sum((white.numbers @ white.prior.T) ** 2, axis=1)
     return np.where(white.is_free, np.inf, np.sqrt(np.maximum(variance, independent)))
 
@@ -95,6 +98,7 @@ def whiten_errors(end: LinearErrors, jacobian: np.ndarray) -> WhitenedErrors | N
     count = len(end.errors) - end.priors
     data = end.rows[:count]
     fit = least_squares_by_svd(data, end.errors[:count], RANK_TOLERANCE)
+    # Initial states were eliminated; each of their directions has used up one error.
     spare = count - end.start_rank - (fit.rank if end.priors == 0 else 0)
     if spare <= 0:
         return None
@@ -105,8 +109,10 @@ def whiten_errors(end: LinearErrors, jacobian: np.ndarray) -> WhitenedErrors | N
     # Columns of unit length: ranks must not depend on units of the parameters.
     size = np.linalg.norm(rows, axis=0)
     size[size <= 1e-12 * size.max(initial=0.0)] = np.inf
+    # The triangle has the singular values of all rows. The full Vt holds the null space, where there are fewer rows than columns.
     _, s, Vt = np.linalg.svd(np.linalg.qr(rows / size)[1], full_matrices=True)
     rank = int(np.sum(s > RANK_TOLERANCE * s.max(initial=0.0)))
+    # No error depends on these coordinates: a number with a share in them is not determined.
     unseen = np.isinf(size)
     scaled = jacobian / np.where(unseen, 1.0, size)
     seen = np.where(unseen[None], 0.0, scaled)

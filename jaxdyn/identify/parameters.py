@@ -180,6 +180,7 @@ def fit_parameters(
         deviation = np.full(len(jacobian), np.nan)
     elif end is not None:
         groups = error_groups(problem, logs, end.errors[: len(end.errors) - end.priors])
+        # Groups are numbered from zero: the largest number is the degrees of freedom, groups - 1.
         deviation, factor = standard_deviations(end, jacobian, groups), student(int(groups.max(initial=1)))
     return ParameterFit(
         system=tree.system(estimate.y),
@@ -203,6 +204,7 @@ def _run_method(problem: Problem, unknowns: Unknowns, method, watch: Watch, lear
     if isinstance(method, str) and method == _GAUSS_NEWTON:
         rounding = float(jnp.finfo(unknowns.y.dtype).eps)
         end = descend(GaussNewton(partial(linearise, problem), tolerance, rounding), unknowns, watch)
+        # Only steps that lower the loss are accepted: the last point is the best one.
         return end.last.point, end.last.state[0], end.history, end.result
     # The other methods search a flat vector.
     z0, unflatten = ravel_pytree(unknowns)

@@ -83,6 +83,7 @@ def select(system: Any, where: Any, argument: str, twice: bool = False) -> list[
     """
     leaves, names, structure = leaves_with_names(system)
     kind = type(system).__name__
+    # Placeholders know their places; the values could not tell two leaves that hold the same array apart.
     marked = jax.tree.unflatten(structure, [_Leaf(i, name) for i, name in enumerate(names)])
     example = f"write e.g. {argument}=lambda system: system.parameters['mass']"
     if not callable(where):
@@ -132,11 +133,13 @@ def prior_root(std, covariance, size: int, label: str) -> np.ndarray | None:
         raise ValueError(
             f"{label}: covariance has shape {matrix.shape}; give a positive definite matrix ({size}, {size})"
         )
+    # For the covariance L L^T, R = L^-1 gives R^T R = (L L^T)^-1.
     return np.linalg.inv(np.linalg.cholesky(matrix))
 
 
 def perpendicular_basis(axis: np.ndarray) -> np.ndarray:
     """Two unit vectors perpendicular to an axis and to each other, as the columns of (3, 2)."""
+    # The unit vector least aligned with the axis: their cross product cannot vanish.
     other = np.cross(axis, np.eye(3)[np.argmin(np.abs(axis))])
     other = other / np.linalg.norm(other)
     return np.stack([other, np.cross(axis, other) / np.linalg.norm(axis)], axis=1)

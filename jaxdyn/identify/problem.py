@@ -190,8 +190,10 @@ def _assemble(problem: Problem, estimate: Unknowns, parts, prior) -> LinearError
     if estimate.start is None:
         errors = np.concatenate([np.reshape(errors, (1, -1)) for errors, _, _ in parts], axis=1)
         rows = np.concatenate([np.reshape(rows, (1, -1, estimate.y.size)) for _, rows, _ in parts], axis=1)
+        # Without free initial states the boundaries of segments do not matter: batches of any lengths become one list.
         data = eliminate_starts(errors, rows, None)
     else:
+        # Only simulated errors have free initial states, and their segments are one batch.
         data = eliminate_starts(*parts[0])
     residual, by_y = prior
     return with_prior(data, residual, by_y, problem.prior_weight)
@@ -206,6 +208,7 @@ def _jacobians(problem: Problem, estimate: Unknowns):
     (rest, batches), divisor = _split_batches(forward(problem)), problem.divisor
 
     def one(problem, y, change, piece):
+        # Errors are returned as auxiliary output too: one simulation gives values and Jacobian.
         def twice(y, change):
             errors = segment_errors(problem, divisor, y, change, piece).reshape(-1)
             return errors, errors
@@ -279,6 +282,7 @@ def segment_starts(problem: Problem, logs: Sequence[Log]) -> list[tuple[int, int
     for k, log in enumerate(logs):
         size = len(log) if whole else max(length - 1, 1)
         count = 1 if whole else len(log) if length == 1 else (len(log) - 1) // size
+        # Remaining samples at the end of a log are in no segment (`replay.segments`).
         samples += [(k, i * size) for i in range(count)]
     return samples
 
@@ -292,6 +296,7 @@ def _errors_at(problem: Problem, batch: Segments, y, start):
 def _parameters_to_blame(problem: Problem, batch: Segments, estimate: Unknowns) -> list[str]:
     names = []
     for i in range(estimate.y.size):
+        # Zero is the start, where the number cannot be at fault.
         if float(estimate.y[i]) != 0:
             errors = _errors_at(problem, batch, estimate.y.at[i].set(0.0), estimate.start)
             if bool(jnp.isfinite(errors).all()):

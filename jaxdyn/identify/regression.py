@@ -21,6 +21,7 @@ _NUMBERS = ("m", "mcx", "mcy", "mcz", "Ixx", "Ixy", "Iyy", "Ixz", "Iyz", "Izz")
 # Iyy into the parent. For other axes the elimination arrives at others.
 _KEPT_FIRST = (9, 1, 2, 4, 5, 7, 8)
 _KEPT_LAST = (6, 3, 0)
+# Samples of one compiled call: without blocks of one size every length of a log would be compiled again.
 _BLOCK = 256
 
 
@@ -199,6 +200,7 @@ def base_parameters(model: Model, terms: Terms = (), *, v_s: float = 0.01, seed:
     terms = check_terms(terms, v_s)
     names = parameter_names(model, terms)
     p = len(names)
+    # Twice as many rows as columns: a rank must not be low for lack of states.
     count = max(2 * p // max(model.nv, 1) + 1, 30)
     generator = np.random.default_rng(seed)
     # Away from the neutral configuration by up to about half a turn; identifiability does not depend on limits.
@@ -215,13 +217,16 @@ def base_parameters(model: Model, terms: Terms = (), *, v_s: float = 0.01, seed:
         + list(range(10 * model.nb, p)),
         int,
     )
+    # QR without column pivoting: the order decides which of dependent parameters stands for the combination.
     pivots = np.abs(np.diag(np.linalg.qr((W / scale)[:, order], mode="r")))
+    # Pivots of unit columns are rounding errors or far above: the root of rounding is between both on a logarithmic scale.
     tolerance = np.sqrt(noise) if noise < 1e-10 else 10 * np.sqrt(noise)
     kept = pivots > tolerance
     independent = np.sort(order[kept])
     scaled = (W / scale)[:, independent]
     singular = np.linalg.svd(W / scale, compute_uv=False)
     rank = int(np.sum(singular > tolerance * singular.max(initial=0.0)))
+    # Two tests of the rank: they differ where a pivot is close to the tolerance.
     if rank != len(independent):
         raise ValueError(
             f"base parameters of {model.name!r} are not clear in {model.home.dtype}: {len(independent)} by "
@@ -229,11 +234,13 @@ def base_parameters(model: Model, terms: Terms = (), *, v_s: float = 0.01, seed:
         )
     dependent = np.setdiff1d(np.arange(p), independent)
     beta = np.linalg.lstsq(scaled, (W / scale)[:, dependent], rcond=None)[0]
+    # Rounding errors would otherwise appear in the combinations as parameters.
     beta[np.abs(beta) < 10 * tolerance] = 0.0
     matrix = np.zeros((len(independent), p))
     matrix[np.arange(len(independent)), independent] = 1.0
     finite = np.isfinite(scale[dependent])
     factor = np.where(finite, scale[dependent], 0.0)
+    # Back from unit columns, W x = (W / scale) (scale x).
     matrix[:, dependent] = beta * factor / scale[independent][:, None]
     return BaseParameters(matrix, independent, names)
 

@@ -43,6 +43,7 @@ class SampledTorque(eqx.Module):
     def at(self, t: Number) -> Float[Array, " nv"]:
         """Torque (nv,) at a time (s); before the first sample and after the last one that of these."""
         last = self.t.shape[0] - 2
+        # Clipped to the last interval: otherwise both indices clamp to the last sample at the end, and 0/0 enters the gradient.
         i = jnp.clip(jnp.searchsorted(self.t, t, side="right") - 1, 0, last)
         if self.hold == "previous":
             return self.tau[i]
@@ -77,6 +78,7 @@ def segments(log: Log | Sequence[Log], horizon: int | None, dtype, *, restart: b
             f"horizon is None, which uses whole logs, and they have {lengths[0]} to {lengths[-1]} samples; give the steps "
             "of a segment"
         )
+    # Segments are concatenated: all of them have accelerations, or none.
     if any(one.a is None for one in logs):
         logs = [dataclasses.replace(one, a=None) for one in logs]
     parts = [_segments(one, horizon, dtype, restart) for one in logs]
@@ -93,6 +95,7 @@ def _segments(log: Log, horizon: int | None, dtype, restart: bool) -> Segments:
         raise ValueError(f"horizon={horizon} steps; a log of {len(log)} samples allows 1 to {len(log) - 1}")
     count = (len(log) - 1) // horizon
     rows = np.arange(count)[:, None] * horizon + np.arange(horizon + 1)
+    # The start is subtracted in float64: float32 time stamps of a long log do not resolve a sample.
     t = np.asarray(log.t, np.float64)[rows]
     parts = [t - t[:, :1] if restart else t, *(np.asarray(x)[rows] for x in (log.q, log.v, log.tau))]
     parts += [] if log.a is None else [np.asarray(log.a)[rows]]
@@ -192,6 +195,7 @@ def with_even_steps(options: dict, data: Segments) -> dict:
     Steps then end on the samples too, and are compiled to native code.
     """
     t = np.asarray(data.t, np.float64)
+    # Gaps inherit the rounding of the times themselves, not that of their own size.
     gaps, rounding = np.diff(t, axis=1), 8 * float(jnp.finfo(data.t.dtype).eps) * np.abs(t).max()
     if "substeps" not in options or np.ptp(gaps) > rounding:
         return options
@@ -224,14 +228,17 @@ def simulate_segment(
         shares = jnp.arange(substeps, dtype=t.dtype) / substeps
         steps = t[:-1, None] + (t[1:] - t[:-1])[:, None] * shares[None, :]
         given.setdefault("max_steps", steps.size + 1)
+        # The last time is taken from the log: recomputed from steps it could miss the sample by rounding.
         given["stepsize"] = diffrax.StepTo(ts=jnp.append(steps.reshape(-1), t[-1]))
     q0, v0 = one.q[0], one.v[0]
     if change is not None:
+        # On the manifold, so that quaternions keep unit length.
         q0, v0 = displace(scene.system, q0, change[0]), v0 + change[1]
     if scene.constraints:
         state = on_constraints(scene, q0, v0, t[0], observed)
         q0, v0 = state.q, state.v
     control = SampledTorque(t, one.tau, hold) if control is None else control
+    # No exception under jax.vmap: one failed segment must not end the others.
     motion = simulate(scene, q0, v0, t, control=control, outputs=outputs, throw=False, **given)
     return motion.q, motion.v, *(getattr(motion, name) for name in outputs)
 
@@ -251,6 +258,7 @@ def motion_scale(system: Any, data: Segments) -> Float[Array, "2 nv"]:
 
 def moving_scale(scale: Float[Array, " n"]) -> Float[Array, " n"]:
     """Scales safe to divide by: those below a thousandth of the largest are replaced by it, and by one where all are zero."""
+    # The noise of a coordinate at rest, in units of itself, would count as much as a motion.
     largest = jnp.max(scale, keepdims=True)
     return jnp.where(scale > 1e-3 * largest, scale, jnp.where(largest > 0, largest, jnp.ones_like(largest)))
 

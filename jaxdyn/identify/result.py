@@ -101,6 +101,7 @@ class Fit(AbstractFit):
         torque = super().torques(log)
         if self.as_measured:
             v_s = float(self.friction.v_s)
+            # The scene has the unfiltered law, and the log's torque went through the low-pass: the difference corrects it.
             change = coulomb_through_filter(log, v_s) - coulomb_column(log, v_s)
             torque = torque + np.asarray(self.friction.coulomb) * change
         if self.extra is None:
@@ -109,6 +110,7 @@ class Fit(AbstractFit):
         if self.extra.needs_load:
             dtype = state_dtype(self.model)
             signals = (jnp.asarray(x, dtype) for x in (log.t, log.q, log.v, log.a))
+            # Without friction: the load of the gears is the torque of bodies and rotors, as in the fit.
             load = np.asarray(_torques(Scene(self.model), *signals), np.float64)
         return torque + self.extra.torque(log, load)
 

@@ -23,6 +23,7 @@ from jaxdyn.model.arguments import Checked, Numbers, warn
 from jaxdyn.model.tree import Model
 from jaxdyn.tasks import DaskClient, Engine, open_engine, results
 
+# At least two blocks form a jackknife group: about ten groups at most, nine degrees of freedom for Student's t.
 _BLOCKS = 20
 # Fits after which the weights of joints and the loads of gears are updated.
 _ROUNDS = 3
@@ -114,6 +115,7 @@ def fit_robot(
     check_bodies(model)
     logs = as_logs(log, model)
     is_auto = isinstance(terms, str) and terms == "auto"
+    # These two need one angle for each torque (`torque_terms._angles`).
     candidates = [term for term in EXTRA.values() if model.nq == model.nv or term.name not in ("spring", "dahl")]
     basic, extra, where = (TERMS, tuple(candidates), ()) if is_auto else split_terms(terms, model.nv)
     for name, value in (("v_s", v_s), ("prior", prior)):
@@ -146,6 +148,7 @@ def fit_robot(
     if delays is not None:
         logs = tuple(shift_torques(log, delays.seconds) for log in given)
     problem = RobotProblem(model, logs, basic, extra, inertia, blocks)
+    # One set of joint weights and loads for the whole search: settings are compared on the same scale.
     problem.refine(setting, fixed, rounds=2)
     trials, by = (), "given"
     if is_auto or any(isinstance(value, str) for value in (v_s, prior, robust)):
@@ -203,6 +206,7 @@ def _cross_validation(problem: RobotProblem, engine: Engine) -> Callable:
         # Weights of samples are those of the first setting with its loss: found here, so that they do not depend on the worker.
         for setting, _ in pairs:
             problem.weigh_samples(setting)
+        # Workers hold a copy of the problem: it is sent again only when it has new weights of samples.
         if sent != (sent := tuple(problem.sample_weights)):
             engine.send(partial(_Folds, problem))
         return results(engine, "squares", pairs)

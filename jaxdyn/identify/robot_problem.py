@@ -31,6 +31,7 @@ class RobotProblem:
         self.still = hardly_moving(model, logs)
         self.loads = [np.zeros_like(np.asarray(log.tau, np.float64)) for log in logs]
         self.torque = float(sum(np.sum(np.asarray(log.tau, np.float64) ** 2) for log in logs))
+        # Caches: `_data` depends on loads and sample weights, `_rows` on joint weights too, `_charts` on v_s alone.
         self._data: dict[tuple, Data] = {}
         self._rows: dict[tuple, np.ndarray] = {}
         self._charts: dict[float, tuple[Chart, np.ndarray]] = {}
@@ -38,6 +39,7 @@ class RobotProblem:
     def data(self, setting: Setting) -> Data:
         """Condensed logs for the v_s and the loss of a setting."""
         weights = None if setting.robust is None else self.sample_weights.get(setting.robust)
+        # Terms and prior are not in the key: all candidate columns are condensed, and the prior enters in the fit.
         key = setting.v_s, None if weights is None else setting.robust
         if key not in self._data:
             self._data[key] = gather(self.model, self.logs, setting.v_s, self.extra, self.loads, self.blocks, weights)
@@ -61,8 +63,10 @@ class RobotProblem:
         blocks, key = self.data(setting).blocks, (setting.v_s, setting.robust, tuple(part.tolist()))
         rest = np.setdiff1d(np.arange(len(blocks)), part)
         if key not in self._rows:
+            # One triangle for each fold, shared by all settings that differ in terms and prior alone.
             self._rows[key] = np.asarray(np.linalg.qr(blocks.rows(self.weights, rest), mode="r"))
         estimate = self.fit(setting, rows=self._rows[key], count=blocks.count(rest), is_rough=True)
+        # All losses are scored by plain squares; weighted ones would favour the loss that ignores most samples.
         return self.data(setting._replace(robust=None)).blocks.squares(estimate.x, part)
 
     def weigh_samples(self, setting: Setting) -> None:
@@ -79,6 +83,7 @@ class RobotProblem:
         is_iterated = bool(self.extra) or fixed is None or setting.robust is not None
         for remaining in reversed(range(rounds if is_iterated else 1)):
             estimate = self.fit(setting)
+            # No update after the last fit: intervals need the weights and loads that the estimate was made with.
             if not remaining:
                 return estimate
             if fixed is None:
@@ -120,6 +125,7 @@ class RobotProblem:
         weights = None if setting.robust is None else self.sample_weights.get(setting.robust)
         if weights is None:
             return None
+        # psi' of Huber's loss: one within the threshold, zero beyond.
         kept = [np.where(weight < 1, 0.0, 1.0) for weight in weights]
         return gather(self.model, self.logs, setting.v_s, self.extra, self.loads, self.blocks, kept)
 
@@ -132,6 +138,7 @@ class RobotProblem:
     def with_term(self, term: TorqueTerm) -> "RobotProblem":
         """Copy with the columns of one more term, after all others."""
         wide = RobotProblem(self.model, self.logs, self.basic, (*self.extra, term), self.inertia, self.blocks)
+        # Those of the fit: intervals are of the estimate that exists, not of a new one.
         wide.weights, wide.loads, wide.sample_weights = self.weights, self.loads, self.sample_weights
         return wide
 
@@ -152,6 +159,7 @@ class RobotProblem:
         rms = np.sqrt(blocks.squares(estimate.x).sum(axis=0) / blocks.samples.sum())
         # A torque that is fitted exactly, or constant, would get an infinite weight; it gets a large finite one.
         weights = 1 / np.maximum(rms, 1e-3 * rms.max(initial=0) or 1.0)
+        # Only ratios matter to the fit; sigma has the level.
         return weights / weights.mean()
 
     def _load(self, log: Log, x: np.ndarray) -> np.ndarray:
@@ -187,10 +195,12 @@ class RobotProblem:
 def huber_weights(errors: Sequence[np.ndarray], threshold: float) -> list[np.ndarray]:
     """Weights (n, nv) of each log's torques whose squares make Huber's loss: sqrt(min(1, threshold scale / |error|))."""
     scale = error_scale(errors)
+    # The scale is zero where most errors are exactly zero: no sample is then down-weighted.
     limit = threshold * np.where(scale > 0, scale, np.inf)
     return [np.sqrt(np.where(np.abs(x) > limit, limit / np.maximum(np.abs(x), 1e-300), 1.0)) for x in errors]
 
 
 def error_scale(errors: Sequence[np.ndarray]) -> np.ndarray:
     """Scale (nv,) of each torque's errors: 1.4826 times their median size, the standard deviation of normal ones."""
+    # A standard deviation would grow with the outliers that it is to detect. 1 / 1.4826 is the normal distribution's quartile.
     return 1.4826 * np.median(np.abs(np.concatenate(errors)), axis=0)

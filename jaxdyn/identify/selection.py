@@ -29,10 +29,12 @@ from jaxdyn.identify.condensed_fit import Setting
 
 VELOCITIES = (0.0003, 0.001, 0.003, 0.01, 0.03, 0.1)
 # Factors by which v_s is refined between two of these, in turn.
+# Neighbours on the grid differ by about 3; each factor halves the remaining step in logarithms.
 _REFINEMENTS = (3**0.5, 3**0.25, 3**0.125)
 PRIORS = (0.1, 1.0, 10.0, 100.0, 1000.0)
 # Thresholds of Huber's loss, in standard deviations: 1.345 is the usual one, 3 leaves all but outliers alone.
 ROBUST = (None, 3.0, 1.345)
+# Hastie et al. (section 7.10) recommend five or ten: a compromise between bias and variance of the estimated error.
 _FOLDS = 5
 # Least decrease of the squared error of left-out blocks for which a term, a loss or another v_s is worth its while.
 _LEAST = 0.01
@@ -50,6 +52,7 @@ class Trial(NamedTuple):
     @property
     def score(self) -> float:
         """Mean logarithm of the squared errors of the torques; lower is better."""
+        # The floor keeps the score of a noise-free log finite.
         return float(np.mean(np.log(np.maximum(self.squares.sum(axis=0), 1e-300))))
 
 
@@ -69,8 +72,10 @@ def folds(blocks: Blocks) -> tuple[list[np.ndarray], str]:
     count = len(blocks)
     if count < 2:
         raise ValueError("the logs are too short to leave a part of them out; give v_s, terms and prior as numbers")
+    # Blocks of one log share its motion and its drift; a log that was left out is an independent test.
     if len(set(blocks.logs.tolist())) >= 3:
         return [np.flatnonzero(blocks.logs == which) for which in np.unique(blocks.logs)], "logs"
+    # Consecutive, not random: errors of neighbouring blocks are correlated, and neighbours would give left-out blocks away.
     parts = np.array_split(np.arange(count), min(_FOLDS, count))
     return parts, f"{len(parts)} parts of consecutive samples"
 
@@ -92,6 +97,7 @@ class Search:
 
     def run(self, settings: Sequence[Setting]) -> None:
         """Run the trials of these settings that are missing, as one list of independent fits."""
+        # dict.fromkeys removes repeated settings and keeps their order, which a set would not.
         missing = [setting for setting in dict.fromkeys(settings) if setting not in self.trials]
         errors = iter(self._fit([(setting, part) for setting in missing for part in self._parts]))
         for setting in missing:
@@ -118,10 +124,12 @@ class Search:
         """
         before, after = (np.maximum(self(one).squares, 1e-300) for one in (plain, other))
         gains = np.mean(np.log(before / after), axis=1)
+        # One-standard-error rule: the best of many settings is better by chance, by about the standard error.
         return bool(gains.mean() > max(_LEAST, standard_error(gains)))
 
     def improving_torques(self, before: Setting, after: Setting) -> tuple[int, ...]:
         """Indices of the torques that a setting predicts better than another one, as `improving_torques`."""
+        # A trial holds its blocks fold after fold, so that reduceat sums each fold.
         edges = np.cumsum([0, *map(len, self._parts)])[:-1]
         sums = [np.add.reduceat(self(one).squares, edges, axis=0) for one in (before, after)]
         return improving_torques(sums[0], sums[1])
@@ -156,6 +164,7 @@ def search(
         if not trials:
             break
         following = search.best(trials)
+        # Joints were chosen by their own errors; the score over all torques must decrease too.
         if search(following).score >= search(setting).score:
             break
         setting = following
@@ -196,4 +205,5 @@ def improving_torques(before: np.ndarray, after: np.ndarray, least: float = _LEA
 
 def standard_error(gains: np.ndarray) -> float:
     """Standard error of the mean of gains (blocks,), from their scatter."""
+    # Of paired differences: blocks that are hard for both settings do not add to the scatter.
     return float(gains.std(ddof=1) / np.sqrt(len(gains)))

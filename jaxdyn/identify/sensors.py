@@ -110,6 +110,7 @@ class Measured(eqx.Module):
         torque_bias: Numbers | None = None,
         delay: Numbers = 0.0,
     ):
+        # A construction is kept: once it is built, its numbers can no longer be freed.
         self.scene = scene if isinstance(scene, Construction) else as_scene(scene)
         own = build_scene(scene)
         dtype, nv = state_dtype(own.system), own.nv

@@ -10,6 +10,7 @@ from jaxdyn.identify.gauss_newton import DAMPING, Unknowns, propose
 from jaxdyn.identify.problem import Problem, linearise_batch
 from jaxdyn.tasks import DaskClient, count_workers, map_tasks
 
+# Rough: the best start is fitted to the end afterwards, so that only the order of the losses matters here.
 _STEPS, _TOLERANCE = 20, 1e-4
 
 
@@ -26,11 +27,13 @@ def best_start(
         raise ValueError(f"spread is {spread}; give a positive number, the deviation of the starts' coordinates")
     y = unknowns.y
     far = spread * jax.random.normal(jax.random.key(seed), (starts, y.size), y.dtype)
+    # With the given start among them, and steps that only lower losses, the choice is never worse than that start.
     points = y[None] + far.at[0].set(0.0)
     blocks = np.array_split(np.asarray(points), min(starts, count_workers(client)))
     results = map_tasks(_Improvement(problem, unknowns), blocks, client)
     candidates = [estimate for estimates, _ in results for estimate in estimates]
     losses = np.concatenate([np.asarray(losses) for _, losses in results])
+    # np.argmin would take a NaN for the smallest.
     losses = np.where(np.isfinite(losses), losses, np.inf)
     if not np.isfinite(losses).any():
         raise ValueError(

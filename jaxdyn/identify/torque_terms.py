@@ -62,6 +62,7 @@ class Friction(eqx.Module):
 
 def friction_regressor(v: Float[Array, " nv"], a: Float[Array, " nv"], terms, v_s) -> Float[Array, "nv terms_nv"]:
     """Regressor of friction and rotors, (nv, nv * len(terms)): one diagonal block per term, in the order of `terms`."""
+    # tanh instead of the sign: a step at zero velocity would have no derivative, and adaptive steps shrink there.
     columns = {"viscous": v, "coulomb": jnp.tanh(v / v_s), "offset": jnp.ones_like(v), "armature": a}
     blocks = [jnp.diag(columns[term]) for term in terms]
     return jnp.concatenate(blocks, axis=1) if blocks else jnp.zeros((v.shape[0], 0), v.dtype)
@@ -135,12 +136,14 @@ def _quadratic(log, load, v_s):
 
 def _spring(log, load, v_s):
     q = _angles(log, "spring")
+    # Both functions, so that the unknown angle of rest stays linear in the coefficients.
     return np.stack([np.sin(q), np.cos(q)], axis=2)
 
 
 def _dahl(log, load, v_s):
     q = _angles(log, "dahl")
     z = np.empty_like(q)
+    # The state before the log is unknown: friction starts fully developed in the direction of motion.
     z[0] = np.tanh(np.asarray(log.v)[0] / v_s)
     for i in range(1, len(q)):
         path = q[i] - q[i - 1]
@@ -204,6 +207,7 @@ def split_terms(
     names = [*basic, *(term.name for term in extra)]
     if len(set(names)) < len(names):
         raise ValueError(f"terms are {', '.join(names)}; each may be given once")
+    # Any positive v_s passes here: this checks the names alone.
     return check_terms(basic, 1.0), tuple(extra), tuple(where)
 
 
@@ -211,12 +215,14 @@ def term_columns(terms: Sequence[TorqueTerm], log: Log, load: np.ndarray, v_s: f
     """Columns of all terms (n, nv, k) side by side, low-passed like the log."""
 
     def columns(term: TorqueTerm, fine: Log) -> np.ndarray:
+        # Refinement makes (n - 1) factor + 1 samples of n. The load is known at the log's own samples only.
         factor = (len(fine) - 1) // max(len(log) - 1, 1)
         return term(fine, load if len(fine) == len(log) else refine_samples(load, factor), v_s)
 
     parts = [
         term(log, load, v_s) if term.is_smooth else low_pass_columns(log, partial(columns, term)) for term in terms
     ]
+    # The empty part gives the shape where there are no terms.
     return np.concatenate([np.zeros((len(log), log.nv, 0)), *parts], axis=2)
 
 

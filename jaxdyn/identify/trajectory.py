@@ -160,6 +160,7 @@ def fit_trajectory(
 def _signals(log: Log):
     """Signals q, v, tau and a of a log."""
     v, t = np.asarray(log.v, np.float64), np.asarray(log.t, np.float64)
+    # Accelerations only set units and scaling here, for which differences of a noisy velocity are good enough.
     return log.q, log.v, log.tau, np.gradient(v, t, axis=0) if log.a is None else log.a
 
 
@@ -173,14 +174,18 @@ def _scaling(problem: Problem, point: Coordinates, signals, size: int) -> Float[
     chart, span = tree.chart, float(problem.batches[0].t[0, -1])
     model, _ = chart.model_at(tree.given, point)
     count = len(signals[0])
+    # The scaling is an estimate: some samples, evenly over all logs, bound its cost.
     few = np.linspace(0, count - 1, min(count, 200)).astype(int)
     q, v, a = (np.asarray(x, model.home.dtype)[few] for x in signals)
     effect = regressor(model, q, v, a, v_s=float(chart.v_s)) @ np.asarray(_parameter_jacobian(chart, point), np.float64)
     rows = np.linalg.solve(np.asarray(_mass_matrices(model, jnp.asarray(q)), np.float64), effect)
+    # The root mean square of the time since the start, over a segment from 0 to span, is span / sqrt(3).
     rows *= span / np.sqrt(3) / np.asarray(problem.scale, np.float64)[1][:, None]
     rows = rows.reshape(-1, rows.shape[-1])
     values, vectors = np.linalg.eigh(2 * rows.T @ rows / len(rows))
+    # 1e-6 in curvature is 1e-3 in length: a thousand times at most.
     values = np.maximum(values, 1e-6 * values.max(initial=1e-300))
+    # Free initial states follow y in the flat vector and have units already.
     result = np.eye(size)
     result[: values.size, : values.size] = vectors / np.sqrt(values)
     return jnp.asarray(result, model.home.dtype)

@@ -28,6 +28,7 @@ def block_groups(count: int, size: float) -> list[np.ndarray]:
     """Indices of the blocks of each jackknife group; `size`: effective sample size of all blocks together."""
     # Few groups make the deviation uncertain, short ones make it too small: length first, then at least six groups.
     groups = min(max(_FEWEST, int(min(size / _INDEPENDENT, count))), count // _TOGETHER)
+    # Two at least: the scatter of a single replicate is zero.
     return np.array_split(np.arange(count), max(2, groups))
 
 
@@ -37,6 +38,7 @@ def jackknife(grams: np.ndarray, gradients: np.ndarray, curvature: np.ndarray) -
     `grams` (groups, n, n) and `gradients` (groups, n) are the groups' curvatures and gradients there, `curvature` (n, n) that of
     the prior, which is in every replicate. To first order the minimum without group b is off by (H - D_b)^-1 g_b.
     """
+    # One Newton step stands for a refit without the group: exact where the loss is quadratic.
     H = grams.sum(axis=0) + curvature
     # Unit diagonal first: parameters differ by many orders of magnitude in size.
     unit = 1 / np.sqrt(np.maximum(np.diag(H), 1e-300))
@@ -47,12 +49,14 @@ def jackknife(grams: np.ndarray, gradients: np.ndarray, curvature: np.ndarray) -
             for gram, gradient in zip(grams, gradients, strict=True)
         ]
     )
+    # Jackknife variance: (g - 1) / g times the squares about the mean of the replicates, not about the estimate (Efron 1982).
     count = len(grams)
     return (changes - changes.mean(axis=0)).T * np.sqrt((count - 1) / count), _inverse(H * scale) * scale
 
 
 def _inverse(matrix: np.ndarray) -> np.ndarray:
     """Inverse of a symmetric matrix of unit diagonal; directions without curvature get that of rounding errors."""
+    # Without a group the matrix may lose rank. The diagonal is of size one, so that 1e-12 is above rounding of the eigenvalues.
     values, vectors = np.linalg.eigh((matrix + matrix.T) / 2)
     return (vectors / np.maximum(values, 1e-12)) @ vectors.T
 
@@ -61,6 +65,7 @@ def student(degrees: int) -> float:
     """Half-width of a 95 % interval in standard deviations, by Student's t with so many degrees of freedom."""
     from scipy.special import stdtrit
 
+    # Two-sided: 2.5 % beyond each end.
     return float(stdtrit(degrees, 0.975))
 
 
@@ -91,19 +96,23 @@ def _autocorrelation_times(residual: np.ndarray) -> np.ndarray:
     times = np.ones(columns)
     for j, x in enumerate((residual - residual.mean(axis=0)).T):
         # Padded to twice the length, so that the circular correlation of the transform does not wrap around.
+        # The scale cancels in the correlation; dividing by the largest value keeps squares from overflow and underflow.
         spectrum = np.abs(np.fft.rfft(x / (np.abs(x).max(initial=0) or 1.0), 2 * n)) ** 2
         correlation = np.fft.irfft(spectrum)[:n]
+        # A residual of zeros has no correlation, and counts as white.
         if not correlation[0] > 0:
             continue
         correlation = correlation / correlation[0]
         # Beyond its first zero the estimate is noise, of which the sum over all lags would be minus one half.
         end = int(np.argmax(correlation < 0)) or n
+        # At least one sample: anticorrelated errors must not give more effective samples than there are.
         times[j] = max(1.0, 1 + 2 * float(correlation[1:end].sum()))
     return times
 
 
 def effective_sample_size(residuals: Sequence[np.ndarray]) -> float:
     """Effective sample size of the residuals (n, k) of all logs, by the column with the longest autocorrelation."""
+    # Logs are independent and add up. Within a log all torques share the parameters, so that the slowest errors decide.
     return sum(float((len(residual) / _autocorrelation_times(residual)).min()) for residual in residuals)
 
 
@@ -124,13 +133,16 @@ def is_white(logs: Sequence[Log], residuals: Sequence[np.ndarray]) -> np.ndarray
         most = rate / 2 if log.cutoff is None else min(0.6 * log.cutoff, rate / 2)
         # Offsets are fitted, so that the mean says nothing.
         band = (frequency > 0) & (frequency <= most)
+        # As shares of each log's band: logs may differ in sampling, length and cut-off.
         places.append(frequency[band] / most)
         powers.append(np.abs(np.fft.rfft(residual - residual.mean(axis=0), axis=0)[band]) ** 2)
     place, power = np.concatenate(places), np.concatenate(powers)
     count = len(place)
     total = power.sum(axis=0)
+    # A single frequency cannot contradict white noise.
     if count < 2:
         return np.ones(power.shape[1], bool)
     share = np.cumsum(power[np.argsort(place)], axis=0) / np.where(total > 0, total, 1)
     excess = np.max(share - np.arange(1, count + 1)[:, None] / count, axis=0)
+    # One-sided Kolmogorov-Smirnov bound: white noise exceeds x with the probability exp(-2 m x^2).
     return excess <= np.sqrt(-np.log(_LEVEL) / 2 / count)

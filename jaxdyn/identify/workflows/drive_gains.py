@@ -129,6 +129,7 @@ def fit_gains(
     carried = []
     for log, holds in zip(logs, is_loaded, strict=True):
         columns = holds * log_regressor(model, log)[:, :, own]
+        # Mass and first moments are known; the six numbers of the rotational inertia stay.
         free = columns[:, :, 4:] if inertia is None else columns[:, :, :0]
         carried.append(np.concatenate([(columns @ known)[:, :, None], free], axis=2))
     best = None
@@ -158,6 +159,7 @@ class _Problem:
         shared = 10 * model.nb
         base = base_parameters(model, terms)
         independent = free_columns(model.nb, model.nv, terms)[base.independent]
+        # Of each torque's terms four are `TERMS` and one is the payload's known torque; the others belong to the unknown inertia.
         self.size = len(independent) + data.terms - 5
         # For each joint, the columns of its triangle and the unknowns that these belong to.
         self.columns, self.unknowns = [], []
@@ -173,10 +175,12 @@ class _Problem:
 
     def rows(self, joint: int, triangle: np.ndarray, z: np.ndarray, u: float):
         """Errors of a joint's condensed currents at the unknowns z and the gain exp(u), and their Jacobian (m, size + 1)."""
+        # By logarithms gains stay positive, and a prior on u is one on relative differences.
         h, W = np.exp(-u), triangle[:, self.columns[joint]]
         predicted = h * (W @ z[self.unknowns[joint]] + triangle[:, self.known])
         jacobian = np.zeros((len(triangle), self.size + 1))
         jacobian[:, self.unknowns[joint]] = h * W
+        # h = exp(-u): the derivative by u is minus the prediction itself.
         jacobian[:, -1] = -predicted
         return predicted - triangle[:, -1], jacobian
 
@@ -209,6 +213,7 @@ def _fit(problem: _Problem, v_s: float):
     state = _State(np.zeros(problem.size), start, 1 / sizes)
     rms = sizes
     for _ in range(_ROUNDS):
+        # Weights depend on the errors of the fit and the fit on the weights: iterated.
         state = _descend(problem, triangles, state, start)
         rms = np.array(
             [np.linalg.norm(problem.rows(j, R, state.z, state.u[j])[0]) for j, R in enumerate(triangles)]
@@ -225,15 +230,19 @@ def _fit(problem: _Problem, v_s: float):
     curvature = np.diag(_weak_prior(total, problem.size))
     parts = [np.stack([np.sum([x[i] for i in group], axis=0) for group in groups]) for x in (grams, gradients)]
     changes, inverse = jackknife(parts[0], parts[1], curvature)
+    # The jackknife does not see the prior; its covariance is H^-1 P H^-1.
     variance = np.sum(changes**2, axis=1) + np.diag(inverse @ curvature @ inverse)
     gains = np.exp(state.u)
+    # Logarithms: the same relative improvement counts alike for currents of any size.
     score = float(np.sum(np.log(np.maximum(rms, _FINEST * sizes))))
     percent = 100 * float(np.sqrt(samples * np.sum(rms**2) / np.sum(sizes**2)))
+    # The deviation of a logarithm is relative.
     return score, percent, gains, gains * np.sqrt(variance[-nv:]), student(len(groups) - 1), v_s
 
 
 def _weak_prior(gram: np.ndarray, size: int) -> np.ndarray:
     """Curvature (n,) of a weak prior: a small share of each number's own, and the prior of the gains."""
+    # Relative to each number's own curvature: it regularises directions that no log excites, and hardly changes any other.
     prior = 1e-12 * np.maximum(np.diag(gram), 1e-300)
     prior[size:] = 1 / _APART**2
     return prior
@@ -252,8 +261,10 @@ def _start(problem: _Problem, triangles) -> np.ndarray:
         used[-2:] = True
         T = np.asarray(np.linalg.qr(table[:, used], mode="r"))
         k = T.shape[1] - 2
+        # T[k, k] is the part of the payload's torque that the robot's own parameters do not explain.
         if len(T) > k and abs(T[k, k]) > 1e-6 * size > 0:
             h, noise = T[k, k + 1] / T[k, k], np.linalg.norm(T[k + 1 :, k + 1])
+            # The deviation of h is that of the error over T[k, k]: at most half of h.
             if h > 0 and noise / np.sqrt(problem.data.samples.sum()) < 0.5 * h * abs(T[k, k]):
                 logarithms[joint] = -np.log(h)
     if np.isnan(logarithms).all():
@@ -280,6 +291,7 @@ def _descend(problem: _Problem, triangles, state: _State, start: np.ndarray) -> 
         A, b = np.concatenate([J, np.diag(root)]), np.concatenate([error, pull])
         if step == 0:  # the errors are linear in the unknowns at fixed gains
             A = A[:, : problem.size]
+        # Unit columns: the test of the rank must not depend on units.
         scale = np.maximum(np.linalg.norm(A, axis=0), 1e-300)
         change = -np.linalg.lstsq(A / scale, b, rcond=_RANK)[0] / scale
         dz, du = change[: problem.size], change[problem.size :] if step else np.zeros(problem.nv)
@@ -287,6 +299,7 @@ def _descend(problem: _Problem, triangles, state: _State, start: np.ndarray) -> 
         while (after := loss(z + share * dz, u + share * du)) > now and share > 1e-6:
             share /= 2
         z, u = z + share * dz, u + share * du
+        # The first step leaves the gains alone: its decrease says nothing about convergence.
         if step > 1 and now - after <= 1e-12 * now:
             break
         now = min(now, after)

@@ -49,6 +49,7 @@ def random_torque(key: Array, size, *, period=2.0, harmonics: int = 3, carry: Mo
 @eqx.filter_jit
 def _amplitudes(key, size, harmonics: int):
     amplitudes = jax.random.normal(key, (2, harmonics, size.shape[0]), size.dtype) * size[None, None]
+    # Variances of harmonics add up: with this factor the sum has the deviation `size`.
     return tuple(amplitudes / np.sqrt(harmonics).astype(size.dtype))
 
 
@@ -96,6 +97,7 @@ def random_motion(key: Array, center, size, *, period=10.0, harmonics: int = 5) 
 @eqx.filter_jit
 def _falling_amplitudes(key, size, harmonics: int):
     k = jnp.arange(1, harmonics + 1, dtype=size.dtype)[:, None]
+    # As 1 / k all harmonics have the same share of the velocity.
     weight = size[None] / k
     cosine, sine = jax.random.normal(key, (2, harmonics, size.shape[0]), size.dtype) * weight[None]
     # Position and velocity of the sum vanish at t = 0: both conditions are distributed over all harmonics.

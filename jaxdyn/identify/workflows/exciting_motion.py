@@ -21,6 +21,7 @@ from jaxdyn.model.tree import Model, neutral
 OBJECTIVES = ("logdet", "condition")
 # Range and speed of a joint without limits of its own (rad, rad/s).
 _TURN, _SPEED = np.pi, 2.0
+# 100 samples are 20 in a period of the fifth harmonic, the default; peaks are checked on a finer grid.
 _SAMPLES, _CHECKED = 100, 1000
 
 
@@ -138,8 +139,10 @@ def exciting_motion(
     dtype = model.home.dtype
     limits = _limits(model, margin, velocity, torque)
     center = (limits.lower + limits.upper) / 2
+    # Two standard deviations reach from the middle to the limits.
     size = np.asarray(limits.upper - limits.lower) / 4
     columns = free_columns(model.nb, model.nv, terms)[base_parameters(model, terms).independent]
+    # Without the end of the period, which repeats its first sample.
     times = jnp.asarray(np.arange(_SAMPLES) * period / _SAMPLES, dtype)
     weights = 1 / limits.torque_limit
     task = _Task(model, limits, times, jnp.ones(len(columns), dtype), weights, jnp.asarray(v_s, dtype))
@@ -150,6 +153,7 @@ def exciting_motion(
     motions = [random_motion(key, center, size * share, period=period, harmonics=harmonics) for key in keys]
     motions = [_shrink(motion, task) for motion in motions]
     lengths = [np.linalg.norm(_rows(motion, task, tuple(columns.tolist())), axis=0) for motion in motions]
+    # One scale for all starts makes their losses comparable.
     task = eqx.tree_at(lambda t: t.scale, task, jnp.asarray(np.where(lengths[0] > 0, lengths[0], 1), dtype))
     places = tuple(columns.tolist())
     first = [float(_loss(_amplitudes(motion), motion, task, places, objective)) for motion in motions]
@@ -238,8 +242,10 @@ def _loss(amplitudes, motion: FourierMotion, task: _Task, places: tuple[int, ...
     floor = 1e-12 * jnp.eye(size, dtype=W.dtype)
     if objective == "logdet":
         root = jnp.linalg.cholesky(W.T @ W + floor)
+        # The mean: its weight against the penalty does not depend on the number of parameters.
         value = -2 * jnp.mean(jnp.log(jnp.diagonal(root)))
     else:
+        # The square root of a column of zeros has no finite derivative: the small number is inside of it.
         unit = W / jnp.sqrt(jnp.sum(W**2, axis=0, keepdims=True) + 1e-12)
         values = jnp.linalg.eigvalsh(unit.T @ unit + floor)
         value = 0.5 * jnp.log(values[-1] / values[0])
@@ -267,6 +273,7 @@ def _descend(motion, task, places, objective, steps, learning_rate, callback):
         loss, gradient = jax.value_and_grad(
             lambda y: _loss(_scale_amplitudes(y, span), motion, task, places, objective)
         )(scaled)
+        # optax mixes dtypes, which strict promotion refuses.
         with jax.numpy_dtype_promotion("standard"):
             change, state = optimiser.update(gradient, state)
             return loss, optax.apply_updates(scaled, change), state
@@ -279,6 +286,7 @@ def _descend(motion, task, places, objective, steps, learning_rate, callback):
         history.append(float(loss))
         if callback is not None:
             callback(number, history[-1])
+        # The loss belongs to the point before the update.
         if history[-1] < best[0]:
             best = history[-1], before
         if not np.isfinite(history[-1]):
@@ -323,9 +331,11 @@ def _shrink(motion: FourierMotion, task: _Task) -> FourierMotion:
         raise ValueError(
             f"torque: holding the robot at the middle of its ranges needs {used['torque']:.3g} times the limits; give larger ones"
         )
+    # 20 bisections determine the factor to 1e-6.
     for _ in range(20):
         share = (low + high) / 2
         low, high = (share, high) if max(_limit_shares(at(share), task).values()) <= 1 else (low, share)
+    # The lower end exceeds no limit; the upper one may.
     return at(low)
 
 

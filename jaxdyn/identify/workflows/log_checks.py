@@ -34,9 +34,11 @@ def check_log_content(model: Model, log: Log, labels: Sequence[str]) -> list[str
             )
     needed = _rms(log_regressor(model, log) @ nominal_parameters(model))
     measured = _rms(np.asarray(log.tau, np.float64))
+    # Where the bodies need little torque, friction may be most of what is measured, and the ratio says nothing about units.
     compared = (needed > 0.1 * needed.max(initial=0)) & (measured > 0)
     ratio = measured[compared] / needed[compared]
     names = ", ".join(label for label, is_compared in zip(labels, compared, strict=True) if is_compared)
+    # At most joints: a single one is a faulty sensor or body rather than a unit.
     if len(ratio) and np.mean(ratio < 1 / _OFF) > 0.5:
         lines.append(
             f"torques of {names} are about 1/{1 / np.median(ratio):.0f} of what the file's bodies need: are they motor torques, "

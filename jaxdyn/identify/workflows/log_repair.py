@@ -87,6 +87,7 @@ def unwrap_angles(log: Log, model: Model | None = None, *, near: bool = True) ->
     for column in _angles(log, model):
         turns = _turns(t, q[:, column], near)
         if turns.any():
+            # Copied before the first change only: the caller's array stays as it is.
             q = q if counts else q.copy()
             q[1:, column] -= 2 * np.pi * np.cumsum(turns)
             counts[_label(log, model, "q", column)] = int(np.count_nonzero(turns))
@@ -115,6 +116,7 @@ def find_outliers(log: Log, model: Model | None = None) -> list[Outlier]:
         values = np.asarray(getattr(log, signal), np.float64)
         if len(t) < 9 or not len(columns):
             continue
+        # Without the extreme hundredths: corrupted samples must not set the range that they are compared with.
         low, high = np.quantile(values[:, list(columns)], (0.01, 0.99), axis=0)
         for place, column in enumerate(columns):
             least = max(_LEAST[signal] * (high - low)[place], _LEAST_OF_WIDEST * float((high - low).max()))
@@ -144,6 +146,7 @@ def _turns(t: np.ndarray, x: np.ndarray, near: bool) -> np.ndarray:
         ends = [side[0] for side in sides if len(side)]
         if not ends:
             continue
+        # The median, so that another corrupted sample nearby does not widen the tolerance.
         scatter = max(float(np.median(np.abs(np.diff(side)))) if len(side) > 1 else 0.0 for side in sides)
         tolerance = max(_TURN_TOLERANCE, steps[i] * max(abs(ends[0] - ends[-1]), 3 * scatter))
         whole = np.round((change[i] - steps[i] * np.mean(ends)) / (2 * np.pi))
@@ -157,11 +160,13 @@ def _find_spikes(t: np.ndarray, x: np.ndarray, least: float, longest: int) -> li
     """Find one to `longest` samples, rows and deviation, that deviate from the line between their neighbours."""
     n = len(x)
     curvature = np.abs(x[1:-1] - _line(t[1:-1], t[:-2], x[:-2], t[2:], x[2:]))
+    # A quantile instead of the maximum: up to a tenth of the samples may be corrupted without raising the floor.
     floor = max(least, _UNUSUAL * float(np.quantile(curvature, 0.9)))
     found, taken = [], np.zeros(n, bool)
     for length in range(1, longest + 1):
         first = np.arange(2, n - length - 1)  # two samples on both sides
         last, left, right = first + length - 1, first - 1, first + length
+        # The smaller deviation of the first and the last sample: both must be off.
         size = np.minimum(
             *(np.abs(x[k] - _line(t[k], t[left], x[left], t[right], x[right])) for k in (first, last)),
         )
@@ -184,6 +189,7 @@ def _find_spikes(t: np.ndarray, x: np.ndarray, least: float, longest: int) -> li
 
 def _find_jumps(t, x, column: int, least: float, limit: float, known: list[Outlier]) -> list[Outlier]:
     """Find jumps of a position that stay, outside of known outliers; one to three samples at an end count as isolated."""
+    # Spikes are bridged first, or both of their flanks would count as jumps.
     if known:
         x = x.copy()
         bad = np.concatenate([np.array(one.rows) for one in known])
@@ -220,6 +226,7 @@ def _find_jumps(t, x, column: int, least: float, limit: float, known: list[Outli
 
 def _resolution(x: np.ndarray, first: int, last: int) -> float:
     """Smallest difference that is not zero, outside of rows first to last; 0 where there is none."""
+    # The smallest step that occurs is the quantum of the encoder.
     change = np.abs(np.diff(x))
     change = np.concatenate([change[:first], change[last:]])
     return float(change[change > 0].min(initial=np.inf)) if (change > 0).any() else 0.0
@@ -242,6 +249,7 @@ def _fill(log: Log, model: Model | None, found: list[Outlier]) -> Log:
                 bad[list(one.rows)] = True
         good = np.flatnonzero(~bad)
         x[bad] = np.interp(t[bad], t[good], x[good])
+        # np.interp repeats the last good value beyond the ends, which would be a stop of the joint.
         for a, b in ((good[0], good[1]), (good[-1], good[-2])):
             outer = bad & (np.arange(len(t)) < a if a < b else np.arange(len(t)) > a)
             x[outer] = _line(t[outer], t[a], x[a], t[b], x[b])

@@ -109,11 +109,13 @@ def fit_payload(
     own = slice(10 * number, 10 * number + 10)
     logs, payload = (*unloaded, *loaded), np.zeros(10)
     is_loaded = np.arange(len(logs)) >= len(unloaded)
+    # Errors without the payload do not depend on it: computed once.
     residuals = [robot.fit.torques(log) - np.asarray(log.tau, np.float64) for log in unloaded]
 
     def size(payload) -> float:
         return effective_sample_size([*residuals, *_residuals(robot, loaded, own, payload)[0]])
 
+    # The load of the gears depends on the payload, which is still zero in the first round.
     for _ in range(_ROUNDS if extra else 1):
         loads = []
         for log, holds in zip(logs, is_loaded, strict=True):
@@ -149,8 +151,10 @@ def _solve(blocks: Blocks, is_loaded, own: slice, kept, weights, rows, size):
     start = _ball(least_squares_by_svd(R[:, :-1], R[:, -1], 1e-6).change)
     builder = ModelBuilder("payload").add_body("payload", joint="free", inertia=start)
     alone = builder.build()
+    # The payload alone is a model of one body: columns of its terms stay zero.
     table = np.zeros((len(R), 10 + 4 * alone.nv + 1))
     table[:, :10], table[:, -1] = R[:, :-1], R[:, -1]
+    # No terms are fitted, so that their units do not matter.
     sizes = [np.ones(alone.nv)] * 3
     problem, point, _ = make_problem(alone, condense_rows(table, blocks.count()), sizes, (), 0.01, "full", 1.0, sigma)
     chart, point, _, result = newton(alone, problem, point, 200, 1e-6)
@@ -163,8 +167,10 @@ def _solve(blocks: Blocks, is_loaded, own: slice, kept, weights, rows, size):
     stretch = np.asarray(jax.jacfwd(lambda theta: chart.inertias(theta)[0])(point.theta), np.float64).reshape(10, 10)
     basis = LOG_CHOLESKY_BASIS
     curvature = np.zeros((count + 10, count + 10))
+    # The weak rows that held the robot's parameters in the fit are a prior of theirs here.
     curvature[np.arange(count), np.arange(count)] = hold**2 / sigma**2
     curvature[count:, count:] = np.einsum("kij,lji->kl", basis, basis)
+    # Jacobians of x for logs without the payload (0) and with it (1): the first have no columns of the payload.
     spreads = np.zeros((2, blocks.size, count + 10))
     spreads[:, kept, np.arange(count)] = 1
     spreads[1, own, count:] += stretch
@@ -183,6 +189,7 @@ def _solve(blocks: Blocks, is_loaded, own: slice, kept, weights, rows, size):
         np.stack([np.sum([values[int(i)] for i in group], axis=0) for group in groups]) for values in (grams, gradients)
     ]
     changes, inverse = jackknife(summed[0], summed[1], curvature)
+    # The log-Cholesky basis spans all symmetric matrices, so that its Gram matrix is positive definite.
     root = np.linalg.cholesky(curvature[count:, count:])
     from_data, from_prior = stretch @ changes[count:], stretch @ inverse[count:, count:] @ root
     std = np.sqrt(np.sum(from_data**2, axis=1) + np.sum(from_prior**2, axis=1))

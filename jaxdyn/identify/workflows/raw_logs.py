@@ -62,6 +62,7 @@ def from_raw(
             raise ValueError(f"{name} is {value!r}; give a whole number of at least {least}")
     if isinstance(cutoff, str) and cutoff != "auto":
         raise ValueError(f'cutoff is {cutoff!r}; give a frequency in Hz, or "auto"')
+    # Before the filter, whose response would spread a corrupted sample over its neighbours.
     raw = repair_log(Log(t, q, tau=tau, joint_names=joint_names), model, unwrap=unwrap, outliers=outliers)
     cutoff = choose_cutoff(raw).frequency if isinstance(cutoff, str) else cutoff
     t, q, tau = (np.asarray(x, np.float64) for x in (raw.t, raw.q, raw.tau))
@@ -71,6 +72,7 @@ def from_raw(
             "give v and a of quaternion joints to Log directly"
         )
     n = len(t)
+    # The first bound leaves two samples after trimming, the second is that of SciPy's default padding.
     need = max(2 * trim + every + 1, 3 * (order + 1) + 1)
     if n < need:
         raise ValueError(
@@ -80,6 +82,7 @@ def from_raw(
     if not 0 < cutoff < rate / 2:
         raise ValueError(f"cutoff={cutoff} Hz must lie between 0 and half the sampling rate, {rate / 2:.4g} Hz")
     widest = int(np.argmax(np.diff(t)))
+    # Nyquist: samples farther apart than half a period do not determine that frequency.
     if t[widest + 1] - t[widest] > 0.5 / cutoff:
         raise ValueError(
             f"gap of {t[widest + 1] - t[widest]:.4g} s after row {widest} (t={t[widest]:.6g} s), longer than half a "
@@ -96,7 +99,9 @@ def from_raw(
         return filtfilt(numerator, denominator, x, axis=0, padlen=pad_length(rate, cutoff, n))
 
     positions, torques = low(uniform(q)), low(uniform(tau))
+    # A difference amplifies noise in proportion to its frequency: each result goes through the low-pass again.
     v = low(np.gradient(positions, grid, axis=0))
     a = low(np.gradient(v, grid, axis=0))
+    # Decimated after the low-pass: before it, frequencies above half of the new rate would alias.
     keep = slice(trim, n - trim, every)
     return Log(grid[keep], positions[keep], v[keep], a[keep], torques[keep], joint_names=raw.joint_names, cutoff=cutoff)

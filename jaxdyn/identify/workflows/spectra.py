@@ -68,6 +68,7 @@ def choose_cutoff(logs: Log | Sequence[Log]) -> Cutoff:
     vibration = None
     if valleys:
         frequency, vibration = min(valleys)
+    # The slowest log limits all of them, since one low-pass is used for all.
     return Cutoff(min(frequency, _SAMPLING * min(one.rate for one in spectra)), motion, vibration)
 
 
@@ -90,6 +91,7 @@ class _Spectra(NamedTuple):
             )
         if len(t) < 32:
             raise ValueError(f"{len(t)} samples are too few to choose a cut-off by their spectrum; give one in Hz")
+        # The transform assumes uniform samples; time stamps of raw logs have jitter.
         grid = np.linspace(t[0], t[-1], len(t))
         q, tau = (np.stack([np.interp(grid, t, column) for column in x.T], axis=1) for x in (q, tau))
         rate = (len(t) - 1) / float(t[-1] - t[0])
@@ -103,6 +105,7 @@ class _Spectra(NamedTuple):
         inside = [(self.frequency >= a) & (self.frequency < b) for a, b in itertools.pairwise(edges)]
         if min(mask.sum() for mask in inside) < _LINES:
             return None
+        # Means compare bands with different numbers of lines; sums give a share of the whole power.
         bands = np.stack([self.torque[mask].mean(axis=0) for mask in inside])
         sums = np.stack([self.torque[mask].sum(axis=0) for mask in inside])
         total = self.torque.sum(axis=0)
@@ -169,6 +172,7 @@ def _motion(frequency: np.ndarray, position: np.ndarray, velocity: np.ndarray) -
     while band > 0:
         below = frequency <= _ABOVE * band
         higher = max(_band(frequency[below], velocity[below], _SLOW), float(frequency[2]))
+        # The iteration comes from below, to the lowest fixed point; higher ones would count more of the noise.
         if higher <= band:
             return band
         if higher > most:
