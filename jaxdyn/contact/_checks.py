@@ -16,6 +16,7 @@ def as_float(value, what: str, shape: tuple | None = None, like=None) -> Float[A
     """
     # Known numbers are checked before they become part of a traced program.
     known = np.asarray(value) if is_concrete(value) else None
+    # NumPy makes an object array of None and the like; the message of JAX would not name the argument.
     if known is not None and known.dtype == object:
         raise ValueError(f"{what} is {value!r}; give numbers")
     array = value if isinstance(value, jax.Array) else jnp.asarray(value) if known is None else known
@@ -27,6 +28,7 @@ def as_float(value, what: str, shape: tuple | None = None, like=None) -> Float[A
     ):
         shown = ", ".join("any" if n is None else str(n) for n in shape)
         raise ValueError(f"{what} has shape {array.shape}, expected ({shown}); batch with jax.vmap")
+    # Infinite entries are valid: an infinite h is no bound.
     if known is not None and np.isnan(known).any():
         raise ValueError(f"{what} is {known}, with entries that are not a number; give numbers")
     return array

@@ -71,6 +71,7 @@ def _times(G, x):
 def _transpose_times(G, z, like):
     """Sum of G^T z over the groups, (n,)."""
     parts = [matmul(g.reshape(-1, g.shape[-1]).T, y.reshape(-1)) for g, y in zip(G, z, strict=True)]
+    # The start value gives the sum its shape where there are no groups.
     return sum(parts, jnp.zeros_like(like))
 
 
@@ -137,6 +138,7 @@ def _start(pattern: Pattern, _, program: Program):
         shift = jnp.where(least > 0.1 * size, 0, jnp.maximum(-least, 0) + size)
         return _zip(lambda v: v + shift * jordan.identity(v), groups)
 
+    # In the least-squares problem above the multipliers are z = G x - h, minus the slacks.
     point = Point(x, inside(slack), inside(_zip(lambda v: -v, slack)))
     return point, *_residuals_and_measure(program, point)
 
@@ -144,6 +146,7 @@ def _start(pattern: Pattern, _, program: Program):
 def _newton(program: Program, s, z):
     """Scaled point lam, and a solver (dx, ds, dz) of the Newton equations for right-hand sides."""
     Q, _, G, _ = program
+    # W z = W^-1 s: both scaled points coincide, which makes the Newton equations symmetric.
     W = _zip(jordan.scaling, s, z)
     n = Q.shape[0]
     # W^-1 G once: both right-hand sides of the step use the same factor.
@@ -171,6 +174,7 @@ def _step(program: Program, point: Point, residuals) -> Point:
     """Take one predictor-corrector step."""
     x, s, z = point
     rx, rz = residuals
+    # mu is the target of complementarity: s o z = mu e on the central path.
     mu = _gap(point)
     lam, solve = _newton(program, s, z)
 
@@ -261,6 +265,7 @@ def _refinement(pattern: Pattern, _, program: Program, point: Point, error, aliv
     # Interior points are not complementary; the projection makes them so, at the price of a residual.
     here, rx, rz, residual = at(x, v)
     dx, dv = _solve_projection_equations(program, v, float(jnp.finfo(x.dtype).eps), -rx, _zip(lambda r: -r, rz), 1)
+    # A full step without line search: it is accepted or refused as a whole.
     there, *_, less = at(x + dx, _zip(lambda a, b: a + b, v, dv))
     # A NaN residual compares false, so that it is rejected.
     better = less < residual
@@ -279,6 +284,7 @@ def _solve_projection_equations(program: Program, v, width, right_x, right_s, co
     Q, _, G, _ = program
     n = Q.shape[0]
     eps = float(jnp.finfo(Q.dtype).eps)
+    # Between 0, where D may be singular, and 1; the square root of rounding leaves half of the digits to each side.
     delta = eps**0.5
     D = tuple(jordan.projection_derivative(y, width) for y in v)
     rest = tuple(d.map(lambda x: 1 - x) for d in D)
@@ -310,6 +316,7 @@ def width_of(dtype):
 
 def _end(pattern: Pattern, tol: float, _, program: Program, last: Point, error, refined: Point, less, infeasible):
     """Select the better point; return it with flags of a solution and of infeasibility."""
+    # Multipliers of an infeasible program diverge, and are the certificate: they must not be refined.
     better = (less <= jnp.maximum(error, tol)) & ~infeasible
     point = _where(better, refined, last)
     solved = (jnp.where(better, less, error) <= tol) & ~infeasible
@@ -372,6 +379,7 @@ def _attach_derivative_jvp(pattern: Pattern, primals, tangents):
 @kernel(static=1)
 def _tangent(pattern: Pattern, _, program: Program, point: Point, change: Program) -> Point:
     """Tangent of the solution for a tangent of the program."""
+    # The pattern is static, so that the tangent of a known zero is zero too.
     program, change = _sparse(program, pattern), _sparse(change, pattern)
     x, s, z = point
     right_x = -matmul(change.Q, x) - change.q - _transpose_times(change.G, z, x)
@@ -379,5 +387,6 @@ def _tangent(pattern: Pattern, _, program: Program, point: Point, change: Progra
     v = _zip(lambda a, b: a - b, s, z)
     width = width_of(x.dtype)
     dx, dv = _solve_projection_equations(program, v, width, right_x, right_s, 2)
+    # From s = P(v) and z = s - v.
     ds = _zip(lambda y, dy: jordan.projection_derivative(y, width).times(dy), v, dv)
     return Point(dx, ds, _zip(lambda a, b: a - b, ds, dv))

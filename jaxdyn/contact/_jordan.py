@@ -20,6 +20,7 @@ def _norm(rest):
     """Norm |rest| along the last axis, with zero derivative where it vanishes."""
     if rest.shape[-1] == 0:
         return jnp.zeros(rest.shape[:-1], rest.dtype)
+    # The inner `where` matters for derivatives: 0 times the infinite derivative of the root would be NaN.
     square = jnp.sum(rest * rest, -1)
     safe = square > 0
     return jnp.where(safe, jnp.sqrt(jnp.where(safe, square, jnp.ones_like(square))), jnp.zeros_like(square))
@@ -48,6 +49,7 @@ def quotient(a, b):
     if a.shape[-1] == 1:
         return b * inverse
     along = jnp.sum(a[..., 1:] * b[..., 1:], -1, keepdims=True)
+    # The determinant in product form: near the boundary v0^2 - |v1|^2 would cancel.
     x0 = (a[..., :1] * b[..., :1] - along) * (1 / determinant(a))[..., None]
     return jnp.concatenate([x0, (b[..., 1:] - x0 * a[..., 1:]) * inverse], -1)
 
@@ -89,6 +91,7 @@ def scaling(s, z) -> Scaling:
     norm_s, norm_z = jnp.sqrt(determinant(s))[..., None], jnp.sqrt(determinant(z))[..., None]
     beta = jnp.sqrt(norm_s / norm_z)
     s, z = s * (1 / norm_s), z * (1 / norm_z)
+    # s . z >= 1 for points of unit determinant inside the cone, so that gamma >= 1 and no quotient is large.
     gamma = jnp.sqrt((1 + jnp.sum(s * z, -1, keepdims=True)) / 2)
     # w is the scaling point of unit determinant, v its square root in the Jordan algebra.
     w = (s + _reflect(z)) / (2 * gamma)
@@ -100,6 +103,7 @@ def inverse_boundary_step(v, dv):
 
     Only entries of v are inverted: a program computes each inverse once, for all dv and for `quotient`.
     """
+    # v0 must stay positive too: the quadratic alone is also positive in the opposite cone.
     second = -dv[..., 0] * (1 / v[..., 0])
     if v.shape[-1] == 1:
         return jnp.max(second, initial=0)
@@ -107,6 +111,7 @@ def inverse_boundary_step(v, dv):
     b = v[..., 0] * dv[..., 0] - jnp.sum(v[..., 1:] * dv[..., 1:], -1)
     c = determinant(v)
     # Inverses of the least positive root of a t^2 + 2 b t + c, in the form that does not cancel, and of the root of v0 + t dv0.
+    # Rounding can make a discriminant of zero negative.
     first = (jnp.sqrt(jnp.maximum(b * b - a * c, 0)) - b) * (1 / c)
     return jnp.max(jnp.maximum(first, second), initial=0)
 
@@ -120,6 +125,7 @@ def projection(v):
         return high[..., None]
     mean, half = (high + low) / 2, (high - low) / 2
     safe = norm > 0
+    # On the axis both eigenvalues agree, and no direction v1 / |v1| is needed.
     rest = jnp.where(safe, half / jnp.where(safe, norm, 1), 0)[..., None] * v[..., 1:]
     return jnp.concatenate([mean[..., None], rest], -1)
 
@@ -161,5 +167,6 @@ def projection_derivative(v, width) -> ProjectionDerivative:
     root_high, root_low = (jnp.sqrt(x * x + 4 * width * width) for x in (high, low))
     # (p(high) - p(low)) / (high - low), without the difference.
     across = (1 + (high + low) / (root_high + root_low)) / 2
+    # On the axis u is zero: the three eigenvalues agree there, and D is a multiple of the unit matrix.
     u = v[..., 1:] / jnp.where(norm > 0, norm, 1)[..., None]
     return ProjectionDerivative((1 + high / root_high) / 2, (1 + low / root_low) / 2, across, u)

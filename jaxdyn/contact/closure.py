@@ -100,6 +100,7 @@ def force_closure(
     # Rows that are only rounding of a cancellation count as zero.
     sizes = np.where(sizes > 1e-13 * sizes.max(initial=0), sizes, 0.0)
     unit = np.where(sizes[:, None] > 0, G[:, rows.kept], 0.0) / np.where(sizes > 0, sizes, 1)[:, None]
+    # The full left factor: without full row rank its last column is orthogonal to the range of G.
     left, singular, _ = np.linalg.svd(unit)
     rank = int(np.sum(singular > _LEAST * singular[0])) if singular.size and singular[0] > 0 else 0
     nothing, none = np.zeros(G.shape[1]), np.zeros(G.shape[0])
@@ -178,18 +179,23 @@ def _largest_margin(G, rows: _Rows) -> tuple[float, np.ndarray, np.ndarray]:
     # Imported here because scipy's optimisers take long to import.
     from scipy.optimize import linprog
 
+    # Tangent planes outside of the round cones: the margin of the first program is an upper bound.
     angles = 2 * np.pi / _FIRST_FACES * np.arange(_FIRST_FACES)
     faces = [
         c * s[1] + d * s[2] - s[0] for s in rows.second for c, d in zip(np.cos(angles), np.sin(angles), strict=True)
     ]
     above = np.concatenate([rows.linear, np.reshape(faces, (len(faces), G.shape[1]))])
     equal = np.concatenate([np.concatenate([G, rows.normal[None]]), np.zeros((len(G) + 1, 1))], 1)
+    # Cones are homogeneous: without a total normal force of 1 the margin would be unbounded.
     right = np.append(np.zeros(len(G)), 1.0)
+    # The unknowns are (f, t); `linprog` minimises, hence -t.
     cost = np.append(np.zeros(G.shape[1]), -1.0)
+    # HiGHS allows 1e-7 by default, more than the accuracy of the margin.
     options = {"primal_feasibility_tolerance": 1e-10, "dual_feasibility_tolerance": 1e-10}
     solution = None
     for _ in range(_ROUNDS):
         limits = np.concatenate([above, np.ones((len(above), 1))], 1)
+        # Without bounds, because the default of `linprog` is x >= 0 and forces have both signs.
         solution = linprog(cost, limits, np.zeros(len(limits)), equal, right, bounds=(None, None), options=options)
         if solution.status == 2:
             # No internal force has a normal component: the normal force is a combination of the rows of G, n = G^T y.
@@ -211,11 +217,13 @@ def _largest_margin(G, rows: _Rows) -> tuple[float, np.ndarray, np.ndarray]:
     return (
         float(min(margins.min(), upper)) if upper > _LEAST else float(upper),
         forces,
+        # Marginals are derivatives of the cost -t with respect to the right-hand side, hence the sign.
         -solution.eqlin.marginals[: len(G)],
     )
 
 
 def _wrench(twist, sizes) -> np.ndarray:
     """Unit wrench in G's units, from the multiplier of its scaled rows."""
+    # Rows were divided by their sizes: the same division turns multipliers of scaled rows into those of the rows.
     direction = twist / np.where(sizes > 0, sizes, 1)
     return direction / np.linalg.norm(direction)

@@ -60,6 +60,7 @@ class FrictionCone(eqx.Module):
             return jnp.zeros((0, self.size))
         one, zero = jnp.ones_like(self.mu), jnp.zeros_like(self.mu)
         if self.in_plane:
+            # In a plane the force is (fx, fz) and the cone a wedge, |fx| <= mu fz: it is linear.
             return jnp.stack([jnp.stack([one, -self.mu]), jnp.stack([-one, -self.mu])])
         if self.gamma is None:
             return jnp.zeros((0, 3), self.mu.dtype)
@@ -74,6 +75,7 @@ class FrictionCone(eqx.Module):
             dtype = jnp.zeros(()).dtype if self.mu is None else self.mu.dtype
             return jnp.zeros((0, 3, self.size), dtype)
         unit = jnp.eye(self.size, dtype=self.mu.dtype)
+        # Both kinds with friction begin with (fx, fy, fz).
         return jnp.stack([self.mu * unit[2], unit[0], unit[1]])[None]
 
     def pyramid(self, faces: int = 8, side: str = "inscribed") -> Float[Array, "k m"]:
@@ -99,6 +101,7 @@ class FrictionCone(eqx.Module):
             return linear
         angles = 2 * np.pi / faces * np.arange(faces)
         shrink = float(np.cos(np.pi / faces)) if side == "inscribed" else 1.0
+        # The directions of the faces are constants: only mu has derivatives.
         normals = np.zeros((faces, self.size))
         normals[:, 0], normals[:, 1] = np.cos(angles), np.sin(angles)
         along = jnp.zeros((faces, self.size), self.mu.dtype).at[:, 2].set(-shrink * self.mu)
@@ -133,6 +136,7 @@ class FrictionCone(eqx.Module):
         every = self.margins(force, smoothing)
         if every.shape[0] == 0:
             return jnp.full((), jnp.inf, every.dtype)
+        # The soft minimum of one margin is that margin.
         if every.shape[0] == 1 or _is_zero(smoothing):
             return jnp.min(every)
         scale = jnp.asarray(smoothing, every.dtype)

@@ -14,6 +14,7 @@ from jaxdyn.contact.touching import newton_steps, patch_at
 from jaxdyn.lie.so3 import matmul
 from jaxdyn.model.arguments import Numbers
 
+# Newton steps without derivatives, and with them: two of these give exact derivatives up to the third order.
 _ROUNDS, _DIFFERENTIATED = 12, 2
 
 
@@ -50,6 +51,7 @@ def contact_coordinates(surface_o: Surface, surface_f: Surface, pose: Numbers) -
     R, p = pose[:3, :3], pose[:3, 3]
     # Initial points: opposite to a plane's normal, for others along the line of the frames' origins.
     place_o = surface_o.toward(-R[:, 2] if isinstance(surface_f, Plane) else p)
+    # R e_z is the normal of the finger's plane in the object's axes, R^T e_z that of the object's plane in the finger's.
     place_f = surface_f.toward(-R[2] if isinstance(surface_o, Plane) else -matmul(p, R))
     if place_o is None or place_f is None:
         which = surface_o if place_o is None else surface_f
@@ -61,6 +63,7 @@ def contact_coordinates(surface_o: Surface, surface_f: Surface, pose: Numbers) -
         place_o, place_f = _by_newton(surface_o, surface_f, R, p, (place_o, place_f))
     at_o, at_f = surface_o.coordinates_at(place_o), surface_f.coordinates_at(place_f)
     frame_o, frame_f = geometry_at(surface_o, at_o).frame, geometry_at(surface_f, at_f).frame
+    # R_psi = [cos psi, -sin psi; -sin psi, -cos psi]: its first row gives psi.
     turn = matmul(frame_o.T, matmul(R, frame_f))
     return jnp.concatenate([at_o, at_f, jnp.arctan2(-turn[0, 1], turn[0, 0])[None]])
 

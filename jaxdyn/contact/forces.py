@@ -87,11 +87,13 @@ def contacts_with_cones(scene: Scene, cones=None) -> tuple[ContactWithCone, ...]
                 f"constraint {place.name!r} is a {type(constraint).__name__} without a normal force; it has no friction "
                 "cone: give cones as a dictionary by the names of contacts"
             )
+        # Cones name components by their places: a cone of another kind would read friction as normal force.
         if cone.size != len(order):
             raise ValueError(
                 f"cone of contact {place.name!r} is of kind {cone.kind!r} with {cone.size} components, the contact has "
                 f"{len(order)}; give the cone of the contact's kind"
             )
+        # `order` counts within the rows of the constraint, `rows` within those of the scene.
         coned.append(ContactWithCone(place.name, place.start + np.array(order, int), cone))
     return tuple(coned)
 

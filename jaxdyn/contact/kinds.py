@@ -10,6 +10,7 @@ _SPATIAL = {
     "soft-finger": (0, 1, 2, 5),
     "rigid": (0, 1, 2, 3, 4, 5),
 }
+# In the x-z plane: forces along x and z, and the torque about y.
 _IN_PLANE = {"frictionless": (2,), "hard-finger": (0, 2), "rigid": (0, 2, 4)}
 
 

@@ -67,6 +67,7 @@ class ContactKinematics(eqx.Module):
 
 
 def _turn(psi):
+    # Symmetric and its own inverse, with determinant -1: with the normal reversed it is a rotation in space.
     c, s = jnp.cos(psi), jnp.sin(psi)
     return jnp.stack([jnp.stack([c, -s]), jnp.stack([-s, -c])])
 
@@ -135,6 +136,7 @@ def montana(surface_o: Surface, surface_f: Surface, eta: Numbers) -> ContactKine
 def _montana(surface_o, surface_f, eta) -> ContactKinematics:
     o, f = geometry_at(surface_o, eta[:2]), geometry_at(surface_f, eta[2:4])
     turn = _turn(eta[4])
+    # R_o of the equations, a constant, so that the kernel drops its zeros.
     quarter = jnp.asarray(np.array([[0.0, -1.0], [1.0, 0.0]]), eta.dtype)
     none = jnp.zeros((2, 1), eta.dtype)
     moved_o, moved_f = o.metric, f.metric
@@ -145,6 +147,7 @@ def _montana(surface_o, surface_f, eta) -> ContactKinematics:
     middle = jnp.concatenate([turning_o, -turning_f, none], 1)
     J_c = jnp.concatenate([top, jnp.zeros((1, 5), eta.dtype), middle, spin[None]])
 
+    # The curvature of the object in the axes of the finger; R_psi is symmetric, so that no transpose is needed.
     seen = matmul(turn, matmul(o.curvature, turn))
     relative = f.curvature + seen
     strict = is_positive(relative)
@@ -180,6 +183,7 @@ def _montana(surface_o, surface_f, eta) -> ContactKinematics:
 def is_positive(matrix) -> Any:
     """Decide whether a symmetric (2, 2) matrix is positive definite beyond rounding."""
     trace, size = matrix[0, 0] + matrix[1, 1], jnp.sum(matrix * matrix)
+    # Compared with the squares of the entries, the size of the products that cancel in it.
     determinant = matrix[0, 0] * matrix[1, 1] - matrix[0, 1] * matrix[1, 0]
     return (trace > 0) & (determinant > 1e2 * float(jnp.finfo(matrix.dtype).eps) * size)
 
@@ -188,5 +192,6 @@ def inverse_2x2(matrix, fine):
     """Inverse (2, 2) in closed form, finite where it is not `fine`."""
     a, b, c, d = matrix[0, 0], matrix[0, 1], matrix[1, 0], matrix[1, 1]
     determinant = a * d - b * c
+    # 1 in place of a singular determinant keeps the branch that `where` does not select free of NaN, in derivatives too.
     determinant = jnp.where(fine & (determinant != 0), determinant, jnp.ones_like(determinant))
     return jnp.stack([jnp.stack([d, -b]), jnp.stack([-c, a])]) / determinant

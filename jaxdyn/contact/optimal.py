@@ -55,6 +55,7 @@ def optimal_forces(
     target = jnp.zeros((m,), G.dtype) if target is None else as_float(target, "target", (m,), G.dtype)
     weights = jnp.ones((m,), G.dtype) if weights is None else as_float(weights, "weights", (m,), G.dtype)
     bounds = cone_bounds(cones, preload, G.dtype)
+    # The square is expanded, without its constant.
     return solve_qp(jnp.diag(weights), -weights * target, A=G, b=wrench, tol=tol, **bounds)
 
 
@@ -71,6 +72,7 @@ def cone_bounds(cones, preload, dtype) -> dict:
         second.append(_pad_rows(cone.second_order_rows().astype(dtype), sides))
         place += size
     rows, round_rows = jnp.concatenate(linear), jnp.concatenate(second)
+    # c - S x = (mu f_n - preload, fx, fy) with S = -rows: the margin enters the first component alone.
     lifted = jnp.zeros(round_rows.shape[:2], dtype).at[:, 0].set(-preload)
     bounds: dict = {"G": rows, "h": jnp.full((rows.shape[0],), -1, dtype) * preload} if rows.shape[0] else {}
     return bounds | ({"cones": [(-round_rows, lifted)]} if round_rows.shape[0] else {})

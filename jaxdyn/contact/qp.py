@@ -114,6 +114,7 @@ def solve_qp(
     given = G  # the original: conversion to an array under tracing would make it unknown
     G, h = _pair(G, h, "G", "h", n, Q.dtype)
     A, b = _pair(A, b, "A", "b", n, Q.dtype)
+    # Two arrays are one pair (S, c); two pairs are tuples, without `ndim`.
     pairs: list[Any] = [cones] if len(cones) == 2 and hasattr(cones[0], "ndim") else list(cones)
     checked = []
     for i, pair in enumerate(pairs):
@@ -170,6 +171,7 @@ def _unit(sizes):
 def _solve(Q, q, G, h, A, b, cones, pattern: tuple[bytes | None, ...], tol: float, max_steps: int) -> QPSolution:
     data = [Q, q, G, A, b, *(x for pair in cones for x in pair)]
     finite = jnp.stack([jnp.isfinite(x).all() for x in data]).all() & ~jnp.isnan(h).any()
+    # Only the symmetric part enters x^T Q x.
     Q = (Q + Q.T) / 2
     bounded = jnp.isfinite(h)
     # A row without a bound becomes 0 <= 1; an infeasible one, h = -inf, becomes 0 <= -1.
@@ -181,8 +183,10 @@ def _solve(Q, q, G, h, A, b, cones, pattern: tuple[bytes | None, ...], tol: floa
     # Scales are constants for differentiation, because the solution does not depend on them.
     # Q gets a unit diagonal and rows unit length, so that `tol` does not depend on units.
     diagonal = jax.lax.stop_gradient(jnp.diagonal(Q))
+    # An indefinite Q may have a negative diagonal; `result` reports it.
     across = _unit(jnp.sqrt(jnp.maximum(diagonal, 0)))
     blocks = [block * across[None, None] for block in blocks]
+    # One scale for all rows of a cone: different ones would make it another cone.
     row_scales = [_unit(jnp.sqrt(jnp.sum(jax.lax.stop_gradient(x) ** 2, (1, 2)))) for x in blocks]
     blocks = [x * r[:, None, None] for x, r in zip(blocks, row_scales, strict=True)]
     levels = [x * r[:, None] for x, r in zip(levels, row_scales, strict=True)]
@@ -212,6 +216,7 @@ def _solve(Q, q, G, h, A, b, cones, pattern: tuple[bytes | None, ...], tol: floa
             tuple(matmul(block, P) for block in program.G),
             tuple(y - matmul(block, x0) for block, y in zip(program.G, program.h, strict=True)),
         )
+        # Contradictory equality rows: the least-squares solution x0 misses them.
         met = jnp.max(jnp.abs(matmul(A, x0) - b)) <= 10 * tol
         result = RESULTS.where(met, result, RESULTS.infeasible)  # pyright: ignore[reportArgumentType]
     steps = jnp.zeros((), jnp.int32)
@@ -231,6 +236,7 @@ def _solve(Q, q, G, h, A, b, cones, pattern: tuple[bytes | None, ...], tol: floa
     finite = finite & (jnp.isfinite(point.x).all() | (result != RESULTS.successful))
     result = RESULTS.where(finite, result, RESULTS.nonfinite)  # pyright: ignore[reportArgumentType]
 
+    # Projected again, because the iteration gives y = P y up to its tolerance only.
     x = point.x if inverse is None else x0 + point.x - matmul(inverse, matmul(A, point.x))
     z = [jnp.zeros_like(y) for y in levels]
     s = [jnp.ones_like(y) for y in levels]

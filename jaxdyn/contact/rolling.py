@@ -40,6 +40,7 @@ class RollingContact(Touching):
     def with_place(self, place: Float[Array, " n"]) -> "RollingContact":
         """Contact at given places, the coordinates for A before those for B."""
         size = self.shape_a.place_size
+        # Stored patches belong to the places before.
         return dataclasses.replace(self, places=(place[:size], place[size:]), about=None)
 
     def structure_key(self) -> tuple:
@@ -54,6 +55,7 @@ class RollingContact(Touching):
         # For touching surfaces, the gap along the normal of the place has the first and second derivatives of the true gap.
         gap = jnp.sum(a.normal * (point - a.at(steps.on_a)))
         normal = a.normal_at(steps.on_a)
+        # A contact that slips has a count of 0, and no tangents.
         return TouchingPoint(point, normal, gap, tangents(normal)[: self.count])
 
     def patches(self) -> tuple[Patch, Patch]:
@@ -149,6 +151,7 @@ class Rolling(Pair):
         return Touching.wrench_components(self)  # pyright: ignore[reportArgumentType]
 
     def _of(self, system) -> RollingContact:
+        # Surfaces are leaves of the system and not of these rows, so that they exist once.
         contacts = getattr(system, "contacts", ())
         if not self.index < len(contacts) or contacts[self.index].name != self.name:
             raise ValueError(

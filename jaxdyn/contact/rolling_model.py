@@ -196,6 +196,7 @@ def _closeness(system: RollingModel, q):
 def _check_places(system: RollingModel, q, what: str, fix: str) -> None:
     if not is_known(system, q):
         return
+    # Within a trace the result would be traced even for concrete numbers, and could not be tested.
     with jax.ensure_compile_time_eval():
         strict, residuals = map(np.asarray, _closeness(system, jnp.asarray(q)))
     for contact, is_strict, off in zip(system.contacts, strict, residuals, strict=True):
@@ -242,6 +243,7 @@ def _between(contact: RollingContact, R, p):
         if place_b is None:
             break
         point = matmul(R, b.point_at(place_b)) + p
+    # Reached when the loop was not left by a break: both surfaces know their closest points.
     else:
         return jnp.concatenate([place_a, place_b])
     raise ValueError(

@@ -126,6 +126,7 @@ class Ellipsoid(Surface):
     def coordinates(self, point: Float[Array, "3"]) -> Float[Array, "2"]:
         """Chart coordinates alpha (2,) of a point of the surface; other points are projected along rays of the scaled space."""
         x, y, z = jnp.unstack((point / self.semi_axes.astype(point.dtype))[np.array(_POLES[self.poles])])
+        # arctan2 and not arcsin, whose derivative is infinite at the poles and which is NaN beyond 1 by rounding.
         return jnp.stack([jnp.arctan2(z, jnp.sqrt(x * x + y * y)), jnp.arctan2(-y, x)])
 
     @property
@@ -137,6 +138,7 @@ class Ellipsoid(Surface):
         """Unit vector n (3,) with f = (a, b, c) n."""
         u, v = jnp.unstack(alpha)
         unit = jnp.stack([jnp.cos(u) * jnp.cos(v), -jnp.cos(u) * jnp.sin(v), jnp.sin(u)])
+        # `argsort` inverts a permutation.
         return unit[np.argsort(_POLES[self.poles])]
 
     def coordinates_at(self, place: Float[Array, " n"]) -> Float[Array, "2"]:
@@ -197,6 +199,7 @@ class Cylinder(Surface):
     def toward(self, point: Float[Array, "3"]) -> Float[Array, " n"]:
         """Place at the angle and the height of the point."""
         x, y, z = jnp.unstack(point)
+        # The derivative of arctan2 is NaN on the axis, where every angle is a closest point.
         on_axis = (x == 0) & (y == 0)
         return jnp.stack([jnp.arctan2(y, jnp.where(on_axis, jnp.ones_like(x), x)), z])
 
@@ -295,6 +298,7 @@ def geometry_at(surface: Surface, alpha: Float[Array, "2"]) -> SurfaceGeometry:
     # rates (3, 3, 2): of the columns of the frame along u and v.
     frame, fine = _frame_of(surface, alpha)
     rates = jax.jacfwd(lambda a: _frame_of(surface, a)[0])(alpha)
+    # y . x_alpha is the rotation of the frame about the normal: the torsion.
     y = frame[:, 1]
     metric = matmul(frame[:, :2].T, tangents)
     # M is upper triangular: its inverse in closed form, with safe denominators.

@@ -68,6 +68,7 @@ def patch_at(surface: Surface, place) -> Patch:
         return surface.point_at(surface.displace(place, step))
 
     zero = jnp.zeros((2,), place.dtype)
+    # On a sphere or an ellipsoid this chart is about the place itself, so that no singularity of (u, v) is met.
     along, bend = jax.jacfwd(point)(zero), jax.jacfwd(jax.jacfwd(point))(zero)
     (u, v), (bend_u, bend_v) = along.T, (bend[:, 0], bend[:, 1])
     across = cross(u, v)
@@ -95,9 +96,11 @@ def newton_steps(a: Patch, b: Patch, R, p) -> Steps:
     back = inverse_2x2(d_b, is_regular)
     n_over_d = matmul(matmul(seen, b.turn), back)
     relative = matmul(bend, n) - matmul(n_over_d, d_a)
+    # Away from the closest points the matrix is not symmetric; its symmetric part decides.
     is_strict = is_regular & is_positive(0.5 * (relative + relative.T))
     on_a = matmul(inverse_2x2(relative, is_strict), matmul(n_over_d, r_d) - r_n)
     on_b = matmul(back, -r_d - matmul(d_a, on_a))
+    # Where the step is undefined the places remain, and `is_strict` reports it.
     on_a, on_b = (jnp.where(is_strict, x, jnp.zeros_like(x)) for x in (on_a, on_b))
     unit = jnp.max(jnp.sum(a.along * a.along, 0))
     residual = jnp.maximum(jnp.max(jnp.abs(r_d)), jnp.max(jnp.abs(r_n))) / jnp.sqrt(

@@ -91,6 +91,7 @@ class DryFriction(WithModes):
                 raise ValueError(
                     f"DryFriction {name!r}: normal is {normal}; give the size of the normal force (N), zero or more"
                 )
+        # True is an int in Python, and would select the second velocity.
         if isinstance(along, bool) or not (callable(along) or isinstance(along, (int, Constraint))):
             raise ValueError(
                 f"DryFriction {name!r}: along is {along!r}; give an index of v, a function A(q, t) -> (nv,), or a constraint"
@@ -188,6 +189,7 @@ def ground_contact(
     radius_leaf = jnp.asarray(as_array(radius, f"ground_contact {name!r}: radius"), float)
     if radius_leaf.shape != () or (is_concrete(radius_leaf) and not 0 <= float(radius_leaf) < np.inf):
         raise ValueError(f"ground_contact {name!r}: radius is {radius}; give one number (m), 0 for a point")
+    # A point is a sphere of radius zero, and a rolling sphere has the rows of gap and slip.
     contact = RollingSphere(
         name=name,
         body=body,

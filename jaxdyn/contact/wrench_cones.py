@@ -59,6 +59,7 @@ def wrench_cone(half_x: Numbers, half_y: Numbers, mu: Numbers) -> Float[Array, "
 
 def corner_wrenches(vertices: Float[np.ndarray, "n 2"], mu: float) -> Float[np.ndarray, "6 k"]:
     """Generators (6, 4 n) of the wrench cone: the edges of each corner's pyramid with unit normal force, about the origin."""
+    # The edges of the pyramid |fx|, |fy| <= mu fz.
     forces = np.array([[a * mu, b * mu, 1.0] for a in (1, -1) for b in (1, -1)])
     places = np.concatenate([vertices, np.zeros((len(vertices), 1))], 1)
     return np.concatenate([np.concatenate([forces, np.cross(place, forces)], 1) for place in places]).T
@@ -107,5 +108,6 @@ def wrench_cone_of_polygon(vertices: Numbers, mu: Numbers) -> Float[Array, "k 6"
     rows = rows[np.unique(np.round(rows, 9), axis=0, return_index=True)[1]] / scale
     torques, forces = np.abs(rows[:, 3:]).max(1), np.abs(rows[:, :2]).max(1)
     turns = torques * size > 1e-9 * (np.abs(rows[:, 2]) + forces)
+    # Entries that are zero in exact arithmetic are rounding of the hull here.
     rows = np.where(np.abs(rows * scale) > 1e-12 * np.abs(rows * scale).max(1, keepdims=True), rows, 0.0)
     return jnp.asarray(rows / np.where(turns, torques, forces)[:, None], float)

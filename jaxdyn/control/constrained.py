@@ -86,6 +86,7 @@ class _ForceLoop(Controller):
         # The sign follows M a + h = tau + A^T lam: a reference multiplier is cancelled by the opposite torque.
         """Force command -lam_d + KI z."""
         wanted = -self.reference_force(q, t)
+        # A law that is called outside of a simulation has no state; its integral then counts as zero.
         return wanted if state is None or self.ki is None else wanted + times(self.ki, state, "ki")
 
 
@@ -145,6 +146,7 @@ class HybridForce(_ForceLoop):
         least_regularity: Numbers | None = None,
     ):
         self.scene = constrained(scene)
+        # kd is None for velocities, whose error equation is of first order.
         self.kp, self.kd = gain(kp, "kp"), None if kd is None else gain(kd, "kd")
         self.error = _error(task, target, of, self.kd)
         self.force = None if force is None else as_target(force, "force")
@@ -200,6 +202,7 @@ class HybridForce(_ForceLoop):
     ) -> Float[Array, " nv"]:
         """Joint torques (nv,), N m or N."""
         t = jnp.asarray(t, q.dtype)
+        # As the plant accelerates by this a, A^T (lam + force command) = 0 remains: this sets the multipliers.
         tau = torque_for(self.scene, q, v, self.acceleration(q, v, t), t)
         if self.actuated is None:
             return tau + matmul(constraint_jacobian(self.scene, q, t).T, self.force_command(q, t, state))
@@ -207,9 +210,11 @@ class HybridForce(_ForceLoop):
         # motion.
         P_omega, motors = projections(self.scene, q, t).P_omega, np.array(self.actuated, int)  # pyright: ignore[reportArgumentType]
         by_motors = P_omega[:, motors]
+        # P_omega has the rank of the degrees of freedom: with more motors than these its columns are dependent.
         inverse = pseudo_inverse(by_motors, tolerance(None, P_omega), True)
         pushed = matmul(inverse, matmul(P_omega, tau))
         if self.internal is not None:
+            # Only the part in the kernel of P_omega S is added: it changes forces and no motion.
             internal = self.internal.astype(q.dtype)
             pushed = pushed + internal - matmul(inverse, matmul(by_motors, internal))
         return jnp.zeros_like(tau).at[motors].set(pushed)
@@ -285,7 +290,9 @@ class GaugeInvariant(_ForceLoop):
         """Joint torques (nv,), N m or N."""
         scene, system, t = self.scene, self.scene.system, jnp.asarray(t, q.dtype)
         J, along, change = self._reference_motion(q, v, t)
+        # The Coriolis matrix and not h: it multiplies the reference velocity J s and not v.
         M, C = mass_matrix(system, q, t), coriolis_matrix(system, q, v, t)  # pyright: ignore[reportArgumentType]
+        # The count is given: under tracing it would be nv minus the number of rows, wrong for dependent ones.
         gauge = gauge_invariant(scene, q, v, None, t, dof=J.shape[1])  # pyright: ignore[reportArgumentType]
         # W^T J (ed + Kp e), which lies along V2.
         eps = matmul(gauge.V2.T, matmul(gauge.W.T, v - along))
@@ -294,9 +301,10 @@ class GaugeInvariant(_ForceLoop):
         normal = matmul(gauge.Gamma_o, gauge.reduced_velocity) + matmul(
             gauge.Lambda_r.T, self.force_command(q, t, state)
         )
-        # Of `push` the part of the motion, W V2 V2^T W^-1, in the place of which the normal one stands.
+        # W V2 V2^T W^-1 takes the part of `push` along the motion; `normal` replaces the rest.
         free = matmul(gauge.V2, matmul(gauge.V2.T, solve_square(gauge.W, push)))
         tau = matmul(gauge.W, free + matmul(gauge.V1, normal))
+        # C v is taken out of h, because `push` has C J s in its place.
         potential, force = bias_force(system, q, v, t) - matmul(C, v), scene.applied_force(q, v, t)  # pyright: ignore[reportArgumentType]
         return tau + potential if force is None else tau + potential - force
 
@@ -331,6 +339,7 @@ class GaugeInvariant(_ForceLoop):
         Source: EQUATIONS section 9.
         """
         q, t = check_state(self.scene.system, q=q, t=t)
+        # J depends on q and t alone, so that any velocity gives the same.
         J, _, _ = self._reference_motion(q, jnp.zeros((self.scene.nv,), q.dtype), t)
         B = matmul(self._to_quasi_velocities(q, t, J.shape[1]), J)
         kp, kd = as_matrix(self.kp, B[0], "kp"), as_matrix(self.kd, B[0], "kd")
@@ -347,11 +356,13 @@ class GaugeInvariant(_ForceLoop):
         scene, system = self.scene, self.scene.system
         errors = Scene(system, (self.error,))
         m = self.error.sizes(system, q.dtype)[0]
+        # Stacked rows of task and constraints must determine v. More of them than nv are allowed: constraints may be dependent.
         if m + _count(scene) < scene.nv:
             raise ValueError(
                 f"task returned {m} coordinates, and the constraints have {_count(scene)} rows of nv = {scene.nv}; give as many "
                 "coordinates as degrees of freedom"
             )
+        # The tangent of t is 1, because constraints and targets may depend on time.
         motion = velocity_to_rate(system, q, v), jnp.ones_like(t)
 
         def both(q, t):
@@ -359,6 +370,7 @@ class GaugeInvariant(_ForceLoop):
 
         def reference(q, t):
             """Reference rates xd_d - Kp e."""
+            # At v = 0 the rate of e = x - x_d is -xd_d.
             speed = -rows(errors, q, jnp.zeros_like(v), t).velocity
             return speed - times(self.kp, self.error.position(system, q, t), "kp")  # pyright: ignore[reportArgumentType]
 
@@ -379,6 +391,7 @@ def constrained(scene: Any) -> Scene:
             "scene has no constraints, so there is no force to control; use jd.control.ComputedTorque or "
             "jd.control.OperationalSpace"
         )
+    # Refuses constraints on unknown bodies here, and not at the first call of the law.
     layout(scene)
     return scene
 

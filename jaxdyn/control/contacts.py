@@ -59,6 +59,7 @@ class ContactCoordinates(eqx.Module):
     ):
         if not isinstance(model, Model):
             raise ValueError(f"model is a {type(model).__name__}, which has no named frames; pass a Model")
+        # Refuses an unknown frame at construction, and not when the law is traced.
         frame_index(model, frame)
         for surface in (object, finger):
             check_surface(surface)
@@ -67,9 +68,11 @@ class ContactCoordinates(eqx.Module):
 
     def __call__(self, q: Float[Array, " nq"]) -> Float[Array, "5"]:
         """Contact coordinates eta (5,), in the units of the charts and rad."""
+        # The object is at rest: the pose of the tip in its axes depends on q through the arm alone.
         seen = matmul(se3.inverse(self.pose.astype(q.dtype)), frame_pose(self.model, q, self.frame))
         return contact_coordinates(self.object, self.finger, seen)
 
     def rolling(self, q: Float[Array, " nq"], v: Float[Array, " nv"]) -> Float[Array, "2"]:
         """Rates alpha_f_dot (2,) of the contact point on the tip, in the units of its chart per second."""
+        # eta = (u_o, v_o, u_f, v_f, psi). One derivative along the motion replaces the Jacobian of all five coordinates.
         return jax.jvp(self, (q,), (velocity_to_rate(self.model, q, v),))[1][2:4]

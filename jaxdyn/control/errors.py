@@ -39,6 +39,7 @@ else:
 TASKS = {"position": (3,), "orientation": (3, 3), "pose": (4, 4)}
 
 
+# A Module and not a closure, so that the value is a leaf: another constant does not cause a second compilation.
 class Fixed(eqx.Module):
     """Constant target."""
 
@@ -56,6 +57,7 @@ def as_target(target: Target, name: str = "target") -> Callable:
     if callable(target):
         return as_pytree(target, name, "t")
     array = as_array(target, name)
+    # Integers become floating-point leaves: `jax.grad` refuses integers.
     return Fixed(jnp.asarray(array, array.dtype if jnp.issubdtype(array.dtype, jnp.floating) else float))
 
 
@@ -64,6 +66,7 @@ def target_value(target: Callable, t, shape: tuple, like) -> Array:
     values = target(t)
     if jnp.shape(values) != shape:
         raise ValueError(f"target has shape {jnp.shape(values)}, expected {shape}{batch_hint(values, shape)}")
+    # A float64 target would promote the law of a float32 state.
     return jnp.asarray(values, like.dtype)
 
 
@@ -91,6 +94,7 @@ class FrameError(Constraint):
         pose, target = frame_pose(system, q, self.frame), target_value(self.target, t, TASKS[self.task], q)
         if self.task == "position":
             return pose[:3, 3] - target
+        # The logarithm jumps at half a turn from the target: the laws are valid for smaller errors.
         turned = so3.log(matmul(target[:3, :3].T, pose[:3, :3]))
         return turned if self.task == "orientation" else jnp.concatenate([pose[:3, 3] - target[:3, 3], turned])
 
@@ -140,6 +144,7 @@ def target_rows(system, error: Constraint, kp, kd, q, v, t) -> tuple[Float[Array
     scene = Scene(system, (error,))
     row = rows(scene, q, v, t)
     if kd is None:
+        # Errors of velocities have no error of position: the gain kp acts on w itself.
         return row.A, row.gamma - times(kp, row.velocity, "kp")
     return row.A, row.gamma - times(kd, row.velocity, "kd") - times(kp, position_residual(scene, q, t), "kp")
 
@@ -152,6 +157,7 @@ def least_acceleration(system, q, t, A, wanted, start) -> Float[Array, " nv"]:
     metric = mass_factor(mass_matrix(system, q, t))
     # With M = L L^T, |a - start|_M is Euclidean in L^T a, where a pseudo-inverse gives the minimum.
     Y = metric.whiten(A.T)
+    # Only what `start` lacks is corrected, so that the change of it is the least one.
     missing = wanted - matmul(A, start)
     return start + metric.unwhiten(matmul(pseudo_inverse(Y, tolerance(None, Y)).T, missing))
 
@@ -162,14 +168,17 @@ def hierarchical_acceleration(system, q, t, orders, start) -> Float[Array, " nv"
     Each is met, in the least-squares sense, in the null space of all before it, which it does not disturb.
     """
     metric = mass_factor(mass_matrix(system, q, t))
+    # In whitened coordinates the null-space projection of the metric M is an orthogonal one.
     free, a = jnp.eye(start.shape[0], dtype=start.dtype), start
     for A, wanted in orders:
         Y = metric.whiten(A.T)
         left = matmul(free, Y)
         # Rows spanned by those of higher priority leave rounding errors, which must not count as directions.
+        # A decision on rank has no derivative.
         sizes = [jnp.sum(jax.lax.stop_gradient(x) ** 2) for x in (left, Y)]
         left = jnp.where(sizes[0] > tolerance(None, Y) ** 2 * sizes[1], left, jnp.zeros_like(left))
         inverse = pseudo_inverse(left, tolerance(None, left)).T
+        # Rows of lower priority correct what those above them have left, within the null space of these.
         a = a + metric.unwhiten(matmul(inverse, wanted - matmul(A, a)))
         # inverse left^T projects on the range of `left`, so that `free` remains an orthogonal projection.
         free = free - matmul(inverse, left.T)
@@ -184,6 +193,7 @@ def regularity(system, q, t, A, T) -> Float[Array, ""]:
     """
     metric = mass_factor(mass_matrix(system, q, t))
     Y, Z = metric.whiten(A.T), metric.whiten(T.T)
+    # What remains of a row without the span of the constraints measures its independence of them.
     Z = Z - matmul(Y, matmul(pseudo_inverse(Y, tolerance(None, Y)), Z))
     sizes = jnp.sum(metric.whiten(T.T) ** 2, 0)
     free, least = list(Z.T), []
@@ -195,10 +205,12 @@ def regularity(system, q, t, A, T) -> Float[Array, ""]:
         unit = row / jnp.sqrt(jnp.where(some, square, jnp.ones_like(square)))
         free[i + 1 :] = [other - jnp.sum(unit * other) * unit for other in free[i + 1 :]]
     smallest = jnp.min(jnp.stack(least))
+    # The square root has an infinite derivative at zero. The inner `where` keeps NaN out of the gradient.
     some = smallest > 0
     return jnp.where(some, jnp.sqrt(jnp.where(some, smallest, jnp.ones_like(smallest))), jnp.zeros_like(smallest))
 
 
 def row_rank(matrix: Float[Array, "m n"]) -> Array:
     """Number of independent rows, (), the trace of a projection."""
+    # Rounded to an integer: each singular value above the tolerance contributes 1 up to rounding.
     return jnp.round(jnp.sum(pseudo_inverse(matrix, tolerance(None, matrix), True) * matrix.T))

@@ -18,6 +18,7 @@ from jaxdyn.model.arguments import Checked, Numbers, as_array, is_concrete
 from jaxdyn.model.names import frame_index
 from jaxdyn.model.tree import Model
 
+# A surface fixes the same six components as a rigid contact; it differs by its cone of wrenches.
 _FLAT = ("rigid", "surface")
 
 
@@ -54,10 +55,12 @@ class Foot(eqx.Module):
     def contact_pose(self, model: Model, q: Float[Array, " nq"]) -> Float[Array, "4 4"]:
         """Pose of the contact frame in the world."""
         pose = matmul(frame_pose(model, q, self.frame), self.pose.astype(q.dtype))
+        # A point's attitude is free: the axes of the ground keep the normal from tilting with the body.
         return pose if self.is_flat else pose.at[:3, :3].set(self.ground.astype(q.dtype))
 
     def jacobian(self, model: Model, q: Float[Array, " nq"]) -> Float[Array, "m nv"]:
         """Jacobian J (m, nv): velocities J v along the components of the force f, generalised force J^T f."""
+        # Ad of the inverse takes the body twist from the axes and origin of the frame to those of the contact.
         to_contact = matmul(se3.inverse(frame_pose(model, q, self.frame)), self.contact_pose(model, q))
         twist = matmul(se3.Ad(se3.inverse(to_contact)), body_jacobian(model, q, self.frame))
         kind = "rigid" if self.cone.kind == "surface" else self.cone.kind
@@ -69,9 +72,11 @@ class Foot(eqx.Module):
         Its multipliers are the foot's force in its contact frame, so that the foot's cone applies to it
         (`jd.control.standing`).
         """
+        # Only the position of a point counts, so the axes of its pose are dropped.
         local = self.pose if self.is_flat else self.pose.at[:3, :3].set(jnp.eye(3, dtype=self.pose.dtype))
         joint = "weld" if self.is_flat else "point"
         hold_loop = loop(None, self.contact_pose(model, q), self.frame, local, joint, name=self.frame)
+        # The rows are those of the loop. The class alone differs, by the order of its multipliers.
         return FootConstraint(**{part.name: getattr(hold_loop, part.name) for part in dataclasses.fields(hold_loop)})
 
 
@@ -114,6 +119,7 @@ def check_feet(model: Any, feet: Any) -> tuple[Foot, ...]:
         raise ValueError(f"contacts is {feet!r}; pass a list of jd.control.foot(frame, cone)")
     for one in feet:
         frame_index(model, one.frame)
+    # `by_foot` and the outputs of a simulation identify feet by their frames.
     names = [one.frame for one in feet]
     if len(set(names)) < len(names):
         raise ValueError(f"contacts name a frame twice: {names}; give every contact a frame of its own")

@@ -85,6 +85,7 @@ def follow(
     if not isinstance(targets, Mapping) or not targets:
         raise ValueError(f"targets is {targets!r}; give a dictionary of targets by the names of frames")
     rows = _rows(targets)
+    # An axis is one vector for the whole path: it must not be scanned over like the rows of the targets.
     axes = {name: value.pop("axis") for name, value in rows.items() if "axis" in value}
     lengths = {np.shape(x)[0] if np.ndim(x) else None for x in jax.tree.leaves(rows)}
     if len(lengths) != 1 or None in lengths or 0 in lengths:
@@ -101,6 +102,7 @@ def follow(
 
     def place(row, guess, guesses):
         """A configuration, and its rows."""
+        # A scan cannot raise: places that were not reached are reported after it, by their index.
         reached = inverse_kinematics(scene, at(row), guess, guesses=guesses, t=t, throw=False, **options)
         whole = Scene(scene.system, (*scene.constraints, *as_targets(scene.system, at(row))))
         return reached, _unit_rows(whole, lax.stop_gradient(reached.q), t, factors)
@@ -108,12 +110,15 @@ def follow(
     def go_on(carry, row):
         q, R, inverse = carry
         reached, (R_after, inverse_after) = place(row, q, guesses)
+        # Derivatives are those of each place by its own targets: the chain through the places before it is cut.
         after = lax.stop_gradient(reached.q)
         changes = _changes_branch(scene.system, q, after, R_after, R, inverse)
         regularity = _regularity(R_after, inverse_after, rank)
         return (after, R_after, inverse_after), (reached, regularity, changes)
 
+    # 16 guesses, the default of `inverse_kinematics`: only the first place has no neighbour to start from.
     begin, (R, inverse) = place(first, guess, 16)
+    # The rank at the first place is the reference for all others.
     rank = _rank(R, inverse)
     states = (lax.stop_gradient(begin.q), R, inverse)
     _, (places, regularity, changes) = lax.scan(go_on, states, rest)
@@ -137,9 +142,11 @@ def _rows(targets: Mapping[str, Any]) -> dict[str, dict]:
 
 def _unit_rows(whole: Scene, q, t: Any, factors):
     """Rows of constraints and targets in coordinates scaled by their sizes, and their pseudo-inverse; constants."""
+    # Only decisions follow from these rows, so they are constants under differentiation.
     whole, q = stop_gradient((whole, q))
     sizes, _ = coordinate_sizes(whole.system, q.dtype)
     R = constraint_jacobian(whole, q, t)[holonomic_rows(layout(whole))] * sizes[None]
+    # Rows of constraints come before those of targets and have the weight 1.
     count = R.shape[0] - factors.size
     R = R * jnp.concatenate([jnp.ones((count,), q.dtype), lax.stop_gradient(factors)])[:, None]
     return R, pseudo_inverse_by_rotations(R, tolerance(None, R))
@@ -152,11 +159,14 @@ def _rank(R, inverse):
 def _regularity(R, inverse, rank):
     """r / (|R| |R^+|) in Frobenius' norm, and 0 where the rank r is less than `rank`."""
     size = jnp.sqrt(jnp.sum(R * R) * jnp.sum(inverse * inverse))
+    # By the inequality of Cauchy and Schwarz |R| |R^+| >= r. The minimum removes rounding above 1.
     regular = jnp.minimum(rank / jnp.where(size > 0, size, jnp.ones_like(size)), 1.0)
+    # R^+ omits singular values below the tolerance: a drop of rank does not make |R^+| large and needs a test of its own.
     return jnp.where(_rank(R, inverse) >= rank, regular, jnp.zeros_like(regular))
 
 
 def _changes_branch(system, before, after, R_after, R, inverse):
+    # A unit block on the complement of the range: dependent rows would make the determinant zero.
     own = jnp.eye(R.shape[0], dtype=R.dtype) - matmul(R, inverse)
     sizes, _ = coordinate_sizes(system, before.dtype)
     turned = sign_of_determinant(matmul(R_after, inverse) + own) < 0

@@ -24,9 +24,11 @@ def gain(value: Any, name: str) -> Array:
     if is_concrete(array):
         # Only the symmetric part enters e . K e, so it alone decides definiteness.
         known = np.asarray(array, float)
+        # `initial` admits a gain for no rows, which has no least entry.
         least = np.linalg.eigvalsh((known + known.T) / 2).min() if _is_matrix(known) else known.min(initial=np.inf)
         if not (np.isfinite(known).all() and least > 0):
             raise ValueError(f"{name} is {known.tolist()}, which is not positive definite; give positive gains")
+    # Integer gains become floating-point leaves: `jax.grad` refuses integers.
     return jnp.asarray(array, array.dtype if jnp.issubdtype(array.dtype, jnp.floating) else float)
 
 
@@ -50,12 +52,14 @@ def times(gain: Array, error: Float[Array, " n"], name: str) -> Float[Array, " n
             f"{name} has shape {gain.shape} for an error of {error.shape[0]} rows; give a number, {error.shape} or "
             f"{error.shape * 2}"
         )
+    # A float64 gain would promote the law of a float32 state.
     gain = gain.astype(error.dtype)
     return matmul(gain, error) if gain.ndim == 2 else gain * error
 
 
 def as_matrix(gain: Array, like: Float[Array, " n"], name: str) -> Float[Array, "n n"]:
     """Matrix (n, n) of a gain."""
+    # Column by column through `times`, so that numbers, diagonals and matrices follow one rule.
     unit = jnp.eye(like.shape[0], dtype=like.dtype)
     return jnp.stack([times(gain, column, name) for column in unit], 1)
 

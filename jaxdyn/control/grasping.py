@@ -128,6 +128,7 @@ class GraspForce(Controller):
         multipliers: Float[Array, " nc"],
     ) -> Float[Array, " nc"]:
         """Internal part of lam - lam_0, (nc,)."""
+        # Only the internal part is integrated: the other part balances the motion of the object and has no reference.
         return self._internal(q, t, multipliers - as_preload(self.grasp, self.preload(t), q.dtype))
 
     def acceleration(self, q: Float[Array, " nq"], v: Float[Array, " nv"], t: Number = 0.0) -> Float[Array, " nv"]:
@@ -139,6 +140,7 @@ class GraspForce(Controller):
     def reference_forces(self, q: Float[Array, " nq"], v: Float[Array, " nv"], t: Number = 0.0) -> Float[Array, " nc"]:
         """Reference contact forces lam_d (nc,) that carry the object, with the internal part of the preload."""
         t = jnp.asarray(t, q.dtype)
+        # None in place of the integral: this is the reference itself, and not the command that corrects it.
         return self._forces(q, t, torque_for(self.grasp, q, v, self.acceleration(q, v, t), t), None)
 
     def wanted_forces(self, q: Float[Array, " nq"], v: Float[Array, " nv"], t: Number = 0.0) -> Float[Array, " nc"]:
@@ -149,6 +151,7 @@ class GraspForce(Controller):
     def is_regular(self, q: Float[Array, " nq"], v: Float[Array, " nv"], t: Number = 0.0) -> Bool[Array, ""]:
         """Decide whether the fingers can follow every motion of the object, as the error equation requires."""
         t = jnp.asarray(t, q.dtype)
+        # Ranks add exactly where the contacts fix no direction of the object's error.
         both, _ = self._rows(q, v, t)
         A = constraint_jacobian(self.grasp, q, t)
         return row_rank(both) == row_rank(A) + both.shape[0] - A.shape[0]
@@ -166,10 +169,13 @@ class GraspForce(Controller):
         hands, _ = velocity_rows(self.grasp)
         push = torque_for(self.grasp, q, v, self.acceleration(q, v, t), t)
         lam = self._forces(q, t, push, state)
+        # The rows are A = [-J_h  G^T], hence the sign.
         Jh = -constraint_jacobian(self.grasp, q, t)[:, hands]
+        # The object has no motors: the contact forces alone satisfy its rows.
         return jnp.zeros_like(push).at[hands].set(push[hands] + matmul(Jh.T, lam))
 
     def _forces(self, q, t, push, state):
+        # The columns of the object in A = [-J_h  G^T] are G^T.
         G = constraint_jacobian(self.grasp, q, t)[:, velocity_rows(self.grasp)[1]].T
         preload = as_preload(self.grasp, self.preload(t), q.dtype)
         if state is not None and self.ki is not None:

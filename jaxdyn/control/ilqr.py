@@ -31,6 +31,7 @@ from jaxdyn.model.arguments import Checked, Function, Numbers, as_array, batch_h
 from jaxdyn.systems.mass_factor import cholesky, solve_cholesky
 from jaxdyn.systems.scene import as_pytree
 
+# Eleven lengths from 1 to 1e-3. They and the schedule of mu are those of the program iLQG of Tassa, Erez & Todorov (2012).
 _LENGTHS = tuple(10.0 ** (-3 * i / 10) for i in range(11))
 _LEAST_PART = 1e-4  # of the reduction that the expansion predicts
 _FACTOR, _LEAST_DAMPING, _LARGEST_DAMPING = 1.6, 1e-6, 1e10
@@ -138,6 +139,7 @@ def ilqr(
     """
     plan = us if isinstance(us, OptimalControl) else None
     us = as_array(us if plan is None else plan.us, "us")
+    # Integers become floating-point numbers: `jax.grad` refuses integers.
     us = jnp.asarray(us, us.dtype if jnp.issubdtype(us.dtype, jnp.floating) else float)
     if us.ndim != 2 or 0 in us.shape:
         raise ValueError(f"us has shape {us.shape}; give controls (n, nu), one row per step{batch_hint(us, (1, 1))}")
@@ -153,7 +155,9 @@ def ilqr(
         for f, name, takes in ((step, "step", "x, u"), (cost, "cost", "x, u, k"), (final_cost, "final_cost", "x"))
     )
     x0 = jax.tree.map(lambda x: jnp.asarray(as_array(x, "x0"), us.dtype), x0)
+    # States are vectors inside, so that one expansion is valid for every pytree of states.
     flat, structure = ravel_pytree(x0)
+    # Before the loop is traced, so that an error names the function.
     _check_functions(step, cost, final_cost, x0, us)
     lower, upper = _limits(limits, us)
     problem = _Problem(
@@ -165,10 +169,12 @@ def ilqr(
         bool(second_order),
     )
     n, nu = us.shape
+    # With zero gains the reference states do not count: the first rollout applies the controls alone.
     xs, gains = jnp.broadcast_to(flat, (n, flat.size)), jnp.zeros((n, nu, flat.size), us.dtype)
     if plan is not None:
         if plan.gains.shape != gains.shape:
             raise ValueError(f"us is a plan with gains {plan.gains.shape}, expected {gains.shape} for this x0")
+        # The last state is left out, because no control follows it.
         xs, gains = jax.vmap(lambda x: ravel_pytree(x)[0])(plan.xs)[:-1], plan.gains
     state = _solve(problem, flat, xs, us, gains, mu, iterations, float(tol))
     codes: Any = RESULTS
@@ -191,6 +197,7 @@ def ilqr(
 def _check_functions(step, cost, final_cost, x0, us) -> None:
     """Refuse functions whose results are none of a step and of costs."""
     u, k = us[0], jnp.zeros((), jnp.int32)
+    # Shapes alone are needed: nothing is computed or compiled.
     after = jax.eval_shape(step, x0, u)
     if jax.tree.structure(after) != jax.tree.structure(x0):
         raise ValueError(f"step returned {jax.tree.structure(after)}, expected {jax.tree.structure(x0)} as of x0")
@@ -222,8 +229,10 @@ def _clip(problem: _Problem, us, k: Any = slice(None)):
 
 def _solve(problem: _Problem, x0, xs, us, gains, damping, iterations: int, tol: float) -> _State:
     xs, us, cost = _rollout(problem, x0, xs, us, jnp.zeros_like(us), gains)
+    # Filled up with the last cost, so that the shape does not depend on the number of iterations made.
     costs = jnp.broadcast_to(cost, (iterations + 1,))
     one, none = jnp.ones((), us.dtype), jnp.zeros((), jnp.int32)
+    # No step reduces a cost of NaN or infinity: the loop does not begin.
     code = jnp.where(jnp.isfinite(cost), _RUNNING, _NOT_FINITE).astype(jnp.int32)
     state = _State(xs, us, gains, cost, costs, damping, one, none, jnp.full_like(cost, jnp.inf), code)
 
@@ -235,9 +244,11 @@ def _solve(problem: _Problem, x0, xs, us, gains, damping, iterations: int, tol: 
 
 def _iterate(problem: _Problem, state: _State, tol: float) -> _State:
     k, K, slope, curvature, is_definite = _backward(problem, state)
+    # The change of the cost for alpha = 1 with its sign reversed: positive where a full step is expected to reduce it.
     predicted = -(slope + curvature)
     # What is left of a cost that goes to zero is rounding of the first one.
     size = jnp.maximum(jnp.abs(state.cost), eps_of(state.cost) * jnp.abs(state.costs[0]))
+    # With large damping a small step is no sign of a minimum; 1e-5 is the bound of iLQG.
     is_small = is_definite & (predicted <= tol * size) & (state.damping <= 1e-5)
 
     def try_length(carry):
@@ -245,22 +256,27 @@ def _iterate(problem: _Problem, state: _State, tol: float) -> _State:
         alpha = jnp.asarray(_LENGTHS, k.dtype)[count]
         xs, us, cost = _rollout(problem, state.xs[0], state.xs[:-1], state.us, alpha * k, K)
         enough = state.cost - cost >= -_LEAST_PART * alpha * (slope + alpha * curvature)
+        # A cost of NaN compares false, so that the next length is tried.
         return (xs, us, cost, enough & (cost < state.cost)), count + 1
 
     def goes_on(carry):
+        # Without a definite Quu the gains are NaN: there is no rollout, and the damping grows.
         return ~carry[0][3] & (carry[1] < len(_LENGTHS)) & is_definite & ~is_small
 
     before = state.xs, state.us, state.cost, jnp.asarray(False)
     (xs, us, cost, falls), _ = lax.while_loop(goes_on, try_length, (before, jnp.zeros((), jnp.int32)))
     xs, us, cost = (jnp.where(falls, x, y) for x, y in zip((xs, us, cost), before[:3], strict=True))
 
+    # Repeated successes or failures change mu ever faster (Tassa, Erez & Todorov 2012, section II).
     ratio = jnp.where(
         falls, jnp.minimum(state.factor / _FACTOR, 1 / _FACTOR), jnp.maximum(state.factor * _FACTOR, _FACTOR)
     )
+    # Below its least value mu is exactly zero, so that steps close to the minimum are undamped.
     less = jnp.where(state.damping * ratio > _LEAST_DAMPING, state.damping * ratio, jnp.zeros_like(ratio))
     damping = jnp.where(falls, less, jnp.maximum(state.damping * ratio, _LEAST_DAMPING))
     converged = is_small | (falls & (state.cost - cost <= tol * size))
     code = jnp.where(converged, _CONVERGED, jnp.where(damping > _LARGEST_DAMPING, _NO_DESCENT, _RUNNING))
+    # An indefinite pass has gains of NaN: those of the pass before remain.
     kept = is_definite
     return _State(
         xs,
@@ -283,6 +299,7 @@ def _rollout(problem: _Problem, x0, xs, us, k, K):
     def go_on(carry, row):
         x, total = carry
         x_before, u, k, K, i = row
+        # Clipped after the feedback: k keeps to the limits, and K (x - xs) need not.
         u = _clip(problem, u + k + matmul(K, x - x_before), i)
         return (problem.step(x, u), total + problem.cost(x, u, i)), (x, u)
 
@@ -305,6 +322,7 @@ def _backward(problem: _Problem, state: _State):
     def cost(z, i):
         return problem.cost(z[:nx], z[nx:], i)
 
+    # Derivatives do not depend on V: they are computed for all steps at once, and not within the backward scan.
     F = jax.vmap(jax.jacrev(step))(Z)
     lz, lzz = jax.vmap(jax.grad(cost))(Z, count), jax.vmap(jax.hessian(cost))(Z, count)
     none = jnp.zeros((), us.dtype)
@@ -315,8 +333,10 @@ def _backward(problem: _Problem, state: _State):
         Qz = lz + matmul(F.T, Vx)
         Qzz = lzz + matmul(F.T, matmul(Vxx, F))
         if problem.second_order:
+            # The Hessian of the scalar Vx . f: the tensor of second derivatives of the step is never formed.
             Qzz = Qzz + jax.hessian(lambda z: jnp.sum(Vx * step(z)))(z)
         Qu, Quu, Qux = Qz[nx:], Qzz[nx:, nx:], Qzz[nx:, :nx]
+        # Only the gains use the damped matrix.
         damped = 0.5 * (Quu + Quu.T) + state.damping * jnp.eye(nu, dtype=Quu.dtype)
         if problem.lower is None or problem.upper is None:
             factor = cholesky(damped)
@@ -324,13 +344,17 @@ def _backward(problem: _Problem, state: _State):
         else:
             u = z[nx:]
             k, free, factor = minimize_in_box(damped, Qu, problem.lower[i] - u, problem.upper[i] - u)
+            # A control at a limit has no feedback: its row of the gain is zero.
             K = -solve_cholesky(factor, jnp.where(free[:, None], Qux, jnp.zeros_like(Qux)))
+        # The Cholesky factor of an indefinite matrix is NaN.
         definite = is_definite & jnp.isfinite(factor).all() & jnp.isfinite(k).all()
+        # The undamped Quu: this update of V is exact for any k and K, also damped ones (Tassa, Erez & Todorov 2012, section II).
         Quuk = matmul(Quu, k)
         Vx = Qz[:nx] + matmul(K.T, Quuk + Qu) + matmul(Qux.T, k)
         crossed = matmul(K.T, Qux)
         Vxx = Qzz[:nx, :nx] + matmul(K.T, matmul(Quu, K)) + crossed + crossed.T
         slope, curvature = slope + jnp.sum(k * Qu), curvature + 0.5 * jnp.sum(k * Quuk)
+        # Symmetrised at each step, so that the unsymmetric part of rounding does not grow.
         return (Vx, 0.5 * (Vxx + Vxx.T), slope, curvature, definite), (k, K)
 
     final = jax.grad(problem.final)(xs[-1]), jax.hessian(problem.final)(xs[-1])

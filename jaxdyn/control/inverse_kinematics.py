@@ -66,6 +66,7 @@ class _HeldAtLimits(Constraint):
 
     def position(self, system, q, t):
         """Distances from the limits, (n,)."""
+        # Rows of inactive joints are zero and not left out: the set changes while shapes stay fixed.
         return jnp.where(self.active > 0, q[np.asarray(self.joints)] - self.limit, jnp.zeros_like(self.limit))
 
 
@@ -133,11 +134,13 @@ def inverse_kinematics(
     if posture is not None:
         (posture,) = check_state(model, q_posture=posture)
     factors = row_weights(rows, weights, guess.dtype)
+    # Forces and cones do not affect configurations: they are left out, so that others do not cause a second compilation.
     place = _solve_by_program(
         Scene(model, scene.constraints), rows, guess, factors, posture, t, bool(limits), steps, guesses, atol
     )
     concrete = is_concrete(place.result)
     if throw and not concrete:
+        # Under tracing the result is unknown, so that only an error at run time is possible.
         return place.result.error_if(place, place.result != RESULTS.successful)
     if concrete and (throw is None or throw) and not bool(place.success):
         raise ValueError(
@@ -177,6 +180,7 @@ def _solve_by_program(scene, rows, guess, factors, posture, t, limits: bool, ste
 def _solve(scene: Scene, rows, guess, factors, posture, t, limits: bool, steps: int, guesses: int, atol):
     model = scene.system
     whole = Scene(model, (*scene.constraints, *rows))
+    # The search is not differentiated: `_differentiable` attaches the derivatives of its result.
     fixed, start, factors, time = stop_gradient((whole, guess, factors, t))
     aims = _aims(fixed, len(scene.constraints), factors, limits, atol)
 
@@ -184,13 +188,16 @@ def _solve(scene: Scene, rows, guess, factors, posture, t, limits: bool, steps: 
         first = position_residual(fixed, clip_to_limits(model, start, aims), time)
 
         def go_on(q, part):
+            # One place only: a search from elsewhere would leave the branch of the guess.
             return search(fixed, q, time, aims._replace(shift=part * first), 1)[0], None
 
+        # Parts of the first errors that are left after each step; the last search, below, leaves none.
         parts = jnp.asarray(1 - np.arange(1, steps) / steps, guess.dtype)
         start = lax.scan(go_on, start, parts)[0]
     q, tried = search(fixed, start, time, aims, guesses)
     q = lax.stop_gradient(q)
     is_reached = _reaches_targets(fixed, q, time, aims)
+    # The implicit function theorem holds at a solution only. Elsewhere q is a constant, with zero derivatives.
     q = jnp.where(is_reached, _differentiable(whole, q, posture, t, aims, len(scene.constraints)), q)
 
     values = position_residual(whole, q, t)
@@ -198,6 +205,7 @@ def _solve(scene: Scene, rows, guess, factors, posture, t, limits: bool, steps: 
     errors = values[np.flatnonzero(_is_target(scene, whole))]
     counted = jnp.where(factors > 0, jnp.abs(errors), jnp.zeros_like(errors))
     opening = jnp.max(jnp.where(exact, jnp.abs(values), jnp.zeros_like(values)), initial=0.0)
+    # Evaluated again, because sliding towards the posture has changed q.
     reached = _reaches_targets(fixed, lax.stop_gradient(q), time, aims)
     closed = jnp.all(~exact | (jnp.abs(lax.stop_gradient(values)) <= aims.tolerances))
     result = RESULTS.where(closed, RESULTS.targets_not_reached, RESULTS.not_assembled)  # pyright: ignore[reportArgumentType]
@@ -223,11 +231,13 @@ def _aims(whole: Scene, constraints: int, factors, limits: bool, atol) -> Aims:
     targets = whole.constraints[constraints:]
     nh = holonomic_rows(layout(whole)).size
     is_length = np.concatenate([np.repeat([True, False], target_rows(target)) for target in targets])
+    # In units of the mechanism's length, errors in m are comparable with those in rad.
     scale = jnp.where(is_length, 1 / length, jnp.ones_like(length))
     count = nh - is_length.size
     weights = jnp.concatenate([jnp.ones((count,), dtype), factors * scale])
     near = closing_tolerance(dtype) if atol is None else atol
     least = near * (jnp.maximum(length, 1.0) if atol is None else jnp.ones_like(length))
+    # Tolerances have the weights of their rows: a weight of zero gives a row and a tolerance of zero, which counts as reached.
     tolerances = jnp.concatenate([jnp.broadcast_to(least, (count,)), least * factors * scale])
     exact = jnp.asarray(np.arange(nh) < count, dtype)
     endless = jnp.full_like(model.lower, jnp.inf)
@@ -242,6 +252,7 @@ def _differentiable(whole: Scene, q, posture, t: Number, aims: Aims, constraints
     rows = list(whole.constraints)
     for i in reversed(range(constraints, len(rows))):
         first -= sum(target_rows(rows[i]))
+        # Rows of weight zero are masked: q does not satisfy them, so that they have no derivative there.
         counted = is_counted[first : first + sum(target_rows(rows[i]))].astype(q.dtype)
         none = jnp.zeros((), q.dtype)
         rows[i] = KeptRows(rows[i], counted, none, none, rows[i].name)  # pyright: ignore[reportArgumentType]
@@ -262,9 +273,12 @@ def _differentiable(whole: Scene, q, posture, t: Number, aims: Aims, constraints
         return (place[at] < lower) | (place[at] > upper)
 
     if posture is None:
+        # Joints at a limit are held there, so that derivatives do not lead out of it.
         scene = scene_at(q, (q[at] <= lower) | (q[at] >= upper))
+        # q is the configuration nearest to itself: `solve` returns the start, and only the derivative is computed.
         return nearest_configuration(scene, q, q, t, None, solve=lambda scene, guess, start, t: start)
     active, place, time = jnp.zeros(at.shape, bool), q, stop_gradient(t)
+    # The set of joints at a limit is a decision without derivative. The last `nearest_configuration` alone is differentiated.
     guess = lax.stop_gradient(posture)
     for _ in range(
         _ACTIVE_ROUNDS if joints else 0
@@ -273,11 +287,13 @@ def _differentiable(whole: Scene, q, posture, t: Number, aims: Aims, constraints
         active = active | beyond(passed)
         place = jnp.where(jnp.any(beyond(passed)), clip_to_limits(model, passed, aims), place)
     place = nearest_configuration(scene_at(place, active), posture, q, t, None)
+    # If a joint is still beyond a limit after all rounds, the q of the search, within its limits, is kept.
     return jnp.where(jnp.any(beyond(clip_rounding(place, at, lower, upper))), q, place)
 
 
 def clip_rounding(q, at: np.ndarray, lower, upper):
     """q with joints that pass a limit by rounding on it."""
+    # A joint that is held at a limit satisfies its row up to this tolerance only.
     near = closing_tolerance(q.dtype)
     x = q[at]
     x = jnp.where((x < lower) & (x > lower - near), lower, x)

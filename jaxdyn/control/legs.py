@@ -113,6 +113,7 @@ def underactuated_inverse_dynamics(
     # With tau eliminated, |tau|^2 = |needed - across^T f|^2: only f remains in the program.
     J = jnp.concatenate([one.jacobian(model, q) for one in feet])
     across, along = J[:, motors], J[:, base].T
+    # The positive weight of forces makes Q definite where the torques do not determine f.
     Q = torque_weight * matmul(across, across.T) + force_weight * jnp.eye(J.shape[0], dtype=q.dtype)
     bounds = cone_bounds([one.cone for one in feet], preload, q.dtype)
     if effort_limit is not None:
@@ -127,12 +128,14 @@ def underactuated_inverse_dynamics(
         bounds["G"] = jnp.concatenate([rows, -across.T, across.T])
         bounds["h"] = jnp.concatenate([levels, limit - needed[motors], limit + needed[motors]])
     linear = -torque_weight * matmul(across, needed[motors])
+    # The rows of `along` may be dependent: two point feet exert no torque about the line through them.
     optimum = solve_qp(Q, linear, A=along, b=needed[base], tol=tol, **bounds)
     # The last iterate of an infeasible program diverges, so it is replaced by the least-norm forces.
     shortest = matmul(pseudo_inverse(along.T, tolerance(None, along)).T, needed[base])
     forces = jnp.where(optimum.result == RESULTS.infeasible, shortest, optimum.x)  # pyright: ignore[reportArgumentType]
     sizes = np.cumsum([one.size for one in feet])[:-1]
     margins = [one.cone.margin(f) for one, f in zip(feet, jnp.split(forces, sizes), strict=True)]
+    # The rows of the base vanish up to the tolerance of the program only.
     tau = (needed - matmul(J.T, forces)).at[base].set(0)
     return LeggedDynamics(
         tau=tau,
@@ -172,6 +175,7 @@ def missing_wrench(
     G = jnp.concatenate([one.jacobian(model, q) for one in feet])[:, base].T
     # The small term determines internal forces, which the remainder does not.
     Q = matmul(G.T, G) + 1e-6 * jnp.eye(G.shape[1], dtype=q.dtype)
+    # Without preload, which would count as a missing wrench where the feet carry little.
     bounds = cone_bounds([one.cone for one in feet], jnp.zeros((), q.dtype), q.dtype)
     return needed - matmul(G, solve_qp(Q, -matmul(G.T, needed), **bounds).x)
 
@@ -185,6 +189,7 @@ def passive_velocities(model: Model, passive: Sequence[int] | None) -> np.ndarra
             for kind, part in zip(top.kinds, top.v_slices, strict=True)
             if kind == "free"
         ]
+        # The empty array keeps the result valid, and an array of integers, for a model without free joints.
         indices = np.concatenate([*places, np.zeros(0, int)])
         if not indices.size:
             raise ValueError(
@@ -192,6 +197,7 @@ def passive_velocities(model: Model, passive: Sequence[int] | None) -> np.ndarra
                 "the unactuated velocities in passive"
             )
         return indices
+    # Sorted: the order of the base's velocities is that of v, whatever the order given.
     indices = np.unique(np.asarray(passive, int))
     if not indices.size or indices[0] < 0 or indices[-1] >= model.nv:
         raise ValueError(f"passive is {passive!r}; give indices of velocities from 0 to {model.nv - 1}")

@@ -134,6 +134,7 @@ class OperationalSpace(eqx.Module):
         A, wanted = target_rows(system, self.error, self.kp, self.kd, q, v, t)
         rest = -self.damping.astype(v.dtype) * v
         if self.posture is not None:
+            # Along the manifold: a difference of unit quaternions is no displacement.
             rest = rest - self.stiffness.astype(v.dtype) * displacement(system, self.posture, q)
         return torque_for(self.scene, q, v, least_acceleration(system, q, t, A, wanted, rest), t)
 
@@ -183,7 +184,9 @@ class CartesianStiffness(eqx.Module):
         """Joint torques (nv,), N m or N."""
         scene, t = Scene(self.model, (self.error,)), jnp.asarray(t, q.dtype)
         row, error = rows(scene, q, v, t), position_residual(scene, q, t)
+        # The rows are the derivative of e, so that A^T K e is the gradient of the potential e . K e / 2.
         push = times(self.stiffness, error, "stiffness") + times(self.damping, row.velocity, "damping")
+        # Gravity alone is compensated. Cancelling inertia or Coriolis forces would cost the passivity.
         return gravity_force(self.model, q, t) - matmul(row.A.T, push) - self.joint_damping.astype(v.dtype) * v
 
 
@@ -200,10 +203,12 @@ def unconstrained(scene: Any) -> Scene:
 
 def _is_flat(system) -> bool:
     """Decide whether v = dq/dt, so that the rows of a configuration error are a unit matrix."""
+    # The velocities of these joints are twists, or in moving axes, and no rates of coordinates.
     return not (isinstance(system, Model) and {"planar", "spherical", "free"} & set(system.topology.kinds))
 
 
 def torque_for(scene: Scene, q, v, a, t) -> Float[Array, " nv"]:
     """Torques M a + h minus the scene's forces, (nv,), for the acceleration a without constraint forces."""
+    # The motors supply what the scene's forces do not.
     tau, force = inverse_dynamics(scene.system, q, v, a, t), scene.applied_force(q, v, t)
     return tau if force is None else tau - force

@@ -40,7 +40,7 @@ _STEPS, _LAST_STEPS = 40, 100
 # The damping of the first step, and its factors where a step has reduced the errors, and where it has not.
 _DAMPING, _LESS, _MORE = 1e-2, 0.2, 6.0
 _LARGEST_STEP = 1.0  # rad or lengths of the mechanism
-# A search comes no further where a step reduces the squared errors by a smaller part than this; the last one goes on longer.
+# A search ends where a step reduces the squared errors by a smaller part than this; the last one continues longer.
 _LEAST_GAIN, _LEAST_LAST_GAIN = 1e-2, 1e-9
 
 
@@ -108,6 +108,7 @@ def _by_turns(guesses: int, scene: Scene, constants, given: Given, carry: Carry)
 
     def step(state: Search) -> Search:
         after = kernel(_improve, static=1, derivative=False)(guesses, scene, constants, state)
+        # A batch continues until all of its samples have ended: those that have must not change.
         return jax.tree.map(lambda new, old: jnp.where(state.done, old, new), after, state)
 
     return Carry(while_loop(lambda state: ~state.done, step, carry.state))
@@ -118,10 +119,12 @@ def _improve(guesses: int, scene: Scene, constants, state: Search) -> Search:
     q, damping = state.q, state.damping
     r = residual(scene, q, t, aims)
     errors = jnp.sum(r * r)
+    # In proportion to the squared errors (Sugihara 2011), the damping vanishes at a solution.
     step = _levenberg_marquardt_step(scene, q, t, aims, r, damping * errors)
     tried = clip_to_limits(scene.system, retract(scene.system, displace(scene.system, q, step)), aims)
     left = residual(scene, tried, t, aims)
     new = jnp.sum(left * left)
+    # A residual of NaN compares false: the step is refused, and `stops` ends the search from this place.
     falls = new < errors
     q, after = jnp.where(falls, tried, q), jnp.where(falls, new, errors)
     damping = jnp.clip(jnp.where(falls, _LESS * damping, _MORE * damping), 1e-8, 1e8)
@@ -161,6 +164,7 @@ def _levenberg_marquardt_step(scene: Scene, q, t, aims: Aims, r, damping):
     R = constraint_jacobian(scene, q, t)[holonomic_rows(layout(scene))] * aims.weights[:, None] * sizes[None]
 
     def shortest(R):
+        # In the space of rows, each row has its own damping: exact rows have none.
         gram = matmul(R, R.T)
         diagonal = jnp.diagonal(gram)
         # Rows that depend on others are met with them; rows that are zero are left out.
@@ -169,9 +173,11 @@ def _levenberg_marquardt_step(scene: Scene, q, t, aims: Aims, r, damping):
         return -matmul(R.T, solve_cholesky(cholesky(gram), r))
 
     step = shortest(R)
+    # Once only: where the new step would pass other limits, the caller clips it, and the next step leaves those joints out.
     inside = _is_inside(scene.system, q, step, aims)
     if inside is not None:
         step = shortest(R * inside[None]) * inside
+    # Shortened as a whole, so that its direction remains.
     length = jnp.max(jnp.abs(step))
     return step * sizes * jnp.minimum(1.0, _LARGEST_STEP / jnp.where(length > 0, length, jnp.ones_like(length)))
 
@@ -213,11 +219,13 @@ def _place(model: Model, guess, count, aims: Aims):
     if not at_q.size:
         return guess
     sizes, _ = coordinate_sizes(model, guess.dtype)
+    # A joint without limits is searched half a turn, or pi lengths of the mechanism, to both sides of the guess.
     reach = np.pi * sizes[at_v]
     ends = aims.lower[at_q], guess[at_q] - reach, aims.upper[at_q], guess[at_q] + reach
     low, high = (jnp.where(jnp.isfinite(x), x, y) for x, y in (ends[:2], ends[2:]))
     # Multiples of powers of the root of x^(n+1) = x + 1 fill a cube evenly (Roberts 2018).
     root = 2.0
+    # A contraction by less than 1/2: 60 iterations of it leave no more than rounding in float64.
     for _ in range(60):
         root = (1 + root) ** (1 / (at_q.size + 1))
     factors = jnp.asarray(root ** -(1.0 + np.arange(at_q.size)), guess.dtype)

@@ -56,6 +56,7 @@ class FrameTarget(Pair):
         if self.task == "direction":
             # The rotation of least angle that takes the target's z axis to the frame's, of quaternion (w, -y/2w, x/2w, 0).
             x, y, z = R[0, 2], R[1, 2], R[2, 2]
+            # For opposite directions w is 0. The least value keeps the quotients and their derivatives finite.
             w = jnp.sqrt(jnp.maximum(0.5 * (1 + z), float(jnp.finfo(R.dtype).eps)))
             vector = so3.quat_log(jnp.stack([w, -0.5 * y / w, 0.5 * x / w, jnp.zeros_like(x)]))
             return vector[:2]
@@ -89,6 +90,7 @@ def as_targets(model: Any, targets: Any) -> tuple[Constraint, ...]:
         raise ValueError(f"targets is {targets!r}; give a dictionary of targets by the names of frames")
     rows: list[Constraint] = []
     for name, value in targets.items():
+        # A frame of the model by this name has precedence.
         if name == CENTER and CENTER not in model.frame_names:
             rows.append(CenterTarget(CENTER, _numbers(value, CENTER, (3,), model.home.dtype)))
             continue
@@ -156,5 +158,6 @@ def _frame_along(direction, name: str) -> Float[Array, "3 3"]:
     """A rotation whose z axis is along a direction."""
     if is_concrete(direction) and not np.linalg.norm(np.asarray(direction)) > 0:
         raise ValueError(f"{name} is {np.asarray(direction)}; give a vector of some length")
+    # Only z enters the residual. x and y are arbitrary: they choose the axes of its two components.
     unit = direction / jnp.sqrt(matmul(direction, direction))
     return jnp.concatenate([tangents(unit), unit[None]]).T

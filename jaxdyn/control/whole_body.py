@@ -134,6 +134,7 @@ class WholeBody(eqx.Module):
         self.force_weight = non_negative(force_weight, "force_weight")
         self.effort_limit = None if effort_limit is None else jnp.asarray(effort_limit, dtype)
         self.passive = tuple(passive_velocities(model, passive).tolist())
+        # A traced stiffness may be positive, so that it needs a posture as well.
         if self.posture is None and not (is_concrete(self.stiffness) and float(self.stiffness) == 0):
             raise ValueError(f"stiffness is {self.stiffness} and posture is None; give the posture (nq,)")
         if self.posture is not None and self.posture.shape != (model.nq,):
@@ -153,6 +154,7 @@ class WholeBody(eqx.Module):
         Zero where feet and joints do not restrict the tasks, so that the error equations hold.
         """
         t = jnp.asarray(t, q.dtype)
+        # The rows of the feet come first and are satisfied before the tasks: only tasks can fall short.
         A, wanted = self._orders(q, v, t)[1]
         return wanted - matmul(A, self.acceleration(q, v, t))
 
@@ -181,6 +183,7 @@ class WholeBody(eqx.Module):
 
     def _orders(self, q, v, t):
         """Rows and right-hand sides of the feet, then of the tasks."""
+        # Held at their present poses: the rows fix accelerations only, and do not correct a drift of the feet.
         feet = rows(Scene(self.model, [one.hold(self.model, q) for one in self.feet]), q, v, t)
         tasks = [target_rows(self.model, self.center, self.kp, self.kd, q, v, t)]
         if self.turn is not None:

@@ -39,6 +39,7 @@ class RayleighDissipation(eqx.Module):
             R = self.function(q, v, t)
             if jnp.shape(R) != ():
                 raise ValueError(f"RayleighDissipation: function returned shape {jnp.shape(R)}; return one number, ()")
+            # The function may return a Python integer, which `jax.grad` refuses.
             return jnp.asarray(R, v.dtype)
 
         return -jax.grad(value)(v)
@@ -104,6 +105,7 @@ class SlidingFriction(PiecewiseForce):
         self, system: SystemLike, q: Float[Array, " nq"], v: Float[Array, " nv"], t: Number
     ) -> Float[Array, " 1"]:
         """Sliding velocity along `direction`, (1,), offset by rounding so that coming to rest is no reversal."""
+        # Positive while the contact slides along `direction`, and, by the offset, where it is at rest.
         along = self.direction * jnp.sum(self._row(q, v, t) * v)
         return (along + _ROUNDING * float(jnp.finfo(v.dtype).eps))[None]
 
@@ -125,6 +127,7 @@ class SlidingFriction(PiecewiseForce):
             )
         # A contact cannot pull: a negative normal force gives no friction instead of friction of the wrong sign.
         limit = self.coefficient.astype(v.dtype) * jnp.maximum(jnp.asarray(normal, v.dtype), 0.0)
+        # By the piece and not by sign(A v): within a step the force is then smooth.
         return jnp.where(positive[0], -self.direction, self.direction) * limit * row
 
     def _row(self, q, v, t):
@@ -132,6 +135,7 @@ class SlidingFriction(PiecewiseForce):
         return jnp.asarray(row, v.dtype)
 
 
+# A Module and not an array: the number of velocities is known only with the system.
 class _Coordinate(eqx.Module):
     """Row A that selects one velocity coordinate."""
 

@@ -35,7 +35,9 @@ class _Lag(DriveDynamics):
     ) -> Float[Array, " nv"]:
         """The torques among the states, and the commands of other joints."""
         index = _joint_indices(system, self.joints, type(self).__name__).v
+        # Torques come first in the state; a drive of second order has their rates after them.
         torque = state[: index.size]
+        # The usual case, all joints: no scatter is compiled.
         return torque if np.array_equal(index, np.arange(system.nv)) else command.at[index].set(torque)
 
     def _error(self, system, state, command):
@@ -68,6 +70,7 @@ class FirstOrderDrive(_Lag):
     joints: tuple[str, ...] | None = eqx.field(static=True, converter=_names, default=None)
 
     def __check_init__(self):
+        # The rate divides by T: for no delay leave the drive out of the scene.
         if not _is_positive(self.time_constant):
             raise ValueError(f"FirstOrderDrive: time_constant is {self.time_constant}; give positive seconds")
 
@@ -128,6 +131,7 @@ class SecondOrderDrive(_Lag):
         command: Float[Array, " nv"],
     ) -> Float[Array, " n"]:
         """tau', then w^2 (u - tau) - 2 zeta w tau'."""
+        # The state is (tau, tau'), both of the selected joints.
         error, leaf = self._error(system, state, command)
         frequency, speed = leaf("frequency"), state[error.shape[0] :]
         return jnp.concatenate([speed, frequency * (frequency * error - 2 * leaf("damping_ratio") * speed)])

@@ -46,6 +46,7 @@ class ElasticTransmission(eqx.Module):
             raise ValueError(
                 f"ElasticTransmission: {len(self.motors)} motors for {len(self.joints)} joints; give pairs"
             )
+        # The sign of n is a direction of rotation; only zero is refused.
         if not _is_positive(self.gear**2):
             raise ValueError(f"ElasticTransmission: gear is {self.gear}; give ratios that are not zero")
 
@@ -60,8 +61,10 @@ class ElasticTransmission(eqx.Module):
             _broadcast(value, q, n, f"ElasticTransmission: {name}")
             for name, value in (("stiffness", self.stiffness), ("damping", self.damping), ("gear", self.gear))
         )
+        # Both are at the joint: the motor's angle is divided by the gear ratio.
         stretch, rate = (x[a] / gear - x[b] for x, a, b in ((q, motor.q, joint.q), (v, motor.v, joint.v)))
         tau = stiffness * stretch + damping * rate
+        # tau/n on the motor, so that the transmission conserves power. `add` sums over pairs that share a motor or a joint.
         return jnp.zeros_like(v).at[joint.v].add(tau).at[motor.v].add(-tau / gear)
 
 
@@ -103,6 +106,7 @@ def elastic_joints(
     ```
     """
     chosen = model.joint_names if joints is None else _tuple(joints)
+    # Called for its message on unknown joints.
     _joint_indices(model, chosen, "elastic_joints")
     kinds = dict(zip(model.joint_names, model.topology.kinds, strict=True))
     if several := [name for name in chosen if KINDS[kinds[name]].nv != 1]:
@@ -114,6 +118,7 @@ def elastic_joints(
     whole = model
     for motor, inertia in zip(motors, inertias, strict=True):
         rotor = ModelBuilder(motor, gravity=model.gravity, dtype=model.home.dtype)
+        # No mass and an armature alone: the rotor's mass belongs to the link that carries it.
         rotor.add_body(motor, None, "continuous", joint_name=motor, armature=inertia)
         whole = join(whole, rotor.build(), name=model.name)
     return Scene(whole, forces=(ElasticTransmission(motors, chosen, stiffness, damping, gear),))

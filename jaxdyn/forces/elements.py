@@ -35,9 +35,11 @@ def _joint_indices(system, joints: tuple[str, ...] | None, force: str) -> _Indic
         raise ValueError(
             f"{force}: joints {missing} are not in model {system.name!r}; it has {list(system.joint_names)}"
         )
+    # In the order of the names given, which is that of the values per coordinate.
     chosen = [system.joint_names.index(name) for name in joints]
     index = np.arange(system.nq), np.arange(system.nv)
     slices = system.topology.q_slices, system.topology.v_slices
+    # The empty array keeps the result valid, and an array of integers, where no joint is selected.
     q, v = (np.concatenate([np.zeros(0, int), *(i[s[j]] for j in chosen)]) for i, s in zip(index, slices, strict=True))
     return _Indices(q, v)
 
@@ -48,6 +50,7 @@ def _broadcast(value, like: Array, size: int, name: str) -> Array:
         raise ValueError(
             f"{name} has shape {jnp.shape(value)}, expected a scalar or {(size,)}, one per coordinate{batch_hint(value, (1,))}"
         )
+    # A float64 leaf would promote the motion of a float32 state.
     return jnp.broadcast_to(jnp.asarray(value, like.dtype), (size,))
 
 
@@ -84,6 +87,7 @@ def _value_or_leaf(value, system, indices: _Indices, field: str, force: str):
 def _displacement(system, rest, q, indices: _Indices, name: str) -> Array:
     """Difference (per velocity coordinate of the chosen joints) from `rest` to q, on the joints' manifold."""
     if not isinstance(system, Model):
+        # Other systems have v = dq/dt, so that a displacement is a difference.
         return take(q, indices.q) - _broadcast(rest, q, len(indices.q), name)
     if jnp.shape(rest) == () and len(indices.q) != len(indices.v):
         raise ValueError(
@@ -141,6 +145,7 @@ class CoulombFriction(eqx.Module):
     def __call__(
         self, system: SystemLike, q: Float[Array, " nq"], v: Float[Array, " nv"], t: Number
     ) -> Float[Array, " nv"]:
+        # tanh and no sign: the force has a derivative at rest, and solutions are unique.
         indices = _joint_indices(system, self.joints, "CoulombFriction")
         level = _value_or_leaf(self.level, system, indices, "friction", "CoulombFriction")
         rate = take(v, indices.v)
@@ -174,6 +179,7 @@ class JointSpring(eqx.Module):
         indices = _joint_indices(system, self.joints, "JointSpring")
         rest = self.rest
         if rest is None:
+            # Zeros are no unit quaternion; the neutral configuration has those of no rotation.
             rest = take(neutral(system), indices.q) if isinstance(system, Model) else jnp.zeros(indices.q.size, q.dtype)
         stretch = _displacement(system, rest, q, indices, "JointSpring: rest")
         return _scatter(
@@ -215,12 +221,14 @@ class Drive(eqx.Module):
             _broadcast(value, v, size, f"Drive: {name}")
             for name, value in (("kp", self.kp), ("kd", self.kd), ("target_velocity", self.target_velocity))
         )
+        # The displacement leads from the target to q, and the drive acts against it.
         error = -_displacement(system, self.target, q, indices, "Drive: target")
         command = kp * error + kd * (rate - take(v, indices.v))
         if self.effort_limit is not None:
             limit = _broadcast(self.effort_limit, v, size, "Drive: effort_limit")
             is_finite = jnp.isfinite(limit)
             safe = jnp.where(is_finite, limit, jnp.ones_like(limit))  # keeps inf * 0 out of the gradient
+            # tanh and no clip: a kink would cost the solver its order, and saturated drives their gradient.
             command = jnp.where(is_finite, safe * jnp.tanh(command / safe), command)
         return _scatter(command, indices.v, system.nv)
 
@@ -260,6 +268,7 @@ class ExternalWrench(eqx.Module):
         if self.axes == "world":
             to_body = frame_pose(system, q, self.frame)[:3, :3].T
             wrench = jnp.concatenate([to_body @ wrench[:3], to_body @ wrench[3:]])
+        # Wrench and Jacobian are both in the frame's axes, at its origin.
         return body_jacobian(system, q, self.frame).T @ wrench
 
 

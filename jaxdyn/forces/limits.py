@@ -48,6 +48,7 @@ class JointStops(PiecewiseForce):
     ) -> Float[Array, " n"]:
         """Switching functions k x + min(d x', 0) of the lower limits, then of the upper ones."""
         # At contact (x = 0, x' > 0) this is k x; at separation (x' < 0) it is the force, which must not become a pull.
+        # An infinite limit has a constant negative guard, so that it is never an event.
         return jnp.concatenate([jnp.where(bounded, k * x + jnp.minimum(d * rate, 0.0), -1.0)
                                 for bounded, k, x, d, rate in self._beyond(system, q, v)])  # fmt: skip
 
@@ -61,9 +62,12 @@ class JointStops(PiecewiseForce):
     ) -> Float[Array, " nv"]:
         """Force of the active stops, (nv,)."""
         total, at_v = jnp.zeros_like(v), self._indices(system)[1]
+        # The guards are those of all lower limits, then of all upper ones.
         is_active = positive.reshape(2, -1)
         for side, (bounded, k, x, d, rate) in enumerate(self._beyond(system, q, v)):
+            # Without a maximum: the guards decide on the piece, and within it the force is smooth.
             push = jnp.where(is_active[side] & bounded, k * x + d * rate, 0.0)
+            # A lower stop pushes in the positive direction.
             total = total.at[at_v].add(push if side == 0 else -push)
         return total
 
@@ -100,6 +104,7 @@ class JointStops(PiecewiseForce):
             at_q, at_v = top.q_slices[i], top.v_slices[i]
             if at_q.stop - at_q.start == 1 and at_v.stop - at_v.start == 1:
                 places.append((at_q.start, at_v.start))
+            # Without names, joints of several coordinates are left out; a joint that was named must have a stop.
             elif self.joints is not None:
                 raise ValueError(
                     f"JointStops: joint {name!r} is {top.kinds[i]!r}; stops are for joints of one coordinate"
@@ -131,6 +136,7 @@ class EffortLimits(eqx.Module):
     def __call__(
         self, system: SystemLike, q: Float[Array, " nq"], v: Float[Array, " nv"], t: Number
     ) -> Float[Array, " nv"]:
+        # It is one of the forces that a scene sums; its effect is `clip_effort` of the control.
         return jnp.zeros_like(v)
 
     def effort_guards(
@@ -141,6 +147,7 @@ class EffortLimits(eqx.Module):
         guards = []
         for side, limit in zip((-1.0, 1.0), self._range(system, tau, v), strict=True):
             bounded = jnp.isfinite(limit)
+            # Inserted in front, so that upper limits come first, as `clip_effort` reads them.
             guards.insert(0, jnp.where(bounded, side * (tau - jnp.where(bounded, limit, 0.0)), -1.0))
         return jnp.concatenate(guards)
 
@@ -162,6 +169,7 @@ class EffortLimits(eqx.Module):
         lower, upper = self._range(system, tau, v)
         if positive is None:
             return jnp.clip(tau, lower, upper)
+        # With given signs each entry keeps its piece within a step, and the torque is smooth.
         above, below = positive.reshape(2, -1)
         return jnp.where(above, upper, jnp.where(below, lower, tau))
 
@@ -199,6 +207,7 @@ class TorqueSpeedLimits(EffortLimits):
     of_speed: ClassVar[bool] = True
 
     def __init__(self, stall: Numbers, no_load: Numbers):
+        # Without a limit of its own: `_range` gives the curve.
         super().__init__()
         for name, value in (("stall", stall), ("no_load", no_load)):
             numbers = jnp.asarray(as_array(value, f"TorqueSpeedLimits: {name}"), float)
@@ -211,6 +220,7 @@ class TorqueSpeedLimits(EffortLimits):
             raise ValueError("TorqueSpeedLimits: limits depend on the speed; pass v, or call Scene.drive_torque")
         stall = _by_coordinate(self.stall, tau, "TorqueSpeedLimits: stall")
         bounded = jnp.isfinite(stall)
+        # 1 in place of an infinite stall torque: inf * 0 would be NaN at rest and in the gradient.
         stall = jnp.where(bounded, stall, 1.0)
         back = stall * v / _by_coordinate(self.no_load, tau, "TorqueSpeedLimits: no_load")
         return jnp.where(bounded, -stall - back, -jnp.inf), jnp.where(bounded, stall - back, jnp.inf)

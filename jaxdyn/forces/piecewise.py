@@ -64,6 +64,7 @@ class PiecewiseForce(eqx.Module):
     def __call__(
         self, system: SystemLike, q: Float[Array, " nq"], v: Float[Array, " nv"], t: Number
     ) -> Float[Array, " nv"]:
+        # A guard of exactly zero belongs to the negative side.
         return self.force(system, q, v, t, self.guards(system, q, v, t) > 0)
 
 
@@ -81,6 +82,7 @@ class _FixedPiece(eqx.Module):
 
     def clip_effort(self, system, tau, v=None):
         cut = getattr(self.inner, "clip_effort", None)
+        # A force without effort limits leaves the command as it is.
         return tau if cut is None else cut(system, tau, self.of_efforts, v=v)
 
 
@@ -92,6 +94,7 @@ def guards_by_force(scene: Scene, q, v, t, tau, state=None) -> list[tuple[Any, A
     """
     rows = []
     for force in scene.forces:
+        # Guards do not depend on the piece, so that a scene with fixed pieces has those of the scene itself.
         force = force.inner if isinstance(force, _FixedPiece) else force
         own = efforts = None
         if isinstance(force, PiecewiseForce):
@@ -120,6 +123,7 @@ def pieces_of(scene: Scene, y, q, v, t, tau_of: Callable | None) -> Pieces:
     tau_of(y, q, v, t) is the control's effort and the state of the scene's drives; None without a control.
     """
 
+    # Smooth scenes end here: their control need not be traced.
     if not any(isinstance(force, PiecewiseForce) or hasattr(force, "effort_guards") for force in scene.forces):
         return Pieces(((0, 0),) * len(scene.forces), ())
 
@@ -146,6 +150,7 @@ def fix_pieces(scene: Scene, pieces: Pieces, positive: Bool[Array, " n"]) -> Sce
     for force, (own, efforts) in zip(scene.forces, pieces.counts, strict=True):
         middle, end = place + own, place + own + efforts
         marks = positive[place:middle], positive[middle:end] if efforts else None
+        # The marks are arrays: all pieces share one compiled program.
         forces.append(_FixedPiece(force, *marks) if own + efforts else force)
         place = end
     return eqx.tree_at(lambda scene: scene.forces, scene, tuple(forces))
@@ -156,5 +161,6 @@ def values_and_levels(switching: Callable, *state):
 
     The derivative of a function along its own arguments (q, v) measures the size of the terms that cancel in it.
     """
+    # Terms that cancel in the value need not cancel in this derivative, unless all are homogeneous of one degree.
     values, sizes = jax.jvp(switching, state, state)
     return values, jax.lax.stop_gradient(100 * float(jnp.finfo(values.dtype).eps) * (jnp.abs(sizes) + jnp.abs(values)))

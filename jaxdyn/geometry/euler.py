@@ -45,5 +45,6 @@ def arnold_form(inertia: Float[Array, "n n"], c: Float[Array, " n"], a: Float[Ar
 def _arnold_form(inertia, c, a):
     # Euler's equations in momentum form; B follows by one solve with the inertia, which is never inverted.
     momentum = matmul(inertia, c)
+    # On SO(3) ad_a^T p = p x a.
     force = so3.cross(momentum, a) if a.shape[0] == 3 else se3.adT_apply(a, momentum)
     return solve_positive(inertia, force)

@@ -117,7 +117,9 @@ class ImmersedSystem(System):
     def _unit_jacobians(self, s, t):
         """Configuration of each unit, and its Jacobian J (nv, m)."""
         q, push = jax.linearize(lambda s: self.configurations(s, t), s)
+        # One linearisation of xi, pushed along each coordinate of s.
         rates = jax.vmap(push)(jnp.eye(self.nq, dtype=s.dtype))
+        # From dq/dt to v of each unit: J has nv rows, which differ from its nq for quaternions.
         columns = jax.vmap(lambda *rates: [rate_to_velocity(*of) for of in zip(self.units, q, rates, strict=True)])
         return q, [J.T for J in columns(*rates)]
 
@@ -148,6 +150,7 @@ class ImmersedSystem(System):
     def _unit_forces(self, motions, a, t):
         """Yield each unit's motion and the generalised force M (J a + c) + h that it requires."""
         for unit, motion in zip(self.units, motions, strict=True):
+            # The bias force is the inverse dynamics at sddot = 0, where a unit's acceleration is its drift.
             acceleration = motion.drift if a is None else motion.drift + matmul(motion.J, a)
             yield motion, dynamics.inverse_dynamics(unit, motion.q, motion.v, acceleration, t)
 
@@ -161,6 +164,7 @@ class ImmersedSystem(System):
 
     def kinetic_energy(self, s, v, t):
         """Sum of the units' kinetic energies, (), J."""
+        # From the velocities and not from rho: with xi(s, t) the energy has terms linear in sdot, and constant ones.
         states = zip(self.units, self.configurations(s, t), self.velocities(s, v, t), strict=True)
         return _sum(dynamics.kinetic_energy(unit, q, w, t) for unit, q, w in states)
 
@@ -172,6 +176,7 @@ class ImmersedSystem(System):
     def check_start(self, q, v, t) -> None:
         """Check the start as for any system, and that the immersion has full rank."""
         if is_known(self, q, v, t):
+            # All units in one matrix: the Jacobian of each may have a lower rank.
             _check_rank(np.concatenate([np.asarray(J) for J in _compiled_unit_jacobians(self, q, t)]), q, t)
         super().check_start(q, v, t)
 
@@ -193,6 +198,7 @@ class PulledForce(eqx.Module):
         ]
         if self.common is None:
             return total
+        # Evaluated once, because an interaction depends on all units.
         common_forces = self.common(tuple(q), tuple(v), t) if system.joined else (self.common(q[0], v[0], t),)
         return _add_forces(total, common_forces, "force")
 
@@ -259,6 +265,7 @@ def constrain_by_immersion(
     if force is None and not any(isinstance(unit, Scene) for unit in given):
         return immersed
     forces = tuple(scene.forces for scene in scenes)
+    # Forces on q remain functions of q and v, and are pulled back at each evaluation.
     pulled = PulledForce(forces, None if force is None else as_pytree(force, "force"))
     return Scene(immersed, forces=(pulled,) if force is not None or any(forces) else ())
 
@@ -328,6 +335,7 @@ def _check_rank(J, s, t) -> None:
     J = np.asarray(J, float)
     # The usual threshold of a numerical rank, max(n, m) eps, with a margin of 10 for the rounding of xi's derivative.
     least = 10 * max(J.shape) * float(np.finfo(np.asarray(s).dtype).eps)
+    # NaN compares false: a Jacobian that is not finite has rank 0 here and is refused. The SVD itself would raise.
     sizes = np.linalg.svd(J, compute_uv=False) if np.isfinite(J).all() else np.full(1, np.nan)
     rank = int(np.sum(sizes > least * sizes.max(initial=0.0)))
     if rank < J.shape[1]:

@@ -41,6 +41,7 @@ def _compile_for_systems(function: Callable) -> Callable:
 
     @functools.wraps(function)
     def call(metric, *args):
+        # The values that a function captures are no operands: a compiled program would keep those of the first call.
         return (program if isinstance(metric, (Model, System)) else function)(metric, *args)
 
     return call
@@ -86,6 +87,7 @@ def christoffel_symbols(metric: Metric, q: Float[Array, " n"], kind: str = "seco
 def _symbols(metric, q, kind):
     g = _as_function(metric)
     first = symbols(jax.jacfwd(g)(q))
+    # One factorisation of g for all n^2 columns.
     return first if kind == "first" else solve_positive(g(q), first.reshape(q.shape[0], -1)).reshape(first.shape)
 
 
@@ -130,6 +132,7 @@ def covariant_derivative(
     **Arguments:** `metric` as above; `field`, X; `q`, `v` (n,). **Returns:** (n,).
     """
     q, v = _vectors(metric, q=q, v=v)
+    # X and dX(v) from one evaluation; the Jacobian of the field is not formed.
     w, rate = jax.jvp(field, (q,), (v,))
     return covariant_rate(metric, q, v, w, rate)
 
@@ -162,6 +165,7 @@ def _curvature(metric, q):
     gamma = _symbols(metric, q, "second")
     derivative = jax.jacfwd(lambda q: _symbols(metric, q, "second"))(q)
     # R is antisymmetric in k and l: half of its terms, minus the same with k and l exchanged.
+    # derivative[i, l, j, k] = dGamma^i_lj / dq_k, in the order [i, j, k, l] of the tensor.
     half = derivative.transpose(0, 2, 3, 1) + jnp.einsum("ikm,mlj->ijkl", gamma, gamma)
     return half - half.transpose(0, 1, 3, 2)
 
@@ -193,6 +197,7 @@ def _vectors(metric, **arguments) -> tuple[Array, ...]:
     if isinstance(metric, (Model, System)):
         return check_state(metric, **arguments)
     q = as_array(arguments["q"], "q")
+    # A function has no dtype of its own.
     dtype = state_dtype(None, q)
     for name, value in arguments.items():
         if np.ndim(value) != 1 or np.shape(value) != q.shape:
@@ -230,6 +235,7 @@ def _as_function(metric) -> Callable:
             raise ValueError(
                 f"metric returned shape {jnp.shape(g)}, expected {(q.shape[0], q.shape[0])} for this q{batch_hint(g, (1, 1))}"
             )
+        # A metric of constants in float64 would promote a float32 q.
         return jnp.asarray(g, q.dtype)
 
     return evaluate

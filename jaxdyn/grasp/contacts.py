@@ -65,12 +65,14 @@ class Contact(Pair):
         """Position, and where the contact constrains it orientation, of the contact frame in the fingertip's, (n,), m and rad."""
         # Frame A is on the object, so p is the fingertip's position relative to it; rows are object minus fingertip.
         residual = p if self.kind != "rigid" else jnp.concatenate([p, jnp.stack(attitude(R))])
+        # Components beyond the residual are rates alone: that of a soft finger is in `twist_residual`.
         return -residual[np.array([i for i in self.components if i < residual.shape[0]])]
 
     def twist_residual(
         self, R: Float[Array, "3 3"], p: Float[Array, "3"], U: Float[Array, "6"]
     ) -> Float[Array, " np"] | None:
         """Angular velocity of the object relative to the finger about the normal, (1,), rad/s, for a soft finger."""
+        # U is the twist of the finger relative to the object, and rows are object minus finger.
         return -U[5:] if self._spins else None
 
 
@@ -144,7 +146,9 @@ def point_contacts(places: dict, *, kind: str = "hard-finger") -> list[Contact]:
         if is_concrete(normal) and not (np.isfinite(normal).all() and normal.any()):
             raise ValueError(f"places[{finger!r}]: normal is {normal.tolist()}; give a direction into the object")
         xp, normal = array_namespace(normal), f64.unit(normal, f"places[{finger!r}]: normal")
+        # The axis of the frame farthest from the normal, so that the cross product is never small.
         across = f64.unit(xp.cross(normal, xp.eye(3)[xp.argmin(xp.abs(normal))]), "across")
+        # Right-handed: across x (normal x across) = normal.
         pose = f64.pose_of(xp.stack([across, xp.cross(normal, across), normal], 1), point)
         contacts.append(contact(kind, finger, pose))
     return contacts
@@ -161,6 +165,7 @@ def on_object(constraint: Constraint, name: str) -> Constraint:
                 f"contact {constraint.name!r} is on {constraint.object!r}, the object of the grasp is {name!r}; leave "
                 "object out"
             )
+        # Modules are frozen: the contact gets its object in a copy.
         fields = ("name", "kind", "finger", "in_plane", "pose", "finger_pose")
         return Contact(object=name, **{field: getattr(constraint, field) for field in fields})
     if isinstance(constraint, (RollingSphere, RollingWheel)):

@@ -166,9 +166,11 @@ def hand_dynamics(
 @entry_point
 def _solve(grasp: Grasp, q, V, tau, t) -> ObjectDynamics:
     hands, objects = velocity_rows(grasp)
+    # One linearisation gives A, and Adot along the motion that A itself determines.
     A, push = jax.linearize(lambda q, t: constraint_jacobian(grasp, q, t), q, t)
     Jh = -A[:, hands]
     inverse = pseudo_inverse(Jh, tolerance(None, Jh))
+    # The columns of the object in A = [-J_h  G^T] are G^T.
     X = matmul(inverse, A[:, objects])
     N = jnp.zeros((grasp.nv, objects.size), q.dtype).at[objects].set(jnp.eye(objects.size, dtype=q.dtype))
     N = N.at[hands].set(X)
@@ -181,6 +183,7 @@ def _solve(grasp: Grasp, q, V, tau, t) -> ObjectDynamics:
     condition = jnp.sqrt(jnp.sum(inverse * inverse) * jnp.sum(A * A))
     # The condition number that the dtype resolves: beyond it the basis N has no correct digits.
     is_regular = whole & (condition * least_quality(q.dtype) < 1)
+    # From the rows of the fingers alone, where A^T is -J_h^T.
     return _solve_dynamics(grasp, q, V, tau, t, N, Ndot, is_regular, lambda left: -matmul(inverse.T, left[hands]))
 
 
@@ -202,6 +205,7 @@ def _solve_dynamics(grasp: Grasp, q, nu, tau, t, N, Ndot, is_regular, multiplier
     M, C = mass_matrix(system, q, t), coriolis_matrix(system, q, v, t)
     gravity, force = gravity_force(system, q, t), total_force(grasp, q, v, tau, t)
     mass = matmul(N.T, matmul(M, N))
+    # The matrix C and not C v: dM~/dt - 2 C~ is skew only if dM/dt - 2 C is.
     coriolis = matmul(N.T, matmul(C, N) + matmul(M, Ndot))
     gravity_part, force_part = matmul(N.T, gravity), matmul(N.T, force)
     factor = cholesky(mass)
@@ -209,6 +213,7 @@ def _solve_dynamics(grasp: Grasp, q, nu, tau, t, N, Ndot, is_regular, multiplier
     a = matmul(N, rate) + matmul(Ndot, nu)
     lam = multipliers(matmul(M, a) + matmul(C, v) + gravity - force)
 
+    # The Cholesky factor of an indefinite matrix is NaN.
     result = RESULTS.where(jnp.isfinite(factor).all(), RESULTS.successful, RESULTS.singular_mass_matrix)  # pyright: ignore[reportArgumentType]
     result = RESULTS.where(is_regular, result, RESULTS.singular_basis)
     push = N[velocity_rows(grasp)[0]].T

@@ -78,6 +78,7 @@ def internal_force_basis(
     inverse = pseudo_inverse(G, tolerance(None, G))
     if reference is None:
         known = is_known(grasp, q, t)
+        # A traced q has no known rank, and the number of columns is a shape: full rank is assumed.
         rank = int(jnp.round(jnp.sum(inverse * G.T))) if known else min(G.shape)
         return split_directions(jnp.eye(G.shape[1], dtype=G.dtype) - matmul(inverse, G))[:, rank:]
     reference = jnp.asarray(as_array(reference, "reference", G.dtype))
@@ -136,6 +137,7 @@ def forces_for_wrench(
 
 def split_forces(G: Float[Array, "no nc"], wrench, preload) -> Float[Array, " nc"]:
     """Contact forces G^+ F + (1 - G^+ G) lam_0."""
+    # As lam_0 + G^+ (F - G lam_0), which needs no projection matrix.
     return preload + matmul(pseudo_inverse(G, tolerance(None, G)), wrench - matmul(G, preload))
 
 
@@ -143,6 +145,7 @@ def as_preload(grasp: Grasp, preload: Any, dtype) -> Float[Array, " nc"]:
     """Contact forces (nc,) from a number, the normal force, or from forces. **Raises:** ValueError."""
     preload, count = as_array(preload, "preload", dtype), layout(grasp)[-1].end
     if preload.ndim == 0:
+        # Zero is valid also for constraints without a normal force, which `normal_forces` refuses.
         if is_known(preload) and float(preload) == 0:
             return jnp.zeros((count,), dtype)
         return preload * jnp.asarray(normal_forces(grasp), dtype)
@@ -198,11 +201,13 @@ def hold(
             )
     A, weight = _static(grasp, q, t)
     order = np.concatenate([contact.rows for contact in contacts])
+    # In equilibrium the contacts exert h minus the other forces on the object.
     wrench = weight if wrench is None else wrench
     G = A[:, np.array(grasp.object_velocities, int)].T
     optimum = optimal_forces(G[:, order], wrench, [contact.cone for contact in contacts], preload=preload)
     # `order` maps the forces of the cones, in the order of components, back to the rows of the grasp.
     forces = jnp.zeros((A.shape[0],), A.dtype).at[order].set(optimum.x)
+    # The columns of the fingers in A are -J_h, hence the sign.
     torques = -matmul(A[:, np.array(grasp.hand_velocities, int)].T, forces)
     return HandForces(forces, torques, optimum.result, layout(grasp))
 
@@ -210,6 +215,7 @@ def hold(
 @entry_point
 def _static(grasp: Grasp, q, t):
     """Constraint rows, and the contact wrench of static equilibrium."""
+    # At rest the bias force is gravity alone.
     at_rest = jnp.zeros((grasp.nv,), q.dtype)
     force = gravity_force(grasp.system, q, t) - total_force(grasp, q, at_rest, at_rest, t)
     return constraint_jacobian(grasp, q, t), force[np.array(grasp.object_velocities, int)]
@@ -232,6 +238,7 @@ def force_closure(
     check_grasp(grasp)
     contacts = _every_cone(grasp, cones)
     order = np.concatenate([contact.rows for contact in contacts])
+    # The cones expect components in the order of the wrench basis, which may differ from that of the rows.
     closure = _closure(grasp_map(grasp, q, t)[:, order], [contact.cone for contact in contacts])
     if required and not closure.closed:
         raise ValueError(
@@ -239,6 +246,7 @@ def force_closure(
             f"{np.round(closure.direction, 6).tolist()} on the object cannot be resisted; add contacts or friction, or place "
             "them elsewhere"
         )
+    # Back from the order of the cones to that of the grasp's rows.
     forces = np.zeros(order.size)
     forces[order] = closure.forces
     return ForceClosure(closure.closed, closure.margin, forces, closure.direction, closure.rank)
@@ -267,6 +275,7 @@ def _every_cone(grasp: Grasp, cones) -> tuple[ContactWithCone, ...]:
             "or to the Grasp"
         )
     coned = contacts_with_cones(grasp, cones)
+    # A contact without a cone would be bilateral: it could pull, and the answer would be too optimistic.
     missing = [name for name in names if name not in {contact.name for contact in coned}]
     if missing:
         raise ValueError(f"contacts {missing} have no cone; give one for every contact of {names}")

@@ -57,6 +57,7 @@ class Grasp(Scene):
         forces: Checked[Sequence[Force]] = (),
         cones: Cones = None,
     ):
+        # One model of all bodies: only then object and fingers have common rows A and one mass matrix.
         models = [fingers] if isinstance(fingers, Model) else list(fingers)
         if not models or not all(isinstance(model, Model) for model in models):
             raise ValueError("fingers is no Model and no list of Models; pass what carries the fingertips")
@@ -69,6 +70,7 @@ class Grasp(Scene):
         if not isinstance(contacts, (tuple, list)) or not contacts:
             raise ValueError(f"contacts is {contacts!r}; pass a list with at least one contact")
         for one in contacts:
+            # J_h thetadot = G^T V has no right-hand side: a prescribed slip would need one in all equations of the grasp.
             if isinstance(one, Pfaffian) and one.b is not None:
                 raise ValueError(f"contact {one.name!r} prescribes a slip b; contacts of a grasp have none")
         super().__init__(model, tuple(on_object(one, object) for one in contacts), forces, cones)
@@ -133,6 +135,7 @@ def internal_forces(
         raise ValueError(
             f"lam has shape {lam.shape}, expected {G.shape[1:]}, one per row of the grasp{batch_hint(lam, (1,))}"
         )
+    # G lam first: the projection matrix (nc, nc) is never formed.
     return lam - matmul(pseudo_inverse(G, tolerance(None, G)), matmul(G, lam))
 
 
@@ -147,6 +150,7 @@ def _check_object(model: Model, name: str) -> None:
     if name not in top.body_names:
         raise ValueError(f"object {name!r} is no body of model {model.name!r}; bodies are {list(top.body_names)}")
     body = top.body_names.index(name)
+    # G and J_h are columns of A: they separate object and fingers only if no joint carries both.
     if top.parents[body] >= 0 or body in top.parents:
         raise ValueError(f"object {name!r} is part of a tree of bodies; give it a joint to the world and no children")
     if top.nb == 1:

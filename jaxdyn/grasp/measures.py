@@ -94,11 +94,14 @@ def _measure(grasp: Grasp, motions: HandMotions, q, length, t) -> Manipulability
     # thetadot for the columns of `along`: N_hands times T^-T of H = along T^T.
     X = solve_lower(factor, N[hands].T).T
     force_axes, vectors = _axes(X)
+    # Singular values descend, and velocity axes are their inverses: reversed, the longest velocity axis comes first.
     force_axes, vectors = force_axes[::-1], vectors[:, ::-1]
     # Axes of the square root of the dtype's resolution are zero: the fingers need not move.
     some = force_axes > least_quality(q.dtype) ** 1.5 * force_axes[-1]
     velocity_axes = jnp.where(some, 1 / jnp.where(some, force_axes, jnp.ones_like(force_axes)), jnp.inf)
+    # Wrenches scale inversely to velocities, so that power remains.
     G = constraint_jacobian(grasp, q, t)[:, objects].T / scale[:, None]
+    # Of G^T, so that there is an axis for every velocity of the object, of length zero where the contacts exert no wrench.
     wrenches = _axes(G.T)[0]
     return Manipulability(
         velocity_axes=velocity_axes,
@@ -115,8 +118,8 @@ def _measure(grasp: Grasp, motions: HandMotions, q, length, t) -> Manipulability
 
 def _axes(X: Float[Array, "n m"]) -> tuple[Float[Array, " m"], Float[Array, "m m"]]:
     """Singular values |X v_i| of X, largest first, and the right vectors v_i, constants."""
-    # By stationarity of singular values, |X v_i| with constant v_i has the exact first derivative, without SVD's
-    # division\n# by differences of singular values.
+    # By stationarity of singular values |X v_i| with constant v_i has the exact first derivative.
+    # The derivative of an SVD would divide by differences of singular values.
     vectors = lax.stop_gradient(jnp.linalg.svd(lax.stop_gradient(X))[2]).T
     square = jnp.sum(matmul(X, vectors) ** 2, 0)
     some = square > 0
@@ -127,6 +130,7 @@ def _scale(grasp: Grasp, length) -> Float[Array, " no"]:
     """Scale of each velocity of the object, `length` for angular ones."""
     top = grasp.system.topology
     kind = top.kinds[top.body_names.index(grasp.object)]
+    # Only joints that mix translations and rotations need the length; others have coordinates of one unit.
     one = jnp.ones_like(length)
     turns = {"free": (0, 0, 0, 1, 1, 1), "planar": (0, 0, 1)}.get(kind, (0,) * len(grasp.object_velocities))
     return jnp.stack([length if turn else one for turn in turns])

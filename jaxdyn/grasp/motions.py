@@ -50,6 +50,7 @@ class HandMotions(Basis):
         """Basis N (nv, nw + nk): H in the rows of the object, (J_h^+ G^T H, K) in those of the joints."""
         hands, objects = velocity_rows(scene)
         A = constraint_jacobian(scene, q, t)
+        # The rows are A = [-J_h  G^T].
         Jh, seen = -A[:, hands], A[:, objects]
         rank = hands.size - self.internal.shape[1]
         inverse = pseudo_inverse(Jh, tolerance(None, Jh), rank < min(Jh.shape))
@@ -62,6 +63,7 @@ class HandMotions(Basis):
             K, least, _ = orthonormal(reference - matmul(inverse, matmul(Jh, reference)))
             N = N.at[hands, H.shape[1] :].set(K)
             pivot = jnp.minimum(pivot, least)
+        # The trace of J_h^+ J_h is its rank. A rank other than at the references changes the number of motions.
         fits = fits & (jnp.round(jnp.sum(inverse * Jh.T)) == rank)
         # |J_h^+| |A|, an upper bound of the condition number that needs no SVD.
         size = jnp.sqrt(jnp.sum(inverse * inverse) * jnp.sum(A * A))
@@ -73,12 +75,14 @@ class HandMotions(Basis):
         """H, its least pivot, and the flag that its number of columns is that of the feasible object velocities."""
         reference = self.object.astype(A.dtype)
         lost = seen - matmul(Jh, matmul(inverse, seen))
+        # A constant H needs no projection, and is valid only where G^T lies in the range of J_h.
         if reference.shape[0] == reference.shape[1]:
             whole = jnp.max(jnp.abs(lost), initial=0.0) <= _negligible(A) * jnp.max(jnp.abs(A))
             return reference, jnp.ones((), A.dtype), whole
         # B, whose kernel are the feasible velocities; its rank follows from the trace of a projection.
         across = pseudo_inverse(lost, tolerance(None, lost), True)
         fits = jnp.round(jnp.sum(across * lost.T)) == reference.shape[0] - reference.shape[1]
+        # No motion of the object is feasible: there is nothing to orthonormalise.
         if not reference.shape[1]:
             return reference, jnp.ones((), A.dtype), fits
         H, pivot, _ = orthonormal(reference - matmul(across, matmul(lost, reference)))
@@ -135,7 +139,9 @@ def hand_motions(
             f"the contacts leave neither the object {grasp.object!r} nor the hand any motion here; use contacts with fewer "
             "rows, or give sizes=(nw, nk) where q is traced"
         )
+    # The unit matrix, so that w is V itself; eigenvectors would be any rotation of it.
     whole = jnp.eye(no, dtype=q.dtype) if nw == no else split_directions(on_object)[:, no - nw :]
+    # The eigenvectors of the range come last.
     return HandMotions(whole, split_directions(on_hand)[:, nh - nk :])
 
 
@@ -162,4 +168,5 @@ def _projections(grasp: Grasp, q, t):
 
 def _negligible(like) -> float:
     """Relative size below which an entry is rounding error."""
+    # 4e-10 in float64, below the rank tolerance of 1.1e-9.
     return eps_of(like) ** 0.6

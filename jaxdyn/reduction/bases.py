@@ -57,6 +57,7 @@ class Basis(eqx.Module):
                 parametrization.N, _check_columns(nu, parametrization.N)
             ) + parametrization.v0, parametrization
 
+        # `linearize` and not `jvp`: the direction, dq/dt for this v, is known only with the value.
         v, push, (N, _, quality) = jax.linearize(velocity, q, t, has_aux=True)
         return VelocityAndDrift(v, push(velocity_to_rate(scene.system, q, v), jnp.ones_like(t)), N, quality)
 
@@ -84,6 +85,7 @@ class Independent(Basis):
         kept = np.asarray(self.velocities, int)
         rest = np.setdiff1d(np.arange(scene.nv), kept)
         A2 = A[:, rest]
+        # A2 may have more rows than columns: dependent constraints are allowed.
         inverse = pseudo_inverse(A2, tolerance(None, A2))
         N = jnp.zeros((scene.nv, kept.size), A.dtype).at[kept].set(jnp.eye(kept.size, dtype=A.dtype))
         N = N.at[rest].set(-matmul(inverse, A[:, kept]))
@@ -94,6 +96,7 @@ class Independent(Basis):
         whole = jnp.round(jnp.sum(inverse * A2.T)) == rest.size
         quality = jnp.where(whole, 1.0 / jnp.where(whole, size, jnp.ones_like(size)), jnp.zeros_like(size))
         if A2.shape[0] == A2.shape[1]:
+            # A step may pass a dead centre without meeting it; the sign then differs at its two ends.
             quality = quality * sign_of_determinant(A2)
         return Parametrization(N, v0, _tangent_only(A, N, quality))
 
@@ -117,13 +120,16 @@ class UserBasis(Basis):
         if N.ndim != 2 or N.shape[0] != scene.nv:
             raise ValueError(f"basis returned shape {N.shape}; return N with shape ({scene.nv}, nr) = (nv, nr)")
         inverse = pseudo_inverse(A, tolerance(None, A))
+        # The shortest v0 with A v0 = b, also for dependent rows.
         v0 = matmul(inverse, b) if v0 is None else jnp.asarray(v0, q.dtype)
         if v0.shape != (scene.nv,):
             raise ValueError(f"basis returned v0 with shape {v0.shape}, expected {(scene.nv,)} = (nv,)")
         # Columns are scaled to unit length, so that the quality does not depend on the units of nu.
+        # The quality decides on singularity and has no derivative.
         lengths = jnp.sqrt(jnp.sum(lax.stop_gradient(N * N), 0))
         some = jnp.all(lengths > 0)
         pivot = _least_pivot(N / jnp.where(some, lengths, jnp.ones_like(lengths))[None])
+        # Fewer columns would be a further constraint, more of them cannot all be tangent.
         whole = scene.nv - jnp.round(jnp.sum(inverse * A.T)) == N.shape[1]
         off = jnp.abs(matmul(A, v0) - b)
         met = jnp.max(off) <= _rounding(A) * (jnp.max(jnp.abs(b)) + jnp.sqrt(jnp.sum(A * A) * jnp.sum(v0 * v0)))
@@ -168,6 +174,7 @@ class Orthonormal(Basis):
         A = A + 0 * reference[0, 0]
         inverse = pseudo_inverse(A, tolerance(None, A))
         N, pivot, factor = orthonormal(reference - matmul(inverse, matmul(A, reference)))
+        # The trace of A^+ A is the rank of A.
         free = scene.nv - jnp.round(jnp.sum(inverse * A.T))
         quality = jnp.where(free == N.shape[1], pivot, jnp.zeros_like(pivot))
         return Parametrization(N, matmul(inverse, b), quality), A, inverse, factor
@@ -185,6 +192,7 @@ class Orthonormal(Basis):
         nu = _check_columns(nu, N)
         v = matmul(N, nu) + parametrization.v0
         along_motion = (q, t), (velocity_to_rate(scene.system, q, v), jnp.ones_like(t))
+        # Rates of A and v0 alone: the factorisation that gave N is not differentiated.
         rate = jax.jvp(lambda q, t: constraint_jacobian(scene, q, t), *along_motion)[1]
         drift = jax.jvp(lambda q, t: self.at(scene, q, t).v0, *along_motion)[1]
         turned, L = matmul(rate, N), solve_lower(factor, matmul(self.reference.astype(A.dtype).T, inverse)).T
@@ -192,6 +200,7 @@ class Orthonormal(Basis):
         Z = Z + Z.T
         U = jnp.triu(Z) - 0.5 * jnp.diag(jnp.diag(Z))
         across = matmul(rate.T, matmul(L, nu))
+        # P as two products, without the projection matrix (nv, nv).
         across = across - matmul(inverse, matmul(A, across))
         drift = drift - matmul(inverse, matmul(turned, nu)) - across + matmul(N, matmul(U, nu))
         return VelocityAndDrift(v, drift, N, parametrization.quality)
@@ -229,6 +238,7 @@ def as_basis(basis: BasisLike | None, scene: Scene) -> Basis:
         return basis
     if callable(basis):
         return UserBasis(as_pytree(basis, "basis"))
+    # True is an int in Python, and would be an index.
     if isinstance(basis, (tuple, list)) and all(isinstance(i, int) and not isinstance(i, bool) for i in basis):
         if not basis or len(set(basis)) < len(basis) or not all(0 <= i < scene.nv for i in basis):
             raise ValueError(f"basis is {basis}; give different indices of velocities, each 0 to {scene.nv - 1}")
@@ -240,6 +250,7 @@ def as_basis(basis: BasisLike | None, scene: Scene) -> Basis:
         )
     if basis.ndim != 2 or basis.shape[0] != scene.nv or not 0 < basis.shape[1] <= scene.nv:
         raise ValueError(f"basis has shape {basis.shape}, expected ({scene.nv}, nr) = (nv, nr)")
+    # A matrix is a reference and need not be tangent: `Orthonormal` projects it.
     return Orthonormal(jnp.asarray(basis))
 
 
@@ -297,6 +308,7 @@ def count_dof(scene: Scene, q, t, dof: int | None = None, rank_tol: float | None
             raise ValueError(f"dof is {dof!r}; give the number of degrees of freedom, 1 to nv = {scene.nv}")
         return dof
     count = layout(scene)[-1].end
+    # The number of columns is a shape: it cannot follow from a traced rank.
     known = is_known(scene, q, t)
     dof = scene.nv - (int(_tangent_projection(scene, q, t, rank_tol)[1]) if known else count)
     if dof < 1:
@@ -321,8 +333,9 @@ def split_directions(projection: Float[Array, "n n"]) -> Float[Array, "n n"]:
 
 def independent_velocities(scene: Scene, q, t: Number = 0.0) -> tuple[int, ...]:
     """Indices of independent velocities at a concrete configuration: those without pivots of A's columns."""
+    # In NumPy, since the pivots are indices that a caller stores as static.
     A = np.asarray(constraint_jacobian_compiled(scene, q, jnp.asarray(t, q.dtype)), float)
-    # Pivoted QR of the columns by modified Gram-Schmidt: pivots are the dependent velocities.
+    # Pivoted QR of the columns by modified Gram-Schmidt, `rest` without the pivots so far: pivots are the dependent velocities.
     rest, pivots = A.copy(), []
     for _ in range(min(A.shape)):
         sizes = np.linalg.norm(rest, axis=0)
@@ -345,6 +358,7 @@ def orthonormal(columns: Float[Array, "n k"]) -> tuple[Float[Array, "n k"], Floa
 
 def minimal_velocity(parametrization: Parametrization, v: Float[Array, " nv"]) -> Float[Array, " nr"]:
     """Minimal velocities nu (nr,) with N nu + v0 = v for an admissible v."""
+    # Exact for an admissible v; the least-squares fit for any other.
     factor = cholesky(matmul(parametrization.N.T, parametrization.N))
     return solve_cholesky(factor, matmul(parametrization.N.T, v - parametrization.v0))
 
@@ -358,12 +372,14 @@ constraint_jacobian_compiled = entry_point(constraint_jacobian)
 
 
 def _affine_rows(scene, q, t):
+    # The residual of the rows is A v - b, and -b at v = 0.
     return constraint_jacobian(scene, q, t), -velocity_residual(scene, q, jnp.zeros((scene.nv,), q.dtype), t)
 
 
 def _least_pivot(columns):
     """Least pivot of the Cholesky factor of columns^T columns, 0 for dependent columns."""
     pivot = jnp.min(jnp.diagonal(cholesky(lax.stop_gradient(matmul(columns.T, columns)))))
+    # The Cholesky factor of dependent columns is NaN.
     return jnp.where(jnp.isfinite(pivot), pivot, jnp.zeros_like(pivot))
 
 

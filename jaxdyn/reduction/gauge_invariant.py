@@ -121,18 +121,23 @@ def _decouple(scene, q, v, tau, t, rotation, motion_rotation, dof, rank_tol) -> 
 
     W, Wdot = jax.jvp(root, (q, t), motion)
     A, Adot = jax.jvp(lambda q, t: constraint_jacobian(scene, q, t), (q, t), motion)
+    # W turn^T is triangular: W^-1 by substitution, without a general inverse.
     inverse = matmul(turn.T, solve_lower(matmul(W, turn.T), unit))
     C = coriolis_matrix(system, q, v, t)
     w = matmul(W.T, v)
+    # Skew, because M = W W^T gives dM/dt = Wdot W^T + W Wdot^T, and dM/dt - 2 C is skew.
     Gamma = matmul(matmul(inverse, C) - Wdot.T, inverse.T)
+    # h - C v leaves N: the Coriolis forces are in Gamma.
     u = matmul(inverse, total_force(scene, q, v, tau, t) - bias_force(system, q, v, t) + matmul(C, v))
     Lambda = matmul(A, inverse.T)
     # Lam = A W^-T: its rate along the motion.
     rate = matmul(Adot - matmul(Lambda, Wdot.T), inverse.T)
+    # kappa: the rows A a = gamma in terms of wdot = W^T a + Wdot^T v.
     wanted = rows(scene, q, v, t).gamma + matmul(Lambda, matmul(Wdot.T, v))
 
     back = pseudo_inverse(Lambda, tolerance(rank_tol, Lambda))
     null_projector = unit - matmul(back, Lambda)
+    # Constants: eigenvectors of equal eigenvalues have no derivative.
     reference = split_directions(null_projector)
     # Projecting constant references makes the bases smooth, and gives them the parallel transport V2^T V2dot = 0.
     V1, *_ = orthonormal(matmul(unit - null_projector, reference[:, : scene.nv - dof]))
@@ -144,6 +149,7 @@ def _decouple(scene, q, v, tau, t, rotation, motion_rotation, dof, rank_tol) -> 
     free = u - matmul(Gamma, w)
     change = matmul(null_projector, free) + matmul(back, wanted)
     rank = jnp.round(jnp.sum(back * Lambda.T))
+    # The bases have a static number of columns, which is valid for this rank alone.
     result = RESULTS.where(rank == scene.nv - dof, RESULTS.successful, RESULTS.singular_basis)  # pyright: ignore[reportArgumentType]
     return GaugeInvariant(
         W=W,
@@ -161,6 +167,7 @@ def _decouple(scene, q, v, tau, t, rotation, motion_rotation, dof, rank_tol) -> 
         normal_force=matmul(V1.T, u),
         Lambda_r=Lambda_r,
         acceleration=matmul(inverse.T, change - matmul(Wdot.T, v)),
+        # (Lam^T)^+ gives the multipliers of least norm where rows are dependent.
         multipliers=matmul(back.T, matmul(back, wanted) - free),
         result=result,
     )

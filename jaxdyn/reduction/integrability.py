@@ -121,7 +121,7 @@ def _fields(scene, reference, q, t, levels):
         outer, within = np.array(pairs).T
 
         def fields(x):
-            # Linearised once, both derivatives serve all pairs of the level.
+            # Linearised once: both derivatives are reused by all pairs of the level.
             X, forward = jax.linearize(generators, x)
             Y, inward = jax.linearize(inner, x)
             along = jax.vmap(inward)(X), jax.vmap(forward)(Y)
@@ -129,6 +129,7 @@ def _fields(scene, reference, q, t, levels):
 
         return fields
 
+    # Each level differentiates the one before: the order of derivatives is the number of levels.
     last = generators
     for pairs in levels:
         last = brackets(last, pairs)
@@ -204,6 +205,7 @@ def spurious_terms(
 def _substitute(scene, choice: Independent, q, nu, tau, t):
     kept = np.asarray(choice.velocities, int)
     rest = np.setdiff1d(np.arange(scene.nv), kept)
+    # The correct equations, from the projection along N.
     right = reduce(scene, choice, q, nu, tau, t)
 
     def at(r):

@@ -186,6 +186,7 @@ def _solve_by_program(scene: Scene, q, v, a_independent, S, weights, t, chosen: 
     v, a, torques, lam, is_determined, agrees, is_actuated, definite = kernel(_solve, static=2)(
         chosen, rank_tol, scene, q, v, a_independent, S, weights, t
     )
+    # Later codes override earlier ones: torques have no meaning where the motion is not determined.
     result = RESULTS.where(is_actuated, RESULTS.successful, RESULTS.underactuated)  # pyright: ignore[reportArgumentType]
     result = RESULTS.where(agrees, result, RESULTS.contradictory_rows)
     result = RESULTS.where(is_determined, result, RESULTS.singular_basis)
@@ -198,6 +199,7 @@ def _solve(chosen: tuple[int, ...], rank_tol, scene: Scene, q, v, a_independent,
     """v, a, torques and lam; whether v is determined, whether a motion has the given values, whether the motors can produce it,
     and whether M is definite."""
     nv, tol, has_rows = scene.nv, tolerance(rank_tol, q), bool(layout(scene))
+    # Residuals are not tested more strictly than the dependence of rows is decided.
     limit = max(eps_of(q) ** 0.5, tol)
     E = np.eye(nv, dtype=q.dtype)[list(chosen)]
     if has_rows:
@@ -217,6 +219,7 @@ def _solve(chosen: tuple[int, ...], rank_tol, scene: Scene, q, v, a_independent,
     def complete(start, right, independent):
         """The solution x of Y^T x = right, Z^T x = independent nearest to the start, and whether there is one."""
         x = start + matmul(inverse.T, right - matmul(Y.T, start))
+        # In the null space of Y, so that the constraints remain satisfied.
         x = x + matmul(free.T, independent - matmul(Z.T, x))
         size = jnp.sqrt(jnp.sum(x * x))
         # By Cauchy-Schwarz a residual is compared with the sizes that cancel in it.
@@ -230,21 +233,26 @@ def _solve(chosen: tuple[int, ...], rank_tol, scene: Scene, q, v, a_independent,
     is_determined, agrees = jnp.asarray(True), jnp.asarray(True)
     if v.shape[0] != nv:
         still = jnp.zeros((nv,), q.dtype)
+        # Y[0] is an empty vector where there are no rows, and A v - b is -b at rest.
         rest = -velocity_residual(scene, q, still, t) if has_rows else Y[0]
         x, agrees = complete(still, rest, v)
         v = metric.unwhiten(x)
         rank = jnp.round(jnp.sum(inverse * Y.T)) + jnp.round(jnp.trace(matmul(free, across(Z))))
+        # The rows of constraints and of independent velocities must span all velocities.
         is_determined = rank == nv
     gamma = rows(scene, q, v, t).gamma if has_rows else Y[0]
     unforced = metric.whiten(total_force(scene, q, v, None, t) - bias_force(scene.system, q, v, t))
     x, fits = complete(unforced, gamma, a_independent)
+    # What motors and constraint forces have to add to the free acceleration.
     needed, by_motors = x - unforced, metric.whiten(jnp.asarray(S))
     # The columns of free^T span the driven motions, so that free takes out the constraint forces.
     root = 1 / jnp.sqrt(weights)
+    # The least sum of weights tau^2 is the least norm of sqrt(weights) tau.
     along = matmul(free, by_motors) * root[None]
     torques = root * matmul(pseudo_inverse(along, tol), matmul(free, needed))
     rest = needed - matmul(by_motors, torques)
     sizes = jnp.sqrt(jnp.sum(needed * needed)) + jnp.sqrt(jnp.sum(unforced * unforced))
+    # What motors do not supply must be a constraint force, on which K is zero.
     is_actuated = jnp.all(jnp.abs(across(rest)) <= limit * sizes + eps_of(q))
     a, lam = metric.unwhiten(x), matmul(inverse, rest)
     return v, a, torques, lam, is_determined, agrees & fits, is_actuated, metric.is_definite()

@@ -98,6 +98,7 @@ def reduced_dynamics(
         raise ValueError(f"nu has shape {nu.shape}, expected {(size,)} as the basis has columns{batch_hint(nu, (1,))}")
     dynamics = _reduce_compiled(scene, choice, q, nu, tau, time)
     singular = dynamics.result == RESULTS.singular_basis
+    # Under tracing only the code `singular_basis` can report it.
     if is_concrete(singular) and bool(singular):
         raise ValueError(f"basis is not valid at this q: {choice.advice(scene, q, time)}")
     return dynamics
@@ -123,6 +124,7 @@ def solve_in_basis(scene: Scene, motion: VelocityAndDrift, q, tau, t) -> Reduced
     factor = cholesky(mass)
     rate = solve_cholesky(factor, force - bias)
     result = RESULTS.where(is_definite(mass, factor), RESULTS.successful, RESULTS.singular_mass_matrix)  # pyright: ignore[reportArgumentType]
+    # The sign of the quality is that of a determinant, and no measure.
     is_regular = jnp.abs(quality) > least_quality(q.dtype)
     result = RESULTS.where(is_regular, result, RESULTS.singular_basis)
     return ReducedDynamics(rate, v, matmul(N, rate) + drift, mass, bias, force, N, result)

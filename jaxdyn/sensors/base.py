@@ -51,18 +51,23 @@ class Noise(eqx.Module):
                 raise ValueError(f"{name} has shape {value.shape}; give one number, or one per entry of the reading")
             if is_concrete(value) and not np.isfinite(value).all():
                 raise ValueError(f"{name} is {value}; give finite numbers")
+            # A bias may have either sign; deviations may not.
             if name != "bias" and is_concrete(value) and (np.asarray(value) < 0).any():
                 raise ValueError(f"{name} is {value}; give standard deviations, which are not negative")
         self.std, self.bias, self.walk = (jnp.asarray(value, float) for value in values.values())
 
     def __call__(self, readings: Float[Array, "n k"], ts: Float[Array, " n"], key: Array) -> Float[Array, "n k"]:
         """Readings (n, k) at the times ts (n,), s, with errors drawn by a key."""
+        # Two keys: the white noise and the walk of the bias are independent.
         white, steps = (jax.random.normal(one, readings.shape, readings.dtype) for one in jax.random.split(key))
+        # The first span is zero, so that the walk starts from the bias at the first sample.
         spans = jnp.sqrt(jnp.diff(ts, prepend=ts[:1]).astype(readings.dtype))
+        # Leaves are cast to the dtype of the readings: float64 noise would promote them.
         entries = (1, readings.shape[1])
         std, bias, walk = (
             jnp.broadcast_to(x.astype(readings.dtype).reshape(1, -1), entries) for x in (self.std, self.bias, self.walk)
         )
+        # Increments have the variance of their spans, so that the walk does not depend on the rate of sampling.
         drift = walk * jnp.cumsum(steps * spans[:, None], 0)
         return readings + bias + drift + std * white
 
@@ -113,6 +118,7 @@ def check_sensors(scene: Scene, sensors: Any) -> tuple[Sensor, ...]:
         raise ValueError(f"sensors is {sensors!r}; give a list of sensors, such as [jd.sensors.Imu('hand')]")
     if not isinstance(scene.system, Model):
         raise ValueError(f"scene: a {type(scene.system).__name__} has no bodies for sensors; pass a Model or its scene")
+    # Readings are a dictionary by name: equal names would overwrite each other.
     names = [sensor.name for sensor in sensors]
     if twice := sorted({name for name in names if names.count(name) > 1}):
         raise ValueError(f"sensors: the name {twice[0]!r} occurs twice; give the sensors different names")
@@ -147,6 +153,7 @@ def measure(
     scene = as_scene(scene)
     sensors = check_sensors(scene, sensors)
     q, v, tau, t = check_state(scene.system, q=q, v=v, tau=zeros_if_none(tau, scene.nv), t=t)
+    # Solved once for all sensors: accelerations and multipliers belong to the same motion.
     dynamics = constrained_dynamics(scene, q, v, tau, t)
     return readings_of(sensors, Motion(scene, q, v, dynamics.acceleration, dynamics.multipliers))
 
@@ -158,6 +165,7 @@ def readings_of(sensors: Sequence[Sensor], motion: Motion) -> dict[str, Array]:
 
 def constraint_place(scene: Scene, name: str) -> slice:
     """Rows of a constraint by its name. **Raises:** ValueError for a name of none."""
+    # The layout depends on structure only, so that the slice is static under tracing.
     for place in layout(scene):
         if place.name == name:
             return slice(place.start, place.end)

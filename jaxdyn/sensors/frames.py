@@ -34,6 +34,7 @@ class _OnFrame(Sensor):
         frame_index(scene.system, self.frame)  # pyright: ignore[reportArgumentType]
 
     def _rotation(self, motion: Motion) -> Float[Array, "3 3"]:
+        # The columns are the frame's axes in the world: its transpose takes a vector of the world to the frame.
         return frame_pose(motion.scene.system, motion.q, self.frame)[:3, :3]  # pyright: ignore[reportArgumentType]
 
     def _in_frame_axes(self, motion: Motion, vector) -> Float[Array, "3"]:
@@ -41,11 +42,14 @@ class _OnFrame(Sensor):
         return matmul(self._rotation(motion).T, vector)
 
     def _velocity(self, motion: Motion) -> Float[Array, "6"]:
+        # Linear part first, of the frame's origin, both parts in world axes.
         return frame_velocity(motion.scene.system, motion.q, motion.v, self.frame)  # pyright: ignore[reportArgumentType]
 
     def _specific_force(self, motion: Motion) -> Float[Array, "3"]:
         model: Any = motion.scene.system
+        # The acceleration of the origin, which has the term w x v that the linear part of a twist's rate lacks.
         a = frame_acceleration(model, motion.q, motion.v, motion.a, self.frame)[:3]
+        # A gravity of None is that of a model without weight. At rest the reading is -g, upwards.
         return a if model.gravity is None else a - model.gravity.astype(a.dtype)
 
 
@@ -85,6 +89,7 @@ class Imu(_OnFrame):
 
     def read(self, motion: Motion) -> Float[Array, "6"]:
         """Specific force, then angular velocity."""
+        # From the world to the frame, once for both parts.
         turn = self._rotation(motion).T
         force, omega = self._specific_force(motion), self._velocity(motion)[3:]
         return jnp.concatenate([matmul(turn, force), matmul(turn, omega)])
@@ -132,9 +137,11 @@ class FramePose(_OnFrame):
 
     def read(self, motion: Motion) -> Float[Array, " k"]:
         """Position and quaternion."""
+        # The pose of the frame in the world. Its quaternion has the real part first, as those of q.
         pose = frame_pose(motion.scene.system, motion.q, self.frame)  # pyright: ignore[reportArgumentType]
         return jnp.concatenate([pose[:3, 3], so3.matrix_to_quat(pose[:3, :3])])[_POSES[self.part]]
 
 
+# Linear before angular, as in the twists of the package.
 _VELOCITIES = {None: slice(0, 6), "linear": slice(0, 3), "angular": slice(3, 6)}
 _POSES = {None: slice(0, 7), "position": slice(0, 3), "orientation": slice(3, 7)}

@@ -54,6 +54,7 @@ class Encoder(Sensor):
             step = as_array(resolution, "resolution")
             if step.shape != () or (is_concrete(step) and not 0 < float(step) < np.inf):
                 raise ValueError(f"resolution is {resolution!r}; give one positive number (rad or m), or None")
+            # A leaf, and not static: another resolution does not cause a second compilation.
             resolution = jnp.asarray(step, float)
         self.resolution, self.noise, self.delay = resolution, noise, as_delay(delay)
 
@@ -61,6 +62,7 @@ class Encoder(Sensor):
         """Refuse a joint that the model does not have. **Raises:** ValueError."""
         model: Any = scene.system
         place = model.topology.q_slices[joint_index(model, self.joint)]
+        # A quaternion rounded entry by entry is no unit quaternion.
         if self.resolution is not None and place.stop - place.start > 1:
             raise ValueError(f"{self.name!r}: joint {self.joint!r} has several coordinates; omit resolution")
 
@@ -74,6 +76,7 @@ class Encoder(Sensor):
         if self.resolution is None:
             return readings
         step = self.resolution.astype(readings.dtype)
+        # `floor` has a derivative of zero everywhere: the rounding is a constant, and the derivative that of the exact reading.
         return readings + lax.stop_gradient(step * jnp.floor(readings / step) - readings)
 
 
@@ -147,6 +150,7 @@ class ForceTorque(Sensor):
         delay: Numbers = 0.0,
     ):
         self.frame, self.joints, self.part = frame, tuple(joints), check_part(part, _PARTS)
+        # Without an inertia all that the frame's body carries lies beyond it: there is no choice of joints.
         if inertia is None and self.joints:
             raise ValueError(
                 "joints are given without inertia; give the inertia of the part beyond the mount, or omit joints"
@@ -165,9 +169,11 @@ class ForceTorque(Sensor):
         """Refuse a frame on the ground, and joints that the frame's body does not carry. **Raises:** ValueError."""
         model: Any = scene.system
         body, _ = named_frame(model, self.frame)
+        # -1 is the world, which has no joint.
         if body < 0:
             raise ValueError(f"{self.name!r}: frame {self.frame!r} stands on the ground, no joint carries it")
         for joint in self.joints:
+            # A mount divides one body: only joints on that body can be on its far side.
             if model.topology.parents[joint_index(model, joint)] != body:
                 raise ValueError(
                     f"{self.name!r}: joint {joint!r} is not on the frame's body {model.body_names[body]!r}"
@@ -178,10 +184,14 @@ class ForceTorque(Sensor):
         scene, q = motion.scene, motion.q
         model: Any = scene.system
         body, offset = named_frame(model, self.frame)
+        # Loops and feet carry loads past the joint, so that the recursion over the tree needs their wrenches.
         pulls = body_wrenches(scene, q, motion.multipliers) if scene.constraints else None
         if self.inertia is not None:
+            # With all other inertias zero the wrench through the joint is that on the part beyond the mount.
             model, beyond = _beyond(model, body, self.inertia, self.joints)
+            # Wrenches on bodies before the mount do not load it.
             pulls = None if pulls is None else pulls * beyond[:, None]
+        # At the origin and in the axes of the body; AdT takes it to those of the frame, which may be displaced and rotated.
         wrench = joint_wrench(model, q, motion.v, motion.a, model.joint_names[body], external=pulls)
         return se3.AdT_apply(jnp.asarray(offset, q.dtype), wrench)[_PARTS[self.part]]
 
@@ -193,8 +203,10 @@ def _beyond(model: Model, body: int, inertia, joints) -> tuple[Model, Array]:
     """The model with the inertias that lie beyond a mount alone, and 1 for bodies that are there, (nb,)."""
     there = np.zeros(model.nb, bool)
     for joint in joints:
+        # The whole subtree: bodies that have this joint's body among their ancestors.
         there |= model.topology.ancestors[:, joint_index(model, joint)]
     kept = jnp.asarray(there, model.inertias.dtype)
+    # The mount's own body counts only with its part beyond the mount.
     inertias = (kept[:, None] * model.inertias).at[body].set(inertia.astype(model.inertias.dtype))
     return eqx.tree_at(lambda model: model.inertias, model, inertias), kept.at[body].set(1)
 

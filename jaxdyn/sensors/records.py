@@ -53,21 +53,26 @@ def record(
     for name, (value, rest) in wanted.items():
         if not count or value.shape != (count, *rest):
             raise ValueError(f"{name} has shape {value.shape}, expected {(count, *rest)}, one row per time in ts")
+    # `jnp.interp` needs increasing times and does not test them.
     if is_concrete(ts) and not (np.diff(np.asarray(ts)) > 0).all():
         raise ValueError("ts does not increase; give the times of the samples in order")
 
     def read(q, v, tau, t):
+        # Accelerations are solved for, and not differences of v, which would amplify its rounding.
         dynamics = constrained_dynamics(scene, q, v, tau, t)
         motion = Motion(scene, q, v, dynamics.acceleration, dynamics.multipliers)
         return [sensor.read(motion) for sensor in sensors]
 
     readings = jax.vmap(read)(q, v, tau, ts)
+    # One key for each sensor: the noise of one does not depend on the number of readings of another.
     keys = [None] * len(sensors) if key is None else list(jax.random.split(key, len(sensors)))
     results = {}
     for sensor, values, one in zip(sensors, readings, keys, strict=True):
+        # Readings are interpolated at ts - delay. Before the first time `jnp.interp` returns the first one.
         late = ts - sensor.delay.astype(dtype)
         values = jax.vmap(lambda column, late=late: jnp.interp(late, ts, column), 1, 1)(values)
         if one is not None and sensor.noise is not None:
             values = sensor.noise(values, ts, one)
+        # The converter is the last element of the chain: it rounds the noise as well.
         results[sensor.name] = sensor.quantize(values)
     return results
