@@ -36,6 +36,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     )
     parser.add_argument("--version", action="version", version=f"jaxdyn {__version__}")
     commands = parser.add_subparsers(title="commands", metavar="COMMAND", required=True)
+    # A command is a module: its name, HELP, DESCRIPTION, EPILOG, add_arguments and run.
     for module in COMMANDS:
         name = module.__name__.rpartition(".")[2]
         command = commands.add_parser(
@@ -47,6 +48,7 @@ def main(argv: Sequence[str] | None = None) -> int:
         )
         module.add_arguments(command)
         command.add_argument("--debug", action="store_true", help="show the traceback of an error")
+        # argparse then selects the function together with the command.
         command.set_defaults(run=module.run)
     args = parser.parse_args(argv)
     # Commands are programs of their own, so they may choose float64; the library never does.
@@ -54,20 +56,25 @@ def main(argv: Sequence[str] | None = None) -> int:
     try:
         return args.run(args) or 0
     except BrokenPipeError:  # the reader (`head`, `less`) closed the pipe
+        # Python would report the closed pipe once more when it flushes at exit.
         sys.stderr.close()
         return 0
+    # The library refuses inputs by these three, so that they mean status 2.
     except (ValueError, OSError, ImportError) as error:
         return _complain(error, 2, args.debug)
     except (RuntimeError, MemoryError, ArithmeticError) as error:
         return _complain(error, 1, args.debug)
     except KeyboardInterrupt:
         print("jaxdyn: interrupted", file=sys.stderr)
+        # Shells report 128 plus the number of the signal, 2 for SIGINT.
         return 130
 
 
 def _complain(error: Exception, status: int, debug: bool) -> int:
+    # Users see one line; a traceback helps only those who look for a fault of the library.
     if debug:
         raise error
     text = " ".join(str(error).split()) or type(error).__name__
+    # A MemoryError has a short text that does not say what it is.
     print(f"jaxdyn: {'not enough memory: ' * isinstance(error, MemoryError)}{text}", file=sys.stderr)
     return status

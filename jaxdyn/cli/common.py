@@ -29,6 +29,7 @@ FILE = "a URDF, xacro, MJCF or SDF file, or a name of robot_descriptions such as
 
 def help_format(prog: str) -> argparse.HelpFormatter:
     """Help formatter that keeps options and their texts on one line where they fit."""
+    # Raw, because the examples in the epilogs have line breaks of their own.
     return argparse.RawDescriptionHelpFormatter(prog, max_help_position=29)
 
 
@@ -38,6 +39,7 @@ def add_model_options(parser: argparse.ArgumentParser, title: str = "model") -> 
     group.add_argument(
         "--floating-base", action="store_true", help="let the root link move freely (6 more degrees of freedom)"
     )
+    # SDF models float by default and URDF models do not, so each direction has an option.
     group.add_argument("--fixed-base", action="store_true", help="fix the root links of an SDF file to the world")
     group.add_argument(
         "--lock",
@@ -71,6 +73,7 @@ def add_model_options(parser: argparse.ArgumentParser, title: str = "model") -> 
 
 def load_model(path: str, args: argparse.Namespace) -> Model:
     """Load the model of a URDF file under the options of `add_model_options`."""
+    # A model alone imposes no couplings, so that joints which follow others are free by default.
     return _movable(load_urdf(path, mimic=args.mimic or "ignore", **_urdf_options(args)), path)
 
 
@@ -86,16 +89,19 @@ def load_scene(path: str, args: argparse.Namespace) -> tuple[LoadedScene, pathli
         scene = load(file, mimic=args.mimic, **_urdf_options(args))
         _movable(scene.system, path)
         return scene, file
+    # Options that only URDF supports are refused, since ignoring them would change the result silently.
     if args.lock:
         raise ValueError(f"--lock: joints of {kind.upper()} files cannot be locked; change the file, or use a URDF")
     if args.mimic or args.arguments:
         option = "--mimic" if args.mimic else "--arguments"
         raise ValueError(f"{option}: {file} is {kind.upper()}; leave it out")
+    # Neither option: None, for the default of the format.
     given = False if args.fixed_base else True if args.floating_base else None
     scene = load(file, floating_base=given)
     _movable(scene.system, path)
     if args.gravity is None:
         return scene, file
+    # Loaders of MJCF and SDF have no option for gravity, since the file states it.
     return eqx.tree_at(lambda s: s.system, scene, scene.system.replace(gravity=np.array(args.gravity))), file
 
 
@@ -125,6 +131,7 @@ def _urdf_options(args: argparse.Namespace) -> dict[str, Any]:
 
 
 def _movable(model: Model, path: str) -> Model:
+    # Later failures, on empty arrays, would not name the cause.
     if model.nv == 0:
         raise ValueError(f"{path}: no joint is free to move; lock fewer joints or use --floating-base")
     return model
@@ -149,6 +156,7 @@ def real(text: str) -> float:
 def whole(text: str) -> int:
     """Argument type of integers of at most 18 digits."""
     with contextlib.suppress(ValueError):
+        # Python reads "1_0" as ten; larger numbers overflow the int64 of JAX.
         if "_" not in text and abs(value := int(text)) < 2**62:
             return value
     raise argparse.ArgumentTypeError(f"{text!r} is no whole number of at most 18 digits")
@@ -168,7 +176,9 @@ def check_memory(count: float, options: str) -> None:
 
     **Raises:** ValueError that names the options.
     """
+    # Windows has no sysconf; 64 GB stands for an unknown size.
     memory = os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES") if hasattr(os, "sysconf") else 2**36
+    # Negated, so that NaN and infinity are refused too.
     if not 8 * count < memory:
         raise ValueError(
             f"{options}: {8 * count / 2**30:.3g} GB of results, and the machine has {memory / 2**30:.3g} GB; request fewer rows "
@@ -178,8 +188,10 @@ def check_memory(count: float, options: str) -> None:
 
 def vector(model: Model, items: Sequence[str], start, what: str) -> np.ndarray:
     """Parse coordinates: as many numbers as `start` has, or JOINT=NUMBER[,NUMBER...] to change some of them."""
+    # A copy, since some of its entries are overwritten.
     start = np.array(start, float)
     slices = model.topology.q_slices if what == "--q0" else model.topology.v_slices
+    # In JOINT=1,2 the comma separates the numbers of one joint; elsewhere it separates coordinates.
     items = [part for item in items for part in (item.split(",") if "=" not in item else [item])]
     if not any("=" in item for item in items):
         if len(items) != len(start):
@@ -212,6 +224,7 @@ def coordinate_labels(model: Model) -> tuple[list[str], list[str]]:
     labels, torque_units = [], []
     for name, kind in zip(model.joint_names, model.topology.kinds, strict=True):
         for i in range(KINDS[kind].nv):
+            # Velocities of free and planar joints have the linear part first.
             linear = kind == "prismatic" or (kind == "free" and i < 3) or (kind == "planar" and i < 2)
             labels.append(name if KINDS[kind].nv == 1 else f"{name}[{i}]")
             torque_units.append("N" if linear else "N m")
@@ -223,6 +236,7 @@ def output_path(text: str | None, suffixes: Sequence[str], option: str) -> pathl
     if text is None:
         return None
     path = as_path(text, option)
+    # The suffix selects the writer, so it is checked with the path.
     if path.suffix.lower() not in suffixes:
         raise ValueError(f"{option} {text}: write to a file that ends in {' or '.join(suffixes)}")
     if not path.parent.is_dir():
@@ -234,6 +248,7 @@ class Stopwatch:
     """Wall-clock time since construction, in seconds."""
 
     def __init__(self):
+        # A monotonic clock: corrections of the wall clock do not show.
         self._start = time.perf_counter()
 
     def __str__(self):

@@ -68,12 +68,14 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(args: argparse.Namespace) -> None:
     """Optimise, print the gain, write the motion."""
+    # Paths are checked before the optimisation, which takes minutes.
     out, plot = (
         output_path(args.out, (".csv", ".npz"), "--out"),
         output_path(args.plot, (".png", ".pdf", ".svg"), "--plot"),
     )
     if not args.rate > 0 or args.periods < 1:
         raise ValueError(f"--rate is {args.rate}, --periods is {args.periods}; give positive numbers")
+    # Negated, so that NaN is refused.
     if not args.period > 0:
         raise ValueError(f"--period is {args.period} s; give a positive time")
     check_least(args, harmonics=1, steps=0, seed=0)
@@ -88,6 +90,7 @@ def run(args: argparse.Namespace) -> None:
     check_memory(
         rows * (1 + model.nq + 3 * model.nv), f"--rate {args.rate:g} --period {args.period:g} --periods {args.periods}"
     )
+    # 14 parameters for each joint: ten of its body, four of friction and rotor.
     check_memory(100.0 * args.harmonics * (model.nv * 14) ** 2, f"--harmonics {args.harmonics}")
     velocity, torque = (
         None if value is None else per_coordinate(model, value, f"--{name}")
@@ -113,6 +116,7 @@ def run(args: argparse.Namespace) -> None:
     )
     print("limits used: " + ", ".join(f"{name} {100 * share:.0f} %" for name, share in motion.used.items()))
     q, v, tau = (np.asarray(x) for x in (log.q, log.v, log.tau))
+    # For a check by eye against the limits before the motion is run.
     extremes = [q.min(axis=0), q.max(axis=0), abs(v).max(axis=0), abs(tau).max(axis=0)]
     rows = [
         [label, *(f"{float(x[j]):.3g}" for x in extremes), unit]
@@ -123,6 +127,7 @@ def run(args: argparse.Namespace) -> None:
         write_log(out, log)
         print(f"Wrote {out}.")
     if plot is not None:
+        # Imported on use: matplotlib is an extra.
         from jaxdyn.reports.plotting import motion_figure
 
         motion_figure(model, log.t, q[None], v[None], tau[None]).savefig(plot)

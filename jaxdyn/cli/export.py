@@ -65,6 +65,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 def run(args: argparse.Namespace) -> None:
     """Export the function and print the paths of its files."""
     scene, _ = load_scene(args.file, args)
+    # The examples fix shapes and dtypes; neutral keeps quaternions of unit length in the reference results.
     names, example = _ARGUMENTS[args.function], np.asarray(jd.neutral(scene.system), float)
     rest = np.zeros(scene.system.nv)
     name = args.function if args.name is None else args.name
@@ -76,6 +77,7 @@ def run(args: argparse.Namespace) -> None:
         batch=args.batch,
     )
     folder = exported.save(args.out, args.target, args.abi, cpu=args.cpu, features=args.features)
+    # The folder may hold exports of other names.
     files = ", ".join(sorted(x.name for x in folder.iterdir() if x.name.startswith(name)))
     print(f"{exported} for {args.target}, in {folder}: {files}")
 
@@ -84,8 +86,10 @@ def _function_of(scene, name: str) -> Callable:
     """Function of arrays only, with the parameter names of the C header."""
     system = scene.system
     if name == "constrained_dynamics":
+        # An exported function returns one array; the result of the library holds more.
         return lambda q, v, tau: jd.constrained_dynamics(scene, q, v, tau).acceleration
     function = getattr(jd, name)
+    # The C header takes its argument names from the signature, so `*args` would not do.
     wrappers: dict[tuple[str, ...], Callable] = {
         ("q", "v", "tau"): lambda q, v, tau: function(system, q, v, tau),
         ("q", "v", "a"): lambda q, v, a: function(system, q, v, a),

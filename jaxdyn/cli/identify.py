@@ -65,6 +65,7 @@ METHODS = ("feasible", "least-squares", "trajectory")
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Add the arguments of the command: those of daily use first, the rest as "advanced"."""
+    # The generated usage would list all options, and a user needs two of them.
     parser.usage = "%(prog)s [FIT.toml] --urdf ROBOT.urdf --log FILE ... [options]"
     # A repeated option extends its list: shells expand one pattern per option.
     several: dict[str, Any] = {"nargs": "+", "action": "extend", "default": []}
@@ -129,6 +130,7 @@ def _add_expert_options(data, fit, several: dict[str, Any]) -> None:
 @on_one_thread
 def run(args: argparse.Namespace) -> None:
     """Fit, print errors and parameters, write the files."""
+    # First, because the options of the file pass the same checks below.
     args = with_file(args, add_arguments)
     missing = [name for name, value in (("--urdf", args.urdf), ("--log", args.log)) if not value]
     if missing:
@@ -137,8 +139,10 @@ def run(args: argparse.Namespace) -> None:
         )
     check_least(args, every=1, trim=0, steps=0)
     for name in ("payload_mass", "horizon"):
+        # Negated, so that NaN is refused.
         if (value := getattr(args, name)) is not None and not value > 0:
             raise ValueError(f"--{name.replace('_', '-')} is {value}; give a positive number")
+    # Paths are checked before the fit, which takes minutes.
     out = output_path(args.out, (".urdf",), "--out")
     json_path = output_path(args.report, (".json",), "--report")
     html = output_path(args.html, (".html",), "--html")
@@ -147,13 +151,16 @@ def run(args: argparse.Namespace) -> None:
     if out is not None and args.method == "least-squares":
         raise ValueError("--out: least squares gives combinations of parameters and no bodies, so there is no URDF to "
                          "write; use --method feasible, or --report FILE.json")  # fmt: skip
+    # The report belongs to the robot that is written: it states the errors.
     json_path = out.with_suffix(".json") if json_path is None and out is not None else json_path
     train_paths, test_paths = log_paths(args)
+    # Before logs are read and filtered, which takes longer than the check.
     if args.method == "trajectory" and len(train_paths) > 1:
         raise ValueError("--log: --method trajectory fits one log; use --method feasible for several")
     if args.payload_log and args.method != "feasible":
         raise ValueError(f"--payload-log: --method {args.method} does not support payloads; use --method feasible")
     model, given = load_for_repair(args.urdf, args) if args.repair else (load_model(args.urdf, args), [])
+    # Links that were merged into a body are frames, and a payload is identified for a body.
     if args.payload_body is not None and args.payload_body not in model.body_names:
         raise ValueError(f"--payload-body {args.payload_body}: the bodies are {', '.join(model.body_names)}")
     if args.repair:
@@ -168,28 +175,34 @@ def run(args: argparse.Namespace) -> None:
 
     gains, loaded = None, [filter_log(raw_log(model, path, args), path, args, cutoff) for path in args.payload_log]
     if args.payload_mass is not None:
+        # Held-out samples must not influence the gains either.
         empty = logs if test_paths else [identify.split(log, args.train)[0] for log in logs]
         gains = find_gains(model, empty, loaded, options, args)
         logs, loaded = ([gains.scale(log) for log in group] for group in (logs, loaded))
 
     watch = Stopwatch()
     if test_paths:
+        # Separate test logs: one fit is both reported and written.
         final = judge = make_fit(model, logs, options, args)
         tests = [filter_log(raw_log(model, path, args), path, args, cutoff) for path in test_paths]
+        # The fit predicts true torques, so test logs need the same scale as the training logs.
         tests = tests if gains is None else [gains.scale(log) for log in tests]
         test_names, trained = names[len(logs) :], logs
     else:
         trained, tests = (list(part) for part in zip(*(identify.split(log, args.train) for log in logs), strict=True))
         test_names = [f"{name} (last {100 * (1 - args.train):.3g} %)" for name in names]
+        # The errors that are reported come from this fit, which has not seen the held-out samples.
         judge = make_fit(model, trained, options, args)
         # The settings chosen on the training part stay; the parameters are refitted to all samples.
         final = make_fit(model, logs, resolve_options(options, judge), args)
     seconds = str(watch)
+    # Least squares and the trajectory fit have no choice of settings around the fit.
     fit = final.fit if isinstance(final, RobotFit) else final
     v_s = float(fit.v_s if isinstance(fit, LeastSquares) else fit.friction.v_s)
     findings = Findings(
         model=model,
         result=final,
+        # Errors on held-out samples are of the fit without them; `final` has seen all.
         tests=_evaluate(model, judge, test_names, tests),
         train=_evaluate(model, judge, names[: len(logs)], trained),
         final=_evaluate(model, final, names[: len(logs)], logs),
@@ -199,6 +212,7 @@ def run(args: argparse.Namespace) -> None:
         identifiability=identify.identifiability(model, logs, base_terms(fit.terms), v_s=v_s),
         choice=judge.choice if isinstance(judge, RobotFit) else None,
     )
+    # The warnings are derived from the other fields, so the list is filled afterwards.
     findings.warnings.extend(_warnings(findings))
     if gains is not None:
         # Gains first: every later number refers to scaled torques.
@@ -213,6 +227,7 @@ def run(args: argparse.Namespace) -> None:
         print(f"Wrote {out}.")
     payload = None
     if isinstance(final, RobotFit) and args.payload_log:
+        # The robot's own parameters are those of the fit, so that only the payload is unknown.
         payload = identify.fit_payload(model, logs, loaded, args.payload_body, robot=final)
         print(payload_text(payload))
     if json_path is not None:
@@ -220,9 +235,11 @@ def run(args: argparse.Namespace) -> None:
             {} if payload is None else {"payload": payload_content(payload)}
         )
         report |= {} if gains is None else {"drive_gains": gains_content(gains)}
+        # Written atomically, as other programs may be reading the file.
         write_text(json_path, json.dumps(report, indent=2) + "\n")
         print(f"Wrote {json_path}.")
     if html is not None:
+        # Imported on use: matplotlib is an extra.
         from jaxdyn.reports.identification_page import page
 
         labels, units = coordinate_labels(model)
@@ -245,14 +262,17 @@ def _extra_torques(result: RobotFit | Fit) -> dict[str, dict[str, float]]:
     named: dict[str, Any] = {"offset": fit.friction.offset, "v_s": np.full(model.nv, float(fit.friction.v_s))}
     if fit.extra is not None:
         for name, values in fit.extra.by_term.items():
+            # A term may have several numbers for each joint, stored one after the other.
             group = np.array(values).reshape(-1, model.nv)
             named |= {f"{name}{k + 1 if len(group) > 1 else ''}": row for k, row in enumerate(group)}
     places = {
         name: where.start
         for name, where in zip(model.joint_names, model.topology.v_slices, strict=True)
+        # URDF joints of several coordinates have no place for a number of each.
         if where.stop - where.start == 1
     }
     return {
+        # Zero terms are left out; offset and v_s are always needed to reproduce the torques.
         joint: {name: float(row[place]) for name, row in named.items() if name in ("offset", "v_s") or row[place]}
         for joint, place in places.items()
     }
@@ -278,6 +298,7 @@ def _outcome(result: RobotFit | Fit | LeastSquares) -> str:
 def _evaluate(model: Model, result, names: list[str], logs: list[Log]) -> list[Evaluation]:
     nominal = identify.nominal_parameters(model)
     fit = result.fit if isinstance(result, RobotFit) else result
+    # Delays are removed from the torques, as they were for the fit.
     logs = [result.align(log) for log in logs] if isinstance(result, RobotFit) else logs
     return [
         Evaluation(name, log, fit.torques(log), log_regressor(model, log) @ nominal)
@@ -288,12 +309,14 @@ def _evaluate(model: Model, result, names: list[str], logs: list[Log]) -> list[E
 def _warnings(findings: Findings) -> list[str]:
     lines = []
     labels, _ = coordinate_labels(findings.model)
+    # After a refit the held-out parts are among the training logs already.
     for one in (*findings.final, *(findings.tests if not findings.is_refit else ())):
         lines += [f"{one.name}: {line}" for line in check_log_content(findings.model, one.log, labels)]
         # Residuals are checked too: drift at rest points to friction or offsets that the model lacks.
         lines += [
             f"{one.name}: {line}" for line in check_rest(one.log, one.predicted - np.asarray(one.log.tau), labels)
         ]
+        # Vibration above the cut-off has been filtered out and needs no advice.
         share, edge = vibration(one.log, one.predicted - np.asarray(one.log.tau))
         if share > _VIBRATES and (one.log.cutoff is None or edge < one.log.cutoff):
             fix = f"low-pass it at {edge:.2g} Hz" if one.log.cutoff is None else f"try --cutoff {edge:.2g}"

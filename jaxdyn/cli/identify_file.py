@@ -35,6 +35,7 @@ def with_file(args: argparse.Namespace, add_arguments) -> argparse.Namespace:
         table = tomllib.loads(path.read_text(encoding="utf-8"))
     except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
         raise ValueError(f"{path}: {error}") from None
+    # A help option in a file would print and exit.
     parser = _Parser(add_help=False)
     add_arguments(parser)
     defaults = vars(parser.parse_args([]))
@@ -49,8 +50,10 @@ def with_file(args: argparse.Namespace, add_arguments) -> argparse.Namespace:
         given = vars(parser.parse_args(tokens))
     except ValueError as error:
         raise ValueError(f"{path}: {error}") from None
+    # The positional argument takes what is left over, such as a second value of an option with one.
     if given["file"] is not None:
         raise ValueError(f"{path}: unrecognized arguments: {given['file']}; an option of one value has a list")
+    # An option that the command line sets to its default looks like one that is left out; the file wins then.
     merged = vars(args) | {key: given[key] for key, value in defaults.items() if getattr(args, key) == value}
     return argparse.Namespace(**merged | {"file": args.file})
 
@@ -60,11 +63,14 @@ def _tokens(name: str, value: Any, path) -> list[str]:
     option = f"--{name.replace('_', '-')}"
     if name in _YES_NO and isinstance(value, bool):
         value = "yes" if value else "no"
+    # Flags have no value on the command line: false means that the option is absent.
     if isinstance(value, bool):
         return [option] if value else []
     values = value if isinstance(value, list) else [value]
     if any(isinstance(item, bool | dict | list) for item in values):
         raise ValueError(f"{path}: {name} is {value!r}; give a number, a string, or a list of them")
     if name.replace("-", "_") in _FILES:
+        # An absolute path stays: joining drops the folder in front of it.
         values = [path.parent / str(item) for item in values]
+    # The form --option=value lets a value start with a minus sign.
     return [option, *map(str, values)] if isinstance(value, list) else [f"{option}={values[0]}"]

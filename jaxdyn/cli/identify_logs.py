@@ -20,6 +20,7 @@ def log_paths(args) -> tuple[list[str], list[str]]:
     """Training and test files. **Raises:** ValueError for a file that is given twice."""
     seen: dict[pathlib.Path, str] = {}
     for path in [*args.log, *args.test_log]:
+        # Two spellings of one file are still one file.
         place = pathlib.Path(path).resolve()
         if place in seen:
             where = "--test-log: a training log is no test of the fit" if path in args.test_log else "--log"
@@ -31,6 +32,7 @@ def log_paths(args) -> tuple[list[str], list[str]]:
 def log_names(paths: list[str]) -> list[str]:
     """Names of files, with their folders where two would be the same."""
     names = [pathlib.Path(path).name for path in paths]
+    # Names are keys of the report, and two logs of one name would overwrite each other.
     return [path if names.count(name) > 1 else name for path, name in zip(paths, names, strict=True)]
 
 
@@ -39,6 +41,7 @@ def raw_log(model: Model, path: str, args) -> Log:
 
     **Raises:** ValueError for logs that do not fit the model, and for outliers.
     """
+    # Repairs follow below with the model, whose continuous joints may turn without limit.
     raw = read_log(path, joint_names=model.joint_names, rename=_renaming(args.rename), unwrap=False, outliers="keep")
     if raw.q.shape[1] != model.nq or raw.nv != model.nv:
         raise ValueError(
@@ -49,6 +52,7 @@ def raw_log(model: Model, path: str, args) -> Log:
         raise ValueError(f"{_span(path, raw)}; a log needs more than one sample")
     try:
         with warnings.catch_warnings(record=True) as caught:
+            # Python shows a repeated warning once, and each log has its own.
             warnings.simplefilter("always")
             raw = repair_log(raw, model, unwrap=_UNWRAP[args.unwrap], outliers=args.outliers)
     except ValueError as error:
@@ -65,6 +69,7 @@ def log_cutoff(logs: list[Log], args) -> float | None:
 
     **Raises:** ValueError for an invalid cut-off, and for logs that do not determine one.
     """
+    # Logs with v and a are used as they are, so they must not influence the choice.
     logs = [log for log in logs if not (args.filtered or _has_derivatives(log))]
     if args.cutoff != "auto":
         cutoff = number(args.cutoff, "--cutoff")
@@ -94,14 +99,17 @@ def filter_log(raw: Log, path: str, args, cutoff: float | None) -> Log:
     **Raises:** ValueError for logs that are too short for the filter.
     """
     span = _span(path, raw)
+    # Filtering twice would attenuate the signals near the cut-off once more.
     if _has_derivatives(raw):
         print(f"{span}, with v and a: used as filtered")
         return raw
     if args.filtered:
         print(f"{span}, used as filtered; missing v and a are computed by differences")
+        # A filtered signal is smooth enough for central differences.
         v = np.gradient(np.asarray(raw.q), np.asarray(raw.t), axis=0) if raw.v is None else raw.v
         a = np.gradient(np.asarray(v), np.asarray(raw.t), axis=0)
         return Log(raw.t, raw.q, v, a, raw.tau, joint_names=raw.joint_names)
+    # The mean rate, because sampling may jitter.
     rate = (len(raw) - 1) / float(raw.t[-1] - raw.t[0])
     if cutoff is None:  # all training logs are filtered already, this one is raw
         cutoff = log_cutoff([raw], args)

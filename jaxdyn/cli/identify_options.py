@@ -31,6 +31,7 @@ def parse_options(args) -> Options:
 
     **Raises:** ValueError for options that the method does not support, and invalid numbers.
     """
+    # The other two methods choose nothing by cross-validation, so "auto" becomes a fixed value for them.
     simple = args.method != "feasible"
     terms = args.terms
     if terms is None or terms == ["auto"]:
@@ -43,6 +44,7 @@ def parse_options(args) -> Options:
     v_s = args.v_s if args.v_s == "auto" else number(args.v_s, "--v-s")
     prior = args.prior if args.prior == "auto" else number(args.prior, "--prior")
     if simple:
+        # The constants of `fit_torques` by default; only "feasible" chooses them.
         v_s, prior = 0.01 if v_s == "auto" else v_s, 1.0 if prior == "auto" else prior
     robust = {"auto": "auto", "none": None}.get(args.robust, args.robust)
     robust = number(robust, "--robust") if robust not in ("auto", None) else robust
@@ -64,6 +66,7 @@ def find_gains(model: Model, unloaded: list[Log], loaded: list[Log], options: Op
             f"--payload-mass {args.payload_mass:g}: gains need --payload-log, logs with the payload, and --payload-centre X Y Z, "
             "its centre of mass in the frame of the link that holds it"
         )
+    # `fit_gains` supports the terms of `TERMS` alone.
     terms = TERMS if options.terms == "auto" else tuple(term for term in TERMS if term in options.terms)
     return identify.fit_gains(
         model,
@@ -95,6 +98,7 @@ def resolve_options(options: Options, result) -> Options:
     delay = options.delay
     if delay == "auto" and (result.delays is None or not np.any(result.delays.seconds)):
         delay = 0.0  # no delay lowers the error
+    # Another choice on all samples would make the reported error that of other settings.
     return options._replace(
         terms=result.terms, v_s=setting.v_s, prior=setting.prior, robust=setting.robust, delay=delay
     )
@@ -127,15 +131,19 @@ def make_fit(model: Model, logs: list[Log], options: Options, args) -> RobotFit 
             delay=options.delay,
             callback=tell,
         )
+    # One log alone, as the command has checked.
     (log,) = logs
     v_s = float(options.v_s)
+    # The trajectory fit starts from the parameters of the torque fit.
     fit = identify.fit_torques(model, log, options.terms, v_s=v_s, prior=float(options.prior), callback=show)
+    # The median, so that a gap in the log does not lengthen the horizon.
     dt = float(np.median(np.diff(np.asarray(log.t))))
     return identify.fit_trajectory(
         fit.model,
         log,
         options.terms,
         v_s=v_s,
+        # At least one step and not longer than the log.
         horizon=min(max(1, round(args.horizon / dt)), len(log) - 1),
         steps=args.steps,
         callback=show,

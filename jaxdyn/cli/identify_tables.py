@@ -79,6 +79,7 @@ def _identifiability_text(findings: Findings) -> str:
     lasting = ", ".join(
         f"{label} {short(float(x), 2)}" for label, x in zip(labels, first.whiteness.correlation_time, strict=True)
     )
+    # The worst joint, because intervals depend on the number of independent errors.
     worst = round(float(first.whiteness.effective_samples.min()))
     return (
         f"Identifiability: {findings.identifiability.summary()}\n"
@@ -111,17 +112,20 @@ def delays_text(delays: Delays, labels) -> str:
 def _robot_base_table(result: RobotFit, model: Model) -> str:
     base, combinations = result.intervals.base, result.intervals.combinations
     basic = tuple(term for term in result.fit.terms if term in TERMS)
+    # The file's parameters in the same combinations, so that the columns compare.
     start = combinations.values(nominal_parameters(model)[free_columns(model.nb, model.nv, basic)])
     rows = [
         [name, short(x0), short(x), short(result.intervals.factor * s, 2), source]
         for name, x0, x, s, source in zip(base.names, start, base.values, base.std, base.sources, strict=True)
     ]
     text = "Base parameters: URDF, fitted, half-width of the 95 % interval, and source"
+    # Large robots have hundreds of combinations; the report holds all of them.
     return text + "\n" + table(["combination", "URDF", "fitted", "+-", "from"], rows[:_BASE_ROWS])
 
 
 def _mass_table(findings: Findings) -> str:
     model = findings.model
+    # Only fits of a robot know whether a mass comes from the data or from the prior.
     sources = {}
     if isinstance(findings.result, RobotFit):
         spread = findings.result.intervals.parameters
@@ -129,6 +133,7 @@ def _mass_table(findings: Findings) -> str:
     rows = []
     fitted = findings.parameters[: 10 * model.nb].reshape(-1, 10)
     for name, old, new in zip(model.body_names, np.asarray(model.inertias), fitted, strict=True):
+        # Least-squares parameters may have a mass of zero or below.
         centre = [short(x, 3) for x in new[1:4] / new[0]] if new[0] > 0 else ["-"] * 3
         rows.append([name, short(old[0]), short(new[0]), sources.get(f"{name}.m", "-"), *centre])
     text = "Bodies: mass (kg) in the URDF and fitted, source, fitted centre of mass (m)"

@@ -60,6 +60,7 @@ def run(args: argparse.Namespace) -> None:
     model, is_urdf = scene.system, format_of(file) == "urdf"
     if out is not None and not is_urdf:
         raise ValueError(f"--repair {args.repair}: only URDF files can be repaired; change the inertias in {file}")
+    # Read once more for names and unused elements, which a model does not hold.
     source = XmlFile(file, "robot", xacro_arguments(args))
     body_problems = _of_the_file(inertia_report(model), source)
     print(describe(scene, args.file))
@@ -74,6 +75,7 @@ def run(args: argparse.Namespace) -> None:
     if out is not None:
         repaired = repair_inertias(model)
         save_urdf(repaired, out)
+        # Massless bodies stay as they are and are no repairs.
         changed = [name for name, *_ in body_problems if name not in dict(inertia_report(repaired))]
         print(f"\nWrote {out}: inertias of {len(changed)} bodies repaired{_name_list(changed)}.")
 
@@ -91,6 +93,7 @@ def _base(scene: LoadedScene) -> str:
         i for i, (parent, kind) in enumerate(zip(top.parents, top.kinds, strict=True)) if parent < 0 and kind == "free"
     ]
     held = []
+    # The root of an SDF model floats by default, and a loop may hold it to the ground.
     if free and scene.constraints:
         rows = np.asarray(constraint_jacobian(scene, scene.starts["reference"].q, jnp.zeros(())), np.float64)
         _, singular, right = np.linalg.svd(rows)
@@ -135,6 +138,7 @@ def constraint_lines(scene: LoadedScene) -> str:
             holonomic, nonholonomic = one.sizes(scene.system, q.dtype)
             gaps = [_gap(one, scene, start.q) for start in scene.starts.values()]
             rows.append([one.name, type(one).__name__.lower(), str(holonomic + nonholonomic), *gaps])
+        # Four states fit on a line.
         heads = ["constraint", "kind", "rows", *(f"gap at {name!r}" for name in list(scene.starts)[:4])]
         lines += [
             "Loops and couplings such as <mimic>, with their gaps (m or rad)",
@@ -170,6 +174,7 @@ def _closure(scene: LoadedScene, q) -> list[str]:
 def _assemblies_near(scene: LoadedScene, q) -> list:
     """A few assembled configurations around q: loops of a file that gives one pose of each body are closed in that pose only."""
     configurations, random = [], np.random.default_rng(0)
+    # Two are enough to see a gap that does not vanish away from the file's pose.
     for _ in range(2):
         step = jnp.asarray(random.uniform(-0.1, 0.1, scene.nv), q.dtype)
         with contextlib.suppress(ValueError):  # not every configuration nearby can be assembled
@@ -181,6 +186,7 @@ def _repeats(scene: LoadedScene, closed, kept) -> list[str]:
     """Lines on the redundant rows of each constraint, with their gaps in assembled configurations."""
     gaps = np.zeros((len(closed), len(kept)))
     for place, q in enumerate(closed):
+        # Rows of velocities have no gap of position and stay at zero.
         gaps[place, holonomic_rows(layout(scene))] = np.abs(np.asarray(position_residual(scene, q, 0.0)))
     lines = []
     for place in layout(scene):
@@ -193,6 +199,7 @@ def _repeats(scene: LoadedScene, closed, kept) -> list[str]:
 
 
 def _gap(constraint, scene: LoadedScene, q) -> str:
+    # A nonholonomic constraint has no position residual.
     residual = constraint.position(scene.system, q, 0.0)
     return "-" if residual is None else f"{float(np.abs(np.asarray(residual)).max(initial=0.0)):.2g}"
 
@@ -206,6 +213,7 @@ def _joint_table(model: Model) -> str:
     for i, (name, kind) in enumerate(zip(model.joint_names, topology.kinds, strict=True)):
         in_q, in_v = topology.q_slices[i], topology.v_slices[i]
         screw = screws[i]
+        # Adding 0.0 turns -0.0 into 0.0.
         axis = "" if KINDS[kind].nv > 1 else " ".join(f"{x + 0.0:.4g}" for x in screw[:3] if kind == "prismatic")
         axis = axis or ("" if KINDS[kind].nv > 1 else " ".join(f"{x + 0.0:.4g}" for x in screw[3:]))
         parent = "world" if topology.parents[i] < 0 else model.body_names[topology.parents[i]]

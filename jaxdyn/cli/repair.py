@@ -32,6 +32,7 @@ def load_for_repair(path: str, args: argparse.Namespace) -> tuple[Model, list[st
             tree, names = None, []
         if tree is None or not names:
             raise
+        # The loader reads files alone, and the user's own file must not change.
         with tempfile.TemporaryDirectory() as folder:
             file = pathlib.Path(folder) / pathlib.Path(path).name
             tree.write(file, encoding="utf-8", xml_declaration=True)
@@ -53,6 +54,7 @@ def _add_balls(robot: ET.Element) -> list[str]:
         own = link.find("inertial/mass")
         if link.get("name") not in moving or (own is not None and parse_number(own.get("value", "0")) > 0):
             continue
+        # An <inertial> of zero mass would be a second one next to the ball.
         for old in link.findall("inertial"):
             link.remove(old)
         inertial = ET.SubElement(link, "inertial")

@@ -66,6 +66,7 @@ def run(args: argparse.Namespace) -> int:
         "rounds": args.rounds,
         "out": args.out,
     }
+    # Flushed, since a full report runs for hours and its output may go to a file.
     result = report(args.scenes, full=args.full, echo=lambda line: print(line, flush=True), **options)
     print(f"\n{result.table()}\n\n{len(result.records)} runs in {watch}, compilation included.")
     if args.out:

@@ -152,6 +152,7 @@ def run(args: argparse.Namespace) -> int:
     check_least(args, spread=0, max_steps=1, torque_size=0, damping=0, friction=0, rank_tol=0)
     loaded, file = load_scene(args.file, args)
     model = loaded.system
+    # Before the starts and the torques of the batch are allocated, which happens ahead of the rows.
     check_memory(8.0 * args.batch * (model.nq + 2 * model.nv + 3), f"--batch {args.batch}")
     control, q0, v0, duration = _excitation(loaded, args)
     if args.duration is not None:
@@ -162,9 +163,11 @@ def run(args: argparse.Namespace) -> int:
     rows = float(duration) / args.sample
     # Rows of q, v, torques, energy and work, and as much again while they are computed and written.
     check_memory(2 * args.batch * (rows + 1) * (model.nq + 2 * model.nv + 3), size)
+    # The end is met exactly; rows may be a little closer or farther than --sample.
     ts = np.linspace(0.0, duration, round(rows) + 1)
     scene = Scene(model, loaded.constraints, _forces(loaded, args))
     starts, speeds = _starts(scene, q0, v0, args)
+    # A fixed step has no tolerance, so only one of the two is passed.
     steps = {"stepsize": args.dt} if args.dt is not None else {"rtol": args.rtol, "atol": args.rtol}
     if args.rank_tol is not None:
         steps["method"] = Projected(rank_tol=args.rank_tol)
@@ -188,7 +191,9 @@ def run(args: argparse.Namespace) -> int:
         motion_figure(model, ts, solution.q, solution.v, tau).savefig(plot)
         print(f"Wrote {plot}.")
     if page is not None or args.view:
+        # A model holds no geometry, so the file is read again.
         solids = shapes(file, arguments=xacro_arguments(args))
+        # Viewers draw torques of the solution, and `simulate` was not asked to store them.
         moving = eqx.tree_at(lambda s: s.torque, solution, tau, is_leaf=lambda x: x is None)
         if page is not None:
             save_html(page, scene, moving, shapes=solids)
@@ -197,6 +202,7 @@ def run(args: argparse.Namespace) -> int:
             view(scene, moving, shapes=solids, block=True)
     if not done.all():
         reached = np.asarray(solution.stats["time_reached"])[~done]
+        # The earliest failure is shown: later ones often have the same cause.
         first = int(np.flatnonzero(~done)[np.argmin(reached)])
         reason = str(RESULTS[jax.tree.map(lambda x: x[first], solution.result)])
         print(
@@ -214,10 +220,12 @@ def _excitation(scene: LoadedScene, args):
     q0, v0, duration = np.asarray(start.q), np.asarray(start.v), 2.0
     size = _torque_size(model, args)
     if args.torque in _KINDS:
+        # Zeros and not another control: every kind of torque shares one code path.
         random = size if "random" in args.torque else 0 * size
         keys = jax.random.split(jax.random.key(args.seed), args.batch)
         control = jax.vmap(lambda key: random_torque(key, random))(keys)
     elif pathlib.Path(args.torque).suffix.lower() in (".csv", ".npz"):
+        # Replayed torques were prescribed: a jump in them is no corrupted sample.
         log = read_log(args.torque, joint_names=model.joint_names, unwrap=False, outliers="keep")
         if (log.q.shape[1], log.nv) != (model.nq, model.nv):
             raise ValueError(f"--torque {args.torque}: the log has {log.q.shape[1]} columns of q and {log.nv} of tau, the "
@@ -227,6 +235,7 @@ def _excitation(scene: LoadedScene, args):
         t = np.asarray(log.t) - float(log.t[0])
         duration = float(t[-1])
         replay = SampledTorque(jnp.asarray(t), jnp.asarray(log.tau))
+        # The batch is over all leaves of the control, so a replay is repeated for each motion.
         control = jax.tree.map(lambda x: jnp.broadcast_to(x, (args.batch, *x.shape)), replay)
     else:
         raise ValueError(f"--torque is {args.torque!r}; give {', '.join(_KINDS)}, or a log FILE.csv or FILE.npz")
@@ -241,16 +250,20 @@ def _torque_size(model: Model, args) -> jax.Array:
     if args.torque_size is not None:
         return jnp.asarray(per_coordinate(model, args.torque_size, "--torque-size"))
     limit = np.asarray(model.effort_limit)
+    # Files without limits have infinity or 0 there.
     return jnp.asarray(np.where(np.isfinite(limit) & (limit > 0), 0.01 * limit, 1.0))
 
 
 def _starts(scene: Scene, q0, v0, args) -> tuple[jax.Array, jax.Array]:
     """Initial positions (n, nq) and velocities (n, nv) of the motions, on the constraints."""
+    # Another seed than that of the torques, which would be correlated with the starts otherwise.
     away = args.spread * jax.random.normal(jax.random.key(args.seed + 1), (args.batch, scene.nv))
+    # Displacements on the manifold keep quaternions of unit length.
     starts = jax.vmap(lambda step: integrate(scene.system, jnp.asarray(q0), step))(away)
     speeds = jnp.broadcast_to(jnp.asarray(v0), (args.batch, scene.nv))
     if not scene.constraints:
         return starts, speeds
+    # One by one: assembly checks concrete numbers and raises for a start that cannot close.
     closed = [assemble(scene, q, v) for q, v in zip(starts, speeds, strict=True)]
     moved = max(float(jnp.abs(x.q - q).max()) for x, q in zip(closed, starts, strict=True))
     if moved > 1e-9:
@@ -267,6 +280,7 @@ def _forces(scene: LoadedScene, args) -> list:
         values = per_coordinate(scene.system, given, f"--{option}")
         if np.any(values < 0):
             raise ValueError(f"--{option} is {values.tolist()}; it must not be negative")
+        # A given value replaces that of the file; adding both would count friction twice.
         forces = [one for one in forces if not isinstance(one, force)] + ([force(values)] if values.any() else [])
     return forces
 
@@ -294,7 +308,9 @@ def _summarise(model: Model, solution: Solution, done: np.ndarray) -> None:
     if not done.any():
         return
     energy, work = np.asarray(solution.energy)[done], np.asarray(solution.work)[done]
+    # Rows of motions that stopped early are NaN and are left out by `done`.
     drift = np.abs(energy - energy[:, :1] - work).max()
+    # The drift means little without the scale of the energy that was exchanged.
     exchanged = max(np.ptp(energy, axis=1).max(), np.abs(work).max())
     print(
         f"energy minus work of torques and friction: at most {drift:.2e} J from its initial value, "
@@ -314,11 +330,13 @@ def _write(path: pathlib.Path, count: int, ts, solution: Solution, tau) -> None:
     arrays = {"q": solution.q, "v": solution.v, "tau": tau, "energy": solution.energy}
     arrays = {name: np.asarray(value) for name, value in arrays.items()}
     if path.suffix.lower() == ".npz":
+        # A single motion has no axis of motions, so that scripts need not index it.
         arrays = arrays if count > 1 else {name: value[0] for name, value in arrays.items()}
         np.savez_compressed(path, t=ts, **arrays)  # pyright: ignore[reportArgumentType]
         return
     header = ["rollout"] if count > 1 else []
     header += ["t", *(f"{name}{i + 1}" for name in ("q", "v", "tau") for i in range(arrays[name].shape[2])), "energy"]
+    # newline="" is required by `csv`: on Windows the line ends would otherwise be doubled.
     with path.open("w", newline="") as file:
         writer = csv.writer(file)
         writer.writerow(header)

@@ -86,6 +86,7 @@ _KEYS: dict[str, tuple[type, ...]] = {
 }
 # Options of `jd.simulate` that a file can set, and of `jd.scale.run`.
 _OPTIONS = {"batch_size", "lanes", "memory", "compress", "verify", *inspect.signature(simulate).parameters}
+# The study sets these itself, or a file cannot express them.
 _OPTIONS -= {"scene", "q0", "v0", "ts", "control", "outputs", "adjoint", "progress", "throw"}
 
 
@@ -113,6 +114,7 @@ def run(args: argparse.Namespace) -> int:
     if args.devices is not None:
         if not 1 <= args.devices <= 4096:
             raise ValueError(f"--devices is {args.devices}; give 1 to 4096")
+        # Before the first computation: JAX fixes its devices then.
         jax.config.update("jax_num_cpu_devices", args.devices)
     given = _require(study, path, "samples") if args.samples is None else args.samples
     duration, points = float(_require(study, path, "duration")), study.get("points", 2)
@@ -122,6 +124,7 @@ def run(args: argparse.Namespace) -> int:
             "and at least two points"
         )
     check_memory(float(points), f"{path}: points {points}")
+    # Relative to the study, so that the command may be called from any folder.
     out = path.parent / _require(study, path, "out") if args.out is None else as_path(args.out, "--out")
     parameters = study.get("parameters", {})
     draw = make_draw(parameters)
@@ -143,6 +146,7 @@ def run(args: argparse.Namespace) -> int:
             outputs=tuple(study.get("outputs", ())),
             rows=study.get("rows", True),
             reductions={name: _reduction(name, one) for name, one in study.get("reductions", {}).items()},
+            # A parameter may have several entries; the cost is one number.
             cost=None if cost is None else lambda p: jnp.sum(p[cost]),
             units={name: one["units"] for name, one in parameters.items() if isinstance(one, dict) and "units" in one},
             client=client,
@@ -161,6 +165,7 @@ def _connect(args: argparse.Namespace) -> Iterator[Any]:
         yield None
         return
     try:
+        # Imported on use: Dask is an extra.
         from distributed import Client, LocalCluster
     except ImportError as error:
         raise ValueError(f"--client and --workers need {error.name}: pip install 'jaxdyn[scale]'") from error
@@ -187,10 +192,12 @@ def make_draw(parameters: Mapping[str, Any]) -> Callable[[Any], dict[str, Any]]:
     # Sorted, so that the order in the file does not change the samples of a seed.
     for name in sorted(parameters):
         one = parameters[name]
+        # `type` and not isinstance: True is an int to Python.
         if type(one) in (int, float) and np.isfinite(one):
             known[name] = float(one)
             continue
         given: dict[str, Any] = one if isinstance(one, dict) else {}
+        # Exactly one distribution, since two of them would contradict each other.
         kinds = [kind for kind in _DRAWS if kind in given]
         ends = given[kinds[0]] if len(kinds) == 1 else None
         numbers = isinstance(ends, list) and len(ends) == 2 and all(type(x) in (int, float) for x in ends)
@@ -211,6 +218,7 @@ def make_draw(parameters: Mapping[str, Any]) -> Callable[[Any], dict[str, Any]]:
             name: _DRAWS[kind](own, a, b, shape)
             for own, (name, (kind, a, b, shape)) in zip(keys, drawn.items(), strict=False)
         }
+        # Known numbers are returned too, so that the store holds all parameters of a rollout.
         return values | {name: jnp.asarray(value) for name, value in known.items()}
 
     return draw
@@ -221,6 +229,7 @@ def _read(path: pathlib.Path) -> dict[str, Any]:
         study = tomllib.loads(path.read_text(encoding="utf-8"))
     except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
         raise ValueError(f"{path} is malformed TOML: {error}") from error
+    # A misspelt key would silently leave its default in force.
     if unknown := study.keys() - _KEYS:
         raise ValueError(f"{path} has {', '.join(sorted(unknown))}; a study has {', '.join(sorted(_KEYS))}")
     for name, value in study.items():
@@ -253,6 +262,7 @@ def _reduction(name: str, given: Any) -> scale.Reduction:
     options = {key: value for key, value in given.items() if key != kinds[0]}
     try:
         if "probabilities" in options:
+            # TOML has lists, and a static field must be hashable.
             options["probabilities"] = tuple(options["probabilities"])
         return _REDUCTIONS[kinds[0]](given[kinds[0]], **options)
     except TypeError as error:
@@ -263,6 +273,7 @@ def _scene(name: str, path: pathlib.Path, parameters: tuple[str, ...]) -> tuple[
     """Functions of the parameters: the scene, and its initial state."""
     file = path.parent / name
     if file.suffix == ".py":
+        # Loaded by path: the folder of the study need not be on sys.path.
         spec = importlib.util.spec_from_file_location(file.stem, file)
         if spec is None or spec.loader is None or not file.is_file():
             raise ValueError(f"{path}: scene is {name!r}, and there is no file {file}")
@@ -279,12 +290,14 @@ def _scene(name: str, path: pathlib.Path, parameters: tuple[str, ...]) -> tuple[
 
         def states(p: Mapping[str, Any]) -> tuple[Any, Any]:
             at_rest = jnp.zeros(model.nv)
+            # A displacement from neutral, since a draw of q itself would leave the unit quaternions.
             return integrate(model, neutral(model), p.get("q0", at_rest)), p.get("v0", at_rest)
 
         return model, states
     if name not in scenes.names():
         raise ValueError(f"{path}: scene is {name!r}; name one of {', '.join(scenes.names())}, or a file .py or .urdf")
     named = getattr(scenes, name)
+    # A parameter may belong to the scene, to its start, or to both.
     of_scene, of_start = (set(inspect.signature(part).parameters) for part in (named, named.start_function))
     if unknown := set(parameters) - of_scene - of_start:
         raise ValueError(

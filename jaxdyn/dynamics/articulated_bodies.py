@@ -50,6 +50,7 @@ def articulated_bodies(
     ```
     """
     q, v, tau, external = check_shapes(model, q=q, v=v, tau=tau, external=external)
+    # The scans need at least one body: the largest size of a joint is a maximum over them.
     if model.nb == 0:
         return ArticulatedBodies(jnp.zeros((0, 6, 6), q.dtype), jnp.zeros((0, 6), q.dtype))
     return _articulated_bodies(model, q, v, tau, external)

@@ -37,6 +37,7 @@ def base_twists(model: Model) -> Float[Array, "nv 6"]:
 @kernel
 def _base_twists(model: Model):
     home = forward_kinematics(model, neutral(model))
+    # A joint of several coordinates repeats its body's pose for each of them.
     return jax.vmap(se3.Ad_apply)(take(home, model.topology.dof_body), body_subspace(model))
 
 

@@ -88,6 +88,7 @@ def com_jacobian(model: Model, q: Float[Array, " nq"]) -> Float[Array, "3 nv"]:
     Source: Orin, Goswami & Lee (2013), eq. 30.
     """
     (q,) = check_shapes(model, q=q)
+    # The linear part of the momentum is m cdot, whatever the point of reference.
     return centroidal_momentum_matrix(model, q)[:3] / jnp.sum(model.inertias[:, 0])
 
 

@@ -67,6 +67,7 @@ def com_dynamics(model: Model, q: Float[Array, " nq"], v: Float[Array, " nv"]) -
     """
     q, v = check_shapes(model, q=q, v=v)
     topology = model.topology
+    # Roots have smaller indices than their children, so a single root is body 0.
     if not model.nb or topology.kinds[0] != "free" or min(topology.parents[1:], default=0) < 0:
         roots = [i for i, parent in enumerate(topology.parents) if parent < 0]
         found = ", ".join(f"{model.body_names[i]!r} ({topology.kinds[i]})" for i in roots) or "no body"
@@ -93,14 +94,17 @@ def _com_dynamics(model: Model, q, v) -> ComDynamics:
         turn = jacobian[:, :3].T
         return jnp.concatenate([jnp.concatenate([turn, -matmul(turn, jacobian[:, 3:])], axis=1), unit])
 
+    # A derivative along the motion: a quaternion's rate is not v, hence `configuration_rate`.
     T, T_rate = jax.jvp(velocity_map, (q,), (configuration_rate(model, q, v),))
     # C' is evaluated with the centre of mass at rest: M' does not depend on its motion, but a Coriolis matrix may.
     internal = matmul(inverse_map(q)[:, 3:], v[3:])
     X, X_rate = jax.jvp(inverse_map, (q,), (configuration_rate(model, q, internal),))
     part, M = X[:, 3:], mass_matrix(model, q)
+    # M d/dt(X nu) = M X nudot + M dX/dt nu: the second term belongs to C'.
     forces = matmul(coriolis_matrix(model, q, internal), part) + matmul(M, X_rate[:, 3:])
     return ComDynamics(
         mass=jnp.sum(model.inertias[:, 0]),
+        # Columns 3 on: the block of the centre of mass is m 1 and decouples.
         mass_matrix=matmul(part.T, matmul(M, part)),
         coriolis_matrix=matmul(part.T, forces),
         jacobian=T,

@@ -40,6 +40,7 @@ def frame_jacobian(
     (q,) = check_shapes(model, q=q)
     body, offset = named_frame(model, frame)
     if body < 0:
+        # A frame fixed to the world does not move, and has no body whose pose could be taken.
         return jnp.zeros((6, model.nv), model.home.dtype)
     return _jacobian(body, (kinematic_part(model), offset), q)
 
@@ -116,6 +117,7 @@ def _acceleration(body: int, tree, q, v, a):
     model, offset = tree
     frame = tree_frame(model, q)
     twists = body_twists(model, frame, v)
+    # A = sum of S_k a_k + dS_k/dt v_k, row by row, before the sum over the frame's own coordinates.
     rows = frame.subspace * a[:, None] + subspace_rate(model, frame, twists) * v[:, None]
     # The tree frame is inertial, with the world's axes: rates of twists are componentwise.
     rate = jnp.sum(twist_columns(model, frame, body, offset, rows), axis=0)

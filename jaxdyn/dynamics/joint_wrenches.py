@@ -56,9 +56,11 @@ def joint_wrench(
     if model.nb == 0:
         return jnp.zeros((0, 6), q.dtype)
     function = _in_world if axes == "world" else _in_bodies
+    # A program without external wrenches is smaller, so None is not replaced by zeros.
     given = (q, v, a) if external is None else (q, v, a, external)
     # Beyond MAX_BODIES a scalar program would compile for too long.
     wrenches = function(model, *given) if model.nb > MAX_BODIES else kernel(function)(model, *given)
+    # All joints share one program; one for each joint's name would be compiled again.
     return wrenches if index is None else wrenches[index]
 
 
@@ -70,5 +72,6 @@ def _in_bodies(model: Model, q, v, a, external=None):
 def _in_world(model: Model, q, v, a, external=None):
     frame = tree_frame(model, q)
     wrenches = jax.vmap(se3.AdT_apply)(frame.pose, joint_wrenches(model, frame, v, a, external))
+    # Tree frames have the world's axes, so the rotation of the pose is that in the world.
     turn = frame.pose[:, :3, :3]
     return jnp.concatenate([matmul(turn, wrenches[:, :3, None]), matmul(turn, wrenches[:, 3:, None])], 1)[..., 0]

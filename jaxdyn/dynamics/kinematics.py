@@ -76,6 +76,7 @@ def body_subspace(model: Model) -> Float[Array, "nv 6"]:
             is_screw[place] = True
         else:
             fixed[place] = np.eye(6)[list(KINDS[kind].columns)]
+    # The screws of other kinds are zero leaves, whose values are not read.
     constant = jnp.asarray(fixed, model.screws.dtype)
     if not is_screw.any():
         return constant
@@ -88,12 +89,14 @@ def tree_frame(model: Model, q: Float[Array, " nq"]) -> TreeFrame:
     topology = model.topology
     local = relative_poses(model, q)
     is_root = np.array([parent < 0 for parent in topology.parents], bool)
+    # Shared by all bodies of one tree; different trees have different frames.
     origin = take(local[:, :3, 3], topology.roots)
     # A root's own translation is replaced by zero before the product, not subtracted after it.
     mask = np.ones((topology.nb, 4, 4), bool)
     mask[is_root, :3, 3] = False
     pose = jnp.where(mask, local, jnp.zeros_like(local))
     pose = _tree_products(topology, pose)
+    # S is constant in the body's frame; Ad carries it to the tree frame.
     subspace = jax.vmap(se3.Ad_apply)(take(pose, topology.dof_body), body_subspace(model))
     return TreeFrame(pose, origin, subspace)
 
@@ -156,6 +159,7 @@ def body_frames(
     if len(kept) < model.nb:
         model, q = _prune(model, kept), take(q, _coordinate_indices(topology.q_slices, kept))
     frame = tree_frame(model, q)
+    # Place len(kept) is the row of the world that is appended below.
     index = np.array([kept.index(body) if body >= 0 else len(kept) for body in bodies])
     pose = jnp.concatenate([frame.pose, jnp.eye(4, dtype=q.dtype)[None]])
     origin = jnp.concatenate([frame.origin, jnp.zeros((1, 3), q.dtype)])
@@ -359,6 +363,7 @@ def _jacobian_dot_v(body: int, tree, q, v):
 
 def kinematic_part(model: Model) -> Model:
     """Model without gravity and armature, so that programs of kinematics do not depend on them."""
+    # `replace` would check and copy all leaves at every call.
     if all(x is None for x in (model.gravity, model.armature)):
         return model
     return model.replace(gravity=None, armature=None)
@@ -367,12 +372,14 @@ def kinematic_part(model: Model) -> Model:
 def take(rows: Array, index: np.ndarray) -> Array:
     """`rows[index]` for a constant index; no operation when the index lists all rows in order."""
     index = np.asarray(index)
+    # A gather stays an operation of the program even where it moves nothing.
     if len(index) == rows.shape[0] and (index == np.arange(len(index))).all():
         return rows
     return rows[index]
 
 
 def _bodies_by_kind(topology: Topology) -> list[tuple[str, np.ndarray]]:
+    # The two kinds differ in limits only and share one batch.
     labels = np.array(["revolute" if kind == "continuous" else kind for kind in topology.kinds], str)
     return [(str(kind), np.flatnonzero(labels == kind)) for kind in dict.fromkeys(labels.tolist())]
 

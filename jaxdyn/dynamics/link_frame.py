@@ -164,8 +164,10 @@ def _matrices(model: Model, q, v, base_twist, base_twist_rate, tip: str | None) 
     to_child = jax.vmap(lambda pose: se3.Ad(se3.inverse(pose)))(relative_poses(model, q))
     parents = np.array(topology.parents, int)
     gamma = _place(to_child, parents[:, None] == np.arange(n))
+    # A root has no parent block in Gamma; its A_i is in P0 instead.
     p0 = jnp.where((parents < 0)[:, None, None], to_child, jnp.zeros_like(to_child)).reshape(6 * n, 6)
     columns = body_subspace(model).T[None]
+    # Column k of xi is nonzero in the rows of the body that coordinate k moves.
     own = np.arange(n)[:, None, None] == topology.dof_body[None, None]
     xi = jnp.where(own, columns, jnp.zeros_like(columns)).reshape(6 * n, topology.nv)
     # Gamma^depth = 0, because a path from the root has at most `depth` bodies.
@@ -191,6 +193,7 @@ def _matrices(model: Model, q, v, base_twist, base_twist_rate, tip: str | None) 
         ad_V=_block_diagonal(ad_v),
         ad_V_T=_block_diagonal(ad_v.transpose(0, 2, 1)),
         V0=jnp.zeros_like(V0_dot) if base_twist is None else base_twist,
+        # Gravity and the acceleration of the base enter the equations in the same way.
         V0_dot=V0_dot if base_twist_rate is None else V0_dot + base_twist_rate,
         V=twists,
     )
@@ -224,4 +227,5 @@ def _tip_selector(model: Model, tip: str) -> Float[Array, "6 n6"]:
     if body < 0:
         raise ValueError(f"tip {tip!r} is fixed to the world and cannot move; name a frame that a joint moves")
     selector = jnp.zeros((6, 6 * model.nb), model.home.dtype)
+    # Ad^-1 carries the twist of the body to the tip frame that is fixed in it.
     return selector.at[:, 6 * body : 6 * body + 6].set(se3.Ad(se3.inverse(model.frame_poses[index])))

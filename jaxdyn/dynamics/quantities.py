@@ -74,6 +74,7 @@ def gravity_force(model: Model | System, q: Float[Array, " nq"], t: Numbers = 0.
         return _system_quantity(model, "gravity_force", *check_state(model, q=q, t=t))
     (q,) = check_shapes(model, q=q)
     if model.gravity is None:
+        # Zero is known without a compiled program.
         return jnp.zeros((model.nv,), model.home.dtype)
     return by_recursion(recursions.gravity_force, world_frame.gravity_force, model, q)
 
@@ -160,6 +161,7 @@ def _kernel_with_checks(recursion: Callable) -> Callable:
 
     @functools.wraps(recursion)
     def call(*args, **named):
+        # Bound by name, so that positional and named arguments pass the same checks.
         (_, model), *rest = signature.bind(*args, **named).arguments.items()
         return by_kernel(model, *check_shapes(model, **dict(rest)))
 
@@ -210,6 +212,7 @@ def _acceleration_tangent(model: Model, q, v, tau, steps):
 
 def _force_tangent(inverse, model, q, v, tau, steps):
     """Function a -> dtau - dID(q, v, a) at fixed a."""
+    # The tangent of tau enters linearly and needs no derivative.
     *steps, tau_step = steps
 
     def change(a):
@@ -341,6 +344,7 @@ def _system_quantity(system: System, name: str, *args):
 
 @kernel(static=1)
 def _method(name: str, system: System, *args):
+    # The method is chosen by a static name, so that each quantity is one cached program.
     return getattr(system, name)(*args)
 
 
@@ -361,6 +365,7 @@ def first_moments(model: Model, frame: TreeFrame):
     positions, for one tree.
     """
     mass = model.inertias[:, 0]
+    # First moments m c rather than centres c: massless bodies need no division.
     rotated = matmul(frame.pose[:, :3, :3], model.inertias[:, 1:4, None])[..., 0]
     origin = frame.origin[0] if model.nb else jnp.zeros((3,), mass.dtype)
     return mass, rotated + mass[:, None] * frame.pose[:, :3, 3], origin, frame.origin - origin[None]

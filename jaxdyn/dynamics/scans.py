@@ -45,6 +45,7 @@ def _padding(model: Model) -> tuple[np.ndarray, np.ndarray]:
     most = max(part.stop - part.start for part in slices)
     places = np.array([part.start for part in slices])[:, None] + np.arange(most)
     own = places < np.array([part.stop for part in slices])[:, None]
+    # Any valid index does for padding: the mask removes what it reads.
     return np.where(own, places, 0), own
 
 
@@ -73,6 +74,7 @@ def _wrenches(model: Model, links: _Links, v, a) -> tuple[Float[Array, "nb 6"], 
         twists, rates = carry
         i, parent, down, turn, push, inertia = link
         twist = matmul(down, twists[parent]) + turn
+        # ad_V of the joint's own twist is the Coriolis part of the rate in the body's frame.
         rate = matmul(down, rates[parent]) + push + se3.ad_apply(twist, turn)
         wrench = matmul(inertia, rate) - se3.adT_apply(twist, matmul(inertia, twist))
         return (twists.at[i].set(twist), rates.at[i].set(rate)), (wrench, rate)
@@ -99,6 +101,7 @@ def inverse_dynamics(model: Model, q, v, a) -> Float[Array, " nv"]:
 
 
 def _flat(model: Model, values: Float[Array, "nb d"]) -> Float[Array, " nv"]:
+    # Row-major order of the mask is the order of v.
     return values[np.nonzero(_padding(model)[1])]
 
 
@@ -112,6 +115,7 @@ def _factorize(model: Model, links: _Links) -> Factor:
     def inward(total, link):
         i, parent, down, S, extra = link
         inertia = total[i]
+        # Rows of S are the directions of the joint, so U is the transpose of that in the literature.
         U = matmul(S, inertia)
         inverse = solve_positive(matmul(U, S.T) + jnp.diag(extra), jnp.eye(S.shape[0], dtype=dtype))
         gain = matmul(inverse, U)
@@ -130,6 +134,7 @@ def _residuals(model: Model, factor: Factor, tau, wrenches) -> tuple[Float[Array
     def inward(total, link):
         i, parent, down, S, gain, force = link
         left = force - matmul(S, total[i])
+        # The wrench on the parent includes the reaction to the residual joint force, left gain.
         return total.at[parent].add(matmul(down.T, total[i] + matmul(left, gain))), (left, total[i])
 
     start = jnp.zeros((model.nb + 1, 6), dtype)
@@ -156,6 +161,7 @@ def _solve(model: Model, factor: Factor, tau, wrenches) -> Float[Array, " nv"]:
 def forward_dynamics(model: Model, q, v, tau) -> Float[Array, " nv"]:
     """Forward dynamics a = M^-1 (tau - C v - N) (nv,) by the articulated-body algorithm."""
     links = _links(model, q)
+    # Wrenches at zero joint acceleration carry C v + N, so the sweeps are those of M^-1 alone.
     return _solve(model, _factorize(model, links), tau, _wrenches(model, links, v, None)[0])
 
 

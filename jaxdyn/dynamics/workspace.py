@@ -89,6 +89,7 @@ def workspace_dynamics(
     Source: Khatib (1987), eqs 19-22 and 50; Murray, Li & Sastry (1994), eq. 4.33; EQUATIONS section 10.
     """
     q, v = check_shapes(model, q=q, v=v)
+    # Static, hence hashable: `rows` selects the program.
     rows = tuple(rows)
     if not rows or len(set(rows)) < len(rows) or not set(rows) <= set(range(6)) or len(rows) > model.nv:
         raise ValueError(
@@ -115,6 +116,7 @@ def _workspace(model: Model, choice: _Choice, q, v) -> WorkspaceDynamics:
 
     J, J_rate = jax.jvp(velocity_map, (q,), (configuration_rate(model, q, v),))
     factor = mass_factor(mass_matrix(model, q))
+    # J M^-1 J^T as a Gram matrix stays symmetric and semidefinite in rounding.
     whitened = factor.whiten(J.T)
     scale, scaled = _unit_diagonal(matmul(whitened.T, whitened))
     # The scaled matrix is a Gram matrix: its least eigenvalue is negative only by
@@ -145,6 +147,7 @@ def _unit_diagonal(matrix):
     """Scale a matrix to D matrix D with a unit diagonal; rows of zeros keep the factor 1 in D (m,)."""
     diagonal = jnp.diagonal(matrix)
     nonzero = diagonal > 0
+    # Double where: 1/sqrt(0) in the unselected branch would make the gradient NaN.
     scale = jnp.where(
         nonzero, 1.0 / jnp.sqrt(jnp.where(nonzero, diagonal, jnp.ones_like(diagonal))), jnp.ones_like(diagonal)
     )

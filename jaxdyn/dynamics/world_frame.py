@@ -92,6 +92,7 @@ def forward_dynamics_tangent(model: Model, q, v, tau, force_change):
 def generalized_force(model: Model, q: Float[Array, " nq"], external: Float[Array, "nb 6"]) -> Float[Array, " nv"]:
     """Generalised force: sum of J_i^T f_i over the bodies, J_i the body Jacobian of body i."""
     frame = tree_frame(model, q)
+    # Wrenches move to the tree frame, where those of all bodies add.
     wrenches = jax.vmap(se3.Ad_inv_T_apply)(frame.pose, external)
     return jnp.sum(frame.subspace * sum_to_coordinates(model, wrenches), axis=1)
 
@@ -202,12 +203,14 @@ def _accelerations(model, frame, twists, v, a) -> Float[Array, "nb 6"]:
     accelerations = sum_to_bodies(model, rows)
     if model.gravity is None:
         return accelerations
+    # Weight is then part of the inertial wrench and needs no term of its own.
     return accelerations - jnp.concatenate([model.gravity, jnp.zeros_like(model.gravity)])[None]
 
 
 def joint_wrenches(model: Model, frame: TreeFrame, v, a, external) -> Float[Array, "nb 6"]:
     """Wrench through each joint, in the tree frame: the sum of the wrenches on the bodies that it carries."""
     wrenches = _body_wrenches(model, frame, tree_inertias(model, frame), v, a, external)
+    # The transposed mask sums over descendants, where `ancestors` lists ancestors.
     return matmul(jnp.asarray(model.topology.ancestors.T, wrenches.dtype), wrenches)
 
 

@@ -41,6 +41,7 @@ class Names:
 
     def new(self, wanted: str) -> str:
         """Reserve a name, with underscores appended while it is taken."""
+        # An appended underscore keeps the file's spelling recognisable, and the result does not depend on other names.
         while wanted in self._used:
             wanted += "_"
         self._used.add(wanted)
@@ -52,6 +53,7 @@ def build_model(builder: ModelBuilder, path) -> Model:
     try:
         return builder.build()
     except ValueError as error:
+        # The builder's advice `lock=` is for URDF files; the loaders of SDF and MJCF have no such option.
         raise ValueError(f"{path}: {re.sub(r' .of a URDF: lock=.*', '', str(error))}") from error
 
 
@@ -78,6 +80,7 @@ def add_chain(
         if turns:
             # The anchor's component along the axis has no effect; dropping it avoids intermediate bodies.
             along = joint.axis * (joint.axis @ joint.anchor) if joint.kind in SCREW_KINDS else np.zeros(3)
+            # The subtraction leaves rounding where the anchor lies on the axis, which would add a massless body per joint.
             shift = joint.anchor - along
             anchor[:3, 3] = np.where(np.abs(shift) > 1e-15 * np.abs(joint.anchor).max(initial=0.0), shift, 0.0)
         leaves: dict[str, Any] = dict(joint.leaves)
@@ -91,6 +94,7 @@ def add_chain(
                 home = home @ f64.joint_pose(joint.kind, screw, np.array([-joint.reference]))
         # Only the body itself carries the inertia; intermediate bodies are massless.
         last = k == len(joints) - 1 and not anchor[:3, 3].any()
+        # Default joint names contain the body's name already; repeating it would give BODY_BODY_joint.
         between = joint.name if joint.name.startswith(body) else f"{body}_{joint.name}"
         name = body if last else frames.new(between)
         builder.add_body(
@@ -98,5 +102,7 @@ def add_chain(
         )
         if last:
             return
+        # The next joint is given in the body's axes, and Trans(-a_k) of D_k comes after J_k.
         here, carrier = f64.inverse(anchor), name
+    # The last anchor is off the origin: a fixed body brings the frame back to the file's own.
     builder.add_body(body, carrier, "fixed", inertia, joint_name=joint_names.new(f"{body}_fixed"), pose=here)

@@ -14,9 +14,11 @@ def replacing(path: str | os.PathLike) -> Iterator[pathlib.Path]:
     """
     path = pathlib.Path(path)
     # The process id keeps two processes that write the same file apart.
+    # The same folder, since a rename is atomic within one file system only; the same suffix, since writers infer the format.
     part = path.with_name(f".{path.stem}.{os.getpid()}{path.suffix}")
     try:
         yield part
+        # os.rename fails on Windows where the target exists.
         os.replace(part, path)
     finally:
         part.unlink(missing_ok=True)

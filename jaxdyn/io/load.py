@@ -74,7 +74,9 @@ def load(
     """
     path = as_path(source, "source")
     if not path.suffix and not path.exists():
+        # A file without a suffix takes precedence over a robot of that name.
         path = find_description(str(source))
+    # The suffix or the root element decides, because URDF, MJCF and SDF all occur as .xml.
     kind = format_of(path)
     if kind == "urdf":
         return _urdf_scene(
@@ -93,6 +95,7 @@ def load(
     of_urdf = {"lock": (lock or (), ()), "mimic": (mimic, None), "gravity": (gravity, GRAVITY)}
     of_urdf["arguments"] = (arguments or None, None)
     for name, (value, default) in of_urdf.items():
+        # An option that the format ignores would silently change nothing, so it is refused.
         if value is not default:
             raise ValueError(
                 f"{name} is {value!r}, but {path} is {kind.upper()}: it applies to URDF files; leave it out"
@@ -103,6 +106,7 @@ def load(
                 f"floating_base is {floating_base}, but {path} is MJCF, which states it by <freejoint>; leave it out"
             )
         return load_mjcf(path, dtype=dtype)
+    # None means the default of the format, which is a free base in SDF and a fixed one in URDF.
     return load_sdf(path, floating_base=floating_base is not False, dtype=dtype)
 
 
@@ -133,12 +137,14 @@ def _urdf_scene(
     )
     rows, not_taken = loop_constraints(closures, file, model)
     warn_not_taken(file.path, not_taken)
+    # Zeros in <dynamics> are common; a force of zeros would be compiled and evaluated in every step.
     forces: list = []
     for leaf, force in ((model.damping, JointDamping), (model.friction, CoulombFriction)):
         if leaf is not None and np.any(np.asarray(leaf) != 0):
             forces.append(force(leaf))
     starts = {"reference": Start(neutral(model), jnp.zeros((model.nv,), model.home.dtype))}
     drives = motors_of(closures, model)
+    # Mimicked joints precede the loops, so that row indices of the couplings do not depend on the YAML file.
     rows = [*model_couplings(model), *rows]
     return LoadedScene(model, rows, forces, starts=starts, actuators=drives, not_taken=not_taken)
 
@@ -165,6 +171,7 @@ def find_description(name: str) -> pathlib.Path:
     ImportError without the package.
     """
     try:
+        # Imported here: the package is an extra, and its modules clone git repositories when they are imported.
         import robot_descriptions
     except ImportError as error:
         raise ImportError(
@@ -183,6 +190,7 @@ def find_description(name: str) -> pathlib.Path:
         raise ValueError(
             f"{name!r} is not in the cache of robot_descriptions and could not be downloaded: {reason}"
         ) from error
+    # A description may offer several formats; the first of this order is taken.
     for attribute in ("URDF_PATH", "MJCF_PATH", "XACRO_PATH"):
         if (path := getattr(module, attribute, None)) is not None:
             return pathlib.Path(path)

@@ -90,7 +90,9 @@ class Actuators(eqx.Module):
         control = self._clipped(control, q.dtype)
         if self._active:
             low, high = jnp.asarray(self.activation_range, q.dtype).T
+            # An integration step may overshoot the range slightly before the rate stops.
             active = jnp.clip(jnp.asarray(self._check_activation(activation), q.dtype), low, high)
+            # The force of an actuator with dynamics depends on its activation and not on the control.
             control = control.at[np.array(self._active)].set(active)
         chosen = [place for place in self.places if place >= 0]
         columns = [i for i, place in enumerate(self.places) if place >= 0]
@@ -118,9 +120,11 @@ class Actuators(eqx.Module):
         activation = jnp.asarray(self._check_activation(activation), float)
         wanted = self._clipped(control, activation.dtype)[np.array(self._active, int)]
         is_filter = np.array([self.dynamics[i] == "filter" for i in self._active])
+        # Integrators have no time constant: a 0 in the file would divide by zero and give NaN in gradients.
         constant = jnp.where(is_filter, jnp.asarray(self.time_constant, activation.dtype), 1.0)
         rate = jnp.where(is_filter, wanted - activation, wanted) / constant
         low, high = jnp.asarray(self.activation_range, activation.dtype).T
+        # Only an outward rate is stopped, so that an activation at its limit can return.
         return jnp.where((activation >= high) & (rate > 0) | (activation <= low) & (rate < 0), 0.0, rate)
 
     def drive(self, law: Function, activation: Numbers | None = None) -> "ActuatorDrive":
@@ -224,6 +228,7 @@ class LoadedScene(Scene):
         not_taken: Sequence[str] = (),
         sensors: Sequence[Sensor] = (),
     ):
+        # `Scene.__init__` checks its arguments, and an equinox module with its own `__init__` does not call it.
         super().__init__(system, constraints, forces)
         self.starts = dict(starts)
         self.actuators = actuators
@@ -236,6 +241,7 @@ def summarize(what: str, names: Iterable[str], most: int = 8) -> list[str]:
     names = list(names)
     if not names:
         return []
+    # A warning that lists hundreds of geoms hides the other entries.
     more = f" and {len(names) - most} more" if len(names) > most else ""
     return [f"{what}: {', '.join(names[:most])}{more}"]
 
@@ -257,6 +263,7 @@ def warn_of_units(path, model: Model) -> None:
     lower, upper = np.asarray(model.lower), np.asarray(model.upper)
     for name, kind, place in zip(top.joint_names, top.kinds, top.q_slices, strict=True):
         ends = np.abs(np.concatenate([lower[place], upper[place]]))
+        # Infinite limits and the huge numbers of files are no limits; they must not count as degrees.
         if kind == "revolute" and (ends[ends < _NO_LIMIT] > 2 * np.pi * _MOST_TURNS).any():
             doubts.append(f"limits {lower[place][0]:g} to {upper[place][0]:g} rad of joint {name!r} (degrees?)")
     for name, home, parameters in zip(top.body_names, np.asarray(model.home), np.asarray(model.inertias), strict=True):

@@ -55,12 +55,14 @@ def read_log(
         raise ValueError(f"{path}: log files are .csv or .npz, not {path.suffix!r}")
     if not path.is_file():
         raise FileNotFoundError(f"{path}: no such log file")
+    # The motion is chosen before anything else: samples of several motions are not monotonic in time.
     columns = _one_motion(readers[path.suffix.lower()](path), rollout, path)
     try:
         columns = _rename(columns, rename or {})
         log = _assemble(columns, None if joint_names is None else tuple(joint_names))
         return repair_log(log, model, unwrap=unwrap, outliers=outliers)
     except ValueError as error:
+        # The inner error is repeated in the text with the path; a chained traceback would show it twice.
         raise ValueError(f"{path}: {error}") from None
 
 
@@ -69,6 +71,7 @@ def _one_motion(columns: dict[str, np.ndarray], rollout: int | None, path) -> di
     numbers = columns.pop("rollout", None)
     stacked = {name: len(columns[name]) for name in _SIGNALS if name in columns}
     known = sorted(set(np.asarray(numbers, int).tolist())) if numbers is not None else []
+    # `Solution.to_npz` stacks a batch on the first axis and has no column of numbers.
     known = known or list(range(1, 1 + max(stacked.values(), default=1)))
     if rollout is None and len(known) > 1:
         raise ValueError(f"{path}: the file holds {len(known)} motions; choose one, as rollout={known[0]}")
@@ -92,6 +95,7 @@ def write_log(path: FilePath, log: Log) -> None:
     """
     path = as_path(path)
     columns: dict[str, np.ndarray] = {"t": np.asarray(log.t)}
+    # A quaternion has four coordinates for three velocities, so a name for each column of q does not exist.
     named = log.joint_names if log.q.shape[1] == log.nv else None
     for signal in _SIGNALS:
         value = getattr(log, signal)
@@ -102,6 +106,7 @@ def write_log(path: FilePath, log: Log) -> None:
     if path.suffix.lower() == ".npz":
         np.savez_compressed(path, **columns)  # pyright: ignore[reportArgumentType]
     elif path.suffix.lower() == ".csv":
+        # newline="" is required by `csv`: on Windows the line ends would otherwise be doubled.
         with path.open("w", newline="") as file:
             writer = csv.writer(file)
             writer.writerow(columns)
@@ -112,6 +117,7 @@ def write_log(path: FilePath, log: Log) -> None:
 
 
 def _read_csv(path) -> dict[str, np.ndarray]:
+    # Bytes, because the position of an invalid one gives its line for the message.
     data = path.read_bytes()
     try:
         # Spreadsheet programs put a byte order mark in front.
@@ -121,6 +127,7 @@ def _read_csv(path) -> dict[str, np.ndarray]:
         raise ValueError(f"{path}: line {line} is not UTF-8 ({error.reason}); save the file as UTF-8") from error
     with io.StringIO(text, newline="") as file:
         first = file.readline()
+        # The header is read again by `csv`, which handles quoted names.
         file.seek(0)
         names = re.sub(r"\[[^\]]*\]", "", first)  # units may contain separators
         # Semicolons win over commas: locales with decimal commas separate by semicolons.
@@ -139,6 +146,7 @@ def _read_csv(path) -> dict[str, np.ndarray]:
             raise ValueError(f"{path}: repeated columns {', '.join(repeated)}")
         rows = []
         for cells in reader:
+            # csv gives an empty list for a blank line; editors leave one at the end.
             if not cells:
                 continue
             if len(cells) != len(header):
@@ -147,6 +155,7 @@ def _read_csv(path) -> dict[str, np.ndarray]:
                 rows.append([parse_number(cell) for cell in cells])
             except ValueError:
                 name, cell = next((n, c) for n, c in zip(header, cells, strict=True) if not _is_number(c))
+                # A decimal comma is the usual cause in files that are separated by semicolons.
                 point = "; write decimal points" if _is_number(cell.replace(",", ".", 1)) else ""
                 raise ValueError(
                     f"{path}: line {reader.line_num}, column {name}: {cell!r} is no number{point}"
@@ -165,12 +174,14 @@ def _is_number(cell: str) -> bool:
 
 def _read_npz(path) -> dict[str, np.ndarray]:
     columns = {}
+    # A pickle in an archive could run code.
     with np.load(path, allow_pickle=False) as archive:
         for name in archive.files:
             value = archive[name]
             if name in _SIGNALS:
                 if value.ndim not in (2, 3):
                     raise ValueError(f"{path}: {name} has shape {value.shape}, expected (n, columns)")
+                # One motion is a batch of one, so that both layouts share the selection in `_one_motion`.
                 columns[name] = value if value.ndim == 3 else value[None]
             else:
                 columns[name] = value
@@ -186,6 +197,7 @@ def _assemble(columns: dict[str, np.ndarray], joint_names) -> Log:
             hint = "" if signal == "q" else ' (of simulate: outputs=("torque",))'
             raise ValueError(f"missing columns {signal}1, {signal}2, ...{hint}; the file has {', '.join(columns)}")
     labels = list(columns_of["tau"])
+    # The torques decide, since every log has them and their columns are never quaternions.
     by_number = all(label.isdecimal() for label in labels)
     if not by_number:
         labels = list(joint_names) if joint_names is not None else labels
@@ -217,11 +229,13 @@ def _rename(columns: dict[str, np.ndarray], names) -> dict[str, np.ndarray]:
     """Rename the joints of columns. **Raises:** ValueError for a name that no column has."""
     result, used = {}, set()
     for column, values in columns.items():
+        # The first underscore only: names of joints contain underscores.
         signal, _, joint = column.partition("_")
         if signal in _SIGNALS and joint in names:
             used.add(joint)
             column = f"{signal}_{names[joint]}"
         result[column] = values
+    # A misspelt key would leave its column under the old name, which is then ignored.
     if unused := sorted(set(names) - used):
         raise ValueError(f"rename: no column is of joint {', '.join(unused)}; the file has {', '.join(columns)}")
     return result
@@ -231,6 +245,7 @@ def _mapping(columns: dict[str, str], labels) -> str:
     """Suggest a mapping where the file has as many joints under other names."""
     others = [label for label in columns if label not in labels]
     wanted = [label for label in labels if label not in columns]
+    # A mapping by order is a guess and is suggested only where the counts agree.
     if not others or len(others) != len(wanted) or others[0].isdecimal():
         return ""
     pairs = " ".join(f"{theirs}={ours}" for theirs, ours in zip(others, wanted, strict=True))

@@ -87,16 +87,21 @@ def load_mjcf(path: str | os.PathLike, *, dtype: DType | None = None) -> LoadedS
 
 def _model(file: CompiledFile, dtype) -> Model:
     m = file.m
+    # Without gravity its terms are not compiled.
     gravity = None if file.off("GRAVITY") or not m.opt.gravity.any() else m.opt.gravity
+    # The buffer of names begins with that of the model, ended by a zero byte.
     name = m.names.split(b"\0", 1)[0].decode() or "mechanism"
     builder = ModelBuilder(name, gravity=gravity, dtype=dtype)
     frames, joint_names = Names(), Names()
+    # All names of the file are reserved before any intermediate body takes one. Body 0 is the world.
     for taken in (*file.bodies[1:], *file.sites):
         frames.new(str(taken))
     for taken in file.joints:
         joint_names.new(taken)
     armature, damping = _rotors(file)
+    # MuJoCo numbers parents before children, as `ModelBuilder` requires.
     for b in range(1, m.nbody):
+        # body_jntadr is -1 where a body has no joint.
         joints = range(m.body_jntadr[b], m.body_jntadr[b] + m.body_jntnum[b]) if m.body_jntnum[b] else ()
         links = [_link(file, j, armature, damping) for j in joints]
         inertia = (m.body_mass[b], *_central_inertia(m, b))
@@ -117,6 +122,7 @@ def _central_inertia(m, b: int) -> tuple[np.ndarray, np.ndarray]:
     """
     same_frame, same_turn = m.body_sameframe[b] == 1, m.body_sameframe[b] in (1, 3)  # mjtSameFrame: BODY, BODYROT
     turn = np.eye(3) if same_turn else pose_of(np.zeros(3), m.body_iquat[b])[:3, :3]
+    # MuJoCo diagonalises the inertia: body_inertia holds principal moments in the axes of body_iquat.
     return np.zeros(3) if same_frame else m.body_ipos[b].copy(), turn @ np.diag(m.body_inertia[b]) @ turn.T
 
 
@@ -129,6 +135,7 @@ def _rotors(file: CompiledFile) -> tuple[np.ndarray, np.ndarray]:
             # Rotor quantities reflect through the gear with its square.
             armature[m.jnt_dofadr[j]] += m.actuator_gear[i, 0] ** 2 * m.actuator_armature[i]
             damping[m.jnt_dofadr[j]] += m.actuator_gear[i, 0] ** 2 * m.actuator_damping[i]
+    # <flag damper="disable"> leaves the numbers in the compiled model and only skips the forces.
     return armature, damping * (not file.off("DAMPER"))
 
 
@@ -140,23 +147,29 @@ def _link(file: CompiledFile, j: int, armature: np.ndarray, damping: np.ndarray)
         key: values[dofs] if values[dofs].any() else None
         for key, values in (("armature", armature), ("damping", damping), ("friction", m.dof_frictionloss))
     }
+    # The range of a ball joint is a cone angle, which is no bound of a coordinate.
     limited = bool(m.jnt_limited[j]) and kind in (SLIDE, HINGE)
     if limited:
         leaves |= {"lower": m.jnt_range[j, 0], "upper": m.jnt_range[j, 1]}
     if m.jnt_actfrclimited[j] and kind in (SLIDE, HINGE):
+        # A model has symmetric effort limits; the asymmetric range itself clips in `Actuators`.
         leaves["effort_limit"] = np.abs(m.jnt_actfrcrange[j]).max()
+    # In the order of mjtJoint.
     word = ("free", "spherical", "prismatic", "revolute" if limited else "continuous")[kind]
+    # qpos0 of ball and free joints is a pose and not an offset of the coordinate.
     reference = m.qpos0[m.jnt_qposadr[j]] if kind in (SLIDE, HINGE) else 0.0
     return Link(file.joints[j], word, m.jnt_axis[j].copy(), m.jnt_pos[j].copy(), float(reference), leaves)
 
 
 def _joint_forces(file: CompiledFile, model: Model) -> list:
     m, forces = file.m, []
+    # A free joint has no spring here; it is reported as not taken.
     scalars = [j for j in range(m.njnt) if m.jnt_type[j] in (SLIDE, HINGE, BALL) and m.jnt_stiffness[j]]
     if scalars and not file.off("SPRING"):
         rest = [m.qpos_spring[m.jnt_qposadr[j] :][: SIZES[m.jnt_type[j]][0]] for j in scalars]
         stiffness = np.repeat(m.jnt_stiffness[scalars], [SIZES[m.jnt_type[j]][1] for j in scalars])
         forces.append(JointSpring(stiffness, np.concatenate(rest), [file.joints[j] for j in scalars]))
+    # Damping disabled by the file is already zero, and zeros give no leaf.
     if model.damping is not None:
         forces.append(JointDamping())
     if model.friction is not None and not file.off("FRICTIONLOSS"):
@@ -167,6 +180,7 @@ def _joint_forces(file: CompiledFile, model: Model) -> list:
 def _starts(file: CompiledFile, model: Model, drives) -> dict[str, Start]:
     m, dtype = file.m, model.home.dtype
 
+    # Only the actuators that are taken have a control in the scene, in the order of their names.
     def start(qpos, qvel, control=None, act=None) -> Start:
         q, v = _state(file, model, qpos, qvel)
         taken = active = None
@@ -192,7 +206,9 @@ def _state(file: CompiledFile, model: Model, qpos, qvel) -> tuple[np.ndarray, np
     for j, name in enumerate(file.joints):
         i = model.joint_names.index(name)
         nq, nv = SIZES[m.jnt_type[j]]
+        # Joints have another order here than in the file, so each one is looked up by its name.
         here, rate = qpos[m.jnt_qposadr[j] :][:nq].copy(), qvel[m.jnt_dofadr[j] :][:nv].copy()
+        # Keyframes are written by hand with few digits; the model expects unit quaternions.
         if nq > 1:
             here[-4:] /= np.linalg.norm(here[-4:])
         # World-frame linear velocity there, body-frame here.
@@ -210,9 +226,11 @@ def _elements_without_effect(file: CompiledFile) -> list[str]:
     def joints(condition) -> list[str]:
         return [file.joints[j] for j in range(m.njnt) if condition(j)]
 
+    # A joint with several degrees of freedom is listed once.
     def dofs(values) -> list[str]:
         return list(dict.fromkeys(file.joints[m.dof_jntid[i]] for i in np.flatnonzero(values)))
 
+    # Geoms without contype and conaffinity are visual and touch nothing unless a pair names them.
     touching = {m.geom_bodyid[g] for g in range(m.ngeom) if m.geom_contype[g] or m.geom_conaffinity[g]}
     touching |= {m.geom_bodyid[g] for pair in (m.pair_geom1, m.pair_geom2) for g in pair}
     names = [file.bodies[b] or "world" for b in sorted(touching)] if not file.off("CONTACT") else []

@@ -54,6 +54,7 @@ def compile_file(mujoco, path: str):
     if not file.is_utf8:
         raise ValueError(f"{path}:1: mujoco reads files in UTF-8 alone; save the file as UTF-8")
     try:
+        # A spec and not a compiled model: assets of missing files can be deleted from it before compilation.
         spec = mujoco.MjSpec.from_file(path)
     except ValueError as error:
         raise ValueError(_add_location(path, error)) from error
@@ -63,6 +64,7 @@ def compile_file(mujoco, path: str):
         try:
             return spec.compile(), missing
         except ValueError as error:
+            # The compiler gives no error code; the file's name is in the text alone.
             name = re.search(r"[Ee]rror opening file '(.*?)'", str(error))
             if name is None or not (gone := _without_file(mujoco, spec, name[1])):
                 hint = f" (already left out: {'; '.join(missing)})" if missing else ""
@@ -71,8 +73,10 @@ def compile_file(mujoco, path: str):
 
 
 def _add_location(path: str, error: Exception) -> str:
+    # mujoco's messages have several lines.
     text = " ".join(str(error).split())
     lines = re.findall(r"[Ll]ine(?: number=| )(\d+)", text)
+    # The last number is that of the innermost element; 0 means an unknown line.
     where = f"{path}:{lines[-1]}" if lines and int(lines[-1]) else path
     return f"{where}: {text}"
 
@@ -97,6 +101,7 @@ def _without_file(mujoco, spec, name: str) -> str:
             # Without an explicit <inertial> the mass of this geom is lost with its shape.
             if geom.mass != 0 and not geom.parent.explicitinertial and geom.parent.name != "world":
                 heavy.add(geom.parent.name or "(unnamed)")
+            # The geom stays, as deleting it would break references by its name.
             geom.meshname = geom.hfieldname = ""
             geom.type, geom.size, geom.mass = mujoco.mjtGeom.mjGEOM_SPHERE, [1e-3, 0.0, 0.0], 0.0
         spec.delete(asset)
@@ -107,6 +112,7 @@ def _without_file(mujoco, spec, name: str) -> str:
     for texture in spec.textures:
         if any(is_it(file) for file in (texture.file, *texture.cubefiles)):
             for material in spec.materials:
+                # No material may refer to a texture that is deleted.
                 material.textures = ["" if used == texture.name else used for used in material.textures]
             spec.delete(texture)
             return f"missing file {name!r}"
@@ -130,9 +136,11 @@ def assign_names(mujoco, m, path: str) -> CompiledFile:
 
     def joint_default(j: int) -> str:
         body = m.jnt_bodyid[j]
+        # A number only where it distinguishes joints, so that common models have short names.
         several = m.body_jntnum[body] > 1
         return f"{bodies[body]}_joint{j - m.body_jntadr[body] if several else ''}"
 
+    # Bodies and sites share one namespace, since both become frames of the model.
     frames = Names()
     bodies: list[str | None] = [None, *fill_names(all_of("BODY", m.nbody)[1:], lambda i: f"body{i + 1}", frames)]
     known = set(bodies)

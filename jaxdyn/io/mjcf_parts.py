@@ -21,6 +21,7 @@ def constraints(file: CompiledFile, model: Model) -> tuple[list[Constraint], lis
     m, taken, left = file.m, [], {}
     for i in range(m.neq):
         name = file.mujoco.mj_id2name(m, file.mujoco.mjtObj.mjOBJ_EQUALITY, i) or f"equality{i}"
+        # Equalities can be switched at run time in MuJoCo; a scene has a fixed set, that of the file's start.
         if not m.eq_active0[i] or file.off("EQUALITY") or file.off("CONSTRAINT"):
             left.setdefault("equalities that the file switches off", []).append(name)
             continue
@@ -49,6 +50,7 @@ def _loop(file: CompiledFile, model: Model, i: int, name: str) -> tuple[Constrai
             (file.bodies[first], pose_of(data[3:6], data[6:10])),
             (file.bodies[second], pose_of(data[:3], _NO_TURN)),
         ]
+    # Bodies merged by fixed joints cannot move relative to each other: such rows are zero.
     if len({body_index(model, body) for body, _ in ends}) == 1:
         return None, "equalities between two parts of one body"
     points = m.eq_type[i] == _CONNECT or data[10] == 0  # without torque scale a weld constrains the point only
@@ -61,6 +63,7 @@ def _coupling(file: CompiledFile, model: Model, i: int, name: str) -> tuple[Cons
     first, second, c = int(m.eq_obj1id[i]), int(m.eq_obj2id[i]), m.eq_data[i, :5]
     if m.eq_type[i] == _JOINT:
         r = [m.qpos0[m.jnt_qposadr[j]] if j >= 0 else 0.0 for j in (first, second)]
+        # Without a second joint MuJoCo holds the first at its reference plus c0.
         if second < 0:
             return lock_joint(file.joints[first], r[0] + c[0], name=name), ""
         if not c[2:].any():
@@ -73,7 +76,9 @@ def _coupling(file: CompiledFile, model: Model, i: int, name: str) -> tuple[Cons
         if None in joint_rows:
             return None, "equalities of spatial tendons"
         rows = [row for row in joint_rows if row is not None]
+        # MuJoCo measures lengths of tendons from those at qpos0.
         r = [m.tendon_length0[t] if t >= 0 else 0.0 for t in (first, second)]
+    # Both rows are over one list of joints, in the order of their first occurrence.
     joints = list(dict.fromkeys(j for row in rows for j in row))
     values = [jnp.asarray([row.get(j, 0.0) for j in joints], float) for row in rows]
     index = tuple(_places(file, model, j)[0] for j in joints)
@@ -94,6 +99,7 @@ def _row(file: CompiledFile, tendon: int) -> dict[int, float] | None:
         if m.wrap_type[w] != int(file.mujoco.mjtWrap.mjWRAP_JOINT):
             return None
         joint = int(m.wrap_objid[w])
+        # A joint may occur twice in one tendon; its coefficients add.
         row[joint] = row.get(joint, 0.0) + float(m.wrap_prm[w])
     return row
 
@@ -101,6 +107,7 @@ def _row(file: CompiledFile, tendon: int) -> dict[int, float] | None:
 def tendon_forces(file: CompiledFile, model: Model) -> tuple[list[TendonForce], list[str]]:
     """Springs and dampers of linear tendons, and descriptions of unsupported features of tendons."""
     m = file.m
+    # Flags leave the numbers of the compiled model as they are.
     springs = m.tendon_stiffness * (not file.off("SPRING"))
     dampers = m.tendon_damping * (not file.off("DAMPER"))
     rows = [_row(file, t) for t in range(m.ntendon)]
@@ -158,6 +165,7 @@ def actuators(file: CompiledFile, model: Model) -> tuple[Actuators | None, list[
         return None, lines
     n = len(taken)
     moment, wrenches = np.zeros((n, model.nv)), np.zeros((n, 6))
+    # -1 marks coordinates of ball and free joints, for which no length is defined.
     places, force_range = np.full(model.nv, -1), np.tile([-np.inf, np.inf], (model.nv, 1))
     for j in range(m.njnt):
         if m.jnt_type[j] in (SLIDE, HINGE):
@@ -177,6 +185,7 @@ def actuators(file: CompiledFile, model: Model) -> tuple[Actuators | None, list[
             moment[k, _places(file, model, joint)[1]] += pull[0] * coefficient
 
     def ranges_of(limited, ranges, off: bool) -> np.ndarray:
+        # A range is stored also where it is not active.
         return np.where((limited[taken] != 0)[:, None] & (not off), ranges[taken], [-np.inf, np.inf])
 
     # Fixed gains and absent biases may leave stale parameters in the arrays.
@@ -211,6 +220,7 @@ def _dynamics(file: CompiledFile, i: int) -> str | None:
     # The two filters have one equation; they differ in MuJoCo's steps.
     names = {kinds.mjDYN_NONE: None, kinds.mjDYN_INTEGRATOR: "integrator"}
     names |= {kinds.mjDYN_FILTER: "filter", kinds.mjDYN_FILTEREXACT: "filter"}
+    # "" and not None: None is an actuator without dynamics, which is supported.
     return {int(kind): name for kind, name in names.items()}.get(int(file.m.actuator_dyntype[i]), "")
 
 
@@ -219,6 +229,7 @@ def _fault(file: CompiledFile, i: int) -> str:
     m, mujoco = file.m, file.mujoco
     dynamics, gain, bias = _dynamics(file, i), m.actuator_gaintype[i], m.actuator_biastype[i]
     kind, target = m.actuator_trntype[i], [int(x) for x in m.actuator_trnid[i]]
+    # disableactuator has one bit per group; actuators of a negative group cannot be disabled.
     if file.off("ACTUATION") or (m.actuator_group[i] >= 0 and m.opt.disableactuator >> m.actuator_group[i] & 1):
         return "that the file switches off"
     if m.actuator_plugin[i] >= 0:
@@ -236,6 +247,7 @@ def _fault(file: CompiledFile, i: int) -> str:
         return "whose force is not affine in length and velocity"
     if m.actuator_ctrlnum[i] != 1 or m.actuator_outnum[i] != 1:
         return "of several controls or forces"
+    # For hinges and slides the two transmissions are the same; they differ for ball and free joints only.
     if kind in (_ON_JOINT, _IN_PARENT):
         return "on ball and free joints" if m.jnt_type[target[0]] not in (SLIDE, HINGE) else ""
     if kind == _ON_TENDON:

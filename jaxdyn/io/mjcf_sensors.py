@@ -43,6 +43,7 @@ def sensors(file: CompiledFile, model: Model) -> tuple[tuple[Sensor, ...], list[
     for i in range(m.nsensor):
         name = mujoco.mj_id2name(m, mujoco.mjtObj.mjOBJ_SENSOR, i) or f"sensor{i}"
         kind = mujoco.mjtSensor(int(m.sensor_type[i])).name.removeprefix("mjSENS_")
+        # Older releases of mujoco have no delay of sensors.
         late = getattr(m, "sensor_delay", np.zeros(m.nsensor))[i]
         noise = Noise(float(m.sensor_noise[i])) if m.sensor_noise[i] > 0 else None
         sensor = _sensor(file, model, i, kind, {"name": name, "noise": noise, "delay": float(max(late, 0.0))})
@@ -50,6 +51,7 @@ def sensors(file: CompiledFile, model: Model) -> tuple[tuple[Sensor, ...], list[
             left.append(name)
             continue
         taken.append(sensor)
+        # The sensor is taken without its clipping, and a warning says so.
         if m.sensor_cutoff[i] > 0:
             clipped.append(name)
     return tuple(taken), [*summarize("sensors", left), *summarize("cutoff of sensors", clipped)]
@@ -61,6 +63,7 @@ def _sensor(file: CompiledFile, model: Model, i: int, kind: str, options: dict) 
     if kind in _ON_JOINTS:
         return _ON_JOINTS[kind](file.joints[place], **options)
     frame = _frame(file, i)
+    # A reference frame (refid) makes the reading relative, which these sensors do not support.
     if kind in _ON_FRAMES and frame is not None and m.sensor_refid[i] < 0:
         of, more = _ON_FRAMES[kind]
         return of(frame, **more, **options)
@@ -75,6 +78,7 @@ def _frame(file: CompiledFile, i: int) -> str | None:
     kind, place = file.mujoco.mjtObj(int(file.m.sensor_objtype[i])).name, int(file.m.sensor_objid[i])
     if kind == "mjOBJ_SITE":
         return file.sites[place]
+    # mjOBJ_BODY is the inertial frame, which has no name in the model; XBODY is the body's own.
     return file.bodies[place] if kind == "mjOBJ_XBODY" else None
 
 
@@ -84,6 +88,7 @@ def _mount(file: CompiledFile, model: Model, body: int) -> dict | None:
     if m.body_jntnum[body]:
         return {}
     carrier, pose = body, np.eye(4)
+    # Bodies without joints are welded, and the model has merged them into the next body that moves.
     while not m.body_jntnum[carrier]:
         if carrier == 0:
             return None
@@ -91,10 +96,12 @@ def _mount(file: CompiledFile, model: Model, body: int) -> dict | None:
         carrier = int(m.body_parentid[carrier])
     parameters, joints = np.zeros(10), []
     poses = {body: pose}
+    # Parents have smaller numbers, so that one pass visits the subtree from the root outwards.
     for b in range(body, m.nbody):
         if b != body and m.body_parentid[b] not in poses:
             continue
         if b != body and m.body_jntnum[b]:
+            # The first joint of a moving body carries all that is beyond it.
             joints.append(file.joints[m.body_jntadr[b]])
             continue
         if b != body:

@@ -69,13 +69,16 @@ def load_sdf(path: str | os.PathLike, *, floating_base: bool = True, dtype: DTyp
     """
     file = SdfFile(path)
     joints = read_joints(file)
+    # A gearbox couples two other joints; as an edge of the graph it would close a loop that does not exist.
     moving = [joint for joint in joints if joint.kind != "gearbox"]
     static = [name for name, (_, scope) in file.links.items() if scope.static]
+    # The format floats a model by its canonical link, which so becomes the root of its part.
     first = [link for model in file.models.values() if (link := file.canonical_link(model)) is not None]
     edges, cut = spanning_tree(file.links, static, moving, first)
     model, roots = _model(file, edges, set(static), floating_base, dtype)
     tree = {edge.joint.name: edge.joint for edge in edges if edge.joint is not None}
     loops, left = _loops(file, model, cut)
+    # Joints that were cut have no coordinate, so couplings are looked up among those of the tree.
     couplings, also = _couplings(file, joints, tree)
     not_taken = (*left, *also, *_elements_without_effect(file))
     warn_not_taken(path, not_taken)
@@ -87,6 +90,7 @@ def load_sdf(path: str | os.PathLike, *, floating_base: bool = True, dtype: DTyp
 def _model(file: SdfFile, edges: list[Edge], static: set[str], floating: bool, dtype) -> tuple[Model, dict[str, str]]:
     """Build the model; return it with the joints of its free roots and the link of each."""
     first = next(iter(file.models.values())).element.get("name")
+    # A world names the whole only where it holds several models.
     name = first if len(file.models) == 1 or file.world is None else ""
     name = name or (file.world.get("name") if file.world is not None else "") or "mechanism"
     gravity: np.ndarray | tuple | None = GRAVITY
@@ -99,6 +103,7 @@ def _model(file: SdfFile, edges: list[Edge], static: set[str], floating: bool, d
         gravity = gravity if gravity.any() else None
     builder = ModelBuilder(name, gravity=gravity, dtype=dtype)
     builder.places = {link: f"{file.path}:{element.line}" for link, (element, _) in file.links.items()}
+    # Joints may have the names of links in SDF, so the two namespaces are kept apart.
     frames, names = Names(), Names()
     for link in file.links:
         frames.new(link)
@@ -112,17 +117,20 @@ def _model(file: SdfFile, edges: list[Edge], static: set[str], floating: bool, d
         links: list[Link] = []
         if edge.joint is not None:
             links = _links(edge, place)
+            # All poses of the file are resolved to the world; home poses are relative to the carrier.
             place = f64.inverse(file.pose(edge.carrier)) @ place if edge.carrier is not None else place
         elif edge.body in free:
             root = names.new(ROOT_JOINT if len(free) == 1 else f"{edge.body}_{ROOT_JOINT}")
             # The free joint's coordinates are the world pose of the link, so its home pose is the identity.
             roots[root] = edge.body
             links, place = [Link(root, "free", np.zeros(3), np.zeros(3), 0.0, {})], np.eye(4)
+        # A fault is located at the joint that moves the body, or at the link of a root.
         element = file.links[edge.body][0] if edge.joint is None else edge.joint.element
         try:
             add_chain(builder, frames, names, edge.body, edge.carrier, place, links, inertia)
         except ValueError as error:
             raise file.fault(element, str(error)) from error
+    # Frames come after all links, so that a clash of names renames the frame and not the link.
     for frame, (_, _) in file.frames.items():
         carrier = file.link_of(frame)
         pose = file.pose(frame) if carrier is None else f64.inverse(file.pose(carrier)) @ file.pose(frame)
@@ -137,15 +145,19 @@ def _axis_names(joint: Joint) -> list[str]:
 def _links(edge: Edge, place: np.ndarray) -> list[Link]:
     """Chain of joints of a body: axes and anchor in its frame, reversed where the tree runs from child to parent."""
     joint = edge.joint
+    # Without joints `add_chain` fixes the body.
     if joint is None or joint.kind == "fixed":
         return []
+    # The joint's axis passes through its own origin, which need not be the child's.
     anchor = np.asarray(f64.inverse(place) @ joint.pose)[:3, 3]
     kind, sign = _KINDS[joint.kind], -1.0 if edge.backwards else 1.0
     if kind == "spherical":
         return [Link(joint.name, kind, np.zeros(3), anchor, 0.0, {})]
     links = []
     for name, axis in zip(_axis_names(joint), joint.axes, strict=True):
+        # Limits of +-1e16, the default up to version 1.6, are none; such a joint is continuous.
         word = "continuous" if kind == "revolute" and not axis.limited else kind
+        # Axes were resolved in the world; a chain wants them in the body's own axes.
         direction = sign * place[:3, :3].T @ axis.direction
         links.append(Link(name, word, direction, anchor, 0.0, axis.leaves, joint.pitch))
     # Two-axis joints reverse their order as well as their sign.
@@ -158,6 +170,7 @@ def _inertia(file: SdfFile, link: str) -> np.ndarray:
     if inertial is None:
         # The format's default inertial: 1 kg and the unit matrix.
         return np.asarray(f64.inertia_numbers((1.0, np.zeros(3), np.ones(3)), what))
+    # Version 1.11 of the format computes inertias from shapes where this attribute is set.
     if (inertial.get("auto") or "").strip().lower() in ("1", "true"):
         raise file.fault(
             inertial,
@@ -165,6 +178,7 @@ def _inertia(file: SdfFile, link: str) -> np.ndarray:
             "and <inertia> (`gz sdf --inertial-stats FILE` prints them)",
         )
     get = lambda tag, default: file.number(inertial, f"inertia/{tag}", default, what)  # noqa: E731
+    # Each missing entry has a default of its own, also in an <inertia> that gives others.
     xx, yy, zz = get("ixx", 1.0), get("iyy", 1.0), get("izz", 1.0)
     xy, xz, yz = get("ixy", 0.0), get("ixz", 0.0), get("iyz", 0.0)
     mass = file.number(inertial, "mass", 1.0, what)
@@ -185,6 +199,7 @@ def _loops(file: SdfFile, model: Model, cut: list[Joint]) -> tuple[list[Constrai
             if joint.kind != "fixed" and bodies != {-1}:
                 left.setdefault("joints between two parts of one body", []).append(joint.name)
             continue
+        # A universal loop has axes at right angles; other angles would change the constraint.
         skew = len(joint.axes) == 2 and abs(joint.axes[0].direction @ joint.axes[1].direction) > _PARALLEL
         if joint.kind == "screw" or skew:
             reason = "screws that close loops" if joint.kind == "screw" else "skew joints of two axes that close loops"
@@ -194,6 +209,7 @@ def _loops(file: SdfFile, model: Model, cut: list[Joint]) -> tuple[list[Constrai
             left.setdefault("springs, damping, friction and limits of joints that close loops", []).append(joint.name)
         poses = []
         for k, end in enumerate(ends):
+            # A universal joint has one axis on each body; other joints share theirs.
             axis = joint.axes[min(k, len(joint.axes) - 1)].direction if joint.axes else joint.pose[:3, 2]
             # The file's placement closes the loop: both frames are at the joint, z along the end's own axis.
             place = f64.rotation_from_z(axis)
@@ -213,6 +229,7 @@ def _couplings(file: SdfFile, joints: list[Joint], tree: dict[str, Joint]) -> tu
             (left if made is None else taken).append(joint.name if made is None else made)  # pyright: ignore[reportArgumentType]
             continue
         for name, axis in zip(_axis_names(joint), joint.axes, strict=False):
+            # <mimic> is an element of an axis and not of the joint.
             if axis.mimic is not None:
                 made = _mimic(file, joint, name, axis, tree)
                 (left if made is None else taken).append(name if made is None else made)  # pyright: ignore[reportArgumentType]
@@ -229,8 +246,10 @@ def _gearbox(file: SdfFile, joint: Joint, tree: Iterable[Joint]) -> Constraint |
     ends = []
     for link, axis in zip((joint.parent, joint.child), joint.axes, strict=True):
         for other in tree:
+            # A gear ratio relates angles, which joints of other kinds do not have.
             if other.kind not in ("revolute", "continuous") or {other.parent, other.child} != {reference, link}:
                 continue
+            # The axes of a gearbox are those of its two joints, up to the sign.
             along = float(other.axes[0].direction @ axis.direction)
             if abs(abs(along) - 1.0) < _PARALLEL:
                 ends.append((other.name, np.sign(along) * (1.0 if other.child == link else -1.0)))
@@ -253,6 +272,7 @@ def _mimic(file: SdfFile, joint: Joint, name: str, axis: Axis, tree: dict[str, J
     which = element.get("axis") or "axis"
     numbers = (file.number(element, tag, default, f"joint {name!r}") for tag, default in _MIMIC)
     multiplier, offset, reference = numbers
+    # A fixed leader stays at zero, so the follower is held and not coupled.
     if joint.name in tree and leader in tree and tree[leader].kind == "fixed":
         return lock_joint(name, offset - multiplier * reference, name=f"mimic {name}-{leader}")
     if joint.name not in tree or leader not in tree or len(tree[leader].axes) < (2 if which == "axis2" else 1):
@@ -281,6 +301,7 @@ def _forces(model: Model, tree: dict[str, Joint]) -> list:
 
 def _start(file: SdfFile, model: Model, roots: dict[str, str]) -> Start:
     """Start at the placement of the file."""
+    # Zero coordinates are the file's placement; quaternions need their 1.
     q = np.concatenate([np.zeros(0), *(joint_neutral(kind) for kind in model.topology.kinds)])
     for joint, link in roots.items():
         pose = file.pose(link)

@@ -44,6 +44,7 @@ class SdfFile(XmlFile):
         root = self.root
         if root.tag != "sdf":
             raise self.fault(root, f"the root element is <{root.tag}>, expected <sdf>; this is not an SDF file")
+        # Axes and default frames changed between versions, so an unknown one cannot be read safely.
         version = root.get("version") or ""
         if version not in _VERSIONS:
             raise self.fault(root, f"the version is {version!r}; {_VERSIONS[0]} to {_VERSIONS[-1]} are supported")
@@ -57,6 +58,7 @@ class SdfFile(XmlFile):
         if len(worlds) > 1:
             raise self.fault(worlds[1], "the file holds several worlds; keep one")
         self.world = worlds[0] if worlds else None
+        # Models may be at the top of a file without a world.
         top = Scope(root if self.world is None else self.world, "", WORLD, None, False)
         self._collect(top)
         if not self.links:
@@ -92,6 +94,7 @@ class SdfFile(XmlFile):
             return scope.frame
         if name in (WORLD, "__root__"):
             return WORLD
+        # Links precede joints: up to 1.6 a joint may have the name of a link.
         for known in (self.links, self.frames, self.models, self.joints):
             if scope.prefix + name in known:
                 return scope.prefix + name
@@ -138,6 +141,7 @@ class SdfFile(XmlFile):
         placement = (element.get("placement_frame") or "").strip() if name in self.models else ""
         if placement:
             inner = self.models[name]
+            # `placement_frame` (1.8) states where that inner frame is put, and not the model's own.
             placed = placed @ f64.inverse(self.pose(self.find(placement, inner, element), name))
         return placed
 
@@ -190,10 +194,12 @@ class SdfFile(XmlFile):
 
     def canonical_link(self, model: Scope) -> str | None:
         """Link that carries a model's frame, None for the world when the model is static or empty."""
+        # A static model does not move whatever its joints are.
         if model.static:
             return None
         if named := (model.element.get("canonical_link") or "").strip():
             return self.find(named, model, model.element)
+        # The format's default is the first link, else that of the first nested model.
         for tag in ("link", "model"):
             for element in model.element.findall(tag):
                 name = model.prefix + self.name(element, model.frame)

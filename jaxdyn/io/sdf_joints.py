@@ -65,6 +65,7 @@ def read_joints(file: SdfFile) -> list[Joint]:
             raise file.fault(element, f"joint {name!r}: {unknown('type', kind, AXES)}; types are {', '.join(AXES)}")
         pose = file.joint_pose(name)
         parent, child = (file.link_of(file.end(name, which)) for which in ("parent", "child"))
+        # Both ends may be None: static models are parts of the world, and joining them has no effect.
         if parent == child and parent is not None:
             raise file.fault(element, f"joint {name!r} joins {parent!r} to itself; name two links")
         tags = ("axis", "axis2")[: AXES[kind]]
@@ -79,11 +80,13 @@ def _axis(file: SdfFile, name: str, joint, scope, tag: str, kind: str, pose: np.
     what = f"joint {name!r}"
     element = joint.find(tag)
     xyz = None if element is None else element.find("xyz")
+    # A missing axis is z from version 1.7 on; earlier files have to state it.
     if xyz is None and (tag == "axis2" or file.minor < 7):
         raise file.fault(joint if element is None else element, f"{what} is {kind} and has no <{tag}> with <xyz>")
     values = np.array([0.0, 0.0, 1.0]) if xyz is None else file.numbers(xyz, 3, f"<{tag}> of {what}")
     if not values.any():
         raise file.fault(xyz, f"<xyz> of <{tag}> of {what} is zero; give a direction")
+    # From 1.5 on, axes are in the joint's own frame by default.
     turn = pose[:3, :3]
     inside = (xyz.get("expressed_in") or "").strip() if xyz is not None else ""
     # Up to 1.4 axes are in the model's frame; in 1.5 and 1.6 where the file says so.
@@ -103,6 +106,7 @@ def _axis(file: SdfFile, name: str, joint, scope, tag: str, kind: str, pose: np.
         if 0 <= value < _FAR:
             leaves[key] = value
     for key in ("damping", "friction"):
+        # Zero is the format's default; a leaf of zeros would be a force that does nothing.
         if value := get(f"dynamics/{key}", 0.0):
             leaves[key] = value
     stiffness, rest = get("dynamics/spring_stiffness", 0.0), get("dynamics/spring_reference", 0.0)
@@ -135,12 +139,15 @@ def spanning_tree(
     **Arguments:** `links`; `fixed`, links that do not move; `joints` without gearboxes; `first`, links preferred as
     roots of parts without a joint to the world, in order of preference.
     """
+    # The arguments are read several times and may be iterators.
     links, fixed, first = list(links), set(fixed), list(first)
+    # The world is a node, so that all joints to it are edges like others.
     nodes: list[str | None] = [None, *links]
     near: dict[str | None, list[str | None]] = {node: [] for node in nodes}
     for joint in joints:
         near[joint.parent].append(joint.child)
         near[joint.child].append(joint.parent)
+    # Links of static models are at depth 1 although no joint holds them.
     for link in fixed:
         near[None].append(link)
     depth: dict[str | None, int] = {}
@@ -161,6 +168,7 @@ def spanning_tree(
         leaves = [axis.leaves for axis in joint.axes]
         moving = any("damping" in leaf or "friction" in leaf for leaf in leaves)
         springs, limits = any(axis.stiffness for axis in joint.axes), any(axis.limited for axis in joint.axes)
+        # Of equal joints the one nearer to the root stays, which gives short branches.
         deep = min(depth[joint.parent], depth[joint.child])
         return joint.cut, joint.kind == "ball", not springs, not moving, not limits, deep
 
@@ -180,6 +188,7 @@ def spanning_tree(
             left.add(joint.name)
             continue
         chosen.append(joint)
+        # The world represents its own group, since it can never be merged into another.
         part[b if a is None else a] = a if a is None else b
     # Directions follow from the roots outwards, whatever parent and child are in the file.
     edges: list[Edge] = [Edge(None, None, link, False) for link in links if link in fixed]

@@ -37,6 +37,7 @@ class TendonForce(eqx.Module):
         # Zero inside the rest interval, signed distance to it outside.
         stretch = length - jnp.clip(length, rest[:, 0], rest[:, 1])
         force = -(stiffness * stretch + damping * (rows @ v[place]))
+        # Each joint is listed once, so that `set` on zeros loses nothing.
         return jnp.zeros((system.nv,), q.dtype).at[place].set(force @ rows)
 
 

@@ -101,6 +101,7 @@ def urdf_model(
         raise ValueError(f"mimic is {mimic!r}; give 'ignore', 'couple' or 'error'")
     urdf, path = _read(file), file.path
     root_joint = ROOT_JOINT
+    # The root's joint is ours; a joint of the file keeps its name.
     while root_joint in urdf.joints:
         root_joint = f"_{root_joint}"
     kinds = {name: JOINTS[joint.type] for name, joint in urdf.joints.items()}
@@ -108,13 +109,16 @@ def urdf_model(
         if kinds.get(name, "fixed") == "fixed":
             raise ValueError(f"{path}: {unknown('joint', name, kinds)}; a ball takes the place of a joint that moves")
         kinds[name] = "spherical"
+    # A floating base can be locked at a pose as any joint.
     locked = _lock_values({root_joint: "free", **kinds} if floating_base else kinds, lock, path)
     couplings = {name: joint.mimic for name, joint in urdf.joints.items() if joint.mimic}
     places = {name: urdf.places[f"joint {name}"] for name in couplings}
     for name, (coupling, where) in (followers or {}).items():
+        # A file may state a coupling as <mimic> and as a plugin; equal ones count once.
         if couplings.setdefault(name, coupling) != coupling:
             raise ValueError(f"{where}: joint {name!r} follows {couplings[name].joint!r} already; keep one of them")
         places.setdefault(name, where)
+    # A fixed joint has no coordinate that could follow another one.
     couplings = {name: coupling for name, coupling in couplings.items() if kinds.get(name) != "fixed"}
     if mimic == "error" and couplings:
         listed = ", ".join(f"{name} (follows {coupling.joint})" for name, coupling in couplings.items())
@@ -123,8 +127,10 @@ def urdf_model(
         couplings = _resolve_couplings(couplings, kinds, locked, places)
 
     builder = ModelBuilder(urdf.name, gravity=gravity, dtype=dtype)
+    # Warnings of the builder can then name lines of the file.
     builder.places = {name: urdf.places[f"link {name}"] for name in urdf.links}
     free = floating_base and root_joint not in locked
+    # A locked base is a fixed body at the pose of the given coordinates.
     base = f64.joint_pose("free", np.zeros(6), locked[root_joint]) if root_joint in locked else None
     inertia = _inertia(urdf, urdf.root)
     builder.add_body(urdf.root, None, "free" if free else "fixed", inertia, joint_name=root_joint, pose=base)
@@ -147,6 +153,7 @@ def urdf_model(
     try:
         model = builder.build()
     except ValueError as error:
+        # The builder names the joint that moves no inertia; its line is looked up here.
         named = re.match(r"joint '(.*?)' \(body", str(error))
         where = urdf.places.get(f"joint {named[1]}", path) if named else path
         raise ValueError(f"{where}: {error}") from error
@@ -165,6 +172,7 @@ def urdf_inertia_report(
     **Raises:** ValueError as `load_urdf` does for a file that cannot be read.
     """
     urdf = _read(XmlFile(path, "URDF", arguments))
+    # A massless link on a fixed joint is a frame, as of a tool or a sensor.
     moved = {joint.child for joint in urdf.joints.values() if joint.type != "fixed"}
     report = []
     for name, link in urdf.links.items():
@@ -187,11 +195,13 @@ def _add_joint(
         turn, axis = f64.rotation_from_z(axis), _Z
     if joint.name in locked:
         screw = np.concatenate([axis, np.zeros(3)] if kind == "prismatic" else [np.zeros(3), axis])
+        # The same rotation before and after: the link stays in the axes of the file.
         pose = pose @ turn @ f64.joint_pose(kind, screw, locked[joint.name]) @ f64.inverse(turn)
         kind, axis, turn = "fixed", _Z, np.eye(4)
     leaves = {} if kind == "fixed" else _leaves(joint, kind)
     if not np.array_equal(turn, np.eye(4)):
         carrier = f"{name}_plane"
+        # The intermediate body is massless and carries the link, whose frame keeps the file's axes.
         builder.add_body(carrier, parent, kind, joint_name=joint.name, pose=pose @ turn, **leaves)
         builder.add_body(name, carrier, "fixed", inertia, joint_name=f"{joint.name}_plane", pose=f64.inverse(turn))
         return
@@ -201,12 +211,14 @@ def _add_joint(
 def _leaves(joint: Joint, kind: str) -> dict[str, Any]:
     leaves: dict[str, Any] = {key: joint.dynamics.get(key) for key in ("armature", "damping", "friction")}
     if joint.limit is not None:
+        # <limit> of a continuous joint has these two alone.
         leaves |= {"velocity_limit": joint.limit.get("velocity"), "effort_limit": joint.limit.get("effort")}
         if kind in ("revolute", "prismatic"):
             # The format's default for a missing bound is zero.
             leaves |= {key: joint.limit.get(key, 0.0) for key in ("lower", "upper")}
         for key in ("velocity_limit", "effort_limit", "lower", "upper"):
             if leaves.get(key) is not None and abs(leaves[key]) >= NO_LIMIT:
+                # The largest double means "no limit" in files of `save_urdf`.
                 leaves[key] = np.copysign(np.inf, leaves[key])
     return leaves
 
@@ -263,6 +275,7 @@ def _resolve_couplings(
             if kinds[joint] not in (*SCREW_KINDS, "fixed"):
                 fault = f"joint {name!r} follows {leader!r}, but {joint!r} is {kinds[joint]}"
                 raise ValueError(f"{where}: {fault}; couple joints of one degree of freedom, or pass mimic='ignore'")
+    # A fixed joint is at zero, so its followers are at their offset.
     held = {name: np.zeros(1) for name, kind in kinds.items() if kind == "fixed"}
     settled = False
     # Chains of couplings: each pass may lock leaders of others, until none changes.
@@ -272,6 +285,7 @@ def _resolve_couplings(
             if coupling.joint not in locked and coupling.joint not in held:
                 continue
             value = coupling.multiplier * (locked | held)[coupling.joint] + coupling.offset
+            # A follower that the caller locks as well is accepted where both values agree.
             if not np.allclose(locked.setdefault(name, value), value, rtol=1e-9, atol=1e-9):
                 raise ValueError(
                     f"lock: joint {name!r} is held at {locked[name]}, but follows {coupling.joint!r} to {value}"

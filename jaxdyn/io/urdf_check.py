@@ -32,6 +32,7 @@ def check_elements(file: XmlFile) -> tuple[list, dict[str, str]]:
     if root.tag != "robot":
         raise fault(root, f"the root element is <{root.tag}>, expected <robot>; this is not a URDF file")
     elements = [element for element in root if element.tag in ("link", "joint")]
+    # A xacro file that was not expanded may have neither, hence the hint.
     if not elements or not root.get("name"):
         missing = "name" if elements else "<link>"
         is_xacro = "xmlns:xacro" in root.attrib and file.source.suffix.lower() != ".xacro"
@@ -50,6 +51,7 @@ def check_elements(file: XmlFile) -> tuple[list, dict[str, str]]:
             for key in REQUIRED.get(part.tag, ()):
                 if part.get(key) is None:
                     raise fault(part, f"<{part.tag}> of {tag} {name!r} has no {key}")
+            # Ignoring this attribute would give the part a wrong rotation.
             if part.get("quat_xyzw") is not None:
                 raise fault(
                     part, f"<{part.tag}> of {tag} {name!r} has quat_xyzw, which is not supported; write it as rpy"
@@ -59,6 +61,7 @@ def check_elements(file: XmlFile) -> tuple[list, dict[str, str]]:
                     what = "a finite number" if count == 1 else f"{count} finite numbers"
                     raise fault(part, f"{key} of <{part.tag}> of {tag} {name!r} is {text!r}, expected {what}")
             for key in ("velocity", "effort") if part.tag == "limit" else ():
+                # Clipping to -limit .. limit would have an empty range.
                 if float(part.get(key, 0)) < 0:
                     raise fault(part, f"{key} of <limit> of {tag} {name!r} is {part.get(key)}; give its magnitude")
     for element in elements:
@@ -81,6 +84,7 @@ def check_elements(file: XmlFile) -> tuple[list, dict[str, str]]:
 def _parts(element) -> Iterator[tuple]:
     """Yield the used elements below an element with their parents, in the file's order, without visual ones."""
     for part in element:
+        # Their <origin> is another one than the link's or the joint's.
         if element.tag not in ("visual", "collision") and part.tag in _READ:
             yield element, part
         yield from _parts(part)
@@ -88,6 +92,7 @@ def _parts(element) -> Iterator[tuple]:
 
 def _check_once(parent, part, what: str, fault) -> None:
     first = parent.find(part.tag)
+    # `find` takes the first, and would ignore the second silently.
     if parent.tag in _PARENTS and first is not part:
         raise fault(part, f"a second <{part.tag}> of {what}, the first is on line {first.line}; keep one")
 

@@ -60,12 +60,14 @@ def read_closures(urdf: pathlib.Path, loops) -> Closures:
         return Closures("")
     if loops is not None:
         return _read(as_path(loops, "loops"), wanted=True)
+    # robot.urdf.xacro belongs to robot.yaml.
     name = urdf.with_suffix("") if urdf.suffix == ".xacro" and len(urdf.suffixes) > 1 else urdf
     beside = [path for suffix in _SUFFIXES if (path := name.with_suffix(suffix)).is_file()]
     return _read(beside[0], wanted=False) if beside else Closures("")
 
 
 def _read(path: pathlib.Path, wanted: bool) -> Closures:
+    # Imported here, since few files have loops.
     import yaml
 
     try:
@@ -153,12 +155,14 @@ def motors_of(closures: Closures, model: Model) -> Actuators | None:
     columns = []
     for name in closures.motors:
         joint = _look_up(joint_index, model, name, f"{closures.path}: name_mot")
+        # A motor has one control, and so one coordinate.
         if KINDS[kind := model.topology.kinds[joint]].nv != 1:
             raise ValueError(
                 f"{closures.path}: name_mot: joint {name!r} is {kind}; motors drive joints with one degree of freedom"
             )
         columns.append(model.topology.v_slices[joint].start)
     n, dtype = len(columns), model.home.dtype
+    # The effort limits of the file stay leaves of the model and do not clip here.
     free = np.tile([-np.inf, np.inf], (n, 1))
     moment = np.zeros((n, model.nv))
     moment[np.arange(n), columns] = 1.0
@@ -187,6 +191,7 @@ def _gazebo(file: XmlFile, model: Model) -> tuple[list[Constraint], list[str]]:
         for joint in element.findall("joint"):
             name = file.name(joint, "<gazebo>")
             kind = joint.get("type") or ""
+            # A prismatic joint without an axis has no direction in which it is free.
             if kind not in LOOPS or (kind == "prismatic" and joint.find("axis") is None):
                 left.setdefault("<gazebo> joints of kinds that cannot close a loop", []).append(f"{name} ({kind})")
                 continue
@@ -217,6 +222,7 @@ def _gazebo_loop(file: XmlFile, joint, name: str, kind: str, model: Model) -> Co
     # All coordinates zero is the configuration at which the format closes the loop.
     world = places[1] @ here
     turns = [_axis_rotation(file, joint, tag, world, what) for tag in ("axis", "axis2")]
+    # Only a universal joint has a second axis; others use one for both ends.
     turns = turns if kind == "universal" else turns[:1] * 2
     poses = []
     for place, turn in zip(places, turns, strict=True):
@@ -233,6 +239,7 @@ def _axis_rotation(file: XmlFile, joint, tag: str, world: np.ndarray, what: str)
         raise file.fault(
             xyz, f"<xyz> of {what} is expressed in {xyz.get('expressed_in')!r}; write it in the joint's frame"
         )
+    # The format's default axis is z; x for the second keeps the two at right angles.
     default = [0.0, 0.0, 1.0] if tag == "axis" else [1.0, 0.0, 0.0]
     axis = np.array(default) if xyz is None else file.numbers(xyz, 3, f"<{tag}> of {what}")
     if not axis.any():
@@ -247,6 +254,7 @@ def plugin_followers(file: XmlFile) -> dict[str, tuple[Mimic, str]]:
     """
     followers: dict[str, tuple[Mimic, str]] = {}
     for plugin in file.root.iterfind(".//gazebo/plugin"):
+        # Plugins of other kinds (controllers, sensors) have no such element.
         if plugin.find("mimicJoint") is None:
             continue
         leader, follower = file.word(plugin, "joint"), file.word(plugin, "mimicJoint")
@@ -263,6 +271,7 @@ def _zero_pose(model: Model, frame: str) -> np.ndarray:
     """World pose (4, 4) of a frame at zero coordinates, in float64."""
     k = model.frame_names.index(frame)
     pose, body = np.asarray(model.frame_poses, np.float64)[k], model.topology.frame_bodies[k]
+    # At neutral coordinates every joint transform is the identity, so home poses alone make the chain.
     while body >= 0:
         pose, body = np.asarray(model.home, np.float64)[body] @ pose, model.topology.parents[body]
     return pose

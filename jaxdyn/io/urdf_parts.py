@@ -93,6 +93,7 @@ def _joint(element) -> Joint:
         element.find("parent").get("link"),
         element.find("child").get("link"),
         np.eye(4) if origin is None else origin,
+        # The format's default axis is x; SDF's is z.
         _vector(axis, "xyz", "1 0 0"),
         None if limit is None else _numbers(limit),
         _numbers(element.find("dynamics")),

@@ -60,6 +60,7 @@ def save_urdf(
     if torques:
         _write_torques(robot, model, torques)
     ET.indent(robot)
+    # An interrupted write must not leave half a file in the place of a good one.
     with replacing(path) as part:
         ET.ElementTree(robot).write(part, encoding="utf-8", xml_declaration=True)
 
@@ -90,6 +91,7 @@ def _write_torques(robot: ET.Element, model: Model, torques: Mapping[str, Mappin
     element = ET.SubElement(robot, "jaxdyn")
     for joint, numbers in torques.items():
         values = {name: float(value) for name, value in numbers.items()}
+        # `joint_torques` would read NaN and infinity back without an error.
         if not np.isfinite(list(values.values())).all():
             raise ValueError(f"torques of joint {joint!r} are {values}; they must be finite")
         ET.SubElement(element, "joint", {"name": joint, **{name: repr(value) for name, value in values.items()}})
@@ -108,8 +110,10 @@ def _edges(model: Model) -> tuple[str, list[_Edge]]:
         frames[body].append(k)
     names = {i: name for i, name in enumerate(topology.body_names)}
     if _has_floating_base(model):
+        # The root link is the body itself, and `floating_base=True` adds its joint again.
         children[-1] = []
     else:
+        # A frame at the world's origin can be the root link; otherwise one is added.
         at_world = [k for k in frames[-1] if np.array_equal(poses[k], np.eye(4))]
         names[-1] = topology.frame_names[at_world[0]] if at_world else _fresh("world", links)
         frames[-1] = [k for k in frames[-1] if k not in at_world[:1]]
@@ -118,6 +122,7 @@ def _edges(model: Model) -> tuple[str, list[_Edge]]:
     for carrier, name in sorted(names.items()):
         runs = _split_runs([topology.joint_names[i] for i in children[carrier]])
         last = max((topology.joint_names[i] for i in children[carrier]), default="")
+        # Siblings in sorted order stay on the body; each further run needs a holder of its own.
         holders = [(name, np.eye(4))]
         for n in range(max(len(frames[carrier]), len(runs) - 1)):
             k = frames[carrier][n] if n < len(frames[carrier]) else None
@@ -133,6 +138,7 @@ def _edges(model: Model) -> tuple[str, list[_Edge]]:
                 edges.append(
                     _Edge(topology.joint_names[i], link, topology.body_names[i], f64.inverse(pose) @ home[i], i)
                 )
+    # The smallest key is -1 for the world, or 0 for the body of a floating base.
     return names[min(names)], edges
 
 
@@ -168,8 +174,10 @@ def _fresh(name: str, taken: set[str]) -> str:
 
 def _write_link(robot: ET.Element, name: str, parameters: np.ndarray | None) -> None:
     link = ET.SubElement(robot, "link", name=name)
+    # A link without <inertial> is massless, and loads as such.
     if parameters is None or not parameters.any():
         return
+    # URDF states inertia about the centre of mass, the model about the frame's origin.
     mass, com, inertia = f64.about_com(parameters)
     if mass == 0 and parameters[1:4].any():
         raise ValueError(
@@ -196,6 +204,7 @@ def _write_joint(robot: ET.Element, model: Model, edge: _Edge) -> None:
         raise ValueError(f"{what} is {kind}; URDF has no such joint")
     if kind != "free":
         screw = np.asarray(model.screws, np.float64)[edge.body]
+        # A planar joint of a model moves in the x-y plane, and URDF gives the normal.
         axis = {"planar": np.array([0.0, 0.0, 1.0]), "prismatic": screw[:3]}.get(kind, screw[3:])
         ET.SubElement(joint, "axis", xyz=_text(axis))
     _write_limits(joint, model, edge.body, what)
@@ -229,12 +238,14 @@ def _write_limits(joint: ET.Element, model: Model, body: int, what: str) -> None
         "effort": np.asarray(model.effort_limit, np.float64)[rates],
     }
     if kind == "continuous":
+        # The <limit> of a continuous joint has velocity and effort alone.
         del limits["lower"], limits["upper"]
     finite = [key for key, values in limits.items() if np.isfinite(values).any()]
     if kind in ("planar", "free"):
         if finite:
             raise ValueError(f"{what} is {kind} and has limits ({', '.join(finite)}); URDF cannot express them")
         return
+    # <limit> is required for revolute and prismatic joints.
     if finite or kind != "continuous":
         ET.SubElement(
             joint, "limit", {key: _text(np.clip(values, -NO_LIMIT, NO_LIMIT)) for key, values in limits.items()}

@@ -24,6 +24,7 @@ class Element(ElementTree.Element):
     line: int = 0
 
 
+# UTF-32 before UTF-16: the mark of UTF-32-LE begins with that of UTF-16-LE.
 _MARKS = ((codecs.BOM_UTF8, "utf-8-sig"), (codecs.BOM_UTF32_LE, "utf-32"), (codecs.BOM_UTF32_BE, "utf-32"))
 _MARKS += (
     (codecs.BOM_UTF16_LE, "utf-16"),
@@ -75,6 +76,7 @@ class XmlFile:
             )
 
         builder = ElementTree.TreeBuilder(element)
+        # Without this, expat reports each line of a text separately.
         parser.buffer_text = True
         parser.StartElementHandler = builder.start
         parser.EndElementHandler = builder.end
@@ -123,6 +125,7 @@ class XmlFile:
             values = self.numbers(pose, 7, what)
             if not values[3:].any():
                 raise self.fault(pose, f"<pose> of {what} has the quaternion zero; give x y z qx qy qz qw")
+            # The format writes (x, y, z, w); the library has (w, x, y, z).
             return f64.joint_pose("free", np.zeros(6), np.concatenate([values[:3], values[6:], values[3:6]]))
         values = self.numbers(pose, 6, what)
         turn = np.deg2rad(values[3:]) if (pose.get("degrees") or "").lower() in ("1", "true") else values[3:]
@@ -133,6 +136,7 @@ class XmlFile:
         child = None if element is None else element.find(tag)
         if child is None or not (child.text or "").strip():
             return default
+        # These words alone: `float` would accept "nan" too.
         if not finite and (child.text or "").strip().lower() in ("inf", "+inf", "-inf"):
             return float(child.text or "")
         return float(self.numbers(child, 1, what)[0])
@@ -141,6 +145,7 @@ class XmlFile:
         """Read a truth value in a child element, false where there is none."""
         child = None if element is None else element.find(tag)
         text = "" if child is None else (child.text or "").strip().lower()
+        # Any other text counted as false would silently change the model.
         if text not in ("", "0", "1", "true", "false"):
             raise self.fault(child, f"<{tag}> of {what} is {text!r}; give true or false")
         return text in ("1", "true")
@@ -151,6 +156,7 @@ def _decode(path: str, data: bytes) -> tuple[str, str]:
     encoding = next((name for mark, name in _MARKS if data.startswith(mark)), None)
     if encoding is None:
         declared = _DECLARED.match(data.lstrip())
+        # The default of XML.
         encoding = "utf-8" if declared is None else declared[1].decode(errors="replace")
         # Declared UTF-16 or UTF-32 without a byte order mark, in single bytes: the declaration is wrong.
         if re.match("(utf|ucs)[-_]?(16|32|2|4)", encoding.lower()):
@@ -179,6 +185,7 @@ def _expand(path: str, arguments: Mapping[str, Any]) -> str:
         import xacro
     except ImportError as error:
         raise ImportError(f"{path}: reading xacro files needs the package xacro: pip install jaxdyn[xacro]") from error
+    # xacro reads "true" and "false" in lower case.
     words = {name: str(value).lower() if isinstance(value, bool) else str(value) for name, value in arguments.items()}
     try:
         return xacro.process_file(path, mappings=words).toprettyxml(indent="  ")  # pyright: ignore[reportAttributeAccessIssue]

@@ -82,6 +82,7 @@ def _cast(value: Any, dtype) -> np.ndarray:
 
 def zeros_if_none(value: Any, size: int) -> Any:
     """The vector, or zeros (size,) where it was omitted."""
+    # Numpy zeros stay known inside a trace.
     return np.zeros(size) if value is None else value
 
 
@@ -196,6 +197,7 @@ def check_system(system: Any, name: str = "model") -> None:
 
     **Raises:** ValueError that states the remedy.
     """
+    # A scene has nq and nv too, so that its constraints and forces would silently be ignored.
     if hasattr(system, "system") and hasattr(system, "constraints"):
         raise ValueError(
             f"{name} is a {type(system).__name__}; pass scene.system: this function accepts no constraints and forces"
@@ -219,6 +221,7 @@ def pose_leaf(pose, what: str) -> Float[Array, "4 4"]:
     """Convert a pose to an array leaf; its numbers may be traced, and jax arrays (4, 4) are used unchanged."""
     if isinstance(pose, jax.Array) and pose.shape == (4, 4):
         return pose
+    # A position keeps its own dtype; the route through `pose_matrix` would give it the default one.
     if isinstance(pose, jax.Array) and pose.shape == (3,):
         return store_leaf(f64.pose_of(np.eye(3), pose), pose.dtype)
     return store_leaf(f64.pose_matrix(pose, what), float)

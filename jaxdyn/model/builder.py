@@ -128,11 +128,13 @@ class ModelBuilder:
         """
         what = f"body {name!r}"
         self._check_new(name, parent)
+        # Fixed joints are no kind of `KINDS`: they have no coordinates and are merged away.
         if joint not in KINDS and joint != "fixed":
             raise ValueError(f"{what}: joint kind {joint!r} is unknown; kinds are fixed, {', '.join(KINDS)}")
         joint_name = f"{name}_joint" if joint_name is None else joint_name
         if not isinstance(joint_name, str) or not joint_name:
             raise ValueError(f"{what}: joint_name is {joint_name!r}; give a non-empty string")
+        # Siblings are sorted by joint name, so equal names would leave their order undefined.
         if joint_name in self._joints:
             raise ValueError(
                 f"{what}: joint name {joint_name!r} is that of body {self._joints[joint_name]!r}; rename one"
@@ -241,6 +243,7 @@ class ModelBuilder:
         kept: dict[str, Any] = {
             key: None if value is None else store_leaf(value, self._dtype) for key, value in leaves.items()
         }
+        # Sorted, as static fields are compared: another order of a file must not compile another program.
         fixed_joints = tuple((self._bodies[name].joint_name, name) for name in sorted(fixed))
         return Model(**kept, topology=topology, fixed_joints=fixed_joints)
 
@@ -273,6 +276,7 @@ class ModelBuilder:
                 carriers[body.name] = (len(moving), np.eye(4))
                 moving.append(body)
                 continue
+            # Poses of fixed chains accumulate, and later children attach to the moving carrier.
             carriers[body.name] = (carrier, pose)
             # Inertia that is fixed to the world never moves and has no place in the model.
             if carrier >= 0:
@@ -340,6 +344,7 @@ def repair_inertias(model: Model) -> Model:
     """
     inertias = np.array(model.inertias)
     for i, parameters in enumerate(inertias):
+        # A massless body has no inertia to repair: only the file's author knows the mass.
         if parameters[0] > 0 and inertia_problems(parameters):
             inertias[i] = _inertia.nearest_feasible(parameters)
     return model.replace(inertias=store_leaf(inertias, inertias.dtype))
@@ -440,14 +445,17 @@ def _check_regular(topology: Topology, home, screws, inertias, armature) -> None
     if not is_concrete(home, screws, inertias, armature):
         return
     # A mass matrix that is singular at one configuration is legitimate; at a random one too, it is so at all of them.
+    # A fixed seed, so that the same file is always accepted or always refused.
     rng = np.random.default_rng(0)
     neutral = [joint_neutral(kind) for kind in topology.kinds]
     if not f64.idle_joints(topology, home, screws, inertias, armature, neutral):
         return
+    # Quaternions need not be of unit length here: `joint_pose` divides by the norm.
     elsewhere = [q + rng.uniform(-1, 1, q.size) for q in neutral]
     if not (idle := f64.idle_joints(topology, home, screws, inertias, armature, elsewhere)):
         return
     names = [topology.joint_names[i] for i in sorted(idle)]
+    # Joints are visited from the leaves, so the first one is the outermost cause.
     i, alone = next(iter(idle.items()))
     fault = (
         "moves no inertia: S^T I S = 0 for all that it carries"

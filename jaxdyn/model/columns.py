@@ -27,6 +27,7 @@ class Columns(NamedTuple):
 
 def columns_of(system: Any) -> Columns:
     """Names and units of a system's coordinates: those of its joints, or q1, q2, ... without units."""
+    # Coordinates of other systems may be anything, so that no unit is known.
     if not isinstance(system, Model):
         q, v = (tuple(f"{name}{i + 1}" for i in range(n)) for name, n in (("q", system.nq), ("v", system.nv)))
         return Columns(q, v, *(("",) * len(x) for x in (q, v, v, v)))

@@ -44,6 +44,7 @@ def scene_lines(scene) -> str:
 
 
 def _force_name(force) -> str:
+    # A static wrapper shows the name of the function that it holds.
     function = getattr(force, "function", None)
     return getattr(function, "__name__", type(force).__name__)
 
@@ -72,6 +73,7 @@ def solution_lines(solution) -> str:
             "traced" if not is_concrete(solution) else f"{int(np.sum(solution.success))} of {np.size(count)} successful"
         )
         return f"Solution: {ended}; q {solution.q.shape}, v {solution.v.shape}; {solution.solver}"
+    # An enumeration prints as name<text>.
     words = str(solution.result).partition("<")[2].rstrip(">")
     steps, rejected = int(count), int(solution.stats["num_rejected_steps"])
     given = [name for name in ("energy", "power", "work", "acceleration", "multipliers", "constraint_residual",
@@ -100,6 +102,7 @@ def _is_readable(leaf, ndim: int) -> bool:
 
 
 def _entry(leaf, place) -> str:
+    # A leaf with a batch axis or a tracer has no single number to print.
     return short(float(leaf[place])) if _is_readable(leaf, len(place)) else "?"
 
 

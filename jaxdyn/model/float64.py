@@ -133,6 +133,7 @@ def adjoint(pose: Values) -> np.ndarray:
     """Adjoint Ad = [[R, hat(p) R], [0, R]] (6, 6)."""
     result = np.zeros((6, 6))
     result[:3, :3] = result[3:, 3:] = pose[:3, :3]
+    # Linear part first, so that the lever is in the upper right block.
     result[:3, 3:] = hat(pose[:3, 3]) @ pose[:3, :3]
     return result
 
@@ -174,6 +175,7 @@ def joint_pose(kind: str, screw: np.ndarray, q: np.ndarray) -> np.ndarray:
         pose[:3, :3] = rotation_matrix(np.array([0.0, 0.0, 1.0]), q[2])
         pose[:2, 3] = q[:2]
     else:
+        # Divided by the norm, as in `joint_transform`: coordinates of files have few digits.
         w, v = q[-4] / np.linalg.norm(q[-4:]), q[-3:] / np.linalg.norm(q[-4:])
         pose[:3, :3] = np.eye(3) + 2 * hat(v) @ (w * np.eye(3) + hat(v))
         if kind == "free":
@@ -192,6 +194,7 @@ def quaternion(rotation: np.ndarray) -> np.ndarray:
     quat = products[k].copy()
     quat[k] = squares[k]
     quat = quat / np.linalg.norm(quat)
+    # Both signs are the same rotation; a fixed one makes results reproducible.
     return quat if quat[0] >= 0 else -quat
 
 

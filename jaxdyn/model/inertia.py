@@ -58,6 +58,7 @@ def inertial_parameters(mass: Number, com: Numbers, inertia_com: Numbers) -> Flo
     """
     _check_shapes(mass=(mass, ()), com=(com, (3,)), inertia_com=(inertia_com, (3, 3)))
     com, inertia_com = jnp.asarray(com), jnp.asarray(inertia_com)
+    # One dtype for all ten numbers: that of the centre of mass.
     mass = jnp.asarray(mass, com.dtype)
     outer = com[:, None] * com[None, :]
     about_origin = inertia_com + mass * (jnp.sum(com**2) * jnp.eye(3, dtype=com.dtype) - outer)
@@ -167,6 +168,7 @@ def is_feasible(parameters: Numbers, *, tolerance: float = 0.0) -> bool:
     `tolerance` is relative to its largest eigenvalue.
     """
     values = np.linalg.eigvalsh(_f64.pseudo_inertia(np.asarray(parameters, np.float64)))
+    # A matrix without a positive eigenvalue gives no scale for the tolerance.
     return bool(values[0] >= -tolerance * max(values[-1], 0.0))
 
 

@@ -73,6 +73,7 @@ def add_prefix(model: Model, prefix: Any) -> Model:
     fixed = tuple((prefix + joint, prefix + link) for joint, link in model.fixed_joints)
     # Frames merged into bodies and names of fixed joints take the prefix too: both are ways to name a frame.
     whole = dataclasses.replace(top, **names)
+    # Without a prefix the same object is returned, whose topology compares by identity first.
     return dataclasses.replace(model, topology=whole, fixed_joints=fixed) if prefix else model
 
 
@@ -111,12 +112,14 @@ def _side_by_side(models: Sequence[Model], name: str, fix: str, by_name: bool) -
         twice = sorted({n for n in names if names.count(n) > 1})
         if twice:
             raise ValueError(f"the names {twice} are in two models; {what} have to differ: {fix}")
+    # Index of the first body of each model in the concatenated list.
     first = np.cumsum([0] + [top.nb for top in tops])
     trees = [
         (top.joint_names[root], first[k] + np.flatnonzero(top.roots == root))
         for k, top in enumerate(tops)
         for root in sorted(set(top.roots.tolist()))
     ]
+    # The order of `ModelBuilder`, so that a joined model equals one that was built at once.
     trees = sorted(trees, key=lambda tree: tree[0]) if by_name else trees
     order = np.concatenate([bodies for _, bodies in trees]) if trees else np.zeros(0, int)
     place = np.append(np.argsort(order), -1)  # new index of each body of the concatenated list; -1, the world, stays
@@ -137,12 +140,14 @@ def _side_by_side(models: Sequence[Model], name: str, fix: str, by_name: bool) -
             body = top.frame_bodies[i]
             others.append((int(place[first[k] + body]) if body >= 0 else -1, top.frame_names[i], len(poses)))
             poses.append(_as_known(model.frame_poses)[i])
+    # By body and name, as `ModelBuilder` sorts them.
     others.sort(key=lambda frame: frame[:2])
     couplings = [
         ((int(place[first[k] + pair[0]]), int(place[first[k] + pair[1]])), k, row)
         for k, top in enumerate(tops)
         for row, pair in enumerate(top.couplings)
     ]
+    # Static pairs and their values must have one order, that of `ModelBuilder`.
     couplings.sort(key=lambda coupling: coupling[0])
     topology = Topology(
         name=name,
@@ -183,6 +188,7 @@ def _join_leaf(models, leaf: str, rows):
     if all(value is None for value in values):
         return None
     dtype = jnp.result_type(*(value for value in values if value is not None))
+    # Only armature, damping and friction may be absent, and zero is their effect then.
     values = [np.zeros(model.nv) if value is None else value for model, value in zip(models, values, strict=True)]
     return _concatenate(values, dtype, rows)
 

@@ -34,6 +34,7 @@ class JointKind(NamedTuple):
     columns: tuple[int, ...]
 
 
+# Columns are empty where a screw, a leaf of the model, gives the subspace.
 KINDS: dict[str, JointKind] = {
     "revolute": JointKind(1, 1, ()),
     "continuous": JointKind(1, 1, ()),

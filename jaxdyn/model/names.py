@@ -16,6 +16,7 @@ def body_index(model: Any, name: str | None) -> int:
         return -1
     if name in model.body_names:
         return model.body_names.index(name)
+    # A link merged into a body is still named by users and files.
     return model.topology.frame_bodies[frame_index(model, name)]
 
 
@@ -24,6 +25,7 @@ def frame_index(model: Any, name: str) -> int:
 
     **Raises:** ValueError when there is no frame of that name; names that look alike are listed.
     """
+    # Files often name the joint where they mean its link, fixed joints included.
     carried = dict(model.fixed_joints) | dict(zip(model.joint_names, model.body_names, strict=True))
     try:
         return model.frame_names.index(name if name in model.frame_names else carried.get(name, name))
@@ -48,6 +50,7 @@ def joint_index(model: Any, name: str) -> int:
 def coordinate_index(slices: Sequence[slice], model: Any, joint: str) -> int | slice:
     """Index of a joint's coordinate, or the slice of several."""
     place = slices[joint_index(model, joint)]
+    # A number and not a slice of one, so that q[index] is a scalar.
     return place.start if place.stop == place.start + 1 else place
 
 
@@ -59,9 +62,11 @@ def velocity_indices(model: Any, joints: Iterable[str]) -> np.ndarray:
     if isinstance(joints, str):
         raise ValueError(f"joints is {joints!r}; give a list of names, [{joints!r}]")
     joints = list(joints)
+    # A repeated joint would give a selection matrix without full column rank.
     if len(set(joints)) < len(joints):
         raise ValueError(f"joints is {joints}; name each joint once")
     places = [model.topology.v_slices[joint_index(model, joint)] for joint in joints]
+    # The empty array keeps the integer type when no joint is named.
     return np.concatenate([np.zeros(0, int), *(np.arange(place.start, place.stop) for place in places)])
 
 

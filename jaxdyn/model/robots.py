@@ -333,8 +333,10 @@ def random_tree(
         if kind in ("revolute", "continuous", "prismatic"):
             axes["axis"] = np.array([0, 0, 1.0]) + skew * rng.normal(size=3)
         elif kind == "helical":
+            # Six random numbers give a pitch and an axis that misses the origin with probability one.
             axes["screw"] = rng.normal(size=6)
         pose = (size * rng.uniform(-0.5, 0.5, 3), skew * rng.normal(size=3))
+        # Leading zeros keep the order of names that of the numbers, as the builder sorts by name.
         label = f"{i:0{len(str(nb))}d}"
         builder.add_body(
             f"body_{label}",

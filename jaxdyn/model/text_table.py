@@ -17,6 +17,7 @@ def table(header: Sequence[str], rows: Sequence[Sequence[str]], indent: str = " 
             cell.rjust(width) if right else cell.ljust(width)
             for cell, width, right in zip(row, widths, numeric, strict=True)
         ]
+        # Trailing spaces of a last left-aligned column would show in copied output.
         lines.append((indent + "  ".join(cells)).rstrip())
     return "\n".join(lines)
 

@@ -73,6 +73,7 @@ class Topology:
     @cached_property
     def screw_mask(self) -> np.ndarray:
         """Mask (nb, 6) of the screw entries that each joint's kind uses."""
+        # The shape (0, 6) of a model without bodies needs the reshape.
         return np.array([screw_mask(kind) for kind in self.kinds], bool).reshape(-1, 6)
 
     @cached_property
@@ -114,5 +115,6 @@ class Topology:
         tables = []
         while self.nb and (jump[:-1] != self.nb).any():
             tables.append(jump[:-1])
+            # Each table composed with itself doubles the distance of the jump.
             jump = jump[jump]
         return tuple(tables)

@@ -157,6 +157,7 @@ class Model(eqx.Module):
             raise ValueError(
                 f"frame {frame!r} is fixed to the world: a payload there has no effect; name a moving frame"
             )
+        # Inertial parameters about one origin add up; the payload is moved to the body's own first.
         added = transform_inertia(self.frame_poses[index], _payload(inertia, dtype))
         return self.replace(inertias=self.inertias.at[body].add(added))
 
@@ -209,6 +210,7 @@ def _payload(inertia: Any, dtype) -> Array:
 def _replace(model: Model, leaves: dict) -> Model:
     names = [field.name for field in dataclasses.fields(Model) if field.name not in ("topology", "fixed_joints")]
     sizes = {"gravity": (3,), "armature": (model.nv,), "damping": (model.nv,), "friction": (model.nv,)}
+    # Without couplings in the static topology there is nothing that the values could belong to.
     if model.topology.couplings == ():
         names.remove("coupling_values")
     for name, value in leaves.items():
@@ -231,7 +233,9 @@ def _replace(model: Model, leaves: dict) -> Model:
 
 def _geometry(model: Model) -> tuple[Array | np.ndarray, Array | np.ndarray]:
     mask = model.topology.screw_mask
+    # A revolute joint of a declared kind ignores v, so that its derivative with respect to v is zero too.
     screws = model.screws * jnp.asarray(mask, model.screws.dtype)
+    # A known home pose has no derivative, and the projection would only add rounding.
     if is_concrete(model.home):
         return model.home, screws
     rotation = model.home[:, :3, :3]
@@ -337,6 +341,7 @@ def normalize(model: Model, q: Float[Array, " nq"]) -> Float[Array, " nq"]:
     def unit(kind, qj):
         if kind not in ("spherical", "free"):
             return qj
+        # No guard for a zero quaternion: it represents no rotation, and NaN shows the fault.
         quat = qj[-4:] / jnp.sqrt(jnp.sum(qj[-4:] ** 2))
         return quat if kind == "spherical" else jnp.concatenate([qj[:3], quat])
 
@@ -356,6 +361,7 @@ def random_configuration(model: Model, key: Array) -> Float[Array, " nq"]:
         place = topology.q_slices[i]
         reach = np.full(KINDS[kind].nq, 1.0 if kind in ("prismatic", "planar", "free") else np.pi)
         if kind == "planar":
+            # The third coordinate of a planar joint is an angle.
             reach[2] = np.pi
         low, high = lower[place], upper[place]
         low = xp.where(xp.isfinite(low), low, xp.asarray(-reach, low.dtype))

@@ -35,6 +35,7 @@ _SHARE = 0.3  # the same for bodies without rods, as a fraction of the mechanism
 def complete_solids(scene: Scene, shapes: Shapes) -> Shapes:
     """Add default solids for bodies with mass that have none, and for rolling surfaces."""
     model = scene.system
+    # A visual on a merged link shows the body that carries the link.
     carried = {model.topology.frame_bodies[frame_index(model, name)] for name in shapes.frames()}
     drawn = list(shapes)
     size = extent(scene)
@@ -51,6 +52,7 @@ def complete_solids(scene: Scene, shapes: Shapes) -> Shapes:
         solid = _of_inertia(model, i, thin, i in wheeled)
         longest = max((rod.size[1] for rod in rods), default=_SHARE * size if whole and model.nb > 3 else 0.0)
         longest *= model.nb > 1  # a single body is drawn as its solid
+        # The object of a grasp has a solid of its own: forces inside it must stay visible.
         if isinstance(scene, Grasp) and model.body_names[i] == grasped:
             drawn += object_solids(scene, solid, thin)
             continue
@@ -62,16 +64,19 @@ def extent(scene: Scene) -> float:
     """Size of the mechanism at its neutral configuration, m: the diagonal of the box around joints, loop ends and masses."""
     model = scene.system
     poses = home_poses(model)
+    # Where all bodies are attached to the world, the size includes the world's origin.
     points = [np.zeros(3)] if (np.array(model.topology.parents) == -1).all() and model.nb > 1 else []
     for i in range(model.nb):
         mass, com, moment = f64.about_com(np.asarray(model.inertias, float)[i])
         points += [poses[i, :3, 3], poses[i, :3, :3] @ com + poses[i, :3, 3]]
         if mass > 0:
+            # A radius of gyration, so that a single body has a size too.
             reach = np.sqrt(np.abs(np.trace(moment)) / mass)
             points += [points[-1] + reach * sign for sign in np.array([[1, 1, 1], [-1, -1, -1]]) / np.sqrt(3)]
     for body, pose in _ends(scene):
         points.append((frame_poses(model, poses, body) @ pose)[:3, 3])
     size = float(np.linalg.norm(np.ptp(np.array(points), axis=0))) if points else 0.0
+    # Point masses at one place have no extent; all other lengths are fractions of the size.
     return size if size > 0 else 1.0
 
 
@@ -111,7 +116,9 @@ def _joints_on(scene: Scene) -> dict[int, list[np.ndarray]]:
     points: dict[int, list[np.ndarray]] = {i: [] for i in range(-1, model.nb)}
     home = np.asarray(model.home, float)
     for i, parent in enumerate(model.topology.parents):
+        # A free body is not attached to anything, so no rod leads to its origin.
         if model.topology.kinds[i] != "free":
+            # Own joint first: rods start at it, and a child may have added its point before.
             points[i].insert(0, np.zeros(3))
             points[parent].append(home[i, :3, 3])
     for constraint in pairs(scene):
@@ -144,6 +151,7 @@ def _rods(model: Model, i: int, points: list[np.ndarray], thin: float) -> list[S
 
 def _or_mark(solid: Shape, longest: float, thin: float) -> Shape:
     """Replace a solid that is bulky compared with a rod of the length `longest` by a ball at its centre."""
+    # In the solid's own axes, so that its orientation does not change the edges.
     edges = np.sort(np.ptp(solid.triangles()[0] @ solid.pose[:3, :3], axis=0))
     if longest and (edges[2] > _BULKY[0] * longest or edges[1] > _BULKY[1] * longest):
         return dataclasses.replace(solid, kind="ellipsoid", size=(2.5 * thin,) * 3)
@@ -161,6 +169,7 @@ def _of_inertia(model: Model, i: int, thin: float, rolls: bool) -> list[Shape]:
     pose[:3, 3] = com
     least = 1.2 * thin
     if model.topology.kinds[i] == "planar":
+        # Inertias of files may be unphysical; a negative moment is drawn as a small solid.
         radius = float(np.sqrt(max(2 * moment[2, 2] / mass, 0.0)))
         return [Shape(name, "cylinder", (max(radius, least), 2 * least), pose, source="inertia")]
     moments, axes = np.linalg.eigh(moment)
@@ -169,6 +178,7 @@ def _of_inertia(model: Model, i: int, thin: float, rolls: bool) -> list[Shape]:
         axes[:, 0] *= -1
     pose[:3, :3] = axes
     options: dict = dict(source="inertia")
+    # A point mass has no shape; a ball of the rods' thickness shows it.
     if moments[2] <= mass * least**2:
         return [Shape(name, "ellipsoid", (2 * thin,) * 3, pose, **options)]
     equal = [abs(moments[a] - moments[b]) <= _EQUAL * moments[2] for a, b in ((0, 1), (1, 2))]
@@ -176,11 +186,13 @@ def _of_inertia(model: Model, i: int, thin: float, rolls: bool) -> list[Shape]:
         radius = float(np.sqrt(2.5 * moments.mean() / mass))
         return [Shape(name, "ellipsoid", (radius,) * 3, pose, **options)]
     if any(equal):
+        # eigh sorts the moments, so the single one is the first or the last.
         axis = 2 if equal[0] else 0
         across = moments[0] if axis == 2 else moments[2]
         radius = np.sqrt(max(2 * moments[axis] / mass, 0.0))
         length = np.sqrt(max(12 * across / mass - 3 * radius**2, 0.0))
         if length > 0 or radius > least:
+            # A cyclic permutation keeps the axes right-handed, with the cylinder's axis as z.
             permuted = np.roll(axes, 2 - axis, axis=1)
             pose[:3, :3] = permuted
             size = (max(float(radius), least), max(float(length), least))
@@ -201,6 +213,7 @@ def _rolling(scene: Scene, carried: set[int]) -> tuple[list[Shape], set[int]]:
             continue
         index = frame_index(model, constraint.body)
         body = model.topology.frame_bodies[index]
+        # The file's own solid shows the wheel already.
         if body in carried:
             continue
         pose, radius = np.asarray(constraint.pose, float), float(constraint.radius)
@@ -209,6 +222,7 @@ def _rolling(scene: Scene, carried: set[int]) -> tuple[list[Shape], set[int]]:
         else:
             shapes.append(Shape(constraint.body, "ellipsoid", (radius,) * 3, pose, source="constraint"))
         centre = (np.asarray(model.frame_poses, float)[index] @ pose)[:3, 3]
+        # A wheel around the centre of mass shows the body; one at a corner does not.
         if body >= 0 and np.linalg.norm(f64.about_com(np.asarray(model.inertias, float)[body])[1] - centre) < radius:
             bodies.add(body)
         reach = getattr(constraint, "surface_radius", None)

@@ -61,6 +61,7 @@ def draw(
         lam = np.asarray(as_array(multipliers, "multipliers"), float)
         if lam.shape != (count,):
             raise ValueError(f"multipliers has shape {lam.shape}, expected ({count},), one per row of the scene")
+        # One motion with one row, as `forces` expects.
         motion = motion._replace(multipliers=lam[None, None])
     picture = _Picture(motion, shapes, ax)
     picture.show(0)
@@ -100,6 +101,7 @@ def animate(
     if not path.parent.is_dir():
         raise ValueError(f"path is {str(path)!r}: there is no directory {path.parent}")
     _matplotlib()
+    # Imported after the check, whose message names the package to install.
     from matplotlib.animation import FFMpegWriter, PillowWriter
 
     duration = float(np.ptp(np.asarray(solution.ts))) if hasattr(solution, "ts") else 0.0
@@ -148,6 +150,7 @@ class _Picture:
         from mpl_toolkits.mplot3d.art3d import Poly3DCollection
 
         for artist in self.drawn:
+            # Removed one by one: clearing the axes would reset the view and the limits.
             artist.remove()
         self.drawn = []
         ax, size, model = self.ax, self.stage.size, self.motion.scene.system
@@ -220,7 +223,9 @@ def arrow(at: np.ndarray, vector: np.ndarray) -> np.ndarray:
     """Points (9, 3) of a polyline that draws an arrow: the shaft, then a head of four lines."""
     tip, length = at + vector, np.linalg.norm(vector)
     if not length > 0:
+        # A zero vector has no direction for a head.
         return np.broadcast_to(at, (2, 3))
+    # The unit vector least parallel to the arrow, as for cones.
     first = np.cross(vector, np.eye(3)[np.argmin(np.abs(vector))])
     first = 0.06 * length * first / np.linalg.norm(first)
     second, back = np.cross(vector, first) / length, at + 0.8 * vector
@@ -234,8 +239,10 @@ def arrow_length(shown: list[Cone], size: float) -> float:
 
 def scale_forces(forces, length: float):
     """Yield each force with the factor (m/N or m/(N m)) that gives the largest of its kind the length (m)."""
+    # Forces and torques have different units and so a scale each.
     for kind in ("force", "torque"):
         members = [force for force in forces if force.kind == kind]
+        # One scale for the whole motion, so that lengths of different rows compare.
         largest = max((float(np.linalg.norm(force.vectors, axis=-1).max()) for force in members), default=0.0)
         yield from ((force, length / largest) for force in members)
 
@@ -246,6 +253,7 @@ def _axes(ax) -> Any:
         from matplotlib.figure import Figure
 
         figure = Figure(figsize=(5.2, 4.6), dpi=110, layout="constrained")
+        # A canvas without a display; `savefig` and the writers of animations need one.
         FigureCanvasAgg(figure)
         return figure.add_subplot(projection="3d")
     if getattr(ax, "name", "") != "3d":
@@ -257,6 +265,7 @@ def _axes(ax) -> Any:
 
 def _set_stage(ax, stage: Stage) -> None:
     """Set equal scales, limits down to the ground, and the view."""
+    # A flat mechanism would have limits of zero width, which matplotlib widens with a warning.
     extent = np.maximum(stage.high - stage.low, 0.12 * stage.size)
     low, high = stage.centre - 0.53 * extent, stage.centre + 0.53 * extent
     axis = int(np.argmax(np.abs(stage.up)))
@@ -269,6 +278,7 @@ def _set_stage(ax, stage: Stage) -> None:
     a, b = np.eye(3)[(axis + 1) % 3], np.eye(3)[(axis + 2) % 3]
     elevation = np.rad2deg(np.arcsin(np.clip(stage.eye @ np.eye(3)[axis], -1, 1)))
     azimuth = np.rad2deg(np.arctan2(stage.eye @ b, stage.eye @ a))
+    # matplotlib draws its vertical axis upwards; gravity along the positive axis turns the picture over.
     roll = 0.0 if stage.up[axis] > 0 else 180.0
     ax.view_init(elevation, azimuth, roll, vertical_axis=vertical)
     ax.set(xlim=(low[0], high[0]), ylim=(low[1], high[1]), zlim=(low[2], high[2]))

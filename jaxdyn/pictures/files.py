@@ -81,6 +81,7 @@ class _Meshes:
 
 def _urdf(file: XmlFile) -> Shapes:
     meshes, shapes = _Meshes(file.source), []
+    # Materials may be defined once, at the robot or in any link, and named elsewhere.
     materials = {element.get("name"): rgba for element in file.root.iter("material") if (rgba := _rgba(file, element))}
     for link in file.root.findall("link"):
         frame = file.name(link, "the robot")
@@ -92,6 +93,7 @@ def _urdf(file: XmlFile) -> Shapes:
                 xyz, rpy = (_attribute(file, origin, key, 3, what, np.zeros(3)) for key in ("xyz", "rpy"))
                 pose = np.asarray(f64.pose_matrix((xyz, rpy), what))
             material = visual.find("material")
+            # A colour in the element itself wins over the named one.
             rgba = None if material is None else _rgba(file, material) or materials.get(material.get("name"))
             color, opacity = (None, 1.0) if rgba is None else (rgba[:3], rgba[3])
             geometry = visual.find("geometry")
@@ -180,18 +182,23 @@ def _mjcf(file: XmlFile) -> Shapes:
             continue
         material = int(m.geom_matid[g])
         rgba = tuple(float(x) for x in (m.mat_rgba[material] if material >= 0 else m.geom_rgba[g]))
+        # Geoms for contact alone are often made invisible this way.
         if rgba[3] == 0:
             continue
+        # A colour that the file does not state leaves the body's own colour of the picture.
         color = None if material < 0 and np.allclose(rgba, _DEFAULT_GREY) else rgba[:3]
         pose = pose_of(m.geom_pos[g], m.geom_quat[g])
         vertices = faces = None
         if kind == "sphere":
+            # MuJoCo stores three sizes for every geom; a sphere uses the first.
             kind, size = "ellipsoid", (size[0],) * 3
         elif kind in ("capsule", "cylinder"):
+            # MuJoCo has half lengths.
             size = size[0], 2 * size[1]
         elif kind == "box":
             size = tuple(2 * x for x in size)
         elif kind == "mesh":
+            # The compiler has scaled the vertices, and moved them to the mesh's own frame.
             mesh, size = int(m.geom_dataid[g]), (1.0, 1.0, 1.0)
             start, count = m.mesh_vertadr[mesh], m.mesh_vertnum[mesh]
             vertices = np.asarray(m.mesh_vert[start : start + count], float)

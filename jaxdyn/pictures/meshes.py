@@ -22,16 +22,19 @@ def find_mesh(uri: str, folder: pathlib.Path) -> pathlib.Path:
     **Raises:** MeshError when there is no such file.
     """
     scheme, mark, rest = uri.partition("://")
+    # URIs write a space as %20.
     rest = unquote(rest if mark else uri)
     if not mark or scheme == "file":
         places = [folder / rest]
     else:
         name, _, inner = rest.partition("/")
         places = []
+        # The file's own package is found without any variable of the environment.
         for above in (folder, *folder.parents):
             places += [above / rest, *([above / inner] if above.name == name else [])]
         for variable in _FOLDERS:
             for place in filter(None, os.environ.get(variable, "").split(os.pathsep)):
+                # A ROS 2 prefix has the packages below share/.
                 places += [pathlib.Path(place) / rest, pathlib.Path(place) / "share" / rest]
                 places += [pathlib.Path(place) / inner] if pathlib.Path(place).name == name else []
     for place in places:
@@ -50,6 +53,7 @@ def read_mesh(path: pathlib.Path) -> list[tuple[np.ndarray, np.ndarray, tuple[fl
     except ImportError:
         raise MeshError("reading meshes needs trimesh: pip install jaxdyn[view]") from None
     try:
+        # Without processing, vertices and faces stay as in the file.
         loaded = trimesh.load_scene(str(path), process=False)
     except Exception as error:  # readers of many formats raise anything
         reason = " ".join(str(error).split()) or type(error).__name__
@@ -59,8 +63,10 @@ def read_mesh(path: pathlib.Path) -> list[tuple[np.ndarray, np.ndarray, tuple[fl
         transform, name = loaded.graph[node]
         mesh = loaded.geometry[name]
         faces = getattr(mesh, "faces", None)
+        # Scenes may hold points and lines, which are no solids.
         if faces is None or not len(faces):
             continue
+        # Nodes of DAE and GLB files have poses of their own.
         vertices = np.asarray(mesh.vertices, float) @ transform[:3, :3].T + transform[:3, 3]
         parts.append((vertices, np.asarray(faces, int), _color(mesh)))
     if not parts:
@@ -78,4 +84,5 @@ def _color(mesh) -> tuple[float, ...] | None:
         rgba = np.asarray(visual.vertex_colors).reshape(-1, 4).mean(0)
     else:
         return None
+    # Alpha is dropped: the opacity of a solid comes from the robot's file.
     return None if rgba is None else tuple(float(x) / 255 for x in np.asarray(rgba)[:3])

@@ -84,6 +84,7 @@ def drawable(scene: Any) -> Scene:
 @functools.lru_cache(maxsize=32)
 def _kinematics(structure):
     """One compiled function for models that differ only in their parameters."""
+    # The argument is the key of the cache; the function itself takes the model.
     del structure
     return jax.jit(lambda model, qs: jax.vmap(lambda q: forward_kinematics(model, q))(qs))
 
@@ -114,6 +115,7 @@ def motion_of(scene: Any, solution: Any, rows: int | None = None, most: int | No
             f"solution.q has shape {q.shape}, expected (..., nt, {model.nq}); is the scene that of the solution?"
         )
     nt = q.shape[-2]
+    # All batch axes become one.
     q = q.reshape(-1, nt, model.nq)
     ts = np.asarray(solution.ts, float).reshape(-1, nt)
     if (ts != ts[0]).any():
@@ -122,6 +124,7 @@ def motion_of(scene: Any, solution: Any, rows: int | None = None, most: int | No
         )
     extras: list[Any] = [solution.multipliers, solution.torque]
     if most is not None and len(q) > most:
+        # Evenly from the batch, since its order often follows a parameter.
         chosen = np.unique(np.linspace(0, len(q) - 1, most).round().astype(int))
     else:
         chosen = np.arange(len(q))
@@ -175,6 +178,7 @@ def marks(motion: Motion) -> list[Mark]:
 def _contact(motion: Motion, constraint: Pair, a: np.ndarray, b: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Point (n, nt, 3) and normal (n, nt, 3) of a contact in the world."""
     model = motion.scene.system
+    # A contact at a fixed point: frame A is there, with z along the normal.
     if not hasattr(constraint.resolve(model), "contact_point"):
         return a[..., :3, 3], a[..., :3, 2]
 
@@ -205,6 +209,7 @@ def forces(motion: Motion) -> list[Force]:
         model = motion.scene.system
         top = model.topology
         for i, kind in enumerate(top.kinds):
+            # A joint of several coordinates has no single axis along which its torque could be drawn.
             if kind not in SCREW_KINDS:
                 continue
             screw = np.asarray(model.screws, float)[i]
@@ -213,6 +218,7 @@ def forces(motion: Motion) -> list[Force]:
             size = motion.torque[:, :, top.v_slices[i]]
             word = "force" if kind == "prismatic" else "torque"
             arrows.append(Force(top.joint_names[i], word, motion.poses[:, :, i, :3, 3], direction * size))
+    # A force that is zero throughout would be an arrow without a direction.
     return [force for force in arrows if np.abs(force.vectors).max(initial=0.0) > 0]
 
 
@@ -223,6 +229,7 @@ def _force(motion: Motion, constraint: Pair, name: str, multipliers: np.ndarray)
     lam = jnp.asarray(multipliers.reshape(len(p), -1))
     wrench = np.asarray(_wrenches(motion.scene.system, constraint, R, p, q, lam), float)
     wrench = wrench[:, :3].reshape(*a.shape[:2], 3)
+    # Multipliers of grasps act on the object, which is frame A; others on frame B.
     vectors = (a[..., :3, :3] @ wrench[..., None])[..., 0] * (-1.0 if isinstance(constraint, Contact) else 1.0)
     at = b[..., :3, 3] if isinstance(constraint, Loop | Distance) else _contact(motion, constraint, a, b)[0]
     return Force(name, "force", at, vectors)
@@ -243,6 +250,7 @@ def cones(motion: Motion) -> list[Cone]:
 
         def direction(component, contact=contact, constraint=constraint, place=place) -> Force:
             unit = np.zeros((*motion.q.shape[:2], place.end - place.start))
+            # The direction of a component is the force of its unit multiplier.
             unit[..., contact.rows[component] - place.start] = 1.0
             return _force(motion, constraint, contact.name, unit)
 

@@ -40,8 +40,10 @@ def object_solids(scene: Grasp, solids: list[Shape], thin: float) -> list[Shape]
         return [rod(name, com, place, 1.5 * thin, source="inertia") for place in places]
     ball = solids[0] if len(solids) == 1 and solids[0].kind == "ellipsoid" and len(set(solids[0].size)) == 1 else None
     if places and ball is not None:
+        # A cube of edge 2 h has the moments 2/3 m h^2.
         half = float(np.sqrt(1.5 * np.trace(moment) / 3 / mass))
         points = np.abs(np.array(places) - com)
+        # The largest coordinate of a point on a cube's surface is half its edge.
         off_cube = np.abs(points.max(1) - half).max()
         if off_cube < np.abs(np.linalg.norm(points, axis=1) - ball.size[0]).max():
             pose = np.eye(4)

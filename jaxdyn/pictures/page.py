@@ -75,8 +75,10 @@ def view(
             "No browser could be opened; open that address in one, or write a file: jd.pictures.save_html(path, scene, solution)"
         )
     if (not _interactive()) if block is None else block:
+        # Ctrl-C closes the page, and the script continues.
         with contextlib.suppress(KeyboardInterrupt):
             while True:
+                # The server runs in threads of its own.
                 time.sleep(3600)
         viewer.stop()
     return viewer
@@ -109,6 +111,7 @@ def save_html(
         raise ValueError(f"path is {str(path)!r}; write to a file .html")
     if not path.parent.is_dir():
         raise ValueError(f"path is {str(path)!r}: there is no directory {path.parent}")
+    # All rows: `_document` chooses them anew for each size.
     motion = motion_of(scene, solution, most=1 + _GHOSTS)
     path.write_text(_document(motion, all_solids(motion, shapes)), encoding="utf-8")
 
@@ -130,6 +133,7 @@ class Viewer:
 
     def stop(self) -> None:
         """Close the page."""
+        # Users may call `stop` after Ctrl-C has stopped the server already.
         if not self._stopped.is_set():
             self._stopped.set()
             _stop(self._server)
@@ -139,6 +143,7 @@ class Viewer:
 
     def _add_controls(self) -> None:
         gui, ts = self._server.gui, self._motion.ts
+        # A slider needs a positive step, also for a motion of no length.
         step = max(float(np.ptp(ts)) / 1000, 1e-6)
         slider = gui.add_slider("time (s)", float(ts[0]), float(ts[-1]), step, float(ts[0]))
         play = gui.add_button("Play / pause")
@@ -147,6 +152,7 @@ class Viewer:
 
         @slider.on_update
         def _(_event) -> None:
+            # The nearest row, because save points need not be evenly spaced.
             self._content.show(int(np.abs(ts - slider.value).argmin()))
 
         @play.on_click
@@ -172,6 +178,7 @@ def _document(motion: Motion, parts: Shapes) -> str:
     """Build the page as one file, coarser until it is small enough."""
     text = ""
     for vertices, rows in _FILED:
+        # Each try records anew, on a server of its own.
         with _recording_server() as server:
             kept = _rows(motion.ts, min(rows, 1 + int(np.ptp(motion.ts) * _PICTURES)))
             content = _Content(server, motion, parts, vertices)
@@ -228,6 +235,7 @@ class _Content:
             if n and frame is None:
                 continue  # solids fixed to the world appear once
             if frame not in groups:
+                # Solids are children of their body's frame; this frame alone moves in each row.
                 groups[frame] = "/world" if frame is None else f"/motion{n}/{_escape(frame)}"
                 self.bodies.append((n, frame, self.scene.add_frame(groups[frame], show_axes=False)))
             opacity = opacity * (_GHOST_OPACITY if n else 1.0)
@@ -293,8 +301,10 @@ def _meshes(motion: Motion, parts: Shapes, most: int) -> Iterator[tuple]:
         parts_of = [shape.triangles() for shape in members]
         groups.append((frame, color_of(members[0], motion.scene.system), opacity, parts_of))
     total = sum(len(vertices) for *_, meshes in groups for vertices, _ in meshes)
+    # Each mesh keeps the same fraction of its vertices, so that large ones do not use up the budget.
     share = min(1.0, most / max(total, 1))
     for frame, color, opacity, meshes in groups:
+        # A lower bound keeps small parts recognisable.
         small = [simplify(v, f, max(24, int(share * len(v)))) if share < 1 else (v, f) for v, f in meshes]
         vertices, faces = sharpen(*merge_meshes(mesh for mesh in small if len(mesh[1])))
         yield frame, color, opacity, vertices.astype(np.float32), faces.astype(np.uint32)
@@ -304,6 +314,7 @@ def _set_stage(server, stage: Stage) -> None:
     scene = server.scene
     scene.set_up_direction(tuple(stage.up.tolist()))
     axis = int(np.argmax(np.abs(stage.up)))
+    # Cells of 1 or 5 times a power of ten can be read as a scale.
     cell = 10.0 ** np.floor(np.log10(stage.size / 2))
     cell = cell / 2 if stage.size / cell < 5 else cell
     centre = np.where(np.abs(stage.up) > 0, stage.ground * stage.up, np.round(stage.centre / cell) * cell)
@@ -337,6 +348,7 @@ def _server(port: int) -> Any:
         import viser
     except ImportError as error:
         raise ImportError("the viewer needs viser: pip install jaxdyn[view]") from error
+    # Before the server starts, since browsers may connect at once.
     _port_filter.ports.add(port)
     logging.getLogger("websockets.server").addFilter(_port_filter)
     with contextlib.redirect_stdout(io.StringIO()):  # viser prints a banner
@@ -384,6 +396,7 @@ def _free_port(port: int | None) -> int:
     if port is not None and not (isinstance(port, int) and 0 < port < 65536):
         raise ValueError(f"port is {port!r}; give a number from 1 to 65535, or None for a free one")
     with socket.socket() as probe:
+        # A port in TIME_WAIT, of a viewer just closed, counts as free.
         probe.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
         try:
             probe.bind((_HOST, port or 0))
@@ -404,4 +417,5 @@ def _open(url: str) -> bool:
 
 
 def _interactive() -> bool:
+    # sys.ps1 exists at a prompt only.
     return hasattr(sys, "ps1") or "ipykernel" in sys.modules

@@ -42,6 +42,7 @@ def states(
     if axes is None:
         _, made = new_figure(7.0, 5.0, 2, 1, sharex=True)
         axes = made[:, 0]
+    # Axes of matplotlib are objects, which numpy must not take for sequences.
     axes = np.atleast_1d(np.asarray(axes, object))
     if axes.shape != (2,):
         raise ValueError(f"axes has shape {axes.shape}; give two, of q and of v, e.g. figure.subplots(2)")
@@ -69,6 +70,7 @@ def energy(scene: SceneLike, solution: Checked[Solution], ax: Checked[Axes | Non
     change = rows - rows[:, :1]
     _lines(ax, times(solution), change[..., None], ("E - E(0)",))
     if solution.work is not None:
+        # Energy that forces and drives brought in is no error of the integration.
         rest = change - np.asarray(solution.work).reshape(change.shape)
         _lines(ax, times(solution), rest[..., None], ("E - E(0) - work",), (RED,))
     return _finish(ax, as_scene(scene), rows, "energy (J)")
@@ -85,6 +87,7 @@ def residuals(scene: SceneLike, solution: Checked[Solution], ax: Checked[Axes | 
     """
     rows = _rows(_require_output(solution, "constraint_residual"), 2, "constraint_residual")
     ax = _axes(ax)
+    # A residual of exactly zero would leave a gap in a logarithmic plot.
     _lines(ax, times(solution), np.maximum(np.abs(rows), _SMALLEST), ("|phi| (m, rad)", "|A v - b| (m/s, rad/s)"))
     ax.set_yscale("log")
     return _finish(ax, as_scene(scene), rows, "largest residual (m, rad; m/s, rad/s)")
@@ -115,6 +118,7 @@ def forces(scene: SceneLike, solution: Checked[Solution], ax: Checked[Axes | Non
         parts.append(_rows(solution.multipliers, len(labels), "multipliers"))
     if solution.torque is not None:
         names = columns_of(scene.system)
+        # Rows of constraints may be forces or torques, so the label has both units.
         units = units if parts else list(names.force_units)
         labels += list(names.v)
         parts.append(_rows(solution.torque, scene.nv, "torque"))
@@ -205,6 +209,7 @@ def _finish(ax, scene, values, label: str) -> Any:
 
 def _legend(ax) -> None:
     if ax.get_legend_handles_labels()[0]:
+        # Beside the axes, where it hides no lines.
         ax.legend(fontsize=7, frameon=False, loc="upper left", bbox_to_anchor=(1.0, 1.0))
 
 

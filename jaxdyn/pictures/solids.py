@@ -62,6 +62,7 @@ class Shapes(tuple[Shape, ...]):
 
     def __new__(cls, items=(), missing=()):
         """Create a tuple with the attribute `missing`."""
+        # A tuple is immutable, so that its items are given in __new__ and not in __init__.
         made = super().__new__(cls, items)
         made.missing = tuple(missing)
         return made
@@ -84,6 +85,7 @@ def along(place, direction) -> np.ndarray:
     pose[:3, 3] = place
     if length > 0:
         z = np.asarray(direction, float) / length
+        # The unit vector least parallel to z keeps the cross product well conditioned.
         helper = np.eye(3)[np.argmin(np.abs(z))]
         x = np.cross(helper, z) / np.linalg.norm(np.cross(helper, z))
         pose[:3, :3] = np.stack([x, np.cross(z, x), z], axis=1)
@@ -95,6 +97,7 @@ def _box(size) -> tuple[np.ndarray, np.ndarray]:
     corners, faces = [], []
     for axis in range(3):
         for sign in (-1.0, 1.0):
+            # The two edges change places on the opposite side, so that faces are counter-clockwise from outside.
             one, other = np.roll(np.eye(3), axis, axis=1)[1:] if sign > 0 else np.roll(np.eye(3), axis, axis=1)[:0:-1]
             middle = sign * np.roll(np.eye(3), axis, axis=1)[0]
             k = len(corners)
@@ -154,6 +157,7 @@ def refine(vertices: np.ndarray, faces: np.ndarray, longest: float) -> tuple[np.
         long = sides.max(1) > longest
         if not long.any():
             break
+        # The longest side first, whose orientation both halves keep.
         rotated = np.stack([np.roll(face, -k) for face, k in zip(faces[long], sides[long].argmax(1), strict=True)])
         middle = len(vertices) + np.arange(len(rotated))
         vertices = np.concatenate([vertices, vertices[rotated[:, :2]].mean(1)])
@@ -177,6 +181,7 @@ def simplify(vertices: np.ndarray, faces: np.ndarray, most: int) -> tuple[np.nda
         if len(count) <= most:
             centres = np.stack([np.bincount(index, vertices[:, k]) for k in range(3)], axis=1) / count[:, None]
             merged = index[faces]
+            # Triangles with two corners in one cell have become lines.
             is_triangle = np.all(merged != np.roll(merged, 1, axis=1), axis=1)
             return centres, merged[is_triangle]
         cells = int(cells * 0.8)
@@ -188,11 +193,13 @@ def sharpen(vertices: np.ndarray, faces: np.ndarray, angle: float = 0.6) -> tupl
 
     The corners of the triangles at a vertex share it where their normals are within `angle` (rad) of one another.
     """
+    # Vertices of one place are merged first: STL files repeat them in each triangle.
     _, first, merged = np.unique(vertices.round(7), axis=0, return_index=True, return_inverse=True)
     corners = merged.ravel()[faces]
     sides = vertices[faces]
     normals = np.cross(sides[:, 1] - sides[:, 0], sides[:, 2] - sides[:, 0])
     sizes = np.linalg.norm(normals, axis=1)
+    # A triangle of no area has no normal.
     corners, normals = corners[sizes > 0], normals[sizes > 0] / sizes[sizes > 0, None]
     owners: dict[int, list[tuple[np.ndarray, int]]] = {}
     places: list[int] = []

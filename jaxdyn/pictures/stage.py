@@ -57,10 +57,12 @@ def stage_of(motion: Motion, shapes: Shapes) -> Stage:
     """Stage for a motion and its solids."""
     model = motion.scene.system
     points = [motion.poses[:, ::, :, :3, 3].reshape(-1, 3)]
+    # Forty rows are enough for the bounds, and the vertices of all solids are placed in each.
     rows = motion._replace(poses=motion.poses[:, :: max(1, motion.poses.shape[1] // 40)])
     for shape in shapes:
         vertices, _ = shape.triangles()
         low, high = vertices.min(0), vertices.max(0)
+        # Corners of the box and not all vertices: meshes have many thousands.
         corners = np.array([[x, y, z] for x in (low[0], high[0]) for y in (low[1], high[1]) for z in (low[2], high[2])])
         if shape.kind == "ellipsoid" and len(set(shape.size)) == 1:
             # The corners of a ball's box turn with it and reach below the ground on which it rolls.
@@ -68,6 +70,7 @@ def stage_of(motion: Motion, shapes: Shapes) -> Stage:
             centre = (here @ shape.pose)[..., :3, 3].reshape(-1, 3)
             points += [centre + sign * shape.size[0] for sign in (-1.0, 1.0)]
             continue
+        # A rolling cylinder would reach below the ground by the corners of its box.
         if shape.kind == "cylinder":
             corners = vertices
         here = frame_poses(model, rows.poses, shape.frame)
@@ -95,10 +98,12 @@ def _ground(motion: Motion, lowest: float, up: np.ndarray, size: float) -> float
         if isinstance(constraint, Loop | Distance):
             continue
         (surface, pose), _ = constraint.ends()
+        # A contact with a fixed, nearly level plane shows where the ground is.
         if surface is None and np.asarray(pose, float)[:3, 2] @ up > 0.9:
             heights.append(float(np.asarray(pose, float)[:3, 3] @ up))
     if heights and min(heights) <= lowest + 0.05 * size:
         return min(heights)
+    # The plane z = 0 is the ground where the mechanism is on it or just above.
     return 0.0 if -0.02 * size <= lowest <= 0.15 * size else lowest
 
 

@@ -73,6 +73,7 @@ def scene_builder(name: str, **parameters) -> Callable[[], tuple[Scene, tuple]]:
 
     def build():
         scene = getattr(scenes, name)
+        # Start and scene get the same parameters, so that the start satisfies the constraints.
         q, v = call_with_known(scene.start_function)
         return call_with_known(scene), (np.asarray(q), np.asarray(v))
 
@@ -88,5 +89,7 @@ def case_of_scene(name: str) -> Case:
         raise ValueError(f"scenes has {name!r}; give a jaxdyn.reports.Case, or choose from {', '.join(scenes.names())}")
     if has_modes(getattr(scenes, name)()):
         raise ValueError(f"scenes has {name!r}, whose steps end at events; a report compares steps of given lengths")
+    # The first line of a scene's docstring describes it.
     text = (inspect.getdoc(getattr(scenes, name)) or name).partition("\n")[0]
+    # The energy of an arbitrary scene need not be constant, so its error is not reported.
     return Case(name, text, "scene", scene_builder(name), None, np.linspace(0.0, 1.0, 11), 250, conserves=False)

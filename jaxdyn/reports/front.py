@@ -13,10 +13,13 @@ TARGETS = (1e-3, 1e-5, 1e-7, 1e-9)
 def pareto_front(records: Iterable[Record], *, error: str = "error_path", cost: str = "seconds_best") -> list[Record]:
     """Pareto-optimal records in `error` and `cost`, from cheap to accurate, without failed runs."""
     # After sorting by cost, a record is on the front if its error is below that of all cheaper ones.
+    # Failed runs have no error.
     usable = [r for r in records if getattr(r, error) is not None and getattr(r, cost) is not None]
+    # At equal cost the more accurate record comes first and hides the other.
     usable.sort(key=lambda r: (getattr(r, cost), getattr(r, error)))
     front: list[Record] = []
     for record in usable:
+        # Strictly: of two equally accurate runs only the cheaper one is on the front.
         if not front or getattr(record, error) < getattr(front[-1], error):
             front.append(record)
     return front
@@ -33,8 +36,10 @@ def cost_at(
     for (rough, cheap), (fine, dear) in zip([(math.inf, 0.0), *points], points, strict=False):
         if fine > target:
             continue
+        # No line leads from an infinite error or to the error 0 in a logarithmic plot.
         if rough == math.inf or fine == 0.0:
             return dear
+        # A straight line in the log-log plot: the logarithm of the cost is linear in that of the error.
         share = math.log(rough / target) / math.log(rough / fine)
         return cheap * (dear / cheap) ** share
     return math.inf
@@ -52,6 +57,7 @@ def beaten_by(
     """
     records = list(records)
     plots = {(r.scene, r.dtype, r.batch) for r in records}
+    # Times of different plots were not measured interleaved and do not compare.
     if len(plots) > 1:
         raise ValueError(f"records has runs of {len(plots)} plots; give those of one scene, dtype and batch")
     ours = [r for r in records if r.source == "jaxdyn"]
@@ -89,15 +95,18 @@ def standings(
     for r in records:
         if r.source == "jaxdyn":
             kind = f"{r.kind}, {r.dtype}, batch {r.batch}"
+            # Costs of one dtype and batch compare, so these are part of the class.
             ladders[kind, r.label][r.scene].append(r)
     table = []
     for kind in dict.fromkeys(kind for kind, _ in ladders):
         integrators = {label: scenes for (k, label), scenes in ladders.items() if k == kind}
+        # Goals of all integrators together: one that fails a scene reaches fewer of them.
         goals = [(scene, target) for scene in {s for x in integrators.values() for s in x} for target in targets]
         costs = {
             label: [cost_at(scenes.get(scene, ()), target, cost=cost) for scene, target in goals]
             for label, scenes in integrators.items()
         }
+        # Goals that nobody reaches are infinite here and count for no one.
         best = [min(column) for column in zip(*costs.values(), strict=True)]
         rows = []
         for label, row in costs.items():

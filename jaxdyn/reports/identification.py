@@ -46,12 +46,14 @@ class Evaluation(NamedTuple):
     @property
     def whiteness(self) -> Whiteness:
         """Autocorrelation of the error."""
+        # In float64: an autocorrelation is a long sum, in which rounding of float32 would show.
         return whiteness(self.log, self.predicted - np.asarray(self.log.tau, np.float64))
 
     @property
     def percent_by_joint(self) -> np.ndarray:
         """Error of each torque in per cent of its own root mean square (nv,); NaN where none was measured."""
         measured = np.sqrt(np.mean(np.asarray(self.log.tau) ** 2, axis=0))
+        # Double where: a joint without torque must not warn about a division by zero.
         return 100 * np.where(measured > 0, self.rms / np.where(measured > 0, measured, 1), np.nan)
 
 
@@ -95,6 +97,7 @@ class Findings(NamedTuple):
 
 def total_percent(evaluations: Sequence[Evaluation], which: str = "predicted") -> float:
     """Torque error over several logs, in per cent."""
+    # Logs have different lengths, so their errors add as squares over all samples.
     rows = [np.asarray(getattr(one, which)).reshape(-1) for one in evaluations]
     return torque_error(
         np.concatenate(rows), np.concatenate([np.asarray(one.log.tau).reshape(-1) for one in evaluations])
@@ -105,6 +108,7 @@ def content(findings: Findings, settings: dict[str, Any]) -> dict[str, Any]:
     """Content of the JSON file; `settings` are the user's options, and come first."""
     model, result, fit = findings.model, findings.result, findings.fit
     names = parameter_names(model)
+    # The regressor of the base parameters has columns for `TERMS` alone.
     base = base_parameters(model, tuple(term for term in fit.terms if term in TERMS))
     columns = free_columns(model.nb, model.nv, tuple(term for term in fit.terms if term in TERMS))
     nominal, fitted = nominal_parameters(model), findings.parameters
@@ -171,6 +175,7 @@ def _add_robot(report: dict[str, Any], result: RobotFit, choice: Choice, model: 
         }
     rows = zip(spreads.parameters.names, _numbers(spreads.parameters.std), spreads.parameters.sources, strict=True)
     for name, std, source in rows:
+        # Extra terms have intervals but no place among the standard parameters.
         report["parameters"].setdefault(name, {})
         report["parameters"][name] |= {"std": std, "from": source}
     for name, value in zip(spreads.parameters.names, spreads.parameters.values, strict=True):
@@ -208,6 +213,7 @@ def payload_content(payload: Payload) -> dict[str, Any]:
 
 def model_joint(model: Model, coordinate: int) -> str:
     """Name of a coordinate of v: the joint's, with an index where it has several."""
+    # After ten parameters of each body, names of the first term are JOINT.term.
     start = 10 * model.nb
     return parameter_names(model)[start + coordinate].rpartition(".")[0]
 

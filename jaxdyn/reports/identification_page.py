@@ -36,6 +36,7 @@ def page(findings: Findings, labels: Sequence[str], units: Sequence[str], title:
             "on them; parameters below are of that fit.</p>"
         )
     for number, one in enumerate(findings.tests):
+        # Each sample is a point of an SVG path: whole logs would make pages of many megabytes.
         thin = _subsample(one)
         figure = torque_figure(thin.log, thin.predicted, labels, units, title=one.name)
         parts += [
@@ -86,6 +87,7 @@ def _spectrum(one: Evaluation, labels: Sequence[str]) -> Any:
         2.9 * columns, 1.8 * -(-count // columns) + 0.6, -(-count // columns), columns, sharex=True
     )
     t, measured = np.asarray(one.log.t), np.asarray(one.log.tau, np.float64)
+    # Frequency zero is left out: a logarithmic axis has no place for it.
     frequency = np.fft.rfftfreq(len(t), (t[-1] - t[0]) / max(len(t) - 1, 1))[1:]
     # A window without jumps at the ends, whose leakage would hide the decay of the spectrum.
     window = np.hanning(len(t))[:, None]
@@ -98,6 +100,7 @@ def _spectrum(one: Evaluation, labels: Sequence[str]) -> Any:
             ax.loglog(frequency, size / len(t), color=colour, linewidth=0.9, label=label)
         ax.minorticks_off()  # drawing hundreds of them takes most of the page's time
         ax.set_title(labels[j], fontsize=9)
+        # Panels share their x axis, and only the lowest of a column shows its numbers.
         if j + columns >= count:
             ax.set_xlabel("frequency (Hz)")
             ax.tick_params(labelbottom=True)
@@ -164,6 +167,7 @@ def _robot(findings: Findings, labels: Sequence[str]) -> list[str]:
 def _interval_figure(result: RobotFit) -> Any:
     """Half-widths of the 95 % intervals relative to the values, sorted; blue from data, grey from the prior."""
     base = result.intervals.base
+    # A logarithmic axis shows no infinite interval, and a value of zero has no relative one.
     shown = np.isfinite(base.std) & (base.values != 0)
     ratio = result.intervals.factor * base.std[shown] / np.abs(base.values[shown])
     order = np.argsort(ratio)
@@ -197,6 +201,7 @@ def _friction(findings: Findings, labels: Sequence[str], units: Sequence[str]) -
     for j, (label, unit) in enumerate(zip(labels, units, strict=True)):
         cells = []
         for name, values in named.items():
+            # Parameters are named JOINT.termK without a space, columns of the table with one.
             half, source = sources.get(f"{model_joint(findings.model, j)}.{name.replace(' ', '')}", (np.nan, ""))
             text = short(float(values[j]), 3)
             cells.append(f"{text} ± {half:.2g}{' (prior)' if source == 'prior' else ''}" if np.isfinite(half) else text)

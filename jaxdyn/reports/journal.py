@@ -44,12 +44,14 @@ class Journal:
             first, *lines = path.read_text(encoding="utf-8").splitlines() or ["{}"]
         except UnicodeDecodeError as error:
             raise ValueError(f"out has {path}, which is not UTF-8 text ({error}); {remedy}") from error
+        # A head alone holds no runs, so that its commit and machine do not matter.
         if not lines:
             return
         try:
             before = json.loads(first)
             for name, of in (
                 ("commit", lambda head: head["commit"]),
+                # The load differs from call to call and is left out of the comparison.
                 ("machine", lambda head: [head["machine"][key] for key in ("processor", "device", "cores")]),
                 ("versions", lambda head: head["machine"]["versions"]),
                 ("full", lambda head: head["full"]),
@@ -65,6 +67,7 @@ class Journal:
                 self._entries[entry["key"]] = _Entry(entry["scene"], Known.from_dict(entry["known"]), records)
         except (KeyError, TypeError, json.JSONDecodeError) as error:
             raise ValueError(f"out has {path}, which is not a journal of this version ({error!r}); {remedy}") from error
+        # The head of the first call stays: its date and load belong to the records.
         self.head = before
 
     def __contains__(self, key: str) -> bool:
@@ -74,6 +77,7 @@ class Journal:
         """Store a finished group."""
         self._entries[key] = _Entry(scene, known, records)
         if self.path is not None:
+            # Appended and closed at once: an interruption loses the group in progress alone.
             with self.path.open("a", encoding="utf-8") as file:
                 file.write(_line(key, self._entries[key]) + "\n")
 

@@ -53,6 +53,7 @@ def ladder(
     """Our contestants that differ only in tolerance or step, sharing one program; `starts` as of `Programs.batch_starts`."""
     batch = len(starts[0])
     run, seconds = prepared.programs.get(method, solver, dtype, batch)
+    # Converted once: the timed call must not include transfers and casts.
     inputs = [jnp.asarray(x[0] if batch == 1 else x, dtype) for x in starts]
     chosen = choose_method(prepared.scene, method)
 
@@ -68,6 +69,7 @@ def ladder(
 
     def contestant(setting):
         number = jnp.asarray(setting, dtype)
+        # JAX returns before the computation is done; without blocking the time would be that of the dispatch.
         call = lambda: jax.block_until_ready(run(*inputs, number))  # noqa: E731
         return Contestant("jaxdyn", method, solver, setting, solver in FIXED, call, motion, seconds, flops)
 
@@ -80,6 +82,7 @@ def evaluations(solver: str, steps: int, scene: Scene, method: Method) -> int | 
     First-same-as-last methods save one evaluation per step, unless the state is corrected after it.
     Two more determine the first step.
     """
+    # The classical Runge-Kutta method has four stages and no first step to choose.
     if solver in FIXED:
         return 4 * steps
     tableau: Any = getattr(SOLVERS[solver](), "tableau", None)
@@ -111,6 +114,7 @@ def flop_counter(prepared: Prepared, method: str, batch: int = 1) -> Callable[[M
         many, inputs = function, (state, t)
         if batch > 1:
             many, inputs = jax.vmap(function), jax.tree.map(lambda x: jnp.tile(x, (batch, *[1] * x.ndim)), inputs)
+        # Some backends have no analysis and return None.
         analysis = jax.jit(many).lower(*inputs).compile().cost_analysis() or {}
         return float(analysis.get("flops", 0.0)) / batch
 
@@ -128,11 +132,13 @@ def flop_counter(prepared: Prepared, method: str, batch: int = 1) -> Callable[[M
 def judge(prepared: Prepared, motion: Motion) -> dict:
     """Errors, residuals and energy error of a motion; None where it did not succeed or there is nothing to measure."""
     names = ("error_end", "error_path", "residual_position", "residual_velocity", "energy_error")
+    # A motion that stopped early has NaN in its last rows, which no error measures.
     if motion.result != "successful":
         return dict.fromkeys(names)
     error = prepared.errors(motion.q, motion.v)
     _, energy, residual = prepared.values(motion.q, motion.v)
     values: list[Any] = [error[-1], error.max(), *residual.max(0), np.abs(energy - energy[0]).max()]
+    # Residuals of a scene without constraints are zeros by definition and no measurement.
     if not prepared.scene.constraints:
         values[2] = values[3] = None
     if not prepared.case.conserves:
@@ -151,6 +157,7 @@ def measure(
     motions, times, calls = [], {}, {}
     for i, contestant in enumerate(contestants):
         began = time.perf_counter()
+        # The first run gives the motion, and an estimate of the time for the rounds.
         outputs = contestant.call()
         passed = time.perf_counter() - began
         motions.append(contestant.motion(outputs))
@@ -171,6 +178,7 @@ def measure(
             setting=float(one.setting),
             fixed=one.fixed,
             result=motion.result,
+            # Per trajectory, so that batches of different sizes compare.
             seconds_best=times[i]["best"] / batch,
             seconds_median=times[i]["median"] / batch,
             rounds=times[i]["rounds"],

@@ -108,6 +108,7 @@ def figure(title: str, known: Known, records: Sequence[Record]) -> Any:
     panels = [("error_path", "seconds_best", "time per trajectory (s)")]
     panels += [("error_path", "evaluations", "evaluations of the vector field")]
     panels += [("energy_error", "seconds_best", "time per trajectory (s)")]
+    # A panel without points would be an empty plot.
     panels = [p for p in panels if any(getattr(r, p[0]) is not None and getattr(r, p[1]) is not None for r in records)]
     if not panels:
         return None
@@ -117,9 +118,11 @@ def figure(title: str, known: Known, records: Sequence[Record]) -> Any:
         ax.set(xscale="log", yscale="log", ylabel=label)
         ax.set_xlabel("energy error (J)" if error == "energy_error" else "error")
         if error == "error_path":
+            # After the lines are drawn, whose limits the band extends to.
             ax.axvspan(ax.get_xlim()[0], max(known.error, ax.get_xlim()[0]), color="0.93", zorder=0)
         if cost == "seconds_best":
             _draw_peers_times(ax, known, error)
+    # Panels have the same lines; a dictionary shows each label once.
     shown = {label: handle for ax in axes[0] for handle, label in zip(*ax.get_legend_handles_labels(), strict=True)}
     drawn.legend(shown.values(), shown.keys(), loc="outside lower center", ncols=3, fontsize=8, frameon=False)
     drawn.suptitle(title, fontsize=10)
@@ -133,8 +136,11 @@ def svg(drawn, salt: str) -> str:
     if drawn is None:
         return "<p>No run succeeded; see the results below.</p>"
     text = io.StringIO()
+    # Text stays text, which is smaller and can be searched; a fixed salt makes pages reproducible.
     with matplotlib.rc_context({"svg.fonttype": "none", "svg.hashsalt": salt}):
+        # Without a date, equal results give equal files.
         drawn.savefig(text, format="svg", metadata=dict.fromkeys(("Date", "Creator", "Format", "Type")))
+    # An HTML page must not contain the XML declaration in front.
     return text.getvalue()[text.getvalue().index("<svg") :]
 
 
@@ -145,10 +151,12 @@ def panel(ax, records, error: str, cost: str) -> None:
         ladder = [r for r in records if r.label == label and None not in (getattr(r, error), getattr(r, cost))]
         points = [(max(getattr(r, error), smallest), getattr(r, cost)) for r in ladder]
         ours = all(r.source == "jaxdyn" for r in records if r.label == label)
+        # Peers differ by line and marker too, so that the plot is readable in print.
         line, marker = ("-", "o") if ours else ("--", "s")
         colour = SERIES[i % len(SERIES)]
         filled = colour if ours else "white"
         style = {"color": colour, "markersize": 4, "linewidth": 1.2, "markerfacecolor": filled}
+        # A ladder whose runs all failed still has its entry in the legend.
         ax.plot(*(zip(*points, strict=True) if points else ((), ())), line, marker=marker, label=label, **style)
     front = [
         (max(getattr(r, error), smallest), getattr(r, cost)) for r in pareto_front(records, error=error, cost=cost)
@@ -162,6 +170,7 @@ def _draw_peers_times(ax, known: Known, error: str) -> None:
         value = point["error" if error == "error_path" else "energy_error"]
         if value is not None:
             ax.plot([value], [point["seconds"]], "*", color="black", markersize=9, label=point["label"])
+        # A time without an error has no place on the other axis and is drawn as a level.
         elif point["error"] is None and point["energy_error"] is None and error == "error_path":
             ax.axhline(
                 point["seconds"], color="black", linestyle=":", linewidth=1, label=f"{point['label']}, no error given"

@@ -39,6 +39,7 @@ def style(ax) -> None:
     """Apply the common style: thin grid, no box, small labels."""
     ax.spines[["top", "right"]].set_visible(False)
     ax.grid(color="0.9", linewidth=0.6)
+    # The grid would otherwise cross thin lines.
     ax.set_axisbelow(True)
     ax.tick_params(labelsize=8)
     ax.xaxis.label.set_size(9)
@@ -48,6 +49,7 @@ def style(ax) -> None:
 
 def bands(ax, t, values, colour: str, label: str | None = None) -> None:
     """Plot the spread of many motions (n, nt): 5 to 95 %, 25 to 75 %, and the median."""
+    # Motions that stopped early are NaN and are left out of the percentiles.
     low, quarter, middle, three, high = np.nanpercentile(np.asarray(values), [5, 25, 50, 75, 95], axis=0)
     ax.fill_between(t, low, high, color=colour, alpha=0.15, linewidth=0)
     ax.fill_between(t, quarter, three, color=colour, alpha=0.3, linewidth=0)
@@ -92,6 +94,7 @@ def motion_figure(model: Model, ts, q, v, tau) -> Any:
     else:
         figure.suptitle(model.name, fontsize=10)
         handles, labels = axes[0, 0].get_legend_handles_labels()
+        # A longer legend would not fit on the page.
         figure.legend(handles[:24], labels[:24], loc="outside right upper", fontsize=8, frameon=False)
     return figure
 
@@ -106,6 +109,7 @@ def torque_figure(log, predicted, labels, units, *, title: str = "held-out sampl
     t, measured, predicted = np.asarray(log.t), np.asarray(log.tau), np.asarray(predicted)
     count = measured.shape[1]
     columns = min(count, 4)
+    # Rounded up.
     rows = -(-count // columns)
     figure, axes = new_figure(2.9 * columns, 2.1 * rows + 0.6, rows, columns, sharex=True)
     for j, ax in enumerate(axes.flat):

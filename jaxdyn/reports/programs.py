@@ -52,15 +52,18 @@ class Programs:
 
     def get(self, method: str, solver: str, dtype: str = "float64", batch: int = 1) -> Program:
         """Program for a method, a solver, a dtype and a number of trajectories, compiled once."""
+        # The resolved name, so that "auto" and the method it chooses share one program.
         key = (choose_method(self.scene, method).name, solver, dtype, batch)
         if key not in self._cache:
             self._cache[key] = self._compile(*key)
         return self._cache[key]
 
     def _compile(self, method, solver, dtype, batch) -> Program:
+        # Integer leaves are indices and keep their type.
         scene = jax.tree.map(lambda x: x.astype(dtype) if eqx.is_inexact_array(x) else x, self.scene)
 
         def one(q, v, ts, setting):
+            # The setting is an argument of the program: a ladder of tolerances compiles once.
             steps = {"stepsize": setting} if solver in FIXED else {"rtol": setting, "atol": setting}
             # Only the integration is measured: contacts that pull are reported and do not end it.
             options = {"method": method, "solver": SOLVERS[solver](), "max_steps": MOST_STEPS, "throw": False}
@@ -72,6 +75,7 @@ class Programs:
         sizes = () if batch == 1 else (batch,)
         shapes = [jax.ShapeDtypeStruct((*sizes, len(x)), dtype) for x in (*self.start, self.ts)]
         began = time.perf_counter()
+        # Compiled ahead of time, so that the time of compilation is measured apart from the run.
         run = jax.jit(several).lower(*shapes, jax.ShapeDtypeStruct((), dtype)).compile()
         return Program(run, time.perf_counter() - began)
 
@@ -91,6 +95,7 @@ class Programs:
         ts, (q, v) = self.ts, self.start
         delays = SPREAD * (ts[-1] - ts[0]) * np.arange(batch) / batch
         states, ahead = [(q, v)], len(ts) - 1
+        # The times of one program have a fixed length, so long batches are reached in several runs.
         while len(states) < batch:
             first = len(states) - 1
             times = ts[0] + SPREAD * (ts[-1] - ts[0]) * np.arange(first, first + ahead + 1) / batch
@@ -98,6 +103,7 @@ class Programs:
             if not all(np.isfinite(x).all() for x in solutions):
                 raise RuntimeError("no starts for a batch: a simulation at tolerances of 1e-12 stopped early")
             states += [*zip(*(x[1:] for x in solutions), strict=True)]
+        # The last run may give more states than the batch needs.
         q, v = (np.stack(x) for x in zip(*states[:batch], strict=True))
         return q, v, ts + delays[:, None]
 
@@ -133,11 +139,13 @@ def prepare(case: Case) -> Prepared:
         energy = kinetic_energy(scene.system, q, v, t) + potential_energy(scene.system, q, t)
         return observables(scene, q, v), energy, residuals(scene, q, v, t) if scene.constraints else jnp.zeros(2)
 
+    # All motions have the times of the reference, so one program evaluates each of them.
     compiled = jax.jit(jax.vmap(row))
 
     def values(q, v):
         return [np.asarray(x) for x in compiled(jnp.asarray(q, float), jnp.asarray(v, float), numbers)]
 
+    # A known motion is preferred: a solution of our own shares our equations of motion.
     return Prepared(case, scene, known or converged_reference(programs, values, case.reduces), programs, values)
 
 
@@ -169,7 +177,9 @@ def converged_reference(programs: Programs, values: Callable, reduces: bool = Tr
 
     **Raises:** RuntimeError when one of them stops early.
     """
+    # Another method or solver makes other errors of integration on the same equations of motion.
     other = ("reduced", "Dopri8") if programs.scene.constraints and reduces else ("auto", "Tsit5")
+    # Tolerances below 1e-13 are within the rounding of float64.
     fine, rough = (programs.solve(*pair, 1e-13) for pair in (("auto", "Dopri8"), other))
     error = float(largest_error(values(*rough)[0], values(*fine)[0]).max())
     if not np.isfinite(error):

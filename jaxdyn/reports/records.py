@@ -114,6 +114,7 @@ def rows(records: Iterable[Record]) -> list[list[str]]:
     """Cells of a table with COLUMNS, one row per record."""
     table = []
     for r in records:
+        # Scenes without constraints have neither.
         residuals = [x for x in (r.residual_position, r.residual_velocity) if x is not None]
         table.append(
             [
@@ -122,10 +123,12 @@ def rows(records: Iterable[Record]) -> list[list[str]]:
                 str(r.batch),
                 f"{'h ' if r.fixed else ''}{r.setting:.1e}",
                 *(short(x, 2) for x in (r.error_path, r.error_end, max(residuals, default=None), r.energy_error)),
+                # Microseconds: most runs of one trajectory take less than a millisecond.
                 *(f"{1e6 * x:.4g}" for x in (r.seconds_best, r.seconds_median)),
                 *("-" if x is None else str(x) for x in (r.rounds, r.steps, r.evaluations)),
                 short(None if r.flops is None else r.flops / 1e6, 3),
                 short(r.compile_seconds, 2),
+                # An empty cell, so that failures stand out.
                 "" if r.result == "successful" else r.result,
             ]
         )

@@ -43,6 +43,7 @@ def settings(case: Case, solver: str, dtype: str, *, full: bool) -> list[float]:
     if solver in FIXED:
         doublings = (range(5) if single else range(7)) if full else ((0, 2) if single else (0, 2, 4))
         return [float(np.ptp(case.ts)) / case.steps / 2**k for k in doublings]
+    # float32 has about seven digits, and smaller tolerances would never be met.
     digits = (range(2, 7) if single else range(3, 13)) if full else ((2, 4, 6) if single else (4, 6, 8, 11))
     return [10.0**-k for k in digits]
 
@@ -92,12 +93,14 @@ def report(
     if ways is not None:
         warnings.warn("`ways` of jd.report is deprecated; pass `integrators`", DeprecationWarning, stacklevel=2)
         integrators = ways
+    # Before anything is measured, since a report runs for hours.
     chosen = _check_arguments(scenes, dtypes, batches, integrators, rounds)
     dtypes = dtypes or (("float64", "float32") if full else ("float64",))
     batches = batches or ((1, 256) if full else (1,))
     say = echo or (lambda line: None)
     groups = []
     for case in chosen:
+        # Chosen integrators are run at any batch: the user knows what they cost.
         sizes = [batch for batch in batches if integrators or case.largest is None or batch <= case.largest]
         groups += [(case, dtype, batch) for dtype in dtypes for batch in sizes]
         if len(sizes) < len(batches):
@@ -120,16 +123,20 @@ def report(
     }
     journal = Journal(None if out is None else Path(out), head)
     prepared, began = None, time.perf_counter()
+    # Part of the key: another choice of integrators must not resume from these records.
     only = "".join(f", {method} {solver}" for method, solver in integrators or ()) + (", with peers" if peers else "")
     keys = [f"{case.name}, {dtype}, batch {batch}, {rounds} rounds{only}" for case, dtype, batch in groups]
     todo = [(key, *group) for key, group in zip(keys, groups, strict=True) if key not in journal]
     if len(todo) < len(groups):
         say(f"{len(groups) - len(todo)} of {len(groups)} are already finished, in {journal.path}")
     for done, (key, case, dtype, batch) in enumerate(todo, 1):
+        # Groups of a case follow each other, so that its scene and reference are made once.
         if prepared is None or prepared.case is not case:
             prepared = prepare(case)
         records = _group(prepared, dtype, batch, integrators, full, rounds, peers)
+        # Written after each group, from which an interrupted call resumes.
         journal.add(key, case.name, _reference_entry(prepared), records)
+        # Since the first group of this call: finished groups of the journal took no time now.
         passed = time.perf_counter() - began
         left = passed / done * (len(todo) - done)
         say(f"{done}/{len(todo)} {key}: {len(records)} runs; {passed:.0f} s, about {left:.0f} s left")
@@ -145,6 +152,7 @@ def _group(prepared: Prepared, dtype, batch, integrators, full, rounds, peers) -
     starts = prepared.programs.batch_starts(batch)
     plain = dtype == "float64" and batch == 1
     pairs = list(integrators) if integrators else combinations(case, bool(scene.constraints), full=full, plain=plain)
+    # Once for each method: solvers differ in the number of evaluations only.
     counters = {method: flop_counter(prepared, method, batch) for method in dict(pairs)}
     contestants = [
         rung
@@ -154,6 +162,7 @@ def _group(prepared: Prepared, dtype, batch, integrators, full, rounds, peers) -
         )
     ]
     if peers is not None:
+        # In the same loop, so that drifts of the machine's speed affect all alike.
         contestants += peers(prepared, dtype, starts)
     return measure(prepared, contestants, dtype, batch, rounds)
 
@@ -182,10 +191,12 @@ def _check_arguments(scenes, dtypes, batches, integrators, rounds) -> list[Case]
     for batch in batches or ():
         if isinstance(batch, bool) or not isinstance(batch, int) or batch < 1:
             raise ValueError(f"batches has {batch!r}; give positive integers")
+    # True is an int to Python.
     if isinstance(rounds, bool) or not isinstance(rounds, int) or rounds < 1:
         raise ValueError(f"rounds is {rounds!r}; give a positive integer")
     if jnp.zeros(()).dtype != jnp.float64:
         raise ValueError('a report needs float64; call jax.config.update("jax_enable_x64", True) first')
+    # Records are kept by the scene's name, so that equal names would be mixed up.
     if len(set(names)) < len(names):
         raise ValueError(f"scenes have the names {', '.join(names)}; give each its own")
     chosen = [case if isinstance(case, Case) else case_of_scene(case) for case in given]

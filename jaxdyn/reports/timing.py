@@ -25,6 +25,7 @@ def time_interleaved(contestants: dict, rounds: int = 20, least: float = 0.02, m
         start = time.perf_counter()
         call()
         spent[name] = time.perf_counter() - start
+        # Repeated, because a clock and the dispatch would dominate the time of a short call.
         repeats[name] = max(1, int(least / max(spent[name], 1e-7)))  # no call is faster than 0.1 us
     samples = {name: [] for name in contestants}
     for index in range(rounds):
@@ -48,6 +49,7 @@ def machine(packages: Sequence[str] = ()) -> dict:
     """
     processor = platform.processor()  # on Linux often empty or only the architecture
     try:
+        # On Linux this file names the model of the processor.
         processor = next(
             line.split(":", 1)[1].strip()
             for line in Path("/proc/cpuinfo").read_text().splitlines()
@@ -64,6 +66,7 @@ def machine(packages: Sequence[str] = ()) -> dict:
     return {
         "processor": processor,
         "device": jax.devices()[0].device_kind,
+        # Containers often allow fewer cores than the machine has.
         "cores": len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count(),
         "load": os.getloadavg()[0] if hasattr(os, "getloadavg") else None,
         "versions": versions,

@@ -23,6 +23,7 @@ class NamedScene(Generic[_P, _S, _Made]):
 
     def __init__(self, build: Callable[_P, _Made], start: Callable[_S, tuple[Array, Array]]):
         self.__name__: str
+        # `help` and documentation tools read name and docstring of the builder from the wrapper.
         functools.update_wrapper(self, build)
         self._build = build
         self.start_function = start  # whose signature says what a start depends on
@@ -59,4 +60,5 @@ def as_leaf(value):
 
 def as_state(values):
     """Convert numbers of an initial state to an array, of jax's default dtype for concrete ones."""
+    # Traced states keep the dtype of their tracers, and with it the caller's precision.
     return store_leaf(values, float) if is_concrete(values) else jnp.asarray(values)

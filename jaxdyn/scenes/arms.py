@@ -36,8 +36,10 @@ _ETA = (0.2, -0.1, 0.15, 0.1, 0.3)
 def _six_joints(links, masses, height, tip_radius, gravity) -> Model:
     """Arm of yaw, two pitches, and a wrist of roll, pitch and roll; the last body is a ball with frame `tip` at its centre."""
     upper, lower, hand = links
+    # About -y, so that a positive pitch lifts the link.
     pitch, roll = (0.0, -1.0, 0.0), (1.0, 0.0, 0.0)
     wrist = [inertia.sphere(mass, 0.03) for mass in masses[3:5]]
+    # 2/5 m r^2, a solid ball.
     ball = masses[5], (hand, 0.0, 0.0), (0.4 * masses[5] * tip_radius**2,) * 3
     builder = ModelBuilder("arm of six joints", gravity=(0.0, 0.0, -gravity))
     builder.add_body("link_1", None, "continuous", inertia.sphere(masses[0], 0.1), pose=(0.0, 0.0, height))
@@ -53,14 +55,17 @@ def _joint_angles(pose, links, height):
     """Inverse kinematics: angles (6,) for a pose (4, 4) of the frame `tip`, with the elbow up."""
     xp = array_namespace(pose, links, height)
     pose = xp.asarray(pose, float)
+    # The three wrist axes meet in this point, so position and orientation are solved one after the other.
     wrist = pose[:3, 3] - links[2] * pose[:3, 0]
     base = f64.pose_of(np.eye(3), (0.0, 0.0, height))
+    # The velocity is zero, and the rates are not used.
     angles, _ = _spatial_finger(base, links[:2], wrist, wrist + xp.asarray([0.0, 0.0, 0.1]), np.zeros(3))
     yaw, elevation = angles[0], angles[1] + angles[2]
     up = xp.asarray([0.0, 0.0, 1.0])
     ahead = xp.stack([xp.cos(yaw), xp.sin(yaw), 0 * yaw])
     forearm = xp.cos(elevation) * ahead + xp.sin(elevation) * up
     left = xp.cross(up, ahead)
+    # Rotation of the hand in the axes of the forearm, which the wrist alone has to make.
     turn = xp.stack([forearm, left, xp.cross(forearm, left)]) @ pose[:3, :3]
     # Of a roll a, a pitch b about -y and a roll c: the first row and column have b and one of the rolls each.
     roll, pitch = xp.arctan2(-turn[1, 0], turn[2, 0]), xp.arctan2(xp.hypot(*turn[0, 1:]), turn[0, 0])
@@ -84,15 +89,18 @@ def _sphere_arm_start(
         raise ValueError(f"slide is {slide}, spin is {spin}; a rolling contact has neither, leave them out")
     kinematics = montana(*_surfaces(radius, tip_radius), as_leaf(eta))
     g_of = array_namespace(kinematics.g_of).asarray(kinematics.g_of)
+    # The contact kinematics are relative to the sphere, which is only shifted in the world.
     pose = f64.pose_of(g_of[:3, :3], g_of[:3, 3] + array_namespace(center).asarray(center, float))
     q = as_state(_joint_angles(pose, links, height))
     twist = as_leaf([*slide, 0.0, *rolling, spin])
+    # Masses and gravity do not enter the kinematics of the start.
     arm = _six_joints(links, _MASSES, height, tip_radius, 0.0)
     return q, _rates_of_tip(arm, q, kinematics, twist)
 
 
 @entry_point
 def _rates_of_tip(arm: Model, q, kinematics, twist):
+    # Six joints for six components of the twist: the rates are unique away from singularities.
     return solve_square(body_jacobian(arm, q, "tip"), se3.Ad_apply(kinematics.finger.pose, twist))
 
 
@@ -161,8 +169,10 @@ _FLANGE = "iiwa_link_7"
 def _lifting_start(
     count: Checked[int] = 2, radius: Number = 0.3, twist: Row = (0.05, 0.0, 0.1, 0.0, 0.2, 0.3)
 ) -> tuple[Array, Array]:
+    # Mass, thickness and gravity do not enter the velocities, so the defaults are used.
     scene: Any = coordinated_lifting(count=count, radius=radius)
     flange = frame_pose(robots.iiwa(), as_leaf(_HOLDING), _FLANGE)
+    # The plate is level with the flanges, whose height follows from the joint angles.
     height = array_namespace(flange).asarray(flange)[2, 3]
     q = as_state([*(_HOLDING * count), 0.0, 0.0, height, 1.0, 0.0, 0.0, 0.0])
     twist = as_leaf(twist)
@@ -194,6 +204,7 @@ def coordinated_lifting(
 
     Source: EQUATIONS section 10, coordinated lifting; Murray, Li & Sastry (1994), section 6.4.
     """
+    # True is an int to Python.
     if isinstance(count, bool) or not isinstance(count, int) or count < 1:
         raise ValueError(f"count is {count!r}; give the number of arms, a positive integer")
     fall = (0.0, 0.0, -gravity)
@@ -201,9 +212,12 @@ def coordinated_lifting(
     flange = frame_pose(robots.iiwa(gravity=None), store_leaf(_HOLDING, arm.home.dtype), _FLANGE)
     xp = array_namespace(flange, radius)
     flange = xp.asarray(flange)
+    # Joining starts from a model without bodies, so that one arm is no special case.
     whole, grips = ModelBuilder("no arm", gravity=fall).build(), []
     for i in range(count):
+        # The arms are copies of the first one, rotated about the z axis through the plate's centre.
         turn = xp.asarray(f64.pose_of(_turn(2 * np.pi / count * i), np.zeros(3)))
+        # The flange of each arm reaches the rim when the plate's centre is on the z axis.
         base = xp.asarray(f64.pose_of(np.eye(3), (-radius - flange[0, 3], 0.0, 0.0)))
         grip = xp.asarray(f64.pose_of(flange[:3, :3], (-radius, 0.0, 0.0)))
         whole = join(whole, arm, prefix=f"arm{i + 1}_", pose=turn @ base)

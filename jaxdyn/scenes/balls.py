@@ -22,6 +22,7 @@ class _Steady(eqx.Module):
     rate: Float[Array, ""] = eqx.field(converter=as_leaf)
 
     def __call__(self, q, t):
+        # The cast keeps a float32 scene in float32, whatever the dtype of the leaf.
         return q[0] - self.rate.astype(q.dtype) * t
 
 
@@ -44,6 +45,7 @@ def ball_on_turntable(*, mass: Number = 1.0, radius: Number = 0.2, rate: Number 
     Source: Weltner (1979), Am. J. Phys. 47, 984.
     """
     builder = ModelBuilder("turntable", gravity=(0.0, 0.0, -gravity))
+    # The drive prescribes the table's motion, so its inertia has no effect on the ball.
     builder.add_body("table", None, "continuous", (1.0, (0.0, 0.0, 0.0), (0.5, 0.5, 1.0)), joint_name="1")
     builder.add_body("ball", None, "free", inertia.sphere(mass, radius), joint_name="2")
     rolling = rolling_sphere("ball", None, radius, surface_body="table", name="contact")
@@ -66,6 +68,7 @@ def ball_on_incline(
     vdot = (5/7) g sin(slope) e_x. Start: `velocity` (m/s) of the centre, without spin about the normal.
     """
     xp = array_namespace(slope)
+    # Gravity is inclined instead of the plane, which keeps the contact in coordinate directions.
     pull = (gravity * xp.sin(slope), 0.0, -gravity * xp.cos(slope))
     builder = ModelBuilder("ball on an incline", gravity=pull)
     builder.add_body("ball", None, "free", inertia.sphere(mass, radius))
@@ -95,6 +98,7 @@ class _Sliding(eqx.Module):
         down = -self.radius.astype(q.dtype) * rotation[2]  # to the contact, in axes of the ball
         slip = v[:3] + so3.cross(v[3:], down)
         push = -self.force.astype(q.dtype) * slip / jnp.sqrt(jnp.sum(slip * slip))
+        # A force at the contact point, as a wrench at the ball's centre in its axes.
         return jnp.concatenate([push, so3.cross(down, push)])
 
 

@@ -22,5 +22,6 @@ def free_body(*, moments: Row = (1.0, 2.0, 3.0)) -> Scene:
     Source: Celledoni, Fasso, Safstrom & Zanna (2008), The exact computation of the free rigid body motion.
     """
     builder = ModelBuilder("free body", gravity=None)
+    # The mass at the fixed point has no effect without gravity.
     builder.add_body("body", None, "spherical", (1.0, (0.0, 0.0, 0.0), tuple(moments)))
     return Scene(builder.build())

@@ -41,6 +41,7 @@ def _chain(model, tip: str) -> tuple[list[int], np.ndarray]:
     frame = frame_index(model, tip)
     joints, offset = [model.topology.frame_bodies[frame]], np.asarray(model.frame_poses, float)[frame]
     while (parent := model.topology.parents[joints[0]]) >= 0:
+        # From the palm outwards, in the order of the product of transforms.
         joints.insert(0, parent)
     return joints, offset
 
@@ -62,6 +63,7 @@ def _tip(model, joints, offset, angles):
 
 def _least(jacobian, motion):
     """Change of a finger's angles of least norm for a motion of its tip."""
+    # Four joints for three components: the normal equations J J^T are regular away from singularities.
     return jacobian.T @ array_namespace(jacobian, motion).linalg.solve(jacobian @ jacobian.T, motion)
 
 
@@ -90,6 +92,7 @@ def _cube_start(
     quaternion, rotation = _quaternion(turned)
     xp = array_namespace(size, position, turned, twist)
     rotation, position, twist = xp.asarray(rotation), xp.asarray(position, float), xp.asarray(twist, float)
+    # Fingers are in the text order of their first joints, joint_N.0 with N = 0, 12, 4, 8.
     angles: list[Any] = [_GUESS[int(name[6:-2])] for name in model.joint_names]
     rates: list[Any] = [0.0] * model.nv
     for name, (point, _) in _PLACES.items():
@@ -97,11 +100,13 @@ def _cube_start(
         target = position + size / 2 * rotation @ np.asarray(point)
         reached = _reach(model, joints, offset, np.array([angles[i] for i in joints]), target)
         place, jacobian = _tip(model, joints, offset, reached)
+        # A traced target cannot be refused; the residuals of the contacts then show the gap.
         if is_concrete(target) and not np.linalg.norm(target - place) < 1e-12:
             raise ValueError(
                 f"size is {size}, position {np.asarray(position).tolist()}, turned {list(turned)}: {name} cannot reach its "
                 "contact point on the cube; give a pose closer to the default one"
             )
+        # The twist is in the cube's axes, and the fingers are computed in those of the world.
         velocity = _point_velocity(position, rotation @ twist[:3], rotation @ twist[3:], target)
         moving = _least(jacobian, velocity)
         for k, i in enumerate(joints):
@@ -139,7 +144,9 @@ def _table_start(
     xp = array_namespace(tilt)
     s, c = xp.sin(tilt), xp.cos(tilt)
     center = height + size[2] / 2
+    # The box turns with the table about the y axis through the origin.
     place = [center * s, 0.0, center * c, xp.cos(tilt / 2), 0.0, xp.sin(tilt / 2), 0.0]
+    # In the box's axes: its centre moves along x at the height of the centre times the rate.
     moving = [center * rate, 0.0, 0.0, 0.0, rate, 0.0]
     return as_state([*place, tilt]), as_state([*moving, rate])
 
@@ -178,5 +185,6 @@ def box_on_table(
     base = contact("rigid", "table", (0.0, 0.0, -size[2] / 2), finger_pose=(0.0, 0.0, height), name="base")
     half_x, half_y = size[0] / 2, size[1] / 2
     rows = wrench_cone(half_x, half_y, mu)
+    # Rows of torques become forces, so that margins of all rows have one unit.
     rows = rows.at[4:].divide(array_namespace(size).maximum(half_x, half_y))
     return Grasp(builder.build(), "box", [base], cones=surface_cone(rows))

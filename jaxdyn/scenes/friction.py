@@ -20,6 +20,7 @@ def _rough_start(
 ) -> tuple[Array, Array]:
     # The link touches the disk of radius 1 from above, tilted clockwise.
     height = 1 + (1 + jnp.sin(tilt) * (place - link_place)) / jnp.cos(tilt)
+    # The tilt is clockwise and the model's angle counter-clockwise.
     q = as_leaf([place, 1.0, 0.0, link_place, height, -tilt])
     # Along itself, so that the contact remains closed; velocities are in the link's axes.
     return q, as_leaf([0.0, 0.0, 0.0, speed, 0.0, 0.0])
@@ -43,6 +44,7 @@ def rough_disk_and_link(
     """
     builder = ModelBuilder("disk and link", gravity=(0.0, -gravity, 0.0))
     for name, mass, moment in zip(("disk", "link"), masses, moments, strict=True):
+        # The moments about x and y have no effect in the plane; half of z each is a plate's.
         builder.add_body(name, None, "planar", (mass, (0.0, 0.0, 0.0), (moment / 2, moment / 2, moment)))
     on_link = rolling_sphere("disk", None, 1.0, surface=_DOWN, surface_body="link", name="link")
     ground = ground_contact("disk", None, friction[1], radius=1.0, plane=_UP, name="ground")
@@ -67,16 +69,19 @@ class _Row(eqx.Module):
 
 
 def _toy_metric(q, t, p):
+    # The mass matrix is constant, as the equations are linear in the angles.
     return p["mass"]
 
 
 def _toy_potential(q, t, p):
+    # The spring acts between the sleeve and the bird, hence the difference of their angles.
     return jnp.sum(p["weight"] * q) + 0.5 * p["stiffness"] * (q[1] - q[2]) ** 2
 
 
 def _woodpecker_start(
     gap: Number = 0.0006, half_height: Number = 0.0058, bird: Number = -0.2788, velocity: Row = (-0.3411, 0.0, -7.4583)
 ) -> tuple[Array, Array]:
+    # The lower edge touches the pole where the angle uses up the play.
     return as_state([0.0, -gap / half_height, bird]), as_state(velocity)
 
 
@@ -116,6 +121,7 @@ def woodpecker(
     """
     sleeve, bird = masses
     arms = as_leaf([1.0, to_spring, to_bird])
+    # The bird's height depends on all three coordinates, with the lever arms as weights.
     mass = bird * jnp.outer(arms, arms) + jnp.diag(as_leaf([sleeve, moments[0], moments[1]]))
     weight = gravity * (bird * arms + as_leaf([sleeve, 0.0, 0.0]))
     numbers = {"mass": mass, "weight": weight, "stiffness": as_leaf(stiffness)}
@@ -126,9 +132,11 @@ def woodpecker(
         gap = _Toy(as_leaf(rate), as_leaf(constant))
         return gap_contact(gap, _Row(as_leaf(along)), friction, restitution=e, name=name)
 
+    # Sliding velocity of an edge: that of the sleeve's centre and of its turn at the radius.
     edge = (1.0, sleeve_radius, 0.0)
     contacts = (
         contact("beak", (0.0, 0.0, -beak[0]), reach - pole_radius, (1.0, to_spring, to_bird - beak[1]), restitution),
+        # The edges touch opposite sides of the pole, hence the opposite signs and one play.
         contact("lower", (0.0, half_height, 0.0), play, edge, 0.0),
         contact("upper", (0.0, -half_height, 0.0), play, edge, 0.0),
     )

@@ -63,6 +63,7 @@ def _planar_hand(name, links, masses, palm, gravity):
 def _planar_object(center, angle, velocity):
     """Position of an object, and its velocity in the plane's axes from the body velocity (vx, vy, w)."""
     xp = array_namespace(center, angle, velocity)
+    # Planar joints have their velocity in the body's axes.
     linear = _turn(angle) @ xp.asarray([velocity[0], velocity[1], 0.0])
     return xp.asarray([*center, 0.0]), linear, xp.asarray([0.0, 0.0, velocity[2]])
 
@@ -73,7 +74,9 @@ def _planar_state(fingers, center, angle, velocity):
     moving = _planar_object(center, angle, velocity)
     q, v = [], []
     for base, knee, tip, point in fingers:
+        # arctan2 takes y first, hence the reversed slice of (x, y).
         low, high = (xp.arctan2(*(b - a)[1::-1]) for a, b in ((base, knee), (knee, tip)))
+        # The second angle is relative to the first link.
         q += [low, high - low]
         axes, origins = np.stack([_UP, _UP]), xp.stack([base, knee])
         v += [*_rates(axes, origins, point, _point_velocity(*moving, point))]
@@ -94,6 +97,7 @@ def _bar_start(
     for side in (-1.0, 1.0):
         base, tip = xp.asarray([side * palm / 2, 0.0, 0.0]), xp.asarray([*center, 0.0]) + side * length / 2 * along
         ends = (base[:2], links[0], tip[:2], links[1])
+        # The order of the circles selects the solution outside of the hand on either side.
         knee = xp.asarray([*(_circles(*ends) if side < 0 else _circles(*ends[2:], *ends[:2])), 0.0])
         fingers.append((base, knee, tip, tip))
     return _planar_state(fingers, center, angle, velocity)
@@ -125,6 +129,7 @@ def hand_with_bar(
     builder.add_body("bar", None, "planar", inertia.rod(mass, length), joint_name="object")
     contacts = []
     for i, side in ((1, -1.0), (2, 1.0)):
+        # Columns of the transpose: z into the bar along its axis, x along its y.
         turned = np.array([[0.0, 1.0, 0.0], [0.0, 0.0, -side], [-side, 0.0, 0.0]]).T
         pose = f64.pose_of(turned, (side * length / 2, 0.0, 0.0))
         contacts.append(contact(kind, f"tip{i}", pose, in_plane=True))
@@ -199,8 +204,10 @@ def _spatial_hand(name, links, masses, circle, gravity):
     builder = ModelBuilder(name, gravity=(0.0, 0.0, -gravity))
     first, second = links
     for i, direction in enumerate(_directions(), 1):
+        # A yaw joint needs an inertia about its axis when the finger is stretched upwards.
         knuckle = inertia.sphere(masses[0], 0.03)
         builder.add_body(f"finger{i}_1", None, "continuous", knuckle, pose=_base(direction, circle))
+        # About -y, so that a positive pitch lifts the link.
         pitch = (0.0, -1.0, 0.0)
         builder.add_body(f"finger{i}_2", f"finger{i}_1", "continuous", thin_bar(masses[1], first), axis=pitch)
         distal = thin_bar(masses[2], second)
@@ -214,8 +221,10 @@ def _spatial_finger(base, links, tip, point, velocity):
     xp = array_namespace(base, links, tip, point, velocity)
     base, tip = xp.asarray(base, float), xp.asarray(tip, float)
     local = base[:3, :3].T @ (tip - base[:3, 3])
+    # After the yaw the finger is a planar arm of two links in its vertical plane.
     yaw, reach = xp.arctan2(local[1], local[0]), xp.hypot(local[0], local[1])
     ahead = base[:3, :3] @ xp.asarray(_turn(yaw))
+    # In the finger's vertical plane: the left of the line to the tip is the knee up.
     knee = xp.asarray(_circles((0.0, 0.0), links[0], (reach, local[2]), links[1]))
     low, high = xp.arctan2(knee[1], knee[0]), xp.arctan2(local[2] - knee[1], reach - knee[0])
     elbow = base[:3, 3] + knee[0] * ahead[:, 0] + knee[1] * xp.asarray(_UP)
@@ -247,6 +256,7 @@ def _ball_state(position, turned, twist, links, circle, radius, reach, fixed):
     moving = position, rotation @ twist[:3], rotation @ twist[3:]
     q, v = [], []
     for direction in _directions():
+        # Fingers of a grasp hold fixed points of the ball; rolling ones touch it at a fixed height.
         outward = rotation @ direction if fixed else direction
         tip, point = position + reach * outward, position + radius * outward
         velocity = _point_velocity(*moving, point)
@@ -288,6 +298,7 @@ def hand_with_ball(
     contacts = []
     for i, direction in enumerate(_directions(), 1):
         turned = np.stack([np.cross(_UP, -direction), _UP, -direction], 1)
+        # z of a contact frame is the inward normal.
         pose = f64.pose_of(turned, radius * direction)
         contacts.append(contact("hard-finger", f"tip{i}", pose))
     return Grasp(builder.build(), "ball", contacts, cones=_cones(mu))
@@ -302,6 +313,7 @@ def _rolling_start(
     radius: Number = 0.1,
     tip_radius: Number = 0.02,
 ) -> tuple[Array, Array]:
+    # The tip's frame is at its centre, one tip radius outside of the ball.
     return _ball_state(position, turned, twist, links, circle, radius, radius + tip_radius, False)
 
 

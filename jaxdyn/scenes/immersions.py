@@ -88,11 +88,13 @@ def _by_model(masses, length, reaches, moments, gravity):
 
 
 def _by_loop(masses, length, reaches, moments, gravity):
+    # The second body is free in the plane here, and a point mass would leave its angle without inertia.
     if is_concrete(moments) and not moments[1] > 0:
         raise ValueError(
             f"moments is {moments}; a free body needs a moment of inertia, so that formulation='loop' takes moments[1] > 0"
         )
     bodies = _bodies(masses, reaches, moments, gravity, "planar", None, None)
+    # In the plane two rows of a revolute joint are left; the others hold identically.
     hinge = loop("first", (0.0, -length, 0.0), "second", (0.0, 0.0, 0.0), in_plane=True, name="hinge")
     return Scene(bodies, (hinge,))
 
@@ -117,6 +119,7 @@ def _double_start(
     _builder(formulation)
     (theta, phi), (theta_rate, phi_rate) = as_leaf(angles), as_leaf(rates)
     if formulation == "model":
+        # Angles of a chain are relative, those of the Lagrangian absolute.
         return jnp.stack([theta, phi - theta]), jnp.stack([theta_rate, phi_rate - theta_rate])
     if formulation == "loop":
         end, turned = _hanging(theta, length), theta - phi
@@ -159,6 +162,7 @@ def double_pendulum(
 def _tangent(s):
     """Immersion q = (z1, theta, y1, theta2) -> configurations of a disk of radius 1 and a link tangent to it from above."""
     z, turn, y, tilt = s
+    # The link touches the disk from above: its line has the distance 1 from the disk's centre (z, 1).
     height = 1 + (1 + jnp.sin(tilt) * (z - y)) / jnp.cos(tilt)
     return jnp.stack([z, jnp.ones_like(z), turn]), jnp.stack([y, height, tilt])
 
@@ -172,7 +176,9 @@ class _Applied(eqx.Module):
     def __call__(self, q, v, t):
         s, c = jnp.sin(q[1][2]), jnp.cos(q[1][2])
         f1, f2 = self.friction.astype(s.dtype)
+        # Both friction forces act at radius 1, which gives the torque -f1 - f2.
         disk = jnp.stack([f1 * c - f2, -f1 * s, -f1 - f2])
+        # The contact force on the link is opposite to that on the disk; it passes along the link, without torque.
         return disk, jnp.stack([-f1 * c, f1 * s, self.torque.astype(s.dtype)])
 
 

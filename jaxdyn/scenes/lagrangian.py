@@ -29,6 +29,7 @@ def _quadratic(q, v, t, p):
 
 
 def _height_energy(q, t, p):
+    # The last coordinate is up.
     return p["mass"] * p["gravity"] * q[-1]
 
 
@@ -98,6 +99,7 @@ def _arm_start(angles: Row = (0.3, 1.1), rates: Row = (0.7, -0.4)) -> tuple[Arra
 
 
 def _arm(q, v, t, p):
+    # Velocities of the centres need the absolute angles; the second coordinate is relative.
     a, b = q[0], q[0] + q[1]
     wa, wb = v[0], v[0] + v[1]
     across = lambda at: jnp.stack([-jnp.sin(at), jnp.cos(at)])  # noqa: E731
@@ -133,6 +135,7 @@ def planar_arm(
     parameters = {"masses": masses, "length": length, "reaches": reaches, "moments": moments}
     potential = None
     if gravity is not None:
+        # Without gravity neither a parameter nor a potential is there to be compiled.
         parameters, potential = parameters | {"gravity": gravity}, _arm_potential
     return Scene(LagrangianSystem(_arm, 2, parameters=parameters, potential=potential))
 
@@ -162,6 +165,7 @@ def spatial_arm(
     centres = ((0.0, 0.0, reaches[0]), (0.0, reaches[1], 0.0), (0.0, reaches[2], 0.0))
     places = ((0.0, 0.0, 0.0), (0.0, 0.0, base), (0.0, upper, 0.0))
     for i, parent in enumerate((None, "link1", "link2")):
+        # The pitch axes are -x: with the links along +y a positive angle lowers them.
         name, axis = f"link{i + 1}", (0.0, 0.0, 1.0) if i == 0 else (-1.0, 0.0, 0.0)
         builder.add_body(name, parent, inertia=(masses[i], centres[i], moments[i]), pose=places[i], axis=axis)
         builder.add_frame(f"centre{i + 1}", name, centres[i])
@@ -181,6 +185,7 @@ def _body_rates(q):
 
 def _euler_metric(q, t, p):
     E = _body_rates(q)
+    # E^T diag(I) E, with the rows of E scaled instead of a matrix product.
     return E.T @ (jnp.stack(p["moments"])[:, None] * E)
 
 
@@ -221,6 +226,7 @@ def free_box(
     if frame is not None:
         pose = array_namespace(frame).asarray(frame, float)
         rotation, place = pose[:3, :3], pose[:3, 3]
+        # Parameters transform by the pose of the centre in the new frame, the inverse of `frame`.
         numbers = displaced(numbers, -rotation.T @ place, rotation.T)
     builder = ModelBuilder("box", gravity=None if gravity is None else (0.0, 0.0, -gravity))
     return Scene(builder.add_body("box", None, "free", numbers).build())

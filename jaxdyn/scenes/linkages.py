@@ -28,6 +28,7 @@ def _circles(center, radius, other, reach):
     center, other = xp.asarray(center, float), xp.asarray(other, float)
     direction = other - center
     distance = xp.sqrt(direction @ direction)
+    # Distance from the first centre to the common chord.
     along = (radius**2 - reach**2 + distance**2) / (2 * distance)
     square = radius**2 - along**2
     if is_concrete(square) and square < 0:
@@ -46,6 +47,7 @@ def _across(length, angle):
 
 def _solve_planar(one, other, right):
     """Solve x one + y other = right in the plane by Cramer's rule."""
+    # Written out: a solver of 2 x 2 systems under JAX would be a call of LAPACK.
     determinant = one[0] * other[1] - one[1] * other[0]
     return (right[0] * other[1] - right[1] * other[0]) / determinant, (
         one[0] * right[1] - one[1] * right[0]
@@ -94,6 +96,7 @@ def _slider_crank_start(
     crank: Number = 1.0, rod: Number = 2.5, angle: Number = 1.0, rate: Number = 1.0
 ) -> tuple[Array, Array]:
     xp = array_namespace(crank, rod, angle, rate)
+    # The rod's end is on the x axis: its height cancels that of the crank.
     lean = -xp.arcsin(crank * xp.sin(angle) / rod)
     leaning = -crank * xp.cos(angle) * rate / (rod * xp.cos(lean))
     place = crank * xp.cos(angle) + rod * xp.cos(lean)
@@ -112,6 +115,7 @@ def slider_crank(
     builder = ModelBuilder("slider-crank", gravity=gravity)
     builder.add_body("crank", None, "continuous", thin_bar(masses[0], crank), joint_name="1")
     builder.add_body("rod", "crank", "continuous", thin_bar(masses[1], rod), joint_name="2", pose=(crank, 0.0, 0.0))
+    # A slider does not turn, so its moments have no effect.
     slider = (masses[2], (0.0, 0.0, 0.0), (0.0, 0.0, 0.0))
     builder.add_body("slider", None, "prismatic", slider, joint_name="3", axis=(1.0, 0.0, 0.0))
     closing = loop("rod", (rod, 0.0, 0.0), "slider", None, in_plane=True, name="pin")
@@ -119,6 +123,7 @@ def slider_crank(
 
 
 def _names(count: int) -> tuple[list[str], list[str]]:
+    # Leading zeros keep the order of names that of the numbers, as models sort joints by name.
     width = len(str(count))
     uprights = [f"upright{i:0{width}d}" for i in range(count + 1)]
     return uprights, [f"coupler{i:0{width}d}" for i in range(count)]
@@ -142,6 +147,7 @@ def windows(
     """
     uprights, couplers = _names(count)
     moment = mass * length**2 / 12
+    # Uprights are along y at zero, bars of `thin_bar` along x.
     up = (mass, (0.0, length / 2, 0.0), (moment, 0.0, moment))
     builder = ModelBuilder(f"{count} windows", gravity=gravity)
     for i, name in enumerate(uprights):
@@ -169,6 +175,7 @@ def _parallel_start(
     xp = array_namespace(point, velocity, length, bases)
     q, v = [], []
     for base, elbow in zip(bases, elbows, strict=True):
+        # Exchanged circles give the solution on the other side.
         a = _circles(base, length, point, length) if elbow > 0 else _circles(point, length, base, length)
         vectors = a - xp.asarray(base, float), xp.asarray(point, float) - a
         first, second = (xp.arctan2(*vector[::-1]) for vector in vectors)
@@ -198,11 +205,13 @@ def parallel_manipulator(
         upper = {"joint_name": f"{leg}2", "pose": (length, 0.0, 0.0)}
         builder.add_body(f"{leg}2", f"{leg}1", "continuous", thin_bar(mass, length), **upper)
     tip = (length, 0.0, 0.0)
+    # Two loops tie three legs; a third one would repeat their rows.
     return Scene(builder.build(), [loop("a2", tip, leg, tip, "point", in_plane=True) for leg in ("b2", "c2")])
 
 
 def _ring_start(count: Checked[int] = 6, length: Number = 1.0, rate: Number = 1.0) -> tuple[Array, Array]:
     middle = length / 2, length / 2 / np.tan(np.pi / count)
+    # Each bar of a regular polygon turns by the same angle from the one before.
     q = [-middle[0], -middle[1], 0.0, *[2 * np.pi / count] * (count - 1)]
     return as_state(q), as_state([rate * middle[1], -rate * middle[0], rate, *[0.0] * (count - 1)])
 
@@ -219,6 +228,7 @@ def closed_ring(
     """
     names = [f"bar{i:0{len(str(count))}d}" for i in range(count)]
     builder = ModelBuilder(f"ring of {count}", gravity=gravity)
+    # The first bar floats in the plane; a fixed base would take away three degrees of freedom.
     builder.add_body(names[0], None, "planar", thin_bar(mass, length))
     for before, name in itertools.pairwise(names):
         builder.add_body(name, before, "continuous", thin_bar(mass, length), pose=(length, 0.0, 0.0))

@@ -19,6 +19,7 @@ class _Rod(eqx.Module):
     length: Float[Array, ""] = eqx.field(converter=as_leaf)
 
     def __call__(self, q, t):
+        # Squares instead of |q| - l: the rows stay defined at q = 0, where |q| has no derivative.
         return 0.5 * (jnp.sum(q * q) - self.length.astype(q.dtype) ** 2)
 
 
@@ -33,6 +34,7 @@ def _scene(dimension: int, mass, length, gravity) -> Scene:
 
 def _plane_start(length: Number = 1.0, angle: Number = -np.pi / 2, rate: Number = 0.0) -> tuple[Array, Array]:
     s, c = array_namespace(angle).sin(angle), array_namespace(angle).cos(angle)
+    # The length multiplies arrays, so that it may be traced.
     return length * as_state([s, -c]), length * rate * as_state([c, s])
 
 
@@ -54,6 +56,7 @@ def _sphere_start(
     xp = array_namespace(theta, phi)
     s, c, sp, cp = xp.sin(theta), xp.cos(theta), xp.sin(phi), xp.cos(phi)
     q = length * jnp.asarray([s * cp, s * sp, -c])
+    # The derivative of the position with respect to the angles, so the velocity is on the constraint.
     along = theta_rate * jnp.asarray([c * cp, c * sp, s]) + phi_rate * s * jnp.asarray([-sp, cp, 0.0])
     return q, length * along
 

@@ -24,6 +24,7 @@ def _sarrus_start(lengths: Row = (1.0, 0.8), height: Number = 0.9, rate: Number 
     q, v = [], []
     for k, length in enumerate(lengths):
         sine = height / (2 * length)
+        # At 1 the bars are stretched, where the rate of the angle is infinite.
         if is_concrete(sine) and abs(sine) >= 1:
             raise ValueError(
                 f"height is {float(height):.6g}; bars of length {float(length):.6g} reach up to twice that"
@@ -77,9 +78,11 @@ def sarrus(
         builder.add_body(f"{name}1", None, "continuous", thin_bar(bar, length), joint_name=f"{name}1", pose=place)
         builder.add_body(f"{name}2", f"{name}1", "continuous", thin_bar(bar, length), pose=(length, 0.0, 0.0))
     # The axes of the platform are those of the first chain, its centre lies inwards of the hinge.
+    # The hinges along z lie in the plane of the disk, so that y is the axis of the disk here.
     across = platform * radius**2 / 4
     disk = platform, (-radius, 0.0, 0.0), (across, 2 * across, across)
     builder.add_body("platform", "a2", "continuous", disk, pose=(lengths[0], 0.0, 0.0))
+    # The second hinge in the platform's frame: both places are at the same height.
     other = f64.inverse(places[0]) @ places[1]
     closing = loop("b2", (lengths[1], 0.0, 0.0), "platform", other, name="second chain")
     return Scene(builder.build(), (closing,))
@@ -106,12 +109,15 @@ def _hinge_platform_start(
     q, v = [], []
     for base, (x, y) in zip(_around(count, radii[0]), _around(count, radii[1]), strict=True):
         arm = xp.stack([c * x - s * y, s * x + c * y])
+        # Velocity of a point of the platform: v + w x arm.
         hinge, speed = point + arm, velocity + rate * xp.stack([-arm[1], arm[0]])
         elbow = _circles(base, length, hinge, length)
         first, second = (xp.arctan2(*way[::-1]) for way in (elbow - base, hinge - elbow))
+        # Velocities of both links add up to that of the hinge on the platform.
         rates = _solve_planar(_across(length, first), _across(length, second), speed)
         q += [first, second - first]
         v += [rates[0], rates[1] - rates[0]]
+        # The platform follows the first leg in depth-first order.
         if len(q) == 2:
             q, v = [*q, angle - second], [*v, rate - rates[1]]
     return as_state(q), as_state(v)
@@ -152,6 +158,7 @@ def hinge_platform(
         place = plane @ f64.pose_of(np.eye(3), (x, y, 0.0))
         builder.add_body(f"{name}_lower", None, "continuous", thin_bar(bar, length), joint_name=name, pose=place)
         builder.add_body(f"{name}_upper", f"{name}_lower", "continuous", thin_bar(bar, length), pose=(length, 0.0, 0.0))
+    # The platform's origin is its hinge on the first leg, from which its centre lies at minus that hinge.
     disk = _disk(mass, radii[1], (-hinges[0][0], -hinges[0][1]))
     builder.add_body("platform", f"{legs[0]}_upper", "continuous", disk, pose=(length, 0.0, 0.0))
     closing = [

@@ -87,6 +87,7 @@ def _andrews_spring(q, p):
     """Position (2,) of the end D of the spring relative to its base C."""
     s, c, sn = p["lengths"], jnp.cos(q[2]), jnp.sin(q[2])
     end = jnp.stack([s["sd"] * c + s["sc"] * sn, s["sd"] * sn - s["sc"] * c])
+    # Body 3 turns about B.
     return end + p["B"] - p["C"]
 
 
@@ -98,6 +99,7 @@ def _andrews_bias(q, v, t, p):
     arm, zf_fa = s["e"] - s["ea"], s["zf"] - s["fa"]
     stretch = _andrews_spring(q, p)
     length = jnp.sqrt(jnp.sum(stretch**2))
+    # The spring pulls along C to D; the stretch has that direction.
     fx, fy = jnp.unstack(-p["c0"] * (length - p["l0"]) / length * stretch)
     force = jnp.stack(
         [
@@ -110,12 +112,14 @@ def _andrews_bias(q, v, t, p):
             m6 * s["u"] * zf_fa * om_ * (om_ + 2 * ep_) * jnp.cos(om),
         ]
     )
+    # The publication has M p'' = f on the right; h is on the left.
     return -force
 
 
 def _andrews_potential(q, t, p):
     """Energy of the spring and of the constant motor torque."""
     length = jnp.sqrt(jnp.sum(_andrews_spring(q, p) ** 2))
+    # A constant torque on beta has the potential -torque beta.
     return 0.5 * p["c0"] * (length - p["l0"]) ** 2 - p["torque"] * q[0]
 
 
@@ -176,6 +180,7 @@ class _AndrewsPotential(eqx.Module):
         return stored - self.torque.astype(q.dtype) * q[0]
 
     def __call__(self, system, q, v, t):
+        # Coordinates have v = dq/dt here, so a gradient in q is a generalised force.
         return -jax.grad(self.energy, argnums=1)(system, q)
 
 
@@ -197,6 +202,7 @@ def andrews_bodies() -> Scene:
     builder = ModelBuilder("Andrews' mechanism", gravity=None)
 
     def body(number, parent, joint, center, place=(0.0, 0.0)):
+        # Motion is in the plane, so that moments about x and y have no effect.
         inertia = (p["m"][number - 1], (*center, 0.0), (0.0, 0.0, p["I"][number - 1]))
         builder.add_body(f"K{number}", parent, "continuous", inertia, joint_name=joint, pose=(*place, 0.0))
 
@@ -233,6 +239,7 @@ def andrews() -> Scene:
 def _road(t, p):
     """Position (xb, yb) of the right wheel's axle on the road."""
     yb = p["amplitude"] * jnp.sin(p["frequency"] * t)
+    # The distance of the wheels is constant while the right one rises and sinks.
     return jnp.sqrt(p["length"] ** 2 - yb**2), yb
 
 
@@ -241,6 +248,7 @@ def _car(q, v, t, p):
     xb, yb = _road(t, p)
     left = jnp.sqrt(xl**2 + yl**2) - p["rest"]
     right = jnp.sqrt((xr - xb) ** 2 + (yr - yb) ** 2) - p["rest"]
+    # The springs of the test set have unit stiffness.
     return 0.5 * p["k"] * jnp.sum(v * v) - 0.5 * (left**2 + right**2) - p["k"] * p["g"] * (yl + yr)
 
 

@@ -40,6 +40,7 @@ def _disk_start(
     xp = array_namespace(heading)
     c, s = xp.cos(heading), xp.sin(heading)
     speed = radius * rolling
+    # The velocity along the heading is radius times the roll rate: no slip.
     return as_state([0.0, 0.0, heading, 0.0]), as_state([speed * c, speed * s, steering, rolling])
 
 
@@ -74,6 +75,7 @@ def chaplygin_sleigh(*, mass: Number = 1.0, inertia_com: Number = 0.5, offset: N
     """
     moments = (0.0, 0.0, inertia_com)
     builder = ModelBuilder("sleigh", gravity=None)
+    # The origin is at the blade, so that the constraint is zero sideways velocity of the body.
     builder.add_body("sleigh", None, "planar", (mass, (offset, 0.0, 0.0), moments))
     return Scene(builder.build(), (knife_edge("sleigh", contact=False, name="blade"),))
 
@@ -135,6 +137,7 @@ class _NoTurn(eqx.Module):
     """Constraint of zero third angular velocity."""
 
     def __call__(self, q, t):
+        # The velocity of a spherical joint is in the body's axes, so the row is constant.
         return jnp.asarray([0.0, 0.0, 1.0], q.dtype)
 
 

@@ -34,6 +34,7 @@ def _support(semi_axes, normal):
     xp = array_namespace(semi_axes, normal)
     semi_axes, normal = xp.asarray(semi_axes, float), xp.asarray(normal, float)
     scaled = semi_axes * normal
+    # On x^T A^-2 x = 1, A the semi-axes, the normal n belongs to x = A^2 n / |A n|.
     return semi_axes * scaled / xp.sqrt(scaled @ scaled)
 
 
@@ -86,6 +87,7 @@ def _egg_start(
         velocity = _point_velocity(*world_motion, point)
         angles, rates = _finger_state(_base(direction, circle), links, tip_semi_axes, point, normal, velocity)
         q, v = [*q, *angles], [*v, *rates]
+    # The contact coordinates follow from the bodies' poses, which a scene with these surfaces places.
     scene = hand_rolling_egg(links=links, circle=circle, semi_axes=semi_axes, tip_semi_axes=tip_semi_axes)
     return scene.system.place(as_state([*q, *position, *quaternion])), as_state([*v, *twist])
 

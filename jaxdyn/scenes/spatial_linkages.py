@@ -14,6 +14,7 @@ from jaxdyn.systems.scene import Scene
 
 def _link(length, twist):
     """Pose of a link's end relative to its start: translation by the length along x, rotation by the twist about x."""
+    # Denavit and Hartenberg's length and twist; offsets along the axes are zero in these linkages.
     return f64.pose_of(f64.rotation_matrix((1.0, 0.0, 0.0), twist), (length, 0.0, 0.0))
 
 
@@ -40,7 +41,9 @@ def _bennett_start(
     xp = array_namespace(lengths, twist, angle, rate)
     # q3 = -q1 up to a turn.
     k = _half_angle_product(twist, _second(lengths[0], twist, lengths[1]))
+    # arctan2 and not a quotient: the angle 0 gives pi without a division by zero.
     follower = 2 * xp.arctan2(k, xp.tan(angle / 2))
+    # The product of the tangents of the half angles is constant, so q'/sin q are opposite.
     following = -rate * xp.sin(follower) / xp.sin(angle)
     return as_state([angle, follower, -angle]), as_state([rate, following, -rate])
 
@@ -119,6 +122,7 @@ def goldberg(
     """
     a, b, c = lengths
     first, shared, other = _goldberg_twists(lengths, twist)
+    # Links in line have parallel common normals, so that lengths and twists add.
     long, middle = _link(a + c, first + other), _link(b, shared)
     builder = ModelBuilder("Goldberg linkage", gravity=gravity)
     builder.add_body("link1", None, "continuous", thin_bar(density * (a + c), a + c))
@@ -141,6 +145,7 @@ def _bricard_start(
     if is_concrete(cosine) and abs(cosine) >= 1:
         raise ValueError(f"angle is {float(angle):.6g}; the linkage of twist {float(twist):.6g} does not close there")
     other = xp.arctan2(y, x) - branch * xp.arccos(cosine)
+    # Implicit differentiation of the closure; both partial derivatives are written out.
     by_angle = (
         -(1 + c**2) * xp.sin(angle) * xp.cos(other) - 2 * c * xp.cos(angle) * xp.sin(other) - s**2 * xp.sin(angle)
     )
@@ -176,6 +181,7 @@ def bricard(
     poses = [_link(length, twist), _link(length, -twist)]
     builder, parent = ModelBuilder("Bricard linkage", gravity=gravity), None
     for k in range(5):
+        # Twists alternate around the loop, the last link on the ground included.
         before = None if parent is None else poses[(k - 1) % 2]
         builder.add_body(f"link{k + 1}", parent, "continuous", thin_bar(mass, length), pose=before)
         parent = f"link{k + 1}"

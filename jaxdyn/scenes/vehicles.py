@@ -68,6 +68,7 @@ def bicycle(
 
     def frame(numbers, origin):
         mass, center, (xx, yy, zz, xz) = numbers
+        # The publication gives centres from the rear contact, a body wants them from its own origin.
         return mass, xp.asarray(center, float) - origin, [[xx, 0.0, xz], [0.0, yy, 0.0], [xz, 0.0, zz]]
 
     def wheel(numbers):
@@ -132,6 +133,7 @@ def differential_drive(
     _add_wheel(builder, "right wheel", "chassis", wheel_mass, radius, (0.0, -half_track, 0.0))
     rolling = [
         rolling_wheel("left wheel", _AXLE, radius, contact=False),
+        # Both wheels on one axle forbid the same sideways slip: one such row is enough.
         rolling_wheel("right wheel", _AXLE, radius, contact=False, lateral=False),
     ]
     return Scene(builder.build(), rolling)
@@ -146,6 +148,7 @@ def _car_start(
     wheel_base: Number = 1.2,
 ) -> tuple[Array, Array]:
     xp = array_namespace(steer)
+    # The circle about the intersection of the two axles has the radius wheel_base / tan(steer).
     yaw_rate = speed * xp.tan(steer) / wheel_base
     speed_difference = yaw_rate * half_track
     spins = [
@@ -187,10 +190,13 @@ def car(
     _add_wheel(builder, "rear left wheel", "chassis", wheel_mass, radius, (0.0, half_track, 0.0))
     _add_wheel(builder, "rear right wheel", "chassis", wheel_mass, radius, (0.0, -half_track, 0.0))
     fork = (0.0, (0.0, 0.0, 0.0), (0.0, 0.0, fork_moment))
+    # The fork has a moment about the steer axis and no mass.
     builder.add_body("steering", "chassis", "continuous", fork, pose=(wheel_base, 0.0, 0.0))
+    # The front wheel has its centre on the steer axis, so that steering does not move it.
     _add_wheel(builder, "front wheel", "steering", wheel_mass, radius, None)
     rolling = [
         rolling_wheel("rear left wheel", _AXLE, radius, contact=False),
+        # The same sideways slip as that of the left wheel.
         rolling_wheel("rear right wheel", _AXLE, radius, contact=False, lateral=False),
         rolling_wheel("front wheel", _AXLE, radius, contact=False),
     ]
@@ -204,6 +210,7 @@ def _snakeboard_start(
     rotor_rate: Number = 1.0,
     half_length: Number = 0.3,
 ) -> tuple[Array, Array]:
+    # A blade lets its truck move along its own direction only, so sideways over forward speed is the tangent.
     front, back = (array_namespace(angle).tan(angle) for angle in angles)
     sideways, yaw_rate = speed * (front + back) / 2, speed * (front - back) / (2 * half_length)
     return as_state([0.0, 0.0, 0.0, *angles, 0.0]), as_state([speed, sideways, yaw_rate, *rates, rotor_rate])
@@ -239,7 +246,9 @@ def snakeboard(
     builder = ModelBuilder("snakeboard", gravity=None)
     builder.add_body("board", None, "planar", (mass, (0.0, 0.0, 0.0), (0.0, 0.0, moment)))
     for name, joint, place in (("front truck", "1 front", half_length), ("back truck", "2 back", -half_length)):
+        # Names of joints give the order of q: front truck, back truck, rotor.
         builder.add_body(name, "board", "continuous", turning(truck_moment), pose=(place, 0.0, 0.0), joint_name=joint)
     builder.add_body("rotor", "board", "continuous", turning(rotor_moment), joint_name="3 rotor")
+    # Planar joints hold the board at its height, so the blades need no contact row.
     blades = [knife_edge(name, contact=False) for name in ("front truck", "back truck")]
     return Scene(builder.build(), blades)

@@ -76,7 +76,9 @@ class DriveDynamics(eqx.Module):
 def pass_command(force: Any, system: Any, q, v, t, command, state):
     """Torque (nv,) behind one force of a scene's list, the rate of its state or None, and the states of the forces after it."""
     if isinstance(force, DriveDynamics):
+        # Shapes alone: the size of a drive's state needs no computation of its start.
         count = eqx.filter_eval_shape(force.start, system, q, v, t).shape[0]
+        # The states of all drives form one vector, in the order of the scene's forces.
         own = state[:count]
         return (
             force.torque(system, q, v, t, own, command),

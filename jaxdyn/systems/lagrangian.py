@@ -57,6 +57,7 @@ class LagrangianSystem(System):
         more = "" if parameters is None else ", t, parameters"
         self.lagrangian = as_pytree(lagrangian, "lagrangian", "q, v" + more)
         self.potential = None if potential is None else as_pytree(potential, "potential", "q" + more)
+        # Python numbers become arrays: a leaf must be differentiable, and its value must not be compiled in.
         self.parameters = jax.tree.map(as_parameter, parameters)
 
     def value(self, q: Float[Array, " nq"], v: Float[Array, " nv"], t: Number) -> Float[Array, ""]:
@@ -104,6 +105,7 @@ class LagrangianSystem(System):
 
     def kinetic_energy(self, q: Float[Array, " nq"], v: Float[Array, " nv"], t: Number) -> Float[Array, ""]:
         """Kinetic energy v . dL/dv - L(q, v) + L(q, 0), (), J."""
+        # Terms of L linear in v cancel in the Jacobi integral: gyroscopic terms hold no energy.
         energy = jnp.sum(v * self._momentum(q, v, t)) - self._lagrangian_value(q, v, t)
         return energy if self.potential is not None else energy + self._lagrangian_value(q, jnp.zeros_like(v), t)
 
@@ -118,6 +120,7 @@ class LagrangianSystem(System):
         if not is_known(self, q, v, t):
             return
         place = describe_state(q, t, v)
+        # First, since an index beyond nq is clamped by JAX and would give a finite L of wrong coordinates.
         self._check_coordinates(q, v, t)
         value, rest, mass, shifted = (np.asarray(x, float) for x in _probe_compiled(self, q, v, t))
         if not np.isfinite(value):
@@ -141,7 +144,9 @@ class LagrangianSystem(System):
         state = [np.asarray(x) for x in (q, v)]
         given = state if self.parameters is None else [*state, t, self.parameters]
         try:
+            # A pole at this state is reported by the check of L itself.
             with np.errstate(all="ignore"):
+                # Inside of `eval_shape` jax operations compute nothing, and indexing of numpy arrays is still checked.
                 jax.eval_shape(lambda: self.lagrangian(*given))
         except (IndexError, ValueError) as error:
             raise ValueError(f"lagrangian does not fit nq = {self.nq}: {error}; pass the number it reads") from error

@@ -31,6 +31,7 @@ def cholesky(matrix: Float[Array, "n n"]) -> Float[Array, "n n"]:
 
 
 def _cholesky(_, matrix):
+    # Without symmetrisation derivatives and operations are those of the lower triangle alone.
     return lax.linalg.cholesky(matrix, symmetrize_input=False)
 
 

@@ -56,6 +56,7 @@ def as_pytree(function: Any, argument: str, takes: str = "") -> Callable:
     owner = function.__self__ if isinstance(function, types.MethodType) else function
     if owner is not function and not (isinstance(owner, type) or jax.tree_util.all_leaves([owner])):
         return jax.tree_util.Partial(function.__func__, owner)
+    # A partial of a plain function holds no attributes that could change; what it wraps is what counts.
     while isinstance(owner, functools.partial):
         owner = owner.func
     names = _attributes(owner)
@@ -72,8 +73,10 @@ def as_pytree(function: Any, argument: str, takes: str = "") -> Callable:
 
 def _attributes(owner: Any) -> list[str]:
     """Attribute names of an object that is no function, class or wrapper of a function."""
+    # Wrappers such as `jax.jit` keep the wrapped function in `__wrapped__` and have attributes of their own.
     if isinstance(owner, _FUNCTIONS) or hasattr(owner, "__wrapped__"):
         return []
+    # An object with __slots__ has no __dict__, and its attributes would be missed.
     slots = [name for kind in type(owner).__mro__ for name in np.atleast_1d(getattr(kind, "__slots__", ())).tolist()]
     names = [*getattr(owner, "__dict__", ()), *(name for name in slots if hasattr(owner, name))]
     return [name for name in names if not name.startswith("__")]
@@ -115,6 +118,7 @@ class Scene(eqx.Module):
         check_system(system, "system")
         self.system = system
         self.constraints = _sequence(constraints, "constraints")
+        # Static wrappers let plain functions pass through `jit` and `vmap` as part of the scene.
         self.forces = tuple(as_pytree(f, f"forces[{i}]") for i, f in enumerate(_sequence(forces, "forces")))
         self.cones = cones
 
@@ -154,12 +158,14 @@ class Scene(eqx.Module):
         """Torques tau (nv,) clipped by the scene's `EffortLimits`."""
         for force in self.forces:
             cut = getattr(force, "clip_effort", None)
+            # Limits act on the command in the order of the list, as in `drive_torque`.
             tau = tau if cut is None else cut(self.system, tau)
         return tau
 
     def drive_state(self, q: Float[Array, " nq"], v: Float[Array, " nv"], t: Number = 0.0) -> Float[Array, " n"] | None:
         """Start of the states of all `jd.forces.DriveDynamics` in the scene, one after the other (n,); None without any."""
         states = [force.start(self.system, q, v, t) for force in self.forces if isinstance(force, DriveDynamics)]
+        # None and not an empty array: scenes without drives integrate no state.
         return jnp.concatenate(states) if states else None
 
     def drive_torque(
@@ -205,6 +211,7 @@ def _check_arguments(function: Any, argument: str, takes: str) -> None:
     except (TypeError, ValueError):  # functions not written in Python have no signature
         return
     try:
+        # The names are placeholders: `bind` checks the number of arguments only.
         signature.bind(*takes.split(", "))
     except TypeError as error:
         raise ValueError(f"{argument} takes {signature}, but is called as ({takes}); {error}") from None
@@ -237,6 +244,7 @@ def check_callback(function: Callable, name: str, signature: str, *args, first: 
 
 
 def _sequence(items, argument: str) -> tuple:
+    # A generator would be empty after the first use, and a single item may be iterable itself.
     if not isinstance(items, (tuple, list)):
         raise ValueError(f"{argument} is a {type(items).__name__}; pass a tuple or a list, e.g. {argument}=(item,)")
     return tuple(items)

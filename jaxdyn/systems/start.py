@@ -17,8 +17,10 @@ def check_mass_matrix(mass, name: str, q, t) -> None:
         raise ValueError(f"the mass matrix of this {name} is not finite at {place}: {mass.tolist()}; start elsewhere")
     # Scaling by the diagonal makes the eigenvalues dimensionless: kg and kg m^2 are not comparable.
     scale = np.sqrt(np.abs(np.diag(mass)))
+    # A coordinate without inertia keeps its zero row, which then shows as a zero eigenvalue.
     scale[scale == 0] = 1.0
     values, vectors = np.linalg.eigh(mass / np.outer(scale, scale))
+    # Eigenvalues of a matrix with unit diagonal have rounding errors of about n eps.
     least = 10 * len(mass) * float(np.finfo(np.asarray(q).dtype).eps)
     if values[0] > least:
         return

@@ -80,6 +80,7 @@ class System(eqx.Module):
         self, q: Float[Array, " nq"], v: Float[Array, " nv"], tau: Float[Array, " nv"], t: Number
     ) -> Float[Array, " nv"]:
         """Acceleration M^-1 (tau - h), (nv,)."""
+        # The fallback is the same function by XLA, for what a kernel cannot express.
         return kernel(_acceleration, fallback=_acceleration)(self, q, v, tau, t)
 
     def check_start(self, q: Float[Array, " nq"], v: Float[Array, " nv"], t: Number) -> None:
@@ -299,6 +300,7 @@ _mass_matrix_compiled = eqx.filter_jit(lambda system, q, t: system.mass_matrix(q
 
 def check_size(nq) -> int:
     """Check that nq is a positive integer."""
+    # True is an int to Python.
     if isinstance(nq, bool) or not isinstance(nq, int) or nq < 1:
         raise ValueError(f"nq is {nq!r}; pass the number of coordinates, a positive integer")
     return nq
@@ -306,6 +308,7 @@ def check_size(nq) -> int:
 
 def as_parameter(leaf):
     """Convert a Python number to a float array, a leaf that can be differentiated; other leaves are returned unchanged."""
+    # A bool stays static: it selects code and has no derivative.
     return jnp.asarray(leaf, float) if isinstance(leaf, (int, float)) and not isinstance(leaf, bool) else leaf
 
 

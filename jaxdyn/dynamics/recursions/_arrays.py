@@ -87,6 +87,7 @@ UPPER = {n: np.triu(np.ones((n, n), bool)) for n in range(1, 7)}
 def _hat_tensor() -> np.ndarray:
     hat = np.zeros((3, 3, 3))
     for i, j, k in ((0, 1, 2), (1, 2, 0), (2, 0, 1)):
+        # (w x x)_k = w_i x_j - w_j x_i for each cyclic (i, j, k).
         hat[k, j, i], hat[j, k, i] = 1.0, -1.0
     return hat
 

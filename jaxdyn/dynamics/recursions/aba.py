@@ -97,4 +97,5 @@ def mass_matrix_sqrt(model: Model, q: Float[Array, " nq"]) -> Float[Array, "nv n
             pieces = dict([(i, join(own, 0)), *ancestor_rows(links, factors.chains, i, force)])
             columns.append(place_rows(links, pieces, 1, q.dtype))
     W: Any = join(columns, 1) if columns else jnp.zeros((0, 0), q.dtype)
+    # Joints are computed with unit screws; the scale restores forces of the screws as given.
     return jnp.asarray(W if links.scale is None else links.scale[:, None] * W)

@@ -134,6 +134,7 @@ def outward(factors: ArticulatedFactors, left: list[list]) -> list:
         for j in reversed(range(len(joint_accelerations))):
             s, gain = entry(links.subspaces[i], j, 1), factors.gains[i][j]
             free = left[i][j] * factors.inverses[i][j]
+            # The world does not accelerate, so a root has no twist to subtract.
             if V is None:
                 joint_accelerations[j] = free
                 V = s * free

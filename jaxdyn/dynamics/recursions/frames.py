@@ -176,6 +176,7 @@ def _decompose(pose, eps) -> Home:
     if sine > eps:
         phi, alpha = _plane_angle(-axis[1], axis[0], eps), _plane_angle(axis[2], sine, eps)
     else:
+        # Parallel axes have a common normal everywhere; the one through the child's origin gives d = 0.
         alpha = PlaneAngle(1.0 if axis[2] > 0 else -1.0, 0.0)
         beside = np.hypot(p[0], p[1]) > reach
         phi = _plane_angle(p[0], p[1], eps) if beside else PlaneAngle(1.0, 0.0)
@@ -185,6 +186,7 @@ def _decompose(pose, eps) -> Home:
         d = length(-along[1] / alpha.sin)
         e, shift = length(along[2] - d * alpha.cos), np.array([length(along[0]), 0.0, 0.0])
     elif sine > eps:
+        # Nearly parallel axes: the foot of their common normal is far away (`LEAST_SINE`).
         shift = np.array([length(x) for x in along])
     else:
         e, shift = length(along[2]), np.array([length(along[0]), 0.0, 0.0])

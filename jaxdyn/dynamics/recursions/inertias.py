@@ -36,6 +36,7 @@ def _moments() -> np.ndarray:
         for place in (4, 6, 9):
             tensor[i, i, place] = 0.5
     for place, (i, j) in {4: (0, 0), 5: (0, 1), 6: (1, 1), 7: (0, 2), 8: (1, 2), 9: (2, 2)}.items():
+        # A set, since a diagonal entry has one place and not two.
         for r, c in {(i, j), (j, i)}:
             tensor[r, c, place] -= 1
     return tensor

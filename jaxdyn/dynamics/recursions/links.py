@@ -153,6 +153,7 @@ def _angles(links: Links, q, turning):
         angle = angle * (rate[turning] if isinstance(rate, np.ndarray) else jnp.stack([rate[i] for i in turning]))
     if links.frames.screws is None:
         return jnp.cos(angle), jnp.sin(angle)
+    # A planar joint translates between theta and its own angle, so the two cannot be added.
     thetas = [links.frames.screws[i].theta if topology.kinds[i] != "planar" else PlaneAngle(1.0, 0.0) for i in turning]
     # Quarter turns only exchange sine and cosine, exactly; other angles are added to q.
     offset = np.array([0.0 if 0 in turn else np.arctan2(turn.sin, turn.cos) for turn in thetas], dtype)

@@ -78,6 +78,7 @@ def body_wrenches(links: Links, chains: list[Chain], v=None, a=None, external=No
         if rates is not None:
             acc = acc + dot(part(S, 0, 3), rates[i]) if slides else acc
             dw = dw + dot(part(S, 3, 6), rates[i]) if turns else dw
+        # At rest K stays the zero matrix of numpy, so that its products are never compiled.
         if speeds is not None or rates is not None:
             square = _hat(w)
             K = _hat(dw) + dot(square, square)
@@ -111,6 +112,7 @@ def _inverse(model: Model, q, v=None, a=None, external=None):
     chains = joint_transforms(links, q)
     tau = as_vector(joint_forces(links, chains, body_wrenches(links, chains, v, a, external)), q)
     if a is not None and links.armature is not None:
+        # Rotors turn with the joint's own rate and belong to no body, so they bypass the recursion.
         tau = tau + links.armature * a
     return from_unit_force(links, tau)
 
