@@ -56,6 +56,7 @@ def check_identifier(name: str, what: str) -> str:
 def _identifier(text: str) -> str:
     # Paths of pytrees are "['gain'][0]" or ".inertias": what separates their parts becomes underscores.
     name = re.sub(r"\W+", "_", text, flags=re.ASCII).strip("_") or "value"
+    # A field of a tuple is "[0]", and no identifier begins with a digit.
     name = f"x{name}" if name[0].isdigit() else name
     return f"{name}_" if name in C_KEYWORDS or keyword.iskeyword(name) else name
 

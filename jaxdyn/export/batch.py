@@ -69,6 +69,7 @@ def _vector_block(e: Emitter, exported: Any, rows: dict[int, list[str]]) -> list
             return e.load(rows[field.argument], entry, kind)
         # One load and a copy to all lanes.
         value = Emitter(1)
+        # Registers have numbers: each emitter counts on from the other, or a name would be defined twice.
         value.count = e.count
         at = value.emit(f"getelementptr i8, ptr %a{field.argument}, i64 {field.offset}")
         name = value.load_one(at, entry, kind)
@@ -110,5 +111,6 @@ def _single_calls(e: Emitter, exported: Any, rows: dict[int, list[str]]) -> str:
     for k in range(e.width):
         pointers = [f"ptr {rows[i][k]}" if i in rows else f"ptr %a{i}" for i in range(count)]
         status = e.emit(f"call i32 @{exported.name}({', '.join(pointers)})")
+        # Bits are collected, so that one status reports every kind of failure among the samples.
         total = e.emit(f"or i32 {total}, {status}")
     return total

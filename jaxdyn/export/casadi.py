@@ -32,6 +32,7 @@ class Pattern(NamedTuple):
 
     def order(self) -> np.ndarray:
         """For each stored entry, by columns, its index in the program's array."""
+        # Entries that are not stored have the place -1 and come first: they are cut off.
         return np.argsort(self.places, kind="stable")[self.places.size - self.count :]
 
     def description(self) -> list[int]:
@@ -50,6 +51,7 @@ def _by_columns(stored: np.ndarray) -> np.ndarray:
 def _dense(array: Array) -> Pattern:
     """Pattern of an array: a vector is a column, and leading axes of more than two become rows."""
     columns = array.shape[-1] if len(array.shape) > 1 else 1
+    # An array may have an axis of length zero, by which nothing can be divided.
     stored = np.ones((array.size // max(columns, 1), columns), bool)
     return Pattern(stored, _by_columns(stored).ravel())
 
@@ -124,6 +126,7 @@ def _functions(
 
 def _descriptions(name: str, inputs: Sequence[Pattern], outputs: Sequence[Pattern], work: int) -> list[str]:
     """Lines of the functions by which CasADi asks for numbers of arguments, patterns and sizes of the work vectors."""
+    # One array of zeros stands for every argument that is null: it is as long as the longest, and never empty.
     lines = [f"@{name}_zero = internal constant [{max([1, *(x.count for x in inputs)])} x double] zeroinitializer"]
     for kind, patterns in (("in", inputs), ("out", outputs)):
         for i, pattern in enumerate(patterns):

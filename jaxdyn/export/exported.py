@@ -74,6 +74,7 @@ def export(
     ```
     """
     check_identifier(name, "name")
+    # A text is a sequence too: "jacobian" would be taken for eight names.
     derivatives = (derivatives,) if isinstance(derivatives, str) else tuple(derivatives)
     for each in derivatives:
         if each not in DERIVATIVES:
@@ -142,6 +143,7 @@ class Exported:
         """Names, shapes and dtypes of the results."""
         outputs = self.value.program.outputs[:-1]  # the last one is the flag
         names = ["out"] if len(outputs) == 1 else [f"out{i}" for i in range(len(outputs))]
+        # Macros of sizes are upper case, so that names which differ by case alone would collide.
         taken = {x.name.lower() for x in self.arguments}
         names = [f"{x}_" if x in taken else x for x in names]
         return [(name, x.shape, x.dtype) for name, x in zip(names, outputs, strict=True)]

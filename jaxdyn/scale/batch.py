@@ -117,6 +117,7 @@ class Options(NamedTuple):
         for name, least in (("batch_size", 1), ("chunk", 1), ("memory", 1), ("retries", 0)):
             value = arguments[name]
             is_given = value is not None or name == "retries"
+            # bool is a subclass of int: True would pass as 1.
             if is_given and (isinstance(value, bool) or not isinstance(value, int) or value < least):
                 raise ValueError(
                     f"{name} is {value!r}; give a whole number of at least {least}{', or None' if least else ''}"
@@ -139,6 +140,7 @@ def run_batch(
 
     `pilot(drawn, row)` counts the steps of a short part of a rollout, for a cost that is measured.
     """
+    # A missing package and a wrong path are reported before anything is compiled.
     zarr_package()
     path = as_path(options.out, "out")
     check_place(path)
@@ -171,6 +173,7 @@ def run_batch(
             engine.send(Study(*fixed, most, options.memory, engine.workers_per_host).open)
             # On one worker, for all: they have the same program, and the store is created once.
             facts: Facts = engine.call("facts", store is None)
+            # Platforms round differently, so that a store keeps to one; it is known when a worker has its devices.
             description["platform"] = facts.platform
             if store is None:
                 variables = [outputs.variables[name] for name in kept] + reducer.variables
@@ -179,6 +182,7 @@ def run_batch(
                 sizes = batch.count, min(chunk, batch.count)
                 store = Store.create(path, variables, outputs.coordinates, description | facts.programs, *sizes)
             store.check(description)
+            # Before the loop: only chunks of earlier calls are checked at the end.
             before = store.record_mask()
             meter = Progress(batch.count, store.count_rollouts(before), shown=options.progress)
             if options.client is not None and (link := options.client.dashboard_link):
@@ -222,6 +226,7 @@ def _compute_chunks(
             if isinstance(result.error, OSError) and result.error.errno in FULL:
                 raise result.error
             failures.append((item if method == "chunk" else item[0], result))
+            # So many failures have a common cause, which the other chunks would meet too.
             if len(failures) == MOST_FAILURES:
                 return
 
@@ -275,6 +280,7 @@ def _select_arrays(outputs: Description, rows: bool | Sequence[str]) -> tuple[st
     unknown = [name for name in rows if name not in outputs.variables]
     if unknown or isinstance(rows, str):
         raise ValueError(f"rows is {rows!r}; name some of {', '.join(outputs.variables)}")
+    # A dictionary removes repetitions and keeps the order that the user gave.
     return tuple(dict.fromkeys([*rows, "result"]))
 
 

@@ -93,7 +93,9 @@ def digest(tree: Any) -> str:
     # With dtypes and shapes: equal bytes of other types are other inputs.
     hashed = hashlib.sha256()
     for path, leaf in jax.tree_util.tree_flatten_with_path(tree)[0]:
+        # The hash reads a buffer, which an array with strides does not have in one piece.
         array = np.ascontiguousarray(leaf)
         hashed.update(f"{jax.tree_util.keystr(path)} {array.dtype} {array.shape}".encode())
         hashed.update(array.data)
+    # 64 bits tell inputs apart, and are short enough for an error message.
     return hashed.hexdigest()[:16]

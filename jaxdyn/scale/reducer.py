@@ -37,6 +37,7 @@ class Reducer:
             empty = reduction.partial(np.zeros((0, *like.shape), like.dtype), np.zeros(0, np.int64))
             self._parts[name] = list(empty)
             self.variables += [_variable(_key(name, part), value, "chunk") for part, value in empty.items()]
+            # Merged once before the run: it shows the shapes of the results, and errors of a user's reduction early.
             merged = reduction.merge({part: np.stack([value, value]) for part, value in empty.items()})
             if missing := set(reduction.parts) - merged.keys():
                 raise ValueError(f"reductions[{name!r}].merge does not return {sorted(missing)}, which its parts name")
@@ -45,6 +46,7 @@ class Reducer:
 
     def partials(self, rows: Mapping[str, np.ndarray], numbers: np.ndarray) -> Arrays:
         """Partial results of a chunk, by their names in the store, of the rollouts that succeeded."""
+        # Rows of rollouts that failed may hold NaN, which would spread to the results.
         good, results = rows["result"] == 0, {}
         for name, reduction in self._reductions.items():
             parts = reduction.partial(rows[QUANTITY + name][good], numbers[good])
@@ -93,6 +95,7 @@ class Merger:
         """Add the summary of the next chunk."""
         self.codes += summary.codes
         self.steps += summary.steps
+        # Summaries come in the order of the chunks, so that these are the first failures for any number of workers.
         self.failed = np.concatenate([self.failed, summary.failed[: self._most - len(self.failed)]])
         if self._reducer.partial_names:
             self._pending.append(summary.partials)
@@ -119,5 +122,6 @@ def _variable(key: str, value: Any, leading: str | None, of: Variable | None = N
     array = np.asarray(value)
     axes = tuple(f"{key.rpartition('/')[2]}_{k}" for k in range(array.ndim))
     if of is not None and of.dims and array.shape[-len(of.dims) :] == of.shape:
+        # xarray aligns axes by their names: those of the quantity keep theirs.
         axes = axes[: -len(of.dims)] + of.dims
     return Variable(key, array.shape, array.dtype, axes, leading)

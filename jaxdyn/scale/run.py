@@ -46,6 +46,7 @@ class Rollout:
     def pilot(self, drawn: Any, row: Any) -> dict[str, Any]:
         """Number of steps of its first part, as its cost."""
         scene, control, q0, v0, _ = self._start(drawn, row)
+        # Two times, because steps are counted and rows are not needed.
         early = np.array([self.ts[0], self.ts[0] + SHARE * (self.ts[-1] - self.ts[0])])
         solution = simulate(scene, q0, v0, early, control=control, throw=False, **{**self.options, "outputs": ()})
         return {"cost": solution.stats[STEPS]}
@@ -148,9 +149,11 @@ def run(
     shared = Options.of(locals())
     ts = np.asarray(as_array(ts, "ts"))
     check_times(ts)
+    # `Rollout` passes `throw` itself, which given twice would be a TypeError.
     for name in ("throw", "progress"):
         options.pop(name, None)
     model: Any = scene
+    # A function is a leaf; a scene or a model is a pytree, even if it can be called.
     builds = callable(scene) and jax.tree_util.all_leaves([scene])
     draw = parameters if callable(parameters) else None
     named: dict[str, Any] = {} if draw is not None or parameters is None else {"parameters": parameters}

@@ -93,6 +93,7 @@ class Store:
                 attributes = dict(self.group.attrs)
             except (FileNotFoundError, NotADirectoryError):  # the path exists, but is no group of Zarr
                 attributes = {}
+            # No damage: the system's own message names the cause.
             except PermissionError:
                 raise
             except Exception as error:  # zarr checks little of its file: bad JSON, keys and types raise anything
@@ -134,6 +135,7 @@ class Store:
         zarr = zarr_package()
         from zarr.codecs import Crc32cCodec, ZstdCodec
 
+        # In the same folder, because a rename to another file system is a copy; the name is unique to this process.
         beside = path.with_name(f"{path.name}.{uuid.uuid4().hex}.tmp")
         chunks = -(-count // chunk)
         lengths = {"rollout": (count, chunk), "chunk": (chunks, 1)}
@@ -164,11 +166,14 @@ class Store:
                     group.create_array(name, **axis)[...] = array
                 zarr.consolidate_metadata(beside)
                 try:
+                    # Atomic: other processes see no store or a complete one, and one process alone is first.
                     beside.rename(path)
                 except OSError as error:
+                    # Another process was first: its store is opened, and `check` compares the studies.
                     if error.errno not in (errno.ENOTEMPTY, errno.EEXIST):
                         raise
         finally:
+            # Behind a successful rename nothing has this name any more.
             shutil.rmtree(beside, ignore_errors=True)
         return cls(path)
 
@@ -205,6 +210,7 @@ class Store:
 
     def count_rollouts(self, chunks: np.ndarray) -> int:
         """Number of rollouts in the chunks of a mask (chunks,)."""
+        # The last chunk may have fewer rollouts than the others.
         last = self.count - (self.chunks - 1) * self.chunk
         return int(chunks.sum()) * self.chunk - int(chunks[-1]) * (self.chunk - last)
 

@@ -102,6 +102,7 @@ class Computation:
         **Raises:** ValueError for a store of another study.
         """
         if not measure:
+            # Reading the property opens the store and checks it.
             _ = self.store
         seconds, programs = 0.0, {LOWERED: self.program.lowered}
         if measure:
@@ -134,8 +135,10 @@ class Computation:
             return compute(self.program, numbers)
         # By decreasing cost, so that the members of a batch take about equally many steps; back in order in the store.
         costs = cost[numbers] if isinstance(cost, np.ndarray) else compute(self.cost, numbers)[0]["cost"]
+        # Stable: rollouts of equal cost keep their order.
         order = np.argsort(-costs.astype(np.float64), kind="stable")
         rows, steps = compute(self.program, numbers[order])
+        # The inverse permutation.
         place = np.argsort(order)
         return {name: values[place] for name, values in rows.items()}, steps
 
@@ -164,6 +167,7 @@ class Computation:
         for chunk, is_checked in enumerate(chunks[1], chunks[0]):
             is_damaged = bool(is_checked) and not self.store.is_whole(chunk)
             if is_damaged:
+                # A chunk without its record is missing, so that `chunk` computes it again.
                 self.store.forget(chunk)
             results.append((is_damaged, self.chunk(chunk)))
         return results

@@ -138,6 +138,7 @@ def sort_outputs(scene: Scene, outputs) -> tuple[str, ...]:
             frame_index(scene.system, name.removeprefix(POSE))
         elif name not in OUTPUTS:
             raise ValueError(f"outputs has {name!r}; choose from {', '.join(OUTPUTS)} and '{POSE}<frame>'")
+    # Names are static: in one order, the same outputs share a compiled program.
     return tuple(sorted(set(outputs)))
 
 

@@ -154,6 +154,7 @@ def check_steps(control: Any, stepsize: Any) -> None:
         raise ValueError(
             "control is sampled, which takes fixed steps; pass stepsize=control.period, or a whole part of it"
         )
+    # Traced values cannot be compared while the program is made.
     if is_concrete((control.period, stepsize)):
         ratio = float(control.period) / float(np.asarray(stepsize))
         # The relative tolerance admits steps that were written with six digits, such as 0.000333333 for a third of 1e-3.
@@ -218,6 +219,7 @@ def sample(control: Sampled, held: Float[Array, " n"], q, v, t) -> Float[Array, 
     tau, state = control.update(q, v, t, state)
     tau = check_force(tau, q, v.shape[0], "control.law")
     fresh = jnp.concatenate([jnp.stack([start, count + 1]), tau, _flat(state, q)])
+    # Trajectories of a batch need not sample at the same step: all compute the law, and those that are due take it.
     return jnp.where(due, fresh, held)
 
 
@@ -268,6 +270,7 @@ def state_of(control: Any, y, q, v, t) -> Any:
         return _unpack(control, y[HELD], v)[3]
     if STATE not in y:
         return None
+    # Of the start only the structure is needed: by its shapes, the user's function is not computed again.
     like = eqx.filter_eval_shape(control.start, q, v, t)
     return ravel_pytree(jax.tree.map(lambda x: jnp.zeros(x.shape, q.dtype), like))[1](y[STATE])
 

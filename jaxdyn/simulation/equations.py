@@ -118,6 +118,7 @@ class Equations:
         if self._added:
             rates = rates | self._extra_rates(args, y, retract(scene.system, y["q"]), v, t, force)
         if KEPT in y:
+            # Constant during a step; `project` renews it at the end.
             rates = rates | {KEPT: jnp.zeros_like(y[KEPT])}
         return rates | {"work": power(force, v)} if "work" in y else rates
 
@@ -141,6 +142,7 @@ class Equations:
         if force is not None:
             # Work and the entries of the control and the drives are integrated explicitly.
             by_force = {name: y[name] for name in y if name not in ("work", *self._added)}
+            # Rates are affine in the force: their derivative along it is its share, without the rest.
             _, share = jax.jvp(lambda f: method.rates(scene, by_force, q, v, t, f), (jnp.zeros_like(v),), (force,))
             rates = rates | share
         return rates | {"q": velocity_to_rate(scene.system, q, v)}
@@ -188,4 +190,5 @@ class Equations:
     def _least_allowance(self, t, y, args):
         scene, _, method = self.unpack(args, y)
         q, v = method.to_qv(scene, y, t)
+        # One event for all conditions: the first one that is violated ends the run.
         return jnp.min(self.allowances(args, y, q, v, t))

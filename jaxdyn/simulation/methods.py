@@ -211,6 +211,7 @@ class Baumgarte(Multipliers):
         row, holonomic = rows(scene, q, v, t), holonomic_rows(layout(scene))
         alpha, beta = self.alpha.astype(q.dtype), self.beta.astype(q.dtype)
         gamma = row.gamma - 2 * alpha * row.velocity
+        # Only rows on positions have a residual phi.
         gamma = gamma.at[holonomic].add(-(beta**2) * position_residual(scene, q, t))
         force = jnp.zeros_like(v) if force is None else force
         return solve_rows(scene, q, v, force, t, Rows(row.A, gamma, row.velocity)).acceleration
@@ -236,6 +237,7 @@ class Reduced(Method):
     projects: ClassVar[bool] = True
 
     def __init__(self, basis: BasisLike | None = None, *, dof: int | None = None):
+        # A function becomes a pytree, so that arrays which it holds are inputs of the compiled run and not constants.
         is_function = callable(basis) and not isinstance(basis, Basis)
         self.basis = UserBasis(as_pytree(basis, "basis")) if is_function else basis
         self.dof = dof
@@ -286,6 +288,7 @@ class Reduced(Method):
         return self._rates(scene, y, velocity_and_drift(scene, self._basis(y), q, y["nu"], t), q, t, force)
 
     def _rates(self, scene, y, motion, q, t, force):
+        # Without the scene's forces, which `force` includes.
         reduced = solve_in_basis(Scene(scene.system, scene.constraints), motion, q, force, t)
         fixed = {name: jnp.zeros_like(y[name]) for name in self.step_constants}
         return {"q": velocity_to_rate(scene.system, q, motion.v), "nu": reduced.nu_rate} | fixed
@@ -324,6 +327,7 @@ def _position_error(scene: Scene, q, error) -> Array:
 
 def dynamics(scene: Scene, q, v, t, force, rank_tol: float | None = None):
     """Acceleration and multipliers at a state; `force` (nv,) is tau plus the scene's forces, or None."""
+    # `force` includes the scene's forces, so that the scene is passed without them: they would act twice.
     motion = constrained_dynamics(Scene(scene.system, scene.constraints), q, v, force, t, rank_tol=rank_tol)
     if not has_selection(scene):
         return motion
@@ -339,6 +343,7 @@ def is_regular(quality) -> Array:
 
 def start_limit(dtype) -> float:
     """Largest residual of a start, relative to the mechanism's length: rounding of the numbers that were given."""
+    # 5e-7 in float64 and 2e-3 in float32: far above eps, as a start may have been printed with few digits.
     return float(jnp.finfo(dtype).eps) ** 0.4
 
 

@@ -63,17 +63,20 @@ def smooth_motion(scene: Scene, control, method: Method, numbers, options) -> So
     # Loops fill rows that they did not reach with infinity.
     finite = [jnp.isfinite(rows).reshape(ts.shape[0], -1).all(1) for rows in y.values()]
     reached = good & jnp.stack(finite).all(0)
+    # The start stands in the rows that were not reached: outputs and their derivatives are finite there.
     y = jax.tree.map(functools.partial(rows_where, reached), y, y0)
     work = y.pop("work", None)
     # By the kernels that have put the start on the constraints.
     q, v = map_rows(lambda row: run.to_qv(*row), (y, ts))
     violation, ends = _violation(run, (y, q, v, ts), reached, result, time_reached, last), []
     if violation is not None:
+        # A save point at the time of the violation still belongs to the motion.
         reached = reached & ~(violation.happened & (ts > violation.time))
         time_reached = jnp.where(violation.happened, violation.time, time_reached)
         ends += violation.codes(run.eqs.conditions.counts(scene))
     # Behind a state whose contact is not unique the rows are those of another motion.
     if has_dependent_coordinates(scene.system):
+        # A running sum: rows behind the first inconsistent one are lost, even where they are consistent again.
         follows = jnp.cumsum(~map_rows(scene.system.is_consistent, q)) == 0
         ends.insert(0, (~follows.all(), RESULTS.no_single_contact))
         reached = reached & follows
@@ -100,6 +103,7 @@ def smooth_motion(scene: Scene, control, method: Method, numbers, options) -> So
     rows = {"q": q, "v": v} | values | ({} if work is None else {"work": work})
     all_finite = jnp.stack([jnp.isfinite(x).all() for x in jax.tree.leaves(rows)]).all()
     result = first_of([*faults, ((result == RESULTS.successful) & ~all_finite, RESULTS.nonfinite_state)], result)
+    # NaN only now, behind all checks and outputs, to which it would spread.
     rows = jax.tree.map(lambda x: rows_where(reached, x, jnp.nan), rows)
     stats = {name: jnp.asarray(counts[name], jnp.int32) for name in COUNTS}
     stats["time_reached"] = jnp.where(good, time_reached, ts[0])
@@ -128,6 +132,7 @@ def _project_start(scene: Scene, method: Method, inputs: Inputs, selects_rows: b
                 jnp.max(jnp.abs(x - y)) / (1 + jnp.max(jnp.abs(x))) for x, y in zip(given_start, (q0, v0), strict=True)
             ]
             start_ok = start_ok & (jnp.maximum(*corrections) <= 10 * start_limit(q0.dtype))
+    # In front, because the first case is reported: the others may follow from a bad start.
     faults.insert(0, (~start_ok, RESULTS.inconsistent_start))
     angles = angle_coordinates(scene.system)
     if angles.size and not is_step_length(inputs.steps[-1]):
@@ -231,5 +236,6 @@ def _redundancy(run: _Run, y, q, ts, reached) -> dict[str, Array]:
     gaps = map_rows(lambda row: gap_of_redundant(run.scene_at(row[0]), *row[1:]), (y, q, ts))
     return {
         "redundant_rows": jnp.sum(1 - row_mask(run.scene)).astype(jnp.int32),
+        # Rows that were not reached hold the start, and are none of the motion's.
         "redundant_gap": jnp.max(jnp.where(reached, gaps, jnp.zeros_like(gaps))),
     }

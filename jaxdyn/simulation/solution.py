@@ -35,6 +35,7 @@ OF_DIFFRAX = (
 
 def first_of(cases: Sequence[tuple[Any, Any]], otherwise: Any) -> Any:
     """Code of the first case (condition, code) whose condition holds, else the one given."""
+    # Backwards, so that the first case replaces the others.
     for condition, code in reversed(cases):
         otherwise = RESULTS.where(condition, code, otherwise)
     return otherwise

@@ -136,16 +136,19 @@ def safe_inputs(system, numbers) -> Inputs:
     `numbers`: q0, v0, ts, rtol, atol, and the length of steps or their controller.
     """
     q0, v0, ts, rtol, atol, stepsize = numbers
+    # Before `retract`, which gives every quaternion the length one.
     unit_start = has_unit_quaternions(system, q0)
     q0 = retract(system, q0)
     in_order = jnp.isfinite(ts).all() & (ts[1:] > ts[:-1]).all()
     given, ts = ts, jnp.where(in_order, ts, jnp.arange(ts.shape[0], dtype=ts.dtype))
     finite_start = jnp.isfinite(q0).all() & jnp.isfinite(v0).all()
     fine_tolerances = jnp.isfinite(rtol) & (rtol >= 0) & jnp.isfinite(atol) & (atol >= 0)
+    # Coarse, so that a trajectory that is refused anyway takes few steps.
     rtol, atol = (jnp.where(fine_tolerances, x, jnp.full_like(x, 1e-3)) for x in (rtol, atol))
     fine_steps = jnp.asarray(True)
     if is_step_length(stepsize):
         fine_steps = jnp.isfinite(stepsize) & (stepsize > 0)
+        # One step to the end, as the trajectory is refused anyway.
         stepsize = jnp.where(fine_steps, stepsize, ts[-1] - ts[0])
     good = finite_start & unit_start & in_order & fine_steps & fine_tolerances
     harmless = jnp.zeros_like(q0)

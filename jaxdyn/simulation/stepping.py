@@ -63,6 +63,7 @@ def stepper(scene: SceneLike, dt: Numbers, substeps: int = 1, remat: bool = True
     scene = as_scene(scene)
     seconds = _check_options(scene, dt, substeps, adjoint)
     system, dtype = scene.system, state_dtype(scene.system)
+    # In numpy a known length stays known inside a jit, where jax would trace it.
     length = np.asarray(seconds, dtype) if is_concrete(seconds) else jnp.asarray(seconds, dtype)
     start, advance = _advance(scene, length, substeps, adjoint != "reverse")
     by_numbers = jax.checkpoint(advance) if remat else advance
@@ -125,6 +126,7 @@ def _advance(scene: Scene, length, substeps: int, is_direct: bool) -> tuple[Any,
 
         def generalized_force(q, v, t):
             force, (torque, rates) = scene.applied_force(q, v, t), scene.drive_torque(q, v, t, tau, y.get(DRIVES))
+            # `evaluate` takes a force alone, so that the rates of the drives leave by this dictionary.
             of_drive.update({} if rates is None else {DRIVES: rates})
             return torque if force is None else torque + force
 
@@ -154,6 +156,7 @@ def _advance(scene: Scene, length, substeps: int, is_direct: bool) -> tuple[Any,
 
     def advance(q, v, tau, t, *z):
         y = method.start(scene, q, v, t) | dict(zip(of_drives, z, strict=True))
+        # Once, at the start on the constraints: between the stages of a step the rank would change.
         selection = select_rows(known(unknown), q, t, None) if selects_rows else None
         plan, args, ts, size = solver.plan(y), (unknown, tau, selection), jnp.stack([t, t + length]), length / substeps
         if pieces.names:

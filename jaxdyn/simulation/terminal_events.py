@@ -87,6 +87,7 @@ class Violation(NamedTuple):
         lost = {"lost_contact": jnp.where(self.entry < contacts, self.entry, -1)} if conditions.contacts else {}
         if conditions.limits:
             is_limit = self.happened & (self.entry >= contacts) & (self.entry < contacts + limits)
+            # The lower limits of all entries come before the upper ones: both belong to the entry modulo their number.
             place = jnp.where(is_limit, (self.entry - contacts) % (limits // 2), -1)
             lost["passed_limit"] = place.astype(jnp.int32)
         return lost
@@ -98,6 +99,7 @@ def first_violation(rows: Float[Array, "nt k"], reached, ts, within) -> Violatio
     `within` is None, or whether there was such an event, its time and the allowances (k,) there.
     """
     below = reached & (rows < 0).any(1)
+    # The first true flag; zero without any, where `happened` is false.
     first = jnp.argmax(below)
     violation = Violation(below.any(), ts[first], jnp.argmin(rows[first]).astype(jnp.int32))
     if within is not None:
@@ -116,6 +118,7 @@ def event(allowance, basis, start, dtype) -> diffrax.Event:
     def condition(t, y, args, **_):
         least = allowance(t, y, args)
         if basis is not None:
+            # A run has one event: a basis that has become singular counts as a violation, whatever the allowances.
             least = jnp.where(basis(t, y, args) * start > 0, least, -jnp.ones_like(least))
         return least.astype(float)  # the dtype of diffrax's own branches
 
@@ -137,6 +140,7 @@ def report_limits(scene: Scene, solution: Solution, is_concrete: bool) -> Soluti
     """Add `stats["passed_limit"]` to a solution; a concrete one that passes a limit warns, a traced one does not."""
     model: Any = scene.system
     margins = jax.vmap(limit_allowances, (None, 0))(model, solution.q)
+    # Rows that the run did not reach are NaN.
     below = jnp.isfinite(solution.q).all(1) & (margins < 0).any(1)
     entry = jnp.argmin(margins[jnp.argmax(below)]) % (margins.shape[1] // 2)
     entry = jnp.where(below.any(), entry, -1).astype(jnp.int32)

@@ -190,6 +190,7 @@ def _newton(function, jacobian, z, n: int):
         z, change, _, count = state
         return (change > eps**0.75 * size(z)) & (count < _MOST_JACOBIANS)
 
+    # A change that is not known yet is infinite, so that both loops begin.
     unknown = jnp.asarray(jnp.inf, z.dtype)
     z, change, _, _ = lax.while_loop(is_running, renew, (z, unknown, unknown, 0))
     return z, change
@@ -223,6 +224,7 @@ def _tree_derivatives(model: Model, q, v):
         wrenches += [inertias[:, :1] * g, jax.vmap(cross)(inertias[:, 1:4], g)]
     sums = sum_to_coordinates(model, jnp.concatenate(wrenches, axis=1))
     carrier = np.array(topology.parents)[topology.dof_body]
+    # The base, whose index -1 becomes nb, stands behind the bodies as one at rest.
     at_rest = jnp.zeros((1, 6), q.dtype)
     bracket = jax.vmap(se3.ad_apply)(
         take(jnp.concatenate([twists, at_rest]), carrier % (topology.nb + 1)), frame.subspace
@@ -254,6 +256,7 @@ def _by_joint(system, x, p, function):
     """Value `function(group, x, p)` of joints that move on a group; p of the others, whose coordinates commute."""
     if not isinstance(system, Model) or set(system.topology.kinds) <= set(SCREW_KINDS):
         return p
+    # Blocks of different sizes by joint: groups have no common shape that a vmap could take.
     parts = []
     for kind, place in zip(system.topology.kinds, system.topology.v_slices, strict=True):
         parts.append(p[place] if kind in SCREW_KINDS else function(_GROUPS[kind], x[place], p[place]))
@@ -267,6 +270,7 @@ def _rows(scene: Scene, q, t, rank_tol):
     A = constraint_jacobian(scene, q, t)
     right_inverse = correction(scene, q, t, rank_tol, holonomic=False)
     spare = jnp.eye(A.shape[0], dtype=A.dtype) - matmul(A, right_inverse)
+    # `spare` only determines unknowns without effect, so that its derivative has none either.
     return A, right_inverse, lax.stop_gradient(spare)
 
 

@@ -47,11 +47,13 @@ def terms_at(scene: Scene, elements: Elements, q, v, t) -> StateTerms:
     """Terms of a scene with its elements."""
     row = rows(extend(scene), q, v, t)
     metric = mass_factor(mass_matrix(scene.system, q, t))
+    # Whitened rows Y give A M^-1 A^T as Y^T Y: symmetric, and positive semidefinite for dependent rows too.
     return StateTerms(row, metric, metric.whiten(row.A.T), by_element(elements, row.velocity))
 
 
 def by_element(elements: Elements, rowwise) -> Array:
     """Entries of the rows that slip, (n, 2), zero where there are none."""
+    # Padded to two directions, so that elements with one row and with two rows share one array.
     zero = jnp.zeros((), rowwise.dtype)
     return jnp.stack(
         [
@@ -83,13 +85,16 @@ def directions(scene: Scene, elements: Elements, slip, reference) -> Array:
         least = 100 * float(jnp.finfo(w.dtype).eps)
         square = jnp.sum(w * w)
         is_sliding = square > least**2
+        # The square root has an infinite derivative at zero, which a mask behind it would turn into NaN.
         length = jnp.sqrt(jnp.where(is_sliding, square, jnp.ones_like(square)))
         if one.smooth:
             speed = force_at(scene, one).smoothing.astype(w.dtype)
+            # 1/speed is the limit of tanh(|w|/speed)/|w| at rest.
             unit_vectors.append(w * jnp.where(is_sliding, jnp.tanh(length / speed) / length, 1 / speed))
         elif len(one.tangent) < 2:
             unit_vectors.append(s)
         else:
+            # Behind w = 0 the direction is reversed: friction stays smooth in the interval that brackets the event.
             forward = jnp.where(jnp.sum(s * w) < 0, -1.0, 1.0).astype(w.dtype)
             unit_vectors.append(jnp.where(is_sliding, forward * w / length, s))
     return jnp.stack(unit_vectors)
@@ -104,6 +109,7 @@ def slides(elements: Elements, mode: Mode) -> list:
 def react(scene: Scene, elements: Elements, mode: Mode, terms: StateTerms, along, target) -> Reaction:
     """Forces that give the active rows the rates `target` (count,), or impulses that give them these velocities."""
     dtype = target.dtype
+    # Rows that do not act are masked and not removed: every mode has the same shapes and the same program.
     active = elements.active(mode).astype(dtype)
     sliding = slides(elements, mode)
     Z = [
@@ -123,6 +129,7 @@ def react(scene: Scene, elements: Elements, mode: Mode, terms: StateTerms, along
     pivots = [jnp.ones((), dtype)] * len(elements.each)
     if count:
         pick = jnp.stack([sign[i] for i in elements.frictional])
+        # Sliding friction changes its own normal forces: N = S (base + by_normal N), S the rows and signs of `pick`.
         K = jnp.eye(count, dtype=dtype) - pick[:, None] * by_normal[jnp.asarray(at)]
         normal, own = _eliminate(K, pick * base[jnp.asarray(at)])
         for i, pivot in zip(elements.frictional, own, strict=True):
@@ -147,6 +154,7 @@ def solve_rows(Y, active, right):
     # Large enough for Cholesky's factors of dependent rows; each step of the proximal method multiplies the error by about it.
     shift = eps**0.5
     count = Y.shape[1]
+    # Rows that do not act have a one on the diagonal, so that the factor exists in every mode.
     factor = cholesky(matmul(Y.T, Y) + jnp.diag(1.0 - active + shift * jnp.ones((count,), Y.dtype)))
     right = right * scale[:, None]
     x = solve_cholesky(factor, right)
@@ -166,6 +174,7 @@ def _eliminate(K, right):
     for i in range(n):
         pivot = matrix[i][i]
         pivots.append(pivot)
+        # The recorded pivot stays zero, which ends the mode; the division needs another number.
         pivot = jnp.where(pivot == 0, jnp.full_like(pivot, float(jnp.finfo(pivot.dtype).eps)), pivot)
         for j in range(i + 1, n):
             share = matrix[j][i] / pivot
@@ -198,6 +207,7 @@ def motion_at(
     along = directions(scene, elements, terms.slip, reference)
     force = jnp.zeros_like(v) if generalized_force is None else generalized_force
     sliding = slides(elements, mode)
+    # A given normal force makes sliding friction a known force: it does not enter the equations of `react`.
     prescribed = {}
     for i, one in enumerate(elements.each):
         if one.normal < 0:
@@ -209,6 +219,7 @@ def motion_at(
     acceleration = terms.metric.unwhiten(free) + reaction.change
     normal = jnp.stack([prescribed.get(i, reaction.normal[i]) for i in range(len(elements.each))])
     parts = terms.row.A * acceleration[None]
+    # A rate is zero up to the rounding of its terms, so that comparisons need their size.
     sizes = jnp.sum(jnp.abs(parts), 1) + jnp.abs(terms.row.gamma)
     return Motion(acceleration, reaction, normal, jnp.sum(parts, 1) - terms.row.gamma, sizes)
 
@@ -244,6 +255,7 @@ def impact(
     scene: Scene, elements: Elements, mode: Mode, terms: StateTerms, along, v, rebound
 ) -> tuple[Array, Reaction]:
     """Velocity after impulses that end the motion of the active rows, or give gaps the velocity `rebound` (n,); and these."""
+    # An impact changes no positions: the rows and the mass matrix are those before it.
     target = -terms.row.velocity
     for i, one in enumerate(elements.each):
         if one.opens:
@@ -257,6 +269,7 @@ def element_guards(
 ) -> Array:
     """Guards (n, CHANNELS), which are positive while the mode holds: 1 where it has no condition."""
     gap, rows = gaps(scene, elements, q, t), []
+    # Every element has all channels: the index of a guard means the same condition in every mode.
     one_ = jnp.ones((), q.dtype)
     for i, one in enumerate(elements.each):
         normal = one_
@@ -268,8 +281,10 @@ def element_guards(
         if one.tangent and not one.smooth:
             hold = motion.reaction.holding[i]
             square = jnp.sum(hold * hold)
+            # The length has no derivative at zero, and an element that slides has a holding force of zero.
             size = jnp.sqrt(jnp.where(square > 0, square, one_)) * (square > 0).astype(q.dtype)
             margin = force_at(scene, one).static.astype(q.dtype) * motion.normal[i] - size
+            # Sliding is guarded by a signed speed, which crosses zero; the length of the velocity only touches it.
             friction = jnp.where(mode.stick[i], margin, jnp.sum(reference[i] * terms.slip[i]))
             friction = jnp.where(mode.closed[i], friction, one_)
         if one.tangent:

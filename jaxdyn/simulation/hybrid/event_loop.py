@@ -87,6 +87,7 @@ def _attempt(plan: Plan, system: HybridSystem, args, t0, t1, y, rtol, atol) -> A
     scaled = step.error / (atol + rtol * jnp.maximum(jnp.abs(y), jnp.abs(step.projected)))
     size = jnp.sqrt(jnp.mean(scaled * scaled))
     middle = (t0 + t1) / 2
+    # The dense output only finds that a guard was negative: the event is located by steps of its own.
     between = dense_output(plan, None, middle, t0, t1, y, step.raw, step.stages, step.shift)
     return Attempt(step, size, *system.guards(args, t1, step.projected), *system.guards(args, middle, between))
 
@@ -114,11 +115,13 @@ def run_events(system: HybridSystem, unknown, ts, y0, mode, rtol, atol, stepsize
     end, count, elements = ts[-1], ts.shape[0] - 1, system.elements
     eps, n = float(jnp.finfo(ts.dtype).eps), len(elements.each)
     hit = jnp.zeros((n * CHANNELS + elements.switches,), bool)
+    # The start may be an impact, or its mode may not hold: it passes a transition before the first step.
     begun = system.reset(unknown, ts[0], y0, mode, system.slip(y0), hit)
     # A short first step: the control may enlarge it tenfold with each one that is kept.
     first, grid = 1e-4 * (end - ts[0]), None
     if stepsize is not None:
         first = (end - ts[0]) / number_of_steps(ts[0], end, stepsize).astype(ts.dtype)
+        # One grid for the whole run: steps that an event has cut return to it.
         grid = FixedGrid(ts[0], first)
     run = _start(system, unknown, ts[0], y0, begun, first)
     origin = run.y
@@ -140,9 +143,11 @@ def run_events(system: HybridSystem, unknown, ts, y0, mode, rtol, atol, stepsize
         if elements.switches:
             after = _cross_loosely(elements, after)
         after = jax.tree.map(lambda a, b: jnp.where(active, a, b), after, run)
+        # A trajectory that has ended still iterates with its batch: it must write no rows and no events.
         kept, hit = kept & active, hit & active & kept
         saved, rows = save(system.plan, ts, run, after, kept, attempt.step, saved, rows)
         happens = hit.any()
+        # Most steps end at no event, and skip the transition.
         after, records = cond(
             happens,
             lambda after, records: _pass_event(system, unknown, after, records, hit, happens, most, grid),
@@ -187,6 +192,7 @@ def _cross_loosely(elements: Elements, run: RunState) -> RunState:
     """Take the pieces at the end of the last step, if steps go across the zeros of switching functions."""
     first, switching = elements.split(run.guards)
     crossed = run.loose & (switching < 0)
+    # Guards have the sign of their piece: with the piece the sign changes, and the guard is positive again.
     guards = jnp.concatenate([first.reshape(-1), jnp.where(crossed, -switching, switching)])
     return run._replace(mode=run.mode._replace(positive=run.mode.positive ^ crossed), guards=guards)
 
@@ -210,6 +216,7 @@ class _Bracket(NamedTuple):
 def _bracket(run: RunState, t1, attempt: Attempt, good, eps: float) -> _Bracket:
     """Narrow the bracket of an event by an attempt whose error is `good`, or begin one."""
     length, (values, levels) = t1 - run.t, (attempt.values, attempt.levels)
+    # Within its rounding level the sign of a guard is not known.
     violated = (values < -levels).any() & ~run.loose
     # In the middle alone: the step is halved first.
     inside = good & ~run.locating & ~run.loose & (attempt.middle < -attempt.middle_levels).any()
@@ -222,6 +229,7 @@ def _bracket(run: RunState, t1, attempt: Attempt, good, eps: float) -> _Bracket:
     value = jnp.min(at / scale)
     first_value = jnp.min(run.guards / scale)
 
+    # A step whose error is too large proves nothing about the guards at its end.
     begins = good & violated & ~run.locating
     low = jnp.where(begins, 0.0, run.low)
     value_low = jnp.where(begins, first_value, run.value_low)
@@ -241,6 +249,7 @@ def _bracket(run: RunState, t1, attempt: Attempt, good, eps: float) -> _Bracket:
     # The root is known when a guard is zero, or when its time is, up to rounding.
     near = jnp.abs(value) <= 64 * eps
     narrow = (high_ - low) <= 4 * eps * jnp.maximum(jnp.abs(t1), run.usual)
+    # A zero in the middle is not at the end of this step, which is where a step can be cut.
     located = locating & (near | narrow) & ~inside
     kept = good & ((~violated & ~run.locating) | located)
     # A zero in the middle of a step may have been an error of the dense output.
@@ -252,6 +261,7 @@ def _bracket(run: RunState, t1, attempt: Attempt, good, eps: float) -> _Bracket:
 def _decide(system: HybridSystem, run: RunState, t1, end, attempt: Attempt, eps: float, grid: FixedGrid | None):
     """State after an attempt, whether the step is kept, and the guards that ended it."""
     length = t1 - run.t
+    # False for an error of NaN, so that a step to a state that is not finite is refused.
     good = attempt.size < 1 if grid is None else jnp.isfinite(attempt.step.projected).all()
     factor = step_factor(attempt.size, system.error_order, good).astype(length.dtype)
     b = _bracket(run, t1, attempt, good, eps)
@@ -259,11 +269,14 @@ def _decide(system: HybridSystem, run: RunState, t1, end, attempt: Attempt, eps:
     guided = (b.value_low > 64 * eps) & (b.value_high < 0) & (run.tries < _MAX_SECANTS)
     difference = jnp.where(guided, b.value_high - b.value_low, 1.0)
     secant = jnp.where(guided, b.high - b.value_high * (b.high - b.low) / difference, (b.low + b.high) / 2)
+    # Rounding can carry the secant out of the bracket.
     secant = jnp.clip(secant, b.low, b.high)
+    # Attempts that locate an event are short for its sake: they say nothing about the usual length.
     usual = jnp.where(run.locating, run.usual, jnp.where(good & ~b.violated, length * factor, length))
     usual = jnp.where(good, usual, length * factor)
     next_length = jnp.where(b.locating, secant, usual)
     next_length = jnp.where(b.located, _AFTER_EVENT * usual, next_length)
+    # The spacing of floating-point numbers at t: shorter steps would not advance.
     least = 4 * eps * jnp.maximum(jnp.abs(run.t), eps)
     short = ~good & (next_length < least)
     # Steps of fixed length have no error to keep: they fail where the state is not finite.
@@ -322,6 +335,7 @@ def _pass_event(
     code = jnp.where(change.settled, FINE, NO_MODE)
     # With switching functions alone, a motion without room for its events continues: it loses its derivatives.
     code = jnp.where(crowded & bool(elements.each), CROWDED, code)
+    # Last, because it is the reason why no mode was found.
     code = jnp.where(change.paradox | lost, PARADOX, code)
     loose = jnp.zeros((), bool)
     if elements.switches:
@@ -329,6 +343,7 @@ def _pass_event(
         # Steps of fixed length go across the zero from then on.
         loose = is_chatter & bool(grid is not None and not elements.each)
         code = jnp.where(is_chatter & ~loose, CROWDED, code)
+        # More events than there is room for: the replay then gives NaN for derivatives, which this motion lacks.
         count = jnp.where(loose, most + 1, count)
     code = code.astype(jnp.int32)
     after = run._replace(y=y, mode=mode, guards=guards, count=count, code=code, loose=run.loose | loose)

@@ -82,6 +82,7 @@ class Elements(NamedTuple):
 
     def active(self, mode: Mode) -> Array:
         """Mask of the rows that act in a mode, (count,)."""
+        # The scene's own constraints act in every mode.
         rows: list[Any] = [jnp.ones((), bool)] * self.count
         for i, one in enumerate(self.each):
             if one.opens:
@@ -100,6 +101,7 @@ def extend(scene: Scene) -> Scene:
     """Scene with the rows of its elements behind its own, and without these forces."""
     return Scene(
         scene.system,
+        # Behind the scene's own rows, whose indices stay as they are: outputs take the first `own` multipliers.
         (*scene.constraints, *(_constraint(force) for force in scene.forces if isinstance(force, WithModes))),
         tuple(force for force in scene.forces if not isinstance(force, WithModes)),
     )
@@ -122,6 +124,7 @@ def elements_of(scene: Scene, pieces: Pieces) -> Elements:
         gap_rows, friction_rows = place.nonholonomic - place.start, place.end - place.nonholonomic
         tangent = tuple(range(place.nonholonomic, place.end))
         name = force.name
+        # `Events.times` finds events by their names, so that two elements may not share one.
         while name in used:
             name = f"{name} ({i})" if name == force.name else f"{name}'"
         used.append(name)
@@ -179,6 +182,7 @@ class Events(eqx.Module):
             raise ValueError(
                 "events.name are texts, which a traced program does not have; take events.index and events.names"
             )
+        # The index -1 picks the last entry, the empty name.
         return np.array([*self.names, ""], dtype=object)[np.asarray(jax.device_get(self.index))]
 
     def times(self, name: str) -> np.ndarray:

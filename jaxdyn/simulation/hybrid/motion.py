@@ -87,6 +87,7 @@ def hybrid_motion(scene: Scene, control, numbers, options) -> Solution:
     inputs = safe_inputs(scene.system, numbers)
     q0, v0, ts, good = inputs.q0, inputs.v0, inputs.ts, inputs.good
     eps, (rtol, atol, stepsize) = float(jnp.finfo(q0.dtype).eps), inputs.steps
+    # Error estimates have rounding of this size: smaller tolerances would refuse every step.
     rtol, atol = (jnp.maximum(x, 10 * eps).astype(q0.dtype) for x in (rtol, atol))
 
     # The transition at the start of the event loop settles this guess, as after an event.
@@ -98,6 +99,7 @@ def hybrid_motion(scene: Scene, control, numbers, options) -> Solution:
     system = ModalSystem(bind, elements, options["solver"], y0)
     room = max_steps if stepsize is not None else min(max_steps, ROOM)
     run: Any = HybridRun(system, mode, rtol, atol, stepsize, max_steps, most, room=room)
+    # A custom rule for reverse mode admits no forward mode: these adjoints need the run without it.
     if isinstance(options["adjoint"], (diffrax.ForwardMode, diffrax.DirectAdjoint)):
         run = run.direct
     rows, times, (end, records, begun) = run(y0, unknown, ts)
@@ -174,6 +176,7 @@ def _guess(scene: Scene, elements, q, v, t):
     smooth = jnp.asarray(np.array([one.smooth for one in elements.each]))
     limit = float(jnp.finfo(q.dtype).eps) ** 0.4
     start_ok = (~opens | (gap >= -limit * reach)).all()
+    # Smooth friction is a function of the state, which has no mode that sticks.
     return mode._replace(stick=mode.stick & ~smooth), lax.stop_gradient(unit), start_ok
 
 
@@ -191,6 +194,7 @@ def _events(elements, touched, start, times, index, good) -> Events:
     first = jnp.where(touched, jnp.arange(touched.shape[0], dtype=index.dtype) * len(KINDS), -1)
     index = jnp.concatenate([first, index])
     times = jnp.concatenate([jnp.where(touched, start, jnp.nan), times])
+    # Stable: events keep their order in time, and empty places go behind them.
     order = jnp.argsort(index < 0, stable=True)[:most]
     index, times = index[order], times[order]
     return Events(jnp.where(good, times, jnp.nan), jnp.where(good, index, -1), elements.names)

@@ -43,6 +43,7 @@ class PiecewiseSystem(HybridSystem):
         return jnp.where(args[1].positive, values, -values), levels
 
     def reset(self, unknown, t, y, mode, slip, hit):
+        # Forces are finite on both sides of a zero: the piece changes, and the velocity does not jump.
         mode, yes = mode._replace(positive=mode.positive ^ hit), jnp.ones((), bool)
         return Transition(mode, slip, mode, slip, jnp.zeros((0,), y.dtype), yes, ~yes)
 
@@ -71,6 +72,7 @@ def piecewise_motion(
     values, _ = system.guards((unknown, mode), ts[0], flat)
     rtol, atol = (jnp.asarray(x, flat.dtype) for x in (rtol, atol))
     mode = lax.stop_gradient(mode._replace(positive=values > 0))
+    # Attempts that locate events do not count among the user's steps, so that there is room for both.
     run = HybridRun(system, mode, rtol, atol, stepsize, max_steps + event_loop.SEARCH_STEPS * most, most, room=room)
     rows, _, (end, _, _) = (run.direct if is_direct else run)(y0, unknown, ts)
     codes: Any = diffrax.RESULTS

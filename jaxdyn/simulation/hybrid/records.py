@@ -47,6 +47,7 @@ def record_elements(
     order = [(i, True) for i in range(len(elements.each))] + [(i, False) for i in range(len(elements.each))]
     for i, by_trigger in order:
         is_row = changed[i] & ((hit.any() & (leading // CHANNELS == i)) == by_trigger)
+        # A scatter needs a place for what is not kept too: the spare last row.
         place = jnp.where(is_row & (count < most), count, most)
         row = Records(
             t,
@@ -64,6 +65,7 @@ def record_elements(
 
 def record_switches(elements: Elements, t, count, mode: Mode, records: Records, switched, slip, most: int):
     """Records with a row for each switching function that changed its sign, and their number."""
+    # Functions that switch together take consecutive rows.
     index = jnp.cumsum(switched, dtype=jnp.int32) - 1
     places = jnp.where(switched, jnp.minimum(count + index, most), most)
     # They change one after the other: the mode of a row has the changes of the rows before it and its own.
@@ -83,5 +85,6 @@ def chatters(elements: Elements, t, usual, count, records: Records, switched, mo
     """True if a switching function changes back at once: on both sides of its zero the force drives the motion onto it."""
     last = jnp.maximum(jnp.minimum(count, most) - 1, 0)
     names = jnp.arange(elements.switches, dtype=jnp.int32) + len(elements.each) * len(KINDS)
+    # Two events of one function within the rounding of the time: the motion cannot leave the zero between them.
     least = 64 * float(jnp.finfo(t.dtype).eps) * jnp.maximum(jnp.abs(t), usual)
     return ((names == records.name[last]) & switched).any() & (t - records.time[last] <= least)

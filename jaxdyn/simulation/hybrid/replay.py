@@ -86,6 +86,7 @@ def _replay(run: HybridRun, inputs, end, records, begun, direct: bool):
         t, y, mode = carry
         event, place = is_event[at], jnp.clip(at - saves, 0, most - 1)
         record = jax.tree.map(lambda x: x[place], records)
+        # The derivative of an event's time enters by `_cross`: here the time is a constant.
         until = jnp.where(event, lax.stop_gradient(record.time), ts[1:][jnp.clip(at, 0, saves - 1)])
         known = ~event | (record.name >= 0)
         # Parts of no length, of events at the same time, make no steps; nothing is known beyond the end of the run.
@@ -105,6 +106,7 @@ def _replay(run: HybridRun, inputs, end, records, begun, direct: bool):
     y = system.with_slip(y, None, lax.stop_gradient(begun.slip))
     # With a checkpoint, reverse mode keeps one state a part, and the steps of one part at a time.
     _, (times, rows) = lax.scan(jax.checkpoint(part_or_none), (ts[0], y, begun.mode), order)
+    # The inverse permutation: save points first, then events.
     back = jnp.argsort(order)
     # A motion that continued beyond the events that there was room for has no derivative here.
     rows = rows * jnp.where((end.count > most) & (end.code == FINE), jnp.nan, 1.0).astype(rows.dtype)

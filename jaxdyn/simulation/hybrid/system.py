@@ -182,6 +182,7 @@ def project(scene: Scene, elements: Elements, mode: Mode, t, y, error):
     tangent = None
     if error is not None:
         e = rate_to_velocity(scene.system, q, error["q"])
+        # Rows on velocities do not confine a displacement: an error of q is projected by rows on positions alone.
         e = e - change(matmul(terms.row.A, e), holds)
         tangent = error | {
             "q": velocity_to_rate(scene.system, q, e),

@@ -84,8 +84,10 @@ def length(x):
 def align(slip, reference):
     """Directions of slipping (n, 2) on the side of the old ones; the old ones where nothing slips."""
     size, unit = length(lax.stop_gradient(slip))
+    # A velocity of the size of rounding has no direction.
     is_sliding = size > 100 * float(jnp.finfo(slip.dtype).eps)
     forward = jnp.where(jnp.sum(unit * reference, 1) < 0, -1.0, 1.0).astype(slip.dtype)
+    # Directions are constants of a step, for derivatives too.
     return lax.stop_gradient(jnp.where(is_sliding[:, None], forward[:, None] * unit, reference))
 
 
@@ -99,6 +101,7 @@ def first_guess(elements: Elements, mode: Mode, slip, state: ContactState, hit) 
     closes, releases = opens & first & ~mode.closed, opens & first & mode.closed
     begins, ends = second & mode.stick & mode.closed, second & ~mode.stick & mode.closed
     _, against = length(-state.holding)
+    # An element that breaks loose slides against the friction that held it: its velocity is still zero.
     slip = jnp.where(begins[:, None], against, slip)
     changed = mode._replace(
         closed=(mode.closed | closes) & ~releases,
@@ -146,7 +149,9 @@ def _solve(rough, disagreements: Callable, mode: Mode, slip):
         return any_sample(carry[3] & (carry[2] < most))
 
     def flip(mode, slip, wrong, sticks, against):
+        # The first one alone: Murty's rule changes one at a time, as several changes at once may cycle.
         first = jnp.argmax(wrong.reshape(-1))
+        # `argmax` is zero where nothing disagrees, so that the flag is masked by `wrong`.
         one = jnp.zeros(wrong.size, bool).at[first].set(True).reshape(wrong.shape) & wrong
         pulls, penetrates, leaves, turns, reverses = (one[:, k] for k in range(5))
         slip = jnp.where(leaves[:, None], against, slip)
@@ -203,6 +208,7 @@ def _disagreements_of_forces(elements: Elements, v, state_at: Callable, mode: Mo
     hold, against = length(-now.holding)
     speed, _ = length(now.slip)
     at_rest = speed <= small * now.slip_size
+    # A contact in flight has no force: it can close only where gap and velocity are both zero.
     resting = opens & (now.gap <= small * now.gap_size) & (jnp.abs(now.gap_velocity) <= small * now.slip_size)
     turns = jnp.sum(slip * now.slip_rate, 1) < -small * now.rate_size
     wrong = [

@@ -167,6 +167,7 @@ def solver_and_control(solver, term, ts, rtol, atol, stepsize):
         return solver, ErrorMonitoredSteps(solver.order(term)), stepsize
     controller = stepsize
     if controller is None:
+        # A step has to be longer than the rounding of the time.
         smallest = 16 * eps * jnp.maximum(jnp.abs(ts[0]), jnp.abs(ts[-1]))
         controller = Adaptive(rtol, atol, norm=_error_size, dtmin=smallest, force_dtmin=False)
     if isinstance(controller, diffrax.AbstractAdaptiveStepSizeController) and _has_coarse_dense_output(solver, term):
@@ -195,4 +196,5 @@ def _has_coarse_dense_output(solver, term) -> bool:
     degrees = [degree for cls, degree in _INTERPOLATION_DEGREE.items() if issubclass(interpolation, cls)]
     if is_split(solver) and hasattr(interpolation, "coeffs"):
         degrees.append(interpolation.coeffs.shape[1])  # of the methods of Kennedy and Carpenter
+    # A polynomial of degree p has an error of order h^(p+1) between steps.
     return bool(degrees) and max(degrees) + 1 < order

@@ -62,6 +62,7 @@ def run_adaptively(inputs, options, limit_is_given: bool):
     if not isinstance(options["controller"], diffrax.AbstractAdaptiveStepSizeController):
         return run(inputs, **options)[:2]  # with steps that are given, as those of `diffrax.StepTo`
     numbers, rest = eqx.partition(options, eqx.is_array)
+    # Tolerances and limits decide which steps are made, and the steps are constants here.
     options = eqx.combine(jax.lax.stop_gradient(numbers), rest)
     room = options["max_steps"] if limit_is_given else min(options["max_steps"], ROOM)
     if isinstance(options["adjoint"], diffrax.RecursiveCheckpointAdjoint):
@@ -128,6 +129,7 @@ class _GivenSteps(diffrax.AbstractStepSizeController):
         return jnp.where(self.count > 0, _along(self.ends[0], t0), t0), jnp.asarray(1)
 
     def adapt_step_size(self, t0, t1, y0, y1_candidate, args, y_error, error_order, controller_state):
+        # Behind the last record the index is held within the array: the code reports that steps are missing.
         row = jnp.minimum(controller_state, self.ends.shape[0] - 1)
         over = controller_state >= self.count
         start = t1 if self.starts is None else jnp.where(over, t1, _along(self.starts[controller_state - 1], t1))

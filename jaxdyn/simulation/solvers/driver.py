@@ -131,6 +131,7 @@ def _run_steps(run: ExplicitRun, y0, args, ts, max_steps: int, record: bool):
     start, end, count = ts[0], ts[-1], ts.shape[0] - 1
     eps, none, no = float(jnp.finfo(ts.dtype).eps), jnp.zeros((), jnp.int32), jnp.asarray(False)
     floor = end - _ROUNDED * eps / 2 * jnp.abs(end)
+    # Fixed steps have no tolerances: zeros keep one structure of the loop's constants.
     rtol, atol = (jnp.zeros_like(start) if x is None else x for x in (run.rtol, run.atol))
     rate, length, quality = _begin(plan, control, args, start, end, y0, rtol, atol)
     steps = none

@@ -94,6 +94,7 @@ class ExplicitSteps(ProjectedSolver):
         if self.project is not None:
             dense = {"dense_info": dense, "shift": structure(shift)}
         dt = jnp.asarray(t1 - t0, start.dtype)
+        # Stages are dt f, and f is carried: the next step may have another length.
         last = k[-1] / jnp.where(dt == 0, jnp.ones_like(dt), dt)
         return structure(projected), structure(error), dense, (last, jnp.asarray(plan.is_fsal)), result
 
@@ -236,6 +237,7 @@ def dense_output(plan: Plan, _, t, t0, t1, y, raw, stages, shift):
     y_dense = ravel_pytree(inner.evaluate(t))[0]
     if plan.project is None:
         return y_dense
+    # Trajectories that have ended take steps of no length, by which nothing can be divided.
     x = jnp.asarray((t - t0) / jnp.where(t1 == t0, jnp.ones_like(t1), t1 - t0), y.dtype)
     return y_dense + x * x * (3 - 2 * x) * shift
 
@@ -283,6 +285,7 @@ def _unroll_stages(plan: Plan, args, t0, t1, start, first):
     if plan.project is not None:
         projected, shift, tangent, _ = plan.project_end(args, t1, raw, none if is_early else error)
     if plan.projects_before_last:
+        # The next step begins with this stage, so that it belongs to the projected state.
         k.append(plan.stage(args, t0, t1, projected, *points[-1]))
     if plan.project is not None:
         error = enlarge(error + float(plan.sums[-1, -1]) * k[-1], tangent) if is_early else tangent
@@ -310,6 +313,7 @@ def _scan_stages(plan: Plan, args, t0, t1, start, last, is_ready):
         k = lax.cond(is_ready & (i == 0), lambda y: dt * last, lambda y: plan.stage(args, t0, t1, y, *point), y)
         return (total + weights[:, None] * k[None], *end), k
 
+    # The last two rows are the sums for the result and for the error, as in `Plan.sums`.
     blank = jnp.zeros((count + 2, start.size), start.dtype)
     first = blank, start, none, none, diffrax.RESULTS.successful
     (total, *end), k = lax.scan(stage, first, rows)
@@ -325,6 +329,7 @@ def _scan_stages(plan: Plan, args, t0, t1, start, last, is_ready):
 
 def _no_change(x):
     """Tangent zero of an array."""
+    # Tangents of integers and flags have the dtype float0 in JAX.
     return jnp.zeros_like(x) if jnp.issubdtype(x.dtype, jnp.floating) else np.zeros(x.shape, jax.dtypes.float0)
 
 

@@ -76,6 +76,7 @@ class ProjectedSolver(Wrapped):
         """Project the end y of a step: the state, its shift (zero in `step_constants`), its error, and a code."""
         projected, tangent, result = self.project(t, y, error, args)
         shift = jax.tree.map(lambda a, b: a - b, projected, y)
+        # What is renewed for the next step must not bend the dense output of this one.
         shift = shift | {name: jnp.zeros_like(shift[name]) for name in self.step_constants}
         if error is not None:
             tangent = jax.tree.map(

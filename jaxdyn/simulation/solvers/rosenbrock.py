@@ -115,6 +115,7 @@ class Rodas5P(diffrax.AbstractAdaptiveSolver):
 
         # One Jacobian with respect to (y, t): its last column is h df/dt.
         jacobian = jax.jacfwd(change)(jnp.append(start, jnp.asarray(t0, start.dtype)))
+        # `change` is h f, so that its Jacobian includes h.
         factors = lu_factor(jnp.eye(start.size, dtype=start.dtype) - _GAMMA * jacobian[:, :-1])
 
         def stage(stages, row):
