@@ -214,7 +214,7 @@ def _solve(scene: Scene, rows, guess, factors, posture, t, limits: bool, steps: 
 
 
 def _is_target(scene: Scene, whole: Scene) -> np.ndarray:
-    """Which of the rows on positions are those of targets."""
+    """Mask of the position rows of `whole` that belong to targets; they follow those of the constraints."""
     count = holonomic_rows(layout(scene)).size
     return np.arange(holonomic_rows(layout(whole)).size) >= count
 

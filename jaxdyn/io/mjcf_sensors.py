@@ -83,7 +83,7 @@ def _frame(file: CompiledFile, i: int) -> str | None:
 
 
 def _mount(file: CompiledFile, model: Model, body: int) -> dict | None:
-    """What lies beyond the joint or the weld of a body: nothing for a joint; None for a body that is fixed to the ground."""
+    """Bodies and joints beyond the weld of a body; empty where the body has a joint, None where it is fixed to the ground."""
     m = file.m
     if m.body_jntnum[body]:
         return {}
