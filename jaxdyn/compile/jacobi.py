@@ -175,7 +175,9 @@ def gram_eigenvectors(matrix: jax.Array) -> tuple[jax.Array, jax.Array]:
 def _gram_eigenvectors_jvp(primals, tangents):
     (X,), (dX,) = primals, tangents
     values, V = gram_eigenvectors(X)
-    half = jnp.matmul(jnp.matmul(X, V, precision="highest").T, jnp.matmul(dX, V, precision="highest"), precision="highest")
+    half = jnp.matmul(
+        jnp.matmul(X, V, precision="highest").T, jnp.matmul(dX, V, precision="highest"), precision="highest"
+    )
     change = half + half.T  # V^T d(X^T X) V
     # dV = V K with K_ij = change_ij / (values_j - values_i).
     gaps = values[None, :] - values[:, None]

@@ -61,6 +61,11 @@ def solve_gram(rows, right):
     return solve(rows @ rows.T, right)
 
 
+def flat_moments(moment):
+    """Moments (3,) of a plate about its centre, of which a motion in the plane sees the last."""
+    return 0.5 * moment, 0.5 * moment, moment
+
+
 def as_leaf(value):
     """Convert a number to a leaf, which can be differentiated and batched."""
     return store_leaf(value, float)

@@ -301,7 +301,9 @@ def test_stiffness_counts_the_poles_of_drives():
     limited = jd.Scene(slider(mass), forces=(jd.forces.FirstOrderDrive(T), jd.forces.EffortLimits(5.0)))
     free, cut = (jd.stiffness(limited, [0.1], [0.2], 0.0, law, drive_state=[z]).frequency for z in (1.0, 9.0))
     np.testing.assert_allclose([free, cut], [one[1], 0.0], rtol=1e-10, atol=1e-7)
-    batch = jax.jit(jax.vmap(lambda T: jd.stiffness(jd.Scene(slider(mass), forces=(jd.forces.FirstOrderDrive(T),)), [0.1], [0.2])))
+    batch = jax.jit(
+        jax.vmap(lambda T: jd.stiffness(jd.Scene(slider(mass), forces=(jd.forces.FirstOrderDrive(T),)), [0.1], [0.2]))
+    )
     np.testing.assert_allclose(batch(jnp.asarray([1e-3, 1e-2])).decay, [1e3, 1e2], rtol=1e-10)
     with pytest.raises(ValueError, match=r"drive_state has shape \(2,\), expected \(1,\)"):
         jd.stiffness(lag, [0.1], [0.2], drive_state=[0.0, 0.0])
