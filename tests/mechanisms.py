@@ -101,10 +101,13 @@ def delta_file():
             rods += (
                 f'<body name="{name}" pos="{UPPER} {y} 0" euler="0 {lean} 0"><joint name="swing_{name}" axis="0 1 0"/>'
             )
-            rods += f'<joint name="tilt_{name}" axis="1 0 0"/><geom type="capsule" fromto="0 0 0 0 0 {-LOWER}" size="0.01"/></body>'
+            rods += f'<joint name="tilt_{name}" axis="1 0 0"/>{_capsule(f"0 0 {-LOWER}")}</body>'
             loops += f'<connect body1="{name}" body2="plate" anchor="0 0 {-LOWER}"/>'
-        arms += f'<body euler="0 0 {120 * i}"><body name="arm{i}" pos="{BASE} 0 0"><joint name="hip{i}" axis="0 1 0"/>'
-        arms += f'<geom type="capsule" fromto="0 0 0 {UPPER} 0 0" size="0.02"/>{rods}</body></body>'
-    plate = f'<body name="plate" pos="0 0 {-HEIGHT}"><freejoint name="plate"/><geom type="cylinder" size="{PLATE} 0.01" mass="1"/></body>'
-    default = '<default><geom contype="0" conaffinity="0"/></default>'
-    return f"<mujoco>{default}<worldbody>{arms}{plate}</worldbody><equality>{loops}</equality></mujoco>"
+        arms += f'<body euler="0 0 {120 * i}"><body pos="{BASE} 0 0"><joint name="hip{i}" axis="0 1 0"/>'
+        arms += f"{_capsule(f'{UPPER} 0 0')}{rods}</body></body>"
+    plate = f'<body name="plate" pos="0 0 {-HEIGHT}"><freejoint name="plate"/>{_capsule("0 0 0.01", PLATE)}</body>'
+    return f"<mujoco><worldbody>{arms}{plate}</worldbody><equality>{loops}</equality></mujoco>"
+
+
+def _capsule(end, radius=0.01):
+    return f'<geom type="capsule" fromto="0 0 0 {end}" size="{radius}" contype="0" conaffinity="0"/>'

@@ -164,8 +164,8 @@ def pseudo_inverse_by_rotations(matrix: jax.Array, tolerance: float) -> jax.Arra
 def gram_eigenvectors(matrix: jax.Array) -> tuple[jax.Array, jax.Array]:
     """Eigenvalues (m,) of X^T X, the squared singular values of X (n, m), largest first, and its eigenvectors (m, m) in columns.
 
-    Small eigenvalues have the digits that X^T X itself has lost. For a symmetric semidefinite X the eigenvectors are those of X, and
-    the eigenvalues the squares. Derivatives of all orders, where vectors of equal values do not turn within the space that they span.
+    Small eigenvalues have the digits that X^T X itself has lost. For a symmetric semidefinite X the eigenvectors are those of
+    X, and the eigenvalues the squares. It has derivatives of all orders; vectors of equal values do not turn in their space.
     """
     vectors = _right_vectors(*matrix.shape, matrix.dtype)(matrix)
     return jnp.sum(jnp.matmul(matrix, vectors, precision="highest") ** 2, 0), vectors

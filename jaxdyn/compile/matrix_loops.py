@@ -1,7 +1,7 @@
 """Kernels of one small matrix as loops over its entries, where the operations depend on the numbers: rotations and pivots.
 
-A `MatrixProgram` stands in the place of a `Program`. As no choice is made by LAPACK, a program with such kernels can be exported, and
-large batches do not wait for each other's threads.
+A `MatrixProgram` stands in the place of a `Program`. As no choice is made by LAPACK, a program with such kernels can be
+exported, and large batches do not wait for each other's threads.
 """
 
 import contextlib

@@ -83,11 +83,11 @@ def stiffness(
     control: Checked[Callable[[Array, Array, Array], Array] | None] = None,
     drive_state: Numbers | None = None,
 ) -> Stiffness:
-    """Fastest rates of the motion M da + D dv + K dq = B dz, dz/dt = R dq + S dv + Z dz near a state, D = -df/dv and K = -df/dq.
+    """Fastest rates of the motion M da + D dv + K dq = B dz, dz/dt = R dq + S dv + Z dz near a state.
 
-    f is the sum of the scene's forces, of `control(q, v, t)` behind the scene's drives and limits, and, for a system that is not a
-    `Model`, of -dV/dq. z are the states of the drives. What velocity does through inertia and the gravity of a `Model` are left
-    out, as neither makes a motion stiff. dq is along the manifold. On constraints da, dv and dq are projected on their tangent
+    D = -df/dv, K = -df/dq and B = df/dz; R, S and Z are the derivatives of dz/dt.     f is the sum of the scene's forces, of `control(q, v, t)` behind the scene's drives and limits, and, for a system that is
+    not a `Model`, of -dV/dq. z are the states of the drives. What velocity does through inertia and the gravity of a `Model`
+    are left out, as neither makes a motion stiff. dq is along the manifold. On constraints da, dv and dq are projected on their tangent
     space in the mass metric; the change of the rows along dq is left out.
 
     **Arguments:** `scene`, a `Scene` or a system; `q` (nq,); `v` (nv,); `t`, s; `drive_state` z (n,), by default

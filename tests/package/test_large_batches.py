@@ -88,8 +88,8 @@ batch(lambda q: jd.grasp.hold(hand, q).torques, qb)
     "laws, poles and starts": """
 frame = arm.body_names[-1]
 place = lambda t: jd.frame_pose(arm, jnp.full(6, 0.3), frame)
-for law in (jd.control.OperationalSpace(arm, frame, place, 10.0, 5.0), jd.control.CartesianStiffness(arm, frame, place, 9.0, 5.0)):
-    batch(lambda q: law(q, 0.1 * q, 0.0), at)
+for law in (jd.control.OperationalSpace, jd.control.CartesianStiffness):
+    batch(lambda q: law(arm, frame, place, 10.0, 5.0)(q, 0.1 * q, 0.0), at)
 batch(lambda q: jd.follow(arm, {frame: jnp.stack([place(0)] * 3)}, q, throw=False).q, at)
 batch(lambda q: jd.dynamics.mass_matrix_sqrt(arm, q), at)
 batch(lambda x: jd.stiffness(jd.Scene(arm, forces=(jd.forces.JointDamping(x),)), at[0], at[0]).decay, x)
