@@ -189,7 +189,7 @@ def _gram_eigenvectors_jvp(primals, tangents):
 @jax.custom_jvp
 def inverse(matrix: jax.Array) -> jax.Array:
     """The inverse (n, n) of a regular matrix by elimination; numbers that are not finite where it is singular."""
-    return _inverse(matrix.shape[0], matrix.dtype)(matrix)
+    return matrix if 0 in matrix.shape else _inverse(matrix.shape[0], matrix.dtype)(matrix)
 
 
 @inverse.defjvp
