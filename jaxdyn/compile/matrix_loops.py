@@ -38,7 +38,7 @@ class MatrixProgram:
 
     @property
     def title(self) -> str:
-        """What the code depends on."""
+        """Shape, dtype and tolerance, on which the code depends."""
         return f"{self.name} of {self.rows} x {self.columns} {self.dtype} at {self.tolerance!r}"
 
     @property

@@ -18,7 +18,7 @@ from jaxtyping import Array, Float, Int
 
 from jaxdyn.compile import is_standalone, kernel, mark_invalid
 from jaxdyn.constraints.base import Layout, Rows, constraint_jacobian, holonomic_rows, layout, rows
-from jaxdyn.constraints.codes import RESULTS, Outcome
+from jaxdyn.constraints.codes import RESULTS, Outcome, require_finite
 from jaxdyn.constraints.rank import (
     check_tolerance,
     eps_of,
@@ -152,7 +152,8 @@ def _by_pivots(rank_tol, scene: Scene, q, v, tau, t):
     quality = jnp.where(metric.is_definite(), quality_of(normal), jnp.nan)
     is_poor = ~(quality > least_pivot(q, rank_tol))
     a, lam = (mark_invalid(is_poor, x) for x in (metric.unwhiten(free + matmul(Y, lam)), lam))
-    return a, lam, *_rank_and_result(scene, q, quality)
+    rank, result = _rank_and_result(scene, q, quality)
+    return a, lam, rank, require_finite(result, a)
 
 
 def _gauss_problem(scene: Scene, q, v, tau, t):
@@ -182,7 +183,7 @@ def _free_dynamics(scene, q, v, force, t) -> ConstrainedDynamics:
     metric = mass_factor(mass_matrix(scene.system, q, t))
     a = metric.solve(force - bias_force(scene.system, q, v, t))
     result = RESULTS.where(metric.is_definite(), RESULTS.successful, RESULTS.singular_mass_matrix)  # pyright: ignore[reportArgumentType]
-    return ConstrainedDynamics(a, jnp.zeros((0,), v.dtype), jnp.zeros((), jnp.int32), result, ())
+    return ConstrainedDynamics(a, jnp.zeros((0,), v.dtype), jnp.zeros((), jnp.int32), require_finite(result, a), ())
 
 
 def solve_rows(scene: Scene, q, v, force, t, row: Rows, rank_tol: float | None = None) -> ConstrainedDynamics:

@@ -265,6 +265,24 @@ def test_no_success_with_rows_that_are_not_finite():
     assert not solution.success
 
 
+@pytest.mark.parametrize("wrong", [np.nan, np.inf, 1e300])
+def test_no_success_with_an_acceleration_that_is_not_finite(wrong):
+    """Under jit and in a batch beside a good sample, whose code does not change; 1e300 m/s overflow in their squares."""
+    free, two = jd.Scene(ARM), jnp.asarray([1.0, wrong])
+    functions = {
+        "free": lambda x: jd.constrained_dynamics(free, [1, 2], x * jnp.asarray([3.0, -1.0])),
+        "pivots": lambda x: jd.constrained_dynamics(CHAIN, [1, 2], x * jnp.asarray([1.0, 2.0])),
+        "schur": lambda x: jd.constrained_dynamics(CHAIN, [1, 2], x * jnp.asarray([1.0, 2.0]), method="schur"),
+        "reduced": lambda x: jd.reduced_dynamics(CHAIN, [1, 2], x * jnp.ones(1), basis=(0,)),
+        "gauge": lambda x: jd.reduction.gauge_invariant(CHAIN, [1, 2], x * jnp.asarray([1.0, 2.0])),
+    }
+    for name, function in functions.items():
+        assert jax.jit(jax.vmap(lambda x: function(x).result == jd.RESULTS.successful))(two).tolist() == [
+            True,
+            False,
+        ], name  # noqa: B023
+
+
 def test_one_enumeration_of_results():
     solution = [
         jd.assemble(CHAIN, Q),
