@@ -277,10 +277,8 @@ def test_no_success_with_an_acceleration_that_is_not_finite(wrong):
         "gauge": lambda x: jd.reduction.gauge_invariant(CHAIN, [1, 2], x * jnp.asarray([1.0, 2.0])),
     }
     for name, function in functions.items():
-        assert jax.jit(jax.vmap(lambda x: function(x).result == jd.RESULTS.successful))(two).tolist() == [
-            True,
-            False,
-        ], name  # noqa: B023
+        result = jax.jit(jax.vmap(function))(two).result
+        assert (result == jd.RESULTS.successful).tolist() == [True, False], name
 
 
 def test_one_enumeration_of_results():
