@@ -243,7 +243,7 @@ def _by_schur(scene: Scene, q, v, tau, t, *, method: str) -> ConstrainedDynamics
     result = RESULTS.where(independent, RESULTS.successful, RESULTS.dependent_rows)  # pyright: ignore[reportArgumentType]
     result = RESULTS.where(is_definite, result, RESULTS.singular_mass_matrix)
     rank = jnp.asarray(lam.shape[0], jnp.int32)
-    return ConstrainedDynamics(a, lam, rank, result, layout(scene))
+    return ConstrainedDynamics(a, lam, rank, require_finite(result, a), layout(scene))
 
 
 def _by_delassus(scene: Scene, q, v, tau, t):

@@ -311,8 +311,8 @@ def test_a_step_of_an_integrator(constrained, tmp_path):
 
 
 def test_a_step_of_an_arm_behind_drives(tmp_path):
-    """Drives of first and second order, limits behind them, and the states of both as an argument and a result."""
-    forces = (jd.forces.FirstOrderDrive(0.01), jd.forces.SecondOrderDrive(80.0, 0.6), jd.forces.EffortLimits(0.8))
+    """Drives of first and second order, their states as an argument and a result; steps that end at kinks are refused."""
+    forces = jd.forces.FirstOrderDrive(0.01), jd.forces.SecondOrderDrive(80.0, 0.6)
     scene = jd.Scene(jd.robots.chain(2), forces=forces)
     step = jd.stepper(scene, 0.004, substeps=2)
     q, v, tau = np.array([0.3, -0.2]), np.array([0.1, 0.4]), np.array([1.0, -0.5])
@@ -342,6 +342,9 @@ def test_a_step_of_an_arm_behind_drives(tmp_path):
         np.testing.assert_allclose(got, expected[-1], atol=1e-5)  # RK4 against Dopri8
     exported.save(tmp_path)
     run_c(tmp_path, "driven")
+    limited = jd.stepper(jd.Scene(scene.system, forces=(*forces, jd.forces.EffortLimits(0.8))), 0.004)
+    with pytest.raises(ValueError, match="its steps end at the kinks of .*leave these forces out"):
+        jd.export(lambda q, v, z, tau: limited((q, v, z), tau), q, v, z, tau, name="limited")
 
 
 def test_jacobians_by_columns_equal_those_that_are_written_out(arm, exported, monkeypatch, tmp_path):
