@@ -13,7 +13,7 @@ import pinocchio
 
 
 def build(given):
-    """The shooting problem: semi-implicit Euler steps, quadratic costs of torque, speed and the tip's place at the end."""
+    """The shooting problem: semi-implicit Euler steps, quadratic costs of torque, speed and the angles at the end."""
     model = pinocchio.buildModelFromUrdf(given["urdf"])
     state = crocoddyl.StateMultibody(model)
     actuation = crocoddyl.ActuationModelFull(state)
@@ -30,11 +30,12 @@ def build(given):
     rest = crocoddyl.ResidualModelState(state, np.zeros(state.nx), model.nv)
     speeds = np.concatenate([np.zeros(model.nv), np.ones(model.nv)])
     torque = crocoddyl.ResidualModelControl(state, np.asarray(given["hold"]))
-    frame = model.getFrameId(given["frame"])
-    place = crocoddyl.ResidualModelFrameTranslation(state, frame, np.asarray(given["goal"]), model.nv)
+    # Residuals of frames end in a segmentation fault in version 3.2.1 from PyPI with pin 4.1, hence angles.
+    place = crocoddyl.ResidualModelState(state, np.concatenate([given["goal"], np.zeros(model.nv)]), model.nv)
+    angles = np.concatenate([np.ones(model.nv), np.zeros(model.nv)])
     w = given["weights"]
     running = {"u": (torque, np.ones(model.nv), w["torque"]), "v": (rest, speeds, w["speed"])}
-    end = {"place": (place, np.ones(3), w["place"]), "v": (rest, speeds, w["last_speed"])}
+    end = {"place": (place, angles, w["place"]), "v": (rest, speeds, w["last_speed"])}
     count = given["steps"]
     problem = crocoddyl.ShootingProblem(x0, [action(running, given["dt"])] * count, action(end, 0.0))
     return problem, [np.asarray(given["hold"])] * count

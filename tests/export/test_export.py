@@ -343,7 +343,7 @@ def test_a_step_of_an_arm_behind_drives(tmp_path):
     exported.save(tmp_path)
     run_c(tmp_path, "driven")
     limited = jd.stepper(jd.Scene(scene.system, forces=(*forces, jd.forces.EffortLimits(0.8))), 0.004)
-    with pytest.raises(ValueError, match="its steps end at the kinks of .*leave these forces out"):
+    with pytest.raises(ValueError, match=r"its steps end at the kinks of .*leave these forces out"):
         jd.export(lambda q, v, z, tau: limited((q, v, z), tau), q, v, z, tau, name="limited")
 
 
