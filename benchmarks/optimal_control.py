@@ -76,7 +76,10 @@ class Crocoddyl:
         """Seconds, iterations and cost."""
         self._send(str(iterations))
         assert self.process.stdout is not None
-        return json.loads(self.process.stdout.readline())
+        line = self.process.stdout.readline()
+        if not line:
+            raise RuntimeError("Crocoddyl's process ended; its message is above")
+        return json.loads(line)
 
     def end(self) -> None:
         """End the process."""

@@ -30,7 +30,6 @@ def build(given):
     rest = crocoddyl.ResidualModelState(state, np.zeros(state.nx), model.nv)
     speeds = np.concatenate([np.zeros(model.nv), np.ones(model.nv)])
     torque = crocoddyl.ResidualModelControl(state, np.asarray(given["hold"]))
-    # Residuals of frames end in a segmentation fault in version 3.2.1 from PyPI with pin 4.1, hence angles.
     place = crocoddyl.ResidualModelState(state, np.concatenate([given["goal"], np.zeros(model.nv)]), model.nv)
     angles = np.concatenate([np.ones(model.nv), np.zeros(model.nv)])
     w = given["weights"]
@@ -38,6 +37,14 @@ def build(given):
     end = {"place": (place, angles, w["place"]), "v": (rest, speeds, w["last_speed"])}
     count = given["steps"]
     problem = crocoddyl.ShootingProblem(x0, [action(running, given["dt"])] * count, action(end, 0.0))
+    # Crocoddyl 3.2.1 from PyPI beside pin 4.1.0 computes other accelerations than Pinocchio, or crashes: built against another one.
+    first = problem.runningDatas[0]
+    problem.runningModels[0].calc(first, x0, np.asarray(given["hold"]))
+    wanted = pinocchio.aba(model, model.createData(), x0[: model.nq], x0[model.nq :], np.asarray(given["hold"]))
+    if not np.abs(first.differential.xout - wanted).max() < 1e-9:
+        raise SystemExit(
+            "Crocoddyl was built against another Pinocchio: its accelerations are wrong; install both from one source"
+        )
     return problem, [np.asarray(given["hold"])] * count
 
 
