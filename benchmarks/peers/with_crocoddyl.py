@@ -37,7 +37,7 @@ def build(given):
     end = {"place": (place, angles, w["place"]), "v": (rest, speeds, w["last_speed"])}
     count = given["steps"]
     problem = crocoddyl.ShootingProblem(x0, [action(running, given["dt"])] * count, action(end, 0.0))
-    # Crocoddyl 3.2.1 from PyPI beside pin 4.1.0 computes other accelerations than Pinocchio, or crashes: built against another one.
+    # Crocoddyl 3.2.1 from PyPI, built against another Pinocchio than 4.1, computes wrong accelerations with that or crashes.
     first = problem.runningDatas[0]
     problem.runningModels[0].calc(first, x0, np.asarray(given["hold"]))
     wanted = pinocchio.aba(model, model.createData(), x0[: model.nq], x0[model.nq :], np.asarray(given["hold"]))
