@@ -100,7 +100,7 @@ def main(argv=None) -> None:
     options = parser.parse_args(argv)
     jax.config.update("jax_enable_x64", True)
     model, q0, hold, goal = problem()
-    # Costs are those before each iteration; the last one is the end's.
+    # Costs along the iterations, then that of the end.
     whole = jax.jit(solver(model, q0, hold, goal, MOST))(goal)
     costs = [*np.asarray(whole.costs)[: int(whole.iterations)], float(whole.cost)]
     peer, theirs = None, []
