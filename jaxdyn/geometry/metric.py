@@ -48,7 +48,9 @@ def _compile_for_systems(function: Callable) -> Callable:
 
 
 def flat(metric: Metric, q: Float[Array, " n"], v: Float[Array, " n"]) -> Float[Array, " n"]:
-    """One-form of a vector, g(q) v: the momentum of a velocity, the force of an acceleration.
+    """One-form of a vector: the momentum of a velocity, the force of an acceleration.
+
+    $$p = g(q) v$$
 
     **Arguments:** `metric` as above; `q`, `v` (n,). **Returns:** (n,).
     """
@@ -57,7 +59,9 @@ def flat(metric: Metric, q: Float[Array, " n"], v: Float[Array, " n"]) -> Float[
 
 
 def sharp(metric: Metric, q: Float[Array, " n"], p: Float[Array, " n"]) -> Float[Array, " n"]:
-    """Vector of a one-form, g(q)^-1 p: the inverse of `flat`.
+    """Vector of a one-form, the inverse of `flat`.
+
+    $$v = g(q)^{-1} p$$
 
     **Arguments:** `metric` as above; `q`, `p` (n,). **Returns:** (n,); NaN where g is not positive definite.
     """
@@ -70,7 +74,10 @@ def _sharp(metric, q, p):
 
 
 def christoffel_symbols(metric: Metric, q: Float[Array, " n"], kind: str = "second") -> Float[Array, "n n n"]:
-    """Christoffel symbols: Gamma^i_jk ("second" kind) or Gamma_ijk = g_il Gamma^l_jk ("first"), the index i in front.
+    r"""Christoffel symbols of the second or of the first kind, the index i in front.
+
+    $$\Gamma_{ijk} = g_{il} \Gamma^l_{jk} = \tfrac12 \left( \frac{\partial g_{ij}}{\partial q_k}
+    + \frac{\partial g_{ik}}{\partial q_j} - \frac{\partial g_{jk}}{\partial q_i} \right)$$
 
     **Arguments:** `metric` as above; `q` (n,).
 
@@ -94,7 +101,9 @@ def _symbols(metric, q, kind):
 def connection(
     metric: Metric, q: Float[Array, " n"], v: Float[Array, " n"], w: Float[Array, " n"]
 ) -> Float[Array, " n"]:
-    """Connection Gamma(v, w)^i = Gamma^i_jk v_j w_k, symmetric and bilinear in v and w; the symbols are not formed.
+    r"""Connection of the metric, symmetric and bilinear in v and w; the symbols are not formed.
+
+    $$\Gamma(v, w)^i = \Gamma^i_{jk} v^j w^k$$
 
     **Arguments:** `metric` as above; `q`, `v`, `w` (n,). **Returns:** (n,).
     """
@@ -114,9 +123,11 @@ def _connection(metric, q, v, w):
 def covariant_rate(
     metric: Metric, q: Float[Array, " n"], v: Float[Array, " n"], w: Float[Array, " n"], rate: Float[Array, " n"]
 ) -> Float[Array, " n"]:
-    """Covariant derivative Dw/dt = dw/dt + Gamma(dq/dt, w) of a vector field w(t) along a curve.
+    r"""Covariant derivative of a vector field w(t) along a curve.
 
-    With w = v = dq/dt and rate = a it is the covariant acceleration nabla_v v. It is zero for parallel transport.
+    $$\frac{Dw}{dt} = \dot w + \Gamma(\dot q, w)$$
+
+    With $w = v = \dot q$ and the rate a it is the covariant acceleration $\nabla_v v$. It is zero for parallel transport.
 
     **Arguments:** `metric` as above; `q`, its rate `v`, `w` and its `rate` dw/dt, each (n,). **Returns:** (n,).
     """
@@ -127,7 +138,9 @@ def covariant_rate(
 def covariant_derivative(
     metric: Metric, field: Callable, q: Float[Array, " n"], v: Float[Array, " n"]
 ) -> Float[Array, " n"]:
-    """Covariant derivative nabla_v X = dX(v) + Gamma(v, X) of a vector field X(q) -> (n,) in the direction v.
+    r"""Covariant derivative of a vector field X(q) -> (n,) in the direction v.
+
+    $$\nabla_v X = dX(v) + \Gamma(v, X)$$
 
     **Arguments:** `metric` as above; `field`, X; `q`, `v` (n,). **Returns:** (n,).
     """
@@ -138,7 +151,9 @@ def covariant_derivative(
 
 
 def geodesic_acceleration(metric: Metric, q: Float[Array, " n"], v: Float[Array, " n"]) -> Float[Array, " n"]:
-    """Acceleration d2q/dt2 = -Gamma(v, v) of the geodesic through q with velocity v.
+    r"""Acceleration of the geodesic through q with velocity v.
+
+    $$\ddot q = -\Gamma(v, v)$$
 
     `jd.MetricSystem(metric, n)` simulates it.
 
@@ -148,10 +163,13 @@ def geodesic_acceleration(metric: Metric, q: Float[Array, " n"], v: Float[Array,
 
 
 def riemann_tensor(metric: Metric, q: Float[Array, " n"]) -> Float[Array, "n n n n"]:
-    """Curvature tensor R^i_jkl, with R(u, w) z = nabla_u nabla_w z - nabla_w nabla_u z - nabla_[u,w] z.
+    r"""Curvature tensor of the metric, with its indices as in R^i_jkl.
 
-        (R(u, w) z)^i = R^i_jkl z^j u^k w^l,
-        R^i_jkl = dGamma^i_lj/dq_k - dGamma^i_kj/dq_l + Gamma^i_km Gamma^m_lj - Gamma^i_lm Gamma^m_kj.
+    $$R(u, w) z = \nabla_u \nabla_w z - \nabla_w \nabla_u z - \nabla_{[u, w]} z, \quad
+    (R(u, w) z)^i = R^i_{jkl} z^j u^k w^l$$
+
+    $$R^i_{jkl} = \frac{\partial \Gamma^i_{lj}}{\partial q_k} - \frac{\partial \Gamma^i_{kj}}{\partial q_l}
+    + \Gamma^i_{km} \Gamma^m_{lj} - \Gamma^i_{lm} \Gamma^m_{kj}$$
 
     **Arguments:** `metric` as above, twice differentiable; `q` (n,). **Returns:** (n, n, n, n), index i in front.
 
@@ -173,7 +191,11 @@ def _curvature(metric, q):
 def sectional_curvature(
     metric: Metric, q: Float[Array, " n"], u: Float[Array, " n"], w: Float[Array, " n"]
 ) -> Float[Array, ""]:
-    """Curvature <R(u, w) w, u> / (|u|^2 |w|^2 - <u, w>^2) of the plane of u and w: 1/r^2 on a sphere of radius r.
+    r"""Curvature of the plane of u and w.
+
+    $$\frac{\langle R(u, w) w, u \rangle}{|u|^2 |w|^2 - \langle u, w \rangle^2}$$
+
+    It is $1/r^2$ on a sphere of radius r.
 
     **Arguments:** `metric` as above; `q`, `u`, `w` (n,), u and w independent. **Returns:** ().
     """
