@@ -124,7 +124,9 @@ class Model(eqx.Module):
         return coordinate_index(self.topology.v_slices, self, joint)
 
     def selection_matrix(self, joints: Iterable[str] | None = None) -> Float[Array, "nv nu"]:
-        """Selection matrix S (nv, nu): tau = S u for the forces u (nu,) of actuated joints, S^T v are their velocities.
+        r"""Selection matrix S (nv, nu) of the actuated joints.
+
+        $\tau = S u$ for their forces u (nu,), and $S^T v$ are their velocities.
 
         **Arguments:** `joints`, names in the order of u; None: all but free ones, which carry floating bases.
 
@@ -324,7 +326,10 @@ def difference(model: Model, q0: Float[Array, " nq"], q1: Float[Array, " nq"]) -
 
 
 def configuration_rate(model: Model, q: Float[Array, " nq"], v: Float[Array, " nv"]) -> Float[Array, " nq"]:
-    """Rate dq/dt (nq,) for the body velocity v (nv,): the kinematic map qdot = H(q) v."""
+    r"""Rate dq/dt (nq,) for the body velocity v (nv,), by the kinematic map of the joints.
+
+    $$\dot q = H(q) v$$
+    """
     q, v = check_shapes(model, q=q, v=v)
     return model.complete_rate(q, v, joint_rates(model, q, v))
 
