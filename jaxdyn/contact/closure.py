@@ -25,15 +25,15 @@ _LEAST = 1e-8  # relative to the largest; margins and singular values below are 
 
 
 class ForceClosure(eqx.Module):
-    """Force closure of a grasp: the decision, its margin, and a certificate where it fails.
+    r"""Force closure of a grasp: the decision, its margin, and a certificate where it fails.
 
-    - `closed`: the decision. `margin`: the largest t such that internal forces f, G f = 0, with total normal force 1 N
-      have every margin of every cone at least t (for a friction cone mu f_n - |f_t|, so t is dimensionless: newtons of
+    - `closed`: the decision. `margin`: the largest t such that internal forces f, $G f = 0$, with total normal force 1 N
+      have every margin of every cone at least t (for a friction cone $\mu f_n - |f_t|$, so t is dimensionless: newtons of
       margin per newton of grip). Zero where the grasp is open, infinite where no contact has a bound.
     - `forces` (m,): those internal forces; zeros where there are none.
     - `direction` (p,): where open, a unit wrench on the object that contact forces cannot balance, in the units and
-      axes of G's rows; zeros where closed. direction . (G f) >= 0 (to 1e-8) for all forces f in the cones, so balancing
-      it would need G f = -direction.
+      axes of G's rows; zeros where closed. Its product with $G f$ is not negative (to 1e-8) for all forces f in the cones,
+      so that balancing it would need $G f = -\mathrm{direction}$.
     - `rank`: of G, in the columns along which forces are possible.
     """
 
@@ -63,7 +63,7 @@ def force_closure(
     faces: int | None = None,
     side: Checked[str] = "inscribed",
 ) -> ForceClosure:
-    """Decide force closure of the grasp with map G, with a margin or with a wrench that it cannot resist.
+    r"""Decide force closure of the grasp with map G, with a margin or with a wrench that it cannot resist.
 
     Round cones are handled exactly by cutting planes: a linear program (HiGHS) is solved, and faces are added where
     its forces leave the cones, until the margin is determined to 1e-9. With `faces` the cones are pyramids instead, one
@@ -73,7 +73,7 @@ def force_closure(
 
     - `G` (p, m): grasp map, G f is the wrench of contact forces f on the object; `jd.grasp.grasp_map`. Known numbers.
     - `cones`: one per contact in the order of G's columns: `friction_cone(...)`, `surface_cone(...)`, or rows U (k, m_i) with
-      U f <= 0, for which the total normal force is the mean of -U f.
+    $U f \le 0$, for which the total normal force is the mean of $-U f$.
     - `faces`, `side`: of `FrictionCone.pyramid`; None: the round cones.
 
     **Returns:** `ForceClosure`.

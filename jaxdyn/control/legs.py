@@ -67,14 +67,16 @@ def underactuated_inverse_dynamics(
     effort_limit: Numbers | None = None,
     tol: float | None = None,
 ) -> LeggedDynamics:
-    """Torques and contact forces, inside their cones, for the acceleration a.
+    r"""Torques and contact forces, inside their cones, for the acceleration a.
 
-        minimise torque_weight |tau|^2 + force_weight |f|^2
-        with M a + h = S^T tau + sum of J_i^T f_i,  margins(f_i) >= preload,  |tau| <= effort_limit
+    $$\begin{gathered}
+        \min_{\tau, f} w_\tau |\tau|^2 + w_f |f|^2 \quad \text{with} \quad M a + h = S^T \tau + \sum_i J_i^T f_i, \\
+        \mathrm{margins}(f_i) \ge \mathrm{preload}, \quad |\tau| \le \tau_\mathrm{limit}
+        \end{gathered}$$
 
     One small quadratic program per sample (`jd.contact.solve_qp`): batched, and differentiable in the state, the
     acceleration, the model and the coefficients of friction. Feet are not constrained to be at rest: choose an `a` with
-    J a + Jdot v = 0 for feet at rest.
+    $J a + \dot J v = 0$ for feet at rest.
 
     **Arguments:**
 
@@ -155,7 +157,9 @@ def missing_wrench(
     *,
     passive: tuple[int, ...] | None = None,
 ) -> Float[Array, " np"]:
-    """Remainder of the generalised force at the base that feet in their cones cannot exert: (M a + h)_base - G f.
+    r"""Remainder of the generalised force at the base that feet in their cones cannot exert.
+
+    $$(M a + h)_\mathrm{base} - G f$$
 
     f in the cones minimises its norm. Zero, up to the tolerance of the program and about 1e-6 of its
     norm, where the feet can carry the robot.

@@ -48,9 +48,11 @@ class _Lag(DriveDynamics):
 
 
 class FirstOrderDrive(_Lag):
-    """First-order drive: T dtau/dt = u - tau, with u the command and tau the torque at the joint.
+    r"""First-order drive, with u the command and tau the torque at the joint.
 
-    The step response is tau = u (1 - exp(-t/T)). It models a current loop of bandwidth 1/(2 pi T) Hz, and MuJoCo's
+    $$T \dot\tau = u - \tau$$
+
+    The step response is $\tau = u (1 - e^{-t/T})$. It models a current loop of bandwidth $1/(2 \pi T)$ Hz, and MuJoCo's
     activation `filter` of a motor.
 
     **Arguments:** `time_constant` T (s), positive, and `initial` torque (N m or N): numbers or one per coordinate. `joints`,
@@ -89,11 +91,14 @@ class FirstOrderDrive(_Lag):
 
 
 class SecondOrderDrive(_Lag):
-    """Second-order drive: tau'' + 2 zeta w tau' + w^2 tau = w^2 u, with u the command and tau the torque at the joint.
+    r"""Second-order drive, with u the command and tau the torque at the joint.
 
-    The states are tau, then tau'. With zeta < 1 the step response overshoots by exp(-pi zeta/sqrt(1 - zeta^2)).
+    $$\ddot\tau + 2 \zeta \omega \dot\tau + \omega^2 \tau = \omega^2 u$$
 
-    **Arguments:** `frequency` w (rad/s) and `damping_ratio` zeta, positive, and `initial` torque (N m or N, with tau' = 0):
+    The states are $\tau$, then $\dot\tau$. With $\zeta < 1$ the step response overshoots by
+    $\exp(-\pi \zeta / \sqrt{1 - \zeta^2})$.
+
+    **Arguments:** `frequency` $\omega$ (rad/s) and `damping_ratio` $\zeta$, positive, and `initial` torque (N m or N, at rest):
     numbers or one per coordinate. `joints` as of `FirstOrderDrive`.
 
     **Raises:** ValueError for numbers that are not positive; (when called) for unknown joints or a wrong shape.

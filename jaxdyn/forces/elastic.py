@@ -20,11 +20,14 @@ def _tuple(names: str | Sequence[str]) -> tuple[str, ...]:
 
 
 class ElasticTransmission(eqx.Module):
-    """Spring and damper between motors and joints: s = theta/n - q, tau = K s + D ds/dt on the joint, -tau/n on the motor.
+    r"""Spring and damper between motors and joints.
 
-    theta is the motor's own angle and n the gear ratio, of one sign with the direction of rotation. It conserves the energy
-    K s^2/2 and dissipates D (ds/dt)^2. Steps must resolve sqrt(K (1/I + 1/(n^2 B))), with B and I the inertias of motor and
-    link; `jd.solvers.Rodas5P` has longer ones where the elastic motion has died out.
+    $$s = \theta/n - q, \quad \tau = K s + D \dot s$$
+
+    $\tau$ acts on the joint and $-\tau/n$ on the motor; $\theta$ is the motor's own angle and n the gear ratio, whose
+    sign is that of the direction of rotation. It conserves the energy $K s^2/2$ and dissipates $D \dot s^2$. Steps must
+    resolve the frequency $\sqrt{K (1/I + 1/(n^2 B))}$, with B and I the inertias of motor and link; `jd.solvers.Rodas5P`
+    has longer ones where the elastic motion has died out.
 
     **Arguments:** `motors`, `joints`, names of joints of one coordinate, in pairs; `stiffness` K (N m/rad or N/m), `damping` D
     (N m s/rad or N s/m), `gear` n (1, or rad/m for a spindle): numbers or one per pair.
@@ -78,15 +81,16 @@ def elastic_joints(
     joints: Checked[str | Sequence[str] | None] = None,
     suffix: str = "_motor",
 ) -> Scene:
-    """Robot with elastic joints: a scene with a rotor for each of them behind the model's coordinates, and the springs.
+    r"""Robot with elastic joints: a scene with a rotor for each of them behind the model's coordinates, and the springs.
 
-        M(q) q'' + h(q, q') = K (theta/n - q) + D (theta'/n - q')
-        B theta'' + (K (theta/n - q) + D (theta'/n - q'))/n = tau
+    $$M(q) \ddot q + h(q, \dot q) = K (\theta/n - q) + D (\dot\theta/n - \dot q) = \tau_s, \quad
+        B \ddot\theta + \tau_s/n = \tau$$
 
-    q = (model's q, theta), v = (model's v, theta'); torques of the motors are the last entries of tau. The kinetic energy of a
-    rotor is that of its own rotation, B theta'^2/2; its mass belongs to the link that carries it. What Spong's model neglects,
-    the coupling with that link's rotation, is of the order of 1/n: where it matters, add rotors as bodies on their links by a
-    `ModelBuilder`, and `ElasticTransmission` to the scene.
+        The scene's q is (model's q, theta) and v is (model's v, rate of theta); torques of the motors are the last
+        entries of tau. The kinetic energy of a rotor is that of its own rotation, $B \dot\theta^2/2$; its mass belongs to
+        the link that carries it. Spong's model neglects the coupling with that link's rotation, which is of the order of
+        1/n: where it matters, add rotors as bodies on their links by a `ModelBuilder`, and `ElasticTransmission` to the
+        scene.
 
     **Arguments:**
 

@@ -99,7 +99,9 @@ def _displacement(system, rest, q, indices: _Indices, name: str) -> Array:
 
 
 class JointDamping(eqx.Module):
-    """Viscous joint friction: tau = -coefficient * v.
+    r"""Viscous joint friction.
+
+    $$\tau = -\mathrm{coefficient} \cdot v$$
 
     **Arguments:** `coefficient` (N m s or N s), scalar or one per coordinate; None means the model's `damping` leaf.
     `joints`, names of the joints, or None for all.
@@ -120,12 +122,14 @@ class JointDamping(eqx.Module):
 
 
 class CoulombFriction(eqx.Module):
-    """Smoothed Coulomb friction of joints: tau = -level * tanh(v / v_s).
+    r"""Smoothed Coulomb friction of joints.
 
-    The jump at v = 0 is replaced by a linear range with derivative level / v_s, so that solutions are
-    unique and gradients exist. There is no sticking: under a load below `level` a joint creeps at v = v_s artanh(load /
-    level). The torque is within 1 % of `level` above 2.65 v_s. A small v_s makes the equations stiff (rate level /
-    (v_s * inertia)): use an implicit solver or a larger v_s.
+    $$\tau = -\mathrm{level} \tanh(v / v_s)$$
+
+    The jump at v = 0 is replaced by a linear range with derivative level / v_s, so that solutions are unique and
+    gradients exist. There is no sticking: under a load F below `level` a joint creeps at
+    $v_s \operatorname{artanh}(F / \mathrm{level})$. The torque is within 1 % of `level` above 2.65 v_s. A small v_s makes
+    the equations stiff (rate level / (v_s * inertia)): use an implicit solver or a larger v_s.
 
     **Arguments:** `level` (N m or N), scalar or one per coordinate; None means the model's `friction` leaf. `v_s`,
     smoothing velocity (rad/s or m/s), positive. `joints`, names of the joints, or None for all.
@@ -156,9 +160,11 @@ class CoulombFriction(eqx.Module):
 
 
 class JointSpring(eqx.Module):
-    """Joint spring: tau = -stiffness * difference(rest, q), along the joints' manifold.
+    r"""Joint spring along the joints' manifold.
 
-    Conservative, with the energy stiffness |difference|^2 / 2, for joints of one coordinate and for spherical joints
+    $$\tau = -\mathrm{stiffness} \cdot \Delta, \quad \Delta = \mathrm{difference}(\mathrm{rest}, q)$$
+
+    Conservative, with the energy stiffness $|\Delta|^2 / 2$, for joints of one coordinate and for spherical joints
     of equal stiffness about the three axes. In planar and free joints the force is along the twist that leads back to
     rest.
 
@@ -188,10 +194,13 @@ class JointSpring(eqx.Module):
 
 
 class Drive(eqx.Module):
-    """Position and velocity drive: tau = kp * difference(q, target) + kd * (target_velocity - v).
+    r"""Position and velocity drive.
 
-    The difference is taken along the joints' manifold. With `effort_limit` L the command u is passed through L tanh(u
-    / L): smooth, never above L, within 1 % of u below 0.17 L. For a time-dependent target pass a `control` to `simulate`.
+    $$\tau = k_p \mathrm{difference}(q, \mathrm{target}) + k_d (v_\mathrm{target} - v)$$
+
+    The difference is taken along the joints' manifold. With `effort_limit` L the command u is passed through
+    $L \tanh(u / L)$: smooth, never above L, within 1 % of u below 0.17 L. For a time-dependent target pass a `control` to
+    `simulate`.
 
     **Arguments:** `kp` (N m/rad or N/m), `kd` (N m s/rad or N s/m), `target_velocity` (rad/s or m/s), `effort_limit`
     (N m or N; None or infinite for no limit): scalar or one per velocity coordinate. `target` (nq of the chosen
@@ -234,7 +243,11 @@ class Drive(eqx.Module):
 
 
 class ExternalWrench(eqx.Module):
-    """Constant wrench on a body: tau = J^T F, with J the body Jacobian of its frame.
+    r"""Constant wrench on a body.
+
+    $$\tau = J^T F$$
+
+    with J the Jacobian of its frame.
 
     **Arguments:** `frame`, name of a body or frame; the wrench acts at its origin. `wrench` (6,), (f, tau) in N and N
     m, acting on the body. `axes`: "world", the wrench keeps its direction in the world; "body", it turns with the

@@ -37,7 +37,7 @@ class HandForces(eqx.Module):
     """Contact forces within their cones, and the joint torques that exert them at rest; see `hold`.
 
     - `contact_forces` (nc,): on the object, in the order of the grasp's rows, N and N m.
-    - `torques` (nh,): J_h^T times them, of the joints in the order of `grasp.hand_velocities`, without the weight of the
+    - `torques` (nh,): $J_h^T$ times them, of the joints in the order of `grasp.hand_velocities`, without the weight of the
       fingers; N m or N.
     - `result`: one of `jaxdyn.contact.RESULTS`; `infeasible` where no forces in the cones exert the wrench.
     - `layout`: name and row range of each contact.
@@ -61,13 +61,15 @@ class HandForces(eqx.Module):
 def internal_force_basis(
     grasp: Grasp, q: Float[Array, " nq"], t: Numbers = 0.0, *, reference: Float[Array, "nc ni"] | None = None
 ) -> Float[Array, "nc ni"]:
-    """Orthonormal basis E (nc, ni) of the internal forces: G E = 0.
+    """Orthonormal basis E (nc, ni) of the internal forces.
+
+    $$G E = 0$$
 
     **Arguments:**
 
     - `q` (nq,); `t`, s.
-    - `reference` (nc, ni): a basis at a configuration nearby, which is continued smoothly, E = P R T^-1 with
-      P = 1 - G^+ G and T the Cholesky factor of R^T P R. By default an arbitrary basis at q, constant under
+    - `reference` (nc, ni): a basis at a configuration nearby, R, which is continued smoothly, $E = P R T^{-1}$ with
+    $P = 1 - G^+ G$ and T the Cholesky factor of $R^T P R$. By default an arbitrary basis at q, constant under
       differentiation; where q is traced it has as many columns as for a G of full rank.
 
     **Raises:** ValueError for a reference of another shape.
@@ -113,13 +115,15 @@ def normal_forces(grasp: Grasp) -> Float[np.ndarray, " nc"]:
 def forces_for_wrench(
     grasp: Grasp, q: Float[Array, " nq"], wrench: Float[Array, " no"], preload: Numbers = 0.0, t: Numbers = 0.0
 ) -> Float[Array, " nc"]:
-    """Contact forces lam = G^+ F + (1 - G^+ G) lam_0 with the resultant wrench F and a given internal force.
+    r"""Contact forces with a given resultant wrench and a given internal force.
+
+    $$\lambda = G^+ F + (1 - G^+ G) \lambda_0$$
 
     **Arguments:**
 
     - `wrench` F (no,): on the object, in its own axes for a free body; N and N m. A wrench that the contacts cannot
       exert is projected to the closest one.
-    - `preload` lam_0: a number (N), the normal force of every contact, or forces (nc,); only the internal part is used.
+    - `preload` $\lambda_0$: a number (N), the normal force of every contact, or forces (nc,); only the internal part is used.
       Equal normal forces are internal where the normals balance, as in an antipodal grasp.
 
     **Raises:** ValueError for inconsistent shapes, and for a number with constraints without normal force.
@@ -255,7 +259,9 @@ def force_closure(
 def joint_torques(
     grasp: Grasp, q: Float[Array, " nq"], lam: Float[Array, " nc"], t: Numbers = 0.0
 ) -> Float[Array, " nh"]:
-    """Joint torques J_h^T lam (nh,) that exert the contact forces lam (nc,) at rest, without the fingers' weight.
+    r"""Joint torques (nh,) that exert the contact forces lam (nc,) at rest, without the fingers' weight.
+
+    $$\tau = J_h^T \lambda$$
 
     Source: Murray, Li & Sastry (1994), eq. 5.31; EQUATIONS section 10.
     """

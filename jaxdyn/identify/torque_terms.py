@@ -36,9 +36,11 @@ else:
 
 
 class Friction(eqx.Module):
-    """Torque of a joint's friction, to be supplied by the motor: tau_f = viscous v + coulomb tanh(v / v_s) + offset.
+    r"""Torque of a joint's friction, to be supplied by the motor.
 
-    Called as a force of a scene, `friction(system, q, v, t)`, it gives -tau_f. The offset (N m) is a constant of the
+    $$\tau_f = \mathrm{viscous} \cdot v + \mathrm{coulomb} \tanh(v / v_s) + \mathrm{offset}$$
+
+    Called as a force of a scene, `friction(system, q, v, t)`, it gives $-\tau_f$. The offset (N m) is a constant of the
     measurement (sensor bias, cable) or of asymmetric dry friction.
 
     - `viscous` (nv,) N m s/rad, `coulomb` (nv,) N m, `offset` (nv,) N m; for prismatic joints N s/m, N, N.
@@ -51,7 +53,7 @@ class Friction(eqx.Module):
     v_s: Float[Array, ""]
 
     def torque(self, v: Float[Array, " nv"]) -> Float[Array, " nv"]:
-        """tau_f (nv,) at the velocity v (nv,)."""
+        """Torque (nv,) at the velocity v (nv,)."""
         return self.viscous * v + self.coulomb * jnp.tanh(v / self.v_s) + self.offset
 
     def __call__(
@@ -84,7 +86,11 @@ PRESLIDING = 0.003
 
 
 class TorqueTerm(eqx.Module):
-    """Torque that is linear in coefficients of each joint: tau_j = sum over k of columns[:, j, k] coefficients[k, j].
+    r"""Torque that is linear in coefficients of each joint.
+
+    $$\tau_j = \sum_k \mathrm{columns}_{jk} \mathrm{coefficients}_{kj}$$
+
+    in each sample.
 
     - `name`: as in reports.
     - `columns(log, load, v_s)`: (n, nv, k) or (n, nv), from a log, the torque (n, nv) that the rigid bodies need along it

@@ -77,9 +77,11 @@ def gauge_invariant(
     dof: int | None = None,
     rank_tol: float | None = None,
 ) -> GaugeInvariant:
-    """Equations of motion and of constraint force in quasi velocities w = W^T v, decoupled.
+    r"""Decoupled equations of motion and of constraint force in quasi velocities.
 
-    wdot_r = u_r - Gamma_r w_r,   Lam_r^T lam = Gamma_o w_r - u_o   (both with further terms where b(q, t) != 0)
+    $$w = W^T v, \quad \dot w_r = u_r - \Gamma_r w_r, \quad \Lambda_r^T \lambda = \Gamma_o w_r - u_o$$
+
+    Both equations have further terms where $b(q, t) \ne 0$.
 
     **Arguments:**
 

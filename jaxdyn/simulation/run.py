@@ -60,7 +60,9 @@ def simulate(
     max_steps: int | None = None,
     throw: bool | None = None,
 ) -> Solution:
-    """Integrate M a + C v + N = tau + forces + A^T lam, dq/dt = H(q) v, from (q0, v0) and save it at the times `ts`.
+    r"""Integrate the equations of motion from (q0, v0) and save the motion at the times `ts`.
+
+    $$M a + C v + N = \tau + \tau_\mathrm{forces} + A^T \lambda, \quad \dot q = H(q) v$$
 
     One sample; batch states, controls and the scene's leaves with `jax.vmap`. Computed in the dtype of the model.
     Called outside of `jax.jit` it compiles once for all scenes of a shape, whose numbers are inputs of the program. Inside your

@@ -81,19 +81,22 @@ def stiffness(
     t: Numbers = 0.0,
     control: Checked[Callable[[Array, Array, Array], Array] | None] = None,
 ) -> Stiffness:
-    """Fastest rates of the motion M da + D dv + K dq = 0 near a state, D = -df/dv and K = -df/dq.
+    r"""Fastest rates of the motion near a state.
 
-    f is the sum of the scene's forces, of `control(q, v, t)` and, for a system that is not a `Model`, of -dV/dq. What
-    velocity does through inertia and the gravity of a `Model` are left out, as neither makes a motion stiff. dq is along the
-    manifold. On constraints da, dv and dq are projected on their tangent space in the mass metric; the change of the rows
-    along dq is left out.
+    $$M \delta a + D \delta v + K \delta q = 0, \quad
+    D = -\frac{\partial f}{\partial v}, \quad K = -\frac{\partial f}{\partial q}$$
+
+    f is the sum of the scene's forces, of `control(q, v, t)` and, for a system that is not a `Model`, of
+    $-\partial V / \partial q$. Velocity-dependent inertial forces and the gravity of a `Model` are left out, as neither
+    makes a motion stiff. $\delta q$ is along the manifold. On constraints $\delta a$, $\delta v$ and $\delta q$ are
+    projected on their tangent space in the mass metric; the change of the rows along $\delta q$ is left out.
 
     **Arguments:** `scene`, a `Scene` or a system; `q` (nq,); `v` (nv,); `t`, s.
 
     **Raises:** ValueError for wrong shapes, and where forces or masses are not finite (NaN where numbers are traced).
 
-    **Returns:** `Stiffness`, from the eigenvalues of [[0, 1], [-M^-1 K, -M^-1 D]]. An explicit method needs steps below
-    `explicit_step`; where the motion itself would allow much longer ones, it is stiff.
+    **Returns:** `Stiffness`, from the eigenvalues of $\begin{bmatrix} 0 & 1 \\ -M^{-1} K & -M^{-1} D \end{bmatrix}$. An
+    explicit method needs steps below `explicit_step`; where the motion itself would allow much longer ones, it is stiff.
 
     Source: Hairer & Wanner 1996, section IV.2.
 

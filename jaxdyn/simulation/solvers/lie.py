@@ -20,9 +20,11 @@ from jaxdyn.systems.system import has_dependent_coordinates
 
 
 class LieGroup(Wrapped):
-    """A method that steps in local coordinates: q = q_k exp(e), with q_k the start of the step.
+    r"""A method that steps in local coordinates about the start of each step.
 
-    The wrapped method integrates e (nv,) from e = 0 by de/dt = J_r(e)^-1 v, J_r the right Jacobian of each joint's group. So
+    $$q = q_k \exp(e), \quad \dot e = J_r(e)^{-1} v$$
+
+    The wrapped method integrates e (nv,) from zero, with $J_r$ the right Jacobian of each joint's group. So
     q stays on its manifold without projection, errors are those of rotations, and implicit methods solve for 2 nv unknowns
     instead of nq + nv. The order is that of the wrapped method, which is used directly for systems without quaternions or
     planar joints. A step may turn a body by less than a full turn.
