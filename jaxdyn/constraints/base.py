@@ -161,7 +161,10 @@ class Pfaffian(Constraint):
         self.with_system = bool(with_system)
 
     def velocity(self, system: SystemLike, q: Float[Array, " nq"], v: Float[Array, " nv"], t: Number) -> Array | None:
-        """A v - b, (n,)."""
+        """Residual of the rows, (n,).
+
+        $$A v - b$$
+        """
         place = (system, q, t) if self.with_system else (q, t)
         rows = jnp.asarray(self.A(*place), q.dtype)
         rows = rows[None] if rows.ndim == 1 else rows

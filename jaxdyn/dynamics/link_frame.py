@@ -69,7 +69,10 @@ class NewtonEulerMatrices(eqx.Module):
 
     @property
     def jacobians(self) -> Float[Array, "n6 nv"]:
-        r"""Body Jacobians $G \xi$ (6n, nv) of all bodies, stacked."""
+        r"""Body Jacobians (6n, nv) of all bodies, stacked.
+
+        $$J = G \xi$$
+        """
         return matmul(self.G, self.xi)
 
     @property

@@ -74,8 +74,8 @@ def workspace_dynamics(
       velocity in world axes.
     - `rows`: components of (vx, vy, vz, wx, wy, wz) to use, at most nv of them: for an arm
       in the x-y plane e.g. (0, 1, 5).
-    - `least`: value of `condition` below which $M_x$ is damped; eps^0.4 by default, 5e-7 in float64. Components that no joint
-      moves are damped everywhere and have no meaning: leave them out of `rows`.
+    - `least`: value of `condition` below which $M_x$ is damped; $\epsilon^{0.4}$ by default, 5e-7 in float64. Components
+      that no joint moves are damped everywhere and have no meaning: leave them out of `rows`.
 
     **Returns:** `WorkspaceDynamics`; m, m/s and N for linear components, rad, rad/s and N m for angular ones. Damped, $M_x$
     is positive definite and finite with a finite gradient, and $J \bar J$ and $\dot M_x - 2 C_x$ are no longer 1 and skew.

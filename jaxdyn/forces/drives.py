@@ -85,7 +85,10 @@ class FirstOrderDrive(_Lag):
         state: Float[Array, " n"],
         command: Float[Array, " nv"],
     ) -> Float[Array, " n"]:
-        """(u - tau)/T."""
+        r"""Rate of the torque.
+
+        $$\dot\tau = (u - \tau) / T$$
+        """
         error, leaf = self._error(system, state, command)
         return error / leaf("time_constant")
 
@@ -135,7 +138,10 @@ class SecondOrderDrive(_Lag):
         state: Float[Array, " n"],
         command: Float[Array, " nv"],
     ) -> Float[Array, " n"]:
-        """tau', then w^2 (u - tau) - 2 zeta w tau'."""
+        r"""Rates of the torque and of its rate.
+
+        $$(\dot\tau, \omega^2 (u - \tau) - 2 \zeta \omega \dot\tau)$$
+        """
         # The state is (tau, tau'), both of the selected joints.
         error, leaf = self._error(system, state, command)
         frequency, speed = leaf("frequency"), state[error.shape[0] :]

@@ -47,7 +47,10 @@ class HandMotions(Basis):
         return self.object.shape[1] + self.internal.shape[1]
 
     def at(self, scene: Scene, q: Float[Array, " nq"], t: Number) -> Parametrization:
-        """Basis N (nv, nw + nk): H in the rows of the object, (J_h^+ G^T H, K) in those of the joints."""
+        """Basis N (nv, nw + nk) of the velocities.
+
+        It is H in the rows of the object and $(J_h^+ G^T H, K)$ in those of the joints.
+        """
         hands, objects = velocity_rows(scene)
         A = constraint_jacobian(scene, q, t)
         # The rows are A = [-J_h  G^T].

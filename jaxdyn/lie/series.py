@@ -97,7 +97,7 @@ def angle_ratio(n2: Scalar, w: Scalar) -> Scalar:
     **Arguments:** `n2`: squared norm of the vector part, (); `w`: scalar part, (), not negative. The two need not
     be normalised; both zero gives NaN.
 
-    **Returns:** the factor, (), that turns the vector part into the rotation vector: 2 / w at n2 = 0, pi / sqrt(n2)
+    **Returns:** the factor, (), that turns the vector part into the rotation vector: $2 / w$ at n2 = 0, $\pi / \sqrt{n_2}$
     at w = 0.
     """
     # With t = tan(theta/2) the series of atan(t)/t leaves out t^(2 n_terms); second derivatives of the rotation

@@ -23,7 +23,7 @@ def matmul(a: Array, b: Array) -> Array:
 
 
 def cross(a: Vector, b: Vector) -> Vector:
-    r"""Cross product $a \times b$, without the matrix of `hat`.
+    r"""Cross product of two vectors, without the matrix of `hat`.
 
     **Arguments:** `a`, `b`: (3,), in the same frame. **Returns:** (3,), product of their units.
     """

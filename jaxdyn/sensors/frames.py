@@ -73,7 +73,9 @@ class Accelerometer(_OnFrame):
 
 
 class Gyroscope(_OnFrame):
-    r"""Angular velocity $R^T \omega$ (3,), rad/s, of a frame in its axes.
+    r"""Angular velocity (3,), rad/s, of a frame in its axes.
+
+    $$R^T \omega$$
 
     **Arguments:** as of `Accelerometer`.
     """
@@ -98,7 +100,9 @@ class Imu(_OnFrame):
 
 
 class Velocimeter(_OnFrame):
-    """Velocity R^T v (3,), m/s, of a frame's origin in its axes.
+    """Velocity (3,), m/s, of a frame's origin in its axes.
+
+    $$R^T v$$
 
     **Arguments:** as of `Accelerometer`.
     """

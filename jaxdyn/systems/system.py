@@ -156,7 +156,10 @@ class MetricSystem(System):
         return jnp.zeros_like(q) if self.potential is None else jax.grad(self.potential_energy)(q, t)
 
     def kinetic_energy(self, q: Float[Array, " nq"], v: Float[Array, " nv"], t: Number) -> Float[Array, ""]:
-        r"""Kinetic energy $\tfrac12 v^T M v$, (), J."""
+        r"""Kinetic energy, (), J.
+
+        $$T = \tfrac12 v^T M v$$
+        """
         return 0.5 * jnp.sum(v * matmul(self.mass_matrix(q, t), v))
 
     def potential_energy(self, q: Float[Array, " nq"], t: Number) -> Float[Array, ""]:
@@ -214,7 +217,10 @@ class ExplicitSystem(System):
         return evaluate_callback(self._bias_force, (self.nq,), "bias_force", (q, v), t, self.parameters)
 
     def kinetic_energy(self, q: Float[Array, " nq"], v: Float[Array, " nv"], t: Number) -> Float[Array, ""]:
-        r"""Kinetic energy $\tfrac12 v^T M v$, (), J."""
+        r"""Kinetic energy, (), J.
+
+        $$T = \tfrac12 v^T M v$$
+        """
         return 0.5 * jnp.sum(v * matmul(self.mass_matrix(q, t), v))
 
     def potential_energy(self, q: Float[Array, " nq"], t: Number) -> Float[Array, ""]:
