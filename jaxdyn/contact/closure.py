@@ -56,7 +56,7 @@ class _Rows(NamedTuple):
     kept: np.ndarray
 
 
-def force_closure(
+def force_closure_of_map(
     G: Numbers,
     cones: Checked[Sequence[FrictionCone | Numbers]],
     *,
@@ -81,14 +81,14 @@ def force_closure(
     **Raises:** ValueError for traced arguments, and for cones that do not fit the columns of G.
 
     ```python
-    jd.contact.force_closure(jd.grasp.grasp_map(hand, q), [jd.contact.friction_cone("hard-finger", 0.5)] * 3).closed
+    jd.contact.force_closure_of_map(jd.grasp.grasp_map(hand, q), [jd.contact.friction_cone("hard-finger", 0.5)] * 3).closed
     ```
 
     Source: Murray, Li & Sastry (1994), proposition 5.3; for the certificate, the theorem of separating hyperplanes.
     """
     if not is_concrete(G, cones):
         raise ValueError(
-            "G or cones are traced; a linear program needs known numbers, call force_closure outside of jit"
+            "G or cones are traced; a linear program needs known numbers, call force_closure_of_map outside of jit"
         )
     G = np.asarray(as_float(G, "G", (None, None)), float)
     every = _as_cones([cones] if isinstance(cones, FrictionCone) else cones, G.shape[1])

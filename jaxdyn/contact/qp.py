@@ -9,7 +9,6 @@ the same in y, with the added term y^T (1 - P) y / 2, zero at y = P y.
 from collections.abc import Sequence
 from typing import TYPE_CHECKING, Any
 
-import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -17,6 +16,7 @@ from jaxtyping import Array, Float, Int
 
 from jaxdyn.compile import entry_point
 from jaxdyn.compile.known import is_concrete, is_tracing
+from jaxdyn.constraints.codes import RESULTS, Outcome
 from jaxdyn.constraints.rank import pseudo_inverse, tolerance
 from jaxdyn.contact._checks import as_float
 from jaxdyn.contact._interior_point import Point, Program, attach_derivative, solve
@@ -25,22 +25,12 @@ from jaxdyn.model.arguments import Numbers
 from jaxdyn.systems.mass_factor import cholesky, is_definite, solve_cholesky
 
 
-class RESULTS(eqx.Enumeration):
-    """Result codes of a quadratic program."""
-
-    successful = "successful"
-    infeasible = "No x satisfies the rows and cones of the quadratic program."
-    stalled = "The quadratic program was not solved to the tolerance within the given steps."
-    indefinite = "The matrix Q of the quadratic program is not positive definite."
-    nonfinite = "The data of the quadratic program, or its solution, are not finite."
-
-
-class QPSolution(eqx.Module):
+class QPSolution(Outcome):
     r"""Solution of a quadratic program, with the multipliers of its stationary point.
 
     $$Q x + q + G^T z + A^T y - \sum_i S_i^T w_i = 0$$
 
-    - `x` (n,): the minimiser. `result`: one of `jaxdyn.contact.RESULTS`; where it is not `successful`, all other fields are the
+    - `x` (n,): the minimiser. `result`: one of `jd.RESULTS`; where it is not `successful`, all other fields are the
       last iterate's.
     - `multipliers` z (m,): of the rows G x <= h, zero or positive. `slack` (m,): h - G x.
     - `equality_multipliers` y (p,): of A x = b; of least norm where rows are dependent.

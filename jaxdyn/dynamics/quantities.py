@@ -342,22 +342,8 @@ def mass_matrix_derivative(model: Model, q: Float[Array, " nq"]) -> Float[Array,
     return by_recursion(world_frame.mass_matrix_derivative, world_frame.mass_matrix_derivative, model, q)
 
 
-def christoffel_symbols(model: Model | System, q: Float[Array, " nq"], t: Numbers = 0.0) -> Float[Array, "nv nv nv"]:
-    r"""Christoffel symbols of the first kind of the mass matrix.
-
-    $$\Gamma_{ijk} = \tfrac12 \left( \frac{\partial M_{ij}}{\partial q_k} + \frac{\partial M_{ik}}{\partial q_j}
-    - \frac{\partial M_{kj}}{\partial q_i} \right)$$
-
-    The matrix $C_{ij} = \sum_k \Gamma_{ijk} v_k$ has the same $C v$ and $C + C^T$ as `coriolis_matrix`.
-
-    **Arguments:** `q` (nq,).
-
-    **Returns:** (nv, nv, nv), symmetric in j and k.
-
-    **Raises:** ValueError when the model has a joint whose v is not dq/dt (planar, spherical, free).
-
-    Source: Murray, Li & Sastry (1994), eq. 4.23; EQUATIONS section 0.
-    """
+def first_kind_symbols(model: Model | System, q: Float[Array, " nq"], t: Numbers = 0.0) -> Float[Array, "nv nv nv"]:
+    """Christoffel symbols of the first kind of the mass matrix, (nv, nv, nv); see `jd.geometry.christoffel_symbols`."""
     if isinstance(model, System):
         return _system_quantity(model, "christoffel_symbols", *check_state(model, q=q, t=t))
     (q,) = check_shapes(model, q=q)

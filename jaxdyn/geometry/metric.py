@@ -19,9 +19,9 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from jaxdyn.compile import entry_point
-from jaxdyn.dynamics.quantities import mass_matrix
+from jaxdyn.dynamics.quantities import first_kind_symbols, mass_matrix
 from jaxdyn.lie.so3 import matmul
-from jaxdyn.model.arguments import as_array, batch_hint, check_state, check_system, state_dtype
+from jaxdyn.model.arguments import Numbers, as_array, batch_hint, check_state, check_system, state_dtype
 from jaxdyn.model.tree import Model
 from jaxdyn.systems.mass_factor import solve_positive
 from jaxdyn.systems.scene import Scene
@@ -73,27 +73,36 @@ def _sharp(metric, q, p):
     return solve_positive(_as_function(metric)(q), p)
 
 
-def christoffel_symbols(metric: Metric, q: Float[Array, " n"], kind: str = "second") -> Float[Array, "n n n"]:
+def christoffel_symbols(
+    metric: Metric, q: Float[Array, " n"], kind: str = "second", t: Numbers = 0.0
+) -> Float[Array, "n n n"]:
     r"""Christoffel symbols of the second or of the first kind, the index i in front.
 
     $$\Gamma_{ijk} = g_{il} \Gamma^l_{jk} = \tfrac12 \left( \frac{\partial g_{ij}}{\partial q_k}
     + \frac{\partial g_{ik}}{\partial q_j} - \frac{\partial g_{jk}}{\partial q_i} \right)$$
 
-    **Arguments:** `metric` as above; `q` (n,).
+    For a mass matrix the symbols of the first kind give $C_{ij} = \sum_k \Gamma_{ijk} v_k$, which has the same $C v$ and
+    $C + C^T$ as `coriolis_matrix`. Those of a `Model` are in closed form.
+
+    **Arguments:** `metric` as above; `q` (n,); `kind`, "first" or "second"; `t`, s, of a system.
 
     **Returns:** (n, n, n), symmetric in the last two indices.
 
-    **Raises:** ValueError for another kind.
+    **Raises:** ValueError for another kind, and for a model with a joint whose v is not dq/dt (planar, spherical, free).
+
+    Source: Murray, Li & Sastry (1994), eq. 4.23; EQUATIONS section 0.
     """
     if kind not in KINDS:
         raise ValueError(f"kind is {kind!r}; choose from {', '.join(KINDS)}")
-    return _symbols(metric, *_vectors(metric, q=q), kind)
+    (q,) = _vectors(metric, q=q)
+    return _symbols(metric, q, as_array(t, "t", q.dtype), kind)
 
 
 @_compile_for_systems
-def _symbols(metric, q, kind):
-    g = _as_function(metric)
-    first = symbols(jax.jacfwd(g)(q))
+def _symbols(metric, q, t, kind):
+    g = _as_function(metric, t)
+    is_system = isinstance(metric, (Model, System))
+    first = first_kind_symbols(metric, q, t) if is_system else symbols(jax.jacfwd(g)(q))
     # One factorisation of g for all n^2 columns.
     return first if kind == "first" else solve_positive(g(q), first.reshape(q.shape[0], -1)).reshape(first.shape)
 
@@ -180,8 +189,9 @@ def riemann_tensor(metric: Metric, q: Float[Array, " n"]) -> Float[Array, "n n n
 
 @_compile_for_systems
 def _curvature(metric, q):
-    gamma = _symbols(metric, q, "second")
-    derivative = jax.jacfwd(lambda q: _symbols(metric, q, "second"))(q)
+    start = jnp.zeros((), q.dtype)
+    gamma = _symbols(metric, q, start, "second")
+    derivative = jax.jacfwd(lambda q: _symbols(metric, q, start, "second"))(q)
     # R is antisymmetric in k and l: half of its terms, minus the same with k and l exchanged.
     # derivative[i, l, j, k] = dGamma^i_lj / dq_k, in the order [i, j, k, l] of the tensor.
     half = derivative.transpose(0, 2, 3, 1) + jnp.einsum("ikm,mlj->ijkl", gamma, gamma)
@@ -227,8 +237,8 @@ def _vectors(metric, **arguments) -> tuple[Array, ...]:
     return tuple(as_array(value, name, dtype) for name, value in arguments.items())
 
 
-def _as_function(metric) -> Callable:
-    """The metric as a function of q.
+def _as_function(metric, t: Numbers = 0.0) -> Callable:
+    """The metric as a function of q, that of a system at the time t.
 
     **Raises:** ValueError for an argument that gives no metric.
     """
@@ -243,7 +253,7 @@ def _as_function(metric) -> Callable:
             f"metric is model {metric.name!r}, which has a planar joint, whose v is not dq/dt; give g(q) in coordinates"
         )
     if isinstance(metric, (Model, System)):
-        return lambda q: mass_matrix(metric, q)
+        return lambda q: mass_matrix(metric, q, t)
     if isinstance(metric, Scene):
         check_system(metric, "metric")
     if not callable(metric):

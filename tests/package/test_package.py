@@ -149,11 +149,12 @@ def test_package_is_typed():
 def test_rooms_use_those_below():
     """Every module is in a room, a room uses rooms on floors below its own alone, and not too many of them."""
     assert {top(module) for module in SOURCES} == {"", *RANK}
+    # `_renamed` is no room: namespaces ask it for names of the release before.
     arrows = {
         (top(module), top(used))
         for module, names in USES.items()
         for used in names
-        if top(used) not in ("", top(module))
+        if top(used) not in ("", "_renamed", top(module))
     }
     wrong = [f"{room} uses {used}" for room, used in arrows if room and RANK[used] >= RANK[room]]
     assert not wrong, "\n".join(sorted(wrong))
@@ -347,5 +348,9 @@ def test_public_namespaces_list_their_names():
         for name in names.split():
             with pytest.warns(DeprecationWarning, match=rf"jd\.{namespace}\.{name}"):
                 assert getattr(jaxdyn, name) is getattr(getattr(jaxdyn, namespace), name)
+    for old in _renamed._RENAMED:
+        namespace, _, name = old.rpartition(".")
+        with pytest.warns(DeprecationWarning, match=rf"jd\.{old} is now jd\."):
+            assert callable(getattr(getattr(jaxdyn, namespace, jaxdyn), name))
     with pytest.raises(AttributeError, match="nonsense"):
         _ = jaxdyn.nonsense
