@@ -6,7 +6,7 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from jaxdyn.dynamics.kinematics import take
-from jaxdyn.forces.elements import _broadcast, _is_positive, _joint_indices, _leaf, _names
+from jaxdyn.forces.elements import as_leaf, as_names, broadcast_leaf, is_positive, joint_indices
 from jaxdyn.model.arguments import Number, SystemLike
 from jaxdyn.systems.drives import DriveDynamics
 
@@ -21,8 +21,8 @@ class _Lag(DriveDynamics):
         self, system: SystemLike, q: Float[Array, " nq"], v: Float[Array, " nv"], t: Number
     ) -> Float[Array, " n"]:
         """Torques `initial` at rest."""
-        size = _joint_indices(system, self.joints, type(self).__name__).v.size
-        return _broadcast(self.initial, v, size, f"{type(self).__name__}: initial")
+        size = joint_indices(system, self.joints, type(self).__name__).v.size
+        return broadcast_leaf(self.initial, v, size, f"{type(self).__name__}: initial")
 
     def torque(
         self,
@@ -34,7 +34,7 @@ class _Lag(DriveDynamics):
         command: Float[Array, " nv"],
     ) -> Float[Array, " nv"]:
         """The torques among the states, and the commands of other joints."""
-        index = _joint_indices(system, self.joints, type(self).__name__).v
+        index = joint_indices(system, self.joints, type(self).__name__).v
         # Torques come first in the state; a drive of second order has their rates after them.
         torque = state[: index.size]
         # The usual case, all joints: no scatter is compiled.
@@ -42,9 +42,9 @@ class _Lag(DriveDynamics):
 
     def _error(self, system, state, command):
         """Commands less torques of the drives (n,), and a function that broadcasts a leaf to (n,)."""
-        index, name = _joint_indices(system, self.joints, type(self).__name__).v, type(self).__name__
+        index, name = joint_indices(system, self.joints, type(self).__name__).v, type(self).__name__
         error = take(command, index) - state[: index.size]
-        return error, lambda leaf: _broadcast(getattr(self, leaf), state, index.size, f"{name}: {leaf}")
+        return error, lambda leaf: broadcast_leaf(getattr(self, leaf), state, index.size, f"{name}: {leaf}")
 
 
 class FirstOrderDrive(_Lag):
@@ -67,13 +67,13 @@ class FirstOrderDrive(_Lag):
     ```
     """
 
-    time_constant: Float[Array, "..."] = eqx.field(converter=_leaf)
-    initial: Float[Array, "..."] = eqx.field(converter=_leaf, default=0.0)
-    joints: tuple[str, ...] | None = eqx.field(static=True, converter=_names, default=None)
+    time_constant: Float[Array, "..."] = eqx.field(converter=as_leaf)
+    initial: Float[Array, "..."] = eqx.field(converter=as_leaf, default=0.0)
+    joints: tuple[str, ...] | None = eqx.field(static=True, converter=as_names, default=None)
 
     def __check_init__(self):
         # The rate divides by T: for no delay leave the drive out of the scene.
-        if not _is_positive(self.time_constant):
+        if not is_positive(self.time_constant):
             raise ValueError(f"FirstOrderDrive: time_constant is {self.time_constant}; give positive seconds")
 
     def rate(
@@ -112,14 +112,14 @@ class SecondOrderDrive(_Lag):
     ```
     """
 
-    frequency: Float[Array, "..."] = eqx.field(converter=_leaf)
-    damping_ratio: Float[Array, "..."] = eqx.field(converter=_leaf, default=1.0)
-    initial: Float[Array, "..."] = eqx.field(converter=_leaf, default=0.0)
-    joints: tuple[str, ...] | None = eqx.field(static=True, converter=_names, default=None)
+    frequency: Float[Array, "..."] = eqx.field(converter=as_leaf)
+    damping_ratio: Float[Array, "..."] = eqx.field(converter=as_leaf, default=1.0)
+    initial: Float[Array, "..."] = eqx.field(converter=as_leaf, default=0.0)
+    joints: tuple[str, ...] | None = eqx.field(static=True, converter=as_names, default=None)
 
     def __check_init__(self):
         for name in ("frequency", "damping_ratio"):
-            if not _is_positive(getattr(self, name)):
+            if not is_positive(getattr(self, name)):
                 raise ValueError(f"SecondOrderDrive: {name} is {getattr(self, name)}; give positive numbers")
 
     def start(

@@ -6,7 +6,7 @@ import equinox as eqx
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from jaxdyn.forces.elements import _broadcast, _is_positive, _joint_indices, _leaf
+from jaxdyn.forces.elements import as_leaf, broadcast_leaf, is_positive, joint_indices
 from jaxdyn.model.arguments import Checked, Number, Numbers, SystemLike
 from jaxdyn.model.builder import ModelBuilder
 from jaxdyn.model.joining import join
@@ -40,9 +40,9 @@ class ElasticTransmission(eqx.Module):
 
     motors: tuple[str, ...] = eqx.field(static=True, converter=_tuple)
     joints: tuple[str, ...] = eqx.field(static=True, converter=_tuple)
-    stiffness: Float[Array, "..."] = eqx.field(converter=_leaf)
-    damping: Float[Array, "..."] = eqx.field(converter=_leaf, default=0.0)
-    gear: Float[Array, "..."] = eqx.field(converter=_leaf, default=1.0)
+    stiffness: Float[Array, "..."] = eqx.field(converter=as_leaf)
+    damping: Float[Array, "..."] = eqx.field(converter=as_leaf, default=0.0)
+    gear: Float[Array, "..."] = eqx.field(converter=as_leaf, default=1.0)
 
     def __check_init__(self):
         if len(self.motors) != len(self.joints):
@@ -50,18 +50,18 @@ class ElasticTransmission(eqx.Module):
                 f"ElasticTransmission: {len(self.motors)} motors for {len(self.joints)} joints; give pairs"
             )
         # The sign of n is a direction of rotation; only zero is refused.
-        if not _is_positive(self.gear**2):
+        if not is_positive(self.gear**2):
             raise ValueError(f"ElasticTransmission: gear is {self.gear}; give ratios that are not zero")
 
     def __call__(
         self, system: SystemLike, q: Float[Array, " nq"], v: Float[Array, " nv"], t: Number
     ) -> Float[Array, " nv"]:
         n = len(self.joints)
-        motor, joint = (_joint_indices(system, names, "ElasticTransmission") for names in (self.motors, self.joints))
+        motor, joint = (joint_indices(system, names, "ElasticTransmission") for names in (self.motors, self.joints))
         if any(len(index) != n for index in (*motor, *joint)):
             raise ValueError("ElasticTransmission: motors and joints have one coordinate each")
         stiffness, damping, gear = (
-            _broadcast(value, q, n, f"ElasticTransmission: {name}")
+            broadcast_leaf(value, q, n, f"ElasticTransmission: {name}")
             for name, value in (("stiffness", self.stiffness), ("damping", self.damping), ("gear", self.gear))
         )
         # Both are at the joint: the motor's angle is divided by the gear ratio.
@@ -111,11 +111,11 @@ def elastic_joints(
     """
     chosen = model.joint_names if joints is None else _tuple(joints)
     # Called for its message on unknown joints.
-    _joint_indices(model, chosen, "elastic_joints")
+    joint_indices(model, chosen, "elastic_joints")
     kinds = dict(zip(model.joint_names, model.topology.kinds, strict=True))
     if several := [name for name in chosen if KINDS[kinds[name]].nv != 1]:
         raise ValueError(f"elastic_joints: {several} have several coordinates; name joints of one")
-    if not _is_positive(rotor_inertia):
+    if not is_positive(rotor_inertia):
         raise ValueError(f"elastic_joints: rotor_inertia is {rotor_inertia}; give positive inertias (kg m^2)")
     motors = tuple(f"{name}{suffix}" for name in chosen)
     inertias = jnp.broadcast_to(jnp.asarray(rotor_inertia, float), (len(chosen),))

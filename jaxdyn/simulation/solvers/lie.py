@@ -14,7 +14,7 @@ from jaxdyn.lie import se2, se3, so3
 from jaxdyn.lie.so3 import matmul
 from jaxdyn.model.arguments import Number, SystemLike
 from jaxdyn.model.joints import SCREW_KINDS, joint_integrate, joint_rate
-from jaxdyn.model.tree import Model, Topology, _per_joint
+from jaxdyn.model.tree import Model, Topology, map_joints
 from jaxdyn.simulation.solvers.base import DenseOutput, Flag, StepOutput, Wrapped
 from jaxdyn.systems.system import has_dependent_coordinates
 
@@ -73,7 +73,7 @@ class LieGroup(Wrapped):
         )
         y1 = _to_manifold(topology, y0["q"], z1)
         if error is not None:
-            error = error | {"q": _per_joint(topology, joint_rate, y1["q"], (error["q"], False))}
+            error = error | {"q": map_joints(topology, joint_rate, y1["q"], (error["q"], False))}
         return y1, error, {"dense_info": dense_info, "q0": y0["q"]}, solver_state, result
 
     def _local(self, terms, y0):
@@ -98,7 +98,7 @@ class _LocalTerm(diffrax.AbstractTerm):
     def vf(self, t, y, args):
         state = _to_manifold(self.topology, self.q0, y)
         rates = self.term.vf(t, state, args)
-        return rates | {"q": _per_joint(self.topology, _local_rate, state["q"], (rates["q"], True), (y["q"], False))}
+        return rates | {"q": map_joints(self.topology, _local_rate, state["q"], (rates["q"], True), (y["q"], False))}
 
     def contr(self, t0, t1, **kwargs):
         return self.term.contr(t0, t1, **kwargs)
@@ -126,7 +126,7 @@ class _Interpolation(DenseOutput):
 
 def _to_manifold(topology, q0, z):
     """State with q = q0 exp(e) in place of e."""
-    return z | {"q": _per_joint(topology, joint_integrate, q0, (z["q"], False))}
+    return z | {"q": map_joints(topology, joint_integrate, q0, (z["q"], False))}
 
 
 def _local_rate(kind: str, q, rate, e):
