@@ -39,7 +39,7 @@ def _split(program: Program, uniform: Sequence[bool]) -> tuple[Program, Program]
     if saved < MIN_SHARED_OPERATIONS:
         return None
     # One array for each kind of number, not one per number: the runtime handler checks every argument of a kernel.
-    passed = _shared_results(program, is_shared)
+    passed = _interface(program, is_shared)
     kinds = sorted({program.operations[i].kind for i in passed})
     by_kind = [[i for i in passed if program.operations[i].kind == kind] for kind in kinds]
     arrays = [Array((len(entries),), dtype_of(kind)) for kind, entries in zip(kinds, by_kind, strict=True)]
@@ -79,7 +79,7 @@ def _split(program: Program, uniform: Sequence[bool]) -> tuple[Program, Program]
     return once, each
 
 
-def _shared_results(program: Program, is_shared: Sequence[bool]) -> list[int]:
+def _interface(program: Program, is_shared: Sequence[bool]) -> list[int]:
     """Shared operations that the second program reads or returns, in the order in which it reads them."""
     read = [x.args for i, x in enumerate(program.operations) if not is_shared[i] and x.op != "input"]
     numbers: dict[int, None] = {}

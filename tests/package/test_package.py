@@ -354,3 +354,19 @@ def test_public_namespaces_list_their_names():
             assert callable(getattr(getattr(jaxdyn, namespace, jaxdyn), name))
     with pytest.raises(AttributeError, match="nonsense"):
         _ = jaxdyn.nonsense
+
+
+def test_one_name_for_one_thing_and_one_thing_by_one_name():
+    """A name in several namespaces is one object in all of them, but for what the Lie groups have in common."""
+    rooms = [jaxdyn, *(room for name in jaxdyn.__all__ if isinstance(room := getattr(jaxdyn, name), ModuleType))]
+    groups = (jaxdyn.so3, jaxdyn.se2, jaxdyn.se3)
+    named = [(name, getattr(room, name)) for room in rooms if room not in groups for name in room.__all__]
+    objects, names = {}, {}
+    for name, value in named:
+        if isinstance(value, ModuleType):
+            continue  # a namespace is no function: `jd.forces`, `jd.plot.forces`
+        objects.setdefault(name, set()).add(id(value))
+        names.setdefault(id(value), set()).add(name)
+    assert not [name for name, values in objects.items() if len(values) > 1]
+    # Numbers and texts may be equal; functions and classes have one name.
+    assert not [names[id(value)] for _, value in named if callable(value) and len(names[id(value)]) > 1]
