@@ -86,3 +86,28 @@ def delta_hips(point):
         size = jnp.sqrt(x * x + z * z)
         angles.append(jnp.arctan2(-z, x) - jnp.arccos(right / size))
     return jnp.stack(angles)
+
+
+HEIGHT = (LOWER**2 - (BASE + UPPER - PLATE) ** 2) ** 0.5  # m, of the hips over the plate where the upper arms are level
+
+
+def delta_file():
+    """MJCF of the same robot with its parallelograms, arms level: two rods an arm, each on two hinges (21 velocities), and a free
+    plate on six balls (18 rows)."""
+    arms, loops, lean = "", "", np.degrees(np.arcsin((BASE + UPPER - PLATE) / LOWER))
+    for i in range(3):
+        rods = ""
+        for name, y in ((f"left{i}", 0.05), (f"right{i}", -0.05)):
+            rods += (
+                f'<body name="{name}" pos="{UPPER} {y} 0" euler="0 {lean} 0"><joint name="swing_{name}" axis="0 1 0"/>'
+            )
+            rods += f'<joint name="tilt_{name}" axis="1 0 0"/>{_capsule(f"0 0 {-LOWER}")}</body>'
+            loops += f'<connect body1="{name}" body2="plate" anchor="0 0 {-LOWER}"/>'
+        arms += f'<body euler="0 0 {120 * i}"><body pos="{BASE} 0 0"><joint name="hip{i}" axis="0 1 0"/>'
+        arms += f"{_capsule(f'{UPPER} 0 0')}{rods}</body></body>"
+    plate = f'<body name="plate" pos="0 0 {-HEIGHT}"><freejoint name="plate"/>{_capsule("0 0 0.01", PLATE)}</body>'
+    return f"<mujoco><worldbody>{arms}{plate}</worldbody><equality>{loops}</equality></mujoco>"
+
+
+def _capsule(end, radius=0.01):
+    return f'<geom type="capsule" fromto="0 0 0 {end}" size="{radius}" contype="0" conaffinity="0"/>'

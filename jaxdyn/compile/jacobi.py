@@ -1,232 +1,217 @@
-"""Pseudo-inverses in machine code: one-sided Jacobi rotations, as loops over the columns of one sample's matrix.
+"""Pseudo-inverses and singular vectors by one-sided Jacobi rotations, inverses by elimination, as kernels of one matrix.
 
-Rotations J from the right make the columns of A J = U orthogonal; then A = U J^T has the pseudo-inverse J D U^T, with D one
-over the squared lengths of the columns, which are the singular values, and zero for those below the tolerance. The relative
-error of small singular values is that of rounding (Demmel & Veselic 1992), which bidiagonalisation does not give. As no
-choice is made by LAPACK, a program with such kernels can be exported, and large batches do not wait for each other's
-threads.
+Rotations J from the right make the columns of A J = U orthogonal; then A = U J^T has the right singular vectors J and the
+pseudo-inverse J D U^T, with D one over the squared lengths of the columns, which are the singular values, and zero for those
+below the tolerance. The relative error of small singular values is that of rounding (Demmel & Veselic 1992), which
+bidiagonalisation does not give.
 
-Source: Hestenes (1958); Golub & Van Loan, Matrix Computations, section 8.6.3.
+Source: Hestenes (1958); Golub & Van Loan, Matrix Computations, sections 3.4 and 8.6.3.
 """
 
 import contextlib
 import functools
-import hashlib
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 
-from jaxdyn.compile import mode
-from jaxdyn.compile.primitive import kernel_p, target
-from jaxdyn.compile.program import Array
+from jaxdyn.compile.matrix_loops import LoopWriter, MatrixProgram
 
 with contextlib.suppress(ImportError):  # no kernels without llvmlite
     import llvmlite.ir as ir
 
-    INT, POINTER = ir.IntType(64), ir.PointerType()
+    from jaxdyn.compile.matrix_loops import INT
 
 # Sweeps converge quadratically: six to ten are enough. The bound ends those over numbers that are not finite, for which the
 # test of convergence never holds.
 MAX_SWEEPS = 60
 
 
-class PseudoInverse:
-    """The kernel of A (rows, columns) -> its pseudo-inverse; stands in the place of a `Program`."""
+def _cost(n: int, m: int) -> int:
+    """Operations of some eight sweeps over m columns of n entries."""
+    return 8 * m * m * (6 * n + 3 * m) // 2 + 1
 
-    derivative = fallback = None
-    subprograms = ()
-    turns = 1
-    is_called = True
+
+class PseudoInverse(MatrixProgram):
+    """A (rows, columns) -> its pseudo-inverse (columns, rows)."""
+
+    name = "pseudo_inverse"
 
     def __init__(self, rows: int, columns: int, dtype, tolerance: float):
-        self.rows, self.columns, self.dtype, self.tolerance = rows, columns, np.dtype(dtype), tolerance
-        self.inputs = (Array((rows, columns), self.dtype),)
-        self.outputs = (Array((columns, rows), self.dtype),)
-        self.results = (tuple(range(rows * columns)),)
-        self.derived: dict = {}
-        self.name = "pseudo_inverse"
+        super().__init__(rows, columns, (columns, rows), dtype, tolerance)
+        self.cost = _cost(max(rows, columns), min(rows, columns))
 
-    @property
-    def digest(self) -> str:
-        """Identity of the code, as `Program.digest`."""
-        # A hash, as programs that call it make its symbol from it.
-        text = f"pseudo_inverse {self.rows} {self.columns} {self.dtype} {self.tolerance!r}"
-        return hashlib.sha256(text.encode()).hexdigest()
+    def write(self, w: LoopWriter, matrix, result) -> None:
+        """Rotations, and J D U^T from them."""
+        rows, columns = self.rows, self.columns
+        # The smaller side is made orthogonal: rotations of m vectors of length n >= m cost n m^2 a sweep.
+        n, m = max(rows, columns), min(rows, columns)
+        # Columns of the matrix, or its rows where there are fewer of them, one after the other.
+        U, J = _rotated(w, matrix, n, m, *((1, columns) if rows >= columns else (columns, 1)))
+        of_column, of_row = (n, 1) if rows >= columns else (1, m)
+        _write_inverse(w, U, J, result, n, m, self.tolerance, of_column, of_row)
 
-    @property
-    def cost(self) -> int:
-        """Operations of some eight sweeps."""
-        n, m = max(self.rows, self.columns), min(self.rows, self.columns)
-        return 8 * m * m * (6 * n + 3 * m) // 2 + 1
-
-    # A vector of samples would sweep until the last one of them has converged.
-    def lanes(self, samples) -> int:
-        """Samples need different numbers of sweeps: one after the other."""
-        return 1
-
-    def ir(self, width: int, uniform) -> str:
-        """The text of the kernel (see `code.kernel_ir`)."""
-        return _kernel_ir(self.rows, self.columns, self.dtype, self.tolerance)
-
-    def definition(self, symbol: str) -> dict[str, str]:
-        """`void symbol(ptr matrix, ptr inverse)` of one sample, and what it declares, by names in a module's text."""
-        loops = f"{symbol}_loops"
-        text = str(_write_kernel(self.rows, self.columns, self.dtype, self.tolerance).function)
-        # Without "no-builtins" LLVM turns the loop that writes zeros into a call of memset, which bare metal may lack.
-        text = text.replace("define void", "define internal void", 1).replace('@"kernel"', f"@{loops}", 1)
-        head, brace, rest = text.partition("{")
-        call = f"""define internal void @{symbol}(ptr %a0, ptr %r0) nounwind {{
-  %data = alloca [2 x ptr]
-  store ptr %a0, ptr %data
-  %second = getelementptr ptr, ptr %data, i64 1
-  store ptr %r0, ptr %second
-  call void @{loops}(ptr %data, i64 1, i64 0, i64 1)
-  ret void
-}}"""
-        suffix = "f64" if self.dtype == np.float64 else "f32"
-        kind = "double" if self.dtype == np.float64 else "float"
-        root = f"llvm.sqrt.{suffix}"
-        return {
-            loops: f'{head} nounwind "no-builtins" {brace}{rest}',
-            symbol: call,
-            root: f"declare {kind} @{root}({kind})",
-        }
-
-    def as_operations(self, array):
+    def compute(self, matrix):
         """The same by JAX's singular value decomposition."""
-        matrix = array.reshape(*array.shape[:-1], self.rows, self.columns)
         U, s, Vt = jnp.linalg.svd(matrix, full_matrices=False)
         # A double where: one over a dropped value would be infinite, and its product with zero NaN.
         drop = s <= self.tolerance * s[..., :1]
         inverse = jnp.where(drop, jnp.zeros_like(s), 1 / jnp.where(drop, jnp.ones_like(s), s))
-        entries = jnp.matmul(
-            jnp.swapaxes(Vt, -1, -2) * inverse[..., None, :], jnp.swapaxes(U, -1, -2), precision="highest"
-        )
-        return [entries.reshape(*array.shape[:-1], self.columns * self.rows)]
+        right = jnp.swapaxes(Vt, -1, -2) * inverse[..., None, :]
+        return jnp.matmul(right, jnp.swapaxes(U, -1, -2), precision="highest")
 
 
-@functools.lru_cache(maxsize=256)
-def pseudo_inverse_program(rows: int, columns: int, dtype, tolerance: float) -> PseudoInverse:
-    """One for each shape, so that programs of JAX are found again."""
-    return PseudoInverse(rows, columns, dtype, tolerance)
+class RightVectors(MatrixProgram):
+    """A (rows, columns) -> its right singular vectors (columns, columns), that of the largest singular value first."""
+
+    name = "right_vectors"
+
+    def __init__(self, rows: int, columns: int, dtype):
+        super().__init__(rows, columns, (columns, columns), dtype)
+        self.cost = _cost(rows, columns)
+
+    def write(self, w: LoopWriter, matrix, result) -> None:
+        """Rotations, and the columns of J in the order of the lengths of U's columns."""
+        b, n, m = w.b, self.rows, self.columns
+        U, J = _rotated(w, matrix, n, m, 1, m)
+        squares, total = w.buffer(m), w.variable(w.float, w.number(0))
+        with w.loop(w.integer(0), w.integer(m)) as p:
+            x = w.at(U, (p, n))
+            square = w.product(x, x, n)
+            b.store(square, w.at(squares, (p, 1)))
+            b.store(b.fadd(w.load(total), square), total)
+        # Rotations pass over numbers that are not finite: without this the vectors would be those of the identity.
+        invalid = b.fsub(w.load(total), w.load(total))
+        with w.loop(w.integer(0), w.integer(m)) as place:
+            most, index = w.variable(w.float, w.number(-1)), w.variable(INT, w.integer(0))
+            with w.loop(w.integer(0), w.integer(m)) as p:
+                square = w.load(w.at(squares, (p, 1)))
+                with b.if_then(b.fcmp_ordered(">", square, w.load(most))):
+                    b.store(square, most)
+                    b.store(p, index)
+            p = b.load(index, typ=INT)
+            b.store(w.number(-2), w.at(squares, (p, 1)))
+            with w.loop(w.integer(0), w.integer(m)) as i:
+                entry = b.fadd(w.load(w.at(J, (p, m), (i, 1))), invalid)
+                b.store(entry, w.at(result, (i, m), (place, 1)))
+
+    def compute(self, matrix):
+        """The same by JAX's singular value decomposition."""
+        return jnp.swapaxes(jnp.linalg.svd(matrix, full_matrices=True)[2], -1, -2)
 
 
-class _Writer:
-    """LLVM IR with loops and columns of numbers."""
+class Inverse(MatrixProgram):
+    """A (n, n) -> its inverse by elimination with exchanges of rows; not finite where it is singular."""
 
-    def __init__(self, dtype):
-        self.module = ir.Module("pseudo_inverse")
-        kind = ir.FunctionType(ir.VoidType(), (POINTER, INT, INT, INT))
-        self.function = ir.Function(self.module, kind, "kernel")
-        self.entry = ir.IRBuilder(self.function.append_basic_block("entry"))
-        self.b = ir.IRBuilder(self.function.append_basic_block("start"))
-        self.float = ir.DoubleType() if dtype == np.float64 else ir.FloatType()
-        self.dtype = np.dtype(dtype)
+    name = "inverse"
 
-    def number(self, value):
-        return ir.Constant(self.float, value)
+    def __init__(self, size: int, dtype):
+        super().__init__(size, size, (size, size), dtype)
+        self.cost = 3 * size**3 + 1
 
-    def integer(self, value):
-        return ir.Constant(INT, value)
+    def write(self, w: LoopWriter, matrix, result) -> None:
+        """Elimination on [A 1], whose right half becomes the inverse."""
+        b, n, zero = w.b, self.rows, w.integer(0)
+        rows = w.buffer(2 * n * n)
+        with w.loop(zero, w.integer(n)) as i, w.loop(zero, w.integer(n)) as j:
+            b.store(w.load(w.at(matrix, (i, n), (j, 1))), w.at(rows, (i, 2 * n), (j, 1)))
+            one = b.select(b.icmp_signed("==", i, j), w.number(1), w.number(0))
+            b.store(one, w.at(rows, (i, 2 * n), (b.add(j, w.integer(n)), 1)))
+        with w.loop(zero, w.integer(n)) as k:
+            size, index = w.variable(w.float, w.number(-1)), w.variable(INT, k)
+            with w.loop(k, w.integer(n)) as i:
+                entry = w.size(w.load(w.at(rows, (i, 2 * n), (k, 1))))
+                with b.if_then(b.fcmp_ordered(">", entry, w.load(size))):
+                    b.store(entry, size)
+                    b.store(i, index)
+            own, other = w.at(rows, (k, 2 * n)), w.at(rows, (b.load(index, typ=INT), 2 * n))
+            scale = b.fdiv(w.number(1), w.load(w.at(other, (k, 1))))
+            # Columns before k are those of the unit matrix already.
+            with w.loop(k, w.integer(2 * n)) as j:
+                pivot, moved = w.load(w.at(other, (j, 1))), w.load(w.at(own, (j, 1)))
+                b.store(moved, w.at(other, (j, 1)))
+                b.store(b.fmul(pivot, scale), w.at(own, (j, 1)))
+            with w.loop(zero, w.integer(n)) as i, b.if_then(b.icmp_signed("!=", i, k)):
+                row = w.at(rows, (i, 2 * n))
+                factor = w.load(w.at(row, (k, 1)))
+                with w.loop(k, w.integer(2 * n)) as j:
+                    change = b.fmul(factor, w.load(w.at(own, (j, 1))))
+                    b.store(b.fsub(w.load(w.at(row, (j, 1))), change), w.at(row, (j, 1)))
+        with w.loop(zero, w.integer(n)) as i, w.loop(zero, w.integer(n)) as j:
+            entry = w.load(w.at(rows, (i, 2 * n), (b.add(j, w.integer(n)), 1)))
+            b.store(entry, w.at(result, (i, n), (j, 1)))
 
-    def variable(self, kind, value=None):
-        place = self.entry.alloca(kind)
-        if value is not None:
-            self.b.store(value, place)
-        return place
-
-    def buffer(self, size: int):
-        return self.entry.alloca(self.float, size=self.integer(max(1, size)))
-
-    def at(self, pointer, *index_and_stride):
-        """Address of entry sum of index times stride."""
-        total = self.integer(0)
-        for index, stride in index_and_stride:
-            total = self.b.add(total, self.b.mul(index, self.integer(stride)))
-        return self.b.gep(pointer, [total], source_etype=self.float)
-
-    def load(self, place):
-        return self.b.load(place, typ=self.float)
-
-    @contextlib.contextmanager
-    def loop(self, start, end):
-        """For i from start to end - 1."""
-        b, function = self.b, self.function
-        head, body, out = (function.append_basic_block() for _ in range(3))
-        before = b.block
-        b.branch(head)
-        b.position_at_end(head)
-        i = b.phi(INT)
-        i.add_incoming(start, before)
-        b.cbranch(b.icmp_signed("<", i, end), body, out)
-        b.position_at_end(body)
-        yield i
-        i.add_incoming(b.add(i, self.integer(1)), b.block)
-        b.branch(head)
-        b.position_at_end(out)
-
-    def root(self, x):
-        name = f"llvm.sqrt.{'f64' if self.dtype == np.float64 else 'f32'}"
-        function = self.module.globals.get(name) or ir.Function(
-            self.module, ir.FunctionType(self.float, (self.float,)), name
-        )
-        return self.b.call(function, (x,))
-
-    def size(self, x):
-        return self.b.select(self.b.fcmp_ordered("<", x, self.number(0)), self.b.fneg(x), x)
-
-    def product(self, x, y, length: int):
-        """Sum of products of two columns."""
-        total = self.variable(self.float, self.number(0))
-        with self.loop(self.integer(0), self.integer(length)) as k:
-            term = self.b.fmul(self.load(self.at(x, (k, 1))), self.load(self.at(y, (k, 1))))
-            self.b.store(self.b.fadd(self.load(total), term), total)
-        return self.load(total)
-
-    def rotate(self, x, y, c, s, length: int):
-        """(x, y) <- (c x - s y, s x + c y)."""
-        b = self.b
-        with self.loop(self.integer(0), self.integer(length)) as k:
-            at_x, at_y = self.at(x, (k, 1)), self.at(y, (k, 1))
-            first, second = self.load(at_x), self.load(at_y)
-            b.store(b.fsub(b.fmul(c, first), b.fmul(s, second)), at_x)
-            b.store(b.fadd(b.fmul(s, first), b.fmul(c, second)), at_y)
+    def compute(self, matrix):
+        """The same by JAX's inverse."""
+        return jnp.linalg.inv(matrix)
 
 
-def _kernel_ir(rows: int, columns: int, dtype, tolerance: float) -> str:
-    shapes = f"; pseudo-inverse of {rows} x {columns} {dtype} at {tolerance!r}\n"
-    return shapes + str(_write_kernel(rows, columns, dtype, tolerance).module)
+# One program for each shape, so that programs of JAX are found again.
+_pseudo_inverse, _right_vectors, _inverse = (
+    functools.lru_cache(maxsize=256)(kind) for kind in (PseudoInverse, RightVectors, Inverse)
+)
 
 
-def _write_kernel(rows: int, columns: int, dtype, tolerance: float) -> "_Writer":
-    n, m = max(rows, columns), min(rows, columns)
-    w = _Writer(dtype)
-    data, _, begin, end = w.function.args
+def pseudo_inverse_by_rotations(matrix: jax.Array, tolerance: float) -> jax.Array:
+    """The pseudo-inverse (m, n) of a matrix (n, m), singular values up to `tolerance` times the largest taken for zero.
+
+    It has no derivative: put it under a rule that gives one.
+    """
+    return _pseudo_inverse(*matrix.shape, matrix.dtype, float(tolerance))(matrix)
+
+
+@jax.custom_jvp
+def gram_eigenvectors(matrix: jax.Array) -> tuple[jax.Array, jax.Array]:
+    """Eigenvalues (m,) of X^T X, the squared singular values of X (n, m), largest first, and its eigenvectors (m, m) in columns.
+
+    Small eigenvalues have the digits that X^T X itself has lost. For a symmetric semidefinite X the eigenvectors are those of
+    X, and the eigenvalues the squares. It has derivatives of all orders; vectors of equal values do not turn in their space.
+    """
+    vectors = _right_vectors(*matrix.shape, matrix.dtype)(matrix)
+    return jnp.sum(jnp.matmul(matrix, vectors, precision="highest") ** 2, 0), vectors
+
+
+@gram_eigenvectors.defjvp
+def _gram_eigenvectors_jvp(primals, tangents):
+    (X,), (dX,) = primals, tangents
+    values, V = gram_eigenvectors(X)
+    half = jnp.matmul(
+        jnp.matmul(X, V, precision="highest").T, jnp.matmul(dX, V, precision="highest"), precision="highest"
+    )
+    change = half + half.T  # V^T d(X^T X) V
+    # dV = V K with K_ij = change_ij / (values_j - values_i).
+    gaps = values[None, :] - values[:, None]
+    is_equal = jnp.abs(gaps) <= 16 * jnp.finfo(X.dtype).eps * jnp.max(values, initial=0.0)
+    turn = jnp.where(is_equal, jnp.zeros_like(gaps), change) / jnp.where(is_equal, jnp.ones_like(gaps), gaps)
+    return (values, V), (jnp.diagonal(change), jnp.matmul(V, turn, precision="highest"))
+
+
+@jax.custom_jvp
+def inverse(matrix: jax.Array) -> jax.Array:
+    """The inverse (n, n) of a regular matrix by elimination; numbers that are not finite where it is singular."""
+    return matrix if 0 in matrix.shape else _inverse(matrix.shape[0], matrix.dtype)(matrix)
+
+
+@inverse.defjvp
+def _inverse_jvp(primals, tangents):
+    X = inverse(primals[0])
+    return X, -jnp.matmul(X, jnp.matmul(tangents[0], X, precision="highest"), precision="highest")
+
+
+def _rotated(w: LoopWriter, matrix, n: int, m: int, of_vector: int, of_entry: int):
+    """Buffers of U = A J, column after column, and J; vector p of A begins at p of_vector, with entries of_entry apart."""
     U, J, zero = w.buffer(n * m), w.buffer(m * m), w.integer(0)
-    given, result = (w.b.load(w.b.gep(data, [w.integer(i)], source_etype=POINTER), typ=POINTER) for i in range(2))
-    with w.loop(begin, end) as sample:
-        matrix = w.at(given, (sample, n * m))
-        inverse = w.at(result, (sample, n * m))
-        # The smaller side is made orthogonal: rotations of m vectors of length n >= m cost n m^2 a sweep.
-        # Columns of the matrix, or its rows where there are fewer of them, one after the other.
-        of_column, of_row = (1, columns) if rows >= columns else (columns, 1)
-        with w.loop(zero, w.integer(m)) as p:
-            with w.loop(zero, w.integer(n)) as k:
-                w.b.store(w.load(w.at(matrix, (p, of_column), (k, of_row))), w.at(U, (p, n), (k, 1)))
-            with w.loop(zero, w.integer(m)) as k:
-                one = w.b.select(w.b.icmp_signed("==", p, k), w.number(1), w.number(0))
-                w.b.store(one, w.at(J, (p, m), (k, 1)))
-        _sweeps(w, U, J, n, m)
-        _write_inverse(
-            w, U, J, inverse, n, m, tolerance, of_column=n if rows >= columns else 1, of_row=1 if rows >= columns else m
-        )
-    w.b.ret_void()
-    w.entry.branch(w.function.blocks[1])
-    return w
+    with w.loop(zero, w.integer(m)) as p:
+        with w.loop(zero, w.integer(n)) as k:
+            w.b.store(w.load(w.at(matrix, (p, of_vector), (k, of_entry))), w.at(U, (p, n), (k, 1)))
+        with w.loop(zero, w.integer(m)) as k:
+            one = w.b.select(w.b.icmp_signed("==", p, k), w.number(1), w.number(0))
+            w.b.store(one, w.at(J, (p, m), (k, 1)))
+    _sweeps(w, U, J, n, m)
+    return U, J
 
 
-def _sweeps(w: _Writer, U, J, n: int, m: int) -> None:
+def _sweeps(w: LoopWriter, U, J, n: int, m: int) -> None:
     """Rotate pairs of columns until all are orthogonal to rounding."""
     b, one = w.b, w.number(1)
     eps = float(np.finfo(w.dtype).eps)
@@ -251,7 +236,7 @@ def _sweeps(w: _Writer, U, J, n: int, m: int) -> None:
                 w.rotate(w.at(J, (p, m)), w.at(J, (q, m)), c, s, m)
 
 
-def _write_inverse(w: _Writer, U, J, inverse, n: int, m: int, tolerance: float, of_column: int, of_row: int) -> None:
+def _write_inverse(w: LoopWriter, U, J, inverse, n: int, m: int, tolerance: float, of_column: int, of_row: int) -> None:
     """J D U^T, entry (i, k) at i of_column + k of_row."""
     b, zero = w.b, w.integer(0)
     sizes, largest = w.buffer(m), w.variable(w.float, w.number(0))
@@ -274,15 +259,3 @@ def _write_inverse(w: _Writer, U, J, inverse, n: int, m: int, tolerance: float, 
                 with w.loop(zero, w.integer(n)) as k:
                     at = w.at(inverse, (i, of_column), (k, of_row))
                     b.store(b.fadd(w.load(at), b.fmul(weight, w.load(w.at(U, (p, n), (k, 1))))), at)
-
-
-def pseudo_inverse_by_rotations(matrix: jax.Array, tolerance: float) -> jax.Array:
-    """The pseudo-inverse (m, n) of a matrix (n, m), singular values up to `tolerance` times the largest taken for zero.
-
-    It has no derivative: put it under a rule that gives one.
-    """
-    program = pseudo_inverse_program(*matrix.shape, matrix.dtype, float(tolerance))
-    # A kernel even for one matrix: LAPACK called in a batched program of XLA can wait for its own threads for ever.
-    if mode.current() == "plain" or target is None:
-        return program.as_operations(matrix.reshape(-1))[0].reshape(matrix.shape[::-1])
-    return kernel_p.bind(matrix.reshape(-1), program=program, rows=0)[0].reshape(matrix.shape[::-1])

@@ -121,9 +121,8 @@ FUNCTIONS: dict[str, Callable] = {  # of one number
         "sqrt": "sqrt", "sin": "sin", "cos": "cos", "tan": "tan", "asin": "arcsin", "acos": "arccos", "atan": "arctan",
         "sinh": "sinh", "cosh": "cosh", "tanh": "tanh", "exp": "exp", "exp2": "exp2", "expm1": "expm1", "log": "log",
         "log1p": "log1p", "abs": "abs", "floor": "floor", "ceil": "ceil", "round": "rint", "sign": "sign", "cbrt": "cbrt",
-        "stop_gradient": "positive",  # a number of its own, so that programs of changes know
     }.items()
-}  # fmt: skip
+} | {"stop_gradient": lambda x: x}  # fmt: skip
 FUNCTIONS_OF_TWO: dict[str, Callable] = {
     "pow": np.power,
     "atan2": np.arctan2,

@@ -76,6 +76,12 @@ class RESULTS(eqx.Enumeration):
 CODES = tuple(_names)
 
 
+def require_finite(result: Any, *values) -> Any:
+    """The result, or `nonfinite` where it is `successful` and a value is not finite."""
+    is_finite = jnp.stack([jnp.isfinite(x).all() for x in values]).all()
+    return RESULTS.where(is_finite | (result != RESULTS.successful), result, RESULTS.nonfinite)  # pyright: ignore[reportArgumentType]
+
+
 def code_of(result: Any) -> Array:
     """Index of a result, traced or batched, in `CODES` (uint8)."""
     # An item of an enumeration is no array that could be stored; comparisons of it are.

@@ -18,7 +18,7 @@ from jaxtyping import Array, Float, Int
 
 from jaxdyn.compile import is_standalone, kernel, mark_invalid
 from jaxdyn.constraints.base import Layout, Rows, constraint_jacobian, holonomic_rows, layout, rows
-from jaxdyn.constraints.codes import RESULTS, Outcome
+from jaxdyn.constraints.codes import RESULTS, Outcome, require_finite
 from jaxdyn.constraints.rank import (
     check_tolerance,
     eps_of,
@@ -155,7 +155,8 @@ def _by_pivots(rank_tol, scene: Scene, q, v, tau, t):
     quality = jnp.where(metric.is_definite(), quality_of(normal), jnp.nan)
     is_poor = ~(quality > least_pivot(q, rank_tol))
     a, lam = (mark_invalid(is_poor, x) for x in (metric.unwhiten(free + matmul(Y, lam)), lam))
-    return a, lam, *_rank_and_result(scene, q, quality)
+    rank, result = _rank_and_result(scene, q, quality)
+    return a, lam, rank, require_finite(result, a)
 
 
 def _gauss_problem(scene: Scene, q, v, tau, t):
@@ -185,7 +186,7 @@ def _free_dynamics(scene, q, v, force, t) -> ConstrainedDynamics:
     metric = mass_factor(mass_matrix(scene.system, q, t))
     a = metric.solve(force - bias_force(scene.system, q, v, t))
     result = RESULTS.where(metric.is_definite(), RESULTS.successful, RESULTS.singular_mass_matrix)  # pyright: ignore[reportArgumentType]
-    return ConstrainedDynamics(a, jnp.zeros((0,), v.dtype), jnp.zeros((), jnp.int32), result, ())
+    return ConstrainedDynamics(a, jnp.zeros((0,), v.dtype), jnp.zeros((), jnp.int32), require_finite(result, a), ())
 
 
 def solve_rows(scene: Scene, q, v, force, t, row: Rows, rank_tol: float | None = None) -> ConstrainedDynamics:
@@ -245,7 +246,7 @@ def _by_schur(scene: Scene, q, v, tau, t, *, method: str) -> ConstrainedDynamics
     result = RESULTS.where(independent, RESULTS.successful, RESULTS.dependent_rows)  # pyright: ignore[reportArgumentType]
     result = RESULTS.where(is_definite, result, RESULTS.singular_mass_matrix)
     rank = jnp.asarray(lam.shape[0], jnp.int32)
-    return ConstrainedDynamics(a, lam, rank, result, layout(scene))
+    return ConstrainedDynamics(a, lam, rank, require_finite(result, a), layout(scene))
 
 
 def _by_delassus(scene: Scene, q, v, tau, t):

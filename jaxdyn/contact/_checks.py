@@ -21,7 +21,7 @@ def as_float(value, what: str, shape: tuple | None = None, like=None) -> Float[A
         raise ValueError(f"{what} is {value!r}; give numbers")
     array = value if isinstance(value, jax.Array) else jnp.asarray(value) if known is None else known
     if like is None:
-        like = array.dtype if jnp.issubdtype(array.dtype, jnp.floating) else float
+        like = jax.dtypes.canonicalize_dtype(array.dtype) if jnp.issubdtype(array.dtype, jnp.floating) else float
     array = jnp.asarray(array, like) if isinstance(array, jax.Array) else store_leaf(array, like)
     if shape is not None and (
         array.ndim != len(shape) or any(n is not None and n != m for n, m in zip(shape, array.shape, strict=True))

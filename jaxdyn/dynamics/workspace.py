@@ -20,7 +20,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float
 
-from jaxdyn.compile import entry_point
+from jaxdyn.compile import entry_point, gram_eigenvectors
 from jaxdyn.dynamics.frame_motion import frame_jacobian
 from jaxdyn.dynamics.quantities import coriolis_matrix, gravity_force, mass_matrix
 from jaxdyn.lie.so3 import matmul
@@ -121,9 +121,7 @@ def _workspace(model: Model, choice: _Choice, q, v) -> WorkspaceDynamics:
     # J M^-1 J^T as a Gram matrix stays symmetric and semidefinite in rounding.
     whitened = factor.whiten(J.T)
     scale, scaled = _unit_diagonal(matmul(whitened.T, whitened))
-    # The scaled matrix is a Gram matrix: its least eigenvalue is negative only by
-    # rounding.
-    condition = jnp.maximum(jnp.linalg.eigvalsh(scaled)[0], jnp.zeros((), q.dtype))
+    condition = gram_eigenvectors(whitened * scale[None])[0][-1]
     # Damping starts at the threshold and grows linearly, so that Lambda is continuous in q; its slope jumps there.
     damping = jnp.maximum(choice.least - condition, jnp.zeros_like(condition))
     unit = jnp.eye(J.shape[0], dtype=q.dtype)

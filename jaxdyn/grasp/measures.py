@@ -10,7 +10,7 @@ import jax.numpy as jnp
 from jax import lax
 from jaxtyping import Array, Bool, Float
 
-from jaxdyn.compile import entry_point
+from jaxdyn.compile import entry_point, gram_eigenvectors
 from jaxdyn.compile.known import is_concrete
 from jaxdyn.constraints.base import constraint_jacobian
 from jaxdyn.grasp.hand import Grasp, check_grasp
@@ -53,8 +53,7 @@ def manipulability(
 ) -> Manipulability:
     """Velocity and force ellipsoids of the object in the hand (see `Manipulability`).
 
-    First derivatives of the axes are exact; for equal axes they are those of their mean. Second ones and those of the
-    directions are not available.
+    Axes have derivatives of all orders where they differ; those of the directions are not available.
 
     **Arguments:**
 
@@ -117,11 +116,8 @@ def _measure(grasp: Grasp, motions: HandMotions, q, length, t) -> Manipulability
 
 
 def _axes(X: Float[Array, "n m"]) -> tuple[Float[Array, " m"], Float[Array, "m m"]]:
-    """Singular values |X v_i| of X, largest first, and the right vectors v_i, constants."""
-    # By stationarity of singular values |X v_i| with constant v_i has the exact first derivative.
-    # The derivative of an SVD would divide by differences of singular values.
-    vectors = lax.stop_gradient(jnp.linalg.svd(lax.stop_gradient(X))[2]).T
-    square = jnp.sum(matmul(X, vectors) ** 2, 0)
+    """Singular values |X v_i| of X, largest first, and the right vectors v_i."""
+    square, vectors = gram_eigenvectors(X)
     some = square > 0
     return jnp.where(some, jnp.sqrt(jnp.where(some, square, jnp.ones_like(square))), jnp.zeros_like(square)), vectors
 

@@ -14,13 +14,12 @@ Source: Lee, Wensing & Park (2020), Geometric robot dynamic identification: a co
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jax import lax
 from jaxtyping import Array, Float
+
+from jaxdyn.compile import gram_eigenvectors
 
 METRICS = ("entropic", "affine")
 _UPPER = np.triu_indices(4, 1)
-# Sweeps over all pairs of rows in Jacobi's method.
-_SWEEPS = 7
 
 
 def barrier_residual(x: Float[Array, "*n"]) -> Float[Array, "*n"]:
@@ -53,13 +52,13 @@ def symmetric_log(matrix: Float[Array, "n n"]) -> Float[Array, "n n"]:
 
     Its derivative, of first order, is that of Daleckii and Krein, which stays finite at equal eigenvalues.
     """
-    values, vectors = jacobi_eigenvectors(matrix)
+    values, vectors = symmetric_eigenvectors(matrix)
     return (vectors * jnp.log(values)[None, :]) @ vectors.T
 
 
 @symmetric_log.defjvp
 def _symmetric_log_jvp(primals, tangents):
-    values, vectors = jacobi_eigenvectors(primals[0])
+    values, vectors = symmetric_eigenvectors(primals[0])
     one, other = values[:, None], values[None, :]
     # (log a - log b) / (a - b) = atanh(x) / x * 2 / (a + b), x = (a - b) / (a + b).
     x = (one - other) / (one + other)
@@ -73,36 +72,7 @@ def _symmetric_log_jvp(primals, tangents):
     return logarithm, vectors @ (quotients * (vectors.T @ change @ vectors)) @ vectors.T
 
 
-def jacobi_eigenvectors(matrix: Float[Array, "n n"]) -> tuple[Float[Array, " n"], Float[Array, "n n"]]:
-    """Eigenvalues (n,), in no order, and eigenvectors in columns (n, n) of a small symmetric matrix, by Jacobi's rotations.
-
-    Residuals of many bodies are batched, and many starts of a fit batch these again: LAPACK under XLA must not be called there
-    (`jaxdyn.systems.mass_factor`). Convergence is quadratic: of 4 x 4 matrices the off-diagonal entries are rounding errors after
-    five or six sweeps.
-
-    Source: Golub & Van Loan (2013), "Matrix computations", section 8.5.
-    """
-    n = matrix.shape[-1]
-    pairs = np.array([(i, j) for _ in range(_SWEEPS) for i in range(n) for j in range(i + 1, n)]).reshape(-1, 2)
-    rows = np.eye(n)[pairs]
-
-    def rotate(state, ends):
-        A, V = state
-        p, q = ends
-        app, aqq, apq = p @ A @ p, q @ A @ q, p @ A @ q
-        is_diagonal = apq == 0
-        # An entry that is zero needs no rotation; dividing by it would give NaN in the derivative.
-        ratio = (aqq - app) / (2 * jnp.where(is_diagonal, jnp.ones_like(apq), apq))
-        # The smaller of the two angles, whose tangent loses no digits.
-        tangent = jnp.where(ratio >= 0, 1.0, -1.0) / (jnp.abs(ratio) + jnp.sqrt(ratio * ratio + 1))
-        tangent = jnp.where(is_diagonal, jnp.zeros_like(apq), tangent)
-        c = 1 / jnp.sqrt(tangent * tangent + 1)
-        s = c * tangent
-        rotation = jnp.eye(n, dtype=A.dtype) + (c - 1) * (jnp.outer(p, p) + jnp.outer(q, q))
-        rotation = rotation + s * (jnp.outer(p, q) - jnp.outer(q, p))
-        return (rotation.T @ A @ rotation, V @ rotation), None
-
-    start = ((matrix + matrix.T) / 2, jnp.eye(n, dtype=matrix.dtype))
-    # A scan: one rotation is compiled instead of all of them.
-    (diagonal, vectors), _ = lax.scan(rotate, start, jnp.asarray(rows, matrix.dtype))
-    return jnp.diagonal(diagonal), vectors
+def symmetric_eigenvectors(matrix: Float[Array, "n n"]) -> tuple[Float[Array, " n"], Float[Array, "n n"]]:
+    """Eigenvalues (n,) and eigenvectors, in columns, of a symmetric matrix that is meant to be positive definite."""
+    vectors = gram_eigenvectors(matrix)[1]
+    return jnp.sum(vectors * (matrix @ vectors), 0), vectors

@@ -82,11 +82,25 @@ def whiteness(log: Log, residual: np.ndarray) -> Whiteness:
     The integrated autocorrelation time, dt (1 + 2 sum of the autocorrelation up to its first zero), is dt for white noise. The
     effective sample size is the duration of the log over it. The low-pass of `from_raw` alone leaves some 1 / (2 cutoff).
 
+    An error that is constant through the log is one sample, and lasts as long as the log; of zeros alone each counts.
+
+    **Raises:** ValueError for a residual that is no table of finite numbers with the rows of the log.
+
     Source: Priestley (1981), "Spectral analysis and time series", section 5.3.
     """
-    n = len(residual)
+    residual = np.asarray(residual, np.float64)
+    n = len(log)
+    if residual.ndim != 2 or len(residual) != n:
+        raise ValueError(f"residual has shape {residual.shape}, expected ({n}, nv), a row for each sample of the log")
+    if len(rows := np.argwhere(~np.isfinite(residual))):
+        row, column = rows[0]
+        raise ValueError(f"residual is {residual[row, column]} in row {row}, column {column}; leave such samples out")
     step = float(log.t[-1] - log.t[0]) / max(n - 1, 1)
-    times = _autocorrelation_times(residual)
+    mean = np.abs(residual.mean(axis=0))
+    spread = np.abs(residual - residual.mean(axis=0)).max(axis=0, initial=0.0)
+    # What rounding of the mean leaves of a constant is no noise.
+    is_constant = (mean > 0) & (spread <= 64 * np.finfo(np.float64).eps * mean)
+    times = np.where(is_constant, float(n), _autocorrelation_times(residual))
     return Whiteness(step * times, n / times)
 
 

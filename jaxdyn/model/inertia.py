@@ -11,6 +11,7 @@ import numpy as np
 from jax import dtypes as _dtypes
 from jaxtyping import Array, Float
 
+from jaxdyn.compile import kernel
 from jaxdyn.compile.known import array_namespace as _numpy_for
 from jaxdyn.lie import so3
 from jaxdyn.model import float64 as _f64
@@ -161,6 +162,12 @@ def to_log_cholesky(parameters: Checked[Float[Array, "10"]]) -> Float[Array, "10
     NaN when the parameters are not strictly feasible (see `is_feasible`).
     """
     _check_shapes(parameters=(parameters, (10,)))
+    return _to_log_cholesky(None, parameters)
+
+
+# A kernel: LAPACK under XLA may wait for ever in a batch of bodies (`jaxdyn.systems.mass_factor`).
+@kernel
+def _to_log_cholesky(_, parameters):
     matrix = pseudo_inertia(parameters)
     # U U^T with U upper triangular is the Cholesky factorisation of the matrix with rows and columns reversed.
     upper = jnp.linalg.cholesky(matrix[::-1, ::-1])[::-1, ::-1]

@@ -14,7 +14,7 @@ import numpy as np
 from jax import lax
 from jaxtyping import Array, Float
 
-from jaxdyn.compile import entry_point
+from jaxdyn.compile import entry_point, gram_eigenvectors
 from jaxdyn.compile.known import is_known
 from jaxdyn.constraints.base import constraint_jacobian, layout, velocity_residual
 from jaxdyn.constraints.rank import pseudo_inverse, sign_of_determinant, tolerance
@@ -327,8 +327,8 @@ def _tangent_projection(scene, q, t, rank_tol):
 
 def split_directions(projection: Float[Array, "n n"]) -> Float[Array, "n n"]:
     """Orthonormal eigenvectors of an orthogonal projection, those of its range last; constants."""
-    # eigh orders eigenvalues ascending, so that the kernel comes first; eigenvectors of equal ones have no derivative.
-    return lax.stop_gradient(jnp.linalg.eigh(lax.stop_gradient(0.5 * (projection + projection.T)))[1])
+    # Eigenvectors of equal eigenvalues have no derivative.
+    return gram_eigenvectors(lax.stop_gradient(projection))[1][:, ::-1]
 
 
 def independent_velocities(scene: Scene, q, t: Number = 0.0) -> tuple[int, ...]:

@@ -22,7 +22,7 @@ from jaxtyping import Array, Float
 
 from jaxdyn.compile import entry_point
 from jaxdyn.constraints.base import constraint_jacobian, layout, rows
-from jaxdyn.constraints.codes import RESULTS, Outcome
+from jaxdyn.constraints.codes import RESULTS, Outcome, require_finite
 from jaxdyn.constraints.dynamics import total_force
 from jaxdyn.constraints.rank import pseudo_inverse, tolerance
 from jaxdyn.dynamics.quantities import bias_force, coriolis_matrix, mass_matrix
@@ -153,6 +153,7 @@ def _decouple(scene, q, v, tau, t, rotation, motion_rotation, dof, rank_tol) -> 
     rank = jnp.round(jnp.sum(back * Lambda.T))
     # The bases have a static number of columns, which is valid for this rank alone.
     result = RESULTS.where(rank == scene.nv - dof, RESULTS.successful, RESULTS.singular_basis)  # pyright: ignore[reportArgumentType]
+    a = matmul(inverse.T, change - matmul(Wdot.T, v))
     return GaugeInvariantDynamics(
         W=W,
         velocity=w,
@@ -168,8 +169,8 @@ def _decouple(scene, q, v, tau, t, rotation, motion_rotation, dof, rank_tol) -> 
         Gamma_o=matmul(V1.T, matmul(Gamma, V2)) + leaning,
         normal_force=matmul(V1.T, u),
         Lambda_r=Lambda_r,
-        acceleration=matmul(inverse.T, change - matmul(Wdot.T, v)),
+        acceleration=a,
         # (Lam^T)^+ gives the multipliers of least norm where rows are dependent.
         multipliers=matmul(back.T, matmul(back, wanted) - free),
-        result=result,
+        result=require_finite(result, a),
     )

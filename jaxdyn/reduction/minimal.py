@@ -17,7 +17,7 @@ from jaxtyping import Array, Float
 from jaxdyn.compile import entry_point, kernel
 from jaxdyn.compile.known import is_concrete
 from jaxdyn.constraints.base import layout
-from jaxdyn.constraints.codes import RESULTS, Outcome
+from jaxdyn.constraints.codes import RESULTS, Outcome, require_finite
 from jaxdyn.constraints.dynamics import total_force
 from jaxdyn.dynamics.quantities import inverse_dynamics, mass_matrix
 from jaxdyn.lie.so3 import matmul
@@ -128,7 +128,7 @@ def solve_in_basis(scene: Scene, motion: VelocityAndDrift, q, tau, t) -> Reduced
     result = RESULTS.where(is_definite(mass, factor), RESULTS.successful, RESULTS.singular_mass_matrix)  # pyright: ignore[reportArgumentType]
     # The sign of the quality is that of a determinant, and no measure.
     is_regular = jnp.abs(quality) > least_quality(q.dtype)
-    result = RESULTS.where(is_regular, result, RESULTS.singular_basis)
+    result = require_finite(RESULTS.where(is_regular, result, RESULTS.singular_basis), rate)
     return ReducedDynamics(rate, v, matmul(N, rate) + drift, mass, bias, force, N, result)
 
 

@@ -5,10 +5,12 @@ from collections.abc import Callable
 from typing import Generic, ParamSpec, TypeVar
 
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array
 
 from jaxdyn.compile.known import is_concrete
 from jaxdyn.model.arguments import store_leaf
+from jaxdyn.systems.mass_factor import solve_positive
 from jaxdyn.systems.scene import Scene
 
 REGISTRY: dict[str, "NamedScene"] = {}
@@ -51,6 +53,17 @@ def register_scene(
         return scene
 
     return register
+
+
+def solve_gram(rows, right):
+    """(X X^T)^-1 right for independent rows X, by NumPy where all is known."""
+    solve = np.linalg.solve if is_concrete(rows, right) else solve_positive
+    return solve(rows @ rows.T, right)
+
+
+def flat_moments(moment):
+    """Moments (3,) of a plate about its centre, of which a motion in the plane sees the last."""
+    return 0.5 * moment, 0.5 * moment, moment
 
 
 def as_leaf(value):

@@ -9,7 +9,7 @@ from jaxtyping import Array
 from jaxdyn.compile import entry_point
 from jaxdyn.compile.known import array_namespace, is_concrete
 from jaxdyn.constraints import rolling_sphere
-from jaxdyn.constraints.rank import solve_square
+from jaxdyn.constraints.rank import pseudo_inverse, solve_square, tolerance
 from jaxdyn.contact import Sphere, montana
 from jaxdyn.dynamics.kinematics import body_jacobian, frame_pose
 from jaxdyn.grasp import Grasp, contact, grasp_map, hand_jacobian
@@ -182,7 +182,8 @@ def _lifting_start(
 
 @entry_point
 def _least_rates(scene, q, twist):
-    rates = jnp.linalg.pinv(hand_jacobian(scene, q)) @ (grasp_map(scene, q).T @ twist)
+    J = hand_jacobian(scene, q)
+    rates = pseudo_inverse(J, tolerance(None, J)) @ (grasp_map(scene, q).T @ twist)
     return jnp.concatenate([rates, twist])
 
 

@@ -15,7 +15,7 @@ from jaxdyn.model import inertia, robots
 from jaxdyn.model.arguments import Number, Row
 from jaxdyn.model.builder import ModelBuilder
 from jaxdyn.model.names import frame_index
-from jaxdyn.scenes._named import as_state, register_scene
+from jaxdyn.scenes._named import as_state, register_scene, solve_gram
 from jaxdyn.scenes.hands import point_velocity, quaternion_and_matrix
 
 # Contact points of the fingertips on the cube, in half edges, and inward normals: index and ring finger on one face,
@@ -64,7 +64,7 @@ def _tip(model, joints, offset, angles):
 def _least(jacobian, motion):
     """Change of a finger's angles of least norm for a motion of its tip."""
     # Four joints for three components: the normal equations J J^T are regular away from singularities.
-    return jacobian.T @ array_namespace(jacobian, motion).linalg.solve(jacobian @ jacobian.T, motion)
+    return jacobian.T @ solve_gram(jacobian, motion)
 
 
 def _reach(model, joints, offset, guess, target):

@@ -8,7 +8,7 @@ from jaxdyn.constraints import rolling_sphere
 from jaxdyn.contact.unilateral import UnilateralContact, gap_contact, ground_contact
 from jaxdyn.model.arguments import Number, Row
 from jaxdyn.model.builder import ModelBuilder
-from jaxdyn.scenes._named import as_leaf, as_state, register_scene
+from jaxdyn.scenes._named import as_leaf, as_state, flat_moments, register_scene
 from jaxdyn.systems.scene import Scene
 from jaxdyn.systems.system import MetricSystem
 
@@ -45,7 +45,7 @@ def rough_disk_and_link(
     builder = ModelBuilder("disk and link", gravity=(0.0, -gravity, 0.0))
     for name, mass, moment in zip(("disk", "link"), masses, moments, strict=True):
         # The moments about x and y have no effect in the plane; half of z each is a plate's.
-        builder.add_body(name, None, "planar", (mass, (0.0, 0.0, 0.0), (moment / 2, moment / 2, moment)))
+        builder.add_body(name, None, "planar", (mass, (0.0, 0.0, 0.0), flat_moments(moment)))
     on_link = rolling_sphere("disk", None, 1.0, surface=_DOWN, surface_body="link", name="link")
     ground = ground_contact("disk", None, friction[1], radius=1.0, plane=_UP, name="ground")
     return Scene(builder.build(), forces=(UnilateralContact(on_link, friction[0]), ground))

@@ -11,7 +11,7 @@ from jaxdyn.model import float64 as f64
 from jaxdyn.model import inertia
 from jaxdyn.model.arguments import Number, Row
 from jaxdyn.model.builder import ModelBuilder
-from jaxdyn.scenes._named import as_state, register_scene
+from jaxdyn.scenes._named import as_state, register_scene, solve_gram
 from jaxdyn.scenes.linkages import intersect_circles, thin_bar
 
 _LINKS = (0.3, 0.25)
@@ -26,7 +26,7 @@ def _rates(axes, origins, point, velocity):
     xp = array_namespace(axes, origins, point, velocity)
     columns = xp.cross(xp.asarray(axes, float), xp.asarray(point, float)[None] - xp.asarray(origins, float))
     # Columns are independent and the velocity is feasible, so that the normal equations are exact.
-    return xp.linalg.solve(columns @ columns.T, columns @ xp.asarray(velocity, float))
+    return solve_gram(columns, columns @ xp.asarray(velocity, float))
 
 
 def point_velocity(position, velocity, omega, point):

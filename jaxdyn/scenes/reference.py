@@ -11,7 +11,7 @@ from jaxtyping import Array, Float
 from jaxdyn.constraints import Holonomic, loop
 from jaxdyn.dynamics.kinematics import frame_pose
 from jaxdyn.model.builder import ModelBuilder
-from jaxdyn.scenes._named import as_leaf, as_state, register_scene
+from jaxdyn.scenes._named import as_leaf, as_state, flat_moments, register_scene
 from jaxdyn.systems.lagrangian import LagrangianSystem
 from jaxdyn.systems.scene import Scene
 from jaxdyn.systems.system import ExplicitSystem
@@ -203,7 +203,7 @@ def andrews_bodies() -> Scene:
 
     def body(number, parent, joint, center, place=(0.0, 0.0)):
         # Motion is in the plane, so that moments about x and y have no effect.
-        inertia = (p["m"][number - 1], (*center, 0.0), (0.0, 0.0, p["I"][number - 1]))
+        inertia = (p["m"][number - 1], (*center, 0.0), flat_moments(p["I"][number - 1]))
         builder.add_body(f"K{number}", parent, "continuous", inertia, joint_name=joint, pose=(*place, 0.0))
 
     # x of each body is along the link where the published equations have a cosine; -y where they have (sin, -cos).

@@ -9,7 +9,7 @@ from jaxdyn.compile.known import array_namespace
 from jaxdyn.constraints import Pfaffian, knife_edge, rolling_wheel
 from jaxdyn.model.arguments import Number, Row
 from jaxdyn.model.builder import ModelBuilder
-from jaxdyn.scenes._named import as_leaf, as_state, register_scene
+from jaxdyn.scenes._named import as_leaf, as_state, flat_moments, register_scene
 from jaxdyn.systems.lagrangian import LagrangianSystem
 from jaxdyn.systems.scene import Scene
 
@@ -73,10 +73,9 @@ def chaplygin_sleigh(*, mass: Number = 1.0, inertia_com: Number = 0.5, offset: N
 
     Source: Bloch, Nonholonomic Mechanics and Control (2003), section 1.7.
     """
-    moments = (0.0, 0.0, inertia_com)
     builder = ModelBuilder("sleigh", gravity=None)
     # The origin is at the blade, so that the constraint is zero sideways velocity of the body.
-    builder.add_body("sleigh", None, "planar", (mass, (offset, 0.0, 0.0), moments))
+    builder.add_body("sleigh", None, "planar", (mass, (offset, 0.0, 0.0), flat_moments(inertia_com)))
     return Scene(builder.build(), (knife_edge("sleigh", contact=False, name="blade"),))
 
 
@@ -98,7 +97,7 @@ def knife_edge_on_incline(
     xp = array_namespace(slope)
     pull = (gravity * xp.sin(slope), 0.0, -gravity * xp.cos(slope))
     builder = ModelBuilder("skate", gravity=pull)
-    builder.add_body("skate", None, "planar", (mass, (0.0, 0.0, 0.0), (0.0, 0.0, moment)))
+    builder.add_body("skate", None, "planar", (mass, (0.0, 0.0, 0.0), flat_moments(moment)))
     return Scene(builder.build(), (knife_edge("skate", contact=False, name="blade"),))
 
 

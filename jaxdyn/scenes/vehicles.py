@@ -7,7 +7,7 @@ from jaxdyn.compile.known import array_namespace
 from jaxdyn.constraints import knife_edge, rolling_wheel
 from jaxdyn.model.arguments import Number, Row
 from jaxdyn.model.builder import ModelBuilder
-from jaxdyn.scenes._named import as_state, register_scene
+from jaxdyn.scenes._named import as_state, flat_moments, register_scene
 from jaxdyn.systems.scene import Scene
 
 _AXLE = (np.zeros(3), (-np.pi / 2, 0.0, 0.0))  # z of the wheel along y of the body
@@ -189,7 +189,7 @@ def car(
     builder.add_body("chassis", None, "planar", chassis, pose=(0.0, 0.0, radius))
     _add_wheel(builder, "rear left wheel", "chassis", wheel_mass, radius, (0.0, half_track, 0.0))
     _add_wheel(builder, "rear right wheel", "chassis", wheel_mass, radius, (0.0, -half_track, 0.0))
-    fork = (0.0, (0.0, 0.0, 0.0), (0.0, 0.0, fork_moment))
+    fork = (0.0, (0.0, 0.0, 0.0), flat_moments(fork_moment))
     # The fork has a moment about the steer axis and no mass.
     builder.add_body("steering", "chassis", "continuous", fork, pose=(wheel_base, 0.0, 0.0))
     # The front wheel has its centre on the steer axis, so that steering does not move it.
@@ -241,10 +241,10 @@ def snakeboard(
     """
 
     def turning(moment):
-        return 0.0, (0.0, 0.0, 0.0), (0.0, 0.0, moment)
+        return 0.0, (0.0, 0.0, 0.0), flat_moments(moment)
 
     builder = ModelBuilder("snakeboard", gravity=None)
-    builder.add_body("board", None, "planar", (mass, (0.0, 0.0, 0.0), (0.0, 0.0, moment)))
+    builder.add_body("board", None, "planar", (mass, (0.0, 0.0, 0.0), flat_moments(moment)))
     for name, joint, place in (("front truck", "1 front", half_length), ("back truck", "2 back", -half_length)):
         # Names of joints give the order of q: front truck, back truck, rotor.
         builder.add_body(name, "board", "continuous", turning(truck_moment), pose=(place, 0.0, 0.0), joint_name=joint)

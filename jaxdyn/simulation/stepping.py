@@ -159,6 +159,11 @@ def _advance(scene: Scene, length, substeps: int, is_direct: bool) -> tuple[Any,
         # Once, at the start on the constraints: between the stages of a step the rank would change.
         selection = select_rows(known(unknown), q, t, None) if selects_rows else None
         plan, args, ts, size = solver.plan(y), (unknown, tau, selection), jnp.stack([t, t + length]), length / substeps
+        if pieces.names and is_standalone():
+            raise ValueError(
+                f"stepper: its steps end at the kinks of {', '.join(pieces.names)}, found by loops that exported code does not "
+                "have; leave these forces out of the exported scene, and clip the torques before the step"
+            )
         if pieces.names:
             system = PiecewiseSystem(plan, pieces, switching)
             rows = piecewise_motion(system, y, args, ts, 0.0, 0.0, size, substeps, substeps + 1, EVENTS, is_direct)[0]

@@ -8,6 +8,7 @@ import diffrax
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jax.custom_batching import sequential_vmap
 from jaxtyping import Array, Float
 
 from jaxdyn.compile import entry_point
@@ -15,7 +16,7 @@ from jaxdyn.compile.known import array_namespace, is_known
 from jaxdyn.constraints.dynamics import constrained_dynamics
 from jaxdyn.dynamics.quantities import gravity_force, mass_matrix
 from jaxdyn.lie.so3 import matmul
-from jaxdyn.model.arguments import Checked, Numbers, check_state, store_leaf
+from jaxdyn.model.arguments import Checked, Numbers, as_array, check_state, store_leaf
 from jaxdyn.model.tree import Model
 from jaxdyn.systems.mass_factor import solve_positive
 from jaxdyn.systems.scene import Scene, as_pytree, as_scene, check_force
@@ -80,23 +81,27 @@ def stiffness(
     v: Numbers,
     t: Numbers = 0.0,
     control: Checked[Callable[[Array, Array, Array], Array] | None] = None,
+    drive_state: Numbers | None = None,
 ) -> Stiffness:
     r"""Fastest rates of the motion near a state.
 
-    $$M \delta a + D \delta v + K \delta q = 0, \quad
-    D = -\frac{\partial f}{\partial v}, \quad K = -\frac{\partial f}{\partial q}$$
+    $$M \delta a + D \delta v + K \delta q = B \delta z, \quad \delta\dot z = R \delta q + S \delta v + Z \delta z$$
 
-    f is the sum of the scene's forces, of `control(q, v, t)` and, for a system that is not a `Model`, of
-    $-\partial V / \partial q$. Velocity-dependent inertial forces and the gravity of a `Model` are left out, as neither
-    makes a motion stiff. $\delta q$ is along the manifold. On constraints $\delta a$, $\delta v$ and $\delta q$ are
-    projected on their tangent space in the mass metric; the change of the rows along $\delta q$ is left out.
+    $D = -\partial f / \partial v$, $K = -\partial f / \partial q$ and $B = \partial f / \partial z$, where f is the sum of
+    the scene's forces, of `control(q, v, t)` behind the scene's drives and limits, and, for a system that is not a `Model`,
+    of $-\partial V / \partial q$. z are the states of the drives, and R, S and Z the derivatives of their rates.
+    Velocity-dependent inertial forces and the gravity of a `Model` are left out, as neither makes a motion stiff.
+    $\delta q$ is along the manifold. On constraints $\delta a$, $\delta v$ and $\delta q$ are projected on their tangent
+    space in the mass metric; the change of the rows along $\delta q$ is left out.
 
-    **Arguments:** `scene`, a `Scene` or a system; `q` (nq,); `v` (nv,); `t`, s.
+    **Arguments:** `scene`, a `Scene` or a system; `q` (nq,); `v` (nv,); `t`, s; `drive_state` z (n,), by default
+    `scene.drive_state(q, v, t)`.
 
     **Raises:** ValueError for wrong shapes, and where forces or masses are not finite (NaN where numbers are traced).
 
-    **Returns:** `Stiffness`, from the eigenvalues of $\begin{bmatrix} 0 & 1 \\ -M^{-1} K & -M^{-1} D \end{bmatrix}$. An
-    explicit method needs steps below `explicit_step`; where the motion itself would allow much longer ones, it is stiff.
+    **Returns:** `Stiffness`, from the eigenvalues of
+    $\begin{bmatrix} 0 & 1 & 0 \\ -M^{-1} K & -M^{-1} D & M^{-1} B \\ R & S & Z \end{bmatrix}$. An explicit method needs
+    steps below `explicit_step`; where the motion itself would allow much longer ones, it is stiff.
 
     Source: Hairer & Wanner 1996, section IV.2.
 
@@ -107,7 +112,14 @@ def stiffness(
     scene = as_scene(scene)
     control = None if control is None else as_pytree(control, "control")
     q, v, t = check_state(scene.system, q=q, v=v, t=t)
-    matrix = _linearize(scene, q, v, t, control)
+    state = scene.drive_state(q, v, t)
+    if drive_state is not None:
+        given = as_array(drive_state, "drive_state", q.dtype)
+        if state is None or given.shape != state.shape:
+            want = "None: the scene has no drives" if state is None else f"{state.shape} as of scene.drive_state(q, v)"
+            raise ValueError(f"drive_state has shape {given.shape}, expected {want}")
+        state = given
+    matrix = _linearize(scene, q, v, t, control, state)
     if is_known(matrix):
         # All by numpy, which compiles nothing.
         known = np.asarray(matrix, float)
@@ -115,24 +127,45 @@ def stiffness(
             raise ValueError(f"forces or masses are not finite at q = {q}, v = {v}, t = {t}; look at another state")
         values = np.linalg.eigvals(known)
     else:
-        values = jnp.linalg.eigvals(matrix)
+        values = _eigenvalues(matrix)
     return Stiffness(*(store_leaf(x, matrix.dtype) for x in _rates(values)))
 
 
+# One matrix after the other: batched calls of LAPACK within one program of XLA can wait for each other for ever.
+@sequential_vmap
+def _decompose(matrix):
+    """Eigenvalues, eigenvectors in columns, and the inverse of these."""
+    values, vectors = jnp.linalg.eig(matrix)
+    return values, vectors, jnp.linalg.inv(vectors)
+
+
+_eigenvalues = jax.custom_jvp(sequential_vmap(jnp.linalg.eigvals))
+
+
+@_eigenvalues.defjvp
+def _eigenvalues_jvp(primals, tangents):
+    values, vectors, inverse = _decompose(*primals)
+    return values, jnp.sum(inverse.T * matmul(tangents[0].astype(vectors.dtype), vectors), 0)
+
+
 @entry_point
-def _linearize(scene: Scene, q, v, t, control) -> Float[Array, "n n"]:
-    """The matrix (2 nv, 2 nv) of d(dq, dv)/dt."""
+def _linearize(scene: Scene, q, v, t, control, state) -> Float[Array, "n n"]:
+    """The matrix (2 nv + nz, 2 nv + nz) of d(dq, dv, dz)/dt."""
     system, n = scene.system, scene.nv
     if n == 0:
         return jnp.zeros((0, 0), q.dtype)
 
-    def force(dq, dv):
+    rest = jnp.zeros((0,), v.dtype) if state is None else state
+
+    def force_and_rates(dq, dv, dz):
         at, speed = displace(system, q, dq), v + dv
-        total = scene.applied_force(at, speed, t)
-        total = jnp.zeros_like(v) if total is None else total
+        command = jnp.zeros_like(v) if control is None else check_force(control(at, speed, t), q, n, "control")
+        torque, rates = scene.drive_torque(at, speed, t, command, None if state is None else state + dz)
+        force = scene.applied_force(at, speed, t)
+        total = torque if force is None else torque + force
         if not isinstance(system, Model):
             total = total - gravity_force(system, at, t)
-        return total if control is None else total + check_force(control(at, speed, t), q, n, "control")
+        return total, jnp.zeros_like(rest) if rates is None else rates
 
     # The rate of v is linear in the force: its derivative by the force is M^-1, or its projection on the constraints.
     mass = mass_matrix(system, q, t)
@@ -143,6 +176,11 @@ def _linearize(scene: Scene, q, v, t, control) -> Float[Array, "n n"]:
         tangent = matmul(inverse, mass)
     else:
         inverse, tangent = solve_positive(mass, unit), unit
-    by_place, by_speed = jax.jacfwd(force, (0, 1))(jnp.zeros_like(v), jnp.zeros_like(v))
-    pull = matmul(inverse, jnp.concatenate([matmul(by_place, tangent), matmul(by_speed, tangent)], 1))
-    return jnp.concatenate([jnp.concatenate([jnp.zeros_like(tangent), tangent], 1), pull])
+    force, rates = jax.jacfwd(force_and_rates, (0, 1, 2))(jnp.zeros_like(v), jnp.zeros_like(v), jnp.zeros_like(rest))
+
+    def along(by_place, by_speed, by_state):
+        return jnp.concatenate([matmul(by_place, tangent), matmul(by_speed, tangent), by_state], 1)
+
+    none = jnp.zeros((n, rest.size), v.dtype)
+    above = jnp.concatenate([jnp.zeros_like(tangent), tangent, none], 1)
+    return jnp.concatenate([above, matmul(inverse, along(*force)), along(*rates)])

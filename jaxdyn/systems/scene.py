@@ -12,6 +12,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, PyTree
 
+from jaxdyn.compile.known import is_concrete
 from jaxdyn.model.arguments import Checked, Number, SystemLike, as_array, batch_hint, check_system, warn
 from jaxdyn.model.description import scene_lines
 from jaxdyn.systems.drives import DriveDynamics, pass_command
@@ -33,13 +34,48 @@ class _Static(eqx.Module):
         return self.function(*args)
 
 
+class _Closure(eqx.Module):
+    """Plain function with the traced values that it captures as leaves, so that they are differentiated and batched."""
+
+    function: types.FunctionType = eqx.field(static=True)
+    # By the number of the variable in the function's closure; None for leaves that are not traced.
+    captured: dict[int, Any]
+
+    def __call__(self, *args):
+        cells: list[Any] = list(self.function.__closure__ or ())
+        for i, value in self.captured.items():
+            whole = value if isinstance(value, _Closure) else eqx.combine(value, cells[i].cell_contents)
+            cells[i] = types.CellType(whole)
+        old = self.function
+        new = types.FunctionType(old.__code__, old.__globals__, old.__name__, old.__defaults__, tuple(cells))
+        new.__kwdefaults__ = old.__kwdefaults__
+        return new(*args)
+
+
+def _bind_traced(function: types.FunctionType) -> _Closure | None:
+    """The function as a pytree of the traced values it captures, also in functions that it captures; None without any."""
+    captured = {}
+    for i, cell in enumerate(function.__closure__ or ()):
+        try:
+            content = cell.cell_contents
+        except ValueError:  # a variable without a value yet
+            continue
+        if isinstance(content, types.FunctionType):
+            value = None if content is function else _bind_traced(content)
+        else:
+            value = None if is_concrete(content) else eqx.filter(content, lambda leaf: not is_concrete(leaf))
+        if value is not None:
+            captured[i] = value
+    return _Closure(function, captured) if captured else None
+
+
 def as_pytree(function: Any, argument: str, takes: str = "") -> Callable:
     """Convert a callable to a pytree: itself if it is one (an equinox Module, a `Partial`), else a static wrapper.
 
     A method of a pytree becomes a `Partial` that holds the pytree.
 
     A plain function is compared by identity: the same one gives the same compiled program, with the values it captured when
-    it was traced; a new lambda in every call compiles a new program.
+    it was traced; a new lambda in every call compiles a new program. Traced values that it captures become leaves.
 
     `takes` names the arguments of its calls, as "q, t".
 
@@ -68,7 +104,8 @@ def as_pytree(function: Any, argument: str, takes: str = "") -> Callable:
             f"compiled program; make it an equinox Module (class {kind}(eqx.Module): with a field for each of them), or pass a "
             "new function for new values"
         )
-    return _Static(function)
+    bound = _bind_traced(function) if isinstance(function, types.FunctionType) else None
+    return _Static(function) if bound is None else bound
 
 
 def _attributes(owner: Any) -> list[str]:

@@ -9,6 +9,8 @@ from hypothesis import strategies as st
 from jax import lax
 from kernel_helpers import by_kernel, quick
 
+from jaxdyn.compile import kernel
+
 pytestmark = pytest.mark.native
 
 
@@ -79,3 +81,16 @@ def test_products_have_the_dtype_that_is_asked_for(given_dtype, wanted, is_known
     for mine, theirs in zip(by_kernel(function, x), quick(function)(x), strict=True):
         assert mine.dtype == theirs.dtype
         np.testing.assert_allclose(mine, theirs, rtol=1e-6 if mine.dtype == np.float32 else 1e-15)
+
+
+def test_known_flags_pass_where_derivatives_stop():
+    """Also of no entries, as the masks of a scene without some kind of limits."""
+
+    @kernel
+    def function(_, x):
+        flags = jax.lax.stop_gradient(jnp.asarray([True, False])), jax.lax.stop_gradient(jnp.zeros(0, bool))
+        return jnp.where(flags[0], x, -x), flags[1]
+
+    values, none = jax.jit(lambda x: function(None, x))(jnp.arange(1.0, 3.0))
+    np.testing.assert_array_equal(values, [1.0, -2.0])
+    assert none.shape == (0,) and none.dtype == bool

@@ -4,6 +4,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from mechanisms import HEIGHT, delta_file, delta_hips
 
 import jaxdyn as jd
 
@@ -99,3 +100,31 @@ def test_a_guess_without_end_is_refused_with_the_open_loop(guess):
         jd.assemble(jd.scenes.four_bar(), jnp.full(3, guess), guesses=2)
     state = jd.assemble(jd.scenes.four_bar(), jnp.full(3, guess), guesses=1, throw=False)
     assert state.result == jd.RESULTS.not_assembled
+
+
+@pytest.mark.parametrize("count", [15, pytest.param(61, marks=pytest.mark.slow)])
+def test_a_delta_robot_from_a_file_keeps_its_branch(count, tmp_path):
+    """The plate held at all points of a grid that are in reach, up to 0.6 m away, from one guess; closed form of the hips."""
+    path = tmp_path / "delta.xml"
+    path.write_text(delta_file())
+    scene = jd.io.load_mjcf(path)
+    model, guess = scene.system, scene.starts["reference"].q
+    assert model.nv == 21 and jd.constraint_jacobian(scene, guess).shape == (18, 21)
+    x = np.linspace(-0.6, 0.6, count)
+    points = np.stack([*np.meshgrid(x, x), np.full((count, count), -HEIGHT)], axis=-1).reshape(-1, 3)
+    hips = np.asarray(jax.vmap(delta_hips)(jnp.asarray(points)))
+    reached = np.isfinite(hips).all(1)
+    points, hips = points[reached], hips[reached]
+    upright = jnp.asarray([1.0, 0.0, 0.0, 0.0])
+    found = jax.jit(
+        jax.vmap(lambda point: jd.assemble(scene, guess, hold={"plate": jnp.concatenate([point, upright])}))
+    )(jnp.asarray(points))
+    assert len(points) > 0.8 * count**2 and bool(found.success.all())
+    q, passed = np.asarray(found.q), np.asarray(found.passed_singular)
+    plate = model.topology.q_slices[model.joint_names.index("plate")]
+    hinges = np.delete(np.abs(q - np.asarray(guess)), np.arange(plate.start, plate.stop), axis=1).max(1)
+    assert hinges.max() <= np.pi + 1e-9 and (np.asarray(found.distance) >= hinges - 1e-12).all()
+    computed = q[:, np.array([model.q_index(f"hip{i}") for i in range(3)])]
+    error = np.abs((computed - hips + np.pi) % (2 * np.pi) - np.pi).max(1)
+    # Elbows stay outwards as in the guess; at the edge of the reach, where both branches meet, a change of the branch is said.
+    assert np.all((error < 1e-8) | passed) and np.mean(error < 1e-8) > 0.99

@@ -104,3 +104,57 @@ def test_attributes_of_pytrees_are_inputs():
     soft, stiff = (reached(Tuple(jnp.asarray(k)).spring) for k in (1.0, 9.0))
     np.testing.assert_allclose(stiff, reached(lambda q, v, t: -9.0 * q), rtol=1e-12)
     assert np.abs(stiff - soft).max() > 1e-3
+
+
+def _last(k, control=None, force=None, phi=None):
+    forces, constraints = [() if x is None else (x,) for x in (force, phi)]
+    scene = jd.Scene(jd.robots.chain(2), constraints, forces)
+    start = jnp.asarray([0.3, -0.3 * 1.0]), jnp.zeros(2)
+    return jd.simulate(scene, *start, [0.0, 0.1], control=control, stepsize=0.01, throw=False).q[-1, 0]
+
+
+class _Law(eqx.Module):
+    k: jax.Array
+
+    def __call__(self, *args):
+        return -self.k * args[-3]
+
+
+def _nested(k):
+    scaled = {"gain": [k, "a name"]}
+
+    def spring(q):
+        return -scaled["gain"][0] * q
+
+    return lambda *args: spring(args[-3])
+
+
+@pytest.mark.parametrize("place", ["control", "force"])
+@pytest.mark.parametrize("law", [lambda k: lambda *args: -k * args[-3], _nested], ids=["plain", "nested"])
+def test_traced_values_that_a_function_captures_are_those_of_a_module(place, law):
+    """Values and derivatives, under every transformation; a traced value was an UnexpectedTracerError or none."""
+    own, wanted = (lambda k, f=f: _last(k, **{place: f(k)}) for f in (law, _Law))
+    for change in (jax.jit, jax.grad, jax.hessian, lambda f: jax.vmap(jax.value_and_grad(f))):
+        k = jnp.asarray(3.0) if change in (jax.jit, jax.grad, jax.hessian) else jnp.asarray([1.0, 3.0])
+        np.testing.assert_allclose(change(own)(k), change(wanted)(k), rtol=1e-12)
+
+
+def test_traced_values_in_constraints_energies_and_bases():
+    arm = jd.robots.chain(2)
+    x = jnp.asarray([0.3, 0.2])
+
+    def acceleration(k):
+        return jd.constrained_dynamics(
+            jd.Scene(arm, (jd.Holonomic(lambda q, t: q[:1] - k * q[1:] ** 2),)), x, x
+        ).acceleration
+
+    step = 1e-5
+    difference = (acceleration(0.7 + step) - acceleration(0.7 - step)) / (2 * step)
+    np.testing.assert_allclose(jax.jacfwd(acceleration)(0.7), difference, rtol=1e-7)
+    np.testing.assert_allclose(jax.jacrev(acceleration)(0.7), difference, rtol=1e-7)
+    mass = lambda k: jd.mass_matrix(jd.LagrangianSystem(lambda q, v: k**3 * v @ v, 1), jnp.ones(1))[0, 0]  # noqa: E731
+    np.testing.assert_allclose([jax.grad(mass)(2.0), jax.hessian(mass)(2.0)], [24.0, 24.0])
+    scene, q = jd.scenes.four_bar(), jd.scenes.four_bar.start()[0]
+    N = jd.reduction.tangent_basis(scene, q)
+    rate = lambda k: jd.reduced_dynamics(scene, q, jnp.zeros(1), basis=lambda q, t: k * N).nu_rate[0]  # noqa: E731
+    np.testing.assert_allclose(jax.grad(rate)(2.0), -rate(2.0) / 2.0, rtol=1e-10)

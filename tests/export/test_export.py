@@ -310,6 +310,43 @@ def test_a_step_of_an_integrator(constrained, tmp_path):
     run_c(tmp_path, "step")
 
 
+def test_a_step_of_an_arm_behind_drives(tmp_path):
+    """Drives of first and second order, their states as an argument and a result; steps that end at kinks are refused."""
+    forces = jd.forces.FirstOrderDrive(0.01), jd.forces.SecondOrderDrive(80.0, 0.6)
+    scene = jd.Scene(jd.robots.chain(2), forces=forces)
+    step = jd.stepper(scene, 0.004, substeps=2)
+    q, v, tau = np.array([0.3, -0.2]), np.array([0.1, 0.4]), np.array([1.0, -0.5])
+    z = np.linspace(-0.3, 0.9, 6)
+    exported = jd.export(
+        lambda q, v, z, tau: step((q, v, z), tau), q, v, z, tau, name="driven", derivatives=("jacobian",)
+    )
+    for got, expected in zip(exported(q, v, z, tau), step((q, v, z), tau), strict=True):
+        np.testing.assert_allclose(got, expected, rtol=1e-12, atol=1e-13)
+    with jd.compilation("plain"):
+        wanted = jax.jacrev(lambda z: step((q, v, z), tau)[1])(jnp.asarray(z))
+    np.testing.assert_allclose(exported.jacobian(q, v, z, tau)[1][2], wanted, rtol=1e-9, atol=1e-12)
+    motion = jd.simulate(
+        scene,
+        q,
+        v,
+        jnp.asarray([0.0, 0.1]),
+        control=lambda q, v, t: jnp.asarray(tau),
+        stepsize=0.002,
+        outputs=("drive_state",),
+    )
+    start = scene.drive_state(jnp.asarray(q), jnp.asarray(v))
+    state = (q, v, np.asarray(start))
+    for _ in range(25):
+        state = exported(*state, tau)
+    for got, expected in zip(state, (motion.q, motion.v, motion.drive_state), strict=True):
+        np.testing.assert_allclose(got, expected[-1], atol=1e-5)  # RK4 against Dopri8
+    exported.save(tmp_path)
+    run_c(tmp_path, "driven")
+    limited = jd.stepper(jd.Scene(scene.system, forces=(*forces, jd.forces.EffortLimits(0.8))), 0.004)
+    with pytest.raises(ValueError, match=r"its steps end at the kinks of .*leave these forces out"):
+        jd.export(lambda q, v, z, tau: limited((q, v, z), tau), q, v, z, tau, name="limited")
+
+
 def test_jacobians_by_columns_equal_those_that_are_written_out(arm, exported, monkeypatch, tmp_path):
     assert isinstance(exported.derivative.program, standalone.Directions)
     monkeypatch.setattr(standalone, "MAX_WRITTEN_OUT", 10**9)

@@ -618,6 +618,16 @@ def test_whiteness_of_known_noise():
     ] == pytest.approx(n, rel=0.1)
     assert computed.correlation_time[1] == pytest.approx(0.19, rel=0.15)
     assert computed.correlation_time[2] == pytest.approx(0.01)
+    constant = identify.whiteness(
+        identify.Log(t, x, tau=x), np.stack([noise, np.full(n, 0.3), np.full(n, 1e-9)], axis=1)
+    )
+    np.testing.assert_allclose(constant.effective_samples[1:], 1.0)
+    for wrong in (np.nan, np.inf):
+        x[7, 1] = wrong
+        with pytest.raises(ValueError, match=f"residual is {wrong} in row 7, column 1"):
+            identify.whiteness(identify.Log(t, slow[:, None], tau=slow[:, None]), x)
+    with pytest.raises(ValueError, match=r"residual has shape \(3, 1\), expected \(40000, nv\)"):
+        identify.whiteness(identify.Log(t, slow[:, None], tau=slow[:, None]), np.zeros((3, 1)))
 
 
 # --- excitation -------------------------------------------------------------------------------------------------------

@@ -132,12 +132,12 @@ def test_logarithm_of_a_matrix_with_equal_eigenvalues():
         np.testing.assert_allclose(back, matrix, atol=1e-13)
 
 
-def test_jacobi_eigenvectors():
+def test_symmetric_eigenvectors():
     """Against LAPACK on the host, in a batch, with equal eigenvalues and entries of all sizes."""
     generator = np.random.default_rng(0)
     matrices = generator.normal(size=(50, 4, 4)) * 10.0 ** generator.uniform(-6, 6, (50, 1, 1))
     matrices = np.concatenate([matrices @ np.swapaxes(matrices, 1, 2), np.eye(4)[None], np.zeros((1, 4, 4))])
-    values, vectors = map(np.asarray, jax.jit(jax.vmap(distances.jacobi_eigenvectors))(matrices))
+    values, vectors = map(np.asarray, jax.jit(jax.vmap(distances.symmetric_eigenvectors))(matrices))
     size = np.maximum(np.linalg.norm(matrices, axis=(1, 2)), 1e-300)
     np.testing.assert_allclose(
         np.sort(values) / size[:, None], np.linalg.eigvalsh(matrices) / size[:, None], atol=1e-14
