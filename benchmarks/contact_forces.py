@@ -121,7 +121,7 @@ def main(argv=None):
     others = peers(*data)
     for kind in ("pyramids", "cones"):
         computed = calls[f"jaxdyn, {kind}"]()
-        solved = int(np.sum(np.asarray(computed.result == jd.contact.RESULTS.successful)))
+        solved = int(np.sum(np.asarray(computed.result == jd.RESULTS.successful)))
         print(f"{kind}: {solved} of {options.batch} solved, at most {int(computed.steps.max())} steps")
         for name, call in others.items():
             if name.endswith(kind):

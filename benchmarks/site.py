@@ -115,7 +115,7 @@ def main(argv=None) -> int:
         gallery.main([])
     strict = [] if options.no_gallery else ["--strict"]
     zensical = Path(sys.executable).with_name("zensical")
-    if subprocess.run([zensical, "build", "-f", "mkdocs.yml", *strict], cwd=ROOT, check=False).returncode:
+    if subprocess.run([zensical, "build", "--clean", "-f", "mkdocs.yml", *strict], cwd=ROOT, check=False).returncode:
         return 1
     kept = ROOT / "out" / "katex"
     if fault := katex(kept):

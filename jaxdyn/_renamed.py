@@ -1,7 +1,8 @@
-"""Names that moved from `jaxdyn` to its namespaces. They are found with a warning until the next release."""
+"""Names that have moved or changed. They are found with a warning until the next release."""
 
 import importlib
 import warnings
+from collections.abc import Callable
 from typing import Any
 
 # Namespace, and the names that it has taken.
@@ -21,7 +22,7 @@ _MOVED = {
         "aba rnea crba ArticulatedBodies articulated_bodies base_twists link_adjoints centroidal_momentum "
         "centroidal_momentum_matrix ComDynamics com_dynamics joint_wrench jacobian_dot_v NewtonEulerMatrices "
         "mass_matrix_derivative mass_matrix_sqrt torque_regressor WorkspaceDynamics workspace_dynamics spatial_jacobian "
-        "generalized_force frame_acceleration christoffel_symbols"
+        "generalized_force frame_acceleration"
     ),
     "geometry": ("constrain_by_immersion reaction_force"),
     "reduction": ("tangent_basis gauge_invariant involutive spurious_terms"),
@@ -30,6 +31,17 @@ _MOVED = {
     "model": ("Topology inertia_report repair_inertias"),
     "control": ("LeggedDynamics underactuated_inverse_dynamics"),
 }
+# Old name below `jaxdyn`: where its object is, and the new name.
+_RENAMED = {
+    "christoffel_symbols": (
+        "dynamics.quantities.first_kind_symbols",
+        "jd.geometry.christoffel_symbols(model, q, 'first')",
+    ),
+    "contact.RESULTS": ("constraints.codes.RESULTS", "jd.RESULTS"),
+    "contact.force_closure": ("contact.closure.force_closure_of_map", "jd.contact.force_closure_of_map"),
+    "io.joint_torques": ("io.urdf_write.read_torque_terms", "jd.io.read_torque_terms"),
+}
+_RENAMED["dynamics.christoffel_symbols"] = _RENAMED["christoffel_symbols"]
 _HOME = {name: namespace for namespace, names in _MOVED.items() for name in names.split()}
 _MODULES = {"solvers": "simulation.solvers"}
 
@@ -37,7 +49,23 @@ _MODULES = {"solvers": "simulation.solvers"}
 def __getattr__(name: str) -> Any:
     """Find a name of `jaxdyn` that has moved, and warn; AttributeError for others."""
     if name not in _HOME:
-        raise AttributeError(f"module 'jaxdyn' has no attribute {name!r}")
+        return _find(name, name, "jaxdyn")
     namespace = _HOME[name]
     warnings.warn(f"jd.{name} is now jd.{namespace}.{name}", DeprecationWarning, stacklevel=2)
     return getattr(importlib.import_module(f"jaxdyn.{_MODULES.get(namespace, namespace)}"), name)
+
+
+def old_names(module: str) -> Callable[[str], Any]:
+    """`__getattr__` of a namespace, which finds its old names."""
+    namespace = module.removeprefix("jaxdyn.")
+    return lambda name: _find(f"{namespace}.{name}", name, module)
+
+
+def _find(old: str, name: str, module: str) -> Any:
+    if old not in _RENAMED:
+        raise AttributeError(f"module {module!r} has no attribute {name!r}")
+    place, new = _RENAMED[old]
+    # The caller of the `__getattr__` that called this.
+    warnings.warn(f"jd.{old} is now {new}", DeprecationWarning, stacklevel=3)
+    home, _, present = place.rpartition(".")
+    return getattr(importlib.import_module(f"jaxdyn.{home}"), present)

@@ -1,6 +1,8 @@
-"""Rules for operations on arrays that need more than their entries one by one: products, choices, factors, scatters.
+"""Rules for operations that do not act entry by entry: products, selections, factorisations, scatters.
 
-Each takes the expansion, the parameters, the operands and the equation, and returns the results (see `expand`).
+Each rule takes the expansion, the parameters of the primitive, its operands and the equation, and returns the results (see
+`expand`). Operands are NumPy arrays: of numbers where they are known while tracing, else of dtype object, whose entries are
+scalars of the program.
 """
 
 import functools
@@ -23,8 +25,8 @@ def polynomial(expansion, params, args, eqn):
 
 
 def integer_pow(expansion, params, args, eqn):
-    """Powers by repeated squares."""
-    # Integers wrap in NumPy's power as in XLA; a negative exponent is of floats alone.
+    """Powers with a known integer exponent, by repeated squares."""
+    # Known operands: integers wrap in NumPy's power as in XLA, and negative exponents occur with floats alone.
     if args[0].dtype.kind != "O":
         return [np.asarray(args[0] ** params["y"] if params["y"] >= 0 else 1 / args[0] ** -params["y"], args[0].dtype)]
     one = as_kind(1, kind_or_refuse(eqn.outvars[0].aval.dtype))
@@ -32,7 +34,7 @@ def integer_pow(expansion, params, args, eqn):
 
 
 def select(expansion, params, args, eqn):
-    """A choice between two, or between any number of cases where it is known."""
+    """Select between two cases, or among any number where the selector is known."""
     which, *cases = args
     out = eqn.outvars[0].aval
     if which.dtype.kind != "O":
@@ -40,20 +42,20 @@ def select(expansion, params, args, eqn):
         if all(x.dtype.kind != "O" for x in cases):
             return [np.choose(which, cases)]
         cases = [as_objects(x) for x in cases]
-        # A known choice of unknown numbers, as masks of a topology are: nothing is written for it.
+        # The selector is known and the cases are not, as for masks of a topology: no operation is emitted.
         chosen = np.where(which == 0, cases[0], cases[1])
         for i in range(2, len(cases)):
             chosen = np.where(which == i, cases[i], chosen)
         return [as_objects(chosen)]
     if len(cases) != 2 or eqn.invars[0].aval.dtype != bool:
-        raise NotNumbers("a choice between more than two")
+        raise NotNumbers("a selection among more than two cases")
     kind = kind_or_refuse(out.dtype)
     columns = (np.broadcast_to(as_objects(x), out.shape).ravel().tolist() for x in args)
     return [objects([expansion.graph.select(a, b, c, kind) for a, b, c in zip(*columns, strict=True)], out.shape)]
 
 
 def clamp(expansion, params, args, eqn):
-    """Entries limited to a range."""
+    """Clip entries to a range."""
     low, x, high = (np.broadcast_to(as_objects(x), eqn.outvars[0].aval.shape).ravel().tolist() for x in args)
     clamped = [expansion.graph.clamp(a, b, c) for a, b, c in zip(low, x, high, strict=True)]
     return [objects(clamped, eqn.outvars[0].aval.shape)]
@@ -72,7 +74,7 @@ def dot_general(expansion, params, args, eqn):
     b = np.moveaxis(b, (*batch_b, *sum_b), (*range(len(batch_b)), *range(-len(sum_b), 0))).reshape(
         count, columns, length
     )
-    # The result may be asked for in a wider type than that of the operands, and is summed in it.
+    # The result may have a wider type than the operands (`preferred_element_type`); then the sums are in that type.
     a, b = (expansion.as_dtype(x, out.dtype) for x in (a, b))
     if out.dtype == bool:
         raise NotNumbers("a product of bools")
@@ -83,9 +85,9 @@ def dot_general(expansion, params, args, eqn):
 
 
 def scatter(expansion, params, args, eqn):
-    """Updates at known places, written or added; those that are outside are dropped, as JAX does."""
+    """Write or add updates at known indices; updates out of bounds are dropped, as in JAX."""
     operand, indices, updates = args
-    # In the order of the updates: where two of them meet, JAX leaves open which one stays, and this is the last.
+    # In the order of the updates: where two of them have the same index, JAX leaves open which one stays; here the last one does.
     entries, adds = as_objects(operand).ravel().tolist(), eqn.primitive.name != "scatter"
     places = scatter_places(eqn, operand, indices, updates)
     for value, i in zip(as_objects(updates).ravel().tolist(), places, strict=True):
@@ -96,7 +98,7 @@ def scatter(expansion, params, args, eqn):
 
 def cumsum(expansion, params, args, eqn):
     """Partial sums, from either end."""
-    # One sum after the other, as the partial sums are results. XLA's tree of sums rounds otherwise.
+    # Sequential, because every partial sum is a result. XLA sums in a tree, whose rounding differs.
     x = np.moveaxis(as_objects(args[0]), params["axis"], 0)
     order = range(x.shape[0])
     order = reversed(order) if params["reverse"] else order
@@ -108,7 +110,7 @@ def cumsum(expansion, params, args, eqn):
 
 
 def cholesky(expansion, params, args, eqn):
-    """Lower factors of symmetric matrices."""
+    """Lower Cholesky factors of symmetric matrices."""
     given = as_objects(args[0]).reshape(-1, *args[0].shape[-2:])
     return [np.stack([matrices.cholesky(expansion.graph, x) for x in given]).reshape(args[0].shape)]
 

@@ -1,7 +1,7 @@
-"""Numbers that all samples of a batch share, such as those that depend on the model alone: computed once a call.
+"""Operations whose results all samples of a batch share, such as those on the model alone: they run once per call.
 
-A program is divided into one of a single sample, which computes the numbers that do not vary, and one of the batch, which reads
-those of them that it needs. Of forward dynamics of a given robot a third goes to the first.
+A program is split in two. The first runs once and computes the shared numbers; the second runs for each sample and reads those
+that it needs. For forward dynamics of a given robot the first program has a third of the operations.
 """
 
 from collections.abc import Sequence
@@ -11,9 +11,10 @@ from jaxdyn.compile.program import Array, Constant, Operation, Program, dtype_of
 
 
 def split_program(program, uniform: Sequence[bool]) -> tuple[Program, Program] | None:
-    """A program of the uniform inputs, in their order, and one of all inputs and the results of the first.
+    """Split a program into one of the uniform inputs and one of all inputs and the results of the first.
 
-    None where too few operations would be saved to be worth a second call.
+    `uniform` marks the inputs that are equal for all samples. None where so few operations are shared that a second call
+    would cost more.
     """
     if not isinstance(program, Program) or not any(uniform):
         return None
@@ -29,7 +30,7 @@ def _split(program: Program, uniform: Sequence[bool]) -> tuple[Program, Program]
         if op == "input":
             is_shared.append(uniform[args[0]])
         else:
-            # Subprograms stay whole: their calls belong to the batch.
+            # Subprograms are not split: their calls stay in the program of the batch.
             is_shared.append(op not in ("call", "part") and all(is_shared[x] for x in args if type(x) is not Constant))
     saved = sum(
         shared and x.op not in ("input", "neg") for shared, x in zip(is_shared, program.operations, strict=True)
@@ -37,15 +38,15 @@ def _split(program: Program, uniform: Sequence[bool]) -> tuple[Program, Program]
     # Below this a second call costs more than the batch saves; for one sample nothing is saved at all.
     if saved < MIN_SHARED_OPERATIONS:
         return None
-    # One array for each kind of number: a kernel takes few arguments, and each is checked by the handler.
-    passed = _handover(program, is_shared)
+    # One array for each kind of number, not one per number: the runtime handler checks every argument of a kernel.
+    passed = _interface(program, is_shared)
     kinds = sorted({program.operations[i].kind for i in passed})
     by_kind = [[i for i in passed if program.operations[i].kind == kind] for kind in kinds]
     arrays = [Array((len(entries),), dtype_of(kind)) for kind, entries in zip(kinds, by_kind, strict=True)]
 
     places = [i for i, same in enumerate(uniform) if same]
-    # Operations keep their order in both programs, and are numbered anew.
-    first = _Renumbered()
+    # Operations keep their order in both programs and get new indices.
+    first = _Renumbering()
     for i, (op, kind, args) in enumerate(program.operations):
         if is_shared[i]:
             args = (places.index(args[0]), args[1]) if op == "input" else first.args(args)
@@ -55,11 +56,11 @@ def _split(program: Program, uniform: Sequence[bool]) -> tuple[Program, Program]
         arrays,
         first.operations,
         [tuple(first.index[i] for i in entries) for entries in by_kind],
-        name=f"{program.name}, of what samples share",
+        name=f"{program.name}, shared by all samples",
     )
 
-    # The second program takes all inputs, also those that only the first one reads: places of arguments stay the same.
-    count, rest = len(program.inputs), _Renumbered()
+    # The second program takes all inputs, also those that only the first one reads, so that argument positions do not change.
+    count, rest = len(program.inputs), _Renumbering()
     for place, (kind, entries) in enumerate(zip(kinds, by_kind, strict=True), count):
         for k, i in enumerate(entries):
             rest.add(i, Operation("input", kind, (place, k)))
@@ -78,8 +79,8 @@ def _split(program: Program, uniform: Sequence[bool]) -> tuple[Program, Program]
     return once, each
 
 
-def _handover(program: Program, is_shared: Sequence[bool]) -> list[int]:
-    """Numbers that all samples share and that are read by what varies or are results, in the order in which they are read."""
+def _interface(program: Program, is_shared: Sequence[bool]) -> list[int]:
+    """Shared operations that the second program reads or returns, in the order in which it reads them."""
     read = [x.args for i, x in enumerate(program.operations) if not is_shared[i] and x.op != "input"]
     numbers: dict[int, None] = {}
     for args in (*read, *program.results):
@@ -87,8 +88,8 @@ def _handover(program: Program, is_shared: Sequence[bool]) -> list[int]:
     return list(numbers)
 
 
-class _Renumbered:
-    """Operations with new numbers."""
+class _Renumbering:
+    """Operations of one half of a program, with indices of their own."""
 
     def __init__(self):
         self.operations: list[Operation] = []

@@ -88,7 +88,9 @@ def assemble(
     rank_tol: float | None = None,
     throw: bool | None = None,
 ) -> Assembly:
-    """Find q with phi(q, t) = 0 and v with A v = b from a rough guess, with the least change in the mass metric.
+    r"""Find a state on the constraints from a rough guess, with the least change in the mass metric.
+
+    $$\phi(q, t) = 0, \quad A v = b$$
 
     q minimises |q - guess| in the metric M(guess) among the configurations on the constraints: a local minimum, on the branch
     that is reached by short steps which reduce all residuals together. Hinges stay within half a turn of the guess. v is the

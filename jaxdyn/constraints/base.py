@@ -93,7 +93,9 @@ class Constraint(eqx.Module):
 
 
 class Holonomic(Constraint):
-    """A constraint on the configuration: phi(q, t) = 0.
+    r"""A constraint on the configuration.
+
+    $$\phi(q, t) = 0$$
 
     **Arguments:**
 
@@ -130,7 +132,9 @@ class Holonomic(Constraint):
 
 
 class Pfaffian(Constraint):
-    """A constraint on the velocity: A(q, t) v = b(q, t).
+    """A constraint on the velocity.
+
+    $$A(q, t) v = b(q, t)$$
 
     **Arguments:**
 
@@ -157,7 +161,10 @@ class Pfaffian(Constraint):
         self.with_system = bool(with_system)
 
     def velocity(self, system: SystemLike, q: Float[Array, " nq"], v: Float[Array, " nv"], t: Number) -> Array | None:
-        """A v - b, (n,)."""
+        """Residual of the rows, (n,).
+
+        $$A v - b$$
+        """
         place = (system, q, t) if self.with_system else (q, t)
         rows = jnp.asarray(self.A(*place), q.dtype)
         rows = rows[None] if rows.ndim == 1 else rows
@@ -292,7 +299,11 @@ def _rows(scene: Scene, q, v, t) -> Rows:
 
 
 def constraint_jacobian(scene: Scene, q: Float[Array, " nq"], t: Numbers = 0.0) -> Float[Array, "nc nv"]:
-    """A(q, t) (nc, nv) of all constraints: admissible velocities satisfy A v = b, constraint forces are A^T lam.
+    r"""Rows A(q, t) (nc, nv) of all constraints.
+
+    $$A v = b, \quad \tau_\mathrm{constraint} = A^T \lambda$$
+
+    hold for admissible velocities v and the forces of the constraints.
 
     **Arguments:** `q` (nq,); `t`, s.
 

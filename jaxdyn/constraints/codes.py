@@ -1,4 +1,4 @@
-"""Result codes of constrained dynamics and of simulations, by name and by number."""
+"""Result codes of all computations, by name and by number."""
 
 from typing import Any
 
@@ -10,7 +10,7 @@ _names: list[str] = []
 
 
 class RESULTS(eqx.Enumeration):
-    """Result codes of constrained dynamics and of simulations."""
+    """Result codes of constrained dynamics, simulations, quadratic programs and searches."""
 
     successful = "successful"
     # Of equation solvers: those of lineax and optimistix, by their names.
@@ -63,6 +63,10 @@ class RESULTS(eqx.Enumeration):
     targets_not_reached = "No configuration that reaches the targets was found."
     no_descent = "No step along the search direction reduces the cost."
     underactuated = "The motors cannot produce this motion."
+    # Of quadratic programs.
+    infeasible = "No x satisfies the rows and cones of the quadratic program."
+    stalled = "The quadratic program was not solved to the tolerance within the given steps."
+    indefinite = "The matrix Q of the quadratic program is not positive definite."
 
     # An enumeration of equinox does not list its names.
     _names.extend(name for name in vars() if not name.startswith("_"))

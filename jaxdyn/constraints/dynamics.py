@@ -81,7 +81,9 @@ def constrained_dynamics(
     method: str = "rank_aware",
     rank_tol: float | None = None,
 ) -> ConstrainedDynamics:
-    """Acceleration and multipliers: M a + h = tau + forces + A^T lam, A a = gamma = -(Adot v) + bdot.
+    r"""Acceleration and multipliers of a constrained system.
+
+    $$M a + h = \tau + \tau_\mathrm{forces} + A^T \lambda, \quad A a = \gamma = -\dot A v + \dot b$$
 
     The state has to satisfy the constraints (`assemble`); violations are not corrected here.
 
@@ -89,12 +91,13 @@ def constrained_dynamics(
 
     - `q` (nq,), `v` (nv,), `tau` (nv,) in N m or N (None: zero), `t` in s. The scene's forces are added to tau.
     - `method`: "rank_aware" is for any rows: where they are dependent, the acceleration is still right and the multipliers are
-      those of least norm. "schur" factors A M^-1 A^T by Cholesky: faster, for independent rows. "range_space" is the same
-      without forming M: articulated bodies of a `Model` apply M^-1 to the nc rows in O(nb nc) operations, which pays for few
+      those of least norm. "schur" factors $A M^{-1} A^T$ by Cholesky: faster, for independent rows. "range_space" is the same
+      without forming M: articulated bodies of a `Model` apply $M^{-1}$ to the nc rows in O(nb nc) operations, which pays for few
       rows on a large tree of nb bodies, in batches. Systems that are no `Model` use their dense M.
-    - `rank_tol`: singular values of Y = U^-1 A^T, with M = U U^T, count as zero below `rank_tol` times the largest. The default
-      is eps^(4/7), 1.1e-9 in float64 and 1.1e-4 in float32: above the 1e-12 to 1e-10 by which dependent rows differ when loops
-      are open by rounding and projection errors, below the least singular values of mechanisms that move.
+    - `rank_tol`: singular values of $Y = U^{-1} A^T$, with $M = U U^T$, count as zero below `rank_tol` times the largest.
+      The default is $\epsilon^{4/7}$, 1.1e-9 in float64 and 1.1e-4 in float32: above the 1e-12 to 1e-10 by which
+      dependent rows differ when loops are open by rounding and projection errors, below the least singular values of
+      mechanisms that move.
 
     **Returns:** `ConstrainedDynamics`. Under "schur" and "range_space", dependent rows give the code `dependent_rows`.
 
@@ -277,9 +280,12 @@ def _solve_delassus(delassus, deficit, nv: int):
 def projections(
     scene: Scene, q: Float[Array, " nq"], t: Numbers = 0.0, *, rank_tol: float | None = None
 ) -> Projections:
-    """Projections P_T = 1 - M^-1 A^T (A M^-1 A^T)^+ A of velocities and P_omega = P_T^T of forces.
+    r"""Projections of velocities and of forces along the constraints.
 
-    P_T is orthogonal in the metric M and keeps what satisfies A v = 0; P_omega removes every constraint force A^T lam.
+    $$P_T = 1 - M^{-1} A^T (A M^{-1} A^T)^+ A, \quad P_\omega = P_T^T$$
+
+    $P_T$ is orthogonal in the metric M and keeps what satisfies $A v = 0$; $P_\omega$ removes every constraint force
+    $A^T \lambda$.
 
     **Arguments:** `q` (nq,); `t`, s; `rank_tol` as in `constrained_dynamics`.
 
@@ -306,10 +312,12 @@ def whiten_rows(scene: Scene, q, t):
 def second_fundamental_form(
     scene: Scene, q: Float[Array, " nq"], v: Float[Array, " nv"], t: Numbers = 0.0, *, rank_tol: float | None = None
 ) -> Float[Array, " nv"]:
-    """Second fundamental form of the constraints, S(v, v) = (1 - P_T)(a + M^-1 C v): the normal part of covariant accelerations.
+    r"""Second fundamental form of the constraints: the normal part of covariant accelerations.
 
-    All motions through (q, v) that satisfy the constraints have it in common, because it is a function of q and v alone:
-    S = M^-1 A^T (A M^-1 A^T)^+ (gamma + A M^-1 C v). M S is the force, normal to the constraints, that keeps the motion on them.
+    $$S(v, v) = (1 - P_T) (a + M^{-1} C v) = M^{-1} A^T (A M^{-1} A^T)^+ (\gamma + A M^{-1} C v)$$
+
+    All motions through (q, v) that satisfy the constraints have it in common, because it is a function of q and v alone.
+    $M S$ is the force, normal to the constraints, that keeps the motion on them.
 
     **Arguments:** `q` (nq,); `v` (nv,) with A v = b; `t`, s; `rank_tol` as in `constrained_dynamics`.
 

@@ -260,7 +260,9 @@ class Gear(Constraint):
 
 
 def gear(joint_a: str, joint_b: str, ratio: Numbers, offset: Numbers = 0.0, *, name: str | None = None) -> Gear:
-    """Couple two joints of one degree of freedom: q_a = ratio q_b + offset.
+    r"""Couple two joints of one degree of freedom.
+
+    $$q_a = \mathrm{ratio} \cdot q_b + \mathrm{offset}$$
 
     A prismatic joint with a revolute one is a rack and pinion (ratio in m/rad) or the other way round.
 

@@ -17,7 +17,7 @@ from jaxdyn.systems.system import SceneLike
 def degrees_of_freedom(
     scene: SceneLike, q: Float[Array, " nq"], t: Numbers = 0.0, *, rank_tol: float | None = None
 ) -> int | Int[Array, ""]:
-    """Degrees of freedom at a configuration: nv minus the rank of the constraints' rows A(q, t).
+    r"""Degrees of freedom at a configuration: nv minus the rank of the constraints' rows A(q, t).
 
     Dependent rows count once, so that the count is right for overconstrained linkages. It counts independent velocities at
     this q: it is larger in singular positions, and rolling reduces it though all configurations remain reachable. Loops whose
@@ -25,13 +25,13 @@ def degrees_of_freedom(
     units of the mechanism's length, each row scaled to length 1; rows at rounding level count as zero.
 
     **Arguments:** `scene`, a `Scene` or a system; `q` (nq,); `t`, s; `rank_tol`: singular values below `rank_tol` times the
-    largest count as zero, by default eps^(4/7), 1e-9 in float64.
+    largest count as zero, by default $\epsilon^{4/7}$, 1e-9 in float64.
 
     **Returns:** an int for concrete arguments, an integer array () for traced ones.
 
     **Raises:** ValueError for shapes that do not fit, or a `rank_tol` outside (0, 1).
 
-    Source: EQUATIONS section 7; the rank is the trace of A A^+.
+    Source: EQUATIONS section 7; the rank is the trace of $A A^+$.
 
     ```python
     count = jd.degrees_of_freedom(jd.scenes.four_bar(), jd.scenes.four_bar.start()[0])  # 1

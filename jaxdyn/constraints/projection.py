@@ -11,7 +11,7 @@ from jax import lax
 from jaxdyn.compile import implicit, is_standalone, kernel, mark_invalid, value_and_jvp, variant
 from jaxdyn.constraints.base import constraint_jacobian, holonomic_rows, layout, position_residual, velocity_residual
 from jaxdyn.constraints.dynamics import whiten_rows
-from jaxdyn.constraints.projection_derivative import LOST, Corrections, closest_state
+from jaxdyn.constraints.projection_derivative import ROUNDING_FACTOR, Corrections, closest_state
 from jaxdyn.constraints.rank import least_pivot, least_pivot_of, pseudo_inverse, quality_of, regular_gram, tolerance
 from jaxdyn.constraints.redundancy import has_selection, rows_of
 from jaxdyn.lie.so3 import matmul
@@ -241,7 +241,7 @@ def _descend(x, size, step, residual):
     for _ in range(_STEPS_A_ROUND):
         state = jax.tree.map(partial(jnp.where, state[2]), improve(state), state)
     x, _, more, away = state
-    return x, away, more & (away > LOST * rounding)
+    return x, away, more & (away > ROUNDING_FACTOR * rounding)
 
 
 def _with_derivatives(rank_tol, scene: Scene, q, v, t, errors):
@@ -253,7 +253,7 @@ def _with_derivatives(rank_tol, scene: Scene, q, v, t, errors):
         of_place = partial(on.shortest, on.of_holonomic) if on.holonomic.size else None
         errors = _tangential_errors(
             errors,
-            (of_place, partial(matmul, A[on.holonomic]), state.q_left),
-            (partial(on.shortest, on.every), partial(matmul, A), state.v_left),
+            (of_place, partial(matmul, A[on.holonomic]), state.q_distance),
+            (partial(on.shortest, on.every), partial(matmul, A), state.v_distance),
         )
     return state.q, state.v, lax.stop_gradient(errors)

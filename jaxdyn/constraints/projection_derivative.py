@@ -4,9 +4,9 @@ The closest state to (q, v), in the metric M(q), is
 
     q' = q - M^-1 A^T mu,   phi(q', t) = 0;        v' = v - M^-1 A^T nu,   A(q') v' = b(q', t),
 
-with M and A taken at q, and A of the holonomic rows for q'. For fixed mu and x = M^-1 A^T mu the change of M^-1 A^T mu is
-M^-1 (dA^T mu - dM x): no factorisation is differentiated. The changes of mu and nu follow from the condition that q' and v'
-stay on the constraints.
+with M and A at q. The first A has the holonomic rows alone, the second has all rows. With x = M^-1 A^T mu and fixed mu, the
+differential of x is M^-1 (dA^T mu - dM x), which needs no derivative of a factorisation. The differentials of mu and nu follow
+from the condition that q' and v' stay on the constraints.
 """
 
 from functools import partial
@@ -26,8 +26,8 @@ from jaxdyn.systems.mass_factor import MassFactor
 from jaxdyn.systems.scene import Scene
 from jaxdyn.systems.system import displace, retract
 
-# Rounding errors of the largest entry below which a residual says nothing: it is a sum of many terms that cancel.
-LOST = 64
+# A residual is a sum of many terms that cancel. Below this many rounding errors of the largest entry it is only rounding.
+ROUNDING_FACTOR = 64
 # Each step multiplies the residual by the size of the correction times the curvature of the constraints. A fixed number, because
 # a scan of fixed length has derivatives of both modes and of any order.
 _STEPS = 4
@@ -36,23 +36,23 @@ _STEPS = 4
 class ClosestState(NamedTuple):
     """State (q, v) on the constraints.
 
-    - `of_q`, `of_v`: the multipliers mu, of the holonomic rows, and nu, of all rows.
-    - `q_left`, `v_left`: remaining distances of q and v from the constraints.
-    - `q_moved`, `v_moved`: one where the correction was applied, else zero.
+    - `mu`, `nu`: the multipliers of the holonomic rows (for q) and of all rows (for v).
+    - `q_distance`, `v_distance`: remaining distances of q and v from the constraints.
+    - `q_applied`, `v_applied`: one where the correction was applied, else zero.
     """
 
     q: Array
     v: Array
-    of_q: Array
-    of_v: Array
-    q_left: Array
-    v_left: Array
-    q_moved: Array
-    v_moved: Array
+    mu: Array
+    nu: Array
+    q_distance: Array
+    v_distance: Array
+    q_applied: Array
+    v_applied: Array
 
 
 class Corrections(NamedTuple):
-    """Steps that remove residuals: by Y = U^-1 A^T in the metric M = U U^T, for all rows and for the holonomic ones."""
+    """Least-squares steps that remove residuals, by Y = U^-1 A^T in the metric M = U U^T, for all rows and for holonomic ones."""
 
     metric: MassFactor
     every: LeastSquares
@@ -92,32 +92,36 @@ def _closest(scene: Scene, q, v, t, rank_tol) -> ClosestState:
 
 
 def _solve(rank_tol, scene: Scene, q, v, t) -> ClosestState:
-    on, none = Corrections.at(scene, q, t, rank_tol), jnp.zeros_like(v)
+    corrections, none = Corrections.at(scene, q, t, rank_tol), jnp.zeros_like(v)
 
     def remove(residual, of, size):
         """The whitened correction that removes a residual, the distance left, and whether the correction is applied."""
 
         def step(whitened, _):
-            return whitened + of.shortest(residual(on.metric.unwhiten(whitened))), None
+            return whitened + of.shortest(residual(corrections.metric.unwhiten(whitened))), None
 
         whitened, _ = lax.scan(step, none, None, length=_STEPS)
-        before, after = (residual(on.metric.unwhiten(x)) for x in (none, whitened))
-        away = jnp.max(jnp.abs(on.shortest(of, after)))
+        before, after = (residual(corrections.metric.unwhiten(x)) for x in (none, whitened))
+        away = jnp.max(jnp.abs(corrections.shortest(of, after)))
         applied = jnp.max(jnp.abs(after)) <= jnp.max(jnp.abs(before))
-        applied = applied | (away <= LOST * float(jnp.finfo(v.dtype).eps) * size)
-        left = jnp.where(applied, away, jnp.max(jnp.abs(on.shortest(of, before))))
+        applied = applied | (away <= ROUNDING_FACTOR * float(jnp.finfo(v.dtype).eps) * size)
+        left = jnp.where(applied, away, jnp.max(jnp.abs(corrections.shortest(of, before))))
         return jnp.where(applied, whitened, none), left, applied.astype(v.dtype)
 
-    place, of_q, q_left, q_moved = q, jnp.zeros((0,), q.dtype), jnp.zeros((), q.dtype), jnp.ones((), q.dtype)
-    if on.holonomic.size:
+    place, mu, q_distance, q_applied = q, jnp.zeros((0,), q.dtype), jnp.zeros((), q.dtype), jnp.ones((), q.dtype)
+    if corrections.holonomic.size:
         size = jnp.max(jnp.abs(q))
-        whitened, q_left, q_moved = remove(lambda x: kernel(_position)(scene, q, t, x), on.of_holonomic, size)
-        place = kernel(_place)(scene, q, on.metric.unwhiten(whitened))
-        of_q = on.of_holonomic.multipliers(whitened)
+        whitened, q_distance, q_applied = remove(
+            lambda x: kernel(_position)(scene, q, t, x), corrections.of_holonomic, size
+        )
+        place = kernel(_place)(scene, q, corrections.metric.unwhiten(whitened))
+        mu = corrections.of_holonomic.multipliers(whitened)
     size = jnp.max(jnp.abs(v))
-    whitened, v_left, v_moved = remove(lambda y: kernel(_velocity)(scene, place, v, t, y), on.every, size)
-    speed, of_v = v - on.metric.unwhiten(whitened), on.every.multipliers(whitened)
-    return ClosestState(place, speed, of_q, of_v, q_left, v_left, q_moved, v_moved)
+    whitened, v_distance, v_applied = remove(
+        lambda y: kernel(_velocity)(scene, place, v, t, y), corrections.every, size
+    )
+    speed, nu = v - corrections.metric.unwhiten(whitened), corrections.every.multipliers(whitened)
+    return ClosestState(place, speed, mu, nu, q_distance, v_distance, q_applied, v_applied)
 
 
 def _place(scene: Scene, q, x):
@@ -133,43 +137,43 @@ def _velocity(scene: Scene, q, v, t, y):
     return velocity_residual(scene, q, v - y, t)
 
 
-def _forces(scene: Scene, q, t, of_q, of_v, x, y):
+def _forces(scene: Scene, q, t, mu, nu, x, y):
     """Imbalance A^T mu - M x and A^T nu - M y of the corrections: zero in value, its derivative gives dA^T mu - dM x."""
     A, M = constraint_jacobian(scene, q, t), mass_matrix(scene.system, q, t)
-    return matmul(A[holonomic_rows(layout(scene))].T, of_q) - matmul(M, x), matmul(A.T, of_v) - matmul(M, y)
+    return matmul(A[holonomic_rows(layout(scene))].T, mu) - matmul(M, x), matmul(A.T, nu) - matmul(M, y)
 
 
 def _tangent(rank_tol, scene: Scene, q, v, t, steps) -> tuple[ClosestState, ClosestState]:
     """The projection, and its tangent for `steps` in the leaves of the scene, q, v and t."""
-    state, on = _closest(scene, q, v, t, rank_tol), Corrections.at(scene, q, t, rank_tol)
+    state, corrections = _closest(scene, q, v, t, rank_tol), Corrections.at(scene, q, t, rank_tol)
     *of_scene, dq, dv, dt = steps
-    x = on.by_forces(on.of_holonomic, state.of_q) if on.holonomic.size else jnp.zeros_like(v)
-    y = on.by_forces(on.every, state.of_v)
+    x = corrections.by_forces(corrections.of_holonomic, state.mu) if corrections.holonomic.size else jnp.zeros_like(v)
+    y = corrections.by_forces(corrections.every, state.nu)
 
-    # First for fixed multipliers, then (`tangent_of`) what the multipliers change by.
-    args = scene, q, t, state.of_q, state.of_v, x, y
+    # First the tangent for fixed multipliers; `tangent_of` adds that of the multipliers.
+    args = scene, q, t, state.mu, state.nu, x, y
     change = value_and_jvp(kernel(_forces), args, [*of_scene, dq, dt, None, None, None, None])[1]
-    dx, dy = (jnp.zeros_like(v),) * 2 if change is None else map(on.metric.solve, change)
+    dx, dy = (jnp.zeros_like(v),) * 2 if change is None else map(corrections.metric.solve, change)
 
     def tangent_of(residual, args, given, correction, of, moved):
         """Tangents of a correction and of its multipliers, so that the residual stays zero; none if it was not applied."""
 
         def step(whitened, _):
-            # As in the solution, steps with the factor at q: the derivative of the residual is taken at q'.
-            change = value_and_jvp(residual, args, [*given, correction + on.metric.unwhiten(whitened)])[1]
+            # The factor is that at q, as in the solution, while the derivative of the residual is taken at q': hence iterations.
+            change = value_and_jvp(residual, args, [*given, correction + corrections.metric.unwhiten(whitened)])[1]
             return whitened + moved * of.shortest(change), None
 
         whitened, _ = lax.scan(step, jnp.zeros_like(v), None, length=_STEPS)
-        return correction + on.metric.unwhiten(whitened), of.multipliers(whitened)
+        return correction + corrections.metric.unwhiten(whitened), of.multipliers(whitened)
 
-    of_q, dplace = jnp.zeros_like(state.of_q), dq
-    if on.holonomic.size:
+    mu, dplace = jnp.zeros_like(state.mu), dq
+    if corrections.holonomic.size:
         args = scene, q, t, x
-        dx, of_q = tangent_of(kernel(_position), args, [*of_scene, dq, dt], dx, on.of_holonomic, state.q_moved)
+        dx, mu = tangent_of(kernel(_position), args, [*of_scene, dq, dt], dx, corrections.of_holonomic, state.q_applied)
         dplace = value_and_jvp(partial(kernel(_place), scene), (q, x), [dq, dx])[1]
 
     args = scene, state.q, v, t, y
-    dy, of_v = tangent_of(kernel(_velocity), args, [*of_scene, dplace, dv, dt], dy, on.every, state.v_moved)
+    dy, nu = tangent_of(kernel(_velocity), args, [*of_scene, dplace, dv, dt], dy, corrections.every, state.v_applied)
     none = jnp.zeros((), v.dtype)
     dq, dv = (jnp.zeros_like(z) if d is None else d for z, d in ((q, dplace), (v, dv)))
-    return state, ClosestState(dq, dv - dy, of_q, of_v, none, none, none, none)
+    return state, ClosestState(dq, dv - dy, mu, nu, none, none, none, none)

@@ -14,7 +14,9 @@ from jaxdyn.systems.scene import Scene, as_scene
 def constraint_forces(
     scene: Scene, q: Float[Array, " nq"], multipliers: Float[Array, " nc"], t: Numbers = 0.0
 ) -> dict[str, Float[Array, " nv"]]:
-    """Generalised force A_i^T lam_i of each constraint on the system, by name.
+    r"""Generalised force of each constraint on the system, by name.
+
+    $$\tau_i = A_i^T \lambda_i$$
 
     **Arguments:** `q` (nq,); `multipliers` (nc,), those of `constrained_dynamics` or of the output "multipliers" of `simulate`.
 
@@ -22,7 +24,7 @@ def constraint_forces(
 
     **Raises:** ValueError for shapes that do not fit.
 
-    Source: EQUATIONS section 7, M a + h = tau + A^T lam.
+    Source: EQUATIONS section 7.
 
     ```python
     dynamics = jd.constrained_dynamics(scene, q, v)
@@ -65,11 +67,11 @@ def constraint_wrenches(
 
 
 def body_wrenches(scene: Scene, q: Float[Array, " nq"], multipliers: Float[Array, " nc"]) -> Float[Array, "nb 6"]:
-    """Wrench (f, tau) of all constraints between two frames ON each body, at its frame's origin and in its axes.
+    r"""Wrench (f, tau) of all constraints between two frames ON each body, at its frame's origin and in its axes.
 
-    They are the `external` of `joint_wrench`, `inverse_dynamics` and `generalized_force`, whose result for them is A^T lam of
-    these constraints. Gears and locked joints act through the joints, and functions of the user on coordinates: they
-    have no wrench here.
+    They are the `external` of `joint_wrench`, `inverse_dynamics` and `generalized_force`, whose result for them is
+    $A^T \lambda$ of these constraints. Gears and locked joints act through the joints, and functions of the user on
+    coordinates: they have no wrench here.
 
     **Arguments:** `scene` of a `Model`; `q` (nq,); `multipliers` (nc,), as in `constraint_forces`.
 

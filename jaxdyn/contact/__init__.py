@@ -3,8 +3,9 @@
 Source: Murray, Li & Sastry (1994), chapter 5; EQUATIONS sections 8, 10 and 11.
 """
 
+from jaxdyn._renamed import old_names as _old_names
 from jaxdyn.contact.closure import ForceClosure as ForceClosure
-from jaxdyn.contact.closure import force_closure as force_closure
+from jaxdyn.contact.closure import force_closure_of_map as force_closure_of_map
 from jaxdyn.contact.cones import FrictionCone as FrictionCone
 from jaxdyn.contact.cones import friction_cone as friction_cone
 from jaxdyn.contact.cones import surface_cone as surface_cone
@@ -16,7 +17,6 @@ from jaxdyn.contact.montana import ContactKinematics as ContactKinematics
 from jaxdyn.contact.montana import montana as montana
 from jaxdyn.contact.montana import relative_pose as relative_pose
 from jaxdyn.contact.optimal import optimal_forces as optimal_forces
-from jaxdyn.contact.qp import RESULTS as RESULTS
 from jaxdyn.contact.qp import QPSolution as QPSolution
 from jaxdyn.contact.qp import solve_qp as solve_qp
 from jaxdyn.contact.rolling import RollingContact as RollingContact
@@ -38,7 +38,6 @@ from jaxdyn.contact.wrench_cones import wrench_cone as wrench_cone
 from jaxdyn.contact.wrench_cones import wrench_cone_of_polygon as wrench_cone_of_polygon
 
 __all__ = [
-    "RESULTS",
     "ContactForces",
     "ContactKinematics",
     "Cylinder",
@@ -57,7 +56,7 @@ __all__ = [
     "UnilateralContact",
     "contact_coordinates",
     "contact_forces",
-    "force_closure",
+    "force_closure_of_map",
     "friction_cone",
     "gap_contact",
     "ground_contact",
@@ -72,6 +71,8 @@ __all__ = [
     "wrench_cone",
     "wrench_cone_of_polygon",
 ]
+
+__getattr__ = _old_names(__name__)
 
 
 def __dir__() -> list[str]:

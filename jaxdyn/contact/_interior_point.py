@@ -21,7 +21,7 @@ from jaxtyping import Array, Bool, Int
 
 from jaxdyn.compile import kernel
 from jaxdyn.compile.batch import any_sample
-from jaxdyn.contact import _jordan as jordan
+from jaxdyn.contact import jordan
 from jaxdyn.lie.so3 import matmul
 from jaxdyn.systems.mass_factor import cholesky, solve_cholesky
 

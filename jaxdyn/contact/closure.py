@@ -25,15 +25,15 @@ _LEAST = 1e-8  # relative to the largest; margins and singular values below are 
 
 
 class ForceClosure(eqx.Module):
-    """Force closure of a grasp: the decision, its margin, and a certificate where it fails.
+    r"""Force closure of a grasp: the decision, its margin, and a certificate where it fails.
 
-    - `closed`: the decision. `margin`: the largest t such that internal forces f, G f = 0, with total normal force 1 N
-      have every margin of every cone at least t (for a friction cone mu f_n - |f_t|, so t is dimensionless: newtons of
+    - `closed`: the decision. `margin`: the largest t such that internal forces f, $G f = 0$, with total normal force 1 N
+      have every margin of every cone at least t (for a friction cone $\mu f_n - |f_t|$, so t is dimensionless: newtons of
       margin per newton of grip). Zero where the grasp is open, infinite where no contact has a bound.
     - `forces` (m,): those internal forces; zeros where there are none.
     - `direction` (p,): where open, a unit wrench on the object that contact forces cannot balance, in the units and
-      axes of G's rows; zeros where closed. direction . (G f) >= 0 (to 1e-8) for all forces f in the cones, so balancing
-      it would need G f = -direction.
+      axes of G's rows; zeros where closed. Its product with $G f$ is not negative (to 1e-8) for all forces f in the cones,
+      so that balancing it would need $G f = -\mathrm{direction}$.
     - `rank`: of G, in the columns along which forces are possible.
     """
 
@@ -56,14 +56,14 @@ class _Rows(NamedTuple):
     kept: np.ndarray
 
 
-def force_closure(
+def force_closure_of_map(
     G: Numbers,
     cones: Checked[Sequence[FrictionCone | Numbers]],
     *,
     faces: int | None = None,
     side: Checked[str] = "inscribed",
 ) -> ForceClosure:
-    """Decide force closure of the grasp with map G, with a margin or with a wrench that it cannot resist.
+    r"""Decide force closure of the grasp with map G, with a margin or with a wrench that it cannot resist.
 
     Round cones are handled exactly by cutting planes: a linear program (HiGHS) is solved, and faces are added where
     its forces leave the cones, until the margin is determined to 1e-9. With `faces` the cones are pyramids instead, one
@@ -73,7 +73,7 @@ def force_closure(
 
     - `G` (p, m): grasp map, G f is the wrench of contact forces f on the object; `jd.grasp.grasp_map`. Known numbers.
     - `cones`: one per contact in the order of G's columns: `friction_cone(...)`, `surface_cone(...)`, or rows U (k, m_i) with
-      U f <= 0, for which the total normal force is the mean of -U f.
+    $U f \le 0$, for which the total normal force is the mean of $-U f$.
     - `faces`, `side`: of `FrictionCone.pyramid`; None: the round cones.
 
     **Returns:** `ForceClosure`.
@@ -81,14 +81,14 @@ def force_closure(
     **Raises:** ValueError for traced arguments, and for cones that do not fit the columns of G.
 
     ```python
-    jd.contact.force_closure(jd.grasp.grasp_map(hand, q), [jd.contact.friction_cone("hard-finger", 0.5)] * 3).closed
+    jd.contact.force_closure_of_map(jd.grasp.grasp_map(hand, q), [jd.contact.friction_cone("hard-finger", 0.5)] * 3).closed
     ```
 
     Source: Murray, Li & Sastry (1994), proposition 5.3; for the certificate, the theorem of separating hyperplanes.
     """
     if not is_concrete(G, cones):
         raise ValueError(
-            "G or cones are traced; a linear program needs known numbers, call force_closure outside of jit"
+            "G or cones are traced; a linear program needs known numbers, call force_closure_of_map outside of jit"
         )
     G = np.asarray(as_float(G, "G", (None, None)), float)
     every = _as_cones([cones] if isinstance(cones, FrictionCone) else cones, G.shape[1])

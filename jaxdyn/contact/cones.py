@@ -30,10 +30,10 @@ SIDES = ("inscribed", "circumscribed")
 
 
 class FrictionCone(eqx.Module):
-    """Cone of forces that one contact can transmit, built by `friction_cone` and `surface_cone`.
+    r"""Cone of forces that one contact can transmit, built by `friction_cone` and `surface_cone`.
 
     - `kind`, `in_plane`: of the contact. `mu` (): friction coefficient. `gamma` (): m, radius of a soft finger's torque.
-    - `rows` (k, 6): U of a surface, U w <= 0.
+    - `rows` (k, 6): U of a surface, $U w \le 0$.
 
     It has `linear_rows` and `second_order_rows`, which together describe the cone exactly, `pyramid`, a linear cone
     inside or around it, and `margins` and `margin`, the distance of a force from the boundary.
@@ -51,7 +51,10 @@ class FrictionCone(eqx.Module):
         return 6 if self.kind == "surface" else len(components(self.kind, self.in_plane, "cone"))
 
     def linear_rows(self) -> Float[Array, "k m"]:
-        """Rows L (k, m) of the linear inequalities L f <= 0; (0, m) if there are none."""
+        r"""Rows L (k, m) of the linear inequalities; (0, m) if there are none.
+
+        $$L f \le 0$$
+        """
         if self.rows is not None:
             return self.rows
         if self.kind == "frictionless":
@@ -67,9 +70,11 @@ class FrictionCone(eqx.Module):
         return jnp.stack([jnp.stack([zero, zero, -self.gamma, sign * one]) for sign in (1.0, -1.0)])
 
     def second_order_rows(self) -> Float[Array, "j 3 m"]:
-        """Rows S (j, 3, m) of the inequalities |(S f)_1, (S f)_2| <= (S f)_0, j = 0 or 1.
+        r"""Rows S (j, 3, m) of the second-order inequalities, j = 0 or 1.
 
-        It is (mu f_n, fx, fy) for a spatial contact with friction.
+        $$|((S f)_1, (S f)_2)| \le (S f)_0$$
+
+        $S f$ is $(\mu f_n, f_x, f_y)$ for a spatial contact with friction.
         """
         if self.mu is None or self.in_plane:
             dtype = jnp.zeros(()).dtype if self.mu is None else self.mu.dtype
@@ -79,11 +84,13 @@ class FrictionCone(eqx.Module):
         return jnp.stack([self.mu * unit[2], unit[0], unit[1]])[None]
 
     def pyramid(self, faces: int = 8, side: str = "inscribed") -> Float[Array, "k m"]:
-        """Rows P (k, m) of a pyramid P f <= 0 that approximates the cone.
+        r"""Rows P (k, m) of a pyramid that approximates the cone.
+
+        $$P f \le 0$$
 
         The faces' normals are at the angles 2 pi i / faces from x. An "inscribed" pyramid lies within the cone: each
-        of its forces is one without slip, and mu is reduced by at most the factor cos(pi / faces), 1/sqrt(2) for four.
-        A "circumscribed" one contains the cone; with four faces it is |fx|, |fy| <= mu f_n. Cones that are linear are
+        of its forces is one without slip, and mu is reduced by at most the factor cos(pi / faces), $1/\sqrt2$ for four.
+        A "circumscribed" one contains the cone; with four faces it is $|f_x|, |f_y| \le \mu f_n$. Cones that are linear are
         returned unchanged.
 
         **Arguments:** `faces`: at least 3. `side`: "inscribed" or "circumscribed".
@@ -108,12 +115,15 @@ class FrictionCone(eqx.Module):
         return jnp.concatenate([jnp.asarray(normals, self.mu.dtype) + along, linear])
 
     def margins(self, force: Numbers, smoothing: Numbers = 0.0) -> Float[Array, " k"]:
-        """Margins of a force in each inequality, (j + k,): mu f_n - |(fx, fy)|, then -L f.
+        r"""Margins (j + k,) of a force in each inequality, those of the second order first.
+
+        $$\mu f_n - |(f_x, f_y)|, \quad -L f$$
 
         Inside the cone all are positive, on its boundary the least is zero. Units are those of the rows: N for forces,
         N m for a soft finger's gamma f_n -+ tz, and those of its rows for a surface.
 
-        **Arguments:** `force` (m,), N and N m. `smoothing` (), N: |(fx, fy)| is replaced by sqrt(fx^2 + fy^2 + smoothing^2)
+        **Arguments:** `force` (m,), N and N m. `smoothing` (), N: the norm is replaced by
+        $\sqrt{f_x^2 + f_y^2 + \mathrm{smoothing}^2}$
         - that is smooth at a force along the normal too, and the margin is then too small by at most `smoothing`, on the
         safe side. With zero the margin has a kink there, at which its derivative is that along the normal.
 
@@ -128,10 +138,10 @@ class FrictionCone(eqx.Module):
         return jnp.concatenate([*cone_margins, -matmul(self.linear_rows().astype(force.dtype), force)])
 
     def margin(self, force: Numbers, smoothing: Numbers = 0.0) -> Float[Array, ""]:
-        """Least of `margins`, () : positive inside the cone, zero on its boundary, infinite for a rigid contact.
+        r"""Least of `margins`, () : positive inside the cone, zero on its boundary, infinite for a rigid contact.
 
-        With `smoothing` > 0 it is -s log(sum exp(-margins / s)), smooth and at most the least margin, by no more than
-        s (1 + log(number of margins)); it may be traced if it is positive.
+        With `smoothing` s > 0 it is $-s \log \sum_i \exp(-\mathrm{margin}_i / s)$, smooth and at most the least margin,
+        by no more than s (1 + log(number of margins)); it may be traced if it is positive.
         """
         every = self.margins(force, smoothing)
         if every.shape[0] == 0:
@@ -195,7 +205,9 @@ def friction_cone(
 
 
 def surface_cone(rows: Numbers) -> FrictionCone:
-    """Cone of wrenches U w <= 0 that a surface contact can transmit.
+    r"""Cone of wrenches that a surface contact can transmit.
+
+    $$U w \le 0$$
 
     **Arguments:** `rows` U (k, 6), from `wrench_cone` or `wrench_cone_of_polygon`. Rows that bound a torque (their
     coefficients of torques are not zero) should be divided by a length to have margins in N throughout.

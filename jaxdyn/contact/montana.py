@@ -41,12 +41,13 @@ from jaxdyn.model.arguments import Numbers
 
 
 class ContactKinematics(eqx.Module):
-    """Kinematics of one contact at eta (see `montana`).
+    r"""Kinematics of one contact at eta (see `montana`).
 
-    - `J_c` (6, 5): V_c = J_c eta_dot, twists of the finger relative to the object in the axes of C_f, at the contact.
-    - `forward` (5, 6): eta_dot = forward V_c where vz = 0; its column of vz is zero, forward J_c = 1.
-    - `J_F` (6, 5): V_of = J_F eta_dot, body twist of the finger's frame relative to the object's, in the finger's axes.
-    - `relative_curvature` (2, 2): K_f + R_psi K_o R_psi, 1/m. `strict` (): true where it is invertible and the surfaces are
+    - `J_c` (6, 5): $V_c = J_c \dot\eta$, twists of the finger relative to the object in the axes of C_f, at the contact.
+    - `forward` (5, 6): $\dot\eta = \mathrm{forward}\, V_c$ where $v_z = 0$; its column of $v_z$ is zero, and it is a left
+      inverse of $J_c$.
+    - `J_F` (6, 5): $V_{of} = J_F \dot\eta$, body twist of the finger's frame relative to the object's, in the finger's axes.
+    - `relative_curvature` (2, 2): $K_f + R_\psi K_o R_\psi$, 1/m. `strict` (): true where it is invertible and the surfaces are
       outside each other (both eigenvalues positive); where not, `forward` is finite without meaning.
     - `g_of` (4, 4): pose of the finger's frame in the object's. `object`, `finger`: `SurfaceGeometry` of the surfaces.
     """
@@ -62,7 +63,7 @@ class ContactKinematics(eqx.Module):
 
     @property
     def rolling(self) -> Float[Array, "5 2"]:
-        """Matrix of eta_dot = rolling (wx, wy), rates of contact coordinates without slip and spin."""
+        """Matrix that maps (wx, wy) to the rates of contact coordinates without slip and spin."""
         return self.forward[:, 3:5]
 
 
@@ -92,13 +93,15 @@ def _pose(geometry_o, geometry_f, psi):
 
 
 def montana(surface_o: Surface, surface_f: Surface, eta: Numbers) -> ContactKinematics:
-    """Montana's equations of contact at eta: J_c, its inverse on vz = 0, and related quantities.
+    r"""Montana's equations of contact at eta: J_c, its inverse on vz = 0, and related quantities.
 
-    The forward form is, with Kt = R_psi K_o R_psi,
+    The forward form is, with $\tilde K = R_\psi K_o R_\psi$,
 
-        alpha_f_dot = M_f^-1 (K_f + Kt)^-1 ((-wy, wx) - Kt (vx, vy)),
-        alpha_o_dot = M_o^-1 R_psi (K_f + Kt)^-1 ((-wy, wx) + K_f (vx, vy)),
-        psi_dot = wz + T_f M_f alpha_f_dot + T_o M_o alpha_o_dot.
+    $$\begin{aligned}
+    \dot\alpha_f &= M_f^{-1} (K_f + \tilde K)^{-1} ((-\omega_y, \omega_x) - \tilde K (v_x, v_y)), \\
+    \dot\alpha_o &= M_o^{-1} R_\psi (K_f + \tilde K)^{-1} ((-\omega_y, \omega_x) + K_f (v_x, v_y)), \\
+    \dot\psi &= \omega_z + T_f M_f \dot\alpha_f + T_o M_o \dot\alpha_o.
+    \end{aligned}$$
 
     **Arguments:**
 

@@ -21,9 +21,10 @@ def optimal_forces(
     weights: Numbers | None = None,
     tol: float | None = None,
 ) -> QPSolution:
-    """Contact forces f closest to `target` with G f = wrench and all margins at least `preload`.
+    r"""Contact forces closest to `target` that exert a wrench, with all margins at least `preload`.
 
-        minimise (f - f0)^T diag(weights) (f - f0) / 2   with   G f = wrench,  margins(f) >= preload
+    $$\min_f \tfrac12 (f - f_0)^T \operatorname{diag}(\mathrm{weights}) (f - f_0)
+    \quad \text{with} \quad G f = \mathrm{wrench}, \quad \mathrm{margins}(f) \ge \mathrm{preload}$$
 
     A second-order cone program, by `solve_qp`: batched, and differentiable in G, the wrench, the friction coefficients and
     all other arguments. Rows of G may be dependent, as for a grasp that cannot resist every wrench.
@@ -34,7 +35,7 @@ def optimal_forces(
       minus its weight; N and N m.
     - `cones`: one per contact, in the order of G's columns.
     - `preload` (): N, least margin of each contact (`FrictionCone.margins`).
-    - `target` f0 (m,), N and N m: zero by default. `weights` (m,): positive, one by default.
+    - `target` $f_0$ (m,), N and N m: zero by default. `weights` (m,): positive, one by default.
     - `tol`: of `solve_qp`.
 
     **Returns:** `QPSolution`, with the forces in `x`; `result` is infeasible where no forces in the cones balance the wrench.

@@ -9,7 +9,6 @@ the same in y, with the added term y^T (1 - P) y / 2, zero at y = P y.
 from collections.abc import Sequence
 from typing import TYPE_CHECKING, Any
 
-import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -17,6 +16,7 @@ from jaxtyping import Array, Float, Int
 
 from jaxdyn.compile import entry_point
 from jaxdyn.compile.known import is_concrete, is_tracing
+from jaxdyn.constraints.codes import RESULTS, Outcome
 from jaxdyn.constraints.rank import pseudo_inverse, tolerance
 from jaxdyn.contact._checks import as_float
 from jaxdyn.contact._interior_point import Point, Program, attach_derivative, solve
@@ -25,20 +25,12 @@ from jaxdyn.model.arguments import Numbers
 from jaxdyn.systems.mass_factor import cholesky, is_definite, solve_cholesky
 
 
-class RESULTS(eqx.Enumeration):
-    """Result codes of a quadratic program."""
+class QPSolution(Outcome):
+    r"""Solution of a quadratic program, with the multipliers of its stationary point.
 
-    successful = "successful"
-    infeasible = "No x satisfies the rows and cones of the quadratic program."
-    stalled = "The quadratic program was not solved to the tolerance within the given steps."
-    indefinite = "The matrix Q of the quadratic program is not positive definite."
-    nonfinite = "The data of the quadratic program, or its solution, are not finite."
+    $$Q x + q + G^T z + A^T y - \sum_i S_i^T w_i = 0$$
 
-
-class QPSolution(eqx.Module):
-    """Solution of a quadratic program, with Q x + q + G^T z + A^T y - sum S^T w = 0.
-
-    - `x` (n,): the minimiser. `result`: one of `jaxdyn.contact.RESULTS`; where it is not `successful`, all other fields are the
+    - `x` (n,): the minimiser. `result`: one of `jd.RESULTS`; where it is not `successful`, all other fields are the
       last iterate's.
     - `multipliers` z (m,): of the rows G x <= h, zero or positive. `slack` (m,): h - G x.
     - `equality_multipliers` y (p,): of A x = b; of least norm where rows are dependent.
@@ -74,7 +66,9 @@ def solve_qp(
     tol: float | None = None,
     max_steps: int = 50,
 ) -> QPSolution:
-    """Minimise x^T Q x / 2 + q^T x with G x <= h, A x = b, and c - S x in second-order cones.
+    r"""Minimise a quadratic function with linear rows and second-order cones.
+
+    $$\min_x \tfrac12 x^T Q x + q^T x \quad \text{with} \quad G x \le h, \quad A x = b, \quad c_i - S_i x \in \mathrm{cone}_i$$
 
     An interior-point method whose steps are kernels (see `compilation`): it compiles, batches (`jax.vmap`) and is
     differentiated in all arrays, forward and reverse, by the equations of the solution, also where forces are on the
@@ -87,8 +81,8 @@ def solve_qp(
     - `Q` (n, n): positive definite; only its symmetric part counts. `q` (n,).
     - `G` (m, n), `h` (m,): inequality rows. An infinite h is no bound.
     - `A` (p, n), `b` (p,): equality rows; they may be dependent.
-    - `cones`: a pair (S, c) or a list of pairs, S (k, d, n) and c (k, d): y = c - S x, of each of the k cones, satisfies
-      |(y1, ..., yd-1)| <= y0. Rows of zeros fill up a smaller cone.
+    - `cones`: a pair (S, c) or a list of pairs, S (k, d, n) and c (k, d): $y = c - S x$, of each of the k cones, satisfies
+    $|(y_1, \ldots, y_{d-1})| \le y_0$. Rows of zeros fill up a smaller cone.
     - `tol`: residuals and gap, with Q's diagonal, the rows and the largest of q scaled to one; by default 1e-9 in float64 and
       1e-4 in float32.
     - `max_steps`: of the interior point; about 10 are usual.

@@ -138,10 +138,11 @@ class RollingModel(Model):
         return q
 
     def contact_coordinates(self, q: Float[Array, " nq"]) -> Float[Array, "n 5"]:
-        """Contact coordinates eta = (u_a, v_a, u_b, v_b, psi) of each contact, as for `jd.contact.montana`.
+        r"""Contact coordinates eta = (u_a, v_a, u_b, v_b, psi) of each contact, as for `jd.contact.montana`.
 
-        psi is the angle (rad) between the Gauss frames of these charts: R_AB = [cos psi, -sin psi; -sin psi, -cos psi] in the
-        tangent plane.
+        psi is the angle (rad) between the Gauss frames of these charts, in the tangent plane:
+
+        $$R_{AB} = \begin{bmatrix} \cos\psi & -\sin\psi \\ -\sin\psi & -\cos\psi \end{bmatrix}$$
         """
         (q,) = check_shapes(self, q=q)
         contacts = self.contacts_at(q)

@@ -98,7 +98,9 @@ def _check_poles(poles: str) -> str:
 
 
 class Ellipsoid(Surface):
-    """Ellipsoid about the body's origin, f = (a cos u cos v, -b cos u sin v, c sin u), |u| < pi / 2.
+    r"""Ellipsoid about the body's origin.
+
+    $$f(u, v) = (a \cos u \cos v, -b \cos u \sin v, c \sin u), \quad |u| < \pi / 2$$
 
     **Arguments:** `semi_axes` (a, b, c): along the body's x, y, z, m. `poles`: "z", "x" or "y", the axis on which the chart
     ends; for another one than z, the axes of the formula are permuted cyclically.
@@ -159,9 +161,11 @@ class Ellipsoid(Surface):
 
 
 class Sphere(Ellipsoid):
-    """Sphere about the body's origin, f = R (cos u cos v, -cos u sin v, sin u), |u| < pi / 2.
+    r"""Sphere about the body's origin.
 
-    M = diag(R, R cos u), K = 1 / R, T = (0, -tan(u) / R).
+    $$f(u, v) = R (\cos u \cos v, -\cos u \sin v, \sin u), \quad |u| < \pi / 2$$
+
+    $$M = \operatorname{diag}(R, R \cos u), \quad K = 1 / R, \quad T = (0, -\tan(u) / R)$$
 
     **Arguments:** `radius`: m. `poles`: as of `Ellipsoid`.
 
@@ -180,7 +184,9 @@ class Sphere(Ellipsoid):
 
 
 class Cylinder(Surface):
-    """Cylinder about the body's z axis, f = (R cos u, R sin u, v). K = diag(1 / R, 0), T = 0.
+    r"""Cylinder about the body's z axis.
+
+    $$f(u, v) = (R \cos u, R \sin u, v), \quad K = \operatorname{diag}(1 / R, 0), \quad T = 0$$
 
     **Arguments:** `radius`: m. **Raises:** ValueError for a radius that is not positive.
     """

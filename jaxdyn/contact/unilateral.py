@@ -34,7 +34,9 @@ class WithModes(eqx.Module):
 
 
 class DryFriction(WithModes):
-    """Coulomb friction that sticks and slips: |f| <= mu_s N at rest, f = -mu N w/|w| while it slides with velocity w.
+    r"""Coulomb friction that sticks and slips.
+
+    $$|f| \le \mu_s N \text{ at rest}, \quad f = -\mu N w / |w| \text{ while it slides with velocity } w$$
 
     N is a number, a function, or the magnitude of a multiplier of the scene's constraints. In the last case friction changes the
     multiplier that causes it, and both are solved from the same equations.
@@ -46,8 +48,9 @@ class DryFriction(WithModes):
       or the name of a constraint with one row, or of a contact (its normal force).
     - `along`: the sliding velocity w: an index of v, a function A(q, t) -> (nv,) or (2, nv) with w = A v, or a constraint with
       one or two rows on velocities, such as `jd.Pfaffian(A, b)` for a moving belt.
-    - `smoothing`: v_s, m/s. The force is then the function f = -mu N tanh(|w|/v_s) w/|w| of the state, without modes. It never
-      sticks: under a load below mu N it creeps at v_s artanh(load/(mu N)). Above 2.65 v_s it is within 1 % of mu N.
+    - `smoothing`: v_s, m/s. The force is then the function $-\mu N \tanh(|w|/v_s) w/|w|$ of the state, without modes. It
+    never sticks: under a load F below $\mu N$ it creeps at $v_s \operatorname{artanh}(F/(\mu N))$. Above 2.65 v_s it is
+    within 1 % of $\mu N$.
     - `name`: name of its events.
 
     **Raises:** ValueError for coefficients and normal forces that are negative, a static one below the other, an invalid
@@ -106,7 +109,7 @@ class DryFriction(WithModes):
 
 
 class UnilateralContact(WithModes):
-    """Unilateral contact with Coulomb friction: open, or closed and sticking or slipping.
+    r"""Unilateral contact with Coulomb friction: open, or closed and sticking or slipping.
 
     It closes by an impact. Without restitution the impulse is the least one, in the metric of the mass matrix, that prevents
     penetration and lies in the friction cone. With a coefficient of restitution e, the rate of the gap after the impact is at
@@ -118,9 +121,10 @@ class UnilateralContact(WithModes):
     - `contact`: a constraint with one row for the gap (m, positive where the contact is open) and up to two rows for slip:
       `jd.rolling_sphere(...)` or `jd.rolling_wheel(...)`. `ground_contact` and `gap_contact` make such constraints.
     - `friction`: mu while it slides; `static`: mu at rest, None for the same.
-    - `restitution`: e, from 0 to 1. By Newton's hypothesis simultaneous impacts with friction and different coefficients may
-      gain energy. A body that bounces to rest has infinitely many impacts. To end the sequence, rebound velocities below
-      eps^0.3 m/s (2e-5 in float64) count as zero: the flight after them would hardly be higher than the rounding of the gap.
+    - `restitution`: e, from 0 to 1. By Newton's hypothesis simultaneous impacts with friction and different coefficients
+      may gain energy. A body that bounces to rest has infinitely many impacts. To end the sequence, rebound velocities
+      below $\epsilon^{0.3}$ m/s (2e-5 in float64) count as zero: the flight after them would hardly be higher than the
+      rounding of the gap.
     - `name`: name of its events; by default that of the constraint.
 
     **Raises:** ValueError for an invalid contact or coefficients.

@@ -26,15 +26,17 @@ _YAW = (
 
 
 def wrench_cone(half_x: Numbers, half_y: Numbers, mu: Numbers) -> Float[Array, "16 6"]:
-    """Wrench cone of a rectangular contact: U (16, 6) with U w <= 0, in closed form.
+    r"""Wrench cone of a rectangular contact: rows U (16, 6), in closed form.
 
-    With X, Y the half sides and w = (f, tau) at the centre, in the axes of the surface, z the normal:
+    $U w \le 0$, with X, Y the half sides and $w = (f, \tau)$ at the centre, in the axes of the surface, z the normal:
 
-        |fx|, |fy| <= mu fz;   |tx| <= Y fz;   |ty| <= X fz;   tmin <= tz <= tmax,
-        tmin = -mu (X + Y) fz + |Y fx - mu tx| + |X fy - mu ty|,
-        tmax =  mu (X + Y) fz - |Y fx + mu tx| - |X fy + mu ty|.
+    $$\begin{gathered}
+    |f_x|, |f_y| \le \mu f_z, \quad |\tau_x| \le Y f_z, \quad |\tau_y| \le X f_z, \quad \tau_{\min} \le \tau_z \le \tau_{\max}, \\
+    \tau_{\min} = -\mu (X + Y) f_z + |Y f_x - \mu \tau_x| + |X f_y - \mu \tau_y|, \\
+    \tau_{\max} = \mu (X + Y) f_z - |Y f_x + \mu \tau_x| - |X f_y + \mu \tau_y|.
+    \end{gathered}$$
 
-    It is exact for the pyramids |fx|, |fy| <= mu fz at the corners; `mu / sqrt(2)` keeps every corner within the circular
+    It is exact for the pyramids $|f_x|, |f_y| \le \mu f_z$ at the corners; `mu / sqrt(2)` keeps every corner within the circular
     cone of mu.
 
     **Arguments:** `half_x`, `half_y` (): half lengths along x and y, m. `mu` (): friction coefficient, zero or positive.
@@ -66,9 +68,11 @@ def corner_wrenches(vertices: Float[np.ndarray, "n 2"], mu: float) -> Float[np.n
 
 
 def wrench_cone_of_polygon(vertices: Numbers, mu: Numbers) -> Float[Array, "k 6"]:
-    """Wrench cone of a convex polygonal contact: U (k, 6) with U w <= 0.
+    r"""Wrench cone of a convex polygonal contact: rows U (k, 6).
 
-    It is the cone of the wrenches of forces at the corners, each within |fx|, |fy| <= mu fz; its facets are those of
+    $$U w \le 0$$
+
+    It is the cone of the wrenches of forces at the corners, each within $|f_x|, |f_y| \le \mu f_z$; its facets are those of
     the convex hull, in five dimensions, of the corners' extreme wrenches for fz = 1 (qhull). A rectangle's are the rows of
     `wrench_cone`, in another order.
 

@@ -91,22 +91,26 @@ class _ForceLoop(Controller):
 
 
 class HybridForce(_ForceLoop):
-    """Motion along constraints and force against them: edd + Kd ed + Kp e = 0 and (lam - lam_d) + KI z = 0.
+    r"""Motion along constraints and force against them.
+
+    $$\ddot e + K_d \dot e + K_p e = 0, \quad (\lambda - \lambda_d) + K_I z = 0$$
 
     For constraints of every kind. A task of positions x(q), `of="position"`, follows x_d(t) by the gains `kp` and `kd`; a task
-    of velocities u(q, v), linear in v, `of="velocity"`, follows u_d(t) by  du/dt - du_d/dt = -Kp (u - u_d): for nonholonomic
-    constraints, whose velocities v = J u are free and whose positions are not. Where task and constraints together leave
+    of velocities u(q, v), linear in v, `of="velocity"`, follows u_d(t) by $\dot u - \dot u_d = -K_p (u - u_d)$: for nonholonomic
+    constraints, whose velocities $v = J u$ are free and whose positions are not. Where task and constraints together leave
     some motion undetermined, it has the least acceleration in the metric M.
 
     Errors decay as set by the gains for an exact model. With model errors, M' and h' in the law, the force is
-    off by  -(A M^-1 A^T)^-1 A M^-1 ((M' - M) a + h' - h),  which integral action removes: lam - lam_d decays with KI.
+    off by $-(A M^{-1} A^T)^{-1} A M^{-1} ((M' - M) a + h' - h)$, which integral action removes: $\lambda - \lambda_d$ decays
+    with $K_I$.
 
     **Arguments:**
 
     - `scene`: with constraints; its forces are compensated.
     - `task`: x(q) -> (m,), or u(q, v) -> (m,); `target`: (m,), or a function of t, differentiable twice (once for velocities).
     - `kp`, `kd`: positive definite, numbers, (m,) or (m, m); 1/s^2 and 1/s, or 1/s for `kp` of velocities, without `kd`.
-    - `force`: lam_d (nc,), or a function of t; None for zero. `ki` (1/s): positive definite, or None for no integral action.
+    - `force`: $\lambda_d$ (nc,), or a function of t; None for zero. `ki` (1/s): positive definite, or None for no
+      integral action.
     - `actuated`: indices of the actuated velocities; None: all. The torques of least norm are used that
       give the motion, plus the part of `internal` (na,), N m, along directions that change only forces: with as many motors as
       degrees of freedom there are none. Forces are then not controlled, and `force` and `ki` must be omitted.
@@ -178,7 +182,7 @@ class HybridForce(_ForceLoop):
     def regularity(self, q: Float[Array, " nq"], v: Float[Array, " nv"], t: Number = 0.0) -> Float[Array, ""]:
         """Distance of the law from a singularity of task and constraints, 1 to 0.
 
-        The least sine of the angle, in the metric M^-1, between a row of the task and the span of the constraints' and
+        The least sine of the angle, in the metric $M^{-1}$, between a row of the task and the span of the constraints' and
         the rows of the task before it. Close to a singularity the law's accelerations grow as its inverse.
         """
         t = jnp.asarray(t, q.dtype)
@@ -227,26 +231,28 @@ class HybridForce(_ForceLoop):
 
 
 class GaugeInvariant(_ForceLoop):
-    """Hybrid law of motion and force in quasi velocities.
+    r"""Hybrid law of motion and force in quasi velocities.
 
-    With eps = B (ed + Kp e), B = V2^T W^T J,
+    With $\varepsilon = B (\dot e + K_p e)$, $B = V_2^T W^T J$, $s = B (\dot x_d - K_p e)$,
 
-        u_r = sdot + Gamma_r s - Kd eps,  s = B (xd_d - Kp e):   d eps/dt = -(Gamma_r + Kd) eps,
-        u_o = Gamma_o w_r - Lam_r^T lam_d + Lam_r^T KI z:        (lam - lam_d) + KI z = 0.
+    $$\begin{aligned}
+    u_r &= \dot s + \Gamma_r s - K_d \varepsilon: & \dot\varepsilon &= -(\Gamma_r + K_d) \varepsilon, \\
+    u_o &= \Gamma_o w_r - \Lambda_r^T \lambda_d + \Lambda_r^T K_I z: & 0 &= (\lambda - \lambda_d) + K_I z.
+    \end{aligned}$$
 
-    Gamma_r is skew, so |eps| decays for every Kd > 0, for Kd = k 1 exactly as exp(-k t), independently of the choice of
-    W and V: |eps|^2 / 2 is the kinetic energy of the velocity error ed + Kp e. Unlike `HybridForce` it
-    cancels no Coriolis force of the error.
+    $\Gamma_r$ is skew, so $|\varepsilon|$ decays for every $K_d > 0$, for $K_d = k 1$ exactly as $e^{-k t}$, independently of the
+    choice of W and V: $|\varepsilon|^2 / 2$ is the kinetic energy of the velocity error $\dot e + K_p e$. Unlike `HybridForce` it
+    cancels no Coriolis force of the error. With $V_2^T \dot V_2 = 0$,
 
-    With V2^T V2dot = 0,  sdot + Gamma_r s = V2^T W^-1 (M J (xdd_d - Kp ed) + (M Jdot + C J)(xd_d - Kp e)).
+    $$\dot s + \Gamma_r s = V_2^T W^{-1} (M J (\ddot x_d - K_p \dot e) + (M \dot J + C J) (\dot x_d - K_p e)).$$
 
     **Arguments:**
 
     - `scene`: with constraints A v = 0; its forces are compensated.
     - `task`: x(q) -> (nr,), as many coordinates as degrees of freedom; `target`: (nr,), or a function of t,
       differentiable twice.
-    - `kp` (1/s), of ed + Kp e; `kd` (1/s), of eps: positive definite, numbers, (nr,) or (nr, nr). A `kd` other than a
-      number acts in the basis V2, which is parallel-transported.
+    - `kp` (1/s), of $\dot e + K_p e$; `kd` (1/s), of $\varepsilon$: positive definite, numbers, (nr,) or (nr, nr). A `kd` other
+      than a number acts in the basis $V_2$, which is parallel-transported.
     - `force`, `ki` as in `HybridForce`.
 
     **Raises:** ValueError for a scene without constraints, gains that are not positive definite; (when called) for shapes that
@@ -309,9 +315,12 @@ class GaugeInvariant(_ForceLoop):
         return tau + potential if force is None else tau + potential - force
 
     def composite_error(self, q: Float[Array, " nq"], v: Float[Array, " nv"], t: Number = 0.0) -> Float[Array, " nr"]:
-        """Composite error eps = B (ed + Kp e) = V2^T W^T (v - J (xd_d - Kp e)), (nr,), in sqrt(J).
+        r"""Composite error of position and velocity, (nr,), in sqrt(J).
 
-        |eps|^2 / 2 is the kinetic energy of the velocity error ed + Kp e. The components depend on the gauge, the norm not.
+        $$\varepsilon = B (\dot e + K_p e) = V_2^T W^T (v - J (\dot x_d - K_p e))$$
+
+        $|\varepsilon|^2 / 2$ is the kinetic energy of the velocity error $\dot e + K_p e$. The components depend on the
+        gauge, the norm not.
 
         **Arguments:** `q` (nq,), `v` (nv,), on the constraints; `t`, s. **Raises:** as calls of the law.
 
@@ -325,16 +334,17 @@ class GaugeInvariant(_ForceLoop):
     def equivalent_gains(
         self, q: Float[Array, " nq"], t: Number = 0.0
     ) -> tuple[Float[Array, "nr nr"], Float[Array, "nr nr"]]:
-        """Gains (Kp', Kd') of the equivalent `HybridForce` law  xdd_d - Kd' ed - Kp' e  in task coordinates.
+        r"""Gains of the equivalent `HybridForce` law in task coordinates.
 
-            Kp' = B^-1 Kd B Kp,   Kd' = Kp + B^-1 Kd B,   B = V2^T W^T J.
+        $$K_p' = B^{-1} K_d B K_p, \quad K_d' = K_p + B^{-1} K_d B, \quad B = V_2^T W^T J$$
 
-        The two laws then differ only by (Bdot + Gamma_r B)(ed + Kp e), a Coriolis force of the composite error. For a number
-        Kd = k these are k Kp and Kp + k, whatever q.
+        Its commanded acceleration is $\ddot x_d - K_d' \dot e - K_p' e$. The two laws then differ only by
+        $(\dot B + \Gamma_r B) (\dot e + K_p e)$, a Coriolis force of the composite error. For a number $K_d = k$ these
+        are $k K_p$ and $K_p + k$, whatever q.
 
         **Arguments:** `q` (nq,), on the constraints; `t`, s.
 
-        **Returns:** (nr, nr) 1/s^2, and (nr, nr) 1/s. **Raises:** as calls of the law.
+        **Returns:** $K_p'$ (nr, nr) 1/s^2, and $K_d'$ (nr, nr) 1/s. **Raises:** as calls of the law.
 
         Source: EQUATIONS section 9.
         """

@@ -16,16 +16,17 @@ from jaxdyn.systems.system import velocity_to_rate
 
 
 class ContactCoordinates(eqx.Module):
-    """Contact coordinates of a fingertip on an object at rest, as tasks of `HybridForce`.
+    r"""Contact coordinates of a fingertip on an object at rest, as tasks of `HybridForce`.
 
     As a function of q it is eta = (u_o, v_o, u_f, v_f, psi) (5,): the task of a tip that slides, five coordinates of the
-    motion free in a frictionless contact. `rolling` is alpha_f_dot (2,), the rates of (u_f, v_f): the task of
-    velocities of a tip that rolls without spin. The laws are then, with the rows J_F of Montana's equations
+    motion free in a frictionless contact. `rolling` is $\dot\alpha_f$ (2,), the rates of (u_f, v_f): the task of
+    velocities of a tip that rolls without spin. The laws are then, with the rows $J_F$ of Montana's equations
     (`jd.contact.montana`) and M, C, N of the arm in the twist of the tip,
 
-        F_m = M J_F (eta_dd_d - Kd ed - Kp e) + (M J_F_dot + C J_F) eta_dot + N + A^T (-lam_d + KI z),    tau = J^T F_m,
+    $$F_m = M J_F (\ddot\eta_d - K_d \dot e - K_p e) + (M \dot J_F + C J_F) \dot\eta + N + A^T (-\lambda_d + K_I z), \quad
+    \tau = J^T F_m,$$
 
-    and the same with J_f alpha_f_dot in place of J_F eta_dot for a tip that rolls.
+    and the same with $J_f \dot\alpha_f$ in place of $J_F \dot\eta$ for a tip that rolls.
 
     **Arguments:** `model`: a `Model`; `frame`: the tip's, a body or frame; `object`, `finger`: surfaces
     (`jd.contact.Sphere` ...) of the object and of the tip, each in its frame; `pose`: of the
@@ -73,6 +74,6 @@ class ContactCoordinates(eqx.Module):
         return contact_coordinates(self.object, self.finger, seen)
 
     def rolling(self, q: Float[Array, " nq"], v: Float[Array, " nv"]) -> Float[Array, "2"]:
-        """Rates alpha_f_dot (2,) of the contact point on the tip, in the units of its chart per second."""
+        """Rates (2,) of the contact point on the tip, in the units of its chart per second."""
         # eta = (u_o, v_o, u_f, v_f, psi). One derivative along the motion replaces the Jacobian of all five coordinates.
         return jax.jvp(self, (q,), (velocity_to_rate(self.model, q, v),))[1][2:4]

@@ -59,7 +59,10 @@ class Foot(eqx.Module):
         return pose if self.is_flat else pose.at[:3, :3].set(self.ground.astype(q.dtype))
 
     def jacobian(self, model: Model, q: Float[Array, " nq"]) -> Float[Array, "m nv"]:
-        """Jacobian J (m, nv): velocities J v along the components of the force f, generalised force J^T f."""
+        """Jacobian J (m, nv): the velocities along the components of the force f are J v.
+
+        Its transpose maps the force to generalised forces.
+        """
         # Ad of the inverse takes the body twist from the axes and origin of the frame to those of the contact.
         to_contact = matmul(se3.inverse(frame_pose(model, q, self.frame)), self.contact_pose(model, q))
         twist = matmul(se3.Ad(se3.inverse(to_contact)), body_jacobian(model, q, self.frame))

@@ -54,12 +54,14 @@ class ObjectError(Constraint):
 
 
 class GraspForce(Controller):
-    """Motion of a grasped object and internal force:  edd + Kd ed + Kp e = 0  and  (lam - lam_d) + KI z = 0.
+    r"""Motion of a grasped object and internal force.
+
+    $$\ddot e + K_d \dot e + K_p e = 0, \quad (\lambda - \lambda_d) + K_I z = 0$$
 
     e (no,) is the displacement from the target to the object: differences of its coordinates, and for a free body the twist
     that leads from the target to it. It decays as set by the gains for an exact model; contact forces are those
     of least norm that carry the object, plus the internal part of `preload`. With integral action the internal part of
-    lam - lam_d, which errors of the fingers' model cause, decays with `ki`. Redundant fingers move with the least
+    $\lambda - \lambda_d$, which errors of the fingers' model cause, decays with `ki`. Redundant fingers move with the least
     acceleration from  -damping v, in the metric M; where they cannot follow the object in all directions, it is followed in
     the least-squares sense (`is_regular`).
 
@@ -127,7 +129,7 @@ class GraspForce(Controller):
         state: PyTree,
         multipliers: Float[Array, " nc"],
     ) -> Float[Array, " nc"]:
-        """Internal part of lam - lam_0, (nc,)."""
+        """Internal part of the force error, (nc,)."""
         # Only the internal part is integrated: the other part balances the motion of the object and has no reference.
         return self._internal(q, t, multipliers - as_preload(self.grasp, self.preload(t), q.dtype))
 
@@ -138,7 +140,7 @@ class GraspForce(Controller):
         return least_acceleration(self.grasp.system, q, t, A, wanted, -self.damping.astype(v.dtype) * v)
 
     def reference_forces(self, q: Float[Array, " nq"], v: Float[Array, " nv"], t: Number = 0.0) -> Float[Array, " nc"]:
-        """Reference contact forces lam_d (nc,) that carry the object, with the internal part of the preload."""
+        """Reference contact forces (nc,) that carry the object, with the internal part of the preload."""
         t = jnp.asarray(t, q.dtype)
         # None in place of the integral: this is the reference itself, and not the command that corrects it.
         return self._forces(q, t, torque_for(self.grasp, q, v, self.acceleration(q, v, t), t), None)

@@ -42,7 +42,7 @@ class OptimalControl(Outcome):
     """A trajectory, the feedback along it, and how it was found.
 
     - `us` (n, nu); `xs`: states, each leaf with n + 1 rows; `cost` ().
-    - `gains` (n, nu, nx): u = us[k] + gains[k] (x - xs[k]), of the states as vectors, leaf after leaf.
+    - `gains` (n, nu, nx): $u = u_k + K_k (x - x_k)$, of the states as vectors, leaf after leaf.
     - `costs` (iterations + 1,): after each iteration, the last one repeated. `iterations` (): how many were made.
     - `regularization` (): mu at the end, for a warm start. `reduction` (): what a further step is predicted to bring.
     - `result`: one of `RESULTS`. `nonlinear_max_steps_reached`: it had not converged after all iterations; `no_descent`: no
@@ -102,7 +102,9 @@ def ilqr(
     regularization: Numbers = 0.0,
     second_order: bool = False,
 ) -> OptimalControl:
-    """Controls that minimise sum_k cost(x_k, u_k, k) + final_cost(x_n) with x_(k+1) = step(x_k, u_k), from a guess.
+    r"""Controls that minimise a sum of costs along a trajectory, from a guess.
+
+    $$\min_u \sum_k \mathrm{cost}(x_k, u_k, k) + \mathrm{final\_cost}(x_n), \quad x_{k+1} = \mathrm{step}(x_k, u_k)$$
 
     One sample; a batch by `jax.vmap` over x0, us, and what the functions hold. Derivatives of the step are those of reverse mode,
     of all steps at once; `jd.stepper` has them as native kernels. It is not differentiable itself.
@@ -310,7 +312,8 @@ def _rollout(problem: _Problem, x0, xs, us, k, K):
 
 def _backward(problem: _Problem, state: _State):
     """k (n, nu), K (n, nu, nx), the predicted change of the cost a slope + a^2 curvature, and whether every Quu
-    is positive definite."""
+    is positive definite.
+    """
     xs, us = state.xs, state.us
     n, nu = us.shape
     nx = xs.shape[1]

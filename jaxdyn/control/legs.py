@@ -14,10 +14,11 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
+from jaxdyn.constraints.codes import RESULTS, Outcome
 from jaxdyn.constraints.rank import pseudo_inverse, tolerance
 from jaxdyn.contact._checks import as_float
 from jaxdyn.contact.optimal import cone_bounds
-from jaxdyn.contact.qp import RESULTS, solve_qp
+from jaxdyn.contact.qp import solve_qp
 from jaxdyn.control.feet import Foot, check_feet
 from jaxdyn.control.gains import non_negative
 from jaxdyn.dynamics.quantities import inverse_dynamics
@@ -26,12 +27,12 @@ from jaxdyn.model.arguments import Checked, Numbers, check_shapes
 from jaxdyn.model.tree import Model
 
 
-class LeggedDynamics(eqx.Module):
+class LeggedDynamics(Outcome):
     """Torques and ground forces for a given acceleration.
 
     - `tau` (nv,), N m: zero for unactuated velocities. `forces` (m,), N and N m: of all feet, in their order, each in its
       contact frame (`Foot`). `margins` (k,): distance of each foot's force from the boundary of its cone; negative outside.
-    - `result`: one of `jd.contact.RESULTS`; `infeasible` where no forces in the cones balance the motion within the
+    - `result`: one of `jd.RESULTS`; `infeasible` where no forces in the cones balance the motion within the
       limits of the torques (`missing_wrench` gives the remainder). Forces are then those of least norm without cones and
       limits, of which one is violated.
     """
@@ -41,11 +42,6 @@ class LeggedDynamics(eqx.Module):
     margins: Float[Array, " k"]
     result: Any
     feet: tuple[tuple[str, int], ...] = eqx.field(static=True)
-
-    @property
-    def success(self) -> Array:
-        """True where `result` is `successful`."""
-        return self.result == RESULTS.successful  # pyright: ignore[reportAttributeAccessIssue]
 
     def by_foot(self) -> dict[str, Array]:
         """Force of each foot, by the name of its frame."""
@@ -67,14 +63,16 @@ def underactuated_inverse_dynamics(
     effort_limit: Numbers | None = None,
     tol: float | None = None,
 ) -> LeggedDynamics:
-    """Torques and contact forces, inside their cones, for the acceleration a.
+    r"""Torques and contact forces, inside their cones, for the acceleration a.
 
-        minimise torque_weight |tau|^2 + force_weight |f|^2
-        with M a + h = S^T tau + sum of J_i^T f_i,  margins(f_i) >= preload,  |tau| <= effort_limit
+    $$\begin{gathered}
+        \min_{\tau, f} w_\tau |\tau|^2 + w_f |f|^2 \quad \text{with} \quad M a + h = S^T \tau + \sum_i J_i^T f_i, \\
+        \mathrm{margins}(f_i) \ge \mathrm{preload}, \quad |\tau| \le \tau_\mathrm{limit}
+        \end{gathered}$$
 
     One small quadratic program per sample (`jd.contact.solve_qp`): batched, and differentiable in the state, the
     acceleration, the model and the coefficients of friction. Feet are not constrained to be at rest: choose an `a` with
-    J a + Jdot v = 0 for feet at rest.
+    $J a + \dot J v = 0$ for feet at rest.
 
     **Arguments:**
 
@@ -155,7 +153,9 @@ def missing_wrench(
     *,
     passive: tuple[int, ...] | None = None,
 ) -> Float[Array, " np"]:
-    """Remainder of the generalised force at the base that feet in their cones cannot exert: (M a + h)_base - G f.
+    r"""Remainder of the generalised force at the base that feet in their cones cannot exert.
+
+    $$(M a + h)_\mathrm{base} - G f$$
 
     f in the cones minimises its norm. Zero, up to the tolerance of the program and about 1e-6 of its
     norm, where the feet can carry the robot.

@@ -31,11 +31,13 @@ from jaxdyn.systems.system import SceneLike, displacement
 
 
 class ComputedTorque(eqx.Module):
-    """Computed torque: tau = M(q) a + C(q, v) v + N(q) - forces of the scene, with the a of  edd + Kd ed + Kp e = 0.
+    r"""Computed torque.
+
+    $$\tau = M(q) a + C(q, v) v + N(q) - \tau_\mathrm{forces}, \quad \ddot e + K_d \dot e + K_p e = 0$$
 
     e (nv,) is the displacement from the target to q: q - q_d, and for joints with rotations in space the twist from
     the target to q. Each error decays exactly as set by the gains for an exact model: for scalar gains
-    with the roots of s^2 + kd s + kp. The twist is discontinuous at an error of half a turn.
+    with the roots of $s^2 + k_d s + k_p$. The twist is discontinuous at an error of half a turn.
 
     **Arguments:**
 
@@ -77,10 +79,14 @@ class ComputedTorque(eqx.Module):
 
 
 class OperationalSpace(eqx.Module):
-    """Operational space: the error of a frame obeys  edd + Kd ed + Kp e = 0, and the null motion is damped.
+    r"""Operational space: linear error dynamics of a frame, with damped motion of the null space.
 
-    tau = M a + h - forces with a = J^ x* + (1 - J^ J) a0, J^ = M^-1 J^T (J M^-1 J^T)^-1: the acceleration closest, in the
-    metric M, to a0 = -damping v - stiffness (displacement from the posture). The null motion does not disturb the task.
+    $$\ddot e + K_d \dot e + K_p e = 0, \quad \tau = M a + h - \tau_\mathrm{forces}$$
+
+    $$a = \bar J x^* + (1 - \bar J J) a_0, \quad \bar J = M^{-1} J^T (J M^{-1} J^T)^{-1}$$
+
+    is the acceleration closest, in the metric M, to $a_0$ = -damping v - stiffness (displacement from the posture), where $x^*$
+    is the value of $J a$ that the error dynamics require. The null motion does not disturb the task.
     Where J loses rank the task is dropped along the singular direction.
 
     **Arguments:**
@@ -140,11 +146,13 @@ class OperationalSpace(eqx.Module):
 
 
 class CartesianStiffness(eqx.Module):
-    """Cartesian stiffness and damping of a frame: tau = N(q) - J^T (K e + D ed) - joint_damping v.
+    r"""Cartesian stiffness and damping of a frame.
 
-    No inertia is cancelled, so the arm is passive for a fixed target: the energy T + e . K e / 2
-    decreases at the rate ed . D ed + joint_damping v . v. At rest under a force F, along
-    the rows of the error, the deflection solves K e = F.
+    $$\tau = N(q) - J^T (K e + D \dot e) - d v$$
+
+    with the `joint_damping` d. No inertia is cancelled, so the arm is passive for a fixed target: the energy
+    $T + \tfrac12 e^T K e$ decreases at the rate $\dot e^T D \dot e + d v^T v$. At rest under a force F, along the rows of
+    the error, the deflection solves $K e = F$.
 
     **Arguments:**
 

@@ -48,7 +48,9 @@ class CenterError(Constraint):
 
 
 class WholeBody(eqx.Module):
-    """Centre of mass and attitude of the base by  edd + Kd ed + Kp e = 0, with ground forces inside their cones.
+    r"""Control of the centre of mass and the attitude of the base, with ground forces inside their cones.
+
+    $$\ddot e + K_d \dot e + K_p e = 0$$
 
     tau comes from `jd.control.underactuated_inverse_dynamics` for the acceleration of `acceleration(q, v, t)`. Errors decay
     exactly as set by the gains for an exact model, while the feet are at rest and their forces can give the acceleration.
@@ -63,7 +65,7 @@ class WholeBody(eqx.Module):
     - `kp` (1/s^2), `kd` (1/s): of the centre of mass, positive definite: numbers, (3,) or (3, 3).
     - `orientation`: target R_d (3, 3) of the frame `base`, or a function of t; None: its attitude follows from the posture.
       `base`: name of a frame or body, by default the model's first body. `turn_kp`, `turn_kd`: its gains, of the error
-      log(R_d^T R); by default `kp` and `kd`.
+      $\log(R_d^T R)$; by default `kp` and `kd`.
     - `posture` (nq,): equilibrium of the remaining motion, with `stiffness` (1/s^2) and `damping` (1/s), zero or positive.
     - `preload` (), N; `torque_weight`, `force_weight`, `effort_limit`, `passive`: of `jd.control.underactuated_inverse_dynamics`.
 

@@ -6,6 +6,7 @@ the matrix form in world axes and in link frames, and scans for many bodies (EQU
 Imports `systems` and what is below it. The four algorithms do not import each other.
 """
 
+from jaxdyn._renamed import old_names as _old_names
 from jaxdyn.dynamics.articulated_bodies import ArticulatedBodies as ArticulatedBodies
 from jaxdyn.dynamics.articulated_bodies import articulated_bodies as articulated_bodies
 from jaxdyn.dynamics.base_twists import base_twists as base_twists
@@ -20,7 +21,6 @@ from jaxdyn.dynamics.kinematics import jacobian_dot_v as jacobian_dot_v
 from jaxdyn.dynamics.kinematics import spatial_jacobian as spatial_jacobian
 from jaxdyn.dynamics.link_frame import NewtonEulerMatrices as NewtonEulerMatrices
 from jaxdyn.dynamics.quantities import aba as aba
-from jaxdyn.dynamics.quantities import christoffel_symbols as christoffel_symbols
 from jaxdyn.dynamics.quantities import crba as crba
 from jaxdyn.dynamics.quantities import generalized_force as generalized_force
 from jaxdyn.dynamics.quantities import mass_matrix_derivative as mass_matrix_derivative
@@ -40,7 +40,6 @@ __all__ = [
     "base_twists",
     "centroidal_momentum",
     "centroidal_momentum_matrix",
-    "christoffel_symbols",
     "com_dynamics",
     "crba",
     "frame_acceleration",
@@ -55,6 +54,8 @@ __all__ = [
     "torque_regressor",
     "workspace_dynamics",
 ]
+
+__getattr__ = _old_names(__name__)
 
 
 def __dir__() -> list[str]:

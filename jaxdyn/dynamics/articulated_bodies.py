@@ -11,10 +11,10 @@ from jaxdyn.model.tree import Model
 
 
 class ArticulatedBodies(eqx.Module):
-    """Articulated inertia and bias of each body (see `articulated_bodies`), in the body's frame.
+    r"""Articulated inertia and bias of each body (see `articulated_bodies`), in the body's frame.
 
-    - `inertias` (nb, 6, 6): Mh_i, symmetric; kg, kg m, kg m^2.
-    - `biases` (nb, 6): b_i; N, N m.
+    - `inertias` (nb, 6, 6): $\hat M_i$, symmetric; kg, kg m, kg m^2.
+    - `biases` (nb, 6): $b_i$; N, N m.
     """
 
     inertias: Float[Array, "nb 6 6"]
@@ -29,16 +29,18 @@ def articulated_bodies(
     *,
     external: Float[Array, "nb 6"] | None = None,
 ) -> ArticulatedBodies:
-    """Articulated inertias Mh_i and biases b_i of all bodies: F_i = Mh_i Vdot_i + b_i.
+    r"""Articulated inertias and biases of all bodies.
 
-    F_i is the wrench that joint i transmits to its body (`joint_wrench`), with the joints beyond it free to move under
-    tau. Vdot_i is the body's twist rate less gravity: it starts from Vdot_0 = (-g, 0), as in `newton_euler_matrices`.
+    $$F_i = \hat M_i \dot V_i + b_i$$
+
+    $F_i$ is the wrench that joint i transmits to its body (`joint_wrench`), with the joints beyond it free to move under
+    tau. $\dot V_i$ is the body's twist rate less gravity: it starts from $\dot V_0 = (-g, 0)$, as in `newton_euler_matrices`.
 
     **Arguments:** `q` (nq,); `v` (nv,); `tau` (nv,), N m or N; `external` (nb, 6), wrench (f, tau) ON each body, at its
     frame's origin and in its axes (N, N m), or None.
 
-    **Returns:** `ArticulatedBodies`. The inertias depend on q alone, and det M = product over the joints of
-    det(S_i^T Mh_i S_i + armature). NaN where M is not positive definite.
+    **Returns:** `ArticulatedBodies`. The inertias depend on q alone, and
+    $\det M = \prod_i \det(S_i^T \hat M_i S_i + \mathrm{armature}_i)$. NaN where M is not positive definite.
 
     **Raises:** ValueError for shapes that do not fit.
 

@@ -23,7 +23,9 @@ from jaxdyn.model.tree import Model, neutral
 
 
 def base_twists(model: Model) -> Float[Array, "nv 6"]:
-    """Twist of every joint in the world frame at the neutral configuration, xi_j = Ad_{g_j(0)} S_j.
+    r"""Twist of every joint in the world frame at the neutral configuration.
+
+    $$\xi_j = \mathrm{Ad}_{g_j(0)} S_j$$
 
     **Returns:** (nv, 6), one row (v, omega) for each velocity coordinate: m/rad and rad/rad for a joint that rotates,
     m/m for one that translates.
@@ -42,11 +44,14 @@ def _base_twists(model: Model):
 
 
 def link_adjoints(model: Model, q: Float[Array, " nq"]) -> Float[Array, "nb nb 6 6"]:
-    """Adjoints A_ij = Ad^-1 of exp(hat(xi_{j+1}) q_{j+1}) ... exp(hat(xi_i) q_i), from body j to body i.
+    r"""Adjoints from each body to each of its descendants, by products of exponentials.
 
-    A_ii = 1, and A_ij = 0 unless body j is an ancestor of body i. In terms of poses g_i(q) of the bodies in the world,
-    A_ij = Ad_{g_i(0)} Ad^-1_{g_j(q)^-1 g_i(q)} Ad^-1_{g_j(0)}. Along a path to the root A_ij A_jk = A_ik, and
-    d(A_lj xi_j)/dq_k = A_lk [A_kj xi_j, xi_k], from which `mass_matrix_derivative` follows.
+    $$A_{ij} = \mathrm{Ad}^{-1}_{\exp(\hat\xi_{j+1} q_{j+1}) \cdots \exp(\hat\xi_i q_i)}
+    = \mathrm{Ad}_{g_i(0)} \mathrm{Ad}^{-1}_{g_j(q)^{-1} g_i(q)} \mathrm{Ad}^{-1}_{g_j(0)}$$
+
+    $A_{ii} = 1$, and $A_{ij} = 0$ unless body j is an ancestor of body i; $g_i(q)$ are the poses of the bodies in the world.
+    Along a path to the root $A_{ij} A_{jk} = A_{ik}$, and
+    $\partial (A_{lj} \xi_j) / \partial q_k = A_{lk} [A_{kj} \xi_j, \xi_k]$, from which `mass_matrix_derivative` follows.
 
     **Arguments:** `q` (nq,).
 

@@ -13,7 +13,9 @@ from jaxdyn.model.tree import Model
 
 
 def center_of_mass(model: Model, q: Float[Array, " nq"]) -> Float[Array, "3"]:
-    """Centre of mass of all bodies, c = sum of m_i c_i / sum of m_i.
+    r"""Centre of mass of all bodies.
+
+    $$c = \sum_i m_i c_i \Big/ \sum_i m_i$$
 
     **Arguments:** `q` (nq,).
 
@@ -30,10 +32,11 @@ def _center_of_mass(model: Model, q):
 
 
 def centroidal_momentum(model: Model, q: Float[Array, " nq"], v: Float[Array, " nv"]) -> Float[Array, "6"]:
-    """Momentum of the whole mechanism about its centre of mass, in world axes.
+    r"""Momentum of the whole mechanism about its centre of mass, in world axes.
 
-    (l, k) = (sum of m_i cdot_i, sum of (c_i - c) x m_i cdot_i + I_i omega_i), c the common centre of mass. Without
-    contact and joint torques on the world, k is constant and dl/dt = m g.
+    $$l = \sum_i m_i \dot c_i, \quad k = \sum_i (c_i - c) \times m_i \dot c_i + I_i \omega_i$$
+
+    with the common centre of mass c. Without contact and joint torques on the world, k is constant and $\dot l = m g$.
 
     **Arguments:** `q` (nq,); `v` (nv,).
 
@@ -53,7 +56,7 @@ def _centroidal_momentum(model: Model, q, v):
 
 
 def centroidal_momentum_matrix(model: Model, q: Float[Array, " nq"]) -> Float[Array, "6 nv"]:
-    """Centroidal momentum matrix A(q): `centroidal_momentum(model, q, v)` = A v.
+    """Centroidal momentum matrix A(q), whose product A v is `centroidal_momentum`.
 
     **Arguments:** `q` (nq,).
 
@@ -77,7 +80,7 @@ def com_jacobian(model: Model, q: Float[Array, " nq"]) -> Float[Array, "3 nv"]:
     """Jacobian of the centre of mass: J v is the velocity of `center_of_mass`, in world axes.
 
     J is the linear part of the centroidal momentum matrix over the total mass, so the generalised force of gravity is
-    N = -m J^T g.
+    $N = -m J^T g$.
 
     **Arguments:** `q` (nq,).
 

@@ -26,13 +26,13 @@ from jaxdyn.model.tree import Model, configuration_rate
 
 
 class ComDynamics(eqx.Module):
-    """Terms of the equations of motion in centre-of-mass coordinates (see `com_dynamics`); k = nv - 3.
+    r"""Terms of the equations of motion in centre-of-mass coordinates (see `com_dynamics`); k = nv - 3.
 
     - `mass` (): m, kg.
-    - `mass_matrix` (k, k): M'. It depends on the joints alone.
-    - `coriolis_matrix` (k, k): C', with dM'/dt - 2 C' skew. It does not depend on the velocity of the centre of mass.
-    - `jacobian` (nv, nv): T. `jacobian_rate` (nv, nv): dT/dt along v, so that nudot = T a + dT/dt v.
-    - `inverse` (nv, nv): X = T^-1.
+    - `mass_matrix` (k, k): $M'$. It depends on the joints alone.
+    - `coriolis_matrix` (k, k): $C'$, with $\dot M' - 2 C'$ skew. It does not depend on the velocity of the centre of mass.
+    - `jacobian` (nv, nv): T. `jacobian_rate` (nv, nv): $\dot T$ along v, so that $\dot\nu = T a + \dot T v$.
+    - `inverse` (nv, nv): $X = T^{-1}$.
     """
 
     mass: Float[Array, ""]
@@ -44,11 +44,13 @@ class ComDynamics(eqx.Module):
 
 
 def com_dynamics(model: Model, q: Float[Array, " nq"], v: Float[Array, " nv"]) -> ComDynamics:
-    """Mass matrix, Coriolis matrix and velocity map in centre-of-mass coordinates of a floating base.
+    r"""Mass matrix, Coriolis matrix and velocity map in centre-of-mass coordinates of a floating base.
 
-    nu = T v = (cdot, omega, v_j): velocity of the centre of mass in world axes, angular velocity of the base in its own
-    axes, joint velocities. The equations of motion split into m cddot = m g + f and M' nudot' + C' nu' = tau' with
-    nu' = (omega, v_j) and (f, tau') = X^T F; joint torques enter tau' unchanged, and not f.
+    $$\nu = T v = (\dot c, \omega, v_j), \quad m \ddot c = m g + f, \quad
+    M' \dot\nu' + C' \nu' = \tau', \quad \nu' = (\omega, v_j)$$
+
+    The velocities are that of the centre of mass in world axes, the angular velocity of the base in its own axes, and those of
+    the joints. With $(f, \tau') = X^T F$, joint torques enter $\tau'$ unchanged, and not f.
 
     **Arguments:** `q` (nq,); `v` (nv,). The first body has a free joint and carries all others.
 

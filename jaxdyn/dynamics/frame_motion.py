@@ -87,10 +87,12 @@ def _velocity(body: int, tree, q, v):
 def frame_acceleration(
     model: Model, q: Float[Array, " nq"], v: Float[Array, " nv"], a: Float[Array, " nv"], frame: str | None
 ) -> Float[Array, "6"]:
-    """Acceleration of a frame's origin and angular acceleration of the frame, in world axes: the rate of `frame_velocity`.
+    r"""Acceleration of a frame's origin and angular acceleration of the frame, in world axes: the rate of `frame_velocity`.
 
-    With the body twist V_b = (v_b, w_b) and the frame's rotation R: R (dv_b/dt + w_b x v_b) and R dw_b/dt. Gravity does not
-    enter: a body in free fall has the linear part g, an accelerometer measures R^T (this - g).
+    $$R (\dot v_b + \omega_b \times v_b), \quad R \dot\omega_b$$
+
+    with the body twist $(v_b, \omega_b)$ and the frame's rotation R. Gravity does not enter: a body in free fall has the linear
+    part g, an accelerometer measures the linear part minus g, in the axes of the frame.
 
     **Arguments:** `q` (nq,); `v` (nv,); `a` (nv,), the rate of v, as `forward_dynamics` or the output "acceleration" of
     `simulate` gives it; `frame`, one of `model.frame_names` or of `model.joint_names` (None: the world).
@@ -99,7 +101,7 @@ def frame_acceleration(
 
     **Raises:** ValueError for an unknown frame or shapes that do not fit.
 
-    Source: EQUATIONS section 2, the rate of R v_b.
+    Source: EQUATIONS section 2, the rate of $R v_b$.
 
     ```python
     hand = jd.dynamics.frame_acceleration(model, q, v, jd.forward_dynamics(model, q, v, tau), "hand")

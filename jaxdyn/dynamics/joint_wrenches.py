@@ -25,11 +25,11 @@ def joint_wrench(
     external: Float[Array, "nb 6"] | None = None,
     axes: str = "body",
 ) -> Float[Array, "*nb 6"]:
-    """Wrench transmitted by a joint in a motion: (f, tau) of the parent ON the body, drive included.
+    r"""Wrench transmitted by a joint in a motion: (f, tau) of the parent ON the body, drive included.
 
-    F_i = sum over the bodies j that joint i carries of (the rate of momentum of j - its weight - external_j). Its component along
-    the joint's motion subspace is the joint's force: S_i^T F_i = tau_i - armature a_i, with tau of `inverse_dynamics`;
-    the rest is the bearing's reaction. Rotors are not included.
+    $F_i$ is the sum, over the bodies that joint i carries, of rate of momentum - weight - external wrench. Its component along
+    the joint's motion subspace is the joint's force: $S_i^T F_i = \tau_i - \mathrm{armature}_i a_i$, with tau of
+    `inverse_dynamics`; the rest is the bearing's reaction. Rotors are not included.
 
     **Arguments:**
 

@@ -230,7 +230,11 @@ def sum_to_coordinates(model: Model, rows: Float[Array, "nb n"]) -> Float[Array,
 
 
 def forward_kinematics(model: Model, q: Float[Array, " nq"]) -> Float[Array, "nb 4 4"]:
-    """Pose of every body frame in the world, T_i = product of home_j exp(hat(S_j) q_j) over the joints above body i.
+    r"""Pose of every body frame in the world.
+
+    $$T_i = \prod_j \mathrm{home}_j \exp(\hat S_j q_j)$$
+
+    over the joints j from the world to body i.
 
     **Arguments:** `q` (nq,).
 
@@ -280,7 +284,9 @@ def _pose_in_body(body: int, tree, q):
 
 
 def body_jacobian(model: Model, q: Float[Array, " nq"], frame: str | None) -> Float[Array, "6 nv"]:
-    """Body Jacobian of a named frame: J v is the frame's body twist, hat(J v) = T^-1 dT/dt.
+    r"""Body Jacobian of a named frame: J v is the frame's body twist.
+
+    $$\widehat{J v} = T^{-1} \dot T$$
 
     **Arguments:** `q` (nq,); `frame`, one of `model.frame_names` (None: the world, J = 0).
 
@@ -306,7 +312,9 @@ def _body_jacobian(body: int, tree, q):
 
 
 def spatial_jacobian(model: Model, q: Float[Array, " nq"], frame: str | None) -> Float[Array, "6 nv"]:
-    """Spatial Jacobian of a named frame: J v is the frame's spatial twist, hat(J v) = (dT/dt) T^-1.
+    r"""Spatial Jacobian of a named frame: J v is the frame's spatial twist.
+
+    $$\widehat{J v} = \dot T T^{-1}$$
 
     **Arguments:** `q` (nq,); `frame`, one of `model.frame_names` (None: the world, J = 0).
 
@@ -334,10 +342,12 @@ def _spatial_jacobian(body: int, model: Model, q):
 def jacobian_dot_v(
     model: Model, q: Float[Array, " nq"], v: Float[Array, " nv"], frame: str | None
 ) -> Float[Array, "6"]:
-    """Velocity-dependent part of a frame's body acceleration: (d/dt J_b) v, with J_b the body Jacobian.
+    r"""Velocity-dependent part of a frame's body acceleration, with the body Jacobian J.
 
-    The body twist V_b = J_b v has the rate dV_b/dt = J_b a + (d/dt J_b) v. In a fixed frame the second part is the sum
-    of (ad_V S_k) v_k over the coordinates that move the frame, carried into it by Ad^-1.
+    $$\dot V_b = J a + \dot J v$$
+
+    In a fixed frame the second part is the sum of $\mathrm{ad}_V S_k v_k$ over the coordinates that move the frame; its adjoint
+    maps the sum into the frame.
 
     **Arguments:** `q` (nq,); `v` (nv,); `frame`, one of `model.frame_names` (None: the world, zero).
 

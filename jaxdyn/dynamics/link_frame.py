@@ -28,16 +28,16 @@ from jaxdyn.model.tree import Model
 
 
 class NewtonEulerMatrices(eqx.Module):
-    """Block matrices of the Newton-Euler equations; n = nb bodies, blocks of 6 in the order of `model.body_names`.
+    r"""Block matrices of the Newton-Euler equations; n = nb bodies, blocks of 6 in the order of `model.body_names`.
 
-    - `G` (6n, 6n): (I - Gamma)^-1; block (i, j) is Ad^-1 of the pose of body i in its ancestor j.
-    - `Gamma` (6n, 6n): A_i in block (i, parent(i)); nilpotent, its index is the depth of the tree.
+    - `G` (6n, 6n): $(1 - \Gamma)^{-1}$; block (i, j) is $\mathrm{Ad}^{-1}$ of the pose of body i in its ancestor j.
+    - `Gamma` (6n, 6n): $A_i$ in block (i, parent(i)); nilpotent, its index is the depth of the tree.
     - `xi` (6n, nv): joint screws, a block of 6 x (coordinates of the joint) for each body.
     - `M` (6n, 6n): spatial inertias of the bodies, block diagonal.
     - `P0` (6n, 6): A_i for the bodies attached to the world.
     - `Pt` (6, 6n): body twist of the tip frame from the body twists, or None without a tip.
-    - `ad_xi`, `ad_V`, `ad_V_T` (6n, 6n): blkdiag(-ad of xi_i v_i), blkdiag(-ad of V_i), blkdiag(-ad^T of V_i). The
-      minus signs are part of the definition.
+    - `ad_xi`, `ad_V`, `ad_V_T` (6n, 6n): block diagonal, of $-\mathrm{ad}_{\xi_i v_i}$, $-\mathrm{ad}_{V_i}$ and
+      $-\mathrm{ad}_{V_i}^T$. The minus signs are part of the definition.
     - `V0` (6,): twist of the base; zero unless `base_twist` was given.
     - `V0_dot` (6,): rate of `V0` less gravity, (-g, 0) for a base at rest; zero without gravity.
     - `V` (6n,): body twists.
@@ -60,20 +60,28 @@ class NewtonEulerMatrices(eqx.Module):
 
     @property
     def mass_matrix(self) -> Float[Array, "nv nv"]:
-        """Mass matrix M(q) = xi^T G^T M G xi (nv, nv), without armature."""
+        r"""Mass matrix (nv, nv), without armature.
+
+        $$M(q) = \xi^T G^T M G \xi$$
+        """
         jacobian = self.jacobians
         return matmul(jacobian.T, matmul(self.M, jacobian))
 
     @property
     def jacobians(self) -> Float[Array, "n6 nv"]:
-        """Body Jacobians G xi (6n, nv) of all bodies, stacked."""
+        r"""Body Jacobians (6n, nv) of all bodies, stacked.
+
+        $$J = G \xi$$
+        """
         return matmul(self.G, self.xi)
 
     @property
     def bias_force(self) -> Float[Array, " nv"]:
-        """Bias force xi^T G^T (M G (P0 V0_dot + ad_xi (P0 V0 + Gamma V)) + ad_V^T M V) (nv,): the forces tau of a = 0.
+        r"""Bias force (nv,): the forces tau of zero acceleration.
 
-        C0 v + phi when the base does not move.
+        $$\xi^T G^T (M G (P_0 \dot V_0 + \mathrm{ad}_\xi (P_0 V_0 + \Gamma V)) + \mathrm{ad}_V^T M V)$$
+
+        It is $C_0 v + \phi$ when the base does not move.
         """
         carried = matmul(self.P0, self.V0) + matmul(self.Gamma, self.V)
         rates = matmul(self.G, matmul(self.P0, self.V0_dot) + matmul(self.ad_xi, carried))
@@ -82,12 +90,17 @@ class NewtonEulerMatrices(eqx.Module):
 
     @property
     def phi(self) -> Float[Array, " nv"]:
-        """Gravity force phi = xi^T G^T M G P0 V0_dot (nv,); +dV/dq when the base does not move."""
+        r"""Gravity force (nv,), the gradient of the potential energy when the base does not move.
+
+        $$\phi = \xi^T G^T M G P_0 \dot V_0$$
+        """
         return matmul(self.jacobians.T, matmul(self.M, matmul(self.G, matmul(self.P0, self.V0_dot))))
 
     @property
     def Jt(self) -> Float[Array, "6 nv"]:
-        """Body Jacobian of the tip frame, Jt = Pt G xi (6, nv).
+        r"""Body Jacobian (6, nv) of the tip frame.
+
+        $$J_t = P_t G \xi$$
 
         **Raises:** ValueError when the matrices were built without a tip.
         """
@@ -97,16 +110,23 @@ class NewtonEulerMatrices(eqx.Module):
 
     @property
     def C0(self) -> Float[Array, "nv nv"]:
-        """Coriolis matrix C0 = xi^T G^T (M G ad_xi Gamma + ad_V^T M) G xi (nv, nv), as printed by Li & Wu.
+        r"""Coriolis matrix (nv, nv) as printed by Li & Wu.
 
-        C0 v is the vector of Coriolis and centrifugal forces when the base does not move (`bias_force` otherwise), but
-        Mdot - 2 C0 is not skew. Use `Cs` where skew symmetry matters.
+        $$C_0 = \xi^T G^T (M G\, \mathrm{ad}_\xi \Gamma + \mathrm{ad}_V^T M) G \xi$$
+
+        $C_0 v$ is the vector of Coriolis and centrifugal forces when the base does not move (`bias_force` otherwise), but
+        $\dot M - 2 C_0$ is not skew. Use `Cs` where skew symmetry matters.
         """
         return self._coriolis(matmul(self.ad_V_T, self.M))
 
     @property
     def Cs(self) -> Float[Array, "nv nv"]:
-        """Coriolis matrix Cs = xi^T G^T (M G ad_xi Gamma + ad_V^T M - M ad_V) G xi (nv, nv): Cs v = C0 v, Mdot - 2 Cs skew."""
+        r"""Coriolis matrix (nv, nv) with the skew property.
+
+        $$C_s = \xi^T G^T (M G\, \mathrm{ad}_\xi \Gamma + \mathrm{ad}_V^T M - M \mathrm{ad}_V) G \xi$$
+
+        $C_s v = C_0 v$, and $\dot M - 2 C_s$ is skew.
+        """
         return self._coriolis(matmul(self.ad_V_T, self.M) - matmul(self.M, self.ad_V))
 
     # Cs and C0 differ by M ad_V alone, whose product with the twists V vanishes: ad_V V = 0.
@@ -125,18 +145,22 @@ def newton_euler_matrices(
     base_twist: Float[Array, "6"] | None = None,
     base_twist_rate: Float[Array, "6"] | None = None,
 ) -> NewtonEulerMatrices:
-    """Block matrices of the Newton-Euler equations in link frames.
+    r"""Block matrices of the Newton-Euler equations in link frames.
 
     **Arguments:**
 
     - `q` (nq,), `v` (nv,).
-    - `tip`: name of the frame where the tip wrench F_t acts, or None.
-    - `base_twist` V_0 (6,): body twist (v, omega) of the frame that the model calls the world, when that frame moves, as
+    - `tip`: name of the frame where the tip wrench $F_t$ acts, or None.
+    - `base_twist` $V_0$ (6,): body twist (v, omega) of the frame that the model calls the world, when that frame moves, as
       on a vehicle; m/s and rad/s in its own axes. `base_twist_rate` (6,): its rate. None is zero. `model.gravity` is
       in the axes that the base has at this instant.
 
-    **Returns:** `NewtonEulerMatrices`. M(q) a + bias_force + Jt^T F_t = tau, with F_t the wrench that the tip applies
-    TO its surroundings, at the tip frame's origin in its axes; bias_force = Cs v + phi for a base at rest.
+    **Returns:** `NewtonEulerMatrices`. The equation of motion is
+
+    $$M(q) a + C_s v + \phi + J_t^T F_t = \tau$$
+
+    for a base at rest (`bias_force` is $C_s v + \phi$ then), with $F_t$ the wrench that the tip applies TO its surroundings, at
+    the tip frame's origin in its axes.
 
     **Raises:** ValueError for shapes that do not fit, an unknown tip, or a tip fixed to the world.
 

@@ -28,7 +28,9 @@ from jaxdyn.systems.system import System, symbols
 
 
 def mass_matrix(model: Model | System, q: Float[Array, " nq"], t: Numbers = 0.0) -> Float[Array, "nv nv"]:
-    """Mass matrix M(q) = sum of J_i^T M_i J_i over the bodies + diag(armature), symmetric.
+    r"""Mass matrix, symmetric, with the armature of the joints on its diagonal.
+
+    $$M(q) = \sum_i J_i^T M_i J_i + \operatorname{diag}(\mathrm{armature})$$
 
     **Arguments:** `q` (nq,).
 
@@ -46,10 +48,13 @@ def mass_matrix(model: Model | System, q: Float[Array, " nq"], t: Numbers = 0.0)
 def coriolis_matrix(
     model: Model | System, q: Float[Array, " nq"], v: Float[Array, " nv"], t: Numbers = 0.0
 ) -> Float[Array, "nv nv"]:
-    """Coriolis matrix C(q, v) with the skew property: C v are the Coriolis and centrifugal forces, dM/dt = C + C^T.
+    r"""Coriolis matrix with the skew property: C v are the Coriolis and centrifugal forces.
 
-    C = sum of J_i^T (M_i Jdot_i + (M_i ad_{V_i} - ad_{V_i}^T M_i) J_i) in link frames. The matrix is not unique: other
-    choices (Christoffel symbols, Pinocchio's) have the same C v and the same C + C^T.
+    $$C(q, v) = \sum_i J_i^T (M_i \dot J_i + (M_i \mathrm{ad}_{V_i} - \mathrm{ad}_{V_i}^T M_i) J_i), \quad
+    \dot M = C + C^T$$
+
+    in link frames. The matrix is not unique: other choices (Christoffel symbols, Pinocchio's) have the same $C v$ and the same
+    $C + C^T$.
 
     **Arguments:** `q` (nq,); `v` (nv,).
 
@@ -64,7 +69,11 @@ def coriolis_matrix(
 
 
 def gravity_force(model: Model | System, q: Float[Array, " nq"], t: Numbers = 0.0) -> Float[Array, " nv"]:
-    """Generalised gravity force N(q) = +dV/dq along the velocity coordinates; it is on the left-hand side, with M a.
+    r"""Generalised gravity force; it is on the left-hand side, with M a.
+
+    $$N(q) = +\frac{\partial V}{\partial q}$$
+
+    along the velocity coordinates.
 
     **Arguments:** `q` (nq,).
 
@@ -82,7 +91,9 @@ def gravity_force(model: Model | System, q: Float[Array, " nq"], t: Numbers = 0.
 def bias_force(
     model: Model | System, q: Float[Array, " nq"], v: Float[Array, " nv"], t: Numbers = 0.0
 ) -> Float[Array, " nv"]:
-    """Bias force h = C(q, v) v + N(q): the forces tau of zero acceleration a.
+    """Bias force: the forces tau of zero acceleration.
+
+    $$h = C(q, v) v + N(q)$$
 
     **Arguments:** `q` (nq,); `v` (nv,).
 
@@ -103,7 +114,9 @@ def inverse_dynamics(
     *,
     external: Float[Array, "nb 6"] | None = None,
 ) -> Float[Array, " nv"]:
-    """Generalised forces of a motion: tau = M(q) a + C(q, v) v + N(q) - sum of J_i^T f_i.
+    r"""Generalised forces of a motion.
+
+    $$\tau = M(q) a + C(q, v) v + N(q) - \sum_i J_i^T F_i$$
 
     **Arguments:** `q` (nq,); `v` (nv,); `a` (nv,), rate of v; `external` (nb, 6), wrench (f, tau) ON each body, at its
     frame's origin and in its axes (N, N m), or None.
@@ -130,7 +143,9 @@ def forward_dynamics(
     *,
     external: Float[Array, "nb 6"] | None = None,
 ) -> Float[Array, " nv"]:
-    """Acceleration under given forces: a = M(q)^-1 (tau - C(q, v) v - N(q) + sum of J_i^T f_i).
+    r"""Acceleration under given forces.
+
+    $$a = M(q)^{-1} \left(\tau - C(q, v) v - N(q) + \sum_i J_i^T F_i\right)$$
 
     **Arguments:** `q` (nq,); `v` (nv,); `tau` (nv,), N m or N; `external` (nb, 6), wrench (f, tau) ON each body, at its
     frame's origin and in its axes (N, N m), or None.
@@ -225,7 +240,9 @@ def _force_tangent(inverse, model, q, v, tau, steps):
 
 
 def generalized_force(model: Model, q: Float[Array, " nq"], external: Float[Array, "nb 6"]) -> Float[Array, " nv"]:
-    """Generalised forces of wrenches on the bodies: sum of J_i^T f_i.
+    r"""Generalised forces of wrenches on the bodies.
+
+    $$\tau = \sum_i J_i^T F_i$$
 
     **Arguments:** `q` (nq,); `external` (nb, 6), wrench (f, tau) ON each body, at its frame's origin and in its axes
     (N, N m).
@@ -239,7 +256,9 @@ def generalized_force(model: Model, q: Float[Array, " nq"], external: Float[Arra
 def kinetic_energy(
     model: Model | System, q: Float[Array, " nq"], v: Float[Array, " nv"], t: Numbers = 0.0
 ) -> Float[Array, ""]:
-    """Kinetic energy T = 1/2 sum of V_i . M_i V_i + 1/2 sum of armature v^2 = 1/2 v . M(q) v.
+    r"""Kinetic energy of the bodies and the rotors.
+
+    $$T = \tfrac12 \sum_i V_i^T M_i V_i + \tfrac12 \sum_j \mathrm{armature}_j v_j^2 = \tfrac12 v^T M(q) v$$
 
     **Arguments:** `q` (nq,); `v` (nv,).
 
@@ -259,10 +278,12 @@ def _kinetic_energy(model: Model, q, v):
 
 
 def potential_energy(model: Model | System, q: Float[Array, " nq"], t: Numbers = 0.0) -> Float[Array, ""]:
-    """Potential energy of gravity, V = -sum of m_i g . c_i with c_i the world position of each centre of mass.
+    r"""Potential energy of gravity.
 
-    Zero height is the plane through the world's origin. Far from it the value is large, and small differences of it are
-    lost to rounding.
+    $$V = -\sum_i m_i g^T c_i$$
+
+    with the world position $c_i$ of each centre of mass. Zero height is the plane through the world's origin. Far from it
+    the value is large, and small differences of it are lost to rounding.
 
     **Arguments:** `q` (nq,).
 
@@ -286,10 +307,12 @@ def _potential_energy(model: Model, q):
 def torque_regressor(
     model: Model, q: Float[Array, " nq"], v: Float[Array, " nv"], a: Float[Array, " nv"]
 ) -> Float[Array, "nv nb10"]:
-    """Regressor Y(q, v, a) of inverse dynamics: tau = Y pi, linear in the inertial parameters.
+    r"""Regressor of inverse dynamics, which is linear in the inertial parameters.
 
-    pi = `model.inertias.reshape(-1)`, the numbers (m, m cx, m cy, m cz, Ixx, Ixy, Iyy, Ixz, Iyz, Izz) of one body after
-    the other. Rotor inertia is not among them: `inverse_dynamics` = Y pi + armature a.
+    $$\tau = Y(q, v, a) \pi + \operatorname{diag}(\mathrm{armature}) a$$
+
+    $\pi$ is `model.inertias.reshape(-1)`, the numbers (m, m cx, m cy, m cz, Ixx, Ixy, Iyy, Ixz, Iyz, Izz) of one body after
+    the other. Rotor inertia is not among them.
 
     **Arguments:** `q` (nq,); `v` (nv,); `a` (nv,).
 
@@ -302,7 +325,9 @@ def torque_regressor(
 
 
 def mass_matrix_derivative(model: Model, q: Float[Array, " nq"]) -> Float[Array, "nv nv nv"]:
-    """Derivative of the mass matrix, D_ijk = dM_ij/dq_k, in closed form.
+    r"""Derivative of the mass matrix, in closed form.
+
+    $$D_{ijk} = \frac{\partial M_{ij}}{\partial q_k}$$
 
     **Arguments:** `q` (nq,).
 
@@ -317,19 +342,8 @@ def mass_matrix_derivative(model: Model, q: Float[Array, " nq"]) -> Float[Array,
     return by_recursion(world_frame.mass_matrix_derivative, world_frame.mass_matrix_derivative, model, q)
 
 
-def christoffel_symbols(model: Model | System, q: Float[Array, " nq"], t: Numbers = 0.0) -> Float[Array, "nv nv nv"]:
-    """Christoffel symbols of the first kind, Gamma_ijk = 1/2 (dM_ij/dq_k + dM_ik/dq_j - dM_kj/dq_i).
-
-    The matrix C_ij = sum_k Gamma_ijk v_k has the same C v and C + C^T as `coriolis_matrix`.
-
-    **Arguments:** `q` (nq,).
-
-    **Returns:** (nv, nv, nv), symmetric in j and k.
-
-    **Raises:** ValueError when the model has a joint whose v is not dq/dt (planar, spherical, free).
-
-    Source: Murray, Li & Sastry (1994), eq. 4.23; EQUATIONS section 0.
-    """
+def first_kind_symbols(model: Model | System, q: Float[Array, " nq"], t: Numbers = 0.0) -> Float[Array, "nv nv nv"]:
+    """Christoffel symbols of the first kind of the mass matrix, (nv, nv, nv); see `jd.geometry.christoffel_symbols`."""
     if isinstance(model, System):
         return _system_quantity(model, "christoffel_symbols", *check_state(model, q=q, t=t))
     (q,) = check_shapes(model, q=q)

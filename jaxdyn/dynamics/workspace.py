@@ -30,16 +30,18 @@ from jaxdyn.systems.mass_factor import mass_factor, solve_positive
 
 
 class WorkspaceDynamics(eqx.Module):
-    """Terms of M_x Vdot + mu + p = F in the velocity V = J v (m,) of a frame (see `workspace_dynamics`).
+    r"""Terms of the equation of motion in the velocity (m,) of a frame (see `workspace_dynamics`).
 
-    - `mass_matrix` (m, m): M_x, also called Lambda. `coriolis_matrix` (m, m): C_x, with dM_x/dt - 2 C_x skew.
-    - `coriolis_force` (m,): mu; C_x V where J is square, for a redundant arm with a term of its internal motion.
-    - `gravity_force` (m,): N_x, also called p.
-    - `jacobian` (m, nv): J. `jacobian_rate` (m, nv): Jdot along v, so that Vdot = J a + Jdot v.
-    - `inverse` (nv, m): Jbar, the dynamically consistent inverse; joint velocities Jbar V have the least kinetic energy of
-      those that move the frame with V. Jbar^T tau is the force on the frame equivalent to tau, J^T F the torques of F.
-    - `condition` (): least eigenvalue of J M^-1 J^T scaled to a unit diagonal, 0 where J has lost rank, at most 1.
-    - `damped` (): true where that is below `least`, so that Lambda is damped: finite and smaller than the exact one.
+    $$M_x \dot V + \mu + p = F, \quad V = J v, \quad M_x = (J M^{-1} J^T)^{-1}$$
+
+    - `mass_matrix` (m, m): $M_x$, also called Lambda. `coriolis_matrix` (m, m): $C_x$, with $\dot M_x - 2 C_x$ skew.
+    - `coriolis_force` (m,): $\mu$; $C_x V$ where J is square, for a redundant arm with a term of its internal motion.
+    - `gravity_force` (m,): p.
+    - `jacobian` (m, nv): J. `jacobian_rate` (m, nv): $\dot J$ along v, so that $\dot V = J a + \dot J v$.
+    - `inverse` (nv, m): $\bar J$, the dynamically consistent inverse; joint velocities $\bar J V$ have the least kinetic energy
+      of those that move the frame with V. $\bar J^T \tau$ is the force on the frame equivalent to tau, $J^T F$ the torques of F.
+    - `condition` (): least eigenvalue of $J M^{-1} J^T$ scaled to a unit diagonal, 0 where J has lost rank, at most 1.
+    - `damped` (): true where that is below `least`, so that $M_x$ is damped: finite and smaller than the exact one.
     """
 
     mass_matrix: Float[Array, "m m"]
@@ -63,7 +65,7 @@ def workspace_dynamics(
     rows: Sequence[int] = (0, 1, 2, 3, 4, 5),
     least: float | None = None,
 ) -> WorkspaceDynamics:
-    """Mass matrix, Coriolis forces and gravity of an arm in the velocity of one of its frames.
+    r"""Mass matrix, Coriolis forces and gravity of an arm in the velocity of one of its frames.
 
     **Arguments:**
 
@@ -72,11 +74,11 @@ def workspace_dynamics(
       velocity in world axes.
     - `rows`: components of (vx, vy, vz, wx, wy, wz) to use, at most nv of them: for an arm
       in the x-y plane e.g. (0, 1, 5).
-    - `least`: value of `condition` below which Lambda is damped; eps^0.4 by default, 5e-7 in float64. Components that no joint
-      moves are damped everywhere and have no meaning: leave them out of `rows`.
+    - `least`: value of `condition` below which $M_x$ is damped; $\epsilon^{0.4}$ by default, 5e-7 in float64. Components
+      that no joint moves are damped everywhere and have no meaning: leave them out of `rows`.
 
-    **Returns:** `WorkspaceDynamics`; m, m/s and N for linear components, rad, rad/s and N m for angular ones. Damped, M_x
-    is positive definite and finite with a finite gradient, and J Jbar and dM_x/dt - 2 C_x are no longer 1 and skew.
+    **Returns:** `WorkspaceDynamics`; m, m/s and N for linear components, rad, rad/s and N m for angular ones. Damped, $M_x$
+    is positive definite and finite with a finite gradient, and $J \bar J$ and $\dot M_x - 2 C_x$ are no longer 1 and skew.
 
     **Raises:** ValueError for shapes that do not fit, an unknown frame, axes, components other than these or more than nv, and
     a `least` outside of (0, 1).

@@ -1,8 +1,8 @@
 """Functions behind CasADi's interface for external functions, so that `casadi.external` has exact first derivatives.
 
-CasADi stores matrices by columns, and sparse ones as the entries of a pattern. The pattern of a Jacobian leaves out
-structural zeros, which no input can make other than zero. A null pointer stands for an argument that is zero, or for a result
-that is not asked for.
+CasADi stores matrices by columns, and of sparse ones only the entries of a pattern. The pattern of a Jacobian leaves out
+structural zeros: entries that are zero for every input. A null pointer stands for an argument that is zero, or for a result that
+CasADi does not need.
 
 Source: CasADi's user guide, "Using the generated code", and the signatures that its code generator writes.
 """
@@ -20,7 +20,7 @@ from jaxdyn.export.arguments import fields_of
 
 
 class Pattern(NamedTuple):
-    """A sparse matrix of CasADi: which entries it stores, and where it stores each entry of the program's array."""
+    """Sparsity pattern of a matrix of CasADi, and the place of each entry of the program's array in it."""
 
     stored: np.ndarray  # (rows, columns) of bools
     places: np.ndarray  # for each entry, by rows, its place among the stored ones by columns; -1 where it is not stored
@@ -51,14 +51,14 @@ def _by_columns(stored: np.ndarray) -> np.ndarray:
 def _dense(array: Array) -> Pattern:
     """Pattern of an array: a vector is a column, and leading axes of more than two become rows."""
     columns = array.shape[-1] if len(array.shape) > 1 else 1
-    # An array may have an axis of length zero, by which nothing can be divided.
+    # An axis may have length zero; `max` avoids a division by it.
     stored = np.ones((array.size // max(columns, 1), columns), bool)
     return Pattern(stored, _by_columns(stored).ravel())
 
 
-def _block(is_stored: np.ndarray, of: Pattern, by: Pattern) -> Pattern:
+def _block(is_stored: np.ndarray, result: Pattern, argument: Pattern) -> Pattern:
     """Pattern of a Jacobian: rows and columns are the entries of a result and of an argument, each by columns as in CasADi."""
-    where = np.ix_(of.places, by.places)
+    where = np.ix_(result.places, argument.places)
     stored = np.zeros(is_stored.shape, bool)
     stored[where] = is_stored
     return Pattern(stored, _by_columns(stored)[where].ravel())
@@ -92,7 +92,7 @@ def _functions(
     nominal: Sequence[Pattern],
     lanes: int,
 ) -> list[Text]:
-    """One function of CasADi's interface; `nominal` are the results, which CasADi passes to a Jacobian as further arguments."""
+    """One function of CasADi's interface; `nominal` are the results, which CasADi passes to a Jacobian after the arguments."""
     core = f"{name}_core"
     places = {i: pattern.places for i, pattern in enumerate(inputs)}
     # A Jacobian by columns stores whole rows of vector registers, so it is stored dense in the work vector and copied from there.
@@ -101,7 +101,7 @@ def _functions(
     fields, routine = fields_of(exported.arguments), routine._replace(symbol=core)
     texts = standalone.routine_ir(routine, fields, lanes=lanes, places=places, results=results, internal=True)
     sizes = [x.stored.size for x in outputs]
-    # Results that CasADi does not ask for are written to the work vector too.
+    # Results whose pointer is null are written to the work vector.
     work = sum(sizes) if is_dense else max([0, *(x.count for x in outputs)])
     # The results at the point are arguments of a Jacobian, which does not read them.
     lines = _descriptions(name, [*inputs, *nominal], outputs, work)

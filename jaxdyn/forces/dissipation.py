@@ -15,9 +15,11 @@ from jaxdyn.systems.scene import as_pytree
 
 
 class RayleighDissipation(eqx.Module):
-    """Dissipative force tau = -dR/dv of a dissipation function R.
+    r"""Dissipative force of a dissipation function R.
 
-    The dissipated power is v . dR/dv: 2R where R is quadratic in v, (n + 1) R where it is of degree n + 1.
+    $$\tau = -\frac{\partial R}{\partial v}$$
+
+    The dissipated power is $v^T \partial R / \partial v$: 2R where R is quadratic in v, (n + 1) R where it is of degree n + 1.
 
     **Arguments:** `function`, R(q, v, t) -> () in W, differentiable; a plain function is static, a Module or
     `jax.tree_util.Partial` carries numbers as leaves.
@@ -50,13 +52,14 @@ _ROUNDING = 100.0
 
 
 class SlidingFriction(PiecewiseForce):
-    """Coulomb friction of a sliding contact: tau = -sign(A v) mu N A^T, for the sliding velocity A v.
+    r"""Coulomb friction of a sliding contact.
 
-    At A v = 0 the sign is that of `direction`, so that the force is smooth while the contact slides that way and where it
-    comes to rest.
-    After a reversal the force opposes the new direction. Sticking is not modelled: fixed steps change the sign of the
-    force from step to step, so that velocities stay as small as a step's change; adaptive ones end the run with the
-    code `too_many_events`.
+    $$\tau = -\operatorname{sign}(A v) \mu N A^T$$
+
+    A v is the sliding velocity. At A v = 0 the sign is that of `direction`, so that the force is smooth while the contact
+    slides that way and where it comes to rest. After a reversal the force opposes the new direction. Sticking is not
+    modelled: fixed steps change the sign of the force from step to step, so that velocities stay as small as a step's
+    change; adaptive ones end the run with the code `too_many_events`.
 
     **Arguments:**
 

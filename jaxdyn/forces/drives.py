@@ -6,7 +6,7 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from jaxdyn.dynamics.kinematics import take
-from jaxdyn.forces.elements import _broadcast, _is_positive, _joint_indices, _leaf, _names
+from jaxdyn.forces.elements import as_leaf, as_names, broadcast_leaf, is_positive, joint_indices
 from jaxdyn.model.arguments import Number, SystemLike
 from jaxdyn.systems.drives import DriveDynamics
 
@@ -21,8 +21,8 @@ class _Lag(DriveDynamics):
         self, system: SystemLike, q: Float[Array, " nq"], v: Float[Array, " nv"], t: Number
     ) -> Float[Array, " n"]:
         """Torques `initial` at rest."""
-        size = _joint_indices(system, self.joints, type(self).__name__).v.size
-        return _broadcast(self.initial, v, size, f"{type(self).__name__}: initial")
+        size = joint_indices(system, self.joints, type(self).__name__).v.size
+        return broadcast_leaf(self.initial, v, size, f"{type(self).__name__}: initial")
 
     def torque(
         self,
@@ -34,7 +34,7 @@ class _Lag(DriveDynamics):
         command: Float[Array, " nv"],
     ) -> Float[Array, " nv"]:
         """The torques among the states, and the commands of other joints."""
-        index = _joint_indices(system, self.joints, type(self).__name__).v
+        index = joint_indices(system, self.joints, type(self).__name__).v
         # Torques come first in the state; a drive of second order has their rates after them.
         torque = state[: index.size]
         # The usual case, all joints: no scatter is compiled.
@@ -42,15 +42,17 @@ class _Lag(DriveDynamics):
 
     def _error(self, system, state, command):
         """Commands less torques of the drives (n,), and a function that broadcasts a leaf to (n,)."""
-        index, name = _joint_indices(system, self.joints, type(self).__name__).v, type(self).__name__
+        index, name = joint_indices(system, self.joints, type(self).__name__).v, type(self).__name__
         error = take(command, index) - state[: index.size]
-        return error, lambda leaf: _broadcast(getattr(self, leaf), state, index.size, f"{name}: {leaf}")
+        return error, lambda leaf: broadcast_leaf(getattr(self, leaf), state, index.size, f"{name}: {leaf}")
 
 
 class FirstOrderDrive(_Lag):
-    """First-order drive: T dtau/dt = u - tau, with u the command and tau the torque at the joint.
+    r"""First-order drive, with u the command and tau the torque at the joint.
 
-    The step response is tau = u (1 - exp(-t/T)). It models a current loop of bandwidth 1/(2 pi T) Hz, and MuJoCo's
+    $$T \dot\tau = u - \tau$$
+
+    The step response is $\tau = u (1 - e^{-t/T})$. It models a current loop of bandwidth $1/(2 \pi T)$ Hz, and MuJoCo's
     activation `filter` of a motor.
 
     **Arguments:** `time_constant` T (s), positive, and `initial` torque (N m or N): numbers or one per coordinate. `joints`,
@@ -65,13 +67,13 @@ class FirstOrderDrive(_Lag):
     ```
     """
 
-    time_constant: Float[Array, "..."] = eqx.field(converter=_leaf)
-    initial: Float[Array, "..."] = eqx.field(converter=_leaf, default=0.0)
-    joints: tuple[str, ...] | None = eqx.field(static=True, converter=_names, default=None)
+    time_constant: Float[Array, "..."] = eqx.field(converter=as_leaf)
+    initial: Float[Array, "..."] = eqx.field(converter=as_leaf, default=0.0)
+    joints: tuple[str, ...] | None = eqx.field(static=True, converter=as_names, default=None)
 
     def __check_init__(self):
         # The rate divides by T: for no delay leave the drive out of the scene.
-        if not _is_positive(self.time_constant):
+        if not is_positive(self.time_constant):
             raise ValueError(f"FirstOrderDrive: time_constant is {self.time_constant}; give positive seconds")
 
     def rate(
@@ -83,17 +85,23 @@ class FirstOrderDrive(_Lag):
         state: Float[Array, " n"],
         command: Float[Array, " nv"],
     ) -> Float[Array, " n"]:
-        """(u - tau)/T."""
+        r"""Rate of the torque.
+
+        $$\dot\tau = (u - \tau) / T$$
+        """
         error, leaf = self._error(system, state, command)
         return error / leaf("time_constant")
 
 
 class SecondOrderDrive(_Lag):
-    """Second-order drive: tau'' + 2 zeta w tau' + w^2 tau = w^2 u, with u the command and tau the torque at the joint.
+    r"""Second-order drive, with u the command and tau the torque at the joint.
 
-    The states are tau, then tau'. With zeta < 1 the step response overshoots by exp(-pi zeta/sqrt(1 - zeta^2)).
+    $$\ddot\tau + 2 \zeta \omega \dot\tau + \omega^2 \tau = \omega^2 u$$
 
-    **Arguments:** `frequency` w (rad/s) and `damping_ratio` zeta, positive, and `initial` torque (N m or N, with tau' = 0):
+    The states are $\tau$, then $\dot\tau$. With $\zeta < 1$ the step response overshoots by
+    $\exp(-\pi \zeta / \sqrt{1 - \zeta^2})$.
+
+    **Arguments:** `frequency` $\omega$ (rad/s) and `damping_ratio` $\zeta$, positive, and `initial` torque (N m or N, at rest):
     numbers or one per coordinate. `joints` as of `FirstOrderDrive`.
 
     **Raises:** ValueError for numbers that are not positive; (when called) for unknown joints or a wrong shape.
@@ -104,14 +112,14 @@ class SecondOrderDrive(_Lag):
     ```
     """
 
-    frequency: Float[Array, "..."] = eqx.field(converter=_leaf)
-    damping_ratio: Float[Array, "..."] = eqx.field(converter=_leaf, default=1.0)
-    initial: Float[Array, "..."] = eqx.field(converter=_leaf, default=0.0)
-    joints: tuple[str, ...] | None = eqx.field(static=True, converter=_names, default=None)
+    frequency: Float[Array, "..."] = eqx.field(converter=as_leaf)
+    damping_ratio: Float[Array, "..."] = eqx.field(converter=as_leaf, default=1.0)
+    initial: Float[Array, "..."] = eqx.field(converter=as_leaf, default=0.0)
+    joints: tuple[str, ...] | None = eqx.field(static=True, converter=as_names, default=None)
 
     def __check_init__(self):
         for name in ("frequency", "damping_ratio"):
-            if not _is_positive(getattr(self, name)):
+            if not is_positive(getattr(self, name)):
                 raise ValueError(f"SecondOrderDrive: {name} is {getattr(self, name)}; give positive numbers")
 
     def start(
@@ -130,7 +138,10 @@ class SecondOrderDrive(_Lag):
         state: Float[Array, " n"],
         command: Float[Array, " nv"],
     ) -> Float[Array, " n"]:
-        """tau', then w^2 (u - tau) - 2 zeta w tau'."""
+        r"""Rates of the torque and of its rate.
+
+        $$(\dot\tau, \omega^2 (u - \tau) - 2 \zeta \omega \dot\tau)$$
+        """
         # The state is (tau, tau'), both of the selected joints.
         error, leaf = self._error(system, state, command)
         frequency, speed = leaf("frequency"), state[error.shape[0] :]

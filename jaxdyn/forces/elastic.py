@@ -6,7 +6,7 @@ import equinox as eqx
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from jaxdyn.forces.elements import _broadcast, _is_positive, _joint_indices, _leaf
+from jaxdyn.forces.elements import as_leaf, broadcast_leaf, is_positive, joint_indices
 from jaxdyn.model.arguments import Checked, Number, Numbers, SystemLike
 from jaxdyn.model.builder import ModelBuilder
 from jaxdyn.model.joining import join
@@ -20,11 +20,14 @@ def _tuple(names: str | Sequence[str]) -> tuple[str, ...]:
 
 
 class ElasticTransmission(eqx.Module):
-    """Spring and damper between motors and joints: s = theta/n - q, tau = K s + D ds/dt on the joint, -tau/n on the motor.
+    r"""Spring and damper between motors and joints.
 
-    theta is the motor's own angle and n the gear ratio, of one sign with the direction of rotation. It conserves the energy
-    K s^2/2 and dissipates D (ds/dt)^2. Steps must resolve sqrt(K (1/I + 1/(n^2 B))), with B and I the inertias of motor and
-    link; `jd.solvers.Rodas5P` has longer ones where the elastic motion has died out.
+    $$s = \theta/n - q, \quad \tau = K s + D \dot s$$
+
+    $\tau$ acts on the joint and $-\tau/n$ on the motor; $\theta$ is the motor's own angle and n the gear ratio, whose
+    sign is that of the direction of rotation. It conserves the energy $K s^2/2$ and dissipates $D \dot s^2$. Steps must
+    resolve the frequency $\sqrt{K (1/I + 1/(n^2 B))}$, with B and I the inertias of motor and link; `jd.solvers.Rodas5P`
+    has longer ones where the elastic motion has died out.
 
     **Arguments:** `motors`, `joints`, names of joints of one coordinate, in pairs; `stiffness` K (N m/rad or N/m), `damping` D
     (N m s/rad or N s/m), `gear` n (1, or rad/m for a spindle): numbers or one per pair.
@@ -37,9 +40,9 @@ class ElasticTransmission(eqx.Module):
 
     motors: tuple[str, ...] = eqx.field(static=True, converter=_tuple)
     joints: tuple[str, ...] = eqx.field(static=True, converter=_tuple)
-    stiffness: Float[Array, "..."] = eqx.field(converter=_leaf)
-    damping: Float[Array, "..."] = eqx.field(converter=_leaf, default=0.0)
-    gear: Float[Array, "..."] = eqx.field(converter=_leaf, default=1.0)
+    stiffness: Float[Array, "..."] = eqx.field(converter=as_leaf)
+    damping: Float[Array, "..."] = eqx.field(converter=as_leaf, default=0.0)
+    gear: Float[Array, "..."] = eqx.field(converter=as_leaf, default=1.0)
 
     def __check_init__(self):
         if len(self.motors) != len(self.joints):
@@ -47,18 +50,18 @@ class ElasticTransmission(eqx.Module):
                 f"ElasticTransmission: {len(self.motors)} motors for {len(self.joints)} joints; give pairs"
             )
         # The sign of n is a direction of rotation; only zero is refused.
-        if not _is_positive(self.gear**2):
+        if not is_positive(self.gear**2):
             raise ValueError(f"ElasticTransmission: gear is {self.gear}; give ratios that are not zero")
 
     def __call__(
         self, system: SystemLike, q: Float[Array, " nq"], v: Float[Array, " nv"], t: Number
     ) -> Float[Array, " nv"]:
         n = len(self.joints)
-        motor, joint = (_joint_indices(system, names, "ElasticTransmission") for names in (self.motors, self.joints))
+        motor, joint = (joint_indices(system, names, "ElasticTransmission") for names in (self.motors, self.joints))
         if any(len(index) != n for index in (*motor, *joint)):
             raise ValueError("ElasticTransmission: motors and joints have one coordinate each")
         stiffness, damping, gear = (
-            _broadcast(value, q, n, f"ElasticTransmission: {name}")
+            broadcast_leaf(value, q, n, f"ElasticTransmission: {name}")
             for name, value in (("stiffness", self.stiffness), ("damping", self.damping), ("gear", self.gear))
         )
         # Both are at the joint: the motor's angle is divided by the gear ratio.
@@ -78,15 +81,16 @@ def elastic_joints(
     joints: Checked[str | Sequence[str] | None] = None,
     suffix: str = "_motor",
 ) -> Scene:
-    """Robot with elastic joints: a scene with a rotor for each of them behind the model's coordinates, and the springs.
+    r"""Robot with elastic joints: a scene with a rotor for each of them behind the model's coordinates, and the springs.
 
-        M(q) q'' + h(q, q') = K (theta/n - q) + D (theta'/n - q')
-        B theta'' + (K (theta/n - q) + D (theta'/n - q'))/n = tau
+    $$M(q) \ddot q + h(q, \dot q) = K (\theta/n - q) + D (\dot\theta/n - \dot q) = \tau_s, \quad
+        B \ddot\theta + \tau_s/n = \tau$$
 
-    q = (model's q, theta), v = (model's v, theta'); torques of the motors are the last entries of tau. The kinetic energy of a
-    rotor is that of its own rotation, B theta'^2/2; its mass belongs to the link that carries it. What Spong's model neglects,
-    the coupling with that link's rotation, is of the order of 1/n: where it matters, add rotors as bodies on their links by a
-    `ModelBuilder`, and `ElasticTransmission` to the scene.
+        The scene's q is (model's q, theta) and v is (model's v, rate of theta); torques of the motors are the last
+        entries of tau. The kinetic energy of a rotor is that of its own rotation, $B \dot\theta^2/2$; its mass belongs to
+        the link that carries it. Spong's model neglects the coupling with that link's rotation, which is of the order of
+        1/n: where it matters, add rotors as bodies on their links by a `ModelBuilder`, and `ElasticTransmission` to the
+        scene.
 
     **Arguments:**
 
@@ -107,11 +111,11 @@ def elastic_joints(
     """
     chosen = model.joint_names if joints is None else _tuple(joints)
     # Called for its message on unknown joints.
-    _joint_indices(model, chosen, "elastic_joints")
+    joint_indices(model, chosen, "elastic_joints")
     kinds = dict(zip(model.joint_names, model.topology.kinds, strict=True))
     if several := [name for name in chosen if KINDS[kinds[name]].nv != 1]:
         raise ValueError(f"elastic_joints: {several} have several coordinates; name joints of one")
-    if not _is_positive(rotor_inertia):
+    if not is_positive(rotor_inertia):
         raise ValueError(f"elastic_joints: rotor_inertia is {rotor_inertia}; give positive inertias (kg m^2)")
     motors = tuple(f"{name}{suffix}" for name in chosen)
     inertias = jnp.broadcast_to(jnp.asarray(rotor_inertia, float), (len(chosen),))

@@ -25,7 +25,8 @@ class _Indices(NamedTuple):
     v: np.ndarray
 
 
-def _joint_indices(system, joints: tuple[str, ...] | None, force: str) -> _Indices:
+def joint_indices(system, joints: tuple[str, ...] | None, force: str) -> _Indices:
+    """Indices of the joints' coordinates in q and v; `force` is its name in errors."""
     if joints is None:
         return _Indices(np.arange(system.nq), np.arange(system.nv))
     if not isinstance(system, Model):
@@ -44,7 +45,7 @@ def _joint_indices(system, joints: tuple[str, ...] | None, force: str) -> _Indic
     return _Indices(q, v)
 
 
-def _broadcast(value, like: Array, size: int, name: str) -> Array:
+def broadcast_leaf(value, like: Array, size: int, name: str) -> Array:
     """Broadcast a leaf to (size,) in the dtype of the state."""
     if jnp.shape(value) not in ((), (size,)):
         raise ValueError(
@@ -62,7 +63,7 @@ def _scatter(values: Array, indices: np.ndarray, size: int) -> Array:
     return jnp.zeros((size,), values.dtype).at[indices].set(values)
 
 
-def _leaf(value) -> Any:
+def as_leaf(value) -> Any:
     """Convert a user's number to a floating array leaf of strong type, so that a new value never recompiles."""
     if value is None:
         return None
@@ -70,7 +71,8 @@ def _leaf(value) -> Any:
     return jnp.asarray(value, value.dtype if jnp.issubdtype(value.dtype, jnp.inexact) else float)
 
 
-def _names(joints) -> tuple[str, ...] | None:
+def as_names(joints) -> tuple[str, ...] | None:
+    """Tuple of joint names, of one name or several; None for all joints."""
     return joints if joints is None else (joints,) if isinstance(joints, str) else tuple(joints)
 
 
@@ -88,18 +90,20 @@ def _displacement(system, rest, q, indices: _Indices, name: str) -> Array:
     """Difference (per velocity coordinate of the chosen joints) from `rest` to q, on the joints' manifold."""
     if not isinstance(system, Model):
         # Other systems have v = dq/dt, so that a displacement is a difference.
-        return take(q, indices.q) - _broadcast(rest, q, len(indices.q), name)
+        return take(q, indices.q) - broadcast_leaf(rest, q, len(indices.q), name)
     if jnp.shape(rest) == () and len(indices.q) != len(indices.v):
         raise ValueError(
             f"{name} is a scalar, but a joint with a quaternion needs all its coordinates, {len(indices.q)} here"
         )
     # Other joints are compared with themselves: exactly zero at any configuration.
-    start = q.at[indices.q].set(_broadcast(rest, q, len(indices.q), name))
+    start = q.at[indices.q].set(broadcast_leaf(rest, q, len(indices.q), name))
     return take(difference(system, start, q), indices.v)
 
 
 class JointDamping(eqx.Module):
-    """Viscous joint friction: tau = -coefficient * v.
+    r"""Viscous joint friction.
+
+    $$\tau = -\mathrm{coefficient} \cdot v$$
 
     **Arguments:** `coefficient` (N m s or N s), scalar or one per coordinate; None means the model's `damping` leaf.
     `joints`, names of the joints, or None for all.
@@ -107,25 +111,27 @@ class JointDamping(eqx.Module):
     **Raises:** (when called) ValueError for unknown joints, a wrong shape, or no coefficient in force and model.
     """
 
-    coefficient: Float[Array, "..."] | None = eqx.field(converter=_leaf, default=None)
-    joints: tuple[str, ...] | None = eqx.field(static=True, converter=_names, default=None)
+    coefficient: Float[Array, "..."] | None = eqx.field(converter=as_leaf, default=None)
+    joints: tuple[str, ...] | None = eqx.field(static=True, converter=as_names, default=None)
 
     def __call__(
         self, system: SystemLike, q: Float[Array, " nq"], v: Float[Array, " nv"], t: Number
     ) -> Float[Array, " nv"]:
-        indices = _joint_indices(system, self.joints, "JointDamping")
+        indices = joint_indices(system, self.joints, "JointDamping")
         value = _value_or_leaf(self.coefficient, system, indices, "damping", "JointDamping")
         rate = take(v, indices.v)
-        return _scatter(-_broadcast(value, v, rate.size, "JointDamping: coefficient") * rate, indices.v, system.nv)
+        return _scatter(-broadcast_leaf(value, v, rate.size, "JointDamping: coefficient") * rate, indices.v, system.nv)
 
 
 class CoulombFriction(eqx.Module):
-    """Smoothed Coulomb friction of joints: tau = -level * tanh(v / v_s).
+    r"""Smoothed Coulomb friction of joints.
 
-    The jump at v = 0 is replaced by a linear range with derivative level / v_s, so that solutions are
-    unique and gradients exist. There is no sticking: under a load below `level` a joint creeps at v = v_s artanh(load /
-    level). The torque is within 1 % of `level` above 2.65 v_s. A small v_s makes the equations stiff (rate level /
-    (v_s * inertia)): use an implicit solver or a larger v_s.
+    $$\tau = -\mathrm{level} \tanh(v / v_s)$$
+
+    The jump at v = 0 is replaced by a linear range with derivative level / v_s, so that solutions are unique and
+    gradients exist. There is no sticking: under a load F below `level` a joint creeps at
+    $v_s \operatorname{artanh}(F / \mathrm{level})$. The torque is within 1 % of `level` above 2.65 v_s. A small v_s makes
+    the equations stiff (rate level / (v_s * inertia)): use an implicit solver or a larger v_s.
 
     **Arguments:** `level` (N m or N), scalar or one per coordinate; None means the model's `friction` leaf. `v_s`,
     smoothing velocity (rad/s or m/s), positive. `joints`, names of the joints, or None for all.
@@ -134,31 +140,33 @@ class CoulombFriction(eqx.Module):
     level.
     """
 
-    level: Float[Array, "..."] | None = eqx.field(converter=_leaf, default=None)
-    v_s: Float[Array, "..."] = eqx.field(converter=_leaf, default=1e-2)
-    joints: tuple[str, ...] | None = eqx.field(static=True, converter=_names, default=None)
+    level: Float[Array, "..."] | None = eqx.field(converter=as_leaf, default=None)
+    v_s: Float[Array, "..."] = eqx.field(converter=as_leaf, default=1e-2)
+    joints: tuple[str, ...] | None = eqx.field(static=True, converter=as_names, default=None)
 
     def __check_init__(self):
-        if not _is_positive(self.v_s):
+        if not is_positive(self.v_s):
             raise ValueError(f"CoulombFriction: v_s is {self.v_s}; give a positive smoothing velocity, e.g. 0.01 rad/s")
 
     def __call__(
         self, system: SystemLike, q: Float[Array, " nq"], v: Float[Array, " nv"], t: Number
     ) -> Float[Array, " nv"]:
         # tanh and no sign: the force has a derivative at rest, and solutions are unique.
-        indices = _joint_indices(system, self.joints, "CoulombFriction")
+        indices = joint_indices(system, self.joints, "CoulombFriction")
         level = _value_or_leaf(self.level, system, indices, "friction", "CoulombFriction")
         rate = take(v, indices.v)
-        ratio = rate / _broadcast(self.v_s, v, rate.size, "CoulombFriction: v_s")
+        ratio = rate / broadcast_leaf(self.v_s, v, rate.size, "CoulombFriction: v_s")
         return _scatter(
-            -_broadcast(level, v, rate.size, "CoulombFriction: level") * jnp.tanh(ratio), indices.v, system.nv
+            -broadcast_leaf(level, v, rate.size, "CoulombFriction: level") * jnp.tanh(ratio), indices.v, system.nv
         )
 
 
 class JointSpring(eqx.Module):
-    """Joint spring: tau = -stiffness * difference(rest, q), along the joints' manifold.
+    r"""Joint spring along the joints' manifold.
 
-    Conservative, with the energy stiffness |difference|^2 / 2, for joints of one coordinate and for spherical joints
+    $$\tau = -\mathrm{stiffness} \cdot \Delta, \quad \Delta = \mathrm{difference}(\mathrm{rest}, q)$$
+
+    Conservative, with the energy stiffness $|\Delta|^2 / 2$, for joints of one coordinate and for spherical joints
     of equal stiffness about the three axes. In planar and free joints the force is along the twist that leads back to
     rest.
 
@@ -169,29 +177,32 @@ class JointSpring(eqx.Module):
     **Raises:** (when called) ValueError for unknown joints or a wrong shape.
     """
 
-    stiffness: Float[Array, "..."] = eqx.field(converter=_leaf)
-    rest: Float[Array, "..."] | None = eqx.field(converter=_leaf, default=None)
-    joints: tuple[str, ...] | None = eqx.field(static=True, converter=_names, default=None)
+    stiffness: Float[Array, "..."] = eqx.field(converter=as_leaf)
+    rest: Float[Array, "..."] | None = eqx.field(converter=as_leaf, default=None)
+    joints: tuple[str, ...] | None = eqx.field(static=True, converter=as_names, default=None)
 
     def __call__(
         self, system: SystemLike, q: Float[Array, " nq"], v: Float[Array, " nv"], t: Number
     ) -> Float[Array, " nv"]:
-        indices = _joint_indices(system, self.joints, "JointSpring")
+        indices = joint_indices(system, self.joints, "JointSpring")
         rest = self.rest
         if rest is None:
             # Zeros are no unit quaternion; the neutral configuration has those of no rotation.
             rest = take(neutral(system), indices.q) if isinstance(system, Model) else jnp.zeros(indices.q.size, q.dtype)
         stretch = _displacement(system, rest, q, indices, "JointSpring: rest")
         return _scatter(
-            -_broadcast(self.stiffness, q, stretch.size, "JointSpring: stiffness") * stretch, indices.v, system.nv
+            -broadcast_leaf(self.stiffness, q, stretch.size, "JointSpring: stiffness") * stretch, indices.v, system.nv
         )
 
 
 class Drive(eqx.Module):
-    """Position and velocity drive: tau = kp * difference(q, target) + kd * (target_velocity - v).
+    r"""Position and velocity drive.
 
-    The difference is taken along the joints' manifold. With `effort_limit` L the command u is passed through L tanh(u
-    / L): smooth, never above L, within 1 % of u below 0.17 L. For a time-dependent target pass a `control` to `simulate`.
+    $$\tau = k_p \mathrm{difference}(q, \mathrm{target}) + k_d (v_\mathrm{target} - v)$$
+
+    The difference is taken along the joints' manifold. With `effort_limit` L the command u is passed through
+    $L \tanh(u / L)$: smooth, never above L, within 1 % of u below 0.17 L. For a time-dependent target pass a `control` to
+    `simulate`.
 
     **Arguments:** `kp` (N m/rad or N/m), `kd` (N m s/rad or N s/m), `target_velocity` (rad/s or m/s), `effort_limit`
     (N m or N; None or infinite for no limit): scalar or one per velocity coordinate. `target` (nq of the chosen
@@ -201,31 +212,31 @@ class Drive(eqx.Module):
     shape.
     """
 
-    kp: Float[Array, "..."] = eqx.field(converter=_leaf)
-    kd: Float[Array, "..."] = eqx.field(converter=_leaf)
-    target: Float[Array, "..."] = eqx.field(converter=_leaf)
-    target_velocity: Float[Array, "..."] = eqx.field(converter=_leaf, default=0.0)
-    effort_limit: Float[Array, "..."] | None = eqx.field(converter=_leaf, default=None)
-    joints: tuple[str, ...] | None = eqx.field(static=True, converter=_names, default=None)
+    kp: Float[Array, "..."] = eqx.field(converter=as_leaf)
+    kd: Float[Array, "..."] = eqx.field(converter=as_leaf)
+    target: Float[Array, "..."] = eqx.field(converter=as_leaf)
+    target_velocity: Float[Array, "..."] = eqx.field(converter=as_leaf, default=0.0)
+    effort_limit: Float[Array, "..."] | None = eqx.field(converter=as_leaf, default=None)
+    joints: tuple[str, ...] | None = eqx.field(static=True, converter=as_names, default=None)
 
     def __check_init__(self):
-        if self.effort_limit is not None and not _is_positive(self.effort_limit):
+        if self.effort_limit is not None and not is_positive(self.effort_limit):
             raise ValueError(f"Drive: effort_limit is {self.effort_limit}; give positive limits, or None for no limit")
 
     def __call__(
         self, system: SystemLike, q: Float[Array, " nq"], v: Float[Array, " nv"], t: Number
     ) -> Float[Array, " nv"]:
-        indices = _joint_indices(system, self.joints, "Drive")
+        indices = joint_indices(system, self.joints, "Drive")
         size = indices.v.size
         kp, kd, rate = (
-            _broadcast(value, v, size, f"Drive: {name}")
+            broadcast_leaf(value, v, size, f"Drive: {name}")
             for name, value in (("kp", self.kp), ("kd", self.kd), ("target_velocity", self.target_velocity))
         )
         # The displacement leads from the target to q, and the drive acts against it.
         error = -_displacement(system, self.target, q, indices, "Drive: target")
         command = kp * error + kd * (rate - take(v, indices.v))
         if self.effort_limit is not None:
-            limit = _broadcast(self.effort_limit, v, size, "Drive: effort_limit")
+            limit = broadcast_leaf(self.effort_limit, v, size, "Drive: effort_limit")
             is_finite = jnp.isfinite(limit)
             safe = jnp.where(is_finite, limit, jnp.ones_like(limit))  # keeps inf * 0 out of the gradient
             # tanh and no clip: a kink would cost the solver its order, and saturated drives their gradient.
@@ -234,7 +245,11 @@ class Drive(eqx.Module):
 
 
 class ExternalWrench(eqx.Module):
-    """Constant wrench on a body: tau = J^T F, with J the body Jacobian of its frame.
+    r"""Constant wrench on a body.
+
+    $$\tau = J^T F$$
+
+    with J the Jacobian of its frame.
 
     **Arguments:** `frame`, name of a body or frame; the wrench acts at its origin. `wrench` (6,), (f, tau) in N and N
     m, acting on the body. `axes`: "world", the wrench keeps its direction in the world; "body", it turns with the
@@ -244,7 +259,7 @@ class ExternalWrench(eqx.Module):
     """
 
     frame: str = eqx.field(static=True)
-    wrench: Float[Array, "..."] = eqx.field(converter=_leaf)
+    wrench: Float[Array, "..."] = eqx.field(converter=as_leaf)
     axes: str = eqx.field(static=True, default="world")
 
     def __check_init__(self):
@@ -272,7 +287,7 @@ class ExternalWrench(eqx.Module):
         return body_jacobian(system, q, self.frame).T @ wrench
 
 
-def _is_positive(value) -> bool:
+def is_positive(value) -> bool:
     """Decide whether a value is positive; a traced one counts as positive."""
 
     return not is_concrete(value) or bool((np.asarray(value) > 0).all())

@@ -14,12 +14,13 @@ from jaxdyn.model.tree import Model
 
 
 class JointStops(PiecewiseForce):
-    """Unilateral spring-damper stops at the position limits of a model's joints.
+    r"""Unilateral spring-damper stops at the position limits of a model's joints.
 
-    Beyond a limit by x, with the velocity x' outwards, tau = -max(k x + d x', 0); else zero. `jd.simulate` ends a step where a
-    joint reaches a stop or leaves it (see `PiecewiseForce`). A joint pressed against its
-    stop with tau comes to rest tau/k beyond it. Steps must resolve the frequency sqrt(k/M); with d = 2 sqrt(k M) the
-    joint does not rebound.
+    $$\tau = -\max(k x + d \dot x, 0)$$
+
+    beyond a limit by x, with the velocity $\dot x$ outwards; else zero. `jd.simulate` ends a step where a joint reaches a stop or
+    leaves it (see `PiecewiseForce`). A joint pressed against its stop with $\tau$ comes to rest $\tau/k$ beyond it. Steps must
+    resolve the frequency $\sqrt{k/M}$; with $d = 2 \sqrt{k M}$ the joint does not rebound.
 
     **Arguments:** `stiffness` k (N m/rad or N/m) and `damping` d (N m s/rad or N s/m), numbers; `joints`, names of
     joints of one coordinate, or None for all that have a finite limit.
@@ -46,7 +47,10 @@ class JointStops(PiecewiseForce):
     def guards(
         self, system: Checked[Model], q: Float[Array, " nq"], v: Float[Array, " nv"], t: Number
     ) -> Float[Array, " n"]:
-        """Switching functions k x + min(d x', 0) of the lower limits, then of the upper ones."""
+        r"""Switching functions of the lower limits, then of the upper ones.
+
+        $$k x + \min(d \dot x, 0)$$
+        """
         # At contact (x = 0, x' > 0) this is k x; at separation (x' < 0) it is the force, which must not become a pull.
         # An infinite limit has a constant negative guard, so that it is never an event.
         return jnp.concatenate([jnp.where(bounded, k * x + jnp.minimum(d * rate, 0.0), -1.0)
@@ -113,7 +117,9 @@ class JointStops(PiecewiseForce):
 
 
 class EffortLimits(eqx.Module):
-    """Saturation of the efforts of a control, or of `jd.stepper`, at actuator limits: -limit <= tau <= limit.
+    r"""Saturation of the efforts of a control, or of `jd.stepper`, at actuator limits.
+
+    $$-\mathrm{limit} \le \tau \le \mathrm{limit}$$
 
     It acts on tau, not on the scene's other forces; its own generalised force is zero.
 
@@ -183,12 +189,15 @@ class EffortLimits(eqx.Module):
 
 
 class TorqueSpeedLimits(EffortLimits):
-    """Torque-speed curve of a motor at its largest voltage: |tau + (stall / no_load) v| <= stall.
+    r"""Torque-speed curve of a motor at its largest voltage.
 
-    A motor of resistance R and constant k at the voltage U gives tau = k (U - k v) / R: at most stall = k U_max / R at rest and
-    nothing at the speed no_load = U_max / k. Beyond that speed it brakes. Against the motion it may give more than `stall`,
-    which the current limits: list `jd.forces.EffortLimits` behind it. Like these it acts on tau, not on the scene's other
-    forces, and `jd.simulate` and `jd.stepper` end a step where a torque reaches the curve or leaves it.
+    $$|\tau + \tau_\mathrm{stall} v / v_\mathrm{no\ load}| \le \tau_\mathrm{stall}$$
+
+    A motor of resistance R and constant k at the voltage U gives $\tau = k (U - k v) / R$: at most $k U_{\max} / R$ at
+    rest, the `stall` torque, and nothing at the speed `no_load`, $U_{\max} / k$. Beyond that speed it brakes. Against the
+    motion it may give more than `stall`, which the current limits: list `jd.forces.EffortLimits` behind it. Like these it
+    acts on tau, not on the scene's other forces, and `jd.simulate` and `jd.stepper` end a step where a torque reaches the
+    curve or leaves it.
 
     **Arguments:** `stall` (N m or N) and `no_load` (rad/s or m/s), at the joint (behind the gear), positive: numbers or one per
     velocity coordinate. Joints without a curve have an infinite `stall`.

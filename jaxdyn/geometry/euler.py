@@ -11,11 +11,12 @@ from jaxdyn.systems.mass_factor import solve_positive
 
 
 def arnold_form(inertia: Float[Array, "n n"], c: Float[Array, " n"], a: Float[Array, " n"]) -> Float[Array, " n"]:
-    """Arnold's bilinear form B(c, a), defined by <B(c, a), b> = <[a, b], c> for all b.
+    r"""Arnold's bilinear form B(c, a) of a rotational or spatial inertia.
 
-    The inner product is <x, y> = x . inertia y.
-    On SO(3) inertia B(c, a) = (inertia c) x a; on SE(3) inertia B(c, a) = ad_a^T (inertia c). Without forces a rigid body moves
-    by Euler's equations dV/dt = B(V, V): the geodesics of the metric, as the left translations of Lemma 7.1 show.
+    $$\langle B(c, a), b \rangle = \langle [a, b], c \rangle \quad \text{for all } b, \qquad \langle x, y \rangle = x^T I y$$
+
+    On SO(3) it satisfies $I B(c, a) = (I c) \times a$, on SE(3) $I B(c, a) = \mathrm{ad}_a^T I c$. Without forces a rigid body
+    moves by Euler's equations $\dot V = B(V, V)$: the geodesics of the metric, as the left translations of Lemma 7.1 show.
 
     **Arguments:** `inertia` (3, 3), kg m^2, in body axes, with angular velocities `c`, `a` (3,), rad/s; or (6, 6), a spatial
     inertia in a body frame (`jd.inertia.spatial_inertia`), with body twists (v, omega) (6,).

@@ -55,12 +55,14 @@ class PullBack(eqx.Module):
 
 
 def pull_back(field: Function, immersion: Function) -> PullBack:
-    """Pull-back of a covariant tensor by q = xi(s): J^T g J of a metric, J^T F of a one-form, V(xi(s)) of a function.
+    r"""Pull-back of a covariant tensor by an immersion.
+
+    It is $J^T g J$ of a metric g, $J^T F$ of a one-form F, and $V(\xi(s))$ of a function V, for $q = \xi(s)$.
 
     **Arguments:**
 
     - `field`: function of q (n,) -> (), (n,), (n, n), ...; one index per argument of the tensor.
-    - `immersion`: xi(s) -> (n,), of s (m,), with J = dxi/ds of rank m.
+    - `immersion`: xi(s) -> (n,), of s (m,), with $J = d\xi/ds$ of rank m.
 
     **Returns:** a function of s that gives (), (m,), (m, m), ...; `jd.MetricSystem` takes it for a metric.
 
@@ -218,10 +220,10 @@ def constrain_by_immersion(
     moving: bool = False,
     force: Function | None = None,
 ) -> ImmersedSystem | Scene:
-    """System in s of one system constrained to q = xi(s), or of several independent ones that xi joins.
+    r"""System in s of one system constrained to q = xi(s), or of several independent ones that xi joins.
 
-    M becomes rho = J^T M J, forces become J^T F, and the reaction forces drop out; `reaction_force` gives them. The motion
-    is that of the same constraint with multipliers, without drift from the constraint.
+    The mass matrix becomes $\rho = J^T M J$ with $J = d\xi/ds$, forces become $J^T F$, and the reaction forces drop out;
+    `reaction_force` gives them. The motion is that of the same constraint with multipliers, without drift from it.
 
     **Arguments:**
 
@@ -277,7 +279,9 @@ def reaction_force(
     force: Numbers | None = None,
     t: Numbers = 0.0,
 ) -> Array | tuple[Array, ...]:
-    """Reaction force R = M a + h - F of an immersion, in the coordinates of its system; J^T R = 0.
+    r"""Reaction force of an immersion, in the coordinates of its system.
+
+    $$R = M a + h - F, \qquad J^T R = 0$$
 
     **Arguments:**
 

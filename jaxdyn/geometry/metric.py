@@ -19,9 +19,9 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from jaxdyn.compile import entry_point
-from jaxdyn.dynamics.quantities import mass_matrix
+from jaxdyn.dynamics.quantities import first_kind_symbols, mass_matrix
 from jaxdyn.lie.so3 import matmul
-from jaxdyn.model.arguments import as_array, batch_hint, check_state, check_system, state_dtype
+from jaxdyn.model.arguments import Numbers, as_array, batch_hint, check_state, check_system, state_dtype
 from jaxdyn.model.tree import Model
 from jaxdyn.systems.mass_factor import solve_positive
 from jaxdyn.systems.scene import Scene
@@ -48,7 +48,9 @@ def _compile_for_systems(function: Callable) -> Callable:
 
 
 def flat(metric: Metric, q: Float[Array, " n"], v: Float[Array, " n"]) -> Float[Array, " n"]:
-    """One-form of a vector, g(q) v: the momentum of a velocity, the force of an acceleration.
+    """One-form of a vector: the momentum of a velocity, the force of an acceleration.
+
+    $$p = g(q) v$$
 
     **Arguments:** `metric` as above; `q`, `v` (n,). **Returns:** (n,).
     """
@@ -57,7 +59,9 @@ def flat(metric: Metric, q: Float[Array, " n"], v: Float[Array, " n"]) -> Float[
 
 
 def sharp(metric: Metric, q: Float[Array, " n"], p: Float[Array, " n"]) -> Float[Array, " n"]:
-    """Vector of a one-form, g(q)^-1 p: the inverse of `flat`.
+    """Vector of a one-form, the inverse of `flat`.
+
+    $$v = g(q)^{-1} p$$
 
     **Arguments:** `metric` as above; `q`, `p` (n,). **Returns:** (n,); NaN where g is not positive definite.
     """
@@ -69,24 +73,36 @@ def _sharp(metric, q, p):
     return solve_positive(_as_function(metric)(q), p)
 
 
-def christoffel_symbols(metric: Metric, q: Float[Array, " n"], kind: str = "second") -> Float[Array, "n n n"]:
-    """Christoffel symbols: Gamma^i_jk ("second" kind) or Gamma_ijk = g_il Gamma^l_jk ("first"), the index i in front.
+def christoffel_symbols(
+    metric: Metric, q: Float[Array, " n"], kind: str = "second", t: Numbers = 0.0
+) -> Float[Array, "n n n"]:
+    r"""Christoffel symbols of the second or of the first kind, the index i in front.
 
-    **Arguments:** `metric` as above; `q` (n,).
+    $$\Gamma_{ijk} = g_{il} \Gamma^l_{jk} = \tfrac12 \left( \frac{\partial g_{ij}}{\partial q_k}
+    + \frac{\partial g_{ik}}{\partial q_j} - \frac{\partial g_{jk}}{\partial q_i} \right)$$
+
+    For a mass matrix the symbols of the first kind give $C_{ij} = \sum_k \Gamma_{ijk} v_k$, which has the same $C v$ and
+    $C + C^T$ as `coriolis_matrix`. Those of a `Model` are in closed form.
+
+    **Arguments:** `metric` as above; `q` (n,); `kind`, "first" or "second"; `t`, s, of a system.
 
     **Returns:** (n, n, n), symmetric in the last two indices.
 
-    **Raises:** ValueError for another kind.
+    **Raises:** ValueError for another kind, and for a model with a joint whose v is not dq/dt (planar, spherical, free).
+
+    Source: Murray, Li & Sastry (1994), eq. 4.23; EQUATIONS section 0.
     """
     if kind not in KINDS:
         raise ValueError(f"kind is {kind!r}; choose from {', '.join(KINDS)}")
-    return _symbols(metric, *_vectors(metric, q=q), kind)
+    (q,) = _vectors(metric, q=q)
+    return _symbols(metric, q, as_array(t, "t", q.dtype), kind)
 
 
 @_compile_for_systems
-def _symbols(metric, q, kind):
-    g = _as_function(metric)
-    first = symbols(jax.jacfwd(g)(q))
+def _symbols(metric, q, t, kind):
+    g = _as_function(metric, t)
+    is_system = isinstance(metric, (Model, System))
+    first = first_kind_symbols(metric, q, t) if is_system else symbols(jax.jacfwd(g)(q))
     # One factorisation of g for all n^2 columns.
     return first if kind == "first" else solve_positive(g(q), first.reshape(q.shape[0], -1)).reshape(first.shape)
 
@@ -94,7 +110,9 @@ def _symbols(metric, q, kind):
 def connection(
     metric: Metric, q: Float[Array, " n"], v: Float[Array, " n"], w: Float[Array, " n"]
 ) -> Float[Array, " n"]:
-    """Connection Gamma(v, w)^i = Gamma^i_jk v_j w_k, symmetric and bilinear in v and w; the symbols are not formed.
+    r"""Connection of the metric, symmetric and bilinear in v and w; the symbols are not formed.
+
+    $$\Gamma(v, w)^i = \Gamma^i_{jk} v^j w^k$$
 
     **Arguments:** `metric` as above; `q`, `v`, `w` (n,). **Returns:** (n,).
     """
@@ -114,9 +132,11 @@ def _connection(metric, q, v, w):
 def covariant_rate(
     metric: Metric, q: Float[Array, " n"], v: Float[Array, " n"], w: Float[Array, " n"], rate: Float[Array, " n"]
 ) -> Float[Array, " n"]:
-    """Covariant derivative Dw/dt = dw/dt + Gamma(dq/dt, w) of a vector field w(t) along a curve.
+    r"""Covariant derivative of a vector field w(t) along a curve.
 
-    With w = v = dq/dt and rate = a it is the covariant acceleration nabla_v v. It is zero for parallel transport.
+    $$\frac{Dw}{dt} = \dot w + \Gamma(\dot q, w)$$
+
+    With $w = v = \dot q$ and the rate a it is the covariant acceleration $\nabla_v v$. It is zero for parallel transport.
 
     **Arguments:** `metric` as above; `q`, its rate `v`, `w` and its `rate` dw/dt, each (n,). **Returns:** (n,).
     """
@@ -127,7 +147,9 @@ def covariant_rate(
 def covariant_derivative(
     metric: Metric, field: Callable, q: Float[Array, " n"], v: Float[Array, " n"]
 ) -> Float[Array, " n"]:
-    """Covariant derivative nabla_v X = dX(v) + Gamma(v, X) of a vector field X(q) -> (n,) in the direction v.
+    r"""Covariant derivative of a vector field X(q) -> (n,) in the direction v.
+
+    $$\nabla_v X = dX(v) + \Gamma(v, X)$$
 
     **Arguments:** `metric` as above; `field`, X; `q`, `v` (n,). **Returns:** (n,).
     """
@@ -138,7 +160,9 @@ def covariant_derivative(
 
 
 def geodesic_acceleration(metric: Metric, q: Float[Array, " n"], v: Float[Array, " n"]) -> Float[Array, " n"]:
-    """Acceleration d2q/dt2 = -Gamma(v, v) of the geodesic through q with velocity v.
+    r"""Acceleration of the geodesic through q with velocity v.
+
+    $$\ddot q = -\Gamma(v, v)$$
 
     `jd.MetricSystem(metric, n)` simulates it.
 
@@ -148,10 +172,13 @@ def geodesic_acceleration(metric: Metric, q: Float[Array, " n"], v: Float[Array,
 
 
 def riemann_tensor(metric: Metric, q: Float[Array, " n"]) -> Float[Array, "n n n n"]:
-    """Curvature tensor R^i_jkl, with R(u, w) z = nabla_u nabla_w z - nabla_w nabla_u z - nabla_[u,w] z.
+    r"""Curvature tensor of the metric, with its indices as in R^i_jkl.
 
-        (R(u, w) z)^i = R^i_jkl z^j u^k w^l,
-        R^i_jkl = dGamma^i_lj/dq_k - dGamma^i_kj/dq_l + Gamma^i_km Gamma^m_lj - Gamma^i_lm Gamma^m_kj.
+    $$R(u, w) z = \nabla_u \nabla_w z - \nabla_w \nabla_u z - \nabla_{[u, w]} z, \quad
+    (R(u, w) z)^i = R^i_{jkl} z^j u^k w^l$$
+
+    $$R^i_{jkl} = \frac{\partial \Gamma^i_{lj}}{\partial q_k} - \frac{\partial \Gamma^i_{kj}}{\partial q_l}
+    + \Gamma^i_{km} \Gamma^m_{lj} - \Gamma^i_{lm} \Gamma^m_{kj}$$
 
     **Arguments:** `metric` as above, twice differentiable; `q` (n,). **Returns:** (n, n, n, n), index i in front.
 
@@ -162,8 +189,9 @@ def riemann_tensor(metric: Metric, q: Float[Array, " n"]) -> Float[Array, "n n n
 
 @_compile_for_systems
 def _curvature(metric, q):
-    gamma = _symbols(metric, q, "second")
-    derivative = jax.jacfwd(lambda q: _symbols(metric, q, "second"))(q)
+    start = jnp.zeros((), q.dtype)
+    gamma = _symbols(metric, q, start, "second")
+    derivative = jax.jacfwd(lambda q: _symbols(metric, q, start, "second"))(q)
     # R is antisymmetric in k and l: half of its terms, minus the same with k and l exchanged.
     # derivative[i, l, j, k] = dGamma^i_lj / dq_k, in the order [i, j, k, l] of the tensor.
     half = derivative.transpose(0, 2, 3, 1) + jnp.einsum("ikm,mlj->ijkl", gamma, gamma)
@@ -173,7 +201,11 @@ def _curvature(metric, q):
 def sectional_curvature(
     metric: Metric, q: Float[Array, " n"], u: Float[Array, " n"], w: Float[Array, " n"]
 ) -> Float[Array, ""]:
-    """Curvature <R(u, w) w, u> / (|u|^2 |w|^2 - <u, w>^2) of the plane of u and w: 1/r^2 on a sphere of radius r.
+    r"""Curvature of the plane of u and w.
+
+    $$\frac{\langle R(u, w) w, u \rangle}{|u|^2 |w|^2 - \langle u, w \rangle^2}$$
+
+    It is $1/r^2$ on a sphere of radius r.
 
     **Arguments:** `metric` as above; `q`, `u`, `w` (n,), u and w independent. **Returns:** ().
     """
@@ -205,8 +237,8 @@ def _vectors(metric, **arguments) -> tuple[Array, ...]:
     return tuple(as_array(value, name, dtype) for name, value in arguments.items())
 
 
-def _as_function(metric) -> Callable:
-    """The metric as a function of q.
+def _as_function(metric, t: Numbers = 0.0) -> Callable:
+    """The metric as a function of q, that of a system at the time t.
 
     **Raises:** ValueError for an argument that gives no metric.
     """
@@ -221,7 +253,7 @@ def _as_function(metric) -> Callable:
             f"metric is model {metric.name!r}, which has a planar joint, whose v is not dq/dt; give g(q) in coordinates"
         )
     if isinstance(metric, (Model, System)):
-        return lambda q: mass_matrix(metric, q)
+        return lambda q: mass_matrix(metric, q, t)
     if isinstance(metric, Scene):
         check_system(metric, "metric")
     if not callable(metric):

@@ -33,14 +33,18 @@ from jaxdyn.systems.system import velocity_to_rate
 
 
 class ObjectDynamics(Outcome):
-    """Equations of motion M~ nudot + C~ nu + N~ = F of a grasped object, their solution and the contact forces.
+    r"""Equations of motion of a grasped object, their solution and the contact forces.
+
+    $$\tilde M \dot\nu + \tilde C \nu + \tilde N = F$$
 
     nu (nr,) is the object's velocity V with `object_dynamics`, and (w, u) with `hand_dynamics`.
 
-    - `mass_matrix`, `coriolis_matrix` (nr, nr); `gravity_force`, `force` (nr,): M~, C~, N~, F; wrenches in the object's
-      frame for the velocity of a free body. M~ is symmetric, dM~/dt - 2 C~ skew.
-    - `input_map` (nr, nh): of the joints' torques, F = input_map tau_f + forces on the object: G J_h^-T with V.
-    - `rate` (nr,): nudot. `velocity`, `acceleration` (nv,): of all joints, v = N nu and its rate.
+    - `mass_matrix`, `coriolis_matrix` (nr, nr); `gravity_force`, `force` (nr,): $\tilde M$, $\tilde C$, $\tilde N$, F;
+      wrenches in the object's frame for the velocity of a free body. $\tilde M$ is symmetric,
+      $\dot{\tilde M} - 2 \tilde C$ skew.
+    - `input_map` (nr, nh): maps the joints' torques to their part of F, the rest is the forces on the object; $G J_h^{-T}$
+      with V.
+    - `rate` (nr,): $\dot\nu$. `velocity`, `acceleration` (nv,): of all joints, $v = N \nu$ and its rate.
     - `contact_forces` (nc,): on the object, along the contacts' components, N and N m.
     - `basis` (nv, nr): N.
     - `result`: one of `jd.RESULTS`; `singular_basis` where the hand Jacobian is singular, or its rank differs from that
@@ -83,7 +87,7 @@ def object_dynamics(
     **Returns:** `ObjectDynamics`.
 
     **Raises:** ValueError for inconsistent shapes, and where the number of contact rows differs from that of the hand's
-    joints, so that J_h is not square: use `hand_dynamics` then.
+    joints, so that $J_h$ is not square: use `hand_dynamics` then.
 
     Source: Murray, Li & Sastry (1994), eqs 6.21-6.25; EQUATIONS section 10 and errata E35-E37.
     """
@@ -114,12 +118,15 @@ def hand_dynamics(
     *,
     motions: HandMotions | None = None,
 ) -> ObjectDynamics:
-    """Equations of motion of any hand, also redundant or nonmanipulable ones.
+    r"""Equations of motion of any hand, also redundant or nonmanipulable ones.
 
-    Formulation: minimal velocities nu = (w, u), w of the object velocities V = H w that the fingers can follow, u of the
-    internal motions of the hand; thetadot = J_h^+ G^T H w + K u with the pseudo-inverse J_h^+ and K a basis of ker J_h. No
-    chart is laid on the object's configuration, nor any quantity damped. Where J_h is square and regular it is
-    `object_dynamics`, and nu = V.
+    Formulation: minimal velocities $\nu = (w, u)$, w of the object velocities that the fingers can follow, u of the internal
+    motions of the hand:
+
+    $$V = H w, \quad \dot\theta = J_h^+ G^T H w + K u$$
+
+    with the pseudo-inverse $J_h^+$ and K a basis of $\ker J_h$. No chart is laid on the object's configuration, nor any quantity
+    damped. Where $J_h$ is square and regular it is `object_dynamics`, and $\nu = V$.
 
     Structural contact forces, which no torque changes, follow from the object's equation
     too; for dependent rows, the forces of least norm, as in `jd.constrained_dynamics`.
@@ -129,7 +136,7 @@ def hand_dynamics(
     - `q` (nq,), on the contacts; `nu` (nw + nk,): (w, u).
     - `tau` (nv,), of the fingers' joints and on the object, N m or N (None: zero); `t`, s. The grasp's forces are added.
     - `motions`: references of H and K, `hand_motions` of a configuration nearby; by default of q itself. Along a motion
-      keep them, so that nu keeps its meaning: dM~/dt - 2 C~ is skew for H and K continued from fixed references.
+      keep them, so that nu keeps its meaning: $\dot{\tilde M} - 2 \tilde C$ is skew for H and K continued from fixed references.
 
     **Returns:** `ObjectDynamics`, in nu.
 

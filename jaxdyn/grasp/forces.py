@@ -11,20 +11,19 @@ from typing import Any
 import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Bool, Float
+from jaxtyping import Array, Float
 
 from jaxdyn.compile import entry_point
 from jaxdyn.compile.known import is_known
 from jaxdyn.constraints.base import Layout, constraint_jacobian, layout
+from jaxdyn.constraints.codes import Outcome
 from jaxdyn.constraints.dynamics import total_force
 from jaxdyn.constraints.rank import pseudo_inverse, tolerance
-from jaxdyn.contact.closure import ForceClosure
-from jaxdyn.contact.closure import force_closure as _closure
+from jaxdyn.contact.closure import ForceClosure, force_closure_of_map
 from jaxdyn.contact.cones import Cones
 from jaxdyn.contact.forces import ContactWithCone, contacts_with_cones
 from jaxdyn.contact.kinds import components
 from jaxdyn.contact.optimal import optimal_forces
-from jaxdyn.contact.qp import RESULTS
 from jaxdyn.dynamics.quantities import gravity_force
 from jaxdyn.grasp.contacts import Contact
 from jaxdyn.grasp.hand import Grasp, check_grasp, grasp_map, hand_jacobian
@@ -33,13 +32,13 @@ from jaxdyn.model.arguments import Numbers, as_array, batch_hint, check_state
 from jaxdyn.reduction.bases import orthonormal, split_directions
 
 
-class HandForces(eqx.Module):
+class HandForces(Outcome):
     """Contact forces within their cones, and the joint torques that exert them at rest; see `hold`.
 
     - `contact_forces` (nc,): on the object, in the order of the grasp's rows, N and N m.
-    - `torques` (nh,): J_h^T times them, of the joints in the order of `grasp.hand_velocities`, without the weight of the
+    - `torques` (nh,): $J_h^T$ times them, of the joints in the order of `grasp.hand_velocities`, without the weight of the
       fingers; N m or N.
-    - `result`: one of `jaxdyn.contact.RESULTS`; `infeasible` where no forces in the cones exert the wrench.
+    - `result`: one of `jd.RESULTS`; `infeasible` where no forces in the cones exert the wrench.
     - `layout`: name and row range of each contact.
     """
 
@@ -47,11 +46,6 @@ class HandForces(eqx.Module):
     torques: Float[Array, " nh"]
     result: Any
     layout: tuple[Layout, ...] = eqx.field(static=True)
-
-    @property
-    def success(self) -> Bool[Array, ""]:
-        """True where `result` is successful."""
-        return self.result == RESULTS.successful
 
     def by_contact(self) -> dict[str, Array]:
         """Forces of each contact on the object, by its name."""
@@ -61,13 +55,15 @@ class HandForces(eqx.Module):
 def internal_force_basis(
     grasp: Grasp, q: Float[Array, " nq"], t: Numbers = 0.0, *, reference: Float[Array, "nc ni"] | None = None
 ) -> Float[Array, "nc ni"]:
-    """Orthonormal basis E (nc, ni) of the internal forces: G E = 0.
+    """Orthonormal basis E (nc, ni) of the internal forces.
+
+    $$G E = 0$$
 
     **Arguments:**
 
     - `q` (nq,); `t`, s.
-    - `reference` (nc, ni): a basis at a configuration nearby, which is continued smoothly, E = P R T^-1 with
-      P = 1 - G^+ G and T the Cholesky factor of R^T P R. By default an arbitrary basis at q, constant under
+    - `reference` (nc, ni): a basis at a configuration nearby, R, which is continued smoothly, $E = P R T^{-1}$ with
+    $P = 1 - G^+ G$ and T the Cholesky factor of $R^T P R$. By default an arbitrary basis at q, constant under
       differentiation; where q is traced it has as many columns as for a G of full rank.
 
     **Raises:** ValueError for a reference of another shape.
@@ -113,13 +109,15 @@ def normal_forces(grasp: Grasp) -> Float[np.ndarray, " nc"]:
 def forces_for_wrench(
     grasp: Grasp, q: Float[Array, " nq"], wrench: Float[Array, " no"], preload: Numbers = 0.0, t: Numbers = 0.0
 ) -> Float[Array, " nc"]:
-    """Contact forces lam = G^+ F + (1 - G^+ G) lam_0 with the resultant wrench F and a given internal force.
+    r"""Contact forces with a given resultant wrench and a given internal force.
+
+    $$\lambda = G^+ F + (1 - G^+ G) \lambda_0$$
 
     **Arguments:**
 
     - `wrench` F (no,): on the object, in its own axes for a free body; N and N m. A wrench that the contacts cannot
       exert is projected to the closest one.
-    - `preload` lam_0: a number (N), the normal force of every contact, or forces (nc,); only the internal part is used.
+    - `preload` $\lambda_0$: a number (N), the normal force of every contact, or forces (nc,); only the internal part is used.
       Equal normal forces are internal where the normals balance, as in an antipodal grasp.
 
     **Raises:** ValueError for inconsistent shapes, and for a number with constraints without normal force.
@@ -224,7 +222,7 @@ def _static(grasp: Grasp, q, t):
 def force_closure(
     grasp: Grasp, q: Float[Array, " nq"], *, cones: Cones = None, t: Numbers = 0.0, required: bool = False
 ) -> ForceClosure:
-    """Force closure of a grasp: the ability to resist every wrench on the object; see `jd.contact.force_closure`.
+    """Force closure of a grasp: the ability to resist every wrench on the object; see `jd.contact.force_closure_of_map`.
 
     **Arguments:** `q` (nq,), concrete numbers; `cones` as in `hold`. `required`: refuse a grasp without force closure.
 
@@ -239,7 +237,7 @@ def force_closure(
     contacts = _every_cone(grasp, cones)
     order = np.concatenate([contact.rows for contact in contacts])
     # The cones expect components in the order of the wrench basis, which may differ from that of the rows.
-    closure = _closure(grasp_map(grasp, q, t)[:, order], [contact.cone for contact in contacts])
+    closure = force_closure_of_map(grasp_map(grasp, q, t)[:, order], [contact.cone for contact in contacts])
     if required and not closure.closed:
         raise ValueError(
             f"the contacts {[contact.name for contact in contacts]} on {grasp.object!r} have no force closure: the wrench "
@@ -255,7 +253,9 @@ def force_closure(
 def joint_torques(
     grasp: Grasp, q: Float[Array, " nq"], lam: Float[Array, " nc"], t: Numbers = 0.0
 ) -> Float[Array, " nh"]:
-    """Joint torques J_h^T lam (nh,) that exert the contact forces lam (nc,) at rest, without the fingers' weight.
+    r"""Joint torques (nh,) that exert the contact forces lam (nc,) at rest, without the fingers' weight.
+
+    $$\tau = J_h^T \lambda$$
 
     Source: Murray, Li & Sastry (1994), eq. 5.31; EQUATIONS section 10.
     """

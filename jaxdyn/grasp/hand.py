@@ -22,10 +22,12 @@ from jaxdyn.systems.scene import Force, Scene
 
 
 class Grasp(Scene):
-    """Grasp of an object by fingers: a scene with rows A = [-J_h  G^T], whose multipliers are forces on the object.
+    r"""Grasp of an object by fingers: a scene whose multipliers are contact forces on the object.
+
+    $$A = \begin{bmatrix} -J_h & G^T \end{bmatrix}, \quad J_h \dot\theta = G^T V$$
 
     It is a `Scene`, so `constrained_dynamics`, `assemble`, `projections` and `simulate` act on it as on any other one.
-    For motion in the velocity of the object alone, with the joints of the fingers recovered from J_h thetadot = G^T V:
+    For motion in the velocity of the object alone, with the joints of the fingers recovered from these rows:
 
         jd.simulate(grasp, q0, v0, ts, method=jd.Reduced(grasp.object_velocities))
 
@@ -93,7 +95,7 @@ class Grasp(Scene):
 
 
 def hand_jacobian(grasp: Grasp, q: Float[Array, " nq"], t: Numbers = 0.0) -> Float[Array, "nc nh"]:
-    """Hand Jacobian J_h (nc, nh): fingertip velocities J_h thetadot along the contacts' components.
+    """Hand Jacobian (nc, nh), which maps joint velocities to fingertip velocities along the contacts' components.
 
     Source: Murray, Li & Sastry (1994), eq. 5.28; EQUATIONS section 10.
     """
@@ -102,10 +104,12 @@ def hand_jacobian(grasp: Grasp, q: Float[Array, " nq"], t: Numbers = 0.0) -> Flo
 
 
 def grasp_map(grasp: Grasp, q: Float[Array, " nq"], t: Numbers = 0.0) -> Float[Array, "no nc"]:
-    """Grasp map G (no, nc): generalised force G lam of the contact forces lam on the object.
+    r"""Grasp map (no, nc), which maps contact forces to their generalised force on the object.
 
-    For a free body it is the wrench (f, tau) at the origin and in the axes of the body frame, and
-    G = [Ad_{g_oc}^-T B] of all contacts. G^T V are the velocities of the object at the contacts.
+    $$G = \begin{bmatrix} \mathrm{Ad}_{g_{oc_1}}^{-T} B_1 & \mathrm{Ad}_{g_{oc_2}}^{-T} B_2 & \cdots \end{bmatrix}$$
+
+    for a free body, where $G \lambda$ is the wrench (f, tau) at the origin and in the axes of the body frame. $G^T V$ are the
+    velocities of the object at the contacts.
 
     Source: Murray, Li & Sastry (1994), eq. 5.11; EQUATIONS section 10.
     """
@@ -121,7 +125,9 @@ def _columns(grasp: Grasp, q, t, columns: tuple[int, ...]) -> Float[Array, "nc k
 def internal_forces(
     grasp: Grasp, q: Float[Array, " nq"], lam: Float[Array, " nc"], t: Numbers = 0.0
 ) -> Float[Array, " nc"]:
-    """Internal part of contact forces, which does not move the object: (1 - G^+ G) lam, with G lam_N = 0.
+    r"""Internal part of contact forces, which does not move the object.
+
+    $$\lambda_N = (1 - G^+ G) \lambda, \quad G \lambda_N = 0$$
 
     The split depends on the units of forces and torques where contacts transmit both, as any orthogonal one.
 

@@ -22,17 +22,17 @@ from jaxdyn.systems.mass_factor import solve_lower
 
 
 class Manipulability(eqx.Module):
-    """Ellipsoids of the object's velocities and of wrenches on it, and scalar measures of them.
+    r"""Ellipsoids of the object's velocities and of wrenches on it, and scalar measures of them.
 
     Angular velocities count `length` times, so that all is in m/s and N per unit of joint velocity and torque.
 
-    - `velocity_axes` (nw,): semi-axes of the ellipsoid of object velocities for |thetadot| <= 1, longest first; infinite
+    - `velocity_axes` (nw,): semi-axes of the ellipsoid of object velocities for $|\dot\theta| \le 1$, longest first; infinite
       for a motion of the object that the fingers need not follow. `force_axes` (nw,): their inverses, of the
-      ellipsoid of wrenches for |tau| <= 1.
+      ellipsoid of wrenches for $|\tau| \le 1$.
     - `directions` (no, nw): twists of the object along them, of unit length in this scaling; constants.
     - `sigma_min` (): least velocity axis. `isotropy` (): least over largest, 1 for a sphere. `volume` (): product of
       the velocity axes, Yoshikawa's measure.
-    - `grasp_axes` (no,): semi-axes of the wrenches G lam for |lam| <= 1, the singular values of G, longest first.
+    - `grasp_axes` (no,): semi-axes of the wrenches $G \lambda$ for $|\lambda| \le 1$, the singular values of G, longest first.
       `grasp_isotropy` (): least over largest.
     - `is_manipulable` (): true where the fingers can follow every velocity of the object.
     """

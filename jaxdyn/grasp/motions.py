@@ -31,11 +31,11 @@ from jaxdyn.systems.scene import Scene
 class HandMotions(Basis):
     """Basis N of the velocities nu = (w, u) of a grasp, from references at one configuration; see `hand_motions`.
 
-    - `object` (no, nw): reference R_o of H = P R_o T^-1, with P = 1 - B^+ B, B = (1 - J_h J_h^+) G^T, and T the Cholesky
-      factor of R_o^T P R_o. With nw = no it is H itself, constant.
-    - `internal` (nh, nk): reference R_i of K, likewise of 1 - J_h^+ J_h.
+    - `object` (no, nw): reference $R_o$ of $H = P R_o T^{-1}$, with $P = 1 - B^+ B$, $B = (1 - J_h J_h^+) G^T$, and T the
+      Cholesky factor of $R_o^T P R_o$. With nw = no it is H itself, constant.
+    - `internal` (nh, nk): reference $R_i$ of K, likewise of $1 - J_h^+ J_h$.
 
-    H and K are as smooth as J_h and G wherever their ranks are constant: no signs or pivots are chosen. It is a
+    H and K are as smooth as $J_h$ and G wherever their ranks are constant: no signs or pivots are chosen. It is a
     basis for `jd.reduced_dynamics` and, around the configuration of its references, for `jd.Reduced`.
     """
 
@@ -47,7 +47,10 @@ class HandMotions(Basis):
         return self.object.shape[1] + self.internal.shape[1]
 
     def at(self, scene: Scene, q: Float[Array, " nq"], t: Number) -> Parametrization:
-        """Basis N (nv, nw + nk): H in the rows of the object, (J_h^+ G^T H, K) in those of the joints."""
+        """Basis N (nv, nw + nk) of the velocities.
+
+        It is H in the rows of the object and $(J_h^+ G^T H, K)$ in those of the joints.
+        """
         hands, objects = velocity_rows(scene)
         A = constraint_jacobian(scene, q, t)
         # The rows are A = [-J_h  G^T].

@@ -61,19 +61,21 @@ def fit_torques(
     tolerance: float = 1e-6,
     callback: Callable[[int, float, Model], None] | None = None,
 ) -> Fit:
-    """Physically feasible inertias, friction and rotor inertia by the error of the joint torques along a log.
+    r"""Physically feasible inertias, friction and rotor inertia by the error of the joint torques along a log.
 
-    Minimises 1/2 |weights (W x - tau)|^2 / sigma^2 + prior * sum over bodies of D(P, P0), where W is the regressor and
-    D(P, P0) = tr(P0^-1 P) - log det(P0^-1 P) - 4 the log-det (entropic) divergence of a body's pseudo-inertia from the
-    nominal one. It determines the combinations that torques do not, is the same in every frame and unit, and grows without
-    bound towards the boundary of the feasible set. x is searched in coordinates in which every point is a feasible body with
+    $$\min_x \frac{|\mathrm{weights} (W x - \tau)|^2}{2 \sigma^2} + \mathrm{prior} \sum_i D(P_i, P_{0i}), \quad
+    D(P, P_0) = \operatorname{tr}(P_0^{-1} P) - \log\det(P_0^{-1} P) - 4$$
+
+    W is the regressor and D the log-det (entropic) divergence of a body's pseudo-inertia from the nominal one. It
+    determines the combinations that torques do not, is the same in every frame and unit, and grows without bound towards
+    the boundary of the feasible set. x is searched in coordinates in which every point is a feasible body with
     dissipative friction (`Chart`), so no iterate can be infeasible. The log is condensed once: a step costs the same for
     any log. Where `from_raw` low-passed a log, the column of Coulomb friction goes through the same low-pass.
 
     **Arguments:**
 
     - `model`: nominal model, where the fit starts; `log` with v and a, or several such logs.
-    - `terms`: fitted in addition to the links, tau_f = viscous v + coulomb tanh(v / v_s) + offset, and armature a; viscous,
+    - `terms`: fitted in addition to the links, friction torques as of `Friction`, and armature a; viscous,
       coulomb and armature stay at or above zero. A term left out keeps the model's value.
     - `inertia`: "full", all ten numbers of each body; "mass", its density alone; "fixed".
     - `weights` (nv,): one over the noise of each joint's torque, relative to the others; ones by default.

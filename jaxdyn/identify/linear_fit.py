@@ -58,7 +58,10 @@ class LeastSquares(eqx.Module):
         return model_torques(self.model, log, self.parameters, self.v_s)
 
     def error(self, log: Log) -> float:
-        """Torque error along a log, in per cent of the measured torque: 100 |tau_fit - tau| / |tau| over all joints."""
+        r"""Torque error along a log, in per cent of the measured torque, over all joints.
+
+        $$100 |\tau_\mathrm{fit} - \tau| / |\tau|$$
+        """
         return torque_error(self.torques(log), log.tau)
 
     def table(self) -> list[tuple[str, float, float, float]]:
@@ -94,12 +97,14 @@ def least_squares(
     rcond: float = 1e-6,
     blocks: int = 20,
 ) -> LeastSquares:
-    """Base parameters, friction and rotor inertia by linear least squares on the torques: min |weights (W x - tau)|^2.
+    r"""Base parameters, friction and rotor inertia by linear least squares on the torques.
+
+    $$\min_x |\mathrm{weights} (W x - \tau)|^2$$
 
     **Arguments:**
 
     - `model`: geometry and nominal parameters; `log` with v and a, or several such logs.
-    - `terms`: fitted in addition to the links: tau_f = viscous v + coulomb tanh(v / v_s) + offset, and armature a.
+    - `terms`: fitted in addition to the links: friction torques as of `Friction`, and armature a.
     - `weights` (nv,): one over the noise of each joint's torque; ones by default.
     - `rcond`: directions whose singular value is below this times the largest are not excited by the log; along them
       the model's values stay.

@@ -1,4 +1,4 @@
-"""Logs of measured motion and torque: checks, the effect of their low-pass on other signals, and the travel of joints."""
+"""Logs of measured motion and torque: checks, the low-pass of a log applied to regressor columns, and the travel of joints."""
 
 from collections.abc import Callable, Sequence
 from typing import Any
@@ -12,7 +12,7 @@ from jaxdyn.model.arguments import Checked, Numbers, is_concrete
 from jaxdyn.model.joints import KINDS
 from jaxdyn.model.tree import Model
 
-# Samples per sample of a log on which columns that jump are evaluated before they are low-passed.
+# Columns that jump are evaluated on this many times the samples of a log before they are low-passed.
 _REFINEMENT = 8
 # Least travel of a joint (rad, m). Friction needs some thousandths of a radian to reverse (`torque_terms.PRESLIDING`): below a
 # few times that a joint does not slide, and its torque says nothing about friction in motion.
@@ -27,11 +27,11 @@ class Log(eqx.Module):
     - `joint_names`: names of the columns of tau, when the file gave them.
     - `cutoff`: Hz, of the low-pass that `from_raw` applied; None for other logs.
 
-    Numpy arrays are kept as they are (a log is data of the host; float64 time stamps do not become float32); anything
-    else is converted to float64. The arrays are leaves, so a log passes through `jax.vmap` and `jax.jit`.
+    NumPy arrays are kept as they are, so that float64 time stamps do not become float32; anything else is converted to
+    float64. The arrays are leaves, so a log passes through `jax.vmap` and `jax.jit`.
 
     **Raises:** ValueError for wrong shapes, unequal lengths, the first NaN or infinity (signal, row and column) and the
-    first step back in time (row and both times); for texts and complex numbers.
+    first step back in time (row and both times); for strings and complex numbers.
     """
 
     t: Float[Array | np.ndarray, " n"]
@@ -153,8 +153,8 @@ def filter_like_log(log: Log, columns: np.ndarray, order: int = 4, factor: int =
 def pad_length(rate: float, cutoff: float, count: int) -> int:
     """Samples of the extension at both ends of a signal of `count` samples before a low-pass: three periods of the cut-off.
 
-    SciPy's default, some fifteen samples, is a small part of the filter's response: accelerations of a motion that does not
-    begin at rest were then off by a third of their size two periods away from the ends.
+    SciPy's default of some fifteen samples is much shorter than the filter's response. With it, accelerations of a motion
+    that does not begin at rest were wrong by a third of their size up to two periods from the ends.
     """
     return min(int(3 * rate / cutoff), count - 1)
 
@@ -162,10 +162,10 @@ def pad_length(rate: float, cutoff: float, count: int) -> int:
 def low_pass_columns(log: Log, columns: Callable[[Log], np.ndarray]) -> np.ndarray:
     """Columns (n, ...) of a function of a log, with the log's low-pass applied to them.
 
-    Friction that jumps where a joint reverses went through the low-pass with the measured torque: its column must go through the
-    same, or the jump counts as an error. The column is evaluated on a finer grid first. On the log's own samples, some fifteen in
-    a period of the cut-off, a jump is known to a sample only, and what a low-pass makes of it is off by enough for other terms
-    and robust losses to look useful.
+    The low-pass has smoothed the measured torque, also where friction jumps because a joint reverses. The column of friction must
+    be smoothed in the same way, or each jump leaves an error. The column is evaluated on a finer grid first: the log has some
+    fifteen samples in a period of the cut-off, which locate a jump too coarsely. The errors that remained there made other terms
+    and robust losses seem useful.
     """
     if not _has_filter(log):
         return columns(log)
@@ -191,7 +191,7 @@ def refine_samples(samples: np.ndarray, factor: int) -> np.ndarray:
 
 def _has_filter(log: Log, order: int = 4) -> bool:
     shortest = 3 * (order + 1) + 1
-    # Close to Nyquist's half of the rate there is no band left to remove, and beyond it no filter can be designed.
+    # Near the Nyquist frequency, half the sampling rate, there is no band left to remove; above it no filter exists.
     return log.cutoff is not None and log.cutoff < 0.45 * log_rate(log) and len(log) >= shortest
 
 
@@ -223,7 +223,7 @@ def _check_signals(signals: dict) -> None:
     for name in ("v", "a"):
         if name in signals and signals[name].shape[1] != signals["tau"].shape[1]:
             raise ValueError(f"{name} has {signals[name].shape[1]} columns, tau has {signals['tau'].shape[1]}")
-    # Traced arrays have shapes and no values that could be checked.
+    # Values of traced arrays are not known.
     if not is_concrete(signals):
         return
     for name, value in signals.items():
@@ -258,7 +258,7 @@ def root_mean_square(samples) -> np.ndarray:
     return largest * np.sqrt(np.mean((samples / np.where(largest > 0, largest, 1)) ** 2, axis=0))
 
 
-def travels(model: Model, log: Log) -> np.ndarray:
+def travel_ranges(model: Model, log: Log) -> np.ndarray:
     """Range of motion (nv,) of each coordinate, rad or m: of its position, or of its integrated velocity for joints with several.
 
     The integral of a velocity is used where no coordinate of q belongs to it alone, as for quaternions.
@@ -273,9 +273,9 @@ def travels(model: Model, log: Log) -> np.ndarray:
     return np.ptp(path, axis=0)
 
 
-def hardly_moving(model: Model, logs: Sequence[Log]) -> tuple[int, ...]:
+def idle_coordinates(model: Model, logs: Sequence[Log]) -> tuple[int, ...]:
     """Indices in v of the coordinates that travel less than 0.02 rad, or 2 mm, in every log."""
-    travel = np.max([travels(model, log) for log in logs], axis=0)
+    travel = np.max([travel_ranges(model, log) for log in logs], axis=0)
     return tuple(int(j) for j in np.flatnonzero(travel < np.where(are_angles(model), _TRAVEL_ANGLE, _TRAVEL_LENGTH)))
 
 

@@ -96,7 +96,7 @@ def complete_log(scene: SceneLike, t: Numbers, measured: dict[Any, Any], tau: Nu
     """Log of all joints of a mechanism, from the measured joints and the constraints.
 
     Positions of the other joints satisfy the constraints and are nearest to those of the previous sample, for the first sample to
-    `guess`. Velocities fit A v = b and the measured ones by least squares. At least as many joints must be measured as the
+    `guess`. Velocities fit $A v = b$ and the measured ones by least squares. At least as many joints must be measured as the
     mechanism has degrees of freedom; with more, positions on the constraints fit the measured ones by least squares.
 
     **Arguments:**

@@ -1,12 +1,12 @@
 """Errors between a scene and a log: of torques, momentum, energy, or simulated motion, open-loop or under the logged controller.
 
-Each is a list of errors of one segment of a log, in units of `scale`. Momentum and energy are balances over a segment,
+The errors of one segment of a log form an array, in units of `scale`. Momentum and energy are balances over a segment,
 
     M v |_0^T     = integral of C^T v - g + f + tau           (nv,),   as dM/dt = C + C^T,
     T + V |_0^T   = integral of v . (f + tau)                 (),
 
-with f the scene's forces, by the trapezoidal rule over its samples: they need velocities and no accelerations, and the errors of
-velocities enter at the ends alone. Sample ten times faster than the motion, or more.
+with f the scene's forces, by the trapezoidal rule over the samples. Balances need velocities and no accelerations, and M v
+and T depend on the velocities at the ends alone. Sample at ten times the bandwidth of the motion, or more.
 
 Source: Gautier & Khalil (1988), energy; Slotine & Li (1987), filtered dynamics; Bock (1983), multiple shooting.
 """
@@ -43,76 +43,80 @@ class Objective(eqx.Module):
     control: Any = None
     observed: tuple[int, ...] | None = eqx.field(static=True, default=None)
 
-    def scale(self, system, pieces: Segments) -> Array:
+    def scale(self, system, segments: Segments) -> Array:
         """Units of the errors."""
-        torque = moving_scale(jnp.sqrt(jnp.mean(pieces.tau**2, axis=(0, 1))))
-        # Impulse and work of a segment grow with its length, and so do the units of the balances.
-        span = jnp.mean(pieces.t[:, -1] - pieces.t[:, 0])
+        torque = moving_scale(jnp.sqrt(jnp.mean(segments.tau**2, axis=(0, 1))))
+        # Impulse and work of a segment grow with its duration, so that the units of the balances do too.
+        span = jnp.mean(segments.t[:, -1] - segments.t[:, 0])
         if self.error == "torque":
             return torque
         if self.error == "momentum":
             return torque * span
         if self.error == "energy":
-            power = jnp.sqrt(jnp.mean(jnp.sum(pieces.tau * pieces.v, axis=-1) ** 2))
+            power = jnp.sqrt(jnp.mean(jnp.sum(segments.tau * segments.v, axis=-1) ** 2))
             return jnp.where(power > 0, power, jnp.ones_like(power)) * span
-        motion = motion_scale(system, pieces)
+        motion = motion_scale(system, segments)
         return motion if self.error == "trajectory" else jnp.concatenate([motion, torque[None]])
 
-    def errors(self, measured: Measured, piece: Segments, change, scale) -> Float[Array, "n k"]:
+    def errors(self, measured: Measured, segment: Segments, change, scale) -> Float[Array, "n k"]:
         """Errors of one segment, a row for each sample (one row for a balance); `change` (2, nv): of its initial state."""
         scene, system = measured.scene, measured.scene.system
-        piece = correct_sensors(measured, piece, None if self.error in SIMULATED else self.hold)
+        segment = correct_sensors(measured, segment, None if self.error in SIMULATED else self.hold)
         if self.error == "torque":
-            tau = jax.vmap(lambda t, q, v, a: inverse_torque(scene, q, v, a, t))(piece.t, piece.q, piece.v, piece.a)
-            return self._select_columns((tau - piece.tau) / scale[None])
+            tau = jax.vmap(lambda t, q, v, a: inverse_torque(scene, q, v, a, t))(
+                segment.t, segment.q, segment.v, segment.a
+            )
+            return self._select_columns((tau - segment.tau) / scale[None])
         if self.error == "momentum":
-            return self._select_columns((momentum_balance(scene, piece) / scale)[None])
+            return self._select_columns((momentum_balance(scene, segment) / scale)[None])
         if self.error == "energy":
-            return (energy_balance(scene, piece) / scale)[None, None]
+            return (energy_balance(scene, segment) / scale)[None, None]
         start = None if change is None else change * scale[:2]
         options: dict[str, Any] = dict(self.options)
-        simulated = partial(simulate_segment, scene, piece, start, self.hold, options, observed=self.observed)
+        simulated = partial(simulate_segment, scene, segment, start, self.hold, options, observed=self.observed)
         if self.error == "trajectory":
-            law = SampledTorque(piece.t + measured.delay, piece.tau, self.hold)
+            law = SampledTorque(segment.t + measured.delay, segment.tau, self.hold)
             q, v = simulated(control=law)
-            return jnp.concatenate([self._select_columns(e) for e in motion_errors(system, piece, q, v, scale)], axis=1)
+            return jnp.concatenate(
+                [self._select_columns(e) for e in motion_errors(system, segment, q, v, scale)], axis=1
+            )
         q, v, tau = simulated(control=self.control, outputs=("torque",))
-        errors = [*motion_errors(system, piece, q, v, scale[:2]), (tau - piece.tau) / scale[2][None]]
+        errors = [*motion_errors(system, segment, q, v, scale[:2]), (tau - segment.tau) / scale[2][None]]
         return jnp.concatenate([self._select_columns(error) for error in errors], axis=1)
 
     def _select_columns(self, errors):
         return errors if self.observed is None else errors[:, jnp.asarray(self.observed)]
 
 
-def correct_sensors(measured: Measured, piece: Segments, hold: str | None) -> Segments:
+def correct_sensors(measured: Measured, segment: Segments, hold: str | None) -> Segments:
     """Correct a log segment for its sensors; with `hold` the torques are the delayed ones at its samples."""
     system = measured.scene.system
-    q = jax.vmap(lambda q: displace(system, q, -measured.position_bias))(piece.q)
-    tau = measured.torque_gain[None] * piece.tau + measured.torque_bias[None]
-    if hold is not None and piece.tau.shape[0] > 1:
-        law = SampledTorque(piece.t, tau, hold)
-        # At a sample, which is a kink, the derivative by time is that of the line after it.
-        tau = jax.vmap(lambda t: law.at(t - measured.delay))(piece.t)
-    return eqx.tree_at(lambda p: (p.q, p.tau), piece, (q, tau))
+    q = jax.vmap(lambda q: displace(system, q, -measured.position_bias))(segment.q)
+    tau = measured.torque_gain[None] * segment.tau + measured.torque_bias[None]
+    if hold is not None and segment.tau.shape[0] > 1:
+        law = SampledTorque(segment.t, tau, hold)
+        # Interpolated torques have kinks at the samples; the derivative there is that of the next interval.
+        tau = jax.vmap(lambda t: law.at(t - measured.delay))(segment.t)
+    return eqx.tree_at(lambda p: (p.q, p.tau), segment, (q, tau))
 
 
-def momentum_balance(scene, piece: Segments) -> Float[Array, " nv"]:
+def momentum_balance(scene, segment: Segments) -> Float[Array, " nv"]:
     """Change of the momentum M v over a segment less the impulse (nv,): zero for a motion of the scene."""
     system = scene.system
 
     def force(t, q, v, tau):
         C, g = dynamics.coriolis_matrix(system, q, v, t), dynamics.gravity_force(system, q, t)
         applied = scene.applied_force(q, v, t)
-        # v @ C is C^T v: of d(M v)/dt = dM/dt v + M a, with dM/dt = C + C^T, it is what M a = ... - C v leaves.
+        # d(M v)/dt = (C + C^T) v + M a = C^T v - g + f + tau, since M a = f + tau - C v - g; v @ C is C^T v.
         return v @ C - g + tau + (0.0 if applied is None else applied)
 
-    rate = jax.vmap(force)(piece.t, piece.q, piece.v, piece.tau)
-    t: Any = piece.t
-    momentum = [dynamics.mass_matrix(system, piece.q[i], t[i]) @ piece.v[i] for i in (0, -1)]
-    return momentum[1] - momentum[0] - _integral(rate, piece.t)
+    rate = jax.vmap(force)(segment.t, segment.q, segment.v, segment.tau)
+    t: Any = segment.t
+    momentum = [dynamics.mass_matrix(system, segment.q[i], t[i]) @ segment.v[i] for i in (0, -1)]
+    return momentum[1] - momentum[0] - _integral(rate, segment.t)
 
 
-def energy_balance(scene, piece: Segments) -> Float[Array, ""]:
+def energy_balance(scene, segment: Segments) -> Float[Array, ""]:
     """Change of the energy over a segment less the work (J): zero for a motion of the scene.
 
     Constraints that do not move with time do no work, so it holds for mechanisms too.
@@ -123,11 +127,11 @@ def energy_balance(scene, piece: Segments) -> Float[Array, ""]:
         force = scene.applied_force(q, v, t)
         return jnp.sum(v * (tau if force is None else tau + force))
 
-    work = _integral(jax.vmap(power)(piece.t, piece.q, piece.v, piece.tau), piece.t)
-    t: Any = piece.t
+    work = _integral(jax.vmap(power)(segment.t, segment.q, segment.v, segment.tau), segment.t)
+    t: Any = segment.t
     energy = [
-        dynamics.kinetic_energy(system, piece.q[i], piece.v[i], t[i])
-        + dynamics.potential_energy(system, piece.q[i], t[i])
+        dynamics.kinetic_energy(system, segment.q[i], segment.v[i], t[i])
+        + dynamics.potential_energy(system, segment.q[i], t[i])
         for i in (0, -1)
     ]
     return energy[1] - energy[0] - work

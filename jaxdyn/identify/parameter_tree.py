@@ -197,7 +197,10 @@ class Parameters(eqx.Module):
         rows: Rows = None,
         to_rows: Rows = None,
     ) -> "Parameters":
-        """Make numbers functions of others: x = scale x_other + offset, entry by entry. Others may be free, or tied before."""
+        r"""Make numbers functions of others, entry by entry. Others may be free, or tied before.
+
+        $$x = \mathrm{scale} \cdot x_\mathrm{other} + \mathrm{offset}$$
+        """
         (leaf, value, name), *rest = select(self.given, where, "tie")
         (other, source, other_name), *more = select(self.given, to, "to", twice=True)
         if rest or more:

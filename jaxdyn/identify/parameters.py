@@ -73,11 +73,11 @@ def fit_parameters(
     resume: bool = True,
     **simulation: Any,
 ) -> ParameterFit:
-    """Fit numbers of a model, a Lagrangian, a force, a sensor, ..., to one or several logs.
+    r"""Fit numbers of a model, a Lagrangian, a force, a sensor, ..., to one or several logs.
 
-    Minimises the mean, over samples and coordinates, of the squared errors in units of their root mean square over the logs, plus
-    noise^2/N times the squares of the priors' residuals, N the number of errors. Numbers that neither logs nor prior determine
-    stay near their start, and their deviation is infinite.
+    Minimises the mean, over samples and coordinates, of the squared errors in units of their root mean square over the
+    logs, plus $\mathrm{noise}^2/N$ times the squares of the priors' residuals, N the number of errors. Numbers that
+    neither logs nor prior determine stay near their start, and their deviation is infinite.
 
     **Arguments:**
 

@@ -182,10 +182,10 @@ class BaseParameters(eqx.Module):
 
 
 def base_parameters(model: Model, terms: Terms = (), *, v_s: float = 0.01, seed: int = 0) -> BaseParameters:
-    """Base inertial parameters: the smallest set of combinations that determines every joint torque of the model.
+    r"""Base inertial parameters: the smallest set of combinations that determines every joint torque of the model.
 
     The regressor is stacked over random states. A column that depends linearly on the columns before it is grouped into
-    them: W_D = W_I beta, so that W x = W_I (x_I + beta x_D). Columns go from the base to the tip, and within a body in
+    them: $W_D = W_I \beta$, so that $W x = W_I (x_I + \beta x_D)$. Columns go from the base to the tip, and within a body in
     the order in which Khalil & Dombre keep them.
 
     **Arguments:** `model`; `terms`, the friction and rotor terms to include in addition to the links (of `TERMS`); `seed` of
@@ -288,7 +288,10 @@ def least_squares_by_svd(A: np.ndarray, b: np.ndarray, rcond: float) -> SvdSolut
 
 
 def torque_error(predicted: Numbers, measured: Numbers) -> float:
-    """Torque error 100 |predicted - measured| / |measured| over all samples and joints (Frobenius norms), in per cent."""
+    r"""Torque error over all samples and joints (Frobenius norms), in per cent.
+
+    $$100 |\tau_\mathrm{predicted} - \tau_\mathrm{measured}| / |\tau_\mathrm{measured}|$$
+    """
     measured = np.asarray(measured, np.float64)
     return float(100 * np.linalg.norm(np.asarray(predicted, np.float64) - measured) / np.linalg.norm(measured))
 

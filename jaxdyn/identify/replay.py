@@ -132,9 +132,11 @@ def trajectory_error(
     substeps: Checked[int | None] = None,
     **simulation: Any,
 ) -> tuple[float, float]:
-    """Error of the simulated motion along a log, of positions and of velocities, each in per cent of the motion.
+    r"""Error of the simulated motion along a log, of positions and of velocities, each in per cent of the motion.
 
-    100 sqrt(mean(((q_sim - q) / q_rms)^2)), and the same of v. Arguments as in `rollout`.
+    $$100 \sqrt{\operatorname{mean}((q_\mathrm{sim} - q)^2 / q_\mathrm{rms}^2)}$$
+
+    and the same of v. Arguments as in `rollout`.
     """
     check_replay(INITIAL[0], hold)
     scene, data = scene_and_segments(system, log, horizon, friction)

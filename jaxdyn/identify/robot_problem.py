@@ -8,7 +8,7 @@ from jaxdyn.identify.chart import Chart, make_chart
 from jaxdyn.identify.condensed_fit import Data, Estimate, Setting, fit_blocks, gather
 from jaxdyn.identify.feasible import move_origin, signal_sizes
 from jaxdyn.identify.intervals import Intervals, intervals
-from jaxdyn.identify.logs import Log, hardly_moving, log_rate
+from jaxdyn.identify.logs import Log, idle_coordinates, log_rate
 from jaxdyn.identify.regression import log_regressor
 from jaxdyn.identify.result import Fit
 from jaxdyn.identify.torque_terms import ExtraTorque, TorqueTerm
@@ -28,7 +28,7 @@ class RobotProblem:
         self.inertia, self.blocks = inertia, blocks
         self.sample_weights: dict[float, list[np.ndarray]] = {}
         self.sizes, self.weights = signal_sizes(logs), np.ones(model.nv)
-        self.still = hardly_moving(model, logs)
+        self.still = idle_coordinates(model, logs)
         self.loads = [np.zeros_like(np.asarray(log.tau, np.float64)) for log in logs]
         self.torque = float(sum(np.sum(np.asarray(log.tau, np.float64) ** 2) for log in logs))
         # Caches: `_data` depends on loads and sample weights, `_rows` on joint weights too, `_charts` on v_s alone.

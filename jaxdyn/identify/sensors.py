@@ -69,11 +69,12 @@ else:
 
 
 class Measured(eqx.Module):
-    """Scene with its sensors and drives.
+    r"""Scene with its sensors and drives.
 
     The robot moves by q and tau; the log holds
 
-        q_log = q + position_bias,   tau(t) = torque_gain * tau_log(t - delay) + torque_bias.
+    $$q_\mathrm{log} = q + \mathrm{position\_bias}, \quad
+        \tau(t) = \mathrm{torque\_gain} \cdot \tau_\mathrm{log}(t - \mathrm{delay}) + \mathrm{torque\_bias}$$
 
     **Arguments:**
 

@@ -1,9 +1,9 @@
-"""Joint torques beyond the links': friction, rotor inertia and further terms, each a column of the regressor.
+"""Joint torques in addition to those of the links: friction, rotor inertia and further terms, each a column of the regressor.
 
     viscous, coulomb, offset, armature   v, tanh(v / v_s), 1, a
 
     load        |tau_rigid| tanh(v / v_s)   Coulomb friction in proportion to the torque that the gear carries
-    dahl        z, dz/dq = (sign v - z) / z0   pre-sliding: friction that reverses over a displacement of about z0
+    dahl        z, dz/dt = |v| (sign v - z) / z0   pre-sliding: friction that reverses over a displacement of about z0
     asymmetric  |v|                         viscous friction that differs between the directions
     quadratic   v |v|                       friction that grows faster than the velocity
     spring      sin q and cos q             springs and counterbalances between a link and its parent
@@ -36,9 +36,11 @@ else:
 
 
 class Friction(eqx.Module):
-    """Torque of a joint's friction, to be supplied by the motor: tau_f = viscous v + coulomb tanh(v / v_s) + offset.
+    r"""Torque of a joint's friction, to be supplied by the motor.
 
-    Called as a force of a scene, `friction(system, q, v, t)`, it gives -tau_f. The offset (N m) is a constant of the
+    $$\tau_f = \mathrm{viscous} \cdot v + \mathrm{coulomb} \tanh(v / v_s) + \mathrm{offset}$$
+
+    Called as a force of a scene, `friction(system, q, v, t)`, it gives $-\tau_f$. The offset (N m) is a constant of the
     measurement (sensor bias, cable) or of asymmetric dry friction.
 
     - `viscous` (nv,) N m s/rad, `coulomb` (nv,) N m, `offset` (nv,) N m; for prismatic joints N s/m, N, N.
@@ -51,7 +53,7 @@ class Friction(eqx.Module):
     v_s: Float[Array, ""]
 
     def torque(self, v: Float[Array, " nv"]) -> Float[Array, " nv"]:
-        """tau_f (nv,) at the velocity v (nv,)."""
+        """Torque (nv,) at the velocity v (nv,)."""
         return self.viscous * v + self.coulomb * jnp.tanh(v / self.v_s) + self.offset
 
     def __call__(
@@ -84,7 +86,11 @@ PRESLIDING = 0.003
 
 
 class TorqueTerm(eqx.Module):
-    """Torque that is linear in coefficients of each joint: tau_j = sum over k of columns[:, j, k] coefficients[k, j].
+    r"""Torque that is linear in coefficients of each joint.
+
+    $$\tau_j = \sum_k \mathrm{columns}_{jk} \mathrm{coefficients}_{kj}$$
+
+    in each sample.
 
     - `name`: as in reports.
     - `columns(log, load, v_s)`: (n, nv, k) or (n, nv), from a log, the torque (n, nv) that the rigid bodies need along it
@@ -147,7 +153,7 @@ def _dahl(log, load, v_s):
     z[0] = np.tanh(np.asarray(log.v)[0] / v_s)
     for i in range(1, len(q)):
         path = q[i] - q[i - 1]
-        # Solution of the differential equation along a path in one direction.
+        # Exact solution of dz/dt = |v| (sign v - z) / z0 for a displacement in one direction.
         z[i] = np.sign(path) + (z[i - 1] - np.sign(path)) * np.exp(-np.abs(path) / PRESLIDING)
     return z
 
@@ -180,10 +186,10 @@ else:
 def split_terms(
     terms: RobotTerms, nv: int
 ) -> tuple[tuple[str, ...], tuple[TorqueTerm, ...], tuple[tuple[str, tuple[int, ...]], ...]]:
-    """Names of `TERMS`; `TorqueTerm`s; and (name, indices of its torques) of each.
+    """Split terms into names of `TERMS`, `TorqueTerm`s, and the name and the torque indices of each `TorqueTerm`.
 
-    `terms` are names of `TERMS` and of `EXTRA` and `TorqueTerm`s, in any order; or pairs of an extra term and the indices
-    of its torques, instead of all.
+    `terms` are names of `TERMS` and `EXTRA`, and `TorqueTerm`s, in any order. A pair (extra term, indices) limits the term to
+    these torques.
 
     **Raises:** ValueError for an unknown or a repeated term, and for indices of no torque.
     """
@@ -207,7 +213,7 @@ def split_terms(
     names = [*basic, *(term.name for term in extra)]
     if len(set(names)) < len(names):
         raise ValueError(f"terms are {', '.join(names)}; each may be given once")
-    # Any positive v_s passes here: this checks the names alone.
+    # The names alone are checked here, so that any positive v_s will do.
     return check_terms(basic, 1.0), tuple(extra), tuple(where)
 
 

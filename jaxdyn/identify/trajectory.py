@@ -81,12 +81,14 @@ def fit_trajectory(
     callback: Callable[[int, float, Model], None] | None = None,
     **simulation: Any,
 ) -> Fit:
-    """Physically feasible inertias and friction by the error of simulated motion, differentiated through `jd.simulate`.
+    r"""Physically feasible inertias and friction by the error of simulated motion, differentiated through `jd.simulate`.
 
-    Minimises mean(((q_sim - q) / q_rms)^2 + ((v_sim - v) / v_rms)^2) + prior * D, over all samples and joints, where
-    each segment of the log is simulated with the measured torques from its own start (multiple shooting), q_rms and
-    v_rms are the root mean squares of each joint's motion in the log, and D is the divergence from the nominal bodies, as
-    in `fit_torques`. Needs no accelerations. Short segments keep the problem close to convex and chaotic or unstable
+    $$\min \operatorname{mean}\left( \frac{(q_\mathrm{sim} - q)^2}{q_\mathrm{rms}^2}
+    + \frac{(v_\mathrm{sim} - v)^2}{v_\mathrm{rms}^2} \right) + \mathrm{prior} \cdot D$$
+
+    over all samples and joints, where each segment of the log is simulated with the measured torques from its own start (multiple
+    shooting), the denominators are the mean squares of each joint's motion in the log, and D is the divergence from the nominal
+    bodies, as in `fit_torques`. Needs no accelerations. Short segments keep the problem close to convex and chaotic or unstable
     motion from diverging; long ones see small errors that add up.
 
     **Arguments:**

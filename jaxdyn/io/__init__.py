@@ -1,5 +1,6 @@
 """Reading and writing mechanisms. File libraries are imported here alone, and only when a file is read."""
 
+from jaxdyn._renamed import old_names as _old_names
 from jaxdyn.io.load import load as load
 from jaxdyn.io.loaded import Actuators as Actuators
 from jaxdyn.io.loaded import LoadedScene as LoadedScene
@@ -12,7 +13,7 @@ from jaxdyn.io.mjcf import load_mjcf as load_mjcf
 from jaxdyn.io.sdf import load_sdf as load_sdf
 from jaxdyn.io.urdf import load_urdf as load_urdf
 from jaxdyn.io.urdf import urdf_inertia_report as urdf_inertia_report
-from jaxdyn.io.urdf_write import joint_torques as joint_torques
+from jaxdyn.io.urdf_write import read_torque_terms as read_torque_terms
 from jaxdyn.io.urdf_write import save_urdf as save_urdf
 
 __all__ = [
@@ -21,16 +22,18 @@ __all__ = [
     "NotTakenWarning",
     "Start",
     "UnitsWarning",
-    "joint_torques",
     "load",
     "load_mjcf",
     "load_sdf",
     "load_urdf",
     "read_log",
+    "read_torque_terms",
     "save_urdf",
     "urdf_inertia_report",
     "write_log",
 ]
+
+__getattr__ = _old_names(__name__)
 
 
 def __dir__() -> list[str]:

@@ -39,15 +39,17 @@ class Start(eqx.Module):
 
 
 class Actuators(eqx.Module):
-    """Named actuators: generalised forces from controls.
+    r"""Named actuators: generalised forces from controls.
 
-    An actuator acts along a length l(q) with the force f = gain u + bias, where gain and bias are affine in l and its
-    rate: gain = g0 + g1 l + g2 ldot, bias = b0 + b1 l + b2 ldot. That covers motors (f = g0 u), position and velocity
-    servos, dampers and general actuators. The force is clipped to `force_range`, the sum of all at each coordinate to
-    `effort_range`, the control to `control_range`.
+    An actuator acts along a length l(q) with the force
 
-    An actuator with dynamics has an activation w, which takes the place of u in the force: a "filter" with T dw/dt = u - w, an
-    "integrator" with dw/dt = u. At the ends of `activation_range` w stops. `drive` makes a force of a scene of them.
+    $$f = (g_0 + g_1 l + g_2 \dot l) u + b_0 + b_1 l + b_2 \dot l.$$
+
+    That covers motors ($f = g_0 u$), position and velocity servos, dampers and general actuators. The force is clipped to
+    `force_range`, the sum of all at each coordinate to `effort_range`, the control to `control_range`.
+
+    An actuator with dynamics has an activation w, which takes the place of u in the force: a "filter" with $T \dot w = u - w$, an
+    "integrator" with $\dot w = u$. At the ends of `activation_range` w stops. `drive` makes a force of a scene of them.
 
     Lengths are linear in q, l = moment q, with the coordinates that have v = dq/dt; actuators at a site have no
     length (l = 0) and act with a wrench fixed in the site's frame.

@@ -41,7 +41,7 @@ def save_urdf(
     written as the largest double, because other readers refuse "inf".
 
     `torques`: additional torque parameters by joint name, which URDF lacks, as {"shoulder": {"offset": 0.3}}. They go into
-    an element `<jaxdyn>` below `<robot>`, which other readers ignore; `jaxdyn.io.joint_torques` reads them.
+    an element `<jaxdyn>` below `<robot>`, which other readers ignore; `jd.io.read_torque_terms` reads them.
 
     **Raises:** ValueError naming the joint or body for features that URDF cannot express: helical and spherical joints, limits
     of planar and free joints, friction or armature that differs between the directions of one joint, first moments
@@ -65,7 +65,7 @@ def save_urdf(
         ET.ElementTree(robot).write(part, encoding="utf-8", xml_declaration=True)
 
 
-def joint_torques(path: str | os.PathLike) -> dict[str, dict[str, float]]:
+def read_torque_terms(path: str | os.PathLike) -> dict[str, dict[str, float]]:
     """Read the additional torque parameters that `save_urdf` wrote; empty where the file has none.
 
     **Raises:** ValueError with file and line for malformed XML, or an invalid number, with the joint.
@@ -91,7 +91,7 @@ def _write_torques(robot: ET.Element, model: Model, torques: Mapping[str, Mappin
     element = ET.SubElement(robot, "jaxdyn")
     for joint, numbers in torques.items():
         values = {name: float(value) for name, value in numbers.items()}
-        # `joint_torques` would read NaN and infinity back without an error.
+        # `read_torque_terms` would read NaN and infinity back without an error.
         if not np.isfinite(list(values.values())).all():
             raise ValueError(f"torques of joint {joint!r} are {values}; they must be finite")
         ET.SubElement(element, "joint", {"name": joint, **{name: repr(value) for name, value in values.items()}})

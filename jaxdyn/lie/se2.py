@@ -29,7 +29,9 @@ def _area(a: Point, b: Point) -> Float[Array, ""]:
 
 
 def from_parts(rotation: Float[Array, "2 2"], position: Point) -> Matrix:
-    """Motion [[R, p], [0, 1]] from its parts.
+    r"""Motion from its rotation and its position.
+
+    $$T = \begin{bmatrix} R & p \\ 0 & 1 \end{bmatrix}$$
 
     **Arguments:** `rotation`: R_ab, (2, 2); `position`: origin of b in a, (2,), m. **Returns:** T_ab, (3, 3).
     """
@@ -38,7 +40,9 @@ def from_parts(rotation: Float[Array, "2 2"], position: Point) -> Matrix:
 
 
 def apply(transform: Matrix, point: Point) -> Point:
-    """Coordinates of a point in the other frame: R x + p.
+    """Coordinates of a point in the other frame.
+
+    $$x_a = R x_b + p$$
 
     **Arguments:** `transform`: T_ab, (3, 3); `point`: (2,), m, in b. **Returns:** (2,), m, in a.
     """
@@ -46,7 +50,9 @@ def apply(transform: Matrix, point: Point) -> Point:
 
 
 def hat(twist: Twist) -> Matrix:
-    """Matrix of a twist: [[0, -omega, vx], [omega, 0, vy], [0, 0, 0]].
+    r"""Matrix of a twist.
+
+    $$\hat V = \begin{bmatrix} 0 & -\omega & v_x \\ \omega & 0 & v_y \\ 0 & 0 & 0 \end{bmatrix}$$
 
     **Arguments:** `twist`: (vx, vy, omega), (3,). **Returns:** (3, 3).
     """
@@ -65,11 +71,13 @@ def vee(matrix: Matrix) -> Twist:
 
 
 def exp(twist: Twist) -> Matrix:
-    """Motion along a constant twist for unit time.
+    r"""Motion along a constant twist for unit time.
 
-    R is the rotation by theta, p = (sin(theta)/theta) rho + ((1 - cos(theta))/theta) z x rho for (rho, theta).
+    R is the rotation by $\theta$; for the exponent $(\rho, \theta)$ the position is
 
-    **Arguments:** `twist`: (rho, theta), (3,), m and rad. **Returns:** (3, 3). The error grows as eps |theta|.
+    $$p = \frac{\sin\theta}{\theta} \rho + \frac{1 - \cos\theta}{\theta} z \times \rho.$$
+
+    **Arguments:** `twist`: (rho, theta), (3,), m and rad. **Returns:** (3, 3). The error grows as $\epsilon |\theta|$.
 
     Source: Murray, Li, Sastry, A Mathematical Introduction to Robotic Manipulation (1994), eq. 2.36 in the plane.
     """
@@ -82,10 +90,13 @@ def exp(twist: Twist) -> Matrix:
 
 
 def log(transform: Matrix) -> Twist:
-    """Exponent of a motion, with rotation angle in [-pi, pi].
+    r"""Exponent of a motion, with rotation angle in [-pi, pi].
 
-    theta = atan2(R10, R00), rho = e p - (theta/2) z x p with e = (theta/2) cot(theta/2). Branch at angle pi: the sign
-    of R10 decides, and R10 = +0 gives +pi, R10 = -0 gives -pi. Derivatives there are those of the branch returned.
+    $$\theta = \operatorname{atan2}(R_{10}, R_{00}), \quad
+    \rho = \frac{\theta}{2} \cot\frac{\theta}{2} p - \frac{\theta}{2} z \times p$$
+
+    Branch at angle pi: the sign of $R_{10}$ decides, and +0 gives +pi, -0 gives -pi. Derivatives there are those of the
+    branch returned.
 
     **Arguments:** `transform`: (3, 3). **Returns:** (rho, theta), (3,), m and rad.
     """
@@ -98,13 +109,21 @@ def log(transform: Matrix) -> Twist:
 
 
 def inverse(transform: Matrix) -> Matrix:
-    """Inverse motion [[R^T, -R^T p], [0, 1]]. **Arguments:** `transform`: T_ab, (3, 3). **Returns:** T_ba, (3, 3)."""
+    r"""Inverse motion.
+
+    $$T^{-1} = \begin{bmatrix} R^T & -R^T p \\ 0 & 1 \end{bmatrix}$$
+
+    **Arguments:** `transform`: T_ab, (3, 3). **Returns:** T_ba, (3, 3).
+    """
     rotation = transform[:2, :2].T
     return from_parts(rotation, -matmul(rotation, transform[:2, 2]))
 
 
 def Ad(transform: Matrix) -> Matrix:
-    """Adjoint: V_a = Ad_T V_b for T = T_ab, Ad_T = [[R, (py, -px)], [0, 1]].
+    r"""Adjoint of a motion, which maps twists to the other frame.
+
+    $$V_a = \mathrm{Ad}_T V_b, \quad T = T_{ab}, \quad
+    \mathrm{Ad}_T = \begin{bmatrix} R & (p_y, -p_x) \\ 0 & 1 \end{bmatrix}$$
 
     **Arguments:** `transform`: T_ab, (3, 3). **Returns:** (3, 3). To act on one vector use `Ad_apply`.
     """
@@ -112,7 +131,10 @@ def Ad(transform: Matrix) -> Matrix:
 
 
 def ad(twist: Twist) -> Matrix:
-    """Adjoint of the algebra, ad_V = [[0, -omega, vy], [omega, 0, -vx], [0, 0, 0]]; ad_V W = vee of the commutator.
+    r"""Adjoint of the algebra; its product with a twist is the commutator.
+
+    $$\mathrm{ad}_V = \begin{bmatrix} 0 & -\omega & v_y \\ \omega & 0 & -v_x \\ 0 & 0 & 0 \end{bmatrix}, \quad
+    \mathrm{ad}_V W = [V, W]$$
 
     **Arguments:** `twist`: (vx, vy, omega), (3,). **Returns:** (3, 3). To act on one vector use `ad_apply`.
     """
@@ -122,12 +144,15 @@ def ad(twist: Twist) -> Matrix:
 
 
 def left_jacobian(twist: Twist) -> Matrix:
-    """Left Jacobian of exp: (d/dt T) T^-1 = hat(J xidot), T = exp(xi).
+    r"""Left Jacobian of exp.
 
-    J = sum_k ad^k / (k+1)! = 1 + c2 ad + c3 ad^2 (Stumpff functions of theta^2), since ad^3 = -theta^2 ad. The right
-    Jacobian is left_jacobian(-xi).
+    $$\dot T T^{-1} = \widehat{J \dot\xi}, \quad T = \exp \hat\xi, \quad
+    J = \sum_k \frac{\mathrm{ad}_\xi^k}{(k+1)!} = 1 + c_2 \mathrm{ad}_\xi + c_3 \mathrm{ad}_\xi^2$$
 
-    **Arguments:** `twist`: (rho, theta), (3,), m and rad. **Returns:** (3, 3). Singular at |theta| = 2 pi n, n > 0.
+    The coefficients are Stumpff functions of $\theta^2$, since $\mathrm{ad}^3 = -\theta^2 \mathrm{ad}$. The right Jacobian is
+    `left_jacobian(-xi)`.
+
+    **Arguments:** `twist`: (rho, theta), (3,), m and rad. **Returns:** (3, 3). Singular at $|\theta| = 2 \pi n$, n > 0.
     """
     x, y, theta = jnp.unstack(twist)
     _, c1, c2, c3 = stumpff(theta * theta)
@@ -138,12 +163,15 @@ def left_jacobian(twist: Twist) -> Matrix:
 
 
 def left_jacobian_inverse(twist: Twist) -> Matrix:
-    """Inverse of the left Jacobian: xidot = J^-1 V, V the spatial twist of exp(xi).
+    r"""Inverse of the left Jacobian.
 
-    J^-1 = 1 - ad/2 + d ad^2, d = (1 - (theta/2) cot(theta/2)) / theta^2.
+    $$\dot\xi = J^{-1} V, \quad J^{-1} = 1 - \frac{\mathrm{ad}_\xi}{2} + d\, \mathrm{ad}_\xi^2, \quad
+    d = \frac{1 - (\theta/2) \cot(\theta/2)}{\theta^2}$$
 
-    **Arguments:** `twist`: (rho, theta), (3,), m and rad, |theta| < 2 pi. **Returns:** (3, 3). Unbounded towards
-    |theta| = 2 pi.
+    V is the spatial twist of $\exp \hat\xi$.
+
+    **Arguments:** `twist`: (rho, theta), (3,), m and rad, $|\theta| < 2 \pi$. **Returns:** (3, 3). Unbounded towards
+    $|\theta| = 2 \pi$.
     """
     x, y, theta = jnp.unstack(twist)
     # 1 - s d = (theta/2) cot(theta/2), by the coefficient that stays finite at theta = 0.
@@ -155,7 +183,9 @@ def left_jacobian_inverse(twist: Twist) -> Matrix:
 
 
 def Ad_apply(transform: Matrix, twist: Twist) -> Twist:
-    """Twist in the other frame, Ad_T V = (R v + omega (py, -px), omega).
+    r"""Twist in the other frame, without the matrix of `Ad`.
+
+    $$\mathrm{Ad}_T V = (R v + \omega (p_y, -p_x), \omega)$$
 
     **Arguments:** `transform`: T_ab, (3, 3); `twist`: in b, (3,). **Returns:** in a, (3,).
     """
@@ -164,7 +194,9 @@ def Ad_apply(transform: Matrix, twist: Twist) -> Twist:
 
 
 def Ad_inv_apply(transform: Matrix, twist: Twist) -> Twist:
-    """Twist in the other frame, Ad_T^-1 V = (R^T (v - omega (py, -px)), omega).
+    r"""Twist in the other frame, the inverse of `Ad_apply`.
+
+    $$\mathrm{Ad}_T^{-1} V = (R^T (v - \omega (p_y, -p_x)), \omega)$$
 
     **Arguments:** `transform`: T_ab, (3, 3); `twist`: in a, (3,). **Returns:** in b, (3,).
     """
@@ -174,7 +206,9 @@ def Ad_inv_apply(transform: Matrix, twist: Twist) -> Twist:
 
 
 def AdT_apply(transform: Matrix, wrench: Twist) -> Twist:
-    """Wrench in the other frame, F_b = Ad_T^T F_a = (R^T f, tau - p x f).
+    r"""Wrench in the other frame, from a to b.
+
+    $$F_b = \mathrm{Ad}_T^T F_a = (R^T f, \tau - p \times f)$$
 
     **Arguments:** `transform`: T_ab, (3, 3); `wrench`: in a, (3,). **Returns:** in b, (3,).
     """
@@ -183,7 +217,9 @@ def AdT_apply(transform: Matrix, wrench: Twist) -> Twist:
 
 
 def Ad_inv_T_apply(transform: Matrix, wrench: Twist) -> Twist:
-    """Wrench in the other frame, F_a = Ad_T^-T F_b = (R f, tau + p x R f).
+    r"""Wrench in the other frame, from b to a.
+
+    $$F_a = \mathrm{Ad}_T^{-T} F_b = (R f, \tau + p \times R f)$$
 
     **Arguments:** `transform`: T_ab, (3, 3); `wrench`: in b, (3,). **Returns:** in a, (3,).
     """
@@ -193,7 +229,9 @@ def Ad_inv_T_apply(transform: Matrix, wrench: Twist) -> Twist:
 
 
 def ad_apply(twist: Twist, other: Twist) -> Twist:
-    """Bracket of twists, ad_V1 V2 = (omega1 z x v2 - omega2 z x v1, 0).
+    r"""Bracket of twists.
+
+    $$\mathrm{ad}_{V_1} V_2 = (\omega_1 z \times v_2 - \omega_2 z \times v_1, 0)$$
 
     **Arguments:** `twist`, `other`: V1, V2, (3,), in the same frame. **Returns:** (3,).
     """
@@ -202,7 +240,9 @@ def ad_apply(twist: Twist, other: Twist) -> Twist:
 
 
 def adT_apply(twist: Twist, wrench: Twist) -> Twist:
-    """Transposed bracket on a wrench, ad_V^T F = (-omega z x f, f x v).
+    r"""Transposed bracket on a wrench.
+
+    $$\mathrm{ad}_V^T F = (-\omega z \times f, f \times v)$$
 
     **Arguments:** `twist`: V, (3,); `wrench`: F, (3,), same frame. **Returns:** (3,).
     """

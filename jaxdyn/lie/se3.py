@@ -30,7 +30,9 @@ def _blocks(a: Float[Array, "3 3"], b: Float[Array, "3 3"]) -> Adjoint:
 
 
 def from_parts(rotation: Float[Array, "3 3"], position: Vector) -> Matrix:
-    """Motion [[R, p], [0, 1]] from its parts.
+    r"""Motion from its rotation and its position.
+
+    $$T = \begin{bmatrix} R & p \\ 0 & 1 \end{bmatrix}$$
 
     **Arguments:** `rotation`: R_ab, (3, 3); `position`: origin of b in a, (3,), m. **Returns:** T_ab, (4, 4).
     """
@@ -39,7 +41,9 @@ def from_parts(rotation: Float[Array, "3 3"], position: Vector) -> Matrix:
 
 
 def apply(transform: Matrix, point: Vector) -> Vector:
-    """Coordinates of a point in the other frame: R x + p.
+    """Coordinates of a point in the other frame.
+
+    $$x_a = R x_b + p$$
 
     **Arguments:** `transform`: T_ab, (4, 4); `point`: (3,), m, in b. **Returns:** (3,), m, in a.
     """
@@ -47,7 +51,9 @@ def apply(transform: Matrix, point: Vector) -> Vector:
 
 
 def hat(twist: Twist) -> Matrix:
-    """Matrix of a twist: [[hat(omega), v], [0, 0]].
+    r"""Matrix of a twist.
+
+    $$\hat V = \begin{bmatrix} \hat\omega & v \\ 0 & 0 \end{bmatrix}$$
 
     **Arguments:** `twist`: (v, omega), (6,). **Returns:** (4, 4).
 
@@ -66,12 +72,13 @@ def vee(matrix: Matrix) -> Twist:
 
 
 def exp(twist: Twist) -> Matrix:
-    """Motion along a constant twist for unit time.
+    r"""Motion along a constant twist for unit time.
 
-    R = so3.exp(phi), p = J(phi) rho = c1 rho + c2 phi x rho + c3 phi (phi . rho) for the exponent (rho, phi), with J
-    the left Jacobian of SO(3) and c_k the Stumpff functions of |phi|^2.
+    $$R = \exp \hat\phi, \quad p = J(\phi) \rho = c_1 \rho + c_2\, \phi \times \rho + c_3\, \phi (\phi \cdot \rho)$$
 
-    **Arguments:** `twist`: (rho, phi), (6,), m and rad. **Returns:** (4, 4). The error grows as eps |phi|.
+    for the exponent $(\rho, \phi)$, with J the left Jacobian of SO(3) and $c_k$ the Stumpff functions of $|\phi|^2$.
+
+    **Arguments:** `twist`: (rho, phi), (6,), m and rad. **Returns:** (4, 4). The error grows as $\epsilon |\phi|$.
 
     Source: Murray, Li, Sastry (1994), eq. 2.36; Barfoot, State Estimation for Robotics (2017), eq. 7.85.
     """
@@ -83,11 +90,12 @@ def exp(twist: Twist) -> Matrix:
 
 
 def log(transform: Matrix) -> Twist:
-    """Exponent of a motion, with rotation angle at most pi.
+    r"""Exponent of a motion, with rotation angle at most pi.
 
-    phi = so3.log(R), rho = J(phi)^-1 p = e p - phi x p / 2 + d phi (phi . p), with d the coefficient of
-    `so3.left_jacobian_inverse` and e = 1 - d |phi|^2. At angle pi the branch is that of `so3.log`; the two branches
-    are different screws that reach the same motion.
+    $$\phi = \log R, \quad \rho = J(\phi)^{-1} p = e p - \tfrac12 \phi \times p + d\, \phi (\phi \cdot p)$$
+
+    with d the coefficient of `so3.left_jacobian_inverse` and $e = 1 - d |\phi|^2$. At angle pi the branch is that of
+    `so3.log`; the two branches are different screws that reach the same motion.
 
     **Arguments:** `transform`: (4, 4), rotation orthogonal to rounding. **Returns:** (rho, phi), (6,), m and rad.
     """
@@ -101,13 +109,20 @@ def log(transform: Matrix) -> Twist:
 
 
 def inverse(transform: Matrix) -> Matrix:
-    """Inverse motion [[R^T, -R^T p], [0, 1]]. **Arguments:** `transform`: T_ab, (4, 4). **Returns:** T_ba, (4, 4)."""
+    r"""Inverse motion.
+
+    $$T^{-1} = \begin{bmatrix} R^T & -R^T p \\ 0 & 1 \end{bmatrix}$$
+
+    **Arguments:** `transform`: T_ab, (4, 4). **Returns:** T_ba, (4, 4).
+    """
     rotation = transform[:3, :3].T
     return from_parts(rotation, -matmul(rotation, transform[:3, 3]))
 
 
 def Ad(transform: Matrix) -> Adjoint:
-    """Adjoint: V_a = Ad_T V_b for T = T_ab, Ad_T = [[R, hat(p) R], [0, R]].
+    r"""Adjoint of a motion, which maps twists to the other frame.
+
+    $$V_a = \mathrm{Ad}_T V_b, \quad T = T_{ab}, \quad \mathrm{Ad}_T = \begin{bmatrix} R & \hat p R \\ 0 & R \end{bmatrix}$$
 
     **Arguments:** `transform`: T_ab, (4, 4). **Returns:** (6, 6). To act on one vector use `Ad_apply`.
 
@@ -118,7 +133,9 @@ def Ad(transform: Matrix) -> Adjoint:
 
 
 def ad(twist: Twist) -> Adjoint:
-    """Adjoint of the algebra, ad_V = [[hat(omega), hat(v)], [0, hat(omega)]]; ad_V W = vee of the commutator.
+    r"""Adjoint of the algebra; its product with a twist is the commutator.
+
+    $$\mathrm{ad}_V = \begin{bmatrix} \hat\omega & \hat v \\ 0 & \hat\omega \end{bmatrix}, \quad \mathrm{ad}_V W = [V, W]$$
 
     **Arguments:** `twist`: (v, omega), (6,). **Returns:** (6, 6). To act on one vector use `ad_apply`.
     """
@@ -126,12 +143,15 @@ def ad(twist: Twist) -> Adjoint:
 
 
 def left_jacobian(twist: Twist) -> Adjoint:
-    """Left Jacobian of exp: (d/dt T) T^-1 = hat(J xidot), T = exp(xi).
+    r"""Left Jacobian of exp.
 
-    J = sum_k ad_xi^k / (k+1)! = [[J3, Q], [0, J3]], xi = (rho, phi), J3 the left Jacobian of SO(3) at phi and Q its
-    derivative at phi in the direction rho. The right Jacobian is left_jacobian(-xi).
+    $$\dot T T^{-1} = \widehat{J \dot\xi}, \quad T = \exp \hat\xi, \quad
+    J = \sum_k \frac{\mathrm{ad}_\xi^k}{(k+1)!} = \begin{bmatrix} J_3 & Q \\ 0 & J_3 \end{bmatrix}$$
 
-    **Arguments:** `twist`: (rho, phi), (6,), m and rad. **Returns:** (6, 6). Singular at |phi| = 2 pi n, n > 0.
+    $J_3$ is the left Jacobian of SO(3) at $\phi$, for $\xi = (\rho, \phi)$, and Q its derivative in the direction $\rho$.
+    The right Jacobian is `left_jacobian(-xi)`.
+
+    **Arguments:** `twist`: (rho, phi), (6,), m and rad. **Returns:** (6, 6). Singular at $|\phi| = 2 \pi n$, n > 0.
 
     Source: Barfoot (2017), eq. 7.86, there Q in closed form.
     """
@@ -141,13 +161,15 @@ def left_jacobian(twist: Twist) -> Adjoint:
 
 
 def left_jacobian_inverse(twist: Twist) -> Adjoint:
-    """Inverse of the left Jacobian: xidot = J^-1 V, V the spatial twist of exp(xi).
+    r"""Inverse of the left Jacobian.
 
-    J^-1 = [[J3^-1, P], [0, J3^-1]], P the derivative of J3^-1 at phi in the direction rho, since
-    d(J3^-1) = -J3^-1 dJ3 J3^-1.
+    $$\dot\xi = J^{-1} V, \quad J^{-1} = \begin{bmatrix} J_3^{-1} & P \\ 0 & J_3^{-1} \end{bmatrix}$$
 
-    **Arguments:** `twist`: (rho, phi), (6,), m and rad, |phi| < 2 pi. **Returns:** (6, 6). Unbounded towards
-    |phi| = 2 pi.
+    V is the spatial twist of $\exp \hat\xi$ and P the derivative of $J_3^{-1}$ at $\phi$ in the direction $\rho$, since
+    $d(J_3^{-1}) = -J_3^{-1} dJ_3 J_3^{-1}$.
+
+    **Arguments:** `twist`: (rho, phi), (6,), m and rad, $|\phi| < 2 \pi$. **Returns:** (6, 6). Unbounded towards
+    $|\phi| = 2 \pi$.
 
     Source: Barfoot (2017), eq. 7.95.
     """
@@ -155,7 +177,9 @@ def left_jacobian_inverse(twist: Twist) -> Adjoint:
 
 
 def Ad_apply(transform: Matrix, twist: Twist) -> Twist:
-    """Twist in the other frame, Ad_T V = (R v + p x R omega, R omega).
+    r"""Twist in the other frame, without the matrix of `Ad`.
+
+    $$\mathrm{Ad}_T V = (R v + p \times R \omega, R \omega)$$
 
     **Arguments:** `transform`: T_ab, (4, 4); `twist`: in b, (6,). **Returns:** in a, (6,).
     """
@@ -165,7 +189,9 @@ def Ad_apply(transform: Matrix, twist: Twist) -> Twist:
 
 
 def Ad_inv_apply(transform: Matrix, twist: Twist) -> Twist:
-    """Twist in the other frame, Ad_T^-1 V = (R^T (v - p x omega), R^T omega).
+    r"""Twist in the other frame, the inverse of `Ad_apply`.
+
+    $$\mathrm{Ad}_T^{-1} V = (R^T (v - p \times \omega), R^T \omega)$$
 
     **Arguments:** `transform`: T_ab, (4, 4); `twist`: in a, (6,). **Returns:** in b, (6,).
     """
@@ -176,7 +202,9 @@ def Ad_inv_apply(transform: Matrix, twist: Twist) -> Twist:
 
 
 def AdT_apply(transform: Matrix, wrench: Twist) -> Twist:
-    """Wrench in the other frame, F_b = Ad_T^T F_a = (R^T f, R^T (tau - p x f)).
+    r"""Wrench in the other frame, from a to b.
+
+    $$F_b = \mathrm{Ad}_T^T F_a = (R^T f, R^T (\tau - p \times f))$$
 
     **Arguments:** `transform`: T_ab, (4, 4); `wrench`: in a, (6,). **Returns:** in b, (6,).
     """
@@ -186,7 +214,9 @@ def AdT_apply(transform: Matrix, wrench: Twist) -> Twist:
 
 
 def Ad_inv_T_apply(transform: Matrix, wrench: Twist) -> Twist:
-    """Wrench in the other frame, F_a = Ad_T^-T F_b = (R f, R tau + p x R f).
+    r"""Wrench in the other frame, from b to a.
+
+    $$F_a = \mathrm{Ad}_T^{-T} F_b = (R f, R \tau + p \times R f)$$
 
     **Arguments:** `transform`: T_ab, (4, 4); `wrench`: in b, (6,). **Returns:** in a, (6,).
     """
@@ -196,7 +226,9 @@ def Ad_inv_T_apply(transform: Matrix, wrench: Twist) -> Twist:
 
 
 def ad_apply(twist: Twist, other: Twist) -> Twist:
-    """Bracket of twists, ad_V1 V2 = (omega1 x v2 - omega2 x v1, omega1 x omega2).
+    r"""Bracket of twists.
+
+    $$\mathrm{ad}_{V_1} V_2 = (\omega_1 \times v_2 - \omega_2 \times v_1, \omega_1 \times \omega_2)$$
 
     **Arguments:** `twist`, `other`: V1, V2, (6,), in the same frame. **Returns:** (6,).
     """
@@ -207,9 +239,11 @@ def ad_apply(twist: Twist, other: Twist) -> Twist:
 
 
 def adT_apply(twist: Twist, wrench: Twist) -> Twist:
-    """Transposed bracket on a wrench, ad_V^T F = (f x omega, f x v + tau x omega).
+    r"""Transposed bracket on a wrench.
 
-    The Newton-Euler equation of a body reads M Vdot - adT_apply(V, M V) = F.
+    $$\mathrm{ad}_V^T F = (f \times \omega, f \times v + \tau \times \omega)$$
+
+    The Newton-Euler equation of a body reads $M \dot V - \mathrm{ad}_V^T M V = F$.
 
     **Arguments:** `twist`: V, (6,); `wrench`: F, (6,), same frame. **Returns:** (6,).
     """

@@ -90,12 +90,14 @@ def inverse_coefficient(s: Scalar) -> Scalar:
 
 
 def angle_ratio(n2: Scalar, w: Scalar) -> Scalar:
-    """Angle over sine of the half angle, from a quaternion's parts: 2 atan2(sqrt(n2), w) / sqrt(n2).
+    r"""Angle over sine of the half angle, from the parts of a quaternion.
+
+    $$2 \operatorname{atan2}(\sqrt{n_2}, w) / \sqrt{n_2}$$
 
     **Arguments:** `n2`: squared norm of the vector part, (); `w`: scalar part, (), not negative. The two need not
     be normalised; both zero gives NaN.
 
-    **Returns:** the factor, (), that turns the vector part into the rotation vector: 2 / w at n2 = 0, pi / sqrt(n2)
+    **Returns:** the factor, (), that turns the vector part into the rotation vector: $2 / w$ at n2 = 0, $\pi / \sqrt{n_2}$
     at w = 0.
     """
     # With t = tan(theta/2) the series of atan(t)/t leaves out t^(2 n_terms); second derivatives of the rotation

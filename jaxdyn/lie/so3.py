@@ -23,7 +23,7 @@ def matmul(a: Array, b: Array) -> Array:
 
 
 def cross(a: Vector, b: Vector) -> Vector:
-    """Cross product a x b = hat(a) b, without the matrix.
+    r"""Cross product of two vectors, without the matrix of `hat`.
 
     **Arguments:** `a`, `b`: (3,), in the same frame. **Returns:** (3,), product of their units.
     """
@@ -34,7 +34,9 @@ def cross(a: Vector, b: Vector) -> Vector:
 
 
 def hat(phi: Vector) -> Matrix:
-    """Skew matrix of a vector: hat(a) b = a x b.
+    r"""Skew matrix of a vector.
+
+    $$\hat a b = a \times b$$
 
     **Arguments:** `phi`: (3,). **Returns:** (3, 3), same unit and frame.
 
@@ -61,11 +63,12 @@ def _isotropic_sum(a: Float[Array, ""], b: Float[Array, ""], c: Float[Array, ""]
 
 
 def exp(phi: Vector) -> Matrix:
-    """Rotation matrix of a rotation vector (Rodrigues).
+    r"""Rotation matrix of a rotation vector (Rodrigues).
 
-    R = cos(theta) 1 + (sin(theta)/theta) hat(phi) + ((1 - cos(theta))/theta^2) phi phi^T, theta = |phi|.
+    $$R = \cos\theta\, 1 + \frac{\sin\theta}{\theta} \hat\phi + \frac{1 - \cos\theta}{\theta^2} \phi \phi^T, \quad
+    \theta = |\phi|$$
 
-    **Arguments:** `phi`: (3,), rad, of any length. **Returns:** (3, 3). The error grows as eps theta for many turns.
+    **Arguments:** `phi`: (3,), rad, of any length. **Returns:** (3, 3). The error grows as $\epsilon \theta$ for many turns.
 
     Source: Murray, Li, Sastry (1994), eq. 2.14.
     """
@@ -74,9 +77,9 @@ def exp(phi: Vector) -> Matrix:
 
 
 def log(rotation: Matrix) -> Vector:
-    """Rotation vector of a rotation matrix, of length at most pi.
+    r"""Rotation vector of a rotation matrix, of length at most pi.
 
-    phi = quat_log(matrix_to_quat(R)). Branch at theta = pi, where +phi and -phi are the same rotation: the sign of
+    It is `quat_log(matrix_to_quat(R))`. Branch at $\theta = \pi$, where $\pm\phi$ are the same rotation: the sign of
     the quaternion's scalar part decides, and where that is exactly zero, the component of the axis with the largest
     magnitude comes out positive (the first of equals). Derivatives there are one-sided, those of the branch returned;
     at an angle within rounding of pi either sign may come out.
@@ -89,12 +92,14 @@ def log(rotation: Matrix) -> Vector:
 
 
 def inverse(rotation: Matrix) -> Matrix:
-    """Inverse rotation, R^T. **Arguments:** `rotation`: (3, 3). **Returns:** (3, 3)."""
+    """Inverse rotation, the transposed matrix. **Arguments:** `rotation`: (3, 3). **Returns:** (3, 3)."""
     return rotation.T
 
 
 def Ad(rotation: Matrix) -> Matrix:
-    """Adjoint of a rotation on angular velocities: R hat(w) R^T = hat(Ad_R w), so Ad_R = R.
+    r"""Adjoint of a rotation on angular velocities, which is the rotation itself.
+
+    $$R \hat\omega R^T = \widehat{\mathrm{Ad}_R \omega}, \quad \mathrm{Ad}_R = R$$
 
     **Arguments:** `rotation`: R_ab, (3, 3). **Returns:** (3, 3), maps angular velocities in b to a.
     """
@@ -102,7 +107,9 @@ def Ad(rotation: Matrix) -> Matrix:
 
 
 def ad(phi: Vector) -> Matrix:
-    """Adjoint of the algebra: ad_a b = a x b, so ad_a = hat(a).
+    r"""Adjoint of the algebra, which is the skew matrix.
+
+    $$\mathrm{ad}_a b = a \times b, \quad \mathrm{ad}_a = \hat a$$
 
     **Arguments:** `phi`: (3,). **Returns:** (3, 3).
     """
@@ -110,12 +117,15 @@ def ad(phi: Vector) -> Matrix:
 
 
 def left_jacobian(phi: Vector) -> Matrix:
-    """Left Jacobian of exp: (d/dt R) R^T = hat(J phidot), R = exp(phi).
+    r"""Left Jacobian of exp.
 
-    J = sum_k hat(phi)^k / (k+1)! = c1 1 + c2 hat(phi) + c3 phi phi^T (Stumpff functions of theta^2). The right
-    Jacobian, which gives R^T dR/dt, is left_jacobian(-phi) = J^T.
+    $$\dot R R^T = \widehat{J \dot\phi}, \quad R = \exp \hat\phi, \quad
+    J = \sum_k \frac{\hat\phi^k}{(k+1)!} = c_1 1 + c_2 \hat\phi + c_3 \phi \phi^T$$
 
-    **Arguments:** `phi`: (3,), rad. **Returns:** (3, 3). Singular at theta = 2 pi n, n > 0.
+    The coefficients are Stumpff functions of $\theta^2$. The right Jacobian, which gives $R^T \dot R$, is
+    `left_jacobian(-phi)`, the transposed matrix.
+
+    **Arguments:** `phi`: (3,), rad. **Returns:** (3, 3). Singular at $\theta = 2 \pi n$, n > 0.
 
     Source: Barfoot, State Estimation for Robotics (2017), eq. 7.77.
     """
@@ -124,11 +134,14 @@ def left_jacobian(phi: Vector) -> Matrix:
 
 
 def left_jacobian_inverse(phi: Vector) -> Matrix:
-    """Inverse of the left Jacobian: phidot = J^-1 w, w the angular velocity in the fixed frame.
+    r"""Inverse of the left Jacobian.
 
-    J^-1 = 1 - hat(phi)/2 + d hat(phi)^2, d = (1 - (theta/2) cot(theta/2)) / theta^2.
+    $$\dot\phi = J^{-1} \omega, \quad J^{-1} = 1 - \tfrac12 \hat\phi + d\, \hat\phi^2, \quad
+    d = \frac{1 - (\theta/2) \cot(\theta/2)}{\theta^2}$$
 
-    **Arguments:** `phi`: (3,), rad, |phi| < 2 pi. **Returns:** (3, 3). Unbounded towards |phi| = 2 pi.
+    with $\omega$ the angular velocity in the fixed frame.
+
+    **Arguments:** `phi`: (3,), rad, $|\phi| < 2 \pi$. **Returns:** (3, 3). Unbounded towards $|\phi| = 2 \pi$.
 
     Source: Barfoot (2017), eq. 7.76; Bullo and Murray, PD control on the Euclidean group (1995).
     """
@@ -138,7 +151,9 @@ def left_jacobian_inverse(phi: Vector) -> Matrix:
 
 
 def quat_exp(phi: Vector) -> Quaternion:
-    """Unit quaternion of a rotation vector: (cos(theta/2), phi sin(theta/2)/theta).
+    r"""Unit quaternion of a rotation vector.
+
+    $$q = \left(\cos\frac{\theta}{2}, \frac{\phi}{\theta} \sin\frac{\theta}{2}\right), \quad \theta = |\phi|$$
 
     **Arguments:** `phi`: (3,), rad, of any length. **Returns:** (4,). Its sign is that of the half angle: adding a
     full turn to phi negates it.
@@ -151,10 +166,12 @@ def quat_exp(phi: Vector) -> Quaternion:
 
 
 def quat_log(q: Quaternion) -> Vector:
-    """Rotation vector of a quaternion, of length at most pi.
+    r"""Rotation vector of a quaternion, of length at most pi.
 
-    phi = 2 atan2(|v|, w) v / |v| for q = (w, v) with w >= 0, and the same of -q (the same rotation) for w < 0. Branch
-    at theta = pi (w = 0): phi = pi v / |v|, with the sign of v as given.
+    $$\phi = 2 \operatorname{atan2}(|v|, w) \frac{v}{|v|}, \quad q = (w, v), \quad w \ge 0$$
+
+    and the same of -q (the same rotation) for w < 0. Branch at angle pi (w = 0): $\phi = \pi v / |v|$, with the sign of v
+    as given.
 
     **Arguments:** `q`: (4,), of any length but zero, which does not matter. **Returns:** (3,), rad.
     """
@@ -165,9 +182,9 @@ def quat_log(q: Quaternion) -> Vector:
 
 
 def quat_multiply(a: Quaternion, b: Quaternion) -> Quaternion:
-    """Hamilton product; quat_to_matrix(a b) = quat_to_matrix(a) quat_to_matrix(b).
+    r"""Hamilton product, the quaternion of the product of the rotation matrices.
 
-    (wa, va)(wb, vb) = (wa wb - va.vb, wa vb + wb va + va x vb).
+    $$(w_a, v_a) (w_b, v_b) = (w_a w_b - v_a \cdot v_b, w_a v_b + w_b v_a + v_a \times v_b)$$
 
     **Arguments:** `a`, `b`: (4,). **Returns:** (4,), not normalised.
     """
@@ -194,11 +211,12 @@ def quat_normalize(q: Quaternion) -> Quaternion:
 
 
 def quat_to_matrix(q: Quaternion) -> Matrix:
-    """Rotation matrix of a quaternion of any length.
+    r"""Rotation matrix of a quaternion of any length.
 
-    R = 1 + (2/|q|^2) (w hat(v) + hat(v)^2) for q = (w, v). Dividing by |q|^2 makes R orthogonal to rounding even
-    where q has drifted from unit length, as it does between the steps of an integrator. The derivative along q is
-    zero.
+    $$R = 1 + \frac{2}{|q|^2} (w \hat v + \hat v^2), \quad q = (w, v)$$
+
+    Dividing by $|q|^2$ makes R orthogonal to rounding even where q has drifted from unit length, as it does between the
+    steps of an integrator. The derivative along q is zero.
 
     **Arguments:** `q`: (4,), not zero (NaN). **Returns:** (3, 3).
 
@@ -213,9 +231,9 @@ def quat_to_matrix(q: Quaternion) -> Matrix:
 
 
 def quat_rotate(q: Quaternion, x: Vector) -> Vector:
-    """Rotated vector, quat_to_matrix(q) x without the matrix; q of any length, as there.
+    r"""Rotated vector, without the matrix of `quat_to_matrix`; q of any length, as there.
 
-    x + (2/|q|^2) (w v x x + v x (v x x)) for q = (w, v).
+    $$R x = x + \frac{2}{|q|^2} (w\, v \times x + v \times (v \times x)), \quad q = (w, v)$$
 
     **Arguments:** `q`: (4,), of R_ab, not zero (NaN); `x`: (3,), in frame b. **Returns:** (3,), in frame a.
     """
@@ -225,10 +243,10 @@ def quat_rotate(q: Quaternion, x: Vector) -> Vector:
 
 
 def matrix_to_quat(rotation: Matrix) -> Quaternion:
-    """Unit quaternion of a rotation matrix, with scalar part w >= 0.
+    r"""Unit quaternion of a rotation matrix, with scalar part w >= 0.
 
-    The rows of 4 q q^T are linear in R. The row with the largest diagonal entry 4 q_i^2 >= 1 is normalised, so no
-    root meets zero, and the four cases differ only by a selection. Branch at theta = pi (w = 0): the component with
+    The rows of $4 q q^T$ are linear in R. The row with the largest diagonal entry $4 q_i^2 \ge 1$ is normalised, so no
+    root meets zero, and the four cases differ only by a selection. Branch at angle pi (w = 0): the component with
     the largest magnitude is positive (the first of equals).
 
     **Arguments:** `rotation`: (3, 3), orthogonal to rounding. **Returns:** (4,). If R is orthogonal to e only, q is
@@ -250,9 +268,11 @@ def matrix_to_quat(rotation: Matrix) -> Quaternion:
 
 
 def euler_to_matrix(angles: Vector, sequence: str = "zyz") -> Matrix:
-    """Rotation matrix of three Euler angles: R = R_a(angles[0]) R_b(angles[1]) R_c(angles[2]) for the sequence "abc".
+    r"""Rotation matrix of three Euler angles.
 
-    Each rotation is about an axis that the former ones have moved: "zyx" is yaw, pitch and roll.
+    $$R = R_a(\theta_1) R_b(\theta_2) R_c(\theta_3)$$
+
+    for the sequence "abc". Each rotation is about an axis that the former ones have moved: "zyx" is yaw, pitch and roll.
 
     **Arguments:** `angles`: (3,), rad; `sequence`: three of x, y, z, neighbours different. **Returns:** (3, 3).
 
@@ -265,12 +285,14 @@ def euler_to_matrix(angles: Vector, sequence: str = "zyz") -> Matrix:
 
 
 def euler_body_jacobian(angles: Vector, sequence: str = "zyz") -> Matrix:
-    """Matrix E(angles) of the body angular velocity: hat(E rates) = R^T dR/dt.
+    r"""Matrix that maps rates of Euler angles to the angular velocity in body axes.
 
-    Its columns are the three axes in body coordinates. Torques about the axes are E^T times those in body axes.
+    $$\widehat{E \dot\theta} = R^T \dot R$$
+
+    Its columns are the three axes in body coordinates. Torques about the axes are $E^T$ times those in body axes.
 
     **Arguments:** `angles`: (3,), rad; `sequence` as of `euler_to_matrix`. **Returns:** (3, 3). Singular where the first
-    and the last axis are parallel: det E = -sin(angles[1]) for "zyz".
+    and the last axis are parallel: $\det E = -\sin\theta_2$ for "zyz".
 
     **Raises:** ValueError for another sequence.
 
@@ -282,7 +304,9 @@ def euler_body_jacobian(angles: Vector, sequence: str = "zyz") -> Matrix:
 
 
 def euler_spatial_jacobian(angles: Vector, sequence: str = "zyz") -> Matrix:
-    """Matrix E_s(angles) of the spatial angular velocity: hat(E_s rates) = (dR/dt) R^T; E_s = R E.
+    r"""Matrix that maps rates of Euler angles to the angular velocity in fixed axes.
+
+    $$\widehat{E_s \dot\theta} = \dot R R^T, \quad E_s = R E$$
 
     Its columns are the three axes in fixed coordinates.
 

@@ -175,7 +175,9 @@ class ModelBuilder:
         return self
 
     def add_coupling(self, joint: str, source: str, multiplier: Number = 1.0, offset: Number = 0.0) -> "ModelBuilder":
-        """Record that q[joint] = multiplier q[source] + offset for two one-degree-of-freedom joints (a gear, a mimic).
+        r"""Record a coupling of two one-degree-of-freedom joints (a gear, a mimic).
+
+        $$q_\mathrm{joint} = \mathrm{multiplier} \cdot q_\mathrm{source} + \mathrm{offset}$$
 
         The joint stays free in the model; a scene takes the coupling as a constraint. Returns the builder.
 
@@ -206,7 +208,7 @@ class ModelBuilder:
         Frames are the bodies in their order, then all others sorted by the body that carries them and by name.
 
         **Raises:** ValueError that names a joint which moves no inertia, so that the mass matrix is singular in every
-        configuration: S^T I S = 0 with the composite or the articulated inertia I of the bodies that it carries.
+        configuration: $S^T I S = 0$ with the composite or the articulated inertia I of the bodies that it carries.
 
         **Warns:** UserWarning naming bodies with an unphysical inertia: a negative principal moment, or one that exceeds
         the sum of the other two (`repair_inertias`).

@@ -39,7 +39,10 @@ def rotational_inertia(parameters: Checked[Float[Array, "10"]]) -> Float[Array, 
 
 
 def spatial_inertia(parameters: Checked[Float[Array, "10"]]) -> Float[Array, "6 6"]:
-    """Spatial inertia M = [[m 1, -hat(m c)], [hat(m c), I]] (6, 6), linear part first (EQUATIONS section 0)."""
+    r"""Spatial inertia (6, 6), linear part first (EQUATIONS section 0).
+
+    $$M = \begin{bmatrix} m 1 & -m \hat c \\ m \hat c & I \end{bmatrix}$$
+    """
     _check_shapes(parameters=(parameters, (10,)))
     first = so3.hat(parameters[1:4])
     mass = parameters[0] * jnp.eye(3, dtype=parameters.dtype)
@@ -53,9 +56,9 @@ def parameters_from_spatial(matrix: Checked[Float[Array, "6 6"]]) -> Float[Array
 
 
 def inertial_parameters(mass: Number, com: Numbers, inertia_com: Numbers) -> Float[Array, "10"]:
-    """Ten inertial parameters from mass (kg), centre of mass (3,) (m) and rotational inertia (3, 3) about it (kg m^2).
+    r"""Ten inertial parameters from mass (kg), centre of mass (3,) (m) and rotational inertia (3, 3) about it (kg m^2).
 
-    Steiner's theorem: I_origin = I_com - m hat(c)^2.
+    Steiner's theorem: $I_\mathrm{origin} = I_\mathrm{com} - m \hat c^2$.
     """
     _check_shapes(mass=(mass, ()), com=(com, (3,)), inertia_com=(inertia_com, (3, 3)))
     com, inertia_com = jnp.asarray(com), jnp.asarray(inertia_com)
@@ -102,7 +105,9 @@ def transform_inertia(
 
 
 def pseudo_inertia(parameters: Checked[Float[Array, "10"]]) -> Float[Array, "4 4"]:
-    """Pseudo-inertia [[Sigma, m c], [m c^T, m]] (4, 4), Sigma = tr(I)/2 1 - I.
+    r"""Pseudo-inertia (4, 4) of ten inertial parameters.
+
+    $$\begin{bmatrix} \Sigma & m c \\ m c^T & m \end{bmatrix}, \quad \Sigma = \tfrac12 \operatorname{tr}(I) 1 - I$$
 
     The parameters belong to a physical body if and only if this matrix is positive definite (Wensing, Kim & Slotine 2018,
     eq. 7; a positive semidefinite one is the limit of point, line and plane bodies).
@@ -115,7 +120,10 @@ def pseudo_inertia(parameters: Checked[Float[Array, "10"]]) -> Float[Array, "4 4
 
 
 def parameters_from_pseudo(matrix: Checked[Float[Array, "4 4"]]) -> Float[Array, "10"]:
-    """Ten inertial parameters of a pseudo-inertia (4, 4); inverse of `pseudo_inertia`: I = tr(Sigma) 1 - Sigma."""
+    r"""Ten inertial parameters of a pseudo-inertia (4, 4); inverse of `pseudo_inertia`.
+
+    $$I = \operatorname{tr}(\Sigma) 1 - \Sigma$$
+    """
     _check_shapes(matrix=(matrix, (4, 4)))
     sigma = matrix[:3, :3]
     inertia = jnp.trace(sigma) * jnp.eye(3, dtype=matrix.dtype) - sigma
@@ -123,11 +131,13 @@ def parameters_from_pseudo(matrix: Checked[Float[Array, "4 4"]]) -> Float[Array,
 
 
 def log_cholesky_factor(theta: Checked[Float[Array, "10"]]) -> Float[Array, "4 4"]:
-    """Upper-triangular factor U (4, 4) of the pseudo-inertia U U^T, from ten unconstrained numbers.
+    r"""Upper-triangular factor U (4, 4) of the pseudo-inertia, from ten unconstrained numbers.
 
-    theta = (alpha, d1, d2, d3, s12, s23, s13, t1, t2, t3) and U = exp(alpha) [[exp d1, s12, s13, t1], [0, exp d2, s23, t2],
-    [0, 0, exp d3, t3], [0, 0, 0, 1]] (Rucker & Wensing 2022, eq. 16): the affine map (stretch, shear, shift, and exp(2 alpha)
-    the mass) that maps a reference body of unit pseudo-inertia to the body. It is the identity at theta = 0.
+    $$U = e^\alpha \begin{bmatrix} e^{d_1} & s_{12} & s_{13} & t_1 \\ 0 & e^{d_2} & s_{23} & t_2 \\
+    0 & 0 & e^{d_3} & t_3 \\ 0 & 0 & 0 & 1 \end{bmatrix}, \quad \text{pseudo-inertia} = U U^T$$
+
+    theta = (alpha, d1, d2, d3, s12, s23, s13, t1, t2, t3) (Rucker & Wensing 2022, eq. 16). U is the affine map (stretch, shear,
+    shift; the mass is $e^{2 \alpha}$) of a reference body of unit pseudo-inertia to the body, the identity at theta = 0.
     """
     _check_shapes(theta=(theta, (10,)))
     alpha, d1, d2, d3, s12, s23, s13, t1, t2, t3 = theta
@@ -139,7 +149,7 @@ def log_cholesky_factor(theta: Checked[Float[Array, "10"]]) -> Float[Array, "4 4
 def from_log_cholesky(theta: Checked[Float[Array, "10"]]) -> Float[Array, "10"]:
     """Physically feasible parameters from ten unconstrained numbers (alpha, d1, d2, d3, s12, s23, s13, t1, t2, t3).
 
-    Pseudo-inertia = U U^T with U = `log_cholesky_factor(theta)` (Rucker & Wensing 2022, eq. 16). Every theta gives a feasible
+    The pseudo-inertia is $U U^T$ with U of `log_cholesky_factor` (Rucker & Wensing 2022, eq. 16). Every theta gives a feasible
     body and every strictly feasible body has exactly one theta, so nothing infeasible can be represented.
     """
     upper = log_cholesky_factor(theta)

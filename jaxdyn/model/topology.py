@@ -83,7 +83,10 @@ class Topology:
 
     @cached_property
     def ancestors(self) -> np.ndarray:
-        """Mask (nb, nb), true at [i, j] when body j is body i or its ancestor: the world-frame G = (I - Gamma)^-1."""
+        r"""Mask (nb, nb), true at [i, j] when body j is body i or its ancestor.
+
+        It is $G = (1 - \Gamma)^{-1}$ of `newton_euler_matrices` with all twists in the world frame.
+        """
         mask = np.eye(self.nb, dtype=bool)
         # parents[i] < i, so the row of the parent is complete.
         for i, parent in enumerate(self.parents):

@@ -124,7 +124,9 @@ class Model(eqx.Module):
         return coordinate_index(self.topology.v_slices, self, joint)
 
     def selection_matrix(self, joints: Iterable[str] | None = None) -> Float[Array, "nv nu"]:
-        """Selection matrix S (nv, nu): tau = S u for the forces u (nu,) of actuated joints, S^T v are their velocities.
+        r"""Selection matrix S (nv, nu) of the actuated joints.
+
+        $\tau = S u$ for their forces u (nu,), and $S^T v$ are their velocities.
 
         **Arguments:** `joints`, names in the order of u; None: all but free ones, which carry floating bases.
 
@@ -225,7 +227,7 @@ def _replace(model: Model, leaves: dict) -> Model:
             raise ValueError(f"replace: {name} has shape {np.shape(value)}, expected {want}")
         if name == "inertias" and is_concrete(value):
             warn_unphysical_inertias(dict(zip(model.body_names, np.asarray(value), strict=True)))
-        # Arrays of jax keep their dtype: a leaf of another precision may be what the caller differentiates.
+        # Arrays of jax keep their dtype: the caller may differentiate a leaf of another precision.
         leaves[name] = jnp.asarray(value, model.home.dtype) if not isinstance(value, jax.Array) else value
     leaves = {name: leaves.get(name, getattr(model, name)) for name in names}
     return Model(**leaves, topology=model.topology, fixed_joints=model.fixed_joints)
@@ -235,7 +237,7 @@ def _geometry(model: Model) -> tuple[Array | np.ndarray, Array | np.ndarray]:
     mask = model.topology.screw_mask
     # A revolute joint of a declared kind ignores v, so that its derivative with respect to v is zero too.
     screws = model.screws * jnp.asarray(mask, model.screws.dtype)
-    # A known home pose has no derivative, and the projection would only add rounding.
+    # A known home pose is not differentiated, so that the projection would only add rounding.
     if is_concrete(model.home):
         return model.home, screws
     rotation = model.home[:, :3, :3]
@@ -248,7 +250,7 @@ def _geometry(model: Model) -> tuple[Array | np.ndarray, Array | np.ndarray]:
 
 
 def _geometry_in_kernel(model: Model) -> tuple[Array | np.ndarray, Array | np.ndarray]:
-    """`_geometry`; entries of known models that rounding keeps from 0, 1 or -1 become those, which cost no operation."""
+    """`_geometry` in a kernel: entries of a known model within rounding of 0, 1 or -1 become exact, and cost no operation."""
     if not is_concrete(model.home, model.screws):
         return _geometry(model)
     screws = _snap_to_integers(model.screws) * model.topology.screw_mask.astype(model.screws.dtype)
@@ -259,9 +261,9 @@ def _geometry_in_kernel(model: Model) -> tuple[Array | np.ndarray, Array | np.nd
 def geometry(model: Model) -> tuple[Array | np.ndarray, Array | np.ndarray]:
     """Home poses (nb, 4, 4) and screws (nb, 6) as every algorithm uses them.
 
-    Values are those of the leaves, except that screw entries which the joint's kind does not have are zero. Derivatives
-    are made unique: a change of a home pose that leaves SE(3) has no meaning, and algorithms would answer it differently,
-    so it is projected onto SE(3), by R (3 - R^T R)/2, which is R for a rotation and has the projection as its derivative.
+    Values are those of the leaves; screw entries that the joint's kind does not have are zero. Derivatives are made unique:
+    a change of a home pose that leaves SE(3) has no meaning, and algorithms would give different derivatives for it. It is
+    projected onto SE(3) by R (3 - R^T R)/2, which equals R for a rotation and whose derivative is the projection.
     """
     return _geometry(model)
 
@@ -277,7 +279,7 @@ def _snap_to_integers(leaf) -> np.ndarray:
     return np.where(close, near, values)
 
 
-def _per_joint(topology: Topology, function, q, *rest) -> Array:
+def map_joints(topology: Topology, function, q, *rest) -> Array:
     """Apply `function(kind, q of the joint, ...)` to every joint; joints with one coordinate share one operation."""
     parts = []
     i = 0
@@ -311,7 +313,7 @@ def integrate(model: Model, q: Float[Array, " nq"], v: Float[Array, " nv"], dt: 
     """
     q, v = check_shapes(model, q=q, v=v)
     dt = as_array(dt, "dt", q.dtype)
-    return model.complete_configuration(q, _per_joint(model.topology, joint_integrate, q, (v * dt, False)))
+    return model.complete_configuration(q, map_joints(model.topology, joint_integrate, q, (v * dt, False)))
 
 
 def difference(model: Model, q0: Float[Array, " nq"], q1: Float[Array, " nq"]) -> Float[Array, " nv"]:
@@ -320,18 +322,21 @@ def difference(model: Model, q0: Float[Array, " nq"], q1: Float[Array, " nq"]) -
     Rotations are compared by the smaller angle; at exactly pi one of the two directions is chosen.
     """
     q0, q1 = check_shapes(model, q0=q0, q1=q1)
-    return _per_joint(model.topology, joint_difference, q0, (q1, True))
+    return map_joints(model.topology, joint_difference, q0, (q1, True))
 
 
 def configuration_rate(model: Model, q: Float[Array, " nq"], v: Float[Array, " nv"]) -> Float[Array, " nq"]:
-    """Rate dq/dt (nq,) for the body velocity v (nv,): the kinematic map qdot = H(q) v."""
+    r"""Rate dq/dt (nq,) for the body velocity v (nv,), by the kinematic map of the joints.
+
+    $$\dot q = H(q) v$$
+    """
     q, v = check_shapes(model, q=q, v=v)
     return model.complete_rate(q, v, joint_rates(model, q, v))
 
 
 def joint_rates(model: Model, q: Float[Array, " nq"], v: Float[Array, " nv"]) -> Array:
     """Rates of the joints' coordinates in q for the body velocity v (nv,)."""
-    return _per_joint(model.topology, joint_rate, q, (v, False))
+    return map_joints(model.topology, joint_rate, q, (v, False))
 
 
 def normalize(model: Model, q: Float[Array, " nq"]) -> Float[Array, " nq"]:
@@ -345,7 +350,7 @@ def normalize(model: Model, q: Float[Array, " nq"]) -> Float[Array, " nq"]:
         quat = qj[-4:] / jnp.sqrt(jnp.sum(qj[-4:] ** 2))
         return quat if kind == "spherical" else jnp.concatenate([qj[:3], quat])
 
-    return model.complete_configuration(q, _per_joint(model.topology, unit, q))
+    return model.complete_configuration(q, map_joints(model.topology, unit, q))
 
 
 def random_configuration(model: Model, key: Array) -> Float[Array, " nq"]:

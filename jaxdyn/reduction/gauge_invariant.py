@@ -34,7 +34,7 @@ from jaxdyn.systems.scene import Scene, as_scene
 from jaxdyn.systems.system import velocity_to_rate
 
 
-class GaugeInvariant(Outcome):
+class GaugeInvariantDynamics(Outcome):
     """Quasi velocities, their equations of motion and of constraint force, and the solution.
 
     - `W` (nv, nv), M = W W^T. `velocity` (nv,), w = W^T v. `Gamma` (nv, nv), skew. `Lambda` (nc, nv) = A W^-T. `force`
@@ -76,10 +76,12 @@ def gauge_invariant(
     motion_rotation: Float[Array, "k k"] | None = None,
     dof: int | None = None,
     rank_tol: float | None = None,
-) -> GaugeInvariant:
-    """Equations of motion and of constraint force in quasi velocities w = W^T v, decoupled.
+) -> GaugeInvariantDynamics:
+    r"""Decoupled equations of motion and of constraint force in quasi velocities.
 
-    wdot_r = u_r - Gamma_r w_r,   Lam_r^T lam = Gamma_o w_r - u_o   (both with further terms where b(q, t) != 0)
+    $$w = W^T v, \quad \dot w_r = u_r - \Gamma_r w_r, \quad \Lambda_r^T \lambda = \Gamma_o w_r - u_o$$
+
+    Both equations have further terms where $b(q, t) \ne 0$.
 
     **Arguments:**
 
@@ -88,7 +90,7 @@ def gauge_invariant(
       V2 is rotated by it. Neither changes the motion.
     - `dof`, `rank_tol` as in `tangent_basis`.
 
-    **Returns:** `GaugeInvariant`. Where the rank of A is not nv - nr the result is `singular_basis`.
+    **Returns:** `GaugeInvariantDynamics`. Where the rank of A is not nv - nr the result is `singular_basis`.
 
     Derivatives are exact where the rank is constant; V1 and V2 are parallel-transported.
 
@@ -111,7 +113,7 @@ def gauge_invariant(
 
 
 @entry_point
-def _decouple(scene, q, v, tau, t, rotation, motion_rotation, dof, rank_tol) -> GaugeInvariant:
+def _decouple(scene, q, v, tau, t, rotation, motion_rotation, dof, rank_tol) -> GaugeInvariantDynamics:
     system, unit = scene.system, jnp.eye(scene.nv, dtype=q.dtype)
     motion = velocity_to_rate(system, q, v), jnp.ones_like(t)
     turn = unit if rotation is None else rotation
@@ -152,7 +154,7 @@ def _decouple(scene, q, v, tau, t, rotation, motion_rotation, dof, rank_tol) -> 
     # The bases have a static number of columns, which is valid for this rank alone.
     result = RESULTS.where(rank == scene.nv - dof, RESULTS.successful, RESULTS.singular_basis)  # pyright: ignore[reportArgumentType]
     a = matmul(inverse.T, change - matmul(Wdot.T, v))
-    return GaugeInvariant(
+    return GaugeInvariantDynamics(
         W=W,
         velocity=w,
         Gamma=Gamma,

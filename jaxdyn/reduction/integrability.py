@@ -40,9 +40,9 @@ class Involutivity(NamedTuple):
 def involutive(
     scene: Scene, q: Float[Array, " nq"], t: Numbers = 0.0, *, dof: int | None = None, rank_tol: float | None = None
 ) -> Involutivity:
-    """Test the distribution of admissible velocities for involutivity (Frobenius's theorem) at a configuration.
+    r"""Test the distribution of admissible velocities for involutivity (Frobenius's theorem) at a configuration.
 
-    Fields X_i span ker A; each level adds the brackets [X_i, Y] = (dY) X_i - (dX_i) Y with the fields Y of the level
+    Fields $X_i$ span $\ker A$; each level adds the brackets $[X_i, Y] = (dY) X_i - (dX_i) Y$ with the fields Y of the level
     before, until the rank stops growing or the holonomic rows allow no more. nv - ranks[-1] is the number of holonomic
     constraints in the rows, ranks[-1] - ranks[0] that of the nonholonomic ones. Rows A v = b with b != 0 are
     tested together with their drift v0 + d/dt.
@@ -164,11 +164,12 @@ def spurious_terms(
     *,
     independent: Sequence[int],
 ) -> SpuriousTerms:
-    """Spurious terms from substituting sdot = -a(r)^T rdot into L before differentiation.
+    r"""Spurious terms from substituting constraints into the Lagrangian before differentiation.
 
-    With q = (r, s), the Lagrange equations of L_c(r, rdot) = L(r, rdot, -a^T rdot) differ from the correct ones by
+    With $q = (r, s)$ and $\dot s = -a(r)^T \dot r$, the Lagrange equations of $L(r, \dot r, -a^T \dot r)$ differ from the correct
+    ones by
 
-        terms_i = dL/dsdot . (d a_i/dt - sum_j da_j/dr_i rdot_j),
+    $$\frac{\partial L}{\partial \dot s} \cdot \left( \dot a_i - \sum_j \frac{\partial a_j}{\partial r_i} \dot r_j \right),$$
 
     which vanish identically when the rows are integrable, and by accident elsewhere (an upright rolling disk).
 

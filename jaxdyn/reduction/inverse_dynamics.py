@@ -74,7 +74,9 @@ def constrained_inverse_dynamics(
     rank_tol: float | None = None,
     throw: bool | None = None,
 ) -> ConstrainedInverseDynamics:
-    """Torques of the motors for a motion of a mechanism: M a + h = S tau + forces + A^T lam, A a = gamma, E a = a_independent.
+    r"""Torques of the motors for a motion of a mechanism.
+
+    $$M a + h = S \tau + \tau_\mathrm{forces} + A^T \lambda, \quad A a = \gamma, \quad E a = a_\mathrm{independent}$$
 
     The inverse of `constrained_dynamics`, whose acceleration under `tau` and multipliers are those returned here. Velocities that
     neither the constraints nor the independent ones determine, as of a rod that spins between two balls, move as the forces
@@ -197,7 +199,8 @@ def _solve_by_program(scene: Scene, q, v, a_independent, S, weights, t, chosen: 
 
 def _solve(chosen: tuple[int, ...], rank_tol, scene: Scene, q, v, a_independent, S, weights, t):
     """v, a, torques and lam; whether v is determined, whether a motion has the given values, whether the motors can produce it,
-    and whether M is definite."""
+    and whether M is definite.
+    """
     nv, tol, has_rows = scene.nv, tolerance(rank_tol, q), bool(layout(scene))
     # Residuals are not tested more strictly than the dependence of rows is decided.
     limit = max(eps_of(q) ** 0.5, tol)

@@ -63,7 +63,9 @@ def reduced_dynamics(
     *,
     basis: BasisLike | None = None,
 ) -> ReducedDynamics:
-    """Motion in minimal velocities: N^T M N nudot + N^T (M (Ndot nu + v0dot) + h) = N^T (tau + forces).
+    r"""Motion in minimal velocities.
+
+    $$N^T M N \dot\nu + N^T (M (\dot N \nu + \dot v_0) + h) = N^T (\tau + \tau_\mathrm{forces})$$
 
     The rates of N and v0 along the motion come from automatic differentiation, also for b(q, t) != 0.
 
@@ -71,9 +73,9 @@ def reduced_dynamics(
 
     - `q` (nq,), on the constraints; `nu` (nr,), minimal velocities; `tau` (nv,), N m or N (None: zero); `t`, s.
     - `basis`, the choice of N and nu. A tuple of indices: nu are these entries of v. A function N(q, t) -> (nv, nr), or
-      -> (N, v0), with A N = 0 and A v0 = b; a plain function is static, a Module carries leaves. A matrix R (nv, nr),
+      -> (N, v0), with $A N = 0$ and $A v_0 = b$; a plain function is static, a Module carries leaves. A matrix R (nv, nr),
       such as `tangent_basis`: N is the orthonormal basis of ker A closest to R in the sense of `Orthonormal`. A scene
-      without constraints needs none: nu = v, M_r = M, h_r = h.
+      without constraints needs none: $\nu = v$, $M_r = M$, $h_r = h$.
 
     **Returns:** `ReducedDynamics`. Where N is invalid (a singular A2, columns that are dependent or violate
     the rows, a rank other than nv - nr) the result is `singular_basis`.

@@ -1,4 +1,4 @@
-"""Journal of finished runs of a report, a file of lines, from which an interrupted report resumes."""
+"""Journal of finished runs: a file of JSON lines, from which an interrupted report resumes."""
 
 import json
 from collections.abc import Iterable
@@ -6,21 +6,23 @@ from dataclasses import asdict
 from pathlib import Path
 from typing import NamedTuple
 
-from jaxdyn.reports.records import Known, Record, Report
+from jaxdyn.reports.records import Record, Report, SceneReference
 
 NAME = "records.jsonl"
 
 
 class _Entry(NamedTuple):
     scene: str
-    known: Known
+    known: SceneReference
     records: list[Record]
 
 
 class Journal:
-    """Groups of records by key; with a directory, also in its file: a line for the head, then one per group.
+    """Groups of records by key, each from one run; with a directory, they are also in its file `records.jsonl`.
 
-    **Raises:** ValueError when the file's records are from another commit, machine, set of versions or kind of report, or
+    The first line of the file is the head: commit, machine and versions. Each further line is a group.
+
+    **Raises:** ValueError when the file's records are of another commit, machine, set of versions or kind of report, or
     cannot be read.
     """
 
@@ -33,7 +35,7 @@ class Journal:
         self.path.parent.mkdir(parents=True, exist_ok=True)
         if self.path.exists():
             self._read(self.path)
-        # Rewritten without a line truncated by an interruption.
+        # The file is written anew, without a line that an interruption has truncated.
         lines = [json.dumps(self.head), *(_line(key, entry) for key, entry in self._entries.items())]
         self.path.write_text("\n".join(lines) + "\n", encoding="utf-8")
 
@@ -49,31 +51,33 @@ class Journal:
             return
         try:
             before = json.loads(first)
-            for name, of in (
+            for name, value_of in (
                 ("commit", lambda head: head["commit"]),
                 # The load differs from call to call and is left out of the comparison.
                 ("machine", lambda head: [head["machine"][key] for key in ("processor", "device", "cores")]),
                 ("versions", lambda head: head["machine"]["versions"]),
                 ("full", lambda head: head["full"]),
             ):
-                if of(before) != of(self.head):
-                    raise ValueError(f"out has {path} with {name} {of(before)}, and this is {of(self.head)}; {remedy}")
+                if value_of(before) != value_of(self.head):
+                    raise ValueError(
+                        f"out has {path} with {name} {value_of(before)}, and this report has {value_of(self.head)}; {remedy}"
+                    )
             for line in lines:
                 try:
                     entry = json.loads(line)
                 except json.JSONDecodeError:  # truncated by an interruption
                     continue
                 records = [Record(**x) for x in entry["records"]]
-                self._entries[entry["key"]] = _Entry(entry["scene"], Known.from_dict(entry["known"]), records)
+                self._entries[entry["key"]] = _Entry(entry["scene"], SceneReference.from_dict(entry["known"]), records)
         except (KeyError, TypeError, json.JSONDecodeError) as error:
             raise ValueError(f"out has {path}, which is not a journal of this version ({error!r}); {remedy}") from error
-        # The head of the first call stays: its date and load belong to the records.
+        # The head of the first run stays: its date and its load of the machine belong to the records.
         self.head = before
 
     def __contains__(self, key: str) -> bool:
         return key in self._entries
 
-    def add(self, key: str, scene: str, known: Known, records: list[Record]) -> None:
+    def add(self, key: str, scene: str, known: SceneReference, records: list[Record]) -> None:
         """Store a finished group."""
         self._entries[key] = _Entry(scene, known, records)
         if self.path is not None:

@@ -9,7 +9,7 @@ from typing import Any
 
 from jaxdyn.reports.front import pareto_front, standings
 from jaxdyn.reports.plotting import GREY, SERIES, new_figure
-from jaxdyn.reports.records import COLUMNS, Known, Record, Report, rows
+from jaxdyn.reports.records import COLUMNS, Record, Report, SceneReference, rows
 
 STYLE = """
 body { font: 15px/1.45 system-ui, sans-serif; max-width: 75rem; margin: 2rem auto; padding: 0 1rem; color: #222; }
@@ -89,7 +89,7 @@ def _standings(records) -> str:
     return html_table(("class", "integrator", "cost", "reached"), cells)
 
 
-def _scene(name: str, known: Known, records: tuple[Record, ...]) -> list[str]:
+def _scene(name: str, known: SceneReference, records: tuple[Record, ...]) -> list[str]:
     reference = f"Reference: {known.kind}, {known.source}; its own error is about {known.error:.0e}."
     parts = [f"<h2 id='{escape(name)}'>{escape(known.text)}</h2>", f"<p>{escape(reference)}</p>"]
     for dtype, batch in dict.fromkeys((r.dtype, r.batch) for r in records):
@@ -100,7 +100,7 @@ def _scene(name: str, known: Known, records: tuple[Record, ...]) -> list[str]:
     return [*parts, f"<details><summary>{len(records)} runs</summary>{cells}</details>"]
 
 
-def figure(title: str, known: Known, records: Sequence[Record]) -> Any:
+def figure(title: str, known: SceneReference, records: Sequence[Record]) -> Any:
     """Log-log plots of one scene: error against time, against evaluations, and the energy error against time.
 
     **Returns:** a matplotlib figure, or None when no run succeeded.
@@ -165,7 +165,7 @@ def panel(ax, records, error: str, cost: str) -> None:
     ax.plot(*zip(*front, strict=True), "o", color=GREY, label="on the front", **halo)
 
 
-def _draw_peers_times(ax, known: Known, error: str) -> None:
+def _draw_peers_times(ax, known: SceneReference, error: str) -> None:
     for point in known.published:
         value = point["error" if error == "error_path" else "energy_error"]
         if value is not None:

@@ -54,7 +54,7 @@ class Record:
 
 
 @dataclasses.dataclass(frozen=True)
-class Known:
+class SceneReference:
     """Reference of a scene and published results."""
 
     text: str
@@ -64,10 +64,10 @@ class Known:
     published: tuple[dict, ...] = ()
 
     @staticmethod
-    def from_dict(data: dict) -> "Known":
+    def from_dict(data: dict) -> "SceneReference":
         """Restore from `dataclasses.asdict`, also through JSON, which has no tuples."""
         values: dict[str, Any] = data | {"published": tuple(data["published"])}
-        return Known(**values)
+        return SceneReference(**values)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -75,7 +75,7 @@ class Report:
     """Records of a report with their context: `head` (machine, versions, commit, date) and each scene's reference."""
 
     head: dict[str, Any]
-    scenes: dict[str, Known]
+    scenes: dict[str, SceneReference]
     records: tuple[Record, ...]
 
     def of(self, scene: str) -> tuple[Record, ...]:
@@ -90,7 +90,7 @@ class Report:
     def from_json(text: str) -> "Report":
         """Read a report that `to_json` wrote."""
         data = json.loads(text)
-        scenes = {name: Known.from_dict(known) for name, known in data["scenes"].items()}
+        scenes = {name: SceneReference.from_dict(known) for name, known in data["scenes"].items()}
         return Report(data["head"], scenes, tuple(Record(**record) for record in data["records"]))
 
     def table(self, scene: str | None = None) -> str:

@@ -15,7 +15,7 @@ from jaxdyn.reports.measure import Contestant, flop_counter, ladder, measure
 from jaxdyn.reports.page import write
 from jaxdyn.reports.plotting import new_figure
 from jaxdyn.reports.programs import FIXED, SOLVERS, Prepared, prepare
-from jaxdyn.reports.records import Known, Record, Report
+from jaxdyn.reports.records import Record, Report, SceneReference
 from jaxdyn.reports.timing import commit, machine
 from jaxdyn.simulation.start import choose_method
 
@@ -167,10 +167,10 @@ def _group(prepared: Prepared, dtype, batch, integrators, full, rounds, peers) -
     return measure(prepared, contestants, dtype, batch, rounds)
 
 
-def _reference_entry(prepared: Prepared) -> Known:
+def _reference_entry(prepared: Prepared) -> SceneReference:
     reference = prepared.reference
     published = tuple(x._asdict() for x in prepared.case.published)
-    return Known(prepared.case.text, reference.kind, reference.source, reference.error, published)
+    return SceneReference(prepared.case.text, reference.kind, reference.source, reference.error, published)
 
 
 def _check_arguments(scenes, dtypes, batches, integrators, rounds) -> list[Case]:

@@ -1,4 +1,4 @@
-"""Named scenes: a builder of the scene, with the initial state of its reference."""
+"""Named scenes: builders of scenes, each with the initial state of its reference motion."""
 
 import functools
 from collections.abc import Callable
@@ -17,20 +17,20 @@ REGISTRY: dict[str, "NamedScene"] = {}
 
 _P = ParamSpec("_P")
 _S = ParamSpec("_S")
-_Made = TypeVar("_Made", bound=Scene, covariant=True)
+_SceneT = TypeVar("_SceneT", bound=Scene, covariant=True)
 
 
-class NamedScene(Generic[_P, _S, _Made]):
+class NamedScene(Generic[_P, _S, _SceneT]):
     """Named scene: `jd.scenes.pendulum(length=2.0)` builds it, `jd.scenes.pendulum.start(...)` gives (q0, v0)."""
 
-    def __init__(self, build: Callable[_P, _Made], start: Callable[_S, tuple[Array, Array]]):
+    def __init__(self, build: Callable[_P, _SceneT], start: Callable[_S, tuple[Array, Array]]):
         self.__name__: str
         # `help` and documentation tools read name and docstring of the builder from the wrapper.
         functools.update_wrapper(self, build)
         self._build = build
-        self.start_function = start  # whose signature says what a start depends on
+        self.start_function = start  # its signature names the parameters of the initial state
 
-    def __call__(self, *args: _P.args, **parameters: _P.kwargs) -> _Made:
+    def __call__(self, *args: _P.args, **parameters: _P.kwargs) -> _SceneT:
         """Build the scene; parameters as in its documentation."""
         return self._build(*args, **parameters)
 
@@ -44,10 +44,10 @@ class NamedScene(Generic[_P, _S, _Made]):
 
 def register_scene(
     start: Callable[_S, tuple[Array, Array]],
-) -> Callable[[Callable[_P, _Made]], NamedScene[_P, _S, _Made]]:
+) -> Callable[[Callable[_P, _SceneT]], NamedScene[_P, _S, _SceneT]]:
     """Register the builder of a scene, with the function of its initial state."""
 
-    def register(build: Callable[_P, _Made]) -> NamedScene[_P, _S, _Made]:
+    def register(build: Callable[_P, _SceneT]) -> NamedScene[_P, _S, _SceneT]:
         scene = NamedScene(build, start)
         REGISTRY[scene.__name__] = scene
         return scene
@@ -73,5 +73,5 @@ def as_leaf(value):
 
 def as_state(values):
     """Convert numbers of an initial state to an array, of jax's default dtype for concrete ones."""
-    # Traced states keep the dtype of their tracers, and with it the caller's precision.
+    # Traced states keep their dtype, and with it the caller's precision.
     return store_leaf(values, float) if is_concrete(values) else jnp.asarray(values)

@@ -21,7 +21,7 @@ from jaxdyn.model.builder import ModelBuilder
 from jaxdyn.model.joining import join
 from jaxdyn.model.tree import Model
 from jaxdyn.scenes._named import as_leaf, as_state, register_scene
-from jaxdyn.scenes.hands import _spatial_finger, _turn
+from jaxdyn.scenes.hands import finger_angles, rotation_about_z
 from jaxdyn.scenes.linkages import thin_bar
 from jaxdyn.systems.scene import Scene
 
@@ -59,7 +59,7 @@ def _joint_angles(pose, links, height):
     wrist = pose[:3, 3] - links[2] * pose[:3, 0]
     base = f64.pose_of(np.eye(3), (0.0, 0.0, height))
     # The velocity is zero, and the rates are not used.
-    angles, _ = _spatial_finger(base, links[:2], wrist, wrist + xp.asarray([0.0, 0.0, 0.1]), np.zeros(3))
+    angles, _ = finger_angles(base, links[:2], wrist, wrist + xp.asarray([0.0, 0.0, 0.1]), np.zeros(3))
     yaw, elevation = angles[0], angles[1] + angles[2]
     up = xp.asarray([0.0, 0.0, 1.0])
     ahead = xp.stack([xp.cos(yaw), xp.sin(yaw), 0 * yaw])
@@ -217,7 +217,7 @@ def coordinated_lifting(
     whole, grips = ModelBuilder("no arm", gravity=fall).build(), []
     for i in range(count):
         # The arms are copies of the first one, rotated about the z axis through the plate's centre.
-        turn = xp.asarray(f64.pose_of(_turn(2 * np.pi / count * i), np.zeros(3)))
+        turn = xp.asarray(f64.pose_of(rotation_about_z(2 * np.pi / count * i), np.zeros(3)))
         # The flange of each arm reaches the rim when the plate's centre is on the z axis.
         base = xp.asarray(f64.pose_of(np.eye(3), (-radius - flange[0, 3], 0.0, 0.0)))
         grip = xp.asarray(f64.pose_of(flange[:3, :3], (-radius, 0.0, 0.0)))

@@ -16,7 +16,7 @@ from jaxdyn.model.arguments import Number, Row
 from jaxdyn.model.builder import ModelBuilder
 from jaxdyn.model.names import frame_index
 from jaxdyn.scenes._named import as_state, register_scene, solve_gram
-from jaxdyn.scenes.hands import _point_velocity, _quaternion
+from jaxdyn.scenes.hands import point_velocity, quaternion_and_matrix
 
 # Contact points of the fingertips on the cube, in half edges, and inward normals: index and ring finger on one face,
 # the thumb on the opposite one.
@@ -89,7 +89,7 @@ def _cube_start(
     twist: Row = (0.02, 0.0, -0.01, 0.1, 0.2, -0.1),
 ) -> tuple[Array, Array]:
     model = robots.allegro()
-    quaternion, rotation = _quaternion(turned)
+    quaternion, rotation = quaternion_and_matrix(turned)
     xp = array_namespace(size, position, turned, twist)
     rotation, position, twist = xp.asarray(rotation), xp.asarray(position, float), xp.asarray(twist, float)
     # Fingers are in the text order of their first joints, joint_N.0 with N = 0, 12, 4, 8.
@@ -107,7 +107,7 @@ def _cube_start(
                 "contact point on the cube; give a pose closer to the default one"
             )
         # The twist is in the cube's axes, and the fingers are computed in those of the world.
-        velocity = _point_velocity(position, rotation @ twist[:3], rotation @ twist[3:], target)
+        velocity = point_velocity(position, rotation @ twist[:3], rotation @ twist[3:], target)
         moving = _least(jacobian, velocity)
         for k, i in enumerate(joints):
             angles[i], rates[i] = reached[k], moving[k]

@@ -12,12 +12,12 @@ from jaxdyn.model import inertia
 from jaxdyn.model.arguments import Number, Row
 from jaxdyn.model.builder import ModelBuilder
 from jaxdyn.scenes._named import as_state, register_scene, solve_gram
-from jaxdyn.scenes.linkages import _circles, thin_bar
+from jaxdyn.scenes.linkages import intersect_circles, thin_bar
 
 _LINKS = (0.3, 0.25)
 _PALM = 0.5  # m, between the bases of two fingers
-_SPATIAL_LINKS = (0.2, 0.2)
-_CIRCLE = 0.25  # m, radius of the circle on which the bases of three fingers stand
+FINGER_LINKS = (0.2, 0.2)
+BASE_CIRCLE = 0.25  # m, radius of the circle on which the bases of three fingers stand
 _UP = np.array([0.0, 0.0, 1.0])
 
 
@@ -29,18 +29,19 @@ def _rates(axes, origins, point, velocity):
     return solve_gram(columns, columns @ xp.asarray(velocity, float))
 
 
-def _point_velocity(position, velocity, omega, point):
+def point_velocity(position, velocity, omega, point):
     """Velocity of the material point of a body at `point`."""
     xp = array_namespace(position, velocity, omega, point)
     position, velocity, omega, point = (xp.asarray(x, float) for x in (position, velocity, omega, point))
     return velocity + xp.cross(omega, point - position)
 
 
-def _turn(angle):
+def rotation_about_z(angle):
+    """Rotation matrix (3, 3) about z."""
     return f64.rotation_matrix((0.0, 0.0, 1.0), angle)
 
 
-def _cones(mu, kind="hard-finger", in_plane=False):
+def cones_of(mu, kind="hard-finger", in_plane=False):
     """Friction cone of all contacts, None without `mu`."""
     return None if mu is None else friction_cone(kind, mu if kind == "hard-finger" else None, in_plane=in_plane)
 
@@ -64,7 +65,7 @@ def _planar_object(center, angle, velocity):
     """Position of an object, and its velocity in the plane's axes from the body velocity (vx, vy, w)."""
     xp = array_namespace(center, angle, velocity)
     # Planar joints have their velocity in the body's axes.
-    linear = _turn(angle) @ xp.asarray([velocity[0], velocity[1], 0.0])
+    linear = rotation_about_z(angle) @ xp.asarray([velocity[0], velocity[1], 0.0])
     return xp.asarray([*center, 0.0]), linear, xp.asarray([0.0, 0.0, velocity[2]])
 
 
@@ -79,7 +80,7 @@ def _planar_state(fingers, center, angle, velocity):
         # The second angle is relative to the first link.
         q += [low, high - low]
         axes, origins = np.stack([_UP, _UP]), xp.stack([base, knee])
-        v += [*_rates(axes, origins, point, _point_velocity(*moving, point))]
+        v += [*_rates(axes, origins, point, point_velocity(*moving, point))]
     return as_state([*q, *center, angle]), as_state([*v, *velocity])
 
 
@@ -92,13 +93,13 @@ def _bar_start(
     length: Number = 0.3,
 ) -> tuple[Array, Array]:
     xp = array_namespace(center, angle, links, palm, length)
-    along = xp.asarray(_turn(angle))[:, 0]
+    along = xp.asarray(rotation_about_z(angle))[:, 0]
     fingers = []
     for side in (-1.0, 1.0):
         base, tip = xp.asarray([side * palm / 2, 0.0, 0.0]), xp.asarray([*center, 0.0]) + side * length / 2 * along
         ends = (base[:2], links[0], tip[:2], links[1])
         # The order of the circles selects the solution outside of the hand on either side.
-        knee = xp.asarray([*(_circles(*ends) if side < 0 else _circles(*ends[2:], *ends[:2])), 0.0])
+        knee = xp.asarray([*(intersect_circles(*ends) if side < 0 else intersect_circles(*ends[2:], *ends[:2])), 0.0])
         fingers.append((base, knee, tip, tip))
     return _planar_state(fingers, center, angle, velocity)
 
@@ -133,7 +134,7 @@ def hand_with_bar(
         turned = np.array([[0.0, 1.0, 0.0], [0.0, 0.0, -side], [-side, 0.0, 0.0]]).T
         pose = f64.pose_of(turned, (side * length / 2, 0.0, 0.0))
         contacts.append(contact(kind, f"tip{i}", pose, in_plane=True))
-    return Grasp(builder.build(), "bar", contacts, cones=_cones(mu, kind, in_plane=True))
+    return Grasp(builder.build(), "bar", contacts, cones=cones_of(mu, kind, in_plane=True))
 
 
 def _disk_start(
@@ -147,7 +148,7 @@ def _disk_start(
     xp = array_namespace(center, tilts, links, palm, radius)
     fingers = []
     for side, tilt in zip((-1.0, 1.0), tilts, strict=True):
-        base, turned = xp.asarray([side * palm / 2, 0.0, 0.0]), xp.asarray(_turn(tilt))
+        base, turned = xp.asarray([side * palm / 2, 0.0, 0.0]), xp.asarray(rotation_about_z(tilt))
         along = turned[:, 1]
         point = xp.asarray([*center, 0.0]) + side * radius * turned[:, 0]
         # The knee is on the line of the face, at the length of the first link from the base.
@@ -183,30 +184,31 @@ def hand_with_disk(
         finger = f"finger{i}_2"
         rolling = rolling_wheel("disk", None, radius, plane=face, plane_body=finger, lateral=False, name=f"finger{i}")
         contacts.append(rolling)
-    return Grasp(builder.build(), "disk", contacts, cones=_cones(mu, in_plane=True))
+    return Grasp(builder.build(), "disk", contacts, cones=cones_of(mu, in_plane=True))
 
 
 # Three fingers in space: their bases on a circle in the x-y plane, a yaw joint and two pitch joints each.
 
 
-def _directions(count=3):
+def finger_directions(count=3):
     """Horizontal directions, away from the axis, of the fingers (count, 3)."""
     angles = np.pi / 2 + 2 * np.pi / count * np.arange(count)
     return np.stack([np.cos(angles), np.sin(angles), 0 * angles], 1)
 
 
-def _base(direction, circle):
+def finger_base(direction, circle):
     """Pose of a finger's base: z up, x to the axis."""
     return f64.pose_of(np.stack([-direction, -np.cross(_UP, direction), _UP], 1), circle * direction)
 
 
-def _spatial_hand(name, links, masses, circle, gravity):
+def hand_builder(name, links, masses, circle, gravity):
+    """Builder of a hand of three fingers in space, with bases on a circle."""
     builder = ModelBuilder(name, gravity=(0.0, 0.0, -gravity))
     first, second = links
-    for i, direction in enumerate(_directions(), 1):
+    for i, direction in enumerate(finger_directions(), 1):
         # A yaw joint needs an inertia about its axis when the finger is stretched upwards.
         knuckle = inertia.sphere(masses[0], 0.03)
-        builder.add_body(f"finger{i}_1", None, "continuous", knuckle, pose=_base(direction, circle))
+        builder.add_body(f"finger{i}_1", None, "continuous", knuckle, pose=finger_base(direction, circle))
         # About -y, so that a positive pitch lifts the link.
         pitch = (0.0, -1.0, 0.0)
         builder.add_body(f"finger{i}_2", f"finger{i}_1", "continuous", thin_bar(masses[1], first), axis=pitch)
@@ -216,16 +218,16 @@ def _spatial_hand(name, links, masses, circle, gravity):
     return builder
 
 
-def _spatial_finger(base, links, tip, point, velocity):
+def finger_angles(base, links, tip, point, velocity):
     """Angles of a finger with its tip at `tip`, and rates for a velocity of its material point at `point`."""
     xp = array_namespace(base, links, tip, point, velocity)
     base, tip = xp.asarray(base, float), xp.asarray(tip, float)
     local = base[:3, :3].T @ (tip - base[:3, 3])
     # After the yaw the finger is a planar arm of two links in its vertical plane.
     yaw, reach = xp.arctan2(local[1], local[0]), xp.hypot(local[0], local[1])
-    ahead = base[:3, :3] @ xp.asarray(_turn(yaw))
+    ahead = base[:3, :3] @ xp.asarray(rotation_about_z(yaw))
     # In the finger's vertical plane: the left of the line to the tip is the knee up.
-    knee = xp.asarray(_circles((0.0, 0.0), links[0], (reach, local[2]), links[1]))
+    knee = xp.asarray(intersect_circles((0.0, 0.0), links[0], (reach, local[2]), links[1]))
     low, high = xp.arctan2(knee[1], knee[0]), xp.arctan2(local[2] - knee[1], reach - knee[0])
     elbow = base[:3, 3] + knee[0] * ahead[:, 0] + knee[1] * xp.asarray(_UP)
     axes = xp.stack([xp.asarray(_UP), -ahead[:, 1], -ahead[:, 1]])
@@ -233,7 +235,7 @@ def _spatial_finger(base, links, tip, point, velocity):
     return [yaw, low, high - low], _rates(axes, origins, point, velocity)
 
 
-def _quaternion(turned):
+def quaternion_and_matrix(turned):
     """Unit quaternion and matrix of a rotation vector."""
     xp = array_namespace(turned)
     turned = xp.asarray(turned, float)
@@ -250,17 +252,17 @@ def _quaternion(turned):
 
 def _ball_state(position, turned, twist, links, circle, radius, reach, fixed):
     """State q and v: fingertips at `reach` (m) from the ball's centre, in directions fixed in the ball or in the world."""
-    quaternion, rotation = _quaternion(turned)
+    quaternion, rotation = quaternion_and_matrix(turned)
     xp = array_namespace(position, turned, twist, circle, reach, radius)
     rotation, position, twist = xp.asarray(rotation), xp.asarray(position, float), xp.asarray(twist, float)
     moving = position, rotation @ twist[:3], rotation @ twist[3:]
     q, v = [], []
-    for direction in _directions():
+    for direction in finger_directions():
         # Fingers of a grasp hold fixed points of the ball; rolling ones touch it at a fixed height.
         outward = rotation @ direction if fixed else direction
         tip, point = position + reach * outward, position + radius * outward
-        velocity = _point_velocity(*moving, point)
-        angles, rates = _spatial_finger(_base(direction, circle), links, tip, point, velocity)
+        velocity = point_velocity(*moving, point)
+        angles, rates = finger_angles(finger_base(direction, circle), links, tip, point, velocity)
         q, v = [*q, *angles], [*v, *rates]
     return as_state([*q, *position, *quaternion]), as_state([*v, *twist])
 
@@ -269,8 +271,8 @@ def _ball_start(
     position: Row = (0.01, -0.02, 0.28),
     turned: Row = (0.1, -0.15, 0.2),
     twist: Row = (0.1, -0.05, 0.08, 0.4, -0.3, 0.6),
-    links: Row = _SPATIAL_LINKS,
-    circle: Number = _CIRCLE,
+    links: Row = FINGER_LINKS,
+    circle: Number = BASE_CIRCLE,
     radius: Number = 0.1,
 ) -> tuple[Array, Array]:
     return _ball_state(position, turned, twist, links, circle, radius, radius, True)
@@ -279,9 +281,9 @@ def _ball_start(
 @register_scene(_ball_start)
 def hand_with_ball(
     *,
-    links: Row = _SPATIAL_LINKS,
+    links: Row = FINGER_LINKS,
     masses: Row = (0.1, 0.2, 0.15),
-    circle: Number = _CIRCLE,
+    circle: Number = BASE_CIRCLE,
     mass: Number = 0.4,
     radius: Number = 0.1,
     gravity: Number = 9.81,
@@ -293,23 +295,23 @@ def hand_with_ball(
     `masses`: of its knuckle and its bars (kg); `circle`: radius of the circle of the bases (m). Start: the ball's
     `position`, rotation vector and body twist.
     """
-    builder = _spatial_hand("hand with a ball", links, masses, circle, gravity)
+    builder = hand_builder("hand with a ball", links, masses, circle, gravity)
     builder.add_body("ball", None, "free", inertia.sphere(mass, radius), joint_name="object")
     contacts = []
-    for i, direction in enumerate(_directions(), 1):
+    for i, direction in enumerate(finger_directions(), 1):
         turned = np.stack([np.cross(_UP, -direction), _UP, -direction], 1)
         # z of a contact frame is the inward normal.
         pose = f64.pose_of(turned, radius * direction)
         contacts.append(contact("hard-finger", f"tip{i}", pose))
-    return Grasp(builder.build(), "ball", contacts, cones=_cones(mu))
+    return Grasp(builder.build(), "ball", contacts, cones=cones_of(mu))
 
 
 def _rolling_start(
     position: Row = (0.01, -0.02, 0.28),
     turned: Row = (0.1, -0.15, 0.2),
     twist: Row = (0.1, -0.05, 0.08, 0.4, -0.3, 0.6),
-    links: Row = _SPATIAL_LINKS,
-    circle: Number = _CIRCLE,
+    links: Row = FINGER_LINKS,
+    circle: Number = BASE_CIRCLE,
     radius: Number = 0.1,
     tip_radius: Number = 0.02,
 ) -> tuple[Array, Array]:
@@ -320,9 +322,9 @@ def _rolling_start(
 @register_scene(_rolling_start)
 def hand_rolling_ball(
     *,
-    links: Row = _SPATIAL_LINKS,
+    links: Row = FINGER_LINKS,
     masses: Row = (0.1, 0.2, 0.15),
-    circle: Number = _CIRCLE,
+    circle: Number = BASE_CIRCLE,
     mass: Number = 0.4,
     radius: Number = 0.1,
     tip_radius: Number = 0.02,
@@ -334,7 +336,7 @@ def hand_rolling_ball(
     Each contact has a holonomic row, the gap, and two Pfaffian ones, no slip; forces are (normal, two tangential).
     Start: as `hand_with_ball`, the contacts at the height of the ball's centre.
     """
-    builder = _spatial_hand("hand rolling a ball", links, masses, circle, gravity)
+    builder = hand_builder("hand rolling a ball", links, masses, circle, gravity)
     builder.add_body("ball", None, "free", inertia.sphere(mass, radius), joint_name="object")
     contacts = [
         rolling_sphere(
@@ -342,4 +344,4 @@ def hand_rolling_ball(
         )
         for i in (1, 2, 3)
     ]
-    return Grasp(builder.build(), "ball", contacts, cones=_cones(mu))
+    return Grasp(builder.build(), "ball", contacts, cones=cones_of(mu))

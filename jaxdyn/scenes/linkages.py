@@ -22,7 +22,7 @@ def thin_bar(mass, length):
     return mass, (length / 2, 0.0, 0.0), (0.0, moment, moment)
 
 
-def _circles(center, radius, other, reach):
+def intersect_circles(center, radius, other, reach):
     """Intersection of two circles to the left of the line from the first centre to the second."""
     xp = array_namespace(center, radius, other, reach)
     center, other = xp.asarray(center, float), xp.asarray(other, float)
@@ -39,13 +39,13 @@ def _circles(center, radius, other, reach):
     return center + along * direction + height * xp.stack([-direction[1], direction[0]])
 
 
-def _across(length, angle):
+def end_velocity(length, angle):
     """Velocity (2,) of the end of a link at one radian per second."""
     xp = array_namespace(length, angle)
     return length * xp.stack([-xp.sin(angle), xp.cos(angle)])
 
 
-def _solve_planar(one, other, right):
+def solve_planar(one, other, right):
     """Solve x one + y other = right in the plane by Cramer's rule."""
     # Written out: a solver of 2 x 2 systems under JAX would be a call of LAPACK.
     determinant = one[0] * other[1] - one[1] * other[0]
@@ -60,10 +60,12 @@ def _four_bar_start(
     crank, coupler, rocker, ground = lengths
     xp = array_namespace(lengths, angle, rate)
     a = crank * xp.stack([xp.cos(angle), xp.sin(angle)])
-    b = _circles(a, coupler, (ground, 0.0), rocker)
+    b = intersect_circles(a, coupler, (ground, 0.0), rocker)
     coupling, rocking = xp.arctan2(*(b - a)[::-1]), xp.arctan2(b[1], b[0] - ground)
     # Velocities of B on the coupler and on the rocker agree.
-    first, second = _solve_planar(_across(coupler, coupling), -_across(rocker, rocking), -rate * _across(crank, angle))
+    first, second = solve_planar(
+        end_velocity(coupler, coupling), -end_velocity(rocker, rocking), -rate * end_velocity(crank, angle)
+    )
     return as_state([angle, coupling - angle, rocking]), as_state([rate, first - rate, second])
 
 
@@ -176,10 +178,14 @@ def _parallel_start(
     q, v = [], []
     for base, elbow in zip(bases, elbows, strict=True):
         # Exchanged circles give the solution on the other side.
-        a = _circles(base, length, point, length) if elbow > 0 else _circles(point, length, base, length)
+        a = (
+            intersect_circles(base, length, point, length)
+            if elbow > 0
+            else intersect_circles(point, length, base, length)
+        )
         vectors = a - xp.asarray(base, float), xp.asarray(point, float) - a
         first, second = (xp.arctan2(*vector[::-1]) for vector in vectors)
-        rates = _solve_planar(_across(length, first), _across(length, second), velocity)
+        rates = solve_planar(end_velocity(length, first), end_velocity(length, second), velocity)
         q += [first, second - first]
         v += [rates[0], rates[1] - rates[0]]
     return as_state(q), as_state(v)

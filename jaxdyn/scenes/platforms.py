@@ -9,7 +9,7 @@ from jaxdyn.model import float64 as f64
 from jaxdyn.model.arguments import Checked, Number, Numbers, Row
 from jaxdyn.model.builder import ModelBuilder
 from jaxdyn.scenes._named import as_state, register_scene
-from jaxdyn.scenes.linkages import _across, _circles, _solve_planar, thin_bar
+from jaxdyn.scenes.linkages import end_velocity, intersect_circles, solve_planar, thin_bar
 from jaxdyn.systems.scene import Scene
 
 
@@ -111,10 +111,10 @@ def _hinge_platform_start(
         arm = xp.stack([c * x - s * y, s * x + c * y])
         # Velocity of a point of the platform: v + w x arm.
         hinge, speed = point + arm, velocity + rate * xp.stack([-arm[1], arm[0]])
-        elbow = _circles(base, length, hinge, length)
+        elbow = intersect_circles(base, length, hinge, length)
         first, second = (xp.arctan2(*way[::-1]) for way in (elbow - base, hinge - elbow))
         # Velocities of both links add up to that of the hinge on the platform.
-        rates = _solve_planar(_across(length, first), _across(length, second), speed)
+        rates = solve_planar(end_velocity(length, first), end_velocity(length, second), speed)
         q += [first, second - first]
         v += [rates[0], rates[1] - rates[0]]
         # The platform follows the first leg in depth-first order.

@@ -12,16 +12,16 @@ from jaxdyn.model import inertia
 from jaxdyn.model.arguments import Number, Row
 from jaxdyn.scenes._named import as_state, register_scene
 from jaxdyn.scenes.hands import (
-    _CIRCLE,
-    _SPATIAL_LINKS,
-    _base,
-    _cones,
-    _directions,
-    _point_velocity,
-    _quaternion,
-    _spatial_finger,
-    _spatial_hand,
-    _turn,
+    BASE_CIRCLE,
+    FINGER_LINKS,
+    cones_of,
+    finger_angles,
+    finger_base,
+    finger_directions,
+    hand_builder,
+    point_velocity,
+    quaternion_and_matrix,
+    rotation_about_z,
 )
 
 _EGG_SEMI_AXES = (0.1, 0.09, 0.11)  # m
@@ -50,9 +50,9 @@ def _finger_state(base, links, tip_axes, point, normal, velocity):
     # The angles determine the orientation of the tip, and this the position of its centre, from which the angles follow: a fixed
     # point. The tip is small against the links, so that each iteration reduces the error.
     def iterate(center):
-        (yaw, low, bend), rates = _spatial_finger(base, links, center, point, velocity)
+        (yaw, low, bend), rates = finger_angles(base, links, center, point, velocity)
         pitch = f64.rotation_matrix((0.0, -1.0, 0.0), low + bend)
-        rotation = base[:3, :3] @ xp.asarray(_turn(yaw)) @ xp.asarray(pitch)
+        rotation = base[:3, :3] @ xp.asarray(rotation_about_z(yaw)) @ xp.asarray(pitch)
         # The outward normal of the tip at the contact is opposite to the object's.
         return point - rotation @ _support(tip_axes, -rotation.T @ normal), ([yaw, low, bend], rates)
 
@@ -70,22 +70,22 @@ def _egg_start(
     position: Row = (0.01, -0.02, 0.28),
     turned: Row = (0.1, -0.15, 0.2),
     twist: Row = (0.02, -0.01, 0.02, 0.2, -0.1, 0.15),
-    links: Row = _SPATIAL_LINKS,
-    circle: Number = _CIRCLE,
+    links: Row = FINGER_LINKS,
+    circle: Number = BASE_CIRCLE,
     semi_axes: Row = _EGG_SEMI_AXES,
     tip_semi_axes: Row = _TIP_SEMI_AXES,
 ) -> tuple[Array, Array]:
     """State (q, v) of `hand_rolling_egg` from the object's position, rotation vector and body twist."""
-    quaternion, rotation = _quaternion(turned)
+    quaternion, rotation = quaternion_and_matrix(turned)
     xp = array_namespace(position, turned, twist, links, circle, semi_axes, tip_semi_axes)
     rotation, position, twist = xp.asarray(rotation), xp.asarray(position, float), xp.asarray(twist, float)
     world_motion = position, rotation @ twist[:3], rotation @ twist[3:]
     q, v = [], []
-    for direction in _directions():
+    for direction in finger_directions():
         normal = xp.asarray(direction)
         point = position + rotation @ _support(semi_axes, rotation.T @ normal)
-        velocity = _point_velocity(*world_motion, point)
-        angles, rates = _finger_state(_base(direction, circle), links, tip_semi_axes, point, normal, velocity)
+        velocity = point_velocity(*world_motion, point)
+        angles, rates = _finger_state(finger_base(direction, circle), links, tip_semi_axes, point, normal, velocity)
         q, v = [*q, *angles], [*v, *rates]
     # The contact coordinates follow from the bodies' poses, which a scene with these surfaces places.
     scene = hand_rolling_egg(links=links, circle=circle, semi_axes=semi_axes, tip_semi_axes=tip_semi_axes)
@@ -95,9 +95,9 @@ def _egg_start(
 @register_scene(_egg_start)
 def hand_rolling_egg(
     *,
-    links: Row = _SPATIAL_LINKS,
+    links: Row = FINGER_LINKS,
     masses: Row = (0.1, 0.2, 0.15),
-    circle: Number = _CIRCLE,
+    circle: Number = BASE_CIRCLE,
     mass: Number = 0.4,
     semi_axes: Row = _EGG_SEMI_AXES,
     tip_semi_axes: Row = _TIP_SEMI_AXES,
@@ -116,9 +116,9 @@ def hand_rolling_egg(
 
     Source: Montana (1988); Murray, Li & Sastry (1994), sections 5.6 and 6.3; EQUATIONS sections 8 and 10.
     """
-    builder = _spatial_hand("hand rolling an egg", links, masses, circle, gravity)
+    builder = hand_builder("hand rolling an egg", links, masses, circle, gravity)
     builder.add_body("egg", None, "free", inertia.ellipsoid(mass, semi_axes), joint_name="object")
     egg, tip = Ellipsoid(semi_axes), Ellipsoid(tip_semi_axes)
     contacts = [rolling_contact(f"tip{i}", tip, "egg", egg, name=f"finger{i}") for i in (1, 2, 3)]
     system = RollingModel(builder.build(), contacts)
-    return Grasp(system, "egg", list(system.rows), cones=_cones(mu))
+    return Grasp(system, "egg", list(system.rows), cones=cones_of(mu))

@@ -28,11 +28,11 @@ class Motion(NamedTuple):
 
 
 class Noise(eqx.Module):
-    """Errors of a sensor: reading + bias + walk(t) + white noise.
+    r"""Errors of a sensor: reading + bias + walk(t) + white noise.
 
     **Arguments:** each a number or one for each entry of the reading, in its units.
 
-    - `std`: standard deviation of the white noise of a sample. A density d (per root of Hz) sampled every dt is d / sqrt(dt).
+    - `std`: standard deviation of the white noise of a sample. A density d (per root of Hz) sampled every dt is $d / \sqrt{dt}$.
     - `bias`: constant. `walk`: the standard deviation of the random walk of the bias after 1 s; it grows as the root of time.
 
     **Raises:** ValueError for deviations that are negative.

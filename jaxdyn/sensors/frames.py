@@ -54,7 +54,9 @@ class _OnFrame(Sensor):
 
 
 class Accelerometer(_OnFrame):
-    """Specific force R^T (a - g) (3,), m/s^2, of a frame's origin in its axes: 9.81 upwards at rest, zero in free fall.
+    """Specific force (3,), m/s^2, of a frame's origin in its axes: 9.81 upwards at rest, zero in free fall.
+
+    $$R^T (a - g)$$
 
     **Arguments:** `frame`, a name; `name`, `noise`, `delay` (s) as of `Sensor`.
 
@@ -71,7 +73,9 @@ class Accelerometer(_OnFrame):
 
 
 class Gyroscope(_OnFrame):
-    """Angular velocity R^T omega (3,), rad/s, of a frame in its axes.
+    r"""Angular velocity (3,), rad/s, of a frame in its axes.
+
+    $$R^T \omega$$
 
     **Arguments:** as of `Accelerometer`.
     """
@@ -96,7 +100,9 @@ class Imu(_OnFrame):
 
 
 class Velocimeter(_OnFrame):
-    """Velocity R^T v (3,), m/s, of a frame's origin in its axes.
+    """Velocity (3,), m/s, of a frame's origin in its axes.
+
+    $$R^T v$$
 
     **Arguments:** as of `Accelerometer`.
     """

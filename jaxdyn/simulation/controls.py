@@ -35,12 +35,12 @@ STATE, HELD = "control", "held"  # keys of the control's entries in the state of
 
 
 class Controller(eqx.Module):
-    """A control law with a state z of its own: integral action, filters, observers.
+    r"""A control law with a state z of its own: integral action, filters, observers.
 
     A subclass defines `start`, `__call__` and `rate`. The state is a pytree of arrays, or None for a law without state. With
     `takes_multipliers = True` the law also receives the multipliers lam (nc,) and has to be affine in them. The algebraic loop
     lam -> tau -> lam is then solved exactly, at the cost of one more evaluation of the dynamics per constraint row. A law that is
-    not affine in lam can use filtered multipliers: a state with dz/dt = (lam - z)/T.
+    not affine in lam can use filtered multipliers: a state with $\dot z = (\lambda - z)/T$.
 
     ```python
     class Integral(jd.Controller):

@@ -190,9 +190,11 @@ class Projected(Multipliers):
 
 
 class Baumgarte(Multipliers):
-    """Accelerations with feedback of violated rows, for comparison: where the feedback is not zero it is an error.
+    r"""Accelerations with feedback of violated rows, for comparison: where the feedback is not zero it is an error.
 
-    Holonomic rows: d2 phi/dt2 + 2 alpha dphi/dt + beta^2 phi = 0. Nonholonomic rows: d psi/dt + 2 alpha psi = 0.
+    $$\ddot\phi + 2 \alpha \dot\phi + \beta^2 \phi = 0, \quad \dot\psi + 2 \alpha \psi = 0$$
+
+    for holonomic rows $\phi$ and nonholonomic rows $\psi$.
 
     **Arguments:** `alpha`, `beta`, 1/s, positive.
 
@@ -207,7 +209,10 @@ class Baumgarte(Multipliers):
         self.alpha, self.beta = jnp.asarray(alpha, float), jnp.asarray(beta, float)
 
     def acceleration(self, scene: Scene, q: Q, v: V, t: Number, force: Force) -> Array:
-        """Acceleration under the rows A a = gamma - 2 alpha psi - beta^2 phi."""
+        r"""Acceleration under the rows with feedback of their violation.
+
+        $$A a = \gamma - 2 \alpha \psi - \beta^2 \phi$$
+        """
         row, holonomic = rows(scene, q, v, t), holonomic_rows(layout(scene))
         alpha, beta = self.alpha.astype(q.dtype), self.beta.astype(q.dtype)
         gamma = row.gamma - 2 * alpha * row.velocity
@@ -218,7 +223,9 @@ class Baumgarte(Multipliers):
 
 
 class Reduced(Method):
-    """Integration of minimal velocities nu, and of q with the velocity v = N nu + v0.
+    r"""Integration of minimal velocities, and of q with the velocity that they give.
+
+    $$v = N \nu + v_0$$
 
     Velocities satisfy the constraints by construction. For holonomic rows q is projected onto them after every step.
 
@@ -268,7 +275,7 @@ class Reduced(Method):
         return y | {"nu": minimal_velocity(self._at(scene, y, q, t), v)}
 
     def to_qv(self, scene: Scene, y: State, t: Number) -> tuple[Array, Array]:
-        """Configuration q, with unit quaternions, and v = N nu + v0."""
+        """Configuration q, with unit quaternions, and velocity v."""
         q = retract(scene.system, y["q"])
         basis = self._at(scene, y, q, t)
         return q, matmul(basis.N, y["nu"]) + basis.v0

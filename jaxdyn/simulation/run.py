@@ -60,7 +60,9 @@ def simulate(
     max_steps: int | None = None,
     throw: bool | None = None,
 ) -> Solution:
-    """Integrate M a + C v + N = tau + forces + A^T lam, dq/dt = H(q) v, from (q0, v0) and save it at the times `ts`.
+    r"""Integrate the equations of motion from (q0, v0) and save the motion at the times `ts`.
+
+    $$M a + C v + N = \tau + \tau_\mathrm{forces} + A^T \lambda, \quad \dot q = H(q) v$$
 
     One sample; batch states, controls and the scene's leaves with `jax.vmap`. Computed in the dtype of the model.
     Called outside of `jax.jit` it compiles once for all scenes of a shape, whose numbers are inputs of the program. Inside your
@@ -100,7 +102,7 @@ def simulate(
       and limits), "control_state" (of a controller), "drive_state" (of drives) and "pose:<frame>". They are computed only if
       asked for.
     - `contacts`: of a scene with `cones`. "stop": where a contact pulls or leaves its cone (a margin below zero by more than
-      rounding, eps^(1/2) of its force) the run ends, with the code `contact_lost` and the time, which is found within the
+      rounding, $\epsilon^{1/2}$ of its force) the run ends, with the code `contact_lost` and the time, which is found within the
       step. "report": it continues, with contacts that hold on both sides.
     - `limits`: of the model's joints (`model.lower`, `model.upper`), which nothing enforces. None: they are ignored.
       "stop": where a joint passes one the run ends, with the code `joint_limit_passed` and the time, found within the step.

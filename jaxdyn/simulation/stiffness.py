@@ -83,21 +83,25 @@ def stiffness(
     control: Checked[Callable[[Array, Array, Array], Array] | None] = None,
     drive_state: Numbers | None = None,
 ) -> Stiffness:
-    """Fastest rates of the motion M da + D dv + K dq = B dz, dz/dt = R dq + S dv + Z dz near a state.
+    r"""Fastest rates of the motion near a state.
 
-    D = -df/dv, K = -df/dq and B = df/dz, where f is the sum of the scene's forces, of `control(q, v, t)` behind the scene's
-    drives and limits, and, for a system that is not a `Model`, of -dV/dq. z are the states of the drives, and R, S and Z the
-    derivatives of their rates. What velocity does through inertia and the gravity of a `Model` are left out, as neither
-    makes a motion stiff. dq is along the manifold. On constraints da, dv and dq are projected on their tangent space in the
-    mass metric; the change of the rows along dq is left out.
+    $$M \delta a + D \delta v + K \delta q = B \delta z, \quad \delta\dot z = R \delta q + S \delta v + Z \delta z$$
+
+    $D = -\partial f / \partial v$, $K = -\partial f / \partial q$ and $B = \partial f / \partial z$, where f is the sum of
+    the scene's forces, of `control(q, v, t)` behind the scene's drives and limits, and, for a system that is not a `Model`,
+    of $-\partial V / \partial q$. z are the states of the drives, and R, S and Z the derivatives of their rates.
+    Velocity-dependent inertial forces and the gravity of a `Model` are left out, as neither makes a motion stiff.
+    $\delta q$ is along the manifold. On constraints $\delta a$, $\delta v$ and $\delta q$ are projected on their tangent
+    space in the mass metric; the change of the rows along $\delta q$ is left out.
 
     **Arguments:** `scene`, a `Scene` or a system; `q` (nq,); `v` (nv,); `t`, s; `drive_state` z (n,), by default
     `scene.drive_state(q, v, t)`.
 
     **Raises:** ValueError for wrong shapes, and where forces or masses are not finite (NaN where numbers are traced).
 
-    **Returns:** `Stiffness`, from the eigenvalues of [[0, 1, 0], [-M^-1 K, -M^-1 D, M^-1 B], [R, S, Z]]. An explicit method
-    needs steps below `explicit_step`; where the motion itself would allow much longer ones, it is stiff.
+    **Returns:** `Stiffness`, from the eigenvalues of
+    $\begin{bmatrix} 0 & 1 & 0 \\ -M^{-1} K & -M^{-1} D & M^{-1} B \\ R & S & Z \end{bmatrix}$. An explicit method needs
+    steps below `explicit_step`; where the motion itself would allow much longer ones, it is stiff.
 
     Source: Hairer & Wanner 1996, section IV.2.
 

@@ -278,7 +278,7 @@ class Variational(Multipliers):
     """Variational steps of fixed length for long motions, by a discrete principle of d'Alembert.
 
     Order 2. Without forces and rows on velocities the steps are symplectic: the
-    error of the energy is of the order h^2 and does not grow with the number of steps, and momenta that symmetries conserve
+    error of the energy is of the order $h^2$ and does not grow with the number of steps, and momenta that symmetries conserve
     are conserved to rounding. Rows on positions are closed at the end of every step, and velocities projected. For rows on
     velocities (rolling, knife edges) the steps are those of the discrete Lagrange-d'Alembert principle, equal to their inverse
     with -h; energy is then kept well in reversible motions and not in general.

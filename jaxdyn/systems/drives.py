@@ -11,9 +11,9 @@ from jaxdyn.model.arguments import Number, SystemLike
 
 
 class DriveDynamics(eqx.Module):
-    """Base class of drives with a state z, between the command of a control and the torque at the joints.
+    r"""Base class of drives with a state z, between the command of a control and the torque at the joints.
 
-        tau = torque(system, q, v, t, z, command),    dz/dt = rate(system, q, v, t, z, command).
+    $$\tau = \mathrm{torque}(q, v, t, z, u), \quad \dot z = \mathrm{rate}(q, v, t, z, u)$$
 
     List one among the forces of a `Scene`. Drives and `jd.forces.EffortLimits` act in the order of the list, each on what the one
     before gives. `jd.simulate` integrates z with the motion; `jd.stepper` takes and returns it as a third entry of the

@@ -17,12 +17,17 @@ from jaxdyn.systems.system import System, as_parameter, check_size, evaluate_cal
 
 
 class LagrangianSystem(System):
-    """System given by its Lagrangian: d/dt dL/dv - dL/dq = tau.
+    r"""System given by its Lagrangian.
 
-    M = d2L/dv2 and h = d(dL/dv)/dq v + d(dL/dv)/dt - dL/dq come from automatic differentiation, the first rate as one
-    derivative along the motion, so L may hold any coordinates, gyroscopic terms and time. L is quadratic in v. The
-    potential energy is -L(q, 0); the kinetic energy is the Jacobi integral v . dL/dv - L less that, so for
-    L = T - V they are T and V.
+    $$\frac{d}{dt} \frac{\partial L}{\partial v} - \frac{\partial L}{\partial q} = M a + h = \tau, \quad
+    M = \frac{\partial^2 L}{\partial v^2}$$
+
+    $$h = \frac{\partial^2 L}{\partial v \partial q} v + \frac{\partial^2 L}{\partial v \partial t}
+    - \frac{\partial L}{\partial q}$$
+
+    M and h come from automatic differentiation, the first two terms of h as one derivative along the motion, so L may hold any
+    coordinates, gyroscopic terms and time. L is quadratic in v. The potential energy is $-L(q, 0)$; the kinetic energy is the
+    Jacobi integral $v^T \partial L / \partial v - L$ less that, so for $L = T - V$ they are T and V.
 
     **Arguments:**
 
@@ -77,12 +82,12 @@ class LagrangianSystem(System):
         return jax.grad(self._lagrangian_value, argnums=1)(q, v, t)
 
     def mass_matrix(self, q: Float[Array, " nq"], t: Number) -> Float[Array, "nv nv"]:
-        """Mass matrix M = d2L/dv2 at v = 0, (nv, nv)."""
+        """Mass matrix (nv, nv) at v = 0."""
         # L is quadratic in v (checked at the start), so that M does not depend on v; v = 0 needs the fewest operations.
         return jax.jacfwd(self._momentum, argnums=1)(q, jnp.zeros_like(q), t)
 
     def bias_force(self, q: Float[Array, " nq"], v: Float[Array, " nv"], t: Number) -> Float[Array, " nv"]:
-        """Bias force h = d(dL/dv)/dq v + d(dL/dv)/dt - dL/dq, (nv,)."""
+        """Bias force (nv,), the left-hand side of the Lagrange equations at zero acceleration."""
         if self.parameters is None:  # then L does not depend on t
             _, rate = jax.jvp(lambda q: self._momentum(q, v, t), (q,), (v,))
         else:
@@ -95,16 +100,19 @@ class LagrangianSystem(System):
         return super().gravity_force(q, t) if self.potential is None else jax.grad(self._potential_value)(q, t)
 
     def coriolis_matrix(self, q: Float[Array, " nq"], v: Float[Array, " nv"], t: Number) -> Float[Array, "nv nv"]:
-        """Coriolis matrix C with C v = h - h(v = 0), (nv, nv): that of the Christoffel symbols, plus terms linear in v.
+        """Coriolis matrix (nv, nv): that of the Christoffel symbols, plus that of terms linear in v.
 
-        The latter is skew where M does not depend on t: gyroscopic forces of terms of L linear in v.
+        $C v = h(v) - h(0)$. The latter matrix is skew where M does not depend on t: gyroscopic forces of terms of L linear in v.
         """
         # h is quadratic in v: half of its derivative is the symbols' matrix plus half of the linear terms' matrix.
         derivative = jax.jacfwd(self.bias_force, argnums=1)
         return 0.5 * (derivative(q, v, t) + derivative(q, jnp.zeros_like(v), t))
 
     def kinetic_energy(self, q: Float[Array, " nq"], v: Float[Array, " nv"], t: Number) -> Float[Array, ""]:
-        """Kinetic energy v . dL/dv - L(q, v) + L(q, 0), (), J."""
+        r"""Kinetic energy (), J.
+
+        $$v^T \frac{\partial L}{\partial v} - L(q, v) + L(q, 0)$$
+        """
         # Terms of L linear in v cancel in the Jacobi integral: gyroscopic terms hold no energy.
         energy = jnp.sum(v * self._momentum(q, v, t)) - self._lagrangian_value(q, v, t)
         return energy if self.potential is not None else energy + self._lagrangian_value(q, jnp.zeros_like(v), t)

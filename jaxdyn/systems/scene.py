@@ -120,7 +120,9 @@ def _attributes(owner: Any) -> list[str]:
 
 
 class Scene(eqx.Module):
-    """System with the constraints and forces that act on it: M a + h = tau + forces + A^T lam.
+    r"""System with the constraints and forces that act on it.
+
+    $$M a + h = \tau + \tau_\mathrm{forces} + A^T \lambda$$
 
     **Arguments:**
 

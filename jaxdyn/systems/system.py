@@ -97,10 +97,12 @@ def _acceleration(system: System, q, v, tau, t):
 
 
 class MetricSystem(System):
-    """System given by a metric and a potential: L = 1/2 v . M(q) v - V(q). Without a potential it moves along geodesics.
+    r"""System given by a metric and a potential. Without a potential it moves along geodesics.
 
-    h = dM/dt v - 1/2 d(v . M v)/dq + dV/dq takes one derivative along the motion and one gradient: neither the Christoffel
-    symbols nor second derivatives are formed.
+    $$L = \tfrac12 v^T M(q) v - V(q), \quad
+    h = \dot M v - \tfrac12 \frac{\partial (v^T M v)}{\partial q} + \frac{\partial V}{\partial q}$$
+
+    h takes one derivative along the motion and one gradient: neither the Christoffel symbols nor second derivatives are formed.
 
     **Arguments:**
 
@@ -138,7 +140,7 @@ class MetricSystem(System):
         return evaluate_callback(self.metric, (self.nq, self.nq), "metric", (q,), t, self.parameters)
 
     def bias_force(self, q: Float[Array, " nq"], v: Float[Array, " nv"], t: Number) -> Float[Array, " nv"]:
-        """Bias force h = dM/dt v - 1/2 d(v . M v)/dq + dV/dq, (nv,)."""
+        """Bias force h, (nv,)."""
 
         def momentum(q, t):
             return matmul(self.mass_matrix(q, t), v)
@@ -154,7 +156,10 @@ class MetricSystem(System):
         return jnp.zeros_like(q) if self.potential is None else jax.grad(self.potential_energy)(q, t)
 
     def kinetic_energy(self, q: Float[Array, " nq"], v: Float[Array, " nv"], t: Number) -> Float[Array, ""]:
-        """Kinetic energy v . M v / 2, (), J."""
+        r"""Kinetic energy, (), J.
+
+        $$T = \tfrac12 v^T M v$$
+        """
         return 0.5 * jnp.sum(v * matmul(self.mass_matrix(q, t), v))
 
     def potential_energy(self, q: Float[Array, " nq"], t: Number) -> Float[Array, ""]:
@@ -165,7 +170,9 @@ class MetricSystem(System):
 
 
 class ExplicitSystem(System):
-    """System given by its equations of motion: M(q) a + h(q, v) = tau.
+    r"""System given by its equations of motion.
+
+    $$M(q) a + h(q, v) = \tau$$
 
     **Arguments:**
 
@@ -210,7 +217,10 @@ class ExplicitSystem(System):
         return evaluate_callback(self._bias_force, (self.nq,), "bias_force", (q, v), t, self.parameters)
 
     def kinetic_energy(self, q: Float[Array, " nq"], v: Float[Array, " nv"], t: Number) -> Float[Array, ""]:
-        """Kinetic energy v . M v / 2, (), J."""
+        r"""Kinetic energy, (), J.
+
+        $$T = \tfrac12 v^T M v$$
+        """
         return 0.5 * jnp.sum(v * matmul(self.mass_matrix(q, t), v))
 
     def potential_energy(self, q: Float[Array, " nq"], t: Number) -> Float[Array, ""]:

@@ -14,7 +14,7 @@ import jaxdyn as jd
 from benchmarks.linkages import bennett
 from jaxdyn.cli import main
 from jaxdyn.identify.torque_terms import coulomb_through_filter
-from jaxdyn.io import joint_torques
+from jaxdyn.io import read_torque_terms
 from jaxdyn.io.logs import read_log, write_log
 
 FINGERS = ("panda_finger_joint1", "panda_finger_joint2")
@@ -352,7 +352,7 @@ def test_identify_from_one_file_and_the_robot_it_writes(arm, tmp_path, capsys):
     assert main(["identify", str(file), "--prior", "1"]) == 0
     assert "v_s 0.02, prior 1, loss squares" in capsys.readouterr().out
     computed = json.loads((tmp_path / "fitted.json").read_text())
-    torques = joint_torques(tmp_path / "fitted.urdf")
+    torques = read_torque_terms(tmp_path / "fitted.urdf")
     assert [torques[name]["offset"] for name in truth.joint_names] == computed["friction"]["offset"]
     assert {torques[name]["v_s"] for name in truth.joint_names} == {0.02}
     assert [torques[name]["quadratic"] for name in truth.joint_names] == computed["extra_terms"]["quadratic"]

@@ -8,7 +8,8 @@ from pinocchio_bridge import quick
 from scipy.optimize import minimize
 
 import jaxdyn as jd
-from jaxdyn.contact import RESULTS, friction_cone, optimal_forces
+from jaxdyn.constraints.codes import RESULTS
+from jaxdyn.contact import friction_cone, optimal_forces
 from jaxdyn.grasp import contact_forces, grasp_map
 
 CONE = friction_cone("hard-finger", 0.8)

@@ -7,7 +7,8 @@ import pytest
 from pinocchio_bridge import quick
 from scipy.optimize import linprog
 
-from jaxdyn.contact import RESULTS, solve_qp
+from jaxdyn.constraints.codes import RESULTS
+from jaxdyn.contact import solve_qp
 
 N, ROWS, CONES = 6, 9, 2
 MU = 0.6

@@ -172,7 +172,7 @@ def test_what_the_feet_cannot_carry_has_a_code(solo):
     assert bool(solve(at_rest, 10.0).success)
     for a, limit in ((down, 10.0), (at_rest, 0.01)):
         solution = solve(a, limit)
-        assert solution.result == jd.contact.RESULTS.infeasible
+        assert solution.result == jd.RESULTS.infeasible
     missing = quick(lambda a: jd.control.missing_wrench(model, q, at_rest, a, feet))
     # Feet cannot pull: what is left is what the base needs, but for torques that no normal force could change.
     mass = float(model.inertias[:, 0].sum())
@@ -182,7 +182,7 @@ def test_what_the_feet_cannot_carry_has_a_code(solo):
     limited = solve(at_rest, 0.9)
     assert bool(limited.success) and np.abs(limited.tau).max() < 0.9 + 1e-6
     flying = jd.control.underactuated_inverse_dynamics(model, q, at_rest, at_rest, [])
-    assert flying.result == jd.contact.RESULTS.infeasible
+    assert flying.result == jd.RESULTS.infeasible
 
 
 def test_forces_are_differentiable(solo):

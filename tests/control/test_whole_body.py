@@ -125,7 +125,7 @@ def test_what_the_feet_cannot_carry_has_a_code(biped, evaluated):
     model, q, feet, _ = biped
     law, at_rest = law_of(biped, (2.0, 0.0, 0.0)), jnp.zeros(model.nv)
     wanted, _, a, _, missing = evaluated(law, q, at_rest)
-    assert wanted.result == jd.contact.RESULTS.infeasible
+    assert wanted.result == jd.RESULTS.infeasible
     # 8 kg at 12 m/s^2 along x are more than mu times the weight; glued feet could do it, with the shortest forces.
     assert np.asarray(wanted.margins).min() < -1.0
     sums = sum(wanted.by_foot().values())

@@ -106,7 +106,7 @@ def printed_quantities(model, q, v, a):
         matrix_form.mass_matrix(model, q),
         dynamics.coriolis_matrix(model, q, v) @ v,
         dynamics.gravity_force(model, q),
-        dynamics.christoffel_symbols(model, q),
+        dynamics.first_kind_symbols(model, q),
         matrix_form.inverse_dynamics(model, q, v, a),
         dynamics.potential_energy(model, q),
     )
@@ -181,7 +181,7 @@ def test_derivative_of_the_mass_matrix(parents):
         return (
             dynamics.mass_matrix_derivative(model, q),
             jax.jacfwd(lambda q: matrix_form.mass_matrix(model, q))(q),
-            dynamics.christoffel_symbols(model, q),
+            dynamics.first_kind_symbols(model, q),
             dynamics.coriolis_matrix(model, q, v),
         )
 
@@ -197,7 +197,7 @@ def test_derivative_of_the_mass_matrix(parents):
 
 def test_refusals():
     model = random_tree(1, ["revolute", "planar"])
-    for function in (dynamics.christoffel_symbols, dynamics.mass_matrix_derivative):
+    for function in (dynamics.first_kind_symbols, dynamics.mass_matrix_derivative):
         with pytest.raises(ValueError, match=r"v = dq/dt .*'j1' \(planar\)"):
             function(model, jnp.zeros(4))
     with pytest.raises(ValueError, match="tip is None"):

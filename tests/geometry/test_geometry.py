@@ -78,7 +78,7 @@ def levi_civita(q, v, w):
     pairs |= {
         "geodesic": (geometry.geodesic_acceleration(bumpy, q, v), dynamics.forward_dynamics(lagrangian, q, v, 0 * v)),
         "bias": (metric.bias_force(q, v, rest), lagrangian.bias_force(q, v, rest)),
-        "system": (dynamics.christoffel_symbols(metric, q), dynamics.christoffel_symbols(lagrangian, q)),
+        "system": (dynamics.first_kind_symbols(metric, q), dynamics.first_kind_symbols(lagrangian, q)),
         "of a system": (geometry.connection(metric, q, v, w), geometry.connection(bumpy, q, v, w)),
         "energy": (metric.kinetic_energy(q, v, rest), lagrangian.kinetic_energy(q, v, rest)),
     }

@@ -201,7 +201,7 @@ def test_a_hand_holds_its_ball_within_cones():
     # Without friction nothing carries a ball that lies between three vertical walls.
     level, _ = jd.scenes.hand_with_ball.start(turned=(0.0, 0.0, 0.0))
     loose = jd.grasp.hold(grasp, level, cones=jd.contact.friction_cone("hard-finger", 0.0))
-    assert bool(loose.result == jd.contact.RESULTS.infeasible)
+    assert bool(loose.result == jd.RESULTS.infeasible)
 
 
 def test_force_closure_of_a_hand():

@@ -11,7 +11,7 @@ from jaxdyn import identify, inertia
 from jaxdyn.identify.condensed import block_slices, condense_rows
 from jaxdyn.identify.condensed_fit import eliminate
 from jaxdyn.identify.intervals import share_of_extra
-from jaxdyn.identify.logs import filter_like_log, hardly_moving, low_pass_columns, travels
+from jaxdyn.identify.logs import filter_like_log, idle_coordinates, low_pass_columns, travel_ranges
 from jaxdyn.identify.regression import condense, condense_model
 from jaxdyn.identify.robot_problem import huber_weights
 from jaxdyn.identify.selection import folds, improving_torques, standard_error
@@ -456,7 +456,7 @@ def test_a_joint_that_hardly_moved_has_no_friction_from_data(truth):
     model, bare = arm(), motion(1, 300)
     size = np.array([1.0, 0.005 / np.ptp(bare.q[:, 1])])
     slow = identify.Log(bare.t, bare.q * size, bare.v * size, bare.a * size, bare.tau)
-    assert hardly_moving(model, [slow]) == (1,) and hardly_moving(model, [slow, bare]) == ()
+    assert idle_coordinates(model, [slow]) == (1,) and idle_coordinates(model, [slow, bare]) == ()
     log = measured(model, slow, truth, noise=0.05)
     fit = identify.fit_robot(model, log)
     sources = dict(zip(fit.intervals.parameters.names, fit.intervals.parameters.sources, strict=True))
@@ -480,8 +480,8 @@ def test_travels_of_joints_with_several_coordinates():
     v[:, 0], v[:, 5], v[:, 6] = 0.3, 0.1, 0.001
     q = np.concatenate([np.zeros((101, 6)), np.ones((101, 1)), 0.001 * t[:, None]], axis=1)
     log = identify.Log(t, q, v, v, v)
-    np.testing.assert_allclose(travels(model, log), [0.3, 0, 0, 0, 0, 0.1, 0.001], atol=1e-12)
-    assert hardly_moving(model, [log]) == (1, 2, 3, 4, 6)
+    np.testing.assert_allclose(travel_ranges(model, log), [0.3, 0, 0, 0, 0, 0.1, 0.001], atol=1e-12)
+    assert idle_coordinates(model, [log]) == (1, 2, 3, 4, 6)
 
 
 # --- what looks wrong -------------------------------------------------------------------------------------------------

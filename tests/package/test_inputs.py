@@ -54,7 +54,6 @@ OF_BODIES = {
 }
 OF_SYSTEMS = {
     "bias_force": (jd.bias_force, Q, V),
-    "christoffel_symbols": (jd.dynamics.christoffel_symbols, Q),
     "coriolis_matrix": (jd.coriolis_matrix, Q, V),
     "forward_dynamics": (jd.forward_dynamics, Q, V, A),
     "geometry.christoffel_symbols": (jd.geometry.christoffel_symbols, Q),

@@ -149,11 +149,12 @@ def test_package_is_typed():
 def test_rooms_use_those_below():
     """Every module is in a room, a room uses rooms on floors below its own alone, and not too many of them."""
     assert {top(module) for module in SOURCES} == {"", *RANK}
+    # `_renamed` is no room: namespaces ask it for names of the release before.
     arrows = {
         (top(module), top(used))
         for module, names in USES.items()
         for used in names
-        if top(used) not in ("", top(module))
+        if top(used) not in ("", "_renamed", top(module))
     }
     wrong = [f"{room} uses {used}" for room, used in arrows if room and RANK[used] >= RANK[room]]
     assert not wrong, "\n".join(sorted(wrong))
@@ -347,5 +348,25 @@ def test_public_namespaces_list_their_names():
         for name in names.split():
             with pytest.warns(DeprecationWarning, match=rf"jd\.{namespace}\.{name}"):
                 assert getattr(jaxdyn, name) is getattr(getattr(jaxdyn, namespace), name)
+    for old in _renamed._RENAMED:
+        namespace, _, name = old.rpartition(".")
+        with pytest.warns(DeprecationWarning, match=rf"jd\.{old} is now jd\."):
+            assert callable(getattr(getattr(jaxdyn, namespace, jaxdyn), name))
     with pytest.raises(AttributeError, match="nonsense"):
         _ = jaxdyn.nonsense
+
+
+def test_one_name_for_one_thing_and_one_thing_by_one_name():
+    """A name in several namespaces is one object in all of them, but for what the Lie groups have in common."""
+    rooms = [jaxdyn, *(room for name in jaxdyn.__all__ if isinstance(room := getattr(jaxdyn, name), ModuleType))]
+    groups = (jaxdyn.so3, jaxdyn.se2, jaxdyn.se3)
+    named = [(name, getattr(room, name)) for room in rooms if room not in groups for name in room.__all__]
+    objects, names = {}, {}
+    for name, value in named:
+        if isinstance(value, ModuleType):
+            continue  # a namespace is no function: `jd.forces`, `jd.plot.forces`
+        objects.setdefault(name, set()).add(id(value))
+        names.setdefault(id(value), set()).add(name)
+    assert not [name for name, values in objects.items() if len(values) > 1]
+    # Numbers and texts may be equal; functions and classes have one name.
+    assert not [names[id(value)] for _, value in named if callable(value) and len(names[id(value)]) > 1]

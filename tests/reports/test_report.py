@@ -39,7 +39,7 @@ from jaxdyn.reports.front import cost_at
 from jaxdyn.reports.journal import Journal
 from jaxdyn.reports.measure import Contestant, Motion, evaluations, flop_counter, ladder, measure
 from jaxdyn.reports.programs import FIXED, SOLVERS, Programs, prepare
-from jaxdyn.reports.records import Known
+from jaxdyn.reports.records import SceneReference
 from jaxdyn.reports.timing import time_interleaved
 from jaxdyn.simulation.solvers import RK4
 from jaxdyn.simulation.solvers.choice import choose_solver
@@ -593,7 +593,7 @@ def test_page_marks_published_figures_and_escapes():
     head = {"machine": {"processor": "<cpu>", "cores": 1, "device": "cpu", "load": 0.0, "versions": {}}}
     head |= {"commit": None, "date": "today"}
     point = {"label": "Somebody (old machine)", "seconds": 0.5, "error": 1e-3, "energy_error": None}
-    known = Known("One & only", "printed", "x", 1e-9, (point,))
+    known = SceneReference("One & only", "printed", "x", 1e-9, (point,))
     report = Report(
         head, {"one": known}, (made(1e-3, 1.0), made(0.0, 2.0, evaluations=10), made(None, 1.0, result="bad"))
     )

@@ -11,7 +11,7 @@ from pinocchio_bridge import quick
 import jaxdyn as jd
 from benchmarks.extremes import name_of
 from benchmarks.stiff import SOLVERS, cases, program, reference, runner
-from jaxdyn.model.tree import _per_joint
+from jaxdyn.model.tree import map_joints
 from jaxdyn.simulation.solvers.lie import _local_rate
 from jaxdyn.simulation.solvers.rosenbrock import _A, _C, _GAMMA, _RATE, _TIME, Rodas5P
 
@@ -144,7 +144,7 @@ def test_local_coordinates_move_as_the_velocity_says(bodies):
     def both(e, v):
         q = jd.integrate(bodies, q0, e)
         rate = jd.configuration_rate(bodies, q, v)
-        local = _per_joint(bodies.topology, _local_rate, q, (rate, True), (e, False))
+        local = map_joints(bodies.topology, _local_rate, q, (rate, True), (e, False))
         return rate, jax.jvp(lambda e: jd.integrate(bodies, q0, e), (e,), (local,))[1]
 
     np.testing.assert_allclose(*both(e, v), rtol=1e-13, atol=1e-14)

@@ -90,7 +90,7 @@ def first_pages(q, v, a):
             dynamics.mass_matrix(arm, q),
             matrix([[alpha + 2 * beta * c2, delta + beta * c2], [delta + beta * c2, delta]]),
         ),
-        "arm symbols": (dynamics.christoffel_symbols(arm, q), gamma),
+        "arm symbols": (dynamics.first_kind_symbols(arm, q), gamma),
         "arm C": (computed, C),
         "arm skew": (rate - 2 * computed, bs * (2 * v[0] + v[1]) * jnp.asarray([[0.0, 1.0], [-1.0, 0.0]])),
         "arm N": (
@@ -183,7 +183,7 @@ def spatial_arm(q, v, a):
         "J3": (computed[2], J3),
         "M": (mass_matrix, M),
         "M by link Jacobians": (by_links, M),
-        "symbols": (dynamics.christoffel_symbols(model, q), gamma),
+        "symbols": (dynamics.first_kind_symbols(model, q), gamma),
         "C v": (coriolis, jnp.einsum("ijk,j,k->i", gamma, v, v)),
         "C v by link Jacobians": (bias, coriolis),
         "tensor": (jnp.einsum("ijk,j,k->i", gamma, v, v), in_space_axes @ v),
@@ -350,7 +350,7 @@ def test_lagrangian_takes_no_more_operations_than_bodies():
     }
     assert 0 < count["lagrangian"] < count["immersion"] <= count["model"], count
     metric = scenes.rigid_body_in_euler_angles().system
-    symbols = lambda q, v: jnp.einsum("ijk,j,k->i", dynamics.christoffel_symbols(metric, q), v, v)  # noqa: E731
+    symbols = lambda q, v: jnp.einsum("ijk,j,k->i", dynamics.first_kind_symbols(metric, q), v, v)  # noqa: E731
     state = jnp.ones((4096, 3))
     bias = operations(lambda q, v: dynamics.bias_force(metric, q, v), state, state)
     assert 0 < 1.5 * bias < operations(symbols, state, state)

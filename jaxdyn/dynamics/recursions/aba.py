@@ -18,16 +18,18 @@ from jaxdyn.model.tree import Model
 
 
 def aba(model: Model, q: Float[Array, " nq"], v: Float[Array, " nv"], tau: Float[Array, " nv"]) -> Float[Array, " nv"]:
-    """Forward dynamics a = M^-1 (tau - C v - N) by the articulated-body algorithm.
+    r"""Forward dynamics by the articulated-body algorithm.
+
+    $$a = M^{-1} (\tau - C v - N)$$
 
     Velocity terms enter as the body wrenches of zero joint accelerations, computed outward, so that the inward and
-    outward sweeps are those of a plain M^-1.
+    outward sweeps are those of a plain $M^{-1}$.
 
     **Arguments:** `q` (nq,); `v` (nv,) rad/s or m/s; `tau` (nv,) generalised forces, N m or N.
 
     **Returns:** joint accelerations (nv,), rad/s^2 or m/s^2. NaN where M is not positive definite.
 
-    Source: EQUATIONS section 5 with b_i started from the bias wrench; Featherstone (2008), section 7.3.
+    Source: EQUATIONS section 5 with $b_i$ started from the bias wrench; Featherstone (2008), section 7.3.
     """
     check_shapes(model, q=q, v=v, tau=tau)
     return _free_and_inverse(model, q, v, tau)[0]
@@ -76,10 +78,12 @@ def mass_matrix_inverse_times(model: Model, q: Float[Array, " nq"], forces: Floa
 
 
 def mass_matrix_sqrt(model: Model, q: Float[Array, " nq"]) -> Float[Array, "nv nv"]:
-    """Square root W (nv, nv) of the mass matrix, M = W W^T, from the articulated bodies; no Cholesky factorisation.
+    r"""Square root W (nv, nv) of the mass matrix from the articulated bodies; no Cholesky factorisation.
 
-    W = xi^T G^T Mh xi D^(-1/2): column k holds, for joint k and its ancestors, the force that U_k / sqrt(D_k) needs. Upper
-    triangular for a chain (within a joint of several degrees of freedom, lower triangular). det M = prod W_kk^2.
+    $$M = W W^T, \quad W = \xi^T G^T \hat M \xi D^{-1/2}, \quad \det M = \prod_k W_{kk}^2$$
+
+    Column k holds, for joint k and its ancestors, the force that $U_k / \sqrt{D_k}$ needs. Upper triangular for a chain
+    (within a joint of several degrees of freedom, lower triangular).
 
     Source: EQUATIONS section 5; Rodriguez, Jain & Kreutz-Delgado (1992).
     """

@@ -125,10 +125,12 @@ def rnea(
     *,
     external: Float[Array, "nb 6"] | None = None,
 ) -> Float[Array, " nv"]:
-    """Inverse dynamics tau = M a + C v + N - sum of J_i^T F_i by the recursive Newton-Euler algorithm.
+    r"""Inverse dynamics by the recursive Newton-Euler algorithm.
+
+    $$\tau = M a + C v + N - \sum_i J_i^T F_i$$
 
     **Arguments:** `q` (nq,); `v`, `a` (nv,) joint velocities and accelerations (rad/s or m/s, rad/s^2 or m/s^2); `a` None is
-    zero acceleration, whose terms are left out. `external` (nb, 6): wrenches F_i that act on the bodies, at their origins
+    zero acceleration, whose terms are left out. `external` (nb, 6): wrenches $F_i$ that act on the bodies, at their origins
     in their axes (N, N m), or None.
 
     **Returns:** generalised forces (nv,), N m or N. Armature included.

@@ -93,7 +93,7 @@ def exciting_motion(
 ) -> Excitation:
     """Optimise a finite Fourier series of every joint for the identification of the base parameters, within the robot's limits.
 
-    The best of some random motions is improved by Adam with exact gradients of the information matrix W^T W, where W is the
+    The best of some random motions is improved by Adam with exact gradients of the information matrix $W^T W$, where W is the
     regressor in base parameters, rows over the torque limits and columns over their lengths along the start. Excess over a limit
     of position, velocity or torque has a quadratic penalty during the search; at the end the amplitudes shrink until there is
     none.

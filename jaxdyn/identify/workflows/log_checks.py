@@ -4,7 +4,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from jaxdyn.identify.logs import Log, are_angles, hardly_moving, travels
+from jaxdyn.identify.logs import Log, are_angles, idle_coordinates, travel_ranges
 from jaxdyn.identify.regression import log_regressor, nominal_parameters
 from jaxdyn.model.tree import Model
 
@@ -49,11 +49,11 @@ def check_log_content(model: Model, log: Log, labels: Sequence[str]) -> list[str
             f"torques of {names} are about {np.median(ratio):.0f} times what the file's bodies need: are they in N mm or in per "
             "cent? N m are expected"
         )
-    travel = travels(model, log)
+    travel = travel_ranges(model, log)
     slow = [
         f"{labels[j]} ({travel[j]:.2g} {'rad' if angle else 'm'})"
         for j, angle in enumerate(are_angles(model))
-        if j in hardly_moving(model, [log])
+        if j in idle_coordinates(model, [log])
     ]
     if slow:
         lines.append(

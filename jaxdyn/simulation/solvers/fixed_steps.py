@@ -28,8 +28,8 @@ class _Interpolation(StageInterpolation):
 class RK4(diffrax.AbstractERK):
     """Classical Runge-Kutta method: order 4, four evaluations a step, for fixed steps.
 
-    Dense output is of order 3 (local error h^4) and keeps the global order 4. The error estimate is the difference from the
-    midpoint rule, of order h^3. It detects steps that are too long (`ErrorMonitoredSteps`) and is too coarse to control them.
+    Dense output is of order 3 (local error $h^4$) and keeps the global order 4. The error estimate is the difference from the
+    midpoint rule, of order $h^3$. It detects steps that are too long (`ErrorMonitoredSteps`) and is too coarse to control them.
 
     Source: Hairer, Norsett & Wanner 1993, tables II.1.2 and section II.6.
     """

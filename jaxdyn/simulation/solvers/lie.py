@@ -14,15 +14,17 @@ from jaxdyn.lie import se2, se3, so3
 from jaxdyn.lie.so3 import matmul
 from jaxdyn.model.arguments import Number, SystemLike
 from jaxdyn.model.joints import SCREW_KINDS, joint_integrate, joint_rate
-from jaxdyn.model.tree import Model, Topology, _per_joint
+from jaxdyn.model.tree import Model, Topology, map_joints
 from jaxdyn.simulation.solvers.base import DenseOutput, Flag, StepOutput, Wrapped
 from jaxdyn.systems.system import has_dependent_coordinates
 
 
 class LieGroup(Wrapped):
-    """A method that steps in local coordinates: q = q_k exp(e), with q_k the start of the step.
+    r"""A method that steps in local coordinates about the start of each step.
 
-    The wrapped method integrates e (nv,) from e = 0 by de/dt = J_r(e)^-1 v, J_r the right Jacobian of each joint's group. So
+    $$q = q_k \exp(e), \quad \dot e = J_r(e)^{-1} v$$
+
+    The wrapped method integrates e (nv,) from zero, with $J_r$ the right Jacobian of each joint's group. So
     q stays on its manifold without projection, errors are those of rotations, and implicit methods solve for 2 nv unknowns
     instead of nq + nv. The order is that of the wrapped method, which is used directly for systems without quaternions or
     planar joints. A step may turn a body by less than a full turn.
@@ -71,7 +73,7 @@ class LieGroup(Wrapped):
         )
         y1 = _to_manifold(topology, y0["q"], z1)
         if error is not None:
-            error = error | {"q": _per_joint(topology, joint_rate, y1["q"], (error["q"], False))}
+            error = error | {"q": map_joints(topology, joint_rate, y1["q"], (error["q"], False))}
         return y1, error, {"dense_info": dense_info, "q0": y0["q"]}, solver_state, result
 
     def _local(self, terms, y0):
@@ -96,7 +98,7 @@ class _LocalTerm(diffrax.AbstractTerm):
     def vf(self, t, y, args):
         state = _to_manifold(self.topology, self.q0, y)
         rates = self.term.vf(t, state, args)
-        return rates | {"q": _per_joint(self.topology, _local_rate, state["q"], (rates["q"], True), (y["q"], False))}
+        return rates | {"q": map_joints(self.topology, _local_rate, state["q"], (rates["q"], True), (y["q"], False))}
 
     def contr(self, t0, t1, **kwargs):
         return self.term.contr(t0, t1, **kwargs)
@@ -124,7 +126,7 @@ class _Interpolation(DenseOutput):
 
 def _to_manifold(topology, q0, z):
     """State with q = q0 exp(e) in place of e."""
-    return z | {"q": _per_joint(topology, joint_integrate, q0, (z["q"], False))}
+    return z | {"q": map_joints(topology, joint_integrate, q0, (z["q"], False))}
 
 
 def _local_rate(kind: str, q, rate, e):

@@ -74,11 +74,13 @@ class _Interpolation(StageInterpolation):
 
 
 class Rodas5P(diffrax.AbstractAdaptiveSolver):
-    """Rosenbrock method of order 5(4) for stiff equations: eight linear systems a step with one matrix.
+    r"""Rosenbrock method of order 5(4) for stiff equations: eight linear systems a step with one matrix.
 
-    (1 - gamma h J) U_i = gamma (h f(t0 + c_i h, y0 + sum_j A_ij U_j) + sum_j C_ij U_j + h^2 d_i df/dt),
-    y1 = y0 + sum_j A_8j U_j + U_8, with the error estimate U_8 and J = df/dy at the start. The Jacobian and df/dt come from
-    forward-mode differentiation. Stiffly accurate and L-stable; nothing is iterated, so nothing can fail to converge.
+    $$(1 - \gamma h J) U_i = \gamma \Big( h f\big(t_0 + c_i h, y_0 + \sum_j A_{ij} U_j\big) + \sum_j C_{ij} U_j
+    + h^2 d_i \frac{\partial f}{\partial t} \Big), \quad y_1 = y_0 + \sum_j A_{8j} U_j + U_8$$
+
+    with the error estimate $U_8$ and $J = \partial f / \partial y$ at the start. Both derivatives of f come from forward-mode
+    differentiation. Stiffly accurate and L-stable; nothing is iterated, so nothing can fail to converge.
 
     The state is any pytree of floating arrays of one dtype. A step costs 9 evaluations, one derivative with respect to each
     entry of the state and to time, and one inverse.

@@ -1,0 +1,1 @@
+"""Workflows around identification: logs, excitation, drive gains, payloads."""
