@@ -97,17 +97,17 @@ def four_bars(samples: int, out, **options):
 
 def with_program(run: Callable, *args, **options):
     """A run of `jd.scale` in this process, and the program of its batches."""
-    kept, usual = [], study.Computation
+    kept, usual = [], study.Study.open
 
-    def note(*given):
-        kept.append(usual(*given))
+    def note(self):
+        kept.append(usual(self))
         return kept[-1]
 
-    study.Computation = note
+    study.Study.open = note
     try:
         return run(*args, **options), kept[-1].program
     finally:
-        study.Computation = usual
+        study.Study.open = usual
 
 
 def store(folder: Path, samples: int) -> None:

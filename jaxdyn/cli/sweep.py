@@ -85,7 +85,7 @@ _KEYS: dict[str, tuple[type, ...]] = {
     "reductions": (dict,),
 }
 # Options of `jd.simulate` that a file can set, and of `jd.scale.run`.
-_OPTIONS = {"batch_size", "lanes", "memory", "compress", "verify", *inspect.signature(simulate).parameters}
+_OPTIONS = {"batch_size", "lanes", *inspect.signature(simulate).parameters}
 # The study sets these itself, or a file cannot express them.
 _OPTIONS -= {"scene", "q0", "v0", "ts", "control", "outputs", "adjoint", "progress", "throw"}
 

@@ -19,13 +19,12 @@ OUTCOMES = ("successful", "failed")  # codes of functions that are no motions
 
 
 class Description(NamedTuple):
-    """A function of one member, `one(drawn, row) -> dict of arrays`, and the description of these arrays in a store.
+    """A function of one member, traced, and the description of its arrays in a store.
 
-    `traced` is the function traced; `is_motion`, whether kernels compute it; `variables` are those that can be stored; `codes`
-    the names of result codes; `coordinates` those of the axes, with their attributes.
+    `is_motion`: whether kernels compute it; `variables` are those that can be stored; `codes` the names of result codes;
+    `coordinates` those of the axes, with their attributes.
     """
 
-    one: Callable[[Any, Any], dict[str, Any]]
     traced: Traced
     is_motion: bool
     variables: dict[str, Variable]
@@ -79,7 +78,7 @@ class FunctionRows(NamedTuple):
 
 
 def describe_motion(
-    one: Callable, batch: Members, reductions: Mapping[str, Reduction], units: dict[str, str], ts: np.ndarray
+    one: Callable, batch: Members, units: dict[str, str], ts: np.ndarray, reductions: Mapping[str, Reduction]
 ) -> Description:
     """Trace and describe `one(drawn, row) -> (solution, scene, parameters)` with rows at the times ts (nt,)."""
     rows = MotionRows(one, reductions, {})
@@ -97,18 +96,18 @@ def describe_motion(
     steps = {"num_steps": "1", "time_reached": "s"}
     others = [name for name in traced.shapes if name in steps or name.startswith("parameter")]
     variables |= _variables(traced.shapes, others, units | steps) | {"result": _codes(CODES)}
-    return Description(rows, traced, True, variables, CODES, coordinates)
+    return Description(traced, True, variables, CODES, coordinates)
 
 
 def describe_function(
-    function: Callable, batch: Members, reductions: Mapping[str, Reduction], units: dict[str, str]
+    function: Callable, batch: Members, units: dict[str, str], reductions: Mapping[str, Reduction]
 ) -> Description:
     """Trace and describe `function(parameters) -> dictionary of arrays`."""
     rows = FunctionRows(function, reductions)
     traced = Traced(rows, batch)
     names = [name for name in traced.shapes if name != "result" and not name.startswith(QUANTITY)]
     variables = _variables(traced.shapes, names, units) | {"result": _codes(OUTCOMES)}
-    return Description(rows, traced, False, variables, OUTCOMES, {})
+    return Description(traced, False, variables, OUTCOMES, {})
 
 
 def _parameters(tree: Any) -> dict[str, Any]:
@@ -136,6 +135,6 @@ def _variable(name: str, shapes: Mapping[str, Any], units: Any, dims: tuple[str,
 
 
 def _codes(names: tuple[str, ...]) -> Variable:
-    """Codes as the CF conventions write flags; compressed, since most of them are zero."""
+    """Codes as the CF conventions write flags."""
     notes = {"flag_values": list(range(len(names))), "flag_meanings": " ".join(names)}
-    return Variable("result", (), np.dtype(np.uint8), (), "rollout", notes, compressed=True)
+    return Variable("result", (), np.dtype(np.uint8), (), "rollout", notes)

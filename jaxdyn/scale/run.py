@@ -1,7 +1,9 @@
 """`jd.scale.run` and `jd.scale.evaluate`: resumable batch runs of functions of one sample."""
 
+import warnings
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
+from functools import partial
 from typing import Any
 
 import jax
@@ -80,9 +82,6 @@ def run(
     devices: Sequence[Any] | None = None,
     batch_size: int | None = None,
     chunk: int | None = None,
-    memory: int | None = None,
-    compress: bool = False,
-    verify: bool = True,
     progress: bool = True,
     lanes: int | None = None,
     **options: Any,
@@ -112,11 +111,9 @@ def run(
     - `client`: a `dask.distributed.Client`, whose workers compute the chunks; without it this process does, and Dask is not
       imported. `retries`: attempts after the first for a chunk that raises; others are finished before its error is reported.
     - `devices`: of this process, all by default; a worker uses all of its own. `batch_size`: rollouts computed at once, by
-      default 2048 for each device of a CPU and fewer where there are few rollouts, or where the compiled program with its
-      results, by XLA's account, does not fit into `memory` (bytes; by default half of the free memory, shared by the workers
-      of a host). `chunk`: rollouts stored at once, and lost at most when killed; by default two seconds of work.
-    - `compress`: store arrays compressed (Zstandard); smaller, and slower.
-    - `verify`: at the end check the chunks of earlier calls, and compute damaged ones again.
+      default 2048 for each device of a CPU and fewer where there are few rollouts. It is reduced where the compiled program
+      with its results, by XLA's account, exceeds half of the free memory, which the workers of a host share. `chunk`: rollouts
+      stored at once, and lost at most when killed; by default two seconds of work.
     - `progress`: show rate and time left on standard error. `lanes`: deprecated name of `batch_size`.
 
     **Returns:** a `Run`. A rollout that fails is a row with its code and does not raise.
@@ -145,8 +142,8 @@ def run(
     )
     ```
     """
-    # First of all, when the local variables are the arguments, whose list stands in the signatures alone.
-    shared = Options.of(locals())
+    size = batch_size if lanes is None else _former_batch_size(lanes)
+    shared = Options(out, reductions, rows, cost, client, retries, devices, size, chunk, progress)
     ts = np.asarray(as_array(ts, "ts"))
     check_times(ts)
     # `Rollout` passes `throw` itself, which given twice would be a TypeError.
@@ -177,8 +174,7 @@ def run(
     }
     # Steps of a given size are equally many: nothing to measure.
     pilot = rollout.pilot if options.get("stepsize") is None else None
-    units = dict(shared.units or {})
-    return run_batch(lambda to: describe_motion(rollout, batch, to, units, ts), given, batch, shared, pilot)
+    return run_batch(partial(describe_motion, rollout, batch, dict(units or {}), ts), given, batch, shared, pilot)
 
 
 def evaluate(
@@ -197,9 +193,6 @@ def evaluate(
     devices: Sequence[Any] | None = None,
     batch_size: int | None = None,
     chunk: int | None = None,
-    memory: int | None = None,
-    compress: bool = False,
-    verify: bool = True,
     progress: bool = True,
     lanes: int | None = None,
 ) -> Run:
@@ -213,8 +206,13 @@ def evaluate(
 
     **Raises:** ValueError for a function that returns no dictionary of arrays, and as `run` does.
     """
-    shared = Options.of(locals())
+    size = batch_size if lanes is None else _former_batch_size(lanes)
+    shared = Options(out, reductions, rows, cost, client, retries, devices, size, chunk, progress)
     draw = parameters if callable(parameters) else None
     batch = members({} if draw is not None else {"parameters": parameters}, draw, samples, seed)
-    units = dict(shared.units or {})
-    return run_batch(lambda to: describe_function(function, batch, to, units), {}, batch, shared)
+    return run_batch(partial(describe_function, function, batch, dict(units or {})), {}, batch, shared)
+
+
+def _former_batch_size(lanes: int) -> int:
+    warnings.warn("lanes is deprecated; pass batch_size", DeprecationWarning, stacklevel=3)
+    return lanes

@@ -75,7 +75,7 @@ class Cluster:
 
         from jaxdyn.tasks.worker import TargetPlugin
 
-        self._plugin = TargetPlugin(cloudpickle.dumps(target), self.mark)
+        self._plugin = TargetPlugin(self._name, cloudpickle.dumps(target), self.mark)
         self.client.register_plugin(self._plugin, name=self._name)
 
     def _begin(self) -> None:
@@ -132,7 +132,7 @@ class Cluster:
             [method] * len(items),
             items,
             key=[(group, place) for place in places],
-            resources={RESOURCE: 1},
+            resources={RESOURCE: 1, self._name: 1},
             retries=self.retries,
             pure=False,  # keys are given, not hashes of the arguments
         )
