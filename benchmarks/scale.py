@@ -231,7 +231,7 @@ def resident(pid: int | str = "self") -> float:
 
 def workers(folder: Path, samples: int) -> None:
     """One process against worker processes on the same cores; the second run finds compiled kernels and running workers."""
-    options = {"chunk": max(1, samples // 32), "batch_size": min(2048, samples // 32)}
+    options = {"chunk": 4096, "batch_size": 2048}
     times = {0: min(arm(samples, folder / f"here{k}.zarr", **options).seconds for k in range(2))}
     for count in (1, 2):
         with cluster(count) as client:
@@ -275,15 +275,15 @@ def tasks(folder: Path, samples: int) -> None:
 
 
 def kill(folder: Path, samples: int) -> None:
-    """A worker killed when half is done."""
-    options = {"chunk": max(1, samples // 64), "batch_size": min(1024, samples // 64)}
+    """A worker killed when half of the chunks are stored."""
+    options = {"chunk": 2048, "batch_size": 2048}
     with cluster(2) as client:
         arm(samples, folder / "warm.zarr", client=client, **options)
         plain = arm(samples, folder / "plain.zarr", client=client, **options).seconds
 
         def watch():
             done = folder / "killed.zarr" / "record" / "checksum" / "c"
-            while not done.exists() or len(list(done.iterdir())) < 32:
+            while not done.exists() or len(list(done.iterdir())) < samples // 4096:
                 time.sleep(0.01)
             os.kill(victim, 9)
 

@@ -4,9 +4,9 @@ import errno
 import os
 import sys
 import time
-import warnings
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
 
@@ -70,12 +70,6 @@ class Run:
         """True if every rollout succeeded."""
         return set(self.codes) <= {"successful"}
 
-    @property
-    def lanes(self) -> int:
-        """Deprecated name of `batch_size`."""
-        warnings.warn("Run.lanes is deprecated; read batch_size", DeprecationWarning, stacklevel=2)
-        return self.batch_size
-
     def dataset(self) -> "xarray.Dataset":
         """The store as an `xarray.Dataset`, read as it is used."""
         import xarray
@@ -129,7 +123,7 @@ def run_batch(
 ) -> Run:
     """Compute a batch that `describe(reductions)` describes; `identity` distinguishes it from others, by argument.
 
-    `pilot(drawn, row)` counts the steps of a short part of a rollout, for a cost that is measured.
+    `pilot(parameters, row)` counts the steps of a short part of a rollout, for a cost that is measured.
     """
     # A missing package and a wrong path are reported before anything is compiled.
     options.check()
@@ -185,58 +179,55 @@ def run_batch(
 
 
 def _compute_chunks(engine: Engine, store: Store, totals: Totals, options: Options) -> tuple[int, list[int]]:
-    """Compute the missing chunks, then check those of earlier calls; returns rollouts computed, and the damaged chunks."""
+    """Compute the missing chunks, check those of earlier calls; returns rollouts computed, and the chunks that were damaged."""
     failures: list[tuple[int, Failure]] = []
-    # Before the loop: only chunks of earlier calls are checked at the end.
+    computed, repaired = 0, []
     before = store.record_mask()
-    is_new = not before.any()
-    # An iterator over the missing ones, not a list: 1e8 rollouts may be a million chunks.
-    missing = range(store.chunks) if is_new else (int(chunk) for chunk in np.flatnonzero(~before))
-    computed, failed, repaired = 0, 0, []
-
-    def results(method: str, items: Any) -> Iterator[tuple[Any, Any]]:
-        for item, result in engine.map(method, items):
-            if not isinstance(result, Failure):
-                yield item, result
-                continue
-            # All other chunks would fail in the same way.
-            if isinstance(result.error, OSError) and result.error.errno in FULL:
-                raise OSError(
-                    result.error.errno,
-                    f"out is {str(store.path)!r}, and its file system is full ({os.strerror(result.error.errno)}); chunks that "
-                    "were finished are kept: make room and run again",
-                ) from result.error
-            failures.append((item if method == "chunk" else item[0], result))
-            # So many failures have a common cause, which the other chunks would meet too.
-            if len(failures) == MOST_FAILURES:
-                return
-
     link = options.client is not None and options.client.dashboard_link
     if options.progress and link:
         print(f"dashboard: {link}", file=sys.stderr)
     with _progress_meter(store.count, store.count_rollouts(before), options.progress) as meter:
-        for chunk, summary in results("chunk", missing):
-            rollouts = len(store.numbers(chunk))
-            computed += rollouts
-            failed += int(summary.codes[1:].sum())
-            meter.set_postfix_str(f"{failed} failed" if failed else "", refresh=False)
-            meter.update(rollouts)
-            if is_new:
+        for chunks, summaries in engine.map("chunks", _tasks(before)):
+            if isinstance(summaries, Failure):
+                number = getattr(summaries.error, "errno", None)
+                # All other chunks would fail in the same way.
+                if number in FULL:
+                    raise OSError(
+                        number,
+                        f"out is {str(store.path)!r}, and its file system is full ({os.strerror(number)}); chunks that were "
+                        "finished are kept: make room and run again",
+                    ) from summaries.error
+                failures.append((chunks[0], summaries))
+                # So many failures have a common cause, which the other chunks would meet too.
+                if len(failures) == MOST_FAILURES:
+                    break
+                continue
+            for chunk, summary in zip(chunks, summaries, strict=True):
                 totals.add(summary)
-        if not is_new and not failures:
-            # A resumed run merges in a second pass, over all chunks in their order: the same bits as without an interruption.
-            parts = ((start, before[start : start + CHECKED]) for start in range(0, store.chunks, CHECKED))
-            for (start, _), summaries in results("check", parts):
-                for chunk, (is_damaged, summary) in enumerate(summaries, start):
-                    totals.add(summary)
-                    if is_damaged:
-                        repaired.append(chunk)
-                        computed += len(store.numbers(chunk))
-                        if options.progress:
-                            meter.write(f"chunk {chunk} of the store was damaged and is computed again", sys.stderr)
+                rollouts = 0 if before[chunk] and not summary.is_repaired else int(summary.codes.sum())
+                computed += rollouts
+                failed = totals.codes[1:].sum()
+                meter.set_postfix_str(f"{failed} failed" if failed else "", refresh=False)
+                if not summary.is_repaired:
+                    meter.update(rollouts)
+                    continue
+                repaired.append(chunk)
+                if options.progress:
+                    meter.write(f"chunk {chunk} of the store was damaged and was computed again", sys.stderr)
     if failures:
         raise _chunk_error(failures, store)
     return computed, repaired
+
+
+def _tasks(before: np.ndarray) -> Iterator[range]:
+    """Chunks of each task, in order: one, or up to CHECKED that are in the store already, by the mask `before` (chunks,)."""
+    first = 0
+    while first < len(before):
+        mask = before[first : first + CHECKED]
+        # Up to the first one that is missing.
+        size = max(1, len(mask) if mask.all() else int(np.argmin(mask)))
+        yield range(first, first + size)
+        first += size
 
 
 def _progress_meter(total: int, before: int, is_shown: bool) -> Any:
@@ -279,23 +270,13 @@ def _select_arrays(outputs: Description, rows: bool | Sequence[str]) -> tuple[st
     return tuple(dict.fromkeys([*rows, "result"]))
 
 
-class _Cost(NamedTuple):
-    """A user's function of the parameters, as a function of a member."""
-
-    function: Callable[[Any], Any]
-    is_drawn: bool
-
-    def __call__(self, drawn: Any, row: Any) -> dict[str, Any]:
-        return {"cost": self.function(drawn if self.is_drawn else row.get("parameters"))}
-
-
 def _cost_of(cost: Cost, batch: Members, pilot: Callable | None) -> Any:
     """`Study.cost` for the option `cost`.
 
     **Raises:** ValueError for an array of another shape, and for a text that is not "measured", or with nothing to measure.
     """
     if cost is None or callable(cost):
-        return cost and _Cost(cost, batch.draw is not None)
+        return cost and partial(_cost_row, cost)
     if isinstance(cost, str):
         if cost == MEASURED and pilot is not None:
             return pilot
@@ -307,6 +288,10 @@ def _cost_of(cost: Cost, batch: Members, pilot: Callable | None) -> Any:
     if costs.shape != (batch.count,):
         raise ValueError(f"cost has shape {costs.shape}; give one number for each of the {batch.count} rollouts")
     return costs
+
+
+def _cost_row(cost: Callable[[Any], Any], parameters: Any, row: Any) -> dict[str, Any]:
+    return {"cost": cost(parameters)}
 
 
 def _bytes(variable: Any) -> int:

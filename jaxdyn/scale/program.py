@@ -99,10 +99,10 @@ class Program:
 
 
 class Traced:
-    """Function `one(drawn, row) -> dict of arrays`, traced once, so that programs of several sizes do not run its Python again.
+    """Function `one(parameters, row) -> dict of arrays`, traced once for programs of all sizes.
 
-    `drawn` are the parameters that a member draws from its random key, `row` is its row of the given arrays (`Members`); either
-    may be None. `inputs`, `shapes`: shapes and dtypes of the inputs of one member, and of its arrays by name.
+    `parameters` of a member are drawn or a part of `row`, its row of the given arrays (`Members`). `inputs`, `shapes`: shapes and
+    dtypes of the inputs of one member, and of its arrays by name.
     """
 
     def __init__(self, one: Callable, members: Members):

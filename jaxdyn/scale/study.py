@@ -1,7 +1,7 @@
 """A study, which determines the rows of a batch, and its computation in one process: pure functions of the number of a chunk."""
 
 import time
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import dataclass
 from functools import cached_property, partial
@@ -40,13 +40,15 @@ class Summary(NamedTuple):
     """Result of the task of a chunk, whose rows are in the store.
 
     `codes`: number of rollouts that ended with each code; `failed`, numbers of the first that failed; `partials` of reductions;
-    `steps`: those that the rollouts needed, and those that their batches computed, (0, 0) of a chunk that was read.
+    `steps`: those that the rollouts needed, and those that their batches computed, (0, 0) of a chunk that was read;
+    `is_repaired`: it was in the store, and damaged.
     """
 
     codes: np.ndarray
     failed: np.ndarray
     partials: Results
     steps: tuple[int, int]
+    is_repaired: bool
 
 
 @dataclass(frozen=True)
@@ -122,13 +124,30 @@ class Study:
             store.check({PROGRAM: self.outputs.traced.fingerprint()})
         return store
 
-    def chunk(self, chunk: int) -> Summary:
-        """Compute and store a chunk, or read it if it is in the store already."""
-        # A task that was lost with its worker may have been finished: Dask computes it again, this reads it.
-        if not self.store.is_done(chunk):
-            return self.write(chunk, *self.rows(chunk))
-        codes = self.store.read(chunk, ["result"])["result"]
-        return self._summary(chunk, codes, self.reducer.from_store(partial(self.store.read, chunk)), (0, 0))
+    def chunks(self, chunks: Sequence[int], rows: Any = None) -> list[Summary]:
+        """Compute and store chunks, or read those that the store has; damaged ones are computed again.
+
+        `rows`, of a single chunk, was computed before (see `rows`).
+        """
+        return [self._chunk(chunk, rows) for chunk in chunks]
+
+    def _chunk(self, chunk: int, rows: Any) -> Summary:
+        # Also a task that was lost with its worker may have been finished: Dask computes it again, this reads it.
+        is_there = self.store.is_done(chunk)
+        is_whole = is_there and self.store.is_whole(chunk)
+        if not is_whole:
+            # Without its record it is missing until it is whole.
+            self.store.forget(chunk)
+            rows, steps = rows or self.rows(chunk)
+            partials = self.reducer.partials(rows, self.store.numbers(chunk))
+            self.store.write(chunk, {name: rows[name] for name in self.kept} | self.reducer.to_store(partials))
+            codes = rows["result"]
+        else:
+            codes, steps = self.store.read(chunk, ["result"])["result"], (0, 0)
+            partials = self.reducer.from_store(partial(self.store.read, chunk))
+        failed = self.store.numbers(chunk)[np.flatnonzero(codes)[:LISTED]]
+        counts = np.bincount(codes, minlength=len(self.outputs.codes))
+        return Summary(counts, failed, partials, steps, is_there and not is_whole)
 
     def rows(self, chunk: int) -> tuple[dict[str, np.ndarray], tuple[int, int]]:
         """Rows of a chunk, and its steps."""
@@ -144,30 +163,6 @@ class Study:
         place = np.argsort(order)
         return {name: values[place] for name, values in rows.items()}, steps
 
-    def write(self, chunk: int, rows: Mapping[str, np.ndarray], steps: tuple[int, int]) -> Summary:
-        """Store the rows of a chunk."""
-        partials = self.reducer.partials(rows, self.store.numbers(chunk))
-        self.store.write(chunk, {name: rows[name] for name in self.kept} | self.reducer.to_store(partials))
-        return self._summary(chunk, rows["result"], partials, steps)
-
-    def check(self, chunks: tuple[int, np.ndarray]) -> list[tuple[bool, Summary]]:
-        """Check consecutive chunks from the first one on: whether each was damaged, and is computed again, and its summary.
-
-        The flags select the chunks whose files are compared with their checksums; the others were just written.
-        """
-        results = []
-        for chunk, is_checked in enumerate(chunks[1], chunks[0]):
-            is_damaged = bool(is_checked) and not self.store.is_whole(chunk)
-            if is_damaged:
-                # A chunk without its record is missing, so that `chunk` computes it again.
-                self.store.forget(chunk)
-            results.append((is_damaged, self.chunk(chunk)))
-        return results
-
-    def _summary(self, chunk: int, codes: np.ndarray, partials: Results, steps: tuple[int, int]) -> Summary:
-        failed = self.store.numbers(chunk)[np.flatnonzero(codes)[:LISTED]]
-        return Summary(np.bincount(codes, minlength=len(self.outputs.codes)), failed, partials, steps)
-
 
 class Pipeline(Local):
     """The computation in this process: a thread writes a chunk while the next one is computed."""
@@ -177,22 +172,22 @@ class Pipeline(Local):
     # Writing releases the interpreter's lock most of the time, computing nearly always: a thread is enough. One chunk ahead, so
     # that two chunks are in memory, not more.
     def map(self, method: str, items: Iterable[Any]) -> Iterator[tuple[Any, Any]]:
-        """Results in the order of the items, as in `Local`."""
-        if method != "chunk":
-            yield from super().map(method, items)
-            return
+        """Results in the order of the items, lists of chunks, as in `Local`."""
         with ThreadPoolExecutor(1, thread_name_prefix="jaxdyn store") as writer:
-            before: tuple[int, Future] | None = None
-            for chunk in items:
-                rows = attempt(self.target.rows, chunk, retries=self.retries)
+            before: tuple[Any, Future] | None = None
+            for chunks in items:
+                is_missing = not self.target.store.is_done(chunks[0])
+                rows = attempt(self.target.rows, chunks[0], retries=self.retries) if is_missing else None
                 if before is not None:
                     yield before[0], before[1].result()
-                before = chunk, writer.submit(self._write, chunk, rows)
+                before = chunks, writer.submit(self._store, method, chunks, rows)
             if before is not None:
                 yield before[0], before[1].result()
 
-    def _write(self, chunk: int, rows: Any) -> Summary | Failure:
-        return rows if isinstance(rows, Failure) else attempt(self.target.write, chunk, *rows, retries=self.retries)
+    def _store(self, method: str, chunks: Any, rows: Any) -> Any:
+        if isinstance(rows, Failure):
+            return rows
+        return attempt(getattr(self.target, method), chunks, rows, retries=self.retries)
 
 
 def compute(program: Program, numbers: np.ndarray) -> tuple[dict[str, np.ndarray], tuple[int, int]]:

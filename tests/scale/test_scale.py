@@ -518,7 +518,11 @@ def test_a_run_of_many_chunks_merges_as_they_come():
         rows = {"result": np.array([k % 2]), **dict.fromkeys(shapes, np.array([value]))}
         merger.add(
             Summary(
-                np.array([1 - k % 2, k % 2]), np.arange(k, k + k % 2), reducer.partials(rows, np.array([k])), (k, 1)
+                np.array([1 - k % 2, k % 2]),
+                np.arange(k, k + k % 2),
+                reducer.partials(rows, np.array([k])),
+                (k, 1),
+                False,
             )
         )
     results = merger.results()
@@ -588,13 +592,6 @@ def test_a_cost_that_nobody_knows_is_measured(tmp_path):
         run("c.zarr", cost="measured", stepsize=0.1)
     with pytest.raises(ValueError, match="cost is 'guessed'"):
         run("c.zarr", cost="guessed")
-
-
-def test_former_names_are_accepted_with_a_warning(tmp_path):
-    with pytest.warns(DeprecationWarning, match="lanes is deprecated; pass batch_size"):
-        run = evaluated(tmp_path / "a.zarr", lanes=4)
-    with pytest.warns(DeprecationWarning, match=r"Run\.lanes is deprecated; read batch_size"):
-        assert run.lanes == run.batch_size == 4
 
 
 def test_blocks_fit_the_memory(tmp_path, monkeypatch):
@@ -684,7 +681,7 @@ def test_progress_has_rate_and_failures_on_standard_error(tmp_path, capsys):
     assert re.search(r"100%.* 4/4 \[.*rollouts/s, 1 failed\]", last) and not said.out
     (run.out / "y" / "c" / "1" / "0").write_bytes(b"damaged")
     evaluated(tmp_path / "a.zarr", **options)
-    assert "chunk 1 of the store was damaged and is computed again" in capsys.readouterr().err
+    assert "chunk 1 of the store was damaged and was computed again" in capsys.readouterr().err
     assert threading.active_count() == threads
 
 
