@@ -207,7 +207,7 @@ def cluster(workers: int):
             "--scheduler-file",
             str(file),
             "--nthreads",
-            "1",
+            "2",
         ]
         processes += [subprocess.Popen(command, stderr=subprocess.DEVNULL) for _ in range(workers)]
         try:

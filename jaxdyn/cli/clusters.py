@@ -36,7 +36,7 @@ def connect(args: argparse.Namespace) -> Iterator[Any]:
         place = args.client
         if place is None:
             # Any free port for the dashboard, whose address is printed.
-            local = LocalCluster(n_workers=args.workers, threads_per_worker=1, processes=True, dashboard_address=":0")
+            local = LocalCluster(n_workers=args.workers, threads_per_worker=2, processes=True, dashboard_address=":0")
             place = stack.enter_context(local)
         try:
             client = stack.enter_context(Client(place))

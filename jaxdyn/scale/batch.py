@@ -149,7 +149,9 @@ def run_batch(
         if store is not None:
             store.check(description)
             store.remove_leftovers()
-        engine = Pipeline(options.retries) if options.client is None else Cluster(options.client, options.retries, mark)
+        # Two tasks of a worker at once: one computes while the other stores.
+        client, retries = options.client, options.retries
+        engine = Pipeline(retries) if client is None else Cluster(client, retries, mark, at_once=2)
         with engine:
             # Not larger than a chunk has to be, so that a batch is never filled up for nothing.
             most = min(BYTES // max(row_bytes, 1), -(-batch.count // (SHARES * engine.workers)))
@@ -186,7 +188,9 @@ def _compute_chunks(engine: Engine, store: Store, totals: Totals, options: Optio
     link = options.client is not None and options.client.dashboard_link
     if options.progress and link:
         print(f"dashboard: {link}", file=sys.stderr)
-    with _progress_meter(store.count, store.count_rollouts(before), options.progress) as meter:
+    # The last chunk may have fewer rollouts than the others.
+    stored = int(np.minimum(store.count - store.chunk * np.flatnonzero(before), store.chunk).sum())
+    with _progress_meter(store.count, stored, options.progress) as meter:
         for chunks, summaries in engine.map("chunks", _tasks(before)):
             if isinstance(summaries, Failure):
                 number = getattr(summaries.error, "errno", None)

@@ -18,7 +18,7 @@ import sys
 import time
 import uuid
 import warnings
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -141,7 +141,7 @@ class Store:
         attributes = {"jaxdyn_store": FORMAT, "description": dict(description), "rollouts": count, "chunk": chunk}
         attributes |= {"arrays": stored, "created": time.strftime("%Y-%m-%dT%H:%M:%S%z")}
         try:
-            with _quiet():
+            with warnings.catch_warnings():
                 group = zarr.create_group(beside, attributes=attributes)
                 record = Variable(RECORD, (len(stored),), np.dtype(np.uint32), ("array",), "chunk")
                 for one in [*variables, record]:
@@ -161,6 +161,8 @@ class Store:
                     kind = "string" if array.dtype.kind in "UO" else array.dtype
                     axis = {"shape": array.shape, "dtype": kind, "dimension_names": (name,), "attributes": notes}
                     group.create_array(name, **axis)[...] = array
+                # xarray reads it. Zarr warns that it is no part of version 3 of the format.
+                warnings.filterwarnings("ignore", message="Consolidated metadata")
                 zarr.consolidate_metadata(beside)
             beside.rename(path)
         finally:
@@ -197,12 +199,6 @@ class Store:
             done = [int(entry.name) for entry in entries if entry.name.isdigit() and self.is_done(int(entry.name))]
             mask[done] = True
         return mask
-
-    def count_rollouts(self, chunks: np.ndarray) -> int:
-        """Number of rollouts in the chunks of a mask (chunks,)."""
-        # The last chunk may have fewer rollouts than the others.
-        last = self.count - (self.chunks - 1) * self.chunk
-        return int(chunks.sum()) * self.chunk - int(chunks[-1]) * (self.chunk - last)
 
     def write(self, chunk: int, arrays: Mapping[str, np.ndarray]) -> None:
         """Write all arrays of a chunk, then its record.
@@ -251,7 +247,7 @@ class Store:
         array = self._arrays[name]
         # Zarr's chunks are full: the last one is filled up.
         if len(values) < array.chunks[0]:
-            short, values = values, np.full(array.chunks, array.fill_value, array.dtype)
+            short, values = values, np.full((array.chunks[0], *array.shape[1:]), array.fill_value, array.dtype)
             values[: len(short)] = short
         # The codec bytes is little-endian.
         data = np.ascontiguousarray(values, array.dtype.newbyteorder("<"))
@@ -275,15 +271,8 @@ class Store:
         checksum = self._checksum(data[:-4])
         if data[-4:].tobytes() != checksum.to_bytes(4, "little"):
             raise ValueError(f"{self._file(name, chunk)} is damaged")
-        return data[:-4].view(array.dtype.newbyteorder("<")).reshape(array.chunks), checksum
-
-
-@contextlib.contextmanager
-def _quiet() -> Iterator[None]:
-    """Suppress Zarr's warning that consolidated metadata is no part of version 3 of its format; xarray reads it."""
-    with warnings.catch_warnings():
-        warnings.filterwarnings("ignore", message="Consolidated metadata")
-        yield
+        values = data[:-4].view(array.dtype.newbyteorder("<"))
+        return values.reshape(array.chunks[0], *array.shape[1:]), checksum
 
 
 def _empty(dtype: Any) -> Any:

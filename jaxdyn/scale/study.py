@@ -1,5 +1,6 @@
 """A study, which determines the rows of a batch, and its computation in one process: pure functions of the number of a chunk."""
 
+import threading
 import time
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
@@ -76,8 +77,13 @@ class Study:
         """This study, compiled in this process."""
         # With all that takes long, so that a worker has it before its first task: zarr's import is a third of a second.
         zarr_package()
-        _ = self.program, callable(self.cost) and self.cost_program
+        _ = self._computing, self.program, callable(self.cost) and self.cost_program
         return self
+
+    @cached_property
+    def _computing(self) -> threading.Lock:
+        # Two threads of a worker have a task each, which would compete for the threads of kernels.
+        return threading.Lock()
 
     @cached_property
     def program(self) -> Program:
@@ -136,9 +142,13 @@ class Study:
         is_there = self.store.is_done(chunk)
         is_whole = is_there and self.store.is_whole(chunk)
         if not is_whole:
-            # Without its record it is missing until it is whole.
-            self.store.forget(chunk)
-            rows, steps = rows or self.rows(chunk)
+            # Missing until it is whole. Only of a damaged one: the record of another task may come at any time.
+            if is_there:
+                self.store.forget(chunk)
+            if rows is None:
+                with self._computing:
+                    rows = self.rows(chunk)
+            rows, steps = rows
             partials = self.reducer.partials(rows, self.store.numbers(chunk))
             self.store.write(chunk, {name: rows[name] for name in self.kept} | self.reducer.to_store(partials))
             codes = rows["result"]

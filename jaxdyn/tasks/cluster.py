@@ -30,18 +30,19 @@ class Cluster:
     """Tasks on the workers of a Dask client: methods of an object that `send` sends to them; a context manager.
 
     **Arguments:** `retries`, of a task that raises. `mark`: a file and its text, which every worker has to see, or None.
+    `at_once`: tasks of a worker with as many threads.
 
-    A worker has one task at a time, so that tasks do not compete for the threads of kernels. Tasks of a worker that dies go
-    to the others. If the scheduler dies, the client reconnects within its own `timeout`, and unfinished tasks are submitted
-    again.
+    A worker has one task at a time by default, so that tasks do not compete for the threads of kernels. Tasks of a worker that
+    dies go to the others. If the scheduler dies, the client reconnects within its own `timeout`, and unfinished tasks are
+    submitted again.
 
     **Raises:** ValueError for anything but a connected client, and for a scheduler or workers with other versions of Python,
     Dask, JAX or jaxdyn, before any task. ConnectionError where the scheduler does not come back.
     """
 
-    def __init__(self, client: DaskClient, retries: int = 0, mark: tuple[Path, str] | None = None):
+    def __init__(self, client: DaskClient, retries: int = 0, mark: tuple[Path, str] | None = None, at_once: int = 1):
         self.client: Any = client
-        self.retries, self.mark = retries, mark
+        self.retries, self.mark, self.at_once = retries, mark, at_once
         self._name = f"jaxdyn-{uuid.uuid4().hex[:12]}"
         self._plugin: Any = None
         self._generation = itertools.count()
@@ -132,7 +133,7 @@ class Cluster:
             [method] * len(items),
             items,
             key=[(group, place) for place in places],
-            resources={RESOURCE: 1, self._name: 1},
+            resources={name: 1 / self.at_once for name in (RESOURCE, self._name)},
             retries=self.retries,
             pure=False,  # keys are given, not hashes of the arguments
         )

@@ -126,6 +126,18 @@ def test_a_store_that_is_whole_is_only_looked_through(pendulums):
     assert files(run.out) == before
 
 
+def test_arrays_without_entries_and_flags_are_stored(tmp_path):
+    def function(p):
+        return {"none": jnp.zeros((2, 0)), "flag": p["x"] > 1.5, "count": jnp.int32(7 * p["x"])}
+
+    run = evaluated(tmp_path / "a.zarr", function=function)
+    assert evaluated(tmp_path / "a.zarr", function=function).repaired == ()
+    table = run.dataset()
+    assert table.none.shape == (23, 2, 0) and table.flag.dtype == bool and table["count"].dtype == np.int32
+    np.testing.assert_array_equal(table.flag, table.parameter_x > 1.5)
+    np.testing.assert_array_equal(table["count"], np.asarray(7 * table.parameter_x).astype(np.int32))
+
+
 def test_a_member_is_found_again(tmp_path):
     run = evaluated(tmp_path / "a.zarr")
     table = run.dataset()

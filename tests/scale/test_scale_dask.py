@@ -76,8 +76,8 @@ def wait_for(condition, what):
 
 @pytest.fixture(scope="module")
 def cluster():
-    """Two worker processes, a thread each."""
-    options = {"threads_per_worker": 1, "processes": True, "dashboard_address": ":0", "silence_logs": 50}
+    """Two worker processes, two threads each; others below have one."""
+    options = {"threads_per_worker": 2, "processes": True, "dashboard_address": ":0", "silence_logs": 50}
     with distributed.LocalCluster(n_workers=2, **options) as local:
         yield local
 
@@ -506,6 +506,9 @@ def test_functions_of_modules_that_workers_lack_are_named(client, tmp_path, monk
     with pytest.raises(ModuleNotFoundError, match=r"of_the_client.*client\.upload_file"):
         jd.scale.evaluate(of_the_client.square, np.arange(4.0), out=tmp_path / "a.zarr", client=client, **QUIET)
     assert not (tmp_path / "a.zarr").exists()
+    client.upload_file(tmp_path / "of_the_client.py")
+    run = jd.scale.evaluate(of_the_client.square, np.arange(4.0), out=tmp_path / "a.zarr", client=client, **QUIET)
+    np.testing.assert_array_equal(run.dataset().y, np.arange(4.0) ** 2)
 
 
 # Tasks
