@@ -11,8 +11,9 @@
 - cost: four-bars whose springs are soft or stiff, adaptive steps: steps that batches compute over steps that are needed, and
   seconds, in the order of the numbers, by decreasing cost (`cost=`), and by the cost that is measured (`cost="measured"`).
 - workers: the arm in this process on two cores, and on a local Dask cluster of one and of two worker processes on the same two.
-- tasks: chunks of one rollout on a local cluster of two workers: milliseconds of a chunk, and memory of the client and of the
-  scheduler after each tenth of them (1e5 chunks with --full, else 1e4); and the same of tasks that do nothing, ten times as many.
+- tasks: chunks of one rollout in this process and on a local cluster of two workers (1e5 chunks with --full, else 1e4):
+  milliseconds of a chunk; and of tasks that do nothing, 17 times as many, with the memory of the client, of the scheduler and of
+  a worker after each seventeenth of them.
 - kill: the arm on two workers, one of which is killed (kill -9) when half of the chunks are stored, against the same undisturbed.
 - hosts: what the arm's rollouts compute, write and exchange, measured here, and what that makes on paper for 1, 8 and 64 hosts
   of 64 cores; what an iteration of a fit exchanges.
@@ -245,32 +246,23 @@ def workers(folder: Path, samples: int) -> None:
 
 def tasks(folder: Path, samples: int) -> None:
     """What a chunk costs that costs nothing, and what a task does; memory against their number."""
+    options = {"chunk": 1, "batch_size": 1, "rows": False} | QUIET
+    small = {"x": np.arange(float(samples))}
     with cluster(2) as client:
-        start = time.perf_counter()
-        small = {"x": np.arange(float(samples))}
-        run = jd.scale.evaluate(
-            lambda p: {"y": p["x"] + 1.0},
-            small,
-            out=folder / "tasks.zarr",
-            chunk=1,
-            batch_size=1,
-            rows=False,
-            client=client,
-            **QUIET,
-        )
-        seconds = time.perf_counter() - start
-        print(
-            f"tasks: {samples} chunks of one rollout: {1e3 * run.seconds / samples:.2f} ms each, {seconds:.3g} s in all; client "
-            f"{resident():.0f} MiB, scheduler {resident(client.scheduler_pid):.0f} MiB"
-        )
+        for name, place in (("in this process", None), ("on two workers", client)):
+            run = jd.scale.evaluate(
+                lambda p: {"y": p["x"] + 1.0}, small, out=folder / f"{name}.zarr", client=place, **options
+            )
+            print(f"tasks: {samples} chunks of one rollout {name}: {1e3 * run.seconds / samples:.2f} ms each")
         with Cluster(client) as many:
             many.send(lambda: [])
             start = time.perf_counter()
-            for k, _ in many.map("count", range(10 * samples)):
+            for k, _ in many.map("count", range(17 * samples)):
                 if k % samples == samples - 1:
+                    worker = max(client.run(resident).values())
                     print(
                         f"tasks: {k + 1} that do nothing: {1e3 * (time.perf_counter() - start) / (k + 1):.2f} ms each; client "
-                        f"{resident():.0f} MiB, scheduler {resident(client.scheduler_pid):.0f} MiB"
+                        f"{resident():.0f} MiB, scheduler {resident(client.scheduler_pid):.0f} MiB, worker {worker:.0f} MiB"
                     )
 
 

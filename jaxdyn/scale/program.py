@@ -50,7 +50,8 @@ class Program:
         least = len(self.devices)  # one member for each device; sizes are multiples of it
         self.size = max(least, -(-size // least) * least)
         while True:
-            lowered = batch.lower(jax.tree.map(self._batch_shape, one.inputs))
+            shapes = jax.tree.map(lambda x: jax.ShapeDtypeStruct((self.size, *x.shape), x.dtype), one.inputs)
+            lowered = batch.lower(shapes)
             self.lowered = hashlib.sha256(lowered.as_text().encode()).hexdigest()[:16]
             self.compiled = lowered.compile(compiler_options=options)
             self.bytes = self._program_bytes()
@@ -84,9 +85,6 @@ class Program:
         before = clock()
         self._first = numbers, jax.block_until_ready(self.start(numbers))
         return clock() - before
-
-    def _batch_shape(self, one: Any) -> Any:
-        return jax.ShapeDtypeStruct((self.size, *one.shape), one.dtype)
 
     def _program_bytes(self) -> int:
         """Bytes of the program and of the results that are in memory at once, on all devices, as XLA reports them."""

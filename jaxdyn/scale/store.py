@@ -45,12 +45,14 @@ class Variable:
 
 
 def zarr_package() -> Any:
-    """The package zarr, if xarray is installed too, which is imported only when a result is read.
+    """The package zarr, if all others of the extra are installed too; xarray is imported only when a result is read.
 
     **Raises:** ImportError that names the extra.
     """
     try:
-        import google_crc32c  # noqa: F401 (reported here if it is missing)
+        import filelock  # noqa: F401 (these three are reported here if they are missing)
+        import google_crc32c  # noqa: F401
+        import tqdm  # noqa: F401
         import zarr
     except ImportError as error:
         raise ImportError(f"jd.scale needs {error.name}: pip install 'jaxdyn[scale]'") from error

@@ -112,9 +112,8 @@ class Cluster:
         while True:
             try:
                 window.submit()
-                while window.is_next_ready:
-                    yield window.take()
-                if not window.is_waiting:
+                yield from window.take_ready()
+                if not window.waiting:
                     if window.is_exhausted:
                         return
                     continue
@@ -169,32 +168,26 @@ class _Window:
         self._completed = as_completed()
         # One name for all tasks: the scheduler keeps an entry for each name.
         self._group = cluster.new_group(method)
-        self._waiting: dict[int, tuple[Any, Any]] = {}  # item and future by place
+        self.waiting: dict[int, tuple[Any, Any]] = {}  # item and future by place
         self._ready: dict[int, tuple[Any, Any]] = {}  # item and result by place
         self._next = self._taken = 0
         self.is_exhausted = False
         self._workers, self._counted = 1, 0.0
 
-    @property
-    def is_waiting(self) -> bool:
-        return bool(self._waiting)
-
-    @property
-    def is_next_ready(self) -> bool:
-        return self._next in self._ready
-
-    def take(self) -> tuple[Any, Any]:
-        self._next += 1
-        return self._ready.pop(self._next - 1)
+    def take_ready(self) -> Iterator[tuple[Any, Any]]:
+        """Results that are next in the order of the items."""
+        while self._next in self._ready:
+            self._next += 1
+            yield self._ready.pop(self._next - 1)
 
     def submit(self) -> None:
         """Fill the window when half of it is empty: a call of the scheduler costs more than a task."""
         if time.monotonic() - self._counted > 1.0:
             self._workers, self._counted = self._cluster.workers, time.monotonic()
         size = max(LEAST_WINDOW, WINDOW * self._workers)
-        if len(self._waiting) > size // 2:
+        if len(self.waiting) > size // 2:
             return
-        room = min(size - len(self._waiting), self._next + AHEAD * size - self._taken)
+        room = min(size - len(self.waiting), self._next + AHEAD * size - self._taken)
         new = list(itertools.islice(self._items, max(0, room)))
         self.is_exhausted |= len(new) < room
         if new:
@@ -205,15 +198,15 @@ class _Window:
         """Submit all unfinished tasks again, whose futures are lost."""
         self._completed.clear()
         self._group = self._cluster.new_group(self._method)
-        lost = {place: item for place, (item, _) in self._waiting.items()}
-        self._waiting.clear()
+        lost = {place: item for place, (item, _) in self.waiting.items()}
+        self.waiting.clear()
         self._add(lost)
 
     def _add(self, new: dict[int, Any]) -> None:
         # Recorded first: if submitting fails, they are submitted again.
-        self._waiting |= {place: (item, None) for place, item in new.items()}
+        self.waiting |= {place: (item, None) for place, item in new.items()}
         futures = self._cluster.submit(self._group, self._method, list(new), list(new.values()))
-        self._waiting |= {place: (new[place], future) for place, future in zip(new, futures, strict=True)}
+        self.waiting |= {place: (new[place], future) for place, future in zip(new, futures, strict=True)}
         self._completed.update(futures)
 
     def collect(self) -> None:
@@ -228,12 +221,12 @@ class _Window:
                 raise ConnectionError(f"{future} is {future.status}")
         for future, result in results.items():
             place = self._place(future)
-            item, _ = self._waiting.pop(place)
+            item, _ = self.waiting.pop(place)
             self._ready[place] = item, result
 
     def _place(self, future: Any) -> Any:
         place = future.key[1]
-        return place if self._waiting.get(place, (None, None))[1] is future else None
+        return place if self.waiting.get(place, (None, None))[1] is future else None
 
 
 def _outages() -> tuple[type[BaseException], ...]:

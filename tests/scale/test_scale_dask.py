@@ -506,7 +506,7 @@ def test_functions_of_modules_that_workers_lack_are_named(client, tmp_path, monk
     with pytest.raises(ModuleNotFoundError, match=r"of_the_client.*client\.upload_file"):
         jd.scale.evaluate(of_the_client.square, np.arange(4.0), out=tmp_path / "a.zarr", client=client, **QUIET)
     assert not (tmp_path / "a.zarr").exists()
-    client.upload_file(tmp_path / "of_the_client.py")
+    client.upload_file(str(tmp_path / "of_the_client.py"))
     run = jd.scale.evaluate(of_the_client.square, np.arange(4.0), out=tmp_path / "a.zarr", client=client, **QUIET)
     np.testing.assert_array_equal(run.dataset().y, np.arange(4.0) ** 2)
 
