@@ -11,8 +11,9 @@
 - cost: four-bars whose springs are soft or stiff, adaptive steps: steps that batches compute over steps that are needed, and
   seconds, in the order of the numbers, by decreasing cost (`cost=`), and by the cost that is measured (`cost="measured"`).
 - workers: the arm in this process on two cores, and on a local Dask cluster of one and of two worker processes on the same two.
-- tasks: chunks of one rollout on a local cluster of two workers: milliseconds of a chunk, and memory of the client and of the
-  scheduler after each tenth of them (1e5 chunks with --full, else 1e4); and the same of tasks that do nothing, ten times as many.
+- tasks: chunks of one rollout in this process and on a local cluster of two workers (1e5 chunks with --full, else 1e4):
+  milliseconds of a chunk; and of tasks that do nothing, 17 times as many, with the memory of the client, of the scheduler and of
+  a worker after each seventeenth of them.
 - kill: the arm on two workers, one of which is killed (kill -9) when half of the chunks are stored, against the same undisturbed.
 - hosts: what the arm's rollouts compute, write and exchange, measured here, and what that makes on paper for 1, 8 and 64 hosts
   of 64 cores; what an iteration of a fit exchanges.
@@ -97,17 +98,17 @@ def four_bars(samples: int, out, **options):
 
 def with_program(run: Callable, *args, **options):
     """A run of `jd.scale` in this process, and the program of its batches."""
-    kept, usual = [], study.Computation
+    kept, usual = [], study.Study.open
 
-    def note(*given):
-        kept.append(usual(*given))
+    def note(self):
+        kept.append(usual(self))
         return kept[-1]
 
-    study.Computation = note
+    study.Study.open = note
     try:
         return run(*args, **options), kept[-1].program
     finally:
-        study.Computation = usual
+        study.Study.open = usual
 
 
 def store(folder: Path, samples: int) -> None:
@@ -207,7 +208,7 @@ def cluster(workers: int):
             "--scheduler-file",
             str(file),
             "--nthreads",
-            "1",
+            "2",
         ]
         processes += [subprocess.Popen(command, stderr=subprocess.DEVNULL) for _ in range(workers)]
         try:
@@ -231,7 +232,7 @@ def resident(pid: int | str = "self") -> float:
 
 def workers(folder: Path, samples: int) -> None:
     """One process against worker processes on the same cores; the second run finds compiled kernels and running workers."""
-    options = {"chunk": max(1, samples // 32), "batch_size": min(2048, samples // 32)}
+    options = {"chunk": 4096, "batch_size": 2048}
     times = {0: min(arm(samples, folder / f"here{k}.zarr", **options).seconds for k in range(2))}
     for count in (1, 2):
         with cluster(count) as client:
@@ -245,45 +246,36 @@ def workers(folder: Path, samples: int) -> None:
 
 def tasks(folder: Path, samples: int) -> None:
     """What a chunk costs that costs nothing, and what a task does; memory against their number."""
+    options = {"chunk": 1, "batch_size": 1, "rows": False} | QUIET
+    small = {"x": np.arange(float(samples))}
     with cluster(2) as client:
-        start = time.perf_counter()
-        small = {"x": np.arange(float(samples))}
-        run = jd.scale.evaluate(
-            lambda p: {"y": p["x"] + 1.0},
-            small,
-            out=folder / "tasks.zarr",
-            chunk=1,
-            batch_size=1,
-            rows=False,
-            client=client,
-            **QUIET,
-        )
-        seconds = time.perf_counter() - start
-        print(
-            f"tasks: {samples} chunks of one rollout: {1e3 * run.seconds / samples:.2f} ms each, {seconds:.3g} s in all; client "
-            f"{resident():.0f} MiB, scheduler {resident(client.scheduler_pid):.0f} MiB"
-        )
+        for name, place in (("in this process", None), ("on two workers", client)):
+            run = jd.scale.evaluate(
+                lambda p: {"y": p["x"] + 1.0}, small, out=folder / f"{name}.zarr", client=place, **options
+            )
+            print(f"tasks: {samples} chunks of one rollout {name}: {1e3 * run.seconds / samples:.2f} ms each")
         with Cluster(client) as many:
             many.send(lambda: [])
             start = time.perf_counter()
-            for k, _ in many.map("count", range(10 * samples)):
+            for k, _ in many.map("count", range(17 * samples)):
                 if k % samples == samples - 1:
+                    worker = max(client.run(resident).values())
                     print(
                         f"tasks: {k + 1} that do nothing: {1e3 * (time.perf_counter() - start) / (k + 1):.2f} ms each; client "
-                        f"{resident():.0f} MiB, scheduler {resident(client.scheduler_pid):.0f} MiB"
+                        f"{resident():.0f} MiB, scheduler {resident(client.scheduler_pid):.0f} MiB, worker {worker:.0f} MiB"
                     )
 
 
 def kill(folder: Path, samples: int) -> None:
-    """A worker killed when half is done."""
-    options = {"chunk": max(1, samples // 64), "batch_size": min(1024, samples // 64)}
+    """A worker killed when half of the chunks are stored."""
+    options = {"chunk": 2048, "batch_size": 2048}
     with cluster(2) as client:
         arm(samples, folder / "warm.zarr", client=client, **options)
         plain = arm(samples, folder / "plain.zarr", client=client, **options).seconds
 
         def watch():
             done = folder / "killed.zarr" / "record" / "checksum" / "c"
-            while not done.exists() or len(list(done.iterdir())) < 32:
+            while not done.exists() or len(list(done.iterdir())) < samples // 4096:
                 time.sleep(0.01)
             os.kill(victim, 9)
 

@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 
 from jaxdyn import __version__, identify
+from jaxdyn.cli.clusters import add_cluster_options, connect
 from jaxdyn.cli.common import (
     Stopwatch,
     add_model_options,
@@ -124,6 +125,7 @@ def _add_expert_options(data, fit, several: dict[str, Any]) -> None:
     )
     fit.add_argument("--horizon", type=real, default=0.25, metavar="S", help="of trajectory segments (default: 0.25)")
     fit.add_argument("--steps", type=whole, default=100, metavar="N", help="of the trajectory fit (default: 100)")
+    add_cluster_options(fit)
     fit.add_argument("--repair", action="store_true", help="replace unphysical and missing inertias first")
 
 
@@ -154,6 +156,11 @@ def run(args: argparse.Namespace) -> None:
     # The report belongs to the robot that is written: it states the errors.
     json_path = out.with_suffix(".json") if json_path is None and out is not None else json_path
     train_paths, test_paths = log_paths(args)
+    if args.method != "feasible" and (args.client, args.workers) != (None, None):
+        raise ValueError(
+            f"--client, --workers: workers share the fits of a cross-validation, which --method {args.method} does not have; "
+            "use --method feasible"
+        )
     # Before logs are read and filtered, which takes longer than the check.
     if args.method == "trajectory" and len(train_paths) > 1:
         raise ValueError("--log: --method trajectory fits one log; use --method feasible for several")
@@ -183,7 +190,8 @@ def run(args: argparse.Namespace) -> None:
     watch = Stopwatch()
     if test_paths:
         # Separate test logs: one fit is both reported and written.
-        final = judge = make_fit(model, logs, options, args)
+        with connect(args) as client:
+            final = judge = make_fit(model, logs, options, args, client)
         tests = [filter_log(raw_log(model, path, args), path, args, cutoff) for path in test_paths]
         # The fit predicts true torques, so test logs need the same scale as the training logs.
         tests = tests if gains is None else [gains.scale(log) for log in tests]
@@ -192,7 +200,8 @@ def run(args: argparse.Namespace) -> None:
         trained, tests = (list(part) for part in zip(*(identify.split(log, args.train) for log in logs), strict=True))
         test_names = [f"{name} (last {100 * (1 - args.train):.3g} %)" for name in names]
         # The errors that are reported come from this fit, which has not seen the held-out samples.
-        judge = make_fit(model, trained, options, args)
+        with connect(args) as client:
+            judge = make_fit(model, trained, options, args, client)
         # The settings chosen on the training part stay; the parameters are refitted to all samples.
         final = make_fit(model, logs, resolve_options(options, judge), args)
     seconds = str(watch)

@@ -1,7 +1,7 @@
 """Options of `jaxdyn identify`, and the fit that they describe."""
 
 import math
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -104,8 +104,10 @@ def resolve_options(options: Options, result) -> Options:
     )
 
 
-def make_fit(model: Model, logs: list[Log], options: Options, args) -> RobotFit | Fit | LeastSquares:
-    """Fit logs by the requested method."""
+def make_fit(
+    model: Model, logs: list[Log], options: Options, args, client: Any = None
+) -> RobotFit | Fit | LeastSquares:
+    """Fit logs by the requested method; workers of a Dask client share the fits of its cross-validation."""
 
     def show(step, loss, _):
         if args.progress:
@@ -129,6 +131,7 @@ def make_fit(model: Model, logs: list[Log], options: Options, args) -> RobotFit 
             robust=options.robust,
             weights=options.weights,
             delay=options.delay,
+            client=client,
             callback=tell,
         )
     # One log alone, as the command has checked.

@@ -1,12 +1,11 @@
 """`jaxdyn sweep`: resumable studies of many rollouts, described by a file, into a Zarr store."""
 
 import argparse
-import contextlib
 import importlib.util
 import inspect
 import pathlib
 import tomllib
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Mapping
 from typing import Any
 
 import jax
@@ -14,6 +13,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from jaxdyn import scale, scenes
+from jaxdyn.cli.clusters import add_cluster_options, connect
 from jaxdyn.cli.common import Stopwatch, check_least, check_memory, whole
 from jaxdyn.io import load_urdf
 from jaxdyn.model.arguments import as_path
@@ -85,7 +85,7 @@ _KEYS: dict[str, tuple[type, ...]] = {
     "reductions": (dict,),
 }
 # Options of `jd.simulate` that a file can set, and of `jd.scale.run`.
-_OPTIONS = {"batch_size", "lanes", "memory", "compress", "verify", *inspect.signature(simulate).parameters}
+_OPTIONS = {"batch_size", *inspect.signature(simulate).parameters}
 # The study sets these itself, or a file cannot express them.
 _OPTIONS -= {"scene", "q0", "v0", "ts", "control", "outputs", "adjoint", "progress", "throw"}
 
@@ -96,11 +96,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--out", metavar="DIR", help="store, instead of the study's")
     parser.add_argument("--samples", type=whole, metavar="N", help="number of rollouts, instead of the study's")
     parser.add_argument("--seed", type=whole, metavar="N", help="seed, instead of the study's")
-    place = parser.add_mutually_exclusive_group()
-    place.add_argument(
-        "--client", metavar="ADDRESS", help="address of a Dask scheduler whose workers compute, as tcp://host:8786"
-    )
-    place.add_argument("--workers", type=whole, metavar="N", help="number of local Dask worker processes to start")
+    add_cluster_options(parser)
     parser.add_argument("--devices", type=whole, metavar="N", help="CPU devices that share the rollouts (default: 1)")
     parser.add_argument("--chunk", type=whole, metavar="N", help="rollouts per chunk (default: two seconds' work)")
     parser.add_argument("--quiet", action="store_true", help="no progress meter")
@@ -108,7 +104,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(args: argparse.Namespace) -> int:
     """Run the study and print its outcome; return 1 if a rollout failed."""
-    check_least(args, chunk=1, samples=1, workers=1)
+    check_least(args, chunk=1, samples=1)
     path = as_path(args.study, "study")
     study = _read(path)
     if args.devices is not None:
@@ -134,7 +130,7 @@ def run(args: argparse.Namespace) -> int:
     if cost is not None and cost not in parameters:
         raise ValueError(f"{path}: cost is {cost!r}; name one of the parameters {', '.join(parameters)}")
     watch = Stopwatch()
-    with _connect(args) as client:
+    with connect(args) as client:
         result = scale.run(
             scene,
             states,
@@ -156,30 +152,6 @@ def run(args: argparse.Namespace) -> int:
         )
     print(f"{result}\nin {watch}, compilation included.")
     return int(not result.success)
-
-
-@contextlib.contextmanager
-def _connect(args: argparse.Namespace) -> Iterator[Any]:
-    """Connect to the scheduler at --client, or to a local cluster of --workers processes, or to neither."""
-    if args.client is None and args.workers is None:
-        yield None
-        return
-    try:
-        # Imported on use: Dask is an extra.
-        from distributed import Client, LocalCluster
-    except ImportError as error:
-        raise ValueError(f"--client and --workers need {error.name}: pip install 'jaxdyn[scale]'") from error
-    with contextlib.ExitStack() as stack:
-        place = args.client
-        if place is None:
-            # Any free port for the dashboard, whose address is printed.
-            local = LocalCluster(n_workers=args.workers, threads_per_worker=1, processes=True, dashboard_address=":0")
-            place = stack.enter_context(local)
-        try:
-            client = stack.enter_context(Client(place))
-        except (OSError, ValueError) as error:
-            raise ValueError(f"--client is {args.client}, where no scheduler of Dask answers: {error}") from error
-        yield client
 
 
 def make_draw(parameters: Mapping[str, Any]) -> Callable[[Any], dict[str, Any]]:

@@ -1,8 +1,12 @@
 """The common part of `run` and `evaluate`: from the description of a function of one sample to the result of a batch."""
 
-import warnings
-from collections.abc import Callable, Iterator, Mapping, Sequence
-from dataclasses import dataclass, replace
+import errno
+import os
+import sys
+import time
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
 
@@ -13,11 +17,11 @@ from jaxdyn.model.arguments import Numbers, as_array, as_path
 from jaxdyn.scale.description import Description
 from jaxdyn.scale.lock import lock_store
 from jaxdyn.scale.members import Members
-from jaxdyn.scale.reducer import Merger, Reducer
+from jaxdyn.scale.reducer import Reducer, Totals
 from jaxdyn.scale.reductions import Arrays, check_reductions, describe_reductions
-from jaxdyn.scale.store import FULL, Store, check_place, full_disk, zarr_package
+from jaxdyn.scale.store import Store, check_place, zarr_package
 from jaxdyn.scale.study import LISTED, SORTED_BATCHES, Facts, Pipeline, Study, local_devices
-from jaxdyn.tasks import Cluster, Engine, Failure, Progress, package_versions
+from jaxdyn.tasks import Cluster, Engine, Failure, package_versions
 
 if TYPE_CHECKING:
     import xarray
@@ -32,6 +36,7 @@ BYTES = 2**25  # of rows in a chunk
 SHARES = 8  # chunks per worker at least, so that all end at about the same time
 CHECKED = 64  # chunks that one task checks
 MOST_FAILURES = 100  # chunks that fail before no others are tried
+FULL = (errno.ENOSPC, errno.EDQUOT)  # of a disk
 
 
 @dataclass(frozen=True)
@@ -65,12 +70,6 @@ class Run:
         """True if every rollout succeeded."""
         return set(self.codes) <= {"successful"}
 
-    @property
-    def lanes(self) -> int:
-        """Deprecated name of `batch_size`."""
-        warnings.warn("Run.lanes is deprecated; read batch_size", DeprecationWarning, stacklevel=2)
-        return self.batch_size
-
     def dataset(self) -> "xarray.Dataset":
         """The store as an `xarray.Dataset`, read as it is used."""
         import xarray
@@ -92,41 +91,27 @@ class Options(NamedTuple):
     reductions: Any
     rows: bool | Sequence[str]
     cost: Cost
-    units: Mapping[str, str] | None
     client: Any
     retries: int
     devices: Sequence[Any] | None
     batch_size: int | None
     chunk: int | None
-    memory: int | None
-    compress: bool
-    verify: bool
     progress: bool
 
-    @classmethod
-    def of(cls, arguments: Mapping[str, Any]) -> "Options":
-        """Options among all arguments of a function, checked.
-
-        **Raises:** ValueError for a number that is not one, and for `devices` of this process next to a client.
-        """
-        # The former name, for one release.
-        if arguments["lanes"] is not None:
-            warnings.warn("lanes is deprecated; pass batch_size", DeprecationWarning, stacklevel=3)
-            arguments = {**arguments, "batch_size": arguments["lanes"]}
-        options = cls._make(arguments[name] for name in cls._fields)
-        for name, least in (("batch_size", 1), ("chunk", 1), ("memory", 1), ("retries", 0)):
-            value = arguments[name]
-            is_given = value is not None or name == "retries"
+    def check(self) -> None:
+        """**Raises:** ValueError for a number that is not one, and for `devices` of this process next to a client."""
+        for name, least in (("batch_size", 1), ("chunk", 1), ("retries", 0)):
+            value = getattr(self, name)
+            is_default = value is None and least
             # bool is a subclass of int: True would pass as 1.
-            if is_given and (isinstance(value, bool) or not isinstance(value, int) or value < least):
+            if not is_default and (isinstance(value, bool) or not isinstance(value, int) or value < least):
                 raise ValueError(
                     f"{name} is {value!r}; give a whole number of at least {least}{', or None' if least else ''}"
                 )
-        if options.client is None:
-            local_devices(options.devices)
-        elif options.devices is not None:
+        if self.client is None:
+            local_devices(self.devices)
+        elif self.devices is not None:
             raise ValueError("devices is given with client; leave it out: each worker uses all of its own")
-        return options
 
 
 def run_batch(
@@ -138,9 +123,10 @@ def run_batch(
 ) -> Run:
     """Compute a batch that `describe(reductions)` describes; `identity` distinguishes it from others, by argument.
 
-    `pilot(drawn, row)` counts the steps of a short part of a rollout, for a cost that is measured.
+    `pilot(parameters, row)` counts the steps of a short part of a rollout, for a cost that is measured.
     """
     # A missing package and a wrong path are reported before anything is compiled.
+    options.check()
     zarr_package()
     path = as_path(options.out, "out")
     check_place(path)
@@ -155,104 +141,108 @@ def run_batch(
         | {"float64": bool(jax.config.read("jax_enable_x64"))}
         | batch.description()
         | identity
-        | {"rows stored": list(kept), "reductions": describe_reductions(reductions), "compression": options.compress}
+        | {"rows stored": list(kept), "reductions": describe_reductions(reductions)}
     )
     row_bytes = sum(_bytes(outputs.variables[name]) for name in kept)
-    with full_disk(path), lock_store(path) as mark:
+    with lock_store(path) as mark:
         store = Store(path) if path.exists() else None
         if store is not None:
             store.check(description)
             store.remove_leftovers()
-        engine: Engine = (
-            Pipeline(options.retries) if options.client is None else Cluster(options.client, options.retries, mark)
-        )
+        # Two tasks of a worker at once: one computes while the other stores.
+        client, retries = options.client, options.retries
+        engine = Pipeline(retries) if client is None else Cluster(client, retries, mark, at_once=2)
         with engine:
             # Not larger than a chunk has to be, so that a batch is never filled up for nothing.
             most = min(BYTES // max(row_bytes, 1), -(-batch.count // (SHARES * engine.workers)))
             fixed = outputs, batch, cost, reducer, kept, path.absolute(), options.devices, options.batch_size
-            engine.send(Study(*fixed, most, options.memory, engine.workers_per_host).open)
+            engine.send(Study(*fixed, most, engine.workers_per_host).open)
             # On one worker, for all: they have the same program, and the store is created once.
             facts: Facts = engine.call("facts", store is None)
             # Platforms round differently, so that a store keeps to one; it is known when a worker has its devices.
             description["platform"] = facts.platform
             if store is None:
                 variables = [outputs.variables[name] for name in kept] + reducer.variables
-                variables = [replace(one, compressed=one.compressed or options.compress) for one in variables]
                 chunk = options.chunk or _chunk_size(facts, row_bytes, batch.count, engine.workers, cost is not None)
                 sizes = batch.count, min(chunk, batch.count)
                 store = Store.create(path, variables, outputs.coordinates, description | facts.programs, *sizes)
             store.check(description)
-            # Before the loop: only chunks of earlier calls are checked at the end.
-            before = store.record_mask()
-            meter = Progress(batch.count, store.count_rollouts(before), shown=options.progress)
-            if options.client is not None and (link := options.client.dashboard_link):
-                meter.note(f"dashboard: {link}")
-            merger = Merger(reducer, len(outputs.codes), LISTED)
-            repaired = _compute_chunks(engine, store, merger, meter, before, options.verify)
-            meter.end()
-            results = merger.results()
+            totals = Totals(reducer, len(outputs.codes), LISTED)
+            begin = time.monotonic()
+            computed, repaired = _compute_chunks(engine, store, totals, options)
+            seconds = time.monotonic() - begin
+            results = totals.results()
             store.write_results({f"{name}_{part}": x for name, parts in results.items() for part, x in parts.items()})
-    needed, computed = merger.steps.tolist()
-    codes = {name: int(n) for name, n in zip(outputs.codes, merger.codes, strict=True) if n}
-    given = (
-        path,
-        batch.count,
-        store.chunk,
-        codes,
-        merger.failed,
-        results,
-        meter.computed,
-        meter.seconds,
-        tuple(repaired),
-    )
-    return Run(*given, facts.size, facts.bytes, computed / needed if needed else float("nan"))
+    codes = {name: int(n) for name, n in zip(outputs.codes, totals.codes, strict=True) if n}
+    needed, stepped = totals.steps.tolist()
+    waiting = stepped / needed if needed else float("nan")
+    given = path, batch.count, store.chunk, codes, totals.failed, results, computed, seconds, tuple(repaired)
+    return Run(*given, facts.size, facts.bytes, waiting)
 
 
-def _compute_chunks(
-    engine: Engine, store: Store, merger: Merger, meter: Progress, before: np.ndarray, verify: bool
-) -> list[int]:
-    """Compute the missing chunks, then check those of earlier calls; returns the damaged ones."""
+def _compute_chunks(engine: Engine, store: Store, totals: Totals, options: Options) -> tuple[int, list[int]]:
+    """Compute the missing chunks, check those of earlier calls; returns rollouts computed, and the chunks that were damaged."""
     failures: list[tuple[int, Failure]] = []
-    is_new = not before.any()
-    # An iterator over the missing ones, not a list: 1e8 rollouts may be a million chunks.
-    missing = range(store.chunks) if is_new else (int(chunk) for chunk in np.flatnonzero(~before))
-
-    def results(method: str, items: Any) -> Iterator[tuple[Any, Any]]:
-        for item, result in engine.map(method, items):
-            if not isinstance(result, Failure):
-                yield item, result
+    computed, repaired = 0, []
+    before = store.record_mask()
+    link = options.client is not None and options.client.dashboard_link
+    if options.progress and link:
+        print(f"dashboard: {link}", file=sys.stderr)
+    # The last chunk may have fewer rollouts than the others.
+    stored = int(np.minimum(store.count - store.chunk * np.flatnonzero(before), store.chunk).sum())
+    with _progress_meter(store.count, stored, options.progress) as meter:
+        for chunks, summaries in engine.map("chunks", _tasks(before)):
+            if isinstance(summaries, Failure):
+                number = getattr(summaries.error, "errno", None)
+                # All other chunks would fail in the same way.
+                if number in FULL:
+                    raise OSError(
+                        number,
+                        f"out is {str(store.path)!r}, and its file system is full ({os.strerror(number)}); chunks that were "
+                        "finished are kept: make room and run again",
+                    ) from summaries.error
+                failures.append((chunks[0], summaries))
+                # So many failures have a common cause, which the other chunks would meet too.
+                if len(failures) == MOST_FAILURES:
+                    break
                 continue
-            # All other chunks would fail in the same way.
-            if isinstance(result.error, OSError) and result.error.errno in FULL:
-                raise result.error
-            failures.append((item if method == "chunk" else item[0], result))
-            # So many failures have a common cause, which the other chunks would meet too.
-            if len(failures) == MOST_FAILURES:
-                return
-
-    def count(chunk: int, summary: Any) -> None:
-        rows = store.rows(chunk)
-        meter.add(rows.stop - rows.start, int(summary.codes[1:].sum()))
-
-    for chunk, summary in results("chunk", missing):
-        count(chunk, summary)
-        if is_new:
-            merger.add(summary)
-    repaired: list[int] = []
-    if not is_new and not failures:
-        # A resumed run merges in a second pass, over all chunks in their order: the same bits as without an interruption.
-        parts = ((start, before[start : start + CHECKED] & verify) for start in range(0, store.chunks, CHECKED))
-        for (start, _), summaries in results("check", parts):
-            for chunk, (is_damaged, summary) in enumerate(summaries, start):
-                merger.add(summary)
-                if is_damaged:
-                    repaired.append(chunk)
-                    meter.note(f"chunk {chunk} of the store was damaged: its rollouts are computed again")
-                    count(chunk, summary)
+            for chunk, summary in zip(chunks, summaries, strict=True):
+                totals.add(summary)
+                rollouts = 0 if before[chunk] and not summary.is_repaired else int(summary.codes.sum())
+                computed += rollouts
+                failed = totals.codes[1:].sum()
+                meter.set_postfix_str(f"{failed} failed" if failed else "", refresh=False)
+                if not summary.is_repaired:
+                    meter.update(rollouts)
+                    continue
+                repaired.append(chunk)
+                if options.progress:
+                    meter.write(f"chunk {chunk} of the store was damaged and was computed again", sys.stderr)
     if failures:
-        meter.end()
         raise _chunk_error(failures, store)
-    return repaired
+    return computed, repaired
+
+
+def _tasks(before: np.ndarray) -> Iterator[range]:
+    """Chunks of each task, in order: one, or up to CHECKED that are in the store already, by the mask `before` (chunks,)."""
+    first = 0
+    while first < len(before):
+        mask = before[first : first + CHECKED]
+        # Up to the first one that is missing.
+        size = max(1, len(mask) if mask.all() else int(np.argmin(mask)))
+        yield range(first, first + size)
+        first += size
+
+
+def _progress_meter(total: int, before: int, is_shown: bool) -> Any:
+    """Meter of rollouts with rate and time left on standard error: a line that is rewritten, rarely where that is a file."""
+    from tqdm import tqdm
+
+    class Meter(tqdm):
+        monitor_interval = 0  # else a thread of tqdm outlives the run
+
+    every = 0.2 if sys.stderr.isatty() else 10.0
+    return Meter(total=total, initial=before, unit=" rollouts", mininterval=every, disable=not is_shown)
 
 
 def _chunk_error(failures: list[tuple[int, Failure]], store: Store) -> RuntimeError:
@@ -284,23 +274,13 @@ def _select_arrays(outputs: Description, rows: bool | Sequence[str]) -> tuple[st
     return tuple(dict.fromkeys([*rows, "result"]))
 
 
-class _Cost(NamedTuple):
-    """A user's function of the parameters, as a function of a member."""
-
-    function: Callable[[Any], Any]
-    is_drawn: bool
-
-    def __call__(self, drawn: Any, row: Any) -> dict[str, Any]:
-        return {"cost": self.function(drawn if self.is_drawn else row.get("parameters"))}
-
-
 def _cost_of(cost: Cost, batch: Members, pilot: Callable | None) -> Any:
     """`Study.cost` for the option `cost`.
 
     **Raises:** ValueError for an array of another shape, and for a text that is not "measured", or with nothing to measure.
     """
     if cost is None or callable(cost):
-        return cost and _Cost(cost, batch.draw is not None)
+        return cost and partial(_cost_row, cost)
     if isinstance(cost, str):
         if cost == MEASURED and pilot is not None:
             return pilot
@@ -312,6 +292,10 @@ def _cost_of(cost: Cost, batch: Members, pilot: Callable | None) -> Any:
     if costs.shape != (batch.count,):
         raise ValueError(f"cost has shape {costs.shape}; give one number for each of the {batch.count} rollouts")
     return costs
+
+
+def _cost_row(cost: Callable[[Any], Any], parameters: Any, row: Any) -> dict[str, Any]:
+    return {"cost": cost(parameters)}
 
 
 def _bytes(variable: Any) -> int:

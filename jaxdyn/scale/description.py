@@ -1,6 +1,7 @@
 """Arrays of a store from a function of one sample: names, axes, units, codes."""
 
 from collections.abc import Callable, Mapping
+from functools import partial
 from typing import Any, NamedTuple
 
 import jax
@@ -19,13 +20,12 @@ OUTCOMES = ("successful", "failed")  # codes of functions that are no motions
 
 
 class Description(NamedTuple):
-    """A function of one member, `one(drawn, row) -> dict of arrays`, and the description of these arrays in a store.
+    """A function of one member, traced, and the description of its arrays in a store.
 
-    `traced` is the function traced; `is_motion`, whether kernels compute it; `variables` are those that can be stored; `codes`
-    the names of result codes; `coordinates` those of the axes, with their attributes.
+    `is_motion`: whether kernels compute it; `variables` are those that can be stored; `codes` the names of result codes;
+    `coordinates` those of the axes, with their attributes.
     """
 
-    one: Callable[[Any, Any], dict[str, Any]]
     traced: Traced
     is_motion: bool
     variables: dict[str, Variable]
@@ -33,109 +33,95 @@ class Description(NamedTuple):
     coordinates: dict[str, tuple[Any, dict[str, Any]]]
 
 
-class MotionRows(NamedTuple):
-    """Arrays of a motion, from `one(drawn, row) -> (solution, scene, parameters)`.
+class Label(NamedTuple):
+    """Axes of an array, its unit or those of the columns, and the names of the columns."""
 
-    `seen`: names of the signals and poses of the latest trace; they are the same in every trace.
-    """
-
-    one: Callable
-    reductions: Mapping[str, Reduction]
-    seen: dict[str, Any]
-
-    def __call__(self, drawn: Any, row: Any) -> dict[str, Any]:
-        """Arrays by their names in the store, with the quantities of reductions."""
-        solution, scene, parameters = self.one(drawn, row)
-        signals = signals_as_given(solution, scene)
-        poses = {f"pose_{name}": pose for name, pose in solution.poses.items()}
-        # Tracing is the only way to the names: outputs and joints are those of the scene that the user's function builds.
-        self.seen.update(signals=[signal._replace(values=None) for signal in signals], poses=tuple(poses))
-        values = {signal.key: signal.values for signal in signals} | poses | _parameters(parameters)
-        values |= {name: solution.stats[name] for name in ("num_steps", "time_reached")}
-        return _with_quantities(values | {"result": code_of(solution.result)}, self.reductions)
+    dims: tuple[str, ...]
+    units: Any
+    columns: tuple[str, ...] = ()
 
 
-class FunctionRows(NamedTuple):
-    """Arrays of a function, from `function(parameters) -> dictionary of arrays`."""
+class Values(NamedTuple):
+    """Arrays of a member by name, its result code, and labels of some of the arrays."""
 
-    function: Callable
-    reductions: Mapping[str, Reduction]
-
-    def __call__(self, drawn: Any, row: Any) -> dict[str, Any]:
-        """Arrays by their names in the store, with the quantities of reductions."""
-        parameters = row["parameters"] if drawn is None else drawn
-        values = self.function(parameters)
-        if not isinstance(values, Mapping) or not values:
-            raise ValueError(f"function returned a {type(values).__name__}; return a dictionary of arrays by name")
-        values = {str(name): jnp.asarray(value) for name, value in values.items()}
-        if {"result", "record", "partial", "rollout"} & values.keys():
-            raise ValueError("function returned an array named result, record, partial or rollout; take another name")
-        # A function without codes of its own fails where a result is not finite, as a simulation that diverges.
-        success = values.pop("success", None)
-        if success is None:
-            success = jnp.stack([jnp.isfinite(value).all() for value in values.values()]).all()
-        code = jnp.where(success, 0, 1).astype(jnp.uint8)
-        return _with_quantities(values | _parameters(parameters) | {"result": code}, self.reductions)
+    arrays: dict[str, Any]
+    code: Any
+    labels: dict[str, Label]
 
 
-def describe_motion(
-    one: Callable, batch: Members, reductions: Mapping[str, Reduction], units: dict[str, str], ts: np.ndarray
+def describe(
+    values: Callable[[Any, Any], Values],
+    batch: Members,
+    units: Mapping[str, str],
+    ts: np.ndarray | None,
+    reductions: Mapping[str, Reduction],
 ) -> Description:
-    """Trace and describe `one(drawn, row) -> (solution, scene, parameters)` with rows at the times ts (nt,)."""
-    rows = MotionRows(one, reductions, {})
-    traced = Traced(rows, batch)
+    """Trace and describe `values(parameters, row)`, of motions with rows at the times ts (nt,), of other functions with None."""
+    # Tracing is the only way to the names: outputs and joints are those of the scene that the user's function builds.
+    labels: dict[str, Label] = {}
+    traced = Traced(partial(_rows, values, reductions, labels), batch)
     variables: dict[str, Variable] = {}
-    coordinates: dict[str, tuple[Any, dict[str, Any]]] = {"t": (ts, {"units": "s"})}
-    for signal in rows.seen["signals"]:
-        dims = dimensions(signal)
-        unit = list(signal.units) if signal.names else signal.units[0]
-        variables[signal.key] = _variable(signal.key, traced.shapes, unit, dims)
-        if signal.names:
-            coordinates[dims[-1]] = (list(signal.names), {})
-    for name in rows.seen["poses"]:
-        variables[name] = _variable(name, traced.shapes, "m", ("t", "pose_row", "pose_column"))
-    steps = {"num_steps": "1", "time_reached": "s"}
-    others = [name for name in traced.shapes if name in steps or name.startswith("parameter")]
-    variables |= _variables(traced.shapes, others, units | steps) | {"result": _codes(CODES)}
-    return Description(rows, traced, True, variables, CODES, coordinates)
+    coordinates: dict[str, tuple[Any, dict[str, Any]]] = {} if ts is None else {"t": (ts, {"units": "s"})}
+    for name, like in traced.shapes.items():
+        if name.startswith(QUANTITY):
+            continue
+        axes = tuple(f"{name}_{k}" for k in range(len(like.shape)))
+        label = labels.get(name, Label(axes, units.get(name.removeprefix("parameter_"))))
+        notes = {"units": label.units} if label.units and any(label.units) else {}  # none where no unit is known
+        variables[name] = Variable(name, like.shape, like.dtype, label.dims, "rollout", notes)
+        if label.columns:
+            coordinates[label.dims[-1]] = (list(label.columns), {})
+    codes = OUTCOMES if ts is None else CODES
+    # The last one, with flags as the CF conventions write them.
+    variables["result"] = result = variables.pop("result")
+    result.attributes.update(flag_values=list(range(len(codes))), flag_meanings=" ".join(codes))
+    return Description(traced, ts is not None, variables, codes, coordinates)
 
 
-def describe_function(
-    function: Callable, batch: Members, reductions: Mapping[str, Reduction], units: dict[str, str]
-) -> Description:
-    """Trace and describe `function(parameters) -> dictionary of arrays`."""
-    rows = FunctionRows(function, reductions)
-    traced = Traced(rows, batch)
-    names = [name for name in traced.shapes if name != "result" and not name.startswith(QUANTITY)]
-    variables = _variables(traced.shapes, names, units) | {"result": _codes(OUTCOMES)}
-    return Description(rows, traced, False, variables, OUTCOMES, {})
+# Functions of a module, not within others: cloudpickle sends them by name, so that workers use the code of their own jaxdyn.
 
 
-def _parameters(tree: Any) -> dict[str, Any]:
-    """Leaves of the parameters by their paths."""
-    values = {}
-    for path, leaf in jax.tree_util.tree_flatten_with_path(tree)[0]:
+def motion_values(rollout: Callable[[Any, Any], tuple[Any, Any]], parameters: Any, row: Any) -> Values:
+    """Arrays of a motion, from `rollout(parameters, row) -> (solution, scene)`."""
+    solution, scene = rollout(parameters, row)
+    arrays = {f"pose_{name}": pose for name, pose in solution.poses.items()}
+    labels = dict.fromkeys(arrays, Label(("t", "pose_row", "pose_column"), "m"))
+    for signal in signals_as_given(solution, scene):
+        arrays[signal.key] = signal.values
+        units = list(signal.units) if signal.names else signal.units[0]
+        labels[signal.key] = Label(dimensions(signal), units, signal.names)
+    for name, unit in (("num_steps", "1"), ("time_reached", "s")):
+        arrays[name], labels[name] = solution.stats[name], Label((), unit)
+    return Values(arrays, code_of(solution.result), labels)
+
+
+def function_values(function: Callable[[Any], Mapping[str, Any]], parameters: Any, row: Any) -> Values:
+    """Arrays of a function of the parameters."""
+    values = function(parameters)
+    if not isinstance(values, Mapping) or not values:
+        raise ValueError(f"function returned a {type(values).__name__}; return a dictionary of arrays by name")
+    arrays = {str(name): jnp.asarray(value) for name, value in values.items()}
+    if {"result", "record", "partial", "rollout"} & arrays.keys():
+        raise ValueError("function returned an array named result, record, partial or rollout; take another name")
+    # A function without codes of its own fails where a result is not finite, as a simulation that diverges.
+    success = arrays.pop("success", None)
+    if success is None:
+        success = jnp.stack([jnp.isfinite(value).all() for value in arrays.values()]).all()
+    return Values(arrays, jnp.where(success, 0, 1).astype(jnp.uint8), {})
+
+
+def _rows(
+    values: Callable[[Any, Any], Values],
+    reductions: Mapping[str, Reduction],
+    labels: dict[str, Label],
+    parameters: Any,
+    row: Any,
+) -> dict[str, Any]:
+    """Arrays of a member by their names in the store, with the quantities of reductions."""
+    rows, code, new = values(parameters, row)
+    labels.update(new)
+    for path, leaf in jax.tree_util.tree_flatten_with_path(parameters)[0]:
         name = jax.tree_util.keystr(path, simple=True, separator="_")
-        values[f"parameter_{name}" if name else "parameter"] = jnp.asarray(leaf)
-    return values
-
-
-def _with_quantities(rows: dict[str, Any], reductions: Mapping[str, Reduction]) -> dict[str, Any]:
+        rows[f"parameter_{name}" if name else "parameter"] = jnp.asarray(leaf)
+    rows["result"] = code
     return rows | {QUANTITY + name: jnp.asarray(value) for name, value in quantities(reductions, rows).items()}
-
-
-def _variables(shapes: Mapping[str, Any], names: list[str], units: Mapping[str, str]) -> dict[str, Variable]:
-    return {name: _variable(name, shapes, units.get(name.removeprefix("parameter_"))) for name in names}
-
-
-def _variable(name: str, shapes: Mapping[str, Any], units: Any, dims: tuple[str, ...] | None = None) -> Variable:
-    like = shapes[name]
-    dims = tuple(f"{name}_{k}" for k in range(len(like.shape))) if dims is None else dims
-    notes = {"units": units} if units and any(units) else {}  # none where no unit is known
-    return Variable(name, like.shape, like.dtype, dims, "rollout", notes)
-
-
-def _codes(names: tuple[str, ...]) -> Variable:
-    """Codes as the CF conventions write flags; compressed, since most of them are zero."""
-    notes = {"flag_values": list(range(len(names))), "flag_meanings": " ".join(names)}
-    return Variable("result", (), np.dtype(np.uint8), (), "rollout", notes, compressed=True)

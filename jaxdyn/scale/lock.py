@@ -14,12 +14,10 @@ from pathlib import Path
 def lock_store(path: Path) -> Iterator[tuple[Path, str]]:
     """Hold the lock of a store; gives the file that names its owner, and its text. The lock of a dead process is free.
 
-    **Raises:** ValueError that names the owner where another process holds it. ImportError that names the extra.
+    **Raises:** ValueError that names the owner where another process holds it.
     """
-    try:
-        from filelock import FileLock, Timeout
-    except ImportError as error:
-        raise ImportError(f"jd.scale needs {error.name}: pip install 'jaxdyn[scale]'") from error
+    from filelock import FileLock, Timeout
+
     # The owner stands in a file of its own: filelock truncates the lock's file when it tries to acquire it.
     lock, owner = FileLock(f"{path}.lock"), path.with_name(f"{path.name}.owner")
     try:

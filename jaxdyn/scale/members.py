@@ -19,24 +19,24 @@ MAX_MEMBERS = 2**32  # `fold_in` takes 32 bits
 class Members:
     """`count` members, each a pytree of its own.
 
-    - `rows`: a pytree of arrays of numpy (count, ...), or None; held by every process.
+    - `rows`: pytrees of arrays of numpy (count, ...), by argument; held by every process.
     - `draw`: a function from the key of a member to its parameters, or None; nothing is held. The key of member i is
       `jax.random.fold_in(jax.random.key(seed), i)`: a member depends neither on chunks nor on devices nor on processes.
     """
 
     count: int
-    rows: Any = None
-    draw: Callable | None = None
-    seed: int = 0
+    rows: dict[str, Any]
+    draw: Callable | None
+    seed: int
 
     def inputs(self, numbers: np.ndarray) -> dict[str, Any]:
         """Inputs of a program for these members, with a leading axis."""
         return {"number": numbers.astype(np.uint32), "rows": jax.tree.map(lambda x: x[numbers], self.rows)}
 
     def one(self, given: dict[str, Any]) -> tuple[Any, Any]:
-        """Draw (None without `draw`) and row of one member, traced."""
+        """Parameters (None without any) and row of one member, traced."""
         if self.draw is None:
-            return None, given["rows"]
+            return given["rows"].get("parameters"), given["rows"]
         return self.draw(jax.random.fold_in(jax.random.key(self.seed), given["number"])), given["rows"]
 
     def description(self) -> dict[str, Any]:

@@ -30,54 +30,41 @@ MEMORY_FRACTION = 0.5
 class Program:
     """A function of one member, compiled for `size` members at a time on these devices.
 
-    `size` is reduced where the program does not fit into `memory` (bytes; by default a fraction of the free memory). `is_glue`:
-    the members are motions, which are computed by kernels. XLA then compiles only the glue between kernels, with options that
-    make this quick.
+    `size` is reduced where the program does not fit into `memory` (bytes). `is_glue`: the members are motions, which are computed
+    by kernels. XLA then compiles only the glue between kernels, with options that make this quick.
 
     Attributes: `size`, the members of a batch; `bytes`, the memory that it needs; `lowered`, a hash of the lowered program.
 
     **Raises:** MemoryError with the figures where not even one member for each device fits.
     """
 
-    def __init__(
-        self,
-        one: "Traced",
-        members: Members,
-        devices: Sequence[Any],
-        size: int,
-        memory: int | None,
-        is_glue: bool = False,
-    ):
-        self.members, self.devices = members, list(devices)
+    def __init__(self, one: "Traced", devices: Sequence[Any], size: int, memory: float, is_glue: bool = False):
+        self.members, self.devices = one.members, list(devices)
         options = glue_options(self.devices[0].platform) if is_glue else None
         axis_types = (jax.sharding.AxisType.Auto,)
         mesh = jax.make_mesh((len(self.devices),), ("rollouts",), devices=self.devices, axis_types=axis_types)
+        axis: Any = jax.P("rollouts")
         # `check_vma` checks values that are equal on all devices. Here every value belongs to one device.
-        options_of_map: Any = {
-            "mesh": mesh,
-            "in_specs": jax.P("rollouts"),
-            "out_specs": jax.P("rollouts"),
-            "check_vma": False,
-        }
-        batch = jax.jit(jax.shard_map(jax.vmap(one), **options_of_map))
+        mapped = jax.shard_map(jax.vmap(one), mesh=mesh, in_specs=axis, out_specs=axis, check_vma=False)
+        batch = jax.jit(mapped)
         least = len(self.devices)  # one member for each device; sizes are multiples of it
         self.size = max(least, -(-size // least) * least)
-        budget = available_memory(self.devices) * MEMORY_FRACTION if memory is None else memory
         while True:
-            lowered = batch.lower(jax.tree.map(self._batch_shape, member_shapes(members)))
+            shapes = jax.tree.map(lambda x: jax.ShapeDtypeStruct((self.size, *x.shape), x.dtype), one.inputs)
+            lowered = batch.lower(shapes)
             self.lowered = hashlib.sha256(lowered.as_text().encode()).hexdigest()[:16]
             self.compiled = lowered.compile(compiler_options=options)
             self.bytes = self._program_bytes()
-            if self.bytes <= budget:
+            if self.bytes <= memory:
                 break
             if self.size == least:
                 raise MemoryError(
-                    f"a program of {least} rollouts needs {self.bytes / 2**20:.3g} MiB, and {budget / 2**20:.3g} MiB are allowed "
-                    "(memory=, or half of what is free); save fewer points or outputs, or take fewer devices"
+                    f"a program of {least} rollouts needs {self.bytes / 2**20:.3g} MiB, and {memory / 2**20:.3g} MiB are allowed "
+                    "(half of what is free); save fewer points or outputs, or take fewer devices"
                 )
             # Memory is nearly proportional to the size. A tenth less makes it likely that the next program fits. Sizes are at
             # least halved, which bounds the number of compilations.
-            fitting = int(0.9 * self.size * budget / self.bytes)
+            fitting = int(0.9 * self.size * memory / self.bytes)
             self.size = max(least, min(fitting, self.size // 2) // least * least)
         self._first: tuple[np.ndarray, Any] | None = None
 
@@ -99,9 +86,6 @@ class Program:
         self._first = numbers, jax.block_until_ready(self.start(numbers))
         return clock() - before
 
-    def _batch_shape(self, one: Any) -> Any:
-        return jax.ShapeDtypeStruct((self.size, *one.shape), one.dtype)
-
     def _program_bytes(self) -> int:
         """Bytes of the program and of the results that are in memory at once, on all devices, as XLA reports them."""
         analysis = self.compiled.memory_analysis()
@@ -113,41 +97,38 @@ class Program:
 
 
 class Traced:
-    """Function `one(drawn, row) -> dict of arrays`, traced once, so that programs of several sizes do not run its Python again.
+    """Function `one(parameters, row) -> dict of arrays`, traced once for programs of all sizes.
 
-    `drawn` are the parameters that a member draws from its random key, `row` is its row of the given arrays (`Members`); either
-    may be None. `shapes`: shapes and dtypes of the arrays of one member, by name.
+    `parameters` of a member are drawn or a part of `row`, its row of the given arrays (`Members`). `inputs`, `shapes`: shapes and
+    dtypes of the inputs of one member, and of its arrays by name.
     """
 
     def __init__(self, one: Callable, members: Members):
-        self._origin = one, members
+        self.one, self.members = one, members
+        self.inputs = jax.tree.map(
+            lambda x: jax.ShapeDtypeStruct(x.shape[1:], jax.dtypes.canonicalize_dtype(x.dtype)),
+            members.inputs(np.zeros(1, np.int64)),
+        )
         # Tracing a scene and its integrator takes seconds, the largest part of the time to the first result.
-        trace = jax.make_jaxpr(lambda given: one(*members.one(given)), return_shape=True)
-        operations, self.shapes = trace(member_shapes(members))
+        operations, self.shapes = jax.make_jaxpr(self._of_inputs, return_shape=True)(self.inputs)
         self._call = function_of(operations)
         self._structure = jax.tree.structure(self.shapes)
 
     def __reduce__(self) -> tuple[Any, ...]:
-        return Traced, self._origin  # a jaxpr cannot be pickled; a worker traces again
+        return Traced, (self.one, self.members)  # a jaxpr cannot be pickled; a worker traces again
 
     def __call__(self, given: Any) -> dict[str, Any]:
         return jax.tree.unflatten(self._structure, self._call(*jax.tree.leaves(given)))
 
+    def fingerprint(self) -> str:
+        """Hash of the computation for one member; equal on all machines with the same versions of the packages."""
+        # Without kernels: they contain machine code, whose bytes depend on the processor.
+        with compilation("plain"):
+            text = jax.jit(self._of_inputs).lower(self.inputs).as_text()
+        return hashlib.sha256(text.encode()).hexdigest()[:16]
 
-def member_shapes(members: Members) -> Any:
-    """Shapes and dtypes of the inputs of one member."""
-    return jax.tree.map(
-        lambda x: jax.ShapeDtypeStruct(x.shape[1:], jax.dtypes.canonicalize_dtype(x.dtype)),
-        members.inputs(np.zeros(1, np.int64)),
-    )
-
-
-def fingerprint(one: Callable, members: Members) -> str:
-    """Hash of the computation for one member; equal on all machines with the same versions of the packages."""
-    # Without kernels: they contain machine code, whose bytes depend on the processor.
-    with compilation("plain"):
-        text = jax.jit(lambda given: one(*members.one(given))).lower(member_shapes(members)).as_text()
-    return hashlib.sha256(text.encode()).hexdigest()[:16]
+    def _of_inputs(self, given: Any) -> dict[str, Any]:
+        return self.one(*self.members.one(given))
 
 
 def default_size(devices: Sequence[Any]) -> int:

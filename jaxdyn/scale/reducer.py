@@ -1,6 +1,6 @@
-"""Reductions of a run as arrays of its store: partial results of chunks, and their merged results."""
+"""Reductions of a run as arrays of its store: partial results of chunks, and results of all."""
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from typing import Any
 
 import jax
@@ -9,8 +9,8 @@ import numpy as np
 from jaxdyn.scale.reductions import Arrays, Reduction
 from jaxdyn.scale.store import Variable
 
-COMBINED = 64  # partial results at once
 QUANTITY = "quantity of "  # in front of a reduction's name: its array of one rollout
+Results = dict[str, Arrays]  # arrays of each reduction, by its name
 
 
 class Reducer:
@@ -28,60 +28,52 @@ class Reducer:
         shapes: Mapping[str, jax.ShapeDtypeStruct],
         variables: Mapping[str, Variable],
     ):
-        self._reductions = dict(reductions)
-        self._parts: dict[str, list[str]] = {}
+        self.reductions = dict(reductions)
+        self.names: dict[str, dict[str, str]] = {}  # of partial results in the store, by reduction and part
         self.variables: list[Variable] = []
         for name, reduction in reductions.items():
             like = shapes[QUANTITY + name]
             # Shapes of partial results are those of a chunk without rollouts: they may not depend on the count.
             empty = reduction.partial(np.zeros((0, *like.shape), like.dtype), np.zeros(0, np.int64))
-            self._parts[name] = list(empty)
-            self.variables += [_variable(_key(name, part), value, "chunk") for part, value in empty.items()]
-            # Merged once before the run: it shows the shapes of the results, and errors of a user's reduction early.
-            merged = reduction.merge({part: np.stack([value, value]) for part, value in empty.items()})
-            if missing := set(reduction.parts) - merged.keys():
-                raise ValueError(f"reductions[{name!r}].merge does not return {sorted(missing)}, which its parts name")
+            self.names[name] = {part: f"partial/{name}_{part}" for part in empty}
+            self.variables += [_variable(self.names[name][part], value, "chunk") for part, value in empty.items()]
+            # Before the run: it shows the shapes of the results, and errors of a user's reduction early.
+            result = reduction.result(reduction.combine(empty, empty))
+            if missing := set(reduction.parts) - result.keys():
+                raise ValueError(f"reductions[{name!r}].result does not return {sorted(missing)}, which its parts name")
             of = variables.get(reduction.quantity) if isinstance(reduction.quantity, str) else None
-            self.variables += [_variable(f"{name}_{part}", merged[part], None, of) for part in reduction.parts]
+            self.variables += [_variable(f"{name}_{part}", result[part], None, of) for part in reduction.parts]
 
-    def partials(self, rows: Mapping[str, np.ndarray], numbers: np.ndarray) -> Arrays:
-        """Partial results of a chunk, by their names in the store, of the rollouts that succeeded."""
+    def partials(self, rows: Mapping[str, np.ndarray], numbers: np.ndarray) -> Results:
+        """Partial results of a chunk, of the rollouts that succeeded."""
         # Rows of rollouts that failed may hold NaN, which would spread to the results.
-        good, results = rows["result"] == 0, {}
-        for name, reduction in self._reductions.items():
-            parts = reduction.partial(rows[QUANTITY + name][good], numbers[good])
-            results |= {_key(name, part): np.asarray(value)[None] for part, value in parts.items()}
-        return results
+        good = rows["result"] == 0
+        return {name: one.partial(rows[QUANTITY + name][good], numbers[good]) for name, one in self.reductions.items()}
 
-    @property
-    def partial_names(self) -> list[str]:
-        """Names of the partial results in the store."""
-        return [_key(name, part) for name, parts in self._parts.items() for part in parts]
+    def combine(self, total: Results, partials: Results) -> Results:
+        """Partial results of all chunks so far, from those of all but the last one and of the last one."""
+        return {name: one.combine(total[name], partials[name]) for name, one in self.reductions.items()}
 
-    def combine(self, partials: Arrays) -> Arrays:
-        """Fewer partial results with the same merged result, from those of some chunks in order, by their names in the store."""
-        combined = {}
-        for name, reduction in self._reductions.items():
-            parts = reduction.combine(self._of(name, partials))
-            combined |= {_key(name, part): np.asarray(value) for part, value in parts.items()}
-        return combined
+    def results(self, total: Results) -> Results:
+        """Results from the partial results of all chunks."""
+        results = {name: (one.parts, one.result(total[name])) for name, one in self.reductions.items()}
+        return {name: {part: np.asarray(all_[part]) for part in parts} for name, (parts, all_) in results.items()}
 
-    def merge(self, partials: Arrays) -> dict[str, Arrays]:
-        """Results of all reductions, from the partial results of all chunks by their names in the store."""
-        results = {}
-        for name, reduction in self._reductions.items():
-            merged = reduction.merge(self._of(name, partials))
-            results[name] = {part: np.asarray(merged[part]) for part in reduction.parts}
-        return results
+    def to_store(self, partials: Results) -> Arrays:
+        """Partial results by their names in the store, with an axis of chunks."""
+        return {self.names[k][part]: np.asarray(x)[None] for k, one in partials.items() for part, x in one.items()}
 
-    def _of(self, name: str, partials: Arrays) -> Arrays:
-        return {part: partials[_key(name, part)] for part in self._parts[name]}
+    def from_store(self, read: Callable[[list[str]], Arrays]) -> Results:
+        """Partial results of a chunk, whose arrays `read(names)` returns."""
+        arrays = read([name for one in self.names.values() for name in one.values()])
+        return {k: {part: arrays[name][0] for part, name in one.items()} for k, one in self.names.items()}
 
 
-class Merger:
+class Totals:
     """Result codes, failures and reductions of a run, from summaries of chunks that are added in the order of the chunks.
 
-    `codes`: number of rollouts that ended with each code; `failed`: numbers of the first `most` that failed.
+    `codes`: number of rollouts that ended with each code; `failed`: numbers of the first `most` that failed; `steps`: those that
+    rollouts needed, and those that their batches computed.
     """
 
     def __init__(self, reducer: Reducer, codes: int, most: int):
@@ -89,7 +81,7 @@ class Merger:
         self.codes = np.zeros(codes, np.int64)
         self.failed = np.zeros(0, np.int64)
         self.steps = np.zeros(2, np.int64)
-        self._size, self._pending = 0, []
+        self._partials: Results | None = None
 
     def add(self, summary: Any) -> None:
         """Add the summary of the next chunk."""
@@ -97,25 +89,12 @@ class Merger:
         self.steps += summary.steps
         # Summaries come in the order of the chunks, so that these are the first failures for any number of workers.
         self.failed = np.concatenate([self.failed, summary.failed[: self._most - len(self.failed)]])
-        if self._reducer.partial_names:
-            self._pending.append(summary.partials)
-            # After as many chunks as partial results are kept: those of a reduction that does not combine are copied rarely.
-            if len(self._pending) > max(COMBINED, self._size):
-                self._combine()
+        before, partials = self._partials, summary.partials
+        self._partials = partials if before is None else self._reducer.combine(before, partials)
 
-    def results(self) -> dict[str, Arrays]:
+    def results(self) -> Results:
         """Results of all reductions."""
-        return self._reducer.merge(self._combine()) if self._reducer.partial_names else {}
-
-    def _combine(self) -> Arrays:
-        together = {name: np.concatenate([one[name] for one in self._pending]) for name in self._pending[0]}
-        self._pending = [self._reducer.combine(together)]
-        self._size = len(next(iter(self._pending[0].values())))
-        return self._pending[0]
-
-
-def _key(name: str, part: str) -> str:
-    return f"partial/{name}_{part}"
+        return self._reducer.results(self._partials or {})
 
 
 def _variable(key: str, value: Any, leading: str | None, of: Variable | None = None) -> Variable:

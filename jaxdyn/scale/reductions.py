@@ -15,7 +15,7 @@ from typing import Any
 
 import numpy as np
 
-Arrays = dict[str, np.ndarray]
+Arrays = dict[str, Any]  # arrays of NumPy, and its scalars
 
 
 class Reduction(abc.ABC):
@@ -35,17 +35,13 @@ class Reduction(abc.ABC):
         Shapes and dtypes of its arrays may depend on the shape and dtype of one value only.
         """
 
-    def combine(self, partials: Arrays) -> Arrays:
-        """Fewer partial results with the same merged result, from those of chunks in order, with a leading axis of chunks.
-
-        By default `partials` itself. With a single partial result the memory of long runs is constant;
-        combine([combine([a, b]), c]) and combine([a, b, c]) have to be equal bit for bit.
-        """
-        return partials
-
     @abc.abstractmethod
-    def merge(self, partials: Arrays) -> Arrays:
-        """Result, by `parts`, from the partial results of all chunks (combined or not), with a leading axis."""
+    def combine(self, total: Arrays, partial: Arrays) -> Arrays:
+        """Partial result of several chunks from that of all but the last one, and that of the last one."""
+
+    def result(self, total: Arrays) -> Arrays:
+        """Result, by `parts`, from the partial result of all rollouts, by default that itself."""
+        return total
 
 
 @dataclass(frozen=True)
@@ -67,28 +63,19 @@ class Mean(Reduction):
         squares = ((values - mean) ** 2).sum(0)
         return {"count": np.asarray(len(values)), "mean": np.asarray(mean), "squares": np.asarray(squares)}
 
-    def combine(self, partials: Arrays) -> Arrays:
-        """One sum, chunk by chunk in order."""
-        count, mean = 0, np.zeros(partials["mean"].shape[1:])
-        squares = np.zeros_like(mean)
-        for n, one, squares_within in zip(partials["count"], partials["mean"], partials["squares"], strict=True):
-            if n == 0:
-                continue
-            if count == 0:  # unchanged, so that a combined result in the first place gives the same bits
-                count, mean, squares = n, one, squares_within
-                continue
-            total, shift = count + n, one - mean
-            mean = mean + shift * (n / total)
-            squares = squares + squares_within + shift**2 * (count * n / total)
-            count = total
-        return {"count": np.asarray([count]), "mean": mean[None], "squares": squares[None]}
+    def combine(self, total: Arrays, partial: Arrays) -> Arrays:
+        """Sums of both, about their common mean."""
+        count = total["count"] + partial["count"]
+        # Exact where one of them is empty: 0 leaves the other as it is, and 1 takes this one.
+        weight, shift = partial["count"] / max(count, 1), partial["mean"] - total["mean"]
+        squares = total["squares"] + partial["squares"] + shift**2 * (total["count"] * weight)
+        return {"count": count, "mean": total["mean"] + shift * weight, "squares": squares}
 
-    def merge(self, partials: Arrays) -> Arrays:
-        """Mean and deviation of the combined sums."""
-        count, mean, squares = (self.combine(partials)[name][0] for name in ("count", "mean", "squares"))
-        mean = mean if count else np.full_like(mean, np.nan)
-        std = np.sqrt(squares / (count - 1)) if count > 1 else np.full_like(mean, np.nan)
-        return {"mean": np.asarray(mean), "std": np.asarray(std), "count": np.asarray(count)}
+    def result(self, total: Arrays) -> Arrays:
+        """Mean and deviation."""
+        count, mean = total["count"], total["mean"] if total["count"] else np.full_like(total["mean"], np.nan)
+        std = np.sqrt(total["squares"] / (count - 1)) if count > 1 else np.full_like(mean, np.nan)
+        return {"mean": mean, "std": std, "count": count}
 
 
 @dataclass(frozen=True)
@@ -125,13 +112,13 @@ class Histogram(Reduction):
         counts = np.bincount((places * width + np.arange(width)).ravel(), minlength=size * width)
         return {"counts": counts.reshape(size, *values.shape[1:])}
 
-    def combine(self, partials: Arrays) -> Arrays:
+    def combine(self, total: Arrays, partial: Arrays) -> Arrays:
         """Their sum."""
-        return {"counts": partials["counts"].sum(0, keepdims=True)}
+        return {"counts": total["counts"] + partial["counts"]}
 
-    def merge(self, partials: Arrays) -> Arrays:
-        """Their sum."""
-        return {"counts": partials["counts"].sum(0), "edges": self.edges}
+    def result(self, total: Arrays) -> Arrays:
+        """The counts, with the edges of the bins."""
+        return total | {"edges": self.edges}
 
 
 @dataclass(frozen=True)
@@ -151,9 +138,9 @@ class Quantiles(Histogram):
         if given.ndim != 1 or not ((given >= 0) & (given <= 1)).all():
             raise ValueError(f"probabilities is {self.probabilities}; give numbers from 0 to 1")
 
-    def merge(self, partials: Arrays) -> Arrays:
+    def result(self, total: Arrays) -> Arrays:
         """Linear within a bin."""
-        counts = partials["counts"].sum(0)
+        counts = total["counts"]
         flat = counts.reshape(len(counts), math.prod(counts.shape[1:]))
         probabilities = np.asarray(self.probabilities, float)
         quantiles = np.empty((len(probabilities), flat.shape[1]))
@@ -203,14 +190,10 @@ class Worst(Reduction):
             )
         return self._worst(values.astype(np.float64), numbers)
 
-    def combine(self, partials: Arrays) -> Arrays:
-        """The worst of these."""
-        return {name: value[None] for name, value in self.merge(partials).items()}
-
-    def merge(self, partials: Arrays) -> Arrays:
-        """The worst of these."""
-        there = partials["rollout"] >= 0
-        return self._worst(partials["value"][there], partials["rollout"][there])
+    def combine(self, total: Arrays, partial: Arrays) -> Arrays:
+        """The worst of both."""
+        value, rollout = (np.concatenate([total[name], partial[name]]) for name in self.parts)
+        return self._worst(value[rollout >= 0], rollout[rollout >= 0])
 
     def _worst(self, values: np.ndarray, numbers: np.ndarray) -> Arrays:
         order = np.lexsort((numbers, -values if self.largest else values))[: self.keep]

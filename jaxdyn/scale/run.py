@@ -2,6 +2,7 @@
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
+from functools import partial
 from typing import Any
 
 import jax
@@ -11,7 +12,7 @@ from jaxtyping import Array, PyTree
 from jaxdyn.model.arguments import Checked, FilePath, Numbers, as_array
 from jaxdyn.model.description import scene_lines
 from jaxdyn.scale.batch import Cost, Options, Run, run_batch
-from jaxdyn.scale.description import describe_function, describe_motion
+from jaxdyn.scale.description import describe, function_values, motion_values
 from jaxdyn.scale.members import digest, members
 from jaxdyn.scale.reductions import Reduction
 from jaxdyn.scale.study import STEPS
@@ -27,7 +28,7 @@ SHARE = 0.05  # of the times, simulated to measure the cost of a rollout
 
 @dataclass(frozen=True, eq=False)
 class Rollout:
-    """A rollout of `run`, as a function of its draw (None without one) and of its row of the arrays."""
+    """A rollout of `run`, as a function of its parameters (or None) and of its row of the arrays."""
 
     # A class, not a function within `run`: cloudpickle sends it by name, so that workers use the code of their own jaxdyn.
     scene: Any
@@ -38,27 +39,26 @@ class Rollout:
     ts: np.ndarray
     options: dict[str, Any]
 
-    def __call__(self, drawn: Any, row: Any) -> tuple[Any, Any, Any]:
-        """Solution, scene and parameters."""
-        scene, control, q0, v0, own = self._start(drawn, row)
-        return simulate(scene, q0, v0, self.ts, control=control, throw=False, **self.options), scene, own
+    def __call__(self, parameters: Any, row: Any) -> tuple[Any, Any]:
+        """Solution and scene."""
+        scene, control, q0, v0 = self._start(parameters, row)
+        return simulate(scene, q0, v0, self.ts, control=control, throw=False, **self.options), scene
 
-    def pilot(self, drawn: Any, row: Any) -> dict[str, Any]:
+    def pilot(self, parameters: Any, row: Any) -> dict[str, Any]:
         """Number of steps of its first part, as its cost."""
-        scene, control, q0, v0, _ = self._start(drawn, row)
+        scene, control, q0, v0 = self._start(parameters, row)
         # Two times, because steps are counted and rows are not needed.
         early = np.array([self.ts[0], self.ts[0] + SHARE * (self.ts[-1] - self.ts[0])])
         solution = simulate(scene, q0, v0, early, control=control, throw=False, **{**self.options, "outputs": ()})
         return {"cost": solution.stats[STEPS]}
 
-    def _start(self, drawn: Any, row: Any) -> tuple[Any, Any, Any, Any, Any]:
-        own = row.get("parameters") if drawn is None else drawn
-        scene, control = self.scene(own) if self.builds else self.scene, self.control
+    def _start(self, parameters: Any, row: Any) -> tuple[Any, Any, Any, Any]:
+        scene, control = self.scene(parameters) if self.builds else self.scene, self.control
         # A control with parameters of the rollout has to be built with the scene.
         if isinstance(scene, tuple):
             scene, control = scene
-        q0, v0 = self.states(own) if self.states else ((row | self.fixed)[name] for name in ("q0", "v0"))
-        return scene, control, q0, v0, own
+        q0, v0 = self.states(parameters) if self.states else ((row | self.fixed)[name] for name in ("q0", "v0"))
+        return scene, control, q0, v0
 
 
 def run(
@@ -80,11 +80,7 @@ def run(
     devices: Sequence[Any] | None = None,
     batch_size: int | None = None,
     chunk: int | None = None,
-    memory: int | None = None,
-    compress: bool = False,
-    verify: bool = True,
     progress: bool = True,
-    lanes: int | None = None,
     **options: Any,
 ) -> Run:
     """Simulate a batch of any size, chunk by chunk, into a Zarr store; the same call resumes an interrupted run.
@@ -112,12 +108,10 @@ def run(
     - `client`: a `dask.distributed.Client`, whose workers compute the chunks; without it this process does, and Dask is not
       imported. `retries`: attempts after the first for a chunk that raises; others are finished before its error is reported.
     - `devices`: of this process, all by default; a worker uses all of its own. `batch_size`: rollouts computed at once, by
-      default 2048 for each device of a CPU and fewer where there are few rollouts, or where the compiled program with its
-      results, by XLA's account, does not fit into `memory` (bytes; by default half of the free memory, shared by the workers
-      of a host). `chunk`: rollouts stored at once, and lost at most when killed; by default two seconds of work.
-    - `compress`: store arrays compressed (Zstandard); smaller, and slower.
-    - `verify`: at the end check the chunks of earlier calls, and compute damaged ones again.
-    - `progress`: show rate and time left on standard error. `lanes`: deprecated name of `batch_size`.
+      default 2048 for each device of a CPU and fewer where there are few rollouts. It is reduced where the compiled program
+      with its results, by XLA's account, exceeds half of the free memory, which the workers of a host share. `chunk`: rollouts
+      stored at once, and lost at most when killed; by default two seconds of work.
+    - `progress`: show rate and time left on standard error.
 
     **Returns:** a `Run`. A rollout that fails is a row with its code and does not raise.
 
@@ -145,8 +139,7 @@ def run(
     )
     ```
     """
-    # First of all, when the local variables are the arguments, whose list stands in the signatures alone.
-    shared = Options.of(locals())
+    shared = Options(out, reductions, rows, cost, client, retries, devices, batch_size, chunk, progress)
     ts = np.asarray(as_array(ts, "ts"))
     check_times(ts)
     # `Rollout` passes `throw` itself, which given twice would be a TypeError.
@@ -177,8 +170,9 @@ def run(
     }
     # Steps of a given size are equally many: nothing to measure.
     pilot = rollout.pilot if options.get("stepsize") is None else None
-    units = dict(shared.units or {})
-    return run_batch(lambda to: describe_motion(rollout, batch, to, units, ts), given, batch, shared, pilot)
+    return run_batch(
+        partial(describe, partial(motion_values, rollout), batch, units or {}, ts), given, batch, shared, pilot
+    )
 
 
 def evaluate(
@@ -197,11 +191,7 @@ def evaluate(
     devices: Sequence[Any] | None = None,
     batch_size: int | None = None,
     chunk: int | None = None,
-    memory: int | None = None,
-    compress: bool = False,
-    verify: bool = True,
     progress: bool = True,
-    lanes: int | None = None,
 ) -> Run:
     """Evaluate a function of one sample for a batch of any size, as `run` simulates: fits from many starts, rewards, designs.
 
@@ -213,8 +203,7 @@ def evaluate(
 
     **Raises:** ValueError for a function that returns no dictionary of arrays, and as `run` does.
     """
-    shared = Options.of(locals())
+    shared = Options(out, reductions, rows, cost, client, retries, devices, batch_size, chunk, progress)
     draw = parameters if callable(parameters) else None
     batch = members({} if draw is not None else {"parameters": parameters}, draw, samples, seed)
-    units = dict(shared.units or {})
-    return run_batch(lambda to: describe_function(function, batch, to, units), {}, batch, shared)
+    return run_batch(partial(describe, partial(function_values, function), batch, units or {}, None), {}, batch, shared)

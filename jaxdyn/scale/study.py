@@ -1,10 +1,11 @@
 """A study, which determines the rows of a batch, and its computation in one process: pure functions of the number of a chunk."""
 
+import threading
 import time
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import dataclass
-from functools import cached_property
+from functools import cached_property, partial
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -13,10 +14,9 @@ import numpy as np
 
 from jaxdyn.scale.description import Description
 from jaxdyn.scale.members import Members
-from jaxdyn.scale.program import MEMORY_FRACTION, Program, Traced, available_memory, default_size, fingerprint
-from jaxdyn.scale.reducer import Reducer
-from jaxdyn.scale.reductions import Arrays
-from jaxdyn.scale.store import Store
+from jaxdyn.scale.program import MEMORY_FRACTION, Program, Traced, available_memory, default_size
+from jaxdyn.scale.reducer import Reducer, Results
+from jaxdyn.scale.store import Store, zarr_package
 from jaxdyn.tasks import Failure, Local, attempt
 
 STEPS = "num_steps"  # of a rollout, by this name among its arrays
@@ -41,23 +41,25 @@ class Summary(NamedTuple):
     """Result of the task of a chunk, whose rows are in the store.
 
     `codes`: number of rollouts that ended with each code; `failed`, numbers of the first that failed; `partials` of reductions;
-    `steps`: those that the rollouts needed, and those that their batches computed, (0, 0) of a chunk that was read.
+    `steps`: those that the rollouts needed, and those that their batches computed, (0, 0) of a chunk that was read;
+    `is_repaired`: it was in the store, and damaged.
     """
 
     codes: np.ndarray
     failed: np.ndarray
-    partials: Arrays
-    steps: tuple[int, int] = (0, 0)
+    partials: Results
+    steps: tuple[int, int]
+    is_repaired: bool
 
 
 @dataclass(frozen=True)
 class Study:
-    """All that determines the rows of a batch, to be sent to workers.
+    """All that determines the rows of a batch; it is sent to workers and compiled there.
 
     - `outputs`: the function of a member; `kept`: names of the arrays that are stored.
-    - `cost`: a function of a member like `outputs`, with one array "cost"; an array (count,); or None.
-    - `size` or None: members of a batch, by default at most `most`; `memory` (bytes) or None: half of the free memory of a host,
-      shared by the `sharing` processes there. `devices`: None for all of a process.
+    - `cost`: a function of a member like that of `outputs`, with one array "cost"; an array (count,); or None.
+    - `size` or None: members of a batch, by default at most `most`. `sharing`: processes that share the free memory of a host.
+      `devices`: None for all of a process.
     """
 
     outputs: Description
@@ -69,72 +71,101 @@ class Study:
     devices: Sequence[Any] | None
     size: int | None
     most: int
-    memory: int | None
     sharing: int
 
-    def open(self) -> "Computation":
-        """Its computation in this process."""
-        return Computation(self)
+    def open(self) -> "Study":
+        """This study, compiled in this process."""
+        # With all that takes long, so that a worker has it before its first task: zarr's import is a third of a second.
+        zarr_package()
+        _ = self._computing, self.program, callable(self.cost) and self.cost_program
+        return self
 
+    @cached_property
+    def _computing(self) -> threading.Lock:
+        # Two threads of a worker have a task each, which would compete for the threads of kernels.
+        return threading.Lock()
 
-class Computation:
-    """A study compiled in this process."""
-
-    def __init__(self, study: Study):
-        self.study = study
-        devices = local_devices(study.devices)
-        size = study.size or max(1, min(default_size(devices), study.most))
-        if study.cost is not None and not study.size:
+    @cached_property
+    def program(self) -> Program:
+        """The program of a batch."""
+        devices = local_devices(self.devices)
+        size = self.size or max(1, min(default_size(devices), self.most))
+        if self.cost is not None and not self.size:
             # Several batches in a chunk of the same bytes, else there is nothing to sort.
-            size = max(min(len(devices) * LEAST_BATCH, study.members.count), size // SORTED_BATCHES)
-        memory = study.memory
-        if memory is None and study.sharing > 1:
-            memory = int(MEMORY_FRACTION * available_memory(devices) / study.sharing)
-        batch, outputs = study.members, study.outputs
-        self.program = Program(outputs.traced, batch, devices, size, memory, outputs.is_motion)
-        if callable(study.cost):
-            traced = Traced(study.cost, batch)
-            self.cost = Program(traced, batch, devices, self.program.size, memory, outputs.is_motion)
+            size = max(min(len(devices) * LEAST_BATCH, self.members.count), size // SORTED_BATCHES)
+        return self._compile(self.outputs.traced, size)
+
+    @cached_property
+    def cost_program(self) -> Program:
+        """The program of the costs of a batch."""
+        return self._compile(Traced(self.cost, self.members), self.program.size)  # pyright: ignore[reportArgumentType]
+
+    def _compile(self, traced: Traced, size: int) -> Program:
+        devices = local_devices(self.devices)
+        memory = MEMORY_FRACTION * available_memory(devices) / self.sharing
+        return Program(traced, devices, size, memory, self.outputs.is_motion)
 
     def facts(self, measure: bool) -> Facts:
         """Facts of the program; with `measure` a batch is timed and hashed for a new store, else an existing one is checked.
 
         **Raises:** ValueError for a store of another study.
         """
-        if not measure:
-            # Reading the property opens the store and checks it.
-            _ = self.store
         seconds, programs = 0.0, {LOWERED: self.program.lowered}
         if measure:
-            first = np.arange(min(self.program.size, self.study.members.count))
+            first = np.arange(min(self.program.size, self.members.count))
             seconds = self.program.time(first, time.perf_counter)
-            programs[PROGRAM] = fingerprint(self.study.outputs.one, self.study.members)
+            programs[PROGRAM] = self.outputs.traced.fingerprint()
+        else:
+            # Reading the property opens the store and checks it.
+            _ = self.store
         return Facts(self.program.devices[0].platform, self.program.size, self.program.bytes, programs, seconds)
 
     @cached_property
     def store(self) -> Store:
         """The store of the study. **Raises:** ValueError where this process would compute something else."""
-        store = Store(self.study.path)
+        store = Store(self.path)
         if store.description[LOWERED] != self.program.lowered:
             # Another batch size, other devices or another processor: the computation for one member has to be the same. Its hash
             # needs a second trace, which a run that resumes with the same program saves.
-            store.check({PROGRAM: fingerprint(self.study.outputs.one, self.study.members)})
+            store.check({PROGRAM: self.outputs.traced.fingerprint()})
         return store
 
-    def chunk(self, chunk: int) -> Summary:
-        """Compute and store a chunk, or read it if it is in the store already."""
-        # A task that was lost with its worker may have been finished: Dask computes it again, this reads it.
-        if self.store.is_done(chunk):
-            return self.read(chunk)
-        return self.write(chunk, *self.rows(chunk))
+    def chunks(self, chunks: Sequence[int], rows: Any = None) -> list[Summary]:
+        """Compute and store chunks, or read those that the store has; damaged ones are computed again.
+
+        `rows`, of a single chunk, was computed before (see `rows`).
+        """
+        return [self._chunk(chunk, rows) for chunk in chunks]
+
+    def _chunk(self, chunk: int, rows: Any) -> Summary:
+        # Also a task that was lost with its worker may have been finished: Dask computes it again, this reads it.
+        is_there = self.store.is_done(chunk)
+        is_whole = is_there and self.store.is_whole(chunk)
+        if not is_whole:
+            # Missing until it is whole. Only of a damaged one: the record of another task may come at any time.
+            if is_there:
+                self.store.forget(chunk)
+            if rows is None:
+                with self._computing:
+                    rows = self.rows(chunk)
+            rows, steps = rows
+            partials = self.reducer.partials(rows, self.store.numbers(chunk))
+            self.store.write(chunk, {name: rows[name] for name in self.kept} | self.reducer.to_store(partials))
+            codes = rows["result"]
+        else:
+            codes, steps = self.store.read(chunk, ["result"])["result"], (0, 0)
+            partials = self.reducer.from_store(partial(self.store.read, chunk))
+        failed = self.store.numbers(chunk)[np.flatnonzero(codes)[:LISTED]]
+        counts = np.bincount(codes, minlength=len(self.outputs.codes))
+        return Summary(counts, failed, partials, steps, is_there and not is_whole)
 
     def rows(self, chunk: int) -> tuple[dict[str, np.ndarray], tuple[int, int]]:
         """Rows of a chunk, and its steps."""
-        numbers, cost = self.numbers(chunk), self.study.cost
+        numbers, cost = self.store.numbers(chunk), self.cost
         if cost is None:
             return compute(self.program, numbers)
         # By decreasing cost, so that the members of a batch take about equally many steps; back in order in the store.
-        costs = cost[numbers] if isinstance(cost, np.ndarray) else compute(self.cost, numbers)[0]["cost"]
+        costs = cost[numbers] if isinstance(cost, np.ndarray) else compute(self.cost_program, numbers)[0]["cost"]
         # Stable: rollouts of equal cost keep their order.
         order = np.argsort(-costs.astype(np.float64), kind="stable")
         rows, steps = compute(self.program, numbers[order])
@@ -142,65 +173,31 @@ class Computation:
         place = np.argsort(order)
         return {name: values[place] for name, values in rows.items()}, steps
 
-    def numbers(self, chunk: int) -> np.ndarray:
-        """Numbers of the rollouts of a chunk."""
-        rows = self.store.rows(chunk)
-        return np.arange(rows.start, rows.stop)
-
-    def write(self, chunk: int, rows: Mapping[str, np.ndarray], steps: tuple[int, int]) -> Summary:
-        """Store the rows of a chunk."""
-        partials = self.study.reducer.partials(rows, self.numbers(chunk))
-        self.store.write(chunk, {name: rows[name] for name in self.study.kept} | partials)
-        return self._summary(chunk, rows["result"], partials, steps)
-
-    def read(self, chunk: int) -> Summary:
-        """Summary of a chunk that is in the store."""
-        arrays = self.store.read(chunk, ["result", *self.study.reducer.partial_names])
-        return self._summary(chunk, arrays.pop("result"), arrays, (0, 0))
-
-    def check(self, chunks: tuple[int, np.ndarray]) -> list[tuple[bool, Summary]]:
-        """Check consecutive chunks from the first one on: whether each was damaged, and is computed again, and its summary.
-
-        The flags select the chunks whose files are compared with their checksums; the others were just written.
-        """
-        results = []
-        for chunk, is_checked in enumerate(chunks[1], chunks[0]):
-            is_damaged = bool(is_checked) and not self.store.is_whole(chunk)
-            if is_damaged:
-                # A chunk without its record is missing, so that `chunk` computes it again.
-                self.store.forget(chunk)
-            results.append((is_damaged, self.chunk(chunk)))
-        return results
-
-    def _summary(self, chunk: int, codes: np.ndarray, partials: Arrays, steps: tuple[int, int]) -> Summary:
-        failed = self.numbers(chunk)[np.flatnonzero(codes)[:LISTED]]
-        return Summary(np.bincount(codes, minlength=len(self.study.outputs.codes)), failed, partials, steps)
-
 
 class Pipeline(Local):
     """The computation in this process: a thread writes a chunk while the next one is computed."""
 
-    target: Computation
+    target: Study
 
     # Writing releases the interpreter's lock most of the time, computing nearly always: a thread is enough. One chunk ahead, so
     # that two chunks are in memory, not more.
     def map(self, method: str, items: Iterable[Any]) -> Iterator[tuple[Any, Any]]:
-        """Results in the order of the items, as in `Local`."""
-        if method != "chunk":
-            yield from super().map(method, items)
-            return
+        """Results in the order of the items, lists of chunks, as in `Local`."""
         with ThreadPoolExecutor(1, thread_name_prefix="jaxdyn store") as writer:
-            before: tuple[int, Future] | None = None
-            for chunk in items:
-                rows = attempt(self.target.rows, chunk, retries=self.retries)
+            before: tuple[Any, Future] | None = None
+            for chunks in items:
+                is_missing = not self.target.store.is_done(chunks[0])
+                rows = attempt(self.target.rows, chunks[0], retries=self.retries) if is_missing else None
                 if before is not None:
                     yield before[0], before[1].result()
-                before = chunk, writer.submit(self._write, chunk, rows)
+                before = chunks, writer.submit(self._store, method, chunks, rows)
             if before is not None:
                 yield before[0], before[1].result()
 
-    def _write(self, chunk: int, rows: Any) -> Summary | Failure:
-        return rows if isinstance(rows, Failure) else attempt(self.target.write, chunk, *rows, retries=self.retries)
+    def _store(self, method: str, chunks: Any, rows: Any) -> Any:
+        if isinstance(rows, Failure):
+            return rows
+        return attempt(getattr(self.target, method), chunks, rows, retries=self.retries)
 
 
 def compute(program: Program, numbers: np.ndarray) -> tuple[dict[str, np.ndarray], tuple[int, int]]:

@@ -16,4 +16,3 @@ from jaxdyn.tasks.local import Failure as Failure
 from jaxdyn.tasks.local import Local as Local
 from jaxdyn.tasks.local import attempt as attempt
 from jaxdyn.tasks.local import package_versions as package_versions
-from jaxdyn.tasks.progress import Progress as Progress

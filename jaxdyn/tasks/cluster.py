@@ -30,18 +30,19 @@ class Cluster:
     """Tasks on the workers of a Dask client: methods of an object that `send` sends to them; a context manager.
 
     **Arguments:** `retries`, of a task that raises. `mark`: a file and its text, which every worker has to see, or None.
+    `at_once`: tasks of a worker with as many threads.
 
-    A worker has one task at a time, so that tasks do not compete for the threads of kernels. Tasks of a worker that dies go
-    to the others. If the scheduler dies, the client reconnects within its own `timeout`, and unfinished tasks are submitted
-    again.
+    A worker has one task at a time by default, so that tasks do not compete for the threads of kernels. Tasks of a worker that
+    dies go to the others. If the scheduler dies, the client reconnects within its own `timeout`, and unfinished tasks are
+    submitted again.
 
     **Raises:** ValueError for anything but a connected client, and for a scheduler or workers with other versions of Python,
     Dask, JAX or jaxdyn, before any task. ConnectionError where the scheduler does not come back.
     """
 
-    def __init__(self, client: DaskClient, retries: int = 0, mark: tuple[Path, str] | None = None):
+    def __init__(self, client: DaskClient, retries: int = 0, mark: tuple[Path, str] | None = None, at_once: int = 1):
         self.client: Any = client
-        self.retries, self.mark = retries, mark
+        self.retries, self.mark, self.at_once = retries, mark, at_once
         self._name = f"jaxdyn-{uuid.uuid4().hex[:12]}"
         self._plugin: Any = None
         self._generation = itertools.count()
@@ -75,7 +76,7 @@ class Cluster:
 
         from jaxdyn.tasks.worker import TargetPlugin
 
-        self._plugin = TargetPlugin(cloudpickle.dumps(target), self.mark)
+        self._plugin = TargetPlugin(self._name, cloudpickle.dumps(target), self.mark)
         self.client.register_plugin(self._plugin, name=self._name)
 
     def _begin(self) -> None:
@@ -111,9 +112,8 @@ class Cluster:
         while True:
             try:
                 window.submit()
-                while window.is_next_ready:
-                    yield window.take()
-                if not window.is_waiting:
+                yield from window.take_ready()
+                if not window.waiting:
                     if window.is_exhausted:
                         return
                     continue
@@ -132,7 +132,7 @@ class Cluster:
             [method] * len(items),
             items,
             key=[(group, place) for place in places],
-            resources={RESOURCE: 1},
+            resources={name: 1 / self.at_once for name in (RESOURCE, self._name)},
             retries=self.retries,
             pure=False,  # keys are given, not hashes of the arguments
         )
@@ -168,32 +168,26 @@ class _Window:
         self._completed = as_completed()
         # One name for all tasks: the scheduler keeps an entry for each name.
         self._group = cluster.new_group(method)
-        self._waiting: dict[int, tuple[Any, Any]] = {}  # item and future by place
+        self.waiting: dict[int, tuple[Any, Any]] = {}  # item and future by place
         self._ready: dict[int, tuple[Any, Any]] = {}  # item and result by place
         self._next = self._taken = 0
         self.is_exhausted = False
         self._workers, self._counted = 1, 0.0
 
-    @property
-    def is_waiting(self) -> bool:
-        return bool(self._waiting)
-
-    @property
-    def is_next_ready(self) -> bool:
-        return self._next in self._ready
-
-    def take(self) -> tuple[Any, Any]:
-        self._next += 1
-        return self._ready.pop(self._next - 1)
+    def take_ready(self) -> Iterator[tuple[Any, Any]]:
+        """Results that are next in the order of the items."""
+        while self._next in self._ready:
+            self._next += 1
+            yield self._ready.pop(self._next - 1)
 
     def submit(self) -> None:
         """Fill the window when half of it is empty: a call of the scheduler costs more than a task."""
         if time.monotonic() - self._counted > 1.0:
             self._workers, self._counted = self._cluster.workers, time.monotonic()
         size = max(LEAST_WINDOW, WINDOW * self._workers)
-        if len(self._waiting) > size // 2:
+        if len(self.waiting) > size // 2:
             return
-        room = min(size - len(self._waiting), self._next + AHEAD * size - self._taken)
+        room = min(size - len(self.waiting), self._next + AHEAD * size - self._taken)
         new = list(itertools.islice(self._items, max(0, room)))
         self.is_exhausted |= len(new) < room
         if new:
@@ -204,15 +198,15 @@ class _Window:
         """Submit all unfinished tasks again, whose futures are lost."""
         self._completed.clear()
         self._group = self._cluster.new_group(self._method)
-        lost = {place: item for place, (item, _) in self._waiting.items()}
-        self._waiting.clear()
+        lost = {place: item for place, (item, _) in self.waiting.items()}
+        self.waiting.clear()
         self._add(lost)
 
     def _add(self, new: dict[int, Any]) -> None:
         # Recorded first: if submitting fails, they are submitted again.
-        self._waiting |= {place: (item, None) for place, item in new.items()}
+        self.waiting |= {place: (item, None) for place, item in new.items()}
         futures = self._cluster.submit(self._group, self._method, list(new), list(new.values()))
-        self._waiting |= {place: (new[place], future) for place, future in zip(new, futures, strict=True)}
+        self.waiting |= {place: (new[place], future) for place, future in zip(new, futures, strict=True)}
         self._completed.update(futures)
 
     def collect(self) -> None:
@@ -227,12 +221,12 @@ class _Window:
                 raise ConnectionError(f"{future} is {future.status}")
         for future, result in results.items():
             place = self._place(future)
-            item, _ = self._waiting.pop(place)
+            item, _ = self.waiting.pop(place)
             self._ready[place] = item, result
 
     def _place(self, future: Any) -> Any:
         place = future.key[1]
-        return place if self._waiting.get(place, (None, None))[1] is future else None
+        return place if self.waiting.get(place, (None, None))[1] is future else None
 
 
 def _outages() -> tuple[type[BaseException], ...]:

@@ -15,7 +15,7 @@ from distributed.core import Status
 from jaxdyn.compile import compilation, compilation_mode
 from jaxdyn.tasks.local import package_versions
 
-RESOURCE = "jaxdyn"  # of Dask: each worker has one, each task takes one
+RESOURCE = "jaxdyn"  # of Dask: each worker has one, each task takes one, and one of the name of its plugin
 
 
 class Settings(NamedTuple):
@@ -49,14 +49,14 @@ class Settings(NamedTuple):
 class TargetPlugin(WorkerPlugin):
     """An object for each worker, also for those that join later, opened before the first task there.
 
-    **Arguments:** `packed`, a function without arguments by cloudpickle, which returns the object; `mark`, a file of the client
-    with its text, which the worker has to see too, or None.
+    **Arguments:** `name` of the plugin; `packed`, a function without arguments by cloudpickle, which returns the object; `mark`,
+    a file of the client with its text, which the worker has to see too, or None.
 
     A worker that does not fit (`setup` raises) gets no unit of the resource, hence no task.
     """
 
-    def __init__(self, packed: bytes, mark: tuple[Path, str] | None):
-        self.packed, self.mark = packed, mark
+    def __init__(self, name: str, packed: bytes, mark: tuple[Path, str] | None):
+        self.name, self.packed, self.mark = name, packed, mark
         self.settings, self.versions = Settings.current(), package_versions()
         self._target: Any = None
 
@@ -68,15 +68,15 @@ class TargetPlugin(WorkerPlugin):
         self.check(worker.address)
         self._address = worker.address
         self._lock = threading.Lock()
-        if RESOURCE not in worker.state.total_resources:
-            self._start = asyncio.create_task(self._enable(worker))
+        self._start = asyncio.create_task(self._enable(worker))
 
     async def _enable(self, worker: Worker) -> None:
         # Tasks come when the object is open, which takes seconds of compilation. A worker that replaces a dead one would else be
-        # given the last tasks, and hold up a run that the others could have finished.
+        # given the last tasks, and hold up a run that the others could have finished. So each object has a resource of its own:
+        # that of all tasks is there from the first object on, or from the start.
         with contextlib.suppress(Exception):  # the first task raises it again, for the client
             await asyncio.get_running_loop().run_in_executor(worker.executors["default"], self._open)
-        await worker.set_resources(**{RESOURCE: 1})
+        await worker.set_resources(**{RESOURCE: 1} | worker.state.total_resources | {self.name: 1})
         # The scheduler looks for workers of waiting tasks when a worker begins to run, not when it is given resources. Without
         # this, a task that waits because all workers have died would wait for ever.
         if worker.status == Status.running:

@@ -67,6 +67,8 @@ USERS = {
     "xarray": {"simulation", "scale"},
     "zarr": {"scale"},
     "filelock": {"scale"},
+    "google_crc32c": {"scale"},
+    "tqdm": {"scale"},
     "cloudpickle": {"tasks"},
     "distributed": {"tasks", "cli"},
 }

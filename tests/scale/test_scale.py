@@ -1,6 +1,7 @@
 """Batches of any size into a store: rows, interruptions, reductions, and how they say no; test_scale_dask.py has clusters."""
 
 import errno
+import functools
 import itertools
 import json
 import os
@@ -10,6 +11,7 @@ import signal
 import subprocess
 import sys
 import textwrap
+import threading
 import time
 from pathlib import Path
 
@@ -124,6 +126,18 @@ def test_a_store_that_is_whole_is_only_looked_through(pendulums):
     assert files(run.out) == before
 
 
+def test_arrays_without_entries_and_flags_are_stored(tmp_path):
+    def function(p):
+        return {"none": jnp.zeros((2, 0)), "flag": p["x"] > 1.5, "count": jnp.int32(7 * p["x"])}
+
+    run = evaluated(tmp_path / "a.zarr", function=function)
+    assert evaluated(tmp_path / "a.zarr", function=function).repaired == ()
+    table = run.dataset()
+    assert table.none.shape == (23, 2, 0) and table.flag.dtype == bool and table["count"].dtype == np.int32
+    np.testing.assert_array_equal(table.flag, table.parameter_x > 1.5)
+    np.testing.assert_array_equal(table["count"], np.asarray(7 * table.parameter_x).astype(np.int32))
+
+
 def test_a_member_is_found_again(tmp_path):
     run = evaluated(tmp_path / "a.zarr")
     table = run.dataset()
@@ -134,7 +148,7 @@ def test_a_member_is_found_again(tmp_path):
 
 @pytest.mark.parametrize(
     "options",
-    [{"chunk": 7}, {"batch_size": 2}, {"devices": 1}, {"compress": True}, {"chunk": None}],
+    [{"chunk": 7}, {"batch_size": 2}, {"devices": 1}, {"chunk": None}],
     ids=str,
 )
 def test_rows_do_not_depend_on_how_they_are_computed(tmp_path, options):
@@ -170,7 +184,7 @@ def test_a_program_has_no_communication(pendulums):
         solution = jd.simulate(build({"damping": row["p"]}), row["q0"], jnp.zeros(2), ts, stepsize=0.01, throw=False)
         return {"q": solution.q, "v": solution.v}
 
-    compiled = program.Program(program.Traced(one, batch), batch, jax.local_devices(), 8, None, True)
+    compiled = program.Program(program.Traced(one, batch), jax.local_devices(), 8, np.inf, True)
     text = compiled.compiled.as_text()
     assert "jaxdyn_kernel" in text
     for collective in (
@@ -325,7 +339,7 @@ def test_a_store_of_something_else_is_refused_with_what_differs(tmp_path, monkey
     refused("of another version of jaxdyn: there it is 0.0.9, here " + jd.__version__)
     old["attributes"]["jaxdyn_store"] = 0
     (out / "zarr.json").write_text(json.dumps(old))
-    refused("whose format is 0 of jaxdyn and not 1")
+    refused("whose format is 0 of jaxdyn and not 2")
     (tmp_path / "c.zarr").mkdir()
     with pytest.raises(ValueError, match=r"no store of jd\.scale"):
         evaluated(tmp_path / "c.zarr")
@@ -425,8 +439,11 @@ class Extent(jd.scale.Reduction):
             "most": np.max(values, axis=0, initial=-np.inf),
         }
 
-    def merge(self, partials):
-        return {"least": partials["least"].min(0), "most": partials["most"].max(0)}
+    def combine(self, total, partial):
+        return {
+            "least": np.minimum(total["least"], partial["least"]),
+            "most": np.maximum(total["most"], partial["most"]),
+        }
 
 
 def test_reductions_are_those_of_all_rows(tmp_path):
@@ -468,11 +485,11 @@ def test_a_mean_of_large_numbers_does_not_cancel():
     values = 1e8 + np.random.default_rng(0).normal(size=(1000, 2))
     mean = jd.scale.Mean("y")
     parts = [mean.partial(part, np.arange(len(part))) for part in (values[:0], values[:3], values[3:700], values[700:])]
-    computed = mean.merge({name: np.stack([part[name] for part in parts]) for name in parts[0]})
+    computed = mean.result(functools.reduce(mean.combine, parts))
     np.testing.assert_allclose(computed["mean"], values.mean(0), rtol=1e-14)
     # The last bit of 1e8 is 1.5e-8, which is that of the deviations too; sums of squares as they are would lose all digits.
     np.testing.assert_allclose(computed["std"], values.std(0, ddof=1), rtol=1.5e-8)
-    none = mean.merge({name: part[None] for name, part in parts[0].items()})
+    none = mean.result(parts[0])
     assert none["count"] == 0 and np.isnan(none["mean"]).all() and np.isnan(none["std"]).all()
 
 
@@ -487,35 +504,37 @@ def test_a_mean_of_large_numbers_does_not_cancel():
     ],
     ids=lambda x: type(x).__name__,
 )
-def test_partial_results_combine_in_groups_to_the_same_bits(reduction):
-    """As results arrive or all at once; groups without rollouts, and one that was combined before, among them."""
+def test_chunks_without_rollouts_change_no_bit_of_a_result(reduction):
+    """First, last and in between; and shapes of partial results stay, so that memory does not grow."""
     values = np.random.default_rng(2).random(200)
-    ends = np.array([0, 0, 3, 40, 41, 41, 120, 200])
-    parts = [reduction.partial(values[a:b], np.arange(a, b)) for a, b in itertools.pairwise(ends)]
-    stacked = {name: np.stack([part[name] for part in parts]) for name in parts[0]}
-    together = {name: value[:1] for name, value in stacked.items()}
-    for begin, end in ((1, 2), (2, 5), (5, 7)):
-        joined = {name: np.concatenate([together[name], value[begin:end]]) for name, value in stacked.items()}
-        together = reduction.combine(joined)
-    assert_equal(reduction.merge(together), reduction.merge(stacked))
-    if not isinstance(reduction, Extent):
-        assert {len(value) for value in together.values()} == {1}
+
+    def combined(*ends):
+        parts = [reduction.partial(values[a:b], np.arange(a, b)) for a, b in itertools.pairwise(ends)]
+        total = functools.reduce(reduction.combine, parts)
+        assert {name: np.shape(x) for name, x in total.items()} == {name: np.shape(x) for name, x in parts[0].items()}
+        return {name: np.asarray(x) for name, x in reduction.result(total).items()}
+
+    assert_equal(combined(0, 0, 3, 40, 41, 41, 120, 200, 200), combined(0, 3, 40, 41, 120, 200))
 
 
 def test_a_run_of_many_chunks_merges_as_they_come():
-    from jaxdyn.scale.reducer import COMBINED, Merger, Reducer
+    from jaxdyn.scale.reducer import Reducer, Totals
     from jaxdyn.scale.study import Summary
 
-    values = np.random.default_rng(3).random(3 * COMBINED + 7)
+    values = np.random.default_rng(3).random(199)
     reductions = {"mean": jd.scale.Mean("y"), "own": Extent()}
     shapes = {f"quantity of {name}": jax.ShapeDtypeStruct((), np.float64) for name in reductions}
     reducer = Reducer(reductions, shapes, {})
-    merger = Merger(reducer, 2, 5)
+    merger = Totals(reducer, 2, 5)
     for k, value in enumerate(values):
         rows = {"result": np.array([k % 2]), **dict.fromkeys(shapes, np.array([value]))}
         merger.add(
             Summary(
-                np.array([1 - k % 2, k % 2]), np.arange(k, k + k % 2), reducer.partials(rows, np.array([k])), (k, 1)
+                np.array([1 - k % 2, k % 2]),
+                np.arange(k, k + k % 2),
+                reducer.partials(rows, np.array([k])),
+                (k, 1),
+                False,
             )
         )
     results = merger.results()
@@ -527,7 +546,7 @@ def test_a_run_of_many_chunks_merges_as_they_come():
 def test_quantiles_outside_of_the_bins_are_not_made_up():
     quantiles = jd.scale.Quantiles("y", 0.0, 1.0, probabilities=(0.0, 0.2, 0.5, 1.0))
     part = quantiles.partial(np.array([-1.0, 0.25, 0.5, 0.75, 3.0]), np.arange(5))
-    computed = quantiles.merge({"counts": part["counts"][None]})["quantiles"]
+    computed = quantiles.result(part)["quantiles"]
     assert np.isnan(computed[[0, 3]]).all() and abs(computed[2] - 0.5) < 2e-3
 
 
@@ -587,21 +606,19 @@ def test_a_cost_that_nobody_knows_is_measured(tmp_path):
         run("c.zarr", cost="guessed")
 
 
-def test_former_names_are_accepted_with_a_warning(tmp_path):
-    with pytest.warns(DeprecationWarning, match="lanes is deprecated; pass batch_size"):
-        run = evaluated(tmp_path / "a.zarr", lanes=4)
-    with pytest.warns(DeprecationWarning, match=r"Run\.lanes is deprecated; read batch_size"):
-        assert run.lanes == run.batch_size == 4
+def test_blocks_fit_the_memory(tmp_path, monkeypatch):
+    def run(name):
+        return evaluated(tmp_path / name, function=heavy, samples=400, chunk=400, batch_size=400)
 
-
-def test_blocks_fit_the_memory(tmp_path):
-    free = evaluated(tmp_path / "a.zarr", function=heavy, samples=400, chunk=400, batch_size=400)
-    tight = evaluated(tmp_path / "b.zarr", function=heavy, samples=400, chunk=400, batch_size=400, memory=2**20)
+    free = run("a.zarr")
+    monkeypatch.setattr("jaxdyn.scale.study.available_memory", lambda _: 2**21)
+    tight = run("b.zarr")
     assert free.batch_size == 400 and free.program_bytes > 2**24
     assert tight.batch_size < 30 and tight.program_bytes <= 2**20
     assert_equal(arrays(free.out), arrays(tight.out))
+    monkeypatch.setattr("jaxdyn.scale.study.available_memory", lambda _: 2000)
     with pytest.raises(MemoryError, match=r"a program of 2 rollouts needs .* MiB, and .* are allowed"):
-        evaluated(tmp_path / "c.zarr", function=heavy, samples=400, memory=1000)
+        run("c.zarr")
     assert not (tmp_path / "c.zarr").exists()
 
 
@@ -665,19 +682,19 @@ def test_the_extra_is_named(tmp_path, monkeypatch):
         evaluated(tmp_path / "a.zarr")
 
 
-def test_progress_has_rate_and_time_left(capsys):
-    from jaxdyn.tasks import Progress
-
-    meter = Progress(100, 10, every=0.0)
-    meter._start -= 10.0
-    meter.add(20, 1)
-    meter.add(30, 0)
-    meter.add(40, 0)
-    meter.end()
-    lines = capsys.readouterr().err.splitlines()
-    assert lines[0].strip() == "30.0 %, 30 of 100 rollouts, 2/s, 35 s left, 1 failed"
-    assert lines[1].split(",")[2].strip() == "5/s" and "8 s left" in lines[1]
-    assert lines[2].startswith("100.0 %") and "left" not in lines[2]
+def test_progress_has_rate_and_failures_on_standard_error(tmp_path, capsys):
+    threads = threading.active_count()
+    parameters = {"x": np.array([1.0, 2.0, 0.0, 4.0])}
+    options = {"parameters": parameters, "samples": None, "chunk": 1, "progress": True}
+    run = evaluated(tmp_path / "a.zarr", **options)
+    assert run.codes == {"successful": 3, "failed": 1}
+    said = capsys.readouterr()
+    last = said.err.splitlines()[-1]
+    assert re.search(r"100%.* 4/4 \[.*rollouts/s, 1 failed\]", last) and not said.out
+    (run.out / "y" / "c" / "1" / "0").write_bytes(b"damaged")
+    evaluated(tmp_path / "a.zarr", **options)
+    assert "chunk 1 of the store was damaged and was computed again" in capsys.readouterr().err
+    assert threading.active_count() == threads
 
 
 # From the shell

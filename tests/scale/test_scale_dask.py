@@ -4,7 +4,9 @@ Functions of studies are made by functions, so that cloudpickle sends them by va
 """
 
 import contextlib
+import json
 import os
+import re
 import signal
 import socket
 import subprocess
@@ -19,7 +21,7 @@ import numpy as np
 import pytest
 
 import jaxdyn as jd
-from jaxdyn.tasks import Cluster, Failure, map_tasks
+from jaxdyn.tasks import Cluster, Failure, map_tasks, package_versions
 
 for package in ("zarr", "xarray", "filelock", "cloudpickle"):
     pytest.importorskip(package, reason=f"{package} is not installed: the extra scale")
@@ -74,8 +76,8 @@ def wait_for(condition, what):
 
 @pytest.fixture(scope="module")
 def cluster():
-    """Two worker processes, a thread each."""
-    options = {"threads_per_worker": 1, "processes": True, "dashboard_address": ":0", "silence_logs": 50}
+    """Two worker processes, two threads each; others below have one."""
+    options = {"threads_per_worker": 2, "processes": True, "dashboard_address": ":0", "silence_logs": 50}
     with distributed.LocalCluster(n_workers=2, **options) as local:
         yield local
 
@@ -141,7 +143,7 @@ def test_the_same_bits_as_in_this_process(client, whole, tmp_path, capfd):
     assert_same(run, whole(100))
     assert run.computed == 240
     said = capfd.readouterr().err
-    assert said.count("dashboard: http://") == 1 and "100.0 %, 240 of 240 rollouts" in said
+    assert said.count("dashboard: http://") == 1 and re.search(r"100%.* 240/240 ", said)
     again = evaluate(tmp_path / "a.zarr", client)
     assert again.computed == 0
     assert_same(again, run)
@@ -486,6 +488,16 @@ def test_a_store_that_workers_do_not_see_is_refused(client, tmp_path):
             cluster.send(lambda: None)
 
 
+def test_a_worker_of_another_version_that_joins_gets_no_task(client, monkeypatch):
+    """Each worker compares its versions with those of the client, which are changed here."""
+    monkeypatch.setattr("jaxdyn.tasks.worker.package_versions", lambda: package_versions() | {"jaxdyn": "0.0.1"})
+    with (
+        Cluster(client) as cluster,
+        pytest.raises(ValueError, match=r"worker tcp://.* and this process 0\.0\.1; install"),
+    ):
+        cluster.send(lambda: None)
+
+
 def test_functions_of_modules_that_workers_lack_are_named(client, tmp_path, monkeypatch):
     (tmp_path / "of_the_client.py").write_text("def square(x):\n    return {'y': x**2}\n")
     monkeypatch.syspath_prepend(tmp_path)
@@ -494,6 +506,9 @@ def test_functions_of_modules_that_workers_lack_are_named(client, tmp_path, monk
     with pytest.raises(ModuleNotFoundError, match=r"of_the_client.*client\.upload_file"):
         jd.scale.evaluate(of_the_client.square, np.arange(4.0), out=tmp_path / "a.zarr", client=client, **QUIET)
     assert not (tmp_path / "a.zarr").exists()
+    client.upload_file(str(tmp_path / "of_the_client.py"))
+    run = jd.scale.evaluate(of_the_client.square, np.arange(4.0), out=tmp_path / "a.zarr", client=client, **QUIET)
+    np.testing.assert_array_equal(run.dataset().y, np.arange(4.0) ** 2)
 
 
 # Tasks
@@ -528,6 +543,27 @@ def test_tasks_are_taken_in_a_window(client):
     assert taken < 400
 
 
+def test_a_worker_that_compiles_gets_no_tasks_yet(client):
+    """Of a second study too, when workers have the resource of all tasks already."""
+    assert map_tasks(lambda x: x, range(4), client) == [0, 1, 2, 3]
+    slow, quick = pids(client)
+
+    def target():
+        class Process:
+            def call(self, item):
+                time.sleep(0.01)
+                return os.getpid()
+
+        time.sleep(5.0 if os.getpid() == slow else 0.0)
+        return Process()
+
+    with Cluster(client) as cluster:
+        cluster.send(target)
+        begin = time.monotonic()
+        assert {result for _, result in cluster.map("call", range(20))} == {quick}
+        assert time.monotonic() - begin < 5.0
+
+
 def test_lists_of_tasks(client):
     assert map_tasks(lambda x: x + 1, range(3)) == [1, 2, 3]
     tripled = map_tasks(lambda x: jnp.asarray(x) * 3.0, range(3), client)
@@ -559,19 +595,51 @@ def test_starts_of_a_fit(client):
     np.testing.assert_allclose(np.abs(there.values), [1.0, 3.0], rtol=1e-6)
 
 
-def test_cross_validation_of_a_fit(client):
-    """The fits of all folds on workers: the trials of this process, in their order and to the last bit."""
+def robot_and_log():
     model, t = jd.robots.chain(2), np.linspace(0.0, 8.0, 400)
     rates, noise = np.array([1.3, 2.1]), np.random.default_rng(2).normal(size=(400, 2))
     q, v, a = np.sin(rates * t[:, None]), rates * np.cos(rates * t[:, None]), -(rates**2) * np.sin(rates * t[:, None])
     tau = jax.vmap(lambda *x: jd.inverse_dynamics(model, *x))(q, v, a) + 0.3 * v + 0.5 * np.tanh(v / 0.01)
-    log = jd.identify.Log(t, q, v, a, np.asarray(tau) + 0.02 * noise)
+    return model, jd.identify.Log(t, q, v, a, np.asarray(tau) + 0.02 * noise)
+
+
+def test_cross_validation_of_a_fit(client):
+    """The fits of all folds on workers: the trials of this process, in their order and to the last bit."""
+    model, log = robot_and_log()
     options = {"terms": ("viscous", "coulomb"), "robust": "auto", "weights": None, "inertia": "mass"}
     here, there = (jd.identify.fit_robot(model, log, client=one, **options) for one in (None, client))
     assert here.choice.setting == there.choice.setting and len(here.choice.trials) > 8
     for one, other in zip(here.choice.trials, there.choice.trials, strict=True):
         assert one.setting == other.setting
         np.testing.assert_array_equal(one.squares, other.squares)
+
+
+def test_identification_from_the_shell(cluster, tmp_path, capsys):
+    """The report of a fit whose cross-validation runs on workers is that of this process."""
+    from jaxdyn.cli import main
+
+    model, log = robot_and_log()
+    jd.save_urdf(model, tmp_path / "arm.urdf")
+    jd.io.write_log(tmp_path / "log.csv", log)
+    args = [
+        "identify",
+        "--urdf",
+        tmp_path / "arm.urdf",
+        "--log",
+        tmp_path / "log.csv",
+        "--filtered",
+        "--weights",
+        "none",
+    ]
+    args = [str(arg) for arg in [*args, "--terms", "viscous", "coulomb", "--repair"]]
+    place = ["--client", cluster.scheduler_address]
+    reports = []
+    for name, options in (("here.json", []), ("there.json", place)):
+        assert main([*args, "--report", str(tmp_path / name), *options]) == 0
+        reports.append(json.loads((tmp_path / name).read_text()))
+    assert reports[0] == reports[1]
+    assert main([*args, "--method", "trajectory", *place]) == 2
+    assert "--method trajectory does not have; use --method feasible" in capsys.readouterr().err
 
 
 def test_without_a_client_no_dask_is_imported(tmp_path, monkeypatch):
