@@ -186,11 +186,11 @@ class Plan(NamedTuple):
         return jnp.asarray(t1 - t0, y.dtype) * self.field_of(args, t, y)
 
     def project_end(self, args, t1, y, error):
-        """Projection of the flat end y of a step, its shift, the error, and a code."""
+        """Flat start of the next step, for the end y of a step, with the end's shift by its projection, and its error."""
         project: Any = self.project
         method = ProjectedSolver(diffrax.Euler(), project, self.step_constants, self.branching)
         end = method.project_end(t1, self.structure(y), self.structure(error), args)
-        return *(ravel_pytree(x)[0] for x in end[:3]), end[3]
+        return tuple(ravel_pytree(x)[0] for x in end)
 
 
 class Step(NamedTuple):
@@ -274,7 +274,7 @@ def _stages(plan: Plan, args, t0, t1, start, first=None, is_ready: Any = True):
         if plan.projects_before_last:
             error = total[count + 1] if plan.knows_error else none
             project = partial(plan.project_end, args, t1)
-            end = lax.cond(i == count - 1, lambda y, error: project(y, error)[:3], lambda y, _: (y, *end[1:]), y, error)
+            end = lax.cond(i == count - 1, project, lambda y, _: (y, *end[1:]), y, error)
             y = end[0]
         k = compute(y, point) if first is None else lax.cond(is_ready & (i == 0), lambda *_: first, compute, y, point)
         return (total + weights[:, None] * k[None], *end), k
@@ -287,7 +287,7 @@ def _stages(plan: Plan, args, t0, t1, start, first=None, is_ready: Any = True):
     if plan.project is None:
         return raw, none, error, raw, k
     if not plan.projects_before_last:
-        end = plan.project_end(args, t1, raw, error)[:3]
+        end = plan.project_end(args, t1, raw, error)
     projected, shift, tangent = end
     error = enlarge(error, tangent) if plan.projects_before_last and not plan.knows_error else tangent
     return projected, shift, error, raw, k
