@@ -7,8 +7,8 @@ differentiated there (`derive`), written as LLVM IR (`code`, `llvm`), and called
 there is no native code, operations of JAX do the same (`operations`).
 
 Nothing of jaxdyn is imported here. Other rooms import the names below, and those of the modules `known` (known and traced
-values), `batch` (decisions for a batch), `loops` and `repair`. Only `jaxdyn.scale`, which compiles programs around kernels ahead
-of time, and `jaxdyn.export`, which writes object files, import the compiler's own modules.
+values), `batch` (decisions for a batch, repetitions), `loops` and `repair`. Only `jaxdyn.scale`, which compiles programs around
+kernels ahead of time, and `jaxdyn.export`, which writes object files, import the compiler's own modules.
 """
 
 from jaxdyn.compile.calls import entry_point as entry_point

@@ -14,8 +14,9 @@ import jax.numpy as jnp
 from jax import lax
 from jax.custom_batching import custom_vmap
 
+from jaxdyn.compile.flags import mark_invalid
 from jaxdyn.compile.known import is_concrete
-from jaxdyn.compile.mode import in_rows
+from jaxdyn.compile.mode import has_branches, in_rows, is_expanding, is_standalone
 
 T = TypeVar("T")
 # Rows that are computed together. It bounds the memory for operands and results of kernels.
@@ -49,6 +50,35 @@ def while_loop(goes_on: Callable[[T], object], body: Callable[[T], T], carry: T)
     `body` leaves a sample unchanged that has ended before.
     """
     return lax.while_loop(lambda carry: any_sample(goes_on(carry)), body, carry)
+
+
+def repeat_while(goes_on: Callable[[T], Any], step: Callable[[T], T], state: T, most: int, *, marks: bool = False) -> T:
+    """Repeat state = step(state) while goes_on(state), `most` times at most; few samples need the first repetition.
+
+    In a native loop a block of samples branches to it. Other kernels have no branches: samples that need a repetition are marked
+    as not valid, and computed again outside of the kernel. In code without JAX all repetitions are written out, unless it
+    `marks` such samples for its second program.
+    """
+    if not is_expanding():
+
+        def again(carry):
+            count, state = carry
+            return count + 1, step(state)
+
+        return lax.while_loop(lambda carry: goes_on(carry[1]) & (carry[0] < most), again, (0, state))[1]
+    if not has_branches() and (marks or not is_standalone()):
+        return jax.tree.map(lambda x: mark_invalid(goes_on(state), x) if _is_float(x) else x, state)
+    for _ in range(most):
+        flag = goes_on(state)
+        if has_branches():
+            state = lax.cond(flag, step, lambda state: state, state)
+        else:
+            state = jax.tree.map(lambda new, old, flag=flag: jnp.where(flag, new, old), step(state), state)
+    return state
+
+
+def _is_float(x) -> bool:
+    return jnp.issubdtype(jnp.result_type(x), jnp.floating)
 
 
 def map_rows(function: Callable, rows):

@@ -61,7 +61,9 @@ class Body:
             if op == "input":
                 continue
             if op == "call":
-                self.names[i] = self._call(i, args)
+                self.names[i] = self._call(i, *args)
+            elif op == "call_where":
+                self.names[i] = self._call_where(i, *args)
             elif op == "part":
                 self.names[i] = self.names[args[0]][args[1].value]
             else:
@@ -72,9 +74,32 @@ class Body:
         rows = zip(self.program.results, self.program.outputs, strict=True)
         return [[self.text(x, kind_of(array.dtype)) for x in row] for row, array in rows]
 
-    def _call(self, i: int, args) -> dict[int, str]:
+    def _call_where(self, i: int, which, flag, *entries) -> dict[int, str]:
+        """Call a subprogram if the flag of any sample is set; names of the entries of its outputs that are needed."""
+        e, called = self.e, self.program.subprograms[which.value]
+        first = sum(array.size for array in called.inputs)
+        given, otherwise = entries[:first], entries[first:]
+        kinds = [kind_of(array.dtype) for array in called.outputs for _ in range(array.size)]
+        # All names before the branch: what is loaded within it is not known behind it.
+        for x in given:
+            if type(x) is not Constant:
+                self.name(x)
+        flag = self.text(flag, "b1")
+        old = {k: self.text(otherwise[k], kinds[k]) for k in set(self.parts.get(i, ()))}
+        before, rare, after = (f"{name}{len(e.lines)}" for name in ("usual", "rare", "joined"))
+        e.lines += [f"  br label %{before}", f"{before}:"]
+        e.lines += [f"  br i1 {e.any(flag)}, label %{rare}, label %{after}", f"{rare}:"]
+        passed = dict(self.passed)
+        new = self._call(i, which, *given)
+        # What the branch has stored is not in memory where it is not taken.
+        self.passed = {at: value for at, value in passed.items() if self.passed.get(at) == value}
+        new = {k: e.emit(f"select {e.type('b1')} {flag}, {e.type(kinds[k])} {x}, {e.type(kinds[k])} {old[k]}")
+               for k, x in new.items()}  # fmt: skip
+        e.lines += [f"  br label %{after}", f"{after}:"]
+        return {k: e.emit(f"phi {e.type(kinds[k])} [ {old[k]}, %{before} ], [ {x}, %{rare} ]") for k, x in new.items()}
+
+    def _call(self, i: int, which, *given) -> dict[int, str]:
         """Call a subprogram; names of the entries of its outputs that are needed."""
-        which, *given = args
         called = self.program.subprograms[which.value]
         if called not in self.regions:
             self.regions[called] = self.bytes
@@ -142,8 +167,6 @@ def symbol_of(called: Program, width: int) -> str:
 
 def subprogram_ir(called: Program, width: int) -> str:
     """The text of a subprogram, the function `called`."""
-    if called.subprograms:
-        raise AssertionError("a subprogram that calls others, which `expand` does not make")
     e = Emitter(width)
     body = Body(e, called, lambda place, entry, kind: e.load_at(f"%a{place}", entry, kind), lambda place: None)
     for i, (row, array) in enumerate(zip(body.results(), called.outputs, strict=True)):
@@ -151,7 +174,7 @@ def subprogram_ir(called: Program, width: int) -> str:
             e.store_at(f"%r{i}", k, kind_of(array.dtype), name)
     names = [f"%a{i}" for i in range(len(called.inputs))] + [f"%r{i}" for i in range(len(called.outputs))]
     head = f"define void @called({', '.join(f'ptr noalias {name}' for name in names)}) #0 {{"
-    return "\n".join([head, *e.lines, "  ret void", "}", *e.declared.values(), *ATTRIBUTES])
+    return "\n".join([head, *body.allocations(), *e.lines, "  ret void", "}", *e.declared.values(), *ATTRIBUTES])
 
 
 def calls_itself(program: Program, width: int) -> bool:

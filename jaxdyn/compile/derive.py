@@ -48,8 +48,8 @@ def _tangent(program: Program, moving: tuple[bool, ...]) -> Program:
         operand_changes = [(0.0 if type(x) is Constant else changes[x]) for x in operation.args]
         any_change = any(is_number(x) or x != 0 for x in operand_changes)
         # After inlining, only subprograms with loops are still called; their derivative needs a rule.
-        if operation.op == "call" and any_change:
-            raise NotNumbers("a pseudo-inverse without a rule for its derivative")
+        if operation.op in ("call", "call_where") and any_change:
+            raise NotNumbers("a branch, or a pseudo-inverse without a rule for its derivative")
         operands = [x.value if type(x) is Constant else values[x] for x in operation.args]
         # Integers and bools have no change. Numbers whose operands do not change have none either: this keeps tangents short.
         varies = operation.kind in FLOATS and any_change

@@ -19,7 +19,7 @@ from jaxdyn.compile.constants import bind_known, convert_known, empty_reduction,
 from jaxdyn.compile.graph import Graph
 from jaxdyn.compile.jax_adapter import ClosedJaxpr, Literal, Tracer, scan_counts  # pyright: ignore[reportPrivateImportUsage]
 from jaxdyn.compile.number import Number, as_objects, is_number, objects
-from jaxdyn.compile.program import Array, NotNumbers, Program, kind_or_refuse
+from jaxdyn.compile.program import Array, NotNumbers, Program, as_kind, kind_or_refuse
 from jaxdyn.compile.rearrange import AT_PLACES, REARRANGEMENTS
 
 # A function of fewer operations is scatter_places where it is called.
@@ -31,7 +31,8 @@ def expand(
 ) -> tuple[Program, bool]:
     """The program of a jaxpr, and whether it has functions whose derivatives are given by rules of their own.
 
-    With `calls`, functions under `jax.jit` of at least `MIN_SUBPROGRAM_OPERATIONS` operations become subprograms.
+    With `calls`, functions under `jax.jit` of at least `MIN_SUBPROGRAM_OPERATIONS` operations become subprograms, and so does the
+    first function of a `lax.cond`, which is called where a sample takes it; the second one is computed for all samples.
 
     `flags`: what to do about numbers that are flagged (see `flags`). "refuse" them; "ignore" them, as a derivative does, whose
     values report them; "report" them by one more output, a bool that is True for valid samples; or "report_always", with
@@ -45,7 +46,7 @@ def expand(
     for array in (*inputs, *outputs):
         if array.dtype.name not in ("float64", "float32", "bool", "int32", "int64"):
             raise NotNumbers(f"an array of {array.dtype}")
-    expansion = _Expansion(graph, calls)
+    expansion = _Expansion(graph, calls, calls)
     entries = [graph.inputs(place, array) for place, array in enumerate(inputs)]
     with np.errstate(all="ignore"):  # known numbers may be none, as in branches that are not taken
         results = expansion.evaluate(closed.jaxpr, closed.consts, entries)
@@ -64,11 +65,11 @@ _FLAG = Array((), np.dtype(bool))
 
 
 class _Expansion:
-    def __init__(self, graph: Graph, calls: bool):
+    def __init__(self, graph: Graph, calls: bool, branches: bool):
         self.graph = graph
         self.has_rules = False
         self.flagged: Any = False  # whether any number is
-        self.calls = calls
+        self.calls, self.branches = calls, branches
         binary = {"add": graph.add, "add_any": graph.add, "sub": graph.sub, "mul": graph.mul}
         binary |= {"and": graph.both, "or": graph.either}
         binary |= {name: functools.partial(graph.compare, name) for name in numbers.COMPARISONS}
@@ -147,11 +148,8 @@ class _Expansion:
         raise NotNumbers(name)
 
     def _call(self, inner: ClosedJaxpr, args) -> list:
-        """A function as a subprogram, if it is long; arguments that are known are compiled in."""
-        known = tuple(None if x.dtype.kind == "O" else (x.shape, x.dtype.str, x.tobytes()) for x in args)
-        program, has_rules = _subprogram(inner, known, self.graph.most)
-        self.has_rules |= has_rules
-        given = [x for x, y in zip(args, known, strict=True) if y is None]
+        """A function as a subprogram, if it is long."""
+        program, given = self._subprogram(inner, args)
         # A short one is written in its place, where zeros of its arguments are seen. A call does not know them.
         is_short = program.cost < MIN_SUBPROGRAM_OPERATIONS
         results = self.graph.replay(program, given)[1] if is_short else self.graph.call(program, given)
@@ -159,6 +157,13 @@ class _Expansion:
         for flagged in results[count:]:
             self.flagged = self.graph.either(self.flagged, flagged.item())
         return results[:count]
+
+    def _subprogram(self, inner: ClosedJaxpr, args) -> tuple[Program, list]:
+        """A function as a subprogram, and its arguments without those that are known, which are compiled in."""
+        known = tuple(None if x.dtype.kind == "O" else (x.shape, x.dtype.str, x.tobytes()) for x in args)
+        program, has_rules = _subprogram(inner, known, self.graph.most)
+        self.has_rules |= has_rules
+        return program, [x for x, y in zip(args, known, strict=True) if y is None]
 
     def _reduce(self, name, array, axes, out):
         # Entries in XLA's order, one after the other: a sum of few numbers, whose order decides the rounding.
@@ -243,11 +248,26 @@ class _Expansion:
             carry = self.evaluate_inner(params["body_jaxpr"], [*of_body, *carry])
 
     def _cond(self, params, args, eqn):
-        which = as_objects(args[0]).item()
+        which, branches = as_objects(args[0]).item(), params["branches"]
         if type(which) is Number:
-            raise NotNumbers("a cond whose branch is not known")
-        branches = params["branches"]
+            if not self.branches or len(branches) != 2:
+                raise NotNumbers("a cond whose branch is not known")
+            return self._branch(which, *branches, args[1:])
         return self.evaluate_inner(branches[min(max(int(which), 0), len(branches) - 1)], args[1:])
+
+    def _branch(self, which, usual: ClosedJaxpr, rare: ClosedJaxpr, args) -> list:
+        """The results of `usual`, or where `which` is not 0 those of `rare`, a subprogram that hardly any sample calls."""
+        otherwise = [as_objects(x) for x in self.evaluate_inner(usual, args)]
+        program, given = self._subprogram(rare, args)
+        if len(program.outputs) > len(otherwise):  # the branch may flag numbers
+            otherwise.append(objects([False], ()))
+        # JAX makes an integer of the flag.
+        flag = which.args[0] if which.op == "convert" else self.graph.compare("ne", which, as_kind(0, which.kind))
+        results = self.graph.call_where(flag, program, given, otherwise)
+        count = len(rare.jaxpr.outvars)
+        for flagged in results[count:]:
+            self.flagged = self.graph.either(self.flagged, flagged.item())
+        return results[:count]
 
     def _linear_solve(self, params, args, eqn):
         counts, jaxprs = params["const_lengths"], params["jaxprs"]
@@ -289,7 +309,8 @@ def _subprogram(inner: ClosedJaxpr, known: tuple, most: int) -> tuple[Program, b
     arrays = [Array(x.aval.shape, np.dtype(x.aval.dtype)) for x in inner.jaxpr.invars]  # pyright: ignore[reportAttributeAccessIssue]
     inputs = [array for array, x in zip(arrays, known, strict=True) if x is None]
     entries = iter([graph.inputs(place, array) for place, array in enumerate(inputs)])
-    expansion = _Expansion(graph, False)
+    # Programs without calls cannot be called where one may branch: `_subprogram` is reached from those with calls alone.
+    expansion = _Expansion(graph, False, True)
     args = [next(entries) if x is None else np.frombuffer(x[2], x[1]).reshape(x[0]) for x in known]
     results = [as_objects(x) for x in expansion.evaluate_inner(inner, args)]
     outputs = [Array(x.aval.shape, np.dtype(x.aval.dtype)) for x in inner.jaxpr.outvars]  # pyright: ignore[reportAttributeAccessIssue]

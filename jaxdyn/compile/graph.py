@@ -67,15 +67,28 @@ class Graph:
 
     def call(self, program: Program, inputs: Sequence[np.ndarray]) -> list[np.ndarray]:
         """The outputs of a subprogram."""
+        return self._parts("call", program, [entry for x in inputs for entry in x.ravel().tolist()])
+
+    def call_where(
+        self, flag, program: Program, inputs: Sequence[np.ndarray], otherwise: Sequence[np.ndarray]
+    ) -> list[np.ndarray]:
+        """The outputs of a subprogram where the flag is set, else `otherwise`; it is called if the flag is set at all."""
+        if type(flag) is not Number:
+            return self.call(program, inputs) if flag else list(otherwise)
+        entries = [entry for x in (*inputs, *otherwise) for entry in x.ravel().tolist()]
+        return self._parts("call_where", program, [flag, *entries])
+
+    def _parts(self, op: str, program: Program, entries: list) -> list[np.ndarray]:
         if program not in self.subprograms:
             self.subprograms.append(program)
-        entries = [entry for x in inputs for entry in x.ravel().tolist()]
-        call = self.make("call", "call", self.subprograms.index(program), *entries)
+        call = self.make(op, "call", self.subprograms.index(program), *entries)
         outputs, at = [], 0
         for row, array in zip(program.results, program.outputs, strict=True):
             kind = kind_of(array.dtype)
+            # A result that is known has no part, unless the call may not happen.
             parts = [
-                x.value if type(x) is Constant else self.make("part", kind, call, at + k) for k, x in enumerate(row)
+                x.value if type(x) is Constant and op == "call" else self.make("part", kind, call, at + k)
+                for k, x in enumerate(row)
             ]
             outputs.append(objects(parts, array.shape))
             at += array.size
@@ -322,6 +335,9 @@ class Graph:
             elif operation.op == "call":  # operands are the number of the subprogram, then all entries of its inputs
                 which, *given = (x.value if type(x) is Constant else numbers[x] for x in operation.args)
                 numbers.append(self._replay_call(program.subprograms[which], given))
+            elif operation.op == "call_where":
+                which, *given = (x.value if type(x) is Constant else numbers[x] for x in operation.args)
+                numbers.append([x for row in self._replay_call_where(program.subprograms[which], *given) for x in row])
             elif operation.op == "part":
                 call, entry = operation.args
                 numbers.append(numbers[call][entry.value])
@@ -342,6 +358,14 @@ class Graph:
             objects(given[end - array.size : end], array.shape) for end, array in zip(ends, program.inputs, strict=True)
         ]
         return [entry for x in self.replay(program, parts)[1] for entry in x.ravel().tolist()]
+
+    def _replay_call_where(self, program: Program, flag, *given) -> list[list]:
+        arrays, at = [], 0
+        for array in (*program.inputs, *program.outputs):
+            arrays.append(objects(list(given[at : at + array.size]), array.shape))
+            at += array.size
+        count = len(program.inputs)
+        return [x.ravel().tolist() for x in self.call_where(flag, program, arrays[:count], arrays[count:])]
 
     def apply(self, op: str, kind: str, args: Sequence):
         """An operation by its name."""
@@ -367,7 +391,7 @@ _BY_NAME: dict[str, Callable] = {
 def _check(operation: Operation, operations: Sequence[Operation]) -> Operation:
     """The operation. **Raises:** `NotNumbers` where its operands differ in kind, which LLVM would refuse with less grace."""
     op, kind, args = operation
-    if op not in ("input", "call", "part", "convert", "is_finite"):
+    if op not in ("input", "call", "call_where", "part", "convert", "is_finite"):
         kinds = {operations[x].kind for x in (args[1:] if op == "select" else args) if type(x) is not Constant}
         if len(kinds) > 1 or (kinds and op not in COMPARISONS and kinds != {kind}):
             raise NotNumbers(f"{op} of {' and '.join(dtype_of(x).name for x in sorted(kinds | {kind}))}")

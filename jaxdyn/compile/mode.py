@@ -21,7 +21,7 @@ MAX_OPERATIONS = 60_000
 
 # None: the environment decides, which is read at each use, so that a test can set it.
 _mode = jax.make_user_context(None)
-_expanding = jax.make_user_context(False)
+_expanding = jax.make_user_context("")
 _rank_safe = jax.make_user_context(False)
 _in_rows = jax.make_user_context(False)
 _standalone = jax.make_user_context("")
@@ -68,12 +68,17 @@ def compilation(mode: str) -> Iterator[None]:
 
 def is_expanding() -> bool:
     """Decide whether a function is being traced to become a program, so that kernels within it are inlined."""
-    return _expanding.value
+    return bool(_expanding.value)
 
 
-def expanding():
+def has_branches() -> bool:
+    """Decide whether a function is being traced to become a program that may take branches (see `expand`)."""
+    return _expanding.value == "branches"
+
+
+def expanding(branches: bool = False):
     """Context in which a function is traced to become a program of numbers."""
-    return _expanding(True)
+    return _expanding("branches" if branches else "straight")
 
 
 def is_rank_safe() -> bool:

@@ -50,7 +50,8 @@ class Program:
 
     - `inputs`, `outputs`: their `Array`s. `results`: per output a tuple of entries, indices of operations or `Constant`s.
     - `operations`: "input" has the arguments (array, entry); "call" the number of a subprogram and the entries of its
-      inputs, one after the other; "part" a call and the number of an entry of its outputs.
+      inputs, one after the other; "part" a call and the number of an entry of its outputs; "call_where" the number, a flag, the
+      entries of the inputs, and entries that stand for the outputs where the flag is not set.
     - `subprograms`: what is called, written once however often it is.
     - `derivative`: None, or a function (which inputs move) -> the `Program` of the change of all outputs, of the inputs and the
       changes of those that move.
@@ -84,7 +85,7 @@ class Program:
     def cost(self) -> int:
         """Number of operations that are carried out, without inputs and changes of sign."""
         # Signs merge with sums and products of LLVM, and inputs are operands in memory.
-        own = sum(_weight(x) for x in self.operations if x.op not in ("input", "neg", "call", "part"))
+        own = sum(_weight(x) for x in self.operations if x.op not in ("input", "neg", "call", "call_where", "part"))
         return own + sum(self.subprograms[x.args[0].value].cost for x in self.operations if x.op == "call")
 
     @functools.cached_property

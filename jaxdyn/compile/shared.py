@@ -31,7 +31,9 @@ def _split(program: Program, uniform: Sequence[bool]) -> tuple[Program, Program]
             is_shared.append(uniform[args[0]])
         else:
             # Subprograms are not split: their calls stay in the program of the batch.
-            is_shared.append(op not in ("call", "part") and all(is_shared[x] for x in args if type(x) is not Constant))
+            is_shared.append(
+                op not in ("call", "call_where", "part") and all(is_shared[x] for x in args if type(x) is not Constant)
+            )
     saved = sum(
         shared and x.op not in ("input", "neg") for shared, x in zip(is_shared, program.operations, strict=True)
     )

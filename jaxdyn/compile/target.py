@@ -188,6 +188,8 @@ def _publish(called: Program, width: int) -> None:
     """Compile a subprogram where that has not been done."""
     symbol = symbol_of(called, width)
     if symbol not in _called:
+        for inner in called.subprograms:
+            _publish(inner, width)
         _called[symbol] = Code(subprogram_ir(called, width), name=called.name)
         _called[symbol].publish("called", symbol)
 

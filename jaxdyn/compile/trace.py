@@ -59,7 +59,7 @@ def _trace_program(function, static, known: Known, count, structure, shapes, tan
     avals = [jax.ShapeDtypeStruct(*shape) for shape in shapes]
     flat = function_of_leaves(function, static, known, count, structure)
     try:
-        with mode.expanding():
+        with mode.expanding(calls):
             # Subprograms are the functions under `jit` within this one; itself it is not a call.
             traced = _flat_function(function, static, known, count, structure) if calls else flat
             closed, out = jax.make_jaxpr(traced, return_shape=True)(*avals)

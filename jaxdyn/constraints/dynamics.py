@@ -16,13 +16,14 @@ import equinox as eqx
 import jax.numpy as jnp
 from jaxtyping import Array, Float, Int
 
-from jaxdyn.compile import is_standalone, kernel, mark_invalid
+from jaxdyn.compile import batch, is_standalone, kernel, mark_invalid
 from jaxdyn.constraints.base import Layout, Rows, constraint_jacobian, holonomic_rows, layout, rows
 from jaxdyn.constraints.codes import RESULTS, Outcome, require_finite
 from jaxdyn.constraints.rank import (
     check_tolerance,
     eps_of,
     least_pivot,
+    least_refinable_pivot,
     pseudo_inverse,
     quality_of,
     regular_gram,
@@ -36,6 +37,9 @@ from jaxdyn.model.arguments import Numbers, check_state, zeros_if_none
 from jaxdyn.model.tree import Model
 from jaxdyn.systems.mass_factor import MassFactor, cholesky, mass_factor, solve_cholesky
 from jaxdyn.systems.scene import Scene, as_scene, check_force
+
+# Steps of refinement near singular positions: the first one is made always, and each gains some four digits.
+_MOST_REFINEMENTS = 4
 
 METHODS = ("rank_aware", "schur", "range_space")
 
@@ -151,9 +155,8 @@ def _by_pivots(rank_tol, scene: Scene, q, v, tau, t):
     """(a, lam, rank, result) by Cholesky; samples whose least pivot of A M^-1 A^T is near its rounding error are invalid."""
     metric, Y, free, deficit, _ = _gauss_problem(scene, q, v, tau, t)
     normal = cholesky(regular_gram(Y) if has_selection(scene) else matmul(Y.T, Y))
-    lam = _solve_with_refinement(normal, Y, deficit)
     quality = jnp.where(metric.is_definite(), quality_of(normal), jnp.nan)
-    is_poor = ~(quality > least_pivot(q, rank_tol))
+    lam, is_poor = _solve_with_refinement(normal, Y, deficit, quality, rank_tol)
     a, lam = (mark_invalid(is_poor, x) for x in (metric.unwhiten(free + matmul(Y, lam)), lam))
     rank, result = _rank_and_result(scene, q, quality)
     return a, lam, rank, require_finite(result, a)
@@ -223,11 +226,24 @@ def _whiten_columns(scene: Scene, q, v, force, t, A):
     return metric, whitened[:, :-1], whitened[:, -1]
 
 
-def _solve_with_refinement(factor, Y, right):
-    """(Y^T Y)^-1 right from the Cholesky factor, with one step of iterative refinement against Y."""
+def _solve_with_refinement(factor, Y, right, quality, rank_tol):
+    """(Y^T Y)^-1 right from the Cholesky factor, by iterative refinement against Y, and whether that is not accurate.
+
+    Source: Bjorck, Stability analysis of the method of seminormal equations, 1987.
+    """
+
     # Y^T Y squares the condition number. The residual formed with Y itself recovers those digits.
-    x = solve_cholesky(factor, right)
-    return x + solve_cholesky(factor, right - matmul(Y.T, matmul(Y, x)))
+    def refine(state):
+        x, _ = state
+        change = solve_cholesky(factor, right - matmul(Y.T, matmul(Y, x)))
+        return x + change, jnp.max(jnp.abs(change)) > eps_of(x) ** 0.75 * jnp.max(jnp.abs(x))
+
+    # One step is enough for rows that are clearly independent. Near a singular position, where more are needed, a sample would
+    # else leave the native loop, which takes as long as some hundred steps.
+    is_poor = ~(quality > least_pivot(right, rank_tol))
+    first = refine((solve_cholesky(factor, right), is_poor))[0], is_poor
+    x, is_open = batch.repeat_while(lambda state: state[1], refine, first, _MOST_REFINEMENTS, marks=True)
+    return x, is_poor & (is_open | ~(quality > least_refinable_pivot(right, rank_tol)))
 
 
 def _min_norm_solution(Y, deficit, rank_tol):

@@ -8,11 +8,18 @@ import jax
 import jax.numpy as jnp
 from jax import lax
 
-from jaxdyn.compile import implicit, is_standalone, kernel, mark_invalid, value_and_jvp, variant
+from jaxdyn.compile import batch, implicit, kernel, mark_invalid, value_and_jvp
 from jaxdyn.constraints.base import constraint_jacobian, holonomic_rows, layout, position_residual, velocity_residual
 from jaxdyn.constraints.dynamics import whiten_rows
 from jaxdyn.constraints.projection_derivative import ROUNDING_FACTOR, Corrections, closest_state
-from jaxdyn.constraints.rank import least_pivot, least_pivot_of, pseudo_inverse, quality_of, regular_gram, tolerance
+from jaxdyn.constraints.rank import (
+    least_pivot_of,
+    least_refinable_pivot,
+    pseudo_inverse,
+    quality_of,
+    regular_gram,
+    tolerance,
+)
 from jaxdyn.constraints.redundancy import has_selection, rows_of
 from jaxdyn.lie.so3 import matmul
 from jaxdyn.systems.mass_factor import cholesky, solve_cholesky
@@ -67,42 +74,22 @@ def _project(scene: Scene, rank_tol, q, v, t, errors):
     return (_by_rank if is_wide else _rounds)(rank_tol, scene, q, v, t, errors)
 
 
-def _one_round(rank_tol, scene: Scene, q, v, t, errors):
-    *state, more = _by_pivots(rank_tol, scene, q, v, t, errors)
-    # A kernel has no loop of data-dependent length: samples that need another round are marked, and computed again outside of it.
-    return jax.tree.map(lambda x: mark_invalid(more, x), tuple(state))
-
-
-@variant(_one_round, marks=True)
 def _rounds(rank_tol, scene: Scene, q, v, t, errors):
     by_kernel = kernel(_by_pivots, static=1, fallback=_by_rank_in_full, derivative=False)
 
     def again(q, v):
         return by_kernel(rank_tol, scene, q, v, t, errors)
 
+    return _in_rounds(again, q, v)
+
+
+def _in_rounds(again: Callable, q, v):
+    """Repeat again(q, v) -> (q, v, errors, more) while `more`, `_MOST_ROUNDS` times at most."""
     # The first round stands before the loop, which most steps never enter.
-    return _in_rounds(again, again(q, v))
-
-
-def _in_rounds(again: Callable, first):
-    """Repeat again(q, v) -> (q, v, errors, more), whose first result is given, while `more`, `_MOST_ROUNDS` times at most."""
-    if is_standalone():
-        # A scalar program has no loop of unknown length: all rounds are written out, and selected where they are needed.
-        state = tuple(first)
-        for _ in range(_MOST_ROUNDS - 1):
-            following = tuple(again(*state[:2]))
-            state = jax.tree.map(lambda new, old, more=state[3]: jnp.where(more, new, old), following, state)
-        return state[:3]
-
-    def step(carry):
-        count, state = carry
-        return count + 1, tuple(again(*state[:2]))
-
-    def needs_round(carry):
-        count, state = carry
-        return state[3] & (count < _MOST_ROUNDS)
-
-    return lax.while_loop(needs_round, step, (1, tuple(first)))[1][:3]
+    first = tuple(again(q, v))
+    return batch.repeat_while(lambda state: state[3], lambda state: tuple(again(*state[:2])), first, _MOST_ROUNDS - 1)[
+        :3
+    ]
 
 
 def _by_rank(rank_tol, scene: Scene, q, v, t, errors):
@@ -115,7 +102,7 @@ def _by_rank(rank_tol, scene: Scene, q, v, t, errors):
         some = every if holonomic.size in (0, Y.shape[1]) else pseudo_inverse(Y[:, holonomic], tolerance(rank_tol, Y))
         return _correct_by_matrices(scene, q, v, t, errors, metric, every, some)
 
-    return _in_rounds(again, again(q, v))
+    return _in_rounds(again, q, v)
 
 
 def _by_rank_in_full(rank_tol, scene: Scene, q, v, t, errors):
@@ -156,7 +143,8 @@ def _by_pivots(rank_tol, scene: Scene, q, v, t, errors):
         quality = jnp.minimum(quality, of_holonomic)
     quality = jnp.where(metric.is_definite(), quality, jnp.nan)
     *state, more = _correct(scene, q, v, t, errors, every, some)
-    is_poor = ~(quality > least_pivot(q, rank_tol))
+    # Not `least_pivot`: the steps correct each other, so that a factor with few digits costs a step, not accuracy.
+    is_poor = ~(quality > least_refinable_pivot(q, rank_tol))
     return *jax.tree.map(lambda x: mark_invalid(is_poor, x), tuple(state)), more
 
 

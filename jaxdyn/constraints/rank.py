@@ -47,6 +47,12 @@ def least_pivot(like, rank_tol: float | None) -> float:
     return max(eps_of(like) ** 0.4, (100 * tolerance(rank_tol, like)) ** 2)
 
 
+def least_refinable_pivot(like, rank_tol: float | None) -> float:
+    """Ratio of the pivots above which each step of refinement gains digits, and rounding cannot make the rows dependent."""
+    # A step multiplies the error by some 2^-52 over this ratio, the square of the condition number: by 1e-4.
+    return max(eps_of(like) ** 0.75, (100 * tolerance(rank_tol, like)) ** 2)
+
+
 def regular_gram(Y: Float[Array, "n m"]) -> Float[Array, "m m"]:
     """Y^T Y, with the largest entry of its diagonal in place of zeros there: a zero column is a row that was dropped.
 

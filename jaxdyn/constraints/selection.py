@@ -14,6 +14,9 @@ dependent (`renew_rows`).
 A dropped row stays in its place as a row of zeros (`KeptRows`), so that shapes, names and multipliers are those of the scene.
 """
 
+from collections.abc import Callable
+from typing import Any
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -156,6 +159,22 @@ def _renew(bare: Scene, q, t, old, is_projected: bool):
         return jnp.where(poor, jnp.append(kept_next, _EXCHANGED_AT * next_pivot), old)
 
     return cond(poor, choose, lambda: old)
+
+
+def _keep_state(old, new, project: Callable, state):
+    return state
+
+
+@variant(_keep_state)
+def project_after_exchange(old, new, project: Callable, state: Any) -> Any:
+    """project(state) where the rows `new` of the next step are not the `old` ones, else the state.
+
+    Rows of rounded numbers that were dropped are open by the rounding. The step after an exchange would close them, and take the
+    distance for its error, which no shorter step reduces. In a kernel rows are not exchanged (see `renew_rows`).
+    """
+    is_new = jnp.any(old != new)
+    moved = cond(is_new, lambda: project(state), lambda: state)
+    return jax.tree.map(lambda x, y: jnp.where(is_new, x, y), moved, state)
 
 
 def _pivot_of(scene: Scene, q, t, kept):

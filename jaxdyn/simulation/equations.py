@@ -3,13 +3,12 @@
 import functools
 from typing import Any
 
-import diffrax
 import jax
 import jax.numpy as jnp
 
 from jaxdyn.compile.known import partition_tracers
 from jaxdyn.constraints.redundancy import exchange_rows
-from jaxdyn.constraints.selection import renew_rows
+from jaxdyn.constraints.selection import project_after_exchange, renew_rows
 from jaxdyn.forces.piecewise import Pieces, fix_pieces, guards, pieces_of, values_and_levels
 from jaxdyn.simulation import controls
 from jaxdyn.simulation.methods import Method, Projected
@@ -150,14 +149,16 @@ class Equations:
     def project(self, t, y, error, args):
         """Correct the state and the error at the end of a step, and renew what is constant during the next one."""
         scene, control, method = self.unpack(args, y)
-        y, error = method.end_step(scene, y, t, error)
         # A step that will be rejected may be too long to be projected, so failing here does not end the run.
-        y = method.renew(scene, y, t)
+        end, error = method.end_step(scene, y, t, error)
+        y = method.renew(scene, end, t)
         if KEPT in y:
-            y = y | {KEPT: renew_rows(scene, retract(scene.system, y["q"]), t, isinstance(method, Projected))}
+            rows = renew_rows(scene, retract(scene.system, y["q"]), t, isinstance(method, Projected))
+            y = project_after_exchange(y[KEPT], rows, lambda y: method.correct(exchange_rows(scene, rows), y, t), y)
+            y = y | {KEPT: rows}
         if controls.HELD in y:
             y = y | {controls.HELD: controls.sample(control, y[controls.HELD], *method.to_qv(scene, y, t), t)}
-        return y, error, diffrax.RESULTS.successful
+        return end, y, error
 
     # diffrax passes more to the condition of an event: `**_`.
     def quality(self, t, y, args, **_):

@@ -3,7 +3,6 @@
 from collections.abc import Callable
 from typing import Any
 
-import diffrax
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -134,7 +133,7 @@ def _advance(scene: Scene, length, substeps: int, is_direct: bool) -> tuple[Any,
 
     def project(t, y, error, args):
         y, error = method.end_step(unpack(args)[0], y, t, error)
-        return y, error, diffrax.RESULTS.successful
+        return y, y, error
 
     def switching(t, y, args):
         scene, tau = unpack(args)

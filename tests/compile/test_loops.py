@@ -1,10 +1,12 @@
-"""Loops of programs: the operations of JAX that take a loop's place on other devices have its numbers."""
+"""Loops of programs: their branches, and the operations of JAX that take a loop's place on other devices."""
 
 import jax
 import jax.numpy as jnp
 import numpy as np
+import pytest
 
-from jaxdyn.compile.batch import while_loop
+from jaxdyn.compile import kernel
+from jaxdyn.compile.batch import repeat_while, while_loop
 from jaxdyn.compile.loops import Carry, Given, Iteration, Task, run_loop
 
 
@@ -45,3 +47,80 @@ def test_operations_of_a_loop_take_arrays_of_any_shape():
     count = np.zeros((5, 1), np.int32)
     flat = np.tile(matrix.reshape(-1), (5, 1)), np.tile(offset, (5, 1)), x, count
     np.testing.assert_allclose(loop.as_operations(*flat)[0], wanted, rtol=1e-13, atol=1e-14)
+
+
+def _many_operations(x):
+    # More than `expand.MIN_SUBPROGRAM_OPERATIONS`, so that the function is a subprogram and its branch one of that.
+    for _ in range(200):
+        x = 0.5 * (x + jnp.sin(x))
+    return x
+
+
+def _refine(state):
+    x, count = state
+    return 0.5 * (x + 2 / x), count + 1
+
+
+@jax.jit
+def _slow_and_branching(x):
+    x, rest = _many_operations(x), x
+    (root, count) = repeat_while(
+        lambda state: jnp.abs(state[0] ** 2 - 2) > 1e-14, _refine, (1 + 0.1 * rest, jnp.zeros((), jnp.int32)), 3
+    )
+    return x, root, count
+
+
+def _branching_turn(tree, constants, state, _):
+    x, total, counts, turn = state
+    small, root, count = _slow_and_branching(x)
+    # A branch in the loop's own program, with results of each kind; its last one is a constant and its flag is an integer's.
+    value, is_taken, one = jax.lax.cond(
+        x > constants, lambda: (x * tree, True, 1), lambda: (root, False, count.astype(jnp.int64))
+    )
+    after = jnp.where(is_taken, value - one.astype(value.dtype), small + 1.0), total + value, counts + one, turn + 1
+    return Iteration(after, turn < 6, turn + 1 < 6)
+
+
+def _branching_by_turns(tree, constants, given, carry):
+    def step(state):
+        return _branching_turn(tree, constants, state, ()).state
+
+    return Carry(while_loop(lambda state: state[3] < 6, step, carry.state))
+
+
+@pytest.mark.native
+@pytest.mark.parametrize("count", [1, 3, 64])
+def test_branches_of_a_loop_are_taken_by_the_samples_that_need_them(count):
+    """Branches of the loop and of a subprogram, against the same turns by JAX, to rounding."""
+    task = Task(_branching_turn, _branching_by_turns, ())
+
+    def native(x):
+        carry, always_ends = run_loop(task, scale, limit, Given(), Carry(start(x)))
+        assert always_ends
+        return carry.state
+
+    def start(x):
+        return x, jnp.zeros(()), jnp.zeros((), jnp.int64), jnp.zeros((), jnp.int32)
+
+    def by_jax(x):
+        return _branching_by_turns(scale, limit, None, Carry(start(x))).state
+
+    scale, limit = jnp.asarray(0.75), jnp.asarray(1.2)
+    x = jnp.linspace(-1.0, 3.0, count) if count > 1 else jnp.asarray([2.5])
+    computed, wanted = (jax.jit(jax.vmap(f))(x) for f in (native, by_jax))
+    for mine, theirs in zip(computed, wanted, strict=True):
+        np.testing.assert_allclose(mine, theirs, rtol=1e-13, atol=1e-14)
+    assert len(set(np.asarray(wanted[2]).tolist())) > (count > 3)  # samples have gone different ways
+
+
+@pytest.mark.native
+def test_other_kernels_compute_repetitions_outside():
+    """A kernel has no branches: the samples that need a repetition are computed by its fallback."""
+
+    def root(tree, x):
+        return repeat_while(lambda state: jnp.abs(state[0] ** 2 - 2) > 1e-14, _refine, (x, jnp.asarray(0)), 60)
+
+    x = jnp.asarray([2.0**0.5, 1.0, 40.0])
+    values, counts = jax.jit(jax.vmap(lambda x: kernel(root)((), x)))(x)
+    np.testing.assert_allclose(values, 2.0**0.5, rtol=1e-15)
+    assert counts[0] <= 1 and counts[1] > 3 and counts[2] > counts[1]

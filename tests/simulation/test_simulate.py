@@ -66,7 +66,7 @@ V0 = np.array([0.5, -1.0, 0.7, 0.4])
 
 def circle(t, y, error, args):
     x = y["x"] / jnp.sqrt(jnp.sum(y["x"] ** 2))
-    return {"x": x}, {"x": error["x"] - x * jnp.sum(x * error["x"])}, diffrax.RESULTS.successful
+    return {"x": x}, {"x": x}, {"x": error["x"] - x * jnp.sum(x * error["x"])}
 
 
 def turning(t, y, args):

@@ -20,7 +20,7 @@ from jaxdyn.simulation.hybrid.records import Records, chatters, no_records, reco
 from jaxdyn.simulation.hybrid.system import HybridSystem
 from jaxdyn.simulation.hybrid.transitions import Transition
 from jaxdyn.simulation.solvers.driver import number_of_steps, save
-from jaxdyn.simulation.solvers.explicit import Plan, Step, by_scan, dense_output, take_step
+from jaxdyn.simulation.solvers.explicit import Plan, Step, dense_output, take_step
 from jaxdyn.simulation.solvers.step_control import add_error, no_sums, step_factor
 
 # Length of the first step after an event, in steps before it: the motion may be another one.
@@ -92,7 +92,7 @@ def _attempt(plan: Plan, system: HybridSystem, args, t0, t1, y, rtol, atol) -> A
     return Attempt(step, size, *system.guards(args, t1, step.projected), *system.guards(args, middle, between))
 
 
-_attempt_by_kernel: Any = kernel(_attempt, static=2, fallback=by_scan(_attempt), derivative=False)
+_attempt_by_kernel: Any = kernel(_attempt, static=2, fallback=_attempt, derivative=False)
 
 
 @kernel(static=1)

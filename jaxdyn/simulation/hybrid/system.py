@@ -106,7 +106,8 @@ class ModalSystem(HybridSystem):
 
     def _project(self, t, y, error, args):
         unknown, mode = args
-        return *project(self._bind(unknown)[0], self.elements, mode, t, y, error), diffrax.RESULTS.successful
+        following, tangent = project(self._bind(unknown)[0], self.elements, mode, t, y, error)
+        return following | {"slip": y["slip"]}, following, tangent
 
     def _switches(self, unknown, positive, q, v, t):
         """Switching functions with such signs that they are positive until one changes its sign, and their levels, (k,)."""

@@ -22,7 +22,7 @@ from jaxdyn.compile.batch import any_sample, while_loop
 from jaxdyn.compile.loops import Carry, Given, Iteration, Passed, Task, run_loop
 from jaxdyn.compile.repair import compute_where
 from jaxdyn.simulation.solvers import reverse
-from jaxdyn.simulation.solvers.explicit import Plan, Step, by_scan, dense_output, take_step
+from jaxdyn.simulation.solvers.explicit import Plan, Step, dense_output, take_step
 from jaxdyn.simulation.solvers.integrator import Integrator, zeros_or
 from jaxdyn.simulation.solvers.step_control import add_error, first_step, least_step, no_sums, step_factor
 
@@ -219,11 +219,8 @@ def _advance(plan: Plan, control, args, limits: _Limits, state: _State, active):
     return *_accept(plan, control, args, limits, state, active, step), step
 
 
-_advance_by_scan = by_scan(_advance)
-
-
 def _advance_by_kernel(plan: Plan, control, args, limits: _Limits, state: _State, active):
-    advance: Any = kernel(_advance, static=2, fallback=_advance_by_scan, derivative=False)
+    advance: Any = kernel(_advance, static=2, fallback=_advance, derivative=False)
     return advance(plan, control, args, limits, state, active, where=active)
 
 
@@ -231,7 +228,7 @@ def _advance_by_fallback(plan: Plan, control, args, limits: _Limits, state: _Sta
     """State after a step that the native loop has refused, for every trajectory that is active."""
     none, stages = jnp.zeros_like(state.y), jnp.zeros((plan.count, state.y.size), state.y.dtype)
     unchanged = state, jnp.zeros_like(active), Step(none, none, none, none, stages, none)
-    return compute_where(active, partial(_advance_by_scan, plan, control), unchanged, (args, limits, state, active))
+    return compute_where(active, partial(_advance, plan, control), unchanged, (args, limits, state, active))
 
 
 def _accept(plan: Plan, control, args, limits: _Limits, state: _State, active, step: Step) -> tuple[_State, Array]:

@@ -5,7 +5,6 @@ for every sample, for example at rows that are close to dependent: there the ste
 Derivatives are those of that loop.
 """
 
-import functools
 from collections.abc import Callable
 from functools import partial
 from typing import Any, NamedTuple
@@ -85,7 +84,7 @@ class ExplicitSteps(ProjectedSolver):
 
         def tangent(args, *rest):
             *state, steps = rest
-            results, changes = value_and_jvp(partial(_scan_stages, plan), (args, *state), steps)
+            results, changes = value_and_jvp(partial(_step_by_jax, plan), (args, *state), steps)
             return results, jax.tree.map(_no_change, results) if changes is None else changes
 
         results: Any = implicit(args, state, partial(_step, plan), tangent)
@@ -100,11 +99,7 @@ class ExplicitSteps(ProjectedSolver):
 
 
 class Plan(NamedTuple):
-    """Definition of a step; equal plans share their programs. `quality(t, y, args)`: see `quality_of`.
-
-    `scans`: the stages are one loop, which compiles quickly, instead of being written out one after the other, which a kernel
-    computes faster.
-    """
+    """Definition of a step; equal plans share their programs. `quality(t, y, args)`: see `quality_of`."""
 
     solver: type
     field: Callable
@@ -114,7 +109,6 @@ class Plan(NamedTuple):
     tree: Any
     shapes: tuple
     quality: Callable | None = None
-    scans: bool = False
 
     @property
     def tableau(self) -> Any:
@@ -192,11 +186,11 @@ class Plan(NamedTuple):
         return jnp.asarray(t1 - t0, y.dtype) * self.field_of(args, t, y)
 
     def project_end(self, args, t1, y, error):
-        """Projection of the flat end y of a step, its shift, the error, and a code."""
+        """Flat start of the next step, for the end y of a step, with the end's shift by its projection, and its error."""
         project: Any = self.project
         method = ProjectedSolver(diffrax.Euler(), project, self.step_constants, self.branching)
         end = method.project_end(t1, self.structure(y), self.structure(error), args)
-        return *(ravel_pytree(x)[0] for x in end[:3]), end[3]
+        return tuple(ravel_pytree(x)[0] for x in end)
 
 
 class Step(NamedTuple):
@@ -213,20 +207,10 @@ class Step(NamedTuple):
 def take_step(plan: Plan, args, t0, t1, y, rate) -> Step:
     """Make a step from t0 to t1; `rate` is the vector field at y if the method is first-same-as-last."""
     dt = jnp.asarray(t1 - t0, y.dtype)
-    if plan.scans:
-        step: Any = _scan_stages(plan, args, t0, t1, y, rate, jnp.asarray(plan.is_fsal))
-        projected, shift, error, raw, stages, _ = step
-    else:
-        first = dt * rate if plan.is_fsal else _first_stage(plan, args, t0, t1, y)
-        projected, shift, error, raw, stages = _unroll_stages(plan, args, t0, t1, y, first)
+    projected, shift, error, raw, stages = _stages(plan, args, t0, t1, y, dt * rate if plan.is_fsal else None)
     # A step of no length leaves its state, and the rate with it.
     rate = jnp.where(dt == 0, rate, stages[-1] / jnp.where(dt == 0, jnp.ones_like(dt), dt))
     return Step(projected, shift, error, raw, stages, rate)
-
-
-def by_scan(function: Callable) -> Callable:
-    """Fallback of a kernel: the same function of a plan, with stages in a loop."""
-    return lambda plan, *rest: function(plan._replace(scans=True), *rest)
 
 
 def dense_output(plan: Plan, _, t, t0, t1, y, raw, stages, shift):
@@ -243,62 +227,44 @@ def dense_output(plan: Plan, _, t, t0, t1, y, raw, stages, shift):
 
 
 def _step(plan: Plan, args, t0, t1, start, last, is_ready):
-    """Projected end of a step, its shift, its error, the end before the projection, stages, and a code."""
-    # For the whole batch: a branch that differs between samples would be computed for all.
-    is_ready = ~any_sample(~is_ready) if plan.tableau.fsal else jnp.asarray(False)
-    dt = jnp.asarray(t1 - t0, start.dtype)
-
-    def anew(y):
-        return kernel(_first_stage, static=1)(plan, args, t0, t1, y)
-
-    first = lax.cond(is_ready, lambda y: dt * last, anew, start)
+    """Projected end of a step, its shift, its error, the end before the projection, stages, and a code; `last`: a rate."""
+    first = None
+    if plan.tableau.fsal:  # outside of the kernel, which has no branch for the step after a jump
+        dt, anew = jnp.asarray(t1 - t0, start.dtype), kernel(_first_stage, static=1)
+        first = lax.cond(_are_ready(is_ready), lambda: dt * last, lambda: anew(plan, args, t0, t1, start))
     # Projections report success, so that the code is no result of the kernel: batched, it would meet the unbatched one of the
     # rule in `step`, which JAX 0.10 cannot lower.
-    return *_unroll_or_scan(plan, args, t0, t1, start, first, last, is_ready), diffrax.RESULTS.successful
+    stages: Any = kernel(_stages, static=1, fallback=_stages, derivative=False)
+    return *stages(plan, args, t0, t1, start, first), diffrax.RESULTS.successful
 
 
-def _scan_anew(plan: Plan, args, t0, t1, start, first, last, is_ready):
-    del first  # the loop over the stages computes it
-    return _scan_stages(plan, args, t0, t1, start, last, is_ready)[:-1]
+def _step_by_jax(plan: Plan, args, t0, t1, start, last, is_ready):
+    """`_step` by operations of JAX, with one copy of the vector field."""
+    dt = jnp.asarray(t1 - t0, start.dtype)
+    first = dt * last if plan.tableau.fsal else None
+    return *_stages(plan, args, t0, t1, start, first, _are_ready(is_ready)), diffrax.RESULTS.successful
 
 
-@kernel(static=1, fallback=_scan_anew, derivative=False)
-def _unroll_or_scan(plan: Plan, args, t0, t1, start, first, last, is_ready):
-    del last, is_ready
-    return _unroll_stages(plan, args, t0, t1, start, first)
+def _are_ready(is_ready):
+    # For the whole batch: a branch that differs between samples would be computed for all.
+    return ~any_sample(~is_ready)
 
 
 def _first_stage(plan: Plan, args, t0, t1, start):
     return plan.stage(args, t0, t1, start, 0.0, 1.0)
 
 
-def _unroll_stages(plan: Plan, args, t0, t1, start, first):
-    """All of a step but its code, with the stages written out."""
-    k, none = [first], jnp.zeros_like(start)
-    points = [(float(time), float(side)) for time, side in zip(plan.times, plan.sides, strict=True)]
-    for i in range(1, plan.count - plan.projects_before_last):
-        k.append(plan.stage(args, t0, t1, start + _sum(plan.sums[i], k), *points[i]))
-    raw, error = start + _sum(plan.sums[plan.count], k), _sum(plan.sums[plan.count + 1], k)
-    projected, shift = raw, none
-    # The error lacks the last stage where that follows the projection: its share is added afterwards.
-    is_early = plan.projects_before_last and not plan.knows_error
-    if plan.project is not None:
-        projected, shift, tangent, _ = plan.project_end(args, t1, raw, none if is_early else error)
-    if plan.projects_before_last:
-        # The next step begins with this stage, so that it belongs to the projected state.
-        k.append(plan.stage(args, t0, t1, projected, *points[-1]))
-    if plan.project is not None:
-        error = enlarge(error + float(plan.sums[-1, -1]) * k[-1], tangent) if is_early else tangent
-    return projected, shift, error, raw, jnp.stack(k)
+def _stages(plan: Plan, args, t0, t1, start, first=None, is_ready: Any = True):
+    """All of a step, as one loop over the stages, which a kernel writes out.
 
-
-def _scan_stages(plan: Plan, args, t0, t1, start, last, is_ready):
-    """All of a step, as one loop over the stages; `last`, the first stage by the step before where that `is_ready`."""
+    `first`: the first stage where that `is_ready`, or None.
+    """
     count, none = plan.count, jnp.zeros_like(start)
-    is_ready = ~any_sample(~is_ready) if plan.tableau.fsal else jnp.asarray(False)
-    dt = jnp.asarray(t1 - t0, start.dtype)
     times, sides = (jnp.asarray(x, jnp.result_type(t0, t1)) for x in (plan.times, plan.sides))
     rows = jnp.arange(count), jnp.asarray(plan.sums.T, start.dtype), times, sides
+
+    def compute(y, point):
+        return plan.stage(args, t0, t1, y, *point)
 
     def stage(carry, row):
         # `total` holds what the stages so far add to each later stage, to the result and to the error.
@@ -310,33 +276,27 @@ def _scan_stages(plan: Plan, args, t0, t1, start, last, is_ready):
             project = partial(plan.project_end, args, t1)
             end = lax.cond(i == count - 1, project, lambda y, _: (y, *end[1:]), y, error)
             y = end[0]
-        k = lax.cond(is_ready & (i == 0), lambda y: dt * last, lambda y: plan.stage(args, t0, t1, y, *point), y)
+        k = compute(y, point) if first is None else lax.cond(is_ready & (i == 0), lambda *_: first, compute, y, point)
         return (total + weights[:, None] * k[None], *end), k
 
     # The last two rows are the sums for the result and for the error, as in `Plan.sums`.
     blank = jnp.zeros((count + 2, start.size), start.dtype)
-    first = blank, start, none, none, diffrax.RESULTS.successful
-    (total, *end), k = lax.scan(stage, first, rows)
+    begin = blank, start, none, none
+    (total, *end), k = lax.scan(stage, begin, rows)
     raw, error = start + total[count], total[count + 1]
     if plan.project is None:
-        return raw, none, error, raw, k, diffrax.RESULTS.successful
+        return raw, none, error, raw, k
     if not plan.projects_before_last:
         end = plan.project_end(args, t1, raw, error)
-    projected, shift, tangent, result = end
+    projected, shift, tangent = end
     error = enlarge(error, tangent) if plan.projects_before_last and not plan.knows_error else tangent
-    return projected, shift, error, raw, k, result
+    return projected, shift, error, raw, k
 
 
 def _no_change(x):
     """Tangent zero of an array."""
     # Tangents of integers and flags have the dtype float0 in JAX.
     return jnp.zeros_like(x) if jnp.issubdtype(x.dtype, jnp.floating) else np.zeros(x.shape, jax.dtypes.float0)
-
-
-def _sum(weights, k):
-    """Sum of the stages times their weights; most weights are zero."""
-    terms = [float(weight) * stage for weight, stage in zip(weights, k, strict=False) if weight != 0]
-    return functools.reduce(jnp.add, terms) if terms else jnp.zeros_like(k[0])
 
 
 def keeps_fsal(tableau, step_constants: tuple[str, ...], branching: bool) -> bool:

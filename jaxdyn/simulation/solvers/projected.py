@@ -48,12 +48,11 @@ class ProjectedSolver(Wrapped):
     removes is not counted, unless the projection moves the result by more than the method expects: where rounding decides to
     which of several branches of a manifold a point is projected, the result moves by much more than its estimated error.
 
-    **Arguments:** `solver`, any diffrax method of an `ODETerm`. `project(t, y, error, args) -> (y, error, diffrax.RESULTS)`:
-    the projected state, the error estimate (None if there is none) without its part normal to the manifold, and whether it
-    succeeded; everything it depends on comes through `args`, so that gradients reach it. The state is a dictionary.
-    `step_constants` names entries of it that are constant within a step and that `project` may change for the next one; the
-    dense output of the step keeps the old ones. `branching`: True if the manifold may have branches that meet. If not,
-    `project` does not change errors.
+    **Arguments:** `solver`, any diffrax method of an `ODETerm`. `project(t, y, error, args) -> (end, following, error)`: the
+    projected end of this step, the state from which the next one starts, and the error estimate (None if there is none)
+    without its part normal to the manifold; everything it depends on comes through `args`, so that gradients reach it.
+    `step_constants` names entries of the state, a dictionary, that are constant within a step and may differ in `following`.
+    `branching`: True if the manifold may have branches that meet. If not, `project` does not change errors.
     """
 
     project: Callable
@@ -70,19 +69,15 @@ class ProjectedSolver(Wrapped):
         """Dense output of the wrapped method, ending at the projected point."""
         return functools.partial(ProjectedInterpolation, self.solver.interpolation_cls)
 
-    def project_end(
-        self, t: Number, y: PyTree, error: PyTree, args: PyTree
-    ) -> tuple[PyTree, PyTree, PyTree, diffrax.RESULTS]:
-        """Project the end y of a step: the state, its shift (zero in `step_constants`), its error, and a code."""
-        projected, tangent, result = self.project(t, y, error, args)
+    def project_end(self, t: Number, y: PyTree, error: PyTree, args: PyTree) -> tuple[PyTree, PyTree, PyTree]:
+        """Project the end y of a step: the state of the next step, the shift of this one's end, and its error."""
+        projected, following, tangent = self.project(t, y, error, args)
         shift = jax.tree.map(lambda a, b: a - b, projected, y)
-        # What is renewed for the next step must not bend the dense output of this one.
-        shift = shift | {name: jnp.zeros_like(shift[name]) for name in self.step_constants}
         if error is not None:
             tangent = jax.tree.map(
                 lambda left, error, shift: enlarge(left, _excess_shift(shift, error - left)), tangent, error, shift
             )
-        return projected, shift, tangent, result
+        return following, shift, tangent
 
     def step(
         self, terms: PyTree, t0: Number, t1: Number, y0: PyTree, args: PyTree, solver_state: PyTree, made_jump: Flag
@@ -92,8 +87,7 @@ class ProjectedSolver(Wrapped):
         y1, error, dense_info, solver_state, result = self.solver.step(
             terms, t0, t1, y0, args, solver_state, made_jump=True
         )
-        projected, shift, error, projection_result = self.project_end(t1, y1, error, args)
-        result = diffrax.RESULTS.where(diffrax.is_successful(result), projection_result, result)
+        projected, shift, error = self.project_end(t1, y1, error, args)
         return projected, error, {"dense_info": dense_info, "shift": shift}, solver_state, result
 
 

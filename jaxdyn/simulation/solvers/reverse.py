@@ -22,7 +22,7 @@ from jaxtyping import Array
 from jaxdyn.compile import kernel
 from jaxdyn.compile.batch import any_sample, cond
 from jaxdyn.compile.loops import Carry, Given, Iteration, Task, run_loop
-from jaxdyn.simulation.solvers.explicit import ExplicitSteps, Plan, by_scan, dense_output, take_step
+from jaxdyn.simulation.solvers.explicit import ExplicitSteps, Plan, dense_output, take_step
 
 # States that are kept of a run: 4 kB a number of the state in float64, which a cache holds for small mechanisms.
 KEPT = 512
@@ -198,7 +198,7 @@ def _iterate_back(plan: Plan, times_move, structure, args, ends: _Ends, cotangen
 
 def _iterate_back_in_jax(plan: Plan, times_move, structure, args, ends: _Ends, given: Given, carry: Carry) -> Carry:
     """One iteration as operations of JAX around kernels."""
-    pull: Any = kernel(_pull_without_loop, static=3, fallback=_pull_by_scan, derivative=False)
+    pull: Any = kernel(_pull_without_loop, static=3, fallback=_pull_step, derivative=False)
     cotangents, pull = carry.state, partial(pull, plan, times_move, structure, *args)
     after = _go_back(pull, times_move, ends, cotangents, _read(given, cotangents.places))
     return Carry(jax.tree.map(lambda new, old: jnp.where(after.active, new, old), after.state, cotangents))
@@ -272,9 +272,6 @@ def _pull_step(plan: Plan, times_move, structure, fixed, free, t0, t1, y, at, af
     return of_free, of_y, *(of_times or (jnp.zeros_like(t0),) * 3)
 
 
-_pull_by_scan = by_scan(_pull_step)
-
-
 def _iterate_replay(plan: Plan, args, ends, replay: _Replay, read) -> Iteration:
     """Take a step again."""
     (t0, t1), kept = read
@@ -290,7 +287,7 @@ def _go_on(after, ends, replay: _Replay, kept) -> Iteration:
 
 def _replay_in_jax(plan: Plan, args, ends, given: Given, carry: Carry) -> Carry:
     """Take the rest of the steps again, as operations of JAX around kernels."""
-    end_of: Any = kernel(_end_of_step, static=1, fallback=by_scan(_end_of_step), derivative=False)
+    end_of: Any = kernel(_end_of_step, static=1, fallback=_end_of_step, derivative=False)
 
     def once(_, carry):
         replay, (between,) = carry.state, carry.records
