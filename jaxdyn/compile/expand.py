@@ -252,7 +252,7 @@ class _Expansion:
         if type(which) is Number:
             if not self.branches or len(branches) != 2:
                 raise NotNumbers("a cond whose branch is not known")
-            return self._branch(which, *branches, args[1:])
+            return self._branch(which, branches[0], branches[1], args[1:])
         return self.evaluate_inner(branches[min(max(int(which), 0), len(branches) - 1)], args[1:])
 
     def _branch(self, which, usual: ClosedJaxpr, rare: ClosedJaxpr, args) -> list:

@@ -35,9 +35,13 @@ _LEAST_NORMAL = {"f8": 2.0**-1022, "f4": 2.0**-126}
 
 
 class Graph:
-    """A program while it is written. **Raises:** `TooLong` beyond `most` operations."""
+    """A program while it is written. **Raises:** `TooLong` beyond `most` operations.
 
-    def __init__(self, most: int = 10**9):
+    Without `branches` those of a program that is replayed are computed for all samples, and selected.
+    """
+
+    def __init__(self, most: int = 10**9, branches: bool = True):
+        self.branches = branches
         self.most, self.most_made = most, _MADE_FOR_ONE_KEPT * most
         self.numbers: list[Number] = []
         # Keys are operations with their operands, by identity: equal numbers are made once.
@@ -75,6 +79,14 @@ class Graph:
         """The outputs of a subprogram where the flag is set, else `otherwise`; it is called if the flag is set at all."""
         if type(flag) is not Number:
             return self.call(program, inputs) if flag else list(otherwise)
+        if not self.branches:
+            return [
+                objects(
+                    [self.select(flag, x, y, kind_of(array.dtype)) for x, y in zip(old.flat, new.flat, strict=True)],
+                    array.shape,
+                )
+                for old, new, array in zip(otherwise, self.replay(program, inputs)[1], program.outputs, strict=True)
+            ]
         entries = [entry for x in (*inputs, *otherwise) for entry in x.ravel().tolist()]
         return self._parts("call_where", program, [flag, *entries])
 
@@ -408,10 +420,10 @@ def _are_same(a, b) -> bool:
 
 
 def inline(program: Program) -> Program:
-    """The same without subprograms, except those that have loops."""
+    """The same without subprograms and branches, except subprograms that have loops."""
     if all(x.is_called for x in program.subprograms):
         return program
-    graph = Graph()
+    graph = Graph(branches=False)
     with np.errstate(all="ignore"):  # known numbers may overflow, as they do in XLA
         _, outputs = graph.replay(program, [graph.inputs(i, array) for i, array in enumerate(program.inputs)])
     return graph.finish(program.inputs, program.outputs, outputs, name=program.name)

@@ -111,15 +111,15 @@ def stiffness(
     """
     scene = as_scene(scene)
     control = None if control is None else as_pytree(control, "control")
-    q, v, t = check_state(scene.system, q=q, v=v, t=t)
-    state = scene.drive_state(q, v, t)
+    at: Any = check_state(scene.system, q=q, v=v, t=t)
+    state = scene.drive_state(*at)
     if drive_state is not None:
-        given = as_array(drive_state, "drive_state", q.dtype)
+        given = as_array(drive_state, "drive_state", at[0].dtype)
         if state is None or given.shape != state.shape:
             want = "None: the scene has no drives" if state is None else f"{state.shape} as of scene.drive_state(q, v)"
             raise ValueError(f"drive_state has shape {given.shape}, expected {want}")
         state = given
-    matrix = _linearize(scene, q, v, t, control, state)
+    matrix = _linearize(scene, *at, control, state)
     if is_known(matrix):
         # All by numpy, which compiles nothing.
         known = np.asarray(matrix, float)

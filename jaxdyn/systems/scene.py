@@ -46,7 +46,7 @@ class _Closure(eqx.Module):
         for i, value in self.captured.items():
             whole = value if isinstance(value, _Closure) else eqx.combine(value, cells[i].cell_contents)
             cells[i] = types.CellType(whole)
-        old = self.function
+        old: Any = self.function
         new = types.FunctionType(old.__code__, old.__globals__, old.__name__, old.__defaults__, tuple(cells))
         new.__kwdefaults__ = old.__kwdefaults__
         return new(*args)
