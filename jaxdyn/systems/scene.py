@@ -52,7 +52,7 @@ class _Closure(eqx.Module):
         return new(*args)
 
 
-def _bind_traced(function: types.FunctionType) -> _Closure | None:
+def _bind_traced(function: types.FunctionType, callers: tuple[types.FunctionType, ...] = ()) -> _Closure | None:
     """The function as a pytree of the traced values it captures, also in functions that it captures; None without any."""
     captured = {}
     for i, cell in enumerate(function.__closure__ or ()):
@@ -61,7 +61,9 @@ def _bind_traced(function: types.FunctionType) -> _Closure | None:
         except ValueError:  # a variable without a value yet
             continue
         if isinstance(content, types.FunctionType):
-            value = None if content is function else _bind_traced(content)
+            # Functions may call each other: what they capture is found once.
+            known = (*callers, function)
+            value = None if any(content is x for x in known) else _bind_traced(content, known)
         else:
             value = None if is_concrete(content) else eqx.filter(content, lambda leaf: not is_concrete(leaf))
         if value is not None:

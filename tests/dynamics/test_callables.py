@@ -158,3 +158,18 @@ def test_traced_values_in_constraints_energies_and_bases():
     N = jd.reduction.tangent_basis(scene, q)
     rate = lambda k: jd.reduced_dynamics(scene, q, jnp.zeros(1), basis=lambda q, t: k * N).nu_rate[0]  # noqa: E731
     np.testing.assert_allclose(jax.grad(rate)(2.0), -rate(2.0) / 2.0, rtol=1e-10)
+
+
+def test_functions_that_call_each_other_are_searched_once():
+    def even(count, q):
+        return -q if count == 0 else odd(count - 1, q)
+
+    def odd(count, q):
+        return even(count - 1, q)
+
+    arm, x = jd.robots.chain(2), jnp.asarray([0.3, 0.2])
+    computed, wanted = (
+        jd.constrained_dynamics(jd.Scene(arm, (), forces=(f,)), x, x).acceleration
+        for f in (lambda q, v, t: even(2, q), lambda q, v, t: -q)
+    )
+    np.testing.assert_allclose(computed, wanted, rtol=1e-14)
