@@ -81,7 +81,7 @@ class Study:
         return self
 
     @cached_property
-    def _computing(self) -> threading.Lock:
+    def _computing(self) -> Any:  # a Lock, which is no type before Python 3.13
         # Two threads of a worker have a task each, which would compete for the threads of kernels.
         return threading.Lock()
 
