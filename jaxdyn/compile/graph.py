@@ -26,6 +26,7 @@ from jaxdyn.compile.program import (
     as_kind,
     dtype_of,
     kind_of,
+    kind_or_refuse,
 )
 
 # Numbers that may be made for each operation that is allowed: those that no output needs are dropped at the end. Without a
@@ -64,8 +65,8 @@ class Graph:
         return number
 
     def inputs(self, place: int, array: Array) -> np.ndarray:
-        """The entries of an argument."""
-        kind = kind_of(array.dtype)
+        """The entries of an argument. **Raises:** `NotNumbers` for a dtype that programs do not have."""
+        kind = kind_or_refuse(array.dtype)
         entries = [self.make("input", kind, place, k) for k in range(array.size)]
         return objects(entries, array.shape)
 

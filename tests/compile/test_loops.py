@@ -124,3 +124,19 @@ def test_other_kernels_compute_repetitions_outside():
     values, counts = jax.jit(jax.vmap(lambda x: kernel(root)((), x)))(x)
     np.testing.assert_allclose(values, 2.0**0.5, rtol=1e-15)
     assert counts[0] <= 1 and counts[1] > 3 and counts[2] > counts[1]
+
+
+@pytest.mark.native
+def test_numbers_that_programs_do_not_have_run_by_jax():
+    """An unsigned integer that a function within the loop takes: no native loop, and no error."""
+
+    @jax.jit
+    def half(x, count):
+        return _many_operations(x) / count.astype(x.dtype)
+
+    def turn(tree, constants, state, _):
+        x, count = state
+        return Iteration((half(x, count.astype(jnp.uint32)), count + 1), count < 3, count + 1 < 3)
+
+    task = Task(turn, _by_turns, ())
+    assert run_loop(task, (), (), Given(), Carry((jnp.ones(()), jnp.ones((), jnp.int32)))) is None
