@@ -170,6 +170,6 @@ def test_functions_that_call_each_other_are_searched_once():
     arm, x = jd.robots.chain(2), jnp.asarray([0.3, 0.2])
     computed, wanted = (
         jd.constrained_dynamics(jd.Scene(arm, (), forces=(f,)), x, x).acceleration
-        for f in (lambda q, v, t: even(2, q), lambda q, v, t: -q)
+        for f in (lambda system, q, v, t: even(2, q), lambda system, q, v, t: -q)
     )
     np.testing.assert_allclose(computed, wanted, rtol=1e-14)

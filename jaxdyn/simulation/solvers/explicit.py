@@ -21,6 +21,7 @@ from jaxtyping import Array, PyTree
 from jaxdyn.compile import implicit, kernel, value_and_jvp
 from jaxdyn.compile.batch import any_sample
 from jaxdyn.constraints.projection import enlarge
+from jaxdyn.lie.so3 import matmul
 from jaxdyn.model.arguments import Number
 from jaxdyn.simulation.solvers.base import DenseOutput, Flag, StepOutput
 from jaxdyn.simulation.solvers.projected import ProjectedInterpolation, ProjectedSolver
@@ -261,29 +262,27 @@ def _stages(plan: Plan, args, t0, t1, start, first=None, is_ready: Any = True):
     """
     count, none = plan.count, jnp.zeros_like(start)
     times, sides = (jnp.asarray(x, jnp.result_type(t0, t1)) for x in (plan.times, plan.sides))
-    rows = jnp.arange(count), jnp.asarray(plan.sums.T, start.dtype), times, sides
+    *starts, of_end, of_error = jnp.asarray(plan.sums, start.dtype)
 
     def compute(y, point):
         return plan.stage(args, t0, t1, y, *point)
 
     def stage(carry, row):
-        # `total` holds what the stages so far add to each later stage, to the result and to the error.
-        total, *end = carry
+        # The stages so far, and zeros. Sums are made where they are used: a kernel would keep sums for all later stages.
+        k, *end = carry
         i, weights, *point = row
-        y = start + total[i]
+        y = start + matmul(weights, k)
         if plan.projects_before_last:
-            error = total[count + 1] if plan.knows_error else none
+            error = matmul(of_error, k) if plan.knows_error else none
             project = partial(plan.project_end, args, t1)
             end = lax.cond(i == count - 1, project, lambda y, _: (y, *end[1:]), y, error)
             y = end[0]
-        k = compute(y, point) if first is None else lax.cond(is_ready & (i == 0), lambda *_: first, compute, y, point)
-        return (total + weights[:, None] * k[None], *end), k
+        new = compute(y, point) if first is None else lax.cond(is_ready & (i == 0), lambda *_: first, compute, y, point)
+        return (k.at[i].set(new), *end), None
 
-    # The last two rows are the sums for the result and for the error, as in `Plan.sums`.
-    blank = jnp.zeros((count + 2, start.size), start.dtype)
-    begin = blank, start, none, none
-    (total, *end), k = lax.scan(stage, begin, rows)
-    raw, error = start + total[count], total[count + 1]
+    begin = jnp.zeros((count, start.size), start.dtype), start, none, none
+    (k, *end), _ = lax.scan(stage, begin, (jnp.arange(count), jnp.stack(starts), times, sides))
+    raw, error = start + matmul(of_end, k), matmul(of_error, k)
     if plan.project is None:
         return raw, none, error, raw, k
     if not plan.projects_before_last:
