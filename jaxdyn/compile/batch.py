@@ -14,7 +14,7 @@ import jax.numpy as jnp
 from jax import lax
 from jax.custom_batching import custom_vmap
 
-from jaxdyn.compile.flags import mark_invalid
+from jaxdyn.compile.flags import mark_floats
 from jaxdyn.compile.known import is_concrete
 from jaxdyn.compile.mode import has_branches, in_rows, is_expanding, is_standalone
 
@@ -55,9 +55,9 @@ def while_loop(goes_on: Callable[[T], object], body: Callable[[T], T], carry: T)
 def repeat_while(goes_on: Callable[[T], Any], step: Callable[[T], T], state: T, most: int, *, marks: bool = False) -> T:
     """Repeat state = step(state) while goes_on(state), `most` times at most; few samples need the first repetition.
 
-    In a native loop a block of samples branches to it. Other kernels have no branches: samples that need a repetition are marked
-    as not valid, and computed again outside of the kernel. In code without JAX all repetitions are written out, unless it
-    `marks` such samples for its second program.
+    In a native loop, and in a kernel without a derivative, a block of samples branches to it. Other kernels have no branches:
+    samples that need a repetition are marked as not valid, and computed again outside of the kernel. In code without JAX all
+    repetitions are written out, or with `marks` such samples are left to its second program.
     """
     if not is_expanding():
 
@@ -67,7 +67,7 @@ def repeat_while(goes_on: Callable[[T], Any], step: Callable[[T], T], state: T, 
 
         return lax.while_loop(lambda carry: goes_on(carry[1]) & (carry[0] < most), again, (0, state))[1]
     if not has_branches() and (marks or not is_standalone()):
-        return jax.tree.map(lambda x: mark_invalid(goes_on(state), x) if _is_float(x) else x, state)
+        return mark_floats(goes_on(state), state)
     for _ in range(most):
         flag = goes_on(state)
         if has_branches():
@@ -75,10 +75,6 @@ def repeat_while(goes_on: Callable[[T], Any], step: Callable[[T], T], state: T, 
         else:
             state = jax.tree.map(lambda new, old, flag=flag: jnp.where(flag, new, old), step(state), state)
     return state
-
-
-def _is_float(x) -> bool:
-    return jnp.issubdtype(jnp.result_type(x), jnp.floating)
 
 
 def map_rows(function: Callable, rows):

@@ -309,7 +309,7 @@ def _subprogram(inner: ClosedJaxpr, known: tuple, most: int) -> tuple[Program, b
     arrays = [Array(x.aval.shape, np.dtype(x.aval.dtype)) for x in inner.jaxpr.invars]  # pyright: ignore[reportAttributeAccessIssue]
     inputs = [array for array, x in zip(arrays, known, strict=True) if x is None]
     entries = iter([graph.inputs(place, array) for place, array in enumerate(inputs)])
-    # Programs without calls cannot be called where one may branch: `_subprogram` is reached from those with calls alone.
+    # A subprogram makes no calls of its own but branches: only programs that have both call it.
     expansion = _Expansion(graph, False, True)
     args = [next(entries) if x is None else np.frombuffer(x[2], x[1]).reshape(x[0]) for x in known]
     results = [as_objects(x) for x in expansion.evaluate_inner(inner, args)]

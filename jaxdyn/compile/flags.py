@@ -22,6 +22,16 @@ def mark_invalid(flag: jax.Array, x: jax.Array) -> jax.Array:
     return invalid_p.bind(jnp.broadcast_to(flag, x.shape), x)
 
 
+def is_float(x) -> bool:
+    """Decide whether an array is of floating-point numbers, which can be marked and differentiated."""
+    return jnp.issubdtype(jnp.result_type(x), jnp.floating)
+
+
+def mark_floats(flag: jax.Array, tree):
+    """`mark_invalid` the float arrays of a pytree; others stay as they are."""
+    return jax.tree.map(lambda x: mark_invalid(flag, x) if is_float(x) else x, tree)
+
+
 def _batch(args, axes):
     size = next(x.shape[axis] for x, axis in zip(args, axes, strict=True) if axis is not None)
     full = [

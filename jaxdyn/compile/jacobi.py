@@ -47,7 +47,7 @@ class PseudoInverse(MatrixProgram):
         # The smaller side is made orthogonal: rotations of m vectors of length n >= m cost n m^2 a sweep.
         n, m = max(rows, columns), min(rows, columns)
         # Columns of the matrix, or its rows where there are fewer of them, one after the other.
-        U, J = _rotated(w, matrix, n, m, *((1, columns) if rows >= columns else (columns, 1)))
+        U, J = _orthogonalise(w, matrix, n, m, *((1, columns) if rows >= columns else (columns, 1)))
         of_column, of_row = (n, 1) if rows >= columns else (1, m)
         _write_inverse(w, U, J, result, n, m, self.tolerance, of_column, of_row)
 
@@ -73,7 +73,7 @@ class RightVectors(MatrixProgram):
     def write(self, w: LoopWriter, matrix, result) -> None:
         """Rotations, and the columns of J in the order of the lengths of U's columns."""
         b, n, m = w.b, self.rows, self.columns
-        U, J = _rotated(w, matrix, n, m, 1, m)
+        U, J = _orthogonalise(w, matrix, n, m, 1, m)
         squares, total = w.buffer(m), w.variable(w.float, w.number(0))
         with w.loop(w.integer(0), w.integer(m)) as p:
             x = w.at(U, (p, n))
@@ -198,7 +198,7 @@ def _inverse_jvp(primals, tangents):
     return X, -jnp.matmul(X, jnp.matmul(tangents[0], X, precision="highest"), precision="highest")
 
 
-def _rotated(w: LoopWriter, matrix, n: int, m: int, of_vector: int, of_entry: int):
+def _orthogonalise(w: LoopWriter, matrix, n: int, m: int, of_vector: int, of_entry: int):
     """Buffers of U = A J, column after column, and J; vector p of A begins at p of_vector, with entries of_entry apart."""
     U, J, zero = w.buffer(n * m), w.buffer(m * m), w.integer(0)
     with w.loop(zero, w.integer(m)) as p:

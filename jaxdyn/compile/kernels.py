@@ -13,7 +13,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from jaxdyn.compile import jax_adapter, mode
-from jaxdyn.compile.flags import mark_invalid
+from jaxdyn.compile.flags import is_float, mark_invalid
 from jaxdyn.compile.known import is_known, partition, partition_tracers
 from jaxdyn.compile.primitive import kernel_p, target
 from jaxdyn.compile.repair import compute_where, rank_safe, repair
@@ -39,8 +39,8 @@ def kernel(
     - `fallback(*static, tree, *args)`: computes the same where there is no kernel, and those samples that the function marks
       by `mark_invalid`. Default: the function itself, by operations of JAX. It depends on nothing traced but its arguments.
     - `derivative`: None for the derivative of the function's numbers; False for functions that are never differentiated, in
-      which long functions under `jax.jit` are compiled once and called; "program" for a function that stays a program of its
-      own, with the derivative of its numbers, inside another kernel too; or a rule
+      which long functions under `jax.jit` are compiled once and called, and `lax.cond` is a branch; "program" for a function that
+      stays a program of its own, with the derivative of its numbers, inside another kernel too; or a rule
       `derivative(*static, tree, *args, steps)` that returns the change of the results for the `steps` of the leaves of tree and
       args (None for a leaf that does not change), where that is cheaper.
 
@@ -98,18 +98,14 @@ def _call(function, static, tree, args, fallback, rule, is_differentiated: bool,
     differentiable, rest = _split_floats(values)
     floats, rest = repair(jnp.logical_not(valid), safe, fast, (differentiable, rest), (traced, args))
     floats, rest = iter(floats), iter(rest)
-    leaves = [next(floats if is_float else rest) for is_float in map(_is_float, jax.tree.leaves(values))]
+    leaves = [next(floats if is_float else rest) for is_float in map(is_float, jax.tree.leaves(values))]
     return jax.tree.unflatten(jax.tree.structure(values), leaves)
-
-
-def _is_float(x) -> bool:
-    return jnp.issubdtype(jnp.result_type(x), jnp.floating)
 
 
 def _split_floats(tree) -> tuple[list, list]:
     """The leaves that are differentiated, and the others: tangents of integers do not pass through a branch of JAX."""
     leaves = [jnp.asarray(x) for x in jax.tree.leaves(tree)]
-    return [x for x in leaves if _is_float(x)], [x for x in leaves if not _is_float(x)]
+    return [x for x in leaves if is_float(x)], [x for x in leaves if not is_float(x)]
 
 
 def _by_kernel(function, static, tree, args, fallback: Callable | None, **how) -> tuple[Any, Any] | None:

@@ -60,7 +60,7 @@ class MatrixProgram:
         """Write the operations on one sample; `matrix` and `result` are pointers to its entries, by rows."""
         raise NotImplementedError
 
-    def _written(self) -> "LoopWriter":
+    def _write_kernel(self) -> "LoopWriter":
         w = LoopWriter(self.dtype)
         data, _, begin, end = w.function.args
         given, result = (w.b.load(w.b.gep(data, [w.integer(i)], source_etype=POINTER), typ=POINTER) for i in range(2))
@@ -72,12 +72,12 @@ class MatrixProgram:
 
     def ir(self, width: int, uniform) -> str:
         """The text of the kernel (see `code.kernel_ir`)."""
-        return f"; {self.title}\n{self._written().module}"
+        return f"; {self.title}\n{self._write_kernel().module}"
 
     def definition(self, symbol: str) -> dict[str, str]:
         """`void symbol(ptr matrix, ptr result)` of one sample, and what it declares, by names in a module's text."""
         loops = f"{symbol}_loops"
-        text = str(self._written().function)
+        text = str(self._write_kernel().function)
         # Without "no-builtins" LLVM turns the loop that writes zeros into a call of memset, which bare metal may lack.
         text = text.replace("define void", "define internal void", 1).replace('@"kernel"', f"@{loops}", 1)
         head, brace, rest = text.partition("{")

@@ -14,7 +14,7 @@ from jax.custom_batching import custom_vmap
 
 from jaxdyn.compile import ahead, mode
 from jaxdyn.compile.batch import any_sample
-from jaxdyn.compile.flags import mark_invalid
+from jaxdyn.compile.flags import mark_floats
 from jaxdyn.compile.jax_adapter import vary_alike
 
 # Samples that are computed again together: they pay for the overhead of a loop of XLA, and the memory of their intermediates
@@ -56,7 +56,7 @@ def repair(flag, careful: Callable, fast: Callable, values: tuple, args: tuple):
     Inside of a kernel, which has no branches, floats of flagged samples are marked as not valid (see `flags`).
     """
     if mode.is_expanding():
-        return jax.tree.map(lambda x: mark_invalid(flag, x) if jnp.issubdtype(x.dtype, jnp.floating) else x, values)
+        return mark_floats(flag, values)
 
     @jax.custom_jvp
     def run(flag, values, args):
