@@ -47,8 +47,7 @@ def zarr_package() -> Any:
     **Raises:** ImportError that names the extra.
     """
     try:
-        import filelock  # noqa: F401 (these three are reported here if they are missing)
-        import google_crc32c  # noqa: F401
+        import filelock  # noqa: F401 (these two are reported here if they are missing)
         import tqdm  # noqa: F401
         import zarr
     except ImportError as error:
