@@ -160,6 +160,7 @@ class _Expansion:
 
     def _subprogram(self, inner: ClosedJaxpr, args) -> tuple[Program, list]:
         """A function as a subprogram, and its arguments without those that are known, which are compiled in."""
+        inner, args = _innermost(inner, args)
         known = tuple(None if x.dtype.kind == "O" else (x.shape, x.dtype.str, x.tobytes()) for x in args)
         program, has_rules = _subprogram(inner, known, self.graph.most)
         self.has_rules |= has_rules
@@ -295,6 +296,19 @@ class _Expansion:
         if self.calls and inner.cost >= MIN_SUBPROGRAM_OPERATIONS and not inner.subprograms:
             return [x.ravel() for x in self.graph.call(inner, shaped)]
         return [x.ravel() for x in self.graph.replay(inner, shaped)[1]]
+
+
+def _innermost(inner: ClosedJaxpr, args: Sequence) -> tuple[ClosedJaxpr, list]:
+    """The function under `jax.jit` to which a function comes down, with its arguments, or the function itself.
+
+    A branch that repeats a call so shares the call's subprogram.
+    """
+    jaxpr = inner.jaxpr
+    if len(jaxpr.eqns) != 1 or jaxpr.eqns[0].primitive.name != "jit" or jaxpr.eqns[0].outvars != jaxpr.outvars:
+        return inner, list(args)
+    values = dict(zip([*jaxpr.constvars, *jaxpr.invars], [*map(_constant, inner.consts), *args], strict=True))
+    given = [np.asarray(x.val) if isinstance(x, Literal) else values[x] for x in jaxpr.eqns[0].invars]
+    return _innermost(jaxpr.eqns[0].params["jaxpr"], given)
 
 
 @functools.lru_cache(maxsize=256)

@@ -211,6 +211,9 @@ def _lower_to_call(ctx, *operands, program, rows):
     except target.Unsupported as reason:  # pyright: ignore[reportOptionalMemberAccess]
         mode.say_once(f"functions run on JAX's own operations: {reason}")
         return lower_function(as_operations, ctx, *operands, program=program, rows=rows)
+    if program.turns > 1:
+        # A loop is the main part of a program and certain to be called: LLVM works on it while XLA compiles the rest.
+        target.make_ahead(number)
     if sharding.is_divisible(ctx.avals_in, lead):
         return lower_function(_with_last_axis, ctx, *operands, program=program, rows=rows and rows + 1)
     order = target.varying_first(uniform)

@@ -62,8 +62,13 @@ class ExplicitRun(Integrator):
 
     def values(self, inputs, room):
         y0, args, ts = inputs
-        most = self.max_steps if room is None else room
-        rows, facts, sums, history = _run_steps(self, ravel_pytree(y0)[0], args, ts, most, room is not None)
+        most, flat = self.max_steps if room is None else room, ravel_pytree(y0)[0]
+        # Of one step that is kept in any case the inputs tell the history: where reverse mode computes a run again for its
+        # history alone, this one is left out.
+        is_told = room == 1 and self.plan.quality is None and isinstance(self.control, FixedSteps)
+        rows, facts, sums, history = _run_steps(self, flat, args, ts, most, room is not None and not is_told)
+        if is_told:
+            history = reverse.of_one_step(flat, ts[0], jnp.minimum(ts[0] + self.stepsize, ts[-1]))
         return (jax.vmap(self.plan.structure)(rows), facts, sums), history
 
     def number_of_steps(self, ts):
