@@ -16,6 +16,7 @@ import numpy as np
 from jaxdyn.compile import array_rules, mode
 from jaxdyn.compile import program as numbers
 from jaxdyn.compile.constants import bind_known, convert_known, empty_reduction, evaluate_known
+from jaxdyn.compile.derive import without_unread
 from jaxdyn.compile.graph import Graph
 from jaxdyn.compile.jax_adapter import ClosedJaxpr, Literal, Tracer, scan_counts  # pyright: ignore[reportPrivateImportUsage]
 from jaxdyn.compile.number import Number, as_objects, is_number, objects
@@ -164,7 +165,9 @@ class _Expansion:
         known = tuple(None if x.dtype.kind == "O" else (x.shape, x.dtype.str, x.tobytes()) for x in args)
         program, has_rules = _subprogram(inner, known, self.graph.most)
         self.has_rules |= has_rules
-        return program, [x for x, y in zip(args, known, strict=True) if y is None]
+        program, places = without_unread(program)
+        given = [x for x, y in zip(args, known, strict=True) if y is None]
+        return program, [given[i] for i in places]
 
     def _reduce(self, name, array, axes, out):
         # Entries in XLA's order, one after the other: a sum of few numbers, whose order decides the rounding.

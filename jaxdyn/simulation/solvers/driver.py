@@ -6,7 +6,8 @@ The step-size control is that of diffrax's `PIDController` with an integral part
 Reverse mode goes back through the same steps (see `reverse`).
 """
 
-from functools import partial
+from collections.abc import Callable
+from functools import lru_cache, partial
 from typing import Any, NamedTuple
 
 import diffrax
@@ -156,7 +157,7 @@ def _run_steps(run: ExplicitRun, y0, args, ts, max_steps: int, record: bool):
         lambda carry: run_loop(task, args, limits, given, carry),
         partial(_iterate_once, *static, args, limits, given),
         # A step that the kernel cannot compute is computed by JAX, and the native loop continues behind it.
-        partial(_iterate_once, *static, args, limits, given, advance=_advance_by_fallback),
+        partial(_iterate_by_fallback(*static), args, limits, given),
         partial(_is_running, max_steps, limits),
         Carry(state, none, rows, records),
     )
@@ -205,6 +206,12 @@ def _iterate_once(
         row = reverse.row(state.y, state.t, state.t_next, kept)
         records = reverse.write(records, strides, row, state.tried, active)
     return Carry(after, *save(plan, given.times, state, after, kept, step, carry.saved, carry.rows), records)
+
+
+@lru_cache(maxsize=256)
+def _iterate_by_fallback(plan: Plan, control, max_steps: int, strides) -> Callable:
+    # Under `jit`, as JAX traces a run several times where it is differentiated: this long part of it once.
+    return jax.jit(partial(_iterate_once, plan, control, max_steps, strides, advance=_advance_by_fallback))
 
 
 def _iterate_in_jax(plan: Plan, control, max_steps: int, strides, args, limits: _Limits, given: Given, carry: Carry):
