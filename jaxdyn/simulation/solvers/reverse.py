@@ -22,6 +22,7 @@ from jaxtyping import Array
 from jaxdyn.compile import kernel
 from jaxdyn.compile.batch import any_sample, cond
 from jaxdyn.compile.loops import Carry, Given, Iteration, Task, run_loop
+from jaxdyn.compile.mode import values_of_rules
 from jaxdyn.compile.repair import compute_where
 from jaxdyn.simulation.solvers.explicit import ExplicitSteps, Plan, dense_output, take_step
 
@@ -280,7 +281,8 @@ def step_share(i, t, end, steps):
 
 def _pull_without_loop(plan: Plan, times_move, structure, fixed, free, t0, t1, y, at, after, row):
     # The vector field and the projection occur in every stage: as programs of their own they are differentiated once.
-    plan = plan._replace(field=OwnProgram(plan.field), project=plan.project and OwnProgram(plan.project))
+    project = plan.project and OwnProgram(_ByRule(plan.project))
+    plan = plan._replace(field=OwnProgram(plan.field), project=project)
     return _pull_step(plan, times_move, structure, fixed, free, t0, t1, y, at, after, row)
 
 
@@ -393,3 +395,13 @@ class OwnProgram(NamedTuple):
 @kernel(static=1, derivative="program")
 def _apply(function, args, given):
     return function(*given, args)
+
+
+class _ByRule(NamedTuple):
+    """A projection whose value is that of the rule for its derivative, most of which is not needed: its rounds are left out."""
+
+    function: Any
+
+    def __call__(self, *args):
+        with values_of_rules():
+            return self.function(*args)
