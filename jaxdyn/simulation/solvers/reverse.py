@@ -150,7 +150,7 @@ def pull(plan: Plan, history: History, y0, args, ts, steps, rows, varies) -> tup
         given = Given(None, (states, history.times, history.kept, rows, ts, ts))
         task = Task(_iterate_back, _loop_back, static)
         args = *static, (fixed, free_leaves), ends, given
-        once, by_fallback = partial(_iterate_back_in_jax, *args), partial(_iterate_back_by_fallback, *args)
+        once, by_fallback = partial(_iterate_back_in_jax, *args), partial(_iterate_by_fallback, *args)
         run = partial(run_loop, task, (fixed, free_leaves), ends, given)
         return run_to_end(run, once, by_fallback, partial(_is_running, ends), Carry(cotangents)).state
 
@@ -214,9 +214,7 @@ def _iterate_back_in_jax(plan: Plan, times_move, structure, args, ends: _Ends, g
     return _iterate_by(partial(pull, plan, times_move, structure, *args), times_move, ends, given, carry)
 
 
-def _iterate_back_by_fallback(
-    plan: Plan, times_move, structure, args, ends: _Ends, given: Given, carry: Carry
-) -> Carry:
+def _iterate_by_fallback(plan: Plan, times_move, structure, args, ends: _Ends, given: Given, carry: Carry) -> Carry:
     """The iteration that the native loop has refused, of every trajectory that is still running."""
     step, active = partial(_pull_step, plan, times_move, structure), _is_active(ends, carry)
 
@@ -281,7 +279,7 @@ def step_share(i, t, end, steps):
 
 def _pull_without_loop(plan: Plan, times_move, structure, fixed, free, t0, t1, y, at, after, row):
     # The vector field and the projection occur in every stage: as programs of their own they are differentiated once.
-    project = plan.project and OwnProgram(_ByRule(plan.project))
+    project = plan.project and OwnProgram(plan.project, by_rules=True)
     plan = plan._replace(field=OwnProgram(plan.field), project=project)
     return _pull_step(plan, times_move, structure, fixed, free, t0, t1, y, at, after, row)
 
@@ -382,26 +380,20 @@ def replay_rows(plan: Plan, history: History, y0, args, ts, steps):
 
 
 class OwnProgram(NamedTuple):
-    """A function of a plan whose derivatives are those of its own scalar program. Equal ones share it."""
+    """A function of a plan whose derivatives are those of its own scalar program. Equal ones share it.
+
+    `by_rules`: its value is that of the rule for its derivative, of which little is needed: a projection leaves out its rounds.
+    """
 
     function: Any
+    by_rules: bool = False
 
     def __call__(self, *args):
         """Value of the function, of whose last argument the arrays are passed."""
-        arrays = eqx.filter(args[-1], eqx.is_array)
-        return _apply(self.function, arrays, args[:-1])
+        return _apply(*self, eqx.filter(args[-1], eqx.is_array), args[:-1])
 
 
-@kernel(static=1, derivative="program")
-def _apply(function, args, given):
-    return function(*given, args)
-
-
-class _ByRule(NamedTuple):
-    """A projection whose value is that of the rule for its derivative, most of which is not needed: its rounds are left out."""
-
-    function: Any
-
-    def __call__(self, *args):
-        with values_of_rules():
-            return self.function(*args)
+@kernel(static=2, derivative="program")
+def _apply(function, by_rules, args, given):
+    with values_of_rules(by_rules):
+        return function(*given, args)
