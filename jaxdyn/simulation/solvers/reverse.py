@@ -19,10 +19,9 @@ from jax import lax
 from jax.flatten_util import ravel_pytree
 from jaxtyping import Array
 
-from jaxdyn.compile import kernel
+from jaxdyn.compile import kernel, values_of_rules
 from jaxdyn.compile.batch import any_sample, cond
 from jaxdyn.compile.loops import Carry, Given, Iteration, Task, run_loop
-from jaxdyn.compile.mode import values_of_rules
 from jaxdyn.compile.repair import compute_where
 from jaxdyn.simulation.solvers.explicit import ExplicitSteps, Plan, dense_output, take_step
 
