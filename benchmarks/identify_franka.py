@@ -19,6 +19,7 @@ jax.config.update("jax_enable_x64", True)
 import numpy as np  # noqa: E402
 
 from jaxdyn import identify  # noqa: E402
+from jaxdyn.constraints.codes import name_of  # noqa: E402
 from jaxdyn.io.urdf import load_urdf  # noqa: E402
 
 ROOT = Path(__file__).resolve().parent.parent
@@ -82,7 +83,12 @@ def main() -> None:
     report("least squares", fit, times, f"{fit.rank} combinations, condition {fit.condition:.1f}, unconstrained")
     for method in options.methods:
         fit, times = timed(lambda method=method: identify.fit_torques(model, train, method=method))
-        report(method, fit, times, f"feasible; {fit.result}, {len(fit.history) - 1} steps, loss {fit.history[-1]:.2f}")
+        report(
+            method,
+            fit,
+            times,
+            f"feasible; {name_of(fit.result)}, {len(fit.history) - 1} steps, loss {fit.history[-1]:.2f}",
+        )
     if options.out:
         options.out.write_text(json.dumps(rows, indent=1))
 
