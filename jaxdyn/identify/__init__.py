@@ -113,4 +113,9 @@ def __getattr__(name: str) -> Any:
         from jaxdyn.identify.mechanisms import completed
 
         return completed
+    if name == "fit_trajectory":
+        raise AttributeError(
+            "jd.identify.fit_trajectory is gone; call jd.identify.fit_parameters(scene, log, jd.identify.Parameters(scene)"
+            '.inertias(), jd.identify.Objective("trajectory"))'
+        )
     raise AttributeError(f"module {__name__!r} has no attribute {name!r}")

@@ -353,6 +353,25 @@ def test_trajectories_on_constraints():
     np.testing.assert_allclose(fit.values, [G, 0.3], rtol=1e-8)
 
 
+def test_options_by_their_own_names_are_deprecated(oscillation):
+    """One release long they are those of the groups, and the warning names these."""
+    start, pick = oscillator(inertia=2.0), lambda s: s.system.parameters["inertia"]
+    objective = identify.Objective("torque", noise=0.02)
+    want = identify.fit_parameters(start, oscillation, None, objective, identify.Solver(steps=2), free=pick)
+    with pytest.warns(DeprecationWarning) as warned:
+        fit = identify.fit_parameters(start, oscillation, free=pick, error="torque", noise=0.02, steps=2)
+    texts = [str(one.message) for one in warned]
+    assert texts == [
+        "error, noise: pass jd.identify.Objective(error, noise), a group of options",
+        "steps: pass jd.identify.Solver(steps), a group of options",
+    ]
+    np.testing.assert_array_equal(fit.history, want.history)
+    with pytest.warns(DeprecationWarning, match=r"horizon, substeps, simulation: pass jd\.identify\.Objective"):
+        error = identify.parameter_error(start, oscillation, horizon=20, substeps=2, rtol=1e-6)
+    objective = identify.Objective(horizon=20, substeps=2, simulation={"rtol": 1e-6})
+    assert error == identify.parameter_error(start, oscillation, objective)
+
+
 def test_float32(oscillation):
     scene = jax.tree.map(lambda x: x.astype(jnp.float32), oscillator(stiffness=4.0))
     fit = identify.fit_parameters(
