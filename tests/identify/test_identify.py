@@ -359,28 +359,6 @@ def test_every_iterate_is_feasible(wrong_iiwa, noisy):
     assert fit.result == RESULTS.successful and len(losses) < 60
 
 
-@pytest.mark.slow
-def test_the_optimum_of_the_convex_loss_is_one(wrong_iiwa, noisy):
-    """Gauss-Newton steps in other coordinates, on samples instead of a triangle and by automatic differentiation, find it too."""
-    log, _ = noisy
-    size = np.sqrt(np.mean(np.asarray(log.tau) ** 2, axis=0))
-    fit = identify.fit_torques(wrong_iiwa, log, ("viscous", "offset"), weights=1 / size)
-    start = wrong_iiwa.replace(damping=jnp.full(7, 0.1))
-    scene = Scene(start, forces=[identify.Friction(jnp.full(7, 0.1), *jnp.zeros((2, 7)), jnp.asarray(0.01))])
-    tree = identify.Parameters(scene).inertias().positive(lambda s: s.forces[0].viscous)
-    tree = tree.free(lambda s: s.forces[0].offset)
-    # |w e|^2 / (2 sigma^2) + D is N / (2 sigma^2) times the mean of (w e)^2 plus 2 sigma^2 / N times D.
-    objective = identify.Objective("torque", noise=2**0.5 * fit.sigma)
-    other = identify.fit_parameters(scene, log, tree, objective, identify.Solver(tolerance=1e-12))
-    model, friction = other.system.system, other.system.forces[0]
-    base = identify.base_parameters(wrong_iiwa)
-    # The loss is within 1e-6 of its minimum: the root of that is the share of a standard deviation.
-    true, computed = (base.values(x.inertias) for x in (fit.model, model))
-    np.testing.assert_allclose(computed, true, atol=1e-3 * np.abs(true - base.values(wrong_iiwa.inertias)).max())
-    np.testing.assert_allclose(friction.viscous, fit.friction.viscous, atol=1e-3)
-    np.testing.assert_allclose(friction.offset, fit.friction.offset, atol=1e-3)
-
-
 def test_prior_decides_between_data_and_nominal(arm):
     """A strong prior keeps the nominal bodies; the weaker it is, the better the fit and the larger the divergence."""
     log = pinocchio_log(planar_arm(1.4, 0.5), noise=0.1)
