@@ -90,11 +90,16 @@ def cube(gravity=(0.0, 0.0, -9.0), center=(0.01, 0.0, -0.01), shape=(-0.1, 0.0, 
     return jd.identify.Construction(tossed, {name: jnp.asarray(x) for name, x in numbers.items()})
 
 
-def identified(logs, start: jd.identify.Construction, **options):
+def identified(logs, start: jd.identify.Construction, progress: bool = False):
     """The fit of all that flight tells: it depends neither on the mass nor on the size of the inertia."""
     parameters = jd.identify.Parameters(start).free(lambda start: list(start.numbers.values()))
     return jd.identify.fit_parameters(
-        start, logs, parameters, horizon=PIECE, initial="free", substeps=1, tolerance=1e-6, **options
+        start,
+        logs,
+        parameters,
+        jd.identify.Objective(horizon=PIECE, initial="free", substeps=1),
+        jd.identify.Solver(tolerance=1e-6),
+        jd.identify.Execution(progress=progress),
     )
 
 
@@ -135,8 +140,9 @@ def main() -> None:
     begun = time.perf_counter()
     identified(train, start)
     print(
-        f"{len(logs)} flights of {PIECE + 1} samples or more; fitted {len(train)}, predicted {len(test)}; {fit.result} after "
-        f"{len(fit.history) - 1} steps in {seconds:.1f} s, once more in {time.perf_counter() - begun:.2f} s"
+        f"{len(logs)} flights of {PIECE + 1} samples or more; fitted {len(train)}, predicted {len(test)}; "
+        f"{jd.RESULTS[fit.result]} after {len(fit.history) - 1} steps in {seconds:.1f} s, once more in "
+        f"{time.perf_counter() - begun:.2f} s"
     )
     # Fits of disjoint fifths: a witness that knows nothing of how deviations are computed.
     parts = np.array([identified(train[k::5], start).values for k in range(5)])

@@ -23,7 +23,7 @@ import sys
 import tempfile
 import time
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 
@@ -121,40 +121,43 @@ def noisy(model, free: int, q, v, a) -> np.ndarray:
 def ours(case: Case, data: Path, limit: float) -> dict:
     """Paths (seconds, share of the first loss) of the first fit and of the second one."""
     from jaxdyn import identify
+    from jaxdyn.constraints.codes import name_of
+    from jaxdyn.identify.condensed_fit import Setting
+    from jaxdyn.identify.robot_problem import RobotProblem
     from jaxdyn.simulation.solvers import RK4
 
     model, log, bodies = problem(case, data)
-    options: dict[str, Any] = (
-        {"error": "torque"} if case.error == "torque" else {"error": "trajectory", "horizon": STEPS}
-    )
+    objective = identify.Objective("torque")
     if case.error == "motion":
-        options |= {"hold": "previous", "substeps": 1, "solver": RK4()}
+        objective = identify.Objective(horizon=STEPS, hold="previous", substeps=1, simulation={"solver": RK4()})
     paths, weights = [], 1 / np.sqrt(np.mean(np.asarray(log.tau) ** 2, axis=0))
 
-    def squares(one) -> float:
-        torques = identify.regressor(one, log.q, log.v, log.a) @ identify.nominal_parameters(one)
+    def squares(x) -> float:
+        torques = identify.regressor(model, log.q, log.v, log.a) @ x
         return float(np.sum((weights * (torques - np.asarray(log.tau))) ** 2))
 
     for _ in range(2):
         path, begun = [], time.perf_counter()
 
-        def watch(step, loss, system, path=path, begun=begun):
-            path.append((time.perf_counter() - begun, system if case.by == "fit_torques" else float(loss)))
+        def watch(step, loss, *point, path=path, begun=begun):
+            path.append((time.perf_counter() - begun, point if case.by == "fit_torques" else float(loss)))
 
         if case.by == "fit_torques":
             # All bodies at once, by the convex fit; its loss has a prior, which here weighs next to nothing.
-            fit = identify.fit_torques(model, log, (), weights=weights, prior=PRIOR, callback=watch)
-            end = time.perf_counter() - begun
+            robot = RobotProblem(model, (log,), (), (), "full", 1)
+            robot.weights = weights
+            estimate = robot.fit(Setting(0.01, (), PRIOR), callback=watch)
+            fit, end = robot.result(Setting(0.01, (), PRIOR), estimate), time.perf_counter() - begun
             path[:] = [
-                (0.0, squares(model)),
-                *((seconds, squares(x)) for seconds, x in path[1:]),
-                (end, squares(fit.model)),
+                (0.0, squares(identify.nominal_parameters(model))),
+                *((seconds, squares(robot.chart.x(*point))) for seconds, point in path[1:]),
+                (end, squares(estimate.x)),
             ]
         else:
             tree = identify.Parameters(model).inertias(bodies, metric=None)
-            fit = identify.fit_parameters(model, log, tree, callback=watch, **options)
+            fit = identify.fit_parameters(model, log, tree, objective, execution=identify.Execution(callback=watch))
         paths.append([(seconds, loss / path[0][1]) for seconds, loss in path])
-        ended = f"{fit.result}, {len(path) - 1} steps, {time.perf_counter() - begun:.1f} s"
+        ended = f"{name_of(fit.result)}, {len(path) - 1} steps, {time.perf_counter() - begun:.1f} s"
     return {"paths": paths, "ended": ended, "samples": len(log)}
 
 

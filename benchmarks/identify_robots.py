@@ -5,7 +5,7 @@
 KUKA KR300 R2500 ultra (Weigand, Ulmen, Janot & Ruskowski 2021): logs A + B tell C, and A alone tells C. Franka Emika
 Panda (Gaz et al. 2019): the first 70 % of its log tell the last 30 %. `jd.identify.fit_robot` chooses terms, prior
 and smoothing on what it fits and never sees the rest. Errors are 100 |tau_fit - tau| / |tau| over all samples, and of
-each joint; "plain" is `fit_torques` with its defaults, "unconstrained" least squares. rms z: how far fits to two
+each joint; "plain" is `fit_torques`, "unconstrained" least squares. rms z: how far fits to two
 parts (A and B, or halves) lie apart, in standard deviations.
 """
 

@@ -192,15 +192,22 @@ def main(argv=None) -> dict[str, float]:
         if step % 10 == 0:
             print(f"   iteration {step:4d}: motion error {loss:.3e}", flush=True)
 
-    fit = jd.identify.fit_trajectory(nominal, train, steps=options.steps, tolerance=1e-3, callback=report, **settings)
-    print(f"   {len(fit.history) - 1} iterations, {fit.result}")
+    fit = jd.identify.fit_parameters(
+        nominal,
+        train,
+        jd.identify.Parameters(nominal).inertias(),
+        jd.identify.Objective("trajectory", **settings),
+        jd.identify.Solver(steps=options.steps, tolerance=1e-3),
+        jd.identify.Execution(callback=report),
+    )
+    print(f"   {len(fit.history) - 1} iterations, {jd.RESULTS[fit.result]}")
     errors = {}
-    for name, candidate in (("nominal", nominal), ("fitted", fit.model), ("true", model)):
+    for name, candidate in (("nominal", nominal), ("fitted", fit.system), ("true", model)):
         errors[name] = jd.identify.trajectory_error(candidate, test, **settings)
         print(
             f"   {name:8s} held-out motion: position error {errors[name][0]:.3f} %, velocity error {errors[name][1]:.3f} %"
         )
-    truth, start, fitted = (base.values(m.inertias.reshape(-1)) for m in (model, nominal, fit.model))
+    truth, start, fitted = (base.values(m.inertias.reshape(-1)) for m in (model, nominal, fit.system))
     print(f"\n   {'base parameter':32s} {'true':>10s} {'nominal':>10s} {'fitted':>10s}")
     for name, *values in zip(base.names, truth, start, fitted, strict=True):
         print(f"   {name:32s} " + " ".join(f"{value:10.5f}" for value in values))
@@ -211,7 +218,7 @@ def main(argv=None) -> dict[str, float]:
     print(
         f"   the same, each weighted by its share of the torques: nominal {torques[0]:.1f} %, fitted {torques[1]:.2f} %"
     )
-    motions = [jd.identify.rollout(m, test, **settings) for m in (nominal, fit.model)]
+    motions = [jd.identify.rollout(m, test, **settings) for m in (nominal, fit.system)]
     pieces = segments(test, settings["horizon"], np.dtype(float))
     figure = fit_figure(shares, truth, start, fitted, fit.history, pieces, *motions)
     figure.savefig(options.out / "fit.png")

@@ -20,7 +20,7 @@ import numpy as np
 from jax import monitoring
 
 import jaxdyn as jd
-from jaxdyn.identify import optax_steps
+from jaxdyn.identify import methods
 
 jax.config.update("jax_enable_x64", True)
 COLLECTIVES = "all-reduce|all-gather|all-to-all|reduce-scatter|collective-permute|collective-broadcast"
@@ -155,27 +155,30 @@ def compare_fits(*names):
     true, nominal = arm(1.2), arm(1.0)
     logs = [log_of(true, phase) for phase in (0.3, 1.1)]
     damped = jd.Scene(true, forces=(jd.forces.JointDamping(0.1 * jnp.ones(2)),))
-    options = {"horizon": 10, "substeps": 2, "steps": 2}
-
-    def parameters(**more):
-        return jd.identify.fit_parameters(damped, logs, free=lambda scene: scene.forces[0].coefficient, **more)
-
+    motion, torque = jd.identify.Objective(horizon=10, substeps=2), jd.identify.Objective("torque")
+    damping = jd.identify.Parameters(damped).free(lambda scene: scene.forces[0].coefficient)
+    inertias = jd.identify.Parameters(nominal).inertias()
     fits = {
-        "trajectory": partial(jd.identify.fit_trajectory, nominal, logs, **options),
-        "slopes": partial(parameters, **options),
-        "torque": partial(parameters, error="torque", method="lbfgs", steps=2),
+        "trajectory": (nominal, inertias, motion, "lbfgs"),
+        "slopes": (damped, damping, motion, "gauss-newton"),
+        "torque": (damped, damping, torque, "lbfgs"),
     }
-    evaluate, programs = optax_steps._evaluate, []
+    evaluate, programs = methods._evaluate, []
+
+    def fit(name, devices=None):
+        system, tree, objective, method = fits[name]
+        solver, execution = jd.identify.Solver(method, steps=2), jd.identify.Execution(devices=devices)
+        return jd.identify.fit_parameters(system, logs, tree, objective, solver, execution)
 
     def noted(*args):
         programs.append(evaluate.lower(*args).compile()) if not programs else None
         return programs[0](*args)
 
     for name in names:
-        one = fits[name]()
-        optax_steps._evaluate = noted
-        many = fits[name](devices=jax.devices())
-        optax_steps._evaluate = evaluate
+        one = fit(name)
+        methods._evaluate = noted
+        many = fit(name, jax.devices())
+        methods._evaluate = evaluate
         calls = exchanged(programs.pop().compiled) if programs else {}
         history = [np.asarray(computed.history).tolist() for computed in (one, many)]
         print(json.dumps({"name": name, "calls": calls, "history": history}))

@@ -24,12 +24,13 @@ from jaxdyn.cli.identify_logs import filter_log, log_cutoff, log_names, log_path
 from jaxdyn.cli.identify_options import find_gains, make_fit, parse_options, resolve_options
 from jaxdyn.cli.identify_tables import error_table, gains_text, payload_text, tables
 from jaxdyn.cli.repair import load_for_repair
+from jaxdyn.constraints.codes import name_of
 from jaxdyn.identify import EXTRA, TERMS, Fit, LeastSquares, Log, RobotFit
-from jaxdyn.identify.identifiability import base_terms
+from jaxdyn.identify.linear_fit import base_terms
 from jaxdyn.identify.regression import log_regressor
 from jaxdyn.identify.threads import on_one_thread
 from jaxdyn.identify.workflows.log_checks import check_log_content, check_rest
-from jaxdyn.identify.workflows.spectra import vibration
+from jaxdyn.identify.workflows.raw_logs import vibration
 from jaxdyn.io import save_urdf
 from jaxdyn.io.files import write_text
 from jaxdyn.model.inertia_checks import inertia_report, repair_inertias
@@ -301,7 +302,7 @@ def _outcome(result: RobotFit | Fit | LeastSquares) -> str:
     if isinstance(result, LeastSquares):
         return f"{len(result.values)} base parameters, {result.rank} excited, condition {result.condition:.4g}"
     fit = result.fit if isinstance(result, RobotFit) else result
-    return f"{fit.result.replace('_', ' ')} after {len(fit.history) - 1} steps"
+    return f"{name_of(fit.result).replace('_', ' ')} after {len(fit.history) - 1} steps"
 
 
 def _evaluate(model: Model, result, names: list[str], logs: list[Log]) -> list[Evaluation]:

@@ -1,5 +1,6 @@
 """Options of `jaxdyn identify`, and the fit that they describe."""
 
+import dataclasses
 import math
 from typing import Any, NamedTuple
 
@@ -138,18 +139,53 @@ def make_fit(
     (log,) = logs
     v_s = float(options.v_s)
     # The trajectory fit starts from the parameters of the torque fit.
-    fit = identify.fit_torques(model, log, options.terms, v_s=v_s, prior=float(options.prior), callback=show)
+    fit = identify.fit_torques(model, log, options.terms, v_s=v_s, prior=float(options.prior))
     # The median, so that a gap in the log does not lengthen the horizon.
     dt = float(np.median(np.diff(np.asarray(log.t))))
-    return identify.fit_trajectory(
-        fit.model,
-        log,
-        options.terms,
-        v_s=v_s,
+    objective = identify.Objective(
         # At least one step and not longer than the log.
         horizon=min(max(1, round(args.horizon / dt)), len(log) - 1),
-        steps=args.steps,
-        callback=show,
         # Fixed steps: in a batch of segments, adaptive ones cost every segment as many steps as the stiffest needs.
         substeps=max(1, math.ceil(dt / _LONGEST_STEP)),
+    )
+    return refine_by_motion(fit, log, objective, identify.Solver(steps=args.steps), identify.Execution(callback=show))
+
+
+def refine_by_motion(
+    fit: Fit, log: Log, objective: identify.Objective, solver: identify.Solver, execution: identify.Execution
+) -> Fit:
+    """Refine a fit by the error of the simulated motion, over all bodies and the terms of the fit.
+
+    Terms that the fit holds at zero stay there.
+    """
+    scene = fit.scene
+    places: dict[str, Any] = {
+        "viscous": lambda scene: scene.forces[0].viscous,
+        "coulomb": lambda scene: scene.forces[0].coulomb,
+        "offset": lambda scene: scene.forces[0].offset,
+        "armature": lambda scene: scene.system.armature,
+    }
+    tree = identify.Parameters(scene).inertias()
+    for term in fit.terms:
+        where = places[term]
+        rows = np.flatnonzero(np.asarray(where(scene)) > 0).tolist()
+        if term == "offset":
+            tree = tree.free(where)
+        elif rows:
+            tree = tree.positive(where, rows=rows)
+    refined = identify.fit_parameters(scene, log, tree, objective, solver, execution)
+    friction, model = refined.system.forces[0], refined.system.system
+    return dataclasses.replace(
+        fit,
+        model=model.replace(
+            # A term that the model lacks stays absent.
+            damping=None if model.damping is None else friction.viscous,
+            friction=None if model.friction is None else friction.coulomb,
+        ),
+        friction=friction,
+        history=refined.history,
+        result=refined.result,
+        method=refined.method,
+        sigma=None,
+        as_measured=False,
     )

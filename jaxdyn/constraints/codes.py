@@ -10,7 +10,7 @@ _names: list[str] = []
 
 
 class RESULTS(eqx.Enumeration):
-    """Result codes of constrained dynamics, simulations, quadratic programs and searches."""
+    """Result codes of constrained dynamics, simulations, quadratic programs, searches and fits."""
 
     successful = "successful"
     # Of equation solvers: those of lineax and optimistix, by their names.
@@ -67,6 +67,8 @@ class RESULTS(eqx.Enumeration):
     infeasible = "No x satisfies the rows and cones of the quadratic program."
     stalled = "The quadratic program was not solved to the tolerance within the given steps."
     indefinite = "The matrix Q of the quadratic program is not positive definite."
+    # Of fits.
+    stopped = "The callback or the time limit stopped the fit."
 
     # An enumeration of equinox does not list its names.
     _names.extend(name for name in vars() if not name.startswith("_"))

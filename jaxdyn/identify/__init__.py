@@ -2,17 +2,19 @@
 
 from typing import Any
 
+from jaxdyn.identify.condensed_fit import Intervals as Intervals
 from jaxdyn.identify.delays import Delays as Delays
 from jaxdyn.identify.delays import shift_torques as shift_torques
-from jaxdyn.identify.feasible import fit_torques as fit_torques
-from jaxdyn.identify.identifiability import Identifiability as Identifiability
-from jaxdyn.identify.identifiability import identifiability as identifiability
-from jaxdyn.identify.intervals import Intervals as Intervals
+from jaxdyn.identify.linear_fit import Identifiability as Identifiability
 from jaxdyn.identify.linear_fit import LeastSquares as LeastSquares
+from jaxdyn.identify.linear_fit import identifiability as identifiability
 from jaxdyn.identify.linear_fit import least_squares as least_squares
 from jaxdyn.identify.logs import Log as Log
 from jaxdyn.identify.logs import split as split
 from jaxdyn.identify.mechanisms import complete_log as complete_log
+from jaxdyn.identify.options import Execution as Execution
+from jaxdyn.identify.options import Objective as Objective
+from jaxdyn.identify.options import Solver as Solver
 from jaxdyn.identify.parameter_tree import Parameters as Parameters
 from jaxdyn.identify.parameters import fit_parameters as fit_parameters
 from jaxdyn.identify.parameters import parameter_error as parameter_error
@@ -29,13 +31,13 @@ from jaxdyn.identify.result import Fit as Fit
 from jaxdyn.identify.result import ParameterFit as ParameterFit
 from jaxdyn.identify.robot import RobotFit as RobotFit
 from jaxdyn.identify.robot import fit_robot as fit_robot
+from jaxdyn.identify.robot import fit_torques as fit_torques
 from jaxdyn.identify.sensors import Construction as Construction
 from jaxdyn.identify.sensors import Measured as Measured
 from jaxdyn.identify.torque_terms import EXTRA as EXTRA
 from jaxdyn.identify.torque_terms import TERMS as TERMS
 from jaxdyn.identify.torque_terms import Friction as Friction
 from jaxdyn.identify.torque_terms import TorqueTerm as TorqueTerm
-from jaxdyn.identify.trajectory import fit_trajectory as fit_trajectory
 from jaxdyn.identify.uncertainty import Whiteness as Whiteness
 from jaxdyn.identify.uncertainty import whiteness as whiteness
 from jaxdyn.identify.workflows.drive_gains import DriveGains as DriveGains
@@ -45,9 +47,9 @@ from jaxdyn.identify.workflows.exciting_motion import exciting_motion as excitin
 from jaxdyn.identify.workflows.log_repair import LogWarning as LogWarning
 from jaxdyn.identify.workflows.payload import Payload as Payload
 from jaxdyn.identify.workflows.payload import fit_payload as fit_payload
+from jaxdyn.identify.workflows.raw_logs import Cutoff as Cutoff
+from jaxdyn.identify.workflows.raw_logs import choose_cutoff as choose_cutoff
 from jaxdyn.identify.workflows.raw_logs import from_raw as from_raw
-from jaxdyn.identify.workflows.spectra import Cutoff as Cutoff
-from jaxdyn.identify.workflows.spectra import choose_cutoff as choose_cutoff
 
 __all__ = [
     "EXTRA",
@@ -58,6 +60,7 @@ __all__ = [
     "Delays",
     "DriveGains",
     "Excitation",
+    "Execution",
     "Fit",
     "Friction",
     "Identifiability",
@@ -66,11 +69,13 @@ __all__ = [
     "Log",
     "LogWarning",
     "Measured",
+    "Objective",
     "ParameterFit",
     "Parameters",
     "Payload",
     "RobotFit",
     "SampledTorque",
+    "Solver",
     "TorqueTerm",
     "Whiteness",
     "base_parameters",
@@ -82,7 +87,6 @@ __all__ = [
     "fit_payload",
     "fit_robot",
     "fit_torques",
-    "fit_trajectory",
     "from_raw",
     "identifiability",
     "least_squares",
@@ -109,4 +113,9 @@ def __getattr__(name: str) -> Any:
         from jaxdyn.identify.mechanisms import completed
 
         return completed
+    if name == "fit_trajectory":
+        raise AttributeError(
+            "jd.identify.fit_trajectory is gone; call jd.identify.fit_parameters(scene, log, jd.identify.Parameters(scene)"
+            '.inertias(), jd.identify.Objective("trajectory"))'
+        )
     raise AttributeError(f"module {__name__!r} has no attribute {name!r}")

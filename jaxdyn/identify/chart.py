@@ -1,9 +1,18 @@
-"""Chart: unconstrained coordinates of all feasible models around a nominal one, in which the fits search.
+"""Chart: unconstrained coordinates of all feasible bodies around nominal ones, and their distances from these.
 
 A body's pseudo-inertia is P = U0 (U U^T) U0^T with U0 the factor of the nominal body and U =
 log_cholesky_factor(theta): the nominal body, stretched, sheared, shifted and made heavier. Every theta is a physical
-body, theta = 0 the nominal one, and theta has no units. Viscous, Coulomb and rotor terms are scale s^2, so that they
-cannot become negative; offsets scale s.
+body, theta = 0 the nominal one, and theta has no units.
+
+P0^-1 P has the eigenvalues of U U^T, so that the distances of a body from the nominal one are the same in every frame and unit.
+Both are sums of squares of residuals, for least squares:
+
+    entropic           tr(P0^-1 P) - log det(P0^-1 P) - 4 = sum of U_ij^2 off the diagonal + sum of U_ii^2 - 2 log U_ii - 1
+    affine-invariant   |log(P0^-1/2 P P0^-1/2)|_F^2       = |log(U U^T)|_F^2
+
+Near the nominal body the first is half of the second.
+
+Source: Lee, Wensing & Park (2020), Geometric robot dynamic identification: a convex programming approach.
 """
 
 import equinox as eqx
@@ -12,102 +21,49 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from jaxdyn.identify.torque_terms import POSITIVE, TERMS, Friction, check_terms
+from jaxdyn.compile import gram_eigenvectors
 from jaxdyn.model import float64 as _f64
 from jaxdyn.model import inertia as _inertia
 from jaxdyn.model.tree import Model
 
-INERTIA = ("full", "mass", "fixed")
-
-
-class Coordinates(eqx.Module):
-    """Point in the chart, a pytree: `theta` (bodies, 10), (bodies, 1) or (0, 0); `s` (terms, nv)."""
-
-    theta: Float[Array, "bodies coordinates"]
-    s: Float[Array, "terms nv"]
+# Coordinates of a body: all ten, its density alone, or none.
+INERTIA = {"full": 10, "mass": 1, "fixed": 0}
+METRICS = ("entropic", "affine")
+_UPPER = np.triu_indices(4, 1)
 
 
 class Chart(eqx.Module):
-    """Map from unconstrained coordinates to feasible parameters, models and friction.
+    """Map from unconstrained coordinates theta to feasible inertias.
 
-    - `factors` (bodies, 4, 4): upper-triangular U0 of the nominal pseudo-inertias of the bodies that have mass.
-      Massless bodies stay massless.
-    - `origin` (bodies, 4, 4): upper-triangular; U is origin @ log_cholesky_factor(theta), so the chart can be moved along with
-      a fit. The identity at first.
-    - `scale` (terms, nv): torque-sized units of the terms.
-    - `nominal_inertias` (nb, 10) and `nominal_terms` (4, nv): the model's values, of everything that is not fitted.
+    - `factors` (bodies, 4, 4): upper-triangular U0 of the nominal pseudo-inertias of `bodies`, those that can change. Massless
+      bodies stay massless.
+    - `nominal` (nb, 10): inertias of all bodies of the model.
     """
 
     factors: Float[Array, "bodies 4 4"]
-    origin: Float[Array, "bodies 4 4"]
-    scale: Float[Array, "terms nv"]
-    nominal_inertias: Float[Array, "nb 10"]
-    nominal_terms: Float[Array, "4 nv"]
-    v_s: Float[Array, ""]
+    nominal: Float[Array, "nb 10"]
     bodies: tuple[int, ...] = eqx.field(static=True)
-    terms: tuple[str, ...] = eqx.field(static=True)
     inertia: str = eqx.field(static=True)
+
+    @property
+    def count(self) -> int:
+        """Number of coordinates of a body."""
+        return INERTIA[self.inertia]
 
     @eqx.filter_jit
     def relative_factors(self, theta: Float[Array, "bodies n"]) -> Float[Array, "bodies 4 4"]:
         """Factors U of every body, relative to the nominal one."""
         fill = jnp.zeros((theta.shape[0], 10 - theta.shape[1]), theta.dtype)  # "mass": alpha alone moves
-        steps = jax.vmap(_inertia.log_cholesky_factor)(jnp.concatenate([theta, fill], axis=1))
-        return jnp.einsum("bij,bjk->bik", self.origin, steps)
+        return jax.vmap(_inertia.log_cholesky_factor)(jnp.concatenate([theta, fill], axis=1))
 
     @eqx.filter_jit
     def inertias(self, theta: Float[Array, "bodies n"]) -> Float[Array, "nb 10"]:
         """Ten inertial parameters of every body."""
         if not self.bodies:
-            return self.nominal_inertias
+            return self.nominal
         upper = jnp.einsum("bij,bjk->bik", self.factors, self.relative_factors(theta))
         fitted = jax.vmap(_inertia.parameters_from_pseudo)(jnp.einsum("bij,bkj->bik", upper, upper))
-        return self.nominal_inertias.at[np.array(self.bodies)].set(fitted)
-
-    @eqx.filter_jit
-    def term_values(self, s: Float[Array, "terms nv"]) -> Float[Array, "4 nv"]:
-        """Values of all `TERMS`: fitted ones at s, others at the model's value."""
-        fitted = self.scale * jnp.where(positive_terms(self.terms), s * s, s)
-        rows = [
-            fitted[self.terms.index(term)] if term in self.terms else self.nominal_terms[i]
-            for i, term in enumerate(TERMS)
-        ]
-        return jnp.stack(rows)
-
-    @eqx.filter_jit
-    def parameters(self, point: Coordinates) -> Float[Array, " p"]:
-        """x (10 nb + 4 nv,), in the order of `parameter_names`."""
-        return jnp.concatenate([self.inertias(point.theta).reshape(-1), self.term_values(point.s).reshape(-1)])
-
-    @eqx.filter_jit
-    def model_at(self, model: Model, point: Coordinates) -> tuple[Model, Friction]:
-        """Model with the inertias, armature, damping and friction of a point, and the friction law with its offset."""
-        viscous, coulomb, offset, armature = self.term_values(point.s)
-        # A leaf that is absent and not fitted stays absent, so that no program compiles it.
-        model = model.replace(
-            inertias=self.inertias(point.theta),
-            armature=None if model.armature is None and "armature" not in self.terms else armature,
-            damping=None if model.damping is None and "viscous" not in self.terms else viscous,
-            friction=None if model.friction is None and "coulomb" not in self.terms else coulomb,
-        )
-        return model, Friction(viscous, coulomb, offset, self.v_s)
-
-    @eqx.filter_jit
-    def divergence(self, theta: Float[Array, "bodies n"]) -> Float[Array, ""]:
-        """Log-det divergence of all bodies from the nominal ones, sum of tr(P0^-1 P) - log det(P0^-1 P) - 4.
-
-        With P = U0 U U^T U0^T it is |U|^2 - 2 sum log U_ii - 4: the same in every frame and unit.
-        """
-        upper = self.relative_factors(theta)
-        # Factors are upper triangular: log det needs the diagonal alone, and has a simple derivative.
-        diagonal = jnp.diagonal(upper, axis1=1, axis2=2)
-        return jnp.sum(upper**2) - 2 * jnp.sum(jnp.log(diagonal)) - 4.0 * len(self.bodies)
-
-    @eqx.filter_jit
-    def clip_terms(self, point: Coordinates) -> Coordinates:
-        """Point with terms below a millionth of their unit set to zero, which fits approach but never reach."""
-        tiny = positive_terms(self.terms) & (point.s**2 < 1e-6)
-        return Coordinates(point.theta, jnp.where(tiny, jnp.zeros_like(point.s), point.s))
+        return self.nominal.at[np.array(self.bodies)].set(fitted)
 
 
 def check_bodies(model) -> None:
@@ -119,22 +75,13 @@ def check_bodies(model) -> None:
         )
 
 
-def make_chart(
-    model: Model, terms, v_s, inertia: str, tau_scale, v_scale, a_scale, *, bodies=None
-) -> tuple[Chart, Coordinates]:
-    """Chart around a model, and the start in it: the model's own numbers, a tenth of a unit where it has none.
+def make_chart(model: Model, inertia: str, bodies=None) -> Chart:
+    """Chart around a model. `bodies`: indices of those whose inertias can change, all that have mass by default.
 
-    `bodies`: indices of those whose inertias can change, all that have mass by default.
-
-    Units are a tenth of the torque, that torque over the velocity and over the acceleration (root mean squares, (nv,)).
-
-    **Raises:** ValueError for unknown terms or `inertia`, and for bodies whose nominal parameters are not strictly
-    feasible.
+    **Raises:** ValueError for unknown `inertia`, and for bodies whose nominal parameters are not strictly feasible.
     """
-    terms = check_terms(terms, v_s)
     if inertia not in INERTIA:
-        raise ValueError(f"inertia is {inertia!r}; give one of {INERTIA}")
-    dtype = np.dtype(model.home.dtype)
+        raise ValueError(f"inertia is {inertia!r}; give one of {tuple(INERTIA)}")
     numbers = np.asarray(model.inertias, np.float64)
     massive = tuple(int(i) for i in np.flatnonzero(numbers[:, 0] > 0)) if inertia != "fixed" else ()
     bodies = massive if bodies is None else tuple(i for i in massive if i in tuple(bodies))
@@ -147,45 +94,7 @@ def make_chart(
             "some thickness, or fit inertia='mass' alone"
         )
     factors = np.array([_factor(P, inertia) for P in matrices]).reshape(-1, 4, 4)
-    unit = 0.1 * np.asarray(tau_scale, np.float64)
-    # A torque that is always zero borrows the largest unit: a term in units of zero could not be changed.
-    unit = np.where(unit > 0, unit, unit.max(initial=0.0) or 1.0)
-    per = {"viscous": v_scale, "coulomb": np.ones(model.nv), "offset": np.ones(model.nv), "armature": a_scale}
-    scale = np.array([unit / np.where(np.asarray(per[t]) > 0, per[t], 1.0) for t in terms]).reshape(
-        len(terms), model.nv
-    )
-    own = np.array([np.asarray(_own_terms(model)[term], np.float64) for term in terms]).reshape(len(terms), model.nv)
-    if np.any(own < 0):
-        row, column = np.argwhere(own < 0)[0]
-        raise ValueError(
-            f"{terms[row]} of coordinate {column} is {own[row, column]} in the model; it must not be negative"
-        )
-    # Zero is a stationary point of s^2, from which no gradient leads away: start near it.
-    s = np.where(positive_terms(terms), np.sqrt(np.where(own > 0, own / scale, 0.1)), 0.0)
-    size = {"full": 10, "mass": 1, "fixed": 0}[inertia]
-    chart = Chart(
-        jnp.asarray(factors, dtype),
-        jnp.asarray(np.broadcast_to(np.eye(4), factors.shape), dtype),
-        jnp.asarray(scale, dtype),
-        model.inertias,
-        jnp.stack([_own_terms(model)[term] for term in TERMS]),
-        jnp.asarray(v_s, dtype),
-        bodies,
-        terms,
-        inertia,
-    )
-    return chart, Coordinates(jnp.zeros((len(bodies), size), dtype), jnp.asarray(s, dtype))
-
-
-def _own_terms(model: Model) -> dict[str, Array]:
-    own = {"viscous": model.damping, "coulomb": model.friction, "offset": None, "armature": model.armature}
-    zero = jnp.zeros((model.nv,), model.home.dtype)
-    return {term: zero if value is None else value for term, value in own.items()}
-
-
-def positive_terms(terms) -> np.ndarray:
-    """Mask (terms, 1) of the terms that must not be negative."""
-    return np.array([[term in POSITIVE] for term in terms], bool).reshape(len(terms), 1)
+    return Chart(jnp.asarray(factors, np.dtype(model.home.dtype)), model.inertias, bodies, inertia)
 
 
 def _is_feasible(matrix: np.ndarray, inertia: str) -> bool:
@@ -203,3 +112,59 @@ def _factor(matrix: np.ndarray, inertia: str) -> np.ndarray:
     values, vectors = np.linalg.eigh(matrix)
     # A rod's or point's pseudo-inertia is singular and has no Cholesky factor.
     return vectors * np.sqrt(np.maximum(values, 0))
+
+
+def barrier_residual(x: Float[Array, "*n"]) -> Float[Array, "*n"]:
+    """r with r^2 = exp(x) - x - 1 and the sign of x: smooth, x / sqrt(2) near zero, huge where exp(x) is huge or next to zero."""
+    # exp(x) - x - 1 cancels near zero. At 0.1 the remainder of the series is 3e-13.
+    small = jnp.abs(x) < 0.1
+    # The unused branch must be finite too: NaN from 0/0 there would pass through `where` into the gradient.
+    safe = jnp.where(small, jnp.ones_like(x), x)
+    # (exp(x) - x - 1) / x^2 = 1/2 + x/6 + x^2/24 + ...
+    series = 1 / 2 + x * (1 / 6 + x * (1 / 24 + x * (1 / 120 + x * (1 / 720 + x * (1 / 5040 + x / 40320)))))
+    share = jnp.where(small, series, (jnp.expm1(safe) - safe) / safe**2)
+    return x * jnp.sqrt(share)
+
+
+def entropic_residual(U: Float[Array, "4 4"]) -> Float[Array, "10"]:
+    """Ten numbers whose squares add up to the entropic divergence of U U^T from 1, U upper triangular."""
+    return jnp.concatenate([barrier_residual(2 * jnp.log(jnp.diagonal(U))), U[_UPPER]])
+
+
+def affine_residual(U: Float[Array, "4 4"]) -> Float[Array, "10"]:
+    """Ten numbers whose squares add up to the squared affine-invariant distance of U U^T from 1."""
+    logarithm = symmetric_log(U @ U.T)
+    # Entries off the diagonal occur twice in the Frobenius norm.
+    return jnp.concatenate([jnp.diagonal(logarithm), np.sqrt(2.0) * logarithm[_UPPER]])
+
+
+@jax.custom_jvp
+def symmetric_log(matrix: Float[Array, "n n"]) -> Float[Array, "n n"]:
+    """Logarithm of a symmetric positive definite matrix; NaN for one that is not positive definite.
+
+    Its derivative, of first order, is that of Daleckii and Krein, which stays finite at equal eigenvalues.
+    """
+    values, vectors = symmetric_eigenvectors(matrix)
+    return (vectors * jnp.log(values)[None, :]) @ vectors.T
+
+
+@symmetric_log.defjvp
+def _symmetric_log_jvp(primals, tangents):
+    values, vectors = symmetric_eigenvectors(primals[0])
+    one, other = values[:, None], values[None, :]
+    # (log a - log b) / (a - b) = atanh(x) / x * 2 / (a + b), x = (a - b) / (a + b).
+    x = (one - other) / (one + other)
+    # Equal eigenvalues make the quotient 0/0, with the limit 1 / a. At 0.01 the remainder of the series is below rounding.
+    small = jnp.abs(x) < 1e-2
+    safe = jnp.where(small, 0.5 * jnp.ones_like(x), x)
+    series = 1 + x**2 * (1 / 3 + x**2 * (1 / 5 + x**2 * (1 / 7 + x**2 / 9)))
+    quotients = jnp.where(small, series, jnp.arctanh(safe) / safe) * 2 / (one + other)
+    change = (tangents[0] + tangents[0].T) / 2
+    logarithm = (vectors * jnp.log(values)[None, :]) @ vectors.T
+    return logarithm, vectors @ (quotients * (vectors.T @ change @ vectors)) @ vectors.T
+
+
+def symmetric_eigenvectors(matrix: Float[Array, "n n"]) -> tuple[Float[Array, " n"], Float[Array, "n n"]]:
+    """Eigenvalues (n,) and eigenvectors, in columns, of a symmetric matrix that is meant to be positive definite."""
+    vectors = gram_eigenvectors(matrix)[1]
+    return jnp.sum(vectors * (matrix @ vectors), 0), vectors

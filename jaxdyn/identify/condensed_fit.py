@@ -1,7 +1,14 @@
-"""Feasible fit of condensed logs at a given setting, with exact elimination of extra torque terms.
+"""Feasible fit of condensed logs at a given setting, with exact elimination of extra torque terms, and its intervals.
 
 The loss 1/2 |W x + E c - tau|^2 / sigma^2 + prior (D(x) + 1/2 sum (c / unit)^2) is quadratic in the coefficients c. The QR
 factorisation of [E, W, tau] with the prior's rows under E leaves a triangle of x alone, whose loss is that of the best c for x.
+
+Residuals of a filtered log are correlated and hold what no term of the model explains, so that independent errors of single
+samples would promise far too much. Standard deviations are those of a delete-a-group jackknife over blocks of consecutive samples
+(`uncertainty`). The prior's contribution is counted as if the nominal bodies were off by as much as a prior of weight 1 assumes.
+
+An interval holds for the terms of its fit. Where two terms explain the same torque, as Dahl's friction and Coulomb's do between
+reversals, the choice between them decides their values and no interval shows it: such numbers are marked as confounded.
 """
 
 from collections.abc import Callable, Sequence
@@ -9,19 +16,27 @@ from typing import NamedTuple
 
 import numpy as np
 
-from jaxdyn.identify.chart import Chart
 from jaxdyn.identify.condensed import Blocks, condense_rows, pad_triangle
-from jaxdyn.identify.feasible import torque_noise
-from jaxdyn.identify.interior import LinearChart, Minimum, TorqueProblem, newton
+from jaxdyn.identify.interior import LOG_CHOLESKY_BASIS, LinearChart, Minimum, TorqueProblem, newton
 from jaxdyn.identify.logs import Log, root_mean_square
-from jaxdyn.identify.regression import condense_model, noise_level
+from jaxdyn.identify.regression import (
+    BaseParameters,
+    base_parameters,
+    condense_model,
+    free_columns,
+    noise_level,
+    parameter_names,
+)
 from jaxdyn.identify.torque_terms import TorqueTerm, coulomb_through_filter, term_columns
+from jaxdyn.identify.uncertainty import jackknife
 from jaxdyn.model.tree import Model
 
 # A unit of a coefficient makes this share of the joint's torque.
 _UNIT = 0.1
-# Tolerance on the loss of a fit, and of one that only compares settings.
-_FINE, _ROUGH = 1e-6, 1e-2
+# Tolerance on the loss of a fit, and of one that only compares settings; most steps of either.
+_FINE, _ROUGH, _STEPS = 1e-6, 1e-2, 200
+# Least torque noise as a share of the torque, so that noise-free logs stay well posed.
+_FINEST = 1e-6
 
 
 class Setting(NamedTuple):
@@ -66,7 +81,7 @@ class Estimate(NamedTuple):
 
     x: np.ndarray
     sigma: float
-    chart: Chart
+    chart: LinearChart
     minimum: Minimum
 
 
@@ -101,8 +116,7 @@ def gather(
 
 
 def fit_blocks(
-    chart: Chart,
-    start: np.ndarray,
+    chart: LinearChart,
     data: Data,
     setting: Setting,
     sizes,
@@ -111,11 +125,13 @@ def fit_blocks(
     rows: np.ndarray | None = None,
     count: int | None = None,
     is_rough: bool = False,
-    steps: int = 200,
+    callback: Callable | None = None,
 ) -> Estimate:
     """Fit all blocks, or those that `rows` and `count` of `Blocks` were given for; `is_rough` for a comparison of settings.
 
-    `chart` and `start` (terms, nv) as of `make_chart`, `sizes` as of `signal_sizes`.
+    `sizes` as of `signal_sizes`, `callback` as of `newton`.
+
+    **Raises:** ValueError for logs with torques of zero alone, or with fewer of them than unknowns.
     """
     rows, size = data.blocks.rows(weights) if rows is None else rows, data.blocks.size
     count = data.blocks.count() if count is None else count
@@ -133,15 +149,14 @@ def fit_blocks(
     # Rows are in N m here: the prior's rows, sqrt(prior) c / unit in deviations, are multiplied by sigma.
     R, coefficients = eliminate(rows, len(places), np.sqrt(setting.prior) * sigma / units)
     condensed = pad_triangle(R, count)
-    # A noise-free log gives zero, which `torque_noise` replaces by a small share of the torque.
-    sigma = torque_noise(condensed, sizes, sigma or None)
-    problem = TorqueProblem(chart, condensed.R / sigma, condensed.d / sigma, condensed.rest / sigma**2, setting.prior)
-    minimum = newton(problem, start, steps, _ROUGH if is_rough else _FINE)
-    linear = LinearChart(chart)
+    # Noise-free logs stay well posed by a small share of the torque.
+    sigma = max(float(sigma), _FINEST * float(np.sqrt(np.mean(sizes[0] ** 2))))
+    problem = TorqueProblem.of(chart, condensed, sigma, setting.prior)
+    minimum = newton(problem, _STEPS, _ROUGH if is_rough else _FINE, callback)
     # Interior points never reach a bound. Exact zeros let `intervals` recognise the terms that are held there.
-    minimum = minimum._replace(s=linear.clip_terms(minimum.s))
+    minimum = minimum._replace(terms=chart.clip_terms(minimum.terms))
     x = np.zeros(size)
-    basic = linear.at(minimum.origin, minimum.s)
+    basic = chart.x(minimum.origin, minimum.terms)
     x[kept] = np.append(basic, coefficients(basic))
     return Estimate(x, sigma, chart, minimum)
 
@@ -160,3 +175,189 @@ def eliminate(rows: np.ndarray, count: int, ridge: np.ndarray) -> tuple[np.ndarr
 
     # Rows below the coefficients' do not involve c: they are the error of the best c.
     return R[count:, count:], coefficients
+
+
+# Share of the variance above which the prior is the source of a number.
+_FROM_PRIOR = 0.5
+# Share of the variance of a number, due to extra terms, above which it is confounded with these.
+_FROM_EXTRA = 0.5
+CONFOUNDED, STILL = "confounded", "hardly moved"
+
+
+class Spread(NamedTuple):
+    """Numbers with uncertainty, all (n,): names, values, standard deviations, and the share of the variance from the prior.
+
+    `marks` (n,): "confounded" or "hardly moved" where that makes a number's interval meaningless, else empty.
+    """
+
+    names: tuple[str, ...]
+    values: np.ndarray
+    std: np.ndarray
+    prior_share: np.ndarray
+    marks: np.ndarray
+
+    @property
+    def sources(self) -> list[str]:
+        """Source of each number.
+
+        - "data" or "prior": the origin of most of its uncertainty, hence of its value;
+        - "bound": a term that the fit holds at zero;
+        - "confounded": most of its variance would vanish with the extra terms, or, for the coefficient of an extra term, most of
+          the variance of another number with it;
+        - "hardly moved": friction or rotor inertia of a joint that stood nearly still in all logs.
+        """
+        source = np.where(self.prior_share > _FROM_PRIOR, "prior", "data")
+        source = np.where(self.marks != "", self.marks, source)
+        return np.where(np.isfinite(self.std), source, "bound").tolist()
+
+
+class Intervals(NamedTuple):
+    """Uncertainty of a feasible fit.
+
+    - `parameters`: all of x in the order of `parameter_names`, then coefficients of extra terms. Terms that the fit holds at
+      zero have no standard deviation (NaN).
+    - `base`: the identifiable combinations of inertias and terms, and `combinations`, their definition.
+    - `factor`: a 95 % interval is the value plus and minus this many standard deviations (Student's t, blocks - 1).
+    """
+
+    parameters: Spread
+    base: Spread
+    combinations: BaseParameters
+    base_covariance: np.ndarray
+    factor: float
+
+
+def intervals(
+    model: Model,
+    data: Data,
+    setting: Setting,
+    estimate: Estimate,
+    weights: np.ndarray,
+    terms,
+    size: float,
+    curved: Data | None = None,
+    still: Sequence[int] = (),
+) -> Intervals:
+    """Intervals of one fit of condensed logs.
+
+    With D_b the data's curvature and g_b their gradient on block b, both over sigma^2, P the prior's curvature and H = sum
+    D_b + P: leaving b out moves the fit by (H - D_b)^-1 g_b. Their covariance times (B - 1) is the data's share, and
+    max(prior, 1) H^-1 P H^-1 the prior's. All in the coordinates of the chart, then carried over to x.
+
+    `size`: effective sample size of the errors, which determines the length of the groups left out. `curved`: logs
+    whose curvature counts, where the loss is not made of squares: Huber's has none beyond its threshold, though it has a gradient
+    there. `still`: indices of the torques whose joints hardly moved.
+
+    Source: Efron (1982), the jackknife; Cameron & Miller (2015), cluster-robust inference (CR3); Huber
+    (1981), "Robust statistics", section 6.4, whose curvature is that of psi'; Kutner, Nachtsheim, Neter & Li (2005), "Applied
+    linear statistical models", section 10.5, variance inflation.
+    """
+    jacobian, curvature, free = _local(data, setting, estimate)
+    blocks, sigma = data.blocks, estimate.sigma
+    # In the chart's coordinates, in which the prior's curvature is known and bounds are inactive or eliminated.
+    gradients = blocks.scores(estimate.x, weights) @ jacobian / sigma**2
+    grams_of_curvature = (data if curved is None else curved).blocks.grams(weights)
+    grams = np.einsum("pi,bpq,qj->bij", jacobian, grams_of_curvature, jacobian, optimize=True) / sigma**2
+    # The prior is in every replicate: it is no observation that could be left out.
+    changes, inverse, factor = jackknife(grams, gradients, curvature, size)
+    # A prior weaker than 1 expresses no belief that the nominal bodies are better: at least weight 1 counts.
+    changes, pulled = jacobian @ changes, jacobian @ inverse @ _root(curvature) * np.sqrt(max(setting.prior, 1.0))
+
+    nb, nv = model.nb, model.nv
+    names = list(parameter_names(model))
+    for term, number in data.counts.items():
+        for k in range(number):
+            names += [f"{joint}.{term}{k + 1 if number > 1 else ''}" for joint in _joints(model)]
+    fitted = np.concatenate([free, np.zeros(blocks.size - len(free), bool)])
+    fitted[data.places(setting.extra)] = True
+    shown = np.flatnonzero(fitted | (np.arange(blocks.size) < data.basic))
+    # Covariances of independent errors suffice for ratios of variances, and have less scatter than those of few groups.
+    extra = data.places(setting.extra)
+    covariance = jacobian @ inverse @ jacobian.T
+    # All terms, extra ones too, are vectors of nv numbers after the inertias.
+    is_still = (np.arange(blocks.size) >= 10 * nb) & np.isin((np.arange(blocks.size) - 10 * nb) % nv, list(still))
+
+    # Torques determine combinations; single inertial numbers in them depend on the prior as well.
+    base = base_parameters(model, terms)
+    columns = free_columns(nb, nv, terms)
+    combine = np.zeros((len(base), blocks.size))
+    combine[:, columns] = base.matrix
+    is_confounded = share_of_extra(np.eye(blocks.size), covariance, extra) > _FROM_EXTRA
+    for place in extra:
+        # The share of an extra coefficient in its own variance is 1: it counts by what it takes from the base parameters instead.
+        is_confounded[place] = np.any(share_of_extra(combine, covariance, np.array([place])) > _FROM_EXTRA)
+    marks = np.where(is_still, STILL, np.where(is_confounded, CONFOUNDED, ""))
+    parameters = _make_spread(
+        [names[i] for i in shown], estimate.x[shown], changes[shown], pulled[shown], fitted[shown], marks[shown]
+    )
+
+    # By absolute values: parameters enter with both signs, and a sum over them can vanish where none is zero.
+    enters = np.abs(base.matrix) > 1e-9 * np.abs(base.matrix).max(axis=1, keepdims=True)
+    known = np.any(enters & fitted[columns], axis=1)
+    a, b = base.matrix @ changes[columns], base.matrix @ pulled[columns]
+    is_confounded = share_of_extra(combine, covariance, extra) > _FROM_EXTRA
+    marks = np.where(is_still[columns[base.independent]], STILL, np.where(is_confounded, CONFOUNDED, ""))
+    spread = _make_spread(base.names, base.values(estimate.x[columns]), a, b, known, marks)
+    return Intervals(parameters, spread, base, a @ a.T + b @ b.T, factor)
+
+
+def share_of_extra(rows: np.ndarray, covariance: np.ndarray, extra: np.ndarray) -> np.ndarray:
+    """Shares (m,) of the variances of linear combinations `rows` (m, p) of the parameters that are due to extra terms.
+
+    The share vanishes when the extra coefficients are held fixed: c E^-1 c^T / v for the variance v of a combination, its
+    covariances c with the extra coefficients, and their covariance E. It is 1 - 1 / (variance inflation factor).
+    """
+    # Only the diagonal of rows covariance rows^T, without the (m, m) product.
+    variance = np.einsum("ip,pq,iq->i", rows, covariance, rows)
+    if not len(extra):
+        return np.zeros(len(rows))
+    # Coefficients of a term whose column is zero have no variance: the pseudo-inverse leaves them out.
+    cross = rows @ covariance[:, extra]
+    inverse = np.linalg.pinv(covariance[np.ix_(extra, extra)], hermitian=True)
+    return np.einsum("ie,ef,if->i", cross, inverse, cross) / np.where(variance > 0, variance, np.inf)
+
+
+def _make_spread(names, values, changes, pulled, fitted, marks) -> Spread:
+    from_data, from_prior = np.sum(changes**2, axis=1), np.sum(pulled**2, axis=1)
+    total = from_data + from_prior
+    # A number that no free coordinate changes keeps its nominal value, so that the prior is its source.
+    share = np.where(total > 0, from_prior / np.where(total > 0, total, 1), 1.0)
+    # NaN marks terms held at zero: at a bound there is no two-sided deviation.
+    return Spread(tuple(names), np.asarray(values), np.where(fitted, np.sqrt(total), np.nan), share, marks)
+
+
+def _local(data: Data, setting: Setting, estimate: Estimate):
+    """Jacobian of x by the free coordinates, the prior's curvature in them, and a mask of the free basic parameters."""
+    linear, minimum = estimate.chart, estimate.minimum
+    derivatives = linear.jacobian(minimum.origin)
+    count, size = len(minimum.origin), linear.count
+    basis = LOG_CHOLESKY_BASIS[:size]
+    # Hessian of the log-det divergence along straight lines in x, tr(S_k S_l) in the frame of the fitted body (`interior`).
+    prior_curvature = setting.prior * np.kron(np.eye(count), np.einsum("kij,lji->kl", basis, basis))
+    bodies = count * size
+    is_free = np.ones(derivatives.shape[1], bool)
+    # Terms at their bound stay there: the one-sided derivative is not that of a minimum.
+    is_free[bodies:] = ~(linear.positive & (minimum.terms == 0))
+    places = data.places(setting.extra)
+    count = int(is_free.sum())
+    jacobian = np.zeros((data.blocks.size, count + len(places)))
+    jacobian[: data.basic, :count] = derivatives[:, is_free]
+    jacobian[places, count + np.arange(len(places))] = 1.0
+    curvature = np.zeros((jacobian.shape[1],) * 2)
+    curvature[:bodies, :bodies] = prior_curvature
+    # The coefficients' prior is prior / 2 (c / unit)^2, as in `condensed_fit`.
+    units = data.units.reshape(-1)[places - data.basic]
+    curvature[count + np.arange(len(places)), count + np.arange(len(places))] = setting.prior / units**2
+    # A basic parameter is free where any coordinate changes it; massless bodies and terms at their bound have zero rows.
+    return jacobian, curvature, np.any(jacobian[: data.basic] != 0, axis=1)
+
+
+def _root(matrix: np.ndarray) -> np.ndarray:
+    # Semidefinite: coordinates without a prior have no curvature, which a Cholesky factorisation would refuse.
+    values, vectors = np.linalg.eigh(matrix)
+    return vectors * np.sqrt(np.maximum(values, 0))
+
+
+def _joints(model: Model) -> list[str]:
+    start = 10 * model.nb
+    return [name.rpartition(".")[0] for name in parameter_names(model)[start : start + model.nv]]

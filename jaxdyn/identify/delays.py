@@ -4,13 +4,13 @@ A torque T recorded late by d is tau(t) = T(t - d), to first order T - d dT/dt: 
 whose interval follows like any other. The logs are then shifted by d and fitted again, until the shifts vanish.
 """
 
+import dataclasses
 from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
 
-from jaxdyn.identify.condensed_fit import Estimate, Setting
-from jaxdyn.identify.intervals import Intervals
+from jaxdyn.identify.condensed_fit import Estimate, Intervals, Setting
 from jaxdyn.identify.logs import Log
 from jaxdyn.identify.result import Fit
 from jaxdyn.identify.robot_problem import RobotProblem
@@ -66,21 +66,18 @@ def shift_torques(log: Log, delay: Numbers) -> Log:
     # Time increases, so that the kept samples are consecutive.
     rows = slice(int(inside[0]), int(inside[-1]) + 1)
     shifted = [CubicSpline(t, column)(t[rows] + d) for column, d in zip(tau.T, delay, strict=True)]
-    part = log[rows]
-    return Log(
-        part.t, part.q, part.v, part.a, np.stack(shifted, axis=1), joint_names=log.joint_names, cutoff=log.cutoff
-    )
+    return dataclasses.replace(log[rows], tau=np.stack(shifted, axis=1))
 
 
 def find_delays(
     model: Model,
     logs: Sequence[Log],
     setting: Setting,
+    start: np.ndarray,
+    *,
     basic,
     extra: Sequence[TorqueTerm],
     fixed: np.ndarray | None,
-    start: np.ndarray,
-    *,
     inertia: str,
     blocks: int,
 ) -> Delays:
@@ -103,7 +100,7 @@ def find_delays(
             break
         # The first-order model holds for shifts that are short against the motion's reversals: longer steps are cut.
         delay = delay + np.clip(step, -_STEP, _STEP)
-    spread = problem.intervals(free, estimate, problem.result(free, estimate, data))
+    spread = problem.intervals(free, estimate, problem.result(free, estimate))
     std = spread.parameters.std[-model.nv :]
     # Changing weights of a robust loss may keep the steps from shrinking below a small share of the standard deviation.
     if np.any(np.abs(step) >= np.maximum(_SMALL, _SETTLED * std)):

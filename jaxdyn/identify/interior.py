@@ -5,14 +5,17 @@ takes about a millisecond, and nothing is compiled.
 """
 
 from collections.abc import Callable
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 
-from jaxdyn.identify.chart import Chart, positive_terms
-from jaxdyn.identify.checkpoint import Watch
-from jaxdyn.identify.descent import Iterate, Method, descend
-from jaxdyn.identify.regression import free_columns
+from jaxdyn.constraints.codes import RESULTS
+from jaxdyn.identify.chart import make_chart
+from jaxdyn.identify.condensed import Condensed
+from jaxdyn.identify.descent import Iterate, Method, Watch, descend
+from jaxdyn.identify.regression import free_columns, nominal_parameters
+from jaxdyn.identify.torque_terms import POSITIVE
+from jaxdyn.model.tree import Model
 
 _EPS = float(np.finfo(np.float64).eps)
 
@@ -20,20 +23,37 @@ _EPS = float(np.finfo(np.float64).eps)
 class TorqueProblem(NamedTuple):
     """Convex problem 1/2 (|R x - d|^2 + rest) + prior D(x) in float64, squares over the variance, in a chart's coordinates."""
 
-    chart: Chart
+    chart: "LinearChart"
     R: np.ndarray
     d: np.ndarray
     rest: float
     prior: float
 
+    @classmethod
+    def of(cls, chart: "LinearChart", condensed: Condensed, sigma: float, prior: float) -> "TorqueProblem":
+        """Problem of condensed logs with the torque noise sigma (N m). **Raises:** ValueError for a noise of zero."""
+        if not sigma > 0:
+            raise ValueError(
+                "the torques of the logs are all zero; a fit by torques needs logs of a robot that is driven"
+            )
+        return cls(chart, condensed.R / sigma, condensed.d / sigma, condensed.rest / sigma**2, prior)
+
+    def loss(self, origin: np.ndarray, terms: np.ndarray) -> float:
+        """Loss at relative pseudo-inertias A A^T, A the `origin`, and terms."""
+        residual = self.R @ self.chart.x(origin, terms) - self.d
+        # The origins are triangular: log det is a sum of logarithms, where a determinant could underflow.
+        diagonal = np.diagonal(origin, axis1=1, axis2=2)
+        divergence = np.sum(origin**2) - 2 * np.sum(np.log(diagonal)) - 4.0 * len(origin)
+        return float(0.5 * (residual @ residual + self.rest) + self.prior * divergence)
+
 
 class Minimum(NamedTuple):
-    """Minimum by `newton`: `origin` (bodies, 4, 4) and `s` (terms, nv) of the chart, losses, and the result."""
+    """Minimum by `newton`: `origin` (bodies, 4, 4) and `terms` (n,) of the chart, losses, and the result."""
 
     origin: np.ndarray
-    s: np.ndarray
+    terms: np.ndarray
     history: np.ndarray
-    result: str
+    result: Any
 
 
 class _State(NamedTuple):
@@ -79,18 +99,40 @@ LOG_CHOLESKY_BASIS, _FROM_PSEUDO = _log_cholesky_basis(), _from_pseudo()
 
 
 class LinearChart:
-    """Map of a chart from relative pseudo-inertias A A^T and terms to x, linear in both."""
+    """Map from relative pseudo-inertias A A^T of the bodies with mass, and terms, to all parameters x, linear in both.
 
-    def __init__(self, chart: Chart):
+    Terms are in units of a tenth of a joint's torque, that torque over the velocity or over the acceleration. `start` (n,): the
+    model's own terms, a tenth of a unit where it has none.
+
+    **Arguments:** `terms`, some of `TERMS`; `inertia`, "full", "mass" or "fixed"; `sizes`, as of `signal_sizes`.
+
+    **Raises:** ValueError for unknown `inertia`, and for nominal bodies and terms that are not feasible.
+    """
+
+    def __init__(self, model: Model, terms: tuple[str, ...], inertia: str, sizes):
+        chart = make_chart(model, inertia)
         self.factors = np.asarray(chart.factors, np.float64)
-        self.scale = np.asarray(chart.scale, np.float64)
         # "mass" uses the first of the ten log-Cholesky coordinates alone, which scales the density.
-        self.bodies, self.count = np.array(chart.bodies, int), {"full": 10, "mass": 1, "fixed": 0}[chart.inertia]
-        nominal = np.asarray(chart.nominal_inertias, np.float64), np.asarray(chart.nominal_terms, np.float64)
-        self.given, (nb, nv) = np.concatenate([x.reshape(-1) for x in nominal]), (len(nominal[0]), nominal[1].shape[1])
+        self.bodies, self.count = np.array(chart.bodies, int), chart.count
+        self.given = nominal_parameters(model)
         self.places = (10 * self.bodies[:, None] + np.arange(10)).astype(int)
-        self.term_places = free_columns(nb, nv, chart.terms)[10 * nb :]
-        self.positive = np.broadcast_to(positive_terms(chart.terms), self.scale.shape).reshape(-1)
+        self.term_places = free_columns(model.nb, model.nv, terms)[10 * model.nb :]
+        self.positive = np.repeat([term in POSITIVE for term in terms], model.nv).astype(bool)
+        torque, velocity, acceleration = (np.asarray(x, np.float64) for x in sizes)
+        unit = 0.1 * torque
+        # A torque that is always zero borrows the largest unit: a term in units of zero could not be changed.
+        unit = np.where(unit > 0, unit, unit.max(initial=0.0) or 1.0)
+        per = {"viscous": velocity, "coulomb": np.ones(model.nv), "offset": np.ones(model.nv), "armature": acceleration}
+        scales = [unit / np.where(per[term] > 0, per[term], 1.0) for term in terms]
+        self.scale = np.concatenate([np.zeros(0), *scales])
+        own = self.given[self.term_places]
+        if np.any(own < 0):
+            row, column = divmod(int(np.flatnonzero(own < 0)[0]), model.nv)
+            raise ValueError(
+                f"{terms[row]} of coordinate {column} is {own[row * model.nv + column]} in the model; it must not be negative"
+            )
+        # At a bound a barrier is infinite: start inside.
+        self.start = np.where(self.positive, np.where(own > 0, own / self.scale, 0.1), 0.0)
 
     def x(self, origin: np.ndarray, terms: np.ndarray) -> np.ndarray:
         """All parameters (p,)."""
@@ -98,7 +140,7 @@ class LinearChart:
         # A body is a product of its factors, so that rounding cannot make it infeasible; a sum P + dP could be.
         upper = self.factors @ origin
         result[self.places] = np.einsum("kij,bij->bk", _FROM_PSEUDO, upper @ np.swapaxes(upper, 1, 2))
-        result[self.term_places] = self.scale.reshape(-1) * terms
+        result[self.term_places] = self.scale * terms
         return result
 
     def body_jacobians(self, origin: np.ndarray) -> np.ndarray:
@@ -107,52 +149,44 @@ class LinearChart:
         moved = upper @ LOG_CHOLESKY_BASIS[None, : self.count] @ np.swapaxes(upper, 2, 3)
         return np.einsum("cij,bkij->bck", _FROM_PSEUDO, moved)
 
-    def clip_terms(self, s: np.ndarray) -> np.ndarray:
-        """Terms s, with those below a millionth of their unit set to zero, which fits approach but never reach."""
-        return np.where(self.positive.reshape(s.shape) & (s**2 < 1e-6), 0.0, s)
+    def clip_terms(self, terms: np.ndarray) -> np.ndarray:
+        """Terms, with those below a millionth of their unit set to zero, which fits approach but never reach."""
+        return np.where(self.positive & (terms < 1e-6), 0.0, terms)
 
-    def at(self, origin: np.ndarray, s: np.ndarray) -> np.ndarray:
-        """All parameters (p,) at s (terms, nv); positive terms are their squares."""
-        flat = s.reshape(-1)
-        return self.x(origin, np.where(self.positive, flat**2, flat))
-
-    def jacobian_at(self, origin: np.ndarray, s: np.ndarray) -> np.ndarray:
-        """Jacobian (p, n) of all parameters by the coordinates of the bodies, then by s."""
-        slopes = self.body_jacobians(origin)
-        count = len(slopes) * self.count
-        result = np.zeros((len(self.given), count + s.size))
-        for i, (places, slope) in enumerate(zip(self.places, slopes, strict=True)):
-            result[places, i * self.count : (i + 1) * self.count] = slope
-        flat = s.reshape(-1)
-        # Positive terms are s^2, whose derivative vanishes at the bound.
-        result[self.term_places, count:] = np.diag(self.scale.reshape(-1) * np.where(self.positive, 2 * flat, 1.0))
+    def jacobian(self, origin: np.ndarray) -> np.ndarray:
+        """Jacobian (p, n) of all parameters by the coordinates of the bodies, then by the terms."""
+        parts = self.body_jacobians(origin)
+        count = len(parts) * self.count
+        result = np.zeros((len(self.given), count + len(self.scale)))
+        for i, (places, part) in enumerate(zip(self.places, parts, strict=True)):
+            result[places, i * self.count : (i + 1) * self.count] = part
+        result[self.term_places, count:] = np.diag(self.scale)
         return result
 
     def rows(self, R: np.ndarray, jacobians: np.ndarray) -> np.ndarray:
         """Jacobian (m, n) of R x by the coordinates of the bodies, then by the terms."""
         inertial = np.matmul(np.swapaxes(R[:, self.places], 0, 1), jacobians)
         inertial = np.swapaxes(inertial, 0, 1).reshape(len(R), -1)
-        return np.concatenate([inertial, R[:, self.term_places] * self.scale.reshape(-1)], axis=1)
+        return np.concatenate([inertial, R[:, self.term_places] * self.scale], axis=1)
 
 
 class InteriorPoint(Method):
-    """Primal-dual interior-point steps from the chart's origin and terms s (terms, nv).
+    """Primal-dual interior-point steps from the nominal bodies and some terms (n,).
 
     The loss is min |R x - d|^2 / 2 + prior tr(P0^-1 P) with -prior log det P as a permanent barrier. The barrier starts as
     strong as the data, so that bodies are not driven to the boundary of the feasible set, and decreases as fast as the
     complementarity of bodies and multipliers allows: to the prior for the bodies, to zero for the terms.
 
-    **Arguments:** `tolerance`: largest excess of the final loss over the minimum; `resolution`: relative size of the smallest
-    significant change of the loss.
+    **Arguments:** `tolerance`: largest excess of the final loss over the minimum.
 
-    A point is (origin, s); the state of an iterate are bodies, terms and multipliers, and the two targets of the barrier.
+    A point is (origin, terms); the state of an iterate are bodies, terms and multipliers, and the two targets of the barrier.
     """
 
     floor = -np.inf  # the divergence makes losses below zero possible
 
-    def __init__(self, problem: TorqueProblem, tolerance: float, resolution: float = _EPS):
-        self.problem, self.linear = problem, LinearChart(problem.chart)
-        self.tolerance, self.resolution = tolerance, resolution
+    def __init__(self, problem: TorqueProblem, tolerance: float):
+        self.problem, self.linear = problem, problem.chart
+        self.tolerance = tolerance
         self.inequalities = int(self.linear.positive.sum())
         # A barrier mu leaves the loss about mu above the minimum for each inequality: together a tenth of the tolerance.
         self.least = 0.1 * tolerance / max(self.inequalities, 1)
@@ -160,15 +194,13 @@ class InteriorPoint(Method):
     def init(self, start, kept):
         """Evaluate the start, with multipliers that make the barrier as strong as the data."""
         problem, positive = self.problem, self.linear.positive
-        origin = np.asarray(problem.chart.origin, np.float64)
-        flat = np.asarray(start, np.float64).reshape(-1)
-        terms = np.where(positive, flat**2, flat)
+        terms, origin = np.asarray(start, np.float64), np.broadcast_to(np.eye(4), (len(self.linear.bodies), 4, 4))
         # Degree of the barrier: log det of a 4 x 4 matrix counts four, an inequality one.
         count = 4 * len(origin) + max(self.inequalities, 1)
         # Not below the prior, which is the final strength of the bodies' barrier.
-        gap = max(problem.prior, _loss(problem, self.linear, origin, terms) / count)
+        gap = max(problem.prior, problem.loss(origin, terms) / count)
         # On the central path terms * multipliers = gap; the floor keeps the multiplier of a term close to zero bounded.
-        slack = np.where(positive, gap / np.maximum(flat**2, 1e-3), 0.0)
+        slack = np.where(positive, gap / np.maximum(terms, 1e-3), 0.0)
         # P is 1 in its own frame, where the central path P Z = gap 1 makes Z a multiple of the identity.
         state = _State(origin, terms, gap * np.broadcast_to(np.eye(4), origin.shape), slack)
         return self._iterate(state, (gap, gap))
@@ -179,51 +211,34 @@ class InteriorPoint(Method):
         try:
             following, decrement, gaps, length = _step(problem, self.linear, state, *targets)
         except np.linalg.LinAlgError:
-            return iterate, "not_finite"
+            return iterate, RESULTS.nonfinite
         if not np.isfinite(iterate.loss + decrement):
-            return iterate, "not_finite"
+            return iterate, RESULTS.nonfinite
         # Rounding of the loss limits the smallest decrease that is visible.
-        smallest = max(self.tolerance, 10 * self.resolution * abs(iterate.loss))
+        smallest = max(self.tolerance, 10 * _EPS * abs(iterate.loss))
         # Half of the decrement is the decrease that Newton's model predicts. It bounds the excess at the final targets alone.
         if targets == (problem.prior, self.least) and decrement / 2 <= smallest:
-            return iterate, "converged"
+            return iterate, RESULTS.successful
         # Mehrotra's idea: after a long step the barrier decreases much; after a short one the iterate returns to the central path
         # first. Below 0.02 a good step would leave the path, above 0.9 the method would stall.
         share = min(max(0.02, (1 - length) ** 2), 0.9)
         return self._iterate(following, (max(problem.prior, share * gaps[0]), max(self.least, share * gaps[1]))), None
 
     def _iterate(self, state: _State, targets: tuple[float, float]) -> Iterate:
-        # The chart's coordinates are roots of positive terms; the steps themselves are straight lines in the terms.
-        s = _roots(state.terms, self.linear.positive).reshape(self.linear.scale.shape)
-        return Iterate((state.origin, s), _loss(self.problem, self.linear, state.origin, state.terms), (state, targets))
+        loss = self.problem.loss(state.origin, state.terms)
+        return Iterate((state.origin, state.terms), loss, (state, targets))
 
 
 def newton(
     problem: TorqueProblem,
-    s: np.ndarray,
     steps: int,
     tolerance: float,
     callback: Callable[[int, float, np.ndarray, np.ndarray], None] | None = None,
-    resolution: float = _EPS,
 ) -> Minimum:
-    """Minimise by `InteriorPoint`; `callback(step, loss, origin, s)` before each step."""
+    """Minimise by `InteriorPoint` from the start of the chart; `callback(step, loss, origin, terms)` before each step."""
     report = None if callback is None else lambda step, loss, point: callback(step, loss, *point)
-    end = descend(InteriorPoint(problem, tolerance, resolution), s, Watch(steps, report))
-    origin, terms = end.last.point
-    return Minimum(origin, terms, end.history, end.result)
-
-
-def _roots(terms: np.ndarray, positive: np.ndarray) -> np.ndarray:
-    # The inner `where` keeps negative offsets out of the square root.
-    return np.where(positive, np.sqrt(np.where(positive, terms, 1)), terms)
-
-
-def _loss(problem: TorqueProblem, linear: LinearChart, origin: np.ndarray, terms: np.ndarray) -> float:
-    residual = problem.R @ linear.x(origin, terms) - problem.d
-    # The origins are triangular: log det is a sum of logarithms, where a determinant could underflow.
-    diagonal = np.diagonal(origin, axis1=1, axis2=2)
-    divergence = np.sum(origin**2) - 2 * np.sum(np.log(diagonal)) - 4.0 * len(origin)
-    return float(0.5 * (residual @ residual + problem.rest) + problem.prior * divergence)
+    end = descend(InteriorPoint(problem, tolerance), problem.chart.start, Watch(steps, report))
+    return Minimum(*end.last.point, end.history, end.result)
 
 
 def _step(problem: TorqueProblem, linear: LinearChart, state: _State, weight: float, barrier: float):

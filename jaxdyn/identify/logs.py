@@ -1,5 +1,6 @@
 """Logs of measured motion and torque: checks, the low-pass of a log applied to regressor columns, and the travel of joints."""
 
+import dataclasses
 from collections.abc import Callable, Sequence
 from typing import Any
 
@@ -77,7 +78,7 @@ class Log(eqx.Module):
         """Log of the samples of a slice."""
         if not isinstance(rows, slice):
             raise ValueError(f"a log is indexed by slices, got {rows!r}; one sample is log.q[i], log.v[i], ...")
-        return _select(self, rows)
+        return map_samples(self, lambda x: x[rows])
 
 
 def split(log: Log, fraction: float = 0.7) -> tuple[Log, Log]:
@@ -174,14 +175,11 @@ def low_pass_columns(log: Log, columns: Callable[[Log], np.ndarray]) -> np.ndarr
 
 def refine_log(log: Log, factor: int) -> Log:
     """A log with `factor` times the samples, by cubic splines, whose every `factor`-th sample is one of the log."""
-    signals = {name: getattr(log, name) for name in ("q", "v", "a", "tau")}
-    fine: dict[str, Any] = {name: None if x is None else refine_samples(x, factor) for name, x in signals.items()}
-    t = refine_samples(np.asarray(log.t)[:, None], factor)[:, 0]
-    return Log(t, **fine, joint_names=log.joint_names, cutoff=log.cutoff)
+    return map_samples(log, lambda x: refine_samples(x, factor))
 
 
 def refine_samples(samples: np.ndarray, factor: int) -> np.ndarray:
-    """Samples (n, k) interpolated to (n - 1) factor + 1 by cubic splines."""
+    """Samples (n, ...) interpolated to (n - 1) factor + 1 by cubic splines."""
     from scipy.interpolate import CubicSpline
 
     samples = np.asarray(samples, np.float64)
@@ -244,10 +242,11 @@ def _check_signals(signals: dict) -> None:
         )
 
 
-def _select(log: Log, rows) -> Log:
-    values = {name: getattr(log, name) for name in ("t", "q", "v", "a", "tau")}
-    sliced: dict[str, Any] = {k: None if x is None else x[rows] for k, x in values.items()}
-    return Log(**sliced, joint_names=log.joint_names, cutoff=log.cutoff)
+def map_samples(log: Log, function: Callable[[Any], Any]) -> Log:
+    """Log with a function applied to each of its signals."""
+    signals = {name: getattr(log, name) for name in ("t", "q", "v", "a", "tau")}
+    changed: dict[str, Any] = {name: function(x) for name, x in signals.items() if x is not None}
+    return dataclasses.replace(log, **changed)
 
 
 def root_mean_square(samples) -> np.ndarray:
@@ -256,6 +255,14 @@ def root_mean_square(samples) -> np.ndarray:
     # Squares of large numbers would overflow: the column is divided by its largest value first.
     largest = np.abs(samples).max(axis=0, initial=0)
     return largest * np.sqrt(np.mean((samples / np.where(largest > 0, largest, 1)) ** 2, axis=0))
+
+
+def signal_sizes(logs: Sequence[Log]) -> list[np.ndarray]:
+    """Root mean squares (nv,) of torque, velocity and acceleration over all logs."""
+    return [
+        root_mean_square(np.concatenate([np.asarray(getattr(log, name), np.float64) for log in logs]))
+        for name in ("tau", "v", "a")
+    ]
 
 
 def travel_ranges(model: Model, log: Log) -> np.ndarray:

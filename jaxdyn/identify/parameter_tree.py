@@ -9,11 +9,14 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, PyTree
 
-from jaxdyn.identify.blocks import Block, Directions, Inertias, Numbers, Poses, Tied
-from jaxdyn.identify.chart import make_chart
-from jaxdyn.identify.distances import METRICS
-from jaxdyn.identify.picking import (
+from jaxdyn.identify.blocks import (
+    Block,
+    Directions,
+    Inertias,
+    Numbers,
+    Poses,
     Rows,
+    Tied,
     entries_of_block,
     find_models,
     free_bodies,
@@ -23,6 +26,7 @@ from jaxdyn.identify.picking import (
     row_indices,
     select,
 )
+from jaxdyn.identify.chart import METRICS, make_chart
 from jaxdyn.identify.sensors import FitSystem, with_sensors
 from jaxdyn.model import float64 as f64
 from jaxdyn.model.arguments import Function, Number, state_dtype, warn
@@ -53,7 +57,7 @@ class Parameters(eqx.Module):
         .poses(lambda scene: scene.system.home, rows=["b"], std=0.001)
         .directions(lambda scene: scene.system.gravity, std=0.01)
     )
-    fit = jd.identify.fit_parameters(scene, log, parameters, error="torque")
+    fit = jd.identify.fit_parameters(scene, log, parameters, jd.identify.Objective("torque"))
     ```
     """
 
@@ -171,8 +175,7 @@ class Parameters(eqx.Module):
         if metric is not None and metric not in METRICS:
             raise ValueError(f"metric is {metric!r}; give one of {METRICS}, or None")
         chosen = None if bodies is None else row_indices(self.given, name, model.nb, list(bodies))[0]
-        one = np.ones(model.nv)
-        chart, _ = make_chart(model, (), 0.01, shape, one, one, one, bodies=chosen)
+        chart = make_chart(model, shape, chosen)
         if chosen is not None and set(chosen) != set(chart.bodies):
             empty = [model.body_names[i] for i in chosen if i not in chart.bodies]
             raise ValueError(f"inertias frees {empty}, which have no mass; give them some, or leave them out")

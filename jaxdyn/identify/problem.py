@@ -9,15 +9,15 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jax.flatten_util import ravel_pytree
 from jaxtyping import Array, Float
 
 from jaxdyn.identify.devices import map_by_device, shard_blocks, sum_over_devices
-from jaxdyn.identify.gauss_newton import LinearErrors, Unknowns, eliminate_starts, with_prior
-from jaxdyn.identify.logs import Log
-from jaxdyn.identify.objectives import BALANCES, SIMULATED, Objective
+from jaxdyn.identify.logs import Log, as_logs
+from jaxdyn.identify.mechanisms import observation_columns
+from jaxdyn.identify.methods import LinearErrors, Unknowns, eliminate_starts, with_prior
+from jaxdyn.identify.options import BALANCES, SIMULATED, Objective
 from jaxdyn.identify.parameter_tree import Parameters
-from jaxdyn.identify.replay import Segments, check_spacing, segments, with_even_steps
+from jaxdyn.identify.replay import Segments, check_spacing, segments, simulation_options, with_even_steps
 from jaxdyn.identify.sensors import Measured, with_sensors
 from jaxdyn.model.tree import Model
 from jaxdyn.systems.scene import has_drives
@@ -29,11 +29,10 @@ class Problem(eqx.Module):
     `batches`: segments of equal length each; `meshes`: of the devices that share those of a batch, None for one device.
     """
 
-    tree: Any  # `Parameters`, or a tree with the same methods
+    tree: Parameters
     objective: Objective
     batches: tuple[Segments, ...]
     scale: Array
-    noise: float = eqx.field(static=True)
     meshes: tuple[Any, ...] = eqx.field(static=True)
 
     @property
@@ -54,23 +53,33 @@ class Problem(eqx.Module):
     @property
     def prior_weight(self) -> float:
         """noise^2/N."""
-        return self.noise**2 / self.divisor
+        return self.objective.noise**2 / self.divisor
+
+    @property
+    def start(self) -> Unknowns:
+        """Unknowns of the system as given, from the measured initial states."""
+        if self.objective.initial != "free":
+            return Unknowns(self.tree.start, None)
+        return Unknowns(self.tree.start, jnp.zeros((self.count, 2, self.batches[0].tau.shape[-1]), self.tree.dtype))
 
 
 def pose_problem(
-    tree: Any,
-    objective: Objective,
-    logs: Sequence[Log],
-    horizon: int | None,
-    noise: float,
-    devices: Sequence[Any] | None = None,
-) -> Problem:
-    """Problem of a parameter tree and logs, whose segments are sharded over devices.
+    tree: Parameters, objective: Objective, log: Log | Sequence[Log], devices: Sequence[Any] | None = None
+) -> tuple[Problem, tuple[Log, ...]]:
+    """Problem of a parameter tree and logs, whose segments are sharded over devices, and the logs.
 
-    **Raises:** ValueError for a horizon that does not fit, for logs of unequal length where segments must have one length, and
-    for drives with a state in an error without simulation.
+    **Raises:** ValueError for logs of another system, a horizon that does not fit, logs of unequal length where segments must
+    have one length, and for constraints or drives with a state in an error that does not allow them.
     """
     system, scene = tree.given, with_sensors(tree.given).scene
+    if scene.constraints and objective.error in ("torque", "momentum"):
+        raise ValueError(
+            f"the scene has {len(scene.constraints)} constraints, whose forces cannot be identified from torques; take "
+            "error='trajectory' or 'energy'"
+        )
+    logs, horizon = as_logs(log, scene.system, needs=objective.needs), objective.horizon
+    if objective.observed is not None:
+        objective = dataclasses.replace(objective, observed=observation_columns(scene.system, objective.observed))
     if has_drives(scene) and objective.error not in SIMULATED:
         raise ValueError(
             f"error is {objective.error!r}, and the scene has drives with a state (jd.forces.DriveDynamics), whose log holds "
@@ -94,14 +103,14 @@ def pose_problem(
         if horizon is None and objective.error in BALANCES:
             horizon = min(20, *(len(log) - 1 for log in logs))
         flat = cut(logs, horizon)
-        options = with_even_steps(objective.options, flat)
         if objective.error in SIMULATED:
+            options = with_even_steps(simulation_options(objective.substeps, objective.simulation), flat)
             check_spacing(options, devices)
-        objective = dataclasses.replace(objective, options=options)
+            objective = dataclasses.replace(objective, substeps=None, simulation=options)
         batches = [flat]
     scale = _scale(objective, scene.system, flat)
     shared = [shard_blocks(batch, devices) for batch in batches]
-    return Problem(tree, objective, tuple(x for x, _ in shared), scale, noise, tuple(mesh for _, mesh in shared))
+    return Problem(tree, objective, tuple(x for x, _ in shared), scale, tuple(mesh for _, mesh in shared)), logs
 
 
 @eqx.filter_jit
@@ -131,10 +140,8 @@ def prior_errors(problem: Problem, y) -> Float[Array, " k"]:
     return problem.prior_weight**0.5 * problem.tree.residual(y)
 
 
-def errors_of(z, args) -> Float[Array, " n"]:
-    """All errors at the flat unknowns, those of the prior after those of the data."""
-    problem, unknowns = args
-    estimate = ravel_pytree(unknowns)[1](z)
+def errors_of(estimate: Unknowns, problem: Problem) -> Float[Array, " n"]:
+    """All errors at a point, those of the prior after those of the data."""
     (rest, batches), divisor, parts = _split_batches(problem), problem.divisor, []
 
     def rows(shared, pieces):
@@ -143,13 +150,11 @@ def errors_of(z, args) -> Float[Array, " n"]:
 
     for batch, mesh in zip(batches, problem.meshes, strict=True):
         parts.append(map_by_device(rows, mesh)((rest, estimate.y), (estimate.start, batch)).reshape(-1))
-    return jnp.concatenate([*parts, prior_errors(problem, estimate.y).astype(z.dtype)])
+    return jnp.concatenate([*parts, prior_errors(problem, estimate.y).astype(estimate.y.dtype)])
 
 
-def loss_of(z, args) -> Float[Array, ""]:
-    """Sum of the squares of all errors at the flat unknowns, for reverse mode."""
-    problem, unknowns = args
-    estimate = ravel_pytree(unknowns)[1](z)
+def loss_of(estimate: Unknowns, problem: Problem) -> Float[Array, ""]:
+    """Sum of the squares of all errors at a point, for reverse mode."""
     (rest, batches), divisor = _split_batches(problem), problem.divisor
 
     def squares(searched, known):
@@ -157,7 +162,7 @@ def loss_of(z, args) -> Float[Array, ""]:
         errors = jax.vmap(partial(segment_errors, problem, divisor, y))(start, pieces)
         return jnp.sum(errors * errors)
 
-    loss = jnp.sum(prior_errors(problem, estimate.y) ** 2).astype(z.dtype)
+    loss = jnp.sum(prior_errors(problem, estimate.y) ** 2).astype(estimate.y.dtype)
     for batch, mesh in zip(batches, problem.meshes, strict=True):
         loss = loss + sum_over_devices(squares, mesh)((estimate.y, estimate.start), (rest, batch))
     return loss
@@ -168,7 +173,7 @@ def forward(problem: Problem) -> Problem:
     objective = problem.objective
     if objective.error not in SIMULATED:
         return problem
-    objective = dataclasses.replace(objective, options=objective.options | {"adjoint": "forward"})
+    objective = dataclasses.replace(objective, simulation=objective.simulation | {"adjoint": "forward"})
     return dataclasses.replace(problem, objective=objective)
 
 

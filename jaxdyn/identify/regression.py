@@ -252,9 +252,7 @@ def noise_level(condensed: Condensed, *, rcond: float = 1e-9) -> float:
     """
     fit = least_squares_by_svd(condensed.R, condensed.d, rcond)
     if condensed.rows <= fit.rank:
-        raise ValueError(
-            f"the log has {condensed.rows} torques for {fit.rank} unknowns; log more, or give sigma yourself"
-        )
+        raise ValueError(f"the log has {condensed.rows} torques for {fit.rank} unknowns; log more")
     return float(np.sqrt((condensed.rest + fit.rest) / (condensed.rows - fit.rank)))
 
 

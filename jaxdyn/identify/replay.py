@@ -114,8 +114,9 @@ def rollout(
 ) -> tuple[Array, Array]:
     """Simulate a log's segments with its torques from its measured states: q (segments, n, nq) and v (segments, n, nv).
 
-    `system` is a `Model`, another system or a `Scene`; `friction` an additional force. The other arguments are as in
-    `fit_trajectory`. The time of a `Model` starts at zero in every segment, that of anything else is the log's.
+    `system` is a `Model`, another system or a `Scene`; `friction` an additional force. The other arguments are as in `Objective`,
+    `simulation` by its options' own names. The time of a `Model` starts at zero in every segment, that of anything else is the
+    log's.
     """
     check_replay(INITIAL[0], hold)
     scene, data = scene_and_segments(system, log, horizon, friction)
@@ -138,11 +139,9 @@ def trajectory_error(
 
     and the same of v. Arguments as in `rollout`.
     """
-    check_replay(INITIAL[0], hold)
+    q, v = rollout(system, log, friction, horizon=horizon, hold=hold, substeps=substeps, **simulation)
     scene, data = scene_and_segments(system, log, horizon, friction)
-    q, v = _rollout(scene, data, hold, with_even_steps(simulation_options(substeps, simulation), data))
-    scale = motion_scale(scene.system, data)
-    errors = _segment_errors(scene.system, data, q, v, scale)
+    errors = _segment_errors(scene.system, data, q, v, motion_scale(scene.system, data))
     of_q, of_v = (100 * float(jnp.sqrt(jnp.mean(error**2))) for error in errors)
     return of_q, of_v
 

@@ -8,6 +8,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from jaxdyn.constraints.codes import Outcome, name_of
 from jaxdyn.dynamics import quantities as dynamics
 from jaxdyn.identify.logs import Log, check_log
 from jaxdyn.identify.regression import nominal_parameters, parameter_names, torque_error
@@ -18,11 +19,11 @@ from jaxdyn.model.tree import Model
 from jaxdyn.systems.scene import Scene
 
 
-class AbstractFit(eqx.Module):
+class AbstractFit(Outcome):
     """Common part of all fits: how they ended, and the errors of their torques along a log."""
 
     history: eqx.AbstractVar[np.ndarray]
-    result: eqx.AbstractVar[str]
+    result: eqx.AbstractVar[Any]
     method: eqx.AbstractVar[str]
 
     @property
@@ -53,7 +54,7 @@ class AbstractFit(eqx.Module):
         """Summary of the fit: how it ended, the error on each log given, and the parameters."""
         system = self.scene.system
         lines = [
-            f"{self.method}, {system.name if isinstance(system, Model) else type(system).__name__}: {self.result} after "
+            f"{self.method}, {system.name if isinstance(system, Model) else type(system).__name__}: {name_of(self.result)} after "
             f"{len(self.history) - 1} steps, loss {self.history[0]:.6g} -> {self.history[-1]:.6g}"
         ]
         for i, log in enumerate(logs):
@@ -74,7 +75,8 @@ class Fit(AbstractFit):
     - `model`: with the fitted inertias, armature, damping and friction. `friction`: the friction law, with its offset;
       a force for `Scene(fit.model, forces=[fit.friction])`.
     - `nominal`: the model the fit started from.
-    - `history` (steps,): loss before each step and at the end. `result`: "converged", "max_steps" or "not_finite".
+    - `history` (steps,): loss before each step and at the end. `result`: one of `RESULTS`, `successful` where it has
+      converged, else `max_steps_reached` or `nonfinite`.
     - `sigma`: torque noise (N m) that weighed the data against the prior, or None.
     - `extra`: fitted torque terms beyond `friction`, or None. They belong to logs, and are no force of the scene.
     - `as_measured`: whether friction was fitted, and is predicted, as the low-pass of a log leaves it (`from_raw`).
@@ -84,7 +86,7 @@ class Fit(AbstractFit):
     friction: Friction
     nominal: Model
     history: np.ndarray
-    result: str = eqx.field(static=True)
+    result: Any
     method: str = eqx.field(static=True)
     terms: tuple[str, ...] = eqx.field(static=True)
     sigma: float | None = None
@@ -144,8 +146,8 @@ class ParameterFit(AbstractFit):
       computes none: the larger of that for independent errors of one size, and of a delete-a-group jackknife, whose groups are
       consecutive samples twice as long as the autocorrelation time, or whole logs where there are twenty or more. `factor`: a
       95 % interval is plus and minus this many of them (Student's t).
-    - `history` (steps,): loss before each step and at the end. `result`: "converged", "max_steps", "stopped" or "not_finite";
-      `cause` then names the log, the sample and the parameters.
+    - `history` (steps,): loss before each step and at the end. `result`: one of `RESULTS`, `successful` where it has
+      converged, else `max_steps_reached`, `stopped` or `nonfinite`; `cause` then names the log, the sample and the parameters.
     """
 
     system: Any
@@ -155,7 +157,7 @@ class ParameterFit(AbstractFit):
     nominal_values: np.ndarray
     deviation: np.ndarray | None
     history: np.ndarray
-    result: str = eqx.field(static=True)
+    result: Any
     method: str = eqx.field(static=True)
     cause: str | None = eqx.field(static=True, default=None)
     factor: float = np.nan

@@ -2,16 +2,15 @@
 
 from collections.abc import Sequence
 
+import jax.numpy as jnp
 import numpy as np
 
-from jaxdyn.identify.chart import Chart, make_chart
-from jaxdyn.identify.condensed_fit import Data, Estimate, Setting, fit_blocks, gather
-from jaxdyn.identify.feasible import move_origin, signal_sizes
-from jaxdyn.identify.intervals import Intervals, intervals
-from jaxdyn.identify.logs import Log, idle_coordinates, log_rate
+from jaxdyn.identify.condensed_fit import Data, Estimate, Intervals, Setting, fit_blocks, gather, intervals
+from jaxdyn.identify.interior import LinearChart
+from jaxdyn.identify.logs import Log, idle_coordinates, log_rate, signal_sizes
 from jaxdyn.identify.regression import log_regressor
 from jaxdyn.identify.result import Fit
-from jaxdyn.identify.torque_terms import ExtraTorque, TorqueTerm
+from jaxdyn.identify.torque_terms import TERMS, ExtraTorque, Friction, TorqueTerm
 from jaxdyn.identify.uncertainty import effective_sample_size, is_white
 from jaxdyn.model.tree import Model
 
@@ -31,10 +30,10 @@ class RobotProblem:
         self.still = idle_coordinates(model, logs)
         self.loads = [np.zeros_like(np.asarray(log.tau, np.float64)) for log in logs]
         self.torque = float(sum(np.sum(np.asarray(log.tau, np.float64) ** 2) for log in logs))
-        # Caches: `_data` depends on loads and sample weights, `_rows` on joint weights too, `_charts` on v_s alone.
+        # Caches: `_data` depends on loads and sample weights, `_rows` on joint weights too.
         self._data: dict[tuple, Data] = {}
         self._rows: dict[tuple, np.ndarray] = {}
-        self._charts: dict[float, tuple[Chart, np.ndarray]] = {}
+        self.chart = LinearChart(model, basic, inertia, self.sizes)
 
     def data(self, setting: Setting) -> Data:
         """Condensed logs for the v_s and the loss of a setting."""
@@ -46,13 +45,8 @@ class RobotProblem:
         return self._data[key]
 
     def fit(self, setting: Setting, **options) -> Estimate:
-        """Fit all blocks, unless the options of `fit_blocks` select some."""
-        v_s, data = setting.v_s, self.data(setting)
-        if v_s not in self._charts:
-            chart, point = make_chart(self.model, self.basic, v_s, self.inertia, *self.sizes)
-            self._charts[v_s] = chart, np.asarray(point.s, np.float64)
-        chart, start = self._charts[v_s]
-        return fit_blocks(chart, start, data, setting, self.sizes, self.weights, **options)
+        """Fit all blocks, unless `options` of `fit_blocks` select some."""
+        return fit_blocks(self.chart, self.data(setting), setting, self.sizes, self.weights, **options)
 
     def validation_squares(self, setting: Setting, part: np.ndarray) -> np.ndarray:
         """Squared errors (blocks, nv) on some blocks, of a rough fit to the others.
@@ -151,7 +145,7 @@ class RobotProblem:
         self._rows = {key: rows for key, rows in self._rows.items() if key[1] != threshold}
 
     def _errors(self, setting: Setting, estimate: Estimate) -> list[np.ndarray]:
-        fit = self.result(setting, estimate, self.data(setting))
+        fit = self.result(setting, estimate)
         return [fit.torques(log) - np.asarray(log.tau, np.float64) for log in self.logs]
 
     def _new_weights(self, setting: Setting, estimate: Estimate) -> np.ndarray:
@@ -167,10 +161,10 @@ class RobotProblem:
         bodies[10 * self.model.nb : -self.model.nv] = 0  # all but the bodies and the rotors
         return log_regressor(self.model, log) @ bodies
 
-    def result(self, setting: Setting, estimate: Estimate, data: Data) -> Fit:
+    def result(self, setting: Setting, estimate: Estimate) -> Fit:
         """Estimate as a `Fit`."""
-        chart, point = move_origin(estimate.chart, estimate.minimum.origin, estimate.minimum.s)
-        model, friction = chart.model_at(self.model, point)
+        data = self.data(setting)
+        model, friction = model_with_parameters(self.model, estimate.x[: data.basic], self.basic, setting.v_s)
         used = dict(setting.extra)
         coefficients = estimate.x[data.basic :].reshape(-1, self.model.nv)
         edges = dict(zip(data.counts, np.cumsum((0, *data.counts.values()))[:-1], strict=True))
@@ -190,6 +184,20 @@ class RobotProblem:
             extra=extra,
             as_measured=True,
         )
+
+
+def model_with_parameters(model: Model, x: np.ndarray, terms, v_s: float) -> tuple[Model, Friction]:
+    """Model with the parameters x (10 nb + 4 nv,), and the friction law with its offset."""
+    dtype, split = model.home.dtype, 10 * model.nb
+    viscous, coulomb, offset, armature = jnp.asarray(x[split:].reshape(len(TERMS), model.nv), dtype)
+    # A leaf that is absent and not fitted stays absent, so that no program compiles it.
+    model = model.replace(
+        inertias=jnp.asarray(x[:split].reshape(model.nb, 10), dtype),
+        armature=None if model.armature is None and "armature" not in terms else armature,
+        damping=None if model.damping is None and "viscous" not in terms else viscous,
+        friction=None if model.friction is None and "coulomb" not in terms else coulomb,
+    )
+    return model, Friction(viscous, coulomb, offset, jnp.asarray(v_s, dtype))
 
 
 def huber_weights(errors: Sequence[np.ndarray], threshold: float) -> list[np.ndarray]:

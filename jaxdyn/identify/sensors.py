@@ -92,7 +92,7 @@ class Measured(eqx.Module):
     ```python
     measured = jd.identify.Measured(scene, torque_gain=[11.0, 8.5])
     parameters = jd.identify.Parameters(measured).positive(lambda m: m.torque_gain).bound(lambda m: m.delay, -0.02, 0.02)
-    fit = jd.identify.fit_parameters(measured, log, parameters, error="torque")
+    fit = jd.identify.fit_parameters(measured, log, parameters, jd.identify.Objective("torque"))
     ```
     """
 

@@ -18,7 +18,7 @@ from jaxdyn.identify import (
     parameter_names,
     torque_error,
 )
-from jaxdyn.identify.identifiability import Identifiability
+from jaxdyn.identify.linear_fit import Identifiability
 from jaxdyn.identify.regression import free_columns
 from jaxdyn.identify.selection import Choice
 from jaxdyn.identify.uncertainty import Whiteness, whiteness

@@ -296,7 +296,7 @@ def simulated_log(scene, taus, dt=0.01):
 def test_constants_of_drives_are_identified():
     """From a simulated log and starts that are 30 to 60 % wrong: a time constant, and stiffness and damping of a joint."""
     t = 0.01 * np.arange(101)[:, None]
-    given = {"error": "trajectory", "substeps": 4, "noise": 1e-6}
+    given = {"objective": jd.identify.Objective("trajectory", substeps=4, noise=1e-6)}
 
     def lagged(T, d):
         return jd.Scene(wheel(), forces=[jd.forces.FirstOrderDrive(T), jd.forces.JointDamping(d)])
@@ -321,6 +321,7 @@ def test_constants_of_drives_are_identified():
 LAGGED = jd.Scene(wheel(), forces=[jd.forces.FirstOrderDrive(0.1)])
 ZERO = jnp.zeros(1)
 MODAL = jd.Scene(wheel(), forces=[*LAGGED.forces, jd.contact.DryFriction(0.1, 1.0)])
+ENERGY = jd.identify.Objective("energy")
 REST = jd.identify.Log([0.0, 0.1, 0.2], *np.zeros((4, 3, 1)))
 
 
@@ -350,7 +351,7 @@ class WithMultipliers(Integral):
         (lambda: jd.simulate(LAGGED, ZERO, ZERO, [0.0, 1.0], method="variational", stepsize=0.1), "variational"),
         (lambda: jd.simulate(MODAL, ZERO, ZERO, [0.0, 1.0]), "modes"),
         (lambda: jd.simulate(LAGGED, ZERO, ZERO, [0.0, 1.0], control=WithMultipliers()), "multipliers"),
-        (lambda: jd.identify.fit_parameters(LAGGED, REST, free=lambda s: s.forces[0].initial, error="energy"), "commands"),
+        (lambda: jd.identify.fit_parameters(LAGGED, REST, objective=ENERGY, free=lambda s: s.forces[0].initial), "commands"),
     ],
 )  # fmt: skip
 def test_what_does_not_fit_is_refused(make, words):

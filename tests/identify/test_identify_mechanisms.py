@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 
 import jaxdyn as jd
+from jaxdyn.constraints.codes import RESULTS
 
 T = np.linspace(0.0, 1.0, 41)
 
@@ -35,9 +36,9 @@ def test_a_four_bar_is_completed_from_its_crank():
         jd.identify.complete_log(scene.system, T, {"1": (q[:, 0], v[:, 0])}, tau, q[0])
 
 
-def computed(scene, log, parameters, observed, **options):
-    options = {"horizon": 20, "substeps": 2, "tolerance": 1e-8, "steps": 15} | options
-    return jd.identify.fit_parameters(scene, log, parameters, observed=observed, **options)
+def computed(scene, log, parameters, observed):
+    objective = jd.identify.Objective(horizon=20, substeps=2, observed=observed)
+    return jd.identify.fit_parameters(scene, log, parameters, objective, jd.identify.Solver(tolerance=1e-8, steps=15))
 
 
 def test_energy_tells_the_coupler_of_a_four_bar():
@@ -47,7 +48,7 @@ def test_energy_tells_the_coupler_of_a_four_bar():
     wrong = jd.scenes.four_bar(masses=(1.0, 2.0, 2.5))
     log = jd.identify.complete_log(wrong, T, {"1": (q[:, 0], v[:, 0])}, tau, q[0])
     tree = jd.identify.Parameters(wrong).inertias(["coupler"], shape="mass", metric=None)
-    fit = jd.identify.fit_parameters(wrong, log, tree, error="energy", horizon=10)
+    fit = jd.identify.fit_parameters(wrong, log, tree, objective=jd.identify.Objective("energy", horizon=10))
     # The trapezoidal rule over 25 ms.
     np.testing.assert_allclose(fit.system.system.inertias[1, 0], 3.0, rtol=2e-2)
 
@@ -61,7 +62,7 @@ def test_a_four_bar_by_its_crank_alone():
     tree = jd.identify.Parameters(wrong).inertias(["coupler"], shape="mass", metric=None)
     fit = computed(wrong, log, tree, ["1"])
     np.testing.assert_allclose(fit.system.system.inertias[1, 0], 3.0, rtol=1e-5)
-    assert fit.result == "converged" and np.isfinite(fit.deviation).all()
+    assert fit.result == RESULTS.successful and np.isfinite(fit.deviation).all()
 
 
 @pytest.mark.slow
@@ -80,7 +81,7 @@ def test_link_lengths_of_a_four_bar_by_two_encoders():
     tree = jd.identify.Parameters(links).positive(lambda links: links.numbers["lengths"])
     fit = computed(links, log, tree, ["1", "3"])
     np.testing.assert_allclose(fit.values, [3.0, 2.5], rtol=1e-5)
-    assert fit.result == "converged" and (fit.deviation < 1e-3).all()
+    assert fit.result == RESULTS.successful and (fit.deviation < 1e-3).all()
 
 
 @pytest.mark.slow
@@ -95,8 +96,8 @@ def test_a_redundant_manipulator_by_its_base_joints():
     tree = jd.identify.Parameters(wrong).inertias(shape="mass", metric=None)
     fit = computed(wrong, log, tree, ["a1", "b1", "c1"])
     # Which masses make the same motion the log leaves open; it is that of equal ones of 1 kg.
-    before = jd.identify.parameter_error(wrong, log, horizon=20, substeps=2)
-    after = jd.identify.parameter_error(fit.system, log, horizon=20, substeps=2)
+    before = jd.identify.parameter_error(wrong, log, objective=jd.identify.Objective(horizon=20, substeps=2))
+    after = jd.identify.parameter_error(fit.system, log, objective=jd.identify.Objective(horizon=20, substeps=2))
     assert after < 1e-3 * before
 
 
@@ -148,7 +149,13 @@ def test_a_toss_tells_gravity_and_ratios_of_inertia():
     start = jd.ModelBuilder("box", gravity=(0.0, 0.0, -9.0))
     start = start.add_body("cube", None, "free", jd.inertia.box(MASS, (0.13, 0.09, 0.11))).build()
     tree = jd.identify.Parameters(start).inertias(metric="affine", weight=1e-6, total=MASS).free(lambda m: m.gravity)
-    fit = jd.identify.fit_parameters(start, logs, tree, substeps=2, tolerance=1e-12, noise=1e-4, steps=30)
+    fit = jd.identify.fit_parameters(
+        start,
+        logs,
+        tree,
+        objective=jd.identify.Objective(substeps=2, noise=1e-4),
+        solver=jd.identify.Solver(tolerance=1e-12, steps=30),
+    )
     np.testing.assert_allclose(fit.system.gravity, [0, 0, -9.81], atol=1e-4)
     np.testing.assert_allclose(
         ratios(np.asarray(fit.system.inertias[0])), ratios(np.asarray(true.inertias[0])), rtol=1e-3

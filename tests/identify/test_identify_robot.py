@@ -9,8 +9,7 @@ import pytest
 from benchmarks.identify_selection import false_choices
 from jaxdyn import identify, inertia
 from jaxdyn.identify.condensed import block_slices, condense_rows
-from jaxdyn.identify.condensed_fit import eliminate
-from jaxdyn.identify.intervals import share_of_extra
+from jaxdyn.identify.condensed_fit import eliminate, share_of_extra
 from jaxdyn.identify.logs import filter_like_log, idle_coordinates, low_pass_columns, travel_ranges
 from jaxdyn.identify.regression import condense, condense_model
 from jaxdyn.identify.robot_problem import huber_weights
@@ -18,7 +17,7 @@ from jaxdyn.identify.selection import folds, improving_torques, standard_error
 from jaxdyn.identify.torque_terms import PRESLIDING, split_terms
 from jaxdyn.identify.uncertainty import block_groups, effective_sample_size, is_white, jackknife
 from jaxdyn.identify.workflows.log_checks import check_log_content, check_rest
-from jaxdyn.identify.workflows.spectra import motion_band, vibration
+from jaxdyn.identify.workflows.raw_logs import motion_band, vibration
 from jaxdyn.model.builder import ModelBuilder
 
 
@@ -351,7 +350,7 @@ def test_the_share_of_the_variance_that_groups_see_is_that_of_theory():
     seen = []
     for series, total in zip(sums, noise.mean(axis=1), strict=True):
         slopes = (length * total - series)[:, None]
-        root, _ = jackknife(np.full((groups, 1, 1), float(length)), slopes, np.zeros((1, 1)))
+        root, *_ = jackknife(np.full((groups, 1, 1), float(length)), slopes, np.zeros((1, 1)))
         seen.append(np.sum(root**2))
     expected = 1 - 2 / -np.log(keep) / (2 * length)
     # 400 means know their variance to 7 %.

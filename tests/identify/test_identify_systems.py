@@ -9,6 +9,7 @@ import scipy.stats
 from jax.tree_util import Partial
 
 from jaxdyn import identify, scenes
+from jaxdyn.constraints.codes import RESULTS
 from jaxdyn.dynamics import quantities as dynamics
 from jaxdyn.forces.elements import JointDamping
 from jaxdyn.identify.chart import check_bodies
@@ -69,17 +70,19 @@ def test_parameters_of_a_lagrangian_are_recovered(swung, error, method):
     fit = identify.fit_parameters(
         nominal(),
         swung,
+        objective=identify.Objective(error, **options),
+        solver=identify.Solver(method=method, tolerance=0.0),
+        execution=identify.Execution(
+            callback=lambda step, loss, system: lowest.append(
+                min(map(float, jax.tree.leaves(masses_and_moments(system))))
+            )
+        ),
         positive=masses_and_moments,
-        error=error,
-        method=method,
-        tolerance=0.0,
-        callback=lambda step, loss, system: lowest.append(min(map(float, jax.tree.leaves(masses_and_moments(system))))),
-        **options,
     )
     # Tsit5 with 5 ms steps is that exact here.
     np.testing.assert_allclose(fit.values, WANTED, rtol=1e-8)
     np.testing.assert_allclose(jax.tree.leaves(masses_and_moments(fit.system)), WANTED, rtol=1e-8)
-    assert fit.names == NAMES and fit.result == "converged"
+    assert fit.names == NAMES and fit.result == RESULTS.successful
     assert min(lowest) > 0 and len(lowest) == len(fit.history)
     assert fit.deviation is None if method == "lbfgs" else np.all(fit.deviation < 1e-6)
     assert (
@@ -108,7 +111,11 @@ def test_parameters_of_joined_bodies_are_recovered(swung):
     reach = lambda system: system.immersion.length  # noqa: E731
     wrong = eqx.tree_at(lambda s: [*chosen(s), reach(s)], system, [jnp.asarray(x) for x in (0.9, 1.4, 0.8)])
     fit = identify.fit_parameters(
-        wrong, swung, positive=lambda s: [*chosen(s), reach(s)], error="torque", tolerance=0.0
+        wrong,
+        swung,
+        objective=identify.Objective("torque"),
+        solver=identify.Solver(tolerance=0.0),
+        positive=lambda s: [*chosen(s), reach(s)],
     )
     np.testing.assert_allclose(fit.values, [1.3, 0.7, 1.1], rtol=1e-8)
     assert fit.names == ("units[0].parameters['mass']", "units[1].parameters['mass']", "immersion.length")
@@ -144,7 +151,11 @@ def test_linear_parameters_and_their_deviations_are_those_of_least_squares(oscil
     noisy = identify.Log(log.t, log.q, log.v, log.a, np.asarray(log.tau) + 0.05 * rng.normal(size=log.tau.shape))
     start = oscillator(inertia=2.0, stiffness=1.0, offset=0.0, drive=2.0, damping=0.1)
     fit = identify.fit_parameters(
-        start, noisy, free=lambda s: [s.system.parameters, s.forces[0].coefficient], error="torque", tolerance=0.0
+        start,
+        noisy,
+        objective=identify.Objective("torque"),
+        solver=identify.Solver(tolerance=0.0),
+        free=lambda s: [s.system.parameters, s.forces[0].coefficient],
     )
     t, q, v, a, tau = (np.asarray(x).reshape(-1) for x in (noisy.t, noisy.q, noisy.v, noisy.a, noisy.tau))
     columns = {"drive": -np.sin(3 * t), "inertia": a, "offset": -np.ones_like(t), "stiffness": q, "damping": v}
@@ -170,7 +181,11 @@ def test_deviations_count_errors_that_last(oscillation):
     noisy = identify.Log(log.t, log.q, log.v, log.a, np.asarray(log.tau) + 0.05 * noise[:, None])
     start = oscillator(inertia=2.0, stiffness=1.0, offset=0.0, drive=2.0, damping=0.1)
     fit = identify.fit_parameters(
-        start, noisy, free=lambda s: [s.system.parameters, s.forces[0].coefficient], error="torque", tolerance=0.0
+        start,
+        noisy,
+        objective=identify.Objective("torque"),
+        solver=identify.Solver(tolerance=0.0),
+        free=lambda s: [s.system.parameters, s.forces[0].coefficient],
     )
     t, q, v, a, tau = (np.asarray(x).reshape(-1) for x in (noisy.t, noisy.q, noisy.v, noisy.a, noisy.tau))
     A = np.stack([-np.sin(3 * t), a, -np.ones_like(t), q, v], axis=1)
@@ -198,7 +213,9 @@ def test_logs_of_their_own_are_left_out_whole():
         tau = (2.0 + 0.1 * error) * one + 0.001 * generator.normal(size=(11, 1))
         logs.append(identify.Log(t, 0 * one, 0 * one, one, tau))
     mass = oscillator(inertia=1.0, stiffness=0.0, offset=0.0, drive=0.0)
-    fit = identify.fit_parameters(mass, logs, free=lambda s: s.system.parameters["inertia"], error="torque")
+    fit = identify.fit_parameters(
+        mass, logs, objective=identify.Objective("torque"), free=lambda s: s.system.parameters["inertia"]
+    )
     pairs = own.reshape(15, 2).mean(axis=1)
     np.testing.assert_allclose(fit.deviation, 0.1 * pairs.std(ddof=1) / 15**0.5, rtol=0.02)
 
@@ -208,15 +225,22 @@ def test_trajectories_with_noise_and_free_starts(oscillation):
     """The log's clock reaches the drive; starts that are fitted too take their noise out of the parameters."""
     log = oscillation
     exact = identify.fit_parameters(
-        oscillator(stiffness=4.0, drive=0.5), log, positive=everything_but_offset, horizon=20, substeps=4, tolerance=0.0
+        oscillator(stiffness=4.0, drive=0.5),
+        log,
+        objective=identify.Objective(horizon=20, substeps=4),
+        solver=identify.Solver(tolerance=0.0),
+        positive=everything_but_offset,
     )
     np.testing.assert_allclose(exact.values, [0.9, 0.8, 5.0], rtol=1e-8)
     # A motion that runs away from the start: the loss is not finite, and the scene given comes back.
     broken = identify.Log(log.t, log.q, log.v, None, 1e300 * log.tau)
     failed = identify.fit_parameters(
-        oscillator(stiffness=4.0, drive=0.5), broken, positive=everything_but_offset, horizon=20, substeps=4
+        oscillator(stiffness=4.0, drive=0.5),
+        broken,
+        objective=identify.Objective(horizon=20, substeps=4),
+        positive=everything_but_offset,
     )
-    assert failed.result == "not_finite" and np.isnan(failed.deviation).all()
+    assert failed.result == RESULTS.nonfinite and np.isnan(failed.deviation).all()
     np.testing.assert_allclose(failed.values, [0.5, 0.8, 4.0])
     # Noise everywhere, and far more of it where the segments start.
     noise = np.random.default_rng(5).normal(size=(2, *log.q.shape)) * np.where(np.arange(81) % 20, 1e-4, 3e-2)[:, None]
@@ -225,10 +249,8 @@ def test_trajectories_with_noise_and_free_starts(oscillation):
         identify.fit_parameters(
             oscillator(stiffness=4.0, drive=0.5),
             noisy,
+            objective=identify.Objective(horizon=20, substeps=4, initial=initial),
             positive=everything_but_offset,
-            horizon=20,
-            substeps=4,
-            initial=initial,
         )
         for initial in ("measured", "free")
     ]
@@ -253,18 +275,23 @@ def test_what_the_log_does_not_determine_is_said(swung):
     fit = identify.fit_parameters(
         scene,
         log,
+        objective=identify.Objective("torque"),
+        solver=identify.Solver(tolerance=0.0),
         positive=lambda s: s.system.parameters,
         free=lambda s: s.forces[0].args,
-        error="torque",
-        tolerance=0.0,
     )
     g, l, m, c = fit.values
     np.testing.assert_allclose([m * l * l, m * g * l, c], [1.3 * 0.49, 1.3 * G * 0.7, 0.2], rtol=1e-8)
     assert np.isinf(fit.deviation[:3]).all() and fit.deviation[3] < 1e-6
     short = identify.fit_parameters(
-        scene, log, positive=lambda s: s.system.parameters, free=lambda s: s.forces[0].args, error="torque", steps=2
+        scene,
+        log,
+        objective=identify.Objective("torque"),
+        solver=identify.Solver(steps=2),
+        positive=lambda s: s.system.parameters,
+        free=lambda s: s.forces[0].args,
     )
-    assert short.result == "max_steps" and len(short.history) == 3
+    assert short.result == RESULTS.max_steps_reached and len(short.history) == 3
 
 
 def test_damping_of_a_model():
@@ -273,7 +300,9 @@ def test_damping_of_a_model():
     arm = Scene(builder.build(), forces=(JointDamping(0.4),))
     log = log_of(arm, jnp.ones(1), jnp.zeros(1), t, jnp.sin(5 * t)[:, None])
     damping = lambda scene: scene.forces[0].coefficient  # noqa: E731
-    fit = identify.fit_parameters(eqx.tree_at(damping, arm, jnp.asarray(1.0)), log, positive=damping, error="torque")
+    fit = identify.fit_parameters(
+        eqx.tree_at(damping, arm, jnp.asarray(1.0)), log, objective=identify.Objective("torque"), positive=damping
+    )
     np.testing.assert_allclose(fit.values, [0.4], rtol=1e-8)
 
 
@@ -292,7 +321,13 @@ def test_descent_in_reverse_mode(oscillation, method):
     lacking = oscillator(stiffness=4.0, drive=0.0)
     scene = Scene(lacking.system, (), (*lacking.forces, Partial(network, weights)))
     options: dict = dict(horizon=20, substeps=4)
-    fit = identify.fit_parameters(scene, oscillation, free=lambda s: s.forces[1], method=method, steps=60, **options)
+    fit = identify.fit_parameters(
+        scene,
+        oscillation,
+        objective=identify.Objective(**options),
+        solver=identify.Solver(method=method, steps=60),
+        free=lambda s: s.forces[1],
+    )
     errors = [max(identify.trajectory_error(x, oscillation, **options)) for x in (scene, fit.system)]
     assert len(fit.names) == 32 and fit.deviation is None
     assert errors[1] < 0.2 * errors[0]
@@ -308,14 +343,39 @@ def test_trajectories_on_constraints():
     log = identify.Log(t, motion.q, motion.v, None, jnp.zeros((21, 2)))
     chosen = lambda scene: [scene.system.parameters["gravity"], scene.forces[0].coefficient]  # noqa: E731
     wrong = eqx.tree_at(chosen, held, [jnp.asarray(7.0), jnp.asarray(0.1)])
-    fit = identify.fit_parameters(wrong, log, positive=chosen, horizon=10, substeps=10, tolerance=0.0)
+    fit = identify.fit_parameters(
+        wrong,
+        log,
+        objective=identify.Objective(horizon=10, substeps=10),
+        solver=identify.Solver(tolerance=0.0),
+        positive=chosen,
+    )
     np.testing.assert_allclose(fit.values, [G, 0.3], rtol=1e-8)
+
+
+def test_options_by_their_own_names_are_deprecated(oscillation):
+    """One release long they are those of the groups, and the warning names these."""
+    start, pick = oscillator(inertia=2.0), lambda s: s.system.parameters["inertia"]
+    objective = identify.Objective("torque", noise=0.02)
+    want = identify.fit_parameters(start, oscillation, None, objective, identify.Solver(steps=2), free=pick)
+    with pytest.warns(DeprecationWarning) as warned:
+        fit = identify.fit_parameters(start, oscillation, free=pick, error="torque", noise=0.02, steps=2)
+    texts = [str(one.message) for one in warned]
+    assert texts == [
+        "error, noise: pass jd.identify.Objective(error, noise), a group of options",
+        "steps: pass jd.identify.Solver(steps), a group of options",
+    ]
+    np.testing.assert_array_equal(fit.history, want.history)
+    with pytest.warns(DeprecationWarning, match=r"horizon, substeps, simulation: pass jd\.identify\.Objective"):
+        error = identify.parameter_error(start, oscillation, horizon=20, substeps=2, rtol=1e-6)
+    objective = identify.Objective(horizon=20, substeps=2, simulation={"rtol": 1e-6})
+    assert error == identify.parameter_error(start, oscillation, objective)
 
 
 def test_float32(oscillation):
     scene = jax.tree.map(lambda x: x.astype(jnp.float32), oscillator(stiffness=4.0))
     fit = identify.fit_parameters(
-        scene, oscillation, positive=lambda s: s.system.parameters["stiffness"], error="torque"
+        scene, oscillation, objective=identify.Objective("torque"), positive=lambda s: s.system.parameters["stiffness"]
     )
     assert fit.system.system.parameters["stiffness"].dtype == jnp.float32
     np.testing.assert_allclose(fit.values, [5.0], rtol=1e-4)
@@ -324,8 +384,11 @@ def test_float32(oscillation):
 def test_bad_choices_are_refused(swung, oscillation):
     metric = MetricSystem(lambda q, t, p: p * jnp.eye(1), 1, parameters=jnp.asarray([[1.0, 0.0]])[0, :1])
 
-    def fit(system, log=oscillation, **options):
-        return lambda: identify.fit_parameters(system, log, **options)
+    def fit(system, log=oscillation, error="trajectory", **options):
+        return lambda: identify.fit_parameters(system, log, objective=identify.Objective(error), **options)
+
+    def objective(error, **options):
+        return lambda: identify.Objective(error, **options)
 
     builder = ModelBuilder("slider")
     builder.add_body("mass", None, "prismatic", inertia=(1.0, (0.0, 0.0, 0.0), (1.0, 1.0, 1.0)))
@@ -347,15 +410,23 @@ def test_bad_choices_are_refused(swung, oscillation):
             oscillator(), positive=parameters
         ),
         "positive picks inertias, the inertias of bodies": fit(model, positive=lambda m: m.inertias),
-        "error is 'position'": fit(metric, positive=lambda s: s.parameters, error="position"),
-        "horizon, hold with error='torque', which simulates nothing": fit(
-            oscillator(), free=parameters, error="torque", hold="previous", horizon=3
-        ),
+        "error is 'position'": objective("position"),
+        "horizon, hold with error='torque', which simulates nothing": objective("torque", hold="previous", horizon=3),
         "the log has 2 columns of q, the MetricSystem has 1; give one column": fit(
             metric, swung, free=lambda s: s.parameters
         ),
-        "method is 'bfgs'": fit(oscillator(), free=parameters, method="bfgs"),
-        "initial is 'guessed'": fit(oscillator(), free=parameters, initial="guessed"),
+        "method is 'bfgs'": lambda: identify.Solver("bfgs"),
+        "steps=0": lambda: identify.Solver(steps=0),
+        "starts is 0": lambda: identify.Solver(starts=0),
+        "initial is 'guessed'": objective("trajectory", initial="guessed"),
+        "hold is 'spline'": objective("trajectory", hold="spline"),
+        "substeps is 0": objective("trajectory", substeps=0),
+        "substeps and stepsize both": objective("trajectory", substeps=1, simulation={"stepsize": 0.1}),
+        "noise is 0": objective("torque", noise=0.0),
+        "control is None with error='closed-loop'": objective("closed-loop"),
+        "horizon=200 steps; a log of 81 samples allows 1 to 80": lambda: identify.fit_parameters(
+            oscillator(), oscillation, objective=identify.Objective(horizon=200), free=parameters
+        ),
         "the scene has 1 constraints, whose forces cannot be identified from torques": fit(
             rod, swung, positive=lambda s: s.system.parameters["mass"], error="torque"
         ),

@@ -12,7 +12,8 @@ import numpy as np
 import pytest
 
 import jaxdyn as jd
-from jaxdyn.identify import checkpoint
+from jaxdyn.constraints.codes import RESULTS
+from jaxdyn.identify import descent
 
 _SCRIPT = """
 import sys, time, jax
@@ -51,11 +52,15 @@ def pick(system):
     return list(system.parameters.values())
 
 
-def fitted(path=None, *, method="adam", start=(0.5, 2.9, 0.0), **options):
+def fitted(path=None, *, method="adam", start=(0.5, 2.9, 0.0), steps=40, **options):
     """Forty steps of a fit that does not converge before."""
-    options = {"every": 1, "steps": 40, "tolerance": 0.0} | options
     return jd.identify.fit_parameters(
-        system(*start), recorded(), free=pick, error="torque", method=method, checkpoint=path, **options
+        system(*start),
+        recorded(),
+        objective=jd.identify.Objective("torque"),
+        solver=jd.identify.Solver(method=method, steps=steps, tolerance=0.0),
+        execution=jd.identify.Execution(checkpoint=path, **({"every": 1} | options)),
+        free=pick,
     )
 
 
@@ -70,7 +75,7 @@ def test_a_killed_fit_resumes_to_the_same_numbers(tmp_path, method, least, point
     )
     try:
         until = time.monotonic() + 300
-        while not path.exists() or len(checkpoint.read(path)[0]) == 0 or _steps(path) < least:
+        while not path.exists() or len(descent.read(path)[0]) == 0 or _steps(path) < least:
             assert run.poll() is None and time.monotonic() < until
             time.sleep(0.02)
     finally:
@@ -86,7 +91,7 @@ def test_a_killed_fit_resumes_to_the_same_numbers(tmp_path, method, least, point
 
 
 def _steps(path):
-    return checkpoint.read(path)[0]["arrays"]["history"][0][0]
+    return descent.read(path)[0]["arrays"]["history"][0][0]
 
 
 @pytest.mark.parametrize("method", ["gauss-newton", "levenberg-marquardt", "lbfgs"])
@@ -94,7 +99,7 @@ def test_a_stopped_fit_resumes_to_the_same_numbers(tmp_path, method):
     path = tmp_path / "fit.ckpt"
     start = dict(method=method, start=(0.2, 2.6, 0.9), steps=12)
     part = fitted(path, callback=lambda step, *_: step == 3, **start)
-    assert part.result == "stopped" and len(part.history) == 4
+    assert part.result == RESULTS.stopped and len(part.history) == 4
     resumed, whole = fitted(path, **start), fitted(None, **start)
     np.testing.assert_array_equal(resumed.history, whole.history)
     np.testing.assert_array_equal(resumed.values, whole.values)
@@ -121,11 +126,11 @@ def test_checkpoints_of_others_and_halves_are_refused(tmp_path):
 
 def test_a_write_that_fails_leaves_the_checkpoint_before(tmp_path, monkeypatch):
     path = tmp_path / "fit.ckpt"
-    checkpoint.write(path, "p", {"y": np.ones(3)})
+    descent.write(path, "p", {"y": np.ones(3)})
     monkeypatch.setattr(os, "fsync", lambda _: (_ for _ in ()).throw(OSError("disk full")))
     with pytest.raises(OSError, match="disk full"):
-        checkpoint.write(path, "p", {"y": np.zeros(3)})
-    assert checkpoint.read(path)[0]["arrays"]["y"][0] == [3] and len(list(tmp_path.iterdir())) == 1
+        descent.write(path, "p", {"y": np.zeros(3)})
+    assert descent.read(path)[0]["arrays"]["y"][0] == [3] and len(list(tmp_path.iterdir())) == 1
 
 
 def test_solvers_agree_and_progress_is_shown(capsys):
@@ -135,19 +140,25 @@ def test_solvers_agree_and_progress_is_shown(capsys):
     want = rows @ (log.a + log.tau * -1)[:, 0] / (rows @ rows)
     for method in ("gauss-newton", "levenberg-marquardt", "dogleg", "lbfgs"):
         fit = jd.identify.fit_parameters(
-            system(size=0.4), log, free=linear, error="torque", method=method, tolerance=1e-12, progress=True
+            system(size=0.4),
+            log,
+            objective=jd.identify.Objective("torque"),
+            solver=jd.identify.Solver(method=method, tolerance=1e-12),
+            execution=jd.identify.Execution(progress=True),
+            free=linear,
         )
         np.testing.assert_allclose(fit.values, [want], rtol=1e-6)
-        assert fit.result == "converged"
+        assert fit.result == RESULTS.successful
         np.testing.assert_allclose(fit.history[-1], fit.history.min(), rtol=1e-12)
     assert "step 0 of at most 200: loss" in capsys.readouterr().err
 
 
 def test_many_starts_reach_what_one_does_not():
     far = system(size=0.5, rate=7.0)
-    options = dict(free=pick, error="torque", steps=50)
-    alone = jd.identify.fit_parameters(far, recorded(), **options)
-    many = jd.identify.fit_parameters(far, recorded(), starts=128, spread=1.0, **options)
+    options = dict(free=pick, objective=jd.identify.Objective("torque"))
+    alone = jd.identify.fit_parameters(far, recorded(), solver=jd.identify.Solver(steps=50), **options)
+    solver = jd.identify.Solver(steps=50, starts=128, spread=1.0)
+    many = jd.identify.fit_parameters(far, recorded(), solver=solver, **options)
     assert many.history[-1] < 1e-2 * alone.history[-1]
     computed = many.system.parameters
     np.testing.assert_allclose([abs(computed["size"]), abs(computed["rate"])], [1.0, 3.0], rtol=0.02)
@@ -161,14 +172,18 @@ def test_a_nan_names_its_log_sample_and_parameter():
     log = recorded()
     early = jd.identify.Log(log.t / 3, log.q, log.v, log.a, log.tau)
     bad = jd.ExplicitSystem(mass, root_push, 1, parameters={"square": 1.0, "late": 2.0})
-    fit = jd.identify.fit_parameters(bad, [early, log], free=pick, error="torque")
-    assert fit.result == "not_finite" and fit.cause is not None
+    fit = jd.identify.fit_parameters(bad, [early, log], objective=jd.identify.Objective("torque"), free=pick)
+    assert fit.result == RESULTS.nonfinite and fit.cause is not None
     first = int(np.argmax(log.t > 2.0))
     assert f"errors of log 2 are not finite from sample {first} on" in fit.cause
     # A step that led there, by gradient descent: the parameter that did it is named.
     start = jd.ExplicitSystem(mass, root_push, 1, parameters={"square": 0.3, "late": 0.9})
     steep = jd.identify.fit_parameters(
-        start, log, free=pick, error="torque", method="adam", learning_rate=0.9, steps=20
+        start,
+        log,
+        objective=jd.identify.Objective("torque"),
+        solver=jd.identify.Solver(method="adam", learning_rate=0.9, steps=20),
+        free=pick,
     )
-    assert steep.result == "not_finite" and "; finite with parameters['late'] where it started" in str(steep.cause)
+    assert steep.result == RESULTS.nonfinite and "; finite with parameters['late'] where it started" in str(steep.cause)
     assert np.isfinite(steep.values).all() and float(steep.system.parameters["late"]) < 1

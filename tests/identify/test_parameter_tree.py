@@ -7,8 +7,9 @@ import numpy as np
 import pytest
 
 import jaxdyn as jd
-from jaxdyn.identify import distances
-from jaxdyn.identify.objectives import energy_balance, momentum_balance
+from jaxdyn.constraints.codes import RESULTS
+from jaxdyn.identify import chart
+from jaxdyn.identify.options import energy_balance, momentum_balance
 from jaxdyn.identify.replay import segments
 
 BOX = (0.3, 0.08, 0.06)
@@ -120,8 +121,8 @@ def test_logarithm_of_a_matrix_with_equal_eigenvalues():
 
     @jax.jit
     def compute(matrix, step):
-        here, slope = jax.jvp(distances.symmetric_log, (matrix,), (step,))
-        ahead, behind = (distances.symmetric_log(matrix + s * h * step) for s in (1, -1))
+        here, slope = jax.jvp(chart.symmetric_log, (matrix,), (step,))
+        ahead, behind = (chart.symmetric_log(matrix + s * h * step) for s in (1, -1))
         return (ahead - behind) / (2 * h), slope, jax.scipy.linalg.expm(here)
 
     for values in ([1.0, 1.0, 1.0, 1.0], [2.0, 2.0, 2.0 + 1e-9, 5.0], [0.1, 0.1, 3.0, 3.1]):
@@ -137,20 +138,20 @@ def test_symmetric_eigenvectors():
     generator = np.random.default_rng(0)
     matrices = generator.normal(size=(50, 4, 4)) * 10.0 ** generator.uniform(-6, 6, (50, 1, 1))
     matrices = np.concatenate([matrices @ np.swapaxes(matrices, 1, 2), np.eye(4)[None], np.zeros((1, 4, 4))])
-    values, vectors = map(np.asarray, jax.jit(jax.vmap(distances.symmetric_eigenvectors))(matrices))
+    values, vectors = map(np.asarray, jax.jit(jax.vmap(chart.symmetric_eigenvectors))(matrices))
     size = np.maximum(np.linalg.norm(matrices, axis=(1, 2)), 1e-300)
     np.testing.assert_allclose(
         np.sort(values) / size[:, None], np.linalg.eigvalsh(matrices) / size[:, None], atol=1e-14
     )
     back = np.einsum("nij,nj,nkj->nik", vectors, values, vectors)
     np.testing.assert_allclose(back / size[:, None, None], matrices / size[:, None, None], atol=1e-14)
-    lowered = jax.jit(jax.vmap(distances.symmetric_log)).lower(matrices[:50]).as_text()
+    lowered = jax.jit(jax.vmap(chart.symmetric_log)).lower(matrices[:50]).as_text()
     assert "lapack" not in lowered
 
 
 def test_barrier_residual_has_one_branch():
     x = jnp.array([-30.0, -2.0, -0.1 - 1e-9, -0.1 + 1e-9, -1e-8, 0.0, 1e-8, 0.1 - 1e-9, 0.1 + 1e-9, 2.0, 20.0])
-    got, slope = map(np.asarray, jax.jit(jax.vmap(jax.value_and_grad(distances.barrier_residual)))(x))
+    got, slope = map(np.asarray, jax.jit(jax.vmap(jax.value_and_grad(chart.barrier_residual)))(x))
     want = np.expm1(np.asarray(x)) - np.asarray(x)
     np.testing.assert_allclose(got**2, want, rtol=1e-12, atol=1e-16)
     np.testing.assert_allclose(2 * got * slope, np.expm1(np.asarray(x)), rtol=1e-11, atol=1e-15)
@@ -186,7 +187,7 @@ def covered(branching, count):
         log = jd.identify.Log(t, q, v, a, tau + 0.01 * np.sqrt(np.mean(tau**2, 0)) * noise)
         scene = scene_of(true)
         tree = jd.identify.Parameters(scene).positive(lambda s: s.forces[0]).inertias(shape="mass", metric=None)
-        fit = jd.identify.fit_parameters(scene, log, tree, error="torque")
+        fit = jd.identify.fit_parameters(scene, log, tree, objective=jd.identify.Objective("torque"))
         rows = [i for i, name in enumerate(fit.names) if name.startswith("forces") or name.endswith(" m")]
         far = np.abs(fit.values - fit.nominal_values)[rows] / fit.deviation[rows]
         inside, total = inside + int(np.sum(far < 1.96)), total + len(rows)
@@ -227,12 +228,18 @@ def test_geometry_gravity_and_sensors_are_found_together(log):
         .poses(lambda m: m.scene.system.home, rows=["link1"], std=1.0)
         .directions(lambda m: m.scene.system.gravity)
     )
-    fit = jd.identify.fit_parameters(measured, recorded, points, error="torque", tolerance=1e-12, noise=1e-6)
+    fit = jd.identify.fit_parameters(
+        measured,
+        recorded,
+        points,
+        objective=jd.identify.Objective("torque", noise=1e-6),
+        solver=jd.identify.Solver(tolerance=1e-12),
+    )
     computed = dict(zip(fit.names, fit.values, strict=True))
     np.testing.assert_allclose([computed[f"torque_gain[{i}]"] for i in range(3)], gain, rtol=2e-2)
     # Torques between samples are taken as linear, which is what is left.
     np.testing.assert_allclose(computed["delay"], delay, atol=1e-3)
-    assert fit.history[-1] < 1e-4 * fit.history[0] and fit.result == "converged"
+    assert fit.history[-1] < 1e-4 * fit.history[0] and fit.result == RESULTS.successful
     assert fit.error(recorded) < 5
 
 
@@ -258,13 +265,19 @@ def test_a_length_that_enters_everywhere_is_found(log):
     # The gain of the torques is known to a part in a thousand: with it alone no mass would be told apart.
     measured = jd.identify.Measured(links, torque_gain=[1.2] * 3)
     tree = jd.identify.Parameters(measured).positive(lambda m: list(m.scene.numbers.values()))
-    fit = jd.identify.fit_parameters(measured, recorded, tree, error="torque", tolerance=1e-14)
+    fit = jd.identify.fit_parameters(
+        measured, recorded, tree, objective=jd.identify.Objective("torque"), solver=jd.identify.Solver(tolerance=1e-14)
+    )
     assert fit.names == ("scene.numbers['density']", "scene.numbers['length']")
     np.testing.assert_allclose(fit.values, [3.0, 0.4], rtol=1e-9)
     assert fit.error(recorded) < 1e-6
     np.testing.assert_allclose(fit.scene.system.inertias, true.inertias, rtol=1e-8, atol=1e-12)
     alone = jd.identify.fit_parameters(
-        links, jd.identify.Log(t, q, v, a, tau), positive=lambda links: links.numbers["length"], error="torque", steps=3
+        links,
+        jd.identify.Log(t, q, v, a, tau),
+        objective=jd.identify.Objective("torque"),
+        solver=jd.identify.Solver(steps=3),
+        positive=lambda links: links.numbers["length"],
     )
     assert alone.values.shape == (1,)
     with pytest.raises(ValueError, match="build is 3; give a function"):
@@ -292,11 +305,11 @@ def test_numbers_of_a_controlled_arm_by_its_motion_in_closed_loop():
     log = jd.identify.Log(t, *(np.asarray(x) for x in (motion.q, motion.v, np.zeros((26, 2)), motion.torque)))
     wrong = scene_of(arm(mass=(2.0, 0.8), damping=(0.5, 0.5)))
     tree = jd.identify.Parameters(wrong).positive(lambda s: s.forces[0]).inertias(["link1"], shape="mass", metric=None)
-    options = {"error": "closed-loop", "horizon": 25, "substeps": 8, "control": law}
-    fit = jd.identify.fit_parameters(wrong, log, tree, tolerance=1e-10, **options)
+    objective = jd.identify.Objective("closed-loop", horizon=25, substeps=8, control=law)
+    fit = jd.identify.fit_parameters(wrong, log, tree, objective, jd.identify.Solver(tolerance=1e-10))
     computed = dict(zip(fit.names, fit.values, strict=True))
     damping = [value for name, value in computed.items() if name.startswith("forces")]
     np.testing.assert_allclose(damping, [0.3, 0.2], rtol=2e-3)
     np.testing.assert_allclose(fit.scene.system.inertias[1, 0], 0.5, rtol=1e-4)
     # Per cent; what steps of 5 ms leave.
-    assert fit.result == "converged" and jd.identify.parameter_error(fit.system, log, **options) < 1e-2
+    assert fit.result == RESULTS.successful and jd.identify.parameter_error(fit.system, log, objective) < 1e-2

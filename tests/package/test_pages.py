@@ -131,7 +131,7 @@ SECTION = re.compile(
 HEAD = re.compile(r"((?:`\w+`(?: \([^)]*\)){0,3}(?:, | and )?)+)")
 CALL = re.compile(r"(?<![\w.`])([a-z_]\w+)\((?:system, )?q(?:, v)?(?:, t)?\)")
 # Options that are passed on, behind the one that takes them.
-PASSED_ON = {"fit_parameters": {"adjoint"}, "run": {"parameter_NAME", "result", "num_steps", "time_reached"}}
+PASSED_ON = {"run": {"parameter_NAME", "result", "num_steps", "time_reached"}}
 
 
 def arguments_in(text: str) -> list[str]:

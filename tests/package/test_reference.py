@@ -45,7 +45,6 @@ ELSEWHERE = {
     "identify.RobotFit": "test_identify_robot",
     "identify.fit_payload": "test_identify_robot",
     "identify.fit_robot": "test_identify_robot",
-    "identify.fit_trajectory": "test_identify",
     "plot.work_precision": "test_plots_and_tables",
     "reduction.spurious_terms": "test_distributions",
 }

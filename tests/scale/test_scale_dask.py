@@ -588,8 +588,15 @@ def test_starts_of_a_fit(client):
     q = np.sin(t)[:, None]
     log = jd.identify.Log(t, q, np.cos(t)[:, None], -q, -q + np.sin(3.0 * q))
     system = jd.ExplicitSystem(mass, bias, 1, parameters={"size": 0.5, "rate": 5.0})
-    options = dict(free=lambda s: [s.parameters["size"], s.parameters["rate"]], error="torque", starts=16, spread=1.0)
-    here, there = (jd.identify.fit_parameters(system, log, client=one, **options) for one in (None, client))
+    options = {
+        "free": lambda s: [s.parameters["size"], s.parameters["rate"]],
+        "objective": jd.identify.Objective("torque"),
+        "solver": jd.identify.Solver(starts=16, spread=1.0),
+    }
+    here, there = (
+        jd.identify.fit_parameters(system, log, execution=jd.identify.Execution(client=one), **options)
+        for one in (None, client)
+    )
     np.testing.assert_allclose(there.values, here.values, rtol=1e-9)
     np.testing.assert_allclose(np.abs(there.values), [1.0, 3.0], rtol=1e-6)
 

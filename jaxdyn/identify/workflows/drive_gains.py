@@ -10,6 +10,7 @@ the inertias in x, so that the gain of a joint with little torque from the paylo
 condensed once.
 """
 
+import dataclasses
 from collections.abc import Sequence
 from typing import NamedTuple
 
@@ -28,7 +29,7 @@ from jaxdyn.identify.regression import (
 from jaxdyn.identify.selection import VELOCITIES
 from jaxdyn.identify.threads import on_one_thread
 from jaxdyn.identify.torque_terms import TERMS, Terms, check_terms, coulomb_through_filter
-from jaxdyn.identify.uncertainty import block_groups, jackknife, student
+from jaxdyn.identify.uncertainty import jackknife
 from jaxdyn.model import inertia as _inertia
 from jaxdyn.model.arguments import Numbers, warn
 from jaxdyn.model.tree import Model
@@ -62,8 +63,7 @@ class DriveGains(eqx.Module):
 
     def scale(self, log: Log) -> Log:
         """Scale a log of these drives to torques in N m, as all fits expect them."""
-        tau = np.asarray(log.tau, np.float64) * self.gains
-        return Log(log.t, log.q, log.v, log.a, tau, joint_names=log.joint_names, cutoff=log.cutoff)
+        return dataclasses.replace(log, tau=np.asarray(log.tau, np.float64) * self.gains)
 
     def scaled(self, log: Log) -> Log:
         """Deprecated name of `scale`."""
@@ -224,12 +224,10 @@ def _fit(problem: _Problem, v_s: float):
         error, J = problem.linearise(block, *state)
         grams.append(J.T @ J)
         gradients.append(J.T @ error)
-    # Errors of currents count as independent: groups of two blocks.
-    groups = block_groups(len(data), np.inf)
     total = np.sum(grams, axis=0)
     curvature = np.diag(_weak_prior(total, problem.size))
-    parts = [np.stack([np.sum([x[i] for i in group], axis=0) for group in groups]) for x in (grams, gradients)]
-    changes, inverse = jackknife(parts[0], parts[1], curvature)
+    # Errors of currents count as independent: groups of two blocks.
+    changes, inverse, factor = jackknife(grams, gradients, curvature, np.inf)
     # The jackknife does not see the prior; its covariance is H^-1 P H^-1.
     variance = np.sum(changes**2, axis=1) + np.diag(inverse @ curvature @ inverse)
     gains = np.exp(state.u)
@@ -237,7 +235,7 @@ def _fit(problem: _Problem, v_s: float):
     score = float(np.sum(np.log(np.maximum(rms, _FINEST * sizes))))
     percent = 100 * float(np.sqrt(samples * np.sum(rms**2) / np.sum(sizes**2)))
     # The deviation of a logarithm is relative.
-    return score, percent, gains, gains * np.sqrt(variance[-nv:]), student(len(groups) - 1), v_s
+    return score, percent, gains, gains * np.sqrt(variance[-nv:]), factor, v_s
 
 
 def _weak_prior(gram: np.ndarray, size: int) -> np.ndarray:

@@ -1,7 +1,7 @@
 """Exciting motions: periodic, within limits, with information about the parameters maximised by gradient descent."""
 
 from collections.abc import Callable
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import equinox as eqx
 import jax
@@ -11,7 +11,9 @@ from jaxtyping import Array, Float
 
 from jaxdyn.dynamics.quantities import inverse_dynamics, torque_regressor
 from jaxdyn.identify.chart import check_bodies
+from jaxdyn.identify.descent import Watch, descend
 from jaxdyn.identify.logs import Log
+from jaxdyn.identify.methods import GradientSteps
 from jaxdyn.identify.regression import base_parameters, free_columns
 from jaxdyn.identify.torque_terms import TERMS, Terms, check_terms, friction_regressor
 from jaxdyn.identify.workflows.excitation import FourierMotion, random_motion
@@ -89,7 +91,7 @@ def exciting_motion(
     starts: int = 8,
     steps: int = 300,
     learning_rate: float = 0.02,
-    callback: Callable[[int, float], None] | None = None,
+    callback: Callable[[int, float], Any] | None = None,
 ) -> Excitation:
     """Optimise a finite Fourier series of every joint for the identification of the base parameters, within the robot's limits.
 
@@ -107,7 +109,7 @@ def exciting_motion(
     - `v_s`: smoothing velocity of Coulomb friction while searching; larger than the fit's, so that the gradient is not zero
       almost everywhere.
     - `seed`, `starts`: of the random motions. `steps`, `learning_rate`: of Adam.
-    - `callback(step, loss)`: before every step.
+    - `callback(step, loss)`: before every step and at the end; True stops the search.
 
     **Returns:** `Excitation`. Collisions with the ground, or of the robot with itself, are not checked: view the motion first
     (`jd.animate`).
@@ -261,37 +263,23 @@ def _loss(amplitudes, motion: FourierMotion, task: _Task, places: tuple[int, ...
     return value + 100 * sum(jnp.mean(jnp.maximum(x, 0) ** 2) for x in over)
 
 
+def _unit_loss(scaled, args):
+    span, motion, *rest = args
+    return _loss(_scale_amplitudes(scaled, span), motion, *rest)
+
+
 def _descend(motion, task, places, objective, steps, learning_rate, callback):
     import optax  # not when jaxdyn is imported
 
     span = (task.limits.upper - task.limits.lower) / 2
-    amplitudes = _amplitudes(motion)
-    optimiser = optax.adam(optax.cosine_decay_schedule(learning_rate, steps, alpha=0.05))
-
-    @eqx.filter_jit
-    def step(scaled, state, motion, task):
-        loss, gradient = jax.value_and_grad(
-            lambda y: _loss(_scale_amplitudes(y, span), motion, task, places, objective)
-        )(scaled)
-        # optax mixes dtypes, which strict promotion refuses.
-        with jax.numpy_dtype_promotion("standard"):
-            change, state = optimiser.update(gradient, state)
-            return loss, optax.apply_updates(scaled, change), state
-
-    scaled = _scale_amplitudes(amplitudes, 1 / span)
-    state, history, best = optimiser.init(scaled), [], (np.inf, scaled)
-    for number in range(steps):
-        before = scaled
-        loss, scaled, state = step(scaled, state, motion, task)
-        history.append(float(loss))
-        if callback is not None:
-            callback(number, history[-1])
-        # The loss belongs to the point before the update.
-        if history[-1] < best[0]:
-            best = history[-1], before
-        if not np.isfinite(history[-1]):
-            break
-    return _with_amplitudes(_scale_amplitudes(best[1], span), motion), np.array(history)
+    method = GradientSteps(
+        _unit_loss,
+        (span, motion, task, places, objective),
+        method=optax.adam(optax.cosine_decay_schedule(learning_rate, steps, alpha=0.05)),
+    )
+    report = None if callback is None else lambda step, loss, _: callback(step, loss)
+    end = descend(method, _scale_amplitudes(_amplitudes(motion), 1 / span), Watch(steps, report))
+    return _with_amplitudes(_scale_amplitudes(end.best.point, span), motion), end.history
 
 
 def _scale_amplitudes(amplitudes, span):

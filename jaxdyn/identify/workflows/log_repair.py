@@ -1,5 +1,6 @@
 """Repair of wrapped angles and corrupted samples of logs, before a low-pass and differences spread them over the log."""
 
+import dataclasses
 from typing import NamedTuple
 
 import numpy as np
@@ -95,7 +96,7 @@ def unwrap_angles(log: Log, model: Model | None = None, *, near: bool = True) ->
         return log
     names = ", ".join(f"{name} ({count} {'jump' if count == 1 else 'jumps'})" for name, count in counts.items())
     warn(f"angles that jump by whole turns were unwrapped: {names}", LogWarning)
-    return _replace(log, q=q)
+    return dataclasses.replace(log, q=q)
 
 
 def find_outliers(log: Log, model: Model | None = None) -> list[Outlier]:
@@ -257,7 +258,7 @@ def _fill(log: Log, model: Model | None, found: list[Outlier]) -> Log:
     total = sum(counts.values())
     names = ", ".join(f"{name} ({count})" for name, count in counts.items())
     warn(f"{total} corrupted {'sample' if total == 1 else 'samples'} left out and interpolated: {names}", LogWarning)
-    return _replace(log, **signals)
+    return dataclasses.replace(log, **signals)
 
 
 def _describe(log: Log, model: Model | None, one: Outlier, count: int) -> str:
@@ -316,8 +317,3 @@ def _velocity_limit(model: Model | None, column: int) -> float:
         return np.inf
     limit = float(np.asarray(model.velocity_limit)[model.topology.v_slices[_joint(model, "q", column)].start])
     return limit if limit > 0 else np.inf
-
-
-def _replace(log: Log, **signals) -> Log:
-    values = {name: getattr(log, name) for name in ("t", "q", "v", "a", "tau")} | signals
-    return Log(**values, joint_names=log.joint_names, cutoff=log.cutoff)

@@ -4,21 +4,20 @@ from collections.abc import Sequence
 from typing import Any
 
 import equinox as eqx
-import jax
 import jax.numpy as jnp
 import numpy as np
 
+from jaxdyn.constraints.codes import RESULTS, name_of
 from jaxdyn.identify.chart import check_bodies
 from jaxdyn.identify.condensed import Blocks, condense_rows
 from jaxdyn.identify.condensed_fit import eliminate, gather
-from jaxdyn.identify.feasible import make_problem, newton
-from jaxdyn.identify.interior import LOG_CHOLESKY_BASIS
+from jaxdyn.identify.interior import LOG_CHOLESKY_BASIS, LinearChart, TorqueProblem, newton
 from jaxdyn.identify.logs import Log, as_logs
 from jaxdyn.identify.regression import least_squares_by_svd, log_regressor, noise_level
 from jaxdyn.identify.robot import RobotFit, fit_robot
 from jaxdyn.identify.threads import on_one_thread
 from jaxdyn.identify.torque_terms import RobotTerms, split_terms
-from jaxdyn.identify.uncertainty import block_groups, effective_sample_size, jackknife, student
+from jaxdyn.identify.uncertainty import effective_sample_size, jackknife
 from jaxdyn.model import float64 as _f64
 from jaxdyn.model import inertia as _inertia
 from jaxdyn.model.builder import ModelBuilder
@@ -156,15 +155,15 @@ def _solve(blocks: Blocks, is_loaded, own: slice, kept, weights, rows, size):
     table[:, :10], table[:, -1] = R[:, :-1], R[:, -1]
     # No terms are fitted, so that their units do not matter.
     sizes = [np.ones(alone.nv)] * 3
-    problem, point, _ = make_problem(alone, condense_rows(table, blocks.count()), sizes, (), 0.01, "full", 1.0, sigma)
-    chart, point, _, result = newton(alone, problem, point, 200, 1e-6)
-    if result != "converged":
-        raise ValueError(f"the payload's fit ended {result!r}; do the loaded logs move the robot?")
-    payload = np.asarray(chart.inertias(point.theta), np.float64)[0]
+    chart = LinearChart(alone, (), "full", sizes)
+    minimum = newton(TorqueProblem.of(chart, condense_rows(table, blocks.count()), sigma, 1.0), 200, 1e-6)
+    if minimum.result is not RESULTS.successful:
+        raise ValueError(f"the payload's fit ended {name_of(minimum.result)!r}; do the loaded logs move the robot?")
+    payload = chart.x(minimum.origin, minimum.terms)[:10]
 
     estimate = robot(payload)
     # In the coordinates of the chart, where the prior's curvature is known; it also determines what no log does.
-    stretch = np.asarray(jax.jacfwd(lambda theta: chart.inertias(theta)[0])(point.theta), np.float64).reshape(10, 10)
+    (stretch,) = chart.body_jacobians(minimum.origin)
     basis = LOG_CHOLESKY_BASIS
     curvature = np.zeros((count + 10, count + 10))
     # The weak rows that held the robot's parameters in the fit are a prior of theirs here.
@@ -184,16 +183,12 @@ def _solve(blocks: Blocks, is_loaded, own: slice, kept, weights, rows, size):
         holds = int(is_loaded[blocks.logs[i]])
         grams.append(spreads[holds].T @ gram @ spreads[holds] / sigma**2)
         gradients.append(scores[holds, i] @ spreads[holds] / sigma**2)
-    groups = block_groups(len(blocks), size(payload))
-    summed = [
-        np.stack([np.sum([values[int(i)] for i in group], axis=0) for group in groups]) for values in (grams, gradients)
-    ]
-    changes, inverse = jackknife(summed[0], summed[1], curvature)
+    changes, inverse, factor = jackknife(grams, gradients, curvature, size(payload))
     # The log-Cholesky basis spans all symmetric matrices, so that its Gram matrix is positive definite.
     root = np.linalg.cholesky(curvature[count:, count:])
     from_data, from_prior = stretch @ changes[count:], stretch @ inverse[count:, count:] @ root
     std = np.sqrt(np.sum(from_data**2, axis=1) + np.sum(from_prior**2, axis=1))
-    return payload, std, student(len(groups) - 1)
+    return payload, std, factor
 
 
 def _ball(numbers: np.ndarray) -> np.ndarray:

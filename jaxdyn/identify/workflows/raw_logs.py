@@ -1,12 +1,17 @@
-"""Logs from raw samples: uniform in time, low-passed without delay, differentiated."""
+"""Logs from raw samples: cut-off by their spectra, uniform in time, low-passed without delay, differentiated.
 
+Rigid bodies respond at the frequencies of the motion and their first multiples, and friction at reversals somewhat higher.
+Power far above is neither: elastic joints, drives, sensors.
+"""
+
+import itertools
 from collections.abc import Sequence
+from typing import NamedTuple
 
 import numpy as np
 
 from jaxdyn.identify.logs import Log, pad_length
 from jaxdyn.identify.workflows.log_repair import repair_log
-from jaxdyn.identify.workflows.spectra import choose_cutoff
 from jaxdyn.model.arguments import Checked, Numbers
 from jaxdyn.model.tree import Model
 
@@ -105,3 +110,172 @@ def from_raw(
     # Decimated after the low-pass: before it, frequencies above half of the new rate would alias.
     keep = slice(trim, n - trim, every)
     return Log(grid[keep], positions[keep], v[keep], a[keep], torques[keep], joint_names=raw.joint_names, cutoff=cutoff)
+
+
+# Share of the velocity's power that defines the band of the motion, and the factor above it up to which a residual may be
+# friction's. With 99.9 % instead, noise of the encoders of two recorded arms doubled the band.
+_MOTION, _ABOVE = 0.99, 10.0
+# A low-pass closer to the motion than this factor removes rigid-body torque.
+_LEAST = 5.0
+# A joint with less than this share of the fastest one's velocity power does not define the band of the motion.
+_SLOW = 1e-4
+# Vibration is a torque whose power rises this many times from one band to a higher one, to this share of the joint's power.
+_RISE, _SHARE = 10.0, 1e-4
+# Least number of frequencies in a band, for a meaningful mean.
+_LINES = 6
+# Highest cut-off as a share of the sampling rate.
+_SAMPLING = 0.4
+
+
+class Cutoff(NamedTuple):
+    """Cut-off of the low-pass of logs, all in Hz.
+
+    - `frequency`: of the low-pass.
+    - `motion`: the band of the motion: 99 % of the power of the velocity lies below.
+    - `vibration`: frequency at which the torque's power rises again, between five and ten times the motion's band, or None.
+    """
+
+    frequency: float
+    motion: float
+    vibration: float | None
+
+
+def choose_cutoff(logs: Log | Sequence[Log]) -> Cutoff:
+    """Choose the cut-off frequency of raw logs from the spectra of positions and torques.
+
+    Ten times the highest band of the motion, up to which rigid bodies and friction respond. Less, down to five times, where a
+    joint's torque vibrates below that: then the band of least power below the vibration. Errors of fits are not used.
+    All logs of a fit should go through the same low-pass.
+
+    **Arguments:** `logs`: one raw log or several, with t, q, tau.
+
+    **Returns:** `Cutoff`.
+
+    **Raises:** ValueError for joints with more than one coordinate, for fewer than 32 samples, and for logs that do not
+    move or whose noise hides the motion.
+    """
+    logs = (logs,) if isinstance(logs, Log) else tuple(logs)
+    spectra = [_Spectra.of(log) for log in logs]
+    motion = max(one.motion for one in spectra)
+    if not motion > 0:
+        raise ValueError("the positions do not move, so their spectrum determines no cut-off; give one in Hz")
+    if not np.isfinite(motion):
+        raise ValueError(
+            "the noise of the positions is as strong as their motion, so no cut-off is chosen; give one in Hz"
+        )
+    frequency = _ABOVE * motion
+    valleys = [valley for one in spectra if (valley := one.valley(motion)) is not None]
+    vibration = None
+    if valleys:
+        frequency, vibration = min(valleys)
+    # The slowest log limits all of them, since one low-pass is used for all.
+    return Cutoff(min(frequency, _SAMPLING * min(one.rate for one in spectra)), motion, vibration)
+
+
+class _Spectra(NamedTuple):
+    """Spectra of one raw log: frequencies, power of torques (frequencies, nv), sampling rate and band of the motion, in Hz."""
+
+    frequency: np.ndarray
+    torque: np.ndarray
+    rate: float
+    motion: float
+
+    @classmethod
+    def of(cls, log: Log) -> "_Spectra":
+        """Spectra on a uniform grid of as many samples."""
+        t, q, tau = (np.asarray(x, np.float64) for x in (log.t, log.q, log.tau))
+        if q.shape[1] != tau.shape[1]:
+            raise ValueError(
+                f"the log has {q.shape[1]} columns of q and {tau.shape[1]} of tau; a cut-off is chosen for joints with one "
+                "coordinate each, give one in Hz"
+            )
+        if len(t) < 32:
+            raise ValueError(f"{len(t)} samples are too few to choose a cut-off by their spectrum; give one in Hz")
+        # The transform assumes uniform samples; time stamps of raw logs have jitter.
+        grid = np.linspace(t[0], t[-1], len(t))
+        q, tau = (np.stack([np.interp(grid, t, column) for column in x.T], axis=1) for x in (q, tau))
+        rate = (len(t) - 1) / float(t[-1] - t[0])
+        # Differentiate before windowing: a path that does not end at its start would be a jump in the spectrum.
+        frequency, velocity = power(np.gradient(q, grid, axis=0), rate)
+        return cls(frequency, power(tau, rate)[1], rate, _motion(frequency, power(q, rate)[1], velocity))
+
+    def valley(self, motion: float) -> tuple[float, float] | None:
+        """Band of least torque below a vibration between five and ten times the motion's band, and that of the vibration."""
+        edges = motion * np.arange(_LEAST, _ABOVE + 1)
+        inside = [(self.frequency >= a) & (self.frequency < b) for a, b in itertools.pairwise(edges)]
+        if min(mask.sum() for mask in inside) < _LINES:
+            return None
+        # Means compare bands with different numbers of lines; sums give a share of the whole power.
+        bands = np.stack([self.torque[mask].mean(axis=0) for mask in inside])
+        sums = np.stack([self.torque[mask].sum(axis=0) for mask in inside])
+        total = self.torque.sum(axis=0)
+        valleys = []
+        for joint in range(bands.shape[1]):
+            for high in range(1, len(bands)):
+                low = int(np.argmin(bands[:high, joint]))
+                rises = bands[high, joint] > _RISE * bands[low, joint]
+                if rises and sums[high, joint] > _SHARE * total[joint]:
+                    valleys.append((float(edges[low : low + 2].mean()), float(edges[high : high + 2].mean())))
+                    break
+        return min(valleys) if valleys else None
+
+
+def motion_band(log: Log) -> float:
+    """Frequency (Hz) below which 99 % of the power of the velocity lies, of the joint where that is highest; 0 at rest."""
+    frequency, velocity = power(np.asarray(log.v, np.float64), _rate(log))
+    return _band(frequency, velocity, 1e-6)
+
+
+def vibration(log: Log, residual: np.ndarray) -> tuple[float, float]:
+    """Share of the power of a residual (n, nv) above ten times the band of the motion, and that frequency (Hz).
+
+    A low-pass at that frequency removes it.
+    """
+    edge = _ABOVE * motion_band(log)
+    frequency, errors = power(np.asarray(residual, np.float64), _rate(log))
+    total = float(errors.sum())
+    return (float(errors[frequency > edge].sum()) / total if total > 0 and edge > 0 else 0.0), edge
+
+
+def power(x: np.ndarray, rate: float) -> tuple[np.ndarray, np.ndarray]:
+    """Frequencies (Hz) and power (frequencies, columns) of samples without their mean, in a window that is zero at both ends.
+
+    The window keeps a slow motion that does not close on itself from reaching high frequencies.
+    """
+    window = np.hanning(len(x))[:, None]
+    return np.fft.rfftfreq(len(x), 1 / rate), np.abs(np.fft.rfft(window * (x - x.mean(axis=0)), axis=0)) ** 2
+
+
+def _rate(log: Log) -> float:
+    return max(len(log) - 1, 1) / float(log.t[-1] - log.t[0])
+
+
+def _band(frequency: np.ndarray, velocity: np.ndarray, slow: float) -> float:
+    """Highest frequency, over the columns that move, below which 99 % of the power lies."""
+    total = velocity.sum(axis=0)
+    moving = velocity[:, total > slow * total.max(initial=0)]
+    if not moving.size or not total.max() > 0:
+        return 0.0
+    share = np.cumsum(moving, axis=0) / moving.sum(axis=0)
+    return float(max(frequency[np.argmax(share >= _MOTION, axis=0)]))
+
+
+def _motion(frequency: np.ndarray, position: np.ndarray, velocity: np.ndarray) -> float:
+    """Band of the motion from raw positions, whose noise dominates the velocity's power at high frequencies.
+
+    A fixed-point iteration from the band of the positions: the band of the velocity below ten times the present one. Infinite
+    where it reaches ten times the band of the positions, which is noise.
+    """
+    # Two lines are the resolution of the window.
+    band = max(_band(frequency, position, _SLOW), float(frequency[2])) if position.any() else 0.0
+    most = _ABOVE * band
+    while band > 0:
+        below = frequency <= _ABOVE * band
+        higher = max(_band(frequency[below], velocity[below], _SLOW), float(frequency[2]))
+        # The iteration comes from below, to the lowest fixed point; higher ones would count more of the noise.
+        if higher <= band:
+            return band
+        if higher > most:
+            return np.inf
+        band = higher
+    return 0.0
