@@ -160,8 +160,7 @@ class Equations:
             y = y | {controls.HELD: controls.sample(control, y[controls.HELD], *method.to_qv(scene, y, t), t)}
         return end, y, error
 
-    # diffrax passes more to the condition of an event: `**_`.
-    def quality(self, t, y, args, **_):
+    def quality(self, t, y, args):
         """Quality of the method's basis."""
         scene, _, method = self.unpack(args, y)
         return method.quality(scene, y, t)

@@ -11,6 +11,7 @@ from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
+import optimistix
 from jaxtyping import Array
 
 from jaxdyn.compile import kernel
@@ -21,20 +22,20 @@ from jaxdyn.simulation.hybrid.system import HybridSystem
 from jaxdyn.simulation.hybrid.transitions import Transition
 from jaxdyn.simulation.solvers.driver import number_of_steps, save
 from jaxdyn.simulation.solvers.explicit import Plan, Step, dense_output, take_step
-from jaxdyn.simulation.solvers.step_control import add_error, no_sums, step_factor
+from jaxdyn.simulation.solvers.roots import Bracket
+from jaxdyn.simulation.solvers.step_control import add_error, error_size, no_sums, step_factor
 
 # Length of the first step after an event, in steps before it: the motion may be another one.
 _AFTER_EVENT = 0.3
 # Powers of eps, of the size of a guard in the step: 1e-9 and 1e-6 in float64. Guards below the first are zero at the same event;
 # a root below the second is one, and not an error of the dense output.
 _SIMULTANEOUS, _REAL = 0.575, 0.383
-_MAX_SECANTS = 30  # iterations after which a root is bisected
 SEARCH_STEPS = 40  # attempts at most to end a step at an event
 FINE, SHORT, PARADOX, NO_MODE, CROWDED = range(5)
 
 
 class RunState(NamedTuple):
-    """State of a run: the motion, the next attempt, and the bracket of an event in lengths of the step."""
+    """State of a run: the motion, the next attempt, and the bracket of an event."""
 
     t: Array
     y: Array
@@ -43,12 +44,7 @@ class RunState(NamedTuple):
     mode: Mode
     guards: Array
     locating: Array  # true while an event is bracketed
-    low: Array
-    high: Array
-    value_low: Array
-    value_high: Array
-    side: Array  # of the last attempt: 1 behind the root, -1 before it
-    tries: Array  # of this event
+    bracket: Bracket  # in lengths of the step
     scale: Array  # of the guards, while an event is bracketed
     tried: Array  # steps
     accepted: Array  # steps
@@ -84,8 +80,7 @@ class Attempt(NamedTuple):
 
 def _attempt(plan: Plan, system: HybridSystem, args, t0, t1, y, rtol, atol) -> Attempt:
     step = take_step(plan, args, t0, t1, y, plan.first_rate(args, t0, y))
-    scaled = step.error / (atol + rtol * jnp.maximum(jnp.abs(y), jnp.abs(step.projected)))
-    size = jnp.sqrt(jnp.mean(scaled * scaled))
+    size = error_size(optimistix.rms_norm, y, step.projected, step.error, rtol, atol)
     middle = (t0 + t1) / 2
     # The dense output only finds that a guard was negative: the event is located by steps of its own.
     between = dense_output(plan, None, middle, t0, t1, y, step.raw, step.stages, step.shift)
@@ -169,7 +164,7 @@ def _start(system: HybridSystem, unknown, t0, y0, begun: Transition, length) -> 
     code = jnp.where(begun.paradox, PARADOX, jnp.where(begun.settled, FINE, NO_MODE)).astype(jnp.int32)
     none, no, zero = jnp.zeros((), jnp.int32), jnp.zeros((), bool), jnp.zeros((), t0.dtype)
     return RunState(
-        t0, y, length, length, begun.mode, guards, no, zero, zero, zero, zero, none, none,
+        t0, y, length, length, begun.mode, guards, no, Bracket.begin(zero, zero, zero, zero),
         jnp.ones_like(guards), none, none, code, none, no_sums(_positions_and_velocities(system, y)), no,
     )  # fmt: skip
 
@@ -197,14 +192,10 @@ def _cross_loosely(elements: Elements, run: RunState) -> RunState:
     return run._replace(mode=run.mode._replace(positive=run.mode.positive ^ crossed), guards=guards)
 
 
-class _Bracket(NamedTuple):
-    """Bracket of an event after an attempt, and what it says of the attempt."""
+class _Search(NamedTuple):
+    """Search for an event after an attempt, and what it says of the attempt."""
 
-    low: Array
-    high: Array
-    value_low: Array
-    value_high: Array
-    side: Array
+    bracket: Bracket
     scale: Array
     violated: Array  # true if a guard is negative
     locating: Array  # true while the event is bracketed
@@ -213,7 +204,7 @@ class _Bracket(NamedTuple):
     hit: Array  # guards that ended the step
 
 
-def _bracket(run: RunState, t1, attempt: Attempt, good, eps: float) -> _Bracket:
+def _search(run: RunState, t1, attempt: Attempt, good, eps: float) -> _Search:
     """Narrow the bracket of an event by an attempt whose error is `good`, or begin one."""
     length, (values, levels) = t1 - run.t, (attempt.values, attempt.levels)
     # Within its rounding level the sign of a guard is not known.
@@ -222,40 +213,26 @@ def _bracket(run: RunState, t1, attempt: Attempt, good, eps: float) -> _Bracket:
     inside = good & ~run.locating & ~run.loose & (attempt.middle < -attempt.middle_levels).any()
     violated = violated | inside
     at = jnp.where(inside, attempt.middle, values)
-    high = jnp.where(inside, length / 2, length)
     level = jnp.maximum(levels, float(jnp.finfo(values.dtype).tiny))
     # Guards have units of their own: each is measured by its size at the ends of the step where the search begins.
     scale = jnp.where(run.locating, run.scale, jnp.maximum(jnp.maximum(jnp.abs(run.guards), jnp.abs(at)), level))
     value = jnp.min(at / scale)
-    first_value = jnp.min(run.guards / scale)
-
     # A step whose error is too large proves nothing about the guards at its end.
     begins = good & violated & ~run.locating
-    low = jnp.where(begins, 0.0, run.low)
-    value_low = jnp.where(begins, first_value, run.value_low)
-    # A value that was a root is near zero and does not guide the secant.
-    behind, before = good & violated, good & ~violated & run.locating
-    low = jnp.where(before, high, low)
-    value_low = jnp.where(before, value, value_low)
-    high_ = jnp.where(behind, high, run.high)
-    value_high = jnp.where(behind, value, run.value_high)
-    side = jnp.where(behind, 1, jnp.where(before, -1, run.side)).astype(jnp.int32)
-    # Rule of Illinois: an end that is kept twice counts half, so that the bracket shrinks from both sides.
-    again = run.locating & (side == run.side)
-    value_low = jnp.where(again & behind, value_low / 2, value_low)
-    value_high = jnp.where(again & before, value_high / 2, value_high)
-
+    fresh = Bracket.begin(jnp.zeros_like(length), run.bracket.high, jnp.min(run.guards / scale), run.bracket.value_high)
+    bracket = jax.tree.map(lambda a, b: jnp.where(begins, a, b), fresh, run.bracket)
+    point = jnp.where(inside, length / 2, length)
+    bracket = bracket.narrow(point, value, good & ~violated & run.locating, good & violated)
     locating = (run.locating & good) | begins
     # The root is known when a guard is zero, or when its time is, up to rounding.
-    near = jnp.abs(value) <= 64 * eps
-    narrow = (high_ - low) <= 4 * eps * jnp.maximum(jnp.abs(t1), run.usual)
+    is_known = (jnp.abs(value) <= 64 * eps) | bracket.is_narrow(jnp.maximum(jnp.abs(t1), run.usual))
     # A zero in the middle is not at the end of this step, which is where a step can be cut.
-    located = locating & (near | narrow) & ~inside
+    located = locating & is_known & ~inside
     kept = good & ((~violated & ~run.locating) | located)
     # A zero in the middle of a step may have been an error of the dense output.
     real = located & (value <= eps**_REAL)
     hit = real & ((values <= eps**_SIMULTANEOUS * scale) & (scale > 4 * level) | (values / scale <= value))
-    return _Bracket(low, high_, value_low, value_high, side, scale, violated, locating, located, kept, hit)
+    return _Search(bracket, scale, violated, locating, located, kept, hit)
 
 
 def _decide(system: HybridSystem, run: RunState, t1, end, attempt: Attempt, eps: float, grid: FixedGrid | None):
@@ -264,51 +241,40 @@ def _decide(system: HybridSystem, run: RunState, t1, end, attempt: Attempt, eps:
     # False for an error of NaN, so that a step to a state that is not finite is refused.
     good = attempt.size < 1 if grid is None else jnp.isfinite(attempt.step.projected).all()
     factor = step_factor(attempt.size, system.error_order, good).astype(length.dtype)
-    b = _bracket(run, t1, attempt, good, eps)
-    # A secant where both ends are known by their values, else bisection.
-    guided = (b.value_low > 64 * eps) & (b.value_high < 0) & (run.tries < _MAX_SECANTS)
-    difference = jnp.where(guided, b.value_high - b.value_low, 1.0)
-    secant = jnp.where(guided, b.high - b.value_high * (b.high - b.low) / difference, (b.low + b.high) / 2)
-    # Rounding can carry the secant out of the bracket.
-    secant = jnp.clip(secant, b.low, b.high)
+    found = _search(run, t1, attempt, good, eps)
     # Attempts that locate an event are short for its sake: they say nothing about the usual length.
-    usual = jnp.where(run.locating, run.usual, jnp.where(good & ~b.violated, length * factor, length))
+    usual = jnp.where(run.locating, run.usual, jnp.where(good & ~found.violated, length * factor, length))
     usual = jnp.where(good, usual, length * factor)
-    next_length = jnp.where(b.locating, secant, usual)
-    next_length = jnp.where(b.located, _AFTER_EVENT * usual, next_length)
+    next_length = jnp.where(found.locating, found.bracket.next(), usual)
+    next_length = jnp.where(found.located, _AFTER_EVENT * usual, next_length)
     # The spacing of floating-point numbers at t: shorter steps would not advance.
     least = 4 * eps * jnp.maximum(jnp.abs(run.t), eps)
     short = ~good & (next_length < least)
+    searches, t = found.locating & ~found.located, jnp.where(found.kept, t1, run.t)
     # Steps of fixed length have no error to keep: they fail where the state is not finite.
     if grid is not None:
         short, usual = ~good, run.usual
-        next_length = jnp.where(b.locating & ~b.located, secant, grid.to_next(jnp.where(b.kept, t1, run.t)))
+        next_length = jnp.where(searches, found.bracket.next(), grid.to_next(t))
     pivots = system.elements.split(run.guards)[0][:, 2]
     pivot = jnp.min(pivots, initial=1.0) < 0.05  # friction that leaves no forces grows without bound before
     code = jnp.where(short, jnp.where(pivot, PARADOX, SHORT), run.code).astype(jnp.int32)
     # Steps end on the run's end, or well before it.
-    t = jnp.where(b.kept, t1, run.t)
-    ends = ~b.locating & (t + next_length > end - 1e-3 * next_length)
+    ends = ~found.locating & (t + next_length > end - 1e-3 * next_length)
     next_length = jnp.where(ends & (t < end), end - t, next_length)
     after = run._replace(
         t=t,
-        y=jnp.where(b.kept, attempt.step.projected, run.y),
+        y=jnp.where(found.kept, attempt.step.projected, run.y),
         length=next_length,
         usual=usual,
-        guards=jnp.where(b.kept, attempt.values, run.guards),
-        locating=b.locating & ~b.located,
-        low=b.low,
-        high=b.high,
-        value_low=b.value_low,
-        value_high=b.value_high,
-        side=b.side,
-        tries=jnp.where(b.locating & ~b.located, run.tries + jnp.ones((), jnp.int32), 0),
-        scale=b.scale,
+        guards=jnp.where(found.kept, attempt.values, run.guards),
+        locating=searches,
+        bracket=found.bracket,
+        scale=found.scale,
         tried=run.tried + jnp.ones((), jnp.int32),
-        accepted=run.accepted + b.kept.astype(jnp.int32),
+        accepted=run.accepted + found.kept.astype(jnp.int32),
         code=code,
     )
-    return after, b.kept, b.hit
+    return after, found.kept, found.hit
 
 
 def _pass_event(

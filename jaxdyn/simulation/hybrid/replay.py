@@ -27,6 +27,7 @@ from jaxdyn.simulation.hybrid.system import HybridSystem
 from jaxdyn.simulation.solvers import driver
 from jaxdyn.simulation.solvers.driver import ExplicitRun
 from jaxdyn.simulation.solvers.integrator import Integrator, zeros_or
+from jaxdyn.simulation.solvers.roots import delay
 
 
 class HybridRun(Integrator):
@@ -93,7 +94,7 @@ def _replay(run: HybridRun, inputs, end, records, begun, direct: bool):
         advances = known & (until > t) & (until <= last)
         until = jnp.where(advances, until, t)
         integrate: Any = part_run.direct if direct else part_run
-        rows, _, _ = integrate(plan.structure(y), (unknown, mode), jnp.stack([t, until]))
+        rows, *_ = integrate(plan.structure(y), (unknown, mode), jnp.stack([t, until]))
         here = jnp.where(advances, ravel_pytree(jax.tree.map(lambda x: x[0], rows))[0], y)
         behind = _cross(system, unknown, mode, record, t, until, here)
         crosses = event & known
@@ -121,15 +122,8 @@ def _cross(system: HybridSystem, unknown, mode: Mode, record: Records, t, known_
         return guard_values(system, (unknown, mode), t, y)[0].reshape(-1)[which]
 
     rate = lax.stop_gradient(system.plan.field_of((unknown, mode), known_time, y))
-    fixed = lax.stop_gradient((known_time, y))
-    _, guard_rate = jax.jvp(guard, fixed, (jnp.ones_like(known_time), rate))
-    value = guard(known_time, y)
-    # The value is zero up to rounding: only its derivative is used.
-    is_regular = hit & (guard_rate != 0)
-    change = value - lax.stop_gradient(value)
-    late = change / lax.stop_gradient(jnp.where(is_regular, guard_rate, jnp.ones_like(guard_rate)))
-    late = jnp.where(is_regular, late, jnp.zeros_like(late))
-    time = jnp.where(hit, known_time - late, t)
-    # Back to the event by the rate before it: of value zero, with the derivative of the time.
-    y = system.impact(unknown, record.impact, record.impact_slip, time, y - late * rate)
+    late = jnp.where(hit, delay(guard, rate, known_time, y), 0.0)
+    time = jnp.where(hit, known_time + late, t)
+    # To the event by the rate before it: a shift of value zero, with the derivative of the time.
+    y = system.impact(unknown, record.impact, record.impact_slip, time, y + late * rate)
     return time, system.with_slip(y, None, lax.stop_gradient(record.slip))

@@ -100,7 +100,10 @@ class ExplicitSteps(ProjectedSolver):
 
 
 class Plan(NamedTuple):
-    """Definition of a step; equal plans share their programs. `quality(t, y, args)`: see `quality_of`."""
+    """Definition of a step; equal plans share their programs.
+
+    `quality(t, y, args)` () changes its sign where the method fails; `guard(t, y, args)` () is negative where the motion ends.
+    """
 
     solver: type
     field: Callable
@@ -110,6 +113,7 @@ class Plan(NamedTuple):
     tree: Any
     shapes: tuple
     quality: Callable | None = None
+    guard: Callable | None = None
 
     @property
     def tableau(self) -> Any:
@@ -178,6 +182,10 @@ class Plan(NamedTuple):
     def quality_of(self, args, t, y):
         """Distance of a flat state from where the method fails, shown by a change of sign; one where it never does."""
         return jnp.ones((), y.dtype) if self.quality is None else self.quality(t, self.structure(y), args)
+
+    def guard_of(self, args, t, y):
+        """Guard of a flat state, negative where the motion ends; one where it never does."""
+        return jnp.ones((), y.dtype) if self.guard is None else self.guard(t, self.structure(y), args)
 
     def stage(self, args, t0, t1, y, c, side):
         """Step length times the vector field, at one of the `times` and from one of the `sides`."""
