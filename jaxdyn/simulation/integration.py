@@ -1,7 +1,6 @@
 """Integration from a start to the save points: the solver, the loop (our own or diffrax's), and the code at the end."""
 
 from collections.abc import Callable
-from functools import partial
 from typing import Any, NamedTuple
 
 import diffrax
@@ -18,7 +17,7 @@ from jaxdyn.simulation.solvers import ExplicitSteps, ProjectedSolver, driver
 from jaxdyn.simulation.solvers.choice import is_explicit, is_step_length, label, progress_meter, solver_and_control
 from jaxdyn.simulation.solvers.differentiable import ROOM, run, run_adaptively
 from jaxdyn.simulation.solvers.driver import ExplicitRun
-from jaxdyn.simulation.solvers.roots import delay
+from jaxdyn.simulation.solvers.guards import SEARCH_STEPS, delay
 from jaxdyn.simulation.solvers.step_control import Adaptive, ErrorMonitoredSteps, too_coarse
 
 
@@ -57,16 +56,16 @@ def integrate(term, project, eqs: Equations, args, method, y0, ts, steps, option
     if eqs.pieces.names and not of_kinks:
         system = PiecewiseSystem(explicit.plan(y0), eqs.pieces, eqs.switching)
         return _by_pieces(system, inputs, controller, steps, options)
-    plan = explicit.plan(y0)._replace(quality=monitors.quality, guard=monitors.guard)
+    plan = explicit.plan(y0)._replace(quality=monitors.quality, guards=monitors.guards)
     run = _explicit_run(plan, explicit, controller, steps, options)
     return _by_steps(run, inputs, _is_direct(adjoint))
 
 
 class Monitors(NamedTuple):
-    """Functions (t, y, args) that end a run: the quality of a basis where it changes its sign, a guard where it is negative."""
+    """Functions (t, y, args) that end a run: the quality of a basis where it changes its sign, guards where one is negative."""
 
     quality: Callable | None = None
-    guard: Callable | None = None
+    guards: Callable | None = None
 
 
 def _monitors(eqs: Equations, method) -> Monitors:
@@ -75,9 +74,7 @@ def _monitors(eqs: Equations, method) -> Monitors:
         value = eqs.quality(t, y, args)
         return jnp.where(is_regular(value), value, jnp.zeros_like(value))
 
-    return Monitors(
-        quality if isinstance(method, Reduced) else None, eqs.least_allowance if any(eqs.conditions) else None
-    )
+    return Monitors(quality if isinstance(method, Reduced) else None, eqs.guards if any(eqs.conditions) else None)
 
 
 def _reason_for_diffrax(solver, controller, adjoint, options) -> str | None:
@@ -94,7 +91,7 @@ def _reason_for_diffrax(solver, controller, adjoint, options) -> str | None:
 
 def _reason_for_crossing(monitors: Monitors) -> str | None:
     """Reason why explicit steps go across the kinks of forces instead of ending there, or None."""
-    if monitors.guard is not None:
+    if monitors.guards is not None:
         return "contacts, limits or the control may end the run; pass contacts='report' and limits=None"
     return None if monitors.quality is None else "method is 'reduced'; take 'projected'"
 
@@ -144,13 +141,14 @@ def _by_diffrax(term, solver, controller, monitors: Monitors, dt0, inputs, steps
     before = ts[0] + (counts["num_steps"].astype(ts.dtype) - 1) * steps[-1]
     result = from_diffrax(result)
     reached = jnp.where(result == RESULTS.nonlinear_divergence, before, reached)
-    return Outcome(rows, _report_coarse(result, sums), counts, reached, *last)
+    return Outcome(rows, _of_fixed_steps(result, sums), counts, reached, *last)
 
 
-def _report_coarse(result, sums):
-    """Code of a run, with that for fixed steps that were too long by their `sums`, if there are any."""
+def _of_fixed_steps(result, sums):
+    """Code of a run, with those of fixed steps if there are their `sums`: too long, or short of what is not finite."""
     if sums is None:
         return result
+    result = RESULTS.where(result == RESULTS.dt_min_reached, RESULTS.nonfinite_state, result)
     return RESULTS.where((result == RESULTS.successful) & too_coarse(sums), RESULTS.coarse_steps, result)
 
 
@@ -164,28 +162,27 @@ def _by_pieces(system, inputs, controller, steps, options) -> Outcome:
     rows, (result, counts, reached), sums = piecewise_motion(
         system, *inputs, rtol, atol, stepsize, options["max_steps"], room, most, _is_direct(options["adjoint"])
     )
-    # Forces that drive the motion onto their jump from both sides; fixed steps end short of what is not finite.
+    # Forces that drive the motion onto their jump from both sides.
     result = from_diffrax(result)
     result = RESULTS.where(result == RESULTS.event_occurred, RESULTS.too_many_events, result)
-    if has_length:
-        result = RESULTS.where(result == RESULTS.dt_min_reached, RESULTS.nonfinite_state, result)
-    return Outcome(rows, _report_coarse(result, sums), counts, reached)
+    return Outcome(rows, _of_fixed_steps(result, sums), counts, reached)
 
 
 def _by_steps(run: ExplicitRun, inputs, is_direct: bool) -> Outcome:
     """Integrate by explicit steps in the library's own loop."""
     rows, end, (result, counts, reached), sums = (run.direct if is_direct else run)(*inputs)
-    plan, result = run.plan, _report_coarse(from_diffrax(result), sums)
-    if plan.guard is None:
+    plan, result = run.plan, _of_fixed_steps(from_diffrax(result), sums)
+    if plan.guards is None:
         return Outcome(rows, result, counts, reached)
     args, y = inputs[1], ravel_pytree(end)[0]
-    late = delay(partial(plan.guard_of, args), plan.field_of(args, reached, y), reached, y)
+    late = delay(lambda t, y: jnp.min(plan.guards_of(args, t, y)[0]), plan.field_of(args, reached, y), reached, y)
     return Outcome(rows, result, counts, reached + jnp.where(result == RESULTS.event_occurred, late, 0.0), end)
 
 
 def _explicit_run(plan, solver: ExplicitSteps, controller, steps, options) -> ExplicitRun:
     """Integrator of the library's own loop."""
-    order, most = solver.error_order(None), options["max_steps"]
+    # Attempts that locate the end do not count among the user's steps.
+    order, most = solver.error_order(None), options["max_steps"] + (0 if plan.guards is None else 2 * SEARCH_STEPS)
     if isinstance(controller, Adaptive):
         room = most if options["limit_is_given"] else min(most, ROOM)
         control = driver.AdaptiveSteps(order, controller.norm)

@@ -113,14 +113,15 @@ def first_violation(rows: Float[Array, "nt k"], reached, ts, within) -> Violatio
 
 
 def event(monitors, t0, y0, args) -> diffrax.Event | None:
-    """Event of a run in diffrax's loop; `monitors`: its quality and guard."""
-    quality, guard = monitors
-    if guard is None:
+    """Event of a run in diffrax's loop; `monitors`: its quality and guards."""
+    quality, guards = monitors
+    if guards is None:
         return None if quality is None else diffrax.Event(quality)
     start = None if quality is None else quality(t0, y0, args)
 
     def condition(t, y, args, **_):
-        least = guard(t, y, args)
+        # One event for all conditions: the first one that is violated ends the run.
+        least = jnp.min(guards(t, y, args)[0])
         if quality is not None:
             # A run has one event: a basis that has become singular counts as a violation, whatever the allowances.
             least = jnp.where(quality(t, y, args) * start > 0, least, -jnp.ones_like(least))

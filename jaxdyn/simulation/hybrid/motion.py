@@ -130,7 +130,7 @@ def hybrid_motion(scene: Scene, control, numbers, options) -> Solution:
     return Solution(ts=inputs.given, result=result, stats=stats, events=events, solver=label(options["solver"]), **rows)
 
 
-def _cases(end: event_loop.RunState, last, is_fixed_length: bool) -> list[tuple[Array, Any]]:
+def _cases(end: event_loop.RunEnd, last, is_fixed_length: bool) -> list[tuple[Array, Any]]:
     """Cases of the result from the state at the end of a run to the time `last`."""
     codes: Any = RESULTS
     names = _CODES | ({event_loop.SHORT: "nonfinite_state"} if is_fixed_length else {})

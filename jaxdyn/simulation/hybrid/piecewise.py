@@ -16,6 +16,7 @@ from jaxdyn.simulation.hybrid.system import HybridSystem
 from jaxdyn.simulation.hybrid.transitions import Transition
 from jaxdyn.simulation.solvers.driver import step_counts
 from jaxdyn.simulation.solvers.explicit import Plan
+from jaxdyn.simulation.solvers.guards import SEARCH_STEPS
 
 MIN_EVENTS = 256  # events that derivatives go through, at least
 
@@ -29,7 +30,8 @@ class PiecewiseSystem(HybridSystem):
 
     def __init__(self, plan: Plan, pieces: Pieces, switching: Callable):
         self.elements, self._plan, self._switching = Elements((), 0, 0, pieces), plan, switching
-        self.plan = plan._replace(field=self._field, project=None if plan.project is None else self._project)
+        project = None if plan.project is None else self._project
+        self.plan = plan._replace(field=self._field, project=project, guards=self.guards)
 
     def _field(self, t, y, args):
         return self._plan.field(t, y, (*args[0], args[1].positive))
@@ -38,8 +40,8 @@ class PiecewiseSystem(HybridSystem):
         project: Any = self._plan.project
         return project(t, y, error, (*args[0], args[1].positive))
 
-    def guards(self, args, t, y):
-        values, levels = self._switching(t, self.plan.structure(y), (*args[0], args[1].positive))
+    def guards(self, t, y, args):
+        values, levels = self._switching(t, y, (*args[0], args[1].positive))
         return jnp.where(args[1].positive, values, -values), levels
 
     def reset(self, unknown, t, y, mode, slip, hit):
@@ -69,11 +71,11 @@ def piecewise_motion(
     unknown, flat = tuple(args or ()), ravel_pytree(y0)[0]
     none = jnp.zeros((0,), bool)
     mode = Mode(none, none, none, jnp.ones((system.elements.switches,), bool))
-    values, _ = system.guards((unknown, mode), ts[0], flat)
+    values, _ = system.guards(ts[0], y0, (unknown, mode))
     rtol, atol = (jnp.asarray(x, flat.dtype) for x in (rtol, atol))
     mode = lax.stop_gradient(mode._replace(positive=values > 0))
     # Attempts that locate events do not count among the user's steps, so that there is room for both.
-    run = HybridRun(system, mode, rtol, atol, stepsize, max_steps + event_loop.SEARCH_STEPS * most, most, room=room)
+    run = HybridRun(system, mode, rtol, atol, stepsize, max_steps + SEARCH_STEPS * most, most, room=room)
     rows, _, (end, _, _) = (run.direct if is_direct else run)(y0, unknown, ts)
     codes: Any = diffrax.RESULTS
     result = codes.where(end.t < ts[-1], codes.max_steps_reached, codes.successful)

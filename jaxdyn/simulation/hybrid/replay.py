@@ -15,19 +15,17 @@ from typing import Any
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-import optimistix
 from jax import lax
 from jax.flatten_util import ravel_pytree
 
 from jaxdyn.compile.batch import cond
-from jaxdyn.simulation.hybrid.event_loop import FINE, guard_values, run_events
+from jaxdyn.simulation.hybrid.event_loop import FINE, guards_at, run_events
 from jaxdyn.simulation.hybrid.modes import Mode
 from jaxdyn.simulation.hybrid.records import Records
 from jaxdyn.simulation.hybrid.system import HybridSystem
-from jaxdyn.simulation.solvers import driver
 from jaxdyn.simulation.solvers.driver import ExplicitRun
+from jaxdyn.simulation.solvers.guards import delay
 from jaxdyn.simulation.solvers.integrator import Integrator, zeros_or
-from jaxdyn.simulation.solvers.roots import delay
 
 
 class HybridRun(Integrator):
@@ -67,15 +65,14 @@ class HybridRun(Integrator):
 def _replay(run: HybridRun, inputs, end, records, begun, direct: bool):
     """Rows at ts[1:] and times of events by replay in the modes that are known; `direct`: differentiable in both modes."""
     system, (y0, unknown, ts) = run.system, inputs
-    plan, saves, most = system.plan, ts.shape[0] - 1, run.most
+    plan, saves, most = system.plan._replace(guards=None), ts.shape[0] - 1, run.most
     happened = records.name[:most] >= 0
     known_times = jnp.concatenate([ts[1:], jnp.where(happened, records.time[:most], jnp.inf)])
     is_event = jnp.arange(saves + most) >= saves
     order = jnp.lexsort((is_event, lax.stop_gradient(known_times)))  # a save point at an event is before it
-    control: Any = driver.AdaptiveSteps(system.error_order, optimistix.rms_norm)
-    if run.stepsize is not None:
-        control = driver.FixedSteps(system.order, system.error_order)
-    part_run = ExplicitRun(plan, control, run.rtol, run.atol, run.stepsize, run.max_steps, room=run.room)
+    part_run = ExplicitRun(
+        plan, system.control(run.stepsize), run.rtol, run.atol, run.stepsize, run.max_steps, room=run.room
+    )
     last = lax.stop_gradient(end.t)
 
     def part_or_none(carry, at):
@@ -119,7 +116,7 @@ def _cross(system: HybridSystem, unknown, mode: Mode, record: Records, t, known_
     hit, which = record.trigger >= 0, jnp.maximum(record.trigger, 0)
 
     def guard(t, y):
-        return guard_values(system, (unknown, mode), t, y)[0].reshape(-1)[which]
+        return guards_at(system.plan, (unknown, mode), t, y)[0][which]
 
     rate = lax.stop_gradient(system.plan.field_of((unknown, mode), known_time, y))
     late = jnp.where(hit, delay(guard, rate, known_time, y), 0.0)

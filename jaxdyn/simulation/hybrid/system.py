@@ -11,6 +11,7 @@ from typing import Any
 import diffrax
 import jax
 import jax.numpy as jnp
+import optimistix
 from jax.flatten_util import ravel_pytree
 
 from jaxdyn.compile import kernel
@@ -30,8 +31,9 @@ from jaxdyn.simulation.hybrid.dynamics import (
     solve_rows,
     terms_at,
 )
-from jaxdyn.simulation.hybrid.modes import Elements, Mode, extend, force_at
+from jaxdyn.simulation.hybrid.modes import CHANNELS, Elements, Mode, extend, force_at
 from jaxdyn.simulation.hybrid.transitions import ContactState, Impact, Transition, align, first_guess, next_mode
+from jaxdyn.simulation.solvers.driver import AdaptiveSteps, FixedSteps
 from jaxdyn.simulation.solvers.explicit import Plan
 from jaxdyn.systems.scene import Scene
 from jaxdyn.systems.system import displace, rate_to_velocity, retract, velocity_to_rate
@@ -49,17 +51,18 @@ class HybridSystem:
     elements: Elements
 
     @property
-    def order(self) -> Any:
-        """Order of the method."""
-        return self.plan.solver().order(None)
+    def count(self) -> int:
+        """Number of guards."""
+        return CHANNELS * len(self.elements.each) + self.elements.switches
 
-    @property
-    def error_order(self) -> Any:
-        """Order of the error estimate."""
-        return self.plan.solver().error_order(None)
+    def control(self, stepsize) -> AdaptiveSteps | FixedSteps:
+        """Control of steps of this length, or of adaptive ones for None."""
+        method: Any = self.plan.solver()
+        order = method.error_order(None)
+        return AdaptiveSteps(order, optimistix.rms_norm) if stepsize is None else FixedSteps(method.order(None), order)
 
     @abstractmethod
-    def guards(self, args, t, y) -> tuple:
+    def guards(self, t, y, args) -> tuple:
         """Guards and their rounding levels: those of the elements by CHANNELS, then those of the switching functions."""
 
     @abstractmethod
@@ -90,7 +93,8 @@ class ModalSystem(HybridSystem):
         leaves, tree = jax.tree.flatten(y0)
         shapes = tuple(x.shape for x in leaves)
         self._bind, self.elements = bind, elements
-        self.plan = Plan(type(solver), jax.jit(self._field), self._project, ("slip",), False, tree, shapes)
+        plan = Plan(type(solver), jax.jit(self._field), self._project, ("slip",), False, tree, shapes)
+        self.plan = plan._replace(guards=self.guards)
 
     def _motion(self, args, t, y):
         unknown, mode = args
@@ -115,8 +119,8 @@ class ModalSystem(HybridSystem):
         values, levels = values_and_levels(lambda q, v: switching(q, v, t), q, v)
         return jnp.where(positive, values, -values), levels
 
-    def guards(self, args, t, y):
-        y, mode = self.plan.structure(y), args[1]
+    def guards(self, t, y, args):
+        mode = args[1]
         scene, q, v, terms, motion = self._motion(args, t, y)
         state = _contact_state(scene, self.elements, mode, terms, motion, y["slip"], q, v, t)
         values, levels = self._switches(args[0], mode.positive, q, v, t)

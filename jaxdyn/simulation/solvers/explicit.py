@@ -102,7 +102,8 @@ class ExplicitSteps(ProjectedSolver):
 class Plan(NamedTuple):
     """Definition of a step; equal plans share their programs.
 
-    `quality(t, y, args)` () changes its sign where the method fails; `guard(t, y, args)` () is negative where the motion ends.
+    `quality(t, y, args)` () changes its sign where the method fails; `guards(t, y, args)` -> values and levels of rounding (k,),
+    of which one is negative where the motion or its mode ends.
     """
 
     solver: type
@@ -113,7 +114,7 @@ class Plan(NamedTuple):
     tree: Any
     shapes: tuple
     quality: Callable | None = None
-    guard: Callable | None = None
+    guards: Callable | None = None
 
     @property
     def tableau(self) -> Any:
@@ -183,9 +184,10 @@ class Plan(NamedTuple):
         """Distance of a flat state from where the method fails, shown by a change of sign; one where it never does."""
         return jnp.ones((), y.dtype) if self.quality is None else self.quality(t, self.structure(y), args)
 
-    def guard_of(self, args, t, y):
-        """Guard of a flat state, negative where the motion ends; one where it never does."""
-        return jnp.ones((), y.dtype) if self.guard is None else self.guard(t, self.structure(y), args)
+    def guards_of(self, args, t, y):
+        """Guards of a flat state and their levels of rounding; none where the motion does not end."""
+        none = jnp.zeros((0,), y.dtype)
+        return (none, none) if self.guards is None else self.guards(t, self.structure(y), args)
 
     def stage(self, args, t0, t1, y, c, side):
         """Step length times the vector field, at one of the `times` and from one of the `sides`."""
