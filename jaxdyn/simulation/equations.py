@@ -189,5 +189,6 @@ class Equations:
 
     def _guards(self, t, y, args):
         scene, _, method = self.unpack(args, y)
-        values = self.allowances(args, y, *method.to_qv(scene, y, t), t)
+        q, v = method.to_qv(scene, y, t)
+        values = self.allowances(args, y, q, v, t)
         return values, jnp.zeros_like(values)  # allowances have the rounding in them

@@ -112,9 +112,8 @@ def first_violation(rows: Float[Array, "nt k"], reached, ts, within) -> Violatio
     return violation._replace(entry=jnp.where(violation.happened, violation.entry, -1))
 
 
-def event(monitors, t0, y0, args) -> diffrax.Event | None:
-    """Event of a run in diffrax's loop; `monitors`: its quality and guards."""
-    quality, guards = monitors
+def event(quality, guards, t0, y0, args) -> diffrax.Event | None:
+    """Event of a run in diffrax's loop, from the quality (t, y, args) of a basis and the guards, each a function or None."""
     if guards is None:
         return None if quality is None else diffrax.Event(quality)
     start = None if quality is None else quality(t0, y0, args)

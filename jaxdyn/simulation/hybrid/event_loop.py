@@ -4,22 +4,23 @@ Every trajectory of a batch steps to its own event; then all of them pass theirs
 next step ends where the cut one would have ended.
 """
 
-from typing import NamedTuple
+from functools import partial
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
 from jaxtyping import Array
 
 from jaxdyn.compile import kernel
-from jaxdyn.compile.batch import while_loop
+from jaxdyn.compile.batch import cond, while_loop
 from jaxdyn.compile.loops import Carry, Given
+from jaxdyn.constraints.codes import RESULTS, first_of
 from jaxdyn.simulation.hybrid.modes import Mode
 from jaxdyn.simulation.hybrid.records import Records, chatters, no_records, record_elements, record_switches
 from jaxdyn.simulation.hybrid.system import HybridSystem
+from jaxdyn.simulation.hybrid.transitions import Transition
 from jaxdyn.simulation.solvers import driver
 from jaxdyn.simulation.solvers.explicit import Plan
-
-FINE, SHORT, PARADOX, NO_MODE, CROWDED = range(5)
 
 
 class RunState(NamedTuple):
@@ -29,18 +30,16 @@ class RunState(NamedTuple):
     mode: Mode
     records: Records
     count: Array  # events
-    code: Array
+    result: Any  # of the mode
 
 
 class RunEnd(NamedTuple):
-    """End of a run: time, steps tried and accepted, a code, the number of events, and sums about steps of fixed length."""
+    """End of a run: its result, counts of steps, the time, and the number of events."""
 
+    result: Any
+    counts: dict[str, Array]
     t: Array
-    tried: Array
-    accepted: Array
-    code: Array
     count: Array
-    sums: tuple[Array, Array]
 
 
 @kernel(static=1)
@@ -72,35 +71,39 @@ def run_events(system: HybridSystem, unknown, ts, y0, mode, rtol, atol, stepsize
     if stepsize is not None:
         # One grid for the whole run: steps that an event has cut return to it.
         stepsize = (ts[-1] - ts[0]) / driver.number_of_steps(ts[0], ts[-1], stepsize).astype(ts.dtype)
-    control = system.control(stepsize)
-    limits, state = driver.begin(plan, control, (unknown, begun.mode), ts, y, rtol, atol, stepsize)
-    code = jnp.where(begun.paradox, PARADOX, jnp.where(begun.settled, FINE, NO_MODE)).astype(jnp.int32)
+    control = driver.step_control(plan.solver(), stepsize)
+    limits, steps = driver.begin(plan, control, (unknown, begun.mode), ts, y, rtol, atol, stepsize)
+    result = first_of(_cases(begun), RESULTS.successful)
     # A mode that has begun holds, whatever the rounding of its guards.
-    state = state._replace(search=state.search._replace(hit=hit), stopped=code != FINE)
-    none = jnp.zeros((), jnp.int32)
+    search = steps.state.search._replace(hit=hit)
+    steps = steps._replace(state=steps.state._replace(search=search, stopped=result != RESULTS.successful))
 
-    def go_on(run: RunState) -> RunState:
-        args = unknown, run.mode
-        return run._replace(steps=driver.run_to_event(plan, control, max_steps, (), args, limits, Given(ts), run.steps))
-
-    def is_at_event(run: RunState):
-        return run.steps.state.search.hit.any() & ~run.steps.state.stopped
+    def is_running(run: RunState):
+        return driver.is_active(max_steps, limits, run.steps.state._replace(search=None))
 
     def body(run: RunState) -> RunState:
-        return go_on(_pass_event(system, unknown, run, most, stepsize is not None))
+        happens = run.steps.state.search.hit.any()
+        pass_event = partial(_pass_event, system, unknown, most, stepsize is not None)
+        run = cond(happens, pass_event, lambda run: run, run)
+        steps = driver.run_to_event(plan, control, max_steps, (), (unknown, run.mode), limits, Given(ts), run.steps)
+        return run._replace(steps=steps)
 
-    steps = Carry(state, none, driver.blank_rows(y, ts))
-    run = go_on(RunState(steps, begun.mode, no_records(elements, y0.dtype, most), none, code))
-    run = while_loop(is_at_event, body, run)
+    run = RunState(steps, begun.mode, no_records(elements, y0.dtype, most), jnp.zeros((), jnp.int32), result)
+    run = while_loop(is_running, body, run)
     state = run.steps.state
     # Friction that leaves no forces grows without bound before.
     pivot = jnp.min(elements.split(state.search.values)[0][:, 2], initial=1.0) < 0.05
-    code = jnp.where(state.failed, jnp.where(pivot, PARADOX, SHORT), run.code).astype(jnp.int32)
-    end = RunEnd(state.t, state.tried, state.accepted, code, run.count, state.sums)
-    return run.steps.rows, end, run.records, begun
+    cases = [(state.failed & pivot, RESULTS.painleve_paradox), *driver.cases_of(limits, control, state)]
+    of_mode = run.result != RESULTS.successful
+    result = RESULTS.where(of_mode, run.result, first_of(cases, RESULTS.successful))
+    return run.steps.rows, RunEnd(result, state.counts, state.t, run.count), run.records, begun
 
 
-def _pass_event(system: HybridSystem, unknown, run: RunState, most: int, is_fixed_length: bool) -> RunState:
+def _cases(change: Transition) -> list[tuple[Array, Any]]:
+    return [(change.paradox, RESULTS.painleve_paradox), (~change.settled, RESULTS.no_contact_mode)]
+
+
+def _pass_event(system: HybridSystem, unknown, most: int, is_fixed_length: bool, run: RunState) -> RunState:
     """State in the mode behind an event, and the records with it; unchanged where there is none."""
     elements, before, state, records = system.elements, run.mode, run.steps.state, run.records
     hit, search = state.search.hit, state.search
@@ -118,23 +121,25 @@ def _pass_event(system: HybridSystem, unknown, run: RunState, most: int, is_fixe
         )
     if elements.each:
         rows, count = record_elements(elements, state.t, before, change, by_element, happens, rows, count, most)
-    crowded = count > most
-    code = jnp.where(change.settled, FINE, NO_MODE)
     # With switching functions alone, a motion without room for its events continues: it loses its derivatives.
-    code = jnp.where(crowded & bool(elements.each), CROWDED, code)
-    # Last, because it is the reason why no mode was found.
-    code = jnp.where(change.paradox | lost, PARADOX, code)
-    loose = search.loose
+    crowded, loose = (count > most) & bool(elements.each), search.loose
     if elements.switches:
         is_chatter = chatters(elements, state.t, search.usual, run.count, records, switched, most) & ~loose
         # Steps of fixed length go across the zero from then on.
         begins = is_chatter & bool(is_fixed_length and not elements.each)
-        code = jnp.where(is_chatter & ~begins, CROWDED, code)
+        crowded = crowded | (is_chatter & ~begins)
         # More events than there is room for: the replay then gives NaN for derivatives, which this motion lacks.
         count = jnp.where(begins, most + 1, count)
         loose = loose | begins
-    code = code.astype(jnp.int32)
+    # First, because it is the reason why no mode was found.
+    cases = [
+        (lost, RESULTS.painleve_paradox),
+        *_cases(change)[:1],
+        (crowded, RESULTS.too_many_events),
+        *_cases(change)[1:],
+    ]
+    result = first_of(cases, RESULTS.successful)
     search = search._replace(values=guards, hit=jnp.zeros_like(hit), loose=loose)
-    state = state._replace(y=y, rate=rate, search=search, stopped=code != FINE)
-    after = RunState(run.steps._replace(state=state), mode, rows, count, code)
+    state = state._replace(y=y, rate=rate, search=search, stopped=result != RESULTS.successful)
+    after = RunState(run.steps._replace(state=state), mode, rows, count, result)
     return jax.tree.map(lambda a, b: jnp.where(happens, a, b), after, run)

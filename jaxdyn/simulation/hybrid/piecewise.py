@@ -3,18 +3,15 @@
 from collections.abc import Callable
 from typing import Any
 
-import diffrax
 import jax.numpy as jnp
 from jax import lax
 from jax.flatten_util import ravel_pytree
 
 from jaxdyn.forces.piecewise import Pieces
-from jaxdyn.simulation.hybrid import event_loop
 from jaxdyn.simulation.hybrid.modes import Elements, Mode
 from jaxdyn.simulation.hybrid.replay import HybridRun
 from jaxdyn.simulation.hybrid.system import HybridSystem
 from jaxdyn.simulation.hybrid.transitions import Transition
-from jaxdyn.simulation.solvers.driver import step_counts
 from jaxdyn.simulation.solvers.explicit import Plan
 from jaxdyn.simulation.solvers.guards import SEARCH_STEPS
 
@@ -62,7 +59,7 @@ class PiecewiseSystem(HybridSystem):
 def piecewise_motion(
     system: PiecewiseSystem, y0, args, ts, rtol, atol, stepsize, max_steps: int, room: int, most: int, is_direct: bool
 ):
-    """Rows of the state at ts[1:]; diffrax's result, counts and the time reached; sums about fixed steps, or None.
+    """Rows of the state at ts[1:], and the end of the run.
 
     **Arguments:** `args` of the equations; `stepsize` (s), or None for adaptive steps; `max_steps`, without those that locate
     events; `room` for steps between two events or save points in reverse mode; `most`, the number of events that derivatives go
@@ -77,8 +74,4 @@ def piecewise_motion(
     # Attempts that locate events do not count among the user's steps, so that there is room for both.
     run = HybridRun(system, mode, rtol, atol, stepsize, max_steps + SEARCH_STEPS * most, most, room=room)
     rows, _, (end, _, _) = (run.direct if is_direct else run)(y0, unknown, ts)
-    codes: Any = diffrax.RESULTS
-    result = codes.where(end.t < ts[-1], codes.max_steps_reached, codes.successful)
-    result = codes.where(end.code == event_loop.SHORT, codes.dt_min_reached, result)
-    result = codes.where(end.code == event_loop.CROWDED, codes.event_occurred, result)
-    return rows, (result, step_counts(end.tried, end.accepted), end.t), None if stepsize is None else end.sums
+    return rows, end

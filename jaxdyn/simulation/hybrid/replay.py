@@ -19,11 +19,13 @@ from jax import lax
 from jax.flatten_util import ravel_pytree
 
 from jaxdyn.compile.batch import cond
-from jaxdyn.simulation.hybrid.event_loop import FINE, guards_at, run_events
+from jaxdyn.constraints.codes import RESULTS
+from jaxdyn.simulation.hybrid.event_loop import guards_at, run_events
 from jaxdyn.simulation.hybrid.modes import Mode
 from jaxdyn.simulation.hybrid.records import Records
 from jaxdyn.simulation.hybrid.system import HybridSystem
-from jaxdyn.simulation.solvers.driver import ExplicitRun
+from jaxdyn.simulation.solvers.driver import step_control
+from jaxdyn.simulation.solvers.explicit_run import ExplicitRun
 from jaxdyn.simulation.solvers.guards import delay
 from jaxdyn.simulation.solvers.integrator import Integrator, zeros_or
 
@@ -71,7 +73,7 @@ def _replay(run: HybridRun, inputs, end, records, begun, direct: bool):
     is_event = jnp.arange(saves + most) >= saves
     order = jnp.lexsort((is_event, lax.stop_gradient(known_times)))  # a save point at an event is before it
     part_run = ExplicitRun(
-        plan, system.control(run.stepsize), run.rtol, run.atol, run.stepsize, run.max_steps, room=run.room
+        plan, step_control(plan.solver(), run.stepsize), run.rtol, run.atol, run.stepsize, run.max_steps, room=run.room
     )
     last = lax.stop_gradient(end.t)
 
@@ -107,7 +109,9 @@ def _replay(run: HybridRun, inputs, end, records, begun, direct: bool):
     # The inverse permutation: save points first, then events.
     back = jnp.argsort(order)
     # A motion that continued beyond the events that there was room for has no derivative here.
-    rows = rows * jnp.where((end.count > most) & (end.code == FINE), jnp.nan, 1.0).astype(rows.dtype)
+    rows = rows * jnp.where((end.count > most) & (end.result != RESULTS.too_many_events), jnp.nan, 1.0).astype(
+        rows.dtype
+    )
     return jax.vmap(plan.structure)(rows[back[:saves]]), times[back[saves:]]
 
 

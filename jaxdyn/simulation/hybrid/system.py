@@ -11,7 +11,6 @@ from typing import Any
 import diffrax
 import jax
 import jax.numpy as jnp
-import optimistix
 from jax.flatten_util import ravel_pytree
 
 from jaxdyn.compile import kernel
@@ -33,7 +32,6 @@ from jaxdyn.simulation.hybrid.dynamics import (
 )
 from jaxdyn.simulation.hybrid.modes import CHANNELS, Elements, Mode, extend, force_at
 from jaxdyn.simulation.hybrid.transitions import ContactState, Impact, Transition, align, first_guess, next_mode
-from jaxdyn.simulation.solvers.driver import AdaptiveSteps, FixedSteps
 from jaxdyn.simulation.solvers.explicit import Plan
 from jaxdyn.systems.scene import Scene
 from jaxdyn.systems.system import displace, rate_to_velocity, retract, velocity_to_rate
@@ -54,12 +52,6 @@ class HybridSystem:
     def count(self) -> int:
         """Number of guards."""
         return CHANNELS * len(self.elements.each) + self.elements.switches
-
-    def control(self, stepsize) -> AdaptiveSteps | FixedSteps:
-        """Control of steps of this length, or of adaptive ones for None."""
-        method: Any = self.plan.solver()
-        order = method.error_order(None)
-        return AdaptiveSteps(order, optimistix.rms_norm) if stepsize is None else FixedSteps(method.order(None), order)
 
     @abstractmethod
     def guards(self, t, y, args) -> tuple:

@@ -82,21 +82,10 @@ class Search(NamedTuple):
         )
 
 
-class Found(NamedTuple):
-    """Search after an attempt, and what it says of it: whether the step is kept, and whether it ends at an event.
-
-    `is_open`: true if the search continues, with the length `following`.
-    """
-
-    search: Search
-    kept: Array
-    located: Array
-    is_open: Array
-    following: Array
-
-
-def search_root(search: Search, t0, t1, at_end, in_middle, good, usual) -> Found:
+def search_root(search: Search, t0, t1, at_end, in_middle, good, usual) -> tuple[Search, Array, Array, Array]:
     """Narrow the bracket of an event by an attempt whose error is `good`, or begin one.
+
+    **Returns:** the search; whether the step is kept, and whether it ends at an event; the length of the next attempt.
 
     **Arguments:** `at_end`, `in_middle`: guards and their levels (k,); `usual`: length of the next step without event.
     """
@@ -126,7 +115,7 @@ def search_root(search: Search, t0, t1, at_end, in_middle, good, usual) -> Found
     is_known = (jnp.abs(value) <= 64 * eps) | (is_narrow & (violated | (width <= 0)))
     # A zero in the middle is not at the end of this step, which is where a step can be cut.
     located = locating & is_known & ~inside
-    kept, is_open = good & ((~violated & ~search.locating) | located), locating & ~located
+    kept = good & ((~violated & ~search.locating) | located)
     real = located & (value <= eps**_REAL)
     hit = real & ((values <= eps**_SIMULTANEOUS * scale) & (scale > 4 * level) | (values / scale <= value))
     # Attempts that locate an event are short for its sake: they say nothing about the usual length.
@@ -134,12 +123,12 @@ def search_root(search: Search, t0, t1, at_end, in_middle, good, usual) -> Found
     after = search._replace(
         values=jnp.where(kept, values, search.values),
         hit=hit | (crosses & (values < -levels)),
-        locating=is_open,
+        locating=locating & ~located,
         bracket=bracket,
         scale=scale,
         usual=jnp.where(search.locating & good, search.usual, usual),
     )
-    return Found(after, kept, located, is_open, bracket.next(is_narrow))
+    return after, kept, located, bracket.next(is_narrow)
 
 
 def delay(guard, rate, t, y) -> Any:

@@ -88,8 +88,8 @@ class Adaptive(diffrax.AbstractAdaptiveStepSizeController):
     def adapt_step_size(self, t0, t1, y0: Any, y1_candidate, args, y_error, error_order: Any, controller_state):
         """Accept or refuse a step, and choose the next one."""
         # Steps are constants to derivatives.
-        ends = jax.lax.stop_gradient((y0, y1_candidate, y_error, self.rtol, self.atol))
-        size, length = error_size(self.norm, *ends), jnp.asarray(t1 - t0)
+        given = jax.lax.stop_gradient((y0, y1_candidate, y_error, self.rtol, self.atol))
+        size, length = error_size(self.norm, *given), jnp.asarray(t1 - t0)
         least = jnp.asarray(least_step(t0, jnp.asarray(self.least)), length.dtype)
         kept, length, at_least, failed = next_step(size, error_order, length, controller_state, least)
         start = jnp.where(kept, t1, t0)
