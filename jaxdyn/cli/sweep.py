@@ -42,7 +42,6 @@ study.toml:
   points = 11                 rows of each rollout
   outputs = ["energy"]        as in jd.simulate
   rows = true                 false: result codes and reductions only; or a list of names
-  cost = "mass"               a parameter that grows with the run time of a rollout
 
   [parameters]                drawn for each rollout; arguments of a scene of jd.scenes and of its start;
                               for a .urdf: q0 and v0, displacements from neutral (size is nv)
@@ -79,7 +78,6 @@ _KEYS: dict[str, tuple[type, ...]] = {
     "points": (int,),
     "outputs": (list,),
     "rows": (bool, list),
-    "cost": (str,),
     "parameters": (dict,),
     "options": (dict,),
     "reductions": (dict,),
@@ -126,9 +124,6 @@ def run(args: argparse.Namespace) -> int:
     draw = make_draw(parameters)
     scene, states = _scene(_require(study, path, "scene"), path, tuple(parameters))
     ts = np.linspace(0.0, duration, points)
-    cost = study.get("cost")
-    if cost is not None and cost not in parameters:
-        raise ValueError(f"{path}: cost is {cost!r}; name one of the parameters {', '.join(parameters)}")
     watch = Stopwatch()
     with connect(args) as client:
         result = scale.run(
@@ -142,8 +137,6 @@ def run(args: argparse.Namespace) -> int:
             outputs=tuple(study.get("outputs", ())),
             rows=study.get("rows", True),
             reductions={name: _reduction(name, one) for name, one in study.get("reductions", {}).items()},
-            # A parameter may have several entries; the cost is one number.
-            cost=None if cost is None else lambda p: jnp.sum(p[cost]),
             units={name: one["units"] for name, one in parameters.items() if isinstance(one, dict) and "units" in one},
             client=client,
             chunk=args.chunk,

@@ -6,31 +6,25 @@ import sys
 import time
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
-from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 import jax
 import numpy as np
 
-from jaxdyn.model.arguments import Numbers, as_array, as_path
+from jaxdyn.model.arguments import as_path
 from jaxdyn.scale.description import Description
 from jaxdyn.scale.lock import lock_store
 from jaxdyn.scale.members import Members
 from jaxdyn.scale.reducer import Reducer, Totals
 from jaxdyn.scale.reductions import Arrays, check_reductions, describe_reductions
 from jaxdyn.scale.store import Store, check_place, zarr_package
-from jaxdyn.scale.study import LISTED, SORTED_BATCHES, Facts, Pipeline, Study, local_devices
-from jaxdyn.tasks import Cluster, Engine, Failure, package_versions
+from jaxdyn.scale.study import LISTED, Facts, Study, local_devices
+from jaxdyn.tasks import Cluster, Engine, Failure, Local, package_versions
 
 if TYPE_CHECKING:
     import xarray
 
-    Cost = Callable[[Any], Any] | Numbers | str | None
-else:
-    Cost = Any  # `_cost_of` checks it
-
-MEASURED = "measured"  # a cost that is found by simulating
 SECONDS = 2.0  # of computing per chunk, if it may be so large
 BYTES = 2**25  # of rows in a chunk
 SHARES = 8  # chunks per worker at least, so that all end at about the same time
@@ -48,8 +42,7 @@ class Run:
     - `reductions`: the arrays of each reduction, by its name and theirs.
     - `computed`: rollouts computed in this call; `seconds`, of the loop, without compilation. `repaired`: chunks
       of earlier calls that were damaged and were computed again. `batch_size`: rollouts at once; `program_bytes`: memory of their
-      program and its results, by XLA's account. `waiting`: steps that batches computed, until their slowest rollouts were done,
-      over those that the rollouts needed, in this call; 1 without any loss, NaN where no steps are counted.
+      program and its results, by XLA's account.
     """
 
     out: Path
@@ -63,7 +56,6 @@ class Run:
     repaired: tuple[int, ...]
     batch_size: int
     program_bytes: int
-    waiting: float
 
     @property
     def success(self) -> bool:
@@ -90,7 +82,6 @@ class Options(NamedTuple):
     out: Any
     reductions: Any
     rows: bool | Sequence[str]
-    cost: Cost
     client: Any
     retries: int
     devices: Sequence[Any] | None
@@ -119,12 +110,8 @@ def run_batch(
     identity: dict[str, Any],
     batch: Members,
     options: Options,
-    pilot: Callable | None = None,
 ) -> Run:
-    """Compute a batch that `describe(reductions)` describes; `identity` distinguishes it from others, by argument.
-
-    `pilot(parameters, row)` counts the steps of a short part of a rollout, for a cost that is measured.
-    """
+    """Compute a batch that `describe(reductions)` describes; `identity` distinguishes it from others, by argument."""
     # A missing package and a wrong path are reported before anything is compiled.
     options.check()
     zarr_package()
@@ -133,7 +120,6 @@ def run_batch(
     reductions = check_reductions(options.reductions)
     outputs = describe(reductions)
     kept = _select_arrays(outputs, options.rows)
-    cost = _cost_of(options.cost, batch, pilot)
     reducer = Reducer(reductions, outputs.traced.shapes, outputs.variables)
     # Everything that decides the bytes of the store, and nothing else: a resumed run may have other devices, batches or workers.
     description = (
@@ -148,14 +134,13 @@ def run_batch(
         store = Store(path) if path.exists() else None
         if store is not None:
             store.check(description)
-            store.remove_leftovers()
-        # Two tasks of a worker at once: one computes while the other stores.
+        # Two tasks at once: one computes while the other stores.
         client, retries = options.client, options.retries
-        engine = Pipeline(retries) if client is None else Cluster(client, retries, mark, at_once=2)
+        engine = Local(retries, 2) if client is None else Cluster(client, retries, mark, 2)
         with engine:
             # Not larger than a chunk has to be, so that a batch is never filled up for nothing.
             most = min(BYTES // max(row_bytes, 1), -(-batch.count // (SHARES * engine.workers)))
-            fixed = outputs, batch, cost, reducer, kept, path.absolute(), options.devices, options.batch_size
+            fixed = outputs, batch, reducer, kept, path.absolute(), options.devices, options.batch_size
             engine.send(Study(*fixed, most, engine.workers_per_host).open)
             # On one worker, for all: they have the same program, and the store is created once.
             facts: Facts = engine.call("facts", store is None)
@@ -163,7 +148,7 @@ def run_batch(
             description["platform"] = facts.platform
             if store is None:
                 variables = [outputs.variables[name] for name in kept] + reducer.variables
-                chunk = options.chunk or _chunk_size(facts, row_bytes, batch.count, engine.workers, cost is not None)
+                chunk = options.chunk or _chunk_size(facts, row_bytes, batch.count, engine.workers)
                 sizes = batch.count, min(chunk, batch.count)
                 store = Store.create(path, variables, outputs.coordinates, description | facts.programs, *sizes)
             store.check(description)
@@ -174,17 +159,15 @@ def run_batch(
             results = totals.results()
             store.write_results({f"{name}_{part}": x for name, parts in results.items() for part, x in parts.items()})
     codes = {name: int(n) for name, n in zip(outputs.codes, totals.codes, strict=True) if n}
-    needed, stepped = totals.steps.tolist()
-    waiting = stepped / needed if needed else float("nan")
     given = path, batch.count, store.chunk, codes, totals.failed, results, computed, seconds, tuple(repaired)
-    return Run(*given, facts.size, facts.bytes, waiting)
+    return Run(*given, facts.size, facts.bytes)
 
 
 def _compute_chunks(engine: Engine, store: Store, totals: Totals, options: Options) -> tuple[int, list[int]]:
     """Compute the missing chunks, check those of earlier calls; returns rollouts computed, and the chunks that were damaged."""
     failures: list[tuple[int, Failure]] = []
     computed, repaired = 0, []
-    before = store.record_mask()
+    before = store.done_mask()
     link = options.client is not None and options.client.dashboard_link
     if options.progress and link:
         print(f"dashboard: {link}", file=sys.stderr)
@@ -257,11 +240,11 @@ def _chunk_error(failures: list[tuple[int, Failure]], store: Store) -> RuntimeEr
     return error
 
 
-def _chunk_size(facts: Facts, row_bytes: int, count: int, workers: int, is_sorted: bool) -> int:
+def _chunk_size(facts: Facts, row_bytes: int, count: int, workers: int) -> int:
     """Rollouts of a chunk: some seconds of work, not too many bytes, and enough chunks for each worker; whole batches."""
     most = BYTES / max(row_bytes * facts.size, 1), count / (SHARES * workers * facts.size)
     batches = min(SECONDS / max(facts.seconds, 1e-6), *most)
-    return max(min(facts.size * max(1, int(batches)), count), SORTED_BATCHES * facts.size if is_sorted else 0)
+    return min(facts.size * max(1, int(batches)), count)
 
 
 def _select_arrays(outputs: Description, rows: bool | Sequence[str]) -> tuple[str, ...]:
@@ -272,30 +255,6 @@ def _select_arrays(outputs: Description, rows: bool | Sequence[str]) -> tuple[st
         raise ValueError(f"rows is {rows!r}; name some of {', '.join(outputs.variables)}")
     # A dictionary removes repetitions and keeps the order that the user gave.
     return tuple(dict.fromkeys([*rows, "result"]))
-
-
-def _cost_of(cost: Cost, batch: Members, pilot: Callable | None) -> Any:
-    """`Study.cost` for the option `cost`.
-
-    **Raises:** ValueError for an array of another shape, and for a text that is not "measured", or with nothing to measure.
-    """
-    if cost is None or callable(cost):
-        return cost and partial(_cost_row, cost)
-    if isinstance(cost, str):
-        if cost == MEASURED and pilot is not None:
-            return pilot
-        raise ValueError(
-            f"cost is {cost!r}; give a function of the parameters, an array of one number for each rollout, or, "
-            f"to jd.scale.run with adaptive steps, {MEASURED!r}"
-        )
-    costs = np.asarray(as_array(cost, "cost"))
-    if costs.shape != (batch.count,):
-        raise ValueError(f"cost has shape {costs.shape}; give one number for each of the {batch.count} rollouts")
-    return costs
-
-
-def _cost_row(cost: Callable[[Any], Any], parameters: Any, row: Any) -> dict[str, Any]:
-    return {"cost": cost(parameters)}
 
 
 def _bytes(variable: Any) -> int:

@@ -101,8 +101,8 @@ def function_values(function: Callable[[Any], Mapping[str, Any]], parameters: An
     if not isinstance(values, Mapping) or not values:
         raise ValueError(f"function returned a {type(values).__name__}; return a dictionary of arrays by name")
     arrays = {str(name): jnp.asarray(value) for name, value in values.items()}
-    if {"result", "record", "partial", "rollout"} & arrays.keys():
-        raise ValueError("function returned an array named result, record, partial or rollout; take another name")
+    if {"result", "partial", "rollout"} & arrays.keys():
+        raise ValueError("function returned an array named result, partial or rollout; take another name")
     # A function without codes of its own fails where a result is not finite, as a simulation that diverges.
     success = arrays.pop("success", None)
     if success is None:

@@ -72,21 +72,18 @@ class Reducer:
 class Totals:
     """Result codes, failures and reductions of a run, from summaries of chunks that are added in the order of the chunks.
 
-    `codes`: number of rollouts that ended with each code; `failed`: numbers of the first `most` that failed; `steps`: those that
-    rollouts needed, and those that their batches computed.
+    `codes`: number of rollouts that ended with each code; `failed`: numbers of the first `most` that failed.
     """
 
     def __init__(self, reducer: Reducer, codes: int, most: int):
         self._reducer, self._most = reducer, most
         self.codes = np.zeros(codes, np.int64)
         self.failed = np.zeros(0, np.int64)
-        self.steps = np.zeros(2, np.int64)
         self._partials: Results | None = None
 
     def add(self, summary: Any) -> None:
         """Add the summary of the next chunk."""
         self.codes += summary.codes
-        self.steps += summary.steps
         # Summaries come in the order of the chunks, so that these are the first failures for any number of workers.
         self.failed = np.concatenate([self.failed, summary.failed[: self._most - len(self.failed)]])
         before, partials = self._partials, summary.partials

@@ -11,19 +11,16 @@ from jaxtyping import Array, PyTree
 
 from jaxdyn.model.arguments import Checked, FilePath, Numbers, as_array
 from jaxdyn.model.description import scene_lines
-from jaxdyn.scale.batch import Cost, Options, Run, run_batch
+from jaxdyn.scale.batch import Options, Run, run_batch
 from jaxdyn.scale.description import describe, function_values, motion_values
 from jaxdyn.scale.members import digest, members
 from jaxdyn.scale.reductions import Reduction
-from jaxdyn.scale.study import STEPS
 from jaxdyn.simulation.checks import check_times
 from jaxdyn.simulation.controls import Control
 from jaxdyn.simulation.run import simulate
 from jaxdyn.systems.scene import as_scene
 from jaxdyn.systems.system import SceneLike
 from jaxdyn.tasks import DaskClient
-
-SHARE = 0.05  # of the times, simulated to measure the cost of a rollout
 
 
 @dataclass(frozen=True, eq=False)
@@ -41,24 +38,12 @@ class Rollout:
 
     def __call__(self, parameters: Any, row: Any) -> tuple[Any, Any]:
         """Solution and scene."""
-        scene, control, q0, v0 = self._start(parameters, row)
-        return simulate(scene, q0, v0, self.ts, control=control, throw=False, **self.options), scene
-
-    def pilot(self, parameters: Any, row: Any) -> dict[str, Any]:
-        """Number of steps of its first part, as its cost."""
-        scene, control, q0, v0 = self._start(parameters, row)
-        # Two times, because steps are counted and rows are not needed.
-        early = np.array([self.ts[0], self.ts[0] + SHARE * (self.ts[-1] - self.ts[0])])
-        solution = simulate(scene, q0, v0, early, control=control, throw=False, **{**self.options, "outputs": ()})
-        return {"cost": solution.stats[STEPS]}
-
-    def _start(self, parameters: Any, row: Any) -> tuple[Any, Any, Any, Any]:
         scene, control = self.scene(parameters) if self.builds else self.scene, self.control
         # A control with parameters of the rollout has to be built with the scene.
         if isinstance(scene, tuple):
             scene, control = scene
         q0, v0 = self.states(parameters) if self.states else ((row | self.fixed)[name] for name in ("q0", "v0"))
-        return scene, control, q0, v0
+        return simulate(scene, q0, v0, self.ts, control=control, throw=False, **self.options), scene
 
 
 def run(
@@ -73,7 +58,6 @@ def run(
     control: Control = None,
     reductions: Checked[Mapping[str, Reduction] | None] = None,
     rows: bool | Sequence[str] = True,
-    cost: Cost = None,
     units: Mapping[str, str] | None = None,
     client: DaskClient | None = None,
     retries: int = 2,
@@ -101,9 +85,6 @@ def run(
     - `reductions`: a dictionary of `jd.scale.Mean`, `Histogram`, `Quantiles`, `Worst` or your own `Reduction`, of the rollouts
       that succeeded. They are variables NAME_PART of the store.
     - `rows`: True to store all arrays, False for none (codes and reductions alone), or the names of those to store.
-    - `cost`: an estimate of the run time of each rollout, in any unit: a function `cost(parameters)`, an array (samples,), or,
-      for adaptive steps, "measured", which simulates the first twentieth of the times. The rollouts of a chunk are computed by
-      decreasing cost, so that those of a batch take about equally many steps. Their order in the store does not change.
     - `units`: of parameters, by name.
     - `client`: a `dask.distributed.Client`, whose workers compute the chunks; without it this process does, and Dask is not
       imported. `retries`: attempts after the first for a chunk that raises; others are finished before its error is reported.
@@ -139,7 +120,7 @@ def run(
     )
     ```
     """
-    shared = Options(out, reductions, rows, cost, client, retries, devices, batch_size, chunk, progress)
+    shared = Options(out, reductions, rows, client, retries, devices, batch_size, chunk, progress)
     ts = np.asarray(as_array(ts, "ts"))
     check_times(ts)
     # `Rollout` passes `throw` itself, which given twice would be a TypeError.
@@ -168,11 +149,7 @@ def run(
         "scene": "built by a function" if builds else scene_lines(model),
         "outputs": list(options.get("outputs", ())),
     }
-    # Steps of a given size are equally many: nothing to measure.
-    pilot = rollout.pilot if options.get("stepsize") is None else None
-    return run_batch(
-        partial(describe, partial(motion_values, rollout), batch, units or {}, ts), given, batch, shared, pilot
-    )
+    return run_batch(partial(describe, partial(motion_values, rollout), batch, units or {}, ts), given, batch, shared)
 
 
 def evaluate(
@@ -184,7 +161,6 @@ def evaluate(
     seed: int = 0,
     reductions: Checked[Mapping[str, Reduction] | None] = None,
     rows: bool | Sequence[str] = True,
-    cost: Cost = None,
     units: Mapping[str, str] | None = None,
     client: DaskClient | None = None,
     retries: int = 2,
@@ -203,7 +179,7 @@ def evaluate(
 
     **Raises:** ValueError for a function that returns no dictionary of arrays, and as `run` does.
     """
-    shared = Options(out, reductions, rows, cost, client, retries, devices, batch_size, chunk, progress)
+    shared = Options(out, reductions, rows, client, retries, devices, batch_size, chunk, progress)
     draw = parameters if callable(parameters) else None
     batch = members({} if draw is not None else {"parameters": parameters}, draw, samples, seed)
     return run_batch(partial(describe, partial(function_values, function), batch, units or {}, None), {}, batch, shared)

@@ -1,16 +1,13 @@
-"""Store of a batch: a Zarr group with one array for each quantity of a rollout, and the record of the finished chunks.
+"""Store of a batch: a Zarr group with one array for each quantity of a rollout.
 
     runs.zarr/            opened by xarray: rows with names and units, reductions, the description in the attributes
-      record/checksum     one row for each chunk, written after all of its arrays: the chunk is finished
+      result/             codes of the rollouts. Those of a chunk are written last: the chunk is finished
       partial/            partial results of reductions, one row for each chunk
 
-Every chunk of every array is a file of its own that ends in a CRC-32C (Zarr's codec crc32c), and the record repeats these
-checksums. So a file that is missing, truncated, changed or of another run is recognised. Files are written under another name
-and renamed: a process that is killed leaves complete files only. Zarr makes the store and its metadata. The files of chunks are
-written and read here: they are bytes and a checksum, for which Zarr takes 4 ms each, ten times as long.
+Every chunk of every array is a file of its own that ends in a CRC-32C (Zarr's codec crc32c), by which a file that is damaged is
+recognised.
 """
 
-import contextlib
 import importlib.util
 import os
 import shutil
@@ -25,8 +22,8 @@ from typing import Any
 
 import numpy as np
 
-FORMAT = 2  # of the layout above
-RECORD = "record/checksum"
+FORMAT = 3  # of the layout above
+RESULT = "result"  # name of the array of codes
 
 
 @dataclass(frozen=True)
@@ -50,8 +47,7 @@ def zarr_package() -> Any:
     **Raises:** ImportError that names the extra.
     """
     try:
-        import filelock  # noqa: F401 (these three are reported here if they are missing)
-        import google_crc32c  # noqa: F401
+        import filelock  # noqa: F401 (these two are reported here if they are missing)
         import tqdm  # noqa: F401
         import zarr
     except ImportError as error:
@@ -86,9 +82,7 @@ class Store:
 
     def __init__(self, path: Path):
         zarr = zarr_package()
-        from google_crc32c import value
-
-        self.path, self._checksum = path, value
+        self.path = path
         try:
             self.group = zarr.open_group(path, mode="r+")
             attributes = dict(self.group.attrs)
@@ -110,7 +104,10 @@ class Store:
             self.count, self.chunk = int(attributes["rollouts"]), int(attributes["chunk"])
             self.chunks = -(-self.count // self.chunk)
             self.names = tuple(attributes["arrays"])
-            self._arrays: dict[str, Any] = {name: self.group[name] for name in (*self.names, RECORD)}
+            # Zarr does not write a chunk that has its fill value alone, such as codes of rollouts that all failed.
+            self._arrays: dict[str, Any] = {
+                name: self.group[name].with_config({"write_empty_chunks": True}) for name in self.names
+            }
         except (KeyError, TypeError, ValueError, ArithmeticError, OSError) as error:
             raise self._damage_error(error) from error
 
@@ -139,14 +136,14 @@ class Store:
         beside = path.with_name(f"{path.name}.{uuid.uuid4().hex}.tmp")
         chunks = -(-count // chunk)
         lengths = {"rollout": (count, chunk), "chunk": (chunks, 1)}
-        stored = [one.name for one in variables if one.leading is not None]
+        # The codes are the last array that is written.
+        stored = sorted((one.name for one in variables if one.leading is not None), key=RESULT.__eq__)
         attributes = {"jaxdyn_store": FORMAT, "description": dict(description), "rollouts": count, "chunk": chunk}
         attributes |= {"arrays": stored, "created": time.strftime("%Y-%m-%dT%H:%M:%S%z")}
         try:
             with warnings.catch_warnings():
                 group = zarr.create_group(beside, attributes=attributes)
-                record = Variable(RECORD, (len(stored),), np.dtype(np.uint32), ("array",), "chunk")
-                for one in [*variables, record]:
+                for one in variables:
                     size, part = ((length,) for length in lengths[one.leading]) if one.leading else ((), ())
                     group.create_array(
                         one.name,
@@ -190,91 +187,58 @@ class Store:
         return np.arange(chunk * self.chunk, min((chunk + 1) * self.chunk, self.count))
 
     def is_done(self, chunk: int) -> bool:
-        """True for a finished chunk: its record exists."""
-        return self._file(RECORD, chunk).exists()
+        """True for a finished chunk: its codes exist."""
+        return self._file(RESULT, chunk).exists()
 
-    def record_mask(self) -> np.ndarray:
+    def done_mask(self) -> np.ndarray:
         """Mask of the finished chunks (chunks,)."""
         mask = np.zeros(self.chunks, bool)
-        # One listing, not a question for each of a million chunks. The folder of a chunk exists before its file.
-        with contextlib.suppress(FileNotFoundError), os.scandir(self._file(RECORD, 0).parent.parent) as entries:
-            done = [int(entry.name) for entry in entries if entry.name.isdigit() and self.is_done(int(entry.name))]
-            mask[done] = True
+        folder = self._file(RESULT, 0).parent
+        # One listing, not a question for each of a million chunks.
+        mask[[int(name) for name in (os.listdir(folder) if folder.exists() else ()) if name.isdigit()]] = True
         return mask
 
     def write(self, chunk: int, arrays: Mapping[str, np.ndarray]) -> None:
-        """Write all arrays of a chunk, then its record.
+        """Write all arrays of a chunk, its codes the last.
 
         **Raises:** OSError for a full disk; chunks that were finished before are kept.
         """
-        checksums = [self._write_file(name, chunk, arrays[name]) for name in self.names]
-        # The record last: a chunk without it is missing, whatever files it has.
-        self._write_file(RECORD, chunk, np.asarray([checksums], np.uint32))
+        for name in self.names:
+            self._arrays[name][self._rows(name, chunk)] = arrays[name]
 
     def read(self, chunk: int, names: Sequence[str]) -> dict[str, np.ndarray]:
-        """These arrays of a chunk. **Raises:** ValueError for a file that does not fit its checksum, OSError for none."""
-        # The file of the last chunk is filled up. Arrays with an axis of chunks have one entry, which this keeps too.
-        size = len(self.numbers(chunk))
-        return {name: self._read_file(name, chunk)[0][:size] for name in names}
+        """These arrays of a chunk. **Raises:** ValueError for a file that does not fit its checksum."""
+        return {name: self._arrays[name][self._rows(name, chunk)] for name in names}
 
     def is_whole(self, chunk: int) -> bool:
-        """True where all files of a finished chunk are those that were written, by their checksums."""
+        """True where all files of a finished chunk are there and fit their checksums."""
+        # Zarr fills up for a file that is missing; it writes none for arrays without entries.
+        if not all(self._file(name, chunk).exists() for name in self.names if self._arrays[name].size):
+            return False
         try:
-            # The record recognises files of another run, too.
-            checksums, _ = self._read_file(RECORD, chunk)
-            return checksums[0].tolist() == [self._read_file(name, chunk)[1] for name in self.names]
+            self.read(chunk, self.names)
         except (ValueError, OSError):
             return False
+        return True
 
     def forget(self, chunk: int) -> None:
-        """Remove the record of a chunk, so that it is computed again."""
-        self._file(RECORD, chunk).unlink(missing_ok=True)
+        """Remove the files of a chunk, so that it is computed again."""
+        for name in reversed(self.names):
+            self._file(name, chunk).unlink(missing_ok=True)
 
     def write_results(self, arrays: Mapping[str, np.ndarray]) -> None:
         """Write the arrays without a leading axis: results of reductions."""
         for name, value in arrays.items():
             self.group[name][...] = value
 
-    def remove_leftovers(self) -> None:
-        """Remove files that killed processes were writing; a task of a dead client that still writes one ends with an error."""
-        for path in self.path.rglob("*.partial"):
-            path.unlink(missing_ok=True)
-
     def _file(self, name: str, chunk: int) -> Path:
         array = self._arrays[name]
         return self.path / name / array.metadata.encode_chunk_key((chunk, *(0,) * (array.ndim - 1)))
 
-    def _write_file(self, name: str, chunk: int, values: np.ndarray) -> int:
-        """Write the file of an array's chunk, and return its checksum."""
-        array = self._arrays[name]
-        # Zarr's chunks are full: the last one is filled up.
-        if len(values) < array.chunks[0]:
-            short, values = values, np.full((array.chunks[0], *array.shape[1:]), array.fill_value, array.dtype)
-            values[: len(short)] = short
-        # The codec bytes is little-endian.
-        data = np.ascontiguousarray(values, array.dtype.newbyteorder("<"))
-        checksum = self._checksum(data)
-        path = self._file(name, chunk)
-        path.parent.mkdir(parents=True, exist_ok=True)
-        beside = path.with_name(f"{path.name}.{uuid.uuid4().hex}.partial")
-        try:
-            with beside.open("wb") as file:
-                file.write(data.data)
-                file.write(checksum.to_bytes(4, "little"))
-            beside.replace(path)
-        except BaseException:
-            beside.unlink(missing_ok=True)
-            raise
-        return checksum
-
-    def _read_file(self, name: str, chunk: int) -> tuple[np.ndarray, int]:
-        """Values and checksum of an array's chunk. **Raises:** ValueError where they do not fit."""
-        array, data = self._arrays[name], np.fromfile(self._file(name, chunk), np.uint8)
-        checksum = self._checksum(data[:-4])
-        if data[-4:].tobytes() != checksum.to_bytes(4, "little"):
-            raise ValueError(f"{self._file(name, chunk)} is damaged")
-        values = data[:-4].view(array.dtype.newbyteorder("<"))
-        return values.reshape(array.chunks[0], *array.shape[1:]), checksum
+    def _rows(self, name: str, chunk: int) -> slice:
+        # Arrays with an axis of chunks have one row for each.
+        size = self._arrays[name].chunks[0]
+        return slice(chunk * size, (chunk + 1) * size)
 
 
 def _empty(dtype: Any) -> Any:

@@ -3,47 +3,16 @@
 import asyncio
 import contextlib
 import threading
-from collections.abc import Iterator
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
 import cloudpickle
-import jax
 from distributed import Worker, WorkerPlugin, get_worker
 from distributed.core import Status
 
-from jaxdyn.compile import compilation, compilation_mode
-from jaxdyn.tasks.local import package_versions
+from jaxdyn.tasks.local import Settings, package_versions
 
 RESOURCE = "jaxdyn"  # of Dask: each worker has one, each task takes one, and one of the name of its plugin
-
-
-class Settings(NamedTuple):
-    """Settings of JAX that decide the bits of a result, and the mode of compilation.
-
-    Each can be set for a thread, so that those of a worker's process, which may serve others, do not change.
-    """
-
-    enable_x64: bool
-    default_prng_impl: str
-    default_matmul_precision: Any
-    threefry_partitionable: bool
-    compilation: str
-
-    @classmethod
-    def current(cls) -> "Settings":
-        """Settings in force on this thread."""
-        config: Any = jax.config
-        return cls._make([*(getattr(config, f"jax_{name}") for name in cls._fields[:-1]), compilation_mode()])
-
-    @contextlib.contextmanager
-    def active(self) -> Iterator[None]:
-        """Put them in force on this thread."""
-        with contextlib.ExitStack() as stack:
-            for name in self._fields[:-1]:
-                stack.enter_context(getattr(jax, name)(getattr(self, name)))
-            stack.enter_context(compilation(self.compilation))
-            yield
 
 
 class TargetPlugin(WorkerPlugin):
