@@ -54,12 +54,11 @@ def integrate(term, project, eqs: Equations, args, method, y0, ts, steps, option
         controller = diffrax.ConstantStepSize() if continuous and has_length else controller
         event = terminal_events.event(quality, guards, ts[0], y0, args)
         return _by_diffrax(term, solver, controller, event, dt0, inputs, steps, options)
-    explicit: Any = solver
     if eqs.pieces.names and not of_kinks:
-        system = PiecewiseSystem(explicit.plan(y0), eqs.pieces, eqs.switching)
+        system = PiecewiseSystem(solver.plan(y0), eqs.pieces, eqs.switching)
         return _by_pieces(system, inputs, controller, steps, options)
-    plan = explicit.plan(y0)._replace(quality=quality, guards=guards)
-    run = _explicit_run(plan, explicit, controller, steps, options)
+    plan = solver.plan(y0)._replace(quality=quality, guards=guards)
+    run = _explicit_run(plan, solver, controller, steps, options)
     return _by_steps(run, inputs, _is_direct(adjoint))
 
 

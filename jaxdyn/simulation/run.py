@@ -129,8 +129,8 @@ def simulate(
     ```
     """
     scene, control = as_scene(scene), controls.as_control(control)
-    numbers = _check_numbers(scene, q0, v0, ts, rtol, atol, stepsize)
-    q0, v0, ts, *_, stepsize = numbers
+    arrays, stepsize = _check_numbers(scene, q0, v0, ts, rtol, atol, stepsize)
+    q0, v0, ts, *_ = arrays
     modal, start = has_modes(scene), (q0, v0, ts)
     scene, method = _prepare_start(scene, choose_method(scene, method), start, stepsize, modal)
     controls.check_steps(control, stepsize)
@@ -153,7 +153,9 @@ def simulate(
         "checks_mass": may_have_singular_mass(scene.system),
         "selects_rows": _selects_rows(scene, method, *start),
     }
-    numbers = _as_dtype(numbers, state_dtype(scene.system))
+    dtype, has_length = state_dtype(scene.system), is_step_length(stepsize)
+    numbers: list[Any] = [jnp.asarray(x, dtype) for x in arrays]
+    numbers.append(jnp.asarray(stepsize, dtype) if has_length else stepsize)
     concrete = is_known(scene, control, method, numbers)
     if modal:
         solution = hybrid_motion(scene, control, numbers, options)
@@ -168,21 +170,14 @@ def simulate(
 
 
 def _check_numbers(scene: Scene, q0, v0, ts, rtol, atol, stepsize) -> tuple:
-    """Start, times, tolerances, and the length of steps as arrays, refused if they do not fit; a controller as it is."""
+    """Start, times and tolerances as arrays, and the length of steps or its controller, refused if they do not fit."""
     q0, v0, ts = as_array(q0, "q0"), as_array(v0, "v0"), as_array(ts, "ts")
     checks.check_start(scene, q0, v0)
     checks.check_times(ts)
     rtol, atol = as_array(rtol, "rtol"), as_array(atol, "atol")
     checks.check_tolerance("rtol", rtol)
     checks.check_tolerance("atol", atol)
-    return q0, v0, ts, rtol, atol, as_array(stepsize, "stepsize") if is_step_length(stepsize) else stepsize
-
-
-def _as_dtype(numbers: tuple, dtype) -> list[Any]:
-    """Numbers of a run in the dtype of its state; a controller as it is."""
-    *arrays, stepsize = numbers
-    stepsize = jnp.asarray(stepsize, dtype) if is_step_length(stepsize) else stepsize
-    return [*(jnp.asarray(x, dtype) for x in arrays), stepsize]
+    return (q0, v0, ts, rtol, atol), as_array(stepsize, "stepsize") if is_step_length(stepsize) else stepsize
 
 
 def _prepare_start(scene: Scene, method: Method, start, stepsize, modal: bool) -> tuple[Scene, Method]:

@@ -15,7 +15,7 @@ from jaxdyn.compile import kernel
 from jaxdyn.compile.batch import cond, while_loop
 from jaxdyn.compile.loops import Carry, Given
 from jaxdyn.constraints.codes import RESULTS, first_of
-from jaxdyn.simulation.hybrid.modes import Mode
+from jaxdyn.simulation.hybrid.modes import CHANNELS, Mode
 from jaxdyn.simulation.hybrid.records import Records, chatters, no_records, record_elements, record_switches
 from jaxdyn.simulation.hybrid.system import HybridSystem
 from jaxdyn.simulation.hybrid.transitions import Transition
@@ -64,7 +64,7 @@ def run_events(system: HybridSystem, unknown, ts, y0, mode, rtol, atol, stepsize
     `y0` (m,), flat, and `mode`: a first guess; `stepsize` (s), or None for adaptive steps. `most`: number of events.
     """
     elements, plan = system.elements, system.plan
-    hit = jnp.zeros((system.count,), bool)
+    hit = jnp.zeros((CHANNELS * len(elements.each) + elements.switches,), bool)
     # The start may be an impact, or its mode may not hold: it passes a transition before the first step.
     begun = system.reset(unknown, ts[0], y0, mode, system.slip(y0), hit)
     y = system.with_slip(y0, begun.v, begun.slip)

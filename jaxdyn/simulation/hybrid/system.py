@@ -30,7 +30,7 @@ from jaxdyn.simulation.hybrid.dynamics import (
     solve_rows,
     terms_at,
 )
-from jaxdyn.simulation.hybrid.modes import CHANNELS, Elements, Mode, extend, force_at
+from jaxdyn.simulation.hybrid.modes import Elements, Mode, extend, force_at
 from jaxdyn.simulation.hybrid.transitions import ContactState, Impact, Transition, align, first_guess, next_mode
 from jaxdyn.simulation.solvers.explicit import Plan
 from jaxdyn.systems.scene import Scene
@@ -47,11 +47,6 @@ class HybridSystem:
 
     plan: Plan
     elements: Elements
-
-    @property
-    def count(self) -> int:
-        """Number of guards."""
-        return CHANNELS * len(self.elements.each) + self.elements.switches
 
     @abstractmethod
     def guards(self, t, y, args) -> tuple:

@@ -140,12 +140,11 @@ def run_to_event(
 
 def cases_of(limits: Limits, control, state: State) -> list[tuple[Array, Any]]:
     """Cases of the result of a run, for `first_of`."""
-    codes: Any = RESULTS
-    cases = [(state.t < limits.end, codes.max_steps_reached)]
+    cases: list[tuple[Any, Any]] = [(state.t < limits.end, RESULTS.max_steps_reached)]
     if isinstance(control, AdaptiveSteps):
-        return [(state.failed, codes.dt_min_reached), *cases]
+        return [(state.failed, RESULTS.dt_min_reached), *cases]
     # Fixed steps end short of what is not finite, or at the end of a run in which they may have been too long.
-    return [(state.failed, codes.nonfinite_state), *cases, (too_coarse(state.sums), codes.coarse_steps)]
+    return [(state.failed, RESULTS.nonfinite_state), *cases, (too_coarse(state.sums), RESULTS.coarse_steps)]
 
 
 def is_active(max_steps: int, limits: Limits, state: State):

@@ -10,15 +10,8 @@ from jax.flatten_util import ravel_pytree
 
 from jaxdyn.compile.loops import Given
 from jaxdyn.constraints.codes import RESULTS, first_of
-from jaxdyn.simulation.solvers import reverse
-from jaxdyn.simulation.solvers.driver import (
-    AdaptiveSteps,
-    FixedSteps,
-    begin,
-    cases_of,
-    number_of_steps,
-    run_to_event,
-)
+from jaxdyn.simulation.solvers import driver, reverse
+from jaxdyn.simulation.solvers.driver import AdaptiveSteps, FixedSteps
 from jaxdyn.simulation.solvers.explicit import Plan
 from jaxdyn.simulation.solvers.integrator import Integrator, zeros_or
 
@@ -46,13 +39,13 @@ class ExplicitRun(Integrator):
         most = self.max_steps if room is None else room
         history = None if room is None else reverse.blank(start, ts[0], most)
         records, strides = ((), ()) if history is None else (history.rows, history.strides)
-        limits, carry = begin(plan, control, args, ts, start, self.rtol, self.atol, self.stepsize, records)
-        state, _, rows, records = run_to_event(plan, control, most, strides, args, limits, Given(ts), carry)
+        limits, carry = driver.begin(plan, control, args, ts, start, self.rtol, self.atol, self.stepsize, records)
+        state, _, rows, records = driver.run_to_event(plan, control, most, strides, args, limits, Given(ts), carry)
         if history is not None:
             states, times, kept = records
             history = reverse.History(states, times, kept, state.tried)
         stopped = state.stopped if state.search is None else state.stopped | state.search.hit.any()
-        cases = [(stopped, RESULTS.event_occurred), *cases_of(limits, control, state)]
+        cases = [(stopped, RESULTS.event_occurred), *driver.cases_of(limits, control, state)]
         rows = rows if plan.guards is None else jnp.concatenate([rows, state.y[None]])
         facts = first_of(cases, RESULTS.successful), state.counts, state.t
         return (jax.vmap(plan.structure)(rows), facts), history
@@ -60,7 +53,7 @@ class ExplicitRun(Integrator):
     def number_of_steps(self, ts):
         """Number of fixed steps, None where their ends do not follow the end of the run."""
         is_free = isinstance(self.control, AdaptiveSteps) or self.plan.guards is not None
-        return None if is_free else number_of_steps(ts[0], ts[-1], self.stepsize)
+        return None if is_free else driver.number_of_steps(ts[0], ts[-1], self.stepsize)
 
     def replay(self, history, inputs, direct):
         y0, args, ts = inputs
