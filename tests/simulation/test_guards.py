@@ -180,3 +180,25 @@ def test_a_start_behind_the_guard_is_the_end():
     beyond = jd.simulate(RAIL, [1.5], [0.0], TS, control=push_cart, limits="stop", throw=False)
     assert beyond.result == jd.RESULTS.joint_limit_passed and float(beyond.stats["time_reached"]) == 0.0
     assert np.isfinite(beyond.q[0]).all() and np.isnan(beyond.q[1:]).all()
+
+
+def test_the_same_without_kernels():
+    with jd.compilation("plain"):
+        solution = limit(jnp.asarray(0.5), **TIGHT)
+    np.testing.assert_allclose(solution.stats["time_reached"], limit_time(0.5), rtol=1e-10)
+
+
+def test_a_guard_that_is_violated_within_a_step_ends_the_motion():
+    """The middle of a step shows a limit that is passed on the way there and back."""
+    top = 1.0 + 1e-3
+
+    def back(q, v, t):
+        return -jnp.ones_like(v)
+
+    # q = v t - t^2/4 has its top v^2 at 2 v, and is above one for 0.13 s; the second step has its middle there.
+    v = np.sqrt(top)
+    ts, options = np.linspace(0.0, 4 * v, 3), {"limits": "stop", "stepsize": 4 * v / 3, "throw": False}
+    solution = jd.simulate(RAIL, [0.0], [v], ts, control=back, **options)
+    assert solution.result == jd.RESULTS.joint_limit_passed
+    time = 2 * (v - np.sqrt(v * v - 1 - ROUNDING))
+    np.testing.assert_allclose(solution.stats["time_reached"], time, rtol=1e-10)
