@@ -81,7 +81,7 @@ def _reason_for_diffrax(solver, controller, adjoint, options) -> str | None:
     if type(controller) not in (Adaptive, ErrorMonitoredSteps):
         return "stepsize is a controller; leave it out"
     if not isinstance(adjoint, (diffrax.RecursiveCheckpointAdjoint, diffrax.ForwardMode, diffrax.DirectAdjoint)):
-        return f"adjoint is {options['adjoint']!r}; take 'reverse'"
+        return f"adjoint is {type(adjoint).__name__}; take 'reverse'"
     return "progress is shown; leave it out" if options["progress"] else None
 
 
@@ -129,9 +129,9 @@ def _by_diffrax(term, solver, controller, event, dt0, inputs, steps, options) ->
         "dt0": dt0,
     }
     if not is_step_length(steps[-1]):
-        rows, (result, *facts) = run_adaptively(inputs, diffrax_options, options["limit_is_given"])
+        solved: Any = run_adaptively(inputs, diffrax_options, options["limit_is_given"])
+        rows, (result, *facts) = solved
         return Outcome(rows, from_diffrax(result), *facts)
-    counts: Any
     rows, (result, counts, reached, *last), solution = run(inputs, **diffrax_options)
     sums = solution.controller_state[2:] if isinstance(controller, ErrorMonitoredSteps) else None
     # diffrax is at the end of the step that could not be solved; what is known ends at its beginning.
