@@ -1,5 +1,6 @@
 """Result codes of all computations, by name and by number."""
 
+from collections.abc import Sequence
 from typing import Any
 
 import equinox as eqx
@@ -102,3 +103,11 @@ class Outcome(eqx.Module):
     def success(self) -> Bool[Array, "..."]:
         """True where `result` is `RESULTS.successful`."""
         return self.result == RESULTS.successful  # pyright: ignore[reportAttributeAccessIssue]
+
+
+def first_of(cases: Sequence[tuple[Any, Any]], otherwise: Any) -> Any:
+    """Code of the first case (condition, code) whose condition holds, else the one given."""
+    # Backwards, so that the first case replaces the others.
+    for condition, code in reversed(cases):
+        otherwise = RESULTS.where(condition, code, otherwise)
+    return otherwise

@@ -15,7 +15,7 @@ from jaxdyn.model.tree import Model
 from jaxdyn.simulation.controls import Controller, Sampled
 from jaxdyn.simulation.methods import Method
 from jaxdyn.simulation.solvers import Stepper
-from jaxdyn.simulation.solvers.choice import innermost, is_step_length, label
+from jaxdyn.simulation.solvers.choice import is_explicit, is_step_length, label
 from jaxdyn.systems.scene import Scene, has_drives
 from jaxdyn.systems.system import has_quaternions
 
@@ -184,7 +184,7 @@ def check_modal_options(control, stepsize, solver, adjoint, outputs, max_events:
         raise ValueError(
             f"stepsize is {stepsize!r}, and {what}; leave it out for steps that keep rtol and atol, or give a length (s)"
         )
-    if not isinstance(solver, diffrax.AbstractERK) or isinstance(innermost(solver), diffrax.AbstractWrappedSolver):
+    if not is_explicit(solver):
         raise ValueError(
             f"solver is {label(solver)}, and {what}, whose events are located within explicit steps; take diffrax.Dopri8() or "
             "Tsit5(), or, where forces are stiff, friction without modes (jd.forces.CoulombFriction)"

@@ -56,7 +56,7 @@ class Equations:
         self.derivative, self.explicit_part, self.implicit_part = map(
             jax.jit, (self._derivative, self._explicit_part, self._implicit_part)
         )
-        self.advance, self.least_allowance = jax.jit(self._advance), jax.jit(self._least_allowance)
+        self.advance, self.guards = jax.jit(self._advance), jax.jit(self._guards)
 
     def unpack(self, args, y=None):
         """Scene with the rows that the step from y keeps, control and method."""
@@ -160,8 +160,7 @@ class Equations:
             y = y | {controls.HELD: controls.sample(control, y[controls.HELD], *method.to_qv(scene, y, t), t)}
         return end, y, error
 
-    # diffrax passes more to the condition of an event: `**_`.
-    def quality(self, t, y, args, **_):
+    def quality(self, t, y, args):
         """Quality of the method's basis."""
         scene, _, method = self.unpack(args, y)
         return method.quality(scene, y, t)
@@ -188,8 +187,8 @@ class Equations:
             margins.append(control.allowance(q, v, t)[None])
         return jnp.concatenate(margins)
 
-    def _least_allowance(self, t, y, args):
+    def _guards(self, t, y, args):
         scene, _, method = self.unpack(args, y)
         q, v = method.to_qv(scene, y, t)
-        # One event for all conditions: the first one that is violated ends the run.
-        return jnp.min(self.allowances(args, y, q, v, t))
+        values = self.allowances(args, y, q, v, t)
+        return values, jnp.zeros_like(values)  # allowances have the rounding in them

@@ -1,115 +1,95 @@
 """Integration from a start to the save points: the solver, the loop (our own or diffrax's), and the code at the end."""
 
-from typing import Any
+from collections.abc import Callable
+from typing import Any, NamedTuple
 
 import diffrax
 import jax
 import jax.numpy as jnp
+from jax.flatten_util import ravel_pytree
 
 from jaxdyn.simulation import controls, terminal_events
 from jaxdyn.simulation.equations import KEPT, Equations
 from jaxdyn.simulation.hybrid.piecewise import MIN_EVENTS, PiecewiseSystem, piecewise_motion
 from jaxdyn.simulation.methods import Reduced, is_regular
 from jaxdyn.simulation.solution import RESULTS, from_diffrax
-from jaxdyn.simulation.solvers import ExplicitSteps, ProjectedSolver, driver
-from jaxdyn.simulation.solvers.choice import is_step_length, label, progress_meter, solver_and_control
+from jaxdyn.simulation.solvers import ExplicitSteps, ProjectedSolver
+from jaxdyn.simulation.solvers.choice import is_explicit, is_step_length, label, progress_meter, solver_and_control
 from jaxdyn.simulation.solvers.differentiable import ROOM, run, run_adaptively
-from jaxdyn.simulation.solvers.driver import ExplicitRun
+from jaxdyn.simulation.solvers.driver import step_control
+from jaxdyn.simulation.solvers.explicit_run import ExplicitRun
+from jaxdyn.simulation.solvers.guards import SEARCH_STEPS, delay
 from jaxdyn.simulation.solvers.step_control import Adaptive, ErrorMonitoredSteps, too_coarse
 
 
-def integrate(term, project, eqs: Equations, args, method, y0, ts, steps, options):
+class Outcome(NamedTuple):
     """Rows of the state at ts[1:], a code, counts, the time reached, and the state there if an event may end the run."""
-    adjoint = options["adjoint"]
+
+    rows: Any
+    result: Any
+    counts: dict[str, Any]
+    time_reached: Any
+    last: Any = None
+
+
+def integrate(term, project, eqs: Equations, args, method, y0, ts, steps, options) -> Outcome:
+    """Integrate from the start to the save points."""
+    adjoint, has_length = options["adjoint"], is_step_length(steps[-1])
     solver: Any
     solver, controller, dt0 = solver_and_control(options["solver"], term, ts, *steps)
     # The continuous adjoint integrates another vector field backwards: projections and events of y do not apply to it.
     continuous = isinstance(adjoint, diffrax.BacksolveAdjoint)
-    # diffrax reports a method that wraps an explicit one as explicit.
-    is_erk = isinstance(solver, diffrax.AbstractERK) and not isinstance(solver, diffrax.AbstractWrappedSolver)
     step_constants = (*method.step_constants, *({controls.HELD, KEPT} & set(y0)))
-    if is_erk and not continuous:
+    reason = _reason_for_diffrax(solver, controller, adjoint, options)
+    if is_explicit(solver) and not continuous:
         solver = ExplicitSteps(solver, project, step_constants, method.projects, field=term.vector_field)
     elif project:
         solver = ProjectedSolver(solver, project, step_constants, method.projects)
-    if continuous and isinstance(controller, ErrorMonitoredSteps):
-        controller = diffrax.ConstantStepSize()
-    quality = eqs.quality if isinstance(method, Reduced) and not continuous else None
-    event = None if continuous else _event(eqs, args, quality, y0, ts)
-    diffrax_options = {
-        "term": term,
-        "solver": solver,
-        "controller": controller,
-        "event": event,
-        "adjoint": adjoint,
-        "max_steps": options["max_steps"],
-        "progress": progress_meter(options["progress"]),
-        "dt0": dt0,
-    }
-    explicit: Any = solver  # where `is_erk`
-    inputs, sums, is_fixed_length = (y0, args, ts), None, is_step_length(steps[-1])
-    reason = _reason_for_crossing(eqs, is_erk, controller, quality is not None, adjoint, options)
-    ends_at_kinks = bool(eqs.pieces.names) and reason is None
-    if eqs.pieces.names and reason is not None:
-        inputs = undifferentiable(inputs, reason)
-    if ends_at_kinks:
-        system = PiecewiseSystem(explicit.plan(y0), eqs.pieces, eqs.switching)
-        rows, facts, sums = _by_pieces(system, inputs, controller, steps, options)
-    elif is_erk and not any(eqs.conditions) and _has_own_loop(controller, adjoint, options):
-        rows, facts, sums = _integrator(explicit, y0, quality, controller, steps, options)(*inputs)
-    elif is_fixed_length:
-        rows, facts, solution = run(inputs, **diffrax_options)
-        sums = solution.controller_state[2:] if isinstance(controller, ErrorMonitoredSteps) else None
-    else:
-        rows, facts = run_adaptively(inputs, diffrax_options, options["limit_is_given"])
-    result, stats, reached, *last = facts
-    result = from_diffrax(result)
-    if ends_at_kinks:
-        # Forces that drive the motion onto their jump from both sides; fixed steps end short of what is not finite.
-        result = RESULTS.where(result == RESULTS.event_occurred, RESULTS.too_many_events, result)
-        if is_fixed_length:
-            result = RESULTS.where(result == RESULTS.dt_min_reached, RESULTS.nonfinite_state, result)
-    if is_fixed_length:
-        if sums is not None:
-            coarse = (result == RESULTS.successful) & too_coarse(sums)
-            result = RESULTS.where(coarse, RESULTS.coarse_steps, result)
-        # diffrax is at the end of the step that could not be solved; what is known ends at its beginning.
-        before = ts[0] + (stats["num_steps"].astype(ts.dtype) - 1) * steps[-1]
-        reached = jnp.where(result == RESULTS.nonlinear_divergence, before, reached)
-    return rows, result, stats, reached, last[0] if last else None
+    quality, guards = (None, None) if continuous else _monitors(eqs, method)
+    of_kinks = reason or _reason_for_crossing(quality, guards)
+    inputs = y0, args, ts
+    if eqs.pieces.names and of_kinks:
+        inputs = undifferentiable(inputs, of_kinks)
+    if reason:
+        controller = diffrax.ConstantStepSize() if continuous and has_length else controller
+        event = terminal_events.event(quality, guards, ts[0], y0, args)
+        return _by_diffrax(term, solver, controller, event, dt0, inputs, steps, options)
+    if eqs.pieces.names and not of_kinks:
+        system = PiecewiseSystem(solver.plan(y0), eqs.pieces, eqs.switching)
+        return _by_pieces(system, inputs, controller, steps, options)
+    plan = solver.plan(y0)._replace(quality=quality, guards=guards)
+    run = _explicit_run(plan, solver, controller, steps, options)
+    return _by_steps(run, inputs, _is_direct(adjoint))
 
 
-def _event(eqs: Equations, args, quality, y0, ts) -> diffrax.Event | None:
-    """Event of a run in diffrax's loop; `quality` of a basis that may become singular, or None."""
-    # Near a singular basis steps become short; a long one may pass it, which the sign shows.
-    basis = None if quality is None else lambda t, y, args, **_: _quality_or_zero(quality(t, y, args))
-    if any(eqs.conditions):
-        start = None if basis is None else basis(ts[0], y0, args)
-        return terminal_events.event(eqs.least_allowance, basis, start, ts.dtype)
-    return None if basis is None else diffrax.Event(basis)
+def _monitors(eqs: Equations, method) -> tuple[Callable | None, Callable | None]:
+    """Functions (t, y, args) that end a run: the quality of a basis where it changes its sign, guards where one is negative."""
+
+    def quality(t, y, args, **_):  # diffrax passes more to the condition of an event
+        # Near a singular basis steps become short; a long one may pass it, which the sign shows.
+        value = eqs.quality(t, y, args)
+        return jnp.where(is_regular(value), value, jnp.zeros_like(value))
+
+    return quality if isinstance(method, Reduced) else None, eqs.guards if any(eqs.conditions) else None
 
 
-def _quality_or_zero(quality):
-    """Quality of a basis, whose change of sign ends the run: zero where the basis is singular."""
-    return jnp.where(is_regular(quality), quality, jnp.zeros_like(quality))
-
-
-def _reason_for_crossing(
-    eqs: Equations, is_erk: bool, controller, monitors_basis: bool, adjoint, options
-) -> str | None:
-    """Reason why steps go across the kinks of forces instead of ending there, or None."""
-    if not is_erk:
+def _reason_for_diffrax(solver, controller, adjoint, options) -> str | None:
+    """Reason why diffrax makes the steps, or None: the library's own loop makes them."""
+    if not is_explicit(solver):
         return f"solver is {label(options['solver'])}; take an explicit one, such as diffrax.Dopri8()"
     # Subclasses and wrappers, such as a clip to samples, have rules that our loops do not know.
     if type(controller) not in (Adaptive, ErrorMonitoredSteps):
-        return "stepsize is a controller, or control a jd.Sampled; leave them out"
-    if any(eqs.conditions):
-        return "contacts, limits or the control may end the run; pass contacts='report' and limits=None"
-    if monitors_basis:
-        return "method is 'reduced'; take 'projected'"
-    if isinstance(adjoint, diffrax.BacksolveAdjoint):
-        return "adjoint is 'backsolve'; take 'reverse'"
+        return "stepsize is a controller; leave it out"
+    if not isinstance(adjoint, (diffrax.RecursiveCheckpointAdjoint, diffrax.ForwardMode, diffrax.DirectAdjoint)):
+        return f"adjoint is {type(adjoint).__name__}; take 'reverse'"
     return "progress is shown; leave it out" if options["progress"] else None
+
+
+def _reason_for_crossing(quality, guards) -> str | None:
+    """Reason why explicit steps go across the kinks of forces instead of ending there, or None."""
+    if guards is not None:
+        return "contacts, limits or the control may end the run; pass contacts='report' and limits=None"
+    return None if quality is None else "method is 'reduced'; take 'projected'"
 
 
 def undifferentiable(tree, reason: str):
@@ -130,31 +110,70 @@ def undifferentiable(tree, reason: str):
     return same(tree)
 
 
-def _by_pieces(system, inputs, controller, steps, options):
-    """Integrate by steps that end at the kinks of forces; rows, facts, and sums of fixed steps."""
+def _is_direct(adjoint) -> bool:
+    """True for derivatives in forward mode too."""
+    return isinstance(adjoint, (diffrax.ForwardMode, diffrax.DirectAdjoint))
+
+
+def _by_diffrax(term, solver, controller, event, dt0, inputs, steps, options) -> Outcome:
+    """Integrate in diffrax's loop."""
+    ts = inputs[2]
+    diffrax_options = {
+        "term": term,
+        "solver": solver,
+        "controller": controller,
+        "event": event,
+        "adjoint": options["adjoint"],
+        "max_steps": options["max_steps"],
+        "progress": progress_meter(options["progress"]),
+        "dt0": dt0,
+    }
+    if not is_step_length(steps[-1]):
+        solved: Any = run_adaptively(inputs, diffrax_options, options["limit_is_given"])
+        rows, (result, *facts) = solved
+        return Outcome(rows, from_diffrax(result), *facts)
+    rows, (result, counts, reached, *last), solution = run(inputs, **diffrax_options)
+    sums = solution.controller_state[2:] if isinstance(controller, ErrorMonitoredSteps) else None
+    # diffrax is at the end of the step that could not be solved; what is known ends at its beginning.
+    before = ts[0] + (counts["num_steps"].astype(ts.dtype) - 1) * steps[-1]
+    result = from_diffrax(result)
+    reached = jnp.where(result == RESULTS.nonlinear_divergence, before, reached)
+    if sums is not None:
+        result = RESULTS.where((result == RESULTS.successful) & too_coarse(sums), RESULTS.coarse_steps, result)
+    return Outcome(rows, result, counts, reached, *last)
+
+
+def _by_pieces(system, inputs, controller, steps, options) -> Outcome:
+    """Integrate by steps that end at the kinks of forces."""
     rtol, atol, stepsize = steps
+    (y0, args, ts), has_length = inputs, is_step_length(stepsize)
     room, most = options["max_steps"], max(MIN_EVENTS, options["max_events"])
-    if not is_step_length(stepsize):
+    if not has_length:
         rtol, atol, stepsize = controller.rtol, controller.atol, None
         room = room if options["limit_is_given"] else min(room, ROOM)
-    is_direct = isinstance(options["adjoint"], (diffrax.ForwardMode, diffrax.DirectAdjoint))
-    y0, args, ts = inputs
-    return piecewise_motion(system, y0, args, ts, rtol, atol, stepsize, options["max_steps"], room, most, is_direct)
+    rows, end = piecewise_motion(
+        system, y0, args, ts, rtol, atol, stepsize, options["max_steps"], room, most, _is_direct(options["adjoint"])
+    )
+    return Outcome(rows, end.result, end.counts, end.t)
 
 
-def _has_own_loop(controller, adjoint, options) -> bool:
-    """True if the library's own loop makes explicit steps: with a known control, reverse mode and no progress meter."""
-    known = type(controller) in (Adaptive, ErrorMonitoredSteps)
-    return known and isinstance(adjoint, diffrax.RecursiveCheckpointAdjoint) and not options["progress"]
+def _by_steps(run: ExplicitRun, inputs, is_direct: bool) -> Outcome:
+    """Integrate by explicit steps in the library's own loop."""
+    rows, (result, counts, reached) = (run.direct if is_direct else run)(*inputs)
+    plan = run.plan
+    if plan.guards is None:
+        return Outcome(rows, result, counts, reached)
+    rows, end = (jax.tree.map(lambda x, at=at: x[at], rows) for at in (slice(-1), -1))
+    args, y = inputs[1], ravel_pytree(end)[0]
+    late = delay(lambda t, y: jnp.min(plan.guards_of(args, t, y)[0]), plan.field_of(args, reached, y), reached, y)
+    return Outcome(rows, result, counts, reached + jnp.where(result == RESULTS.event_occurred, late, 0.0), end)
 
 
-def _integrator(solver: ExplicitSteps, y0, quality, controller, steps, options) -> ExplicitRun:
+def _explicit_run(plan, solver: ExplicitSteps, controller, steps, options) -> ExplicitRun:
     """Integrator of the library's own loop."""
-    order, most, plan = solver.error_order(None), options["max_steps"], solver.plan(y0)
-    if quality is not None:
-        plan = plan._replace(quality=lambda t, y, args: _quality_or_zero(quality(t, y, args)))
-    if isinstance(controller, Adaptive):
-        room = most if options["limit_is_given"] else min(most, ROOM)
-        control = driver.AdaptiveSteps(order, controller.norm)
-        return ExplicitRun(plan, control, controller.rtol, controller.atol, None, most, room=room)
-    return ExplicitRun(plan, driver.FixedSteps(solver.order(None), order), None, None, steps[-1], most, room=most)
+    # Attempts that locate the end do not count among the user's steps.
+    most = options["max_steps"] + (0 if plan.guards is None else 2 * SEARCH_STEPS)
+    if not isinstance(controller, Adaptive):
+        return ExplicitRun(plan, step_control(solver, steps[-1]), None, None, steps[-1], most, room=most)
+    room, control = most if options["limit_is_given"] else min(most, ROOM), step_control(solver, None, controller.norm)
+    return ExplicitRun(plan, control, controller.rtol, controller.atol, None, most, room=room)

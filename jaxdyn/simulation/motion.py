@@ -11,6 +11,7 @@ from jaxtyping import Array
 
 from jaxdyn.compile import entry_point, kernel
 from jaxdyn.compile.batch import map_rows
+from jaxdyn.constraints.codes import first_of
 from jaxdyn.constraints.redundancy import exchange_rows, gap_of_redundant, has_selection, keep_rows, row_mask, rows_of
 from jaxdyn.constraints.selection import most_rounding, select_rows
 from jaxdyn.simulation import controls
@@ -19,7 +20,7 @@ from jaxdyn.simulation.equations import DRIVES, KEPT, Equations, equations
 from jaxdyn.simulation.integration import integrate
 from jaxdyn.simulation.methods import Method, consistent, is_regular, satisfies_redundant_rows, start_limit
 from jaxdyn.simulation.outputs import at_save_point
-from jaxdyn.simulation.solution import RESULTS, Solution, first_of, rows_where
+from jaxdyn.simulation.solution import RESULTS, Solution, rows_where
 from jaxdyn.simulation.solvers import LieGroup, Stepper
 from jaxdyn.simulation.solvers.choice import is_split, is_step_length, label
 from jaxdyn.simulation.solvers.differentiable import COUNTS

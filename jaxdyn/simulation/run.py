@@ -19,7 +19,6 @@ from jaxdyn.contact.unilateral import has_modes
 from jaxdyn.model.arguments import Numbers, as_array, state_dtype
 from jaxdyn.simulation import checks, controls
 from jaxdyn.simulation.controls import Control
-from jaxdyn.simulation.hybrid.event_loop import SEARCH_STEPS
 from jaxdyn.simulation.hybrid.motion import hybrid_motion
 from jaxdyn.simulation.methods import Method
 from jaxdyn.simulation.motion import smooth_motion
@@ -113,7 +112,7 @@ def simulate(
       which end at events.
     - `progress`: show a meter (tqdm if installed, else lines of text).
     - `max_steps`: most steps to take, rejected ones included. Default: what fixed steps need; 65536 for adaptive ones,
-      4096 with "direct", and where reverse mode goes through adaptive steps: it records the end of each one, 8 bytes a step
+      4096 with "direct", and where derivatives go through adaptive steps: the end of each one is recorded, 8 bytes a step
       and trajectory.
     - `throw`: raise when the integration fails. Default: yes if all inputs are concrete, else see `Solution.result`.
 
@@ -129,21 +128,13 @@ def simulate(
     solution = jd.simulate(model, q0, v0, jnp.linspace(0.0, 1.0, 101), outputs=("energy",))
     ```
     """
-    scene = as_scene(scene)
-    q0, v0, ts = as_array(q0, "q0"), as_array(v0, "v0"), as_array(ts, "ts")
-    checks.check_start(scene, q0, v0)
-    checks.check_times(ts)
-    rtol, atol = as_array(rtol, "rtol"), as_array(atol, "atol")
-    checks.check_tolerance("rtol", rtol)
-    checks.check_tolerance("atol", atol)
-    has_length, modal = is_step_length(stepsize), has_modes(scene)
-    stepsize = as_array(stepsize, "stepsize") if has_length else stepsize
-    scene, method = _prepare_start(scene, choose_method(scene, method), q0, v0, ts, modal)
-    if not has_length and is_concrete(q0):
-        checks.check_angles(scene, q0, state_dtype(scene.system))
-    control = controls.as_control(control)
+    scene, control = as_scene(scene), controls.as_control(control)
+    arrays, stepsize = _check_numbers(scene, q0, v0, ts, rtol, atol, stepsize)
+    q0, v0, ts, *_ = arrays
+    modal, start = has_modes(scene), (q0, v0, ts)
+    scene, method = _prepare_start(scene, choose_method(scene, method), start, stepsize, modal)
     controls.check_steps(control, stepsize)
-    solver, adjoint = _choose(scene, control, method, solver, stepsize, adjoint, (q0, v0, ts), modal)
+    solver, adjoint = _choose(scene, control, method, solver, stepsize, adjoint, start, modal)
     outputs = checks.sort_outputs(scene, outputs)
     if modal:
         checks.check_modal_options(control, stepsize, solver, adjoint, outputs, max_events)
@@ -160,12 +151,10 @@ def simulate(
         "limit_is_given": max_steps is not None,
         "max_events": max_events,
         "checks_mass": may_have_singular_mass(scene.system),
-        "selects_rows": _selects_rows(scene, method, q0, v0, ts),
+        "selects_rows": _selects_rows(scene, method, *start),
     }
-    if modal and has_length and max_steps is None:
-        options["max_steps"] += SEARCH_STEPS * max_events
-    dtype = state_dtype(scene.system)
-    numbers: list[Any] = [jnp.asarray(x, dtype) for x in (q0, v0, ts, rtol, atol)]
+    dtype, has_length = state_dtype(scene.system), is_step_length(stepsize)
+    numbers: list[Any] = [jnp.asarray(x, dtype) for x in arrays]
     numbers.append(jnp.asarray(stepsize, dtype) if has_length else stepsize)
     concrete = is_known(scene, control, method, numbers)
     if modal:
@@ -174,17 +163,26 @@ def simulate(
         solution = smooth_motion(scene, control, method, numbers, options)
     if limits == "report":
         solution = report_limits(scene, solution, concrete)
-    if throw is None:
-        throw = concrete
+    throw = concrete if throw is None else throw
     if throw and concrete:
         raise_failure(solution, scene, control, options)
-    elif throw:
-        solution = solution.result.error_if(solution, ~solution.success)
-    return solution
+    return solution.result.error_if(solution, ~solution.success) if throw and not concrete else solution
 
 
-def _prepare_start(scene: Scene, method: Method, q0, v0, ts, modal: bool) -> tuple[Scene, Method]:
+def _check_numbers(scene: Scene, q0, v0, ts, rtol, atol, stepsize) -> tuple:
+    """Start, times and tolerances as arrays, and the length of steps or its controller, refused if they do not fit."""
+    q0, v0, ts = as_array(q0, "q0"), as_array(v0, "v0"), as_array(ts, "ts")
+    checks.check_start(scene, q0, v0)
+    checks.check_times(ts)
+    rtol, atol = as_array(rtol, "rtol"), as_array(atol, "atol")
+    checks.check_tolerance("rtol", rtol)
+    checks.check_tolerance("atol", atol)
+    return (q0, v0, ts, rtol, atol), as_array(stepsize, "stepsize") if is_step_length(stepsize) else stepsize
+
+
+def _prepare_start(scene: Scene, method: Method, start, stepsize, modal: bool) -> tuple[Scene, Method]:
     """Check a concrete start by the rules of the system and of the constraints, and drop redundant rows."""
+    q0, v0, ts = start
 
     def check_system():
         with jax.ensure_compile_time_eval():
@@ -200,6 +198,8 @@ def _prepare_start(scene: Scene, method: Method, q0, v0, ts, modal: bool) -> tup
         scene = scene if modal else selected
     if isinstance(scene.system, System) and is_concrete((scene, q0, v0, ts)):
         check_system()
+    if not is_step_length(stepsize) and is_concrete(q0):
+        checks.check_angles(scene, q0, state_dtype(scene.system))
     return scene, method
 
 

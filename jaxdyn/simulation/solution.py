@@ -1,6 +1,5 @@
 """Result of a simulation: the motion, its code, and advice where it ended early."""
 
-from collections.abc import Sequence
 from typing import TYPE_CHECKING, Any
 
 import diffrax
@@ -10,7 +9,7 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from jaxdyn.constraints.codes import RESULTS as RESULTS
-from jaxdyn.constraints.codes import Outcome, name_of
+from jaxdyn.constraints.codes import Outcome, first_of, name_of
 from jaxdyn.contact.forces import contacts_with_cones
 from jaxdyn.forces.dissipation import SlidingFriction
 from jaxdyn.model.arguments import FilePath
@@ -31,14 +30,6 @@ OF_DIFFRAX = (
     "nonlinear_max_steps_reached", "nonlinear_divergence", "nonfinite", "dt_min_reached", "event_occurred", "max_steps_rejected",
     "internal_error",
 )  # fmt: skip
-
-
-def first_of(cases: Sequence[tuple[Any, Any]], otherwise: Any) -> Any:
-    """Code of the first case (condition, code) whose condition holds, else the one given."""
-    # Backwards, so that the first case replaces the others.
-    for condition, code in reversed(cases):
-        otherwise = RESULTS.where(condition, code, otherwise)
-    return otherwise
 
 
 def rows_where(mask, rows, otherwise):

@@ -17,9 +17,10 @@ from jaxdyn.forces.piecewise import fix_pieces, guards, pieces_of, values_and_le
 from jaxdyn.model.arguments import Numbers, as_array, check_shape, state_dtype
 from jaxdyn.simulation.equations import DRIVES
 from jaxdyn.simulation.hybrid.piecewise import PiecewiseSystem, piecewise_motion
-from jaxdyn.simulation.solvers import ExplicitSteps, driver
-from jaxdyn.simulation.solvers.driver import ExplicitRun
+from jaxdyn.simulation.solvers import ExplicitSteps
+from jaxdyn.simulation.solvers.driver import step_control
 from jaxdyn.simulation.solvers.explicit import take_step
+from jaxdyn.simulation.solvers.explicit_run import ExplicitRun
 from jaxdyn.simulation.solvers.fixed_steps import RK4
 from jaxdyn.simulation.start import choose_method
 from jaxdyn.systems.scene import Scene, as_scene, check_force
@@ -158,12 +159,8 @@ def _advance(scene: Scene, length, substeps: int, is_direct: bool) -> tuple[Any,
         # Once, at the start on the constraints: between the stages of a step the rank would change.
         selection = select_rows(known(unknown), q, t, None) if selects_rows else None
         plan, args, ts, size = solver.plan(y), (unknown, tau, selection), jnp.stack([t, t + length]), length / substeps
-        if pieces.names and is_standalone():
-            raise ValueError(
-                f"stepper: its steps end at the kinks of {', '.join(pieces.names)}, found by loops that exported code does not "
-                "have; leave these forces out of the exported scene, and clip the torques before the step"
-            )
         if pieces.names:
+            _refuse_export(pieces)
             system = PiecewiseSystem(plan, pieces, switching)
             rows = piecewise_motion(system, y, args, ts, 0.0, 0.0, size, substeps, substeps + 1, EVENTS, is_direct)[0]
         elif is_standalone():
@@ -174,9 +171,16 @@ def _advance(scene: Scene, length, substeps: int, is_direct: bool) -> tuple[Any,
                 flat = take_step(plan, args, start, end, flat, plan.first_rate(args, start, flat)).projected
             return state_of(plan.structure(flat), t + length)
         else:
-            # Orders of RK4 and of its error estimate.
-            run = ExplicitRun(plan, driver.FixedSteps(4, 3), None, None, size, substeps, room=substeps)
+            run = ExplicitRun(plan, step_control(solver, size), None, None, size, substeps, room=substeps)
             rows = (run.direct if is_direct else run)(y, args, ts)[0]
         return state_of(jax.tree.map(lambda x: x[0], rows), t + length)
 
     return start, advance
+
+
+def _refuse_export(pieces) -> None:
+    if is_standalone():
+        raise ValueError(
+            f"stepper: its steps end at the kinks of {', '.join(pieces.names)}, found by loops that exported code does not "
+            "have; leave these forces out of the exported scene, and clip the torques before the step"
+        )

@@ -112,17 +112,21 @@ def first_violation(rows: Float[Array, "nt k"], reached, ts, within) -> Violatio
     return violation._replace(entry=jnp.where(violation.happened, violation.entry, -1))
 
 
-def event(allowance, basis, start, dtype) -> diffrax.Event:
-    """Event where the least allowance falls to zero, or where the quality `basis` no longer has the sign of `start`."""
+def event(quality, guards, t0, y0, args) -> diffrax.Event | None:
+    """Event of a run in diffrax's loop, from the quality (t, y, args) of a basis and the guards, each a function or None."""
+    if guards is None:
+        return None if quality is None else diffrax.Event(quality)
+    start = None if quality is None else quality(t0, y0, args)
 
     def condition(t, y, args, **_):
-        least = allowance(t, y, args)
-        if basis is not None:
+        # One event for all conditions: the first one that is violated ends the run.
+        least = jnp.min(guards(t, y, args)[0])
+        if quality is not None:
             # A run has one event: a basis that has become singular counts as a violation, whatever the allowances.
-            least = jnp.where(basis(t, y, args) * start > 0, least, -jnp.ones_like(least))
+            least = jnp.where(quality(t, y, args) * start > 0, least, -jnp.ones_like(least))
         return least.astype(float)  # the dtype of diffrax's own branches
 
-    eps = float(jnp.finfo(dtype).eps)
+    eps = float(jnp.finfo(t0.dtype).eps)
     return diffrax.Event(condition, Bisection(rtol=8 * eps, atol=8 * eps, flip=True), direction=False)
 
 

@@ -23,7 +23,7 @@ def lorenz(t, y, args):
 
 
 def control(kind, ts, tolerance=1e-9):
-    adaptive = Adaptive(tolerance, tolerance, norm=optimistix.rms_norm, dtmin=1e-12, force_dtmin=False)
+    adaptive = Adaptive(tolerance, tolerance, optimistix.rms_norm, 1e-12)
     if kind == "own":
         return adaptive
     if kind == "save points":

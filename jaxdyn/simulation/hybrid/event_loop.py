@@ -1,12 +1,10 @@
-"""Event loop of a hybrid system: one attempt to make a step an iteration, independently for every trajectory of a batch.
+"""Event loop of a hybrid system: steps to the next event (`driver`), the reset map, and steps again.
 
-A step that ends where a guard is negative is repeated with a shorter length, until its end is the event: the root is bracketed by
-the steps before and behind it, and approached by the secant rule of Illinois. So the state at the event is that of a step of full
-order, and not of an interpolation. Events also cut steps of fixed length, and the next step ends where the cut one would have
-ended. Guards are evaluated in the middle and at the end of every step: what is violated and satisfied again between them is not
-seen.
+Every trajectory of a batch steps to its own event; then all of them pass theirs. Events also cut steps of fixed length, and the
+next step ends where the cut one would have ended.
 """
 
+from functools import partial
 from typing import Any, NamedTuple
 
 import jax
@@ -15,336 +13,133 @@ from jaxtyping import Array
 
 from jaxdyn.compile import kernel
 from jaxdyn.compile.batch import cond, while_loop
-from jaxdyn.simulation.hybrid.modes import CHANNELS, Elements, Mode
+from jaxdyn.compile.loops import Carry, Given
+from jaxdyn.constraints.codes import RESULTS, first_of
+from jaxdyn.simulation.hybrid.modes import CHANNELS, Mode
 from jaxdyn.simulation.hybrid.records import Records, chatters, no_records, record_elements, record_switches
 from jaxdyn.simulation.hybrid.system import HybridSystem
 from jaxdyn.simulation.hybrid.transitions import Transition
-from jaxdyn.simulation.solvers.driver import number_of_steps, save
-from jaxdyn.simulation.solvers.explicit import Plan, Step, dense_output, take_step
-from jaxdyn.simulation.solvers.step_control import add_error, no_sums, step_factor
-
-# Length of the first step after an event, in steps before it: the motion may be another one.
-_AFTER_EVENT = 0.3
-# Powers of eps, of the size of a guard in the step: 1e-9 and 1e-6 in float64. Guards below the first are zero at the same event;
-# a root below the second is one, and not an error of the dense output.
-_SIMULTANEOUS, _REAL = 0.575, 0.383
-_MAX_SECANTS = 30  # iterations after which a root is bisected
-SEARCH_STEPS = 40  # attempts at most to end a step at an event
-FINE, SHORT, PARADOX, NO_MODE, CROWDED = range(5)
+from jaxdyn.simulation.solvers import driver
+from jaxdyn.simulation.solvers.explicit import Plan
 
 
 class RunState(NamedTuple):
-    """State of a run: the motion, the next attempt, and the bracket of an event in lengths of the step."""
+    """State of a run at an event: the steps, the mode, the records of events and their number, and a code."""
 
-    t: Array
-    y: Array
-    length: Array  # of the next attempt
-    usual: Array  # length of steps that end at no event
+    steps: Carry
     mode: Mode
-    guards: Array
-    locating: Array  # true while an event is bracketed
-    low: Array
-    high: Array
-    value_low: Array
-    value_high: Array
-    side: Array  # of the last attempt: 1 behind the root, -1 before it
-    tries: Array  # of this event
-    scale: Array  # of the guards, while an event is bracketed
-    tried: Array  # steps
-    accepted: Array  # steps
-    code: Array
+    records: Records
     count: Array  # events
-    sums: tuple[Array, Array]  # about steps of fixed length (`add_error`)
-    loose: Array  # true if steps go across the zeros of switching functions, and pieces change where the steps end
+    result: Any  # of the mode
 
 
-class FixedGrid(NamedTuple):
-    """Grid of steps of fixed length: from `start`, `length` apart."""
+class RunEnd(NamedTuple):
+    """End of a run: its result, counts of steps, the time, and the number of events."""
 
-    start: Array
-    length: Array
-
-    def to_next(self, t):
-        """Length of a step from t to the next point of the grid."""
-        # A point of the grid nearer than a thousandth of a step has been reached up to rounding.
-        passed = jnp.floor((t - self.start) / self.length + 1e-3)
-        return self.start + (passed + 1) * self.length - t
-
-
-class Attempt(NamedTuple):
-    """A step, the size of its error, and guards with their rounding levels at its end and in its middle."""
-
-    step: Step
-    size: Array
-    values: Array
-    levels: Array
-    middle: Array
-    middle_levels: Array
-
-
-def _attempt(plan: Plan, system: HybridSystem, args, t0, t1, y, rtol, atol) -> Attempt:
-    step = take_step(plan, args, t0, t1, y, plan.first_rate(args, t0, y))
-    scaled = step.error / (atol + rtol * jnp.maximum(jnp.abs(y), jnp.abs(step.projected)))
-    size = jnp.sqrt(jnp.mean(scaled * scaled))
-    middle = (t0 + t1) / 2
-    # The dense output only finds that a guard was negative: the event is located by steps of its own.
-    between = dense_output(plan, None, middle, t0, t1, y, step.raw, step.stages, step.shift)
-    return Attempt(step, size, *system.guards(args, t1, step.projected), *system.guards(args, middle, between))
-
-
-_attempt_by_kernel: Any = kernel(_attempt, static=2, fallback=_attempt, derivative=False)
+    result: Any
+    counts: dict[str, Array]
+    t: Array
+    count: Array
 
 
 @kernel(static=1)
-def guard_values(system: HybridSystem, args, t, y):
+def guards_at(plan: Plan, args, t, y):
     """Guards and levels."""
-    return system.guards(args, t, y)
+    return plan.guards_of(args, t, y)
 
 
 @kernel(static=1)
-def _project(system: HybridSystem, args, t, y):
-    """State projected onto the rows that act."""
-    return system.plan.project_end(args, t, y, jnp.zeros_like(y))[0]
+def _begin_mode(system: HybridSystem, args, t, y):
+    """State behind an event on the rows that act, its rate of change if steps reuse it, and its guards."""
+    plan = system.plan
+    if system.elements.each:
+        # A gap is closed where it has fallen below zero by its level, which the first step behind would count as its error.
+        y = plan.project_end(args, t, y, jnp.zeros_like(y))[0]
+    return y, plan.first_rate(args, t, y), plan.guards_of(args, t, y)[0]
 
 
 def run_events(system: HybridSystem, unknown, ts, y0, mode, rtol, atol, stepsize, max_steps: int, most: int):
-    """Rows of the state at ts[1:], the state at the end, the records, and the transition at the start.
+    """Rows of the state at ts[1:], the end, the records, and the transition at the start.
 
     `y0` (m,), flat, and `mode`: a first guess; `stepsize` (s), or None for adaptive steps. `most`: number of events.
     """
-    end, count, elements = ts[-1], ts.shape[0] - 1, system.elements
-    eps, n = float(jnp.finfo(ts.dtype).eps), len(elements.each)
-    hit = jnp.zeros((n * CHANNELS + elements.switches,), bool)
+    elements, plan = system.elements, system.plan
+    hit = jnp.zeros((CHANNELS * len(elements.each) + elements.switches,), bool)
     # The start may be an impact, or its mode may not hold: it passes a transition before the first step.
     begun = system.reset(unknown, ts[0], y0, mode, system.slip(y0), hit)
-    # A short first step: the control may enlarge it tenfold with each one that is kept.
-    first, grid = 1e-4 * (end - ts[0]), None
-    if stepsize is not None:
-        first = (end - ts[0]) / number_of_steps(ts[0], end, stepsize).astype(ts.dtype)
-        # One grid for the whole run: steps that an event has cut return to it.
-        grid = FixedGrid(ts[0], first)
-    run = _start(system, unknown, ts[0], y0, begun, first)
-    origin = run.y
-    # What is not reached stays infinite, which tells it from rows that are computed.
-    rows = jnp.broadcast_to(jnp.full_like(origin, jnp.inf), (count, origin.size))
-
-    def is_active(run: RunState):
-        return (run.t < end) & (run.code == FINE) & (run.tried < max_steps)
-
-    def body(carry):
-        run, saved, rows, records = carry
-        active = is_active(run)
-        # Trajectories that have ended make steps of no length until the last one of the batch has ended.
-        t1 = jnp.where(active, jnp.minimum(run.t + run.length, end), run.t)
-        attempt = _attempt_by_kernel(system.plan, system, (unknown, run.mode), run.t, t1, run.y, rtol, atol)
-        after, kept, hit = _decide(system, run, t1, end, attempt, eps, grid)
-        if grid is not None:
-            after = _add_errors(system, origin, run, after, kept, attempt.step)
-        if elements.switches:
-            after = _cross_loosely(elements, after)
-        after = jax.tree.map(lambda a, b: jnp.where(active, a, b), after, run)
-        # A trajectory that has ended still iterates with its batch: it must write no rows and no events.
-        kept, hit = kept & active, hit & active & kept
-        saved, rows = save(system.plan, ts, run, after, kept, attempt.step, saved, rows)
-        happens = hit.any()
-        # Most steps end at no event, and skip the transition.
-        after, records = cond(
-            happens,
-            lambda after, records: _pass_event(system, unknown, after, records, hit, happens, most, grid),
-            lambda after, records: (after, records),
-            after,
-            records,
-        )
-        return after, saved, rows, records
-
-    carry = run, jnp.zeros((), jnp.int32), rows, no_records(elements, y0.dtype, most)
-    run, _, rows, records = while_loop(lambda carry: is_active(carry[0]), body, carry)
-    return rows, run, records, begun
-
-
-def _start(system: HybridSystem, unknown, t0, y0, begun: Transition, length) -> RunState:
-    """State of a run at its start, behind the transition `begun`."""
     y = system.with_slip(y0, begun.v, begun.slip)
-    guards, _ = guard_values(system, (unknown, begun.mode), t0, y)
-    code = jnp.where(begun.paradox, PARADOX, jnp.where(begun.settled, FINE, NO_MODE)).astype(jnp.int32)
-    none, no, zero = jnp.zeros((), jnp.int32), jnp.zeros((), bool), jnp.zeros((), t0.dtype)
-    return RunState(
-        t0, y, length, length, begun.mode, guards, no, zero, zero, zero, zero, none, none,
-        jnp.ones_like(guards), none, none, code, none, no_sums(_positions_and_velocities(system, y)), no,
-    )  # fmt: skip
+    if stepsize is not None:
+        # One grid for the whole run: steps that an event has cut return to it.
+        stepsize = (ts[-1] - ts[0]) / driver.number_of_steps(ts[0], ts[-1], stepsize).astype(ts.dtype)
+    control = driver.step_control(plan.solver(), stepsize)
+    limits, steps = driver.begin(plan, control, (unknown, begun.mode), ts, y, rtol, atol, stepsize)
+    result = first_of(_cases(begun), RESULTS.successful)
+    # A mode that has begun holds, whatever the rounding of its guards.
+    search = steps.state.search._replace(hit=hit)
+    steps = steps._replace(state=steps.state._replace(search=search, stopped=result != RESULTS.successful))
+
+    def is_running(run: RunState):
+        return driver.is_active(max_steps, limits, run.steps.state._replace(search=None))
+
+    def body(run: RunState) -> RunState:
+        happens = run.steps.state.search.hit.any()
+        pass_event = partial(_pass_event, system, unknown, most, stepsize is not None)
+        run = cond(happens, pass_event, lambda run: run, run)
+        steps = driver.run_to_event(plan, control, max_steps, (), (unknown, run.mode), limits, Given(ts), run.steps)
+        return run._replace(steps=steps)
+
+    run = RunState(steps, begun.mode, no_records(elements, y0.dtype, most), jnp.zeros((), jnp.int32), result)
+    run = while_loop(is_running, body, run)
+    state = run.steps.state
+    # Friction that leaves no forces grows without bound before.
+    pivot = jnp.min(elements.split(state.search.values)[0][:, 2], initial=1.0) < 0.05
+    cases = [(state.failed & pivot, RESULTS.painleve_paradox), *driver.cases_of(limits, control, state)]
+    of_mode = run.result != RESULTS.successful
+    result = RESULTS.where(of_mode, run.result, first_of(cases, RESULTS.successful))
+    return run.steps.rows, RunEnd(result, state.counts, state.t, run.count), run.records, begun
 
 
-def _positions_and_velocities(system: HybridSystem, y) -> dict[str, Array]:
-    """Entries of a flat state without the directions of sliding."""
-    return {name: part for name, part in system.plan.structure(y).items() if name != "slip"}
+def _cases(change: Transition) -> list[tuple[Array, Any]]:
+    return [(change.paradox, RESULTS.painleve_paradox), (~change.settled, RESULTS.no_contact_mode)]
 
 
-def _add_errors(system: HybridSystem, origin, run: RunState, after: RunState, kept, step: Step) -> RunState:
-    """Add the error of a kept step to the sum."""
-    start, before, y, error = (
-        _positions_and_velocities(system, x) for x in (origin, run.y, step.projected, step.error)
-    )
-    sums = add_error(system.order, system.error_order, start, before, y, error, *run.sums)
-    return after._replace(sums=jax.tree.map(lambda new, old: jnp.where(kept, new, old), sums, run.sums))
-
-
-def _cross_loosely(elements: Elements, run: RunState) -> RunState:
-    """Take the pieces at the end of the last step, if steps go across the zeros of switching functions."""
-    first, switching = elements.split(run.guards)
-    crossed = run.loose & (switching < 0)
-    # Guards have the sign of their piece: with the piece the sign changes, and the guard is positive again.
-    guards = jnp.concatenate([first.reshape(-1), jnp.where(crossed, -switching, switching)])
-    return run._replace(mode=run.mode._replace(positive=run.mode.positive ^ crossed), guards=guards)
-
-
-class _Bracket(NamedTuple):
-    """Bracket of an event after an attempt, and what it says of the attempt."""
-
-    low: Array
-    high: Array
-    value_low: Array
-    value_high: Array
-    side: Array
-    scale: Array
-    violated: Array  # true if a guard is negative
-    locating: Array  # true while the event is bracketed
-    located: Array  # true if the attempt ends at the event
-    kept: Array
-    hit: Array  # guards that ended the step
-
-
-def _bracket(run: RunState, t1, attempt: Attempt, good, eps: float) -> _Bracket:
-    """Narrow the bracket of an event by an attempt whose error is `good`, or begin one."""
-    length, (values, levels) = t1 - run.t, (attempt.values, attempt.levels)
-    # Within its rounding level the sign of a guard is not known.
-    violated = (values < -levels).any() & ~run.loose
-    # In the middle alone: the step is halved first.
-    inside = good & ~run.locating & ~run.loose & (attempt.middle < -attempt.middle_levels).any()
-    violated = violated | inside
-    at = jnp.where(inside, attempt.middle, values)
-    high = jnp.where(inside, length / 2, length)
-    level = jnp.maximum(levels, float(jnp.finfo(values.dtype).tiny))
-    # Guards have units of their own: each is measured by its size at the ends of the step where the search begins.
-    scale = jnp.where(run.locating, run.scale, jnp.maximum(jnp.maximum(jnp.abs(run.guards), jnp.abs(at)), level))
-    value = jnp.min(at / scale)
-    first_value = jnp.min(run.guards / scale)
-
-    # A step whose error is too large proves nothing about the guards at its end.
-    begins = good & violated & ~run.locating
-    low = jnp.where(begins, 0.0, run.low)
-    value_low = jnp.where(begins, first_value, run.value_low)
-    # A value that was a root is near zero and does not guide the secant.
-    behind, before = good & violated, good & ~violated & run.locating
-    low = jnp.where(before, high, low)
-    value_low = jnp.where(before, value, value_low)
-    high_ = jnp.where(behind, high, run.high)
-    value_high = jnp.where(behind, value, run.value_high)
-    side = jnp.where(behind, 1, jnp.where(before, -1, run.side)).astype(jnp.int32)
-    # Rule of Illinois: an end that is kept twice counts half, so that the bracket shrinks from both sides.
-    again = run.locating & (side == run.side)
-    value_low = jnp.where(again & behind, value_low / 2, value_low)
-    value_high = jnp.where(again & before, value_high / 2, value_high)
-
-    locating = (run.locating & good) | begins
-    # The root is known when a guard is zero, or when its time is, up to rounding.
-    near = jnp.abs(value) <= 64 * eps
-    narrow = (high_ - low) <= 4 * eps * jnp.maximum(jnp.abs(t1), run.usual)
-    # A zero in the middle is not at the end of this step, which is where a step can be cut.
-    located = locating & (near | narrow) & ~inside
-    kept = good & ((~violated & ~run.locating) | located)
-    # A zero in the middle of a step may have been an error of the dense output.
-    real = located & (value <= eps**_REAL)
-    hit = real & ((values <= eps**_SIMULTANEOUS * scale) & (scale > 4 * level) | (values / scale <= value))
-    return _Bracket(low, high_, value_low, value_high, side, scale, violated, locating, located, kept, hit)
-
-
-def _decide(system: HybridSystem, run: RunState, t1, end, attempt: Attempt, eps: float, grid: FixedGrid | None):
-    """State after an attempt, whether the step is kept, and the guards that ended it."""
-    length = t1 - run.t
-    # False for an error of NaN, so that a step to a state that is not finite is refused.
-    good = attempt.size < 1 if grid is None else jnp.isfinite(attempt.step.projected).all()
-    factor = step_factor(attempt.size, system.error_order, good).astype(length.dtype)
-    b = _bracket(run, t1, attempt, good, eps)
-    # A secant where both ends are known by their values, else bisection.
-    guided = (b.value_low > 64 * eps) & (b.value_high < 0) & (run.tries < _MAX_SECANTS)
-    difference = jnp.where(guided, b.value_high - b.value_low, 1.0)
-    secant = jnp.where(guided, b.high - b.value_high * (b.high - b.low) / difference, (b.low + b.high) / 2)
-    # Rounding can carry the secant out of the bracket.
-    secant = jnp.clip(secant, b.low, b.high)
-    # Attempts that locate an event are short for its sake: they say nothing about the usual length.
-    usual = jnp.where(run.locating, run.usual, jnp.where(good & ~b.violated, length * factor, length))
-    usual = jnp.where(good, usual, length * factor)
-    next_length = jnp.where(b.locating, secant, usual)
-    next_length = jnp.where(b.located, _AFTER_EVENT * usual, next_length)
-    # The spacing of floating-point numbers at t: shorter steps would not advance.
-    least = 4 * eps * jnp.maximum(jnp.abs(run.t), eps)
-    short = ~good & (next_length < least)
-    # Steps of fixed length have no error to keep: they fail where the state is not finite.
-    if grid is not None:
-        short, usual = ~good, run.usual
-        next_length = jnp.where(b.locating & ~b.located, secant, grid.to_next(jnp.where(b.kept, t1, run.t)))
-    pivots = system.elements.split(run.guards)[0][:, 2]
-    pivot = jnp.min(pivots, initial=1.0) < 0.05  # friction that leaves no forces grows without bound before
-    code = jnp.where(short, jnp.where(pivot, PARADOX, SHORT), run.code).astype(jnp.int32)
-    # Steps end on the run's end, or well before it.
-    t = jnp.where(b.kept, t1, run.t)
-    ends = ~b.locating & (t + next_length > end - 1e-3 * next_length)
-    next_length = jnp.where(ends & (t < end), end - t, next_length)
-    after = run._replace(
-        t=t,
-        y=jnp.where(b.kept, attempt.step.projected, run.y),
-        length=next_length,
-        usual=usual,
-        guards=jnp.where(b.kept, attempt.values, run.guards),
-        locating=b.locating & ~b.located,
-        low=b.low,
-        high=b.high,
-        value_low=b.value_low,
-        value_high=b.value_high,
-        side=b.side,
-        tries=jnp.where(b.locating & ~b.located, run.tries + jnp.ones((), jnp.int32), 0),
-        scale=b.scale,
-        tried=run.tried + jnp.ones((), jnp.int32),
-        accepted=run.accepted + b.kept.astype(jnp.int32),
-        code=code,
-    )
-    return after, b.kept, b.hit
-
-
-def _pass_event(
-    system: HybridSystem, unknown, run: RunState, records: Records, hit, happens, most: int, grid: FixedGrid | None
-):
-    """State in the mode behind an event, and the records with it."""
-    elements, before = system.elements, run.mode
-    change = system.reset(unknown, run.t, run.y, before, system.slip(run.y), hit)
-    mode, y = change.mode, system.with_slip(run.y, change.v, change.slip)
-    if elements.each:
-        # A gap is closed where it has fallen below zero by its level, which the first step behind would count as its error.
-        y = _project(system, (unknown, mode), run.t, y)
-    guards, _ = guard_values(system, (unknown, mode), run.t, y)
+def _pass_event(system: HybridSystem, unknown, most: int, is_fixed_length: bool, run: RunState) -> RunState:
+    """State in the mode behind an event, and the records with it; unchanged where there is none."""
+    elements, before, state, records = system.elements, run.mode, run.steps.state, run.records
+    hit, search = state.search.hit, state.search
+    happens = hit.any() & ~state.stopped
+    change = system.reset(unknown, state.t, state.y, before, system.slip(state.y), hit)
+    mode, y = change.mode, system.with_slip(state.y, change.v, change.slip)
+    y, rate, guards = _begin_mode(system, (unknown, mode), state.t, y)
     by_element, switched = elements.split(hit)
     lost = by_element[:, 2].any()  # of pivots: no mode follows
     rows, count = records, run.count
     if elements.switches:
+        # Steps that go across the roots have no records.
         rows, count = record_switches(
-            elements, run.t, run.count, before, records, switched & happens, change.slip, most
+            elements, state.t, count, before, records, switched & happens & ~search.loose, change.slip, most
         )
     if elements.each:
-        rows, count = record_elements(elements, run.t, before, change, by_element, happens, rows, count, most)
-    crowded = count > most
-    code = jnp.where(change.settled, FINE, NO_MODE)
+        rows, count = record_elements(elements, state.t, before, change, by_element, happens, rows, count, most)
     # With switching functions alone, a motion without room for its events continues: it loses its derivatives.
-    code = jnp.where(crowded & bool(elements.each), CROWDED, code)
-    # Last, because it is the reason why no mode was found.
-    code = jnp.where(change.paradox | lost, PARADOX, code)
-    loose = jnp.zeros((), bool)
+    crowded, loose = (count > most) & bool(elements.each), search.loose
     if elements.switches:
-        is_chatter = chatters(elements, run.t, run.usual, run.count, records, switched, most)
+        is_chatter = chatters(elements, state.t, search.usual, run.count, records, switched, most) & ~loose
         # Steps of fixed length go across the zero from then on.
-        loose = is_chatter & bool(grid is not None and not elements.each)
-        code = jnp.where(is_chatter & ~loose, CROWDED, code)
+        begins = is_chatter & bool(is_fixed_length and not elements.each)
+        crowded = crowded | (is_chatter & ~begins)
         # More events than there is room for: the replay then gives NaN for derivatives, which this motion lacks.
-        count = jnp.where(loose, most + 1, count)
-    code = code.astype(jnp.int32)
-    after = run._replace(y=y, mode=mode, guards=guards, count=count, code=code, loose=run.loose | loose)
-    return jax.tree.map(lambda a, b: jnp.where(happens, a, b), (after, rows), (run, records))
+        count = jnp.where(begins, most + 1, count)
+        loose = loose | begins
+    # First, because it is the reason why no mode was found.
+    cases = [
+        (lost, RESULTS.painleve_paradox),
+        *_cases(change)[:1],
+        (crowded, RESULTS.too_many_events),
+        *_cases(change)[1:],
+    ]
+    result = first_of(cases, RESULTS.successful)
+    search = search._replace(values=guards, hit=jnp.zeros_like(hit), loose=loose)
+    state = state._replace(y=y, rate=rate, search=search, stopped=result != RESULTS.successful)
+    after = RunState(run.steps._replace(state=state), mode, rows, count, result)
+    return jax.tree.map(lambda a, b: jnp.where(happens, a, b), after, run)

@@ -8,14 +8,12 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import lax
-from jaxtyping import Array
 
 from jaxdyn.compile import entry_point, kernel
 from jaxdyn.compile.known import partition_tracers
 from jaxdyn.constraints.base import velocity_residual
-from jaxdyn.constraints.codes import RESULTS
+from jaxdyn.constraints.codes import RESULTS, first_of
 from jaxdyn.forces.piecewise import Pieces, fix_pieces, guards, pieces_of
-from jaxdyn.simulation.hybrid import event_loop
 from jaxdyn.simulation.hybrid.dynamics import by_element, directions, gaps, motion_at, slides, terms_at
 from jaxdyn.simulation.hybrid.modes import KINDS, Elements, Events, Mode, elements_of, extend, force_at
 from jaxdyn.simulation.hybrid.replay import HybridRun
@@ -23,20 +21,12 @@ from jaxdyn.simulation.hybrid.system import ModalSystem, project
 from jaxdyn.simulation.hybrid.transitions import length
 from jaxdyn.simulation.methods import consistent
 from jaxdyn.simulation.outputs import state_outputs
-from jaxdyn.simulation.solution import Solution, first_of, rows_where
+from jaxdyn.simulation.solution import Solution, rows_where
 from jaxdyn.simulation.solvers.choice import label
 from jaxdyn.simulation.solvers.differentiable import ROOM
-from jaxdyn.simulation.solvers.driver import step_counts
-from jaxdyn.simulation.solvers.step_control import too_coarse
+from jaxdyn.simulation.solvers.guards import SEARCH_STEPS
 from jaxdyn.simulation.start import safe_inputs
 from jaxdyn.systems.scene import Scene, check_callback, check_force
-
-_CODES = {
-    event_loop.SHORT: "dt_min_reached",
-    event_loop.PARADOX: "painleve_paradox",
-    event_loop.NO_MODE: "no_contact_mode",
-    event_loop.CROWDED: "too_many_events",
-}
 
 
 class _Binder:
@@ -96,6 +86,8 @@ def hybrid_motion(scene: Scene, control, numbers, options) -> Solution:
     if scene.constraints:
         start_ok = start_ok & consistent(Scene(scene.system, scene.constraints), q0, v0, ts[0])
     y0, most, max_steps = {"q": q0, "v": v0, "slip": slip}, options["max_events"], options["max_steps"]
+    if stepsize is not None and not options["limit_is_given"]:
+        max_steps += SEARCH_STEPS * most
     system = ModalSystem(bind, elements, options["solver"], y0)
     room = max_steps if stepsize is not None else min(max_steps, ROOM)
     run: Any = HybridRun(system, mode, rtol, atol, stepsize, max_steps, most, room=room)
@@ -121,22 +113,14 @@ def hybrid_motion(scene: Scene, control, numbers, options) -> Solution:
     later = lax.map(partial(kernel(correct), unknown), jax.tree.map(lambda x: x[1:], (y, modes, ts)))
     y = jax.tree.map(lambda a, b: jnp.concatenate([a[:1], b]), y, later)
     values = lax.map(partial(kernel(outputs_of), unknown), (y, modes, ts))
-    cases = [*inputs.faults, (~start_ok, RESULTS.inconsistent_start), *_cases(end, ts[-1], stepsize is not None)]
-    result = first_of([*cases, (~reached.all(), RESULTS.nonfinite_state)], RESULTS.successful)
-    stats = step_counts(end.tried, end.accepted) | {"time_reached": jnp.where(good, end.t, ts[0])}
+    ended = (end.result == RESULTS.successful) & ~reached.all()
+    cases = [*inputs.faults, (~start_ok, RESULTS.inconsistent_start), (ended, RESULTS.nonfinite_state)]
+    result = first_of(cases, end.result)
+    stats = end.counts | {"time_reached": jnp.where(good, end.t, ts[0])}
     touched = _impacts_at_start(scene, elements, q0, v0, ts[0], mode)
     events = _events(elements, touched, ts[0], times, records.name[:most], good & start_ok)
     rows = jax.tree.map(lambda rows: rows_where(reached, rows, jnp.nan), {"q": y["q"], "v": y["v"], **values})
     return Solution(ts=inputs.given, result=result, stats=stats, events=events, solver=label(options["solver"]), **rows)
-
-
-def _cases(end: event_loop.RunState, last, is_fixed_length: bool) -> list[tuple[Array, Any]]:
-    """Cases of the result from the state at the end of a run to the time `last`."""
-    codes: Any = RESULTS
-    names = _CODES | ({event_loop.SHORT: "nonfinite_state"} if is_fixed_length else {})
-    cases = [(end.code == code, getattr(codes, name)) for code, name in names.items()]
-    cases.append((end.t < last, codes.max_steps_reached))
-    return [*cases, (too_coarse(end.sums), codes.coarse_steps)] if is_fixed_length else cases
 
 
 def _outputs(bind: _Binder, elements: Elements, outputs, unknown, y, mode: Mode, t) -> dict[str, Any]:

@@ -3,19 +3,17 @@
 from collections.abc import Callable
 from typing import Any
 
-import diffrax
 import jax.numpy as jnp
 from jax import lax
 from jax.flatten_util import ravel_pytree
 
 from jaxdyn.forces.piecewise import Pieces
-from jaxdyn.simulation.hybrid import event_loop
 from jaxdyn.simulation.hybrid.modes import Elements, Mode
 from jaxdyn.simulation.hybrid.replay import HybridRun
 from jaxdyn.simulation.hybrid.system import HybridSystem
 from jaxdyn.simulation.hybrid.transitions import Transition
-from jaxdyn.simulation.solvers.driver import step_counts
 from jaxdyn.simulation.solvers.explicit import Plan
+from jaxdyn.simulation.solvers.guards import SEARCH_STEPS
 
 MIN_EVENTS = 256  # events that derivatives go through, at least
 
@@ -29,7 +27,8 @@ class PiecewiseSystem(HybridSystem):
 
     def __init__(self, plan: Plan, pieces: Pieces, switching: Callable):
         self.elements, self._plan, self._switching = Elements((), 0, 0, pieces), plan, switching
-        self.plan = plan._replace(field=self._field, project=None if plan.project is None else self._project)
+        project = None if plan.project is None else self._project
+        self.plan = plan._replace(field=self._field, project=project, guards=self.guards)
 
     def _field(self, t, y, args):
         return self._plan.field(t, y, (*args[0], args[1].positive))
@@ -38,8 +37,8 @@ class PiecewiseSystem(HybridSystem):
         project: Any = self._plan.project
         return project(t, y, error, (*args[0], args[1].positive))
 
-    def guards(self, args, t, y):
-        values, levels = self._switching(t, self.plan.structure(y), (*args[0], args[1].positive))
+    def guards(self, t, y, args):
+        values, levels = self._switching(t, y, (*args[0], args[1].positive))
         return jnp.where(args[1].positive, values, -values), levels
 
     def reset(self, unknown, t, y, mode, slip, hit):
@@ -60,7 +59,7 @@ class PiecewiseSystem(HybridSystem):
 def piecewise_motion(
     system: PiecewiseSystem, y0, args, ts, rtol, atol, stepsize, max_steps: int, room: int, most: int, is_direct: bool
 ):
-    """Rows of the state at ts[1:]; diffrax's result, counts and the time reached; sums about fixed steps, or None.
+    """Rows of the state at ts[1:], and the end of the run.
 
     **Arguments:** `args` of the equations; `stepsize` (s), or None for adaptive steps; `max_steps`, without those that locate
     events; `room` for steps between two events or save points in reverse mode; `most`, the number of events that derivatives go
@@ -69,14 +68,10 @@ def piecewise_motion(
     unknown, flat = tuple(args or ()), ravel_pytree(y0)[0]
     none = jnp.zeros((0,), bool)
     mode = Mode(none, none, none, jnp.ones((system.elements.switches,), bool))
-    values, _ = system.guards((unknown, mode), ts[0], flat)
+    values, _ = system.guards(ts[0], y0, (unknown, mode))
     rtol, atol = (jnp.asarray(x, flat.dtype) for x in (rtol, atol))
     mode = lax.stop_gradient(mode._replace(positive=values > 0))
     # Attempts that locate events do not count among the user's steps, so that there is room for both.
-    run = HybridRun(system, mode, rtol, atol, stepsize, max_steps + event_loop.SEARCH_STEPS * most, most, room=room)
+    run = HybridRun(system, mode, rtol, atol, stepsize, max_steps + SEARCH_STEPS * most, most, room=room)
     rows, _, (end, _, _) = (run.direct if is_direct else run)(y0, unknown, ts)
-    codes: Any = diffrax.RESULTS
-    result = codes.where(end.t < ts[-1], codes.max_steps_reached, codes.successful)
-    result = codes.where(end.code == event_loop.SHORT, codes.dt_min_reached, result)
-    result = codes.where(end.code == event_loop.CROWDED, codes.event_occurred, result)
-    return rows, (result, step_counts(end.tried, end.accepted), end.t), None if stepsize is None else end.sums
+    return rows, end

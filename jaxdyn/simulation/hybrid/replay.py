@@ -15,17 +15,18 @@ from typing import Any
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-import optimistix
 from jax import lax
 from jax.flatten_util import ravel_pytree
 
 from jaxdyn.compile.batch import cond
-from jaxdyn.simulation.hybrid.event_loop import FINE, guard_values, run_events
+from jaxdyn.constraints.codes import RESULTS
+from jaxdyn.simulation.hybrid.event_loop import guards_at, run_events
 from jaxdyn.simulation.hybrid.modes import Mode
 from jaxdyn.simulation.hybrid.records import Records
 from jaxdyn.simulation.hybrid.system import HybridSystem
-from jaxdyn.simulation.solvers import driver
-from jaxdyn.simulation.solvers.driver import ExplicitRun
+from jaxdyn.simulation.solvers.driver import step_control
+from jaxdyn.simulation.solvers.explicit_run import ExplicitRun
+from jaxdyn.simulation.solvers.guards import delay
 from jaxdyn.simulation.solvers.integrator import Integrator, zeros_or
 
 
@@ -66,15 +67,14 @@ class HybridRun(Integrator):
 def _replay(run: HybridRun, inputs, end, records, begun, direct: bool):
     """Rows at ts[1:] and times of events by replay in the modes that are known; `direct`: differentiable in both modes."""
     system, (y0, unknown, ts) = run.system, inputs
-    plan, saves, most = system.plan, ts.shape[0] - 1, run.most
+    plan, saves, most = system.plan._replace(guards=None), ts.shape[0] - 1, run.most
     happened = records.name[:most] >= 0
     known_times = jnp.concatenate([ts[1:], jnp.where(happened, records.time[:most], jnp.inf)])
     is_event = jnp.arange(saves + most) >= saves
     order = jnp.lexsort((is_event, lax.stop_gradient(known_times)))  # a save point at an event is before it
-    control: Any = driver.AdaptiveSteps(system.error_order, optimistix.rms_norm)
-    if run.stepsize is not None:
-        control = driver.FixedSteps(system.order, system.error_order)
-    part_run = ExplicitRun(plan, control, run.rtol, run.atol, run.stepsize, run.max_steps, room=run.room)
+    part_run = ExplicitRun(
+        plan, step_control(plan.solver(), run.stepsize), run.rtol, run.atol, run.stepsize, run.max_steps, room=run.room
+    )
     last = lax.stop_gradient(end.t)
 
     def part_or_none(carry, at):
@@ -93,7 +93,7 @@ def _replay(run: HybridRun, inputs, end, records, begun, direct: bool):
         advances = known & (until > t) & (until <= last)
         until = jnp.where(advances, until, t)
         integrate: Any = part_run.direct if direct else part_run
-        rows, _, _ = integrate(plan.structure(y), (unknown, mode), jnp.stack([t, until]))
+        rows, *_ = integrate(plan.structure(y), (unknown, mode), jnp.stack([t, until]))
         here = jnp.where(advances, ravel_pytree(jax.tree.map(lambda x: x[0], rows))[0], y)
         behind = _cross(system, unknown, mode, record, t, until, here)
         crosses = event & known
@@ -109,7 +109,9 @@ def _replay(run: HybridRun, inputs, end, records, begun, direct: bool):
     # The inverse permutation: save points first, then events.
     back = jnp.argsort(order)
     # A motion that continued beyond the events that there was room for has no derivative here.
-    rows = rows * jnp.where((end.count > most) & (end.code == FINE), jnp.nan, 1.0).astype(rows.dtype)
+    rows = rows * jnp.where((end.count > most) & (end.result != RESULTS.too_many_events), jnp.nan, 1.0).astype(
+        rows.dtype
+    )
     return jax.vmap(plan.structure)(rows[back[:saves]]), times[back[saves:]]
 
 
@@ -118,18 +120,11 @@ def _cross(system: HybridSystem, unknown, mode: Mode, record: Records, t, known_
     hit, which = record.trigger >= 0, jnp.maximum(record.trigger, 0)
 
     def guard(t, y):
-        return guard_values(system, (unknown, mode), t, y)[0].reshape(-1)[which]
+        return guards_at(system.plan, (unknown, mode), t, y)[0][which]
 
     rate = lax.stop_gradient(system.plan.field_of((unknown, mode), known_time, y))
-    fixed = lax.stop_gradient((known_time, y))
-    _, guard_rate = jax.jvp(guard, fixed, (jnp.ones_like(known_time), rate))
-    value = guard(known_time, y)
-    # The value is zero up to rounding: only its derivative is used.
-    is_regular = hit & (guard_rate != 0)
-    change = value - lax.stop_gradient(value)
-    late = change / lax.stop_gradient(jnp.where(is_regular, guard_rate, jnp.ones_like(guard_rate)))
-    late = jnp.where(is_regular, late, jnp.zeros_like(late))
-    time = jnp.where(hit, known_time - late, t)
-    # Back to the event by the rate before it: of value zero, with the derivative of the time.
-    y = system.impact(unknown, record.impact, record.impact_slip, time, y - late * rate)
+    late = jnp.where(hit, delay(guard, rate, known_time, y), 0.0)
+    time = jnp.where(hit, known_time + late, t)
+    # To the event by the rate before it: a shift of value zero, with the derivative of the time.
+    y = system.impact(unknown, record.impact, record.impact_slip, time, y + late * rate)
     return time, system.with_slip(y, None, lax.stop_gradient(record.slip))

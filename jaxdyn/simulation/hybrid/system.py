@@ -48,18 +48,8 @@ class HybridSystem:
     plan: Plan
     elements: Elements
 
-    @property
-    def order(self) -> Any:
-        """Order of the method."""
-        return self.plan.solver().order(None)
-
-    @property
-    def error_order(self) -> Any:
-        """Order of the error estimate."""
-        return self.plan.solver().error_order(None)
-
     @abstractmethod
-    def guards(self, args, t, y) -> tuple:
+    def guards(self, t, y, args) -> tuple:
         """Guards and their rounding levels: those of the elements by CHANNELS, then those of the switching functions."""
 
     @abstractmethod
@@ -90,7 +80,8 @@ class ModalSystem(HybridSystem):
         leaves, tree = jax.tree.flatten(y0)
         shapes = tuple(x.shape for x in leaves)
         self._bind, self.elements = bind, elements
-        self.plan = Plan(type(solver), jax.jit(self._field), self._project, ("slip",), False, tree, shapes)
+        plan = Plan(type(solver), jax.jit(self._field), self._project, ("slip",), False, tree, shapes)
+        self.plan = plan._replace(guards=self.guards)
 
     def _motion(self, args, t, y):
         unknown, mode = args
@@ -115,8 +106,8 @@ class ModalSystem(HybridSystem):
         values, levels = values_and_levels(lambda q, v: switching(q, v, t), q, v)
         return jnp.where(positive, values, -values), levels
 
-    def guards(self, args, t, y):
-        y, mode = self.plan.structure(y), args[1]
+    def guards(self, t, y, args):
+        mode = args[1]
         scene, q, v, terms, motion = self._motion(args, t, y)
         state = _contact_state(scene, self.elements, mode, terms, motion, y["slip"], q, v, t)
         values, levels = self._switches(args[0], mode.positive, q, v, t)

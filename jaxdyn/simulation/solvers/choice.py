@@ -102,6 +102,12 @@ def label(solver: diffrax.AbstractSolver) -> str:
     return f"{name}({label(inner)})" if isinstance(inner, diffrax.AbstractSolver) else name
 
 
+def is_explicit(solver: diffrax.AbstractSolver) -> bool:
+    """True for an explicit Runge-Kutta method, whose steps the library makes itself."""
+    # diffrax reports a method that wraps an explicit one as explicit.
+    return isinstance(solver, diffrax.AbstractERK) and not isinstance(solver, diffrax.AbstractWrappedSolver)
+
+
 def is_split(solver: diffrax.AbstractSolver) -> bool:
     """True if the method integrates an explicit and an implicit part, as `diffrax.KenCarp4` does."""
     return isinstance(getattr(innermost(solver), "tableau", None), diffrax.MultiButcherTableau)
@@ -169,7 +175,7 @@ def solver_and_control(solver, term, ts, rtol, atol, stepsize):
     if controller is None:
         # A step has to be longer than the rounding of the time.
         smallest = 16 * eps * jnp.maximum(jnp.abs(ts[0]), jnp.abs(ts[-1]))
-        controller = Adaptive(rtol, atol, norm=_error_size, dtmin=smallest, force_dtmin=False)
+        controller = Adaptive(rtol, atol, _error_size, smallest)
     if isinstance(controller, diffrax.AbstractAdaptiveStepSizeController) and _has_coarse_dense_output(solver, term):
         controller = diffrax.ClipStepSizeController(controller, step_ts=ts)
     return solver, controller, None

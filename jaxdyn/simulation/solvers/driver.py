@@ -1,7 +1,8 @@
 """Integration by explicit steps, as one loop around kernels: diffrax's rules in a program that compiles in a second.
 
-The step-size control is that of diffrax's `PIDController` with an integral part alone, and fixed steps are those of its
-`ConstantStepSize`. Trajectories of a batch that have ended take steps of no length until the last one has ended.
+A step at whose end a guard is negative is repeated with a shorter length, until its end is the root (`guards`). There the loop
+ends: with the run, or until a reset map has set the state behind the event (`hybrid.event_loop`).
+Trajectories of a batch that have ended take steps of no length until the last one has ended.
 
 Reverse mode goes back through the same steps (see `reverse`).
 """
@@ -11,25 +12,36 @@ from functools import lru_cache, partial
 from typing import Any, NamedTuple
 
 import diffrax
-import equinox as eqx
 import jax
 import jax.numpy as jnp
+import optimistix
 from jax import lax
-from jax.flatten_util import ravel_pytree
 from jaxtyping import Array
 
 from jaxdyn.compile import kernel
 from jaxdyn.compile.batch import any_sample, while_loop
 from jaxdyn.compile.loops import Carry, Given, Iteration, Passed, Task, run_loop
 from jaxdyn.compile.repair import compute_where
+from jaxdyn.constraints.codes import RESULTS
 from jaxdyn.simulation.solvers import reverse
 from jaxdyn.simulation.solvers.explicit import Plan, Step, dense_output, take_step
-from jaxdyn.simulation.solvers.integrator import Integrator, zeros_or
-from jaxdyn.simulation.solvers.step_control import add_error, first_step, least_step, no_sums, step_factor
+from jaxdyn.simulation.solvers.guards import Search, search_root
+from jaxdyn.simulation.solvers.step_control import (
+    NextStep,
+    add_error,
+    error_size,
+    first_step,
+    least_step,
+    next_step,
+    no_sums,
+    too_coarse,
+)
 
 # Floating-point numbers before the end of a run from which a step goes to the end: what is left is rounding, and a step of its
 # own for it would be shorter than the least one.
 _ROUNDED = 100
+# Length of the first step after an event, in steps before it: the motion may be another one.
+_AFTER_EVENT = 0.3
 
 
 class AdaptiveSteps(NamedTuple):
@@ -46,60 +58,13 @@ class FixedSteps(NamedTuple):
     error_order: Any
 
 
-class ExplicitRun(Integrator):
-    """Integrator by explicit steps: call(y0, args, ts) -> rows of the state at ts[1:]; result, counts, time reached; sums.
-
-    - `plan`, `control`: the steps and their control.
-    - `rtol`, `atol`, for adaptive steps; `stepsize` (s), for fixed ones.
-    - `max_steps`; `room`, the most where reverse mode is asked for.
-    """
-
-    plan: Plan = eqx.field(static=True)
-    control: AdaptiveSteps | FixedSteps = eqx.field(static=True)
-    rtol: Any
-    atol: Any
-    stepsize: Any
-    max_steps: int = eqx.field(static=True)
-
-    def values(self, inputs, room):
-        y0, args, ts = inputs
-        most, flat = self.max_steps if room is None else room, ravel_pytree(y0)[0]
-        # Of one step that is kept in any case the inputs tell the history: where reverse mode computes a run again for its
-        # history alone, this one is left out.
-        is_told = room == 1 and self.plan.quality is None and isinstance(self.control, FixedSteps)
-        rows, facts, sums, history = _run_steps(self, flat, args, ts, most, room is not None and not is_told)
-        if is_told:
-            history = reverse.of_one_step(flat, ts[0], jnp.minimum(ts[0] + self.stepsize, ts[-1]))
-        return (jax.vmap(self.plan.structure)(rows), facts, sums), history
-
-    def number_of_steps(self, ts):
-        """Number of fixed steps, or None."""
-        return None if isinstance(self.control, AdaptiveSteps) else number_of_steps(ts[0], ts[-1], self.stepsize)
-
-    def replay(self, history, inputs, direct):
-        y0, args, ts = inputs
-        rows = reverse.replay_rows(self.plan, history, ravel_pytree(y0)[0], args, ts, self.number_of_steps(ts))
-        return (jax.vmap(self.plan.structure)(rows),)
-
-    def weights(self, inputs, gradients, history):
-        return (zeros_or(gradients[0], inputs[0], inputs[2].shape[0] - 1),)
-
-    def pull(self, inputs, weights, history, perturbed):
-        """Cotangents of the inputs by kernels."""
-        y0, args, ts = inputs
-        flat = jax.vmap(lambda y: ravel_pytree(y)[0])(weights[0])
-        start, structure = ravel_pytree(y0)
-        of_y, of_args, of_ts = reverse.pull(
-            self.plan, history, start, args, ts, self.number_of_steps(ts), flat, perturbed[1:]
-        )
-
-        def or_none(x, varies):
-            return x if varies else None
-
-        return jax.tree.map(or_none, structure(of_y), perturbed[0]), of_args, or_none(of_ts, perturbed[2])
+def step_control(solver: Any, stepsize, norm: Callable = optimistix.rms_norm) -> AdaptiveSteps | FixedSteps:
+    """Control of the steps of a method: of this length, or adaptive ones for None."""
+    order, error_order = solver.order(None), solver.error_order(None)
+    return AdaptiveSteps(error_order, norm) if stepsize is None else FixedSteps(order, error_order)
 
 
-class _Limits(NamedTuple):
+class Limits(NamedTuple):
     """Constants of a run: its ends, the time from which a step goes to the end, and what sets the length of steps."""
 
     start: Array
@@ -112,7 +77,7 @@ class _Limits(NamedTuple):
     y0: Array
 
 
-class _State(NamedTuple):
+class State(NamedTuple):
     """State of a run: the next step goes from t to t_next, from the state y with the rate of change `rate`."""
 
     t: Array
@@ -126,81 +91,88 @@ class _State(NamedTuple):
     quality: Array  # of the state if the method may fail on the way (`Plan.quality`), else one
     stopped: Array  # true where that has changed its sign
     sums: tuple[Array, Array]
+    search: Search | None  # for the events of a plan that has guards
+
+    @property
+    def counts(self) -> dict[str, Array]:
+        """Counts of steps, by diffrax's names."""
+        counts = self.tried, self.accepted, self.tried - self.accepted
+        return dict(zip(("num_steps", "num_accepted_steps", "num_rejected_steps"), counts, strict=True))
 
 
-def _run_steps(run: ExplicitRun, y0, args, ts, max_steps: int, record: bool):
-    """Rows (nt - 1, n) at ts[1:]; diffrax's result, counts and time reached; sums (`add_error`); a `History` or None.
-
-    **Arguments:** `y0` (n,), flat; `record`: True to write the history that reverse mode needs.
-    """
-    plan, control, is_adaptive = run.plan, run.control, isinstance(run.control, AdaptiveSteps)
-    start, end, count = ts[0], ts[-1], ts.shape[0] - 1
+def begin(plan: Plan, control, args, ts, y0, rtol, atol, stepsize, records=()) -> tuple[Limits, Carry]:
+    """Constants of a run, and the carry of its loop at the start, with the rows of the history that it writes."""
+    start, end = ts[0], ts[-1]
     eps, none, no = float(jnp.finfo(ts.dtype).eps), jnp.zeros((), jnp.int32), jnp.asarray(False)
     floor = end - _ROUNDED * eps / 2 * jnp.abs(end)
     # Fixed steps have no tolerances: zeros keep one structure of the loop's constants.
-    rtol, atol = (jnp.zeros_like(start) if x is None else x for x in (run.rtol, run.atol))
-    rate, length, quality = _begin(plan, control, args, start, end, y0, rtol, atol)
+    rtol, atol = (jnp.zeros_like(start) if x is None else x for x in (rtol, atol))
+    rate, length, quality, (values, levels) = _begin(plan, control, args, start, end, y0, rtol, atol)
     steps = none
-    if not is_adaptive:
-        length, steps = run.stepsize, number_of_steps(start, end, run.stepsize)
+    if not isinstance(control, AdaptiveSteps):
+        length, steps = stepsize, number_of_steps(start, end, stepsize)
     least_at_end = 16 * eps * jnp.maximum(jnp.abs(start), jnp.abs(end))
-    limits = _Limits(start, end, floor, least_at_end, steps, rtol, atol, y0)
+    limits = Limits(start, end, floor, least_at_end, steps, rtol, atol, y0)
+    search = None if plan.guards is None else Search.begin(values, values < -levels, jnp.asarray(length, ts.dtype))
     sums = no_sums(plan.structure(y0))
-    state = _State(start, jnp.minimum(start + length, end), y0, rate, no, none, none, no, quality, quality == 0, sums)
+    t_next = jnp.minimum(start + length, end)
     # What is not reached stays infinite, which tells it from rows that are computed.
-    rows = jnp.broadcast_to(jnp.full_like(y0, jnp.inf), (count, y0.size))
-    history = reverse.blank(y0, start, max_steps) if record else None
-    records, strides = ((), ()) if history is None else (history.rows, history.strides)
-    static, given = (plan, control, max_steps, strides), Given(ts)
+    rows = jnp.broadcast_to(jnp.full_like(y0, jnp.inf), (ts.shape[0] - 1, y0.size))
+    state = State(start, t_next, y0, rate, no, none, none, no, quality, quality == 0, sums, search)
+    return limits, Carry(state, none, rows, records)
+
+
+def run_to_event(
+    plan: Plan, control, max_steps: int, strides, args, limits: Limits, given: Given, carry: Carry
+) -> Carry:
+    """Make steps to the end of the run, or to an event."""
+    static = plan, control, max_steps, strides
     task = Task(_iterate, _iterate_in_jax, static, dense_output, (plan,), strides)
-    state, _, rows, records = reverse.run_to_end(
+    return reverse.run_to_end(
         lambda carry: run_loop(task, args, limits, given, carry),
         partial(_iterate_once, *static, args, limits, given),
         # A step that the kernel cannot compute is computed by JAX, and the native loop continues behind it.
         partial(_iterate_by_fallback(*static), args, limits, given),
         partial(_is_running, max_steps, limits),
-        Carry(state, none, rows, records),
+        carry,
     )
-    if history is not None:
-        states, times, kept = records
-        history = reverse.History(states, times, kept, state.tried)
-    codes: Any = diffrax.RESULTS
-    result = codes.where(state.t < end, codes.max_steps_reached, codes.successful)
-    result = codes.where(state.failed, codes.dt_min_reached, result)
-    result = codes.where(state.stopped, codes.event_occurred, result)
-    facts = result, step_counts(state.tried, state.accepted), state.t
-    return rows, facts, None if is_adaptive else state.sums, history
 
 
-def step_counts(tried, accepted) -> dict[str, Array]:
-    """Counts of steps, by diffrax's names."""
-    return {"num_steps": tried, "num_accepted_steps": accepted, "num_rejected_steps": tried - accepted}
+def cases_of(limits: Limits, control, state: State) -> list[tuple[Array, Any]]:
+    """Cases of the result of a run, for `first_of`."""
+    cases: list[tuple[Any, Any]] = [(state.t < limits.end, RESULTS.max_steps_reached)]
+    if isinstance(control, AdaptiveSteps):
+        return [(state.failed, RESULTS.dt_min_reached), *cases]
+    # Fixed steps end short of what is not finite, or at the end of a run in which they may have been too long.
+    return [(state.failed, RESULTS.nonfinite_state), *cases, (too_coarse(state.sums), RESULTS.coarse_steps)]
 
 
-def _is_active(max_steps: int, limits: _Limits, state: _State):
-    return (state.t < limits.end) & ~state.failed & ~state.stopped & (state.tried < max_steps)
+def is_active(max_steps: int, limits: Limits, state: State):
+    """True until the end of a run, or an event."""
+    active = (state.t < limits.end) & ~state.failed & ~state.stopped & (state.tried < max_steps)
+    return active if state.search is None else active & ~state.search.hit.any()
 
 
-def _is_running(max_steps: int, limits: _Limits, carry: Carry):
-    return any_sample(_is_active(max_steps, limits, carry.state))
+def _is_running(max_steps: int, limits: Limits, carry: Carry):
+    return any_sample(is_active(max_steps, limits, carry.state))
 
 
-def _iterate(plan: Plan, control, max_steps: int, strides, args, limits: _Limits, state: _State, _) -> Iteration:
+def _iterate(plan: Plan, control, max_steps: int, strides, args, limits: Limits, state: State, _) -> Iteration:
     """Make a step, in a native loop."""
-    active = _is_active(max_steps, limits, state)
+    active = is_active(max_steps, limits, state)
     after, kept, step = _advance(plan, control, args, limits, state, active)
     dense = state.t, after.t, state.y, step.raw, step.stages, step.shift
     row = reverse.row(state.y, state.t, state.t_next, kept) if strides else ()
-    more = _is_active(max_steps, limits, after)
+    more = is_active(max_steps, limits, after)
     return Iteration(after, active, more, Passed(kept, after.t, dense), state.tried, row)
 
 
 def _iterate_once(
-    plan: Plan, control, max_steps: int, strides, args, limits: _Limits, given: Given, carry: Carry, advance=None
+    plan: Plan, control, max_steps: int, strides, args, limits: Limits, given: Given, carry: Carry, advance=None
 ) -> Carry:
     """Make a step, as operations of JAX around kernels; by `advance` (default: `_advance_by_kernel`)."""
     state, records = carry.state, carry.records
-    active = _is_active(max_steps, limits, state)
+    active = is_active(max_steps, limits, state)
     after, kept, step = (advance or _advance_by_kernel)(plan, control, args, limits, state, active)
     if records:
         row = reverse.row(state.y, state.t, state.t_next, kept)
@@ -214,7 +186,7 @@ def _iterate_by_fallback(plan: Plan, control, max_steps: int, strides) -> Callab
     return jax.jit(partial(_iterate_once, plan, control, max_steps, strides, advance=_advance_by_fallback))
 
 
-def _iterate_in_jax(plan: Plan, control, max_steps: int, strides, args, limits: _Limits, given: Given, carry: Carry):
+def _iterate_in_jax(plan: Plan, control, max_steps: int, strides, args, limits: Limits, given: Given, carry: Carry):
     """All steps, as operations of JAX around kernels."""
     step_on = partial(_iterate_once, plan, control, max_steps, strides, args, limits, given)
     return lax.while_loop(partial(_is_running, max_steps, limits), step_on, carry)
@@ -225,55 +197,99 @@ def number_of_steps(start, end, stepsize):
     return jnp.ceil((end - start) / jnp.nextafter(stepsize, jnp.inf)).astype(jnp.int32)
 
 
-def _advance(plan: Plan, control, args, limits: _Limits, state: _State, active):
+def _advance(plan: Plan, control, args, limits: Limits, state: State, active):
     """State after a step, whether the step is kept, and the step."""
     step = take_step(plan, args, state.t, jnp.where(active, state.t_next, state.t), state.y, state.rate)
     return *_accept(plan, control, args, limits, state, active, step), step
 
 
-def _advance_by_kernel(plan: Plan, control, args, limits: _Limits, state: _State, active):
+def _advance_by_kernel(plan: Plan, control, args, limits: Limits, state: State, active):
     advance: Any = kernel(_advance, static=2, fallback=_advance, derivative=False)
     return advance(plan, control, args, limits, state, active, where=active)
 
 
-def _advance_by_fallback(plan: Plan, control, args, limits: _Limits, state: _State, active):
+def _advance_by_fallback(plan: Plan, control, args, limits: Limits, state: State, active):
     """State after a step that the native loop has refused, for every trajectory that is active."""
     none, stages = jnp.zeros_like(state.y), jnp.zeros((plan.count, state.y.size), state.y.dtype)
     unchanged = state, jnp.zeros_like(active), Step(none, none, none, none, stages, none)
     return compute_where(active, partial(_advance, plan, control), unchanged, (args, limits, state, active))
 
 
-def _accept(plan: Plan, control, args, limits: _Limits, state: _State, active, step: Step) -> tuple[_State, Array]:
+def _accept(plan: Plan, control, args, limits: Limits, state: State, active, step: Step) -> tuple[State, Array]:
     """State after a step that is kept or refused, and whether it is kept."""
-    t_next, end = jnp.where(active, state.t_next, state.t), limits.end
-    if isinstance(control, AdaptiveSteps):
-        kept, t, after, at_least, failed = _control_step(plan, control, limits, state, t_next, step)
-        sums = state.sums
+    t_next, sums, search = jnp.where(active, state.t_next, state.t), state.sums, state.search
+    is_adaptive = isinstance(control, AdaptiveSteps)
+    decided = _control_step(plan, control, limits, state, t_next, step)
+    if search is not None:
+        decided, search = _search(plan, args, state, search, t_next, step, decided, is_adaptive)
+    kept = decided.kept
+    t = jnp.where(kept, jnp.minimum(t_next, limits.end), state.t)
+    after = t + decided.length
+    if is_adaptive:
+        # A step that would end within rounding of the end goes there; a refused one tries half of the way.
+        clipped = jnp.where(kept, limits.end, t + 0.5 * (limits.end - t))
+        point = jnp.where(after > limits.floor, clipped, after)
     else:
-        kept, t, at_least, failed = jnp.asarray(True), t_next, state.at_least, jnp.asarray(False)
         start, before, y, error = (plan.structure(x) for x in (limits.y0, state.y, step.projected, step.error))
         sums = add_error(control.order, control.error_order, start, before, y, error, *state.sums)
-        # From the start of the run, as sums of lengths would carry their rounding on.
-        done = (state.tried + 2).astype(end.dtype) / limits.steps.astype(end.dtype)
-        after = limits.start + (end - limits.start) * done
-        after = jnp.where((state.tried + 2 >= limits.steps) | (after > limits.floor), end, after)
+        sums = jax.tree.map(lambda new, old: jnp.where(kept, new, old), sums, state.sums)
+        number = state.tried + 1
+        if search is not None:
+            # A step that an event has cut less than a thousandth before a point of the grid has reached it.
+            is_cut = ~kept | (t_next <= _grid_point(limits, number - search.cuts) - 1e-3 * search.usual)
+            search = search._replace(cuts=search.cuts + is_cut.astype(jnp.int32))
+            number = number - search.cuts
+        point = _grid_point(limits, number + 1)
+    # The search for an event sets the length itself.
+    after = point if search is None else jnp.where(search.locating, after, point)
     # What follows is masked by `active`: a trajectory that has ended keeps its state while others of the batch continue.
     kept, one = kept & active, active.astype(jnp.int32)
     quality = jnp.where(kept, plan.quality_of(args, t_next, step.projected), state.quality)
-    state = _State(
-        jnp.where(active, t, state.t),
-        jnp.where(active, jnp.minimum(after, end), state.t_next),
+
+    def if_active(new, old):
+        return jax.tree.map(lambda new, old: jnp.where(active, new, old), new, old)
+
+    state = State(
+        if_active(t, state.t),
+        if_active(jnp.minimum(after, limits.end), state.t_next),
         jnp.where(kept, step.projected, state.y),
         jnp.where(kept, step.rate, state.rate),
-        at_least,
+        decided.at_least,
         state.tried + one,
         state.accepted + kept.astype(jnp.int32),
-        state.failed | (failed & active),
+        state.failed | (decided.failed & active),
         quality,
         state.stopped | (quality * state.quality <= 0),
-        jax.tree.map(lambda new, old: jnp.where(active, new, old), sums, state.sums),
+        if_active(sums, state.sums),
+        if_active(search, state.search),
     )
     return state, kept
+
+
+def _search(
+    plan: Plan, args, state: State, search: Search, t_next, step: Step, decided: NextStep, is_adaptive: bool
+) -> tuple[NextStep, Search]:
+    """Decision about a step by its guards, after that by its error, and the search for an event."""
+    middle = (state.t + t_next) / 2
+    # The dense output only finds that a guard was negative: the event is located by steps of its own.
+    between = dense_output(plan, None, middle, state.t, t_next, state.y, step.raw, step.stages, step.shift)
+    at_end, in_middle = plan.guards_of(args, t_next, step.projected), plan.guards_of(args, middle, between)
+    # Fixed steps fail where the state is not finite.
+    good = decided.kept if is_adaptive else jnp.isfinite(step.projected).all()
+    after, kept, located, length = search_root(search, state.t, t_next, at_end, in_middle, good, decided.length)
+    after = after if is_adaptive else after._replace(usual=search.usual)
+    # Steps that an event has cut may be shorter than the least one of the control.
+    at_least, failed = decided.at_least & ~after.locating & ~located, decided.failed | (not is_adaptive)
+    usual = jnp.where(located, _AFTER_EVENT * after.usual, decided.length)
+    return NextStep(kept, jnp.where(after.locating, length, usual), at_least, failed & ~good), after
+
+
+def _grid_point(limits: Limits, number):
+    """End of the fixed step of this number, from one."""
+    # From the start of the run, as sums of lengths would carry their rounding on.
+    done = number.astype(limits.end.dtype) / limits.steps.astype(limits.end.dtype)
+    t = limits.start + (limits.end - limits.start) * done
+    return jnp.where((number >= limits.steps) | (t > limits.floor), limits.end, t)
 
 
 def save(plan: Plan, ts, before: Any, after: Any, kept, step: Step, saved, rows):
@@ -296,35 +312,19 @@ def save(plan: Plan, ts, before: Any, after: Any, kept, step: Step, saved, rows)
 
 @kernel(static=2, derivative=False)
 def _begin(plan: Plan, control, args, t0, t1, y, rtol, atol):
-    """Rate of change at the start, if steps reuse it, the length of the first adaptive step, and the quality."""
-    rate, quality = plan.first_rate(args, t0, y), plan.quality_of(args, t0, y)
+    """Rate of change at the start, if steps reuse it, the length of the first adaptive step, the quality, and the guards."""
+    rate, monitors = plan.first_rate(args, t0, y), (plan.quality_of(args, t0, y), plan.guards_of(args, t0, y))
     if not isinstance(control, AdaptiveSteps):
-        return rate, t1 - t0, quality
+        return rate, t1 - t0, *monitors
     term = diffrax.ODETerm(plan.field)
     length = first_step(term, t0, t1, plan.structure(y), args, control.order, rtol, atol, control.size)
-    return rate, jnp.where(jnp.isfinite(length), length, t1 - t0), quality
+    return rate, jnp.where(jnp.isfinite(length), length, t1 - t0), *monitors
 
 
-def _control_step(plan: Plan, control: AdaptiveSteps, limits: _Limits, state: _State, t1, step: Step):
-    """Decide whether a step is kept, where the next one begins and ends, and whether that has the least length or failed."""
-    t0, end = state.t, limits.end
-    before, after = plan.structure(state.y), plan.structure(step.projected)
-
-    def scale(y0, y1, error):
-        # As in diffrax: a result of NaN is measured by the size of the start.
-        y1 = jnp.where(jnp.isnan(y1).any(), y0, y1)
-        return error / (limits.atol + limits.rtol * jnp.maximum(jnp.abs(y0), jnp.abs(y1)))
-
-    size = control.size(jax.tree.map(scale, before, after, plan.structure(step.error)))
-    kept = (size < 1) | state.at_least
-    factor = step_factor(size, control.order, kept)
-    length, least = (t1 - t0) * factor.astype(t0.dtype), least_step(t0, limits.least_at_end)
-    failed = length < least
-    length = jnp.where(state.at_least & (factor == 1), least, length)
-    at_least, length = length <= least, jnp.maximum(length, least)
-    t = jnp.where(kept, t1, t0)
-    following = t + length
-    # A step that would end within rounding of the end goes there; a refused one tries half of the way.
-    clipped = jnp.where(kept, end, t + 0.5 * (end - t))
-    following = jnp.where(following > limits.floor, clipped, following)
-    return kept, jnp.minimum(t, end), following, at_least, failed
+def _control_step(plan: Plan, control, limits: Limits, state: State, t1, step: Step) -> NextStep:
+    """Decide whether a step is kept, and the length of the next one."""
+    if not isinstance(control, AdaptiveSteps):
+        return NextStep(jnp.asarray(True), limits.end - limits.start, state.at_least, jnp.asarray(False))
+    before, after, error = (plan.structure(x) for x in (state.y, step.projected, step.error))
+    size = error_size(control.size, before, after, error, limits.rtol, limits.atol)
+    return next_step(size, control.order, t1 - state.t, state.at_least, least_step(state.t, limits.least_at_end))

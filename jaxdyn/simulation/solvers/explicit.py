@@ -19,7 +19,6 @@ from jax.flatten_util import ravel_pytree
 from jaxtyping import Array, PyTree
 
 from jaxdyn.compile import implicit, kernel, value_and_jvp
-from jaxdyn.compile.batch import any_sample
 from jaxdyn.constraints.projection import enlarge
 from jaxdyn.lie.so3 import matmul
 from jaxdyn.model.arguments import Number
@@ -71,36 +70,27 @@ class ExplicitSteps(ProjectedSolver):
         return Plan(type(self.solver), self.field, self.project, self.step_constants, self.branching, tree, shapes)
 
     def init(self, terms: PyTree, t0: Number, t1: Number, y0: PyTree, args: PyTree) -> PyTree:
-        """Last stage of the previous step, and a flag that says whether there is one."""
-        return jnp.zeros_like(ravel_pytree(y0)[0]), jnp.asarray(False)
+        """No state: steps in diffrax's loop compute their first stage anew."""
+        return None
 
     def step(
         self, terms: PyTree, t0: Number, t1: Number, y0: PyTree, args: PyTree, solver_state: PyTree, made_jump: Flag
     ) -> StepOutput:
         """Make one step and project its end."""
         start, structure = ravel_pytree(y0)
-        plan = self.plan(y0)
-        last, is_ready = solver_state
-        state = t0, t1, start, last, is_ready & ~jnp.asarray(made_jump)
-
-        def tangent(args, *rest):
-            *state, steps = rest
-            results, changes = value_and_jvp(partial(_step_by_jax, plan), (args, *state), steps)
-            return results, jax.tree.map(_no_change, results) if changes is None else changes
-
-        results: Any = implicit(args, state, partial(_step, plan), tangent)
-        projected, shift, error, raw, k, result = results
+        projected, shift, error, raw, k = differentiable_step(self.plan(y0), args, t0, t1, start)
         dense = {"y0": y0, "y1": structure(raw), "stages": k}
         if self.project is not None:
             dense = {"dense_info": dense, "shift": structure(shift)}
-        dt = jnp.asarray(t1 - t0, start.dtype)
-        # Stages are dt f, and f is carried: the next step may have another length.
-        last = k[-1] / jnp.where(dt == 0, jnp.ones_like(dt), dt)
-        return structure(projected), structure(error), dense, (last, jnp.asarray(plan.is_fsal)), result
+        return structure(projected), structure(error), dense, None, diffrax.RESULTS.successful
 
 
 class Plan(NamedTuple):
-    """Definition of a step; equal plans share their programs. `quality(t, y, args)`: see `quality_of`."""
+    """Definition of a step; equal plans share their programs.
+
+    `quality(t, y, args)` () changes its sign where the method fails; `guards(t, y, args)` -> values and levels of rounding (k,),
+    of which one is negative where the motion or its mode ends.
+    """
 
     solver: type
     field: Callable
@@ -110,6 +100,7 @@ class Plan(NamedTuple):
     tree: Any
     shapes: tuple
     quality: Callable | None = None
+    guards: Callable | None = None
 
     @property
     def tableau(self) -> Any:
@@ -179,6 +170,11 @@ class Plan(NamedTuple):
         """Distance of a flat state from where the method fails, shown by a change of sign; one where it never does."""
         return jnp.ones((), y.dtype) if self.quality is None else self.quality(t, self.structure(y), args)
 
+    def guards_of(self, args, t, y):
+        """Guards of a flat state and their levels of rounding; none where the motion does not end."""
+        none = jnp.zeros((0,), y.dtype)
+        return (none, none) if self.guards is None else self.guards(t, self.structure(y), args)
+
     def stage(self, args, t0, t1, y, c, side):
         """Step length times the vector field, at one of the `times` and from one of the `sides`."""
         # By more than the rounding of ends of steps and of times of samples, which are seldom computed alike.
@@ -214,6 +210,19 @@ def take_step(plan: Plan, args, t0, t1, y, rate) -> Step:
     return Step(projected, shift, error, raw, stages, rate)
 
 
+def differentiable_step(plan: Plan, args, t0, t1, y):
+    """Projected end of a step, its shift, its error, the end before the projection, and stages, by a kernel with derivatives."""
+
+    def tangent(args, *rest):
+        *state, steps = rest
+        results, changes = value_and_jvp(partial(_stages, plan), (args, *state), steps)
+        return results, jax.tree.map(jnp.zeros_like, results) if changes is None else changes
+
+    stages: Any = kernel(_stages, static=1, fallback=_stages, derivative=False)
+    results: Any = implicit(args, (t0, t1, y), partial(stages, plan), tangent)
+    return results
+
+
 def dense_output(plan: Plan, _, t, t0, t1, y, raw, stages, shift):
     """State (n,) at a time t within a step, by the method's dense output bent to the projected end."""
     inner: Any = plan.solver.interpolation_cls(
@@ -227,38 +236,10 @@ def dense_output(plan: Plan, _, t, t0, t1, y, raw, stages, shift):
     return y_dense + x * x * (3 - 2 * x) * shift
 
 
-def _step(plan: Plan, args, t0, t1, start, last, is_ready):
-    """Projected end of a step, its shift, its error, the end before the projection, stages, and a code; `last`: a rate."""
-    first = None
-    if plan.tableau.fsal:  # outside of the kernel, which has no branch for the step after a jump
-        dt, anew = jnp.asarray(t1 - t0, start.dtype), kernel(_first_stage, static=1)
-        first = lax.cond(_are_ready(is_ready), lambda: dt * last, lambda: anew(plan, args, t0, t1, start))
-    # Projections report success, so that the code is no result of the kernel: batched, it would meet the unbatched one of the
-    # rule in `step`, which JAX 0.10 cannot lower.
-    stages: Any = kernel(_stages, static=1, fallback=_stages, derivative=False)
-    return *stages(plan, args, t0, t1, start, first), diffrax.RESULTS.successful
-
-
-def _step_by_jax(plan: Plan, args, t0, t1, start, last, is_ready):
-    """`_step` by operations of JAX, with one copy of the vector field."""
-    dt = jnp.asarray(t1 - t0, start.dtype)
-    first = dt * last if plan.tableau.fsal else None
-    return *_stages(plan, args, t0, t1, start, first, _are_ready(is_ready)), diffrax.RESULTS.successful
-
-
-def _are_ready(is_ready):
-    # For the whole batch: a branch that differs between samples would be computed for all.
-    return ~any_sample(~is_ready)
-
-
-def _first_stage(plan: Plan, args, t0, t1, start):
-    return plan.stage(args, t0, t1, start, 0.0, 1.0)
-
-
-def _stages(plan: Plan, args, t0, t1, start, first=None, is_ready: Any = True):
+def _stages(plan: Plan, args, t0, t1, start, first=None):
     """All of a step, as one loop over the stages, which a kernel writes out.
 
-    `first`: the first stage where that `is_ready`, or None.
+    `first`: the first stage, or None.
     """
     count, none = plan.count, jnp.zeros_like(start)
     times, sides = (jnp.asarray(x, jnp.result_type(t0, t1)) for x in (plan.times, plan.sides))
@@ -277,7 +258,7 @@ def _stages(plan: Plan, args, t0, t1, start, first=None, is_ready: Any = True):
             project = partial(plan.project_end, args, t1)
             end = lax.cond(i == count - 1, project, lambda y, _: (y, *end[1:]), y, error)
             y = end[0]
-        new = compute(y, point) if first is None else lax.cond(is_ready & (i == 0), lambda *_: first, compute, y, point)
+        new = compute(y, point) if first is None else lax.cond(i == 0, lambda *_: first, compute, y, point)
         return (k.at[i].set(new), *end), None
 
     begin = jnp.zeros((count, start.size), start.dtype), start, none, none
@@ -290,12 +271,6 @@ def _stages(plan: Plan, args, t0, t1, start, first=None, is_ready: Any = True):
     projected, shift, tangent = end
     error = enlarge(error, tangent) if plan.projects_before_last and not plan.knows_error else tangent
     return projected, shift, error, raw, k
-
-
-def _no_change(x):
-    """Tangent zero of an array."""
-    # Tangents of integers and flags have the dtype float0 in JAX.
-    return jnp.zeros_like(x) if jnp.issubdtype(x.dtype, jnp.floating) else np.zeros(x.shape, jax.dtypes.float0)
 
 
 def keeps_fsal(tableau, step_constants: tuple[str, ...], branching: bool) -> bool:

@@ -16,14 +16,13 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 from jax import lax
-from jax.flatten_util import ravel_pytree
 from jaxtyping import Array
 
 from jaxdyn.compile import kernel, values_of_rules
 from jaxdyn.compile.batch import any_sample, cond
 from jaxdyn.compile.loops import Carry, Given, Iteration, Task, run_loop
 from jaxdyn.compile.repair import compute_where
-from jaxdyn.simulation.solvers.explicit import ExplicitSteps, Plan, dense_output, take_step
+from jaxdyn.simulation.solvers.explicit import Plan, dense_output, differentiable_step, take_step
 
 # States that are kept of a run: 4 kB a number of the state in float64, which a cache holds for small mechanisms.
 KEPT = 512
@@ -336,7 +335,6 @@ def replay_rows(plan: Plan, history: History, y0, args, ts, steps):
     """
     times, kept, count, steps = lax.stop_gradient((history.times, history.kept, history.count, steps))
     room = kept.shape[0]
-    solver = ExplicitSteps(plan.solver(), plan.project, plan.step_constants, plan.branching, field=plan.field)
 
     def move(i, t):
         """Time at which step i (from 1) ends or begins, which follows the ends of the run."""
@@ -344,14 +342,9 @@ def replay_rows(plan: Plan, history: History, y0, args, ts, steps):
         start, end = ts[0] - lax.stop_gradient(ts[0]), ts[-1] - lax.stop_gradient(ts[-1])
         return t + (1 - share) * start + share * end
 
-    def step(args, y, t0, t1):
-        state = jnp.zeros_like(y), jnp.asarray(False)
-        results: Any = solver.step(None, t0, t1, plan.structure(y), args, state, True)
-        return results[0], results[2]
-
     @jax.checkpoint
     def end_of(args, y, i, t0, t1):
-        return ravel_pytree(step(args, y, move(i, t0), move(i + 1, t1))[0])[0]
+        return differentiable_step(plan, args, move(i, t0), move(i + 1, t1), y)[0]
 
     def advance(y, row):
         i, (t0, t1), is_kept = row
@@ -370,9 +363,8 @@ def replay_rows(plan: Plan, history: History, y0, args, ts, steps):
         holds = taken & (times[:, 0] < known) & (known <= times[:, 1])
         i = jnp.argmax(holds)
         t0, t1 = move(i, times[i, 0]), move(i + 1, times[i, 1])
-        _, dense = step(args, states[i], t0, t1)
-        inner: Any = solver.interpolation_cls(t0=t0, t1=t1, **dense)
-        at = ravel_pytree(inner.evaluate(t))[0]
+        _, shift, _, raw, stages = differentiable_step(plan, args, t0, t1, states[i])
+        at = dense_output(plan, None, t, t0, t1, states[i], raw, stages, shift)
         return jnp.where(holds.any(), at, jnp.zeros_like(at))
 
     return lax.map(partial(row, args, states), ts[1:])

@@ -1,21 +1,43 @@
 """Step-size control: adaptive steps with their first length, and fixed steps that detect when they are too long."""
 
-from typing import Any
+from collections.abc import Callable
+from typing import Any, NamedTuple
 
 import diffrax
 import equinox as eqx
 import jax
 import jax.numpy as jnp
+from jaxtyping import Array
 
 from jaxdyn.compile.known import stop_gradient
 
 # Largest sum of error estimates, as a fraction of the distance that positions, or velocities, have come from their start.
 ALLOWED = 0.1
 # Entries of a state that are no motion: constants of a step, and what nothing depends on.
-_NO_MOTION = ("frame", "held", "work")
-# Control of the step length by the last error alone. The values are the defaults of diffrax's `PIDController`, so that runs in
-# our loops and in diffrax's take the same steps.
+_NO_MOTION = ("frame", "held", "work", "slip")
+# Control of the step length by the last error alone (Hairer, Norsett & Wanner 1993, section II.4): the next step aims at an error
+# of _SAFETY^order of the tolerance, and is at most _MOST_FACTOR times as long, at least _LEAST_FACTOR times.
 _SAFETY, _LEAST_FACTOR, _MOST_FACTOR = 0.9, 0.2, 10.0
+
+
+class NextStep(NamedTuple):
+    """Decision about a step: whether it is kept, the length of the next one, whether that is the least, and whether it failed."""
+
+    kept: Array
+    length: Array
+    at_least: Array
+    failed: Array
+
+
+def error_size(norm, y0, y1, error, rtol, atol):
+    """Norm of the error of a step from y0 to y1, in units of the tolerance."""
+
+    def scale(y0, y1, error):
+        # A result of NaN is measured by the size of the start.
+        y1 = jnp.where(jnp.isnan(y1).any(), y0, y1)
+        return error / (atol + rtol * jnp.maximum(jnp.abs(y0), jnp.abs(y1)))
+
+    return norm(jax.tree.map(scale, y0, y1, error))
 
 
 def step_factor(size, order, kept):
@@ -27,32 +49,53 @@ def step_factor(size, order, kept):
     return jnp.clip(factor, jnp.where(kept, 1.0, _LEAST_FACTOR), jnp.where(kept, _MOST_FACTOR, _SAFETY))
 
 
-class Adaptive(diffrax.PIDController):
-    """diffrax's step-size control, with a first step from the derivative in any unit of time.
+def next_step(size, order, length, at_least, least) -> NextStep:
+    """Decide about a step of this length and scaled error; one of the least length (`at_least`) is kept whatever its error."""
+    kept = (size < 1) | at_least
+    factor = step_factor(size, order, kept)
+    following = length * factor.astype(length.dtype)
+    failed = following < least
+    following = jnp.where(at_least & (factor == 1), least, following)
+    return NextStep(kept, jnp.maximum(following, least), following <= least, failed)
 
-    diffrax chooses one from the derivative for a bare `ODETerm` only; what its own `diffeqsolve` passes on is wrapped, and
-    starts with 0.01 s. A first derivative that is NaN starts with the whole span: a step that is NaN would make every later one
-    NaN, rejected and tried again until the last of `max_steps`. A finite one is halved and halved again until the least
-    step ends the run.
 
-    The least step is `dtmin` at the end of the run and shorter at earlier times, whose neighbouring numbers are closer.
+class Adaptive(diffrax.AbstractAdaptiveStepSizeController):
+    """The step control of the library's own loop for diffrax's loop.
+
+    A first derivative that is NaN starts with the whole span: a step that is NaN would make every later one NaN, rejected and
+    tried again until the last of `max_steps`. A finite one is halved and halved again until the least step ends the run.
+
+    **Arguments:** tolerances, the norm of a scaled error, and the least step (s) at the end of the run. It is shorter at
+    earlier times, whose neighbouring numbers are closer.
     """
 
-    def init(self, terms, t0, t1, y0, dt0, args, func, error_order):
-        """End of the first step and state of the controller."""
-        if dt0 is None and _is_ordinary(terms):
-            dt0 = first_step(
-                terms, t0, t1, y0, args, self._get_error_order(error_order), self.rtol, self.atol, self.norm
-            )
-        first, state = super().init(terms, t0, t1, y0, dt0, args, func, error_order)
-        return jnp.where(jnp.isfinite(first), jnp.minimum(first, t1), t1), state
+    rtol: Any
+    atol: Any
+    norm: Callable
+    least: Any
 
-    def adapt_step_size(self, t0, t1, y0, y1_candidate, args, y_error, error_order, controller_state):
+    def wrap(self, direction):
+        """Control of a run in a direction: forwards."""
+        return self
+
+    def init(self, terms, t0, t1, y0: Any, dt0, args, func, error_order):
+        """End of the first step, and whether it is the least one."""
+        if dt0 is None:
+            dt0 = first_step(terms, t0, t1, y0, args, error_order, self.rtol, self.atol, self.norm)
+        first = jnp.where(jnp.isfinite(dt0), jnp.minimum(t0 + jnp.maximum(dt0, self.least), t1), t1)
+        return first, jnp.asarray(False)
+
+    def adapt_step_size(self, t0, t1, y0: Any, y1_candidate, args, y_error, error_order: Any, controller_state):
         """Accept or refuse a step, and choose the next one."""
-        local = eqx.tree_at(lambda c: c.dtmin, self, least_step(t0, jnp.asarray(self.dtmin)))
-        return diffrax.PIDController.adapt_step_size(
-            local, t0, t1, y0, y1_candidate, args, y_error, error_order, controller_state
-        )
+        # Steps are constants to derivatives.
+        given = jax.lax.stop_gradient((y0, y1_candidate, y_error, self.rtol, self.atol))
+        size, length = error_size(self.norm, *given), jnp.asarray(t1 - t0)
+        least = jnp.asarray(least_step(t0, jnp.asarray(self.least)), length.dtype)
+        kept, length, at_least, failed = next_step(size, error_order, length, controller_state, least)
+        start = jnp.where(kept, t1, t0)
+        codes: Any = diffrax.RESULTS
+        result = codes.where(failed, codes.dt_min_reached, codes.successful)
+        return kept, start, start + length, False, at_least, result
 
 
 def least_step(t0, at_end):
@@ -100,13 +143,6 @@ def first_step(terms, t0, t1, y0, args, order, rtol, atol, norm):
     amplitude = jnp.maximum(d1 / rate, tiny)
     step = (0.01 / amplitude) ** (1 / order) / rate
     return jax.lax.stop_gradient(jnp.minimum(jnp.minimum(100 * h0, step), span))
-
-
-def _is_ordinary(terms) -> bool:
-    """True where the term, unwrapped, is an `ODETerm`, or a sum of such."""
-    inner = getattr(terms, "term", terms)
-    parts = inner.terms if isinstance(inner, diffrax.MultiTerm) else (inner,)
-    return all(isinstance(getattr(part, "term", part), diffrax.ODETerm) for part in parts)
 
 
 class ErrorMonitoredSteps(diffrax.ConstantStepSize):

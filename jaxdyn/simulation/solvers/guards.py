@@ -1,0 +1,145 @@
+"""Guards, which fall below zero at an event: the search for their roots by steps, and the derivatives of the roots.
+
+A step that ends where a guard is negative is repeated with a shorter length, until its end is the event: the root is bracketed by
+the steps before and behind it. So the state at the event is that of a step of full order, and not of an interpolation. Guards are
+evaluated in the middle and at the end of every step: what is violated and satisfied again between them is not seen.
+"""
+
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+from jax import lax
+from jaxtyping import Array
+
+_MAX_SECANTS = 30  # points after which a root is bisected
+# Powers of eps, of the size of a guard in the step: 1e-9 and 1e-6 in float64. Guards below the first are zero at the same event;
+# a root below the second is one, and not an error of the dense output.
+_SIMULTANEOUS, _REAL = 0.575, 0.383
+SEARCH_STEPS = 40  # attempts to end a step at an event, of which a limit on steps leaves room for
+
+
+class Bracket(NamedTuple):
+    """Bracket of a root between `low`, where a function is positive, and `high`, where it is negative.
+
+    Points between are chosen by the secant through the values at both ends. An end that is kept twice counts half (the rule of
+    Illinois; Dowell & Jarratt 1971), so that the bracket shrinks from both sides. Values are of the size of one or less.
+    """
+
+    low: Array
+    high: Array
+    value_low: Array
+    value_high: Array
+    side: Array  # of the last point: 1 behind the root, -1 before it, 0 where there is none yet
+    tries: Array
+
+    @classmethod
+    def begin(cls, high, value_low) -> "Bracket":
+        """Bracket from zero."""
+        none, zero = jnp.zeros((), jnp.int32), jnp.zeros_like(high)
+        return cls(zero, high, value_low, zero, none, none)
+
+    def narrow(self, x, value, before, behind) -> "Bracket":
+        """Bracket after the value at x, which is `before` the root, `behind` it, or neither: then x is ignored."""
+        side = jnp.where(behind, 1, jnp.where(before, -1, self.side)).astype(jnp.int32)
+        again = side == self.side
+        low, value_low = jnp.where(before, x, self.low), jnp.where(before, value, self.value_low)
+        high, value_high = jnp.where(behind, x, self.high), jnp.where(behind, value, self.value_high)
+        value_low = jnp.where(again & behind, value_low / 2, value_low)
+        value_high = jnp.where(again & before, value_high / 2, value_high)
+        return Bracket(low, high, value_low, value_high, side, self.tries + jnp.ones((), jnp.int32))
+
+    def next(self, is_narrow):
+        """Next point: by a secant where both ends are known by their values, else the middle; the end of a narrow bracket."""
+        eps = float(jnp.finfo(self.low.dtype).eps)
+        # A value that was a root is near zero and does not guide the secant.
+        guided = (self.value_low > 64 * eps) & (self.value_high < 0) & (self.tries < _MAX_SECANTS)
+        difference = jnp.where(guided, self.value_high - self.value_low, 1.0)
+        secant = self.high - self.value_high * (self.high - self.low) / difference
+        # Rounding can carry the secant out of the bracket.
+        point = jnp.clip(jnp.where(guided, secant, (self.low + self.high) / 2), self.low, self.high)
+        return jnp.where(is_narrow, self.high, point)
+
+
+class Search(NamedTuple):
+    """State of the guards (k,) of a run, and of the search for an event; lengths are those of steps."""
+
+    values: Array  # of the state (k,)
+    hit: Array  # guards (k,) at whose root the last step has ended
+    locating: Array  # true while an event is bracketed
+    bracket: Bracket
+    scale: Array  # of the guards (k,), while an event is bracketed
+    usual: Array  # length of steps that end at no event
+    cuts: Array  # attempts that have not come to the next point of a fixed grid
+    loose: Array  # true if steps go across the roots, and end behind them
+
+    @classmethod
+    def begin(cls, values, hit, length) -> "Search":
+        """Search before the first step, with guards that end the run at its start."""
+        no, zero = jnp.zeros((), bool), jnp.zeros_like(length)
+        return cls(
+            values, hit, no, Bracket.begin(zero, zero), jnp.ones_like(values), length, zero.astype(jnp.int32), no
+        )
+
+
+def search_root(search: Search, t0, t1, at_end, in_middle, good, usual) -> tuple[Search, Array, Array, Array]:
+    """Narrow the bracket of an event by an attempt whose error is `good`, or begin one.
+
+    **Returns:** the search; whether the step is kept, and whether it ends at an event; the length of the next attempt.
+
+    **Arguments:** `at_end`, `in_middle`: guards and their levels (k,); `usual`: length of the next step without event.
+    """
+    (values, levels), (middle, middle_levels) = at_end, in_middle
+    length, eps, strict = t1 - t0, float(jnp.finfo(values.dtype).eps), ~search.loose
+    # Within its rounding level the sign of a guard is not known.
+    violated = (values < -levels).any()
+    # In the middle alone: the step is halved first.
+    inside = good & ~search.locating & strict & (middle < -middle_levels).any()
+    crosses, violated = good & search.loose & violated, (violated & strict) | inside
+    at = jnp.where(inside, middle, values)
+    level = jnp.maximum(levels, float(jnp.finfo(values.dtype).tiny))
+    # Guards have units of their own: each is measured by its size at the ends of the step where the search begins.
+    sizes = jnp.maximum(jnp.maximum(jnp.abs(search.values), jnp.abs(at)), level)
+    scale = jnp.where(search.locating, search.scale, sizes)
+    value = jnp.min(at / scale)
+    # A step whose error is too large proves nothing about the guards at its end.
+    begins = good & violated & ~search.locating
+    fresh = Bracket.begin(length, jnp.min(search.values / scale).astype(length.dtype))
+    bracket = jax.tree.map(lambda a, b: jnp.where(begins, a, b), fresh, search.bracket)
+    before, point = good & ~violated & search.locating, jnp.where(inside, length / 2, length)
+    bracket = bracket.narrow(point, value.astype(length.dtype), before, good & violated)
+    locating, width = (search.locating & good) | begins, bracket.high - bracket.low
+    is_narrow = width <= 4 * eps * jnp.maximum(jnp.abs(t1), search.usual)
+    # The root is known when a guard is zero, or when its time is, up to rounding. A zero in the middle may have been an error of
+    # the dense output: then the bracket closes on its end, before which no guard is negative.
+    is_known = (jnp.abs(value) <= 64 * eps) | (is_narrow & (violated | (width <= 0)))
+    # A zero in the middle is not at the end of this step, which is where a step can be cut.
+    located = locating & is_known & ~inside
+    kept = good & ((~violated & ~search.locating) | located)
+    real = located & (value <= eps**_REAL)
+    hit = real & ((values <= eps**_SIMULTANEOUS * scale) & (scale > 4 * level) | (values / scale <= value))
+    # Attempts that locate an event are short for its sake: they say nothing about the usual length.
+    usual = jnp.where(good & violated, length, usual)
+    after = search._replace(
+        values=jnp.where(kept, values, search.values),
+        hit=hit | (crosses & (values < -levels)),
+        locating=locating & ~located,
+        bracket=bracket,
+        scale=scale,
+        usual=jnp.where(search.locating & good, search.usual, usual),
+    )
+    return after, kept, located, bracket.next(is_narrow)
+
+
+def delay(guard, rate, t, y) -> Any:
+    """Delay of an event, (), s: zero, with its derivative.
+
+    Where guard(t, y) is zero, a change of the guard by de moves the root by dt = -de/(de/dt), with de/dt along the motion, whose
+    `rate` is dy/dt before the event.
+    """
+    fixed, value = lax.stop_gradient((t, y)), guard(t, y)
+    _, guard_rate = jax.jvp(guard, fixed, (jnp.ones_like(t), lax.stop_gradient(rate)))
+    is_regular = guard_rate != 0
+    guard_rate = lax.stop_gradient(jnp.where(is_regular, guard_rate, jnp.ones_like(guard_rate)))
+    # The value is zero up to rounding: only its derivative is used.
+    return jnp.where(is_regular, (lax.stop_gradient(value) - value) / guard_rate, jnp.zeros_like(value))

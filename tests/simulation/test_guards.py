@@ -1,0 +1,204 @@
+"""Motions that a guard ends: the time of the end, and its derivatives, in closed form."""
+
+from typing import Any, NamedTuple
+
+import diffrax
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from pinocchio_bridge import quick
+
+import jaxdyn as jd
+from jaxdyn.contact import friction_cone
+from jaxdyn.grasp import contact
+
+TS = np.linspace(0.0, 3.0, 7)
+ROUNDING = np.finfo(float).eps ** 0.5  # that conditions let pass, of the size of a limit or a force
+TIGHT: dict[str, Any] = {"rtol": 1e-12, "atol": 1e-12}
+WEIGHT = 2.0 * 9.81
+UPRIGHT = np.array([[1.0, 0, 0, 0], [0, 0, 1, 0], [0, -1, 0, 0], [0, 0, 0, 1]])  # z of the contact along y of the plane
+
+
+def cart(**limits):
+    builder = jd.ModelBuilder("cart on a rail", gravity=None)
+    box = jd.inertia.box(2.0, (0.1, 0.1, 0.1))
+    builder.add_body("cart", joint="prismatic", axis=(1, 0, 0), inertia=box, **limits)
+    return builder.build()
+
+
+def block():
+    builder = jd.ModelBuilder("block", gravity=(0.0, -9.81, 0.0))
+    builder.add_body("block", None, "planar", jd.inertia.box(2.0, (0.2, 0.1, 0.3)))
+    touch = contact("hard-finger", None, UPRIGHT, object="block", finger_pose=UPRIGHT, in_plane=True, name="table")
+    return jd.Scene(builder.build(), [touch], cones=friction_cone("hard-finger", 0.5, in_plane=True))
+
+
+class Spring(jd.Controller):
+    """A spring that is lost where the cart comes to 0.3 m."""
+
+    stiffness: jax.Array
+
+    def __call__(self, q, v, t, state=None, multipliers=None):
+        return -self.stiffness * q
+
+    def allowance(self, q, v, t):
+        return q[0] - 0.3
+
+
+def push_block(rate, q, v, t):
+    return jnp.stack([rate * t, jnp.zeros_like(t), jnp.zeros_like(t)])
+
+
+def push_cart(q, v, t):
+    return jnp.ones_like(v)
+
+
+RAIL, FREE, BLOCK = cart(lower=-1.0, upper=1.0), cart(), block()
+
+
+def limit(v, **options):
+    """q(t) = v t + t^2/4 from the middle of the rail to its end."""
+    return jd.simulate(RAIL, jnp.zeros(1), v[None], TS, control=push_cart, limits="stop", throw=False, **options)
+
+
+def cone(rate, **options):
+    """A block that is pushed by a force that grows with time, until it slips."""
+    control = jax.tree_util.Partial(push_block, rate)
+    return jd.simulate(BLOCK, jnp.zeros(3), jnp.zeros(3), TS, control=control, throw=False, **options)
+
+
+def spring(stiffness, **options):
+    """q(t) = cos(w t) with w^2 = k/m."""
+    return jd.simulate(FREE, jnp.ones(1), jnp.zeros(1), TS, control=Spring(stiffness), throw=False, **options)
+
+
+class Case(NamedTuple):
+    """A motion of one number, with three of them, the time of its end, and its first derivative."""
+
+    move: Any
+    numbers: np.ndarray
+    time: Any
+    derivative: Any
+    code: str
+
+
+def limit_time(v):
+    return 2 * (-v + np.sqrt(v * v + 1 + ROUNDING))
+
+
+def spring_time(k):
+    return np.arccos(0.3) / np.sqrt(k / 2)
+
+
+CASES = {
+    "limit": Case(
+        limit,
+        np.array([0.0, 0.5, -0.4]),
+        limit_time,
+        lambda v: -limit_time(v) / (v + limit_time(v) / 2),
+        "joint_limit_passed",
+    ),
+    "cone": Case(
+        cone,
+        np.array([15.0, 4.0, 30.0]),
+        lambda r: WEIGHT * (0.5 + ROUNDING) / (r * (1 - ROUNDING)),
+        lambda r: -WEIGHT * (0.5 + ROUNDING) / (r * r * (1 - ROUNDING)),
+        "contact_lost",
+    ),
+    "controller": Case(
+        spring,
+        np.array([3.0, 2.0, 7.0]),
+        spring_time,
+        lambda k: -spring_time(k) / (2 * k),
+        "control_singular",
+    ),
+}
+EXPLICIT = {
+    "Dopri8": TIGHT,
+    "Tsit5": TIGHT | {"solver": diffrax.Tsit5()},
+    # Steps of RK4 are exact for the motions of cart and block; those of the spring end within 1e-10 by their length.
+    "RK4": {"stepsize": 2e-3},
+}
+
+
+def end_of(move, **options):
+    def time(x):
+        solution = move(x, **options)
+        return solution.stats["time_reached"], solution
+
+    return time
+
+
+@pytest.mark.parametrize("name", CASES)
+@pytest.mark.parametrize("how", ["Dopri8", pytest.param("Tsit5", marks=pytest.mark.slow), "RK4"])
+def test_a_motion_ends_at_the_root(name, how):
+    """Three trajectories, the rows before the end and none behind it, and the derivative of the time by reverse mode."""
+    case = CASES[name]
+    gradient = jax.value_and_grad(end_of(case.move, **EXPLICIT[how]), has_aux=True)
+    (times, solution), derivatives = jax.jit(jax.vmap(gradient))(jnp.asarray(case.numbers))
+    assert np.asarray(solution.result == getattr(jd.RESULTS, case.code)).all()
+    expected = case.time(case.numbers)
+    np.testing.assert_allclose(times, expected, rtol=1e-10)
+    np.testing.assert_allclose(derivatives, case.derivative(case.numbers), rtol=1e-9 if how == "RK4" else 1e-10)
+    np.testing.assert_array_equal(np.isfinite(solution.q).all(2), expected[:, None] >= TS)
+
+
+@pytest.mark.parametrize("name", CASES)
+def test_a_single_motion_has_both_modes(name):
+    case = CASES[name]
+    x = jnp.asarray(case.numbers[0])
+    solution = case.move(x, **TIGHT)
+    assert solution.result == getattr(jd.RESULTS, case.code)
+    np.testing.assert_allclose(solution.stats["time_reached"], case.time(case.numbers[0]), rtol=1e-10)
+    forward = quick(jax.jacfwd(end_of(case.move, adjoint="forward", **TIGHT), has_aux=True))
+    np.testing.assert_allclose(forward(x)[0], case.derivative(case.numbers[0]), rtol=1e-10)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", CASES)
+def test_implicit_steps_find_the_same_time(name):
+    """In the loop of diffrax, by its dense output of third order."""
+    case = CASES[name]
+    solution = case.move(jnp.asarray(case.numbers[0]), solver=diffrax.Kvaerno5(), rtol=1e-9, atol=1e-9)
+    assert solution.result == getattr(jd.RESULTS, case.code)
+    np.testing.assert_allclose(solution.stats["time_reached"], case.time(case.numbers[0]), rtol=1e-6)
+
+
+def test_rows_before_the_end_have_derivatives():
+    """q = v t + t^2/4 has the derivative t at the save points before the end; those behind it are NaN."""
+
+    def rows(v):
+        q = limit(v, **TIGHT).q[:, 0]
+        return jnp.where(jnp.isfinite(q), q, 0.0)
+
+    computed = jax.jit(jax.jacrev(rows))(jnp.asarray(0.5))
+    np.testing.assert_allclose(computed, np.where(limit_time(0.5) >= TS, TS, 0.0), atol=1e-11)
+
+
+def test_a_start_behind_the_guard_is_the_end():
+    beyond = jd.simulate(RAIL, [1.5], [0.0], TS, control=push_cart, limits="stop", throw=False)
+    assert beyond.result == jd.RESULTS.joint_limit_passed and float(beyond.stats["time_reached"]) == 0.0
+    assert np.isfinite(beyond.q[0]).all() and np.isnan(beyond.q[1:]).all()
+
+
+def test_the_same_without_kernels():
+    with jd.compilation("plain"):
+        solution = limit(jnp.asarray(0.5), **TIGHT)
+    np.testing.assert_allclose(solution.stats["time_reached"], limit_time(0.5), rtol=1e-10)
+
+
+def test_a_guard_that_is_violated_within_a_step_ends_the_motion():
+    """The middle of a step shows a limit that is passed on the way there and back."""
+    top = 1.0 + 1e-3
+
+    def back(q, v, t):
+        return -jnp.ones_like(v)
+
+    # q = v t - t^2/4 has its top v^2 at 2 v, and is above one for 0.13 s; the second step has its middle there.
+    v = np.sqrt(top)
+    ts, options = np.linspace(0.0, 4 * v, 3), {"limits": "stop", "stepsize": 4 * v / 3, "throw": False}
+    solution = jd.simulate(RAIL, [0.0], [v], ts, control=back, **options)
+    assert solution.result == jd.RESULTS.joint_limit_passed
+    time = 2 * (v - np.sqrt(v * v - 1 - ROUNDING))
+    np.testing.assert_allclose(solution.stats["time_reached"], time, rtol=1e-10)
