@@ -33,7 +33,7 @@ from jaxdyn.identify.workflows.log_checks import check_log_content, check_rest
 from jaxdyn.identify.workflows.raw_logs import vibration
 from jaxdyn.io import save_urdf
 from jaxdyn.io.files import write_text
-from jaxdyn.model.builder import inertia_report, repair_inertias
+from jaxdyn.model.inertia_checks import inertia_report, repair_inertias
 from jaxdyn.model.tree import Model
 from jaxdyn.reports.identification import Evaluation, Findings, content, gains_content, payload_content
 

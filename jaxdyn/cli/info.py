@@ -16,7 +16,7 @@ from jaxdyn.constraints.selection import select_concrete_rows
 from jaxdyn.io import LoadedScene, NotTakenWarning, save_urdf, urdf_inertia_report
 from jaxdyn.io.load import format_of
 from jaxdyn.io.xml_lines import XmlFile
-from jaxdyn.model.builder import inertia_report, repair_inertias
+from jaxdyn.model.inertia_checks import inertia_report, repair_inertias
 from jaxdyn.model.joints import KINDS
 from jaxdyn.model.tree import Model, integrate
 

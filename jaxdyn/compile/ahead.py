@@ -1,7 +1,8 @@
 """Native code compiled in advance: by a thread, while Python traces on and XLA compiles.
 
 LLVM releases Python's lock while it compiles. The thread belongs to one call from outside, which waits for it before it returns,
-so that no thread outlives the call and none is left at the end of the process.
+so that no thread outlives the call. Under the user's own `jax.jit` there is no such call: a thread ends with its task there, for
+which Python waits at the end of the process.
 """
 
 import contextlib
@@ -52,10 +53,14 @@ def is_active() -> bool:
 
 
 def make_later(make: Callable) -> None:
-    """Call `make()` in the thread of the context.
+    """Call `make()` in the thread of the context, or in one of its own.
 
     An error here is dropped: the first call of the kernel compiles it once more, and raises the error there.
     """
     current = _worker.get()
-    assert current is not None
-    current.submit(make)
+    if current is not None:
+        current.submit(make)
+        return
+    alone = ThreadPoolExecutor(1, thread_name_prefix="jaxdyn compiler")
+    alone.submit(make)
+    alone.shutdown(wait=False)

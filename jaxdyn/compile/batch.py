@@ -15,6 +15,7 @@ from jax import lax
 from jax.custom_batching import custom_vmap
 
 from jaxdyn.compile.flags import mark_floats
+from jaxdyn.compile.jax_adapter import vary_alike
 from jaxdyn.compile.known import is_concrete
 from jaxdyn.compile.mode import has_branches, in_rows, is_expanding, is_standalone
 
@@ -53,11 +54,12 @@ def while_loop(goes_on: Callable[[T], object], body: Callable[[T], T], carry: T)
 
 
 def repeat_while(goes_on: Callable[[T], Any], step: Callable[[T], T], state: T, most: int, *, marks: bool = False) -> T:
-    """Repeat state = step(state) while goes_on(state), `most` times at most; few samples need the first repetition.
+    """Repeat state = step(state) while goes_on(state), `most` times at most; few samples need more than a certain first time.
 
-    In a native loop, and in a kernel without a derivative, a block of samples branches to it. Other kernels have no branches:
-    samples that need a repetition are marked as not valid, and computed again outside of the kernel. In code without JAX all
-    repetitions are written out, or with `marks` such samples are left to its second program.
+    The first repetition is certain where `goes_on(state)` is True itself. For others a native loop, and a kernel without a
+    derivative, branches where a block of samples needs it. Other kernels have no branches: samples that need a repetition are
+    marked as not valid, and computed again outside of the kernel. In code without JAX all repetitions are written out, or with
+    `marks` such samples are left to its second program.
     """
     if not is_expanding():
 
@@ -65,7 +67,11 @@ def repeat_while(goes_on: Callable[[T], Any], step: Callable[[T], T], state: T, 
             count, state = carry
             return count + 1, step(state)
 
+        leaves, structure = jax.tree.flatten(state)
+        state = jax.tree.unflatten(structure, vary_alike([*map(jnp.asarray, leaves)]))
         return lax.while_loop(lambda carry: goes_on(carry[1]) & (carry[0] < most), again, (0, state))[1]
+    if goes_on(state) is True:
+        state, most = step(state), most - 1
     if not has_branches() and (marks or not is_standalone()):
         return mark_floats(goes_on(state), state)
     for _ in range(most):

@@ -262,3 +262,59 @@ def _transpose_operation(g: Graph, op: str, kind: str, args, values, c, accumula
         accumulate(args[0], g.convert(c, program.operations[args[0]].kind))
     else:
         raise AssertionError(f"{op} is not linear")
+
+
+# --- inputs that are read ---
+
+
+def without_unread(program: Program) -> tuple[Program, tuple[int, ...]]:
+    """The program with those of its inputs alone that it reads, and their places.
+
+    A model that is an argument has leaves that a function does not need, such as the limits of its joints, and JAX takes a third
+    of a microsecond for each leaf of a call.
+    """
+    key = ("read",)
+    if key not in program.derived:
+        read = {x.args[0] for x in program.operations if x.op == "input"}
+        # A call without operands would have no batch.
+        places = tuple(sorted(read)) or tuple(range(len(program.inputs)))
+        program.derived[key] = _with_inputs(program, places), places
+    return program.derived[key]
+
+
+def _with_inputs(program: Program, places: tuple[int, ...]) -> Program:
+    """The program of some of its inputs. **Raises:** `NotNumbers` where it reads others."""
+    if len(places) == len(program.inputs):
+        return program
+    index = {place: i for i, place in enumerate(places)}
+    operations = []
+    for operation in program.operations:
+        if operation.op == "input":
+            place, entry = operation.args
+            if place not in index:
+                raise NotNumbers("a derivative of what the values do not depend on")
+            operation = operation._replace(args=(index[place], entry))
+        operations.append(operation)
+    inputs = [program.inputs[i] for i in places]
+    few = Program(inputs, program.outputs, operations, program.results, program.subprograms, name=program.name)
+    few.reports_validity = program.reports_validity
+    if program.derivative is not None:
+        few.derivative = functools.partial(_tangent_of_few, program, places)
+    if program.fallback is not None:
+        few.fallback = functools.partial(_fallback_of_few, program, index)
+    return few
+
+
+def _tangent_of_few(program: Program, places: tuple[int, ...], moving) -> Program:
+    varying = {place for place, varies in zip(places, moving, strict=True) if varies}
+    count = len(program.inputs)
+    change = tangent(program, [i in varying for i in range(count)])
+    return _with_inputs(change, (*places, *range(count, len(change.inputs))))
+
+
+def _fallback_of_few(program: Program, index: dict[int, int], *flat):
+    assert program.fallback is not None
+    full = [
+        flat[index[i]] if i in index else np.zeros(array.size, array.dtype) for i, array in enumerate(program.inputs)
+    ]
+    return program.fallback(*full)

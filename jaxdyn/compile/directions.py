@@ -49,11 +49,11 @@ class Directions:
                 numbers[number] = len(numbers)
         arrays = [Array((len(numbers),), dtype_of(kind)) for kind, numbers in kept.items()]
         entries = [objects(list(numbers), (len(numbers),)) for numbers in kept.values()]
-        self.point = graph.finish(program.inputs, [*arrays, program.outputs[-1]], [*entries, flag])
         self.linear = [
             _linear_program(graph, needed, reach, kept, [*arrays, x], values, rows)
             for x, rows in zip(self.varied, changes, strict=True)
         ]
+        self.point = graph.finish(program.inputs, [*arrays, program.outputs[-1]], [*entries, flag])
         self.inputs = program.inputs
         blocks = [Array((y.size, x.size), y.dtype) for y in values for x in self.varied]
         self.outputs = (*blocks, program.outputs[-1])

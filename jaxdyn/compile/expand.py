@@ -16,6 +16,7 @@ import numpy as np
 from jaxdyn.compile import array_rules, mode
 from jaxdyn.compile import program as numbers
 from jaxdyn.compile.constants import bind_known, convert_known, empty_reduction, evaluate_known
+from jaxdyn.compile.derive import without_unread
 from jaxdyn.compile.graph import Graph
 from jaxdyn.compile.jax_adapter import ClosedJaxpr, Literal, Tracer, scan_counts  # pyright: ignore[reportPrivateImportUsage]
 from jaxdyn.compile.number import Number, as_objects, is_number, objects
@@ -58,6 +59,7 @@ def expand(
         results.append(objects([graph.invert(expansion.flagged)], ()))
     program = graph.finish(inputs, outputs, [as_objects(x) for x in results], name=name)
     program.reports_validity = reports
+    numbers.prune_calls(program)
     return program, expansion.has_rules
 
 
@@ -160,10 +162,13 @@ class _Expansion:
 
     def _subprogram(self, inner: ClosedJaxpr, args) -> tuple[Program, list]:
         """A function as a subprogram, and its arguments without those that are known, which are compiled in."""
+        inner, args = _innermost(inner, args)
         known = tuple(None if x.dtype.kind == "O" else (x.shape, x.dtype.str, x.tobytes()) for x in args)
         program, has_rules = _subprogram(inner, known, self.graph.most)
         self.has_rules |= has_rules
-        return program, [x for x, y in zip(args, known, strict=True) if y is None]
+        program, places = without_unread(program)
+        given = [x for x, y in zip(args, known, strict=True) if y is None]
+        return program, [given[i] for i in places]
 
     def _reduce(self, name, array, axes, out):
         # Entries in XLA's order, one after the other: a sum of few numbers, whose order decides the rounding.
@@ -295,6 +300,19 @@ class _Expansion:
         if self.calls and inner.cost >= MIN_SUBPROGRAM_OPERATIONS and not inner.subprograms:
             return [x.ravel() for x in self.graph.call(inner, shaped)]
         return [x.ravel() for x in self.graph.replay(inner, shaped)[1]]
+
+
+def _innermost(inner: ClosedJaxpr, args: Sequence) -> tuple[ClosedJaxpr, list]:
+    """The function under `jax.jit` to which a function comes down, with its arguments, or the function itself.
+
+    A branch that repeats a call so shares the call's subprogram.
+    """
+    jaxpr = inner.jaxpr
+    if len(jaxpr.eqns) != 1 or jaxpr.eqns[0].primitive.name != "jit" or jaxpr.eqns[0].outvars != jaxpr.outvars:
+        return inner, list(args)
+    values = dict(zip([*jaxpr.constvars, *jaxpr.invars], [*map(_constant, inner.consts), *args], strict=True))
+    given = [np.asarray(x.val) if isinstance(x, Literal) else values[x] for x in jaxpr.eqns[0].invars]
+    return _innermost(jaxpr.eqns[0].params["jaxpr"], given)
 
 
 @functools.lru_cache(maxsize=256)

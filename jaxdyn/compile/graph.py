@@ -7,6 +7,7 @@ Each has its comment "Listed" here. What no output needs is dropped when a graph
 
 import functools
 import math
+from collections import defaultdict
 from collections.abc import Callable, Sequence
 from typing import Any
 
@@ -45,22 +46,22 @@ class Graph:
         self.branches = branches
         self.most, self.most_made = most, _MADE_FOR_ONE_KEPT * most
         self.numbers: list[Number] = []
-        # Keys are operations with their operands, by identity: equal numbers are made once.
-        self.shared: dict[tuple, Number] = {}
+        # For each operation and kind, numbers by their operands, by identity: equal numbers are made once.
+        self.shared: dict[tuple[str, str], dict[tuple, Number]] = defaultdict(dict)
         self.subprograms: list[Program] = []
 
     # --- making numbers ---
 
     def make(self, op: str, kind: str, *args) -> Number:
         """The number op(*args), made once."""
-        key = (op, kind, *args)
+        key, made = args, self.shared[op, kind]
         if 0.0 in args:  # zeros of both signs compare equal, and are different numbers: 1 / -0.0 is not 1 / 0.0
             key = (*key, tuple(isinstance(x, (float, np.floating)) and x == 0 and _is_negative(x) for x in args))
-        number = self.shared.get(key)
+        number = made.get(key)
         if number is None:
             if len(self.numbers) >= self.most_made:
                 raise TooLong(f"more than {self.most} operations")
-            number = self.shared[key] = Number(self, op, kind, args)
+            number = made[key] = Number(self, op, kind, args)
             self.numbers.append(number)
         return number
 
@@ -121,7 +122,7 @@ class Graph:
         if a.op == "neg":
             return self.sub(b, a.args[0])
         # Sums commute: one number for a + b and b + a.
-        if ("add", a.kind, b, a) in self.shared:
+        if (b, a) in self.shared["add", a.kind]:
             a, b = b, a
         return self.make("add", a.kind, a, b)
 
@@ -144,8 +145,9 @@ class Graph:
         if a.op == "neg":
             return self.neg(self.add(a.args[0], b))
         # y - x where x - y is there: one operation less, and the sign moves outwards.
-        if ("sub", a.kind, b, a) in self.shared:
-            return self.neg(self.shared["sub", a.kind, b, a])
+        opposite = self.shared["sub", a.kind].get((b, a))
+        if opposite is not None:
+            return self.neg(opposite)
         return self.make("sub", a.kind, a, b)
 
     def neg(self, a):
@@ -177,7 +179,7 @@ class Graph:
             return self.neg(self.mul(a.args[0], b))
         if b.op == "neg":
             return self.neg(self.mul(a, b.args[0]))
-        if ("mul", a.kind, b, a) in self.shared:
+        if (b, a) in self.shared["mul", a.kind]:
             a, b = b, a
         return self.make("mul", a.kind, a, b)
 
@@ -310,7 +312,7 @@ class Graph:
     def finish(
         self, inputs: Sequence[Array], outputs: Sequence[Array], entries: Sequence[np.ndarray], **more
     ) -> Program:
-        """The program of those numbers that the entries of the outputs need."""
+        """The program of those numbers that the entries of the outputs need; the graph ends with it."""
         flat = [tuple(x.ravel().tolist()) for x in entries]
         # Marked from the outputs backwards, with a list instead of recursion: programs are tens of thousands deep.
         live: set = set()
@@ -325,7 +327,11 @@ class Graph:
         operations = []
         # In the order of creation, where operands precede their operation. Depth first from the outputs was tried: forward
         # dynamics of a Panda took 1.6 times as long.
-        for number in self.numbers:
+        numbers, self.numbers = self.numbers, []
+        # Numbers know their graph: with these references the collector of cycles would look for them in the whole process,
+        # which was a tenth of a first call.
+        self.shared.clear()
+        for number in numbers:
             if number in live:
                 index[number] = len(operations)
                 args = number.args

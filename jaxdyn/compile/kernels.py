@@ -13,6 +13,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from jaxdyn.compile import jax_adapter, mode
+from jaxdyn.compile.derive import without_unread
 from jaxdyn.compile.flags import is_float, mark_invalid
 from jaxdyn.compile.known import is_known, partition, partition_tracers
 from jaxdyn.compile.primitive import kernel_p, target
@@ -137,7 +138,8 @@ def _bind(function, static, tree, args, **how) -> tuple[Any, Any] | str | None:
     leaves, traced = program_of(function, static, tree, args, flags="report", **how)
     if isinstance(traced, str):
         return traced
-    program, out_structure = traced
+    (program, places), out_structure = without_unread(traced[0]), traced[1]
+    leaves = [leaves[i] for i in places]
     if program.reports_validity and mode.is_rank_safe():
         # A part of another function's fallback: the fast path has failed for the sample, and may fail it here again.
         return None
@@ -195,10 +197,11 @@ def evaluate(function: Callable, tree, *args, static: tuple = (), is_input: bool
         # With the arguments of `_bind`, so that both share one trace.
         traced = trace_program(function, static, known, len(inputs), structure, shapes, flags="report")
         if not isinstance(traced, str):
+            program, places = without_unread(traced[0])
             try:
                 # The native code is called without XLA, as a call through XLA would be staged into the trace around it.
-                results = target.call(traced[0], leaves)
-                if not traced[0].reports_validity:
+                results = target.call(program, [leaves[i] for i in places])
+                if not program.reports_validity:
                     return jax.tree.unflatten(traced[1], results)
                 if results.pop():
                     return jax.tree.unflatten(traced[1], results)

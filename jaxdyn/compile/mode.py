@@ -25,6 +25,7 @@ _expanding = jax.make_user_context("")
 _rank_safe = jax.make_user_context(False)
 _in_rows = jax.make_user_context(False)
 _standalone = jax.make_user_context("")
+_by_rules = jax.make_user_context(False)
 _said: set[str] = set()
 
 
@@ -104,6 +105,16 @@ def is_careful() -> bool:
 def standalone(is_careful: bool = False):
     """Context in which a function is traced for code that runs without JAX, where no fallback of JAX computes a sample."""
     return _standalone("careful" if is_careful else "fast")
+
+
+def has_values_of_rules() -> bool:
+    """Decide whether a function with a rule for its derivative is traced for the rule's own values (see `rules.implicit`)."""
+    return _by_rules.value
+
+
+def values_of_rules(is_wanted: bool = True):
+    """Context in which functions with rules for their derivatives have the values of these rules."""
+    return _by_rules(is_wanted)
 
 
 def is_row() -> bool:

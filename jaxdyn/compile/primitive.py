@@ -207,10 +207,16 @@ def _lower_to_call(ctx, *operands, program, rows):
         return lower_function(_call_in_two, ctx, *operands, program=program, rows=rows)
     try:
         assert target is not None
-        number = target.kernel(program, target.width_of(program, samples), uniform)
+        width = target.width_of(program, samples)
+        # A loop is the main part of a program and certain to be called: LLVM works on it while XLA compiles the rest. Another
+        # kernel of the same width continues a run whose step has needed the fallback.
+        is_certain = program.turns > 1 and all(key[1] != width for key in program.derived)
+        number = target.kernel(program, width, uniform)
     except target.Unsupported as reason:  # pyright: ignore[reportOptionalMemberAccess]
         mode.say_once(f"functions run on JAX's own operations: {reason}")
         return lower_function(as_operations, ctx, *operands, program=program, rows=rows)
+    if is_certain:
+        target.make_ahead(number)
     if sharding.is_divisible(ctx.avals_in, lead):
         return lower_function(_with_last_axis, ctx, *operands, program=program, rows=rows and rows + 1)
     order = target.varying_first(uniform)

@@ -5,6 +5,8 @@ samples are gathered to small blocks first, and the branch is taken for as many 
 """
 
 import functools
+import math
+from collections import defaultdict
 from collections.abc import Callable
 
 import jax
@@ -116,16 +118,24 @@ def _many(careful: Callable, axes: list):
         size = flag.shape[0]
         # `jax.export` has sizes without a number.
         count = min(SAMPLES_AT_ONCE, size) if isinstance(size, int) else SAMPLES_AT_ONCE
-        # Padded by a block of places beyond the batch, which are read as the last sample and are not written.
-        places = jnp.nonzero(flag, size=size + count, fill_value=size)[0]
+        # Flagged samples first, in their order, then places beyond the batch, which are read as the last sample and are not
+        # written. A sort, as `jnp.nonzero` is compiled to thirty loops.
+        total = jnp.sum(flag)
+        order = jnp.argsort(jnp.logical_not(flag), stable=True)
+        places = jnp.append(jnp.where(jnp.arange(size) < total, order, size), jnp.full(count, size, order.dtype))
+        varying = [x for x, axis in zip(args, axes, strict=True) if axis is not None]
+        rows = _pack(varying)
 
-        def repair(i, values):
+        def repair(i, packed):
             here = lax.dynamic_slice_in_dim(places, i * count, count)
-            taken = [x if axis is None else x.at[here].get(mode="clip") for x, axis in zip(args, axes, strict=True)]
-            new = _like(jax.vmap(careful, axes)(*taken), values)
-            return jax.tree.map(lambda old, new: old.at[here].set(new, mode="drop"), values, new)
+            own = iter(_unpack([x.at[here].get(mode="clip") for x in rows], varying))
+            taken = [x if axis is None else next(own) for x, axis in zip(args, axes, strict=True)]
+            new = _pack(jax.tree.leaves(_like(jax.vmap(careful, axes)(*taken), values)))
+            return [old.at[here].set(x, mode="drop") for old, x in zip(packed, new, strict=True)]
 
-        return lax.fori_loop(0, (jnp.sum(flag) + count - 1) // count, repair, values)
+        leaves, structure = jax.tree.flatten(values)
+        packed = lax.fori_loop(0, (total + count - 1) // count, repair, _pack(leaves))
+        return jax.tree.unflatten(structure, _unpack(packed, leaves))
 
     @custom_vmap
     def many(flag, values, args):
@@ -143,6 +153,25 @@ def _many(careful: Callable, axes: list):
         return values, jax.tree.map(lambda _: True, values)
 
     return many
+
+
+def _pack(leaves: list) -> list:
+    """The rows of arrays with one leading axis, side by side: an array for each dtype, so that one loop of XLA moves them."""
+    groups: dict = {}
+    for x in leaves:
+        groups.setdefault(x.dtype, []).append(x.reshape(x.shape[0], math.prod(x.shape[1:])))
+    return [jnp.concatenate(group, 1) for group in groups.values()]
+
+
+def _unpack(packed: list, like: list) -> list:
+    """The arrays in the shapes of others that were packed, but for the leading axis."""
+    rows, ends = dict(zip(dict.fromkeys(x.dtype for x in like), packed, strict=True)), defaultdict(int)
+    arrays = []
+    for x in like:
+        start, row = ends[x.dtype], rows[x.dtype]
+        ends[x.dtype] += math.prod(x.shape[1:])
+        arrays.append(row[:, start : ends[x.dtype]].reshape(row.shape[0], *x.shape[1:]))
+    return arrays
 
 
 def _like(new, values):

@@ -5,15 +5,20 @@ from collections.abc import Callable
 import jax
 import jax.numpy as jnp
 
+from jaxdyn.compile import mode
 from jaxdyn.compile.known import partition_tracers
 
 
 def implicit(tree, args: tuple, solve: Callable, tangent: Callable):
     """solve(tree, *args), whose derivative is given by tangent(tree, *args, steps) -> (value, its change).
 
+    Under `mode.values_of_rules` it is the value of the tangent's rule, which is all that a derivative needs.
     `steps` are those of the tree's leaves and of the args, None where nothing moves. Leaves with known values stay outside of
     the differentiated function: inside it they would be traced, and a recursion could not see their zeros any more.
     """
+    if mode.has_values_of_rules():
+        with mode.values_of_rules(False):  # rules within the rule are no part of the question
+            return tangent(tree, *args, [None] * len(jax.tree.leaves((tree, args))))[0]
     unknown, known = partition_tracers(tree)
 
     # With symbolic zeros the rule sees which leaves do not change: a state's derivative computes none of the model's.

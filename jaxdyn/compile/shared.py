@@ -7,7 +7,7 @@ that it needs. For forward dynamics of a given robot the first program has a thi
 from collections.abc import Sequence
 
 from jaxdyn.compile.code import MIN_SHARED_OPERATIONS
-from jaxdyn.compile.program import Array, Constant, Operation, Program, dtype_of
+from jaxdyn.compile.program import Array, Constant, Operation, Program, Renumbering, dtype_of
 
 
 def split_program(program, uniform: Sequence[bool]) -> tuple[Program, Program] | None:
@@ -48,7 +48,7 @@ def _split(program: Program, uniform: Sequence[bool]) -> tuple[Program, Program]
 
     places = [i for i, same in enumerate(uniform) if same]
     # Operations keep their order in both programs and get new indices.
-    first = _Renumbering()
+    first = Renumbering()
     for i, (op, kind, args) in enumerate(program.operations):
         if is_shared[i]:
             args = (places.index(args[0]), args[1]) if op == "input" else first.args(args)
@@ -62,7 +62,7 @@ def _split(program: Program, uniform: Sequence[bool]) -> tuple[Program, Program]
     )
 
     # The second program takes all inputs, also those that only the first one reads, so that argument positions do not change.
-    count, rest = len(program.inputs), _Renumbering()
+    count, rest = len(program.inputs), Renumbering()
     for place, (kind, entries) in enumerate(zip(kinds, by_kind, strict=True), count):
         for k, i in enumerate(entries):
             rest.add(i, Operation("input", kind, (place, k)))
@@ -88,18 +88,3 @@ def _interface(program: Program, is_shared: Sequence[bool]) -> list[int]:
     for args in (*read, *program.results):
         numbers |= {x: None for x in args if type(x) is not Constant and is_shared[x]}
     return list(numbers)
-
-
-class _Renumbering:
-    """Operations of one half of a program, with indices of their own."""
-
-    def __init__(self):
-        self.operations: list[Operation] = []
-        self.index: dict[int, int] = {}
-
-    def add(self, i: int, operation: Operation) -> None:
-        self.index[i] = len(self.operations)
-        self.operations.append(operation)
-
-    def args(self, args) -> tuple:
-        return tuple(x if type(x) is Constant else self.index[x] for x in args)

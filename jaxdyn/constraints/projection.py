@@ -80,16 +80,16 @@ def _rounds(rank_tol, scene: Scene, q, v, t, errors):
     def again(q, v):
         return by_kernel(rank_tol, scene, q, v, t, errors)
 
-    return _in_rounds(again, q, v)
+    return _in_rounds(again, q, v, errors)
 
 
-def _in_rounds(again: Callable, q, v):
-    """Repeat again(q, v) -> (q, v, errors, more) while `more`, `_MOST_ROUNDS` times at most."""
-    # The first round stands before the loop, which most steps never enter.
-    first = tuple(again(q, v))
-    return batch.repeat_while(lambda state: state[3], lambda state: tuple(again(*state[:2])), first, _MOST_ROUNDS - 1)[
-        :3
-    ]
+def _in_rounds(again: Callable, q, v, errors):
+    """Repeat again(q, v) -> (q, v, errors, more) while `more`, once at least and `_MOST_ROUNDS` times at most."""
+
+    def step(state):
+        return tuple(again(*state[:2]))
+
+    return batch.repeat_while(lambda state: state[3], step, (q, v, errors, True), _MOST_ROUNDS)[:3]
 
 
 def _by_rank(rank_tol, scene: Scene, q, v, t, errors):
@@ -102,7 +102,7 @@ def _by_rank(rank_tol, scene: Scene, q, v, t, errors):
         some = every if holonomic.size in (0, Y.shape[1]) else pseudo_inverse(Y[:, holonomic], tolerance(rank_tol, Y))
         return _correct_by_matrices(scene, q, v, t, errors, metric, every, some)
 
-    return _in_rounds(again, q, v)
+    return _in_rounds(again, q, v, errors)
 
 
 def _by_rank_in_full(rank_tol, scene: Scene, q, v, t, errors):

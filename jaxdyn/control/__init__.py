@@ -7,12 +7,12 @@
 Sources: EQUATIONS sections 8 to 10.
 """
 
-from jaxdyn.control.constrained import GaugeInvariant as GaugeInvariant
-from jaxdyn.control.constrained import HybridForce as HybridForce
 from jaxdyn.control.contacts import ContactCoordinates as ContactCoordinates
 from jaxdyn.control.feet import Foot as Foot
 from jaxdyn.control.feet import foot as foot
+from jaxdyn.control.gauge_invariant import GaugeInvariant as GaugeInvariant
 from jaxdyn.control.grasping import GraspForce as GraspForce
+from jaxdyn.control.hybrid_force import HybridForce as HybridForce
 from jaxdyn.control.ilqr import OptimalControl as OptimalControl
 from jaxdyn.control.ilqr import ilqr as ilqr
 from jaxdyn.control.legs import LeggedDynamics as LeggedDynamics

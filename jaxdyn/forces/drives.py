@@ -1,5 +1,7 @@
 """Drives whose torque follows the command with first- or second-order dynamics."""
 
+from collections.abc import Sequence
+
 import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
@@ -7,7 +9,7 @@ from jaxtyping import Array, Float
 
 from jaxdyn.dynamics.kinematics import take
 from jaxdyn.forces.elements import as_leaf, as_names, broadcast_leaf, is_positive, joint_indices
-from jaxdyn.model.arguments import Number, SystemLike
+from jaxdyn.model.arguments import Number, Numbers, SystemLike
 from jaxdyn.systems.drives import DriveDynamics
 
 
@@ -67,11 +69,12 @@ class FirstOrderDrive(_Lag):
     ```
     """
 
-    time_constant: Float[Array, "..."] = eqx.field(converter=as_leaf)
-    initial: Float[Array, "..."] = eqx.field(converter=as_leaf, default=0.0)
-    joints: tuple[str, ...] | None = eqx.field(static=True, converter=as_names, default=None)
+    time_constant: Float[Array, "..."]
+    initial: Float[Array, "..."]
+    joints: tuple[str, ...] | None = eqx.field(static=True)
 
-    def __check_init__(self):
+    def __init__(self, time_constant: Numbers, initial: Numbers = 0.0, joints: Sequence[str] | str | None = None):
+        self.time_constant, self.initial, self.joints = as_leaf(time_constant), as_leaf(initial), as_names(joints)
         # The rate divides by T: for no delay leave the drive out of the scene.
         if not is_positive(self.time_constant):
             raise ValueError(f"FirstOrderDrive: time_constant is {self.time_constant}; give positive seconds")
@@ -112,12 +115,20 @@ class SecondOrderDrive(_Lag):
     ```
     """
 
-    frequency: Float[Array, "..."] = eqx.field(converter=as_leaf)
-    damping_ratio: Float[Array, "..."] = eqx.field(converter=as_leaf, default=1.0)
-    initial: Float[Array, "..."] = eqx.field(converter=as_leaf, default=0.0)
-    joints: tuple[str, ...] | None = eqx.field(static=True, converter=as_names, default=None)
+    frequency: Float[Array, "..."]
+    damping_ratio: Float[Array, "..."]
+    initial: Float[Array, "..."]
+    joints: tuple[str, ...] | None = eqx.field(static=True)
 
-    def __check_init__(self):
+    def __init__(
+        self,
+        frequency: Numbers,
+        damping_ratio: Numbers = 1.0,
+        initial: Numbers = 0.0,
+        joints: Sequence[str] | str | None = None,
+    ):
+        self.frequency, self.damping_ratio = as_leaf(frequency), as_leaf(damping_ratio)
+        self.initial, self.joints = as_leaf(initial), as_names(joints)
         for name in ("frequency", "damping_ratio"):
             if not is_positive(getattr(self, name)):
                 raise ValueError(f"SecondOrderDrive: {name} is {getattr(self, name)}; give positive numbers")

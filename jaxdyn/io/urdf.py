@@ -17,7 +17,8 @@ from jaxdyn.io.urdf_parts import Inertial, Joint, Mimic, read_parts
 from jaxdyn.io.xml_lines import XmlFile
 from jaxdyn.model import float64 as f64
 from jaxdyn.model.arguments import DType, Numbers
-from jaxdyn.model.builder import GRAVITY, ModelBuilder, inertia_problems, unknown
+from jaxdyn.model.builder import GRAVITY, ModelBuilder, unknown
+from jaxdyn.model.inertia_checks import inertia_problems
 from jaxdyn.model.joints import KINDS, SCREW_KINDS, joint_neutral
 from jaxdyn.model.tree import Model
 

@@ -3,8 +3,8 @@
 Imports `lie` and `compile`. Conventions: docs/conventions.md.
 """
 
-from jaxdyn.model.builder import inertia_report as inertia_report
-from jaxdyn.model.builder import repair_inertias as repair_inertias
+from jaxdyn.model.inertia_checks import inertia_report as inertia_report
+from jaxdyn.model.inertia_checks import repair_inertias as repair_inertias
 from jaxdyn.model.topology import Topology as Topology
 
 __all__ = [

@@ -1,4 +1,4 @@
-"""Construction of mechanisms in code, and checks and repairs of their inertias.
+"""Construction of mechanisms in code.
 
 `ModelBuilder` collects bodies and joints; `build` merges fixed bodies, sorts the tree and returns a `Model`.
 All arithmetic of a build is float64 on known numbers; the result is stored in jax's default dtype. Numbers may be traced: the
@@ -15,7 +15,6 @@ import numpy as np
 
 from jaxdyn.compile.known import array_namespace, is_concrete
 from jaxdyn.model import float64 as f64
-from jaxdyn.model import inertia as _inertia
 from jaxdyn.model.arguments import DType, Number, Numbers, store_leaf, warn_unphysical_inertias
 from jaxdyn.model.joints import KINDS, SCREW_KINDS, joint_neutral
 from jaxdyn.model.tree import Model, Topology
@@ -302,54 +301,6 @@ def _sum(one: f64.Values, other: f64.Values) -> f64.Values:
 def _rows(values, shape: tuple[int, ...]) -> f64.Values:
     """Stack arrays of one shape as rows; without any, an empty array of that shape."""
     return array_namespace(values).asarray(values, float).reshape(-1, *shape)
-
-
-def inertia_report(model: Model) -> list[tuple[str, str]]:
-    """Unphysical inertias of a model, as (body, problem).
-
-    Listed are bodies that are massless, whose rotational inertia about the centre of mass is not positive definite, or
-    whose principal moments break the triangle inequality (one exceeds the sum of the other two).
-
-    Such bodies are common in files made by hand and harmless where other bodies move with them; see `repair_inertias`.
-    """
-    return [
-        (name, problem)
-        for name, parameters in zip(model.body_names, np.asarray(model.inertias), strict=True)
-        for problem in inertia_problems(parameters)
-    ]
-
-
-def inertia_problems(parameters) -> list[str]:
-    """Faults of ten inertial parameters (10,), in words; an empty list for physical ones."""
-    parameters = np.asarray(parameters)
-    # The shift from the origin to the centre of mass leaves a few roundings of the precision the numbers came in.
-    rounding = 64 * np.finfo(parameters.dtype).eps
-    parameters = parameters.astype(np.float64)
-    if not parameters.any():
-        return ["massless"]
-    if parameters[0] <= 0:
-        return [f"mass {parameters[0]} kg with first moments and inertia {parameters[1:].tolist()}"]
-    moments = np.linalg.eigvalsh(f64.about_com(parameters)[2])
-    slack = rounding * np.abs(f64.rotational_inertia(parameters)).max()
-    text = ", ".join(f"{moment:.6g}" for moment in moments)
-    if moments[0] <= slack:
-        return [f"not positive definite: principal moments {text} kg m^2"]
-    if moments[2] > moments[0] + moments[1] + slack:
-        return [f"triangle inequality violated: principal moments {text} kg m^2"]
-    return []
-
-
-def repair_inertias(model: Model) -> Model:
-    """Copy of a model in which every body with mass has physical inertial parameters (`inertia.nearest_feasible`).
-
-    Bodies that `inertia_report` does not list and massless ones stay unchanged.
-    """
-    inertias = np.array(model.inertias)
-    for i, parameters in enumerate(inertias):
-        # A massless body has no inertia to repair: only the file's author knows the mass.
-        if parameters[0] > 0 and inertia_problems(parameters):
-            inertias[i] = _inertia.nearest_feasible(parameters)
-    return model.replace(inertias=store_leaf(inertias, inertias.dtype))
 
 
 def _float_dtype(dtype):

@@ -67,6 +67,9 @@ class Accelerometer(_OnFrame):
     ```
     """
 
+    # Type checkers take an inherited constructor for that of the fields.
+    __init__ = _OnFrame.__init__
+
     def read(self, motion: Motion) -> Float[Array, "3"]:
         """Specific force in the frame's axes, m/s^2."""
         return self._in_frame_axes(motion, self._specific_force(motion))
@@ -80,6 +83,8 @@ class Gyroscope(_OnFrame):
     **Arguments:** as of `Accelerometer`.
     """
 
+    __init__ = _OnFrame.__init__
+
     def read(self, motion: Motion) -> Float[Array, "3"]:
         """Angular velocity in the frame's axes, rad/s."""
         return self._in_frame_axes(motion, self._velocity(motion)[3:])
@@ -90,6 +95,8 @@ class Imu(_OnFrame):
 
     **Arguments:** as of `Accelerometer`.
     """
+
+    __init__ = _OnFrame.__init__
 
     def read(self, motion: Motion) -> Float[Array, "6"]:
         """Specific force, then angular velocity."""
@@ -106,6 +113,8 @@ class Velocimeter(_OnFrame):
 
     **Arguments:** as of `Accelerometer`.
     """
+
+    __init__ = _OnFrame.__init__
 
     def read(self, motion: Motion) -> Float[Array, "3"]:
         """Velocity of the origin in the frame's axes, m/s."""

@@ -44,9 +44,9 @@ def stepper(scene: SceneLike, dt: Numbers, substeps: int = 1, remat: bool = True
     - `scene`: a `Scene` or `Model`. Friction that sticks and contacts that open need events, which steps of one length
       do not have: take `jd.forces.CoulombFriction`.
     - `dt`: s; `substeps`: steps in it.
-    - `remat`: if True, reverse mode keeps no more of a step than its state and tau, and computes the rest again. That costs a
-      step, and a run of n steps then keeps 8 (nq + 2 nv) n bytes a sample in float64; with a law as tau, which is computed
-      again too, 8 (nq + nv) n bytes and no intermediates of the law.
+    - `remat`: if True, reverse mode keeps no more of a step than its state and tau, and computes the rest again. With several
+      substeps that costs a step. A run of n steps then keeps 8 (nq + 2 nv) n bytes a sample in float64; with a law as tau,
+      which is computed again too, 8 (nq + nv) n bytes and no intermediates of the law.
     - `adjoint`: "reverse" (default), for `jax.grad`, `jax.jacrev` and, over them, `jax.hessian`; "forward" or "direct", for
       forward mode too (`jax.jvp`, `jax.jacfwd`), in which reverse mode takes longer.
 

@@ -1141,3 +1141,28 @@ def test_an_interruption_leaves_nothing_half_made(monkeypatch, folder):
 
 
 # --- who may import what ---
+
+
+def test_inputs_that_are_not_read_are_not_passed():
+    """They have derivatives of zero, and a rule that reads them gives way to JAX."""
+
+    def function(tree, x):
+        return tree["read"] * x
+
+    def rule(tree, x, steps):
+        # One, but not for a compiler that keeps roundings.
+        one = tree["unread"][0] + 1.0 - tree["unread"][0]
+        by_tree = 0.0 if steps[0] is None else steps[0] * x
+        return one * (by_tree + (0.0 if steps[2] is None else tree["read"] * steps[2]))
+
+    tree, x = {"read": jnp.asarray([2.0, 3.0]), "unread": jnp.ones(4)}, jnp.asarray([5.0, 7.0])
+    for derivative in (None, rule):
+        run = jax.jit(backend.kernel(function, derivative=derivative))
+        (call,) = [line for line in run.lower(tree, x).as_text().splitlines() if "@jaxdyn_kernel" in line]
+        assert len(re.search(r"@jaxdyn_kernel\(([^)]*)\)", call).group(1).split(",")) == 2
+        assert run(tree, x).tolist() == [10.0, 21.0]
+        many = jax.vmap(run, ({"read": None, "unread": 0}, None))({**tree, "unread": jnp.ones((3, 4))}, x)
+        assert many.tolist() == [[10.0, 21.0]] * 3
+        by_tree, by_x = jax.grad(lambda tree, x: run(tree, x).sum(), (0, 1))(tree, x)  # noqa: B023
+        assert by_x.tolist() == [2.0, 3.0] and by_tree["read"].tolist() == [5.0, 7.0]
+        assert by_tree["unread"].tolist() == [0.0] * 4

@@ -5,8 +5,9 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from jaxdyn.compile import kernel
+from jaxdyn.compile import kernel, target
 from jaxdyn.compile.batch import repeat_while, while_loop
+from jaxdyn.compile.expand import expand
 from jaxdyn.compile.loops import Carry, Given, Iteration, Task, run_loop
 
 
@@ -140,3 +141,32 @@ def test_numbers_that_programs_do_not_have_run_by_jax():
 
     task = Task(turn, _by_turns, ())
     assert run_loop(task, (), (), Given(), Carry((jnp.ones(()), jnp.ones((), jnp.int32)))) is None
+
+
+def test_a_branch_that_repeats_a_call_shares_its_code():
+    """The second round of a projection is the subprogram of the first one."""
+    long = jax.jit(lambda x, y: (_many_operations(_many_operations(x)) + y, x - y))
+
+    def twice(x, y):
+        state = long(x, y)
+        return jax.lax.cond(state[0] > 1.0, lambda state: long(*state), lambda state: state, state)
+
+    program = expand(jax.make_jaxpr(twice)(1.0, 2.0), 10**5, calls=True)[0]
+    assert [x.op for x in program.operations if x.op.startswith("call")] == ["call", "call_where"]
+    assert len(program.subprograms) == 1
+
+
+@pytest.mark.native
+def test_llvm_works_on_a_loop_while_xla_compiles(monkeypatch):
+    """Once, under the user's own `jax.jit` too: a second kernel of the loop is for what the native loop refuses."""
+    made = []
+    monkeypatch.setattr(target, "make_ahead", made.append)
+    task = Task(lambda *args: _turn(*args), _by_turns, ())  # new, so that no other test has lowered its loop
+
+    def iterate(matrix, offset, x):
+        return run_loop(task, matrix, offset, Given(), Carry((x, jnp.zeros((), jnp.int32))))[0].state[0]
+
+    x = np.ones((3, 2))
+    for axes, matrix in (((None, None, 0), x[:2]), ((0, None, 0), np.ones((3, 2, 2)))):
+        jax.jit(jax.vmap(iterate, axes)).lower(matrix, x[0], x)
+    assert len(made) == 1

@@ -19,7 +19,8 @@ from jaxdyn.io import load_urdf
 from jaxdyn.model import float64 as f64
 from jaxdyn.model import joints
 from jaxdyn.model import tree as mdl
-from jaxdyn.model.builder import ModelBuilder, inertia_report, repair_inertias
+from jaxdyn.model.builder import ModelBuilder
+from jaxdyn.model.inertia_checks import inertia_report, repair_inertias
 from tests.pinocchio_bridge import quick, to_pinocchio
 
 BALL = (2.0, (0.1, 0.2, 0.3), (0.03, 0.04, 0.05))

@@ -6,7 +6,8 @@ The step-size control is that of diffrax's `PIDController` with an integral part
 Reverse mode goes back through the same steps (see `reverse`).
 """
 
-from functools import partial
+from collections.abc import Callable
+from functools import lru_cache, partial
 from typing import Any, NamedTuple
 
 import diffrax
@@ -62,8 +63,13 @@ class ExplicitRun(Integrator):
 
     def values(self, inputs, room):
         y0, args, ts = inputs
-        most = self.max_steps if room is None else room
-        rows, facts, sums, history = _run_steps(self, ravel_pytree(y0)[0], args, ts, most, room is not None)
+        most, flat = self.max_steps if room is None else room, ravel_pytree(y0)[0]
+        # Of one step that is kept in any case the inputs tell the history: where reverse mode computes a run again for its
+        # history alone, this one is left out.
+        is_told = room == 1 and self.plan.quality is None and isinstance(self.control, FixedSteps)
+        rows, facts, sums, history = _run_steps(self, flat, args, ts, most, room is not None and not is_told)
+        if is_told:
+            history = reverse.of_one_step(flat, ts[0], jnp.minimum(ts[0] + self.stepsize, ts[-1]))
         return (jax.vmap(self.plan.structure)(rows), facts, sums), history
 
     def number_of_steps(self, ts):
@@ -151,7 +157,7 @@ def _run_steps(run: ExplicitRun, y0, args, ts, max_steps: int, record: bool):
         lambda carry: run_loop(task, args, limits, given, carry),
         partial(_iterate_once, *static, args, limits, given),
         # A step that the kernel cannot compute is computed by JAX, and the native loop continues behind it.
-        partial(_iterate_once, *static, args, limits, given, advance=_advance_by_fallback),
+        partial(_iterate_by_fallback(*static), args, limits, given),
         partial(_is_running, max_steps, limits),
         Carry(state, none, rows, records),
     )
@@ -200,6 +206,12 @@ def _iterate_once(
         row = reverse.row(state.y, state.t, state.t_next, kept)
         records = reverse.write(records, strides, row, state.tried, active)
     return Carry(after, *save(plan, given.times, state, after, kept, step, carry.saved, carry.rows), records)
+
+
+@lru_cache(maxsize=256)
+def _iterate_by_fallback(plan: Plan, control, max_steps: int, strides) -> Callable:
+    # Under `jit`, as JAX traces a run several times where it is differentiated: this long part of it once.
+    return jax.jit(partial(_iterate_once, plan, control, max_steps, strides, advance=_advance_by_fallback))
 
 
 def _iterate_in_jax(plan: Plan, control, max_steps: int, strides, args, limits: _Limits, given: Given, carry: Carry):

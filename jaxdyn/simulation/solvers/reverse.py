@@ -19,9 +19,10 @@ from jax import lax
 from jax.flatten_util import ravel_pytree
 from jaxtyping import Array
 
-from jaxdyn.compile import kernel
+from jaxdyn.compile import kernel, values_of_rules
 from jaxdyn.compile.batch import any_sample, cond
 from jaxdyn.compile.loops import Carry, Given, Iteration, Task, run_loop
+from jaxdyn.compile.repair import compute_where
 from jaxdyn.simulation.solvers.explicit import ExplicitSteps, Plan, dense_output, take_step
 
 # States that are kept of a run: 4 kB a number of the state in float64, which a cache holds for small mechanisms.
@@ -62,6 +63,11 @@ def blank(y0, t, room: int) -> History:
     rows = -(-room // stride)
     times, kept = jnp.zeros((room, 2), t.dtype), jnp.zeros(room, bool)
     return History(jnp.zeros((rows, y0.size), y0.dtype), times, kept, jnp.zeros((), jnp.int32))
+
+
+def of_one_step(y0, t0, t1) -> History:
+    """History of a run of one step, which was kept."""
+    return History(y0[None], jnp.stack([t0, t1])[None], jnp.ones(1, bool), jnp.ones((), jnp.int32))
 
 
 def row(y, t0, t1, kept) -> tuple:
@@ -142,9 +148,10 @@ def pull(plan: Plan, history: History, y0, args, ts, steps, rows, varies) -> tup
         cotangents = cotangents._replace(places=_places(last - 1, first, cotangents.saved))
         given = Given(None, (states, history.times, history.kept, rows, ts, ts))
         task = Task(_iterate_back, _loop_back, static)
-        once = partial(_iterate_back_in_jax, *static, (fixed, free_leaves), ends, given)
+        args = *static, (fixed, free_leaves), ends, given
+        once, by_fallback = partial(_iterate_back_in_jax, *args), partial(_iterate_by_fallback, *args)
         run = partial(run_loop, task, (fixed, free_leaves), ends, given)
-        return run_to_end(run, once, once, partial(_is_running, ends), Carry(cotangents)).state
+        return run_to_end(run, once, by_fallback, partial(_is_running, ends), Carry(cotangents)).state
 
     def replay(first, last, y):
         """States from which the steps first .. last - 1 begin, (stride, n), the first of them y."""
@@ -182,8 +189,12 @@ def _places(step, first, saved):
     return jnp.stack([step - first, step, step, row, saved, row])
 
 
+def _is_active(ends: _Ends, carry: Carry):
+    return carry.state.places[1] >= ends.first
+
+
 def _is_running(ends: _Ends, carry: Carry):
-    return any_sample(carry.state.places[1] >= ends.first)
+    return any_sample(_is_active(ends, carry))
 
 
 def _read(given: Given, places):
@@ -199,9 +210,23 @@ def _iterate_back(plan: Plan, times_move, structure, args, ends: _Ends, cotangen
 def _iterate_back_in_jax(plan: Plan, times_move, structure, args, ends: _Ends, given: Given, carry: Carry) -> Carry:
     """One iteration as operations of JAX around kernels."""
     pull: Any = kernel(_pull_without_loop, static=3, fallback=_pull_step, derivative=False)
-    cotangents, pull = carry.state, partial(pull, plan, times_move, structure, *args)
-    after = _go_back(pull, times_move, ends, cotangents, _read(given, cotangents.places))
-    return Carry(jax.tree.map(lambda new, old: jnp.where(after.active, new, old), after.state, cotangents))
+    return _iterate_by(partial(pull, plan, times_move, structure, *args), times_move, ends, given, carry)
+
+
+def _iterate_by_fallback(plan: Plan, times_move, structure, args, ends: _Ends, given: Given, carry: Carry) -> Carry:
+    """The iteration that the native loop has refused, of every trajectory that is still running."""
+    step, active = partial(_pull_step, plan, times_move, structure), _is_active(ends, carry)
+
+    def pull(t0, t1, y, at, after, row):
+        unchanged = jax.tree.map(jnp.zeros_like, (args[1], y, t0, t1, at))
+        return compute_where(active, step, unchanged, (*args, t0, t1, y, at, after, row))
+
+    return _iterate_by(pull, times_move, ends, given, carry)
+
+
+def _iterate_by(pull, times_move, ends: _Ends, given: Given, carry: Carry) -> Carry:
+    after = _go_back(pull, times_move, ends, carry.state, _read(given, carry.state.places))
+    return Carry(jax.tree.map(lambda new, old: jnp.where(after.active, new, old), after.state, carry.state))
 
 
 def _loop_back(plan: Plan, times_move, structure, args, ends: _Ends, given: Given, carry: Carry) -> Carry:
@@ -253,7 +278,8 @@ def step_share(i, t, end, steps):
 
 def _pull_without_loop(plan: Plan, times_move, structure, fixed, free, t0, t1, y, at, after, row):
     # The vector field and the projection occur in every stage: as programs of their own they are differentiated once.
-    plan = plan._replace(field=OwnProgram(plan.field), project=plan.project and OwnProgram(plan.project))
+    project = plan.project and OwnProgram(plan.project, by_rules=True)
+    plan = plan._replace(field=OwnProgram(plan.field), project=project)
     return _pull_step(plan, times_move, structure, fixed, free, t0, t1, y, at, after, row)
 
 
@@ -353,16 +379,20 @@ def replay_rows(plan: Plan, history: History, y0, args, ts, steps):
 
 
 class OwnProgram(NamedTuple):
-    """A function of a plan whose derivatives are those of its own scalar program. Equal ones share it."""
+    """A function of a plan whose derivatives are those of its own scalar program. Equal ones share it.
+
+    `by_rules`: its value is that of the rule for its derivative, of which little is needed: a projection leaves out its rounds.
+    """
 
     function: Any
+    by_rules: bool = False
 
     def __call__(self, *args):
         """Value of the function, of whose last argument the arrays are passed."""
-        arrays = eqx.filter(args[-1], eqx.is_array)
-        return _apply(self.function, arrays, args[:-1])
+        return _apply(*self, eqx.filter(args[-1], eqx.is_array), args[:-1])
 
 
-@kernel(static=1, derivative="program")
-def _apply(function, args, given):
-    return function(*given, args)
+@kernel(static=2, derivative="program")
+def _apply(function, by_rules, args, given):
+    with values_of_rules(by_rules):
+        return function(*given, args)

@@ -1,0 +1,79 @@
+"""Loop of the constraint forces, and requirements of a scene, for laws that control forces beside motions."""
+
+from collections.abc import Callable
+from typing import Any
+
+import equinox as eqx
+import jax.numpy as jnp
+from jaxtyping import Array, Float, PyTree
+
+from jaxdyn.constraints.base import layout
+from jaxdyn.control.gains import times
+from jaxdyn.model.arguments import Number, batch_hint, warn
+from jaxdyn.simulation.controls import Controller
+from jaxdyn.systems.scene import Scene
+
+
+class ForceLoop(Controller):
+    """Base class of laws whose state is the integral of lam - lam_d, (nc,), with integral action."""
+
+    scene: eqx.AbstractVar[Scene]
+    force: eqx.AbstractVar[Callable | None]
+    ki: eqx.AbstractVar[Array | None]
+
+    def start(self, q: Float[Array, " nq"], v: Float[Array, " nv"], t: Number) -> Float[Array, " nc"] | None:
+        """Zero integral at the start; None without integral action."""
+        return None if self.ki is None else jnp.zeros((row_count(self.scene),), q.dtype)
+
+    def rate(
+        self,
+        q: Float[Array, " nq"],
+        v: Float[Array, " nv"],
+        t: Number,
+        state: PyTree,
+        multipliers: Float[Array, " nc"],
+    ) -> Float[Array, " nc"]:
+        """Rate lam - lam_d of the integral."""
+        return multipliers - self.reference_force(q, t)
+
+    def reference_force(self, q: Float[Array, " nq"], t: Number) -> Float[Array, " nc"]:
+        """Reference lam_d (nc,) of the multipliers."""
+        count = row_count(self.scene)
+        if self.force is None:
+            return jnp.zeros((count,), q.dtype)
+        force = self.force(t)
+        if jnp.shape(force) != (count,):
+            raise ValueError(
+                f"force has shape {jnp.shape(force)}, expected {(count,)}, one per row of the constraints"
+                f"{batch_hint(force, (count,))}"
+            )
+        return jnp.asarray(force, q.dtype)
+
+    def wanted_force(self, q: Float[Array, " nq"], t: Number) -> Float[Array, " nc"]:
+        """Deprecated name of `reference_force`."""
+        warn("wanted_force is deprecated; call reference_force", DeprecationWarning)
+        return self.reference_force(q, t)
+
+    def force_command(self, q: Float[Array, " nq"], t: Number, state: PyTree) -> Float[Array, " nc"]:
+        # The sign follows M a + h = tau + A^T lam: a reference multiplier is cancelled by the opposite torque.
+        """Force command -lam_d + KI z."""
+        wanted = -self.reference_force(q, t)
+        # A law that is called outside of a simulation has no state; its integral then counts as zero.
+        return wanted if state is None or self.ki is None else wanted + times(self.ki, state, "ki")
+
+
+def constrained(scene: Any) -> Scene:
+    """Require a scene with constraints. **Raises:** ValueError for anything else."""
+    if not isinstance(scene, Scene) or not scene.constraints:
+        raise ValueError(
+            "scene has no constraints, so there is no force to control; use jd.control.ComputedTorque or "
+            "jd.control.OperationalSpace"
+        )
+    # Refuses constraints on unknown bodies here, and not at the first call of the law.
+    layout(scene)
+    return scene
+
+
+def row_count(scene: Scene) -> int:
+    """Number of rows of the constraints of a scene."""
+    return layout(scene)[-1].end
