@@ -359,6 +359,27 @@ def test_every_iterate_is_feasible(wrong_iiwa, noisy):
     assert fit.result == RESULTS.successful and len(losses) < 60
 
 
+@pytest.mark.parametrize("prior", [1.0, 10.0])
+def test_the_optimum_of_the_convex_loss_is_one(arm, prior):
+    """Gauss-Newton steps in other coordinates, on samples instead of a triangle and by automatic differentiation, find it too."""
+    log = pinocchio_log(planar_arm(1.4, 0.5), noise=0.1)
+    log = identify.Log(log.t, log.q, log.v, log.a, log.tau + 0.3 * log.v + 0.2)
+    size = np.sqrt(np.mean(log.tau**2, axis=0))
+    fit = identify.fit_torques(arm, log, ("viscous", "offset"), weights=1 / size, prior=prior)
+    scene = Scene(arm, forces=[identify.Friction(jnp.full(2, 0.1), *jnp.zeros((2, 2)), jnp.asarray(0.01))])
+    tree = identify.Parameters(scene).inertias(weight=prior).positive(lambda s: s.forces[0].viscous)
+    tree = tree.free(lambda s: s.forces[0].offset)
+    # |w e|^2 / (2 sigma^2) + prior D is N / (2 sigma^2) times the mean of (w e)^2 plus 2 sigma^2 / N times prior D.
+    objective = identify.Objective("torque", noise=2**0.5 * fit.sigma)
+    other = identify.fit_parameters(scene, log, tree, objective, identify.Solver(tolerance=1e-12))
+    np.testing.assert_allclose(other.history[-1] * log.tau.size / (2 * fit.sigma**2), fit.history[-1], rtol=1e-9)
+    base, friction = identify.base_parameters(arm), other.system.forces[0]
+    # A loss within 1e-6 of its minimum leaves the numbers within a thousandth of a standard deviation, some 1e-6.
+    np.testing.assert_allclose(base.values(other.system.system.inertias), base.values(fit.model.inertias), atol=1e-6)
+    np.testing.assert_allclose(friction.viscous, fit.friction.viscous, atol=1e-6)
+    np.testing.assert_allclose(friction.offset, fit.friction.offset, atol=1e-6)
+
+
 def test_prior_decides_between_data_and_nominal(arm):
     """A strong prior keeps the nominal bodies; the weaker it is, the better the fit and the larger the divergence."""
     log = pinocchio_log(planar_arm(1.4, 0.5), noise=0.1)
