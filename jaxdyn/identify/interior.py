@@ -236,7 +236,11 @@ def newton(
     callback: Callable[[int, float, np.ndarray, np.ndarray], None] | None = None,
 ) -> Minimum:
     """Minimise by `InteriorPoint` from the start of the chart; `callback(step, loss, origin, terms)` before each step."""
-    report = None if callback is None else lambda step, loss, point: callback(step, loss, *point)
+
+    def report(step: int, loss: float, point: tuple[np.ndarray, np.ndarray]) -> None:
+        if callback is not None:
+            callback(step, loss, *point)
+
     end = descend(InteriorPoint(problem, tolerance), problem.chart.start, Watch(steps, report))
     return Minimum(*end.last.point, end.history, end.result)
 
