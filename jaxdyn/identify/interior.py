@@ -242,7 +242,8 @@ def newton(
             callback(step, loss, *point)
 
     end = descend(InteriorPoint(problem, tolerance), problem.chart.start, Watch(steps, report))
-    return Minimum(*end.last.point, end.history, end.result)
+    origin, terms = end.last.point
+    return Minimum(origin, terms, end.history, end.result)
 
 
 def _step(problem: TorqueProblem, linear: LinearChart, state: _State, weight: float, barrier: float):
