@@ -13,6 +13,7 @@ import tempfile
 from collections.abc import Iterator
 from importlib.metadata import PackageNotFoundError, distribution, version
 from pathlib import Path
+from typing import Any
 
 if os.environ.get("JAXDYN_COMPILATION_OPTIONS") == "least" and "XLA_FLAGS" not in os.environ:
     # As little work for XLA as for LLVM. A flag that XLA does not know ends the process, as that of the emitters does since 0.11.
@@ -103,7 +104,7 @@ def mode(request: pytest.FixtureRequest) -> Iterator[str]:
 @pytest.fixture(scope="session")
 def data_dir(pytestconfig: pytest.Config) -> Path:
     """The directory of recorded data; tests that ask for it carry the marker `data`."""
-    directory = pytestconfig.getoption("data")
+    directory: Any = pytestconfig.getoption("data")
     if not directory.is_dir():
         pytest.skip(f"no recorded data at {directory}; name its directory with --data")
     return directory
@@ -112,7 +113,7 @@ def data_dir(pytestconfig: pytest.Config) -> Path:
 @pytest.fixture(scope="session")
 def all_robots(pytestconfig: pytest.Config) -> bool:
     """Whether robot tests run on every robot."""
-    return pytestconfig.getoption("all_robots")
+    return bool(pytestconfig.getoption("all_robots"))
 
 
 @pytest.fixture(scope="session")

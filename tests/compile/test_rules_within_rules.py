@@ -9,7 +9,7 @@ import jax.numpy as jnp
 import jax.scipy.special
 import numpy as np
 import pytest
-from jax.extend.core import ClosedJaxpr, Jaxpr
+from jax.extend.core import ClosedJaxpr, Jaxpr  # pyright: ignore[reportPrivateImportUsage]
 from kernel_helpers import assert_close, native, quick, root, root_derivatives
 
 from jaxdyn import compile as backend

@@ -267,7 +267,7 @@ def test_arm_on_a_sphere(contact):
         center = jnp.asarray([0.5, 0.0, 0.0])
         home = jd.frame_pose(model, q0, "tip")[:3, :3]
 
-        def task(q):
+        def task(q):  # pyright: ignore[reportRedeclaration]
             pose = jd.frame_pose(model, q, "tip")
             return jnp.concatenate([(pose[:3, 3] - center)[:2] / 0.18, jd.so3.log(home.T @ pose[:3, :3])])
 

@@ -219,7 +219,7 @@ def test_pages_of_robots(page, tmp_path, monkeypatch):
         "drives": lambda n: (
             np.allclose(n["fit"].values, [0.06, 0.3], rtol=1e-3)
             and bool(n["motion"].success)
-            and n["slopes"].shape == (2,)
+            and n["derivatives"].shape == (2,)
         ),
         "inverse": lambda n: n["batch"].success.mean() > 0.99 and not n["path"].changes_branch.any(),
         "optimal_control": lambda n: bool(n["plan"].success),

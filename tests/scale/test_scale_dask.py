@@ -387,7 +387,7 @@ def test_sweep_on_clusters(cluster, tmp_path):
 
 
 def test_sweep_refuses_places_without_a_scheduler(tmp_path, capsys):
-    import dask
+    import dask.config
 
     from jaxdyn.cli import main
 
