@@ -26,17 +26,21 @@ PANDA = "panda_description/urdf/panda.urdf", False, ("panda_finger_joint1", "pan
 G1 = "g1_description/urdf/g1_29dof_rev_1_0.urdf", True, ()
 
 
+def robot_file(file: str) -> Path:
+    """Path of a file of the package example-robot-data."""
+    found = importlib.util.find_spec("pinocchio")  # beside which the files lie; it is not imported
+    if found is None or found.origin is None:
+        raise SystemExit("pinocchio and example-robot-data are not installed")
+    return Path(found.origin).parents[4] / "share/example-robot-data/robots" / file
+
+
 def robot(file: str, floating: bool, lock: tuple[str, ...]):
     """A robot of the package example-robot-data, and a state q, v, tau."""
     import jax.numpy as jnp
 
     import jaxdyn as jd
 
-    computed = importlib.util.find_spec("pinocchio")  # beside which the files lie; it is not imported
-    if computed is None or computed.origin is None:
-        raise SystemExit("pinocchio and example-robot-data are not installed")
-    path = Path(computed.origin).parents[4] / "share/example-robot-data/robots" / file
-    model = jd.load_urdf(path, floating_base=floating, lock=lock)
+    model = jd.load_urdf(robot_file(file), floating_base=floating, lock=lock)
     return model, jd.neutral(model), jnp.full(model.nv, 0.1), jnp.zeros(model.nv)
 
 
