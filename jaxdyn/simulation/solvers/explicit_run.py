@@ -37,17 +37,17 @@ class ExplicitRun(Integrator):
         y0, args, ts = inputs
         plan, control, start = self.plan, self.control, ravel_pytree(y0)[0]
         most = self.max_steps if room is None else room
-        # Of one step that is kept in any case the inputs tell the history: where reverse mode computes a run again for its
-        # history alone, this one is left out.
-        is_told = room == 1 and plan.quality is plan.guards is None and isinstance(control, FixedSteps)
-        history = None if room is None or is_told else reverse.blank(start, ts[0], most)
+        # The history of one step that is kept in any case follows from the inputs: where reverse mode computes a run again for
+        # its history alone, this one is left out.
+        is_one_step = room == 1 and plan.quality is plan.guards is None and isinstance(control, FixedSteps)
+        history = None if room is None or is_one_step else reverse.blank(start, ts[0], most)
         records, strides = ((), ()) if history is None else (history.rows, history.strides)
         limits, carry = driver.begin(plan, control, args, ts, start, self.rtol, self.atol, self.stepsize, records)
         state, _, rows, records = driver.run_to_event(plan, control, most, strides, args, limits, Given(ts), carry)
         if history is not None:
             states, times, kept = records
             history = reverse.History(states, times, kept, state.tried)
-        elif is_told:
+        elif is_one_step:
             history = reverse.of_one_step(start, ts[0], jnp.minimum(ts[0] + self.stepsize, ts[-1]))
         stopped = state.stopped if state.search is None else state.stopped | state.search.hit.any()
         cases = [(stopped, RESULTS.event_occurred), *driver.cases_of(limits, control, state)]
