@@ -2,14 +2,12 @@
 
 import html
 import io
-import math
 from collections.abc import Iterable, Sequence
 from pathlib import Path
 from typing import Any
 
-from jaxdyn.reports.front import pareto_front, standings
 from jaxdyn.reports.plotting import GREY, SERIES, new_figure
-from jaxdyn.reports.records import COLUMNS, Record, Report, SceneReference, rows
+from jaxdyn.reports.records import COLUMNS, Record, Report, SceneReference, pareto_front, rows
 
 STYLE = """
 body { font: 15px/1.45 system-ui, sans-serif; max-width: 75rem; margin: 2rem auto; padding: 0 1rem; color: #222; }
@@ -25,8 +23,7 @@ cheaper. Points with a grey disc are on the Pareto front. The error is the large
 over the entries y of position and velocity and over the save points, r the reference; quaternions are compared as rotation
 matrices. In the grey band on the left the error of the reference dominates. Times are the best of the rounds, per
 trajectory, without compilation. All runs of a plot were timed interleaved, so its lines compare; plots of different
-machines do not. Stars and dotted lines are published results on the named machines. Evaluations of implicit
-methods are not counted.
+machines do not. Evaluations of implicit methods are not counted.
 """
 
 
@@ -50,10 +47,6 @@ def html_page(report: Report) -> str:
         "<!doctype html><html lang='en'><head><meta charset='utf-8'><title>Error against run time</title>",
         f"<style>{STYLE}</style></head><body><h1>Error against run time</h1>",
         f"<p>{escape(_machine(head))}</p><p class='note'>{_READING}</p>",
-        "<h2>Integrators by class of scene</h2>",
-        "<p class='note'>Cost relative to the best integrator at the errors 1e-3, 1e-5, 1e-7 and 1e-9, geometric mean over the "
-        "scenes of the class and the errors that it reaches; the number of these, out of those that any integrator reaches.</p>",
-        _standings(report.records),
     ]
     for name, known in report.scenes.items():
         parts += _scene(name, known, report.of(name))
@@ -65,7 +58,7 @@ def _machine(head) -> str:
     versions = ", ".join(f"{name} {x}" for name, x in machine["versions"].items() if x)
     return (
         f"{machine['processor']}, {machine['cores']} cores, device {machine['device']}, load {machine['load']} at the start; "
-        f"{versions}; commit {head['commit'] or 'unknown'}; {head['date']}"
+        f"{versions}; {head['date']}"
     )
 
 
@@ -79,14 +72,6 @@ def html_table(header: Sequence[str], cells: Iterable[Sequence[str]]) -> str:
     lines = [f"<tr>{''.join(f'<th>{escape(x)}</th>' for x in header)}</tr>"]
     lines += [f"<tr>{''.join(f'<td>{escape(x)}</td>' for x in row)}</tr>" for row in cells]
     return f"<div class='wide'><table>{''.join(lines)}</table></div>"
-
-
-def _standings(records) -> str:
-    cells = [
-        (s.kind, s.label, f"{s.ratio:.2f}" if math.isfinite(s.ratio) else "-", f"{s.reached}/{s.wanted}")
-        for s in standings(records)
-    ]
-    return html_table(("class", "integrator", "cost", "reached"), cells)
 
 
 def _scene(name: str, known: SceneReference, records: tuple[Record, ...]) -> list[str]:
@@ -120,8 +105,6 @@ def figure(title: str, known: SceneReference, records: Sequence[Record]) -> Any:
         if error == "error_path":
             # After the lines are drawn, whose limits the band extends to.
             ax.axvspan(ax.get_xlim()[0], max(known.error, ax.get_xlim()[0]), color="0.93", zorder=0)
-        if cost == "seconds_best":
-            _draw_peers_times(ax, known, error)
     # Panels have the same lines; a dictionary shows each label once.
     shown = {label: handle for ax in axes[0] for handle, label in zip(*ax.get_legend_handles_labels(), strict=True)}
     drawn.legend(shown.values(), shown.keys(), loc="outside lower center", ncols=3, fontsize=8, frameon=False)
@@ -163,15 +146,3 @@ def panel(ax, records, error: str, cost: str) -> None:
     ]
     halo = {"markersize": 10, "alpha": 0.35, "markeredgewidth": 0, "zorder": 1}
     ax.plot(*zip(*front, strict=True), "o", color=GREY, label="on the front", **halo)
-
-
-def _draw_peers_times(ax, known: SceneReference, error: str) -> None:
-    for point in known.published:
-        value = point["error" if error == "error_path" else "energy_error"]
-        if value is not None:
-            ax.plot([value], [point["seconds"]], "*", color="black", markersize=9, label=point["label"])
-        # A time without an error has no place on the other axis and is drawn as a level.
-        elif point["error"] is None and point["energy_error"] is None and error == "error_path":
-            ax.axhline(
-                point["seconds"], color="black", linestyle=":", linewidth=1, label=f"{point['label']}, no error given"
-            )
