@@ -19,6 +19,10 @@ from jaxdyn.model.joints import KINDS
 from jaxdyn.model.text_table import short as short
 from jaxdyn.model.text_table import table as table
 from jaxdyn.model.tree import Model
+from jaxdyn.pictures import plot
+from jaxdyn.reports.plotting import new_figure
+from jaxdyn.simulation.solution import Solution
+from jaxdyn.systems.system import SceneLike
 
 # Unit of q of joints with one coordinate.
 UNITS = {"revolute": "rad", "continuous": "rad", "helical": "rad", "prismatic": "m"}
@@ -242,6 +246,15 @@ def output_path(text: str | None, suffixes: Sequence[str], option: str) -> pathl
     if not path.parent.is_dir():
         raise ValueError(f"{option} {text}: there is no directory {path.parent}")
     return path
+
+
+def plot_motion(path: pathlib.Path, scene: SceneLike, solution: Solution) -> None:
+    """Plot positions, velocities and torques of a motion, or the bands of a batch, to a file."""
+    figure, axes = new_figure(8.5, 7.5, 3, 1, sharex=True)
+    plot.states(scene, solution, axes[:2, 0])
+    plot.forces(scene, solution, axes[2, 0])
+    figure.savefig(path)
+    print(f"Wrote {path}.")
 
 
 class Stopwatch:

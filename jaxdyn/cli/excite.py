@@ -13,13 +13,16 @@ from jaxdyn.cli.common import (
     load_model,
     output_path,
     per_coordinate,
+    plot_motion,
     real,
     table,
     whole,
 )
+from jaxdyn.constraints.codes import RESULTS
 from jaxdyn.identify import TERMS
 from jaxdyn.identify.workflows.exciting_motion import OBJECTIVES
 from jaxdyn.io import write_log
+from jaxdyn.simulation.solution import Solution
 
 HELP = "optimise an exciting motion within limits for the identification of inertias and friction"
 DESCRIPTION = """\
@@ -127,8 +130,4 @@ def run(args: argparse.Namespace) -> None:
         write_log(out, log)
         print(f"Wrote {out}.")
     if plot is not None:
-        # Imported on use: matplotlib is an extra.
-        from jaxdyn.reports.plotting import motion_figure
-
-        motion_figure(model, log.t, q[None], v[None], tau[None]).savefig(plot)
-        print(f"Wrote {plot}.")
+        plot_motion(plot, model, Solution(log.t, log.q, log.v, RESULTS.successful, {}, torque=log.tau))

@@ -7,7 +7,7 @@ from jaxdyn.identify import TERMS, Delays, DriveGains, LeastSquares, Payload, Ro
 from jaxdyn.identify.regression import free_columns
 from jaxdyn.identify.selection import Choice
 from jaxdyn.model.tree import Model
-from jaxdyn.reports.identification import Findings, total_percent
+from jaxdyn.reports.identification import Findings, model_joint, total_percent
 
 _BASE_ROWS = 200
 
@@ -54,22 +54,33 @@ def _each(values: np.ndarray) -> list[str]:
 
 
 def _joint_table(findings: Findings) -> str:
+    """Errors of each joint, and its friction and rotor inertia, with half-widths of the 95 % intervals where they are known."""
     labels, units = coordinate_labels(findings.model)
-    first = findings.tests[0]
+    first, result = findings.tests[0], findings.result
     measured = np.sqrt(np.mean(np.asarray(first.log.tau) ** 2, axis=0))
-    columns = [measured, first.rms, *(findings.friction[term] for term in TERMS)]
-    header = ["joint", "unit", "torque rms", "error rms", "viscous", "coulomb", "offset", "rotor inertia"]
-    extra = findings.result.fit.extra if isinstance(findings.result, RobotFit) else None
-    if extra is not None:
-        for name, values in extra.by_term.items():
+    columns = {("rotor inertia" if term == "armature" else term): (term, findings.friction[term]) for term in TERMS}
+    half: dict[str, str] = {}
+    if isinstance(result, RobotFit):
+        for name, values in result.fit.extra.by_term.items() if result.fit.extra is not None else ():
             group = np.array(values).reshape(-1, findings.model.nv)
-            header += [name if len(group) == 1 else f"{name} {k + 1}" for k in range(len(group))]
-            columns += list(group)
+            # Parameters are named JOINT.termK without a space, columns of the table with one.
+            columns |= {
+                name if len(group) == 1 else f"{name} {k + 1}": (name if len(group) == 1 else f"{name}{k + 1}", row)
+                for k, row in enumerate(group)
+            }
+        known, factor = result.intervals.parameters, result.intervals.factor
+        for name, std, source in zip(known.names, known.std, known.sources, strict=True):
+            half[name] = f" +- {factor * std:.2g}{' (prior)' * (source == 'prior')}" if np.isfinite(std) else ""
     rows = [
-        [label, unit, *(short(float(x), 3) for x in row)]
-        for label, unit, row in zip(labels, units, np.stack(columns, 1), strict=True)
+        [label, unit, short(float(measured[j]), 3), short(float(first.rms[j]), 3)]
+        + [
+            short(float(values[j]), 3) + half.get(f"{model_joint(findings.model, j)}.{term}", "")
+            for term, values in columns.values()
+        ]
+        for j, (label, unit) in enumerate(zip(labels, units, strict=True))
     ]
-    return f"Joints: errors on {first.name}, friction and rotor inertia\n" + table(header, rows)
+    text = f"Joints: errors on {first.name}, friction and rotor inertia, with half-widths of 95 % intervals\n"
+    return text + table(["joint", "unit", "torque rms", "error rms", *columns], rows)
 
 
 def _identifiability_text(findings: Findings) -> str:

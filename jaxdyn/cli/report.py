@@ -15,7 +15,7 @@ EPILOG = """\
 examples:
   jaxdyn report --list
   jaxdyn report pendulum_in_plane
-  jaxdyn report four_bar andrews --dtype float64 float32 --batch 1 256 --out out/report
+  jaxdyn report four_bar windows --dtype float64 float32 --batch 1 256 --out out/report
 
 The usual integrators, at four tolerances or three steps each, take a quarter of a minute to two minutes a scene,
 most of it compilation.
