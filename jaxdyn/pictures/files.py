@@ -39,7 +39,7 @@ def shapes(path: str | os.PathLike, *, arguments: Mapping[str, Any] | None = Non
     **Warns:** `NotTakenWarning` naming meshes that are missing or cannot be read.
 
     **Raises:** ValueError with file and line for a file that cannot be read and for another format. ImportError without
-    mujoco (MJCF); without trimesh, a dependency of viser, meshes are named in the warning.
+    mujoco (MJCF); without trimesh meshes are named in the warning.
 
     ```python
     solids = jd.pictures.shapes("robot.urdf")
