@@ -9,6 +9,7 @@ import numpy as np
 from benchmarks.report_cases import references
 from benchmarks.report_cases.in_contact import in_contact
 from benchmarks.report_cases.mechanisms import mechanisms
+from benchmarks.report_cases.test_set import andrews, car_axis
 from jaxdyn.forces.elements import Drive
 from jaxdyn.model import robots
 from jaxdyn.reports.case import Case, scene_builder
@@ -132,7 +133,7 @@ def _cases() -> tuple[Case, ...]:
         Case(
             "andrews",
             "Andrews' squeezing mechanism, 0.03 s (test set for IVP solvers)",
-            scene_builder("andrews"),
+            scene_builder(andrews),
             references.andrews,
             np.array([0.0, 0.03]),
             250,
@@ -150,7 +151,7 @@ def _cases() -> tuple[Case, ...]:
         Case(
             "car_axis",
             "Car axis on a bumpy road, 3 s (test set for IVP solvers): constraints that move with time",
-            scene_builder("car_axis"),
+            scene_builder(car_axis),
             references.car_axis,
             np.array([0.0, 3.0]),
             250,

@@ -3,8 +3,8 @@
 import numpy as np
 
 from benchmarks.report_cases import references
+from benchmarks.report_cases.test_set import ANDREWS_ORDER, andrews_bodies
 from jaxdyn.reports.case import Case, Reference, scene_builder
-from jaxdyn.scenes.reference import ANDREWS_ORDER
 
 
 def _andrews_bodies(start) -> Reference:
@@ -113,7 +113,7 @@ def _linkages(ten: np.ndarray) -> tuple[Case, ...]:
         Case(
             "andrews_bodies",
             "Andrews' squeezing mechanism from its seven bodies, 0.03 s (test set for IVP solvers)",
-            scene_builder("andrews_bodies"),
+            scene_builder(andrews_bodies),
             _andrews_bodies,
             np.array([0.0, 0.03]),
             250,

@@ -50,8 +50,8 @@ class Case(NamedTuple):
     reduces: bool = True
 
 
-def scene_builder(name: str, **parameters) -> Callable[[], tuple[Scene, tuple]]:
-    """Function `build` for a scene of `jaxdyn.scenes`; scene and start get the parameters that they accept."""
+def scene_builder(scene: str | scenes.NamedScene, **parameters) -> Callable[[], tuple[Scene, tuple]]:
+    """Function `build` for a scene of `jaxdyn.scenes` or a `NamedScene`; scene and start get the parameters that they accept."""
 
     def call_with_known(function):
         # A parameter may belong to the scene, to its start, or to both.
@@ -59,10 +59,10 @@ def scene_builder(name: str, **parameters) -> Callable[[], tuple[Scene, tuple]]:
         return function(**{key: value for key, value in parameters.items() if key in known})
 
     def build():
-        scene = getattr(scenes, name)
+        named = getattr(scenes, scene) if isinstance(scene, str) else scene
         # Start and scene get the same parameters, so that the start satisfies the constraints.
-        q, v = call_with_known(scene.start_function)
-        return call_with_known(scene), (np.asarray(q), np.asarray(v))
+        q, v = call_with_known(named.start_function)
+        return call_with_known(named), (np.asarray(q), np.asarray(v))
 
     return build
 
