@@ -151,10 +151,10 @@ def number(text: str, what: str) -> float:
 
 def real(text: str) -> float:
     """Argument type of finite numbers in decimal digits."""
-    with contextlib.suppress(ValueError):
-        if np.isfinite(value := parse_number(text)):
-            return value
-    raise argparse.ArgumentTypeError(f"{text!r} is no finite number")
+    try:
+        return number(text, "argument")
+    except ValueError:
+        raise argparse.ArgumentTypeError(f"{text!r} is no finite number") from None
 
 
 def whole(text: str) -> int:

@@ -76,7 +76,6 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--out", metavar="FILE", help="write the fitted robot, .urdf; also the report")
     parser.add_argument("--report", metavar="FILE", help="write parameters and errors, .json (default: next to --out)")
     parser.add_argument("--html", metavar="FILE", help="write a page with tables and plots, .html")
-    parser.add_argument("--plot", metavar="FILE", help="plot measured and predicted torques, .png, .pdf, .svg")
     parser.add_argument("--progress", action="store_true", help="print trials and the loss while fitting")
     _add_expert_options(
         parser.add_argument_group("advanced: data"), parser.add_argument_group("advanced: fit"), several
@@ -143,7 +142,6 @@ def run(args: argparse.Namespace) -> None:
     out = output_path(args.out, (".urdf",), "--out")
     json_path = output_path(args.report, (".json",), "--report")
     html = output_path(args.html, (".html",), "--html")
-    plot = output_path(args.plot, (".png", ".pdf", ".svg"), "--plot")
     options = parse_options(args)
     if out is not None and args.method == "least-squares":
         raise ValueError("--out: least squares gives combinations of parameters and no bodies, so there is no URDF to "
@@ -248,12 +246,6 @@ def run(args: argparse.Namespace) -> None:
 
         write_text(html, page(findings, labels, units, f"jaxdyn identify: {model.name}", text))
         print(f"Wrote {html}.")
-    if plot is not None:
-        from jaxdyn.reports.plotting import torque_figure
-
-        first = findings.tests[0]
-        torque_figure(first.log, first.predicted, labels, units, title=first.name).savefig(plot)
-        print(f"Wrote {plot}.")
 
 
 def _extra_torques(result: RobotFit | Fit) -> dict[str, dict[str, float]]:

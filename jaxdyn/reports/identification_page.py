@@ -1,5 +1,6 @@
 """Identification results as one HTML page: the printed tables and plots, readable offline."""
 
+import html
 from collections.abc import Sequence
 from typing import Any
 
@@ -7,7 +8,7 @@ import numpy as np
 
 from jaxdyn.identify import RobotFit
 from jaxdyn.reports.identification import Evaluation, Findings
-from jaxdyn.reports.page import STYLE, escape, svg
+from jaxdyn.reports.page import document, svg, text_block
 from jaxdyn.reports.plotting import BLUE, GREY, RED, add_legend, joint_panels, new_figure, torque_figure
 
 _MOST_SAMPLES = 1500
@@ -18,23 +19,19 @@ def page(findings: Findings, labels: Sequence[str], units: Sequence[str], title:
 
     **Raises:** ImportError without matplotlib.
     """
-    parts = [
-        f"<!doctype html><html lang='en'><head><meta charset='utf-8'><title>{escape(title)}</title>",
-        f"<style>{STYLE} pre {{ font-size: 12px; overflow-x: auto; }}</style></head><body><h1>{escape(title)}</h1>",
-        f"<pre>{escape(text)}</pre>",
-    ]
+    parts = [text_block(text)]
     for number, one in enumerate(findings.tests):
         # Each sample is a point of an SVG path: whole logs would make pages of many megabytes.
         thin = _subsample(one)
         figure = torque_figure(thin.log, thin.predicted, labels, units, title=one.name)
         parts += [
-            f"<h2>{escape(one.name)}</h2>",
+            f"<h2>{html.escape(one.name)}</h2>",
             svg(figure, f"torque{number}"),
             svg(_spectrum(one, labels), f"spectrum{number}"),
         ]
     if isinstance(findings.result, RobotFit):
         parts += ["<h2>Base parameters</h2>", svg(_interval_figure(findings.result), "intervals")]
-    return "\n".join([*parts, "</body></html>\n"])
+    return document(title, parts)
 
 
 def _subsample(one: Evaluation) -> Evaluation:

@@ -7,15 +7,12 @@ from pathlib import Path
 from typing import Any
 
 from jaxdyn.reports.plotting import GREY, SERIES, new_figure
-from jaxdyn.reports.records import COLUMNS, Record, Report, SceneReference, pareto_front, rows
+from jaxdyn.reports.records import Record, Report, SceneReference, pareto_front
 
-STYLE = """
+_STYLE = """
 body { font: 15px/1.45 system-ui, sans-serif; max-width: 75rem; margin: 2rem auto; padding: 0 1rem; color: #222; }
 h1 { font-size: 1.5rem; } h2 { font-size: 1.15rem; margin-top: 2.5rem; }
-table { border-collapse: collapse; font-size: 12px; font-variant-numeric: tabular-nums; }
-th, td { padding: 1px 8px; text-align: right; border-bottom: 1px solid #e5e5e5; white-space: nowrap; }
-th:first-child, td:first-child { text-align: left; }
-.wide { overflow-x: auto; } svg { max-width: 100%; height: auto; } .note { color: #555; }
+pre { font-size: 12px; overflow-x: auto; } svg { max-width: 100%; height: auto; } .note { color: #555; }
 """
 _READING = """
 Each line is one integrator, each point a tolerance or a step: left is more accurate, down is
@@ -40,17 +37,29 @@ def write(report: Report, directory: str | Path) -> None:
         (directory / f"report.{kind}").write_text(text(), encoding="utf-8")
 
 
+def document(title: str, parts: Iterable[str]) -> str:
+    """Page of HTML elements that works offline."""
+    head = f"<!doctype html><html lang='en'><head><meta charset='utf-8'><title>{html.escape(title)}</title>"
+    start = f"{head}<style>{_STYLE}</style></head><body><h1>{html.escape(title)}</h1>"
+    return "\n".join([start, *parts, "</body></html>\n"])
+
+
+def text_block(text: str) -> str:
+    """Element of a page that shows a text with its lines and columns."""
+    return f"<pre>{html.escape(text)}</pre>"
+
+
 def html_page(report: Report) -> str:
     """Build the report as one self-contained HTML page: plots as SVG, tables, the machine."""
-    head = report.head
-    parts = [
-        "<!doctype html><html lang='en'><head><meta charset='utf-8'><title>Error against run time</title>",
-        f"<style>{STYLE}</style></head><body><h1>Error against run time</h1>",
-        f"<p>{escape(_machine(head))}</p><p class='note'>{_READING}</p>",
-    ]
+    parts = [f"<p>{html.escape(_machine(report.head))}</p><p class='note'>{_READING}</p>"]
     for name, known in report.scenes.items():
-        parts += _scene(name, known, report.of(name))
-    return "\n".join([*parts, "</body></html>\n"])
+        parts.append(f"<h2 id='{html.escape(name)}'>{html.escape(known.text)}</h2>")
+        records = report.of(name)
+        for dtype, batch in dict.fromkeys((r.dtype, r.batch) for r in records):
+            group = [r for r in records if (r.dtype, r.batch) == (dtype, batch)]
+            parts.append(svg(figure(f"{dtype}, {batch} at once", known, group), f"{name}{dtype}{batch}"))
+        parts.append(f"<details><summary>{len(records)} runs</summary>{text_block(report.table(name))}</details>")
+    return document("Error against run time", parts)
 
 
 def _machine(head) -> str:
@@ -60,29 +69,6 @@ def _machine(head) -> str:
         f"{machine['processor']}, {machine['cores']} cores, device {machine['device']}, load {machine['load']} at the start; "
         f"{versions}; {head['date']}"
     )
-
-
-def escape(value) -> str:
-    """Escape a value as text of a page."""
-    return html.escape(str(value))
-
-
-def html_table(header: Sequence[str], cells: Iterable[Sequence[str]]) -> str:
-    """HTML table, first column left-aligned."""
-    lines = [f"<tr>{''.join(f'<th>{escape(x)}</th>' for x in header)}</tr>"]
-    lines += [f"<tr>{''.join(f'<td>{escape(x)}</td>' for x in row)}</tr>" for row in cells]
-    return f"<div class='wide'><table>{''.join(lines)}</table></div>"
-
-
-def _scene(name: str, known: SceneReference, records: tuple[Record, ...]) -> list[str]:
-    reference = f"Reference: {known.kind}, {known.source}; its own error is about {known.error:.0e}."
-    parts = [f"<h2 id='{escape(name)}'>{escape(known.text)}</h2>", f"<p>{escape(reference)}</p>"]
-    for dtype, batch in dict.fromkeys((r.dtype, r.batch) for r in records):
-        group = [r for r in records if (r.dtype, r.batch) == (dtype, batch)]
-        drawn = figure(f"{dtype}, {batch} at once", known, group)
-        parts.append(svg(drawn, f"{name}{dtype}{batch}"))
-    cells = html_table(COLUMNS, rows(records))
-    return [*parts, f"<details><summary>{len(records)} runs</summary>{cells}</details>"]
 
 
 def figure(title: str, known: SceneReference, records: Sequence[Record]) -> Any:
