@@ -12,10 +12,9 @@ import equinox as eqx
 import numpy as np
 
 from jaxdyn.io import LoadedScene, load_urdf
-from jaxdyn.io.load import find_description, format_of, load
+from jaxdyn.io.load import find_description, load
 from jaxdyn.model.arguments import as_path, parse_number
 from jaxdyn.model.builder import GRAVITY
-from jaxdyn.model.joints import KINDS
 from jaxdyn.model.text_table import short as short
 from jaxdyn.model.text_table import table as table
 from jaxdyn.model.tree import Model
@@ -23,10 +22,6 @@ from jaxdyn.pictures import plot
 from jaxdyn.reports.plotting import new_figure
 from jaxdyn.simulation.solution import Solution
 from jaxdyn.systems.system import SceneLike
-
-# Unit of q of joints with one coordinate.
-UNITS = {"revolute": "rad", "continuous": "rad", "helical": "rad", "prismatic": "m"}
-
 
 FILE = "a URDF, xacro, MJCF or SDF file, or a name of robot_descriptions such as go2_description"
 
@@ -78,7 +73,15 @@ def add_model_options(parser: argparse.ArgumentParser, title: str = "model") -> 
 def load_model(path: str, args: argparse.Namespace) -> Model:
     """Load the model of a URDF file under the options of `add_model_options`."""
     # A model alone imposes no couplings, so that joints which follow others are free by default.
-    return _movable(load_urdf(path, mimic=args.mimic or "ignore", **_urdf_options(args)), path)
+    model = load_urdf(
+        path,
+        floating_base=args.floating_base,
+        lock=_lock(args),
+        mimic=args.mimic or "ignore",
+        gravity=GRAVITY if args.gravity is None else tuple(args.gravity),
+        arguments=xacro_arguments(args),
+    )
+    return _movable(model, path)
 
 
 def load_scene(path: str, args: argparse.Namespace) -> tuple[LoadedScene, pathlib.Path]:
@@ -86,27 +89,15 @@ def load_scene(path: str, args: argparse.Namespace) -> tuple[LoadedScene, pathli
     file = as_path(path, "file")
     if not file.suffix and not file.exists():
         file = find_description(path)
-    kind = format_of(file)
     if args.floating_base and args.fixed_base:
         raise ValueError("--floating-base and --fixed-base contradict each other; give one of them")
-    if kind == "urdf":
-        scene = load(file, mimic=args.mimic, **_urdf_options(args))
-        _movable(scene.system, path)
-        return scene, file
-    # Options that only URDF supports are refused, since ignoring them would change the result silently.
-    if args.lock:
-        raise ValueError(f"--lock: joints of {kind.upper()} files cannot be locked; change the file, or use a URDF")
-    if args.mimic or args.arguments:
-        option = "--mimic" if args.mimic else "--arguments"
-        raise ValueError(f"{option}: {file} is {kind.upper()}; leave it out")
     # Neither option: None, for the default of the format.
-    given = False if args.fixed_base else True if args.floating_base else None
-    scene = load(file, floating_base=given)
+    floating = False if args.fixed_base else True if args.floating_base else None
+    scene = load(file, floating_base=floating, lock=_lock(args), mimic=args.mimic, arguments=xacro_arguments(args))
     _movable(scene.system, path)
-    if args.gravity is None:
-        return scene, file
-    # Loaders of MJCF and SDF have no option for gravity, since the file states it.
-    return eqx.tree_at(lambda s: s.system, scene, scene.system.replace(gravity=np.array(args.gravity))), file
+    if args.gravity is not None:
+        scene = eqx.tree_at(lambda s: s.system, scene, scene.system.replace(gravity=np.array(args.gravity)))
+    return scene, file
 
 
 def _lock(args: argparse.Namespace) -> dict[str, Any]:
@@ -122,16 +113,6 @@ def xacro_arguments(args: argparse.Namespace) -> dict[str, str]:
     if bad := [item for item in args.arguments if item.find("=") < 1]:
         raise ValueError(f"--arguments {bad[0]}: give NAME=VALUE")
     return {name: value for name, _, value in (item.partition("=") for item in args.arguments)}
-
-
-def _urdf_options(args: argparse.Namespace) -> dict[str, Any]:
-    gravity = GRAVITY if args.gravity is None else tuple(args.gravity)
-    return {
-        "floating_base": args.floating_base,
-        "lock": _lock(args),
-        "gravity": gravity,
-        "arguments": xacro_arguments(args),
-    }
 
 
 def _movable(model: Model, path: str) -> Model:
@@ -221,18 +202,6 @@ def per_coordinate(model: Model, values: Sequence[float], what: str) -> np.ndarr
     if len(values) not in (1, model.nv):
         raise ValueError(f"{what} has {len(values)} numbers; give 1, or {model.nv}, one per velocity coordinate")
     return np.broadcast_to(np.array(values, float), (model.nv,)).copy()
-
-
-def coordinate_labels(model: Model) -> tuple[list[str], list[str]]:
-    """Label of each velocity coordinate, and the unit of its generalised force."""
-    labels, torque_units = [], []
-    for name, kind in zip(model.joint_names, model.topology.kinds, strict=True):
-        for i in range(KINDS[kind].nv):
-            # Velocities of free and planar joints have the linear part first.
-            linear = kind == "prismatic" or (kind == "free" and i < 3) or (kind == "planar" and i < 2)
-            labels.append(name if KINDS[kind].nv == 1 else f"{name}[{i}]")
-            torque_units.append("N" if linear else "N m")
-    return labels, torque_units
 
 
 def output_path(text: str | None, suffixes: Sequence[str], option: str) -> pathlib.Path | None:

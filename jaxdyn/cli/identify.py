@@ -13,7 +13,6 @@ from jaxdyn.cli.common import (
     Stopwatch,
     add_model_options,
     check_least,
-    coordinate_labels,
     load_model,
     output_path,
     real,
@@ -32,6 +31,7 @@ from jaxdyn.identify.workflows.log_checks import check_log_content, check_rest
 from jaxdyn.identify.workflows.raw_logs import vibration
 from jaxdyn.io import save_urdf
 from jaxdyn.io.files import write_text
+from jaxdyn.model.columns import columns_of
 from jaxdyn.model.inertia_checks import inertia_report, repair_inertias
 from jaxdyn.model.tree import Model
 from jaxdyn.reports.identification import Evaluation, Findings, content, gains_content, payload_content
@@ -216,7 +216,7 @@ def run(args: argparse.Namespace) -> None:
     )
     # The warnings are derived from the other fields, so the list is filled afterwards.
     findings.warnings.extend(_warnings(findings))
-    labels, units = coordinate_labels(model)
+    labels, units = columns_of(model).v, columns_of(model).force_units
     # Gains first: every later number refers to scaled torques.
     lines = [] if gains is None else [gains_text(gains, labels)]
     lines += [error_table(findings)]
@@ -301,7 +301,7 @@ def _evaluate(model: Model, result, names: list[str], logs: list[Log]) -> list[E
 
 def _warnings(findings: Findings) -> list[str]:
     lines = []
-    labels, _ = coordinate_labels(findings.model)
+    labels = columns_of(findings.model).v
     # After a refit the held-out parts are among the training logs already.
     for one in (*findings.final, *(findings.tests if not findings.is_refit else ())):
         lines += [f"{one.name}: {line}" for line in check_log_content(findings.model, one.log, labels)]

@@ -650,7 +650,7 @@ def test_info_of_a_file_with_a_loop(four_bar, capsys):
     assert main(["info", str(four_bar), "--repair", "x.urdf"]) == 2
     assert "only URDF files can be repaired" in capsys.readouterr().err
     assert main(["info", str(four_bar), "--lock", "knee"]) == 2
-    assert "--lock: joints of MJCF files cannot be locked" in capsys.readouterr().err
+    assert "it applies to URDF files; leave it out" in capsys.readouterr().err
 
 
 @pytest.mark.parametrize(
