@@ -210,6 +210,7 @@ def test_only_programs_switch_to_float64():
     assert not wrong, wrong
 
 
+@pytest.mark.long
 def test_import_is_light_and_leaves_jax_unconfigured():
     """In a fresh interpreter: no plotting, optax or scipy, and no array made before the user chooses devices and dtype."""
     program = """
