@@ -345,8 +345,7 @@ def test_public_namespaces_list_their_names():
         namespace = getattr(jaxdyn, name)
         if isinstance(namespace, ModuleType):
             assert all(hasattr(namespace, each) for each in namespace.__all__), name
-            if hasattr(namespace, "__path__"):
-                assert sorted(namespace.__all__) == dir(namespace), name
+            assert sorted(namespace.__all__) == dir(namespace), name
     for namespace, names in _renamed._MOVED.items():
         for name in names.split():
             with pytest.warns(DeprecationWarning, match=rf"jd\.{namespace}\.{name}"):
