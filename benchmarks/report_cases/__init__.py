@@ -7,12 +7,13 @@ import jax.numpy as jnp
 import numpy as np
 
 from benchmarks.report_cases import references
+from benchmarks.report_cases.builders import scene_builder
 from benchmarks.report_cases.in_contact import in_contact
 from benchmarks.report_cases.mechanisms import mechanisms
 from benchmarks.report_cases.test_set import andrews, car_axis
 from jaxdyn.forces.elements import Drive
 from jaxdyn.model import robots
-from jaxdyn.reports.case import Case, scene_builder
+from jaxdyn.reports.case import Case
 from jaxdyn.systems.scene import Scene
 
 _I5 = "Intel i5-4570, date not stated"

@@ -3,7 +3,8 @@
 import numpy as np
 
 from benchmarks.report_cases import references
-from jaxdyn.reports.case import Case, scene_builder
+from benchmarks.report_cases.builders import scene_builder
+from jaxdyn.reports.case import Case
 
 
 def in_contact() -> tuple[Case, ...]:

@@ -4,8 +4,9 @@ import numpy as np
 
 import jaxdyn as jd
 from benchmarks.report_cases import references
+from benchmarks.report_cases.builders import scene_builder
 from benchmarks.report_cases.test_set import ANDREWS_ORDER, andrews_bodies
-from jaxdyn.reports.case import Case, Reference, scene_builder
+from jaxdyn.reports.case import Case, Reference
 
 
 def _andrews_bodies(start) -> Reference:

@@ -50,23 +50,6 @@ class Case(NamedTuple):
     reduces: bool = True
 
 
-def scene_builder(scene: str | scenes.NamedScene, **parameters) -> Callable[[], tuple[Scene, tuple]]:
-    """Function `build` for a scene of `jaxdyn.scenes` or a `NamedScene`; scene and start get the parameters that they accept."""
-
-    def call_with_known(function):
-        # A parameter may belong to the scene, to its start, or to both.
-        known = inspect.signature(function).parameters
-        return function(**{key: value for key, value in parameters.items() if key in known})
-
-    def build():
-        named = getattr(scenes, scene) if isinstance(scene, str) else scene
-        # Start and scene get the same parameters, so that the start satisfies the constraints.
-        q, v = call_with_known(named.start_function)
-        return call_with_known(named), (np.asarray(q), np.asarray(v))
-
-    return build
-
-
 def case_of_scene(name: str) -> Case:
     """Case of a scene of `jd.scenes`: its default start, one second, and a converged solution as the reference.
 
@@ -76,7 +59,9 @@ def case_of_scene(name: str) -> Case:
         raise ValueError(f"scenes has {name!r}; give a jaxdyn.reports.Case, or choose from {', '.join(scenes.names())}")
     if has_modes(getattr(scenes, name)()):
         raise ValueError(f"scenes has {name!r}, whose steps end at events; a report compares steps of given lengths")
+    scene = getattr(scenes, name)
     # The first line of a scene's docstring describes it.
-    text = (inspect.getdoc(getattr(scenes, name)) or name).partition("\n")[0]
+    text = (inspect.getdoc(scene) or name).partition("\n")[0]
     # The energy of an arbitrary scene need not be constant, so its error is not reported.
-    return Case(name, text, scene_builder(name), None, np.linspace(0.0, 1.0, 11), 250, conserves=False)
+    build = lambda: (scene(), tuple(np.asarray(x) for x in scene.start()))  # noqa: E731
+    return Case(name, text, build, None, np.linspace(0.0, 1.0, 11), 250, conserves=False)
