@@ -19,7 +19,8 @@ from jaxdyn.model.text_table import short as short
 from jaxdyn.model.text_table import table as table
 from jaxdyn.model.tree import Model
 from jaxdyn.pictures import plot
-from jaxdyn.reports.plotting import new_figure
+from jaxdyn.reports.plotting import BLUE, bands, new_figure
+from jaxdyn.simulation.export import signals, times
 from jaxdyn.simulation.solution import Solution
 from jaxdyn.systems.system import SceneLike
 
@@ -218,10 +219,21 @@ def output_path(text: str | None, suffixes: Sequence[str], option: str) -> pathl
 
 
 def plot_motion(path: pathlib.Path, scene: SceneLike, solution: Solution) -> None:
-    """Plot positions, velocities and torques of a motion, or the bands of a batch, to a file."""
-    figure, axes = new_figure(8.5, 7.5, 3, 1, sharex=True)
-    plot.states(scene, solution, axes[:2, 0])
-    plot.forces(scene, solution, axes[2, 0])
+    """Plot positions, velocities and torques of a motion to a file; of a batch, the bands of the first eight of each."""
+    if np.ndim(solution.q) == 2:
+        figure, axes = new_figure(8.5, 7.5, 3, 1, sharex=True)
+        plot.states(scene, solution, axes[:2, 0])
+        plot.forces(scene, solution, axes[2, 0])
+    else:
+        # Bands of several joints would cover each other.
+        drawn = [one for one in signals(solution, scene) if one.key in ("q", "v", "tau")]
+        columns = min(8, max(len(one.names) for one in drawn))
+        figure, axes = new_figure(2.1 * columns + 0.7, 6.2, len(drawn), columns, sharex=True)
+        for row, one in zip(axes, drawn, strict=True):
+            for k, (ax, name, unit) in enumerate(zip(row, one.names, one.units, strict=False)):
+                bands(ax, times(solution), one.values[:, :, k], BLUE)
+                ax.set(xlabel="time (s)", ylabel=f"{one.key} {name} ({unit})")
+        figure.suptitle(f"median, 25 to 75 % and 5 to 95 % of {len(solution.q)} motions", fontsize=10)
     figure.savefig(path)
     print(f"Wrote {path}.")
 

@@ -2,6 +2,7 @@
 
 import argparse
 
+import jax.numpy as jnp
 import numpy as np
 
 from jaxdyn import identify
@@ -130,4 +131,5 @@ def run(args: argparse.Namespace) -> None:
         write_log(out, log)
         print(f"Wrote {out}.")
     if plot is not None:
-        plot_motion(plot, model, Solution(log.t, log.q, log.v, RESULTS.successful, {}, torque=log.tau))
+        ts, *rows, torque = (jnp.asarray(x) for x in (log.t, log.q, log.v, log.tau))
+        plot_motion(plot, model, Solution(ts, *rows, RESULTS.successful, {}, torque=torque))
