@@ -131,5 +131,5 @@ def run(args: argparse.Namespace) -> None:
         write_log(out, log)
         print(f"Wrote {out}.")
     if plot is not None:
-        ts, *rows, torque = (jnp.asarray(x) for x in (log.t, log.q, log.v, log.tau))
-        plot_motion(plot, model, Solution(ts, *rows, RESULTS.successful, {}, torque=torque))
+        arrays = [jnp.asarray(x) for x in (log.t, q, v, tau)]
+        plot_motion(plot, model, Solution(*arrays[:3], RESULTS.successful, {}, torque=arrays[3]))
