@@ -131,5 +131,5 @@ def run(args: argparse.Namespace) -> None:
         write_log(out, log)
         print(f"Wrote {out}.")
     if plot is not None:
-        arrays = [jnp.asarray(x) for x in (log.t, q, v, tau)]
-        plot_motion(plot, model, Solution(*arrays[:3], RESULTS.successful, {}, torque=arrays[3]))
+        ts, q, v, torque = (jnp.asarray(x) for x in (log.t, q, v, tau))
+        plot_motion(plot, model, Solution(ts, q, v, RESULTS.successful, {}, torque=torque))
