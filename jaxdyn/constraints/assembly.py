@@ -23,6 +23,7 @@ from jaxdyn.constraints.selection import clear_pivot, most_rounding, select_conc
 from jaxdyn.constraints.tolerances import coordinate_sizes, largest_ratio, row_limits
 from jaxdyn.lie.so3 import matmul
 from jaxdyn.model.arguments import Numbers, check_state, zeros_if_none
+from jaxdyn.model.numbers import check_count
 from jaxdyn.model.tree import Model
 from jaxdyn.systems.scene import Scene, as_scene
 from jaxdyn.systems.system import displace, displacement
@@ -122,12 +123,7 @@ def assemble(
     ```
     """
     scene, rank_tol = as_scene(scene), check_tolerance(rank_tol)
-    for name, count in (("guesses", guesses), ("steps", steps)):
-        if isinstance(count, bool) or not isinstance(count, int) or count < 1:
-            what = "configurations to start from" if name == "guesses" else "steps to make at most"
-            raise ValueError(f"{name} is {count!r}; give how many {what}, at least 1")
-    if atol is not None and (not is_concrete(atol) or not 0 <= float(atol) < np.inf):
-        raise ValueError(f"atol is {atol!r}; give a length (m) or an angle (rad) that is not negative, or None")
+    check_search(steps, guesses, atol)
     v = zeros_if_none(v, scene.nv)
     q, v, t = check_state(scene.system, q=q, v=v, t=t)
     locked = Scene(scene.system, (*scene.constraints, *(lock_joint(*joint) for joint in (hold or {}).items())))
@@ -149,6 +145,14 @@ def assemble(
     if throw and not concrete:
         assembly = assembly.result.error_if(assembly, assembly.result != RESULTS.successful)
     return assembly
+
+
+def check_search(steps: Any, guesses: Any, atol: Any) -> None:
+    """Check the extent of a search for a configuration, and its tolerance. **Raises:** ValueError."""
+    check_count(steps, "steps")
+    check_count(guesses, "guesses")
+    if atol is not None and (not is_concrete(atol) or not 0 <= float(atol) < np.inf):
+        raise ValueError(f"atol is {atol!r}; give a length (m) or an angle (rad) that is not negative, or None")
 
 
 def closing_tolerance(dtype) -> float:

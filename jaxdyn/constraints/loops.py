@@ -13,7 +13,6 @@ from collections.abc import Callable
 from typing import NamedTuple
 
 import equinox as eqx
-import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
@@ -24,6 +23,7 @@ from jaxdyn.constraints.frames import Pair
 from jaxdyn.model.arguments import Checked, DType, Number, Numbers, pose_leaf
 from jaxdyn.model.joints import KINDS, SCREW_KINDS, joint_difference
 from jaxdyn.model.names import body_index
+from jaxdyn.model.numbers import as_number
 from jaxdyn.model.tree import Model
 
 
@@ -217,20 +217,18 @@ def distance(
     """Hold two points at a distance, as a massless rod with ball joints does.
 
     **Arguments:** `body_a`, `body_b`: bodies or frames, None for the world; `point_a`, `point_b` (3,), in the body's
-    frame, m; `length`, m, positive.
+    frame, m; `length`, m, positive (for zero take `loop(..., joint="point")`).
 
     **Raises:** ValueError for bad points or a length that is not positive.
     """
     name = f"distance {body_a or 'world'}-{body_b or 'world'}" if name is None else name
-    if is_concrete(length) and not (np.isfinite(length) and length > 0):
-        raise ValueError(f"{name!r}: length is {length}; give a positive number (m), or take loop(..., joint='point')")
     return Distance(
         name=name,
         body_a=body_a,
         body_b=body_b,
         pose_a=pose_leaf(point_a, f"{name!r}: point_a"),
         pose_b=pose_leaf(point_b, f"{name!r}: point_b"),
-        length=jnp.asarray(length, float) if not isinstance(length, jax.Array) else length,
+        length=as_number(length, f"{name!r}: length", "m"),
     )
 
 

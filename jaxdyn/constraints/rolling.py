@@ -15,7 +15,6 @@ the body. Source: Murray, Li & Sastry (1994), chapters 5.6 and 6.1.
 from typing import NamedTuple
 
 import equinox as eqx
-import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
@@ -24,6 +23,7 @@ from jaxdyn.constraints.frames import Pair
 from jaxdyn.constraints.loops import check_bodies
 from jaxdyn.lie.so3 import cross, matmul
 from jaxdyn.model.arguments import DType, Numbers, SystemLike, pose_leaf
+from jaxdyn.model.numbers import as_number
 
 
 class TouchingPoint(NamedTuple):
@@ -180,7 +180,7 @@ def rolling_wheel(
         surface_body=plane_body,
         pose=pose_leaf(pose, f"{name!r}: pose"),
         surface=pose_leaf(plane, f"{name!r}: plane"),
-        radius=_length(radius, f"{name!r}: radius"),
+        radius=as_number(radius, f"{name!r}: radius", "m"),
         contact=bool(contact),
         spin=False,
         count=2 if lateral else 1,
@@ -313,8 +313,8 @@ def rolling_sphere(
         raise ValueError(
             f"{name!r}: slip is True and contact and spin are False, which leaves no rows; set contact=True"
         )
-    radius = _length(radius, f"{name!r}: radius")
-    reach = None if surface_radius is None else _length(surface_radius, f"{name!r}: surface_radius")
+    radius = as_number(radius, f"{name!r}: radius", "m")
+    reach = None if surface_radius is None else as_number(surface_radius, f"{name!r}: surface_radius", "m")
     concrete = reach is not None and is_concrete(radius - reach)
     if inside and concrete and reach is not None and not radius < reach:
         raise ValueError(f"{name!r}: radius {radius} is not below surface_radius {reach}; it does not fit inside")
@@ -332,10 +332,3 @@ def rolling_sphere(
         spin=bool(spin),
         count=0 if slip else 2,
     )
-
-
-def _length(value, what: str) -> Float[Array, ""]:
-    value = jnp.asarray(value, float) if not isinstance(value, jax.Array) else value
-    if value.shape != () or (is_concrete(value) and not 0 < float(value) < float("inf")):
-        raise ValueError(f"{what} is {value}; give one positive number (m)")
-    return value

@@ -14,9 +14,9 @@ import numpy as np
 from jaxtyping import Float
 
 from jaxdyn.compile.known import is_concrete
-from jaxdyn.contact._checks import as_float
 from jaxdyn.contact.cones import SIDES, FrictionCone, surface_cone
 from jaxdyn.model.arguments import Checked, Numbers
+from jaxdyn.model.numbers import as_float
 
 _FIRST_FACES = 8
 _ROUNDS = 60

@@ -21,10 +21,10 @@ import numpy as np
 from jax.nn import logsumexp
 from jaxtyping import Array, Float
 
-from jaxdyn.contact._checks import as_float, as_number
 from jaxdyn.contact.kinds import components
 from jaxdyn.lie.so3 import matmul
 from jaxdyn.model.arguments import Numbers
+from jaxdyn.model.numbers import as_float, as_number
 
 SIDES = ("inscribed", "circumscribed")
 

@@ -8,11 +8,11 @@ import jax.numpy as jnp
 from jax import lax
 from jaxtyping import Array, Float
 
-from jaxdyn.contact._checks import as_float
 from jaxdyn.contact.surfaces import Plane, Sphere, Surface, check_surface, geometry_at
 from jaxdyn.contact.touching import newton_steps, patch_at
 from jaxdyn.lie.so3 import matmul
 from jaxdyn.model.arguments import Numbers
+from jaxdyn.model.numbers import as_float
 
 # Newton steps without derivatives, and with them: two of these give exact derivatives up to the third order.
 _ROUNDS, _DIFFERENTIATED = 12, 2

@@ -26,7 +26,6 @@ from jaxtyping import Array, Bool, Float
 
 from jaxdyn.compile import entry_point
 from jaxdyn.compile.known import is_concrete
-from jaxdyn.contact._checks import as_float
 from jaxdyn.contact.surfaces import (
     Surface,
     SurfaceGeometry,
@@ -38,6 +37,7 @@ from jaxdyn.contact.surfaces import (
 from jaxdyn.lie import se3
 from jaxdyn.lie.so3 import matmul
 from jaxdyn.model.arguments import Numbers
+from jaxdyn.model.numbers import as_float
 
 
 class ContactKinematics(eqx.Module):

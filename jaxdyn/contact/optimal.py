@@ -5,10 +5,10 @@ from collections.abc import Sequence
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from jaxdyn.contact._checks import as_float
 from jaxdyn.contact.cones import FrictionCone
 from jaxdyn.contact.qp import QPSolution, solve_qp
 from jaxdyn.model.arguments import Checked, Numbers
+from jaxdyn.model.numbers import as_float
 
 
 def optimal_forces(

@@ -18,10 +18,10 @@ from jaxdyn.compile import entry_point
 from jaxdyn.compile.known import is_concrete, is_tracing
 from jaxdyn.constraints.codes import RESULTS, Outcome
 from jaxdyn.constraints.rank import pseudo_inverse, tolerance
-from jaxdyn.contact._checks import as_float
 from jaxdyn.contact._interior_point import Point, Program, attach_derivative, solve
 from jaxdyn.lie.so3 import matmul
 from jaxdyn.model.arguments import Numbers
+from jaxdyn.model.numbers import as_float, check_count
 from jaxdyn.systems.mass_factor import cholesky, is_definite, solve_cholesky
 
 
@@ -125,9 +125,7 @@ def solve_qp(
         tol = max(1e-9, float(jnp.finfo(Q.dtype).eps) ** 0.575)
     if not 0 < float(tol) < 1:
         raise ValueError(f"tol is {tol}; give a number between 0 and 1")
-    if isinstance(max_steps, bool) or not isinstance(max_steps, (int, np.integer)) or max_steps < 1:
-        raise ValueError(f"max_steps is {max_steps!r}; give a positive integer")
-    return _solve(Q, q, G, h, A, b, tuple(checked), pattern, float(tol), int(max_steps))
+    return _solve(Q, q, G, h, A, b, tuple(checked), pattern, float(tol), check_count(max_steps, "max_steps"))
 
 
 def _pair(matrix, level, name: str, right: str, n: int, dtype):

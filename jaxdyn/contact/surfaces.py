@@ -24,9 +24,9 @@ from jaxtyping import Array, Float
 from jaxdyn.compile import entry_point
 from jaxdyn.compile.known import is_concrete
 from jaxdyn.constraints.rolling import tangents, unit_or
-from jaxdyn.contact._checks import as_float, as_number
 from jaxdyn.lie.so3 import cross, matmul
 from jaxdyn.model.arguments import Checked, Function, Numbers, warn
+from jaxdyn.model.numbers import as_float, as_number
 from jaxdyn.systems.scene import as_pytree
 
 
@@ -173,7 +173,7 @@ class Sphere(Ellipsoid):
     """
 
     def __init__(self, radius: Numbers, poles: str = "z"):
-        radius = as_number(radius, "radius", "m", zero=False)
+        radius = as_number(radius, "radius", "m")
         self.semi_axes = jnp.stack([radius] * 3)
         self.poles = _check_poles(poles)
 
@@ -194,7 +194,7 @@ class Cylinder(Surface):
     radius: Float[Array, ""]
 
     def __init__(self, radius: Numbers):
-        self.radius = as_number(radius, "radius", "m", zero=False)
+        self.radius = as_number(radius, "radius", "m")
 
     def point(self, alpha: Float[Array, "2"]) -> Float[Array, "3"]:
         """Point (R cos u, R sin u, v), m."""

@@ -15,6 +15,7 @@ from jaxdyn.compile.known import is_concrete
 from jaxdyn.constraints.base import Constraint, Pfaffian
 from jaxdyn.constraints.rolling import RollingSphere
 from jaxdyn.model.arguments import Checked, Function, Number, Numbers, SystemLike, as_array, pose_leaf
+from jaxdyn.model.numbers import as_number
 from jaxdyn.systems.scene import Scene, as_pytree
 
 
@@ -190,9 +191,6 @@ def ground_contact(
     ```
     """
     name = f"{body} on the ground" if name is None else name
-    radius_leaf = jnp.asarray(as_array(radius, f"ground_contact {name!r}: radius"), float)
-    if radius_leaf.shape != () or (is_concrete(radius_leaf) and not 0 <= float(radius_leaf) < np.inf):
-        raise ValueError(f"ground_contact {name!r}: radius is {radius}; give one number (m), 0 for a point")
     # A point is a sphere of radius zero, and a rolling sphere has the rows of gap and slip.
     contact = RollingSphere(
         name=name,
@@ -200,7 +198,7 @@ def ground_contact(
         surface_body=plane_body,
         pose=pose_leaf(point, f"ground_contact {name!r}: point"),
         surface=pose_leaf(plane, f"ground_contact {name!r}: plane"),
-        radius=radius_leaf,
+        radius=as_number(radius, f"ground_contact {name!r}: radius", "m", zero=True, like=float),
         surface_radius=None,
         on="plane",
         inside=False,

@@ -9,8 +9,8 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from jaxdyn.compile.known import is_concrete
-from jaxdyn.contact._checks import as_float, as_number
 from jaxdyn.model.arguments import Numbers
+from jaxdyn.model.numbers import as_float, as_number
 
 # Signs of (Y, X) and of mu (tx, ty) in the bounds of the torque about the normal, lower ones first.
 _YAW = (
@@ -47,8 +47,8 @@ def wrench_cone(half_x: Numbers, half_y: Numbers, mu: Numbers) -> Float[Array, "
 
     Source: Caron, Pham & Nakamura (2015), eqs. 22-28; EQUATIONS section 11.
     """
-    X = as_number(half_x, "half_x", "m", zero=False)
-    Y = as_number(half_y, "half_y", "m", zero=False, like=X.dtype)
+    X = as_number(half_x, "half_x", "m")
+    Y = as_number(half_y, "half_y", "m", like=X.dtype)
     mu = as_number(mu, "mu", "", zero=True, like=X.dtype)
     o, one, reach = jnp.zeros_like(X), jnp.ones_like(X), mu * (X + Y)
     rows = [jnp.stack([s * one, o, -mu, o, o, o]) for s in (1.0, -1.0)]
@@ -91,7 +91,7 @@ def wrench_cone_of_polygon(vertices: Numbers, mu: Numbers) -> Float[Array, "k 6"
     if not is_concrete(vertices, mu):
         raise ValueError("vertices and mu are traced; facets need concrete numbers, call this outside of jit")
     corners = np.asarray(as_float(vertices, "vertices", (None, 2)), float)
-    friction = float(as_number(mu, "mu", "", zero=False))
+    friction = float(as_number(mu, "mu", ""))
     size = np.ptp(corners, axis=0).max() if len(corners) else 0.0
     flat = corners - corners.mean(0) if len(corners) else corners
     if len(corners) < 3 or not np.isfinite(corners).all() or np.linalg.svd(flat)[1][-1] < 1e-9 * size:

@@ -7,7 +7,7 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from jaxdyn.lie.so3 import matmul
-from jaxdyn.model.arguments import as_array, batch_hint, is_concrete
+from jaxdyn.model.arguments import as_array, is_concrete
 
 
 def gain(value: Any, name: str) -> Array:
@@ -30,19 +30,6 @@ def gain(value: Any, name: str) -> Array:
             raise ValueError(f"{name} is {known.tolist()}, which is not positive definite; give positive gains")
     # Integer gains become floating-point leaves: `jax.grad` refuses integers.
     return jnp.asarray(array, array.dtype if jnp.issubdtype(array.dtype, jnp.floating) else float)
-
-
-def non_negative(value: Any, name: str) -> Array:
-    """Convert a damping or weight to a leaf: (), zero allowed.
-
-    **Raises:** ValueError for another shape and, for a concrete negative number.
-    """
-    number = as_array(value, name)
-    if number.ndim:
-        raise ValueError(f"{name} has shape {number.shape}; give one number{batch_hint(number, ())}")
-    if is_concrete(number) and not 0 <= float(number) < np.inf:
-        raise ValueError(f"{name} is {float(number)}; give zero or a positive number")
-    return jnp.asarray(number, number.dtype if jnp.issubdtype(number.dtype, jnp.floating) else float)
 
 
 def times(gain: Array, error: Float[Array, " n"], name: str) -> Float[Array, " n"]:

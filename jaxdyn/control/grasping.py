@@ -19,13 +19,14 @@ from jaxtyping import Array, Bool, Float, PyTree
 
 from jaxdyn.constraints.base import Constraint, constraint_jacobian, layout, rows
 from jaxdyn.control.errors import Target, as_target, least_acceleration, row_rank, target_rows
-from jaxdyn.control.gains import gain, non_negative, times
+from jaxdyn.control.gains import gain, times
 from jaxdyn.control.motion import torque_for
 from jaxdyn.grasp.forces import as_preload, split_forces
 from jaxdyn.grasp.hand import Grasp, check_grasp
 from jaxdyn.grasp.motions import velocity_rows
 from jaxdyn.lie.so3 import matmul
 from jaxdyn.model.arguments import Checked, Number, Numbers, batch_hint, warn
+from jaxdyn.model.numbers import as_number
 from jaxdyn.simulation.controls import Controller
 from jaxdyn.systems.system import displacement
 
@@ -115,7 +116,7 @@ class GraspForce(Controller):
         self.kp, self.kd = gain(kp, "kp"), gain(kd, "kd")
         self.preload = as_target(preload, "preload")
         self.ki = None if ki is None else gain(ki, "ki")
-        self.damping = non_negative(damping, "damping")
+        self.damping = as_number(damping, "damping", zero=True)
 
     def start(self, q: Float[Array, " nq"], v: Float[Array, " nv"], t: Number) -> Float[Array, " nc"] | None:
         """Zero integral at the start; None without integral action."""

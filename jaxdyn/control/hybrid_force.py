@@ -31,10 +31,11 @@ from jaxdyn.control.errors import (
     target_rows,
 )
 from jaxdyn.control.force_loop import ForceLoop, constrained, row_count
-from jaxdyn.control.gains import gain, non_negative
+from jaxdyn.control.gains import gain
 from jaxdyn.control.motion import torque_for
 from jaxdyn.lie.so3 import matmul
 from jaxdyn.model.arguments import Checked, Function, Number, Numbers, as_array
+from jaxdyn.model.numbers import as_number
 from jaxdyn.systems.scene import Scene, as_pytree
 from jaxdyn.systems.system import SceneLike
 
@@ -106,7 +107,9 @@ class HybridForce(ForceLoop):
         self.ki = None if ki is None else gain(ki, "ki")
         self.actuated = None if actuated is None else _indices(actuated, scene.nv)
         self.internal = None if internal is None else jnp.asarray(as_array(internal, "internal"), float)
-        self.least_regularity = None if least_regularity is None else non_negative(least_regularity, "least_regularity")
+        self.least_regularity = (
+            None if least_regularity is None else as_number(least_regularity, "least_regularity", zero=True)
+        )
         if self.actuated is None and self.internal is not None:
             raise ValueError("internal is given without actuated; name the actuated velocities")
         if self.actuated is not None and not (self.force is None and self.ki is None):

@@ -28,6 +28,7 @@ from jaxdyn.constraints.rank import eps_of
 from jaxdyn.control.box_qp import minimize_in_box
 from jaxdyn.lie.so3 import matmul
 from jaxdyn.model.arguments import Checked, Function, Numbers, as_array, batch_hint
+from jaxdyn.model.numbers import as_number, check_count
 from jaxdyn.systems.mass_factor import cholesky, solve_cholesky
 from jaxdyn.systems.scene import as_pytree
 
@@ -145,13 +146,10 @@ def ilqr(
     us = jnp.asarray(us, us.dtype if jnp.issubdtype(us.dtype, jnp.floating) else float)
     if us.ndim != 2 or 0 in us.shape:
         raise ValueError(f"us has shape {us.shape}; give controls (n, nu), one row per step{batch_hint(us, (1, 1))}")
-    if isinstance(iterations, bool) or not isinstance(iterations, int) or iterations < 1:
-        raise ValueError(f"iterations is {iterations!r}; give a positive integer")
+    check_count(iterations, "iterations")
     if not is_concrete(tol) or not 0 < float(tol) < 1:
         raise ValueError(f"tol is {tol!r}; give a number between 0 and 1")
-    mu = as_array(regularization, "regularization", us.dtype)
-    if mu.shape != () or (is_concrete(mu) and not 0 <= float(mu) < np.inf):
-        raise ValueError(f"regularization is {regularization!r}; give one number that is not negative")
+    mu = as_number(regularization, "regularization", zero=True, like=us.dtype)
     step, cost, final_cost = (
         as_pytree(f, name, takes)
         for f, name, takes in ((step, "step", "x, u"), (cost, "cost", "x, u, k"), (final_cost, "final_cost", "x"))

@@ -18,7 +18,7 @@ from jaxtyping import Array, Float, Int
 
 from jaxdyn.compile import entry_point
 from jaxdyn.compile.known import is_concrete, stop_gradient
-from jaxdyn.constraints.assembly import closing_tolerance
+from jaxdyn.constraints.assembly import check_search, closing_tolerance
 from jaxdyn.constraints.base import Constraint, holonomic_rows, layout, position_residual
 from jaxdyn.constraints.closing import nearest_configuration
 from jaxdyn.constraints.codes import RESULTS, Outcome, name_of
@@ -126,11 +126,7 @@ def inverse_kinematics(
     rows = as_targets(scene.system, targets)
     model: Model = scene.system
     guess, t = check_state(model, q=guess, t=t)
-    for name, count in (("steps", steps), ("guesses", guesses)):
-        if isinstance(count, bool) or not isinstance(count, int) or count < 1:
-            raise ValueError(f"{name} is {count!r}; give a positive integer")
-    if atol is not None and (not is_concrete(atol) or not 0 <= float(atol) < np.inf):
-        raise ValueError(f"atol is {atol!r}; give a length (m) or an angle (rad) that is not negative, or None")
+    check_search(steps, guesses, atol)
     if posture is not None:
         (posture,) = check_state(model, q_posture=posture)
     factors = row_weights(rows, weights, guess.dtype)

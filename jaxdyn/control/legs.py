@@ -16,14 +16,13 @@ from jaxtyping import Array, Float
 
 from jaxdyn.constraints.codes import RESULTS, Outcome
 from jaxdyn.constraints.rank import pseudo_inverse, tolerance
-from jaxdyn.contact._checks import as_float
 from jaxdyn.contact.optimal import cone_bounds
 from jaxdyn.contact.qp import solve_qp
 from jaxdyn.control.feet import Foot, check_feet
-from jaxdyn.control.gains import non_negative
 from jaxdyn.dynamics.quantities import inverse_dynamics
 from jaxdyn.lie.so3 import matmul
 from jaxdyn.model.arguments import Checked, Numbers, check_shapes
+from jaxdyn.model.numbers import as_float, as_number
 from jaxdyn.model.tree import Model
 
 
@@ -101,8 +100,8 @@ def underactuated_inverse_dynamics(
     base = passive_velocities(model, passive)
     motors = np.setdiff1d(np.arange(model.nv), base)
     preload = as_float(preload, "preload", (), q.dtype)
-    torque_weight = non_negative(torque_weight, "torque_weight").astype(q.dtype)
-    force_weight = non_negative(force_weight, "force_weight").astype(q.dtype)
+    torque_weight = as_number(torque_weight, "torque_weight", zero=True).astype(q.dtype)
+    force_weight = as_number(force_weight, "force_weight", zero=True).astype(q.dtype)
     needed = inverse_dynamics(model, q, v, a)
     if not feet:
         result = RESULTS.where(jnp.any(needed[base] != 0), RESULTS.infeasible, RESULTS.successful)  # pyright: ignore[reportArgumentType]

@@ -21,10 +21,11 @@ from jaxdyn.control.errors import (
     least_acceleration,
     target_rows,
 )
-from jaxdyn.control.gains import gain, non_negative, times
+from jaxdyn.control.gains import gain, times
 from jaxdyn.dynamics.quantities import gravity_force, inverse_dynamics
 from jaxdyn.lie.so3 import matmul
 from jaxdyn.model.arguments import Number, Numbers, SystemLike, state_dtype
+from jaxdyn.model.numbers import as_number
 from jaxdyn.model.tree import Model
 from jaxdyn.systems.scene import Scene, as_scene
 from jaxdyn.systems.system import SceneLike, displacement
@@ -127,7 +128,10 @@ class OperationalSpace(eqx.Module):
         self.scene = unconstrained(scene)
         self.error = frame_error(self.scene.system, frame, target, task)
         self.kp, self.kd = gain(kp, "kp"), gain(kd, "kd")
-        self.damping, self.stiffness = non_negative(damping, "damping"), non_negative(stiffness, "stiffness")
+        self.damping, self.stiffness = (
+            as_number(damping, "damping", zero=True),
+            as_number(stiffness, "stiffness", zero=True),
+        )
         self.posture = None if posture is None else jnp.asarray(posture, state_dtype(self.scene.system))
 
     def __check_init__(self):
@@ -186,7 +190,7 @@ class CartesianStiffness(eqx.Module):
         self.model = model
         self.error = frame_error(model, frame, target, task)
         self.stiffness, self.damping = gain(stiffness, "stiffness"), gain(damping, "damping")
-        self.joint_damping = non_negative(joint_damping, "joint_damping")
+        self.joint_damping = as_number(joint_damping, "joint_damping", zero=True)
 
     def __call__(self, q: Float[Array, " nq"], v: Float[Array, " nv"], t: Number = 0.0) -> Float[Array, " nv"]:
         """Joint torques (nv,), N m or N."""

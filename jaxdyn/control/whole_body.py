@@ -26,11 +26,12 @@ from jaxdyn.control.errors import (
     target_value,
 )
 from jaxdyn.control.feet import Foot, check_feet
-from jaxdyn.control.gains import gain, non_negative
+from jaxdyn.control.gains import gain
 from jaxdyn.control.legs import LeggedDynamics, missing_wrench, passive_velocities, underactuated_inverse_dynamics
 from jaxdyn.dynamics.centroidal import center_of_mass
 from jaxdyn.lie.so3 import matmul
 from jaxdyn.model.arguments import Checked, Number, Numbers
+from jaxdyn.model.numbers import as_number
 from jaxdyn.model.tree import Model
 from jaxdyn.systems.scene import Force, Scene
 from jaxdyn.systems.system import displacement
@@ -130,10 +131,13 @@ class WholeBody(eqx.Module):
         self.turn_kd = self.kd if turn_kd is None else gain(turn_kd, "turn_kd")
         dtype = model.inertias.dtype
         self.posture = None if posture is None else jnp.asarray(posture, dtype)
-        self.stiffness, self.damping = non_negative(stiffness, "stiffness"), non_negative(damping, "damping")
-        self.preload = non_negative(preload, "preload")
-        self.torque_weight = non_negative(torque_weight, "torque_weight")
-        self.force_weight = non_negative(force_weight, "force_weight")
+        self.stiffness, self.damping = (
+            as_number(stiffness, "stiffness", zero=True),
+            as_number(damping, "damping", zero=True),
+        )
+        self.preload = as_number(preload, "preload", zero=True)
+        self.torque_weight = as_number(torque_weight, "torque_weight", zero=True)
+        self.force_weight = as_number(force_weight, "force_weight", zero=True)
         self.effort_limit = None if effort_limit is None else jnp.asarray(effort_limit, dtype)
         self.passive = tuple(passive_velocities(model, passive).tolist())
         # A traced stiffness may be positive, so that it needs a posture as well.

@@ -10,6 +10,7 @@ from jaxtyping import Array, Bool, Float
 
 from jaxdyn.forces.piecewise import PiecewiseForce
 from jaxdyn.model.arguments import Checked, Number, Numbers, SystemLike, as_array, is_concrete, warn
+from jaxdyn.model.numbers import as_number
 from jaxdyn.model.tree import Model
 
 
@@ -40,8 +41,8 @@ class JointStops(PiecewiseForce):
     def __init__(
         self, stiffness: Numbers = 1e4, damping: Numbers = 0.0, joints: Checked[str | Sequence[str] | None] = None
     ):
-        self.stiffness = _number(stiffness, "JointStops: stiffness", least=0.0, strict=True)
-        self.damping = _number(damping, "JointStops: damping", least=0.0, strict=False)
+        self.stiffness = as_number(stiffness, "JointStops: stiffness", like=float)
+        self.damping = as_number(damping, "JointStops: damping", zero=True, like=float)
         self.joints = (joints,) if isinstance(joints, str) else joints if joints is None else tuple(joints)
 
     def guards(
@@ -239,15 +240,3 @@ def _by_coordinate(value, tau, what: str) -> Array:
     if jnp.shape(value) not in ((), tau.shape):
         raise ValueError(f"{what} has shape {jnp.shape(value)}, expected a number or {tau.shape} = (nv,)")
     return jnp.broadcast_to(jnp.asarray(value, tau.dtype), tau.shape)
-
-
-def _number(value: Any, what: str, least: float, strict: bool):
-    number = jnp.asarray(as_array(value, what), float)
-    fine = not is_concrete(number) or (
-        number.shape == () and np.isfinite(number) and (number > least if strict else number >= least)
-    )
-    if not fine:
-        raise ValueError(
-            f"{what} is {value}; give one {'positive number' if strict else 'number that is not negative'}"
-        )
-    return number

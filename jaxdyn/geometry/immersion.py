@@ -24,9 +24,10 @@ from jaxdyn.compile.known import is_known
 from jaxdyn.dynamics import quantities as dynamics
 from jaxdyn.lie.so3 import matmul
 from jaxdyn.model.arguments import Checked, Function, Numbers, check_state
+from jaxdyn.model.numbers import check_count
 from jaxdyn.systems.scene import Scene, as_pytree, as_scene, check_force
 from jaxdyn.systems.start import describe_state
-from jaxdyn.systems.system import SceneLike, System, check_size, rate_to_velocity
+from jaxdyn.systems.system import SceneLike, System, rate_to_velocity
 
 
 class PullBack(eqx.Module):
@@ -262,7 +263,7 @@ def constrain_by_immersion(
             )
     units = tuple(scene.system for scene in scenes)
     immersed = ImmersedSystem(
-        units=units, immersion=as_pytree(xi, "xi"), nq=check_size(nq), moving=bool(moving), joined=joined
+        units=units, immersion=as_pytree(xi, "xi"), nq=check_count(nq, "nq"), moving=bool(moving), joined=joined
     )
     if force is None and not any(isinstance(unit, Scene) for unit in given):
         return immersed

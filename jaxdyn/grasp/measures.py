@@ -11,12 +11,12 @@ from jax import lax
 from jaxtyping import Array, Bool, Float
 
 from jaxdyn.compile import entry_point, gram_eigenvectors
-from jaxdyn.compile.known import is_concrete
 from jaxdyn.constraints.base import constraint_jacobian
 from jaxdyn.grasp.hand import Grasp, check_grasp
 from jaxdyn.grasp.motions import HandMotions, hand_motions, velocity_rows
 from jaxdyn.lie.so3 import matmul
-from jaxdyn.model.arguments import Numbers, as_array, check_state
+from jaxdyn.model.arguments import Numbers, check_state
+from jaxdyn.model.numbers import as_number
 from jaxdyn.reduction.bases import least_quality, orthonormal
 from jaxdyn.systems.mass_factor import solve_lower
 
@@ -71,9 +71,7 @@ def manipulability(
     """
     check_grasp(grasp)
     q, t = check_state(grasp.system, q=q, t=t)
-    length = as_array(length, "length", q.dtype)
-    if length.shape != () or (is_concrete(length) and not 0 < float(length) < float("inf")):
-        raise ValueError(f"length is {length}; give one positive number (m)")
+    length = as_number(length, "length", "m", like=q.dtype)
     motions = hand_motions(grasp, q, t) if motions is None else motions
     if not motions.object.shape[1]:
         raise ValueError(

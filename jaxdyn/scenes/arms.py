@@ -19,6 +19,7 @@ from jaxdyn.model import inertia, robots
 from jaxdyn.model.arguments import Checked, Number, Row, store_leaf
 from jaxdyn.model.builder import ModelBuilder
 from jaxdyn.model.joining import join
+from jaxdyn.model.numbers import check_count
 from jaxdyn.model.tree import Model
 from jaxdyn.scenes._named import as_leaf, as_state, register_scene
 from jaxdyn.scenes.hands import finger_angles, rotation_about_z
@@ -205,9 +206,7 @@ def coordinated_lifting(
 
     Source: EQUATIONS section 10, coordinated lifting; Murray, Li & Sastry (1994), section 6.4.
     """
-    # True is an int to Python.
-    if isinstance(count, bool) or not isinstance(count, int) or count < 1:
-        raise ValueError(f"count is {count!r}; give the number of arms, a positive integer")
+    check_count(count, "count")
     fall = (0.0, 0.0, -gravity)
     arm = robots.iiwa(gravity=fall)
     flange = frame_pose(robots.iiwa(gravity=None), store_leaf(_HOLDING, arm.home.dtype), _FLANGE)

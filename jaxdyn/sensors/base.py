@@ -12,6 +12,7 @@ from jaxtyping import Array, Float
 from jaxdyn.constraints.base import layout
 from jaxdyn.constraints.dynamics import constrained_dynamics
 from jaxdyn.model.arguments import Checked, Numbers, as_array, check_state, is_concrete, zeros_if_none
+from jaxdyn.model.numbers import as_number
 from jaxdyn.model.tree import Model
 from jaxdyn.systems.scene import Scene, as_scene
 from jaxdyn.systems.system import SceneLike
@@ -72,16 +73,27 @@ class Noise(eqx.Module):
         return readings + bias + drift + std * white
 
 
+def _as_delay(delay: Numbers) -> Array:
+    return as_number(delay, "delay", "s", zero=True, like=float)
+
+
 class Sensor(eqx.Module):
     """Base class of sensors.
 
-    - `name`: of its readings. `noise`: its errors, or None; `delay` (), s: how much later its readings come. Both are applied by
-      `record`.
+    - `name`: of its readings, by default `default_name()`. `noise`: its errors, or None; `delay` (), s: how much later its
+      readings come. Both are applied by `record`.
     """
 
-    name: eqx.AbstractVar[str]
-    noise: eqx.AbstractVar[Noise | None]
-    delay: eqx.AbstractVar[Array]
+    name: str = eqx.field(static=True, default="", kw_only=True)
+    noise: Noise | None = eqx.field(default=None, kw_only=True)
+    delay: Array = eqx.field(converter=_as_delay, default=0.0, kw_only=True)
+
+    def __post_init__(self):
+        self.name = self.name or self.default_name()
+
+    def default_name(self) -> str:
+        """Name of the readings where none is given."""
+        return type(self).__name__.lower()
 
     def read(self, motion: Motion) -> Float[Array, " k"]:
         """The reading (k,) without errors."""
@@ -95,19 +107,10 @@ class Sensor(eqx.Module):
         """Refuse a scene that has not what the sensor is on. **Raises:** ValueError."""
 
 
-def as_delay(delay: Numbers) -> Array:
-    """Convert a delay, s. **Raises:** ValueError for anything but one number that is not negative."""
-    value = as_array(delay, "delay")
-    if value.shape != () or (is_concrete(value) and not 0 <= float(value) < np.inf):
-        raise ValueError(f"delay is {delay!r}; give one number (s) that is not negative")
-    return jnp.asarray(value, float)
-
-
-def check_part(part: Any, parts: dict) -> Any:
+def check_part(part: Any, parts: dict) -> None:
     """Check that a sensor has such a part. **Raises:** ValueError."""
     if part not in parts:
         raise ValueError(f"part is {part!r}; choose from {', '.join(map(repr, parts))}")
-    return part
 
 
 def check_sensors(scene: Scene, sensors: Any) -> tuple[Sensor, ...]:

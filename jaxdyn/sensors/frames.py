@@ -10,9 +10,8 @@ from jaxdyn.dynamics.frame_motion import frame_acceleration, frame_velocity
 from jaxdyn.dynamics.kinematics import frame_pose
 from jaxdyn.lie import so3
 from jaxdyn.lie.so3 import matmul
-from jaxdyn.model.arguments import Numbers
 from jaxdyn.model.names import frame_index
-from jaxdyn.sensors.base import Motion, Noise, Sensor, as_delay, check_part
+from jaxdyn.sensors.base import Motion, Sensor, check_part
 from jaxdyn.systems.scene import Scene
 
 
@@ -20,14 +19,10 @@ class _OnFrame(Sensor):
     """A sensor on a frame: `frame` its name, `name` by default KIND of FRAME; `noise`, `delay` (s) as of `Sensor`."""
 
     frame: str = eqx.field(static=True)
-    name: str = eqx.field(static=True)
-    noise: Noise | None
-    delay: Array
 
-    def __init__(self, frame: str, *, name: str | None = None, noise: Noise | None = None, delay: Numbers = 0.0):
-        self.frame = frame
-        self.name = f"{type(self).__name__.lower()} of {frame}" if name is None else name
-        self.noise, self.delay = noise, as_delay(delay)
+    def default_name(self) -> str:
+        """Name "KIND of FRAME"."""
+        return f"{type(self).__name__.lower()} of {self.frame}"
 
     def check(self, scene: Scene) -> None:
         """Refuse a frame that the model does not have. **Raises:** ValueError."""
@@ -67,9 +62,6 @@ class Accelerometer(_OnFrame):
     ```
     """
 
-    # Type checkers take an inherited constructor for that of the fields.
-    __init__ = _OnFrame.__init__
-
     def read(self, motion: Motion) -> Float[Array, "3"]:
         """Specific force in the frame's axes, m/s^2."""
         return self._in_frame_axes(motion, self._specific_force(motion))
@@ -83,8 +75,6 @@ class Gyroscope(_OnFrame):
     **Arguments:** as of `Accelerometer`.
     """
 
-    __init__ = _OnFrame.__init__
-
     def read(self, motion: Motion) -> Float[Array, "3"]:
         """Angular velocity in the frame's axes, rad/s."""
         return self._in_frame_axes(motion, self._velocity(motion)[3:])
@@ -95,8 +85,6 @@ class Imu(_OnFrame):
 
     **Arguments:** as of `Accelerometer`.
     """
-
-    __init__ = _OnFrame.__init__
 
     def read(self, motion: Motion) -> Float[Array, "6"]:
         """Specific force, then angular velocity."""
@@ -114,8 +102,6 @@ class Velocimeter(_OnFrame):
     **Arguments:** as of `Accelerometer`.
     """
 
-    __init__ = _OnFrame.__init__
-
     def read(self, motion: Motion) -> Float[Array, "3"]:
         """Velocity of the origin in the frame's axes, m/s."""
         return self._in_frame_axes(motion, self._velocity(motion)[:3])
@@ -127,11 +113,10 @@ class FrameVelocity(_OnFrame):
     **Arguments:** as of `Accelerometer`; `part`: "linear" or "angular" for three of them, None for all.
     """
 
-    part: str | None = eqx.field(static=True)
+    part: str | None = eqx.field(static=True, default=None, kw_only=True)
 
-    def __init__(self, frame: str, *, part: str | None = None, **options: Any):
-        super().__init__(frame, **options)
-        self.part = check_part(part, _VELOCITIES)
+    def __check_init__(self):
+        check_part(self.part, _VELOCITIES)
 
     def read(self, motion: Motion) -> Float[Array, " k"]:
         """Linear, then angular velocity in world axes."""
@@ -144,11 +129,10 @@ class FramePose(_OnFrame):
     **Arguments:** as of `Accelerometer`; `part`: "position" or "orientation" for one of them, None for both.
     """
 
-    part: str | None = eqx.field(static=True)
+    part: str | None = eqx.field(static=True, default=None, kw_only=True)
 
-    def __init__(self, frame: str, *, part: str | None = None, **options: Any):
-        super().__init__(frame, **options)
-        self.part = check_part(part, _POSES)
+    def __check_init__(self):
+        check_part(self.part, _POSES)
 
     def read(self, motion: Motion) -> Float[Array, " k"]:
         """Position and quaternion."""

@@ -1,6 +1,5 @@
 """Sensors of joints and of forces: encoder, tachometer, force and torque in a joint or a mount, contact force."""
 
-from collections.abc import Sequence
 from typing import Any
 
 import equinox as eqx
@@ -13,11 +12,20 @@ from jaxdyn.constraints.reactions import body_wrenches
 from jaxdyn.dynamics.joint_wrenches import joint_wrench
 from jaxdyn.dynamics.kinematics import named_frame
 from jaxdyn.lie import se3
-from jaxdyn.model.arguments import Checked, Numbers, as_array, is_concrete
+from jaxdyn.model.arguments import Numbers
 from jaxdyn.model.names import joint_index
+from jaxdyn.model.numbers import as_float, as_number
 from jaxdyn.model.tree import Model
-from jaxdyn.sensors.base import Motion, Noise, Sensor, as_delay, check_part, constraint_place
+from jaxdyn.sensors.base import Motion, Sensor, check_part, constraint_place
 from jaxdyn.systems.scene import Scene
+
+
+def _as_resolution(resolution: Numbers | None) -> Array | None:
+    return None if resolution is None else as_number(resolution, "resolution", "rad or m", like=float)
+
+
+def _as_inertia(inertia: Numbers | None) -> Array | None:
+    return None if inertia is None else as_float(inertia, "inertia", (10,), float)
 
 
 class Encoder(Sensor):
@@ -35,28 +43,12 @@ class Encoder(Sensor):
     """
 
     joint: str = eqx.field(static=True)
-    name: str = eqx.field(static=True)
-    resolution: Array | None
-    noise: Noise | None
-    delay: Array
+    # A leaf, and not static: another resolution does not cause a second compilation.
+    resolution: Array | None = eqx.field(converter=_as_resolution, default=None, kw_only=True)
 
-    def __init__(
-        self,
-        joint: str,
-        *,
-        resolution: Numbers | None = None,
-        name: str | None = None,
-        noise: Noise | None = None,
-        delay: Numbers = 0.0,
-    ):
-        self.joint, self.name = joint, f"encoder of {joint}" if name is None else name
-        if resolution is not None:
-            step = as_array(resolution, "resolution")
-            if step.shape != () or (is_concrete(step) and not 0 < float(step) < np.inf):
-                raise ValueError(f"resolution is {resolution!r}; give one positive number (rad or m), or None")
-            # A leaf, and not static: another resolution does not cause a second compilation.
-            resolution = jnp.asarray(step, float)
-        self.resolution, self.noise, self.delay = resolution, noise, as_delay(delay)
+    def default_name(self) -> str:
+        """Name "encoder of JOINT"."""
+        return f"encoder of {self.joint}"
 
     def check(self, scene: Scene) -> None:
         """Refuse a joint that the model does not have. **Raises:** ValueError."""
@@ -87,13 +79,10 @@ class Tachometer(Sensor):
     """
 
     joint: str = eqx.field(static=True)
-    name: str = eqx.field(static=True)
-    noise: Noise | None
-    delay: Array
 
-    def __init__(self, joint: str, *, name: str | None = None, noise: Noise | None = None, delay: Numbers = 0.0):
-        self.joint, self.name = joint, f"tachometer of {joint}" if name is None else name
-        self.noise, self.delay = noise, as_delay(delay)
+    def default_name(self) -> str:
+        """Name "tachometer of JOINT"."""
+        return f"tachometer of {self.joint}"
 
     def check(self, scene: Scene) -> None:
         """Refuse a joint that the model does not have. **Raises:** ValueError."""
@@ -131,39 +120,21 @@ class ForceTorque(Sensor):
     """
 
     frame: str = eqx.field(static=True)
-    joints: tuple[str, ...] = eqx.field(static=True)
-    part: str | None = eqx.field(static=True)
-    name: str = eqx.field(static=True)
-    inertia: Array | None
-    noise: Noise | None
-    delay: Array
+    inertia: Array | None = eqx.field(converter=_as_inertia, default=None, kw_only=True)
+    joints: tuple[str, ...] = eqx.field(static=True, converter=tuple, default=(), kw_only=True)
+    part: str | None = eqx.field(static=True, default=None, kw_only=True)
 
-    def __init__(
-        self,
-        frame: str,
-        *,
-        inertia: Numbers | None = None,
-        joints: Checked[Sequence[str]] = (),
-        part: str | None = None,
-        name: str | None = None,
-        noise: Noise | None = None,
-        delay: Numbers = 0.0,
-    ):
-        self.frame, self.joints, self.part = frame, tuple(joints), check_part(part, _PARTS)
+    def __check_init__(self):
+        check_part(self.part, _PARTS)
         # Without an inertia all that the frame's body carries lies beyond it: there is no choice of joints.
-        if inertia is None and self.joints:
+        if self.inertia is None and self.joints:
             raise ValueError(
                 "joints are given without inertia; give the inertia of the part beyond the mount, or omit joints"
             )
-        if inertia is not None:
-            inertia = jnp.asarray(as_array(inertia, "inertia"), float)
-            if inertia.shape != (10,):
-                raise ValueError(
-                    f"inertia has shape {inertia.shape}; give ten inertial parameters, as of Model.inertias"
-                )
-        self.inertia = inertia
-        self.name = f"wrench of {frame}" if name is None else name
-        self.noise, self.delay = noise, as_delay(delay)
+
+    def default_name(self) -> str:
+        """Name "wrench of FRAME"."""
+        return f"wrench of {self.frame}"
 
     def check(self, scene: Scene) -> None:
         """Refuse a frame on the ground, and joints that the frame's body does not carry. **Raises:** ValueError."""
@@ -222,13 +193,10 @@ class ContactForce(Sensor):
     """
 
     constraint: str = eqx.field(static=True)
-    name: str = eqx.field(static=True)
-    noise: Noise | None
-    delay: Array
 
-    def __init__(self, constraint: str, *, name: str | None = None, noise: Noise | None = None, delay: Numbers = 0.0):
-        self.constraint, self.name = constraint, f"force of {constraint}" if name is None else name
-        self.noise, self.delay = noise, as_delay(delay)
+    def default_name(self) -> str:
+        """Name "force of CONSTRAINT"."""
+        return f"force of {self.constraint}"
 
     def check(self, scene: Scene) -> None:
         """Refuse a constraint that the scene does not have. **Raises:** ValueError."""

@@ -11,9 +11,10 @@ from jaxtyping import Array, Float, PyTree
 
 from jaxdyn.compile.known import is_known
 from jaxdyn.model.arguments import Checked, Function, Number
+from jaxdyn.model.numbers import check_count
 from jaxdyn.systems.scene import as_pytree
 from jaxdyn.systems.start import check_mass_matrix, describe_state
-from jaxdyn.systems.system import System, as_parameter, check_size, evaluate_callback
+from jaxdyn.systems.system import System, as_parameter, evaluate_callback
 
 
 class LagrangianSystem(System):
@@ -58,7 +59,7 @@ class LagrangianSystem(System):
     def __init__(
         self, lagrangian: Function, nq: Checked[int], *, parameters: PyTree = None, potential: Function | None = None
     ):
-        self.nq = check_size(nq)
+        self.nq = check_count(nq, "nq")
         more = "" if parameters is None else ", t, parameters"
         self.lagrangian = as_pytree(lagrangian, "lagrangian", "q, v" + more)
         self.potential = None if potential is None else as_pytree(potential, "potential", "q" + more)

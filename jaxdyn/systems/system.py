@@ -19,6 +19,7 @@ from jaxdyn.compile import entry_point, kernel
 from jaxdyn.compile.known import is_known
 from jaxdyn.lie.so3 import matmul
 from jaxdyn.model.arguments import Checked, Function, Number, batch_hint
+from jaxdyn.model.numbers import check_count
 from jaxdyn.model.tree import Model, configuration_rate, difference, integrate, joint_rates, normalize
 from jaxdyn.systems.mass_factor import solve_positive
 from jaxdyn.systems.scene import Scene, as_pytree
@@ -132,7 +133,7 @@ class MetricSystem(System):
         more = "" if parameters is None else ", t, parameters"
         self.metric = as_pytree(metric, "metric", "q" + more)
         self.potential = None if potential is None else as_pytree(potential, "potential", "q" + more)
-        self.nq = check_size(nq)
+        self.nq = check_count(nq, "nq")
         self.parameters = jax.tree.map(as_parameter, parameters)
 
     def mass_matrix(self, q: Float[Array, " nq"], t: Number) -> Float[Array, "nv nv"]:
@@ -205,7 +206,7 @@ class ExplicitSystem(System):
         self._mass_matrix = as_pytree(mass_matrix, "mass_matrix", "q" + more)
         self._bias_force = as_pytree(bias_force, "bias_force", "q, v" + more)
         self._potential = None if potential is None else as_pytree(potential, "potential", "q" + more)
-        self.nq = check_size(nq)
+        self.nq = check_count(nq, "nq")
         self.parameters = jax.tree.map(as_parameter, parameters)
 
     def mass_matrix(self, q: Float[Array, " nq"], t: Number) -> Float[Array, "nv nv"]:
@@ -306,14 +307,6 @@ def evaluate_callback(function, shape, name, state, t, parameters):
 
 
 _mass_matrix_compiled = eqx.filter_jit(lambda system, q, t: system.mass_matrix(q, t))
-
-
-def check_size(nq) -> int:
-    """Check that nq is a positive integer."""
-    # True is an int to Python.
-    if isinstance(nq, bool) or not isinstance(nq, int) or nq < 1:
-        raise ValueError(f"nq is {nq!r}; pass the number of coordinates, a positive integer")
-    return nq
 
 
 def as_parameter(leaf):

@@ -69,7 +69,7 @@ def test_shorter_paths_do_not_arrive():
     assert float(jnp.abs(one.q - many.q).max()) > 1e-3 or not bool(one.success)
     assert bool(jd.assemble(arm(target), GUESS, guesses=1).success)
     for name, wrong in (("steps", 0), ("steps", True), ("guesses", -2)):
-        with pytest.raises(ValueError, match=f"{name} is {wrong}; give how many"):
+        with pytest.raises(ValueError, match=f"{name} is {wrong}; give a positive integer"):
             jd.assemble(arm(target), GUESS, **{name: wrong})
 
 
