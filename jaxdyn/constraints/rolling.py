@@ -38,14 +38,15 @@ class TouchingPoint(NamedTuple):
 class Touching(Pair):
     """A body in contact with a surface. Subclasses give the contact point and the directions without slip."""
 
-    name: eqx.AbstractVar[str]
-    body: eqx.AbstractVar[str]
-    surface_body: eqx.AbstractVar[str | None]
-    pose: eqx.AbstractVar[Array]
-    surface: eqx.AbstractVar[Array]
-    contact: eqx.AbstractVar[bool]
-    spin: eqx.AbstractVar[bool]
-    count: eqx.AbstractVar[int]
+    name: str = eqx.field(static=True)
+    body: str | None = eqx.field(static=True)
+    surface_body: str | None = eqx.field(static=True)
+    pose: Float[Array, "4 4"]
+    surface: Float[Array, "4 4"]
+    contact: bool = eqx.field(static=True, kw_only=True)
+    spin: bool = eqx.field(static=True, default=False, kw_only=True)
+    # Directions without slip, of those that `touching` gives.
+    count: int = eqx.field(static=True, default=2, kw_only=True)
 
     def ends(self) -> tuple[tuple[str | None, Array], tuple[str | None, Array]]:
         """Frame A on the surface, frame B on the body."""
@@ -125,15 +126,7 @@ def tangents(normal):
 class RollingWheel(Touching):
     """A wheel or disk that rolls on a plane; made by `jd.rolling_wheel`."""
 
-    name: str = eqx.field(static=True)
-    body: str = eqx.field(static=True)
-    surface_body: str | None = eqx.field(static=True)
-    pose: Float[Array, "4 4"]
-    surface: Float[Array, "4 4"]
     radius: Float[Array, ""]
-    contact: bool = eqx.field(static=True)
-    spin: bool = eqx.field(static=True)
-    count: int = eqx.field(static=True)
 
     def touching(self, R, p):
         axis, normal = R[:, 2], _unit(2, p)
@@ -182,22 +175,12 @@ def rolling_wheel(
         surface=pose_leaf(plane, f"{name!r}: plane"),
         radius=as_number(radius, f"{name!r}: radius", "m"),
         contact=bool(contact),
-        spin=False,
         count=2 if lateral else 1,
     )
 
 
 class KnifeEdge(Touching):
     """A blade that slides along its own axis on a plane; made by `jd.constraints.knife_edge`."""
-
-    name: str = eqx.field(static=True)
-    body: str = eqx.field(static=True)
-    surface_body: str | None = eqx.field(static=True)
-    pose: Float[Array, "4 4"]
-    surface: Float[Array, "4 4"]
-    contact: bool = eqx.field(static=True)
-    spin: bool = eqx.field(static=True, default=False)
-    count: int = eqx.field(static=True, default=1)
 
     def touching(self, R, p):
         normal = _unit(2, p)
@@ -228,24 +211,17 @@ def knife_edge(
         pose=pose_leaf(pose, f"{name!r}: pose"),
         surface=pose_leaf(plane, f"{name!r}: plane"),
         contact=bool(contact),
+        count=1,
     )
 
 
 class RollingSphere(Touching):
     """A sphere that rolls on a plane, a sphere or a cylinder; made by `jd.rolling_sphere`."""
 
-    name: str = eqx.field(static=True)
-    body: str = eqx.field(static=True)
-    surface_body: str | None = eqx.field(static=True)
-    pose: Float[Array, "4 4"]
-    surface: Float[Array, "4 4"]
     radius: Float[Array, ""]
-    surface_radius: Float[Array, ""] | None
-    on: str = eqx.field(static=True)
-    inside: bool = eqx.field(static=True)
-    contact: bool = eqx.field(static=True)
-    spin: bool = eqx.field(static=True)
-    count: int = eqx.field(static=True, default=2)
+    surface_radius: Float[Array, ""] | None = None
+    on: str = eqx.field(static=True, default="plane")
+    inside: bool = eqx.field(static=True, default=False)
 
     def structure_key(self):
         """Kinds of the rows and of the surface."""
@@ -309,10 +285,7 @@ def rolling_sphere(
         raise ValueError(f"{name!r}: surface_radius is {surface_radius} on a {on}; {fix}")
     if on == "plane" and inside:
         raise ValueError(f"{name!r}: a plane has no inside; turn the plane over")
-    if slip and not (spin or contact):
-        raise ValueError(
-            f"{name!r}: slip is True and contact and spin are False, which leaves no rows; set contact=True"
-        )
+    check_has_rows(name, slip, spin, contact)
     radius = as_number(radius, f"{name!r}: radius", "m")
     reach = None if surface_radius is None else as_number(surface_radius, f"{name!r}: surface_radius", "m")
     concrete = reach is not None and is_concrete(radius - reach)
@@ -332,3 +305,11 @@ def rolling_sphere(
         spin=bool(spin),
         count=0 if slip else 2,
     )
+
+
+def check_has_rows(name: str, slip: bool, spin: bool, contact: bool) -> None:
+    """Refuse a contact that constrains nothing. **Raises:** ValueError."""
+    if slip and not (spin or contact):
+        raise ValueError(
+            f"{name!r}: slip is True and contact and spin are False, which leaves no rows; set contact=True"
+        )

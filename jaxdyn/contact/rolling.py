@@ -9,7 +9,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from jaxdyn.constraints.frames import Pair, displace_pose
-from jaxdyn.constraints.rolling import Touching, TouchingPoint, tangents
+from jaxdyn.constraints.rolling import Touching, TouchingPoint, check_has_rows, tangents
 from jaxdyn.contact.surfaces import Surface, check_surface
 from jaxdyn.contact.touching import Patch, Steps, newton_steps, patch_at
 from jaxdyn.lie.so3 import cross, matmul
@@ -19,16 +19,8 @@ from jaxdyn.model.arguments import Checked, Numbers, pose_leaf
 class RollingContact(Touching):
     """Rolling contact of two surfaces, built by `jd.contact.rolling_contact`. Body A carries `shape_a`, body B `shape_b`."""
 
-    name: str = eqx.field(static=True)
-    body: str | None = eqx.field(static=True)
-    surface_body: str | None = eqx.field(static=True)
-    pose: Float[Array, "4 4"]
-    surface: Float[Array, "4 4"]
     shape_a: Surface
     shape_b: Surface
-    contact: bool = eqx.field(static=True)
-    spin: bool = eqx.field(static=True)
-    count: int = eqx.field(static=True)
     places: tuple[Array, Array] | None = None
     about: tuple[Patch, Patch] | None = None
 
@@ -195,10 +187,7 @@ def rolling_contact(
     name = f"{body_b or 'world'} on {body_a or 'world'}" if name is None else name
     for surface in (surface_a, surface_b):
         check_surface(surface)
-    if slip and not (spin or contact):
-        raise ValueError(
-            f"{name!r}: slip is True and contact and spin are False, which leaves no rows; set contact=True"
-        )
+    check_has_rows(name, slip, spin, contact)
     return RollingContact(
         name=name,
         body=body_b,

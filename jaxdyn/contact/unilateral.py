@@ -199,11 +199,7 @@ def ground_contact(
         pose=pose_leaf(point, f"ground_contact {name!r}: point"),
         surface=pose_leaf(plane, f"ground_contact {name!r}: plane"),
         radius=as_number(radius, f"ground_contact {name!r}: radius", "m", zero=True, like=float),
-        surface_radius=None,
-        on="plane",
-        inside=False,
         contact=True,
-        spin=False,
     )
     return UnilateralContact(contact, friction, static=static, restitution=restitution, name=name)
 

@@ -20,6 +20,7 @@ from jaxtyping import Array, Float
 from jaxdyn.constraints.base import Constraint, position_residual, rows
 from jaxdyn.constraints.rank import pseudo_inverse, tolerance
 from jaxdyn.control.gains import times
+from jaxdyn.dynamics.centroidal import center_of_mass
 from jaxdyn.dynamics.kinematics import frame_pose
 from jaxdyn.dynamics.quantities import mass_matrix
 from jaxdyn.lie import so3
@@ -99,6 +100,28 @@ class FrameError(Constraint):
         return turned if self.task == "orientation" else jnp.concatenate([pose[:3, 3] - target[:3, 3], turned])
 
 
+class CenterError(Constraint):
+    """Error c(q) - c_d(t) of the centre of mass, (3,), m, in world axes."""
+
+    target: Callable
+    name: str = eqx.field(static=True, default="center_of_mass")
+
+    def sizes(self, system, dtype):
+        """Three rows."""
+        return 3, 0
+
+    def position(self, system: Model, q: Float[Array, " nq"], t: Number) -> Float[Array, "3"]:
+        """Error of the position, m."""
+        return center_of_mass(system, q) - target_value(self.target, t, (3,), q)
+
+
+def _task_error(value, target, t, like) -> Float[Array, " m"]:
+    value = jnp.asarray(value, like.dtype)
+    if value.ndim != 1:
+        raise ValueError(f"task returned shape {value.shape}; return a vector (m,){batch_hint(value, (1,))}")
+    return value - target_value(target, t, value.shape, like)
+
+
 class TaskError(Constraint):
     """Error task(q) - target(t), (m,)."""
 
@@ -108,10 +131,7 @@ class TaskError(Constraint):
 
     def position(self, system, q, t):
         """Error task(q) - target(t)."""
-        value = jnp.asarray(self.task(q), q.dtype)
-        if value.ndim != 1:
-            raise ValueError(f"task returned shape {value.shape}; return a vector (m,){batch_hint(value, (1,))}")
-        return value - target_value(self.target, t, value.shape, q)
+        return _task_error(self.task(q), self.target, t, q)
 
 
 class RateError(Constraint):
@@ -123,10 +143,7 @@ class RateError(Constraint):
 
     def velocity(self, system, q, v, t):
         """Error task(q, v) - target(t)."""
-        value = jnp.asarray(self.task(q, v), q.dtype)
-        if value.ndim != 1:
-            raise ValueError(f"task returned shape {value.shape}; return a vector (m,){batch_hint(value, (1,))}")
-        return value - target_value(self.target, t, value.shape, q)
+        return _task_error(self.task(q, v), self.target, t, q)
 
 
 def frame_error(model: Any, frame: str, target: Any, task: str) -> FrameError:

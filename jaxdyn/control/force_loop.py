@@ -5,25 +5,48 @@ from typing import Any
 
 import equinox as eqx
 import jax.numpy as jnp
-from jaxtyping import Array, Float, PyTree
+from jaxtyping import Array, Bool, Float, PyTree
 
-from jaxdyn.constraints.base import layout
+from jaxdyn.constraints.base import Constraint, constraint_jacobian, layout, rows
+from jaxdyn.control.errors import row_rank, target_rows
 from jaxdyn.control.gains import times
 from jaxdyn.model.arguments import Number, batch_hint, warn
 from jaxdyn.simulation.controls import Controller
 from jaxdyn.systems.scene import Scene
 
 
-class ForceLoop(Controller):
-    """Base class of laws whose state is the integral of lam - lam_d, (nc,), with integral action."""
+class ForceIntegral(Controller):
+    """Base class of laws whose state is the integral of a force error, (nc,), with integral action."""
 
     scene: eqx.AbstractVar[Scene]
-    force: eqx.AbstractVar[Callable | None]
+    error: eqx.AbstractVar[Constraint]
+    kp: eqx.AbstractVar[Array]
+    kd: eqx.AbstractVar[Array | None]
     ki: eqx.AbstractVar[Array | None]
 
     def start(self, q: Float[Array, " nq"], v: Float[Array, " nv"], t: Number) -> Float[Array, " nc"] | None:
         """Zero integral at the start; None without integral action."""
         return None if self.ki is None else jnp.zeros((row_count(self.scene),), q.dtype)
+
+    def is_regular(self, q: Float[Array, " nq"], v: Float[Array, " nv"], t: Number = 0.0) -> Bool[Array, ""]:
+        """Decide whether task and constraints are independent, as the error equations require."""
+        t = jnp.asarray(t, q.dtype)
+        A = constraint_jacobian(self.scene, q, t)
+        both, _ = self._rows(q, v, t)
+        # Ranks add exactly where no direction of the task is fixed by the constraints.
+        return row_rank(both) == row_rank(A) + both.shape[0] - A.shape[0]
+
+    def _rows(self, q, v, t):
+        """Rows A and right-hand sides of A a = ..., those of the constraints before those of the task."""
+        row = rows(self.scene, q, v, t)
+        A, wanted = target_rows(self.scene.system, self.error, self.kp, self.kd, q, v, t)
+        return jnp.concatenate([row.A, A]), jnp.concatenate([row.gamma, wanted])
+
+
+class ForceLoop(ForceIntegral):
+    """Base class of laws whose state is the integral of lam - lam_d, (nc,), with integral action."""
+
+    force: eqx.AbstractVar[Callable | None]
 
     def rate(
         self,

@@ -15,10 +15,11 @@ from collections.abc import Callable
 
 import equinox as eqx
 import jax.numpy as jnp
-from jaxtyping import Array, Bool, Float, PyTree
+from jaxtyping import Array, Float, PyTree
 
-from jaxdyn.constraints.base import Constraint, constraint_jacobian, layout, rows
-from jaxdyn.control.errors import Target, as_target, least_acceleration, row_rank, target_rows
+from jaxdyn.constraints.base import Constraint, constraint_jacobian
+from jaxdyn.control.errors import Target, as_target, least_acceleration
+from jaxdyn.control.force_loop import ForceIntegral
 from jaxdyn.control.gains import gain, times
 from jaxdyn.control.motion import torque_for
 from jaxdyn.grasp.forces import as_preload, split_forces
@@ -27,7 +28,6 @@ from jaxdyn.grasp.motions import velocity_rows
 from jaxdyn.lie.so3 import matmul
 from jaxdyn.model.arguments import Checked, Number, Numbers, batch_hint, warn
 from jaxdyn.model.numbers import as_number
-from jaxdyn.simulation.controls import Controller
 from jaxdyn.systems.system import displacement
 
 
@@ -54,7 +54,7 @@ class ObjectError(Constraint):
         return displacement(system, wanted, q)[velocity_rows(self.grasp)[1]]
 
 
-class GraspForce(Controller):
+class GraspForce(ForceIntegral):
     r"""Motion of a grasped object and internal force.
 
     $$\ddot e + K_d \dot e + K_p e = 0, \quad (\lambda - \lambda_d) + K_I z = 0$$
@@ -91,7 +91,7 @@ class GraspForce(Controller):
     Source: Murray, Li & Sastry (1994), section 6.4; EQUATIONS section 10.
     """
 
-    grasp: Grasp
+    scene: Grasp
     error: ObjectError
     kp: Array
     kd: Array
@@ -111,16 +111,12 @@ class GraspForce(Controller):
         damping: Numbers = 0.0,
     ):
         check_grasp(grasp)
-        self.grasp = grasp
+        self.scene = grasp
         self.error = ObjectError(as_target(target), grasp)  # pyright: ignore[reportCallIssue]
         self.kp, self.kd = gain(kp, "kp"), gain(kd, "kd")
         self.preload = as_target(preload, "preload")
         self.ki = None if ki is None else gain(ki, "ki")
         self.damping = as_number(damping, "damping", zero=True)
-
-    def start(self, q: Float[Array, " nq"], v: Float[Array, " nv"], t: Number) -> Float[Array, " nc"] | None:
-        """Zero integral at the start; None without integral action."""
-        return None if self.ki is None else jnp.zeros((layout(self.grasp)[-1].end,), q.dtype)
 
     def rate(
         self,
@@ -132,32 +128,24 @@ class GraspForce(Controller):
     ) -> Float[Array, " nc"]:
         """Internal part of the force error, (nc,)."""
         # Only the internal part is integrated: the other part balances the motion of the object and has no reference.
-        return self._internal(q, t, multipliers - as_preload(self.grasp, self.preload(t), q.dtype))
+        return self._internal(q, t, multipliers - as_preload(self.scene, self.preload(t), q.dtype))
 
     def acceleration(self, q: Float[Array, " nq"], v: Float[Array, " nv"], t: Number = 0.0) -> Float[Array, " nv"]:
         """Commanded acceleration (nv,), consistent with the contacts and the object's error equation."""
         t = jnp.asarray(t, q.dtype)
         A, wanted = self._rows(q, v, t)
-        return least_acceleration(self.grasp.system, q, t, A, wanted, -self.damping.astype(v.dtype) * v)
+        return least_acceleration(self.scene.system, q, t, A, wanted, -self.damping.astype(v.dtype) * v)
 
     def reference_forces(self, q: Float[Array, " nq"], v: Float[Array, " nv"], t: Number = 0.0) -> Float[Array, " nc"]:
         """Reference contact forces (nc,) that carry the object, with the internal part of the preload."""
         t = jnp.asarray(t, q.dtype)
         # None in place of the integral: this is the reference itself, and not the command that corrects it.
-        return self._forces(q, t, torque_for(self.grasp, q, v, self.acceleration(q, v, t), t), None)
+        return self._forces(q, t, torque_for(self.scene, q, v, self.acceleration(q, v, t), t), None)
 
     def wanted_forces(self, q: Float[Array, " nq"], v: Float[Array, " nv"], t: Number = 0.0) -> Float[Array, " nc"]:
         """Deprecated name of `reference_forces`."""
         warn("GraspForce.wanted_forces is deprecated; call reference_forces", DeprecationWarning)
         return self.reference_forces(q, v, t)
-
-    def is_regular(self, q: Float[Array, " nq"], v: Float[Array, " nv"], t: Number = 0.0) -> Bool[Array, ""]:
-        """Decide whether the fingers can follow every motion of the object, as the error equation requires."""
-        t = jnp.asarray(t, q.dtype)
-        # Ranks add exactly where the contacts fix no direction of the object's error.
-        both, _ = self._rows(q, v, t)
-        A = constraint_jacobian(self.grasp, q, t)
-        return row_rank(both) == row_rank(A) + both.shape[0] - A.shape[0]
 
     def __call__(
         self,
@@ -169,29 +157,24 @@ class GraspForce(Controller):
     ) -> Float[Array, " nv"]:
         """Joint torques (nv,), N m or N, zero on the object."""
         t = jnp.asarray(t, q.dtype)
-        hands, _ = velocity_rows(self.grasp)
-        push = torque_for(self.grasp, q, v, self.acceleration(q, v, t), t)
+        hands, _ = velocity_rows(self.scene)
+        push = torque_for(self.scene, q, v, self.acceleration(q, v, t), t)
         lam = self._forces(q, t, push, state)
         # The rows are A = [-J_h  G^T], hence the sign.
-        Jh = -constraint_jacobian(self.grasp, q, t)[:, hands]
+        Jh = -constraint_jacobian(self.scene, q, t)[:, hands]
         # The object has no motors: the contact forces alone satisfy its rows.
         return jnp.zeros_like(push).at[hands].set(push[hands] + matmul(Jh.T, lam))
 
     def _forces(self, q, t, push, state):
         # The columns of the object in A = [-J_h  G^T] are G^T.
-        G = constraint_jacobian(self.grasp, q, t)[:, velocity_rows(self.grasp)[1]].T
-        preload = as_preload(self.grasp, self.preload(t), q.dtype)
+        G = constraint_jacobian(self.scene, q, t)[:, velocity_rows(self.scene)[1]].T
+        preload = as_preload(self.scene, self.preload(t), q.dtype)
         if state is not None and self.ki is not None:
             # The integral acts on forces, whose sign is that of lam: no torque of the object's motion changes.
             preload = preload - times(self.ki, state, "ki")
-        return split_forces(G, push[velocity_rows(self.grasp)[1]], preload)
+        return split_forces(G, push[velocity_rows(self.scene)[1]], preload)
 
     def _internal(self, q, t, forces):
-        G = constraint_jacobian(self.grasp, q, t)[:, velocity_rows(self.grasp)[1]].T
+        G = constraint_jacobian(self.scene, q, t)[:, velocity_rows(self.scene)[1]].T
         # With zero wrench `split_forces` is the projection on the internal forces.
         return split_forces(G, jnp.zeros((G.shape[0],), q.dtype), forces)
-
-    def _rows(self, q, v, t):
-        row = rows(self.grasp, q, v, t)
-        A, wanted = target_rows(self.grasp.system, self.error, self.kp, self.kd, q, v, t)
-        return jnp.concatenate([row.A, A]), jnp.concatenate([row.gamma, wanted])

@@ -15,9 +15,9 @@ from typing import Any
 import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Bool, Float, PyTree
+from jaxtyping import Array, Float, PyTree
 
-from jaxdyn.constraints.base import Constraint, constraint_jacobian, rows
+from jaxdyn.constraints.base import Constraint, constraint_jacobian
 from jaxdyn.constraints.dynamics import projections
 from jaxdyn.constraints.rank import pseudo_inverse, tolerance
 from jaxdyn.control.errors import (
@@ -27,8 +27,6 @@ from jaxdyn.control.errors import (
     as_target,
     least_acceleration,
     regularity,
-    row_rank,
-    target_rows,
 )
 from jaxdyn.control.force_loop import ForceLoop, constrained, row_count
 from jaxdyn.control.gains import gain
@@ -123,14 +121,6 @@ class HybridForce(ForceLoop):
         A, wanted = self._rows(q, v, t)
         return least_acceleration(self.scene.system, q, t, A, wanted, jnp.zeros_like(v))
 
-    def is_regular(self, q: Float[Array, " nq"], v: Float[Array, " nv"], t: Number = 0.0) -> Bool[Array, ""]:
-        """Decide whether task and constraints are independent, as the error equations require."""
-        t = jnp.asarray(t, q.dtype)
-        A = constraint_jacobian(self.scene, q, t)
-        both, _ = self._rows(q, v, t)
-        # Ranks add exactly where no direction of the task is fixed by the constraints.
-        return row_rank(both) == row_rank(A) + both.shape[0] - A.shape[0]
-
     def regularity(self, q: Float[Array, " nq"], v: Float[Array, " nv"], t: Number = 0.0) -> Float[Array, ""]:
         """Distance of the law from a singularity of task and constraints, 1 to 0.
 
@@ -138,6 +128,7 @@ class HybridForce(ForceLoop):
         the rows of the task before it. Close to a singularity the law's accelerations grow as its inverse.
         """
         t = jnp.asarray(t, q.dtype)
+        # Constraints come first: the rows are split at their count.
         both, _ = self._rows(q, v, t)
         count = row_count(self.scene)
         return regularity(self.scene.system, q, t, both[:count], both[count:])
@@ -174,12 +165,6 @@ class HybridForce(ForceLoop):
             internal = self.internal.astype(q.dtype)
             pushed = pushed + internal - matmul(inverse, matmul(by_motors, internal))
         return jnp.zeros_like(tau).at[motors].set(pushed)
-
-    def _rows(self, q, v, t):
-        # Constraints come first: `regularity` splits the rows at their count.
-        row = rows(self.scene, q, v, t)
-        A, wanted = target_rows(self.scene.system, self.error, self.kp, self.kd, q, v, t)
-        return jnp.concatenate([row.A, A]), jnp.concatenate([row.gamma, wanted])
 
 
 def _error(task: Any, target: Any, of: str, kd) -> Constraint:

@@ -16,10 +16,10 @@ from jaxdyn.compile.known import is_concrete
 from jaxdyn.constraints.base import Constraint
 from jaxdyn.constraints.frames import Pair
 from jaxdyn.constraints.rolling import tangents
-from jaxdyn.dynamics.centroidal import center_of_mass
+from jaxdyn.control.errors import CenterError, Fixed
 from jaxdyn.lie import so3
 from jaxdyn.lie.so3 import matmul
-from jaxdyn.model.arguments import Number, as_array, batch_hint
+from jaxdyn.model.arguments import as_array, batch_hint
 from jaxdyn.model.names import frame_index
 from jaxdyn.model.tree import Model
 
@@ -64,21 +64,6 @@ class FrameTarget(Pair):
         return turned if self.task == "orientation" else jnp.concatenate([p, turned])
 
 
-class CenterTarget(Constraint):
-    """A position of the centre of mass, (3,), m."""
-
-    name: str = eqx.field(static=True)
-    target: Float[Array, "3"]
-
-    def sizes(self, system, dtype):
-        """Three rows."""
-        return 3, 0
-
-    def position(self, system: Model, q: Float[Array, " nq"], t: Number) -> Array:
-        """Error of the position, m."""
-        return center_of_mass(system, q) - self.target.astype(q.dtype)
-
-
 def as_targets(model: Any, targets: Any) -> tuple[Constraint, ...]:
     """Targets by the names of frames as constraints (see `inverse_kinematics`).
 
@@ -92,7 +77,8 @@ def as_targets(model: Any, targets: Any) -> tuple[Constraint, ...]:
     for name, value in targets.items():
         # A frame of the model by this name has precedence.
         if name == CENTER and CENTER not in model.frame_names:
-            rows.append(CenterTarget(CENTER, _numbers(value, CENTER, (3,), model.home.dtype)))
+            target = Fixed(_numbers(value, CENTER, (3,), model.home.dtype))
+            rows.append(CenterError(target, CENTER))  # pyright: ignore[reportCallIssue]
             continue
         frame_index(model, name)  # refuses unknown names
         tasks = value if isinstance(value, Mapping) else {_task_of(name, value): value}

@@ -9,43 +9,31 @@ The acceleration satisfies tasks of three priorities, each in the null space of 
 Torques and ground forces follow from it (`jaxdyn.control.legs`), inside their cones.
 """
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 
 import equinox as eqx
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from jaxdyn.compile.known import is_concrete
-from jaxdyn.constraints.base import Constraint, rows
+from jaxdyn.constraints.base import rows
 from jaxdyn.control.errors import (
+    CenterError,
     FrameError,
     as_target,
     frame_error,
     hierarchical_acceleration,
     target_rows,
-    target_value,
 )
 from jaxdyn.control.feet import Foot, check_feet
 from jaxdyn.control.gains import gain
 from jaxdyn.control.legs import LeggedDynamics, missing_wrench, passive_velocities, underactuated_inverse_dynamics
-from jaxdyn.dynamics.centroidal import center_of_mass
 from jaxdyn.lie.so3 import matmul
 from jaxdyn.model.arguments import Checked, Number, Numbers
 from jaxdyn.model.numbers import as_number
 from jaxdyn.model.tree import Model
 from jaxdyn.systems.scene import Force, Scene
 from jaxdyn.systems.system import displacement
-
-
-class CenterError(Constraint):
-    """Error of the centre of mass, (3,), m, in world axes."""
-
-    target: Callable
-    name: str = eqx.field(static=True, default="centre of mass")
-
-    def position(self, system: Model, q: Float[Array, " nq"], t: Number) -> Float[Array, "3"]:
-        """Error c(q) - c_d(t)."""
-        return center_of_mass(system, q) - target_value(self.target, t, (3,), q)
 
 
 class WholeBody(eqx.Module):
