@@ -19,7 +19,7 @@ from jaxdyn.compile import implicit, kernel, pseudo_inverse_by_rotations, value_
 from jaxdyn.compile.known import stop_gradient
 from jaxdyn.constraints.base import constraint_jacobian, holonomic_rows, layout, position_residual
 from jaxdyn.constraints.dynamics import correction, right_inverse, whiten_rows
-from jaxdyn.constraints.rank import eps_of, sign_of_determinant, solve_square
+from jaxdyn.constraints.rank import eps_of, passes_singular, solve_square
 from jaxdyn.constraints.tolerances import coordinate_sizes
 from jaxdyn.dynamics.quantities import mass_matrix
 from jaxdyn.lie.so3 import matmul
@@ -57,6 +57,12 @@ def _step_to_rows(scene: Scene, q, t, loose: float):
     return position_residual(scene, q, t), constraint_jacobian(scene, q, t)[held], B
 
 
+def _limit_step(step, sizes):
+    """The step of at most `_LONGEST`, and the size before."""
+    size = jnp.max(jnp.abs(step) / sizes)
+    return step * jnp.minimum(1.0, _LONGEST / jnp.where(size > 0, size, jnp.ones_like(size))), size
+
+
 def follow_path(scene: Scene, guess, t, loose: float, steps: int) -> Path:
     """Newton's steps of limited length towards the constraints.
 
@@ -71,13 +77,8 @@ def follow_path(scene: Scene, guess, t, loose: float, steps: int) -> Path:
     def improve(state):
         q, _, passed, A_before, B_before, count = state
         phi, A, B = _step_to_rows(scene, q, t, loose)
-        step = -matmul(B, phi)
-        size = jnp.max(jnp.abs(step) / sizes)
-        step = step * jnp.minimum(1.0, _LONGEST / jnp.where(size > 0, size, jnp.ones_like(size)))
-        # det(A B_before) changes its sign where a combination of the rows goes through zero: a singular position was passed. The
-        # projector `own` is zero for independent rows, and fills the null space of dependent ones.
-        own = jnp.eye(phi.shape[0], dtype=phi.dtype) - matmul(A_before, B_before)
-        turned = (count > 0) & (sign_of_determinant(matmul(A, B_before) + own) < 0)
+        step, size = _limit_step(-matmul(B, phi), sizes)
+        turned = (count > 0) & passes_singular(A_before, B_before, A)
         is_stuck = (count >= _PATIENCE) & ((count - _PATIENCE) % (_PATIENCE // 2) == 0)
         push = 2 * _LONGEST * aside * jnp.where((count // (_PATIENCE // 2)) % 2 == 0, 1.0, -1.0).astype(guess.dtype)
         step = jnp.where(is_stuck, push * sizes, step)
@@ -121,8 +122,7 @@ def slide_to_nearest(scene: Scene, guess, start, t, rank_tol):
         phi, A = _linearize_rows(scene, guess, t, e)
         # The shortest displacement that satisfies the linearised rows, all of it and not its change: Gauss-Newton on the minimum.
         step = matmul(right_inverse(metric, A, rank_tol), matmul(A, e) - phi) - e
-        size = jnp.max(jnp.abs(step) / sizes)
-        step = step * jnp.minimum(1.0, _LONGEST / jnp.where(size > 0, size, jnp.ones_like(size)))
+        step, size = _limit_step(step, sizes)
         return e + step, size, count + 1
 
     def is_far(state):

@@ -6,7 +6,7 @@ from typing import Any, NamedTuple
 import jax
 import jax.numpy as jnp
 from jax import lax
-from jaxtyping import Array, Float
+from jaxtyping import Array, Bool, Float
 
 from jaxdyn.compile import batch, kernel, mark_invalid, pseudo_inverse_by_rotations, variant
 from jaxdyn.compile.known import is_concrete
@@ -179,6 +179,18 @@ def solve_square(A: Float[Array, "n n"], right: Float[Array, "n *k"]) -> Float[A
 def sign_of_determinant(A: Float[Array, "n n"]) -> Float[Array, ""]:
     """-1 where the determinant is negative, else 1; a constant."""
     return kernel(_sign, fallback=_sign_by_lapack)(None, lax.stop_gradient(A))
+
+
+def passes_singular(
+    A: Float[Array, "m n"], inverse: Float[Array, "n m"], after: Float[Array, "m n"]
+) -> Bool[Array, ""]:
+    """Decide whether a combination of rows goes through zero between A, with its pseudo-inverse, and the rows `after`.
+
+    det(A' A^+ + (1 - A A^+)) then changes its sign. The second term fills the null space of dependent rows, where the
+    determinant of the first one is zero.
+    """
+    own = jnp.eye(A.shape[0], dtype=A.dtype) - matmul(A, inverse)
+    return sign_of_determinant(matmul(after, inverse) + own) < 0
 
 
 def _sign(_, A):

@@ -18,11 +18,10 @@ from jaxdyn.compile import pseudo_inverse_by_rotations
 from jaxdyn.compile.known import is_concrete, stop_gradient
 from jaxdyn.constraints.base import constraint_jacobian, holonomic_rows, layout
 from jaxdyn.constraints.codes import Outcome
-from jaxdyn.constraints.rank import sign_of_determinant, tolerance
+from jaxdyn.constraints.rank import passes_singular, tolerance
 from jaxdyn.constraints.tolerances import coordinate_sizes
 from jaxdyn.control.inverse_kinematics import inverse_kinematics, row_weights
 from jaxdyn.control.targets import as_targets
-from jaxdyn.lie.so3 import matmul
 from jaxdyn.model.arguments import Checked, Numbers, check_state
 from jaxdyn.systems.scene import Scene, as_scene
 from jaxdyn.systems.system import SceneLike, displacement
@@ -166,8 +165,7 @@ def _regularity(R, inverse, rank):
 
 
 def _changes_branch(system, before, after, R_after, R, inverse):
-    # A unit block on the complement of the range: dependent rows would make the determinant zero.
-    own = jnp.eye(R.shape[0], dtype=R.dtype) - matmul(R, inverse)
     sizes, _ = coordinate_sizes(system, before.dtype)
-    turned = sign_of_determinant(matmul(R_after, inverse) + own) < 0
-    return turned | (jnp.max(jnp.abs(displacement(system, before, after)) / sizes) > _JUMP)
+    return passes_singular(R, inverse, R_after) | (
+        jnp.max(jnp.abs(displacement(system, before, after)) / sizes) > _JUMP
+    )

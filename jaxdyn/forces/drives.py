@@ -1,15 +1,12 @@
 """Drives whose torque follows the command with first- or second-order dynamics."""
 
-from collections.abc import Sequence
-
 import equinox as eqx
 import jax.numpy as jnp
-import numpy as np
 from jaxtyping import Array, Float
 
 from jaxdyn.dynamics.kinematics import take
-from jaxdyn.forces.elements import as_leaf, as_names, broadcast_leaf, is_positive, joint_indices
-from jaxdyn.model.arguments import Number, Numbers, SystemLike
+from jaxdyn.forces.elements import as_leaf, as_names, broadcast_leaf, is_positive, joint_indices, scatter
+from jaxdyn.model.arguments import Number, SystemLike
 from jaxdyn.systems.drives import DriveDynamics
 
 
@@ -38,9 +35,7 @@ class _Lag(DriveDynamics):
         """The torques among the states, and the commands of other joints."""
         index = joint_indices(system, self.joints, type(self).__name__).v
         # Torques come first in the state; a drive of second order has their rates after them.
-        torque = state[: index.size]
-        # The usual case, all joints: no scatter is compiled.
-        return torque if np.array_equal(index, np.arange(system.nv)) else command.at[index].set(torque)
+        return scatter(state[: index.size], index, command)
 
     def _error(self, system, state, command):
         """Commands less torques of the drives (n,), and a function that broadcasts a leaf to (n,)."""
@@ -69,12 +64,11 @@ class FirstOrderDrive(_Lag):
     ```
     """
 
-    time_constant: Float[Array, "..."]
-    initial: Float[Array, "..."]
-    joints: tuple[str, ...] | None = eqx.field(static=True)
+    time_constant: Float[Array, "..."] = eqx.field(converter=as_leaf)
+    initial: Float[Array, "..."] = eqx.field(converter=as_leaf, default=0.0)
+    joints: tuple[str, ...] | None = eqx.field(static=True, converter=as_names, default=None)
 
-    def __init__(self, time_constant: Numbers, initial: Numbers = 0.0, joints: Sequence[str] | str | None = None):
-        self.time_constant, self.initial, self.joints = as_leaf(time_constant), as_leaf(initial), as_names(joints)
+    def __check_init__(self):
         # The rate divides by T: for no delay leave the drive out of the scene.
         if not is_positive(self.time_constant):
             raise ValueError(f"FirstOrderDrive: time_constant is {self.time_constant}; give positive seconds")
@@ -115,20 +109,12 @@ class SecondOrderDrive(_Lag):
     ```
     """
 
-    frequency: Float[Array, "..."]
-    damping_ratio: Float[Array, "..."]
-    initial: Float[Array, "..."]
-    joints: tuple[str, ...] | None = eqx.field(static=True)
+    frequency: Float[Array, "..."] = eqx.field(converter=as_leaf)
+    damping_ratio: Float[Array, "..."] = eqx.field(converter=as_leaf, default=1.0)
+    initial: Float[Array, "..."] = eqx.field(converter=as_leaf, default=0.0)
+    joints: tuple[str, ...] | None = eqx.field(static=True, converter=as_names, default=None)
 
-    def __init__(
-        self,
-        frequency: Numbers,
-        damping_ratio: Numbers = 1.0,
-        initial: Numbers = 0.0,
-        joints: Sequence[str] | str | None = None,
-    ):
-        self.frequency, self.damping_ratio = as_leaf(frequency), as_leaf(damping_ratio)
-        self.initial, self.joints = as_leaf(initial), as_names(joints)
+    def __check_init__(self):
         for name in ("frequency", "damping_ratio"):
             if not is_positive(getattr(self, name)):
                 raise ValueError(f"SecondOrderDrive: {name} is {getattr(self, name)}; give positive numbers")

@@ -55,12 +55,10 @@ def broadcast_leaf(value, like: Array, size: int, name: str) -> Array:
     return jnp.broadcast_to(jnp.asarray(value, like.dtype), (size,))
 
 
-def _scatter(values: Array, indices: np.ndarray, size: int) -> Array:
-    """Scatter values into a vector of zeros; the values themselves when they fill it in order."""
-    # The rule, all joints: no scatter is compiled.
-    if len(indices) == size and (indices == np.arange(size)).all():
-        return values
-    return jnp.zeros((size,), values.dtype).at[indices].set(values)
+def scatter(values: Array, indices: np.ndarray, others: Array) -> Array:
+    """Replace entries of `others` (nv,) by values; the values themselves when they fill it in order."""
+    # The usual case, all joints: no scatter is compiled.
+    return values if np.array_equal(indices, np.arange(others.size)) else others.at[indices].set(values)
 
 
 def as_leaf(value) -> Any:
@@ -120,7 +118,9 @@ class JointDamping(eqx.Module):
         indices = joint_indices(system, self.joints, "JointDamping")
         value = _value_or_leaf(self.coefficient, system, indices, "damping", "JointDamping")
         rate = take(v, indices.v)
-        return _scatter(-broadcast_leaf(value, v, rate.size, "JointDamping: coefficient") * rate, indices.v, system.nv)
+        return scatter(
+            -broadcast_leaf(value, v, rate.size, "JointDamping: coefficient") * rate, indices.v, jnp.zeros_like(v)
+        )
 
 
 class CoulombFriction(eqx.Module):
@@ -156,8 +156,10 @@ class CoulombFriction(eqx.Module):
         level = _value_or_leaf(self.level, system, indices, "friction", "CoulombFriction")
         rate = take(v, indices.v)
         ratio = rate / broadcast_leaf(self.v_s, v, rate.size, "CoulombFriction: v_s")
-        return _scatter(
-            -broadcast_leaf(level, v, rate.size, "CoulombFriction: level") * jnp.tanh(ratio), indices.v, system.nv
+        return scatter(
+            -broadcast_leaf(level, v, rate.size, "CoulombFriction: level") * jnp.tanh(ratio),
+            indices.v,
+            jnp.zeros_like(v),
         )
 
 
@@ -190,8 +192,10 @@ class JointSpring(eqx.Module):
             # Zeros are no unit quaternion; the neutral configuration has those of no rotation.
             rest = take(neutral(system), indices.q) if isinstance(system, Model) else jnp.zeros(indices.q.size, q.dtype)
         stretch = _displacement(system, rest, q, indices, "JointSpring: rest")
-        return _scatter(
-            -broadcast_leaf(self.stiffness, q, stretch.size, "JointSpring: stiffness") * stretch, indices.v, system.nv
+        return scatter(
+            -broadcast_leaf(self.stiffness, q, stretch.size, "JointSpring: stiffness") * stretch,
+            indices.v,
+            jnp.zeros_like(v),
         )
 
 
@@ -241,7 +245,7 @@ class Drive(eqx.Module):
             safe = jnp.where(is_finite, limit, jnp.ones_like(limit))  # keeps inf * 0 out of the gradient
             # tanh and no clip: a kink would cost the solver its order, and saturated drives their gradient.
             command = jnp.where(is_finite, safe * jnp.tanh(command / safe), command)
-        return _scatter(command, indices.v, system.nv)
+        return scatter(command, indices.v, jnp.zeros_like(v))
 
 
 class ExternalWrench(eqx.Module):

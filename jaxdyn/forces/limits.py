@@ -8,8 +8,10 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float
 
+from jaxdyn.forces.elements import as_names, broadcast_leaf, joint_indices
 from jaxdyn.forces.piecewise import PiecewiseForce
 from jaxdyn.model.arguments import Checked, Number, Numbers, SystemLike, as_array, is_concrete, warn
+from jaxdyn.model.joints import KINDS
 from jaxdyn.model.numbers import as_number
 from jaxdyn.model.tree import Model
 
@@ -43,7 +45,7 @@ class JointStops(PiecewiseForce):
     ):
         self.stiffness = as_number(stiffness, "JointStops: stiffness", like=float)
         self.damping = as_number(damping, "JointStops: damping", zero=True, like=float)
-        self.joints = (joints,) if isinstance(joints, str) else joints if joints is None else tuple(joints)
+        self.joints = as_names(joints)
 
     def guards(
         self, system: Checked[Model], q: Float[Array, " nq"], v: Float[Array, " nv"], t: Number
@@ -76,9 +78,21 @@ class JointStops(PiecewiseForce):
             total = total.at[at_v].add(push if side == 0 else -push)
         return total
 
-    def _indices(self, system):
-        places = self._joint_pairs(system)
-        return tuple(np.array(x, int) for x in zip(*places, strict=True)) if places else (np.zeros(0, int),) * 2
+    def _indices(self, system) -> tuple[np.ndarray, np.ndarray]:
+        """Indices of the joints in q and v."""
+        if not isinstance(system, Model):
+            raise ValueError(f"JointStops: a {type(system).__name__} has no joints with limits; pass a Model")
+        kinds = dict(zip(system.joint_names, system.topology.kinds, strict=True))
+        # The names that are given include unknown ones, which `joint_indices` refuses.
+        names = system.joint_names if self.joints is None else self.joints
+        joint_indices(system, names, "JointStops")
+        several = [name for name in names if not KINDS[kinds[name]].nq == KINDS[kinds[name]].nv == 1]
+        # Without names, joints of several coordinates are left out; a joint that was named must have a stop.
+        if several and self.joints is not None:
+            raise ValueError(
+                f"JointStops: joint {several[0]!r} is {kinds[several[0]]!r}; stops are for joints of one coordinate"
+            )
+        return joint_indices(system, tuple(name for name in names if name not in several), "JointStops")
 
     def _beyond(self, system, q, v):
         """Data of the lower and of the upper limits: mask of the finite ones, and k, x, d and x' outwards."""
@@ -91,30 +105,6 @@ class JointStops(PiecewiseForce):
             # The zero keeps inf out of the gradient.
             sides.append((bounded, k, sign * (q[at_q] - jnp.where(bounded, edge, 0.0)), d, sign * v[at_v]))
         return sides
-
-    def _joint_pairs(self, system) -> list[tuple[int, int]]:
-        """Indices of the joints in q and v."""
-        if not isinstance(system, Model):
-            raise ValueError(f"JointStops: a {type(system).__name__} has no joints with limits; pass a Model")
-        top = system.topology
-        names = top.joint_names if self.joints is None else self.joints
-        missing = [name for name in names if name not in top.joint_names]
-        if missing:
-            raise ValueError(
-                f"JointStops: joints {missing} are not in model {system.name!r}; it has {list(top.joint_names)}"
-            )
-        places = []
-        for name in names:
-            i = top.joint_names.index(name)
-            at_q, at_v = top.q_slices[i], top.v_slices[i]
-            if at_q.stop - at_q.start == 1 and at_v.stop - at_v.start == 1:
-                places.append((at_q.start, at_v.start))
-            # Without names, joints of several coordinates are left out; a joint that was named must have a stop.
-            elif self.joints is not None:
-                raise ValueError(
-                    f"JointStops: joint {name!r} is {top.kinds[i]!r}; stops are for joints of one coordinate"
-                )
-        return places
 
 
 class EffortLimits(eqx.Module):
@@ -185,7 +175,7 @@ class EffortLimits(eqx.Module):
         limit: Any = getattr(system, "effort_limit", None) if self.limit is None else self.limit
         if limit is None:
             raise ValueError(f"EffortLimits: a {type(system).__name__} has no effort_limit; give the limit")
-        limit = _by_coordinate(limit, tau, "EffortLimits: limit")
+        limit = broadcast_leaf(limit, tau, tau.size, "EffortLimits: limit")
         return -limit, limit
 
 
@@ -228,15 +218,9 @@ class TorqueSpeedLimits(EffortLimits):
     def _range(self, system, tau, v) -> tuple[Array, Array]:
         if v is None:
             raise ValueError("TorqueSpeedLimits: limits depend on the speed; pass v, or call Scene.drive_torque")
-        stall = _by_coordinate(self.stall, tau, "TorqueSpeedLimits: stall")
+        stall = broadcast_leaf(self.stall, tau, tau.size, "TorqueSpeedLimits: stall")
         bounded = jnp.isfinite(stall)
         # 1 in place of an infinite stall torque: inf * 0 would be NaN at rest and in the gradient.
         stall = jnp.where(bounded, stall, 1.0)
-        back = stall * v / _by_coordinate(self.no_load, tau, "TorqueSpeedLimits: no_load")
+        back = stall * v / broadcast_leaf(self.no_load, tau, tau.size, "TorqueSpeedLimits: no_load")
         return jnp.where(bounded, -stall - back, -jnp.inf), jnp.where(bounded, stall - back, jnp.inf)
-
-
-def _by_coordinate(value, tau, what: str) -> Array:
-    if jnp.shape(value) not in ((), tau.shape):
-        raise ValueError(f"{what} has shape {jnp.shape(value)}, expected a number or {tau.shape} = (nv,)")
-    return jnp.broadcast_to(jnp.asarray(value, tau.dtype), tau.shape)

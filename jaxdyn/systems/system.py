@@ -44,9 +44,12 @@ class System(eqx.Module):
     def bias_force(self, q: Float[Array, " nq"], v: Float[Array, " nv"], t: Number) -> Array:
         """Bias force h(q, v, t) in M a + h = tau, (nv,)."""
 
-    @abc.abstractmethod
-    def kinetic_energy(self, q: Float[Array, " nq"], v: Float[Array, " nv"], t: Number) -> Array:
-        """Kinetic energy, (), J."""
+    def kinetic_energy(self, q: Float[Array, " nq"], v: Float[Array, " nv"], t: Number) -> Float[Array, ""]:
+        r"""Kinetic energy, (), J.
+
+        $$T = \tfrac12 v^T M v$$
+        """
+        return 0.5 * jnp.sum(v * matmul(self.mass_matrix(q, t), v))
 
     @abc.abstractmethod
     def potential_energy(self, q: Float[Array, " nq"], t: Number) -> Array:
@@ -156,13 +159,6 @@ class MetricSystem(System):
         """Gravity force dV/dq, (nv,)."""
         return jnp.zeros_like(q) if self.potential is None else jax.grad(self.potential_energy)(q, t)
 
-    def kinetic_energy(self, q: Float[Array, " nq"], v: Float[Array, " nv"], t: Number) -> Float[Array, ""]:
-        r"""Kinetic energy, (), J.
-
-        $$T = \tfrac12 v^T M v$$
-        """
-        return 0.5 * jnp.sum(v * matmul(self.mass_matrix(q, t), v))
-
     def potential_energy(self, q: Float[Array, " nq"], t: Number) -> Float[Array, ""]:
         """Potential energy V as given, (), J; zero when there is none."""
         if self.potential is None:
@@ -216,13 +212,6 @@ class ExplicitSystem(System):
     def bias_force(self, q: Float[Array, " nq"], v: Float[Array, " nv"], t: Number) -> Float[Array, " nv"]:
         """Bias force h as given, (nv,)."""
         return evaluate_callback(self._bias_force, (self.nq,), "bias_force", (q, v), t, self.parameters)
-
-    def kinetic_energy(self, q: Float[Array, " nq"], v: Float[Array, " nv"], t: Number) -> Float[Array, ""]:
-        r"""Kinetic energy, (), J.
-
-        $$T = \tfrac12 v^T M v$$
-        """
-        return 0.5 * jnp.sum(v * matmul(self.mass_matrix(q, t), v))
 
     def potential_energy(self, q: Float[Array, " nq"], t: Number) -> Float[Array, ""]:
         """Potential energy V as given, (), J. **Raises:** ValueError when it was not given."""
