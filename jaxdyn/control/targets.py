@@ -78,7 +78,7 @@ def as_targets(model: Any, targets: Any) -> tuple[Constraint, ...]:
         # A frame of the model by this name has precedence.
         if name == CENTER and CENTER not in model.frame_names:
             target = Fixed(_numbers(value, CENTER, (3,), model.home.dtype))
-            rows.append(CenterError(target, CENTER))  # pyright: ignore[reportCallIssue]
+            rows.append(CenterError(target=target, name=CENTER))
             continue
         frame_index(model, name)  # refuses unknown names
         tasks = value if isinstance(value, Mapping) else {_task_of(name, value): value}

@@ -6,13 +6,17 @@ import equinox as eqx
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from jaxdyn.forces.elements import as_leaf, as_names, broadcast_leaf, is_positive, joint_indices
+from jaxdyn.forces.elements import as_leaf, broadcast_leaf, is_positive, joint_indices
 from jaxdyn.model.arguments import Checked, Number, Numbers, SystemLike
 from jaxdyn.model.builder import ModelBuilder
 from jaxdyn.model.joining import join
 from jaxdyn.model.joints import KINDS
 from jaxdyn.model.tree import Model
 from jaxdyn.systems.scene import Scene
+
+
+def _tuple(names: str | Sequence[str]) -> tuple[str, ...]:
+    return (names,) if isinstance(names, str) else tuple(names)
 
 
 class ElasticTransmission(eqx.Module):
@@ -34,8 +38,8 @@ class ElasticTransmission(eqx.Module):
     Source: Spong (1987), ASME J. Dyn. Sys. Meas. Control 109, eq. 13; De Luca & Book, Springer Handbook of Robotics, ch. 11.
     """
 
-    motors: tuple[str, ...] = eqx.field(static=True, converter=as_names)
-    joints: tuple[str, ...] = eqx.field(static=True, converter=as_names)
+    motors: tuple[str, ...] = eqx.field(static=True, converter=_tuple)
+    joints: tuple[str, ...] = eqx.field(static=True, converter=_tuple)
     stiffness: Float[Array, "..."] = eqx.field(converter=as_leaf)
     damping: Float[Array, "..."] = eqx.field(converter=as_leaf, default=0.0)
     gear: Float[Array, "..."] = eqx.field(converter=as_leaf, default=1.0)
@@ -105,7 +109,7 @@ def elastic_joints(
     scene = jd.forces.elastic_joints(jd.robots.iiwa(), 1e4, 3e-5, damping=5.0, gear=100.0)
     ```
     """
-    chosen = model.joint_names if joints is None else as_names(joints)
+    chosen = model.joint_names if joints is None else _tuple(joints)
     # Called for its message on unknown joints.
     joint_indices(model, chosen, "elastic_joints")
     kinds = dict(zip(model.joint_names, model.topology.kinds, strict=True))
