@@ -14,7 +14,7 @@ from jaxdyn.compile import entry_point, evaluate, kernel
 from jaxdyn.compile.known import is_concrete, is_tracing, stop_gradient
 from jaxdyn.constraints.base import Layout, holonomic_rows, layout, position_residual, velocity_residual
 from jaxdyn.constraints.closing import follow_path, nearest_configuration
-from jaxdyn.constraints.codes import RESULTS, Outcome, name_of
+from jaxdyn.constraints.codes import RESULTS, Outcome, name_of, require_success
 from jaxdyn.constraints.dynamics import correction
 from jaxdyn.constraints.loops import lock_joint
 from jaxdyn.constraints.rank import check_tolerance, tolerance
@@ -128,23 +128,22 @@ def assemble(
     q, v, t = check_state(scene.system, q=q, v=v, t=t)
     locked = Scene(scene.system, (*scene.constraints, *(lock_joint(*joint) for joint in (hold or {}).items())))
     layout(locked)  # raises for joints that do not exist
-    # Only concrete inputs allow more guesses and a message: both need to know whether the first guess has failed.
-    concrete = is_concrete(locked, q, v, t)
     atol = None if atol is None else float(atol)
 
     def from_guess(q):
         return _assemble(locked, q, v, t, rank_tol, atol, steps, scene.is_rounded, scene if hold else None)
 
     assembly = from_guess(q)
-    if concrete and not bool(assembly.success):
+    # Only concrete inputs allow more guesses, which need to know whether the first guess has failed.
+    if is_concrete(assembly.result) and not bool(assembly.success):
         assembly = _from_elsewhere(assembly, guesses, from_guess, locked, q)
-    if concrete and (throw is None or throw) and not bool(assembly.success):
+
+    def message() -> str:
         left = open_constraints(locked, assembly.q, assembly.v, t, closing_tolerance(q.dtype))
         tried = f" (nor are they from {guesses - 1} configurations around it)" if guesses > 1 else ""
-        raise ValueError(f"not assembled: {left}{tried}; give a better guess")
-    if throw and not concrete:
-        assembly = assembly.result.error_if(assembly, assembly.result != RESULTS.successful)
-    return assembly
+        return f"not assembled: {left}{tried}; give a better guess"
+
+    return require_success(assembly, throw, message)
 
 
 def check_search(steps: Any, guesses: Any, atol: Any) -> None:

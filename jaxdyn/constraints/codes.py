@@ -1,11 +1,13 @@
 """Result codes of all computations, by name and by number."""
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from typing import Any
 
 import equinox as eqx
 import jax.numpy as jnp
 from jaxtyping import Array, Bool
+
+from jaxdyn.compile.known import is_concrete
 
 _names: list[str] = []
 
@@ -103,6 +105,20 @@ class Outcome(eqx.Module):
     def success(self) -> Bool[Array, "..."]:
         """True where `result` is `RESULTS.successful`."""
         return self.result == RESULTS.successful  # pyright: ignore[reportAttributeAccessIssue]
+
+
+def require_success(outcome: Any, throw: bool | None, message: Callable[[], str]) -> Any:
+    """The outcome, or an error where it failed: by default for concrete ones, and always or never as `throw` says.
+
+    **Raises:** ValueError with the message; under tracing the program raises the text of the result's code.
+    """
+    failed = ~outcome.success
+    if not is_concrete(outcome.result):
+        # Under tracing the result is unknown, so that only an error at run time is possible.
+        return outcome.result.error_if(outcome, failed) if throw else outcome
+    if (throw is None or throw) and bool(jnp.any(failed)):
+        raise ValueError(message())
+    return outcome
 
 
 def first_of(cases: Sequence[tuple[Any, Any]], otherwise: Any) -> Any:

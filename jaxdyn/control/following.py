@@ -15,9 +15,9 @@ from jax import lax
 from jaxtyping import Array, Bool, Float
 
 from jaxdyn.compile import pseudo_inverse_by_rotations
-from jaxdyn.compile.known import is_concrete, stop_gradient
+from jaxdyn.compile.known import stop_gradient
 from jaxdyn.constraints.base import constraint_jacobian, holonomic_rows, layout
-from jaxdyn.constraints.codes import Outcome
+from jaxdyn.constraints.codes import Outcome, require_success
 from jaxdyn.constraints.rank import passes_singular, tolerance
 from jaxdyn.constraints.tolerances import coordinate_sizes
 from jaxdyn.control.inverse_kinematics import inverse_kinematics, row_weights
@@ -125,13 +125,15 @@ def follow(
     regularity = jnp.concatenate([_regularity(R, inverse, rank)[None], regularity])
     changes = jnp.concatenate([jnp.zeros(1, bool), changes])
     path = Following(every.q, every.residual, every.result, regularity, changes)
-    if is_concrete(path.q) and (throw is None or throw) and not bool(jnp.all(path.success)):
+
+    def message() -> str:
         lost = np.flatnonzero(~np.asarray(path.success))
-        raise ValueError(
+        return (
             f"follow: {lost.size} places of {path.q.shape[0]} were not reached, the first one number {lost[0]}, with errors "
             f"up to {float(path.residual[lost[0]]):.3g} (m or rad); give shorter steps, more guesses, or throw=False"
         )
-    return path
+
+    return require_success(path, throw, message)
 
 
 def _rows(targets: Mapping[str, Any]) -> dict[str, dict]:

@@ -34,6 +34,7 @@ from jaxdyn.control.motion import torque_for
 from jaxdyn.lie.so3 import matmul
 from jaxdyn.model.arguments import Checked, Function, Number, Numbers, as_array
 from jaxdyn.model.numbers import as_number
+from jaxdyn.reduction.inverse_dynamics import velocity_choice
 from jaxdyn.systems.scene import Scene, as_pytree
 from jaxdyn.systems.system import SceneLike
 
@@ -103,7 +104,7 @@ class HybridForce(ForceLoop):
         self.error = _error(task, target, of, self.kd)
         self.force = None if force is None else as_target(force, "force")
         self.ki = None if ki is None else gain(ki, "ki")
-        self.actuated = None if actuated is None else _indices(actuated, scene.nv)
+        self.actuated = None if actuated is None else velocity_choice(self.scene, actuated, "actuated")
         self.internal = None if internal is None else jnp.asarray(as_array(internal, "internal"), float)
         self.least_regularity = (
             None if least_regularity is None else as_number(least_regularity, "least_regularity", zero=True)
@@ -176,16 +177,3 @@ def _error(task: Any, target: Any, of: str, kd) -> Constraint:
         )
     function = as_pytree(task, f"task (of {of})", "q" if of == "position" else "q, v")
     return TaskError(function, as_target(target)) if of == "position" else RateError(function, as_target(target))  # pyright: ignore[reportCallIssue]
-
-
-def _indices(actuated: Any, nv: int) -> tuple[int, ...]:
-    indices = np.asarray(actuated, int)
-    if (
-        indices.ndim != 1
-        or not indices.size
-        or indices.min() < 0
-        or indices.max() >= nv
-        or np.unique(indices).size < indices.size
-    ):
-        raise ValueError(f"actuated is {actuated!r}; give different indices of velocities from 0 to {nv - 1}")
-    return tuple(indices.tolist())

@@ -21,7 +21,7 @@ from jaxdyn.compile.known import is_concrete, stop_gradient
 from jaxdyn.constraints.assembly import check_search, closing_tolerance
 from jaxdyn.constraints.base import Constraint, holonomic_rows, layout, position_residual
 from jaxdyn.constraints.closing import nearest_configuration
-from jaxdyn.constraints.codes import RESULTS, Outcome, name_of
+from jaxdyn.constraints.codes import RESULTS, Outcome, name_of, require_success
 from jaxdyn.constraints.redundancy import KeptRows
 from jaxdyn.constraints.tolerances import own_length
 from jaxdyn.control.search import Aims, clip_to_limits, screw_joints, search
@@ -134,17 +134,15 @@ def inverse_kinematics(
     place = _solve_by_program(
         Scene(model, scene.constraints), rows, guess, factors, posture, t, bool(limits), steps, guesses, atol
     )
-    concrete = is_concrete(place.result)
-    if throw and not concrete:
-        # Under tracing the result is unknown, so that only an error at run time is possible.
-        return place.result.error_if(place, place.result != RESULTS.successful)
-    if concrete and (throw is None or throw) and not bool(place.success):
-        raise ValueError(
+
+    def message() -> str:
+        return (
             f"inverse_kinematics: {name_of(place.result)}: errors {np.array2string(np.asarray(place.errors), precision=3)} "
             f"(m, rad) are left, and {float(place.constraint_residual):.3g} of the constraints, from {int(place.guesses)} "
             "places; give a better guess, other targets or weights, more guesses, or throw=False"
         )
-    return place
+
+    return require_success(place, throw, message)
 
 
 def row_weights(rows: tuple[Constraint, ...], weights, dtype) -> Array:

@@ -23,7 +23,7 @@ from jaxtyping import Array, Float
 from jaxdyn.compile import entry_point, kernel
 from jaxdyn.compile.known import is_concrete
 from jaxdyn.constraints.base import layout, rows, velocity_residual
-from jaxdyn.constraints.codes import RESULTS, Outcome, name_of
+from jaxdyn.constraints.codes import RESULTS, Outcome, name_of, require_success
 from jaxdyn.constraints.dynamics import total_force, whiten_rows
 from jaxdyn.constraints.rank import check_tolerance, eps_of, pseudo_inverse, tolerance
 from jaxdyn.dynamics.quantities import bias_force, mass_matrix
@@ -38,7 +38,7 @@ from jaxdyn.systems.system import SceneLike, velocity_to_rate
 if TYPE_CHECKING:
     Velocities = Sequence[str] | Sequence[int] | np.ndarray | Array
 else:
-    Velocities = Any  # `_indices` checks them
+    Velocities = Any  # `velocity_choice` checks them
 
 
 class ConstrainedInverseDynamics(Outcome):
@@ -110,7 +110,7 @@ def constrained_inverse_dynamics(
     scene, rank_tol = as_scene(scene), check_tolerance(rank_tol)
     q, t = check_state(scene.system, q=q, t=t)
     S, where = _motors(scene, motors, q.dtype)
-    chosen = where if independent is None else _indices(scene, independent, "independent")
+    chosen = where if independent is None else velocity_choice(scene, independent, "independent")
     if chosen is None:
         raise ValueError("motors is a matrix, which names no velocities; give independent as well")
     a_independent = as_array(a_independent, "a_independent", q.dtype)
@@ -126,12 +126,7 @@ def constrained_inverse_dynamics(
     dynamics = _solve_by_program(
         scene, q, v, a_independent, S, _weights(weights, S.shape[1], q.dtype), t, tuple(chosen), rank_tol
     )
-    concrete = is_concrete(dynamics.result)
-    if throw and not concrete:
-        return dynamics.result.error_if(dynamics, dynamics.result != RESULTS.successful)
-    if concrete and (throw is None or throw) and not bool(dynamics.success):
-        raise ValueError(_reason(dynamics, chosen))
-    return dynamics
+    return require_success(dynamics, throw, lambda: _reason(dynamics, chosen))
 
 
 def _reason(dynamics, chosen) -> str:
@@ -153,12 +148,12 @@ def _motors(scene: Scene, motors, dtype) -> tuple[Any, tuple[int, ...] | None]:
         if S.shape[0] != scene.nv or not S.shape[1]:
             raise ValueError(f"motors has shape {S.shape}, expected ({scene.nv}, nm) = (nv, nm)")
         return S, None
-    where = tuple(range(scene.nv)) if motors is None else _indices(scene, motors, "motors")
+    where = tuple(range(scene.nv)) if motors is None else velocity_choice(scene, motors, "motors")
     return np.eye(scene.nv, dtype=dtype)[:, list(where)], where
 
 
-def _indices(scene: Scene, velocities, argument: str) -> tuple[int, ...]:
-    """Indices of velocities, named by joints or given."""
+def velocity_choice(scene: Scene, velocities: Any, argument: str) -> tuple[int, ...]:
+    """Different indices of velocities, named by joints or given. **Raises:** ValueError for others."""
     given = [velocities] if isinstance(velocities, str) else list(velocities)
     if given and all(isinstance(name, str) for name in given):
         if not isinstance(scene.system, Model):

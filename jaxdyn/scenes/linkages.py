@@ -54,6 +54,21 @@ def solve_planar(one, other, right):
     ) / determinant
 
 
+def two_link_leg(base, length, end, velocity, elbow=1):
+    """Angles of a leg of two links of one length, the second relative to the first, and their rates for a velocity of its end.
+
+    The `elbow` is to the left of the line from the base to the end for +1, to the right for -1.
+    """
+    xp = array_namespace(base, length, end, velocity)
+    base, end = xp.asarray(base, float), xp.asarray(end, float)
+    # Exchanged circles give the solution on the other side.
+    knee = intersect_circles(*(base, length, end, length) if elbow > 0 else (end, length, base, length))
+    first, second = (xp.arctan2(*vector[::-1]) for vector in (knee - base, end - knee))
+    # Velocities of both links add up to that of the end.
+    rates = solve_planar(end_velocity(length, first), end_velocity(length, second), velocity)
+    return [first, second - first], [rates[0], rates[1] - rates[0]]
+
+
 def _four_bar_start(
     lengths: Row = (1.0, 3.0, 2.5, 3.5), angle: Number = 1.0, rate: Number = 1.0, in_plane: bool = True
 ) -> tuple[Array, Array]:
@@ -174,20 +189,8 @@ def _parallel_start(
     bases: Row = _BASES,
     elbows: Row = (1, 1, 1),
 ) -> tuple[Array, Array]:
-    xp = array_namespace(point, velocity, length, bases)
-    q, v = [], []
-    for base, elbow in zip(bases, elbows, strict=True):
-        # Exchanged circles give the solution on the other side.
-        a = (
-            intersect_circles(base, length, point, length)
-            if elbow > 0
-            else intersect_circles(point, length, base, length)
-        )
-        vectors = a - xp.asarray(base, float), xp.asarray(point, float) - a
-        first, second = (xp.arctan2(*vector[::-1]) for vector in vectors)
-        rates = solve_planar(end_velocity(length, first), end_velocity(length, second), velocity)
-        q += [first, second - first]
-        v += [rates[0], rates[1] - rates[0]]
+    legs = [two_link_leg(base, length, point, velocity, elbow) for base, elbow in zip(bases, elbows, strict=True)]
+    q, v = (list(itertools.chain(*numbers)) for numbers in zip(*legs, strict=True))
     return as_state(q), as_state(v)
 
 

@@ -9,7 +9,7 @@ from jaxdyn.model import float64 as f64
 from jaxdyn.model.arguments import Checked, Number, Numbers, Row
 from jaxdyn.model.builder import ModelBuilder
 from jaxdyn.scenes._named import as_state, register_scene
-from jaxdyn.scenes.linkages import end_velocity, intersect_circles, solve_planar, thin_bar
+from jaxdyn.scenes.linkages import thin_bar, two_link_leg
 from jaxdyn.systems.scene import Scene
 
 
@@ -110,16 +110,11 @@ def _hinge_platform_start(
     for base, (x, y) in zip(_around(count, radii[0]), _around(count, radii[1]), strict=True):
         arm = xp.stack([c * x - s * y, s * x + c * y])
         # Velocity of a point of the platform: v + w x arm.
-        hinge, speed = point + arm, velocity + rate * xp.stack([-arm[1], arm[0]])
-        elbow = intersect_circles(base, length, hinge, length)
-        first, second = (xp.arctan2(*way[::-1]) for way in (elbow - base, hinge - elbow))
-        # Velocities of both links add up to that of the hinge on the platform.
-        rates = solve_planar(end_velocity(length, first), end_velocity(length, second), speed)
-        q += [first, second - first]
-        v += [rates[0], rates[1] - rates[0]]
-        # The platform follows the first leg in depth-first order.
+        angles, rates = two_link_leg(base, length, point + arm, velocity + rate * xp.stack([-arm[1], arm[0]]))
+        q, v = q + angles, v + rates
+        # The platform follows the first leg in depth-first order; its angle is relative to the upper link.
         if len(q) == 2:
-            q, v = [*q, angle - second], [*v, rate - rates[1]]
+            q, v = [*q, angle - sum(angles)], [*v, rate - sum(rates)]
     return as_state(q), as_state(v)
 
 

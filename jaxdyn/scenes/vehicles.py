@@ -105,6 +105,18 @@ def _add_wheel(builder, name, parent, mass, radius, place):
     builder.add_body(name, parent, "continuous", disk, pose=place, axis=(0.0, 1.0, 0.0))
 
 
+def _add_chassis(builder, mass, moment, offset, wheel_mass, radius, half_track, where):
+    """Add a chassis with two wheels on one axle; the constraints of the wheels, whose names begin with `where`."""
+    chassis = (mass, (offset, 0.0, 0.0), (moment, moment, moment))
+    builder.add_body("chassis", None, "planar", chassis, pose=(0.0, 0.0, radius))
+    left, right = f"{where}left wheel", f"{where}right wheel"
+    _add_wheel(builder, left, "chassis", wheel_mass, radius, (0.0, half_track, 0.0))
+    _add_wheel(builder, right, "chassis", wheel_mass, radius, (0.0, -half_track, 0.0))
+    # Both wheels on one axle forbid the same sideways slip: one such row is enough.
+    rolling = rolling_wheel(left, _AXLE, radius, contact=False)
+    return [rolling, rolling_wheel(right, _AXLE, radius, contact=False, lateral=False)]
+
+
 @register_scene(_drive_start)
 def differential_drive(
     *,
@@ -127,15 +139,7 @@ def differential_drive(
     Start: `speed` (m/s) and `yaw_rate` (rad/s).
     """
     builder = ModelBuilder("differential drive", gravity=None)
-    chassis = (mass, (offset, 0.0, 0.0), (moment, moment, moment))
-    builder.add_body("chassis", None, "planar", chassis, pose=(0.0, 0.0, radius))
-    _add_wheel(builder, "left wheel", "chassis", wheel_mass, radius, (0.0, half_track, 0.0))
-    _add_wheel(builder, "right wheel", "chassis", wheel_mass, radius, (0.0, -half_track, 0.0))
-    rolling = [
-        rolling_wheel("left wheel", _AXLE, radius, contact=False),
-        # Both wheels on one axle forbid the same sideways slip: one such row is enough.
-        rolling_wheel("right wheel", _AXLE, radius, contact=False, lateral=False),
-    ]
+    rolling = _add_chassis(builder, mass, moment, offset, wheel_mass, radius, half_track, "")
     return Scene(builder.build(), rolling)
 
 
@@ -185,22 +189,13 @@ def car(
     cos(theta + phi) - thetadot l cos(phi) = 0 and xdot sin(theta) - ydot cos(theta) = 0.
     """
     builder = ModelBuilder("car", gravity=None)
-    chassis = (mass, (offset, 0.0, 0.0), (moment, moment, moment))
-    builder.add_body("chassis", None, "planar", chassis, pose=(0.0, 0.0, radius))
-    _add_wheel(builder, "rear left wheel", "chassis", wheel_mass, radius, (0.0, half_track, 0.0))
-    _add_wheel(builder, "rear right wheel", "chassis", wheel_mass, radius, (0.0, -half_track, 0.0))
+    rolling = _add_chassis(builder, mass, moment, offset, wheel_mass, radius, half_track, "rear ")
     fork = (0.0, (0.0, 0.0, 0.0), flat_moments(fork_moment))
     # The fork has a moment about the steer axis and no mass.
     builder.add_body("steering", "chassis", "continuous", fork, pose=(wheel_base, 0.0, 0.0))
     # The front wheel has its centre on the steer axis, so that steering does not move it.
     _add_wheel(builder, "front wheel", "steering", wheel_mass, radius, None)
-    rolling = [
-        rolling_wheel("rear left wheel", _AXLE, radius, contact=False),
-        # The same sideways slip as that of the left wheel.
-        rolling_wheel("rear right wheel", _AXLE, radius, contact=False, lateral=False),
-        rolling_wheel("front wheel", _AXLE, radius, contact=False),
-    ]
-    return Scene(builder.build(), rolling)
+    return Scene(builder.build(), [*rolling, rolling_wheel("front wheel", _AXLE, radius, contact=False)])
 
 
 def _snakeboard_start(
