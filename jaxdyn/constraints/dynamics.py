@@ -26,6 +26,7 @@ from jaxdyn.constraints.rank import (
     least_refinable_pivot,
     pseudo_inverse,
     quality_of,
+    rank_of,
     regular_gram,
     tolerance,
 )
@@ -251,8 +252,7 @@ def _min_norm_solution(Y, deficit, rank_tol):
     # More rows than velocities are always dependent: the normal equations would fail for all samples, and are not tried.
     inverse = pseudo_inverse(Y, tolerance(rank_tol, Y), Y.shape[1] > Y.shape[0])
     w = matmul(inverse.T, deficit)
-    # The rank is the trace of the projection Y Y^+.
-    return matmul(inverse, w), w, jnp.round(jnp.sum(inverse * Y.T)).astype(jnp.int32)
+    return matmul(inverse, w), w, rank_of(Y, inverse).astype(jnp.int32)
 
 
 def _by_schur(scene: Scene, q, v, tau, t, *, method: str) -> ConstrainedDynamics:

@@ -170,6 +170,17 @@ def _pseudo_inverse_jvp(rank_tol, dependent, primals, tangents):
     return P, dP
 
 
+def rank_of(A: Float[Array, "n m"], inverse: Float[Array, "m n"]) -> Float[Array, ""]:
+    """Rank of a matrix with a pseudo-inverse A^+: the trace of A^+ A, rounded to an integer."""
+    # Each singular value above the tolerance contributes 1 up to rounding.
+    return jnp.round(jnp.sum(inverse * A.T))
+
+
+def condition_number(A: Float[Array, "n m"], inverse: Float[Array, "k l"]) -> Float[Array, ""]:
+    """|A| |A^+| in Frobenius' norm, an upper bound of the condition number of A, or of a part of it, that needs no SVD."""
+    return jnp.sqrt(jnp.sum(inverse * inverse) * jnp.sum(A * A))
+
+
 def solve_square(A: Float[Array, "n n"], right: Float[Array, "n *k"]) -> Float[Array, "n *k"]:
     """A^-1 right for a regular A, by Jacobi rotations."""
     # Without LAPACK: its calls from several samples of a batch can deadlock in XLA's thread pool.

@@ -297,7 +297,7 @@ def select_concrete_rows(
     if 0 < B.shape[0] <= B.shape[1] and np.linalg.svd(B, compute_uv=False)[-1] > apart:
         return every, B.shape[0]
     # The SVD is sufficient, not necessary: the least singular value may be far below the least pivot.
-    pivots = _pivots(B)
+    pivots = pivoted_rows(B)[1]
     if np.sum(pivots > apart) == B.shape[0]:
         return every, B.shape[0]
     with jax.ensure_compile_time_eval():
@@ -310,15 +310,15 @@ def _select_by_program(scene: Scene, q, t, rank_tol, is_rounded):
     return select_rows(scene, q, t, rank_tol, is_rounded)
 
 
-def _pivots(B: np.ndarray) -> np.ndarray:
-    """Pivots of `eliminate`, of a concrete B."""
-    rest, pivots = np.array(B), []
+def pivoted_rows(B: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Indices of the rows that `eliminate` takes one after the other, and their pivots, of a concrete B."""
+    rest, rows, pivots = np.array(B), [], []
     for _ in range(min(B.shape)):
         lengths = np.linalg.norm(rest, axis=1)
-        row = int(np.argmax(lengths))
-        pivots.append(lengths[row])
-        if lengths[row] == 0:
+        rows.append(int(np.argmax(lengths)))
+        pivots.append(lengths[rows[-1]])
+        if pivots[-1] == 0:
             break
-        along = rest[row] / lengths[row]
+        along = rest[rows[-1]] / pivots[-1]
         rest = rest - np.outer(rest @ along, along)
-    return np.asarray(pivots)
+    return np.asarray(rows, int), np.asarray(pivots)

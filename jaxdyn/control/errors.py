@@ -18,7 +18,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from jaxdyn.constraints.base import Constraint, position_residual, rows
-from jaxdyn.constraints.rank import pseudo_inverse, tolerance
+from jaxdyn.constraints.rank import pseudo_inverse, rank_of, tolerance
 from jaxdyn.control.gains import times
 from jaxdyn.dynamics.centroidal import center_of_mass
 from jaxdyn.dynamics.kinematics import frame_pose
@@ -228,6 +228,5 @@ def regularity(system, q, t, A, T) -> Float[Array, ""]:
 
 
 def row_rank(matrix: Float[Array, "m n"]) -> Array:
-    """Number of independent rows, (), the trace of a projection."""
-    # Rounded to an integer: each singular value above the tolerance contributes 1 up to rounding.
-    return jnp.round(jnp.sum(pseudo_inverse(matrix, tolerance(None, matrix), True) * matrix.T))
+    """Number of independent rows, ()."""
+    return rank_of(matrix, pseudo_inverse(matrix, tolerance(None, matrix), True))

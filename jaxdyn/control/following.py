@@ -18,7 +18,7 @@ from jaxdyn.compile import pseudo_inverse_by_rotations
 from jaxdyn.compile.known import stop_gradient
 from jaxdyn.constraints.base import constraint_jacobian, holonomic_rows, layout
 from jaxdyn.constraints.codes import Outcome, require_success
-from jaxdyn.constraints.rank import passes_singular, tolerance
+from jaxdyn.constraints.rank import condition_number, passes_singular, rank_of, tolerance
 from jaxdyn.constraints.tolerances import coordinate_sizes
 from jaxdyn.control.inverse_kinematics import inverse_kinematics, row_weights
 from jaxdyn.control.targets import as_targets
@@ -118,7 +118,7 @@ def follow(
     # 16 guesses, the default of `inverse_kinematics`: only the first place has no neighbour to start from.
     begin, (R, inverse) = place(first, guess, 16)
     # The rank at the first place is the reference for all others.
-    rank = _rank(R, inverse)
+    rank = rank_of(R, inverse)
     states = (lax.stop_gradient(begin.q), R, inverse)
     _, (places, regularity, changes) = lax.scan(go_on, states, rest)
     every = jax.tree.map(lambda one, rest: jnp.concatenate([one[None], rest]), begin, places)
@@ -153,17 +153,13 @@ def _unit_rows(whole: Scene, q, t: Any, factors):
     return R, pseudo_inverse_by_rotations(R, tolerance(None, R))
 
 
-def _rank(R, inverse):
-    return jnp.round(jnp.sum(inverse * R.T))
-
-
 def _regularity(R, inverse, rank):
     """r / (|R| |R^+|) in Frobenius' norm, and 0 where the rank r is less than `rank`."""
-    size = jnp.sqrt(jnp.sum(R * R) * jnp.sum(inverse * inverse))
+    size = condition_number(R, inverse)
     # By the inequality of Cauchy and Schwarz |R| |R^+| >= r. The minimum removes rounding above 1.
     regular = jnp.minimum(rank / jnp.where(size > 0, size, jnp.ones_like(size)), 1.0)
     # R^+ omits singular values below the tolerance: a drop of rank does not make |R^+| large and needs a test of its own.
-    return jnp.where(_rank(R, inverse) >= rank, regular, jnp.zeros_like(regular))
+    return jnp.where(rank_of(R, inverse) >= rank, regular, jnp.zeros_like(regular))
 
 
 def _changes_branch(system, before, after, R_after, R, inverse):

@@ -21,7 +21,7 @@ from jaxdyn.compile import entry_point
 from jaxdyn.constraints.base import Layout, constraint_jacobian, layout
 from jaxdyn.constraints.codes import RESULTS, Outcome
 from jaxdyn.constraints.dynamics import total_force
-from jaxdyn.constraints.rank import pseudo_inverse, tolerance
+from jaxdyn.constraints.rank import condition_number, pseudo_inverse, rank_of, tolerance
 from jaxdyn.dynamics.quantities import coriolis_matrix, gravity_force, mass_matrix
 from jaxdyn.grasp.hand import Grasp, check_grasp
 from jaxdyn.grasp.motions import HandMotions, hand_motions, velocity_rows
@@ -185,9 +185,8 @@ def _solve(grasp: Grasp, q, V, tau, t) -> ObjectDynamics:
     # From J_h X = G^T: J_h Xdot = Gdot^T - J_hdot X, which is Adot N.
     Xdot = matmul(inverse, matmul(push(velocity_to_rate(grasp.system, q, v), jnp.ones_like(t)), N))
     Ndot = jnp.zeros_like(N).at[hands].set(Xdot)
-    # The trace of J_h^+ J_h is the rank of J_h.
-    whole = jnp.round(jnp.sum(inverse * Jh.T)) == hands.size
-    condition = jnp.sqrt(jnp.sum(inverse * inverse) * jnp.sum(A * A))
+    whole = rank_of(Jh, inverse) == hands.size
+    condition = condition_number(A, inverse)
     # The condition number that the dtype resolves: beyond it the basis N has no correct digits.
     is_regular = whole & (condition * least_quality(q.dtype) < 1)
     # From the rows of the fingers alone, where A^T is -J_h^T.

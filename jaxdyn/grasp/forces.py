@@ -18,7 +18,7 @@ from jaxdyn.compile.known import is_known
 from jaxdyn.constraints.base import Layout, constraint_jacobian, layout
 from jaxdyn.constraints.codes import Outcome
 from jaxdyn.constraints.dynamics import total_force
-from jaxdyn.constraints.rank import pseudo_inverse, tolerance
+from jaxdyn.constraints.rank import pseudo_inverse, rank_of, tolerance
 from jaxdyn.contact.closure import ForceClosure, force_closure_of_map
 from jaxdyn.contact.cones import Cones
 from jaxdyn.contact.forces import ContactWithCone, contacts_with_cones
@@ -75,7 +75,7 @@ def internal_force_basis(
     if reference is None:
         known = is_known(grasp, q, t)
         # A traced q has no known rank, and the number of columns is a shape: full rank is assumed.
-        rank = int(jnp.round(jnp.sum(inverse * G.T))) if known else min(G.shape)
+        rank = int(rank_of(G, inverse)) if known else min(G.shape)
         return split_directions(jnp.eye(G.shape[1], dtype=G.dtype) - matmul(inverse, G))[:, rank:]
     reference = jnp.asarray(as_array(reference, "reference", G.dtype))
     if reference.ndim != 2 or reference.shape[0] != G.shape[1]:

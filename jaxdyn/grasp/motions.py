@@ -20,7 +20,7 @@ from jaxtyping import Array, Float
 from jaxdyn.compile import entry_point
 from jaxdyn.compile.known import is_known
 from jaxdyn.constraints.base import constraint_jacobian, layout
-from jaxdyn.constraints.rank import eps_of, pseudo_inverse, tolerance
+from jaxdyn.constraints.rank import condition_number, eps_of, pseudo_inverse, rank_of, tolerance
 from jaxdyn.grasp.hand import Grasp, check_grasp
 from jaxdyn.lie.so3 import matmul
 from jaxdyn.model.arguments import Number, Numbers, check_state
@@ -66,10 +66,9 @@ class HandMotions(Basis):
             K, least, _ = orthonormal(reference - matmul(inverse, matmul(Jh, reference)))
             N = N.at[hands, H.shape[1] :].set(K)
             pivot = jnp.minimum(pivot, least)
-        # The trace of J_h^+ J_h is its rank. A rank other than at the references changes the number of motions.
-        fits = fits & (jnp.round(jnp.sum(inverse * Jh.T)) == rank)
-        # |J_h^+| |A|, an upper bound of the condition number that needs no SVD.
-        size = jnp.sqrt(jnp.sum(inverse * inverse) * jnp.sum(A * A))
+        # A rank other than at the references changes the number of motions.
+        fits = fits & (rank_of(Jh, inverse) == rank)
+        size = condition_number(A, inverse)
         size = jnp.where(size > 0, size, jnp.ones_like(size))
         good = fits & jnp.isfinite(pivot)
         return Parametrization(N, jnp.zeros((scene.nv,), A.dtype), jnp.where(good, pivot / size, jnp.zeros_like(size)))
@@ -84,7 +83,7 @@ class HandMotions(Basis):
             return reference, jnp.ones((), A.dtype), whole
         # B, whose kernel are the feasible velocities; its rank follows from the trace of a projection.
         across = pseudo_inverse(lost, tolerance(None, lost), True)
-        fits = jnp.round(jnp.sum(across * lost.T)) == reference.shape[0] - reference.shape[1]
+        fits = rank_of(lost, across) == reference.shape[0] - reference.shape[1]
         # No motion of the object is feasible: there is nothing to orthonormalise.
         if not reference.shape[1]:
             return reference, jnp.ones((), A.dtype), fits
@@ -166,7 +165,7 @@ def _projections(grasp: Grasp, q, t):
     across = pseudo_inverse(lost, tolerance(None, lost), True)
     on_object = jnp.eye(objects.size, dtype=A.dtype) - matmul(across, lost)
     on_hand = jnp.eye(hands.size, dtype=A.dtype) - matmul(inverse, Jh)
-    return on_object, on_hand, (jnp.round(jnp.sum(across * lost.T)), jnp.round(jnp.sum(inverse * Jh.T)))
+    return on_object, on_hand, (rank_of(lost, across), rank_of(Jh, inverse))
 
 
 def _negligible(like) -> float:

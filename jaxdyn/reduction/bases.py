@@ -17,7 +17,8 @@ from jaxtyping import Array, Float
 from jaxdyn.compile import entry_point, gram_eigenvectors
 from jaxdyn.compile.known import is_known
 from jaxdyn.constraints.base import constraint_jacobian, layout, velocity_residual
-from jaxdyn.constraints.rank import pseudo_inverse, sign_of_determinant, tolerance
+from jaxdyn.constraints.rank import condition_number, pseudo_inverse, rank_of, sign_of_determinant, tolerance
+from jaxdyn.constraints.selection import pivoted_rows
 from jaxdyn.lie.so3 import matmul
 from jaxdyn.model.arguments import Number, Numbers, batch_hint, check_state
 from jaxdyn.systems.mass_factor import cholesky, solve_cholesky, solve_lower
@@ -90,10 +91,8 @@ class Independent(Basis):
         N = jnp.zeros((scene.nv, kept.size), A.dtype).at[kept].set(jnp.eye(kept.size, dtype=A.dtype))
         N = N.at[rest].set(-matmul(inverse, A[:, kept]))
         v0 = jnp.zeros((scene.nv,), A.dtype).at[rest].set(matmul(inverse, b))
-        # |A2^+| |A|, an upper bound of the condition number that needs no SVD.
-        size = jnp.sqrt(jnp.sum(inverse * inverse) * jnp.sum(A * A))
-        # The trace of A2^+ A2 is the rank of A2.
-        whole = jnp.round(jnp.sum(inverse * A2.T)) == rest.size
+        size = condition_number(A, inverse)
+        whole = rank_of(A2, inverse) == rest.size
         quality = jnp.where(whole, 1.0 / jnp.where(whole, size, jnp.ones_like(size)), jnp.zeros_like(size))
         if A2.shape[0] == A2.shape[1]:
             # A step may pass a dead centre without meeting it; the sign then differs at its two ends.
@@ -130,7 +129,7 @@ class UserBasis(Basis):
         some = jnp.all(lengths > 0)
         pivot = _least_pivot(N / jnp.where(some, lengths, jnp.ones_like(lengths))[None])
         # Fewer columns would be a further constraint, more of them cannot all be tangent.
-        whole = scene.nv - jnp.round(jnp.sum(inverse * A.T)) == N.shape[1]
+        whole = scene.nv - rank_of(A, inverse) == N.shape[1]
         off = jnp.abs(matmul(A, v0) - b)
         met = jnp.max(off) <= _rounding(A) * (jnp.max(jnp.abs(b)) + jnp.sqrt(jnp.sum(A * A) * jnp.sum(v0 * v0)))
         quality = jnp.where(some & whole & met, pivot, jnp.zeros_like(pivot))
@@ -174,8 +173,7 @@ class Orthonormal(Basis):
         A = A + 0 * reference[0, 0]
         inverse = pseudo_inverse(A, tolerance(None, A))
         N, pivot, factor = orthonormal(reference - matmul(inverse, matmul(A, reference)))
-        # The trace of A^+ A is the rank of A.
-        free = scene.nv - jnp.round(jnp.sum(inverse * A.T))
+        free = scene.nv - rank_of(A, inverse)
         quality = jnp.where(free == N.shape[1], pivot, jnp.zeros_like(pivot))
         return Parametrization(N, matmul(inverse, b), quality), A, inverse, factor
 
@@ -322,7 +320,7 @@ def _tangent_projection(scene, q, t, rank_tol):
     """Projection 1 - A^+ A, and the rank of A."""
     A = constraint_jacobian(scene, q, t)
     inverse = pseudo_inverse(A, tolerance(rank_tol, A))
-    return jnp.eye(scene.nv, dtype=A.dtype) - matmul(inverse, A), jnp.round(jnp.sum(inverse * A.T))
+    return jnp.eye(scene.nv, dtype=A.dtype) - matmul(inverse, A), rank_of(A, inverse)
 
 
 def split_directions(projection: Float[Array, "n n"]) -> Float[Array, "n n"]:
@@ -335,17 +333,10 @@ def independent_velocities(scene: Scene, q, t: Number = 0.0) -> tuple[int, ...]:
     """Indices of independent velocities at a concrete configuration: those without pivots of A's columns."""
     # In NumPy, since the pivots are indices that a caller stores as static.
     A = np.asarray(constraint_jacobian_compiled(scene, q, jnp.asarray(t, q.dtype)), float)
-    # Pivoted QR of the columns by modified Gram-Schmidt, `rest` without the pivots so far: pivots are the dependent velocities.
-    rest, pivots = A.copy(), []
-    for _ in range(min(A.shape)):
-        sizes = np.linalg.norm(rest, axis=0)
-        pivot = int(np.argmax(sizes))
-        if sizes[pivot] <= 1e-9 * np.linalg.norm(A):
-            break
-        along = rest[:, pivot] / sizes[pivot]
-        rest = rest - np.outer(along, along @ rest)
-        pivots.append(pivot)
-    return tuple(i for i in range(scene.nv) if i not in pivots)
+    # The pivots of its columns are the dependent velocities.
+    columns, pivots = pivoted_rows(A.T)
+    dependent = columns[pivots > 1e-9 * np.linalg.norm(A)]
+    return tuple(np.setdiff1d(np.arange(scene.nv), dependent).tolist())
 
 
 def orthonormal(columns: Float[Array, "n k"]) -> tuple[Float[Array, "n k"], Float[Array, ""], Float[Array, "k k"]]:

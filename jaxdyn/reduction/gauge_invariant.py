@@ -24,7 +24,7 @@ from jaxdyn.compile import entry_point
 from jaxdyn.constraints.base import constraint_jacobian, layout, rows
 from jaxdyn.constraints.codes import RESULTS, Outcome, require_finite
 from jaxdyn.constraints.dynamics import total_force
-from jaxdyn.constraints.rank import pseudo_inverse, tolerance
+from jaxdyn.constraints.rank import pseudo_inverse, rank_of, tolerance
 from jaxdyn.dynamics.quantities import bias_force, coriolis_matrix, mass_matrix
 from jaxdyn.lie.so3 import matmul
 from jaxdyn.model.arguments import Numbers, batch_hint, check_state, zeros_if_none
@@ -150,7 +150,7 @@ def _decouple(scene, q, v, tau, t, rotation, motion_rotation, dof, rank_tol) -> 
     leaning = -matmul(matmul(V1.T, back), matmul(rate, V2))
     free = u - matmul(Gamma, w)
     change = matmul(null_projector, free) + matmul(back, wanted)
-    rank = jnp.round(jnp.sum(back * Lambda.T))
+    rank = rank_of(Lambda, back)
     # The bases have a static number of columns, which is valid for this rank alone.
     result = RESULTS.where(rank == scene.nv - dof, RESULTS.successful, RESULTS.singular_basis)  # pyright: ignore[reportArgumentType]
     a = matmul(inverse.T, change - matmul(Wdot.T, v))

@@ -25,7 +25,7 @@ from jaxdyn.compile.known import is_concrete
 from jaxdyn.constraints.base import layout, rows, velocity_residual
 from jaxdyn.constraints.codes import RESULTS, Outcome, name_of, require_success
 from jaxdyn.constraints.dynamics import total_force, whiten_rows
-from jaxdyn.constraints.rank import check_tolerance, eps_of, pseudo_inverse, tolerance
+from jaxdyn.constraints.rank import check_tolerance, eps_of, pseudo_inverse, rank_of, tolerance
 from jaxdyn.dynamics.quantities import bias_force, mass_matrix
 from jaxdyn.lie.so3 import matmul
 from jaxdyn.model.arguments import Numbers, as_array, batch_hint, check_state
@@ -235,7 +235,7 @@ def _solve(chosen: tuple[int, ...], rank_tol, scene: Scene, q, v, a_independent,
         rest = -velocity_residual(scene, q, still, t) if has_rows else Y[0]
         x, agrees = complete(still, rest, v)
         v = metric.unwhiten(x)
-        rank = jnp.round(jnp.sum(inverse * Y.T)) + jnp.round(jnp.trace(matmul(free, across(Z))))
+        rank = rank_of(Y, inverse) + jnp.round(jnp.trace(matmul(free, across(Z))))
         # The rows of constraints and of independent velocities must span all velocities.
         is_determined = rank == nv
     gamma = rows(scene, q, v, t).gamma if has_rows else Y[0]
