@@ -69,3 +69,20 @@ def _find(old: str, name: str, module: str) -> Any:
     warnings.warn(f"jd.{old} is now {new}", DeprecationWarning, stacklevel=3)
     home, _, present = place.rpartition(".")
     return getattr(importlib.import_module(f"jaxdyn.{home}"), present)
+
+
+class RenamedMethod:
+    """Old name of a method, as `placed = RenamedMethod("contacts_at")` in the class that has the new one."""
+
+    def __init__(self, new: str):
+        self.new = new
+
+    def __set_name__(self, owner: type, name: str):
+        self.old = f"{owner.__name__}.{name}"
+
+    def __get__(self, instance: Any, owner: type | None = None) -> Any:
+        # The class itself is asked by tools that list its names.
+        if instance is None:
+            return self
+        warnings.warn(f"{self.old} is deprecated; call {self.new}", DeprecationWarning, stacklevel=2)
+        return getattr(instance, self.new)

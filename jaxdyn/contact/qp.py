@@ -7,7 +7,7 @@ the same in y, with the added term y^T (1 - P) y / 2, zero at y = P y.
 """
 
 from collections.abc import Sequence
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -159,19 +159,28 @@ def _unit(sizes):
     return jnp.where(sizes > 0, 1 / jnp.where(sizes > 0, sizes, 1), 1)
 
 
-@entry_point
-def _solve(Q, q, G, h, A, b, cones, pattern: tuple[bytes | None, ...], tol: float, max_steps: int) -> QPSolution:
-    data = [Q, q, G, A, b, *(x for pair in cones for x in pair)]
-    finite = jnp.stack([jnp.isfinite(x).all() for x in data]).all() & ~jnp.isnan(h).any()
-    # Only the symmetric part enters x^T Q x.
-    Q = (Q + Q.T) / 2
-    bounded = jnp.isfinite(h)
-    # A row without a bound becomes 0 <= 1; an infeasible one, h = -inf, becomes 0 <= -1.
-    G_used, h_used = jnp.where(bounded[:, None], G, 0), jnp.where(bounded, h, jnp.where(h > 0, 1, -1).astype(h.dtype))
-    blocks, levels = [G_used[:, None, :]], [h_used[:, None]]
-    blocks, levels = [*blocks, *(S for S, _ in cones)], [*levels, *(c for _, c in cones)]
-    kept = [i for i, block in enumerate(blocks) if block.shape[0]]
+class _Scaled(NamedTuple):
+    """A program with Q of unit diagonal, rows of unit length and data of size one; its scales; x0, which satisfies A x = b.
 
+    `blocks` (k, d, n) and `levels` (k, d) are those of the linear rows, d = 1, then those of each group of cones; `inverse` is
+    A^+, None without equality rows.
+    """
+
+    Q: Array
+    q: Array
+    A: Array
+    b: Array
+    blocks: list[Array]
+    levels: list[Array]
+    inverse: Array | None
+    x0: Array
+    across: Array
+    equality_scale: Array
+    row_scales: list[Array]
+    size: Array
+
+
+def _scale(Q, q, A, b, blocks, levels) -> _Scaled:
     # Scales are constants for differentiation, because the solution does not depend on them.
     # Q gets a unit diagonal and rows unit length, so that `tol` does not depend on units.
     diagonal = jax.lax.stop_gradient(jnp.diagonal(Q))
@@ -195,23 +204,44 @@ def _solve(Q, q, G, h, A, b, cones, pattern: tuple[bytes | None, ...], tol: floa
     # The solution is homogeneous in (q, b, h), whose size is scaled to one.
     size = 1 / _unit(jax.lax.stop_gradient(jnp.max(jnp.stack(shortest))))
     q, b, x0, levels = q / size, b / size, x0 / size, [x / size for x in levels]
+    return _Scaled(Q, q, A, b, blocks, levels, inverse, x0, across, equality_scale, row_scales, size)
 
-    result = RESULTS.successful
-    program = Program(Q, q, tuple(blocks[i] for i in kept), tuple(levels[i] for i in kept))
-    if inverse is not None:
-        # x = x0 + P y; the term 1 - P keeps the matrix definite on the range of A^T.
-        unit = jnp.eye(q.shape[0], dtype=q.dtype)
-        P = unit - matmul(inverse, A)
-        program = Program(
-            matmul(P, matmul(Q, P)) + unit - P,
-            matmul(P, q + matmul(Q, x0)),
-            tuple(matmul(block, P) for block in program.G),
-            tuple(y - matmul(block, x0) for block, y in zip(program.G, program.h, strict=True)),
-        )
+
+def _without_equalities(scaled: _Scaled, kept: list[int]) -> Program:
+    """The program in y with x = x0 + P y, for the groups of rows that have some."""
+    Q, q, x0 = scaled.Q, scaled.q, scaled.x0
+    program = Program(Q, q, tuple(scaled.blocks[i] for i in kept), tuple(scaled.levels[i] for i in kept))
+    if scaled.inverse is None:
+        return program
+    unit = jnp.eye(q.shape[0], dtype=q.dtype)
+    P = unit - matmul(scaled.inverse, scaled.A)
+    return Program(
+        # The term 1 - P keeps the matrix definite on the range of A^T.
+        matmul(P, matmul(Q, P)) + unit - P,
+        matmul(P, q + matmul(Q, x0)),
+        tuple(matmul(block, P) for block in program.G),
+        tuple(y - matmul(block, x0) for block, y in zip(program.G, program.h, strict=True)),
+    )
+
+
+@entry_point
+def _solve(Q, q, G, h, A, b, cones, pattern: tuple[bytes | None, ...], tol: float, max_steps: int) -> QPSolution:
+    data = [Q, q, G, A, b, *(x for pair in cones for x in pair)]
+    finite = jnp.stack([jnp.isfinite(x).all() for x in data]).all() & ~jnp.isnan(h).any()
+    bounded = jnp.isfinite(h)
+    # A row without a bound becomes 0 <= 1; an infeasible one, h = -inf, becomes 0 <= -1.
+    G_used, h_used = jnp.where(bounded[:, None], G, 0), jnp.where(bounded, h, jnp.where(h > 0, 1, -1).astype(h.dtype))
+    blocks, levels = [G_used[:, None, :], *(S for S, _ in cones)], [h_used[:, None], *(c for _, c in cones)]
+    kept = [i for i, block in enumerate(blocks) if block.shape[0]]
+    # Only the symmetric part enters x^T Q x.
+    scaled = _scale((Q + Q.T) / 2, q, A, b, blocks, levels)
+    program = _without_equalities(scaled, kept)
+
+    result, steps = RESULTS.successful, jnp.zeros((), jnp.int32)
+    if scaled.inverse is not None:
         # Contradictory equality rows: the least-squares solution x0 misses them.
-        met = jnp.max(jnp.abs(matmul(A, x0) - b)) <= 10 * tol
+        met = jnp.max(jnp.abs(matmul(scaled.A, scaled.x0) - scaled.b)) <= 10 * tol
         result = RESULTS.where(met, result, RESULTS.infeasible)  # pyright: ignore[reportArgumentType]
-    steps = jnp.zeros((), jnp.int32)
     if kept:
         pattern = tuple(pattern[i] for i in kept)
         # The loop is not differentiated: `attach_derivative` differentiates the equations of its solution.
@@ -222,29 +252,14 @@ def _solve(Q, q, G, h, A, b, cones, pattern: tuple[bytes | None, ...], tol: floa
         result = RESULTS.where(end.infeasible, RESULTS.infeasible, result)  # pyright: ignore[reportArgumentType]
     else:
         point = Point(-solve_cholesky(cholesky(program.Q), program.q), (), ())
-    result = RESULTS.where(is_definite(Q, cholesky(Q)), result, RESULTS.indefinite)  # pyright: ignore[reportArgumentType]
+    result = RESULTS.where(is_definite(scaled.Q, cholesky(scaled.Q)), result, RESULTS.indefinite)  # pyright: ignore[reportArgumentType]
     # Comparisons with NaN are false, and zeroed rows without a bound hide nonfinite entries, so finiteness is checked
     # separately.
     finite = finite & (jnp.isfinite(point.x).all() | (result != RESULTS.successful))
     result = RESULTS.where(finite, result, RESULTS.nonfinite)  # pyright: ignore[reportArgumentType]
-
-    # Projected again, because the iteration gives y = P y up to its tolerance only.
-    x = point.x if inverse is None else x0 + point.x - matmul(inverse, matmul(A, point.x))
-    z = [jnp.zeros_like(y) for y in levels]
-    s = [jnp.ones_like(y) for y in levels]
-    for i, slack, multiplier in zip(kept, point.s, point.z, strict=True):
-        s[i], z[i] = slack, multiplier
-    y = jnp.zeros_like(b)
-    if inverse is not None:
-        gradient = matmul(Q, x) + q
-        for block, multiplier in zip(blocks, z, strict=True):
-            gradient = gradient + jnp.einsum("kdn,kd->n", block, multiplier)
-        # The multipliers of least norm, of all that satisfy stationarity with dependent rows.
-        y = -matmul(inverse.T, gradient) * equality_scale * size
-    z = [x * r[:, None] * size for x, r in zip(z, row_scales, strict=True)]
-    s = [x / r[:, None] * size for x, r in zip(s, row_scales, strict=True)]
+    x, y, z, s = _unscale(scaled, point, kept)
     return QPSolution(
-        x=x * across * size,
+        x=x,
         multipliers=jnp.where(bounded, z[0][:, 0], 0),
         slack=jnp.where(bounded, s[0][:, 0], h),
         equality_multipliers=y,
@@ -253,3 +268,23 @@ def _solve(Q, q, G, h, A, b, cones, pattern: tuple[bytes | None, ...], tol: floa
         steps=steps,
         result=result,
     )
+
+
+def _unscale(scaled: _Scaled, point: Point, kept: list[int]):
+    """x, the multipliers y of the equality rows, and those, z, and the slack of each group of rows, in the units given."""
+    inverse, size = scaled.inverse, scaled.size
+    # Projected again, because the iteration gives y = P y up to its tolerance only.
+    x = point.x if inverse is None else scaled.x0 + point.x - matmul(inverse, matmul(scaled.A, point.x))
+    z, s = [jnp.zeros_like(y) for y in scaled.levels], [jnp.ones_like(y) for y in scaled.levels]
+    for i, slack, multiplier in zip(kept, point.s, point.z, strict=True):
+        s[i], z[i] = slack, multiplier
+    y = jnp.zeros_like(scaled.b)
+    if inverse is not None:
+        gradient = matmul(scaled.Q, x) + scaled.q
+        for block, multiplier in zip(scaled.blocks, z, strict=True):
+            gradient = gradient + jnp.einsum("kdn,kd->n", block, multiplier)
+        # The multipliers of least norm, of all that satisfy stationarity with dependent rows.
+        y = -matmul(inverse.T, gradient) * scaled.equality_scale * size
+    z = [x * r[:, None] * size for x, r in zip(z, scaled.row_scales, strict=True)]
+    s = [x / r[:, None] * size for x, r in zip(s, scaled.row_scales, strict=True)]
+    return x * scaled.across * size, y, z, s

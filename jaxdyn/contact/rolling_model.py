@@ -20,13 +20,14 @@ import numpy as np
 from jax import lax
 from jaxtyping import Array, Bool, Float, PyTree
 
+from jaxdyn._renamed import RenamedMethod
 from jaxdyn.compile import kernel
 from jaxdyn.compile.known import is_known
 from jaxdyn.constraints.frames import each, relative_motions, relative_poses
 from jaxdyn.constraints.loops import check_bodies
 from jaxdyn.contact.rolling import Rolling, RollingContact
 from jaxdyn.lie.so3 import matmul
-from jaxdyn.model.arguments import Checked, Number, Numbers, as_array, check_shapes, warn
+from jaxdyn.model.arguments import Checked, Number, Numbers, as_array, check_shapes
 from jaxdyn.model.tree import Model
 
 # Newton steps after a step of the integration; the second one makes the first derivatives exact.
@@ -103,10 +104,7 @@ class RollingModel(Model):
         """Contacts at their places in q."""
         return tuple(one.with_place(q[at]) for one, at in zip(self.contacts, self.place_slices, strict=True))
 
-    def placed(self, q: Float[Array, " nq"]) -> tuple[RollingContact, ...]:
-        """Deprecated name of `contacts_at`."""
-        warn("RollingModel.placed is deprecated; call contacts_at", DeprecationWarning)
-        return self.contacts_at(q)
+    placed = RenamedMethod("contacts_at")
 
     def place(self, joints: Numbers, near: Numbers | None = None) -> Float[Array, " nq"]:
         """Configuration q (nq,) for the joints' coordinates, with the closest points of the surfaces as places.

@@ -21,11 +21,12 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
+from jaxdyn._renamed import RenamedMethod
 from jaxdyn.compile import entry_point
 from jaxdyn.compile.known import is_concrete
 from jaxdyn.constraints.rolling import tangents, unit_or
 from jaxdyn.lie.so3 import cross, matmul
-from jaxdyn.model.arguments import Checked, Function, Numbers, warn
+from jaxdyn.model.arguments import Checked, Function, Numbers
 from jaxdyn.model.numbers import as_float, as_number
 from jaxdyn.systems.scene import as_pytree
 
@@ -61,10 +62,7 @@ class Surface(eqx.Module):
         """Place at `step` in a chart about `place`, with the orientation of f."""
         return place + step
 
-    def moved(self, place: Float[Array, " n"], step: Float[Array, "2"]) -> Float[Array, " n"]:
-        """Deprecated name of `displace`."""
-        warn("Surface.moved is deprecated; call displace", DeprecationWarning)
-        return self.displace(place, step)
+    moved = RenamedMethod("displace")
 
     def point_at(self, place: Float[Array, " n"]) -> Float[Array, "3"]:
         """Point of the surface, m, in the body's axes."""

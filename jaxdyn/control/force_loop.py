@@ -7,10 +7,11 @@ import equinox as eqx
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, PyTree
 
+from jaxdyn._renamed import RenamedMethod
 from jaxdyn.constraints.base import Constraint, constraint_jacobian, layout, rows
 from jaxdyn.control.errors import row_rank, target_rows
 from jaxdyn.control.gains import times
-from jaxdyn.model.arguments import Number, batch_hint, warn
+from jaxdyn.model.arguments import Number, batch_hint
 from jaxdyn.simulation.controls import Controller
 from jaxdyn.systems.scene import Scene
 
@@ -72,10 +73,7 @@ class ForceLoop(ForceIntegral):
             )
         return jnp.asarray(force, q.dtype)
 
-    def wanted_force(self, q: Float[Array, " nq"], t: Number) -> Float[Array, " nc"]:
-        """Deprecated name of `reference_force`."""
-        warn("wanted_force is deprecated; call reference_force", DeprecationWarning)
-        return self.reference_force(q, t)
+    wanted_force = RenamedMethod("reference_force")
 
     def force_command(self, q: Float[Array, " nq"], t: Number, state: PyTree) -> Float[Array, " nc"]:
         # The sign follows M a + h = tau + A^T lam: a reference multiplier is cancelled by the opposite torque.

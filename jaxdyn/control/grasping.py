@@ -17,6 +17,7 @@ import equinox as eqx
 import jax.numpy as jnp
 from jaxtyping import Array, Float, PyTree
 
+from jaxdyn._renamed import RenamedMethod
 from jaxdyn.constraints.base import Constraint, constraint_jacobian
 from jaxdyn.control.errors import Target, as_target, least_acceleration
 from jaxdyn.control.force_loop import ForceIntegral
@@ -26,7 +27,7 @@ from jaxdyn.grasp.forces import as_preload, split_forces
 from jaxdyn.grasp.hand import Grasp, check_grasp
 from jaxdyn.grasp.motions import velocity_rows
 from jaxdyn.lie.so3 import matmul
-from jaxdyn.model.arguments import Checked, Number, Numbers, batch_hint, warn
+from jaxdyn.model.arguments import Checked, Number, Numbers, batch_hint
 from jaxdyn.model.numbers import as_number
 from jaxdyn.systems.system import displacement
 
@@ -142,10 +143,7 @@ class GraspForce(ForceIntegral):
         # None in place of the integral: this is the reference itself, and not the command that corrects it.
         return self._forces(q, t, torque_for(self.scene, q, v, self.acceleration(q, v, t), t), None)
 
-    def wanted_forces(self, q: Float[Array, " nq"], v: Float[Array, " nv"], t: Number = 0.0) -> Float[Array, " nc"]:
-        """Deprecated name of `reference_forces`."""
-        warn("GraspForce.wanted_forces is deprecated; call reference_forces", DeprecationWarning)
-        return self.reference_forces(q, v, t)
+    wanted_forces = RenamedMethod("reference_forces")
 
     def __call__(
         self,

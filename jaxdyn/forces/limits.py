@@ -8,9 +8,10 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float
 
+from jaxdyn._renamed import RenamedMethod
 from jaxdyn.forces.elements import as_names, broadcast_leaf, joint_indices
 from jaxdyn.forces.piecewise import PiecewiseForce
-from jaxdyn.model.arguments import Checked, Number, Numbers, SystemLike, as_array, is_concrete, warn
+from jaxdyn.model.arguments import Checked, Number, Numbers, SystemLike, as_array, is_concrete
 from jaxdyn.model.joints import KINDS
 from jaxdyn.model.numbers import as_number
 from jaxdyn.model.tree import Model
@@ -148,12 +149,7 @@ class EffortLimits(eqx.Module):
             guards.insert(0, jnp.where(bounded, side * (tau - jnp.where(bounded, limit, 0.0)), -1.0))
         return jnp.concatenate(guards)
 
-    def limited(
-        self, system: SystemLike, tau: Float[Array, " nv"], positive: Bool[Array, " n"] | None = None
-    ) -> Float[Array, " nv"]:
-        """Deprecated name of `clip_effort`."""
-        warn("EffortLimits.limited is deprecated; call clip_effort", DeprecationWarning)
-        return self.clip_effort(system, tau, positive)
+    limited = RenamedMethod("clip_effort")
 
     def clip_effort(
         self,

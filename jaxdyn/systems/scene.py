@@ -12,8 +12,9 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, PyTree
 
+from jaxdyn._renamed import RenamedMethod
 from jaxdyn.compile.known import is_concrete
-from jaxdyn.model.arguments import Checked, Number, SystemLike, as_array, batch_hint, check_system, warn
+from jaxdyn.model.arguments import Checked, Number, SystemLike, as_array, batch_hint, check_system
 from jaxdyn.model.description import scene_lines
 from jaxdyn.systems.drives import DriveDynamics, pass_command
 
@@ -190,10 +191,7 @@ class Scene(eqx.Module):
             total = value if total is None else total + value
         return total
 
-    def limited(self, tau: Float[Array, " nv"]) -> Float[Array, " nv"]:
-        """Deprecated name of `clip_effort`."""
-        warn("Scene.limited is deprecated; call clip_effort", DeprecationWarning)
-        return self.clip_effort(tau)
+    limited = RenamedMethod("clip_effort")
 
     def clip_effort(self, tau: Float[Array, " nv"]) -> Float[Array, " nv"]:
         """Torques tau (nv,) clipped by the scene's `EffortLimits`."""

@@ -358,6 +358,12 @@ def test_public_namespaces_list_their_names():
         _ = jaxdyn.nonsense
 
 
+def test_old_names_of_methods_warn():
+    scene, tau = jaxdyn.Scene(jaxdyn.robots.chain(2)), jnp.ones(2)
+    with pytest.warns(DeprecationWarning, match="Scene.limited is deprecated; call clip_effort"):
+        np.testing.assert_array_equal(scene.limited(tau), scene.clip_effort(tau))
+
+
 def test_one_name_for_one_thing_and_one_thing_by_one_name():
     """A name in several namespaces is one object in all of them, but for what the Lie groups have in common."""
     rooms = [jaxdyn, *(room for name in jaxdyn.__all__ if isinstance(room := getattr(jaxdyn, name), ModuleType))]
