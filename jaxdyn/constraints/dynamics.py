@@ -258,7 +258,7 @@ def _min_norm_solution(Y, deficit, rank_tol):
 def _by_schur(scene: Scene, q, v, tau, t, *, method: str) -> ConstrainedDynamics:
     """Dynamics with independent rows, by the Cholesky factor of A M^-1 A^T."""
     by_tree = method == "range_space" and isinstance(scene.system, Model)
-    a, lam, independent, is_definite = kernel(_by_articulated_bodies if by_tree else _by_delassus)(scene, q, v, tau, t)
+    a, lam, independent, is_definite = kernel(_by_aba if by_tree else _by_delassus)(scene, q, v, tau, t)
     result = RESULTS.where(independent, RESULTS.successful, RESULTS.dependent_rows)  # pyright: ignore[reportArgumentType]
     result = RESULTS.where(is_definite, result, RESULTS.singular_mass_matrix)
     rank = jnp.asarray(lam.shape[0], jnp.int32)
@@ -272,7 +272,7 @@ def _by_delassus(scene: Scene, q, v, tau, t):
     return metric.unwhiten(free + matmul(Y, lam)), lam, independent, metric.is_definite()
 
 
-def _by_articulated_bodies(scene: Scene, q, v, tau, t):
+def _by_aba(scene: Scene, q, v, tau, t):
     """`_by_delassus` without M: a0 and X = M^-1 A^T from one articulated-body factorisation, a = a0 + X lam.
 
     Here `free` is a0 itself, without whitening.

@@ -54,7 +54,7 @@ def solve_planar(one, other, right):
     ) / determinant
 
 
-def two_link_leg(base, length, end, velocity, elbow=1):
+def two_link_leg(base, length, end, velocity, elbow: Number = 1):
     """Angles of a leg of two links of one length, the second relative to the first, and their rates for a velocity of its end.
 
     The `elbow` is to the left of the line from the base to the end for +1, to the right for -1.

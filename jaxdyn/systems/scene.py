@@ -53,7 +53,7 @@ class _Closure(eqx.Module):
         return new(*args)
 
 
-def _bind_traced(function: types.FunctionType, callers: tuple[types.FunctionType, ...] = ()) -> _Closure | None:
+def _bind_tracers(function: types.FunctionType, callers: tuple[types.FunctionType, ...] = ()) -> _Closure | None:
     """The function as a pytree of the traced values it captures, also in functions that it captures; None without any."""
     captured = {}
     for i, cell in enumerate(function.__closure__ or ()):
@@ -64,7 +64,7 @@ def _bind_traced(function: types.FunctionType, callers: tuple[types.FunctionType
         if isinstance(content, types.FunctionType):
             # Functions may call each other: what they capture is found once.
             known = (*callers, function)
-            value = None if any(content is x for x in known) else _bind_traced(content, known)
+            value = None if any(content is x for x in known) else _bind_tracers(content, known)
         else:
             value = None if is_concrete(content) else eqx.filter(content, lambda leaf: not is_concrete(leaf))
         if value is not None:
@@ -107,7 +107,7 @@ def as_pytree(function: Any, argument: str, takes: str = "") -> Callable:
             f"compiled program; make it an equinox Module (class {kind}(eqx.Module): with a field for each of them), or pass a "
             "new function for new values"
         )
-    bound = _bind_traced(function) if isinstance(function, types.FunctionType) else None
+    bound = _bind_tracers(function) if isinstance(function, types.FunctionType) else None
     return _Static(function) if bound is None else bound
 
 
