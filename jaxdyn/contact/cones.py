@@ -22,6 +22,7 @@ from jax.nn import logsumexp
 from jaxtyping import Array, Float
 
 from jaxdyn.contact.kinds import components
+from jaxdyn.lie.series import safe_sqrt
 from jaxdyn.lie.so3 import matmul
 from jaxdyn.model.arguments import Numbers
 from jaxdyn.model.numbers import as_float, as_number
@@ -168,8 +169,7 @@ def _length(parts, smoothing):
     square = jnp.sum(jnp.stack(parts) ** 2)
     if not _is_zero(smoothing):
         square = square + jnp.asarray(smoothing, square.dtype) ** 2
-    safe = square > 0
-    return jnp.where(safe, jnp.sqrt(jnp.where(safe, square, jnp.ones_like(square))), jnp.zeros_like(square))
+    return safe_sqrt(square)
 
 
 def friction_cone(

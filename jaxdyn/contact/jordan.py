@@ -10,6 +10,8 @@ from typing import NamedTuple
 
 import jax.numpy as jnp
 
+from jaxdyn.lie.series import safe_sqrt
+
 
 def identity(like):
     """Identity e = (1, 0, ...) of the Jordan algebra of each cone, (k, d)."""
@@ -20,10 +22,7 @@ def _norm(rest):
     """Norm |rest| along the last axis, with zero derivative where it vanishes."""
     if rest.shape[-1] == 0:
         return jnp.zeros(rest.shape[:-1], rest.dtype)
-    # The inner `where` matters for derivatives: 0 times the infinite derivative of the root would be NaN.
-    square = jnp.sum(rest * rest, -1)
-    safe = square > 0
-    return jnp.where(safe, jnp.sqrt(jnp.where(safe, square, jnp.ones_like(square))), jnp.zeros_like(square))
+    return safe_sqrt(jnp.sum(rest * rest, -1))
 
 
 def boundary_distance(v):

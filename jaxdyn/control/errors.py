@@ -24,6 +24,7 @@ from jaxdyn.dynamics.centroidal import center_of_mass
 from jaxdyn.dynamics.kinematics import frame_pose
 from jaxdyn.dynamics.quantities import mass_matrix
 from jaxdyn.lie import so3
+from jaxdyn.lie.series import safe_sqrt
 from jaxdyn.lie.so3 import matmul
 from jaxdyn.model.arguments import Number, Numbers, as_array, batch_hint
 from jaxdyn.model.names import frame_index
@@ -221,10 +222,7 @@ def regularity(system, q, t, A, T) -> Float[Array, ""]:
         least.append(square / jnp.where(sizes[i] > 0, sizes[i], jnp.ones_like(square)))
         unit = row / jnp.sqrt(jnp.where(some, square, jnp.ones_like(square)))
         free[i + 1 :] = [other - jnp.sum(unit * other) * unit for other in free[i + 1 :]]
-    smallest = jnp.min(jnp.stack(least))
-    # The square root has an infinite derivative at zero. The inner `where` keeps NaN out of the gradient.
-    some = smallest > 0
-    return jnp.where(some, jnp.sqrt(jnp.where(some, smallest, jnp.ones_like(smallest))), jnp.zeros_like(smallest))
+    return safe_sqrt(jnp.min(jnp.stack(least)))
 
 
 def row_rank(matrix: Float[Array, "m n"]) -> Array:

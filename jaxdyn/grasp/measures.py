@@ -14,6 +14,7 @@ from jaxdyn.compile import entry_point, gram_eigenvectors
 from jaxdyn.constraints.base import constraint_jacobian
 from jaxdyn.grasp.hand import Grasp, check_grasp
 from jaxdyn.grasp.motions import HandMotions, hand_motions, velocity_rows
+from jaxdyn.lie.series import safe_sqrt
 from jaxdyn.lie.so3 import matmul
 from jaxdyn.model.arguments import Numbers, check_state
 from jaxdyn.model.numbers import as_number
@@ -116,8 +117,7 @@ def _measure(grasp: Grasp, motions: HandMotions, q, length, t) -> Manipulability
 def _axes(X: Float[Array, "n m"]) -> tuple[Float[Array, " m"], Float[Array, "m m"]]:
     """Singular values |X v_i| of X, largest first, and the right vectors v_i."""
     square, vectors = gram_eigenvectors(X)
-    some = square > 0
-    return jnp.where(some, jnp.sqrt(jnp.where(some, square, jnp.ones_like(square))), jnp.zeros_like(square)), vectors
+    return safe_sqrt(square), vectors
 
 
 def _scale(grasp: Grasp, length) -> Float[Array, " no"]:

@@ -110,3 +110,10 @@ def angle_ratio(n2: Scalar, w: Scalar) -> Scalar:
     n_large = jnp.sqrt(jnp.where(small, 1.0, n2))
     far = 2.0 * jnp.arctan2(n_large, jnp.where(small, 1.0, w)) / n_large
     return jnp.where(small, near, far)
+
+
+def safe_sqrt(square: Array) -> Array:
+    """Square root of numbers that are not negative, with a derivative of zero, in place of an infinite one, at zero."""
+    # The inner `where` matters for derivatives: 0 times the infinite derivative of the root would be NaN.
+    some = square > 0
+    return jnp.where(some, jnp.sqrt(jnp.where(some, square, jnp.ones_like(square))), jnp.zeros_like(square))
