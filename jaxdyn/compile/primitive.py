@@ -70,6 +70,9 @@ def _batch(args, axes, *, program, rows):
             x = jnp.broadcast_to(x.reshape(size, *[1] * len(inner), x.shape[-1]), (size, *inner, x.shape[-1]))
         full.append(x)
     rows += mode.is_row() and not mode.is_expanding()
+    if program.turns > 1 and not mode.is_expanding() and target is not None and jax.default_backend() == "cpu":
+        # A loop is the main part of a program: LLVM works on it while Python traces on.
+        target.publish_ahead(program, target.width_of(program, size))
     results = kernel_p.bind(*full, program=program, rows=rows)
     return results, [0] * len(results)
 
@@ -210,7 +213,7 @@ def _lower_to_call(ctx, *operands, program, rows):
         width = target.width_of(program, samples)
         # A loop is the main part of a program and certain to be called: LLVM works on it while XLA compiles the rest. Another
         # kernel of the same width continues a run whose step has needed the fallback.
-        is_certain = program.turns > 1 and all(key[1] != width for key in program.derived)
+        is_certain = program.turns > 1 and all(key[:2] != ("kernel", width) for key in program.derived)
         number = target.kernel(program, width, uniform)
     except target.Unsupported as reason:  # pyright: ignore[reportOptionalMemberAccess]
         mode.say_once(f"functions run on JAX's own operations: {reason}")

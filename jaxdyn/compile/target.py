@@ -184,6 +184,20 @@ def make_ahead(number: int) -> None:
         ahead.make_later(made.address)
 
 
+def publish_ahead(program, width: int) -> None:
+    """Let another thread make the subprograms of a loop, whichever of its operands all samples share."""
+    key = ("ahead", width)
+    if key not in program.derived:
+        program.derived[key] = True
+
+        def make() -> None:
+            for called in program.subprograms:
+                with _making:
+                    _publish(called, width)
+
+        ahead.make_later(make)
+
+
 def _publish(called: Program, width: int) -> None:
     """Compile a subprogram where that has not been done."""
     symbol = symbol_of(called, width)

@@ -211,8 +211,11 @@ def _advance_by_kernel(plan: Plan, control, args, limits: Limits, state: State, 
 def _advance_by_fallback(plan: Plan, control, args, limits: Limits, state: State, active):
     """State after a step that the native loop has refused, for every trajectory that is active."""
     none, stages = jnp.zeros_like(state.y), jnp.zeros((plan.count, state.y.size), state.y.dtype)
-    unchanged = state, jnp.zeros_like(active), Step(none, none, none, none, stages, none)
-    return compute_where(active, partial(_advance, plan, control), unchanged, (args, limits, state, active))
+    ends = state.t, state.t_next, state.y, state.rate
+    step = compute_where(active, partial(take_step, plan), Step(none, none, none, none, stages, none), (args, *ends))
+    # The step alone is what a program cannot compute. XLA would compile the decision about it for longer than it runs.
+    accept: Any = kernel(_accept, static=2, derivative=False)
+    return *accept(plan, control, args, limits, state, active, step), step
 
 
 def _accept(plan: Plan, control, args, limits: Limits, state: State, active, step: Step) -> tuple[State, Array]:

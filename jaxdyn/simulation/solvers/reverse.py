@@ -224,8 +224,14 @@ def _iterate_by_fallback(plan: Plan, times_move, structure, args, ends: _Ends, g
 
 
 def _iterate_by(pull, times_move, ends: _Ends, given: Given, carry: Carry) -> Carry:
-    after = _go_back(pull, times_move, ends, carry.state, _read(given, carry.state.places))
-    return Carry(jax.tree.map(lambda new, old: jnp.where(after.active, new, old), after.state, carry.state))
+    read = _read(given, carry.state.places)
+    back = pull(*kernel(_asked, derivative=False)((), ends, carry.state, read))
+    return Carry(kernel(_add_if_active, static=1, derivative=False)(times_move, (), ends, carry.state, read, back))
+
+
+def _add_if_active(times_move, _, ends: _Ends, cotangents: _Cotangents, read, back) -> _Cotangents:
+    after = _add(times_move, ends, cotangents, read, back)
+    return jax.tree.map(lambda new, old: jnp.where(after.active, new, old), after.state, cotangents)
 
 
 def _loop_back(plan: Plan, times_move, structure, args, ends: _Ends, given: Given, carry: Carry) -> Carry:
@@ -235,21 +241,37 @@ def _loop_back(plan: Plan, times_move, structure, args, ends: _Ends, given: Give
 
 def _go_back(pull, times_move: bool, ends: _Ends, cotangents: _Cotangents, read) -> Iteration:
     """Add the cotangents of a step, pull(t0, t1, y, at, after, row), and choose what follows."""
-    y, (t0, t1), kept, row, at_row, at_next = read
-    step, active = cotangents.places[1], cotangents.places[1] >= ends.first
-    kept = kept & active
+    return _add(times_move, ends, cotangents, read, pull(*_asked((), ends, cotangents, read)))
 
-    def when(flag, x):
-        return jnp.where(flag, x, jnp.zeros_like(x))
 
+def _asked(_, ends: _Ends, cotangents: _Cotangents, read):
+    """Arguments of `pull`: the step, the time of a row within it, and the cotangents of its end and of the row."""
+    y, (t0, t1), kept, row, at_row, _ = read
+    kept, here = _flags(ends, cotangents, read)
+    return t0, t1, y, jnp.where(here, at_row, t1), _when(kept, cotangents.after), _when(here, row)
+
+
+def _flags(ends: _Ends, cotangents: _Cotangents, read):
+    """Whether the step was kept, and whether there is a row within it."""
+    _, (t0, _), kept, _, at_row, _ = read
+    kept = kept & (cotangents.places[1] >= ends.first)
     # A step with several rows is visited once for each: the last visit adds the cotangent of its end.
-    here = kept & (cotangents.saved > 0) & (at_row > t0)
-    row, after = when(here, row), when(kept, cotangents.after)
-    at = jnp.where(here, at_row, t1)
+    return kept, kept & (cotangents.saved > 0) & (at_row > t0)
+
+
+def _when(flag, x):
+    return jnp.where(flag, x, jnp.zeros_like(x))
+
+
+def _add(times_move: bool, ends: _Ends, cotangents: _Cotangents, read, back) -> Iteration:
+    """Add the cotangents of a step, and choose what follows."""
+    step, active = cotangents.places[1], cotangents.places[1] >= ends.first
+    t0, t1, _, _, after, row = _asked((), ends, cotangents, read)
+    kept, here = _flags(ends, cotangents, read)
+    at_next = read[-1]
     # What nothing depends on gets nothing, even where a step has no derivative.
     asked = kept & ((after != 0).any() | (row != 0).any())
-    back = jax.tree.map(lambda x: when(asked, x), pull(t0, t1, y, at, after, row))
-    of_args, of_y, of_t0, of_t1, of_at = back
+    of_args, of_y, of_t0, of_t1, of_at = jax.tree.map(lambda x: _when(asked, x), back)
     from_start, to_end = (step_share(i, t, ends.end, ends.steps) for i, t in ((step, t0), (step + 1, t1)))
     saved = cotangents.saved - here.astype(jnp.int32)
     again = here & (saved > 0) & (at_next > t0)
@@ -257,11 +279,11 @@ def _go_back(pull, times_move: bool, ends: _Ends, cotangents: _Cotangents, read)
     following = jnp.where(again, step, step - 1)
     state = _Cotangents(
         jnp.where(again, jnp.zeros_like(before), jnp.where(kept, before, cotangents.after)),
-        when(again, before),
+        _when(again, before),
         [total + x for total, x in zip(cotangents.args, of_args, strict=True)],
         cotangents.start + of_t0 * (1 - from_start) + of_t1 * (1 - to_end),
         cotangents.end + of_t0 * from_start + of_t1 * to_end,
-        cotangents.ts.at[cotangents.saved].add(when(here, of_at)) if times_move else cotangents.ts,
+        cotangents.ts.at[cotangents.saved].add(_when(here, of_at)) if times_move else cotangents.ts,
         saved,
         _places(following, step - cotangents.places[0], saved),
     )
