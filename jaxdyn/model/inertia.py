@@ -12,7 +12,7 @@ from jax import dtypes as _dtypes
 from jaxtyping import Array, Float
 
 from jaxdyn.compile import kernel
-from jaxdyn.compile.known import array_namespace as _numpy_for
+from jaxdyn.compile.known import array_namespace
 from jaxdyn.lie import so3
 from jaxdyn.model import float64 as _f64
 from jaxdyn.model.arguments import Checked, Number, Numbers, Row
@@ -26,7 +26,7 @@ def _check_shapes(**given) -> None:
     """Refuse arguments whose shapes differ from the expected ones, given with them by name."""
     for name, (value, want) in given.items():
         # Rows may be tuples of traced numbers, whose shape numpy cannot ask for.
-        shape = np.shape(_numpy_for(value).asarray(value))
+        shape = np.shape(array_namespace(value).asarray(value))
         if shape != want:
             shapes = ", ".join(f"{other} {size}" for other, (_, size) in given.items())
             raise ValueError(f"{name} has shape {shape}, expected {shapes}")
@@ -247,11 +247,11 @@ def displaced(parameters: Numbers, position: Numbers, rotation: Numbers | None =
     rotation = np.eye(3) if rotation is None else rotation
     _check_shapes(parameters=(parameters, (10,)), position=(position, (3,)), rotation=(rotation, (3, 3)))
     pose = _f64.pose_of(rotation, position)
-    return _f64.move_inertia(pose, _numpy_for(parameters).asarray(parameters, float))
+    return _f64.move_inertia(pose, array_namespace(parameters).asarray(parameters, float))
 
 
 def _from_moments(mass, moments) -> Array | np.ndarray:
-    xp = _numpy_for(mass, moments)
+    xp = array_namespace(mass, moments)
     return xp.asarray([mass, 0.0, 0.0, 0.0, moments[0], 0.0, moments[1], 0.0, 0.0, moments[2]], float)
 
 
@@ -277,3 +277,7 @@ __all__ = [
     "to_log_cholesky",
     "transform_inertia",
 ]
+
+
+def __dir__() -> list[str]:
+    return __all__
