@@ -146,17 +146,16 @@ def pull(plan: Plan, history: History, y0, args, ts, steps, rows, varies) -> tup
         ends = _Ends(first, ts[0], ts[-1], steps)
         cotangents = cotangents._replace(places=_places(last - 1, first, cotangents.saved))
         given = Given(None, (states, history.times, history.kept, rows, ts, ts))
-        task = Task(_iterate_back, _loop_back, static)
         args = *static, (fixed, free_leaves), ends, given
         once, by_fallback = partial(_iterate_back_in_jax, *args), partial(_iterate_by_fallback, *args)
-        run = partial(run_loop, task, (fixed, free_leaves), ends, given)
+        run = partial(run_loop, Task(_iterate_back, _loop_back, static), (fixed, free_leaves), ends, given)
         return run_to_end(run, once, by_fallback, partial(_is_running, ends), Carry(cotangents)).state
 
     def replay(first, last, y):
         """States from which the steps first .. last - 1 begin, (stride, n), the first of them y."""
         given = Given(None, (history.times, history.kept))
-        task = Task(_iterate_replay, _replay_in_jax, (plan,), strides=(1,))
         carry = Carry(_Replay(y, jnp.stack([first, first])), records=(jnp.zeros((stride, y.size), y.dtype),))
+        task = Task(_iterate_replay, _replay_in_jax, (plan,), strides=(1,))
         after = run_loop(task, args, (first, last), given, carry)
         carry, always_ends = (carry, False) if after is None else after
         return (carry if always_ends else _replay_in_jax(plan, args, (first, last), given, carry)).records[0]
@@ -202,8 +201,8 @@ def _read(given: Given, places):
 
 def _iterate_back(plan: Plan, times_move, structure, args, ends: _Ends, cotangents: _Cotangents, read) -> Iteration:
     """Go back through a step, or to the next row within it."""
-    pull = partial(_pull_without_loop, plan, times_move, structure, *args)
-    return _go_back(pull, times_move, ends, cotangents, read)
+    back = partial(_pull_without_loop, plan, times_move, structure, *args)(*_asked((), ends, cotangents, read))
+    return _add(times_move, (), ends, cotangents, read, back)
 
 
 def _iterate_back_in_jax(plan: Plan, times_move, structure, args, ends: _Ends, given: Given, carry: Carry) -> Carry:
@@ -225,13 +224,10 @@ def _iterate_by_fallback(plan: Plan, times_move, structure, args, ends: _Ends, g
 
 def _iterate_by(pull, times_move, ends: _Ends, given: Given, carry: Carry) -> Carry:
     read = _read(given, carry.state.places)
+    # Kernels around what a program cannot compute: XLA would compile their operations for longer than they run.
     back = pull(*kernel(_asked, derivative=False)((), ends, carry.state, read))
-    return Carry(kernel(_add_if_active, static=1, derivative=False)(times_move, (), ends, carry.state, read, back))
-
-
-def _add_if_active(times_move, _, ends: _Ends, cotangents: _Cotangents, read, back) -> _Cotangents:
-    after = _add(times_move, ends, cotangents, read, back)
-    return jax.tree.map(lambda new, old: jnp.where(after.active, new, old), after.state, cotangents)
+    after = kernel(_add, static=1, derivative=False)(times_move, (), ends, carry.state, read, back)
+    return Carry(jax.tree.map(lambda new, old: jnp.where(after.active, new, old), after.state, carry.state))
 
 
 def _loop_back(plan: Plan, times_move, structure, args, ends: _Ends, given: Given, carry: Carry) -> Carry:
@@ -239,39 +235,28 @@ def _loop_back(plan: Plan, times_move, structure, args, ends: _Ends, given: Give
     return lax.while_loop(partial(_is_running, ends), once, carry)
 
 
-def _go_back(pull, times_move: bool, ends: _Ends, cotangents: _Cotangents, read) -> Iteration:
-    """Add the cotangents of a step, pull(t0, t1, y, at, after, row), and choose what follows."""
-    return _add(times_move, ends, cotangents, read, pull(*_asked((), ends, cotangents, read)))
-
-
 def _asked(_, ends: _Ends, cotangents: _Cotangents, read):
-    """Arguments of `pull`: the step, the time of a row within it, and the cotangents of its end and of the row."""
-    y, (t0, t1), kept, row, at_row, _ = read
+    """The last arguments of `_pull_step`."""
+    y, (t0, t1), _, row, at_row, _ = read
     kept, here = _flags(ends, cotangents, read)
-    return t0, t1, y, jnp.where(here, at_row, t1), _when(kept, cotangents.after), _when(here, row)
+    return t0, t1, y, jnp.where(here, at_row, t1), jnp.where(kept, cotangents.after, 0.0), jnp.where(here, row, 0.0)
 
 
 def _flags(ends: _Ends, cotangents: _Cotangents, read):
     """Whether the step was kept, and whether there is a row within it."""
-    _, (t0, _), kept, _, at_row, _ = read
-    kept = kept & (cotangents.places[1] >= ends.first)
+    kept = read[2] & (cotangents.places[1] >= ends.first)
     # A step with several rows is visited once for each: the last visit adds the cotangent of its end.
-    return kept, kept & (cotangents.saved > 0) & (at_row > t0)
+    return kept, kept & (cotangents.saved > 0) & (read[4] > read[1][0])
 
 
-def _when(flag, x):
-    return jnp.where(flag, x, jnp.zeros_like(x))
-
-
-def _add(times_move: bool, ends: _Ends, cotangents: _Cotangents, read, back) -> Iteration:
-    """Add the cotangents of a step, and choose what follows."""
+def _add(times_move: bool, _, ends: _Ends, cotangents: _Cotangents, read, back) -> Iteration:
+    """Add the cotangents `back` of a step, and choose what follows."""
     step, active = cotangents.places[1], cotangents.places[1] >= ends.first
     t0, t1, _, _, after, row = _asked((), ends, cotangents, read)
-    kept, here = _flags(ends, cotangents, read)
-    at_next = read[-1]
+    (kept, here), at_next = _flags(ends, cotangents, read), read[-1]
     # What nothing depends on gets nothing, even where a step has no derivative.
     asked = kept & ((after != 0).any() | (row != 0).any())
-    of_args, of_y, of_t0, of_t1, of_at = jax.tree.map(lambda x: _when(asked, x), back)
+    of_args, of_y, of_t0, of_t1, of_at = jax.tree.map(lambda x: jnp.where(asked, x, 0.0), back)
     from_start, to_end = (step_share(i, t, ends.end, ends.steps) for i, t in ((step, t0), (step + 1, t1)))
     saved = cotangents.saved - here.astype(jnp.int32)
     again = here & (saved > 0) & (at_next > t0)
@@ -279,11 +264,11 @@ def _add(times_move: bool, ends: _Ends, cotangents: _Cotangents, read, back) -> 
     following = jnp.where(again, step, step - 1)
     state = _Cotangents(
         jnp.where(again, jnp.zeros_like(before), jnp.where(kept, before, cotangents.after)),
-        _when(again, before),
+        jnp.where(again, before, 0.0),
         [total + x for total, x in zip(cotangents.args, of_args, strict=True)],
         cotangents.start + of_t0 * (1 - from_start) + of_t1 * (1 - to_end),
         cotangents.end + of_t0 * from_start + of_t1 * to_end,
-        cotangents.ts.at[cotangents.saved].add(_when(here, of_at)) if times_move else cotangents.ts,
+        cotangents.ts.at[cotangents.saved].add(jnp.where(here, of_at, 0.0)) if times_move else cotangents.ts,
         saved,
         _places(following, step - cotangents.places[0], saved),
     )
