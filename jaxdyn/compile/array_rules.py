@@ -11,6 +11,7 @@ import math
 import numpy as np
 
 from jaxdyn.compile import matrices
+from jaxdyn.compile.constants import convert_known
 from jaxdyn.compile.number import as_objects, objects
 from jaxdyn.compile.program import NotNumbers, as_kind, kind_or_refuse
 from jaxdyn.compile.rearrange import scatter_places
@@ -31,6 +32,18 @@ def integer_pow(expansion, params, args, eqn):
         return [np.asarray(args[0] ** params["y"] if params["y"] >= 0 else 1 / args[0] ** -params["y"], args[0].dtype)]
     one = as_kind(1, kind_or_refuse(eqn.outvars[0].aval.dtype))
     return [objects([expansion.graph.power(x, params["y"], one) for x in args[0].ravel().tolist()], args[0].shape)]  # pyright: ignore[reportArgumentType]
+
+
+def convert(expansion, params, args, eqn):
+    """Conversion to another dtype."""
+    return [_as_dtype(expansion, args[0], params["new_dtype"])]
+
+
+def _as_dtype(expansion, x: np.ndarray, dtype) -> np.ndarray:
+    if x.dtype.kind != "O":
+        return convert_known(x, dtype)
+    kind = kind_or_refuse(dtype)
+    return objects([expansion.graph.convert(y, kind) for y in x.ravel().tolist()], x.shape)
 
 
 def select(expansion, params, args, eqn):
@@ -75,7 +88,7 @@ def dot_general(expansion, params, args, eqn):
         count, columns, length
     )
     # The result may have a wider type than the operands (`preferred_element_type`); then the sums are in that type.
-    a, b = (expansion.as_dtype(x, out.dtype) for x in (a, b))
+    a, b = (_as_dtype(expansion, x, out.dtype) for x in (a, b))
     if out.dtype == bool:
         raise NotNumbers("a product of bools")
     if a.dtype.kind != "O" and b.dtype.kind != "O":

@@ -15,7 +15,7 @@ import numpy as np
 
 from jaxdyn.compile import array_rules, mode
 from jaxdyn.compile import program as numbers
-from jaxdyn.compile.constants import bind_known, convert_known, empty_reduction, evaluate_known
+from jaxdyn.compile.constants import bind_known, empty_reduction, evaluate_known
 from jaxdyn.compile.derive import without_unread
 from jaxdyn.compile.graph import Graph
 from jaxdyn.compile.jax_adapter import ClosedJaxpr, Literal, Tracer, scan_counts  # pyright: ignore[reportPrivateImportUsage]
@@ -213,16 +213,6 @@ class _Expansion:
         chosen = [self.graph.select(flag, x, math.nan, kind) for flag, x in zip(flags, entries, strict=True)]
         return [objects(chosen, args[1].shape)]
 
-    def _convert(self, params, args, eqn):
-        return [self.as_dtype(args[0], params["new_dtype"])]
-
-    def as_dtype(self, x: np.ndarray, dtype) -> np.ndarray:
-        """An array, known or not, as one of a dtype."""
-        if x.dtype.kind != "O":
-            return convert_known(x, dtype)
-        kind = kind_or_refuse(dtype)
-        return objects([self.graph.convert(y, kind) for y in x.ravel().tolist()], x.shape)
-
     def _scan(self, params, args, eqn):
         count, carried = scan_counts(params)
         consts, carry, rows = args[:count], args[count : count + carried], args[count + carried :]
@@ -346,7 +336,7 @@ _OTHER: dict[str, Callable] = {
     "copy": _Expansion._same,
     "optimization_barrier": _Expansion._same,
     "pvary": _Expansion._same,
-    "convert_element_type": _Expansion._convert,
+    "convert_element_type": array_rules.convert,
     "integer_pow": array_rules.integer_pow,
     "select_n": array_rules.select,
     "clamp": array_rules.clamp,

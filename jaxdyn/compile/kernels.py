@@ -189,7 +189,7 @@ def evaluate(function: Callable, tree, *args, static: tuple = (), is_input: bool
     that takes the tree as an argument: it is the same kernel then.
     """
     leaves, structure = jax.tree.flatten(args)
-    inputs, known = partition(tree, lambda leaf: is_input and isinstance(leaf, jax.Array))
+    inputs, known = partition(tree, jax.Array if is_input else ())
     leaves = [np.asarray(x) for x in (*inputs, *leaves)]
     leaves = [x.astype(jax.dtypes.canonicalize_dtype(x.dtype)) for x in leaves]
     if mode.current() != "plain" and target is not None:

@@ -15,7 +15,7 @@ import jax.numpy as jnp
 from jax import lax
 
 from jaxdyn.compile import ahead, derive, jax_adapter, mode, sharding
-from jaxdyn.compile.jax_adapter import define_primitive, is_linear, is_zero, lower_function, zero_tangent
+from jaxdyn.compile.jax_adapter import define_primitive, is_linear, is_zero, lowering_of, zero_tangent
 from jaxdyn.compile.operations import as_operations, by_jax
 from jaxdyn.compile.program import NotNumbers, Program, TooLong
 from jaxdyn.compile.shared import split_program
@@ -191,7 +191,7 @@ def _lower_on_cpu(ctx, *operands, program, rows):
     except Exception as error:
         if not jax_adapter.forgive(error):
             raise
-        return lower_function(by_jax, ctx, *operands, program=program, rows=rows)
+        return lowering_of(by_jax)(ctx, *operands, program=program, rows=rows)
 
 
 def _lower_to_call(ctx, *operands, program, rows):
@@ -200,11 +200,11 @@ def _lower_to_call(ctx, *operands, program, rows):
     uniform = [bool(lead) and len(x.shape) == 1 for x in ctx.avals_in]
     if any(uniform) and not all(uniform) and len(lead) == rows:
         # Rows go through the kernel of one sample, which is compiled already and has no notion of shared operands.
-        return lower_function(_broadcast_rows, ctx, *operands, program=program, rows=rows)
+        return lowering_of(_broadcast_rows)(ctx, *operands, program=program, rows=rows)
     batch = lead[: len(lead) - rows]
     samples = math.prod(batch) if all(isinstance(n, int) for n in batch) else None  # `jax.export` has symbolic sizes
     if samples != 1 and target is not None and target.is_available() and split_program(program, uniform) is not None:
-        return lower_function(_call_in_two, ctx, *operands, program=program, rows=rows)
+        return lowering_of(_call_in_two)(ctx, *operands, program=program, rows=rows)
     try:
         assert target is not None
         width = target.width_of(program, samples)
@@ -214,11 +214,11 @@ def _lower_to_call(ctx, *operands, program, rows):
         number = target.kernel(program, width, uniform)
     except target.Unsupported as reason:  # pyright: ignore[reportOptionalMemberAccess]
         mode.say_once(f"functions run on JAX's own operations: {reason}")
-        return lower_function(as_operations, ctx, *operands, program=program, rows=rows)
+        return lowering_of(as_operations)(ctx, *operands, program=program, rows=rows)
     if is_certain:
         target.make_ahead(number)
     if sharding.is_divisible(ctx.avals_in, lead):
-        return lower_function(_with_last_axis, ctx, *operands, program=program, rows=rows and rows + 1)
+        return lowering_of(_with_last_axis)(ctx, *operands, program=program, rows=rows and rows + 1)
     order = target.varying_first(uniform)
     attributes = functools.partial(sharding.attributes, [ctx.avals_in[i] for i in order], ctx.avals_out)
     return jax_adapter.lower_call(target.TARGET, ctx, operands, order, attributes(), program=number)
