@@ -12,12 +12,13 @@ reversals, the choice between them decides their values and no interval shows it
 """
 
 from collections.abc import Callable, Sequence
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 
 from jaxdyn.identify.condensed import Blocks, condense_rows, pad_triangle
-from jaxdyn.identify.interior import LOG_CHOLESKY_BASIS, LinearChart, Minimum, TorqueProblem, newton
+from jaxdyn.identify.descent import Watch, descend
+from jaxdyn.identify.interior import LOG_CHOLESKY_BASIS, InteriorPoint, LinearChart, TorqueProblem
 from jaxdyn.identify.logs import Log, root_mean_square
 from jaxdyn.identify.regression import (
     BaseParameters,
@@ -76,6 +77,23 @@ class Data(NamedTuple):
         return np.array(result, int)
 
 
+class Minimum(NamedTuple):
+    """Minimum by `minimize_torque_error`: `origin` (bodies, 4, 4) and `terms` (n,) of the chart, losses, and the result."""
+
+    origin: np.ndarray
+    terms: np.ndarray
+    history: np.ndarray
+    result: Any
+
+
+def minimize_torque_error(
+    problem: TorqueProblem, steps: int, tolerance: float, callback: Callable | None = None
+) -> Minimum:
+    """Minimise by `InteriorPoint` from the start of the chart; `callback(step, loss, (origin, terms))` before each step."""
+    end = descend(InteriorPoint(problem, tolerance), problem.chart.start, Watch(steps, callback))
+    return Minimum(*end.last.point, end.history, end.result)
+
+
 class Estimate(NamedTuple):
     """Result of `fit_blocks`: all parameters x, the torque noise, and the minimum in the chart."""
 
@@ -129,7 +147,7 @@ def fit_blocks(
 ) -> Estimate:
     """Fit all blocks, or those that `rows` and `count` of `Blocks` were given for; `is_rough` for a comparison of settings.
 
-    `sizes` as of `signal_sizes`, `callback` as of `newton`.
+    `sizes` as of `signal_sizes`, `callback` as of `minimize_torque_error`.
 
     **Raises:** ValueError for logs with torques of zero alone, or with fewer of them than unknowns.
     """
@@ -152,7 +170,7 @@ def fit_blocks(
     # Noise-free logs stay well posed by a small share of the torque.
     sigma = max(float(sigma), _FINEST * float(np.sqrt(np.mean(sizes[0] ** 2))))
     problem = TorqueProblem.of(chart, condensed, sigma, setting.prior)
-    minimum = newton(problem, _STEPS, _ROUGH if is_rough else _FINE, callback)
+    minimum = minimize_torque_error(problem, _STEPS, _ROUGH if is_rough else _FINE, callback)
     # Interior points never reach a bound. Exact zeros let `intervals` recognise the terms that are held there.
     minimum = minimum._replace(terms=chart.clip_terms(minimum.terms))
     x = np.zeros(size)

@@ -1,6 +1,8 @@
 """Logs of a robot's fit, with the weights and loads that are updated between fits."""
 
-from collections.abc import Sequence
+from collections.abc import Callable, Iterator, Sequence
+from functools import partial
+from typing import NamedTuple
 
 import jax.numpy as jnp
 import numpy as np
@@ -10,9 +12,11 @@ from jaxdyn.identify.interior import LinearChart
 from jaxdyn.identify.logs import Log, idle_coordinates, log_rate, signal_sizes
 from jaxdyn.identify.regression import log_regressor
 from jaxdyn.identify.result import Fit
+from jaxdyn.identify.threads import on_one_thread
 from jaxdyn.identify.torque_terms import TERMS, ExtraTorque, Friction, TorqueTerm
 from jaxdyn.identify.uncertainty import effective_sample_size, is_white
 from jaxdyn.model.tree import Model
+from jaxdyn.tasks import Engine, results
 
 # Share of errors beyond three standard deviations from which on their tails are heavy: 0.3 % of normal ones are, and of those of
 # two recorded robots 5 to 15 % at some joint. Between, unresolved reversals of simulated friction make up to 4 %.
@@ -184,6 +188,34 @@ class RobotProblem:
             extra=extra,
             as_measured=True,
         )
+
+
+class _Folds(NamedTuple):
+    """The fits of a cross-validation as tasks."""
+
+    problem: RobotProblem
+
+    @on_one_thread
+    def squares(self, pair: tuple[Setting, np.ndarray]) -> np.ndarray:
+        """Squared errors on some blocks of a fit to the others."""
+        return self.problem.validation_squares(*pair)
+
+
+def cross_validation(problem: RobotProblem, engine: Engine) -> Callable:
+    """Function from pairs of a setting and left-out blocks to the squared errors of these, by an engine of tasks."""
+    sent = None
+
+    def squares(pairs: list[tuple[Setting, np.ndarray]]) -> Iterator[np.ndarray]:
+        nonlocal sent
+        # Weights of samples are those of the first setting with its loss: found here, so that they do not depend on the worker.
+        for setting, _ in pairs:
+            problem.weigh_samples(setting)
+        # Workers hold a copy of the problem: it is sent again only when it has new weights of samples.
+        if sent != (sent := tuple(problem.sample_weights)):
+            engine.send(partial(_Folds, problem))
+        return results(engine, "squares", pairs)
+
+    return squares
 
 
 def model_with_parameters(model: Model, x: np.ndarray, terms, v_s: float) -> tuple[Model, Friction]:

@@ -238,9 +238,8 @@ class LoadedScene(Scene):
         self.sensors = tuple(sensors)
 
 
-def summarize(what: str, names: Iterable[str], most: int = 8) -> list[str]:
+def summarize(what: str, names: Sequence[str], most: int = 8) -> list[str]:
     """One entry of `not_taken`: a description and the first names; empty when there are none."""
-    names = list(names)
     if not names:
         return []
     # A warning that lists hundreds of geoms hides the other entries.

@@ -248,9 +248,9 @@ def _elements_without_effect(file: CompiledFile) -> list[str]:
             [name for name in dofs(m.dof_armature) if name in free],
         ),
         *summarize(
-            "gravity compensation of bodies", (str(file.bodies[b]) for b in np.flatnonzero(m.body_gravcomp) if b)
+            "gravity compensation of bodies", [str(file.bodies[b]) for b in np.flatnonzero(m.body_gravcomp) if b]
         ),
-        *summarize("mocap bodies, fixed here", (str(file.bodies[b]) for b in range(m.nbody) if m.body_mocapid[b] >= 0)),
+        *summarize("mocap bodies, fixed here", [str(file.bodies[b]) for b in range(m.nbody) if m.body_mocapid[b] >= 0]),
         *summarize("fluid forces", fluid),
         *summarize("flexible bodies", flexes),
         *(["plugins"] if m.nplugin else []),

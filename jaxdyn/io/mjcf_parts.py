@@ -154,12 +154,12 @@ def actuators(file: CompiledFile, model: Model) -> tuple[Actuators | None, list[
     lines = [line for reason, names in left.items() for line in summarize(f"actuators {reason}", names)]
     lines += summarize(
         "armature or damping of actuators on tendons and sites",
-        (
+        [
             file.actuators[i]
             for i in range(m.nactuator)
             if (m.actuator_armature[i] or m.actuator_damping[i] or m.actuator_dampingpoly[i].any())
             and (m.actuator_trntype[i] not in (_ON_JOINT, _IN_PARENT) or m.actuator_dampingpoly[i].any())
-        ),
+        ],
     )
     if not taken:
         return None, lines

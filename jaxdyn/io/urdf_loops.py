@@ -119,7 +119,7 @@ def _read(path: pathlib.Path, wanted: bool) -> Closures:
         tuple(
             summarize(
                 f"kinds of joints in {path.name}, which stay as in the URDF",
-                (f"{name} ({word})" for name, word in chosen if word not in ("SPHERICAL", "FIXED")),
+                [f"{name} ({word})" for name, word in chosen if word not in ("SPHERICAL", "FIXED")],
             )
         ),
     )

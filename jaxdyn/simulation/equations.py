@@ -113,9 +113,11 @@ class Equations:
 
     def _derivative(self, t, y, args):
         scene, _, method = self.unpack(args, y)
-        rates, force, v = method.evaluate(scene, y, t, functools.partial(self.generalized_force, args, y))
+        q, v, in_basis = method.to_qv_and_basis(scene, y, t)
+        force = self.generalized_force(args, y, q, v, t)
+        rates = method.rates(scene, y, q, v, t, force, in_basis)
         if self._added:
-            rates = rates | self._extra_rates(args, y, retract(scene.system, y["q"]), v, t, force)
+            rates = rates | self._extra_rates(args, y, q, v, t, force)
         if KEPT in y:
             # Constant during a step; `project` renews it at the end.
             rates = rates | {KEPT: jnp.zeros_like(y[KEPT])}

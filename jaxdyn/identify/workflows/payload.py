@@ -10,8 +10,8 @@ import numpy as np
 from jaxdyn.constraints.codes import RESULTS, name_of
 from jaxdyn.identify.chart import check_bodies
 from jaxdyn.identify.condensed import Blocks, condense_rows
-from jaxdyn.identify.condensed_fit import eliminate, gather
-from jaxdyn.identify.interior import LOG_CHOLESKY_BASIS, LinearChart, TorqueProblem, newton
+from jaxdyn.identify.condensed_fit import eliminate, gather, minimize_torque_error
+from jaxdyn.identify.interior import LOG_CHOLESKY_BASIS, LinearChart, TorqueProblem
 from jaxdyn.identify.logs import Log, as_logs
 from jaxdyn.identify.regression import least_squares_by_svd, log_regressor, noise_level
 from jaxdyn.identify.robot import RobotFit, fit_robot
@@ -156,7 +156,8 @@ def _solve(blocks: Blocks, is_loaded, own: slice, kept, weights, rows, size):
     # No terms are fitted, so that their units do not matter.
     sizes = [np.ones(alone.nv)] * 3
     chart = LinearChart(alone, (), "full", sizes)
-    minimum = newton(TorqueProblem.of(chart, condense_rows(table, blocks.count()), sigma, 1.0), 200, 1e-6)
+    problem = TorqueProblem.of(chart, condense_rows(table, blocks.count()), sigma, 1.0)
+    minimum = minimize_torque_error(problem, 200, 1e-6)
     if minimum.result is not RESULTS.successful:
         raise ValueError(f"the payload's fit ended {name_of(minimum.result)!r}; do the loaded logs move the robot?")
     payload = chart.x(minimum.origin, minimum.terms)[:10]
