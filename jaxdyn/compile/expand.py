@@ -15,13 +15,23 @@ import numpy as np
 
 from jaxdyn.compile import array_rules, mode
 from jaxdyn.compile import program as numbers
-from jaxdyn.compile.constants import bind_known, empty_reduction, evaluate_known
+from jaxdyn.compile.array_rules import bind_known, empty_reduction, evaluate_known
 from jaxdyn.compile.derive import without_unread
 from jaxdyn.compile.graph import Graph
 from jaxdyn.compile.jax_adapter import ClosedJaxpr, Literal, Tracer, scan_counts  # pyright: ignore[reportPrivateImportUsage]
-from jaxdyn.compile.number import Number, as_objects, is_number, objects
-from jaxdyn.compile.program import Array, NotNumbers, Program, as_kind, kind_or_refuse
+from jaxdyn.compile.program import (
+    Array,
+    NotNumbers,
+    Number,
+    Program,
+    as_kind,
+    as_objects,
+    is_number,
+    kind_or_refuse,
+    objects,
+)
 from jaxdyn.compile.rearrange import AT_PLACES, REARRANGEMENTS
+from jaxdyn.compile.replay import replay
 
 # A function of fewer operations is scatter_places where it is called.
 MIN_SUBPROGRAM_OPERATIONS = 300
@@ -154,7 +164,7 @@ class _Expansion:
         program, given = self._subprogram(inner, args)
         # A short one is written in its place, where zeros of its arguments are seen. A call does not know them.
         is_short = program.cost < MIN_SUBPROGRAM_OPERATIONS
-        results = self.graph.replay(program, given)[1] if is_short else self.graph.call(program, given)
+        results = replay(self.graph, program, given)[1] if is_short else self.graph.call(program, given)
         count = len(inner.jaxpr.outvars)
         for flagged in results[count:]:
             self.flagged = self.graph.either(self.flagged, flagged.item())
@@ -289,7 +299,7 @@ class _Expansion:
         # A kernel within this one: called where it is long, else written out.
         if self.calls and inner.cost >= MIN_SUBPROGRAM_OPERATIONS and not inner.subprograms:
             return [x.ravel() for x in self.graph.call(inner, shaped)]
-        return [x.ravel() for x in self.graph.replay(inner, shaped)[1]]
+        return [x.ravel() for x in replay(self.graph, inner, shaped)[1]]
 
 
 def _innermost(inner: ClosedJaxpr, args: Sequence) -> tuple[ClosedJaxpr, list]:
