@@ -19,7 +19,7 @@ import jax
 
 from benchmarks import peers, timing
 from benchmarks.report_cases import cases
-from jaxdyn.model.text_table import table
+from jaxdyn.model.description import table
 from jaxdyn.reports import Record, Report, beaten_by, report
 from jaxdyn.reports.front import TARGETS, cost_at
 from jaxdyn.reports.page import figure

@@ -15,9 +15,9 @@ from jaxdyn.io import LoadedScene, load_urdf
 from jaxdyn.io.load import find_description, format_of, load
 from jaxdyn.model.arguments import as_path, parse_number
 from jaxdyn.model.builder import GRAVITY
+from jaxdyn.model.description import short as short
+from jaxdyn.model.description import table as table
 from jaxdyn.model.joints import KINDS
-from jaxdyn.model.text_table import short as short
-from jaxdyn.model.text_table import table as table
 from jaxdyn.model.tree import Model
 
 # Unit of q of joints with one coordinate.

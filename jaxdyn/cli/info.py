@@ -11,14 +11,14 @@ import numpy as np
 from jaxdyn.cli.common import FILE, UNITS, add_model_options, load_scene, output_path, short, table, xacro_arguments
 from jaxdyn.constraints.assembly import assemble
 from jaxdyn.constraints.base import constraint_jacobian, holonomic_rows, layout, position_residual
-from jaxdyn.constraints.mobility import degrees_of_freedom
-from jaxdyn.constraints.selection import select_concrete_rows
+from jaxdyn.constraints.selection import degrees_of_freedom, select_concrete_rows
 from jaxdyn.io import LoadedScene, NotTakenWarning, save_urdf, urdf_inertia_report
 from jaxdyn.io.load import format_of
 from jaxdyn.io.xml_lines import XmlFile
+from jaxdyn.model.configuration import integrate
 from jaxdyn.model.inertia_checks import inertia_report, repair_inertias
 from jaxdyn.model.joints import KINDS
-from jaxdyn.model.tree import Model, integrate
+from jaxdyn.model.tree import Model
 
 HELP = "bodies, joints, limits, loops, frames and faulty inertias of a URDF, MJCF or SDF file"
 DESCRIPTION = """\

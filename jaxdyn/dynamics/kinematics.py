@@ -25,7 +25,7 @@ from jaxdyn.lie import se3
 from jaxdyn.lie.so3 import matmul
 from jaxdyn.model.arguments import Given, check_shapes
 from jaxdyn.model.joints import KINDS, SCREW_KINDS, joint_transform, screw_transform
-from jaxdyn.model.names import frame_index
+from jaxdyn.model.topology import frame_index
 from jaxdyn.model.tree import Model, Topology, geometry
 
 

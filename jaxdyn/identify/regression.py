@@ -13,8 +13,9 @@ from jaxdyn.identify.condensed import Blocks, Condensed, block_slices, condense_
 from jaxdyn.identify.logs import Log, as_logs
 from jaxdyn.identify.torque_terms import TERMS, Terms, check_terms, friction_regressor
 from jaxdyn.model.arguments import Number, Numbers, as_array, check_shapes, is_concrete
+from jaxdyn.model.configuration import integrate, neutral
 from jaxdyn.model.joints import KINDS
-from jaxdyn.model.tree import Model, integrate, neutral
+from jaxdyn.model.tree import Model
 
 _NUMBERS = ("m", "mcx", "mcy", "mcz", "Ixx", "Ixy", "Iyy", "Ixz", "Iyz", "Izz")
 # The order of elimination of a body's ten numbers, for a joint about z: Khalil & Dombre keep the first ones and group m, m cz and

@@ -8,7 +8,7 @@ from jaxdyn.constraints.loops import gear, lock_joint, loop
 from jaxdyn.io.loaded import Actuators, summarize
 from jaxdyn.io.mjcf_file import HINGE, SLIDE, CompiledFile, pose_of
 from jaxdyn.io.tendons import PolynomialCoupling, TendonForce
-from jaxdyn.model.names import body_index
+from jaxdyn.model.topology import body_index
 from jaxdyn.model.tree import Model
 
 _CONNECT, _WELD, _JOINT, _TENDON = range(4)  # mjtEq

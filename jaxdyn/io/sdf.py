@@ -18,7 +18,7 @@ from jaxdyn.model import float64 as f64
 from jaxdyn.model.arguments import DType
 from jaxdyn.model.builder import GRAVITY, ModelBuilder
 from jaxdyn.model.joints import joint_neutral
-from jaxdyn.model.names import body_index
+from jaxdyn.model.topology import body_index
 from jaxdyn.model.tree import Model
 
 _KINDS = dict(revolute="revolute", continuous="revolute", revolute2="revolute", universal="revolute")

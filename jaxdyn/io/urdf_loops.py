@@ -28,7 +28,7 @@ from jaxdyn.io.xml_lines import XmlFile
 from jaxdyn.model import float64 as f64
 from jaxdyn.model.arguments import as_path
 from jaxdyn.model.joints import KINDS
-from jaxdyn.model.names import frame_index, joint_index
+from jaxdyn.model.topology import frame_index, joint_index
 from jaxdyn.model.tree import Model
 
 _SUFFIXES = (".yaml", ".yml")

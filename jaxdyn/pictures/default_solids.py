@@ -20,7 +20,7 @@ from jaxdyn.grasp.contacts import Contact
 from jaxdyn.grasp.hand import Grasp
 from jaxdyn.model import float64 as f64
 from jaxdyn.model.joints import joint_neutral
-from jaxdyn.model.names import frame_index
+from jaxdyn.model.topology import frame_index
 from jaxdyn.model.tree import Model
 from jaxdyn.pictures.object_solids import object_name, object_solids, see_through
 from jaxdyn.pictures.solids import Shape, Shapes, rod

@@ -6,7 +6,7 @@ from typing import Any
 import numpy as np
 
 from jaxdyn.identify import RobotFit
-from jaxdyn.model.text_table import short
+from jaxdyn.model.description import short
 from jaxdyn.reports.identification import Evaluation, Findings, model_joint, total_percent
 from jaxdyn.reports.page import STYLE, escape, html_table, svg
 from jaxdyn.reports.plotting import BLUE, GREY, RED, new_figure, torque_figure

@@ -14,7 +14,7 @@ from jaxdyn.model import float64 as f64
 from jaxdyn.model import inertia, robots
 from jaxdyn.model.arguments import Number, Row
 from jaxdyn.model.builder import ModelBuilder
-from jaxdyn.model.names import frame_index
+from jaxdyn.model.topology import frame_index
 from jaxdyn.scenes._named import as_state, register_scene, solve_gram
 from jaxdyn.scenes.hands import point_velocity, quaternion_and_matrix
 

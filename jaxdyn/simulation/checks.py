@@ -10,7 +10,7 @@ from jaxtyping import Array, Bool
 from jaxdyn.compile.known import is_concrete
 from jaxdyn.contact.forces import contacts_with_cones
 from jaxdyn.model.arguments import batch_hint, check_shape
-from jaxdyn.model.names import frame_index
+from jaxdyn.model.topology import frame_index
 from jaxdyn.model.tree import Model
 from jaxdyn.simulation.controls import Controller, Sampled
 from jaxdyn.simulation.methods import Method

@@ -17,8 +17,8 @@ from jaxdyn.simulation.solvers import ExplicitSteps, ProjectedSolver
 from jaxdyn.simulation.solvers.choice import is_explicit, is_step_length, label, progress_meter, solver_and_control
 from jaxdyn.simulation.solvers.differentiable import ROOM, run, run_adaptively
 from jaxdyn.simulation.solvers.driver import step_control
-from jaxdyn.simulation.solvers.explicit_run import ExplicitRun
 from jaxdyn.simulation.solvers.guards import SEARCH_STEPS, delay
+from jaxdyn.simulation.solvers.integrator import ExplicitRun
 from jaxdyn.simulation.solvers.step_control import Adaptive, ErrorMonitoredSteps, too_coarse
 
 

@@ -15,7 +15,8 @@ from jaxdyn.constraints.redundancy import keep_rows
 from jaxdyn.constraints.selection import most_rounding, select_concrete_rows
 from jaxdyn.dynamics.quantities import mass_matrix
 from jaxdyn.model import float64 as f64
-from jaxdyn.model.tree import Model, neutral
+from jaxdyn.model.configuration import neutral
+from jaxdyn.model.tree import Model
 from jaxdyn.simulation.checks import has_unit_quaternions
 from jaxdyn.simulation.methods import Baumgarte, Free, Method, Multipliers, Projected, Reduced, is_regular, start_limit
 from jaxdyn.simulation.solution import RESULTS

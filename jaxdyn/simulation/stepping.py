@@ -20,8 +20,8 @@ from jaxdyn.simulation.hybrid.piecewise import PiecewiseSystem, piecewise_motion
 from jaxdyn.simulation.solvers import ExplicitSteps
 from jaxdyn.simulation.solvers.driver import step_control
 from jaxdyn.simulation.solvers.explicit import take_step
-from jaxdyn.simulation.solvers.explicit_run import ExplicitRun
 from jaxdyn.simulation.solvers.fixed_steps import RK4
+from jaxdyn.simulation.solvers.integrator import ExplicitRun
 from jaxdyn.simulation.start import choose_method
 from jaxdyn.systems.scene import Scene, as_scene, check_force
 from jaxdyn.systems.system import SceneLike

@@ -23,7 +23,7 @@ from scipy.linalg import expm
 from jaxdyn import se3
 from jaxdyn.compile import compilation
 from jaxdyn.dynamics import frame_motion, kinematics
-from jaxdyn.model.tree import configuration_rate
+from jaxdyn.model.configuration import configuration_rate
 
 ALL_KINDS = ["free", "revolute", "spherical", "planar", "helical", "prismatic", "continuous", "revolute"]
 CASES = {

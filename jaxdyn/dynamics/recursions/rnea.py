@@ -4,7 +4,7 @@ Every point r of a body (in its frame) has the acceleration a + K r, where a is 
 
     K = hat(dw) + hat(w)^2.
 
-Multiplied by the body's moments J (4 x 4, see `inertias`), Y = [K a] J = sum of m (a + K r)(r, 1)^T collects the
+Multiplied by the body's moments J (4 x 4, see `frames`), Y = [K a] J = sum of m (a + K r)(r, 1)^T collects the
 inertial forces: its last column is the inertial force, and vee(Y - Y^T) the moment. The velocity of the origin is not needed.
 
 Source: Luh, Walker & Paul (1980); K as in Balafoutis, Patel & Misra (1988); EQUATIONS section 4.
