@@ -12,8 +12,8 @@ from typing import Any
 import numpy as np
 
 from jaxdyn.compile.graph import Graph
+from jaxdyn.compile.inlining import inline, replay
 from jaxdyn.compile.program import FLOATS, Constant, NotNumbers, Program, is_number, objects
-from jaxdyn.compile.replay import inline, replay
 
 
 def tangent(program: Program, moving: Sequence[bool]) -> Program:

@@ -11,9 +11,9 @@ from typing import Any
 
 from jaxdyn.compile.code import Body
 from jaxdyn.compile.graph import Graph
+from jaxdyn.compile.inlining import replay
 from jaxdyn.compile.llvm import Emitter
 from jaxdyn.compile.program import Array, Constant, NotNumbers, Number, Program, dtype_of, kind_of, objects
-from jaxdyn.compile.replay import replay
 
 
 class Directions:

@@ -18,6 +18,7 @@ from jaxdyn.compile import program as numbers
 from jaxdyn.compile.array_rules import bind_known, empty_reduction, evaluate_known
 from jaxdyn.compile.derive import without_unread
 from jaxdyn.compile.graph import Graph
+from jaxdyn.compile.inlining import replay
 from jaxdyn.compile.jax_adapter import ClosedJaxpr, Literal, Tracer, scan_counts  # pyright: ignore[reportPrivateImportUsage]
 from jaxdyn.compile.program import (
     Array,
@@ -31,7 +32,6 @@ from jaxdyn.compile.program import (
     objects,
 )
 from jaxdyn.compile.rearrange import AT_PLACES, REARRANGEMENTS
-from jaxdyn.compile.replay import replay
 
 # A function of fewer operations is scatter_places where it is called.
 MIN_SUBPROGRAM_OPERATIONS = 300

@@ -17,9 +17,9 @@ import jax.numpy as jnp
 from jax import lax
 
 from jaxdyn.compile import ahead, derive, jax_adapter, mode
+from jaxdyn.compile.inlining import inline
 from jaxdyn.compile.jax_adapter import ShapedArray, define_primitive, is_linear, is_zero, lowering_of, zero_tangent
 from jaxdyn.compile.program import COMPARISONS, Constant, NotNumbers, Program, TooLong, dtype_of
-from jaxdyn.compile.replay import inline
 from jaxdyn.compile.shared import split_program
 from jaxdyn.compile.trace import tangent_program
 from jaxdyn.compile.trigonometry import cosine, sine

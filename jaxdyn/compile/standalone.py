@@ -15,10 +15,10 @@ from jaxdyn.compile import derive
 from jaxdyn.compile.code import ATTRIBUTES, Body, symbol_of
 from jaxdyn.compile.directions import Directions
 from jaxdyn.compile.graph import Graph
+from jaxdyn.compile.inlining import inline, replay
 from jaxdyn.compile.llvm import Emitter
 from jaxdyn.compile.mode import standalone
 from jaxdyn.compile.program import FLOATS, Array, Constant, Program, kind_of, objects
-from jaxdyn.compile.replay import inline, replay
 from jaxdyn.compile.trace import program_of
 
 # Operations of a directional derivative times the number of directions. A Panda's forward dynamics has 63 000: by columns its
