@@ -16,8 +16,8 @@ from jaxdyn.dynamics.centroidal import centroidal_momentum_matrix as centroidal_
 from jaxdyn.dynamics.com_dynamics import ComDynamics as ComDynamics
 from jaxdyn.dynamics.com_dynamics import com_dynamics as com_dynamics
 from jaxdyn.dynamics.frame_motion import frame_acceleration as frame_acceleration
+from jaxdyn.dynamics.frame_motion import jacobian_dot_v as jacobian_dot_v
 from jaxdyn.dynamics.joint_wrenches import joint_wrench as joint_wrench
-from jaxdyn.dynamics.kinematics import jacobian_dot_v as jacobian_dot_v
 from jaxdyn.dynamics.kinematics import spatial_jacobian as spatial_jacobian
 from jaxdyn.dynamics.link_frame import NewtonEulerMatrices as NewtonEulerMatrices
 from jaxdyn.dynamics.quantities import aba as aba

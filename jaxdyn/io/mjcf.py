@@ -29,7 +29,7 @@ from jaxdyn.io.mjcf_file import (
 )
 from jaxdyn.io.mjcf_parts import actuators, constraints, tendon_forces
 from jaxdyn.io.mjcf_sensors import sensors
-from jaxdyn.model import float64 as f64
+from jaxdyn.model import host_math
 from jaxdyn.model.arguments import DType, as_path
 from jaxdyn.model.builder import ModelBuilder
 from jaxdyn.model.joints import joint_neutral
@@ -213,7 +213,7 @@ def _state(file: CompiledFile, model: Model, qpos, qvel) -> tuple[np.ndarray, np
             here[-4:] /= np.linalg.norm(here[-4:])
         # World-frame linear velocity there, body-frame here.
         if nq == 7:
-            rate[:3] = f64.joint_pose("free", np.zeros(6), here)[:3, :3].T @ rate[:3]
+            rate[:3] = host_math.joint_pose("free", np.zeros(6), here)[:3, :3].T @ rate[:3]
         q[model.topology.q_slices[i]], v[model.topology.v_slices[i]] = here, rate
     return q, v
 

@@ -133,8 +133,8 @@ def body_index(model: Any, name: str | None) -> int:
     """
     if name is None:
         return -1
-    if name in model.body_names:
-        return model.body_names.index(name)
+    if name in model.topology.body_names:
+        return model.topology.body_names.index(name)
     # A link merged into a body is still named by users and files.
     return model.topology.frame_bodies[frame_index(model, name)]
 
@@ -145,9 +145,9 @@ def frame_index(model: Any, name: str) -> int:
     **Raises:** ValueError when there is no frame of that name; names that look alike are listed.
     """
     # Files often name the joint where they mean its link, fixed joints included.
-    carried = dict(model.fixed_joints) | dict(zip(model.joint_names, model.body_names, strict=True))
+    carried = dict(model.fixed_joints) | dict(zip(model.topology.joint_names, model.topology.body_names, strict=True))
     try:
-        return model.frame_names.index(name if name in model.frame_names else carried.get(name, name))
+        return model.topology.frame_names.index(name if name in model.topology.frame_names else carried.get(name, name))
     except ValueError:
         raise ValueError(f"frame {name!r} is not in model {model.name!r}; {_hint(name, model, carried)}") from None
 
@@ -157,12 +157,12 @@ def joint_index(model: Any, name: str) -> int:
 
     **Raises:** ValueError for a name of no joint, or of a fixed one; names that look alike are listed.
     """
-    if name in model.joint_names:
-        return model.joint_names.index(name)
+    if name in model.topology.joint_names:
+        return model.topology.joint_names.index(name)
     if name in dict(model.fixed_joints):
         raise ValueError(f"joint {name!r} of model {model.name!r} is fixed: it has no coordinates")
-    near = difflib.get_close_matches(str(name), model.joint_names, n=5, cutoff=0.4)
-    hint = f"did you mean {', '.join(near)}?" if near else f"joints are {', '.join(model.joint_names[:10])}"
+    near = difflib.get_close_matches(str(name), model.topology.joint_names, n=5, cutoff=0.4)
+    hint = f"did you mean {', '.join(near)}?" if near else f"joints are {', '.join(model.topology.joint_names[:10])}"
     raise ValueError(f"joint {name!r} is not in model {model.name!r}; {hint}")
 
 
@@ -190,5 +190,7 @@ def velocity_indices(model: Any, joints: Iterable[str]) -> np.ndarray:
 
 
 def _hint(name: str, model: Any, carried: dict) -> str:
-    near = difflib.get_close_matches(str(name), (*model.frame_names, *carried), n=5, cutoff=0.4)
-    return f"did you mean {', '.join(near)}?" if near else f"frames are {', '.join(model.frame_names[:10])} ..."
+    near = difflib.get_close_matches(str(name), (*model.topology.frame_names, *carried), n=5, cutoff=0.4)
+    return (
+        f"did you mean {', '.join(near)}?" if near else f"frames are {', '.join(model.topology.frame_names[:10])} ..."
+    )

@@ -1,7 +1,7 @@
 """Parameters of a mechanism on a static tree of bodies: `Model`."""
 
 import dataclasses
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping
 from typing import Any
 
 import equinox as eqx
@@ -12,7 +12,8 @@ from jaxtyping import Array, Bool, Float, PyTree
 
 from jaxdyn.compile import variant
 from jaxdyn.compile.known import is_concrete
-from jaxdyn.model.arguments import Numbers, as_array, batch_hint, warn, warn_unphysical_inertias
+from jaxdyn.model import host_math
+from jaxdyn.model.arguments import Numbers, as_array, batch_hint, warn
 from jaxdyn.model.description import tree_table
 from jaxdyn.model.inertia import inertial_parameters, transform_inertia
 from jaxdyn.model.topology import Topology as Topology
@@ -223,6 +224,19 @@ def _replace(model: Model, leaves: dict) -> Model:
         leaves[name] = jnp.asarray(value, model.home.dtype) if not isinstance(value, jax.Array) else value
     leaves = {name: leaves.get(name, getattr(model, name)) for name in names}
     return Model(**leaves, topology=model.topology, fixed_joints=model.fixed_joints)
+
+
+def warn_unphysical_inertias(inertias: Mapping[str, Any], places: Mapping[str, str] | None = None) -> None:
+    """Give one warning for all bodies whose inertia (10,) is unphysical; `places` gives file:line of bodies."""
+    faults = []
+    for name, parameters in inertias.items():
+        if is_concrete(parameters) and (fault := host_math.inertia_fault(np.asarray(parameters))):
+            place = f"{places[name]}: " if places and name in places else ""
+            faults.append(f"{place}body {name!r}: {fault}")
+    if faults:
+        more = f"; and {len(faults) - 5} more bodies" if len(faults) > 5 else ""
+        fix = "correct the numbers, or use jd.model.repair_inertias(model)"
+        warn(f"{'; '.join(faults[:5])}{more}. No body has such an inertia: {fix}", UserWarning)
 
 
 def _geometry(model: Model) -> tuple[Array | np.ndarray, Array | np.ndarray]:

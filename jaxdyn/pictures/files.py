@@ -15,7 +15,7 @@ from jaxdyn.io.loaded import NotTakenWarning
 from jaxdyn.io.mjcf_file import assign_names, compile_file, import_mujoco, pose_of
 from jaxdyn.io.sdf_frames import SdfFile
 from jaxdyn.io.xml_lines import XmlFile
-from jaxdyn.model import float64 as f64
+from jaxdyn.model import host_math
 from jaxdyn.model.arguments import parse_number, warn
 from jaxdyn.pictures.meshes import MeshError, find_mesh, read_mesh
 from jaxdyn.pictures.solids import Shape, Shapes
@@ -91,7 +91,7 @@ def _urdf(file: XmlFile) -> Shapes:
             pose = np.eye(4)
             if origin is not None:
                 xyz, rpy = (_attribute(file, origin, key, 3, what, np.zeros(3)) for key in ("xyz", "rpy"))
-                pose = np.asarray(f64.pose_matrix((xyz, rpy), what))
+                pose = np.asarray(host_math.pose_matrix((xyz, rpy), what))
             material = visual.find("material")
             # A colour in the element itself wins over the named one.
             rgba = None if material is None else _rgba(file, material) or materials.get(material.get("name"))

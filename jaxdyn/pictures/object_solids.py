@@ -9,7 +9,7 @@ import numpy as np
 
 from jaxdyn.grasp.contacts import Contact
 from jaxdyn.grasp.hand import Grasp
-from jaxdyn.model import float64 as f64
+from jaxdyn.model import host_math
 from jaxdyn.pictures.solids import Shape, rod
 from jaxdyn.systems.scene import Scene
 
@@ -35,7 +35,7 @@ def object_solids(scene: Grasp, solids: list[Shape], thin: float) -> list[Shape]
     model, name = scene.system, scene.object
     places = [np.asarray(one.pose, float)[:3, 3] for one in scene.constraints if isinstance(one, Contact)]
     body = model.body_names.index(name)
-    mass, com, moment = f64.about_com(np.asarray(model.inertias, float)[body])
+    mass, com, moment = host_math.about_com(np.asarray(model.inertias, float)[body])
     if places and model.topology.kinds[body] == "planar":
         return [rod(name, com, place, 1.5 * thin, source="inertia") for place in places]
     ball = solids[0] if len(solids) == 1 and solids[0].kind == "ellipsoid" and len(set(solids[0].size)) == 1 else None

@@ -14,7 +14,7 @@ from jaxdyn.constraints.base import layout
 from jaxdyn.constraints.redundancy import keep_rows
 from jaxdyn.constraints.selection import most_rounding, select_concrete_rows
 from jaxdyn.dynamics.quantities import mass_matrix
-from jaxdyn.model import float64 as f64
+from jaxdyn.model import host_math
 from jaxdyn.model.configuration import neutral
 from jaxdyn.model.tree import Model
 from jaxdyn.simulation.checks import has_unit_quaternions
@@ -106,7 +106,7 @@ def may_have_singular_mass(system) -> bool:
     if not is_concrete(system.inertias):
         return True
     # Positive definite pseudo-inertias make the mass matrix positive definite, whatever the configuration.
-    sizes = [np.linalg.eigvalsh(f64.pseudo_inertia(x)) for x in np.asarray(system.inertias, float)]
+    sizes = [np.linalg.eigvalsh(host_math.pseudo_inertia(x)) for x in np.asarray(system.inertias, float)]
     return not all(least > 1e-12 * largest for least, *_, largest in sizes)
 
 
