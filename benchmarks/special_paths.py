@@ -22,7 +22,7 @@ from jax import lax
 import jaxdyn as jd
 from benchmarks import first_calls, timing
 from benchmarks.first_calls import CLOCKS
-from jaxdyn.compile import array_rules, batch, expand, primitive
+from jaxdyn.compile import array_rules, batch, expansion, primitive
 from jaxdyn.simulation.solvers import driver
 
 CALLS = 20  # in a round
@@ -73,7 +73,7 @@ def without_shared() -> None:
 
 def without_constants() -> None:
     """Known arrays are computed by JAX."""
-    patched: Any = expand
+    patched: Any = expansion
     patched.evaluate_known = array_rules.bind_known
 
 

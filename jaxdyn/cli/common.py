@@ -12,7 +12,7 @@ import equinox as eqx
 import numpy as np
 
 from jaxdyn.io import LoadedScene, load_urdf
-from jaxdyn.io.load import find_description, format_of, load
+from jaxdyn.io.formats import find_description, format_of, load
 from jaxdyn.model.arguments import as_path, parse_number
 from jaxdyn.model.builder import GRAVITY
 from jaxdyn.model.description import short as short

@@ -18,7 +18,7 @@ from jaxdyn.cli.common import (
     whole,
 )
 from jaxdyn.identify import TERMS
-from jaxdyn.identify.workflows.exciting_motion import OBJECTIVES
+from jaxdyn.identify.workflows.excitation_search import OBJECTIVES
 from jaxdyn.io import write_log
 
 HELP = "optimise an exciting motion within limits for the identification of inertias and friction"

@@ -13,7 +13,7 @@ from jaxdyn.constraints.assembly import assemble
 from jaxdyn.constraints.base import constraint_jacobian, holonomic_rows, layout, position_residual
 from jaxdyn.constraints.selection import degrees_of_freedom, select_concrete_rows
 from jaxdyn.io import LoadedScene, NotTakenWarning, save_urdf, urdf_inertia_report
-from jaxdyn.io.load import format_of
+from jaxdyn.io.formats import format_of
 from jaxdyn.io.xml_lines import XmlFile
 from jaxdyn.model.configuration import integrate
 from jaxdyn.model.inertia_checks import inertia_report, repair_inertias

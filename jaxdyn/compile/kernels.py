@@ -139,7 +139,7 @@ def _bind(function, static, tree, args, **how) -> tuple[Any, Any] | str | None:
         return traced
     (program, places), out_structure = without_unread(traced[0]), traced[1]
     leaves = [leaves[i] for i in places]
-    if program.reports_validity and mode.is_rank_safe():
+    if program.reports_validity and mode.rank_safe.value:
         # A part of another function's fallback: the fast path has failed for the sample, and may fail it here again.
         return None
     # A kernel takes flat arrays. Under a trace reshapes are free.

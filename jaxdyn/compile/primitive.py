@@ -72,7 +72,7 @@ def _batch(args, axes, *, program, rows):
         elif v and lead != inner:
             x = jnp.broadcast_to(x.reshape(size, *[1] * len(inner), x.shape[-1]), (size, *inner, x.shape[-1]))
         full.append(x)
-    rows += mode.is_row() and not mode.is_expanding()
+    rows += mode.in_rows.value and not mode.is_expanding()
     results = kernel_p.bind(*full, program=program, rows=rows)
     return results, [0] * len(results)
 

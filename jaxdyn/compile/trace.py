@@ -11,7 +11,7 @@ import jax
 import jax.numpy as jnp
 
 from jaxdyn.compile import jax_adapter, mode
-from jaxdyn.compile.expand import expand
+from jaxdyn.compile.expansion import expand
 from jaxdyn.compile.known import Known, partition_tracers
 from jaxdyn.compile.program import NotNumbers, Program, TooLong
 

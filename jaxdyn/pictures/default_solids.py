@@ -22,7 +22,7 @@ from jaxdyn.model import host_math
 from jaxdyn.model.joints import joint_neutral
 from jaxdyn.model.topology import frame_index
 from jaxdyn.model.tree import Model
-from jaxdyn.pictures.object_solids import object_name, object_solids, see_through
+from jaxdyn.pictures.grasped_object import object_name, object_solids, see_through
 from jaxdyn.pictures.solids import Shape, Shapes, rod
 from jaxdyn.systems.scene import Scene
 

@@ -11,13 +11,13 @@ import numpy as np
 
 from jaxdyn.reports.case import Case, case_of_scene
 from jaxdyn.reports.journal import Journal
-from jaxdyn.reports.measure import Contestant, flop_counter, ladder, measure
+from jaxdyn.reports.measurement import Contestant, flop_counter, ladder, measure
 from jaxdyn.reports.page import write
 from jaxdyn.reports.plotting import new_figure
 from jaxdyn.reports.programs import FIXED, SOLVERS, Prepared, prepare
 from jaxdyn.reports.records import Record, Report, SceneReference
 from jaxdyn.reports.timing import commit, machine
-from jaxdyn.simulation.start import choose_method
+from jaxdyn.simulation.checks import choose_method
 
 # Contestants of other libraries for a scene, a dtype and starts (q, v, ts); see `Contestant`.
 Peers = Callable[[Prepared, str, tuple], Sequence[Contestant]]
@@ -76,7 +76,7 @@ def report(
     - `rounds`: timings of each run, at least 20 for a figure to be quoted.
     - `out`: directory for report.json, report.txt and report.html, and for records.jsonl, from which an
       interrupted call resumes.
-    - `peers(prepared, dtype, starts)` -> contestants that are timed in the same loop; see `jaxdyn.reports.measure`.
+    - `peers(prepared, dtype, starts)` -> contestants that are timed in the same loop; see `jaxdyn.reports.measurement`.
     - `echo`: receives lines of progress, e.g. `print`.
     - `ways`: the former name of `integrators`.
 

@@ -38,6 +38,7 @@ from jaxdyn.reduction.bases import (
     BasisLike,
     Orthonormal,
     UserBasis,
+    VelocityAndDrift,
     as_basis,
     least_quality,
     minimal_velocity,
@@ -74,11 +75,13 @@ class Method(eqx.Module):
         """Configuration q, with unit quaternions, and velocity v of a state."""
         return retract(scene.system, y["q"]), y["v"]
 
-    def to_qv_and_basis(self, scene: Scene, y: State, t: Number) -> tuple[Array, Array, Any]:
+    def to_qv_and_basis(self, scene: Scene, y: State, t: Number) -> tuple[Array, Array, VelocityAndDrift | None]:
         """Configuration and velocity of `to_qv`, and the velocity in the basis of minimal velocities, None without one."""
         return *self.to_qv(scene, y, t), None
 
-    def rates(self, scene: Scene, y: State, q: Q, v: V, t: Number, force: Force, in_basis: Any = None) -> State:
+    def rates(
+        self, scene: Scene, y: State, q: Q, v: V, t: Number, force: Force, in_basis: VelocityAndDrift | None = None
+    ) -> State:
         """Rate dy/dt; q, v are those of `to_qv`, and `in_basis` of `to_qv_and_basis`; `force` (nv,) as of `acceleration`."""
         return {"q": velocity_to_rate(scene.system, q, v), "v": self.acceleration(scene, q, v, t, force)}
 
@@ -274,13 +277,15 @@ class Reduced(Method):
         basis = self._at(scene, y, q, t)
         return q, matmul(basis.N, y["nu"]) + basis.v0
 
-    def to_qv_and_basis(self, scene: Scene, y: State, t: Number) -> tuple[Array, Array, Any]:
+    def to_qv_and_basis(self, scene: Scene, y: State, t: Number) -> tuple[Array, Array, VelocityAndDrift | None]:
         """As in `Method`; v = N nu + v0 and dv/dt = N dnu/dt + drift come from one decomposition of the rows."""
         q = retract(scene.system, y["q"])
         in_basis = velocity_and_drift(scene, self._basis(y), q, y["nu"], t)
         return q, in_basis.v, in_basis
 
-    def rates(self, scene: Scene, y: State, q: Q, v: V, t: Number, force: Force, in_basis: Any = None) -> State:
+    def rates(
+        self, scene: Scene, y: State, q: Q, v: V, t: Number, force: Force, in_basis: VelocityAndDrift | None = None
+    ) -> State:
         """Rate of the reduced equations."""
         motion = velocity_and_drift(scene, self._basis(y), q, y["nu"], t) if in_basis is None else in_basis
         # Without the scene's forces, which `force` includes.

@@ -15,6 +15,7 @@ from jaxdyn.constraints.selection import may_have_redundant_rows, select_rows
 from jaxdyn.contact.unilateral import has_modes
 from jaxdyn.forces.piecewise import fix_pieces, guards, pieces_of, values_and_levels
 from jaxdyn.model.arguments import Numbers, as_array, check_shape, state_dtype
+from jaxdyn.simulation.checks import choose_method
 from jaxdyn.simulation.equations import DRIVES
 from jaxdyn.simulation.hybrid.piecewise import PiecewiseSystem, piecewise_motion
 from jaxdyn.simulation.solvers import ExplicitSteps
@@ -22,7 +23,6 @@ from jaxdyn.simulation.solvers.driver import step_control
 from jaxdyn.simulation.solvers.explicit import take_step
 from jaxdyn.simulation.solvers.fixed_steps import RK4
 from jaxdyn.simulation.solvers.integrator import ExplicitRun
-from jaxdyn.simulation.start import choose_method
 from jaxdyn.systems.scene import Scene, as_scene, check_force
 from jaxdyn.systems.system import SceneLike
 

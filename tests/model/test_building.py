@@ -16,8 +16,8 @@ from jaxdyn import inertia, robots
 from jaxdyn.dynamics import kinematics
 from jaxdyn.dynamics.centroidal import center_of_mass
 from jaxdyn.io import load_urdf
+from jaxdyn.model import configuration as mdl
 from jaxdyn.model import host_math, joints
-from jaxdyn.model import tree as mdl
 from jaxdyn.model.builder import ModelBuilder
 from jaxdyn.model.inertia_checks import inertia_report, repair_inertias
 from tests.pinocchio_bridge import quick, to_pinocchio
