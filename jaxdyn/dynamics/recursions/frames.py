@@ -18,7 +18,7 @@ from typing import Any, NamedTuple
 import jax.numpy as jnp
 import numpy as np
 
-from jaxdyn.dynamics.recursions._arrays import is_known
+from jaxdyn.compile.known import is_concrete
 from jaxdyn.model.joints import SCREW_KINDS
 from jaxdyn.model.tree import Model, Topology, geometry
 
@@ -57,7 +57,7 @@ class Frames(NamedTuple):
 
 def canonical_frames(model: Model) -> Frames:
     """Canonical frames of the bodies of a model."""
-    known = is_known(model.home, model.screws)
+    known = is_concrete(model.home, model.screws)
     if known:
         home, screws = np.asarray(model.home), np.asarray(model.screws) * model.topology.screw_mask
         screws = screws.astype(home.dtype)
@@ -237,7 +237,7 @@ def pseudo_inertias(model: Model, frames: Frames) -> list:
 
     Masses are transferred between bodies only if all values are known, where that costs nothing.
     """
-    known = is_known(model.inertias, frames.placement)
+    known = is_concrete(model.inertias, frames.placement)
     xp = np if known else jnp
     dtype = model.home.dtype
     inertias = xp.asarray(model.inertias)
