@@ -278,7 +278,7 @@ class Reduced(Method):
         return q, matmul(basis.N, y["nu"]) + basis.v0
 
     def to_qv_and_basis(self, scene: Scene, y: State, t: Number) -> tuple[Array, Array, VelocityAndDrift | None]:
-        """As in `Method`; v = N nu + v0 and dv/dt = N dnu/dt + drift come from one decomposition of the rows."""
+        """Configuration, and v = N nu + v0 with dv/dt = N dnu/dt + drift from one decomposition of the rows."""
         q = retract(scene.system, y["q"])
         in_basis = velocity_and_drift(scene, self._basis(y), q, y["nu"], t)
         return q, in_basis.v, in_basis
