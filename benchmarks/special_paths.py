@@ -22,8 +22,7 @@ from jax import lax
 import jaxdyn as jd
 from benchmarks import first_calls, timing
 from benchmarks.first_calls import CLOCKS
-from jaxdyn.compile import array_rules, batch, expansion, primitive
-from jaxdyn.simulation.solvers import driver
+from jaxdyn.compile import array_rules, batch, expansion, loops, primitive
 
 CALLS = 20  # in a round
 
@@ -54,7 +53,7 @@ def accelerations(which) -> Callable:
 
 def without_loop() -> None:
     """Steps are turns of a loop of XLA's."""
-    patched: Any = driver
+    patched: Any = loops
     patched.run_loop = lambda *_: None
 
 
