@@ -5,8 +5,7 @@
 | `frames`           | canonical link frames (joint axis on z, Denavit-Hartenberg) and masses transferred between bodies    |
 | `transforms`       | changes of frame of twists, wrenches and inertias                                            |
 | `links`            | joint transforms and motion subspaces of every joint kind                                    |
-| `newton_euler`     | recursive Newton-Euler: inverse dynamics, bias and gravity force                             |
-| `composite_bodies` | composite rigid bodies: the mass matrix                                                      |
+| `newton_euler`     | recursive Newton-Euler: inverse dynamics, bias and gravity force; composite bodies: the mass matrix |
 | `articulated`      | articulated-body inertias: M = W W^T, and M^-1 times a vector; forward dynamics and its tangent |
 
 EQUATIONS sections 4 and 5; Featherstone (2008), chapters 5 to 7. Twists are (v, omega) and wrenches (f, n), linear part first.
@@ -24,7 +23,7 @@ from jaxdyn.dynamics.recursions.articulated import aba_tangent as aba_tangent
 from jaxdyn.dynamics.recursions.articulated import aba_with_columns as aba_with_columns
 from jaxdyn.dynamics.recursions.articulated import mass_matrix_inverse_times as mass_matrix_inverse_times
 from jaxdyn.dynamics.recursions.articulated import mass_matrix_sqrt as mass_matrix_sqrt
-from jaxdyn.dynamics.recursions.composite_bodies import crba as crba
 from jaxdyn.dynamics.recursions.newton_euler import bias_force as bias_force
+from jaxdyn.dynamics.recursions.newton_euler import crba as crba
 from jaxdyn.dynamics.recursions.newton_euler import gravity_force as gravity_force
 from jaxdyn.dynamics.recursions.newton_euler import rnea as rnea

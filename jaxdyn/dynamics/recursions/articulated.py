@@ -19,7 +19,6 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from jaxdyn.dynamics.recursions._arrays import constants, contract, dot, entry, join, outer, select, symmetric
-from jaxdyn.dynamics.recursions.composite_bodies import ancestor_rows, place_rows
 from jaxdyn.dynamics.recursions.links import (
     Links,
     as_vector,
@@ -31,7 +30,7 @@ from jaxdyn.dynamics.recursions.links import (
     unit_force,
     unit_velocity,
 )
-from jaxdyn.dynamics.recursions.newton_euler import body_wrenches
+from jaxdyn.dynamics.recursions.newton_euler import ancestor_rows, body_wrenches, place_rows
 from jaxdyn.dynamics.recursions.transforms import Chain, inertia_to_parent, twist_to_child, wrench_to_parent
 from jaxdyn.model.arguments import check_shapes
 from jaxdyn.model.tree import Model
