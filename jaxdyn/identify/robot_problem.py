@@ -70,7 +70,8 @@ class RobotProblem:
     def weigh_samples(self, setting: Setting) -> None:
         """Find the weights of samples for the loss of a setting, unless they are known."""
         if setting.robust is not None and setting.robust not in self.sample_weights:
-            self.reweigh(setting)
+            for _ in range(2):
+                self._weigh(setting, self.fit(setting))
 
     def refine(self, setting: Setting, fixed: np.ndarray | None, rounds: int) -> Estimate:
         """Fit several times; after each but the last, update weights and loads."""
@@ -112,11 +113,6 @@ class RobotProblem:
         """Indices of the torques whose errors are not white, of joints that move: where another term may explain something."""
         errors = self._errors(setting, self.fit(setting))
         return tuple(int(j) for j in np.flatnonzero(~is_white(self.logs, errors)) if j not in self.still)
-
-    def reweigh(self, setting: Setting, rounds: int = 2) -> None:
-        """Update the weights of samples for a setting with a robust loss."""
-        for _ in range(rounds):
-            self._weigh(setting, self.fit(setting))
 
     def curvature_data(self, setting: Setting) -> Data | None:
         """Logs without the samples beyond the threshold of a robust loss, where it has no curvature."""
