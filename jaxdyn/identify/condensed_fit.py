@@ -24,6 +24,7 @@ from jaxdyn.identify.regression import (
     BaseParameters,
     base_parameters,
     condense_model,
+    coordinate_names,
     free_columns,
     noise_level,
     parameter_names,
@@ -285,7 +286,7 @@ def intervals(
     names = list(parameter_names(model))
     for term, number in data.counts.items():
         for k in range(number):
-            names += [f"{joint}.{term}{k + 1 if number > 1 else ''}" for joint in _joints(model)]
+            names += [f"{joint}.{term}{k + 1 if number > 1 else ''}" for joint in coordinate_names(model)]
     fitted = np.concatenate([free, np.zeros(blocks.size - len(free), bool)])
     fitted[data.places(setting.extra)] = True
     shown = np.flatnonzero(fitted | (np.arange(blocks.size) < data.basic))
@@ -374,8 +375,3 @@ def _root(matrix: np.ndarray) -> np.ndarray:
     # Semidefinite: coordinates without a prior have no curvature, which a Cholesky factorisation would refuse.
     values, vectors = np.linalg.eigh(matrix)
     return vectors * np.sqrt(np.maximum(values, 0))
-
-
-def _joints(model: Model) -> list[str]:
-    start = 10 * model.nb
-    return [name.rpartition(".")[0] for name in parameter_names(model)[start : start + model.nv]]

@@ -28,12 +28,15 @@ _BLOCK = 256
 _SAMPLES = 1024
 
 
+def coordinate_names(model: Model) -> list[str]:
+    """Names (nv,) of the velocity coordinates: of their joints, with an index where a joint has several."""
+    sizes = zip(model.joint_names, (KINDS[kind].nv for kind in model.topology.kinds), strict=True)
+    return [name if n == 1 else f"{name}[{i}]" for name, n in sizes for i in range(n)]
+
+
 def parameter_names(model: Model, terms: Terms = TERMS) -> tuple[str, ...]:
     """Names of x: the ten numbers of each body (`body.m`, `body.mcx`, ...), then the terms (`joint.viscous`)."""
-    joints = []
-    for name, kind in zip(model.joint_names, model.topology.kinds, strict=True):
-        n = KINDS[kind].nv
-        joints += [name] if n == 1 else [f"{name}[{i}]" for i in range(n)]
+    joints = coordinate_names(model)
     bodies = [f"{body}.{number}" for body in model.body_names for number in _NUMBERS]
     return tuple(bodies + [f"{joint}.{term}" for term in terms for joint in joints])
 
