@@ -25,7 +25,7 @@ QUICK := JAXDYN_COMPILATION_OPTIONS=least
 .DEFAULT_GOAL := help
 .NOTPARALLEL:
 .DELETE_ON_ERROR:
-.PHONY: help venv demo test test-all test-oldest coverage lint types bench docs notebooks wheel clean
+.PHONY: help venv demo test test-ci test-all test-oldest coverage lint types bench docs notebooks wheel clean
 
 help:  ## print the targets
 	@sed -n 's/^\([a-z-]*\):.*  ## \(.*\)/  \1\t\2/p' $(MAKEFILE_LIST) | expand -t 14
@@ -35,8 +35,13 @@ venv: $(VENV)/.installed-dev  ## the environment for development
 demo: $(VENV)/.installed-plot  ## simulate, check and plot a first example
 	$(BIN)/python -m jaxdyn.demo
 
-test: $(VENV)/.installed-test  ## the tests, without the slow ones
-	$(QUICK) $(PYTEST) -m "not slow and not native"; mechanics=$$?; $(PYTEST) -m "not slow and native" $(NATIVE) && exit $$mechanics
+test: SELECTION := not slow and not long
+test-ci: SELECTION := not slow
+test: $(VENV)/.installed-test  ## the tests of each function, in minutes
+test-ci: $(VENV)/.installed-test  ## those, and the tests that compile for seconds each
+test test-ci:
+	$(QUICK) $(PYTEST) -m "$(SELECTION) and not native"; mechanics=$$?; \
+		$(PYTEST) -m "$(SELECTION) and native" $(NATIVE) && exit $$mechanics
 
 test-all: $(VENV)/.installed-test  ## every test, on every robot, with XLA's own options
 	$(PYTEST) --all-robots
@@ -45,7 +50,7 @@ test-oldest: .venv-oldest/.installed  ## the tests of mechanics with the lowest 
 	$(QUICK) .venv-oldest/bin/python $(RUN) -m "not slow and not native" $(CORE)
 	.venv-oldest/bin/python $(RUN) -m "not slow and native" $(filter $(CORE),$(NATIVE))
 
-coverage: $(VENV)/.installed-coverage  ## lines that the fast tests run, by module
+coverage: $(VENV)/.installed-coverage  ## lines that test-ci runs, by module
 	$(QUICK) $(PYTEST) -m "not slow and not native" --cov=jaxdyn --cov-report=
 	$(PYTEST) -m "not slow and native" --cov=jaxdyn --cov-append --cov-report=term:skip-covered $(NATIVE)
 

@@ -2,14 +2,14 @@
 
     python -m pytest -m "not slow" --cpu-times out/times.txt && python tests/cpu_times.py out/times.txt
 
-Prints the sums of files and the slowest tests, in seconds of the processor, as tables for a page.
+Prints the sums of the slowest files and the slowest tests, in seconds of the processor, as tables for a page.
 """
 
 import sys
 from collections import defaultdict
 from pathlib import Path
 
-SLOWEST = 20
+SLOWEST = 40
 
 
 def tables(text: str) -> str:
@@ -20,7 +20,7 @@ def tables(text: str) -> str:
         files[test.split("::")[0].removeprefix("tests/")].append(seconds)
     rows = sorted(((sum(x), len(x), max(x), name) for name, x in files.items()), reverse=True)
     lines = ["| file | tests | sum, s | longest, s |", "|---|---|---|---|"]
-    lines += [f"| {name} | {count} | {total:.1f} | {longest:.1f} |" for total, count, longest, name in rows]
+    lines += [f"| {name} | {count} | {total:.1f} | {longest:.1f} |" for total, count, longest, name in rows[:SLOWEST]]
     lines += [f"| all | {len(times)} | {sum(x for x, _ in times):.1f} | {max(x for x, _ in times):.1f} |", ""]
     lines += ["| test | s |", "|---|---|"]
     lines += [

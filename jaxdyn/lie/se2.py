@@ -269,3 +269,7 @@ __all__ = [
     "log",
     "vee",
 ]
+
+
+def __dir__() -> list[str]:
+    return __all__

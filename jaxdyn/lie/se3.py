@@ -271,3 +271,7 @@ __all__ = [
     "log",
     "vee",
 ]
+
+
+def __dir__() -> list[str]:
+    return __all__

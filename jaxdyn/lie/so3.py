@@ -358,3 +358,7 @@ __all__ = [
     "quat_to_matrix",
     "vee",
 ]
+
+
+def __dir__() -> list[str]:
+    return __all__

@@ -358,3 +358,7 @@ __all__ = [
     "random_tree",
     "ur5",
 ]
+
+
+def __dir__() -> list[str]:
+    return __all__

@@ -231,3 +231,7 @@ __all__ = [
     "states",
     "work_precision",
 ]
+
+
+def __dir__() -> list[str]:
+    return __all__

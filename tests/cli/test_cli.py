@@ -108,6 +108,7 @@ def test_info_of_a_real_robot_says_what_is_not_used(panda, capsys):
     assert "<mimic>" in text
 
 
+@pytest.mark.long
 def test_simulate_writes_the_motion_that_the_library_computes(arm, tmp_path, capsys):
     out = tmp_path / "motion.csv"
     args = ["--duration", "0.2", "--sample", "0.05", "--q0", "shoulder=0.5", "--friction", "0", "--torque", "gravity"]
@@ -145,6 +146,7 @@ def test_simulate_writes_the_motion_that_the_library_computes(arm, tmp_path, cap
     np.testing.assert_allclose(read_log(again).q, motion.q, atol=1e-4)
 
 
+@pytest.mark.long
 def test_simulate_a_batch_with_seed_and_plot(arm, tmp_path, capsys):
     args = ["simulate", str(arm), "--duration", "0.1", "--dt", "0.01", "--batch", "3", "--torque", "gravity+random"]
     for name, seed in (("a.npz", 1), ("b.npz", 1), ("c.npz", 2)):
@@ -165,6 +167,7 @@ def test_a_simulation_that_stops_early_is_exit_status_1(arm, capsys):
     assert "1 of 1 motions stopped early" in capsys.readouterr().out
 
 
+@pytest.mark.long
 @pytest.mark.data
 def test_identify_the_recorded_panda_from_raw_samples(panda, franka, tmp_path, capsys):
     """Held-out torque error at most 1.45 %; unconstrained least squares with the same filter and split has 1.36 %."""
@@ -253,6 +256,7 @@ def simulated_logs(model, folder, seeds, noise=0.0, delay=0.0, gains=1.0):
     return paths
 
 
+@pytest.mark.long
 def test_identify_chooses_the_cutoff_and_warns_of_vibration(arm, tmp_path, capsys):
     """Raw logs of a motion up to 0.5 Hz, torques that vibrate at 9 Hz."""
     model = jd.model.repair_inertias(jd.load_urdf(arm))
@@ -377,6 +381,7 @@ def test_identify_from_one_file_and_the_robot_it_writes(arm, tmp_path, capsys):
         jd.save_urdf(truth, tmp_path / "x.urdf", torques={"elbow": {"offset": 1.0}})
 
 
+@pytest.mark.long
 def test_identify_finds_delays_from_a_file_of_options(arm, tmp_path, capsys):
     """20 ms: found, printed, in both reports, judged on shifted logs, counted in a payload; given as a number, the same fit."""
     truth = jd.model.repair_inertias(jd.load_urdf(arm))
@@ -452,6 +457,7 @@ def test_identify_a_payload(arm, tmp_path, capsys):
     assert "the bodies are" in capsys.readouterr().err
 
 
+@pytest.mark.long
 def test_identify_the_gains_of_drives_from_a_known_payload(arm, tmp_path, capsys):
     """Currents of three drives; what is written is then the robot in newton metres."""
     truth = jd.model.repair_inertias(jd.load_urdf(arm))
@@ -482,6 +488,7 @@ def test_identify_the_gains_of_drives_from_a_known_payload(arm, tmp_path, capsys
         assert words in capsys.readouterr().err
 
 
+@pytest.mark.long
 def test_identify_chooses_for_several_logs(arm, tmp_path, capsys):
     truth = jd.model.repair_inertias(jd.load_urdf(arm))
     a, b = simulated_logs(truth, tmp_path, (0, 1), noise=0.01)
@@ -643,6 +650,7 @@ def four_bar(tmp_path):
     return path
 
 
+@pytest.mark.long
 def test_info_of_a_file_with_a_loop(four_bar, capsys):
     assert main(["info", str(four_bar)]) == 0
     text = capsys.readouterr().out
@@ -662,6 +670,7 @@ def test_info_of_a_file_with_a_loop(four_bar, capsys):
     assert "--lock: joints of MJCF files cannot be locked" in capsys.readouterr().err
 
 
+@pytest.mark.long
 @pytest.mark.parametrize(
     "digits", [5, pytest.param(8, marks=pytest.mark.slow), pytest.param(17, marks=pytest.mark.slow)]
 )
@@ -682,6 +691,7 @@ def test_info_counts_couplings(panda, capsys):
     assert "Degrees of freedom after constraints: 8 of 9" in text and "gear" in text
 
 
+@pytest.mark.long
 def test_simulate_a_file_with_a_loop(four_bar, tmp_path, capsys):
     """From its keyframe, closed at the start, and closed to its end; a start that the file does not name is refused."""
     out = tmp_path / "motion.npz"

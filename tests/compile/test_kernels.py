@@ -407,6 +407,7 @@ def _transforms(f, x, step):
     }
 
 
+@pytest.mark.long
 def test_derivatives_of_every_function():
     """First and second, in both modes and mixed."""
     x, step = jnp.asarray(RNG.uniform(0.1, 0.9, 2)), normal(2)
@@ -417,6 +418,7 @@ def test_derivatives_of_every_function():
     assert_same(computed(x, step), wanted(x, step), 1e-11)
 
 
+@pytest.mark.long
 def test_derivatives_of_operations():
     """Reverse mode of what moves entries, and of loops."""
     x = 1.5 * normal(3, 4)
@@ -953,6 +955,7 @@ def second_process(tmp_path_factory):
     return own, files, json.loads(done.stdout)
 
 
+@pytest.mark.long
 def test_exported_programs(second_process):
     """They run in the process that has their kernels; in another one they say what is missing."""
     x, exported = jnp.linspace(0.1, 0.3, 3), _exported()

@@ -33,6 +33,7 @@ def functions(draw) -> Function:
     return Function(tuple((name, tuple(args)) for name, args in steps))
 
 
+@pytest.mark.long
 @settings(max_examples=14, deadline=None, derandomize=True)
 @given(
     functions(),

@@ -44,6 +44,7 @@ def targets():
     return jnp.asarray(points[(distance > FIRST - SECOND + 0.02) & (distance < FIRST + SECOND - 0.02)])
 
 
+@pytest.mark.long
 def test_targets_all_over_the_workspace_are_reached_on_the_branch_of_the_guess(targets):
     """Against the closed form: the elbow keeps its sign, and hinges stay within half a turn of the guess."""
     found = jax.jit(jax.vmap(lambda target: jd.assemble(arm(target), GUESS)))(targets)
@@ -87,6 +88,7 @@ def test_what_is_out_of_reach_is_met_as_near_as_can_be():
             jd.assemble(arm(target), GUESS, atol=wrong)
 
 
+@pytest.mark.long
 def test_redundant_rows_are_said():
     state = jd.assemble(jd.scenes.bennett(), jd.scenes.bennett.start()[0])
     assert "redundant rows of" in str(state) and int(state.dropped.sum()) == 3
@@ -102,6 +104,7 @@ def test_a_guess_without_end_is_refused_with_the_open_loop(guess):
     assert state.result == jd.RESULTS.not_assembled
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("count", [15, pytest.param(61, marks=pytest.mark.slow)])
 def test_a_delta_robot_from_a_file_keeps_its_branch(count, tmp_path):
     """The plate held at all points of a grid that are in reach, up to 0.6 m away, from one guess; closed form of the hips."""

@@ -94,6 +94,7 @@ def solved(tree):
     return jax.tree.map(np.asarray, compute(scene, q, guess, tau)) | {"tau": np.asarray(tau)}
 
 
+@pytest.mark.long
 def test_all_methods_solve_the_saddle_point_system(solved):
     """M a + h = tau + A^T lam, A a = gamma, against a dense solve of both at once."""
     x = solved
@@ -430,6 +431,7 @@ def test_assemble_finds_the_nearest_configuration():
     np.testing.assert_allclose(left, 0, atol=1e-12)
 
 
+@pytest.mark.long
 def test_assemble_fails_clearly():
     scene = scenes.four_bar(lengths=(1.0, 1.0, 1.0, 2.5))
     far = scene.system.replace(home=scene.system.home.at[2, 0, 3].set(4.0))
@@ -450,6 +452,7 @@ def test_assemble_fails_clearly():
         assemble(Scene(system, both), jnp.asarray([0.2, 0.1]))
 
 
+@pytest.mark.long
 def test_assembling_with_a_joint_held():
     """The crank where it was told to be, the loop closed; velocities are those of the free mechanism."""
     scene, (q, v) = scenes.four_bar(), scenes.four_bar.start()
@@ -507,6 +510,7 @@ def test_assembling_from_afar_is_differentiable(in_plane):
     assert_close(second[1], (forward[2] - forward[0]) / (2 * h), 1e-6)
 
 
+@pytest.mark.long
 def test_a_batch_of_mechanisms_of_different_lengths():
     """One vmap over lengths equals a loop, and every lane assembles."""
     lengths = jnp.linspace(2.0, 3.0, 50)

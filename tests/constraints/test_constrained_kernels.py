@@ -77,6 +77,7 @@ def solved(request):
         return scene, tau, numbers, quick(jax.vmap(wanted))(q, v, tau)
 
 
+@pytest.mark.long
 def test_accelerations_and_multipliers_are_those_of_the_dense_solve(solved):
     _, _, numbers, (want, *_) = solved
     for computed in numbers:
@@ -143,6 +144,7 @@ def two_windows():
     return scene, jnp.stack([q0, q0.at[0].add(0.1), q0 - 0.3, q0 + 0.2]), jnp.asarray(v0)
 
 
+@pytest.mark.long
 def test_a_singular_sample_is_solved_with_its_rank():
     scene, q, v0 = two_windows()
 
@@ -236,6 +238,7 @@ def at_start(name):
     return made(), q, v
 
 
+@pytest.mark.long
 @pytest.mark.parametrize(
     "name", [pytest.param(x, marks=[pytest.mark.slow] * (x not in ("andrews", "rolling_coin"))) for x in NAMES]
 )

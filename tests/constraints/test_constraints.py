@@ -118,6 +118,7 @@ def fourth_order(function, h):
     return (8 * (function(h) - function(-h)) - (function(2 * h) - function(-2 * h))) / (12 * h)
 
 
+@pytest.mark.long
 def test_rows_and_gamma_are_rates_along_the_motion(pair, state, everything):
     """A v - b = d/dt phi and gamma = -d/dt (A v - b) at zero acceleration, by differences along a curve on the manifold."""
     (q, v), (places, evaluate), t, h = state, everything, 0.4, 5e-4

@@ -101,6 +101,7 @@ def test_states_come_back_by_the_least_change(name, parameters):
         assert np.linalg.norm(across) <= 20 * drift * max(np.linalg.norm(force), 1e-12) + 1e-13
 
 
+@pytest.mark.long
 @BOTH
 @pytest.mark.parametrize(
     "name, parameters",

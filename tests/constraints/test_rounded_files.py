@@ -164,6 +164,7 @@ def exact(tmp_path_factory):
     return {name: crank_angles(write(folder / name, 17, TILT))[0] for name, write in WRITERS.items()}
 
 
+@pytest.mark.long
 @pytest.mark.parametrize(
     ("kind", "digits"),
     [
@@ -197,6 +198,7 @@ def test_a_four_bar_with_few_digits_moves_as_with_all(tmp_path, exact, kind, dig
     assert np.abs(kept * np.asarray(phi)).max() < 1e-12
 
 
+@pytest.mark.long
 def test_a_traced_start_drops_the_same_rows(tmp_path):
     path = WRITERS["sdf"](tmp_path / "bars", 5, TILT)
     _, motion, start, scene = crank_angles(path)

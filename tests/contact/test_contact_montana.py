@@ -190,6 +190,7 @@ def test_rolling_returns_without_slip_and_spin():
         np.testing.assert_allclose(twist(etas[i], np.linalg.inv(poses[i]) @ rate), wanted, atol=1e-6)
 
 
+@pytest.mark.long
 def test_batches_compile_and_differentiate_in_the_shape():
     def size(axes, eta):
         return jnp.sum(montana(Ellipsoid(axes), Sphere(0.02), eta).forward ** 2)

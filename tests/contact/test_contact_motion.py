@@ -58,6 +58,7 @@ def motions():
     return jax.jit(jax.vmap(motion))(FRICTION, RATES)
 
 
+@pytest.mark.long
 def test_a_contact_that_pulls_or_slips_ends_each_lane_at_its_time(motions):
     lost = np.isfinite(ENDS)
     np.testing.assert_array_equal(motions.success, ~lost)
@@ -81,6 +82,7 @@ def test_forces_and_margins_are_those_of_newton(motions):
     np.testing.assert_allclose(margins[reached], wanted[reached], atol=1e-12)
 
 
+@pytest.mark.long
 def test_a_run_that_may_go_on_reports_negative_margins():
     rates = RATES[SLIPS]
     options = {"control": push(rates), "stepsize": 0.11, "outputs": WORDS}

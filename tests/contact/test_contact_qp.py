@@ -132,6 +132,7 @@ def test_infeasible_lanes_are_told_and_leave_the_others_alone():
     ]
 
 
+@pytest.mark.long
 def test_derivatives_are_those_of_differences():
     data = problems(200, 1)
     random = np.random.default_rng(5)

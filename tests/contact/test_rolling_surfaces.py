@@ -79,6 +79,7 @@ TWIST = jnp.array([0.2, -0.1, 0.3, 0.5, 0.4, -0.6])
 FAST = ("ellipsoid on plane",)
 
 
+@pytest.mark.long
 @pytest.mark.parametrize(
     "name", [name if name in FAST else pytest.param(name, marks=pytest.mark.slow) for name in PAIRS]
 )
@@ -133,6 +134,7 @@ CLOSED = {
 }
 
 
+@pytest.mark.long
 @pytest.mark.parametrize(
     ("on", "spin"),
     [("plane", True), *(pytest.param(on, True, marks=pytest.mark.slow) for on in ("sphere", "cylinder"))],

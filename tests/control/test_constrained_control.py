@@ -46,6 +46,7 @@ def torques(pendulum):
     return p, quick(lambda q, v, t: (hybrid(q, v, t), gauge(q, v, t)))
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("ki", [pytest.param(None, marks=pytest.mark.slow), 4.0])
 def test_motion_and_force_on_a_sphere(pendulum, ki):
     """Errors by the closed form; the force is the wanted one at every moment."""
@@ -92,6 +93,7 @@ def test_integral_action_takes_a_force_error_away():
     np.testing.assert_allclose(solution.torque, again, atol=1e-12)
 
 
+@pytest.mark.long
 def test_velocities_of_a_rolling_disk():
     """A J = 0: steering and rolling rates follow by one gain each, the forces of both rows as wanted."""
     scene = scenes.rolling_disk()
@@ -234,6 +236,7 @@ def test_rank_loss_is_told(pendulum):
     assert not bool(is_regular) and np.isfinite(torque).all()
 
 
+@pytest.mark.long
 def test_a_motion_into_rank_loss_ends_with_a_code(pendulum):
     """A target beside the sphere: x goes as the gains say until z is 0.1, where the run ends."""
     scene, reach = pendulum[0], jnp.asarray([1.5, 0.0])

@@ -95,6 +95,7 @@ def rates_goal(t):
     return jnp.stack([jnp.sin(t), 0.5 + 0.2 * t])
 
 
+@pytest.mark.long
 def test_law_of_a_tip_that_rolls_is_the_printed_one():
     """Erratum E22: two rates of the place on the tip, and four forces, for the arm whose mass is the ball."""
     scene, (q, v) = light("rolling"), start("rolling")

@@ -82,6 +82,7 @@ def test_computed_torque_of_a_free_body_turns_it_to_its_target():
     assert_decays(TS, errors, start_rate=moved)
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("task", ["position", pytest.param("orientation", marks=pytest.mark.slow)])
 def test_operational_space_decays_as_the_gains_say(long_arm, task):
     """Three rows on four joints; the null motion is damped."""

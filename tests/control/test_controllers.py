@@ -104,6 +104,7 @@ def test_adaptive_steps_integrate_a_state_as_fixed_ones_do():
     np.testing.assert_allclose(ends[0].control_state[-1, 0], want, rtol=1e-5)
 
 
+@pytest.mark.long
 def test_feedback_of_the_multipliers_is_solved():
     """lam of the output is that of the torque of the output, which is the law's at that lam."""
     scene = scenes.spherical_pendulum()

@@ -106,6 +106,7 @@ def controlled(scene, dt, motors):
     return lambda x, u: step(x, columns @ u)
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("second_order", [False, pytest.param(True, marks=pytest.mark.slow)])
 def test_cart_pole_swings_up(second_order):
     """From hanging to standing within the limits of the force; the plan is a motion of the model."""
@@ -141,6 +142,7 @@ def test_cart_pole_swings_up(second_order):
     assert_close(x[0], q[-1], 1e-8)
 
 
+@pytest.mark.long
 def test_arm_reaches_places_in_a_batch():
     """A UR5 from rest; each sample of a batch is the solution alone, whatever the others need."""
     model = robots.ur5()
@@ -170,6 +172,7 @@ def test_arm_reaches_places_in_a_batch():
     assert np.abs(ends - goals).max() < 1e-3 and np.all(batch.cost < 1e-3 * batch.costs[:, 0])
 
 
+@pytest.mark.long
 def test_car_with_rolling_wheels():
     """A differential drive comes to a place beside it, which its wheels cannot roll to directly."""
     scene = scenes.differential_drive()
@@ -194,6 +197,7 @@ def test_car_with_rolling_wheels():
     )
 
 
+@pytest.mark.long
 def test_four_bar_by_its_crank():
     """The loop stays closed along the plan, and the crank comes to rest at its target."""
     scene, (q0, _) = scenes.four_bar(), scenes.four_bar.start()

@@ -32,6 +32,7 @@ def two_bars(lengths=(1.0, 0.8), **limits):
     return builder.add_frame("end", "b", (lengths[1], 0, 0)).build()
 
 
+@pytest.mark.long
 def test_two_bars_in_closed_form():
     """Both elbows, by the guess; derivatives of the angles by place and lengths, of first and second order."""
     model, place = two_bars(), np.array([0.9, 0.7, 0.0])
@@ -59,6 +60,7 @@ def test_two_bars_in_closed_form():
         assert_close(quick(order(by_search))(x), order(closed)(x), 1e-9)
 
 
+@pytest.mark.long
 def test_random_poses_of_an_arm_with_limits():
     """All of a batch within the limits, each as alone; the derivative is the least change in the mass metric."""
     model = robots.iiwa()
@@ -83,6 +85,7 @@ def test_random_poses_of_an_arm_with_limits():
     assert_close(quick(jax.jacrev(moved))(jnp.zeros(3)), least[:, :3], 1e-8)
 
 
+@pytest.mark.long
 def test_posture_is_the_nearest_configuration():
     """Stationary in the null space, in the mass metric; joints that would pass a limit stay on it."""
     model = robots.iiwa()
@@ -122,6 +125,7 @@ def velocity_slots(model, names):
     return np.array([model.topology.q_slices[model.joint_names.index(name)].start for name in names])
 
 
+@pytest.mark.long
 def test_delta_robot_in_a_batch():
     scene, guess = delta()
     rng = np.random.default_rng(0)
@@ -146,6 +150,7 @@ def test_four_bar_by_a_point_on_its_coupler():
     assert np.abs(position_residual(scene, reached.q)).max() < 1e-11
 
 
+@pytest.mark.long
 def test_directions_and_the_centre_of_mass():
     """A floating quadruped: its feet stay, its centre of mass and the direction of its trunk follow."""
     model = robots.quadruped()
@@ -192,6 +197,7 @@ def test_steps_keep_the_branch():
     assert_close(reached.q, [2.5, 0.5], 1e-9)
 
 
+@pytest.mark.long
 def test_paths():
     """A circle: as solved place by place; through a singular position the branch changes, and is said to."""
     model, given = two_bars(), {"weights": {"end": [1, 1, 0]}}

@@ -162,6 +162,7 @@ def test_solo_stands_with_forces_in_its_cones(solo):
     np.testing.assert_allclose(sum(f[2] for f in wanted.by_foot().values()), weight, rtol=1e-7)
 
 
+@pytest.mark.long
 def test_what_the_feet_cannot_carry_has_a_code(solo):
     """A wanted fall faster than free fall asks feet to pull; a limit on torques that is too low."""
     model, _, _, q, feet = solo
@@ -185,6 +186,7 @@ def test_what_the_feet_cannot_carry_has_a_code(solo):
     assert flying.result == jd.RESULTS.infeasible
 
 
+@pytest.mark.long
 def test_forces_are_differentiable(solo):
     """Gradients in the acceleration and in friction against differences, forces on the boundary of their cones."""
     model, _, _, q, _ = solo

@@ -177,6 +177,7 @@ def motion_of_two(q):
     return np.vstack([np.eye(2), -np.asarray(q[:2]) / float(q[2])])
 
 
+@pytest.mark.long
 def test_composite_error(pendulum):
     """Its norm is the kinetic energy of ed + Kp e; its rate in the closed loop is -(Gamma_r + Kd) eps, by differences."""
     scene, q, v = pendulum

@@ -70,6 +70,7 @@ def solved():
 WRENCH = jnp.array([0.4, -1.2, 2.1, 0.03, -0.05, 0.02])
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("kind", KINDS)
 def test_start_is_at_its_contact_coordinates(solved, kind):
     at = solved[kind]

@@ -61,6 +61,7 @@ def evaluated(biped):
     return evaluate
 
 
+@pytest.mark.long
 def test_it_stands_still_at_its_target(biped, evaluated):
     """The held robot does not move, and the multipliers are the program's forces, which carry the weight."""
     model, q, _, _ = biped

@@ -129,6 +129,7 @@ def _nested(k):
     return lambda *args: spring(args[-3])
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("place", ["control", "force"])
 @pytest.mark.parametrize("law", [lambda k: lambda *args: -k * args[-3], _nested], ids=["plain", "nested"])
 def test_traced_values_that_a_function_captures_are_those_of_a_module(place, law):
@@ -139,6 +140,7 @@ def test_traced_values_that_a_function_captures_are_those_of_a_module(place, law
         np.testing.assert_allclose(change(own)(k), change(wanted)(k), rtol=1e-12)
 
 
+@pytest.mark.long
 def test_traced_values_in_constraints_energies_and_bases():
     arm = jd.robots.chain(2)
     x = jnp.asarray([0.3, 0.2])

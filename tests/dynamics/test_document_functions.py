@@ -158,6 +158,7 @@ def test_centre_of_mass_coordinates_have_a_skew_rate_and_ignore_translation(floa
     assert_close(pushed.coriolis_matrix, C, 1e-10)
 
 
+@pytest.mark.long
 def test_centre_of_mass_coordinates_in_batches_and_their_derivatives(floating):
     """A batch equals the samples, and the derivative in a mass equals the difference quotient."""
     model, *_ = floating
@@ -218,6 +219,7 @@ def test_euler_rates_of_every_sequence(sequence):
     assert_close(R @ E, E_s, 1e-13)
 
 
+@pytest.mark.long
 def test_euler_rates_as_printed():
     """The closed forms of EQUATIONS section 12, for ZYZ, with errata E51 and E52; finite gradients at the pole."""
     phi, theta, psi = angles = jnp.asarray([0.4, 1.1, -0.3])

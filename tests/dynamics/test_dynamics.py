@@ -115,6 +115,7 @@ def pinocchio_values(source, bridge, q, v, a, tau, external):
     return out, acceleration
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("name", CASES)
 def test_agrees_with_pinocchio(name):
     source, _, bridge, states, ours = case(name)
@@ -147,6 +148,7 @@ def test_identities_at_one_state(name):
     assert_close(linear, np.einsum("sij,sj->si", mass, a) + ours["bias_force"], 1e-11)
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("name", ["floating", pytest.param("anymal", marks=pytest.mark.slow)])
 def test_identities_along_the_motion(name):
     _, model, _, (q, v, a, tau, external), _ = case(name)
@@ -301,6 +303,7 @@ def _in_other_frames(model, seed):
     ), transforms
 
 
+@pytest.mark.long
 def test_frames_of_description_do_not_matter():
     model = random_tree(51, ["helical", "prismatic", "helical", "helical", "helical", "prismatic"])
     other, transforms = _in_other_frames(model, 0)
@@ -446,6 +449,7 @@ def test_forward_dynamics_by_check_grads():
         jax.config.update("jax_disable_most_optimizations", False)
 
 
+@pytest.mark.long
 def test_every_quantity_has_derivatives_in_every_leaf():
     model, at = _derivative_case()
     rng = np.random.default_rng(0)

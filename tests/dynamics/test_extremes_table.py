@@ -42,6 +42,7 @@ QUICK = {
 FAST = ("rates", "turns")
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("name", [pytest.param(x, marks=[pytest.mark.slow] * (x not in FAST)) for x in QUICK])
 def test_verdicts(name):
     dtypes, expected = QUICK[name]
@@ -50,6 +51,7 @@ def test_verdicts(name):
     assert len(rows) >= 5
 
 
+@pytest.mark.long
 def test_the_longest_stable_step():
     """2.785 and 2.828 for RK4 on the negative real and the imaginary axis, as in every book; the rest from the tableaux."""
     real, imaginary = stability_limits(None)

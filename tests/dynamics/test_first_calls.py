@@ -238,6 +238,7 @@ def test_a_quantity_of_known_numbers_is_one_program(programs, of):
     assert programs == []
 
 
+@pytest.mark.long
 def test_degrees_of_freedom_and_rates_are_one_program_each(programs):
     scene, (q, v) = jd.scenes.slider_crank(), jd.scenes.slider_crank.start()
     programs.clear()

@@ -83,6 +83,7 @@ def called_between_guards(address: int, program, uniform, samples: int) -> None:
         kernel((ctypes.c_void_p * len(pointers))(*pointers), samples, 0, samples)
 
 
+@pytest.mark.long
 @pytest.mark.skipif(sys.platform != "linux", reason="protects pages by mprotect")
 @pytest.mark.parametrize("derivatives", [False, pytest.param(True, marks=pytest.mark.slow)])
 def test_kernels_stay_within_their_buffers(request, derivatives):

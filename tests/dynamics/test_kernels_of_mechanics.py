@@ -81,6 +81,7 @@ def test_exported_programs_of_a_batch_of_any_size():
             np.testing.assert_allclose(computed, known[:n], rtol=1e-13, atol=1e-13)
 
 
+@pytest.mark.long
 def test_without_jit_kernels_are_still_compiled():
     model, state = jd.robots.chain(2), (jnp.ones(2), jnp.zeros(2))
 

@@ -17,6 +17,7 @@ pytestmark = pytest.mark.native
 KINDS = ("free", "revolute", "spherical", "helical", "planar", "prismatic")
 
 
+@pytest.mark.long
 def test_joints_of_every_kind():
     model = random_tree(3, KINDS, parents=(-1, 0, 1, 0, -1, 4))
     q, v, a, tau, _ = random_states(model, 3, 0)
@@ -73,6 +74,7 @@ def test_five_hundred_links(branching):
     assert_close(a, want, 1e-8)
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("links", [pytest.param(40, marks=pytest.mark.slow), dynamics.MAX_BODIES + 1])
 @pytest.mark.parametrize("count", [pytest.param(1, marks=pytest.mark.slow), 40])
 def test_long_chains(count, links):

@@ -50,6 +50,7 @@ def case(name):
     return (model, states, *jax.tree.map(np.asarray, out))
 
 
+@pytest.mark.long
 @FEW
 def test_link_frames_agree_with_the_tree_frame(name):
     _, (_, v, a), _, link, world = case(name)
@@ -166,6 +167,7 @@ def test_three_joint_arm_as_printed():
     assert_close(potential, g * sum(x * y for x, y in zip(m, h, strict=True)))
 
 
+@pytest.mark.long
 @pytest.mark.parametrize(
     "parents",
     [*(pytest.param(x, marks=pytest.mark.slow) for x in (None, [0, 1, 2, 3, 4, 5])), [0, 0, 2, -1, 4, 4]],

@@ -222,6 +222,7 @@ def test_against_pinocchio():
         assert_close(mass[i], np.triu(M) + np.triu(M, 1).T, 1e-11, "crba")
 
 
+@pytest.mark.long
 def test_gradients_at_rest():
     """At the neutral configuration, at rest, without gravity: finite, and those of the matrix form; every leaf."""
     model = random_tree(2, ["free", "helical", "spherical"], armature=False)

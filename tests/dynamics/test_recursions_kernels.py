@@ -54,6 +54,7 @@ def test_inverse_dynamics_in_float32():
     assert_close(got, want, 2e-5)
 
 
+@pytest.mark.long
 def test_every_quantity_in_both_modes():
     """What users call, with the model known, against operations of JAX alone; the other kinds of joints are cases of these."""
     model = random_tree(5, ["free", "helical", "planar", "spherical"])
@@ -115,6 +116,7 @@ def test_operations_grow_with_the_number_of_bodies():
         assert costs[2] - costs[1] < 2.1 * (costs[1] - costs[0]), costs
 
 
+@pytest.mark.long
 def test_derivatives_of_forward_dynamics():
     """Every argument and leaf, order 2, against the matrix form and finite differences."""
     model = random_tree(9, ["spherical", "helical"])
@@ -150,6 +152,7 @@ def test_derivatives_of_forward_dynamics():
     assert_close(second[2], stencil @ first, 1e-8)
 
 
+@pytest.mark.long
 def test_the_change_of_an_acceleration_is_that_of_its_numbers():
     """The rule by a second sweep of the recursions against forward and reverse mode of the matrix form."""
     model = random_tree(7, ["free", "revolute", "prismatic"])

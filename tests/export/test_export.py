@@ -62,6 +62,7 @@ def test_calls_from_numpy_equal_the_library(arm, exported):
     assert isinstance(exported(X, V, TAU), np.ndarray)
 
 
+@pytest.mark.long
 def test_jacobian_equals_that_of_plain_jax(arm, exported):
     with jd.compilation("plain"):
         expected = jax.jacrev(lambda q, v, tau: jd.forward_dynamics(arm, q, v, tau), (0, 1, 2))(
@@ -261,6 +262,7 @@ def test_results_that_are_not_finite_have_a_status(tmp_path):
     run_c(tmp_path, "f")  # which expects the status at its examples
 
 
+@pytest.mark.long
 def test_redundant_rows(tmp_path):
     """Bennett's linkage: seven degrees of freedom of its tree, more rows than that, one freedom left."""
     scene = jd.scenes.bennett()
@@ -290,6 +292,7 @@ def test_redundant_rows(tmp_path):
     assert all(name in LIBM or name.startswith("__aeabi") for name in undefined_symbols(tmp_path / "bennett.o"))
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("constrained", [False, True], ids=["free", "constrained"])
 def test_a_step_of_an_integrator(constrained, tmp_path):
     scene = jd.scenes.four_bar() if constrained else jd.Scene(jd.robots.ur5())
@@ -310,6 +313,7 @@ def test_a_step_of_an_integrator(constrained, tmp_path):
     run_c(tmp_path, "step")
 
 
+@pytest.mark.long
 def test_a_step_of_an_arm_behind_drives(tmp_path):
     """Drives of first and second order, their states as an argument and a result; steps that end at kinks are refused."""
     forces = jd.forces.FirstOrderDrive(0.01), jd.forces.SecondOrderDrive(80.0, 0.6)

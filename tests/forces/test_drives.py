@@ -82,6 +82,7 @@ DRIVES = {
 }
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("kind", DRIVES)
 def test_step_response_of_a_drive(kind):
     """Torque, states and motion of a wheel under a constant command, in `simulate` and in `stepper`."""
@@ -126,6 +127,7 @@ def test_drives_of_named_joints():
     np.testing.assert_allclose(rates, [30.0, 5.0])
 
 
+@pytest.mark.long
 def test_gradients_of_a_drive_in_both_modes_and_batches():
     """dv/dT of v = u (t - T (1 - exp(-t/T)))/I under a first-order drive; its second derivative too."""
     t, u = 0.05, 3.0
@@ -158,6 +160,7 @@ def limited_wheel(stall, no_load, peak, t):
     return switch, no_load - (no_load - knee) * jnp.exp(-stall * (t - switch) / (LINK * no_load))
 
 
+@pytest.mark.long
 def test_torque_speed_curve_and_its_kink():
     """Constant torque up to the knee, exponential behind it; the kink ends a step, and gradients have its time."""
     ts, zero = jnp.array([0.0, 0.4, 1.5]), jnp.zeros(1)
@@ -190,6 +193,7 @@ def order(error, steps):
     return np.log2(abs(error(steps) / error(2 * steps)))
 
 
+@pytest.mark.long
 def test_stepper_ends_steps_at_kinks_of_drives():
     """Over the knee RK4 keeps its order, which would be the second across it."""
     scene = jd.Scene(wheel(), forces=[jd.forces.TorqueSpeedLimits(8.0, 6.0), jd.forces.EffortLimits(5.0)])
@@ -201,6 +205,7 @@ def test_stepper_ends_steps_at_kinks_of_drives():
     assert 3.5 < order(error, 8) < 4.5 and abs(error(16)) < 1e-5
 
 
+@pytest.mark.long
 def test_limits_before_and_behind_a_drive():
     """Behind a first-order drive the torque is cut off from T ln(u/(u - L)) on; before it, the drive approaches the limit."""
     T, u, limit, t = 0.1, 3.0, 2.0, 0.4

@@ -146,6 +146,7 @@ def test_joints_are_taken_in_the_order_named(arm):
         evaluate(spring, arm, q, v)
 
 
+@pytest.mark.long
 def test_spring_and_drive_move_along_the_manifold(arm):
     """A unit-gain spring is the library's difference, and minus the gradient of its energy where it is conservative."""
     q, v = sample(arm, 3)
@@ -222,6 +223,7 @@ def all_forces(arm, coefficient):
     )
 
 
+@pytest.mark.long
 def test_derivatives():
     """Reverse mode and forward over reverse against central differences at a general point; finite at rest."""
     builder = ModelBuilder("leg")
@@ -255,6 +257,7 @@ def test_derivatives():
     assert np.isfinite(gradient[19]).all() and np.isfinite(hessian[19]).all() and np.any(hessian[19])
 
 
+@pytest.mark.long
 def test_scenes_are_arguments_and_batches(arm):
     """A scene of library forces is an array pytree for jit, and vmap reaches its leaves."""
     q, v = sample(arm, 11)

@@ -53,6 +53,7 @@ def end(scene, x, **options):
     return jnp.concatenate([motion.q[-1], motion.v[-1]])
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("damping", [0.0, 20.0])
 def test_gradient_through_a_stop_is_that_of_the_closed_form(damping):
     """Ten times the tolerance, of derivatives up to 6; with damping the force jumps where the stop is met."""
@@ -90,6 +91,7 @@ def test_gradient_of_steps_through_a_stop():
 BLOCK = jd.LagrangianSystem(lambda q, v: 0.5 * v @ v, 1)
 
 
+@pytest.mark.long
 def test_gradient_through_a_reversal_of_sliding_friction():
     """A block that a force of -6 N stops and pushes back: parabolas on both sides."""
 
@@ -114,6 +116,7 @@ def spring(q, v, t):
     return -4.0 * q
 
 
+@pytest.mark.long
 def test_gradient_through_a_limit_of_effort():
     """A spring of 4 N/m by a motor of at most 2 N: a parabola from 1 m to 0.5 m, then a cosine of 2 rad/s."""
 
@@ -144,6 +147,7 @@ class Backlash(jd.forces.PiecewiseForce):
         return jnp.zeros_like(v).at[0].set(-self.stiffness * beyond)
 
 
+@pytest.mark.long
 def test_gradient_of_a_spring_with_play():
     """A quarter of a period to where the spring lets go, and on at a constant velocity; by the play and the stiffness."""
 
@@ -159,6 +163,7 @@ def test_gradient_of_a_spring_with_play():
     np.testing.assert_allclose(jax.grad(run)(x), jax.grad(exact)(x), atol=1e-7)
 
 
+@pytest.mark.long
 def test_derivatives_across_kinks_are_refused_where_steps_cannot_end_there():
     """Implicit steps are not cut; their motion is right, their derivative would lack what the time of the stop adds."""
     options = {"solver": diffrax.Kvaerno5(), "rtol": 1e-6, "atol": 1e-6}
@@ -172,6 +177,7 @@ def falling(e):
     return jd.Scene(system, forces=[jd.contact.gap_contact(lambda q, t: q[0], restitution=e, name="floor")])
 
 
+@pytest.mark.long
 def test_impact_at_the_start_is_an_event_and_a_refused_start_has_none():
     ts = jnp.asarray([0.0, 0.05, 0.15])
     motion = jax.jit(lambda q: jd.simulate(falling(0.5), q, jnp.asarray([-1.0]), ts))

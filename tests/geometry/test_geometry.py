@@ -85,6 +85,7 @@ def levi_civita(q, v, w):
     return pairs
 
 
+@pytest.mark.long
 def test_connection_of_levi_civita():
     """No torsion, constant metric; curvature by its definition, with its symmetries; geodesics by Euler-Lagrange."""
     q, v, w, _ = (jnp.asarray(x) for x in STATES)

@@ -81,6 +81,7 @@ def solved(name):
     } | computed
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("name", CASES)
 def test_reduced_equations_are_those_with_multipliers(name):
     """Accelerations and contact forces of (6.21)-(6.25) against the saddle-point solve."""

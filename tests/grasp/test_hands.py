@@ -122,6 +122,7 @@ def test_equations_of_any_hand_are_those_with_multipliers(hand):
         assert_close(pushed, computed.force, 1e-11)
 
 
+@pytest.mark.long
 def test_a_square_hand_is_its_own_object_dynamics():
     """With J_h square and regular nu is V, and both functions agree."""
     grasp, (q, v) = jd.scenes.hand_with_bar(), jd.scenes.hand_with_bar.start()

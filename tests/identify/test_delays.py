@@ -41,6 +41,7 @@ def test_the_motion_of_the_witness_is_that_of_the_log():
         np.testing.assert_allclose(mine, other, atol=1e-12)
 
 
+@pytest.mark.long
 def test_delays_are_found_to_their_intervals():
     """12 ms at one joint, -5 ms at the other; and the robot's numbers come out as without delays."""
     truth = np.array([0.012, -0.005])
@@ -67,6 +68,7 @@ def test_a_delay_that_is_not_there_is_not_found():
     assert np.all(np.abs(fit.delays.seconds) <= fit.delays.factor * fit.delays.std)
 
 
+@pytest.mark.long
 def test_intervals_know_that_delays_were_fitted_too():
     """Against the information of independent samples: by how much two unknown delays widen the intervals of all other numbers."""
     smooth, truth = GIVEN | {"v_s": 0.5}, np.array([0.012, -0.008])

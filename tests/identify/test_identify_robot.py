@@ -236,6 +236,7 @@ def test_choice_by_cross_validation(truth):
     assert fit.fit.error(log(3)) < plain.fit.error(log(3))
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("seeds", [range(4), pytest.param(range(100), marks=pytest.mark.slow)])
 def test_terms_that_are_not_there_are_not_chosen(seeds):
     """Exact models, viscous and Coulomb friction, normal noise: at most one log in twenty gets a term, or a robust loss."""
@@ -633,6 +634,7 @@ def test_whiteness_of_known_noise():
 # --- excitation -------------------------------------------------------------------------------------------------------
 
 
+@pytest.mark.long
 def test_exciting_motion_tells_more_within_its_limits():
     """Rest at both ends, all limits kept on a fine grid, torques by inverse dynamics; better condition than where it began."""
     model = arm().replace(lower=np.array([-1.0, -0.5]), upper=np.array([1.0, 2.0]), velocity_limit=np.array([2.0, 3.0]))

@@ -55,6 +55,7 @@ WANTED = (*TRUE["masses"], *TRUE["moments"])
 NAMES = tuple(f"parameters['{key}'][{i}]" for key in ("masses", "moments") for i in (0, 1))
 
 
+@pytest.mark.long
 @pytest.mark.parametrize(
     ("error", "method"),
     [
@@ -145,6 +146,7 @@ def oscillation():
     return log_of(oscillator(), jnp.ones(1), jnp.zeros(1), t, jnp.sin(2 * t)[:, None])
 
 
+@pytest.mark.long
 def test_linear_parameters_and_their_deviations_are_those_of_least_squares(oscillation):
     """Equation error with noise, linear in what is fitted: numpy's solution and its covariance."""
     log, rng = oscillation, np.random.default_rng(3)

@@ -65,6 +65,7 @@ def fitted(path=None, *, method="adam", start=(0.5, 2.9, 0.0), steps=40, **optio
 
 
 # Gauss-Newton steps end after six points.
+@pytest.mark.long
 @pytest.mark.parametrize(
     ("method", "least", "points"), [("adam", 5, 41), pytest.param("gauss-newton", 3, 6, marks=pytest.mark.slow)]
 )
@@ -133,6 +134,7 @@ def test_a_write_that_fails_leaves_the_checkpoint_before(tmp_path, monkeypatch):
     assert descent.read(path)[0]["arrays"]["y"][0] == [3] and len(list(tmp_path.iterdir())) == 1
 
 
+@pytest.mark.long
 def test_solvers_agree_and_progress_is_shown(capsys):
     """The optimum of least squares in the linear case, to 1e-6, by every solver."""
     log, linear = recorded(), lambda system: [system.parameters["size"]]

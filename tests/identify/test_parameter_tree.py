@@ -92,6 +92,7 @@ def test_every_point_is_a_system_that_can_exist():
     assert points.names[0] == "system.inertias[link1] m"
 
 
+@pytest.mark.long
 def test_distances_of_bodies_are_those_of_their_eigenvalues():
     """Against eigenvalues of P0^-1 P in numpy, near and far, and at the nominal body itself."""
     model, pseudo = arm(), jax.jit(jax.vmap(jd.inertia.pseudo_inertia))
@@ -206,6 +207,7 @@ def test_intervals_cover_the_truth_on_arms_and_trees(branching):
     assert 0.90 <= inside / total <= 0.99
 
 
+@pytest.mark.long
 def test_geometry_gravity_and_sensors_are_found_together(log):
     """Length, direction of gravity, an encoder's bias, gains and a delay, all at once, with the inertias known."""
     true = scene_of(arm())
@@ -243,6 +245,7 @@ def test_geometry_gravity_and_sensors_are_found_together(log):
     assert fit.error(recorded) < 5
 
 
+@pytest.mark.long
 def test_a_length_that_enters_everywhere_is_found(log):
     """The length of the links moves joints and, with a mass per length, bodies: one number of a construction."""
 
@@ -296,6 +299,7 @@ class Tracking(eqx.Module):
         return self.gain * (0.4 * jnp.sin(3 * t + phase) - q) + 1.0 * (1.2 * jnp.cos(3 * t + phase) - v)
 
 
+@pytest.mark.long
 def test_numbers_of_a_controlled_arm_by_its_motion_in_closed_loop():
     """Damping and a mass from a log under a controller; its torques are part of what is compared."""
     true, law, t = scene_of(arm(mass=(2.0, 0.5))), Tracking(), np.linspace(0.0, 1.0, 26)

@@ -46,6 +46,7 @@ def null_space(rows) -> np.ndarray:
     return free @ free.T
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("kind", ["3d", pytest.param("6D", marks=pytest.mark.slow)])
 def test_rows_and_accelerations_are_pinocchios(tmp_path, kind):
     """The null space of Pinocchio's rows, and the accelerations of M a + h = tau within it, at rest."""
@@ -84,6 +85,7 @@ def test_a_6d_loop_closes_where_the_frames_coincide(tmp_path):
     np.testing.assert_allclose(position_residual(scene, jnp.zeros(3), jnp.asarray(0.0)), 0.0, atol=1e-15)
 
 
+@pytest.mark.long
 def test_balls_held_joints_and_motors(tmp_path):
     yaml = YAML.format("3d") + "name_mot: [a]\njoint_name: [b, c]\njoint_type: [SPHERICAL, FIXED]\n"
     path = write(tmp_path, yaml)
@@ -161,6 +163,7 @@ def test_joints_in_gazebo_elements_close_loops(tmp_path, kind, loop, axes, rows)
         np.testing.assert_allclose(*open_by, rtol=1e-12)
 
 
+@pytest.mark.long
 def test_rounding_out_of_the_plane_takes_no_freedom(tmp_path):
     """The axes of a planar linkage agree to rounding; their two rows are dependent and not two more."""
     scene = jd.load(

@@ -304,6 +304,7 @@ def test_oracle_is_the_matrix_exponential(name):
             assert abs(to_mp(power_series(fixed(m), 0)) - want).max() < 1e-50
 
 
+@pytest.mark.long
 @pytest.mark.parametrize(("name", "dtype"), CASES)
 def test_exp_and_jacobians_to_second_order(name, dtype):
     xs, (a, b) = samples(name, ANGLES, dtype), directions(name)
@@ -313,6 +314,7 @@ def test_exp_and_jacobians_to_second_order(name, dtype):
         check(differentiate(getattr(GROUPS[name], f), xs, a, b), [[y[i, :n, :n] for y in row] for row in want], xs)
 
 
+@pytest.mark.long
 @pytest.mark.parametrize(("name", "dtype"), CASES)
 def test_log_to_second_order(name, dtype):
     """log along exp(x) exp(t a + u b), given as the matrix and its derivatives, so that it stays on the group."""

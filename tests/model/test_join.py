@@ -151,6 +151,7 @@ def saddle_point(scene, q, v):
     return A, solution[: model.nv], solution[model.nv :]
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("count", [2, pytest.param(3, marks=pytest.mark.slow)])
 def test_arms_lift_a_plate_together(count):
     """6 k rows [-J_h, Ad^-1_{g_ot}], 6 k - 6 internal forces, motion and wrenches as of the saddle-point system."""

@@ -73,6 +73,7 @@ def theirs(source, frames, q, v, a, tau):
     }
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("file,floating", CASES)
 def test_agrees_with_pinocchio(file, floating):
     model, source, bridge = load_both(file, floating)

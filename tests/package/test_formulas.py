@@ -4,6 +4,8 @@ import ast
 import re
 from pathlib import Path
 
+import pytest
+
 import jaxdyn
 
 PACKAGE = Path(jaxdyn.__file__).parent
@@ -18,6 +20,7 @@ COMMANDS = set(
 PAIRS = [("{", "}"), (r"\left", r"\right"), (r"\begin", r"\end")]
 
 
+@pytest.mark.long
 def test_formulas_in_docstrings_are_latex():
     wrong, count = [], 0
     for path in sorted(PACKAGE.rglob("*.py")):

@@ -58,6 +58,7 @@ ENTRY %main (q: f32[4]) -> f32[4] {
     assert gpu.launches(text) == {"once": 1, "each turn": 3, "libraries": 1, "callbacks": 1}
 
 
+@pytest.mark.long
 def test_the_benchmark_for_gpus_runs_to_its_end_without_one(capsys):
     gpu.measure(["iiwa"], [4], steps=2, size=2**10)
     printed = capsys.readouterr().out

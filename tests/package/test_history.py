@@ -24,6 +24,7 @@ def test_a_call_gives_the_same_bits_after_another_one(case):
     assert end.value.code == 0, text.getvalue()
 
 
+@pytest.mark.long
 def test_a_motion_has_the_same_bits_after_one_of_other_masses():
     """In this process, whose caches are cleared in between: the run of other masses left nothing behind."""
     model = jd.robots.chain(2)

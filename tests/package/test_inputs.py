@@ -362,6 +362,7 @@ def _free_and_ball():
     return builder.build()
 
 
+@pytest.mark.long
 def test_quaternions_stand_for_their_direction():
     """Of any length, in functions and under jit: those of the unit quaternion, with no derivative along the length."""
     model = _free_and_ball()
@@ -466,6 +467,7 @@ def test_an_error_inside_a_traced_law_is_told_in_few_lines(way):
     assert len(text.splitlines()) < 100 and "{ lambda" not in text
 
 
+@pytest.mark.long
 def test_scenes_are_built_without_a_warning():
     """In single precision, as a new process has it; Allegro's file alone holds inertias of no body."""
     code = """

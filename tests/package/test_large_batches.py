@@ -113,6 +113,7 @@ for derivative, options in ((jax.jacrev, {}), (jax.jacfwd, {"adjoint": "forward"
 }
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("name", FUNCTIONS)
 def test_programs_of_a_batch_call_no_lapack(name):
     def check(function, *args):

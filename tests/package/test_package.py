@@ -210,6 +210,7 @@ def test_only_programs_switch_to_float64():
     assert not wrong, wrong
 
 
+@pytest.mark.long
 def test_import_is_light_and_leaves_jax_unconfigured():
     """In a fresh interpreter: no plotting, optax or scipy, and no array made before the user chooses devices and dtype."""
     program = """
@@ -344,8 +345,7 @@ def test_public_namespaces_list_their_names():
         namespace = getattr(jaxdyn, name)
         if isinstance(namespace, ModuleType):
             assert all(hasattr(namespace, each) for each in namespace.__all__), name
-            if hasattr(namespace, "__path__"):
-                assert sorted(namespace.__all__) == dir(namespace), name
+            assert sorted(namespace.__all__) == dir(namespace), name
     for namespace, names in _renamed._MOVED.items():
         for name in names.split():
             with pytest.warns(DeprecationWarning, match=rf"jd\.{namespace}\.{name}"):

@@ -146,6 +146,7 @@ def arguments_in(text: str) -> list[str]:
     return names
 
 
+@pytest.mark.long
 def test_docstrings_name_arguments_that_exist():
     """Every function, method and class of the package: what is described is an argument, a field, or a name of the module."""
     wrong, count = [], 0

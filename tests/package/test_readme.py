@@ -6,6 +6,7 @@ import pytest
 from pages import run
 
 
+@pytest.mark.long
 def test_example_of_the_readme_runs(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     names = run("README.md", least=1)
@@ -18,6 +19,7 @@ def test_example_of_the_readme_runs(tmp_path, monkeypatch):
     np.testing.assert_allclose(jnp.einsum("ncbk,bk->nc", names["jacobians"], inertias), names["weights"], atol=1e-10)
 
 
+@pytest.mark.long
 def test_examples_of_the_first_steps_run():
     names = run("docs/start.md")
     assert np.abs(names["a"]).max() < 1e-10, "gravity compensation holds the arm still"

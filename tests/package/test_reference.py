@@ -216,6 +216,7 @@ def use_what_was_made(before: dict, names: dict) -> int:
 QUICK = ("constraints", "files", "forces")
 
 
+@pytest.mark.long
 @pytest.mark.parametrize(
     "page", [pytest.param(page, marks=() if page in QUICK else pytest.mark.slow) for page in PAGES]
 )

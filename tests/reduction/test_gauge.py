@@ -159,6 +159,7 @@ def test_bodies_with_dependent_rows():
     assert_close(computed.Lambda @ computed.W.T, constraint_jacobian(sleigh, q), 1e-13)
 
 
+@pytest.mark.long
 def test_derivatives_and_float32(state):
     """The acceleration's Jacobian equals that of the projection form, also at rest; float32 keeps its type."""
     q, _, tau = state

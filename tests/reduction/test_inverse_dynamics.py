@@ -61,6 +61,7 @@ def rolling():
 CASES = [four_bar, platform, delta_robot, redundant, overconstrained, rolling]
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("case", CASES, ids=lambda case: case.__name__)
 def test_inverse_of_constrained_dynamics(case):
     """The torques give back the acceleration and the multipliers, which satisfy the equations of motion."""
@@ -93,6 +94,7 @@ def test_inverse_of_constrained_dynamics(case):
     assert_close(forward.multipliers, inverse.multipliers, 1e-12)
 
 
+@pytest.mark.long
 def test_torques_of_a_delta_robot_are_those_of_virtual_work():
     """J^T tau = power of gravity and inertia, by differences of the closed form of the hips along a straight path."""
     scene, guess = delta()
@@ -150,6 +152,7 @@ def test_without_constraints_it_is_inverse_dynamics():
     assert inverse.multipliers.shape == (0,) and inverse.q_dot.shape == (7,)
 
 
+@pytest.mark.long
 def test_derivatives_and_batches():
     """Forward and reverse mode against differences, in the state, the accelerations and the masses; a batch is the loop."""
     *_, motors, independent = redundant()
@@ -175,6 +178,7 @@ def test_derivatives_and_batches():
     assert_close(batch, np.stack([value(*x[:2], rate) for rate in rates]), 1e-12)
 
 
+@pytest.mark.long
 def test_refusals_and_codes():
     scene, (q, v) = scenes.four_bar(), scenes.four_bar.start()
     model = scene.system

@@ -206,6 +206,7 @@ def test_orthonormal_basis_is_smooth_and_can_be_continued():
     assert abs(float(at(np.arccos(-0.25), start)[2])) < 1e-6
 
 
+@pytest.mark.long
 def test_a_singular_choice_is_reported():
     """Where the pendulum is level, x does not determine y; a traced place gets the code, a concrete one the fix."""
     scene, level = scenes.pendulum_in_plane(), jnp.asarray([1.0, 0.0])
@@ -321,6 +322,7 @@ def test_rolling_disk_with_torques_full_and_reduced():
     np.testing.assert_allclose(full.acceleration[:, 2:], torques[:, 2:] / [0.125, 0.25 + 2.0 * RHO**2], atol=1e-10)
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("method", [Reduced((0, 2)), pytest.param("reduced", marks=pytest.mark.slow)], ids=str)
 def test_sleigh_in_minimal_velocities(method):
     """tanh and sech: printed state at t = 10, v = (forward, sideways, yaw rate) with the yaw rate and speed kept."""
@@ -330,6 +332,7 @@ def test_sleigh_in_minimal_velocities(method):
     np.testing.assert_allclose(computed.v[-1], [1.169390226108, 0.0, 0.00670176830728], atol=1e-10)
 
 
+@pytest.mark.long
 def test_pendulum_in_one_velocity():
     """Holonomic rows: exact positions of problem A01 (elliptic functions), q on the constraint to rounding."""
     computed = moved(

@@ -284,6 +284,7 @@ def test_evaluations_of_implicit_methods_are_not_known():
     assert evaluations("Kvaerno5", 10, scene, choose_method(scene, "auto")) is None
 
 
+@pytest.mark.long
 def test_every_way_can_be_simulated():
     """Solvers suit the steps they get, methods the scene, and ladders go from coarse to fine."""
     for case in cases().values():
@@ -450,6 +451,7 @@ def small(monkeypatch, body):
     return prepared
 
 
+@pytest.mark.long
 def test_report_resumes_and_writes(small, body, rungs, tmp_path, capsys, monkeypatch):
     lines = []
     measured = jd.report("free_body", rounds=1, out=tmp_path, echo=lines.append)

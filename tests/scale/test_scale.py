@@ -258,6 +258,7 @@ def killed_at(processes, path, chunks, which):
         processes[k].communicate()
 
 
+@pytest.mark.long
 def test_kill_9_and_resume(tmp_path):
     """One process: what was recorded is kept, the rest is computed, and the whole is that of a run without interruption."""
     out = tmp_path / "killed.zarr"
@@ -679,6 +680,7 @@ def states(p):
 """
 
 
+@pytest.mark.long
 def test_sweep_runs_a_study_and_goes_on_with_it(tmp_path, capsys):
     from jaxdyn.cli import main
 
@@ -725,6 +727,7 @@ def test_sweep_refuses(tmp_path, capsys, old, new, error):
     assert not (tmp_path / "study.zarr").exists()
 
 
+@pytest.mark.long
 def test_sweep_draws_for_scenes_by_name_and_for_files(tmp_path, capsys):
     from jaxdyn.cli import main
 

@@ -139,6 +139,7 @@ class Running:
         return self.result
 
 
+@pytest.mark.long
 def test_the_same_bits_as_in_this_process(client, whole, tmp_path, capfd):
     run = evaluate(tmp_path / "a.zarr", client, progress=True)
     assert_same(run, whole(100))
@@ -186,6 +187,7 @@ def test_motions_are_the_same(client, tmp_path):
     assert files(here.out) == files(there.out)
 
 
+@pytest.mark.long
 def test_a_worker_killed_in_a_chunk(client, whole, tmp_path):
     running = Running(tmp_path / "a.zarr", client, iterations=SLOW // 3)
     running.wait_for_chunks(5)
@@ -620,6 +622,7 @@ def test_cross_validation_of_a_fit(client):
         np.testing.assert_array_equal(one.squares, other.squares)
 
 
+@pytest.mark.long
 def test_identification_from_the_shell(cluster, tmp_path, capsys):
     """The report of a fit whose cross-validation runs on workers is that of this process."""
     from jaxdyn.cli import main
@@ -648,6 +651,7 @@ def test_identification_from_the_shell(cluster, tmp_path, capsys):
     assert "--method trajectory does not have; use --method feasible" in capsys.readouterr().err
 
 
+@pytest.mark.long
 def test_without_a_client_no_dask_is_imported(tmp_path, monkeypatch):
     for name in ("dask", "distributed"):
         monkeypatch.setitem(sys.modules, name, None)

@@ -51,6 +51,7 @@ def begin(one, scale=1.0):
     return one.start(np.asarray(one.x), scale * np.asarray(one.rate))
 
 
+@pytest.mark.long
 @pytest.mark.parametrize(("name", "rows", "rank", "freedom"), COUNTS)
 def test_rank_and_freedom(name, rows, rank, freedom):
     """Starts are on the constraints, with the freedom that the mechanism has and not the one that counting joints gives."""
@@ -135,6 +136,7 @@ def test_closures_of_goldberg_and_bricard():
     np.testing.assert_allclose(np.cos(q[:, 3] + q[:, 0] + q[:, 1]), -1, atol=1e-12)
 
 
+@pytest.mark.long
 @chosen("goldberg")
 def test_motion_in_minimal_coordinates(name):
     """All coordinates at several times, closed loops and energy, with the steps of a mechanism whose rows are independent."""

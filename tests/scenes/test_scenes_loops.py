@@ -204,6 +204,7 @@ def test_bennett_linkage():
         scenes.bennett(lengths=(1.0, 2.0))
 
 
+@pytest.mark.long
 def test_andrews_from_its_bodies():
     """The tree of seven bodies and the printed M and f: equal accelerations and energies on the constraints."""
     printed, built = scenes.andrews(), scenes.andrews_bodies()

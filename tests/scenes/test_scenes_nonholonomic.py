@@ -70,6 +70,7 @@ def test_stability_of_the_upright_disk():
         np.testing.assert_allclose(np.poly(J), [1.0, 0.0, -k, 0.0, 0.0], atol=1e-10 * level)
 
 
+@pytest.mark.long
 def test_suslov():
     """tanh and sech: the body goes over to a steady rotation about its second axis."""
     (one, two, three), product, start = (1.0, 1.5, 2.0), 0.4, (1.0, -0.5)

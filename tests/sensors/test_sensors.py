@@ -127,6 +127,7 @@ def test_pendulum_in_closed_form():
     np.testing.assert_allclose(falling["accelerometer of ball"], 0, atol=1e-12)
 
 
+@pytest.mark.long
 def test_forces_under_constraints():
     """Contact forces are the multipliers; the wrench in a joint includes those of the loop."""
     scene, (q, v) = scenes.four_bar(), scenes.four_bar.start()
@@ -153,6 +154,7 @@ def test_mount_inside_a_body():
     np.testing.assert_allclose(tool.read(still), [*weight, 0, 0, 0], atol=1e-12)
 
 
+@pytest.mark.long
 def test_resolution_delay_and_noise():
     model, ts = pendulum(), jnp.linspace(0.0, 2.0, 2001)
     q, v = 0.5 * ts[:, None] ** 1, 0.5 * jnp.ones((2001, 1))

@@ -58,6 +58,7 @@ def test_a01_pendulum_in_plane():
     assert drift(computed) < 1e-9
 
 
+@pytest.mark.long
 def test_car_axis():
     """Moving constraints, all components at t = 3 (published, quadruple precision)."""
     computed = motion(scenes.car_axis(), scenes.car_axis.start(), [0.0, 3.0], rtol=1e-11, atol=1e-11)
@@ -90,6 +91,7 @@ def test_chaplygin_sleigh():
     np.testing.assert_allclose(computed.v[-1], [1.169390226108, 0.0, 0.00670176830728], atol=1e-10)
 
 
+@pytest.mark.long
 def test_knife_edge_on_an_incline():
     """A cycloid: it does not go downhill on average."""
     t = np.array([0.0, 1.0, 5.0, 10.0])
@@ -124,6 +126,7 @@ def test_coin_on_a_steady_circle():
     np.testing.assert_allclose(along_across, along_across[:1].repeat(9, 0), atol=1e-10)
 
 
+@pytest.mark.long
 def test_rolling_disk_rolls_on_a_circle():
     """Radius rho phidot / thetadot, and the torques' closed form for constant ones along a straight line."""
     rho, steer, roll = 0.5, 1.0, 2.0
@@ -166,6 +169,7 @@ def test_a02_forty_windows():
     assert drift(computed) < 1e-4
 
 
+@pytest.mark.long
 @pytest.mark.parametrize(
     ("solver", "order"),
     [
@@ -205,6 +209,7 @@ def test_without_projection_the_constraint_opens():
     np.testing.assert_allclose(computed.multipliers[:, 0], want / (computed.q**2).sum(1), rtol=1e-12)
 
 
+@pytest.mark.long
 def test_gradients_through_the_projected_motion():
     """d(final state)/d(start, mass, gravity, length) in reverse and forward mode, by differences."""
     ts = jnp.asarray([0.0, 0.7])
@@ -237,6 +242,7 @@ def test_gradients_through_the_projected_motion():
     assert (np.abs(reverse).max(0) > 1e-3).all()
 
 
+@pytest.mark.long
 def test_bad_starts_and_methods_are_refused():
     scene, (q, v) = scenes.pendulum_in_plane(), scenes.pendulum_in_plane.start()
     ts = np.array([0.0, 1.0])
@@ -256,6 +262,7 @@ def test_bad_starts_and_methods_are_refused():
     assert [bool(codes(x * q)) for x in (0.9, 1.0)] == [True, False]
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("method", [pytest.param("multipliers", marks=pytest.mark.slow), "baumgarte"])
 def test_rows_that_contradict_each_other_end_with_a_code(method):
     """q1 = 0 and q1 = t^2 meet at t = 0, with their rates. Without a projection no open constraint would tell."""
@@ -266,6 +273,7 @@ def test_rows_that_contradict_each_other_end_with_a_code(method):
     assert run(Scene(system, (at_rest, at_rest))) == RESULTS.successful
 
 
+@pytest.mark.long
 def test_rows_that_open_within_their_rank_tolerance_do_not_contradict():
     """The five rows of Bennett's linkage, of which two are independent where the loop is closed."""
     start = scenes.bennett.start()
@@ -291,6 +299,7 @@ def _without_forces(q, v, t, mass):
     return jnp.zeros_like(v)
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("method", ["multipliers", "projected"])
 def test_rows_at_small_angles_hold(method):
     """A particle on the line in which two planes meet at an angle of 1e-2 to 4e-6, pushed along it and across, to rounding.
@@ -317,6 +326,7 @@ def test_rows_at_small_angles_hold(method):
         np.testing.assert_array_less(errors, bounds)
 
 
+@pytest.mark.long
 def test_a_joint_lock_holds_a_moving_mechanism():
     """A lock on one joint of a double pendulum leaves a rigid pendulum: its period's angle by the reduced equation."""
     system = LagrangianSystem(double_pendulum, 2)
@@ -345,6 +355,7 @@ def double_pendulum(q, v):
     return kinetic - 9.81 * (heights[0] + heights[1])
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("in_plane", [pytest.param(True, marks=pytest.mark.slow), False])
 @pytest.mark.parametrize("branch", ["parallelogram", "antiparallelogram"])
 def test_both_branches_pass_their_flat_position(branch, in_plane):
@@ -375,6 +386,7 @@ def test_both_branches_pass_their_flat_position(branch, in_plane):
         assert drift(computed) < 1e-7
 
 
+@pytest.mark.long
 def test_a_traced_start_without_freedom_ends_with_a_code():
     """Two joints of two are held."""
     system = LagrangianSystem(double_pendulum, 2)

@@ -134,6 +134,7 @@ def test_room_for_steps(monkeypatch):
     np.testing.assert_array_equal(plain[0], free[0])
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("case", [pytest.param("no step", marks=pytest.mark.slow), "one step"])
 def test_runs_that_end_early(case):
     """No step kept, as the rates after the start are no numbers, or one: codes, and derivatives of what was reached."""

@@ -42,6 +42,7 @@ def shaken():
     return jd.simulate(block(), [0.0], [2.0], TS, control=load, outputs=("acceleration", "contact_forces"), **TIGHT)
 
 
+@pytest.mark.long
 def test_block_turns_sticks_and_slips_at_the_times_of_the_closed_form(shaken):
     first, back = block_velocity(0.0, 2.0, 1), None
     turns = brentq(first, 1.5, 3.0, xtol=1e-15)
@@ -58,6 +59,7 @@ def test_block_turns_sticks_and_slips_at_the_times_of_the_closed_form(shaken):
     np.testing.assert_allclose(shaken.events.times("friction: slip"), [slips], atol=1e-10)
 
 
+@pytest.mark.long
 def test_steps_of_fixed_length_end_at_events_and_go_on(shaken):
     """To the order of RK4; the points of the steps stay where they were, so that the end is met."""
     errors = []
@@ -72,6 +74,7 @@ def test_steps_of_fixed_length_end_at_events_and_go_on(shaken):
     assert 10 < errors[0] / errors[1] < 24
 
 
+@pytest.mark.long
 def test_steps_of_fixed_length_have_gradients_through_events():
     ts = jnp.asarray([0.0, 2.5, 4.0])
 
@@ -87,6 +90,7 @@ def test_steps_of_fixed_length_have_gradients_through_events():
         assert abs(float(got) - float(seen(*up) - seen(*down)) / (2 * h)) < 1e-5 * max(1.0, abs(float(got)))
 
 
+@pytest.mark.long
 def test_steps_of_fixed_length_that_are_too_long_say_so():
     spring = jd.forces.JointSpring(jnp.asarray([400.0]), jnp.asarray([0.0]))
     scene = jd.Scene(block().system, forces=(*block().forces, spring))
@@ -233,6 +237,7 @@ def rod(mu, angle, speed, end=0.3, height=0.0):
     return jd.simulate(jd.Scene(builder.build(), forces=[tip]), q0, v0, jnp.linspace(0, end, 4), throw=False)
 
 
+@pytest.mark.long
 def test_painleves_rod_and_one_pressed_into_the_ground_have_codes():
     """No force serves where 1 + 3 cos^2 + 3 mu sin cos sign(v) < 0; it ends that lane of a batch alone, as a start
     below the ground ends another."""

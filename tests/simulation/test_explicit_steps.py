@@ -82,6 +82,7 @@ def twice(scene):
     return Scene(scene.system, (rolling, jd.Pfaffian(rolling.A, name="again")))
 
 
+@pytest.mark.long
 @pytest.mark.parametrize(
     "case", [pytest.param(name, marks=[pytest.mark.slow] * (name != "free body")) for name in CASES]
 )
@@ -160,6 +161,7 @@ def motion(name, **options):
     return run, (jnp.asarray(q), jnp.asarray(v), jnp.asarray(1e-9))
 
 
+@pytest.mark.long
 @pytest.mark.parametrize(
     ("name", "options"),
     [

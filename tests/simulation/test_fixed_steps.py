@@ -115,6 +115,7 @@ def test_reduced_and_projected_steps_are_watched():
         np.testing.assert_array_equal(fine, [True, False], err_msg=method)
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("name", ["RK4", "Tsit5", pytest.param("Dopri8", marks=pytest.mark.slow)])
 def test_torques_held_from_step_to_step_are_those_within_each(name):
     """A unit mass under forces that jump where steps end: v_k = sum of tau_i dt, and its derivative in every tau_i, exactly."""

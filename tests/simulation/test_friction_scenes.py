@@ -57,6 +57,7 @@ def phases(mu, speed):
     return np.array(times), np.array(states)
 
 
+@pytest.mark.long
 @pytest.mark.parametrize(
     ("mu", "names"),
     [
@@ -202,6 +203,7 @@ def bounce(e, height=1.0, most=64, end=1.6):
     return jd.simulate(scene, start, jnp.zeros(1), jnp.linspace(0.0, end, 9), max_events=most, throw=False, **TIGHT)
 
 
+@pytest.mark.long
 def test_ball_bounces_as_newton_says():
     """Times of impacts in closed form; a gradient of the height afterwards in the restitution and the start."""
     motion = bounce(0.8)

@@ -130,6 +130,7 @@ def end_of(move, **options):
     return time
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("name", CASES)
 @pytest.mark.parametrize("how", ["Dopri8", pytest.param("Tsit5", marks=pytest.mark.slow), "RK4"])
 def test_a_motion_ends_at_the_root(name, how):
@@ -144,6 +145,7 @@ def test_a_motion_ends_at_the_root(name, how):
     np.testing.assert_array_equal(np.isfinite(solution.q).all(2), expected[:, None] >= TS)
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("name", CASES)
 def test_a_single_motion_has_both_modes(name):
     case = CASES[name]

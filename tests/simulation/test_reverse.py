@@ -41,6 +41,7 @@ def gradients(adjoint, jit=jax.jit, **options):
     return call(Q, V, jnp.asarray(0.3), TS)
 
 
+@pytest.mark.long
 @pytest.mark.parametrize(
     "options",
     [

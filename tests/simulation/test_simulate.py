@@ -213,6 +213,7 @@ def driven(leg):
     )
 
 
+@pytest.mark.long
 def test_energy_is_work(driven):
     solution = driven[2]
     energy, work, power = (np.asarray(x) for x in (solution.energy, solution.work, solution.power))
@@ -290,6 +291,7 @@ def central_difference(function, point, step=1e-4):
     return (8 * (one - minus) - (two - minus_two)) / (12 * step)
 
 
+@pytest.mark.long
 def test_reverse_mode_against_finite_differences(leg):
     """Masses, start, coefficients and control, with adaptive steps; and finite at rest, where error estimates vanish."""
 
@@ -539,6 +541,7 @@ def test_quaternions_near_unit_length_are_normalised(leg):
     np.testing.assert_allclose(run(scaled), run(jnp.asarray(Q0)), rtol=1e-14, atol=1e-15)
 
 
+@pytest.mark.long
 @pytest.mark.parametrize(
     "wrapped",
     [LieGroup(diffrax.Tsit5()), pytest.param(diffrax.HalfSolver(diffrax.Tsit5()), marks=pytest.mark.slow)],
@@ -554,6 +557,7 @@ def test_methods_that_wrap_an_explicit_one(wrapped, name):
     assert_close(solutions[1].v, solutions[0].v, 1e-6)
 
 
+@pytest.mark.long
 def test_constraints_may_be_functions_that_hold_numbers_of_a_batch():
     """No leaf of the scene says that they do."""
     builder = ModelBuilder("two slides", gravity=None)

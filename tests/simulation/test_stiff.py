@@ -185,6 +185,7 @@ def turned_exactly(ball):
 IMPLICIT = diffrax.Kvaerno3(root_finder=optimistix.Newton(1e-13, 1e-13))
 
 
+@pytest.mark.long
 @pytest.mark.parametrize(
     ("solver", "order"),
     [
@@ -344,6 +345,7 @@ def two_to_one(q, t):
     return jnp.asarray([[2.0, -1.0]], q.dtype)
 
 
+@pytest.mark.long
 def test_default_solver_and_advice_follow_stiffness():
     """A spring with twice the critical damping: Dopri8 as long as it is slow, Rodas5P where it is not, and the numbers said."""
     case = cases()["spring"]
@@ -362,6 +364,7 @@ def test_default_solver_and_advice_follow_stiffness():
         run(1e9, solver=diffrax.Dopri8())
 
 
+@pytest.mark.long
 def test_implicit_explicit_split():
     """A released spring with twice the critical damping, decays of 3e2 to 4e3 1/s: springs and dampers are implicit."""
     k = 1e6
@@ -459,6 +462,7 @@ def test_what_succeeds_is_right(name):
     assert codes["RK4, 1 ms"] == BY_RK4[name]
 
 
+@pytest.mark.long
 def test_rodas_serves_at_every_stiffness():
     """Springs of 1e2 to 1e9 N/m in one program: positions and their derivatives against closed forms."""
     case = cases()["flexible_joint"]

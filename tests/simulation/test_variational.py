@@ -83,6 +83,7 @@ def runs():
 FEW = [pytest.param(name, marks=[pytest.mark.slow] * (name != "pendulum_in_plane")) for name in CLOSED]
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("name", FEW)
 def test_order_two(name, runs):
     """At save points that no step ends on, with the dense output, and at the end of a clipped step."""
@@ -212,6 +213,7 @@ class _Field(eqx.Module):
         return -self.stiffness * q - 0.3 * v + jnp.cos(t)
 
 
+@pytest.mark.long
 def test_forces():
     """Damped oscillator under a periodic force: order 2 against its closed form, and its work."""
     system = LagrangianSystem(lambda q, v: 0.5 * v[0] ** 2, 1)
@@ -308,6 +310,7 @@ def test_bad_input_is_refused():
         Variational(rank_tol=2.0)
 
 
+@pytest.mark.long
 def test_a_step_that_cannot_be_solved_ends_the_run():
     """Steps far too long for the rod: no point of the circle can be reached. Rows after that are NaN.
 

@@ -18,7 +18,7 @@ from jaxdyn.identify.robot import RobotFit, fit_robot
 from jaxdyn.identify.threads import on_one_thread
 from jaxdyn.identify.torque_terms import RobotTerms, split_terms
 from jaxdyn.identify.uncertainty import effective_sample_size, jackknife
-from jaxdyn.model import host_math as _host_math
+from jaxdyn.model import host_math
 from jaxdyn.model import inertia as _inertia
 from jaxdyn.model.builder import ModelBuilder
 from jaxdyn.model.tree import Model
@@ -62,7 +62,7 @@ class Payload(eqx.Module):
     @property
     def rotational(self) -> np.ndarray:
         """Rotational inertia (3, 3) about the centre of mass, in axes of that frame (kg m^2)."""
-        return _host_math.about_com(self.inertia)[2]
+        return host_math.about_com(self.inertia)[2]
 
 
 @on_one_thread
