@@ -92,7 +92,8 @@ def minimize_torque_error(
 ) -> Minimum:
     """Minimise by `InteriorPoint` from the start of the chart; `callback(step, loss, (origin, terms))` before each step."""
     end = descend(InteriorPoint(problem, tolerance), problem.chart.start, Watch(steps, callback))
-    return Minimum(*end.last.point, end.history, end.result)
+    origin, terms = end.last.point
+    return Minimum(origin, terms, end.history, end.result)
 
 
 class Estimate(NamedTuple):
