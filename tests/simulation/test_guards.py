@@ -162,9 +162,14 @@ def test_a_single_motion_has_both_modes(name):
 def test_implicit_steps_find_the_same_time(name):
     """In the loop of diffrax, by its dense output of third order."""
     case = CASES[name]
-    solution = case.move(jnp.asarray(case.numbers[0]), solver=diffrax.Kvaerno5(), rtol=1e-9, atol=1e-9)
-    assert solution.result == getattr(jd.RESULTS, case.code)
-    np.testing.assert_allclose(solution.stats["time_reached"], case.time(case.numbers[0]), rtol=1e-6)
+    options: dict[str, Any] = {"solver": diffrax.Kvaerno5(), "rtol": 1e-9, "atol": 1e-9}
+    gradient = jax.value_and_grad(end_of(case.move, **options), has_aux=True)
+    (times, solution), derivatives = jax.jit(jax.vmap(gradient))(jnp.asarray(case.numbers))
+    assert np.asarray(solution.result == getattr(jd.RESULTS, case.code)).all()
+    np.testing.assert_allclose(times, case.time(case.numbers), rtol=1e-6)
+    np.testing.assert_allclose(derivatives, case.derivative(case.numbers), rtol=1e-6)
+    forward = quick(jax.jacfwd(end_of(case.move, adjoint="forward", **options), has_aux=True))
+    np.testing.assert_allclose(forward(case.numbers[0])[0], case.derivative(case.numbers[0]), rtol=1e-6)
 
 
 def test_rows_before_the_end_have_derivatives():

@@ -12,24 +12,29 @@ import diffrax
 import equinox as eqx
 import jax
 import jax.numpy as jnp
+from jax.flatten_util import ravel_pytree
+
+from jaxdyn.simulation.solvers.guards import delay
 
 COUNTS = ("num_steps", "num_accepted_steps", "num_rejected_steps")
 ROOM = 4096  # steps that are recorded where the user gives no limit: 32 kB a trajectory
 
 
-def run(inputs, *, term, solver, controller, event, adjoint, max_steps, progress, dt0=None, record=False):
+def run(inputs, *, term, solver, controller, event, adjoint, max_steps, progress, dt0=None, record=False, end=None):
     """diffrax's solution from one end of the save points to the other.
 
     **Arguments:** `inputs`, what may be differentiated: the initial state, `args`, and the save points (nt,) with the start in
-    front; `record`: True to save the times at which steps ended too; the rest as in diffrax.
+    front; `record`: True to save the times at which steps ended too; `end`, (), s: a time whose state is returned as that of the
+    event; the rest as in diffrax.
 
     **Returns:** rows of the state at ts[1:]; the result, the counts, the time reached and, if the time of an event is located,
     the state there; all that diffrax returned.
     """
     y0, args, ts = inputs
-    located = event is not None and event.root_finder is not None
+    located = _is_located(event)
     saves = diffrax.SubSaveAt(ts=ts[1:])
     last = diffrax.SubSaveAt(t1=True, fn=_state if located else _nothing)
+    last = last if end is None else diffrax.SubSaveAt(ts=end[None])
     ends = (diffrax.SubSaveAt(steps=True, fn=_nothing),) if record else ()
     saveat = diffrax.SaveAt(subs=(saves, last, *ends), controller_state=True)
     continuous = isinstance(adjoint, diffrax.BacksolveAdjoint)  # supports save points and nothing else
@@ -53,12 +58,15 @@ def run(inputs, *, term, solver, controller, event, adjoint, max_steps, progress
     if continuous:
         reached = jnp.max(jnp.where(jnp.isfinite(solved.ts), solved.ts, ts[0]))
         return solved.ys, (solved.result, counts, reached), solved
-    end = (jax.tree.map(lambda rows: rows[0], solved.ys[1]),) if located else ()
+    end = (jax.tree.map(lambda rows: rows[0], solved.ys[1]),) if located or end is not None else ()
     return solved.ys[0], (solved.result, counts, solved.ts[1][0], *end), solved
 
 
 def run_adaptively(inputs, options, limit_is_given: bool):
-    """Rows and facts of `run` with adaptive steps whose ends are constants to reverse mode."""
+    """Rows and facts of `run` with adaptive steps whose ends are constants to reverse mode.
+
+    The time of an event then follows from the state at its end.
+    """
     if not isinstance(options["controller"], diffrax.AbstractAdaptiveStepSizeController):
         return run(inputs, **options)[:2]  # with steps that are given, as those of `diffrax.StepTo`
     numbers, rest = eqx.partition(options, eqx.is_array)
@@ -66,11 +74,12 @@ def run_adaptively(inputs, options, limit_is_given: bool):
     options = eqx.combine(jax.lax.stop_gradient(numbers), rest)
     room = options["max_steps"] if limit_is_given else min(options["max_steps"], ROOM)
     if isinstance(options["adjoint"], diffrax.RecursiveCheckpointAdjoint):
-        return _run(inputs, options, room)
+        return _with_end(_run(inputs, options, room), inputs[1], options)
     if isinstance(options["adjoint"], diffrax.DirectAdjoint):
         numbers, rest = eqx.partition(inputs, eqx.is_array)
         facts, steps = _record(eqx.combine(jax.lax.stop_gradient(numbers), rest), options, options["max_steps"])[1:]
-        return run(inputs, **_repeat(options, steps))[0], facts
+        rows, repeated, _ = run(inputs, **_repeat(options, steps, facts[2]))
+        return _with_end((rows, (*facts[:3], *repeated[3:])), inputs[1], options)
     return run(inputs, **options)[:2]
 
 
@@ -82,15 +91,39 @@ def _run(inputs, options, room):
 @_run.def_fwd
 def _(perturbed, inputs, options, room):
     rows, facts, steps = _record(inputs, options, room)
-    return (rows, facts), steps
+    return (rows, facts), (steps, facts[2])
 
 
 @_run.def_bwd
-def _(steps, gradients, perturbed, inputs, options, room):
+def _(residuals, gradients, perturbed, inputs, options, room):
     free, fixed = eqx.partition(inputs, perturbed)
-    options = _repeat(options, steps)
-    rows, pull = eqx.filter_vjp(lambda free: run(eqx.combine(free, fixed), **options)[0], free)
-    return pull(jax.tree.map(lambda y, g: jnp.zeros_like(y) if g is None else g, rows, gradients[0]))[0]
+    options = _repeat(options, *residuals)
+
+    def states(free):
+        rows, facts, _ = run(eqx.combine(free, fixed), **options)
+        return rows, facts[3:]
+
+    values, pull = eqx.filter_vjp(states, free)
+    of_states = gradients[0], gradients[1][3:]
+    return pull(jax.tree.map(lambda y, g: jnp.zeros_like(y) if g is None else g, values, of_states))[0]
+
+
+def _is_located(event) -> bool:
+    """True for an event whose time within a step is found."""
+    return event is not None and event.root_finder is not None
+
+
+def _with_end(solved, args, options):
+    """Rows and facts, whose time of an event has its derivative."""
+    rows, (result, counts, reached, *last) = solved
+    if not last:
+        return solved
+    codes: Any = diffrax.RESULTS
+    event, term, (end,) = options["event"], options["term"], last
+    rate = term.vf_prod(reached, end, args, term.contr(reached, reached + 1))
+    y, unravel = ravel_pytree(end)
+    late = delay(lambda t, y: event.cond_fn(t, unravel(y), args), ravel_pytree(rate)[0], reached, y)
+    return rows, (result, counts, reached + jnp.where(result == codes.event_occurred, late, 0.0), end)
 
 
 def _record(inputs, options, room):
@@ -108,10 +141,11 @@ def _record(inputs, options, room):
     return rows, facts, jax.lax.stop_gradient(controller)
 
 
-def _repeat(options, controller):
-    """Options of a run that repeats steps."""
+def _repeat(options, controller, end):
+    """Options of a run that repeats steps, with the state at the time `end` if that is the time of an event."""
+    end = jax.lax.stop_gradient(end) if _is_located(options["event"]) else None
     changes = {"controller": controller, "max_steps": controller.ends.shape[0], "progress": diffrax.NoProgressMeter()}
-    return options | changes | {"event": None}
+    return options | changes | {"event": None, "end": end}
 
 
 class _GivenSteps(diffrax.AbstractStepSizeController):
