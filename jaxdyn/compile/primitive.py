@@ -16,7 +16,7 @@ import jax
 import jax.numpy as jnp
 from jax import lax
 
-from jaxdyn.compile import calls, derive, jax_adapter, mode
+from jaxdyn.compile import ahead, derive, jax_adapter, mode
 from jaxdyn.compile.inlining import inline
 from jaxdyn.compile.jax_adapter import ShapedArray, define_primitive, is_linear, is_zero, lowering_of, zero_tangent
 from jaxdyn.compile.program import COMPARISONS, Constant, NotNumbers, Program, TooLong, dtype_of
@@ -47,7 +47,7 @@ def _implement(*args, program, rows):
 
 def _result_types(*avals, program, rows):
     is_one = not any(len(x.shape) > 1 for x in avals)
-    if is_one and calls.has_worker() and not mode.is_expanding():
+    if is_one and ahead.is_active() and not mode.is_expanding():
         assert target is not None
         # JAX asks for the types first, long before it lowers: LLVM works while Python traces on. An error is raised, with
         # its message, where the kernel is lowered.

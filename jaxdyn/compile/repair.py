@@ -14,7 +14,7 @@ import jax.numpy as jnp
 from jax import lax
 from jax.custom_batching import custom_vmap
 
-from jaxdyn.compile import calls, mode
+from jaxdyn.compile import ahead, mode
 from jaxdyn.compile.batch import any_sample
 from jaxdyn.compile.flags import mark_floats
 from jaxdyn.compile.jax_adapter import vary_alike
@@ -105,7 +105,7 @@ def _without_worker(careful: Callable) -> Callable:
     """The function, whose kernels are compiled when they are called: hardly any sample needs them."""
 
     def call(*args):
-        with calls.worker(False):
+        with ahead.worker(False):
             return careful(*args)
 
     return call

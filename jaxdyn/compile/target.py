@@ -11,7 +11,7 @@ from typing import Any
 
 import numpy as np
 
-from jaxdyn.compile import calls
+from jaxdyn.compile import ahead
 from jaxdyn.compile.code import calls_itself, kernel_ir, subprogram_ir, symbol_of, varying_first
 from jaxdyn.compile.jax_adapter import Unsupported as Unsupported
 from jaxdyn.compile.jax_adapter import ffi_version, register_handler
@@ -144,7 +144,7 @@ class _Kernel:
         self.program: Any = program
         self.width, self.uniform = width, uniform
         self.code: Code | None = None
-        self.is_awaited = False  # whether a worker is to compile it (see `calls`)
+        self.is_awaited = False  # whether a worker is to compile it (see `ahead`)
         order = varying_first(uniform)
         # The handler checks buffers against these; a negative size is one row for all samples.
         sizes = [-1 - program.inputs[i].size if uniform[i] else program.inputs[i].size for i in order]
@@ -183,7 +183,7 @@ def make_ahead(number: int) -> None:
     made = _kernels[number]
     if made.code is None and not made.is_awaited:
         made.is_awaited = True
-        calls.make_later(made.address)
+        ahead.make_later(made.address)
 
 
 def _publish(called: Program, width: int) -> None:

@@ -12,7 +12,7 @@ from jax import monitoring
 
 import jaxdyn as jd
 from jaxdyn import compile as backend
-from jaxdyn.compile import calls, objects, target
+from jaxdyn.compile import ahead, calls, objects, target
 from jaxdyn.compile.repair import compute_where
 
 pytestmark = pytest.mark.native
@@ -101,7 +101,7 @@ def test_no_thread_outlives_the_call_and_the_collector_stays_on():
     def function(x):
         for k in range(3):
             x = native(lambda x, k=k: jnp.sin(x) * (1.48484 + k))(x)
-        calls.make_later(lambda: slow.wait(0.2))
+        ahead.make_later(lambda: slow.wait(0.2))
         seen.append((gc.isenabled(), len(set(threading.enumerate()) - before)))
         return x
 
@@ -137,7 +137,7 @@ def test_the_environment_turns_both_off(usual, monkeypatch):
     seen = []
 
     def function(x):
-        seen.append(calls.has_worker())
+        seen.append(ahead.is_active())
         return native(lambda x: jnp.sin(x) * 1.67676)(x)
 
     np.testing.assert_allclose(backend.entry_point(function)(jnp.ones(2)), np.sin(1) * 1.67676, rtol=1e-15)
