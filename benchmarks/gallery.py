@@ -26,7 +26,6 @@ SCENES = {
     "windows": 3.0,
     "closed_ring": 2.0,
     "parallel_manipulator": 2.0,
-    "andrews_bodies": 0.03,
     "rolling_coin": 1.5,
     "ball_on_turntable": 4.0,
     "chaplygin_sleigh": 4.0,

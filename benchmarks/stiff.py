@@ -19,6 +19,7 @@ import numpy as np
 
 import jaxdyn as jd
 from benchmarks.extremes import name_of
+from benchmarks.report_cases import test_set
 from benchmarks.report_cases.references import car_axis
 from benchmarks.timing import chosen_names
 from jaxdyn.constraints.codes import code_of
@@ -156,7 +157,7 @@ def _press(k):
 
 def _car(scale):
     with jax.ensure_compile_time_eval():
-        scene, start = jd.scenes.car_axis(), [np.asarray(x) for x in jd.scenes.car_axis.start()]
+        scene, start = test_set.car_axis(), [np.asarray(x) for x in test_set.car_axis.start()]
     mass = scene.system.parameters["k"] * scale
     return eqx.tree_at(lambda s: s.system.parameters["k"], scene, mass), None, *start
 
@@ -212,7 +213,7 @@ def cases() -> dict[str, Case]:
             _car,
             np.array([0.0, 3.0]),
             np.ones(1),
-            lambda scale: car_axis(jd.scenes.car_axis.start()).q,
+            lambda scale: car_axis(test_set.car_axis.start()).q,
             1.0,
             # 15 000 steps; and nothing in Scene.forces that could be split off.
             ("Kvaerno3", "KenCarp4"),

@@ -1,12 +1,13 @@
 """Error against run time beside other tools, all timed in turn within one loop, and who lies below our front.
 
-    python -m benchmarks.work_precision [SCENE ...] [--batch 1 1024] [--integrator projected:Dopri8] [--rounds 20] [--full]
-        [--out out/work_precision]
+    python -m benchmarks.work_precision [SCENE ...] [--batch 1 1024] [--integrator projected:Dopri8] [--rounds 20] [--all]
+        [--out out/work_precision] [--figures DIRECTORY]
 
 The page is that of `jaxdyn report`, for cases whose motions are known, with the peers of `benchmarks.peers` as dashed lines
-on scenes that they can do. A run that was interrupted goes on where it stopped. Then, for each plot: the peers' points that
-lie below jaxdyn's front, and the time at equal error relative to the best of them. A peer without a batched call counts in
-a batch with its time for one trajectory over the number of cores, as if it made perfect use of them.
+on scenes that they can do. Finished scenes stay in `OUT/scenes`, from which an interrupted run resumes. Then, for each
+plot: the peers' points that lie below jaxdyn's front, and the time at equal error relative to the best of them. A peer
+without a batched call counts in a batch with its time for one trajectory over the number of cores, as if it made perfect
+use of them.
 """
 
 import argparse
@@ -18,10 +19,10 @@ from pathlib import Path
 import jax
 
 from benchmarks import peers, timing
-from benchmarks.report_cases import cases
+from benchmarks.fronts import TARGETS, beaten_by, cost_at
+from benchmarks.report_cases import PUBLISHED, cases
 from jaxdyn.model.description import table
-from jaxdyn.reports import Record, Report, beaten_by, report
-from jaxdyn.reports.front import TARGETS, cost_at
+from jaxdyn.reports import Record, Report, report, write
 from jaxdyn.reports.page import figure
 
 SCENES = ("andrews", "car_axis", "windows_40", "free_body", "rolling_disk")
@@ -85,7 +86,19 @@ def draw(computed: Report, directory: Path) -> None:
         scene, batch = group[0].scene, group[0].batch
         drawn = figure(f"{computed.scenes[scene].text}: {batch} at once", computed.scenes[scene], group)
         if drawn is not None:
+            _draw_published(drawn.axes[0], PUBLISHED.get(scene, ()))
             drawn.savefig(directory / f"{scene}_{batch}.png", dpi=110)
+
+
+def _draw_published(ax, runs) -> None:
+    """Stars of published errors and times; dotted lines of times without an error."""
+    for label, seconds, error, energy_error in runs:
+        if error is not None:
+            ax.plot([error], [seconds], "*", color="black", markersize=9, label=label)
+        elif energy_error is None:
+            ax.axhline(seconds, color="black", linestyle=":", linewidth=1, label=f"{label}, no error given")
+    if runs:
+        ax.legend(fontsize=6, frameon=False)
 
 
 def main(argv=None) -> None:
@@ -95,7 +108,7 @@ def main(argv=None) -> None:
     parser.add_argument("--batch", nargs="+", type=int, default=(1,))
     parser.add_argument("--integrator", nargs="+", help="method:solver in place of the usual ones")
     parser.add_argument("--rounds", type=int, default=20)
-    parser.add_argument("--full", action="store_true")
+    parser.add_argument("--all", action="store_true", help="all cases instead of five")
     parser.add_argument("--out", default=str(timing.OUT / "work_precision"))
     parser.add_argument("--figures", type=Path, help="directory for an image of each plot")
     options = parser.parse_args(argv)
@@ -104,18 +117,30 @@ def main(argv=None) -> None:
     def say(line):
         print(line, flush=True)
 
-    known = cases()
-    measured = report(
-        [known[name] for name in options.scenes or (known if options.full else SCENES)],
-        full=options.full,
-        dtypes=("float64",),
-        batches=tuple(options.batch),
-        integrators=None if options.integrator is None else [tuple(pair.split(":")) for pair in options.integrator],
-        rounds=options.rounds,
-        out=options.out,
-        peers=peers.Peers(say),
-        echo=say,
+    known, out, parts = cases(), Path(options.out), []
+    integrators = None if options.integrator is None else [tuple(pair.split(":")) for pair in options.integrator]
+    for name in options.scenes or (known if options.all else SCENES):
+        done = out / "scenes" / f"{name}.json"
+        if done.exists():
+            say(f"{name} as in {done}; remove the file to measure it anew")
+        else:
+            one = report(
+                known[name],
+                batches=options.batch,
+                integrators=integrators,
+                rounds=options.rounds,
+                peers=peers.Peers(say),
+                echo=say,
+            )
+            done.parent.mkdir(parents=True, exist_ok=True)
+            done.write_text(one.to_json(), encoding="utf-8")
+        parts.append(Report.from_json(done.read_text(encoding="utf-8")))
+    measured = Report(
+        parts[0].head,
+        {name: known for part in parts for name, known in part.scenes.items()},
+        tuple(record for part in parts for record in part.records),
     )
+    write(measured, out)
     print(f"\n{measured.table()}\n\nWritten to {options.out}/report.html\n")
     if options.figures:
         draw(measured, options.figures)

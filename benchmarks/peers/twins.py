@@ -8,6 +8,7 @@ import numpy as np
 
 import jaxdyn as jd
 from benchmarks.peers.equations import from_angle, same, to_angle, unit_quaternion
+from benchmarks.report_cases import test_set
 
 
 class Spring(NamedTuple):
@@ -61,7 +62,7 @@ def _andrews() -> Twin:
         pull = -spring.stiffness * (length - spring.rest) / length
         return np.array([motor, 0.0, pull * (armx * dy - army * dx), 0.0, 0.0, 0.0, 0.0])
 
-    return Twin(jd.scenes.andrews_bodies(), turn, turn, spring, torques, push)
+    return Twin(test_set.andrews_bodies(), turn, turn, spring, torques, push)
 
 
 TWINS: dict[str, Callable[[], Twin]] = {

@@ -7,12 +7,31 @@ import jax.numpy as jnp
 import numpy as np
 
 from benchmarks.report_cases import references
+from benchmarks.report_cases.builders import scene_builder
 from benchmarks.report_cases.in_contact import in_contact
 from benchmarks.report_cases.mechanisms import mechanisms
+from benchmarks.report_cases.test_set import andrews, car_axis
 from jaxdyn.forces.elements import Drive
 from jaxdyn.model import robots
-from jaxdyn.reports.case import Case, Published, scene_builder
+from jaxdyn.reports.case import Case
 from jaxdyn.systems.scene import Scene
+
+_I5 = "Intel i5-4570, date not stated"
+# Published runs of the same motions: label, CPU seconds, and the largest error of the state or of the energy (J) where stated.
+PUBLISHED = {
+    "pendulum_in_plane": (
+        (f"OpenSim 3.2 ({_I5})", 0.637, None, None),
+        ("Exudyn, step 0.8 ms (Intel i7 laptop, date not stated)", 0.037, None, 5e-5),
+    ),
+    "windows": (
+        (f"OpenSim 3.2 ({_I5})", 0.455, None, None),
+        ("Exudyn, step 10 ms (date not stated)", 0.0776, None, 0.114),
+    ),
+    "andrews": (
+        ("PSIDE at 1e-14 (Cray C90, 1990s)", 56.74, 3e-8, None),
+        (f"OpenSim 3.2 on 0.05 s, problem A03 ({_I5})", 0.384, None, None),
+    ),
+}
 
 
 def _stiff_elbow() -> tuple[Scene, tuple]:
@@ -22,25 +41,18 @@ def _stiff_elbow() -> tuple[Scene, tuple]:
 
 def _cases() -> tuple[Case, ...]:
     ten = np.linspace(0.0, 10.0, 11)
-    i5 = "Intel i5-4570, date not stated"
     return (
         Case(
             "pendulum_in_plane",
             "Plane pendulum in x and y, 10 s (problem A01 of the IFToMM library)",
-            "holonomic",
             scene_builder("pendulum_in_plane"),
             lambda start: references.plane_pendulum(ten),
             ten,
             500,
-            published=(
-                Published(f"OpenSim 3.2 ({i5})", 0.637),
-                Published("Exudyn, step 0.8 ms (Intel i7 laptop, date not stated)", 0.037, energy_error=5e-5),
-            ),
         ),
         Case(
             "spherical_pendulum",
             "Spherical pendulum in x, y and z, 10 s",
-            "holonomic",
             scene_builder("spherical_pendulum"),
             lambda start: references.sphere_pendulum(ten),
             ten,
@@ -49,7 +61,6 @@ def _cases() -> tuple[Case, ...]:
         Case(
             "free_body",
             "Free rigid body with three different moments of inertia, 20 s",
-            "free",
             scene_builder("free_body"),
             lambda start: references.free_top(2 * ten),
             2 * ten,
@@ -58,7 +69,6 @@ def _cases() -> tuple[Case, ...]:
         Case(
             "double_pendulum",
             "Double pendulum of two bodies in a chain, 5 s",
-            "free",
             scene_builder("double_pendulum", formulation="model"),
             None,
             ten / 2,
@@ -67,7 +77,6 @@ def _cases() -> tuple[Case, ...]:
         Case(
             "rolling_disk",
             "Upright disk that rolls on a circle, 10 s",
-            "nonholonomic",
             scene_builder("rolling_disk"),
             lambda start: references.upright_disk(ten),
             ten,
@@ -76,7 +85,6 @@ def _cases() -> tuple[Case, ...]:
         Case(
             "chaplygin_sleigh",
             "Chaplygin's sleigh, 10 s",
-            "nonholonomic",
             scene_builder("chaplygin_sleigh"),
             lambda start: references.sleigh(ten),
             ten,
@@ -85,7 +93,6 @@ def _cases() -> tuple[Case, ...]:
         Case(
             "rolling_coin",
             "Leaning disk that rolls steadily on a circle, 5 s: close to one turn",
-            "nonholonomic",
             scene_builder("rolling_coin"),
             lambda start: references.coin(ten / 2),
             ten / 2,
@@ -94,7 +101,6 @@ def _cases() -> tuple[Case, ...]:
         Case(
             "bicycle",
             "Whipple's bicycle at 4.6 m/s after a push to its side, 3 s",
-            "nonholonomic",
             scene_builder("bicycle", roll_rate=0.5),
             None,
             np.linspace(0.0, 3.0, 7),
@@ -103,7 +109,6 @@ def _cases() -> tuple[Case, ...]:
         Case(
             "four_bar",
             "Four-bar linkage, 5 s",
-            "holonomic",
             scene_builder("four_bar"),
             None,
             ten / 2,
@@ -112,45 +117,31 @@ def _cases() -> tuple[Case, ...]:
         Case(
             "windows",
             "Two four-bar windows, 10 s (problem A02 of the IFToMM library, N = 2), through positions where rows lose rank",
-            "holonomic, losing rank",
             scene_builder("windows", count=2),
             lambda start: references.windows(ten, 2),
             ten,
             500,
-            published=(
-                Published(f"OpenSim 3.2 ({i5})", 0.455),
-                Published("Exudyn, step 10 ms (date not stated)", 0.0776, energy_error=0.114),
-            ),
         ),
         Case(
             "windows_40",
             "Forty four-bar windows, 1 s of the 20 s of problem A02 of the IFToMM library, through one position where rows "
             "lose rank",
-            "holonomic, losing rank",
             scene_builder("windows", count=40),
             lambda start: references.windows(ten / 10, 40),
             ten / 10,
             10,
-            # Programs for a batch compile for a minute and more each.
-            largest=1,
         ),
         Case(
             "andrews",
             "Andrews' squeezing mechanism, 0.03 s (test set for IVP solvers)",
-            "holonomic",
-            scene_builder("andrews"),
+            scene_builder(andrews),
             references.andrews,
             np.array([0.0, 0.03]),
             250,
-            published=(
-                Published("PSIDE at 1e-14 (Cray C90, 1990s)", 56.74, error=3e-8),
-                Published(f"OpenSim 3.2 on 0.05 s, problem A03 ({i5})", 0.384),
-            ),
         ),
         Case(
             "held_elbow",
             "Double pendulum whose elbow a stiff drive holds, 2 s: decays of 1e5 1/s",
-            "free, stiff",
             _stiff_elbow,
             None,
             ten / 5,
@@ -161,8 +152,7 @@ def _cases() -> tuple[Case, ...]:
         Case(
             "car_axis",
             "Car axis on a bumpy road, 3 s (test set for IVP solvers): constraints that move with time",
-            "driven",
-            scene_builder("car_axis"),
+            scene_builder(car_axis),
             references.car_axis,
             np.array([0.0, 3.0]),
             250,

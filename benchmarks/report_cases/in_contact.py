@@ -3,7 +3,8 @@
 import numpy as np
 
 from benchmarks.report_cases import references
-from jaxdyn.reports.case import Case, scene_builder
+from benchmarks.report_cases.builders import scene_builder
+from jaxdyn.reports.case import Case
 
 
 def in_contact() -> tuple[Case, ...]:
@@ -14,7 +15,6 @@ def in_contact() -> tuple[Case, ...]:
         Case(
             "sphere_arm",
             "Arm of six joints whose tip slides on a sphere without friction, 0.5 s: five coordinates of contact",
-            "holonomic",
             scene_builder("sphere_arm"),
             None,
             ten / 20,
@@ -23,7 +23,6 @@ def in_contact() -> tuple[Case, ...]:
         Case(
             "sphere_arm_rolling",
             "Arm of six joints whose tip rolls on a sphere, 0.5 s: two velocities, four rows",
-            "nonholonomic",
             scene_builder("sphere_arm", contact="rolling"),
             None,
             ten / 20,
@@ -32,7 +31,6 @@ def in_contact() -> tuple[Case, ...]:
         Case(
             "hand_with_bar",
             "Two-finger hand in a plane that holds a bar, 0.2 s",
-            "holonomic",
             scene_builder("hand_with_bar"),
             None,
             short,
@@ -41,7 +39,6 @@ def in_contact() -> tuple[Case, ...]:
         Case(
             "hand_with_disk",
             "Two-finger hand in a plane with a disk that rolls between its fingers, 0.2 s",
-            "nonholonomic",
             scene_builder("hand_with_disk"),
             None,
             short,
@@ -50,7 +47,6 @@ def in_contact() -> tuple[Case, ...]:
         Case(
             "hand_with_ball",
             "Three-finger hand that holds a ball at three points, 0.2 s",
-            "holonomic",
             scene_builder("hand_with_ball"),
             None,
             short,
@@ -59,7 +55,6 @@ def in_contact() -> tuple[Case, ...]:
         Case(
             "hand_rolling_ball",
             "Three-finger hand whose round fingertips roll on a ball, 0.2 s",
-            "nonholonomic",
             scene_builder("hand_rolling_ball"),
             None,
             short,
@@ -68,37 +63,30 @@ def in_contact() -> tuple[Case, ...]:
         Case(
             "hand_rolling_egg",
             "Three-finger hand whose fingertips, ellipsoids, roll on an ellipsoid, 0.2 s",
-            "nonholonomic",
             scene_builder("hand_rolling_egg"),
             None,
             short,
             25,
-            largest=1,
         ),
         Case(
             "allegro_with_cube",
             "Allegro hand with a cube, 0.05 s: 13 degrees of freedom, seven of them internal",
-            "holonomic",
             scene_builder("allegro_with_cube"),
             None,
             ten / 200,
             25,
-            largest=1,
         ),
         Case(
             "coordinated_lifting",
             "Two KUKA iiwa that hold a plate together, 0.4 s",
-            "holonomic",
             scene_builder("coordinated_lifting"),
             None,
             ten / 25,
             25,
-            largest=1,
         ),
         Case(
             "box_on_table",
             "Box on a table that tips over, held by six rows, 4 s: its base lets go soon after",
-            "holonomic",
             scene_builder("box_on_table"),
             lambda start: references.falling_table(0.4 * ten),
             0.4 * ten,

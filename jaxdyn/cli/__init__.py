@@ -1,6 +1,7 @@
 """Command line: `jaxdyn info`, `simulate`, `sweep`, `excite`, `identify`, `report` and `export`."""
 
 import argparse
+import shlex
 import sys
 from collections.abc import Sequence
 
@@ -20,19 +21,28 @@ examples:
   jaxdyn report four_bar --out report
   jaxdyn export panda.urdf --function forward_dynamics --jacobian --out panda_fd
 
-All numbers are in SI units and radians, in float64. `jaxdyn COMMAND --help` explains a command.
+All numbers are in SI units and radians, in float64. `jaxdyn COMMAND --help` explains a command. Options can stand in a file:
+`jaxdyn identify @fit.txt --train 0.6`; later ones override earlier ones.
 Exit status: 0 done; 1 the computation failed; 2 wrong input or arguments.
 """
 
 
+class _Parser(argparse.ArgumentParser):
+    """Parser whose files of options, @FILE, are split as by a shell, with comments after #."""
+
+    def convert_arg_line_to_args(self, arg_line: str) -> list[str]:
+        return shlex.split(arg_line, comments=True)
+
+
 def main(argv: Sequence[str] | None = None) -> int:
     """Run a command with the given arguments (by default those of the process) and return the exit status."""
-    parser = argparse.ArgumentParser(
+    parser = _Parser(
         prog="jaxdyn",
         description="Rigid-body dynamics of robots: inspect a file, simulate it, run studies of many rollouts, identify "
         "inertias from logs, report error against run time, and export functions to C.",
         epilog=_EPILOG,
         formatter_class=help_format,
+        fromfile_prefix_chars="@",
     )
     parser.add_argument("--version", action="version", version=f"jaxdyn {__version__}")
     commands = parser.add_subparsers(title="commands", metavar="COMMAND", required=True)

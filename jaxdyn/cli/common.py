@@ -12,17 +12,17 @@ import equinox as eqx
 import numpy as np
 
 from jaxdyn.io import LoadedScene, load_urdf
-from jaxdyn.io.formats import find_description, format_of, load
+from jaxdyn.io.formats import find_description, load
 from jaxdyn.model.arguments import as_path, parse_number
 from jaxdyn.model.builder import GRAVITY
 from jaxdyn.model.description import short as short
 from jaxdyn.model.description import table as table
-from jaxdyn.model.joints import KINDS
 from jaxdyn.model.tree import Model
-
-# Unit of q of joints with one coordinate.
-UNITS = {"revolute": "rad", "continuous": "rad", "helical": "rad", "prismatic": "m"}
-
+from jaxdyn.pictures import plot
+from jaxdyn.reports.plotting import BLUE, bands, new_figure
+from jaxdyn.simulation.export import signals, times
+from jaxdyn.simulation.solution import Solution
+from jaxdyn.systems.system import SceneLike
 
 FILE = "a URDF, xacro, MJCF or SDF file, or a name of robot_descriptions such as go2_description"
 
@@ -74,7 +74,15 @@ def add_model_options(parser: argparse.ArgumentParser, title: str = "model") -> 
 def load_model(path: str, args: argparse.Namespace) -> Model:
     """Load the model of a URDF file under the options of `add_model_options`."""
     # A model alone imposes no couplings, so that joints which follow others are free by default.
-    return _movable(load_urdf(path, mimic=args.mimic or "ignore", **_urdf_options(args)), path)
+    model = load_urdf(
+        path,
+        floating_base=args.floating_base,
+        lock=_lock(args),
+        mimic=args.mimic or "ignore",
+        gravity=GRAVITY if args.gravity is None else tuple(args.gravity),
+        arguments=xacro_arguments(args),
+    )
+    return _movable(model, path)
 
 
 def load_scene(path: str, args: argparse.Namespace) -> tuple[LoadedScene, pathlib.Path]:
@@ -82,27 +90,15 @@ def load_scene(path: str, args: argparse.Namespace) -> tuple[LoadedScene, pathli
     file = as_path(path, "file")
     if not file.suffix and not file.exists():
         file = find_description(path)
-    kind = format_of(file)
     if args.floating_base and args.fixed_base:
         raise ValueError("--floating-base and --fixed-base contradict each other; give one of them")
-    if kind == "urdf":
-        scene = load(file, mimic=args.mimic, **_urdf_options(args))
-        _movable(scene.system, path)
-        return scene, file
-    # Options that only URDF supports are refused, since ignoring them would change the result silently.
-    if args.lock:
-        raise ValueError(f"--lock: joints of {kind.upper()} files cannot be locked; change the file, or use a URDF")
-    if args.mimic or args.arguments:
-        option = "--mimic" if args.mimic else "--arguments"
-        raise ValueError(f"{option}: {file} is {kind.upper()}; leave it out")
     # Neither option: None, for the default of the format.
-    given = False if args.fixed_base else True if args.floating_base else None
-    scene = load(file, floating_base=given)
+    floating = False if args.fixed_base else True if args.floating_base else None
+    scene = load(file, floating_base=floating, lock=_lock(args), mimic=args.mimic, arguments=xacro_arguments(args))
     _movable(scene.system, path)
-    if args.gravity is None:
-        return scene, file
-    # Loaders of MJCF and SDF have no option for gravity, since the file states it.
-    return eqx.tree_at(lambda s: s.system, scene, scene.system.replace(gravity=np.array(args.gravity))), file
+    if args.gravity is not None:
+        scene = eqx.tree_at(lambda s: s.system, scene, scene.system.replace(gravity=np.array(args.gravity)))
+    return scene, file
 
 
 def _lock(args: argparse.Namespace) -> dict[str, Any]:
@@ -118,16 +114,6 @@ def xacro_arguments(args: argparse.Namespace) -> dict[str, str]:
     if bad := [item for item in args.arguments if item.find("=") < 1]:
         raise ValueError(f"--arguments {bad[0]}: give NAME=VALUE")
     return {name: value for name, _, value in (item.partition("=") for item in args.arguments)}
-
-
-def _urdf_options(args: argparse.Namespace) -> dict[str, Any]:
-    gravity = GRAVITY if args.gravity is None else tuple(args.gravity)
-    return {
-        "floating_base": args.floating_base,
-        "lock": _lock(args),
-        "gravity": gravity,
-        "arguments": xacro_arguments(args),
-    }
 
 
 def _movable(model: Model, path: str) -> Model:
@@ -147,10 +133,10 @@ def number(text: str, what: str) -> float:
 
 def real(text: str) -> float:
     """Argument type of finite numbers in decimal digits."""
-    with contextlib.suppress(ValueError):
-        if np.isfinite(value := parse_number(text)):
-            return value
-    raise argparse.ArgumentTypeError(f"{text!r} is no finite number")
+    try:
+        return number(text, "argument")
+    except ValueError:
+        raise argparse.ArgumentTypeError(f"{text!r} is no finite number") from None
 
 
 def whole(text: str) -> int:
@@ -219,18 +205,6 @@ def per_coordinate(model: Model, values: Sequence[float], what: str) -> np.ndarr
     return np.broadcast_to(np.array(values, float), (model.nv,)).copy()
 
 
-def coordinate_labels(model: Model) -> tuple[list[str], list[str]]:
-    """Label of each velocity coordinate, and the unit of its generalised force."""
-    labels, torque_units = [], []
-    for name, kind in zip(model.joint_names, model.topology.kinds, strict=True):
-        for i in range(KINDS[kind].nv):
-            # Velocities of free and planar joints have the linear part first.
-            linear = kind == "prismatic" or (kind == "free" and i < 3) or (kind == "planar" and i < 2)
-            labels.append(name if KINDS[kind].nv == 1 else f"{name}[{i}]")
-            torque_units.append("N" if linear else "N m")
-    return labels, torque_units
-
-
 def output_path(text: str | None, suffixes: Sequence[str], option: str) -> pathlib.Path | None:
     """Path of an output file, checked before any work is done: known suffix, existing directory."""
     if text is None:
@@ -242,6 +216,26 @@ def output_path(text: str | None, suffixes: Sequence[str], option: str) -> pathl
     if not path.parent.is_dir():
         raise ValueError(f"{option} {text}: there is no directory {path.parent}")
     return path
+
+
+def plot_motion(path: pathlib.Path, scene: SceneLike, solution: Solution) -> None:
+    """Plot positions, velocities and torques of a motion to a file; of a batch, the bands of the first eight of each."""
+    if np.ndim(solution.q) == 2:
+        figure, axes = new_figure(8.5, 7.5, 3, 1, sharex=True)
+        plot.states(scene, solution, axes[:2, 0])
+        plot.forces(scene, solution, axes[2, 0])
+    else:
+        # Bands of several joints would cover each other.
+        drawn = [one for one in signals(solution, scene) if one.key in ("q", "v", "tau")]
+        columns = min(8, max(len(one.names) for one in drawn))
+        figure, axes = new_figure(2.1 * columns + 0.7, 6.2, len(drawn), columns, sharex=True)
+        for row, one in zip(axes, drawn, strict=True):
+            for k, (ax, name, unit) in enumerate(zip(row, one.names, one.units, strict=False)):
+                bands(ax, times(solution), one.values[:, :, k], BLUE)
+                ax.set(xlabel="time (s)", ylabel=f"{one.key} {name} ({unit})")
+        figure.suptitle(f"median, 25 to 75 % and 5 to 95 % of {len(solution.q)} motions", fontsize=10)
+    figure.savefig(path)
+    print(f"Wrote {path}.")
 
 
 class Stopwatch:

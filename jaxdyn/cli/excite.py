@@ -2,6 +2,7 @@
 
 import argparse
 
+import jax.numpy as jnp
 import numpy as np
 
 from jaxdyn import identify
@@ -9,17 +10,20 @@ from jaxdyn.cli.common import (
     add_model_options,
     check_least,
     check_memory,
-    coordinate_labels,
     load_model,
     output_path,
     per_coordinate,
+    plot_motion,
     real,
     table,
     whole,
 )
+from jaxdyn.constraints.codes import RESULTS
 from jaxdyn.identify import TERMS
 from jaxdyn.identify.workflows.excitation_search import OBJECTIVES
 from jaxdyn.io import write_log
+from jaxdyn.model.columns import columns_of
+from jaxdyn.simulation.solution import Solution
 
 HELP = "optimise an exciting motion within limits for the identification of inertias and friction"
 DESCRIPTION = """\
@@ -109,7 +113,7 @@ def run(args: argparse.Namespace) -> None:
         torque=torque,
     )
     log = motion.log(args.rate, args.periods)
-    labels, units = coordinate_labels(model)
+    names = columns_of(model)
     print(
         f"condition of the regressor {motion.condition:.4g}, of a random motion within the same limits "
         f"{motion.start_condition:.4g}; log det of the information matrix larger by {motion.logdet:.3g}"
@@ -120,15 +124,12 @@ def run(args: argparse.Namespace) -> None:
     extremes = [q.min(axis=0), q.max(axis=0), abs(v).max(axis=0), abs(tau).max(axis=0)]
     rows = [
         [label, *(f"{float(x[j]):.3g}" for x in extremes), unit]
-        for j, (label, unit) in enumerate(zip(labels, units, strict=True))
+        for j, (label, unit) in enumerate(zip(names.v, names.force_units, strict=True))
     ]
     print(table(["joint", "lowest", "highest", "fastest", "torque", "unit"], rows))
     if out is not None:
         write_log(out, log)
         print(f"Wrote {out}.")
     if plot is not None:
-        # Imported on use: matplotlib is an extra.
-        from jaxdyn.reports.plotting import motion_figure
-
-        motion_figure(model, log.t, q[None], v[None], tau[None]).savefig(plot)
-        print(f"Wrote {plot}.")
+        ts, q, v, torque = (jnp.asarray(x) for x in (log.t, q, v, tau))
+        plot_motion(plot, model, Solution(ts, q, v, RESULTS.successful, {}, torque=torque))

@@ -13,13 +13,11 @@ from jaxdyn.cli.common import (
     Stopwatch,
     add_model_options,
     check_least,
-    coordinate_labels,
     load_model,
     output_path,
     real,
     whole,
 )
-from jaxdyn.cli.identify_file import with_file
 from jaxdyn.cli.identify_logs import filter_log, log_cutoff, log_names, log_paths, raw_log
 from jaxdyn.cli.identify_options import find_gains, make_fit, parse_options, resolve_options
 from jaxdyn.cli.identify_tables import error_table, gains_text, payload_text, tables
@@ -33,6 +31,7 @@ from jaxdyn.identify.workflows.log_checks import check_log_content, check_rest
 from jaxdyn.identify.workflows.raw_logs import vibration
 from jaxdyn.io import save_urdf
 from jaxdyn.io.files import write_text
+from jaxdyn.model.columns import columns_of
 from jaxdyn.model.inertia_checks import inertia_report, repair_inertias
 from jaxdyn.model.tree import Model
 from jaxdyn.reports.identification import Evaluation, Findings, content, gains_content, payload_content
@@ -50,7 +49,7 @@ examples:
   jaxdyn identify --urdf panda.urdf --log log.csv --out fitted.urdf
   jaxdyn identify --urdf arm.urdf --log A.csv B.csv --test-log C.csv --out fitted.urdf --html fit.html
   jaxdyn identify --urdf arm.urdf --log empty.csv --payload-log holding.csv --report fit.json
-  jaxdyn identify fit.toml          urdf = "arm.urdf", log = ["A.csv", "B.csv"], out = "fitted.urdf", ...
+  jaxdyn identify @fit.txt          a file with lines of options: --urdf arm.urdf, --log A.csv B.csv, ...
 
 logs (.csv with one header line, or .npz), in SI units:
   t                time, s, increasing; jitter is allowed
@@ -68,17 +67,15 @@ METHODS = ("feasible", "least-squares", "trajectory")
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Add the arguments of the command: those of daily use first, the rest as "advanced"."""
     # The generated usage would list all options, and a user needs two of them.
-    parser.usage = "%(prog)s [FIT.toml] --urdf ROBOT.urdf --log FILE ... [options]"
+    parser.usage = "%(prog)s --urdf ROBOT.urdf --log FILE ... [options]"
     # A repeated option extends its list: shells expand one pattern per option.
     several: dict[str, Any] = {"nargs": "+", "action": "extend", "default": []}
-    parser.add_argument("file", nargs="?", metavar="FIT.toml", help="options in a file, named without dashes")
     parser.add_argument("--urdf", metavar="FILE", help="robot; its geometry is fixed, its inertias are the prior")
     parser.add_argument("--log", **several, metavar="FILE", help="training logs, .csv or .npz")
     parser.add_argument("--test-log", **several, metavar="FILE", help="test logs (default: the end of every log)")
     parser.add_argument("--out", metavar="FILE", help="write the fitted robot, .urdf; also the report")
     parser.add_argument("--report", metavar="FILE", help="write parameters and errors, .json (default: next to --out)")
     parser.add_argument("--html", metavar="FILE", help="write a page with tables and plots, .html")
-    parser.add_argument("--plot", metavar="FILE", help="plot measured and predicted torques, .png, .pdf, .svg")
     parser.add_argument("--progress", action="store_true", help="print trials and the loss while fitting")
     _add_expert_options(
         parser.add_argument_group("advanced: data"), parser.add_argument_group("advanced: fit"), several
@@ -133,13 +130,9 @@ def _add_expert_options(data, fit, several: dict[str, Any]) -> None:
 @on_one_thread
 def run(args: argparse.Namespace) -> None:
     """Fit, print errors and parameters, write the files."""
-    # First, because the options of the file pass the same checks below.
-    args = with_file(args, add_arguments)
     missing = [name for name, value in (("--urdf", args.urdf), ("--log", args.log)) if not value]
     if missing:
-        raise ValueError(
-            f"{' and '.join(missing)}: missing; give the robot's URDF file and at least one log, or a file fit.toml"
-        )
+        raise ValueError(f"{' and '.join(missing)}: missing; give the robot's URDF file and at least one log")
     check_least(args, every=1, trim=0, steps=0)
     for name in ("payload_mass", "horizon"):
         # Negated, so that NaN is refused.
@@ -149,7 +142,6 @@ def run(args: argparse.Namespace) -> None:
     out = output_path(args.out, (".urdf",), "--out")
     json_path = output_path(args.report, (".json",), "--report")
     html = output_path(args.html, (".html",), "--html")
-    plot = output_path(args.plot, (".png", ".pdf", ".svg"), "--plot")
     options = parse_options(args)
     if out is not None and args.method == "least-squares":
         raise ValueError("--out: least squares gives combinations of parameters and no bodies, so there is no URDF to "
@@ -224,14 +216,14 @@ def run(args: argparse.Namespace) -> None:
     )
     # The warnings are derived from the other fields, so the list is filled afterwards.
     findings.warnings.extend(_warnings(findings))
-    if gains is not None:
-        # Gains first: every later number refers to scaled torques.
-        print(gains_text(gains, coordinate_labels(model)[0]))
-    print(error_table(findings))
-    print(f"{args.method} fit of {model.name!r}, {model.nv} joints: {findings.outcome}, in {seconds}")
-    for line in findings.warnings:
-        print(f"warning: {line}")
-    print(tables(findings))
+    labels, units = columns_of(model).v, columns_of(model).force_units
+    # Gains first: every later number refers to scaled torques.
+    lines = [] if gains is None else [gains_text(gains, labels)]
+    lines += [error_table(findings)]
+    lines += [f"{args.method} fit of {model.name!r}, {model.nv} joints: {findings.outcome}, in {seconds}"]
+    lines += [*(f"warning: {line}" for line in findings.warnings), tables(findings)]
+    text = "\n".join(lines)
+    print(text)
     if out is not None and not isinstance(final, LeastSquares):
         save_urdf((final.fit if isinstance(final, RobotFit) else final).model, out, torques=_extra_torques(final))
         print(f"Wrote {out}.")
@@ -252,17 +244,8 @@ def run(args: argparse.Namespace) -> None:
         # Imported on use: matplotlib is an extra.
         from jaxdyn.reports.identification_page import page
 
-        labels, units = coordinate_labels(model)
-        lines = [] if gains is None else gains_text(gains, labels).split("\n")
-        write_text(html, page(findings, labels, units, f"jaxdyn identify: {model.name}", lines))
+        write_text(html, page(findings, labels, units, f"jaxdyn identify: {model.name}", text))
         print(f"Wrote {html}.")
-    if plot is not None:
-        from jaxdyn.reports.plotting import torque_figure
-
-        labels, units = coordinate_labels(model)
-        first = findings.tests[0]
-        torque_figure(first.log, first.predicted, labels, units, title=first.name).savefig(plot)
-        print(f"Wrote {plot}.")
 
 
 def _extra_torques(result: RobotFit | Fit) -> dict[str, dict[str, float]]:
@@ -318,7 +301,7 @@ def _evaluate(model: Model, result, names: list[str], logs: list[Log]) -> list[E
 
 def _warnings(findings: Findings) -> list[str]:
     lines = []
-    labels, _ = coordinate_labels(findings.model)
+    labels = columns_of(findings.model).v
     # After a refit the held-out parts are among the training logs already.
     for one in (*findings.final, *(findings.tests if not findings.is_refit else ())):
         lines += [f"{one.name}: {line}" for line in check_log_content(findings.model, one.log, labels)]

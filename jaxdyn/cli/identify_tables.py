@@ -2,19 +2,20 @@
 
 import numpy as np
 
-from jaxdyn.cli.common import coordinate_labels, short, table
+from jaxdyn.cli.common import short, table
 from jaxdyn.identify import TERMS, Delays, DriveGains, LeastSquares, Payload, RobotFit, nominal_parameters
 from jaxdyn.identify.regression import free_columns
 from jaxdyn.identify.selection import Choice
+from jaxdyn.model.columns import columns_of
 from jaxdyn.model.tree import Model
-from jaxdyn.reports.identification import Findings, total_percent
+from jaxdyn.reports.identification import Findings, model_joint, total_percent
 
 _BASE_ROWS = 200
 
 
 def error_table(findings: Findings) -> str:
     """Torque errors in per cent: test data first, all joints together and each."""
-    labels, _ = coordinate_labels(findings.model)
+    labels = columns_of(findings.model).v
     rows = []
     for kind, group in (("test", findings.tests), ("fitted", findings.train)):
         rows += [[one.name, kind, f"{one.percent:.2f}", *_each(one.percent_by_joint)] for one in group]
@@ -43,7 +44,7 @@ def tables(findings: Findings) -> str:
         return "\n".join(parts)
     if isinstance(result, RobotFit):
         parts += [_choice_text(findings.choice or result.choice, model)]
-        parts += [] if result.delays is None else [delays_text(result.delays, coordinate_labels(model)[0])]
+        parts += [] if result.delays is None else [delays_text(result.delays, columns_of(model).v)]
         parts += [_robot_base_table(result, model)]
     parts.append(_mass_table(findings))
     return "\n".join(parts)
@@ -54,27 +55,38 @@ def _each(values: np.ndarray) -> list[str]:
 
 
 def _joint_table(findings: Findings) -> str:
-    labels, units = coordinate_labels(findings.model)
-    first = findings.tests[0]
+    """Errors of each joint, and its friction and rotor inertia, with half-widths of the 95 % intervals where they are known."""
+    labels, units = columns_of(findings.model).v, columns_of(findings.model).force_units
+    first, result = findings.tests[0], findings.result
     measured = np.sqrt(np.mean(np.asarray(first.log.tau) ** 2, axis=0))
-    columns = [measured, first.rms, *(findings.friction[term] for term in TERMS)]
-    header = ["joint", "unit", "torque rms", "error rms", "viscous", "coulomb", "offset", "rotor inertia"]
-    extra = findings.result.fit.extra if isinstance(findings.result, RobotFit) else None
-    if extra is not None:
-        for name, values in extra.by_term.items():
+    columns = {("rotor inertia" if term == "armature" else term): (term, findings.friction[term]) for term in TERMS}
+    half: dict[str, str] = {}
+    if isinstance(result, RobotFit):
+        for name, values in result.fit.extra.by_term.items() if result.fit.extra is not None else ():
             group = np.array(values).reshape(-1, findings.model.nv)
-            header += [name if len(group) == 1 else f"{name} {k + 1}" for k in range(len(group))]
-            columns += list(group)
+            # Parameters are named JOINT.termK without a space, columns of the table with one.
+            columns |= {
+                name if len(group) == 1 else f"{name} {k + 1}": (name if len(group) == 1 else f"{name}{k + 1}", row)
+                for k, row in enumerate(group)
+            }
+        known, factor = result.intervals.parameters, result.intervals.factor
+        for name, std, source in zip(known.names, known.std, known.sources, strict=True):
+            half[name] = f" +- {factor * std:.2g}{' (prior)' * (source == 'prior')}" if np.isfinite(std) else ""
     rows = [
-        [label, unit, *(short(float(x), 3) for x in row)]
-        for label, unit, row in zip(labels, units, np.stack(columns, 1), strict=True)
+        [label, unit, short(float(measured[j]), 3), short(float(first.rms[j]), 3)]
+        + [
+            short(float(values[j]), 3) + half.get(f"{model_joint(findings.model, j)}.{term}", "")
+            for term, values in columns.values()
+        ]
+        for j, (label, unit) in enumerate(zip(labels, units, strict=True))
     ]
-    return f"Joints: errors on {first.name}, friction and rotor inertia\n" + table(header, rows)
+    text = f"Joints: errors on {first.name}, friction and rotor inertia, with half-widths of 95 % intervals\n"
+    return text + table(["joint", "unit", "torque rms", "error rms", *columns], rows)
 
 
 def _identifiability_text(findings: Findings) -> str:
     """Identifiability of the parameters, and autocorrelation of the errors on the first test log."""
-    labels = coordinate_labels(findings.model)[0]
+    labels = columns_of(findings.model).v
     first = findings.tests[0]
     lasting = ", ".join(
         f"{label} {short(float(x), 2)}" for label, x in zip(labels, first.whiteness.correlation_time, strict=True)
@@ -89,7 +101,7 @@ def _identifiability_text(findings: Findings) -> str:
 
 
 def _choice_text(choice: Choice, model: Model) -> str:
-    setting, labels = choice.setting, coordinate_labels(model)[0]
+    setting, labels = choice.setting, columns_of(model).v
     extra = "; ".join(f"{name} at {', '.join(labels[j] for j in joints)}" for name, joints in setting.extra) or "none"
     how = f", chosen over {len(choice.trials)} settings by cross-validation over {choice.by}"
     loss = "squares" if setting.robust is None else f"Huber's beyond {setting.robust:g}"

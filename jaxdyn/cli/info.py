@@ -8,13 +8,15 @@ import warnings
 import jax.numpy as jnp
 import numpy as np
 
-from jaxdyn.cli.common import FILE, UNITS, add_model_options, load_scene, output_path, short, table, xacro_arguments
+from jaxdyn.cli.common import FILE, add_model_options, load_scene, output_path, short, table, xacro_arguments
 from jaxdyn.constraints.assembly import assemble
 from jaxdyn.constraints.base import constraint_jacobian, holonomic_rows, layout, position_residual
 from jaxdyn.constraints.selection import degrees_of_freedom, select_concrete_rows
 from jaxdyn.io import LoadedScene, NotTakenWarning, save_urdf, urdf_inertia_report
 from jaxdyn.io.formats import format_of
 from jaxdyn.io.xml_lines import XmlFile
+from jaxdyn.model import host_math
+from jaxdyn.model.columns import columns_of
 from jaxdyn.model.configuration import integrate
 from jaxdyn.model.inertia_checks import inertia_report, repair_inertias
 from jaxdyn.model.joints import KINDS
@@ -38,6 +40,9 @@ examples:
 Links on fixed joints are merged into the body that carries them; they stay available as frames.
 Units: kg, m, rad, rad/s or m/s, N m or N, kg m^2.
 """
+
+
+_SOUND = "Inertias: every moving {} has a physical inertia."
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -65,11 +70,10 @@ def run(args: argparse.Namespace) -> None:
     body_problems = _of_the_file(inertia_report(model), source)
     print(describe(scene, args.file))
     print(constraint_lines(scene))
+    links = urdf_inertia_report(file, arguments=xacro_arguments(args)) if is_urdf else None
+    print(_problems(links, body_problems))
     if is_urdf:
-        print(_problems(urdf_inertia_report(file, arguments=xacro_arguments(args)), body_problems))
         print(_elements_without_effect(source))
-    else:
-        print(_body_problems(body_problems))
     if scene.not_taken or not is_urdf:
         print("\n".join(["\nUnsupported elements of the file:", *(scene.not_taken or ["none"])]))
     if out is not None:
@@ -209,36 +213,29 @@ def _joint_table(model: Model) -> str:
     lower, upper = np.asarray(model.lower), np.asarray(model.upper)
     leaves = {key: getattr(model, key) for key in ("velocity_limit", "effort_limit", "damping", "friction", "armature")}
     shown = {key: np.asarray(value) for key, value in leaves.items() if value is not None}
-    rows = []
+    rows, units = [], columns_of(model).q_units
     for i, (name, kind) in enumerate(zip(model.joint_names, topology.kinds, strict=True)):
         in_q, in_v = topology.q_slices[i], topology.v_slices[i]
-        screw = screws[i]
+        single = KINDS[kind].nv == 1
         # Adding 0.0 turns -0.0 into 0.0.
-        axis = "" if KINDS[kind].nv > 1 else " ".join(f"{x + 0.0:.4g}" for x in screw[:3] if kind == "prismatic")
-        axis = axis or ("" if KINDS[kind].nv > 1 else " ".join(f"{x + 0.0:.4g}" for x in screw[3:]))
+        axis = screws[i, :3] + 0.0 if kind == "prismatic" else screws[i, 3:] + 0.0
         parent = "world" if topology.parents[i] < 0 else model.body_names[topology.parents[i]]
         span = f"{in_q.start}" if KINDS[kind].nq == 1 else f"{in_q.start}..{in_q.stop - 1}"
-        single = KINDS[kind].nv == 1
         limits = [short(float(x[in_q.start])) if single else "-" for x in (lower, upper)]
         numbers = [short(float(values[in_v.start])) if single else "-" for values in shown.values()]
-        rows.append(
-            [span, name, kind, UNITS.get(kind, ""), axis, f"{parent} -> {model.body_names[i]}", *limits, *numbers]
-        )
+        ways = [" ".join(f"{x:.4g}" for x in axis) if single else "", f"{parent} -> {model.body_names[i]}"]
+        rows.append([span, name, kind, units[in_q.start] if single else "", *ways, *limits, *numbers])
     header = ["q", "joint", "kind", "unit", "axis", "moves", "lower", "upper", "speed", "effort"]
     return table(header + [key for key in shown if not key.endswith("_limit")], rows)
 
 
 def _body_table(model: Model) -> str:
     rows = []
-    for name, parameters in zip(model.body_names, np.asarray(model.inertias), strict=True):
-        mass, first = parameters[0], parameters[1:4]
-        xx, xy, yy, xz, yz, zz = parameters[4:]
-        com = first / mass if mass > 0 else np.zeros(3)
-        about_com = np.array([[xx, xy, xz], [xy, yy, yz], [xz, yz, zz]]) - mass * (
-            com @ com * np.eye(3) - np.outer(com, com)
+    for name, parameters in zip(model.body_names, np.asarray(model.inertias, float), strict=True):
+        mass, com, moment = host_math.about_com(parameters)
+        rows.append(
+            [name, f"{mass:.4g}", *(f"{x:.4f}" for x in com), *(f"{x:.3g}" for x in np.linalg.eigvalsh(moment))]
         )
-        moments = np.linalg.eigvalsh(about_com)
-        rows.append([name, f"{mass:.4g}", *(f"{x:.4f}" for x in com), *(f"{x:.3g}" for x in moments)])
     return table(["body", "mass", "x", "y", "z", "I1", "I2", "I3"], rows)
 
 
@@ -252,26 +249,22 @@ def _frames(model: Model) -> str:
     return "\n".join(lines + [f"  {body}: {', '.join(names)}" for body, names in carried.items()])
 
 
-def _problems(links: list[tuple[str, str]], bodies: list[tuple[str, str]]) -> str:
+def _problems(links: list[tuple[str, str]] | None, bodies: list[tuple[str, str]]) -> str:
+    """Lines on unphysical inertias: of the links that a URDF states (None for other files), and of the model's bodies."""
+    if links is None:
+        rows, advice = table(("body", "problem"), bodies), "jd.model.repair_inertias(scene.system) gives physical ones"
+        return f"\nInertia problems ({len(bodies)}); {advice}\n{rows}" if bodies else f"\n{_SOUND.format('body')}"
     if not links:
-        text = "\nInertias: every moving link has a physical inertia."
+        text = f"\n{_SOUND.format('link')}"
     else:
-        text = f"\nInertia problems of the links, as stated in the file ({len(links)})\n" + table(
-            ("link", "problem"), links
-        )
+        rows = table(("link", "problem"), links)
+        text = f"\nInertia problems of the links, as stated in the file ({len(links)})\n{rows}"
     if bodies:
         text += f"\nAfter merging fixed links, {len(bodies)} bodies are affected{_name_list([b for b, _ in bodies])}."
         text += "\nThe model is used unchanged; --repair writes a physical one."
     elif links:
         text += "\nOnce fixed links are merged, every body has a physical inertia."
     return text
-
-
-def _body_problems(bodies: list[tuple[str, str]]) -> str:
-    if not bodies:
-        return "\nInertias: every moving body has a physical inertia."
-    rows = table(("body", "problem"), bodies)
-    return f"\nInertia problems ({len(bodies)}); jd.model.repair_inertias(scene.system) gives physical ones\n{rows}"
 
 
 def _name_list(names: list[str]) -> str:

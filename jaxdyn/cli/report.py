@@ -15,18 +15,15 @@ EPILOG = """\
 examples:
   jaxdyn report --list
   jaxdyn report pendulum_in_plane
-  jaxdyn report four_bar andrews --dtype float64 float32 --batch 1 256 --out out/report
-  jaxdyn report four_bar --full --out out/report
+  jaxdyn report four_bar windows --dtype float64 float32 --batch 1 256 --out out/report
 
-Without --full: the usual integrators, four tolerances each, a quarter of a minute to two minutes a scene, of which
-most is compilation. With it: every sensible integrator, in both dtypes, single and in batches; restarted with the same --out,
-it resumes.
+The usual integrators, at four tolerances or three steps each, take a quarter of a minute to two minutes a scene,
+most of it compilation.
 
 output (--out DIR):
   report.html      one page: plots, tables, the machine; needs no network
   report.json      the same as data; jaxdyn.reports.Report.from_json reads it
   report.txt       what is printed
-  records.jsonl    finished groups of runs, from which an interrupted call resumes
 """
 
 
@@ -34,10 +31,13 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Add the arguments of the command."""
     parser.add_argument("scenes", nargs="*", metavar="SCENE", help="names of scenes (see --list)")
     parser.add_argument("--list", action="store_true", help="print the scenes and exit")
-    parser.add_argument("--full", action="store_true", help="every sensible method and solver; resumable")
     parser.add_argument("--out", metavar="DIR", help="directory for the page, the data and the text")
-    parser.add_argument("--dtype", nargs="+", metavar="T", help="float64, float32 (default: float64; both with --full)")
-    parser.add_argument("--batch", nargs="+", type=whole, metavar="N", help="trajectories at once (default: 1; 1 256)")
+    parser.add_argument(
+        "--dtype", nargs="+", default=["float64"], metavar="T", help="float64, float32 (default: float64)"
+    )
+    parser.add_argument(
+        "--batch", nargs="+", type=whole, default=[1], metavar="N", help="trajectories at once (default: 1)"
+    )
     parser.add_argument(
         "--integrator",
         "--way",
@@ -56,7 +56,7 @@ def run(args: argparse.Namespace) -> int:
     if not args.scenes:
         raise ValueError(f"no scene is named; name one of {', '.join(scenes.names())}")
     check_least(args, batch=1, rounds=1)
-    check_memory(1000.0 * max(args.batch or [1]), f"--batch {max(args.batch or [1])}")
+    check_memory(1000.0 * max(args.batch), f"--batch {max(args.batch)}")
     watch = Stopwatch()
     integrators = None if args.integrator is None else [tuple(pair.split(":")) for pair in args.integrator]
     options = {
@@ -66,8 +66,8 @@ def run(args: argparse.Namespace) -> int:
         "rounds": args.rounds,
         "out": args.out,
     }
-    # Flushed, since a full report runs for hours and its output may go to a file.
-    result = report(args.scenes, full=args.full, echo=lambda line: print(line, flush=True), **options)
+    # Flushed, since a long report's output may go to a file.
+    result = report(args.scenes, echo=lambda line: print(line, flush=True), **options)
     print(f"\n{result.table()}\n\n{len(result.records)} runs in {watch}, compilation included.")
     if args.out:
         print(f"Wrote {args.out}/report.html, .json and .txt.")

@@ -1,7 +1,6 @@
 """`jaxdyn simulate`: motions of a robot under chosen torques, written, plotted or shown."""
 
 import argparse
-import csv
 import pathlib
 
 import equinox as eqx
@@ -18,6 +17,7 @@ from jaxdyn.cli.common import (
     load_scene,
     output_path,
     per_coordinate,
+    plot_motion,
     real,
     vector,
     whole,
@@ -61,8 +61,10 @@ torques (--torque):
                    the log's first state unless --q0 and --v0 say otherwise, and lasts as long as the log
 
 output (--out):
-  .csv             columns t, q1.., v1.., tau1.., energy; with --batch also rollout, the number of the motion
-  .npz             arrays t (nt), q (nt, nq), v and tau (nt, nv), energy (nt); with --batch a leading axis of motions
+  .csv             columns t, q_.., v_.., tau_.. with the joints' names (numbers where a joint has several coordinates),
+                   energy, work, each with its unit; with --batch also rollout, the number of the motion
+  .npz             arrays t (nt), q (nt, nq), v and tau (nt, nv), energy and work (nt), and JSON texts of their names and
+                   units; with --batch a leading axis of motions
   v is the velocity in the body's frame: of a free base, linear (m/s) then angular (rad/s).
   Quaternions in q are (w, x, y, z); a free base is (x, y, z, qw, qx, qy, qz).
 """
@@ -183,19 +185,18 @@ def run(args: argparse.Namespace) -> int:
     print(f"{args.file}: {args.batch} motion{'s' * (args.batch > 1)} of {duration:g} s, {len(ts)} rows each, in {watch} "
           "(compilation included)")  # fmt: skip
     _summarise(model, solution, done)
+    # Files, plots and viewers have torques of the solution, and `simulate` was not asked to store them.
+    moving = eqx.tree_at(lambda s: s.torque, solution, tau, is_leaf=lambda x: x is None)
+    # A single motion has no axis of motions, so that scripts need not index it.
+    moving = moving if args.batch > 1 else jax.tree.map(lambda x: x[0], moving)
     if out is not None:
-        _write(out, args.batch, ts, solution, tau)
+        (moving.to_csv if out.suffix.lower() == ".csv" else moving.to_npz)(out, scene)
         print(f"Wrote {out}.")
     if plot is not None:
-        from jaxdyn.reports.plotting import motion_figure
-
-        motion_figure(model, ts, solution.q, solution.v, tau).savefig(plot)
-        print(f"Wrote {plot}.")
+        plot_motion(plot, scene, moving)
     if page is not None or args.view:
         # A model holds no geometry, so the file is read again.
         solids = shapes(file, arguments=xacro_arguments(args))
-        # Viewers draw torques of the solution, and `simulate` was not asked to store them.
-        moving = eqx.tree_at(lambda s: s.torque, solution, tau, is_leaf=lambda x: x is None)
         if page is not None:
             save_html(page, scene, moving, shapes=solids)
             print(f"Wrote {page}.")
@@ -325,23 +326,3 @@ def _summarise(model: Model, solution: Solution, done: np.ndarray) -> None:
 def _outside(model: Model, q: np.ndarray) -> list[str]:
     far = np.any((q < np.asarray(model.lower)) | (q > np.asarray(model.upper)), axis=(0, 1))
     return [name for name, place in zip(model.joint_names, model.topology.q_slices, strict=True) if far[place].any()]
-
-
-def _write(path: pathlib.Path, count: int, ts, solution: Solution, tau) -> None:
-    arrays = {"q": solution.q, "v": solution.v, "tau": tau, "energy": solution.energy}
-    arrays = {name: np.asarray(value) for name, value in arrays.items()}
-    if path.suffix.lower() == ".npz":
-        # A single motion has no axis of motions, so that scripts need not index it.
-        arrays = arrays if count > 1 else {name: value[0] for name, value in arrays.items()}
-        np.savez_compressed(path, t=ts, **arrays)  # pyright: ignore[reportArgumentType]
-        return
-    header = ["rollout"] if count > 1 else []
-    header += ["t", *(f"{name}{i + 1}" for name in ("q", "v", "tau") for i in range(arrays[name].shape[2])), "energy"]
-    # newline="" is required by `csv`: on Windows the line ends would otherwise be doubled.
-    with path.open("w", newline="") as file:
-        writer = csv.writer(file)
-        writer.writerow(header)
-        for k in range(count):
-            rows = np.column_stack([ts, *(arrays[name][k] for name in ("q", "v", "tau", "energy"))])
-            # repr is the shortest text that reads back as the same double.
-            writer.writerows([str(k + 1)] * (count > 1) + [repr(float(x)) for x in row] for row in rows)

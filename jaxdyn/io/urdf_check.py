@@ -3,10 +3,7 @@
 from collections.abc import Iterator
 from typing import Any
 
-import numpy as np
-
 from jaxdyn.io.xml_lines import XmlFile
-from jaxdyn.model.arguments import parse_number
 
 JOINTS = {"floating": "free", **{kind: kind for kind in ("revolute", "continuous", "prismatic", "planar", "fixed")}}
 # Number of finite values of each attribute used by the model.
@@ -57,9 +54,8 @@ def check_elements(file: XmlFile) -> tuple[list, dict[str, str]]:
                     part, f"<{part.tag}> of {tag} {name!r} has quat_xyzw, which is not supported; write it as rpy"
                 )
             for key, count in NUMBERS.get(part.tag, {}).items():
-                if (text := part.get(key)) is not None and not _are_numbers(text, count):
-                    what = "a finite number" if count == 1 else f"{count} finite numbers"
-                    raise fault(part, f"{key} of <{part.tag}> of {tag} {name!r} is {text!r}, expected {what}")
+                if part.get(key) is not None:
+                    file.numbers(part, count, f"{tag} {name!r}", key)
             for key in ("velocity", "effort") if part.tag == "limit" else ():
                 # Clipping to -limit .. limit would have an empty range.
                 if float(part.get(key, 0)) < 0:
@@ -95,11 +91,3 @@ def _check_once(parent, part, what: str, fault) -> None:
     # `find` takes the first, and would ignore the second silently.
     if parent.tag in _PARENTS and first is not part:
         raise fault(part, f"a second <{part.tag}> of {what}, the first is on line {first.line}; keep one")
-
-
-def _are_numbers(text: str, count: int) -> bool:
-    try:
-        values = [parse_number(part) for part in text.split()]
-    except ValueError:
-        return False
-    return len(values) == count and bool(np.all(np.isfinite(values)))

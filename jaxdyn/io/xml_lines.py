@@ -106,17 +106,25 @@ class XmlFile:
         """Text of a child element, or the default where there is none."""
         return (element.findtext(tag) or default).strip()
 
-    def numbers(self, element, count: int | tuple[int, ...], what: str) -> np.ndarray:
-        """Read the finite numbers in an element. **Raises:** ValueError for another count than `count`."""
+    def numbers(
+        self, element, count: int | tuple[int, ...], what: str, key: str | None = None, default: Any = None
+    ) -> np.ndarray:
+        """Read the finite numbers in an element, or in its attribute `key`, which may be missing where there is a default.
+
+        **Raises:** ValueError for another count than `count`.
+        """
         counts = (count,) if isinstance(count, int) else count
-        text = (element.text or "").strip()
+        text = ((element.text if key is None else element.get(key)) or "").strip()
+        if not text and default is not None:
+            return np.asarray(default, float)
         try:
             values = np.array([parse_number(part) for part in text.split()])
         except ValueError:
             values = np.zeros(0)
         if len(values) not in counts or not np.isfinite(values).all():
-            wanted = " or ".join(str(n) for n in counts)
-            raise self.fault(element, f"<{element.tag}> of {what} is {text!r}; give {wanted} finite numbers")
+            wanted = "a finite number" if counts == (1,) else f"{' or '.join(map(str, counts))} finite numbers"
+            name = f"<{element.tag}>" if key is None else f"{key} of <{element.tag}>"
+            raise self.fault(element, f"{name} of {what} is {text!r}; give {wanted}")
         return values
 
     def pose_numbers(self, pose, what: str) -> np.ndarray:

@@ -22,13 +22,13 @@ from jaxdyn.model import host_math
 from jaxdyn.model.joints import joint_neutral
 from jaxdyn.model.topology import frame_index
 from jaxdyn.model.tree import Model
-from jaxdyn.pictures.grasped_object import object_name, object_solids, see_through
 from jaxdyn.pictures.solids import Shape, Shapes, rod
 from jaxdyn.systems.scene import Scene
 
 _EQUAL = 1e-3  # relative difference of moments that count as equal
 _THIN = 0.012  # radius of rods, as a fraction of the mechanism's size
 _BULKY = (1.2, 0.5)  # largest longest and middle edge of a solid, as fractions of the longest rod of its body
+_OPACITY = 0.35  # of a grasped object, so that contact forces and friction cones inside are visible
 _SHARE = 0.3  # the same for bodies without rods, as a fraction of the mechanism's size
 
 
@@ -41,8 +41,8 @@ def complete_solids(scene: Scene, shapes: Shapes) -> Shapes:
     size = extent(scene)
     thin = _THIN * size
     rolling, wheeled = _rolling(scene, carried)
-    grasped = object_name(scene)
-    drawn += [see_through(shape) if shape.frame == grasped and grasped is not None else shape for shape in rolling]
+    grasped = scene.object if isinstance(scene, Grasp) else None
+    drawn += [_see_through(shape) if shape.frame == grasped and grasped is not None else shape for shape in rolling]
     bare = [i for i in range(model.nb) if i not in carried]
     points = _joints_on(scene)
     whole = not shapes
@@ -54,7 +54,7 @@ def complete_solids(scene: Scene, shapes: Shapes) -> Shapes:
         longest *= model.nb > 1  # a single body is drawn as its solid
         # The object of a grasp has a solid of its own: forces inside it must stay visible.
         if isinstance(scene, Grasp) and model.body_names[i] == grasped:
-            drawn += object_solids(scene, solid, thin)
+            drawn += _object_solids(scene, solid, thin)
             continue
         drawn += rods + [_or_mark(shape, longest, thin) for shape in solid]
     return Shapes(drawn, shapes.missing)
@@ -252,3 +252,33 @@ def _surfaces(model: Model, contact: RollingContact, carried: set[int]) -> list[
             continue
         shapes.append(Shape(frame, kind, size, np.asarray(pose, float), source="constraint"))
     return shapes
+
+
+def _see_through(shape: Shape) -> Shape:
+    return dataclasses.replace(shape, opacity=min(shape.opacity, _OPACITY))
+
+
+def _object_solids(scene: Grasp, solids: list[Shape], thin: float) -> list[Shape]:
+    """Solids of a grasped object from its inertia and contacts.
+
+    In a plane it is a bar between its contacts. For three equal moments of inertia, which a ball and a cube have, it is the one
+    of these whose surface is closer to the contacts.
+    """
+    model, name = scene.system, scene.object
+    places = [np.asarray(one.pose, float)[:3, 3] for one in scene.constraints if isinstance(one, Contact)]
+    body = model.body_names.index(name)
+    mass, com, moment = host_math.about_com(np.asarray(model.inertias, float)[body])
+    if places and model.topology.kinds[body] == "planar":
+        return [rod(name, com, place, 1.5 * thin, source="inertia") for place in places]
+    ball = solids[0] if len(solids) == 1 and solids[0].kind == "ellipsoid" and len(set(solids[0].size)) == 1 else None
+    if places and ball is not None:
+        # A cube of edge 2 h has the moments 2/3 m h^2.
+        half = float(np.sqrt(1.5 * np.trace(moment) / 3 / mass))
+        points = np.abs(np.array(places) - com)
+        # The largest coordinate of a point on a cube's surface is half its edge.
+        off_cube = np.abs(points.max(1) - half).max()
+        if off_cube < np.abs(np.linalg.norm(points, axis=1) - ball.size[0]).max():
+            pose = np.eye(4)
+            pose[:3, 3] = com
+            solids = [Shape(name, "box", (2 * half,) * 3, pose, source="inertia")]
+    return [_see_through(solid) for solid in solids]

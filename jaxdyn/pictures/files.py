@@ -6,7 +6,7 @@ A file that is missing or cannot be read is named in a warning; the body is then
 
 import os
 import pathlib
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from typing import Any
 
 import numpy as np
@@ -16,7 +16,7 @@ from jaxdyn.io.mjcf_file import assign_names, compile_file, import_mujoco, pose_
 from jaxdyn.io.sdf_frames import SdfFile
 from jaxdyn.io.xml_lines import XmlFile
 from jaxdyn.model import host_math
-from jaxdyn.model.arguments import parse_number, warn
+from jaxdyn.model.arguments import warn
 from jaxdyn.pictures.meshes import MeshError, find_mesh, read_mesh
 from jaxdyn.pictures.solids import Shape, Shapes
 
@@ -39,7 +39,7 @@ def shapes(path: str | os.PathLike, *, arguments: Mapping[str, Any] | None = Non
     **Warns:** `NotTakenWarning` naming meshes that are missing or cannot be read.
 
     **Raises:** ValueError with file and line for a file that cannot be read and for another format. ImportError without
-    mujoco (MJCF); without trimesh, a dependency of viser, meshes are named in the warning.
+    mujoco (MJCF); without trimesh meshes are named in the warning.
 
     ```python
     solids = jd.pictures.shapes("robot.urdf")
@@ -56,16 +56,35 @@ def shapes(path: str | os.PathLike, *, arguments: Mapping[str, Any] | None = Non
     return drawn
 
 
-class _Meshes:
-    """Meshes of one file, each read once, with a list of the missing ones."""
+class _Visuals:
+    """Solids of the visuals of one file, with a list of the missing ones. Each mesh is read once."""
 
     def __init__(self, path: pathlib.Path):
         self.folder = path.resolve().parent
         self.missing: list[str] = []
+        self.solids: list[Shape] = []
         self._read: dict[str, list[tuple]] = {}
 
-    def shapes(self, frame, uri: str, scale, pose, color, opacity) -> list[Shape]:
-        """Solids of a mesh, none where it is missing; the mesh file's own colour has the lowest priority."""
+    def add(self, frame: str, visual, numbers: Callable, uri: Callable, pose, color, opacity: float) -> None:
+        """Add the solids of a <visual>; `numbers(part, key, count, default)` and `uri(part)` read an element of its geometry."""
+        geometry, options = visual.find("geometry"), (pose, color, opacity)
+        for part in () if geometry is None else geometry:
+            if part.tag == "box":
+                self.solids.append(Shape(frame, "box", tuple(numbers(part, "size", 3, np.ones(3))), *options))
+            elif part.tag == "sphere":
+                radius = float(numbers(part, "radius", 1, 1.0))
+                self.solids.append(Shape(frame, "ellipsoid", (radius,) * 3, *options))
+            elif part.tag in ("cylinder", "capsule"):
+                size = float(numbers(part, "radius", 1, 0.5)), float(numbers(part, "length", 1, 1.0))
+                self.solids.append(Shape(frame, part.tag, size, *options))
+            elif part.tag == "ellipsoid":
+                self.solids.append(Shape(frame, "ellipsoid", tuple(numbers(part, "radii", 3, np.ones(3))), *options))
+            elif part.tag == "mesh":
+                self._add_mesh(frame, uri(part), numbers(part, "scale", 3, np.ones(3)), *options)
+            elif part.tag not in ("empty", "plane"):
+                self.missing.append(f"<{part.tag}> of link {frame!r}")
+
+    def _add_mesh(self, frame: str, uri: str, scale, pose, color, opacity: float) -> None:
         if uri not in self._read:
             try:
                 self._read[uri] = read_mesh(find_mesh(uri, self.folder))
@@ -73,98 +92,60 @@ class _Meshes:
                 self._read[uri] = []
                 self.missing.append(f"mesh {uri!r} ({error})")
         size = tuple(float(x) for x in scale)
-        return [
-            Shape(frame, "mesh", size, pose, color or own, opacity, vertices, faces)
-            for vertices, faces, own in self._read[uri]
-        ]
+        for vertices, faces, own in self._read[uri]:
+            # The mesh file's own colour has the lowest priority.
+            self.solids.append(Shape(frame, "mesh", size, pose, color or own, opacity, vertices, faces))
 
 
 def _urdf(file: XmlFile) -> Shapes:
-    meshes, shapes = _Meshes(file.source), []
+    visuals = _Visuals(file.source)
+
+    def rgba_of(material) -> tuple[float, ...] | None:
+        color = material.find("color")
+        return None if color is None else tuple(file.numbers(color, 4, "a material", "rgba").tolist())
+
     # Materials may be defined once, at the robot or in any link, and named elsewhere.
-    materials = {element.get("name"): rgba for element in file.root.iter("material") if (rgba := _rgba(file, element))}
+    materials = {element.get("name"): rgba for element in file.root.iter("material") if (rgba := rgba_of(element))}
     for link in file.root.findall("link"):
         frame = file.name(link, "the robot")
+        what = f"<visual> of link {frame!r}"
         for visual in link.findall("visual"):
-            what = f"<visual> of link {frame!r}"
-            origin = visual.find("origin")
+            origin, material = visual.find("origin"), visual.find("material")
             pose = np.eye(4)
             if origin is not None:
-                xyz, rpy = (_attribute(file, origin, key, 3, what, np.zeros(3)) for key in ("xyz", "rpy"))
-                pose = np.asarray(host_math.pose_matrix((xyz, rpy), what))
-            material = visual.find("material")
+                place = tuple(file.numbers(origin, 3, what, key, np.zeros(3)) for key in ("xyz", "rpy"))
+                pose = np.asarray(host_math.pose_matrix(place, what))
             # A colour in the element itself wins over the named one.
-            rgba = None if material is None else _rgba(file, material) or materials.get(material.get("name"))
+            rgba = None if material is None else rgba_of(material) or materials.get(material.get("name"))
             color, opacity = (None, 1.0) if rgba is None else (rgba[:3], rgba[3])
-            geometry = visual.find("geometry")
-            for part in () if geometry is None else geometry:
-                get = lambda key, count, part=part, what=what: _attribute(file, part, key, count, what)  # noqa: E731
-                if part.tag == "box":
-                    shapes.append(Shape(frame, "box", tuple(get("size", 3)), pose, color, opacity))
-                elif part.tag == "sphere":
-                    shapes.append(Shape(frame, "ellipsoid", (float(get("radius", 1)[0]),) * 3, pose, color, opacity))
-                elif part.tag in ("cylinder", "capsule"):
-                    size = float(get("radius", 1)[0]), float(get("length", 1)[0])
-                    shapes.append(Shape(frame, part.tag, size, pose, color, opacity))
-                elif part.tag == "mesh":
-                    scale = _attribute(file, part, "scale", 3, what, np.ones(3))
-                    shapes += meshes.shapes(frame, part.get("filename") or "", scale, pose, color, opacity)
-                else:
-                    meshes.missing.append(f"<{part.tag}> of link {frame!r}")
-    return Shapes(shapes, meshes.missing)
 
+            def numbers(part, key, count, default, what=what):
+                # Of the attributes of a geometry, URDF has a default for the scale alone.
+                values = file.numbers(part, count, what, key, default if key == "scale" else None)
+                return values if count > 1 else values[0]
 
-def _rgba(file: XmlFile, material) -> tuple[float, ...] | None:
-    color = material.find("color")
-    return None if color is None else tuple(_attribute(file, color, "rgba", 4, "a material").tolist())
-
-
-def _attribute(file: XmlFile, element, key: str, count: int, what: str, default: Any = None) -> np.ndarray:
-    text = (element.get(key) or "").strip()
-    if not text and default is not None:
-        return default
-    try:
-        values = np.array([parse_number(part) for part in text.split()])
-    except ValueError:
-        values = np.zeros(0)
-    if len(values) != count or not np.isfinite(values).all():
-        raise file.fault(element, f"{key} of <{element.tag}> in {what} is {text!r}; give {count} finite numbers")
-    return values
+            visuals.add(frame, visual, numbers, lambda part: part.get("filename") or "", pose, color, opacity)
+    return Shapes(visuals.solids, visuals.missing)
 
 
 def _sdf(file: XmlFile) -> Shapes:
-    scene, shapes = SdfFile(file.source), []
-    meshes = _Meshes(file.source)
+    scene, visuals = SdfFile(file.source), _Visuals(file.source)
     for frame, (link, _) in scene.links.items():
+        what = f"<visual> of link {frame!r}"
         for visual in link.findall("visual"):
-            what = f"<visual> of link {frame!r}"
             pose = scene.raw_pose(visual, what)
             diffuse = visual.find("material/diffuse")
-            rgba = None if diffuse is None else scene.numbers(diffuse, (3, 4), what).tolist()
+            color = None if diffuse is None else tuple(scene.numbers(diffuse, (3, 4), what).tolist()[:3])
             opacity = 1.0 - scene.number(visual, "transparency", 0.0, what)
-            color = None if rgba is None else tuple(rgba[:3])
-            geometry = visual.find("geometry")
-            for part in () if geometry is None else geometry:
-                number = lambda tag, default, part=part, what=what: scene.number(part, tag, default, what)  # noqa: E731
-                options = (pose, color, opacity)
-                if part.tag == "box":
-                    size = part.find("size")
-                    edges = np.ones(3) if size is None else scene.numbers(size, 3, what)
-                    shapes.append(Shape(frame, "box", tuple(edges), *options))
-                elif part.tag == "sphere":
-                    shapes.append(Shape(frame, "ellipsoid", (number("radius", 1.0),) * 3, *options))
-                elif part.tag in ("cylinder", "capsule"):
-                    shapes.append(Shape(frame, part.tag, (number("radius", 0.5), number("length", 1.0)), *options))
-                elif part.tag == "ellipsoid":
-                    radii = part.find("radii")
-                    shapes.append(Shape(frame, "ellipsoid", tuple(scene.numbers(radii, 3, what)), *options))
-                elif part.tag == "mesh":
-                    factors = part.find("scale")
-                    scale = np.ones(3) if factors is None else scene.numbers(factors, 3, what)
-                    shapes += meshes.shapes(frame, scene.word(part, "uri"), scale, *options)
-                elif part.tag not in ("empty", "plane"):
-                    meshes.missing.append(f"<{part.tag}> of link {frame!r}")
-    return Shapes(shapes, meshes.missing)
+
+            def numbers(part, key, count, default, what=what):
+                if count == 1:
+                    return scene.number(part, key, default, what)
+                child = part.find(key)
+                return default if child is None else scene.numbers(child, count, what)
+
+            visuals.add(frame, visual, numbers, lambda part: scene.word(part, "uri"), pose, color, opacity)
+    return Shapes(visuals.solids, visuals.missing)
 
 
 def _mjcf(file: XmlFile) -> Shapes:

@@ -1,4 +1,4 @@
-"""Mesh files: search and triangles, read by trimesh, a dependency of viser."""
+"""Mesh files: search and triangles, read by trimesh."""
 
 import os
 import pathlib
@@ -51,7 +51,7 @@ def read_mesh(path: pathlib.Path) -> list[tuple[np.ndarray, np.ndarray, tuple[fl
     try:
         import trimesh
     except ImportError:
-        raise MeshError("reading meshes needs trimesh: pip install jaxdyn[view]") from None
+        raise MeshError("reading meshes needs trimesh: pip install jaxdyn[plot]") from None
     try:
         # Without processing, vertices and faces stay as in the file.
         loaded = trimesh.load_scene(str(path), process=False)

@@ -128,10 +128,7 @@ def motion_of(scene: Any, solution: Any, rows: int | None = None, most: int | No
         chosen = np.unique(np.linspace(0, len(q) - 1, most).round().astype(int))
     else:
         chosen = np.arange(len(q))
-    kept = np.arange(nt)
-    if rows is not None and nt > rows:
-        # Evenly spaced in time, because save points need not be.
-        kept = np.unique(np.abs(ts[:1] - np.linspace(ts[0, 0], ts[0, -1], rows)[:, None]).argmin(1))
+    kept = np.arange(nt) if rows is None or nt <= rows else select_rows(ts[0], rows)
     q = q[chosen][:, kept]
     reached = np.logical_and.reduce(np.isfinite(q), axis=-1)
     if not reached[:, 0].all():
@@ -145,6 +142,12 @@ def motion_of(scene: Any, solution: Any, rows: int | None = None, most: int | No
             extras[k] = np.take_along_axis(values, last, 1)
     poses = poses_of(model, q.reshape(-1, model.nq)).reshape(*q.shape[:2], model.nb, 4, 4)
     return Motion(scene, ts[0, kept], q, poses, *extras)
+
+
+def select_rows(ts: np.ndarray, most: int) -> np.ndarray:
+    """Rows evenly spaced in time, as save points need not be."""
+    wanted = np.linspace(ts[0], ts[-1], max(most, 2) if len(ts) > 1 else 1)
+    return np.unique(np.abs(ts - wanted[:, None]).argmin(1))
 
 
 def _ends(motion: Motion, pair: Pair) -> tuple[np.ndarray, np.ndarray]:

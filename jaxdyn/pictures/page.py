@@ -15,7 +15,7 @@ from jaxdyn.model.arguments import Checked, Numbers, as_path
 from jaxdyn.model.host_math import quaternion
 from jaxdyn.pictures.default_solids import frame_poses
 from jaxdyn.pictures.drawing import CONE_HEIGHT, arrow_length, cone_sides, scale_forces
-from jaxdyn.pictures.motion import Cone, Motion, cones, forces, marks, motion_of
+from jaxdyn.pictures.motion import Cone, Motion, cones, forces, marks, motion_of, select_rows
 from jaxdyn.pictures.server import (
     HOST,
     free_port,
@@ -183,7 +183,7 @@ def _document(motion: Motion, parts: Shapes) -> str:
     for vertices, rows in _FILED:
         # Each try records anew, on a server of its own.
         with recording_server() as server:
-            kept = _rows(motion.ts, min(rows, 1 + int(np.ptp(motion.ts) * _PICTURES)))
+            kept = select_rows(motion.ts, min(rows, 1 + int(np.ptp(motion.ts) * _PICTURES)))
             content = _Content(server, motion, parts, vertices)
             serializer = server.get_scene_serializer()
             for before, row in itertools.pairwise(kept):
@@ -196,12 +196,6 @@ def _document(motion: Motion, parts: Shapes) -> str:
         f"the page has {len(text) / 1e6:.1f} MB, more than {MOST_BYTES / 1e6:g} MB; show fewer motions: jax.tree.map(lambda x: "
         "x[:2], solution)"
     )
-
-
-def _rows(ts: np.ndarray, most: int) -> np.ndarray:
-    """Rows evenly spaced in time."""
-    wanted = np.linspace(ts[0], ts[-1], max(most, 2) if len(ts) > 1 else 1)
-    return np.unique(np.abs(ts - wanted[:, None]).argmin(1))
 
 
 class _Content:

@@ -1,7 +1,6 @@
 """Solids of a mechanism as triangles: boxes, balls, cylinders and meshes, each on a frame of the model."""
 
 import dataclasses
-import itertools
 from collections.abc import Iterator
 
 import numpy as np
@@ -48,7 +47,7 @@ class Shape:
             if np.prod(self.size) < 0:  # a reflection reverses the orientation of triangles
                 faces = faces[:, ::-1]
         else:
-            vertices, faces = _SOLIDS[self.kind](self.size)
+            vertices, faces = _triangles(self.kind, self.size)
         return vertices @ self.pose[:3, :3].T + self.pose[:3, 3], faces
 
 
@@ -92,62 +91,23 @@ def along(place, direction) -> np.ndarray:
     return pose
 
 
-def _box(size) -> tuple[np.ndarray, np.ndarray]:
-    # Each side has vertices of its own, so that edges stay sharp where normals are averaged at vertices.
-    corners, faces = [], []
-    for axis in range(3):
-        for sign in (-1.0, 1.0):
-            # The two edges change places on the opposite side, so that faces are counter-clockwise from outside.
-            one, other = np.roll(np.eye(3), axis, axis=1)[1:] if sign > 0 else np.roll(np.eye(3), axis, axis=1)[:0:-1]
-            middle = sign * np.roll(np.eye(3), axis, axis=1)[0]
-            k = len(corners)
-            corners += [middle - one - other, middle + one - other, middle + one + other, middle - one + other]
-            faces += [[k, k + 1, k + 2], [k, k + 2, k + 3]]
-    return np.array(corners) * np.asarray(size) / 2, np.array(faces)
-
-
-def _revolve(radii, heights, smooth: bool) -> tuple[np.ndarray, np.ndarray]:
-    """Surface of revolution about z of a profile (radius and height at each ring), with rings of radius zero at its ends."""
-    angles = np.linspace(0, 2 * np.pi, _SIDES, endpoint=False)
-    circle = np.stack([np.cos(angles), np.sin(angles), np.zeros(_SIDES)], axis=1)
-    rings = [circle * r + [0, 0, h] for r, h in zip(radii, heights, strict=True)]
-    vertices, faces = [], []
-    step = np.arange(_SIDES)
-    following = (step + 1) % _SIDES
-    count = 0
-    for low, high in itertools.pairwise(rings):
-        # Smooth surfaces share the vertices of adjacent bands; sharp ones repeat the ring.
-        if smooth and vertices:
-            first, new = count - _SIDES, [high]
-        else:
-            first, new = count, [low, high]
-        vertices += new
-        count += _SIDES * len(new)
-        a, b = first + step, first + following
-        faces += [np.stack([a, b, b + _SIDES], 1), np.stack([a, b + _SIDES, a + _SIDES], 1)]
-    return np.concatenate(vertices), np.concatenate(faces)
-
-
-def _cylinder(size) -> tuple[np.ndarray, np.ndarray]:
-    radius, length = size
-    return _revolve([0.0, radius, radius, 0.0], np.array([-1, -1, 1, 1]) * length / 2, smooth=False)
-
-
-def _capsule(size) -> tuple[np.ndarray, np.ndarray]:
-    radius, length = size
-    up = np.linspace(0, np.pi / 2, 6)
-    radii = np.concatenate([np.cos(up)[::-1], np.cos(up)]) * radius
-    heights = np.concatenate([-np.sin(up)[::-1] * radius - length / 2, np.sin(up) * radius + length / 2])
-    return _revolve(radii, heights, smooth=True)
-
-
-def _ellipsoid(size) -> tuple[np.ndarray, np.ndarray]:
-    up = np.linspace(-np.pi / 2, np.pi / 2, _SIDES // 2 + 1)
-    vertices, faces = _revolve(np.cos(up), np.sin(up), smooth=True)
-    return vertices * np.asarray(size), faces
-
-
-_SOLIDS = {"box": _box, "cylinder": _cylinder, "capsule": _capsule, "ellipsoid": _ellipsoid}
+def _triangles(kind: str, size: tuple[float, ...]) -> tuple[np.ndarray, np.ndarray]:
+    """Vertices and faces of a solid of Trimesh, in its own axes."""
+    try:
+        # Imported on use: Trimesh is an extra.
+        from trimesh import creation
+    except ImportError as error:
+        raise ImportError("pictures need trimesh: pip install jaxdyn[plot]") from error
+    if kind == "box":
+        mesh = creation.box(size)
+    elif kind == "ellipsoid":
+        mesh = creation.icosphere(subdivisions=2)
+        mesh.apply_scale(size)
+    elif kind == "cylinder":
+        mesh = creation.cylinder(size[0], size[1], sections=_SIDES)
+    else:
+        mesh = creation.capsule(size[1], size[0], count=(_SIDES // 2, _SIDES))
+    return np.asarray(mesh.vertices), np.asarray(mesh.faces)
 
 
 def refine(vertices: np.ndarray, faces: np.ndarray, longest: float) -> tuple[np.ndarray, np.ndarray]:
@@ -189,34 +149,12 @@ def simplify(vertices: np.ndarray, faces: np.ndarray, most: int) -> tuple[np.nda
 
 
 def sharpen(vertices: np.ndarray, faces: np.ndarray, angle: float = 0.6) -> tuple[np.ndarray, np.ndarray]:
-    """Duplicate vertices at sharp edges, so that averaged normals keep these sharp.
+    """Duplicate vertices at edges sharper than `angle` (rad), so that averaged normals keep these sharp."""
+    import trimesh
 
-    The corners of the triangles at a vertex share it where their normals are within `angle` (rad) of one another.
-    """
-    # Vertices of one place are merged first: STL files repeat them in each triangle.
-    _, first, merged = np.unique(vertices.round(7), axis=0, return_index=True, return_inverse=True)
-    corners = merged.ravel()[faces]
-    sides = vertices[faces]
-    normals = np.cross(sides[:, 1] - sides[:, 0], sides[:, 2] - sides[:, 0])
-    sizes = np.linalg.norm(normals, axis=1)
-    # A triangle of no area has no normal.
-    corners, normals = corners[sizes > 0], normals[sizes > 0] / sizes[sizes > 0, None]
-    owners: dict[int, list[tuple[np.ndarray, int]]] = {}
-    places: list[int] = []
-    indices = np.zeros_like(corners)
-    least = np.cos(angle)
-    for f, (corner, normal) in enumerate(zip(corners.tolist(), normals, strict=True)):
-        for k, vertex in enumerate(corner):
-            known = owners.setdefault(vertex, [])
-            for other, index in known:
-                if other @ normal > least:
-                    indices[f, k] = index
-                    break
-            else:
-                known.append((normal, len(places)))
-                indices[f, k] = len(places)
-                places.append(int(first[vertex]))
-    return vertices[places], indices
+    # Trimesh merges vertices of one place: STL files repeat them in each triangle.
+    mesh = trimesh.graph.smooth_shade(trimesh.Trimesh(vertices, faces), angle=angle)
+    return np.asarray(mesh.vertices), np.asarray(mesh.faces)
 
 
 def by_frame(shapes: Shapes) -> Iterator[tuple[str | None, tuple | None, float, list[Shape]]]:
@@ -230,9 +168,6 @@ def by_frame(shapes: Shapes) -> Iterator[tuple[str | None, tuple | None, float, 
 
 def merge_meshes(parts) -> tuple[np.ndarray, np.ndarray]:
     """Merge several meshes."""
-    vertices, faces, count = [], [], 0
-    for points, triangles in parts:
-        vertices.append(points)
-        faces.append(triangles + count)
-        count += len(points)
-    return np.concatenate(vertices), np.concatenate(faces)
+    import trimesh
+
+    return trimesh.util.append_faces(*zip(*parts, strict=True))

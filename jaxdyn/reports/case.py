@@ -1,4 +1,4 @@
-"""Cases of a report: a scene with its reference motion, measured quantities, and published results."""
+"""Cases of a report: a scene with its reference motion and measured quantities."""
 
 import inspect
 from collections.abc import Callable
@@ -29,29 +29,18 @@ class Reference(NamedTuple):
     error: float = ROUNDING
 
 
-class Published(NamedTuple):
-    """Published run of the same motion: CPU `seconds`, and the largest `error` or `energy_error` (J) if stated."""
-
-    label: str
-    seconds: float
-    error: float | None = None
-    energy_error: float | None = None
-
-
 class Case(NamedTuple):
     """Scene of the report with its measurements.
 
-      - `name`, `text`: name and description; `kind`: the class of scenes for comparing defaults.
+      - `name`, `text`: name and description.
       - `build()` -> (scene, (q0, v0)); `reference(start)` -> `Reference`, or None where a
     converged solution at `ts` is the reference.
       - `steps`: fixed steps of the coarsest run; `conserves`: whether the energy is constant; `stiff`.
       - `reduces`: whether the method "reduced" finds the scene's degrees of freedom.
-      - `largest`: largest measured batch unless `integrators` are chosen; None for no limit.
     """
 
     name: str
     text: str
-    kind: str
     build: Callable[[], tuple[Scene, tuple]]
     reference: Callable[[Any], Reference] | None
     ts: np.ndarray
@@ -59,25 +48,6 @@ class Case(NamedTuple):
     conserves: bool = True
     stiff: bool = False
     reduces: bool = True
-    largest: int | None = None
-    published: tuple[Published, ...] = ()
-
-
-def scene_builder(name: str, **parameters) -> Callable[[], tuple[Scene, tuple]]:
-    """Function `build` for a scene of `jaxdyn.scenes`; scene and start get the parameters that they accept."""
-
-    def call_with_known(function):
-        # A parameter may belong to the scene, to its start, or to both.
-        known = inspect.signature(function).parameters
-        return function(**{key: value for key, value in parameters.items() if key in known})
-
-    def build():
-        scene = getattr(scenes, name)
-        # Start and scene get the same parameters, so that the start satisfies the constraints.
-        q, v = call_with_known(scene.start_function)
-        return call_with_known(scene), (np.asarray(q), np.asarray(v))
-
-    return build
 
 
 def case_of_scene(name: str) -> Case:
@@ -89,7 +59,9 @@ def case_of_scene(name: str) -> Case:
         raise ValueError(f"scenes has {name!r}; give a jaxdyn.reports.Case, or choose from {', '.join(scenes.names())}")
     if has_modes(getattr(scenes, name)()):
         raise ValueError(f"scenes has {name!r}, whose steps end at events; a report compares steps of given lengths")
+    scene = getattr(scenes, name)
     # The first line of a scene's docstring describes it.
-    text = (inspect.getdoc(getattr(scenes, name)) or name).partition("\n")[0]
+    text = (inspect.getdoc(scene) or name).partition("\n")[0]
     # The energy of an arbitrary scene need not be constant, so its error is not reported.
-    return Case(name, text, "scene", scene_builder(name), None, np.linspace(0.0, 1.0, 11), 250, conserves=False)
+    build = lambda: (scene(), tuple(np.asarray(x) for x in scene.start()))  # noqa: E731
+    return Case(name, text, build, None, np.linspace(0.0, 1.0, 11), 250, conserves=False)

@@ -13,7 +13,7 @@ from jaxdyn.reports.programs import FIXED, SOLVERS, Prepared
 from jaxdyn.reports.records import Record
 from jaxdyn.reports.timing import time_interleaved
 from jaxdyn.simulation.checks import choose_method
-from jaxdyn.simulation.methods import Method, Reduced
+from jaxdyn.simulation.methods import Method
 from jaxdyn.simulation.solvers.explicit import keeps_fsal
 from jaxdyn.systems.scene import Scene
 
@@ -44,11 +44,10 @@ class Contestant(NamedTuple):
     call: Callable[[], Any]
     motion: Callable[[Any], Motion]
     compile_seconds: float | None = None
-    flops: Callable[[Motion], float | None] = lambda motion: None
 
 
 def ladder(
-    prepared: Prepared, method: str, solver: str, settings: Sequence[float], dtype: str, starts, flops: Callable
+    prepared: Prepared, method: str, solver: str, settings: Sequence[float], dtype: str, starts
 ) -> list[Contestant]:
     """Our contestants that differ only in tolerance or step, sharing one program; `starts` as of `Programs.batch_starts`."""
     batch = len(starts[0])
@@ -71,7 +70,7 @@ def ladder(
         number = jnp.asarray(setting, dtype)
         # JAX returns before the computation is done; without blocking the time would be that of the dispatch.
         call = lambda: jax.block_until_ready(run(*inputs, number))  # noqa: E731
-        return Contestant("jaxdyn", method, solver, setting, solver in FIXED, call, motion, seconds, flops)
+        return Contestant("jaxdyn", method, solver, setting, solver in FIXED, call, motion, seconds)
 
     return [contestant(setting) for setting in settings]
 
@@ -91,42 +90,6 @@ def evaluations(solver: str, steps: int, scene: Scene, method: Method) -> int | 
     saves = keeps_fsal(tableau, method.step_constants, method.projects) if method.corrects(scene) else tableau.fsal
     saved = steps - 1 if saves else 0
     return tableau.num_stages * steps - saved + 2
-
-
-def flop_counter(prepared: Prepared, method: str, batch: int = 1) -> Callable[[Motion], float | None]:
-    """Counter of floating-point operations of a motion: evaluations, and projections after its steps.
-
-    Per sample of a batch, because large batches run another program. XLA counts compiled expressions; calls of LAPACK
-    and repetitions of loops are not included.
-    """
-    scene = prepared.scene
-    chosen = choose_method(scene, method)
-    q, v, t = (jnp.asarray(x, float) for x in (*prepared.programs.start, prepared.reference.ts[0]))
-    if isinstance(chosen, Reduced):
-        chosen = chosen.for_scene(scene, None)
-    state = chosen.start(scene, q, v, t)
-
-    def rates(y, t):
-        q, v = chosen.to_qv(scene, y, t)
-        return chosen.rates(scene, y, q, v, t, scene.applied_force(q, v, t))
-
-    def cost(function):
-        many, inputs = function, (state, t)
-        if batch > 1:
-            many, inputs = jax.vmap(function), jax.tree.map(lambda x: jnp.tile(x, (batch, *[1] * x.ndim)), inputs)
-        # Some backends have no analysis and return None.
-        analysis = jax.jit(many).lower(*inputs).compile().cost_analysis() or {}
-        return float(analysis.get("flops", 0.0)) / batch
-
-    once = cost(rates)
-    again = cost(lambda y, t: chosen.correct(scene, y, t)) if chosen.corrects(scene) else 0.0
-
-    def count(motion: Motion) -> float | None:
-        if motion.evaluations is None or motion.steps is None:
-            return None
-        return once * motion.evaluations + again * motion.steps
-
-    return count
 
 
 def judge(prepared: Prepared, motion: Motion) -> dict:
@@ -169,7 +132,6 @@ def measure(
     return [
         Record(
             scene=prepared.case.name,
-            kind=prepared.case.kind,
             source=one.source,
             method=one.method,
             solver=one.solver,
@@ -186,7 +148,6 @@ def measure(
             steps=motion.steps,
             rejected=motion.rejected,
             evaluations=motion.evaluations,
-            flops=one.flops(motion),
             **judge(prepared, motion),
         )
         for i, (one, motion) in enumerate(zip(contestants, motions, strict=True))

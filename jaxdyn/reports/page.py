@@ -2,22 +2,17 @@
 
 import html
 import io
-import math
 from collections.abc import Iterable, Sequence
 from pathlib import Path
 from typing import Any
 
-from jaxdyn.reports.front import pareto_front, standings
 from jaxdyn.reports.plotting import GREY, SERIES, new_figure
-from jaxdyn.reports.records import COLUMNS, Record, Report, SceneReference, rows
+from jaxdyn.reports.records import Record, Report, SceneReference, pareto_front
 
-STYLE = """
+_STYLE = """
 body { font: 15px/1.45 system-ui, sans-serif; max-width: 75rem; margin: 2rem auto; padding: 0 1rem; color: #222; }
 h1 { font-size: 1.5rem; } h2 { font-size: 1.15rem; margin-top: 2.5rem; }
-table { border-collapse: collapse; font-size: 12px; font-variant-numeric: tabular-nums; }
-th, td { padding: 1px 8px; text-align: right; border-bottom: 1px solid #e5e5e5; white-space: nowrap; }
-th:first-child, td:first-child { text-align: left; }
-.wide { overflow-x: auto; } svg { max-width: 100%; height: auto; } .note { color: #555; }
+pre { font-size: 12px; overflow-x: auto; } svg { max-width: 100%; height: auto; } .note { color: #555; }
 """
 _READING = """
 Each line is one integrator, each point a tolerance or a step: left is more accurate, down is
@@ -25,8 +20,7 @@ cheaper. Points with a grey disc are on the Pareto front. The error is the large
 over the entries y of position and velocity and over the save points, r the reference; quaternions are compared as rotation
 matrices. In the grey band on the left the error of the reference dominates. Times are the best of the rounds, per
 trajectory, without compilation. All runs of a plot were timed interleaved, so its lines compare; plots of different
-machines do not. Stars and dotted lines are published results on the named machines. Evaluations of implicit
-methods are not counted.
+machines do not. Evaluations of implicit methods are not counted.
 """
 
 
@@ -43,21 +37,29 @@ def write(report: Report, directory: str | Path) -> None:
         (directory / f"report.{kind}").write_text(text(), encoding="utf-8")
 
 
+def document(title: str, parts: Iterable[str]) -> str:
+    """Page of HTML elements that works offline."""
+    head = f"<!doctype html><html lang='en'><head><meta charset='utf-8'><title>{html.escape(title)}</title>"
+    start = f"{head}<style>{_STYLE}</style></head><body><h1>{html.escape(title)}</h1>"
+    return "\n".join([start, *parts, "</body></html>\n"])
+
+
+def text_block(text: str) -> str:
+    """Element of a page that shows a text with its lines and columns."""
+    return f"<pre>{html.escape(text)}</pre>"
+
+
 def html_page(report: Report) -> str:
     """Build the report as one self-contained HTML page: plots as SVG, tables, the machine."""
-    head = report.head
-    parts = [
-        "<!doctype html><html lang='en'><head><meta charset='utf-8'><title>Error against run time</title>",
-        f"<style>{STYLE}</style></head><body><h1>Error against run time</h1>",
-        f"<p>{escape(_machine(head))}</p><p class='note'>{_READING}</p>",
-        "<h2>Integrators by class of scene</h2>",
-        "<p class='note'>Cost relative to the best integrator at the errors 1e-3, 1e-5, 1e-7 and 1e-9, geometric mean over the "
-        "scenes of the class and the errors that it reaches; the number of these, out of those that any integrator reaches.</p>",
-        _standings(report.records),
-    ]
+    parts = [f"<p>{html.escape(_machine(report.head))}</p><p class='note'>{_READING}</p>"]
     for name, known in report.scenes.items():
-        parts += _scene(name, known, report.of(name))
-    return "\n".join([*parts, "</body></html>\n"])
+        parts.append(f"<h2 id='{html.escape(name)}'>{html.escape(known.text)}</h2>")
+        records = report.of(name)
+        for dtype, batch in dict.fromkeys((r.dtype, r.batch) for r in records):
+            group = [r for r in records if (r.dtype, r.batch) == (dtype, batch)]
+            parts.append(svg(figure(f"{dtype}, {batch} at once", known, group), f"{name}{dtype}{batch}"))
+        parts.append(f"<details><summary>{len(records)} runs</summary>{text_block(report.table(name))}</details>")
+    return document("Error against run time", parts)
 
 
 def _machine(head) -> str:
@@ -65,39 +67,8 @@ def _machine(head) -> str:
     versions = ", ".join(f"{name} {x}" for name, x in machine["versions"].items() if x)
     return (
         f"{machine['processor']}, {machine['cores']} cores, device {machine['device']}, load {machine['load']} at the start; "
-        f"{versions}; commit {head['commit'] or 'unknown'}; {head['date']}"
+        f"{versions}; {head['date']}"
     )
-
-
-def escape(value) -> str:
-    """Escape a value as text of a page."""
-    return html.escape(str(value))
-
-
-def html_table(header: Sequence[str], cells: Iterable[Sequence[str]]) -> str:
-    """HTML table, first column left-aligned."""
-    lines = [f"<tr>{''.join(f'<th>{escape(x)}</th>' for x in header)}</tr>"]
-    lines += [f"<tr>{''.join(f'<td>{escape(x)}</td>' for x in row)}</tr>" for row in cells]
-    return f"<div class='wide'><table>{''.join(lines)}</table></div>"
-
-
-def _standings(records) -> str:
-    cells = [
-        (s.kind, s.label, f"{s.ratio:.2f}" if math.isfinite(s.ratio) else "-", f"{s.reached}/{s.wanted}")
-        for s in standings(records)
-    ]
-    return html_table(("class", "integrator", "cost", "reached"), cells)
-
-
-def _scene(name: str, known: SceneReference, records: tuple[Record, ...]) -> list[str]:
-    reference = f"Reference: {known.kind}, {known.source}; its own error is about {known.error:.0e}."
-    parts = [f"<h2 id='{escape(name)}'>{escape(known.text)}</h2>", f"<p>{escape(reference)}</p>"]
-    for dtype, batch in dict.fromkeys((r.dtype, r.batch) for r in records):
-        group = [r for r in records if (r.dtype, r.batch) == (dtype, batch)]
-        drawn = figure(f"{dtype}, {batch} at once", known, group)
-        parts.append(svg(drawn, f"{name}{dtype}{batch}"))
-    cells = html_table(COLUMNS, rows(records))
-    return [*parts, f"<details><summary>{len(records)} runs</summary>{cells}</details>"]
 
 
 def figure(title: str, known: SceneReference, records: Sequence[Record]) -> Any:
@@ -120,8 +91,6 @@ def figure(title: str, known: SceneReference, records: Sequence[Record]) -> Any:
         if error == "error_path":
             # After the lines are drawn, whose limits the band extends to.
             ax.axvspan(ax.get_xlim()[0], max(known.error, ax.get_xlim()[0]), color="0.93", zorder=0)
-        if cost == "seconds_best":
-            _draw_peers_times(ax, known, error)
     # Panels have the same lines; a dictionary shows each label once.
     shown = {label: handle for ax in axes[0] for handle, label in zip(*ax.get_legend_handles_labels(), strict=True)}
     drawn.legend(shown.values(), shown.keys(), loc="outside lower center", ncols=3, fontsize=8, frameon=False)
@@ -163,15 +132,3 @@ def panel(ax, records, error: str, cost: str) -> None:
     ]
     halo = {"markersize": 10, "alpha": 0.35, "markeredgewidth": 0, "zorder": 1}
     ax.plot(*zip(*front, strict=True), "o", color=GREY, label="on the front", **halo)
-
-
-def _draw_peers_times(ax, known: SceneReference, error: str) -> None:
-    for point in known.published:
-        value = point["error" if error == "error_path" else "energy_error"]
-        if value is not None:
-            ax.plot([value], [point["seconds"]], "*", color="black", markersize=9, label=point["label"])
-        # A time without an error has no place on the other axis and is drawn as a level.
-        elif point["error"] is None and point["energy_error"] is None and error == "error_path":
-            ax.axhline(
-                point["seconds"], color="black", linestyle=":", linewidth=1, label=f"{point['label']}, no error given"
-            )

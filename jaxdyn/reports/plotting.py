@@ -8,9 +8,6 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from jaxdyn.model.joints import KINDS
-from jaxdyn.model.tree import Model
-
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
 else:
@@ -56,47 +53,24 @@ def bands(ax, t, values, colour: str, label: str | None = None) -> None:
     ax.plot(t, middle, color=colour, linewidth=1.3, label=label)
 
 
-def motion_figure(model: Model, ts, q, v, tau) -> Any:
-    """Position, velocity and torque of every one-coordinate joint over time.
+def joint_panels(count: int, height: float, xlabel: str) -> tuple[Any, list[Any]]:
+    """Figure with a panel of a given height (inches) for each of `count` joints, four in a row, and their axes."""
+    columns = min(count, 4)
+    rows = -(-count // columns)  # rounded up
+    figure, axes = new_figure(2.9 * columns, height * rows + 0.6, rows, columns, sharex=True)
+    for j, ax in enumerate(axes.flat):
+        ax.set_visible(j < count)
+        # The lowest panel of each column has the labels of the shared axis.
+        if j + columns >= count:
+            ax.set_xlabel(xlabel)
+            ax.tick_params(labelbottom=True)
+    return figure, list(axes.flat)[:count]
 
-    **Arguments:** `ts` (nt,) s; `q` (n, nt, nq); `v`, `tau` (n, nt, nv), of n motions. One motion is drawn as a line, many as
-    their median with bands of 25 to 75 and 5 to 95 %. Joints with more coordinates are not drawn; all coordinates
-    are listed by `jaxdyn info`.
 
-    **Raises:** ImportError without matplotlib.
-    """
-    q, v, tau = (np.asarray(x) for x in (q, v, tau))
-    topology = model.topology
-    joints = [i for i, kind in enumerate(topology.kinds) if KINDS[kind].nv == 1]
-    linear = {topology.kinds[i] == "prismatic" for i in joints}
-    units = ("m", "m/s", "N") if linear == {True} else ("rad", "rad/s", "N m")
-    units = units if len(linear) < 2 else ("rad, m", "rad/s, m/s", "N m, N")
-    many = len(q) > 1
-    # Bands of several joints would cover each other, so each joint has its own column.
-    columns = min(len(joints), 8) if many else 1
-    figure, axes = new_figure(2.1 * columns + 0.7 if many else 8.5, 6.2, 3, columns, sharex=True)
-    for k, i in enumerate(joints[:columns] if many else joints):
-        at_q, at_v = topology.q_slices[i].start, topology.v_slices[i].start
-        for row, values in enumerate((q[:, :, at_q], v[:, :, at_v], tau[:, :, at_v])):
-            if many:
-                bands(axes[row, k], ts, values, BLUE)
-            else:
-                colour, dashed = SERIES[k % len(SERIES)], "--" if k // len(SERIES) % 2 else "-"
-                axes[row, 0].plot(ts, values[0], dashed, color=colour, linewidth=1.2, label=model.joint_names[i])
-        if many:
-            axes[0, k].set_title(model.joint_names[i], fontsize=9)
-    for row, (name, unit) in enumerate(zip(("position", "velocity", "torque"), units, strict=True)):
-        axes[row, 0].set_ylabel(f"{name} ({unit})", fontsize=9)
-    for ax in axes[-1]:
-        ax.set_xlabel("time (s)", fontsize=9)
-    if many:
-        figure.suptitle(f"{model.name}: median, 25 to 75 % and 5 to 95 % of {len(q)} motions", fontsize=10)
-    else:
-        figure.suptitle(model.name, fontsize=10)
-        handles, labels = axes[0, 0].get_legend_handles_labels()
-        # A longer legend would not fit on the page.
-        figure.legend(handles[:24], labels[:24], loc="outside right upper", fontsize=8, frameon=False)
-    return figure
+def add_legend(figure, ax) -> None:
+    """Add the legend of one panel below all."""
+    handles, names = ax.get_legend_handles_labels()
+    figure.legend(handles, names, loc="outside lower center", ncols=3, fontsize=9, frameon=False)
 
 
 def torque_figure(log, predicted, labels, units, *, title: str = "held-out samples") -> Any:
@@ -107,27 +81,15 @@ def torque_figure(log, predicted, labels, units, *, title: str = "held-out sampl
     **Raises:** ImportError without matplotlib.
     """
     t, measured, predicted = np.asarray(log.t), np.asarray(log.tau), np.asarray(predicted)
-    count = measured.shape[1]
-    columns = min(count, 4)
-    # Rounded up.
-    rows = -(-count // columns)
-    figure, axes = new_figure(2.9 * columns, 2.1 * rows + 0.6, rows, columns, sharex=True)
-    for j, ax in enumerate(axes.flat):
-        if j >= count:
-            ax.set_visible(False)
-            continue
+    figure, axes = joint_panels(measured.shape[1], 2.1, "time (s)")
+    for j, ax in enumerate(axes):
         ax.plot(t, measured[:, j], color="0.6", linewidth=2.4, label="measured")
         ax.plot(t, predicted[:, j], color=BLUE, linewidth=1.0, label="predicted")
         ax.plot(t, predicted[:, j] - measured[:, j], color=RED, linewidth=0.8, label="difference")
         share = 100 * np.linalg.norm(predicted[:, j] - measured[:, j]) / np.linalg.norm(measured[:, j])
         ax.set_title(f"{labels[j]}: error {share:.1f} %", fontsize=9)
         ax.set_ylabel(f"torque ({units[j]})" if units[j] == "N m" else f"force ({units[j]})", fontsize=9)
-        # The lowest panel of each column has the time labels.
-        if j + columns >= count:
-            ax.set_xlabel("time (s)", fontsize=9)
-            ax.tick_params(labelbottom=True)
     total = 100 * np.linalg.norm(predicted - measured) / np.linalg.norm(measured)
     figure.suptitle(f"{title}: torque error {total:.2f} %", fontsize=10)
-    handles, names = axes[0, 0].get_legend_handles_labels()
-    figure.legend(handles, names, loc="outside lower center", ncols=3, fontsize=9, frameon=False)
+    add_legend(figure, axes[0])
     return figure

@@ -18,12 +18,11 @@ class Record:
     - `error_end`, `error_path`: error at the last save point and the largest of all (`cases.errors`).
     - `residual_position`, `residual_velocity`: largest |phi| and |A v - b|; `energy_error`: largest |E - E(0)|, J.
     - `seconds_best`, `seconds_median`: wall time per trajectory, of `rounds`; `compile_seconds`, separate, of the ladder.
-    - `steps`, rejected ones included, and `rejected`; `evaluations` of the vector field; `flops` that XLA counts.
+    - `steps`, rejected ones included, and `rejected`; `evaluations` of the vector field.
       Of the first trajectory of a batch, whose start is the reference's.
     """
 
     scene: str
-    kind: str
     source: str
     method: str
     solver: str
@@ -44,7 +43,6 @@ class Record:
     steps: int | None
     rejected: int | None
     evaluations: int | None
-    flops: float | None
 
     @property
     def label(self) -> str:
@@ -55,24 +53,17 @@ class Record:
 
 @dataclasses.dataclass(frozen=True)
 class SceneReference:
-    """Reference of a scene and published results."""
+    """Reference of a scene."""
 
     text: str
     kind: str
     source: str
     error: float
-    published: tuple[dict, ...] = ()
-
-    @staticmethod
-    def from_dict(data: dict) -> "SceneReference":
-        """Restore from `dataclasses.asdict`, also through JSON, which has no tuples."""
-        values: dict[str, Any] = data | {"published": tuple(data["published"])}
-        return SceneReference(**values)
 
 
 @dataclasses.dataclass(frozen=True)
 class Report:
-    """Records of a report with their context: `head` (machine, versions, commit, date) and each scene's reference."""
+    """Records of a report with their context: `head` (machine, versions, date) and each scene's reference."""
 
     head: dict[str, Any]
     scenes: dict[str, SceneReference]
@@ -90,7 +81,7 @@ class Report:
     def from_json(text: str) -> "Report":
         """Read a report that `to_json` wrote."""
         data = json.loads(text)
-        scenes = {name: SceneReference.from_dict(known) for name, known in data["scenes"].items()}
+        scenes = {name: SceneReference(**known) for name, known in data["scenes"].items()}
         return Report(data["head"], scenes, tuple(Record(**record) for record in data["records"]))
 
     def table(self, scene: str | None = None) -> str:
@@ -104,9 +95,24 @@ class Report:
         return f"{head}\n{table(COLUMNS, rows(records))}" if records else head
 
 
+def pareto_front(records: Iterable[Record], *, error: str = "error_path", cost: str = "seconds_best") -> list[Record]:
+    """Pareto-optimal records in `error` and `cost`, from cheap to accurate, without failed runs."""
+    # After sorting by cost, a record is on the front if its error is below that of all cheaper ones.
+    # Failed runs have no error.
+    usable = [r for r in records if getattr(r, error) is not None and getattr(r, cost) is not None]
+    # At equal cost the more accurate record comes first and hides the other.
+    usable.sort(key=lambda r: (getattr(r, cost), getattr(r, error)))
+    front: list[Record] = []
+    for record in usable:
+        # Strictly: of two equally accurate runs only the cheaper one is on the front.
+        if not front or getattr(record, error) < getattr(front[-1], error):
+            front.append(record)
+    return front
+
+
 COLUMNS = (
     "method", "dtype", "batch", "setting", "error", "at end", "residual", "energy", "us", "median", "rounds", "steps", "evals",
-    "Mflop", "compile s", "result",
+    "compile s", "result",
 )  # fmt: skip
 
 
@@ -126,7 +132,6 @@ def rows(records: Iterable[Record]) -> list[list[str]]:
                 # Microseconds: most runs of one trajectory take less than a millisecond.
                 *(f"{1e6 * x:.4g}" for x in (r.seconds_best, r.seconds_median)),
                 *("-" if x is None else str(x) for x in (r.rounds, r.steps, r.evaluations)),
-                short(None if r.flops is None else r.flops / 1e6, 3),
                 short(r.compile_seconds, 2),
                 # An empty cell, so that failures stand out.
                 "" if r.result == "successful" else r.result,

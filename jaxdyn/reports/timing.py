@@ -3,7 +3,6 @@
 import os
 import platform
 import statistics
-import subprocess
 import time
 from collections.abc import Sequence
 from importlib.metadata import PackageNotFoundError, version
@@ -71,18 +70,3 @@ def machine(packages: Sequence[str] = ()) -> dict:
         "load": os.getloadavg()[0] if hasattr(os, "getloadavg") else None,
         "versions": versions,
     }
-
-
-def commit() -> str | None:
-    """Commit of the package's source tree, followed by "+" if tracked files are modified; None outside of a repository."""
-
-    def git(*arguments) -> str:
-        call = ["git", "-C", str(Path(__file__).parent), *arguments]
-        return subprocess.run(call, capture_output=True, text=True, check=True).stdout.strip()
-
-    try:
-        # An installed package may lie inside another repository, which does not track this file: git then fails.
-        git("ls-files", "--error-unmatch", Path(__file__).name)
-        return git("rev-parse", "HEAD") + ("+" if git("status", "--porcelain", "--untracked-files=no") else "")
-    except (OSError, subprocess.CalledProcessError):
-        return None

@@ -38,9 +38,6 @@ from jaxdyn.scenes.particles import pendulum_in_plane as pendulum_in_plane
 from jaxdyn.scenes.particles import spherical_pendulum as spherical_pendulum
 from jaxdyn.scenes.platforms import hinge_platform as hinge_platform
 from jaxdyn.scenes.platforms import sarrus as sarrus
-from jaxdyn.scenes.reference import andrews as andrews
-from jaxdyn.scenes.reference import andrews_bodies as andrews_bodies
-from jaxdyn.scenes.reference import car_axis as car_axis
 from jaxdyn.scenes.rolling import chaplygin_sleigh as chaplygin_sleigh
 from jaxdyn.scenes.rolling import knife_edge_on_incline as knife_edge_on_incline
 from jaxdyn.scenes.rolling import rolling_coin as rolling_coin
@@ -64,8 +61,6 @@ def names() -> tuple[str, ...]:
 __all__ = [
     "NamedScene",
     "allegro_with_cube",
-    "andrews",
-    "andrews_bodies",
     "ball_on_incline",
     "ball_on_turntable",
     "bennett",
@@ -74,7 +69,6 @@ __all__ = [
     "box_on_table",
     "bricard",
     "car",
-    "car_axis",
     "chaplygin_sleigh",
     "closed_ring",
     "coordinated_lifting",

@@ -1,14 +1,12 @@
 """Balls in rolling or sliding contact with planes."""
 
 import equinox as eqx
-import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
 from jaxdyn.compile.known import array_namespace
 from jaxdyn.constraints import Holonomic, rolling_sphere
 from jaxdyn.contact.unilateral import ground_contact
-from jaxdyn.lie import so3
 from jaxdyn.model import inertia
 from jaxdyn.model.arguments import Number, Row
 from jaxdyn.model.builder import ModelBuilder
@@ -75,33 +73,6 @@ def ball_on_incline(
     return Scene(builder.build(), (rolling_sphere("ball", None, radius, name="contact"),))
 
 
-class _Height(eqx.Module):
-    """Height of the centre above its value in contact with the plane z = 0."""
-
-    radius: Float[Array, ""] = eqx.field(converter=as_leaf)
-
-    def __call__(self, q, t):
-        return q[2] - self.radius.astype(q.dtype)
-
-
-class _Sliding(eqx.Module):
-    """Friction on a sliding ball: `force` (N) against the velocity of its contact point with the plane z = 0.
-
-    It has no direction, hence no derivatives, where the ball rolls.
-    """
-
-    force: Float[Array, ""] = eqx.field(converter=as_leaf)
-    radius: Float[Array, ""] = eqx.field(converter=as_leaf)
-
-    def __call__(self, system, q, v, t):
-        rotation = so3.quat_to_matrix(q[3:])
-        down = -self.radius.astype(q.dtype) * rotation[2]  # to the contact, in axes of the ball
-        slip = v[:3] + so3.cross(v[3:], down)
-        push = -self.force.astype(q.dtype) * slip / jnp.sqrt(jnp.sum(slip * slip))
-        # A force at the contact point, as a wrench at the ball's centre in its axes.
-        return jnp.concatenate([push, so3.cross(down, push)])
-
-
 def _bowling_start(
     radius: Number = 0.10795, velocity: Row = (8.0, 0.0), spin: Row = (-8 * np.pi, 0.0, 0.0)
 ) -> tuple[Array, Array]:
@@ -116,7 +87,6 @@ def bowling_ball(
     moment: Number = 0.0296,
     friction: Number = 0.12,
     gravity: Number = 9.8,
-    until_rolling: bool = False,
 ) -> Scene:
     """Bowling ball that slides with Coulomb friction, then rolls.
 
@@ -124,15 +94,10 @@ def bowling_ball(
     vdot = -mu g u/|u|, with I w + m r e_z x v constant. It rolls after |u0| / (mu g (1 + m r^2/I)), at constant velocity
     (`jd.contact.ground_contact`, whose events say when).
 
-    With `until_rolling` the friction has a formula without modes, so that all methods integrate it, up to where it rolls.
-
     Start: `velocity` (m/s) of the centre, `spin` (rad/s) in axes of the world.
 
     Source: test "bowling ball" of Drake (multibody/benchmarks).
     """
     builder = ModelBuilder("bowling ball", gravity=(0.0, 0.0, -gravity))
     builder.add_body("ball", None, "free", (mass, (0.0, 0.0, 0.0), (moment, moment, moment)))
-    if not until_rolling:
-        return Scene(builder.build(), (), (ground_contact("ball", None, friction, radius=radius, name="lane"),))
-    lane = Holonomic(_Height(radius), name="lane")
-    return Scene(builder.build(), (lane,), (_Sliding(friction * mass * gravity, radius),))
+    return Scene(builder.build(), (), (ground_contact("ball", None, friction, radius=radius, name="lane"),))

@@ -6,7 +6,6 @@ from jaxtyping import Array
 
 from jaxdyn.compile.known import array_namespace
 from jaxdyn.contact.unilateral import DryFriction
-from jaxdyn.forces.dissipation import SlidingFriction
 from jaxdyn.model.arguments import Checked, Number, Numbers, Row
 from jaxdyn.model.builder import ModelBuilder
 from jaxdyn.model.inertia import box, displaced
@@ -247,23 +246,13 @@ def sliding_block(
     friction: Number = 0.3,
     static: Checked[Number | None] = None,
     gravity: Number = 9.81,
-    direction: int | None = None,
 ) -> Scene:
     """Block that slides on a table with Coulomb friction, m xdd = u - sign(xd) mu m g, and sticks for |u| <= `static` m g.
 
     Without u it stops after |v0| / (mu g), v0^2 / (2 mu g) further on, where it sticks (`jd.contact.DryFriction`, whose events
-    say when). `static`: None for the coefficient of sliding.
-
-    With a `direction`, 1 or -1, it slides that way and does not stick: sign(0) is `direction`, so that all methods integrate
-    it, up to where it stops (`jd.forces.SlidingFriction`).
+    say when). `static`: None for the coefficient of sliding. `jd.forces.SlidingFriction` is friction that does not stick.
 
     Source: EQUATIONS section 11 and erratum E42.
     """
     system = LagrangianSystem(_block, 1, parameters={"mass": mass})
-    if direction is None:
-        return Scene(system, forces=(DryFriction(friction, mass * gravity, 0, static=static),))
-    if static is not None:
-        raise ValueError(
-            f"sliding_block: static is {static} and direction {direction}; a block that does not stick has none"
-        )
-    return Scene(system, forces=(SlidingFriction(friction, mass * gravity, direction),))
+    return Scene(system, forces=(DryFriction(friction, mass * gravity, 0, static=static),))

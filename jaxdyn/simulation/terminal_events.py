@@ -116,9 +116,9 @@ def event(quality, guards, t0, y0, args) -> diffrax.Event | None:
     """Event of a run in diffrax's loop, from the quality (t, y, args) of a basis and the guards, each a function or None."""
     if guards is None:
         return None if quality is None else diffrax.Event(quality)
-    start = None if quality is None else quality(t0, y0, args)
+    start = None if quality is None else jax.lax.stop_gradient(quality(t0, y0, args))
 
-    def condition(t, y, args, **_):
+    def condition(start, t, y, args, **_):
         # One event for all conditions: the first one that is violated ends the run.
         least = jnp.min(guards(t, y, args)[0])
         if quality is not None:
@@ -127,7 +127,10 @@ def event(quality, guards, t0, y0, args) -> diffrax.Event | None:
         return least.astype(float)  # the dtype of diffrax's own branches
 
     eps = float(jnp.finfo(t0.dtype).eps)
-    return diffrax.Event(condition, Bisection(rtol=8 * eps, atol=8 * eps, flip=True), direction=False)
+    # A traced value must be a leaf of the event: reverse mode refuses one that a function captures.
+    return diffrax.Event(
+        jax.tree_util.Partial(condition, start), Bisection(rtol=8 * eps, atol=8 * eps, flip=True), direction=False
+    )
 
 
 class Bisection(optimistix.Bisection):

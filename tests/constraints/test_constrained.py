@@ -9,6 +9,7 @@ from jax.extend.core import jaxprs_in_params
 from pinocchio_bridge import assert_close, quick, random_tree, to_pinocchio
 
 import jaxdyn as jd
+from benchmarks.report_cases import test_set
 from jaxdyn import scenes
 from jaxdyn.constraints import Holonomic, Pfaffian, lock_joint, loop, rolling_wheel
 from jaxdyn.constraints.assembly import assemble, residuals
@@ -344,8 +345,8 @@ def test_printed_numbers():
     np.testing.assert_allclose(dynamics.multipliers, -7.04496621, rtol=1e-9)
     np.testing.assert_allclose(-length * dynamics.multipliers, 8.45395945, rtol=1e-9)
 
-    q, v = scenes.andrews.start()
-    dynamics = quick(lambda scene: constrained_dynamics(scene, q, v))(scenes.andrews())
+    q, v = test_set.andrews.start()
+    dynamics = quick(lambda scene: constrained_dynamics(scene, q, v))(test_set.andrews())
     want = [14222.4439199541138705911625887, -10666.8329399655854029433719415, 0, 0, 0, 0, 0]
     np.testing.assert_allclose(dynamics.acceleration, want, rtol=1e-11, atol=1e-8)
     # Printed multipliers stand on the left.

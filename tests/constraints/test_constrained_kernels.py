@@ -7,6 +7,7 @@ import pytest
 from pinocchio_bridge import assert_close, quick, random_states, random_tree
 
 import jaxdyn as jd
+from benchmarks.report_cases import test_set
 from jaxdyn import scenes, se3
 from jaxdyn.constraints import loop
 from jaxdyn.constraints.assembly import residuals
@@ -233,7 +234,7 @@ NAMES = ("andrews", "car_axis", "rolling_disk", "chaplygin_sleigh", "rolling_coi
 
 
 def at_start(name):
-    made = getattr(scenes, name)
+    made = getattr(scenes, name, None) or getattr(test_set, name)
     q, v = (jnp.asarray(x, float) for x in made.start())
     return made(), q, v
 

@@ -11,6 +11,7 @@ from jax.flatten_util import ravel_pytree
 from pinocchio_bridge import assert_close, quick
 
 import jaxdyn as jd
+from benchmarks.report_cases import test_set
 from jaxdyn import scenes
 from jaxdyn.constraints import projection
 from jaxdyn.constraints.assembly import residuals
@@ -173,7 +174,7 @@ def test_a_singular_sample_of_a_batch_is_projected_by_its_rank(mode):
 @pytest.mark.parametrize("off", [1e-3, *(pytest.param(x, marks=pytest.mark.slow) for x in (1e-6, 0.0))])
 def test_kernels_project_as_matrices_do(name, off):
     """On the constraints to rounding, and as close to the start of the projection as in plain mode."""
-    made = getattr(scenes, name)
+    made = getattr(scenes, name, None) or getattr(test_set, name)
     scene, (q, v) = made(), (jnp.asarray(x, float) for x in made.start())
     q, v = (x + off * jnp.cos(jnp.arange(float(x.size)) + k) for k, x in enumerate((q, v)))
     error = off * jnp.sin(jnp.arange(float(scene.nv)))

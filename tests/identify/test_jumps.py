@@ -275,9 +275,6 @@ def test_command_line(clean, tmp_path, capsys):
     assert main([*args, "--unwrap", "no", "--outliers", "drop"]) == 2
     text = capsys.readouterr().err
     assert "joint shoulder jumps" in text and "--unwrap auto" in text
-    (tmp_path / "fit.toml").write_text('urdf = "arm.urdf"\nlog = ["log.csv"]\nunwrap = false\noutliers = "drop"\n')
-    assert main(["identify", str(tmp_path / "fit.toml")]) == 2
-    assert capsys.readouterr().err == text
     assert main([*args, "--outliers", "drop"]) == 0
     text = capsys.readouterr().out
     assert "log.csv: angles that jump by whole turns were unwrapped: joint shoulder (" in text

@@ -375,7 +375,7 @@ BAD_FILES = {
         6,
         "xyz of <origin> of joint 'j' is '1 2 x'",
     ),
-    "two for three": ((*TREE, joint("j", "a", "b", '<axis xyz="1 2"/>')), 6, "'1 2', expected 3 finite numbers"),
+    "two for three": ((*TREE, joint("j", "a", "b", '<axis xyz="1 2"/>')), 6, "'1 2'; give 3 finite numbers"),
     "NaN mass": ((link("a", SOLID.replace('"1"/>', '"nan"/>', 1)),), 2, "value of <mass> of link 'a' is 'nan'"),
     "infinite limit": (
         (*TREE, joint("j", "a", "b", '<limit upper="inf"/>')),
@@ -702,7 +702,7 @@ def test_bad_encodings_are_named_with_their_line(data, words, reader, suffix, tm
 def test_numbers_that_only_python_reads_are_refused(text, urdf):
     inertial = f'<inertial><mass value="{text}"/><inertia ixx="1" iyy="1" izz="1" ixy="0" ixz="0" iyz="0"/></inertial>'
     path = urdf(link("a"), link("b", inertial), joint("j", "a", "b"))
-    with pytest.raises(ValueError, match=f"value of <mass> of link 'b' is '{text}', expected a finite number"):
+    with pytest.raises(ValueError, match=f"value of <mass> of link 'b' is '{text}'; give a finite number"):
         load_urdf(path)
 
 

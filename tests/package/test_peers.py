@@ -18,7 +18,7 @@ from benchmarks.peers.equations import EQUATIONS
 from benchmarks.peers.twins import TWINS
 from benchmarks.peers.with_mujoco import _timed
 from benchmarks.peers.with_pinocchio import slope
-from benchmarks.report_cases import cases
+from benchmarks.report_cases import cases, test_set
 
 # Accelerations of Andrews' mechanism at its start, printed in the test set for IVP solvers; the others are zero.
 ANDREWS = (14222.4439199541138705911625887, -10666.8329399655854029433719415, 0.0, 0.0, 0.0, 0.0, 0.0)
@@ -48,7 +48,7 @@ def accelerations(name, q, v, t=0.0):
 
 
 def test_andrews_by_hand_has_the_printed_accelerations():
-    q, v = (np.asarray(x) for x in jd.scenes.andrews.start())
+    q, v = (np.asarray(x) for x in test_set.andrews.start())
     computed, multipliers = accelerations("andrews", q, v)
     np.testing.assert_allclose(computed, ANDREWS, rtol=1e-10, atol=1e-8)
     # They stand on the left as printed.
@@ -103,7 +103,7 @@ def test_andrews_of_bodies_for_pinocchio_and_mujoco():
     import mujoco
 
     twin = TWINS["andrews"]()
-    q, v = twin.there(*(np.asarray(x) for x in jd.scenes.andrews.start()))
+    q, v = twin.there(*(np.asarray(x) for x in test_set.andrews.start()))
     want = twin.there(q, np.array(ANDREWS))[1]
     np.testing.assert_allclose(slope(twin)(0.0, np.concatenate([q, v]))[7:], want, rtol=1e-9, atol=1e-4)
     model = _timed(twin, 1e-5, mujoco.mjtIntegrator.mjINT_RK4)

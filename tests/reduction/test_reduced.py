@@ -419,8 +419,9 @@ def test_large_batches_end():
     program = """
 import jax, numpy as np, jaxdyn as jd
 jax.config.update("jax_enable_x64", True)
-scene = jd.scenes.andrews()
-q, v = jd.scenes.andrews.start()
+from benchmarks.report_cases.test_set import andrews
+scene = andrews()
+q, v = andrews.start()
 
 def success(share):
     ts, tolerances = jax.numpy.stack([0 * share, 0.002 * share]), {"rtol": 1e-4, "atol": 1e-4}

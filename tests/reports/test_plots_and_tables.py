@@ -181,18 +181,10 @@ def test_work_precision_draws_each_ladder():
 
     def record(solver, error, seconds, scene="pendulum"):
         rest = dict.fromkeys(
-            (
-                "residual_position",
-                "residual_velocity",
-                "energy_error",
-                "compile_seconds",
-                "rejected",
-                "evaluations",
-                "flops",
-            )
+            ("residual_position", "residual_velocity", "energy_error", "compile_seconds", "rejected", "evaluations")
         )
         return Record(
-            scene=scene, kind="free", source="jaxdyn", method="free", solver=solver, dtype="float64", batch=1, setting=error,
+            scene=scene, source="jaxdyn", method="free", solver=solver, dtype="float64", batch=1, setting=error,
             fixed=False, result="successful", error_end=error, error_path=error, seconds_best=seconds,
             seconds_median=seconds, rounds=1, steps=10, **rest,
         )  # fmt: skip

@@ -8,6 +8,7 @@ import pytest
 from pinocchio_bridge import assert_close, quick
 from scipy.integrate import solve_ivp
 
+from benchmarks.report_cases import test_set
 from jaxdyn import scenes
 from jaxdyn.constraints.assembly import assemble, residuals
 from jaxdyn.constraints.base import constraint_jacobian
@@ -207,9 +208,9 @@ def test_bennett_linkage():
 @pytest.mark.long
 def test_andrews_from_its_bodies():
     """The tree of seven bodies and the printed M and f: equal accelerations and energies on the constraints."""
-    printed, built = scenes.andrews(), scenes.andrews_bodies()
+    printed, built = test_set.andrews(), test_set.andrews_bodies()
     order = np.array([0, 1, 2, 4, 3, 6, 5])
-    q0, v0 = scenes.andrews.start()
+    q0, v0 = test_set.andrews.start()
     rough = [15.8107, -15.7563, 0.040822, -0.53473, 0.524410, 0.53473, 1.04808]
 
     @quick

@@ -85,31 +85,13 @@ def test_suslov():
 
 
 def test_accelerations_of_balls_on_planes():
-    """5/7 of the acceleration of a body that slides, with the contact forces; and friction against the slip."""
+    """5/7 of the acceleration of a body that slides, with the contact forces."""
     slope, pull = 0.4, 9.81 * np.sin(0.4)
     state = scenes.ball_on_incline.start(velocity=(0.1, 0.5))
     solution = solved(scenes.ball_on_incline(slope=slope, mass=1.4), state, np.zeros(6))
     across = np.cross(state[1][3:], state[1][:3])
     assert_close(solution.acceleration[:3] + across, [5 / 7 * pull, 0.0, 0.0], 1e-12)
     assert_close(solution.multipliers, 1.4 * np.array([9.81 * np.cos(slope), -2 / 7 * pull, 0.0]), 1e-12)
-
-    state = scenes.bowling_ball.start()
-    solution = solved(scenes.bowling_ball(until_rolling=True), state, np.zeros(6))
-    push, spin, _, _ = sliding()
-    across = np.cross(state[1][3:], state[1][:3])
-    assert_close(solution.acceleration[:3] + across, push, 1e-13)
-    assert_close(solution.acceleration[3:], spin, 1e-13)
-    assert_close(solution.multipliers, [6.35 * 9.8], 1e-13)
-
-
-def sliding():
-    """Bowling ball of problem 5.4: acceleration, angular acceleration, time to rolling and velocity then (Drake)."""
-    r, m, moment, mu, g = 0.10795, 6.35, 0.0296, 0.12, 9.8
-    v0, w0, up = np.array([8.0, 0.0, 0.0]), np.array([-8 * np.pi, 0.0, 0.0]), np.array([0.0, 0.0, 1.0])
-    slip = v0 + np.cross(w0, -r * up)
-    push = -mu * g * slip / np.linalg.norm(slip)
-    roll = r / (moment + m * r**2) * np.cross(moment * w0 + m * r * np.cross(up, v0), up)
-    return push, m / moment * np.cross(-r * up, push), np.linalg.norm(v0 - roll) / (mu * g), roll
 
 
 @pytest.mark.slow
@@ -121,22 +103,6 @@ def test_ball_on_an_incline():
     computed = motion(scene, scenes.ball_on_incline.start(radius=0.5, velocity=(0.1, 0.5)), t, 0.1)
     want = np.stack([0.1 * t + 5 / 14 * 9.81 * np.sin(slope) * t**2, 0.5 * t, 0 * t + 0.5], 1)
     np.testing.assert_allclose(computed.q[:, :3], want, atol=1e-10)
-
-
-@pytest.mark.slow
-def test_bowling_ball_slides_until_it_rolls():
-    """A parabola, with the turns of the ball, up to just before it rolls with the velocity that Drake gives."""
-    push, spin, end, roll = sliding()
-    t = end * np.array([0.0, 0.3, 0.99])
-    computed = motion(scenes.bowling_ball(until_rolling=True), scenes.bowling_ball.start(), t, 0.004)
-    v0 = np.array([8.0, 0.0, 0.0])
-    np.testing.assert_allclose(v0 + push * end, roll, atol=1e-13)
-    want = v0[:2] * t[:, None] + 0.5 * push[:2] * t[:, None] ** 2
-    np.testing.assert_allclose(computed.q[:, :2], want, atol=1e-10)
-    turned = np.asarray(jax.vmap(so3.quat_to_matrix)(computed.q[:, 3:]))
-    np.testing.assert_allclose(np.einsum("tij,tj->ti", turned, computed.v[:, :3]), v0 + push * t[:, None], atol=1e-10)
-    turning = np.array([-8 * np.pi, 0.0, 0.0]) + spin * t[:, None]
-    np.testing.assert_allclose(np.einsum("tij,tj->ti", turned, computed.v[:, 3:]), turning, atol=1e-9)
 
 
 def by_hand(mass_matrix, bias, rows, q, v, tau):

@@ -11,6 +11,7 @@ import pytest
 from pinocchio_bridge import quick
 from scipy.integrate import solve_ivp
 
+from benchmarks.report_cases import test_set
 from jaxdyn import scenes
 from jaxdyn.compile import compilation
 from jaxdyn.constraints import Holonomic, lock_joint
@@ -61,7 +62,7 @@ def test_a01_pendulum_in_plane():
 @pytest.mark.long
 def test_car_axis():
     """Moving constraints, all components at t = 3 (published, quadruple precision)."""
-    computed = motion(scenes.car_axis(), scenes.car_axis.start(), [0.0, 3.0], rtol=1e-11, atol=1e-11)
+    computed = motion(test_set.car_axis(), test_set.car_axis.start(), [0.0, 3.0], rtol=1e-11, atol=1e-11)
     q = [0.493455784275402809122e-1, 0.496989460230171153861, 0.104174252488542151681e1, 0.373911027265361256927]
     v = [-0.770583684040972357970e-1, 0.744686658723778553466e-2, 0.175568157537232222276e-1, 0.770341043779251976443]
     np.testing.assert_allclose(computed.q[-1], q, atol=1e-9)
@@ -71,7 +72,7 @@ def test_car_axis():
 @pytest.mark.slow
 def test_andrews():
     """Positions published to 1e-10, velocities to 5e-8 relative; the energy balance is exact."""
-    computed = motion(scenes.andrews(), scenes.andrews.start(), [0.0, 0.01, 0.02, 0.03], rtol=1e-13, atol=1e-13)
+    computed = motion(test_set.andrews(), test_set.andrews.start(), [0.0, 0.01, 0.02, 0.03], rtol=1e-13, atol=1e-13)
     q = [15.81077119629904, -15.75637105984298, 0.04082224013073101, -0.5347301163226948]
     q += [0.5244099658805304, 0.5347301163226948, 1.048080741042263]
     v = [1139.920302151208, -1424.379294994111, 11.03291221937134, 19.29337464421385]

@@ -8,7 +8,7 @@ import pytest
 from pinocchio_bridge import quick
 
 import jaxdyn as jd
-from benchmarks.report_cases import cases
+from benchmarks.report_cases import cases, test_set
 from jaxdyn import scenes
 from jaxdyn.compile import loops
 from jaxdyn.constraints.base import velocity_residual
@@ -70,7 +70,7 @@ def batch(scene, start, size=3):
 CASES = {
     "free body": lambda: (scenes.free_body(), scenes.free_body.start()),
     "disk": lambda: (scenes.rolling_disk(), scenes.rolling_disk.start()),
-    "car axis": lambda: (scenes.car_axis(), scenes.car_axis.start()),
+    "car axis": lambda: (test_set.car_axis(), test_set.car_axis.start()),
     "four-bar": lambda: (scenes.four_bar(), scenes.four_bar.start()),
     "dependent rows": lambda: (twice(scenes.rolling_disk()), scenes.rolling_disk.start()),
 }

@@ -3,6 +3,7 @@
 from typing import Any, NamedTuple
 
 import diffrax
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -170,6 +171,24 @@ def test_implicit_steps_find_the_same_time(name):
     np.testing.assert_allclose(derivatives, case.derivative(case.numbers), rtol=1e-6)
     forward = quick(jax.jacfwd(end_of(case.move, adjoint="forward", **options), has_aux=True))
     np.testing.assert_allclose(forward(case.numbers[0])[0], case.derivative(case.numbers[0]), rtol=1e-6)
+
+
+@pytest.mark.slow
+def test_a_basis_and_limits_in_one_run_have_derivatives():
+    """The end of a four-bar in minimal velocities by implicit steps, and in all of them by explicit ones."""
+    scene = jd.scenes.four_bar()
+    q, v = jd.scenes.four_bar.start()
+    limits = eqx.tree_at(
+        lambda s: (s.system.lower, s.system.upper), scene, (jnp.asarray(q) - 0.05, jnp.asarray(q) + 0.05)
+    )
+
+    def time(rate, **options):
+        run = jd.simulate(limits, q, rate * v, jnp.linspace(0.0, 1.0, 5), limits="stop", throw=False, **options)
+        return run.stats["time_reached"]
+
+    implicit: dict[str, Any] = {"method": "reduced", "solver": diffrax.Kvaerno5(), "rtol": 1e-9, "atol": 1e-9}
+    computed, expected = (jax.value_and_grad(time)(1.0, **options) for options in (implicit, TIGHT))
+    np.testing.assert_allclose(computed, expected, rtol=1e-5)
 
 
 def test_rows_before_the_end_have_derivatives():

@@ -11,10 +11,15 @@ from jaxtyping import Array, Float
 from jaxdyn.constraints import Holonomic, loop
 from jaxdyn.dynamics.kinematics import frame_pose
 from jaxdyn.model.builder import ModelBuilder
-from jaxdyn.scenes._named import as_leaf, as_state, flat_moments, register_scene
+from jaxdyn.scenes._named import NamedScene, as_leaf, as_state, flat_moments
 from jaxdyn.systems.lagrangian import LagrangianSystem
 from jaxdyn.systems.scene import Scene
 from jaxdyn.systems.system import ExplicitSystem
+
+
+def _with_start(start):
+    return lambda build: NamedScene(build, start)
+
 
 # Names as printed; m, I are lists m1..m7 and I1..I7. SI units.
 _ANDREWS = {
@@ -189,7 +194,7 @@ def _andrews_bodies_start() -> tuple[Array, Array]:
     return as_state(np.asarray(q)[np.array(ANDREWS_ORDER)]), v
 
 
-@register_scene(_andrews_bodies_start)
+@_with_start(_andrews_bodies_start)
 def andrews_bodies() -> Scene:
     """Andrews' squeezing mechanism of seven bodies: a tree of four branches, three loops at the point E.
 
@@ -222,7 +227,7 @@ def andrews_bodies() -> Scene:
     return Scene(builder.build(), closing, (_AndrewsPotential(p["c0"], p["l0"], p["C"], p["torque"]),))
 
 
-@register_scene(_andrews_start)
+@_with_start(_andrews_start)
 def andrews() -> Scene:
     """Andrews' squeezing mechanism: seven bodies, three loops, q = (beta, Theta, gamma, Phi, delta, Omega, epsilon).
 
@@ -267,7 +272,7 @@ def _car_start() -> tuple[Array, Array]:
     return as_state([0.0, 0.5, 1.0, 0.5]), as_state([-0.5, 0.0, -0.5, 0.0])
 
 
-@register_scene(_car_start)
+@_with_start(_car_start)
 def car_axis() -> Scene:
     """Car axis on a bumpy road: two masses on springs, q = (xl, yl, xr, yr), with rheonomic constraints.
 
