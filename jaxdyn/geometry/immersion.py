@@ -25,8 +25,7 @@ from jaxdyn.dynamics import quantities as dynamics
 from jaxdyn.lie.so3 import matmul
 from jaxdyn.model.arguments import Checked, Function, Numbers, check_state
 from jaxdyn.systems.scene import Scene, as_pytree, as_scene, check_force
-from jaxdyn.systems.start import describe_state
-from jaxdyn.systems.system import SceneLike, System, check_size, rate_to_velocity
+from jaxdyn.systems.system import SceneLike, System, check_size, describe_state, rate_to_velocity
 
 
 class PullBack(eqx.Module):

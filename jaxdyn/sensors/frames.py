@@ -11,7 +11,7 @@ from jaxdyn.dynamics.kinematics import frame_pose
 from jaxdyn.lie import so3
 from jaxdyn.lie.so3 import matmul
 from jaxdyn.model.arguments import Numbers
-from jaxdyn.model.names import frame_index
+from jaxdyn.model.topology import frame_index
 from jaxdyn.sensors.base import Motion, Noise, Sensor, as_delay, check_part
 from jaxdyn.systems.scene import Scene
 

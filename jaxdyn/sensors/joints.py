@@ -14,7 +14,7 @@ from jaxdyn.dynamics.joint_wrenches import joint_wrench
 from jaxdyn.dynamics.kinematics import named_frame
 from jaxdyn.lie import se3
 from jaxdyn.model.arguments import Checked, Numbers, as_array, is_concrete
-from jaxdyn.model.names import joint_index
+from jaxdyn.model.topology import joint_index
 from jaxdyn.model.tree import Model
 from jaxdyn.sensors.base import Motion, Noise, Sensor, as_delay, check_part, constraint_place
 from jaxdyn.systems.scene import Scene

@@ -12,8 +12,7 @@ from jaxtyping import Array, Float, PyTree
 from jaxdyn.compile.known import is_known
 from jaxdyn.model.arguments import Checked, Function, Number
 from jaxdyn.systems.scene import as_pytree
-from jaxdyn.systems.start import check_mass_matrix, describe_state
-from jaxdyn.systems.system import System, as_parameter, check_size, evaluate_callback
+from jaxdyn.systems.system import System, as_parameter, check_mass_matrix, check_size, describe_state, evaluate_callback
 
 
 class LagrangianSystem(System):

@@ -8,7 +8,7 @@ import pytest
 from jaxdyn.compile import kernel, target
 from jaxdyn.compile.batch import repeat_while, while_loop
 from jaxdyn.compile.code import symbol_of
-from jaxdyn.compile.expand import expand
+from jaxdyn.compile.expansion import expand
 from jaxdyn.compile.loops import Carry, Given, Iteration, Task, run_loop
 
 

@@ -8,7 +8,6 @@ or every third and so on, and those between are computed again, so that memory i
 `replay_rows` takes the same steps as operations of JAX, which have derivatives of any order in both modes.
 """
 
-from collections.abc import Callable
 from functools import partial
 from typing import Any, NamedTuple
 
@@ -20,7 +19,7 @@ from jaxtyping import Array
 
 from jaxdyn.compile import kernel, values_of_rules
 from jaxdyn.compile.batch import any_sample, cond
-from jaxdyn.compile.loops import Carry, Given, Iteration, Task, run_loop
+from jaxdyn.compile.loops import Carry, Given, Iteration, Task, run_loop, run_to_end
 from jaxdyn.compile.repair import compute_where
 from jaxdyn.simulation.solvers.explicit import Plan, dense_output, differentiable_step, take_step
 
@@ -85,20 +84,6 @@ def write(rows: tuple, strides: tuple[int, ...], new: tuple, index, active) -> t
     return tuple(map(one, rows, new, strides))
 
 
-def run_to_end(run: Callable, otherwise: Callable, by_fallback: Callable, is_running: Callable, carry: Carry) -> Carry:
-    """Iterate by a native loop to the end.
-
-    **Arguments:** `run(carry)`, see `run_loop`; `otherwise(carry)`, an iteration where there is no native loop; `by_fallback`,
-    one that the native loop has refused, after which it continues; `is_running(carry)`.
-    """
-    after = run(carry)
-    if after is None:
-        return lax.while_loop(is_running, otherwise, carry)
-    carry, always_ends = after
-    # A loop whose iterations are all valid has ended: no code for the fallback is compiled.
-    return carry if always_ends else lax.while_loop(is_running, lambda carry: run(by_fallback(carry))[0], carry)
-
-
 class _Ends(NamedTuple):
     """Constants of the way back: the first step, the ends of the run, and the number of fixed steps or None."""
 
@@ -148,8 +133,9 @@ def pull(plan: Plan, history: History, y0, args, ts, steps, rows, varies) -> tup
         given = Given(None, (states, history.times, history.kept, rows, ts, ts))
         args = *static, (fixed, free_leaves), ends, given
         once, by_fallback = partial(_iterate_back_in_jax, *args), partial(_iterate_by_fallback, *args)
-        run = partial(run_loop, Task(_iterate_back, _loop_back, static), (fixed, free_leaves), ends, given)
-        return run_to_end(run, once, by_fallback, partial(_is_running, ends), Carry(cotangents)).state
+        task = Task(_iterate_back, _loop_back, static)
+        carry, is_running = Carry(cotangents), partial(_is_running, ends)
+        return run_to_end(task, (fixed, free_leaves), ends, given, carry, once, by_fallback, is_running).state
 
     def replay(first, last, y):
         """States from which the steps first .. last - 1 begin, (stride, n), the first of them y."""
