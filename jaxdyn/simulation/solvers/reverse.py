@@ -187,8 +187,8 @@ def _read(given: Given, places):
 
 def _iterate_back(plan: Plan, times_move, structure, args, ends: _Ends, cotangents: _Cotangents, read) -> Iteration:
     """Go back through a step, or to the next row within it."""
-    back = partial(_pull_without_loop, plan, times_move, structure, *args)(*_asked((), ends, cotangents, read))
-    return _add(times_move, (), ends, cotangents, read, back)
+    back = partial(_pull_without_loop, plan, times_move, structure, *args)(*_step_arguments((), ends, cotangents, read))
+    return _accumulate(times_move, (), ends, cotangents, read, back)
 
 
 def _iterate_back_in_jax(plan: Plan, times_move, structure, args, ends: _Ends, given: Given, carry: Carry) -> Carry:
@@ -211,8 +211,8 @@ def _iterate_by_fallback(plan: Plan, times_move, structure, args, ends: _Ends, g
 def _iterate_by(pull, times_move, ends: _Ends, given: Given, carry: Carry) -> Carry:
     read = _read(given, carry.state.places)
     # Kernels around what a program cannot compute: XLA would compile their operations for longer than they run.
-    back = pull(*kernel(_asked, derivative=False)((), ends, carry.state, read))
-    after = kernel(_add, static=1, derivative=False)(times_move, (), ends, carry.state, read, back)
+    back = pull(*kernel(_step_arguments, derivative=False)((), ends, carry.state, read))
+    after = kernel(_accumulate, static=1, derivative=False)(times_move, (), ends, carry.state, read, back)
     return Carry(jax.tree.map(lambda new, old: jnp.where(after.active, new, old), after.state, carry.state))
 
 
@@ -221,7 +221,7 @@ def _loop_back(plan: Plan, times_move, structure, args, ends: _Ends, given: Give
     return lax.while_loop(partial(_is_running, ends), once, carry)
 
 
-def _asked(_, ends: _Ends, cotangents: _Cotangents, read):
+def _step_arguments(_, ends: _Ends, cotangents: _Cotangents, read):
     """The last arguments of `_pull_step`."""
     y, (t0, t1), _, row, at_row, _ = read
     kept, here = _flags(ends, cotangents, read)
@@ -235,10 +235,10 @@ def _flags(ends: _Ends, cotangents: _Cotangents, read):
     return kept, kept & (cotangents.saved > 0) & (read[4] > read[1][0])
 
 
-def _add(times_move: bool, _, ends: _Ends, cotangents: _Cotangents, read, back) -> Iteration:
+def _accumulate(times_move: bool, _, ends: _Ends, cotangents: _Cotangents, read, back) -> Iteration:
     """Add the cotangents `back` of a step, and choose what follows."""
     step, active = cotangents.places[1], cotangents.places[1] >= ends.first
-    t0, t1, _, _, after, row = _asked((), ends, cotangents, read)
+    t0, t1, _, _, after, row = _step_arguments((), ends, cotangents, read)
     (kept, here), at_next = _flags(ends, cotangents, read), read[-1]
     # What nothing depends on gets nothing, even where a step has no derivative.
     asked = kept & ((after != 0).any() | (row != 0).any())
