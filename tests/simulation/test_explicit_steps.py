@@ -101,7 +101,10 @@ def test_stages_at_once_are_those_in_turn(case, monkeypatch):
     assert all(looped) and looped
     monkeypatch.setattr(loops, "run_loop", lambda *_: None)
 
-    def refuse(*_):
+    def refuse(*args):
+        # Where rows may be exchanged, the program has a second way: zeros show if a step takes it.
+        if case == "dependent rows":
+            return jax.tree.map(jnp.zeros_like, driver._advance_by_fallback(*args))
         taken.append(False)
         raise AssertionError("a step is no kernel")
 
