@@ -15,8 +15,8 @@ import numpy as np
 
 import jaxdyn as jd
 from benchmarks import timing
+from jaxdyn.model.description import table
 from jaxdyn.model.robots import random_tree
-from jaxdyn.model.text_table import table
 
 COUNTS = (50, 100, 200, 500)
 

@@ -144,7 +144,7 @@ def by_kernel(function: Callable, args, lanes: int) -> list[np.ndarray]:
     """All derivatives for the samples (n, 3) of args, by machine code that is called without XLA."""
     from jaxdyn import compile as backend
     from jaxdyn.compile import target
-    from jaxdyn.compile.expand import expand
+    from jaxdyn.compile.expansion import expand
 
     def native(x):
         return backend.kernel(lambda _, x: function(x), fallback=_refused)((), x)

@@ -22,8 +22,7 @@ from jax import lax
 import jaxdyn as jd
 from benchmarks import first_calls, timing
 from benchmarks.first_calls import CLOCKS
-from jaxdyn.compile import batch, constants, expand, primitive
-from jaxdyn.simulation.solvers import driver
+from jaxdyn.compile import array_rules, batch, expansion, loops, primitive
 
 CALLS = 20  # in a round
 
@@ -54,7 +53,7 @@ def accelerations(which) -> Callable:
 
 def without_loop() -> None:
     """Steps are turns of a loop of XLA's."""
-    patched: Any = driver
+    patched: Any = loops
     patched.run_loop = lambda *_: None
 
 
@@ -73,8 +72,8 @@ def without_shared() -> None:
 
 def without_constants() -> None:
     """Known arrays are computed by JAX."""
-    patched: Any = expand
-    patched.evaluate_known = constants.bind_known
+    patched: Any = expansion
+    patched.evaluate_known = array_rules.bind_known
 
 
 CASES: dict[str, tuple[Callable[[], None], dict[str, Callable[[], Callable]]]] = {

@@ -21,7 +21,7 @@ import jax
 from benchmarks import peers, timing
 from benchmarks.fronts import TARGETS, beaten_by, cost_at
 from benchmarks.report_cases import PUBLISHED, cases
-from jaxdyn.model.text_table import table
+from jaxdyn.model.description import table
 from jaxdyn.reports import Record, Report, report, write
 from jaxdyn.reports.page import figure
 

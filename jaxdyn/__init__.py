@@ -24,8 +24,8 @@ from jaxdyn.constraints import Holonomic, Pfaffian, constraint_jacobian, loop, r
 from jaxdyn.constraints.assembly import assemble
 from jaxdyn.constraints.codes import RESULTS
 from jaxdyn.constraints.dynamics import constrained_dynamics
-from jaxdyn.constraints.mobility import degrees_of_freedom
 from jaxdyn.constraints.reactions import constraint_forces
+from jaxdyn.constraints.selection import degrees_of_freedom
 from jaxdyn.control.following import follow
 from jaxdyn.control.inverse_kinematics import inverse_kinematics
 from jaxdyn.dynamics.centroidal import center_of_mass, com_jacobian
@@ -47,8 +47,16 @@ from jaxdyn.io import load, load_urdf, read_log, save_urdf
 from jaxdyn.lie import se2, se3, so3
 from jaxdyn.model import inertia, robots
 from jaxdyn.model.builder import ModelBuilder
+from jaxdyn.model.configuration import (
+    configuration_rate,
+    difference,
+    integrate,
+    neutral,
+    normalize,
+    random_configuration,
+)
 from jaxdyn.model.joining import join
-from jaxdyn.model.tree import Model, configuration_rate, difference, integrate, neutral, normalize, random_configuration
+from jaxdyn.model.tree import Model
 from jaxdyn.pictures import animate, draw, plot, view
 from jaxdyn.reduction.inverse_dynamics import constrained_inverse_dynamics
 from jaxdyn.reduction.minimal import reduced_dynamics

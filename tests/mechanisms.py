@@ -5,7 +5,7 @@ import numpy as np
 
 from jaxdyn.constraints import loop
 from jaxdyn.model.builder import ModelBuilder
-from jaxdyn.model.tree import neutral
+from jaxdyn.model.configuration import neutral
 from jaxdyn.systems.scene import Scene
 
 

@@ -12,11 +12,11 @@ import equinox as eqx
 import numpy as np
 
 from jaxdyn.io import LoadedScene, load_urdf
-from jaxdyn.io.load import find_description, load
+from jaxdyn.io.formats import find_description, load
 from jaxdyn.model.arguments import as_path, parse_number
 from jaxdyn.model.builder import GRAVITY
-from jaxdyn.model.text_table import short as short
-from jaxdyn.model.text_table import table as table
+from jaxdyn.model.description import short as short
+from jaxdyn.model.description import table as table
 from jaxdyn.model.tree import Model
 from jaxdyn.pictures import plot
 from jaxdyn.reports.plotting import BLUE, bands, new_figure

@@ -20,7 +20,7 @@ from jaxdyn.cli.common import (
 )
 from jaxdyn.constraints.codes import RESULTS
 from jaxdyn.identify import TERMS
-from jaxdyn.identify.workflows.exciting_motion import OBJECTIVES
+from jaxdyn.identify.workflows.excitation_search import OBJECTIVES
 from jaxdyn.io import write_log
 from jaxdyn.model.columns import columns_of
 from jaxdyn.simulation.solution import Solution

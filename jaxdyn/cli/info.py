@@ -11,16 +11,16 @@ import numpy as np
 from jaxdyn.cli.common import FILE, add_model_options, load_scene, output_path, short, table, xacro_arguments
 from jaxdyn.constraints.assembly import assemble
 from jaxdyn.constraints.base import constraint_jacobian, holonomic_rows, layout, position_residual
-from jaxdyn.constraints.mobility import degrees_of_freedom
-from jaxdyn.constraints.selection import select_concrete_rows
+from jaxdyn.constraints.selection import degrees_of_freedom, select_concrete_rows
 from jaxdyn.io import LoadedScene, NotTakenWarning, save_urdf, urdf_inertia_report
-from jaxdyn.io.load import format_of
+from jaxdyn.io.formats import format_of
 from jaxdyn.io.xml_lines import XmlFile
-from jaxdyn.model import float64 as f64
+from jaxdyn.model import host_math
 from jaxdyn.model.columns import columns_of
+from jaxdyn.model.configuration import integrate
 from jaxdyn.model.inertia_checks import inertia_report, repair_inertias
 from jaxdyn.model.joints import KINDS
-from jaxdyn.model.tree import Model, integrate
+from jaxdyn.model.tree import Model
 
 HELP = "bodies, joints, limits, loops, frames and faulty inertias of a URDF, MJCF or SDF file"
 DESCRIPTION = """\
@@ -232,7 +232,7 @@ def _joint_table(model: Model) -> str:
 def _body_table(model: Model) -> str:
     rows = []
     for name, parameters in zip(model.body_names, np.asarray(model.inertias, float), strict=True):
-        mass, com, moment = f64.about_com(parameters)
+        mass, com, moment = host_math.about_com(parameters)
         rows.append(
             [name, f"{mass:.4g}", *(f"{x:.4f}" for x in com), *(f"{x:.3g}" for x in np.linalg.eigvalsh(moment))]
         )

@@ -30,7 +30,8 @@ from jaxdyn.identify import SampledTorque
 from jaxdyn.identify.workflows.excitation import FourierTorque, random_torque
 from jaxdyn.io import LoadedScene
 from jaxdyn.io.logs import read_log
-from jaxdyn.model.tree import Model, integrate
+from jaxdyn.model.configuration import integrate
+from jaxdyn.model.tree import Model
 from jaxdyn.pictures import save_html, shapes, view
 from jaxdyn.simulation.methods import Projected
 from jaxdyn.simulation.run import Solution, simulate

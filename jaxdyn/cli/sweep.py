@@ -17,7 +17,7 @@ from jaxdyn.cli.clusters import add_cluster_options, connect
 from jaxdyn.cli.common import Stopwatch, check_least, check_memory, whole
 from jaxdyn.io import load_urdf
 from jaxdyn.model.arguments import as_path
-from jaxdyn.model.tree import integrate, neutral
+from jaxdyn.model.configuration import integrate, neutral
 from jaxdyn.simulation.run import simulate
 
 HELP = "simulate a study of many rollouts into a Zarr store; resumable"

@@ -1,10 +1,10 @@
 """Functions of one sample as native kernels; a compiler for JAX that could be published alone (README.md).
 
 `kernel` is the decorator that turns a function of one sample, written with arrays, into native code for one sample or a
-batch of them. A function is traced once (`trace`), expanded to a program of single numbers (`expand`, `graph`, `program`),
+batch of them. A function is traced once (`trace`), expanded to a program of single numbers (`expansion`, `graph`, `program`),
 differentiated there (`derive`), written as LLVM IR (`code`, `llvm`), and called through XLA's foreign function interface
-(`target`, `objects`). A primitive of JAX stands for the kernel, with rules for batches and derivatives (`primitive`); where
-there is no native code, operations of JAX do the same (`operations`).
+(`target`, `objects`). A primitive of JAX stands for the kernel, with rules for batches and derivatives; where there is no
+native code, operations of JAX do the same (`primitive`).
 
 Nothing of jaxdyn is imported here. Other rooms import the names below, and those of the modules `known` (known and traced
 values), `batch` (decisions for a batch, repetitions), `loops` and `repair`. Only `jaxdyn.scale`, which compiles programs around

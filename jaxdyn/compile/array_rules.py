@@ -1,4 +1,4 @@
-"""Rules for operations that do not act entry by entry: products, selections, factorisations, scatters.
+"""Rules for operations that do not act entry by entry, such as products, selections and scatters, and for known arrays.
 
 Each rule takes the expansion, the parameters of the primitive, its operands and the equation, and returns the results (see
 `expand`). Operands are NumPy arrays: of numbers where they are known while tracing, else of dtype object, whose entries are
@@ -7,12 +7,14 @@ scalars of the program.
 
 import functools
 import math
+from collections.abc import Callable
 
+import jax
 import numpy as np
 
-from jaxdyn.compile import matrices
-from jaxdyn.compile.number import as_objects, objects
-from jaxdyn.compile.program import NotNumbers, as_kind, kind_or_refuse
+from jaxdyn.compile import program as numbers
+from jaxdyn.compile.graph import Graph
+from jaxdyn.compile.program import NotNumbers, Number, as_kind, as_objects, kind_or_refuse, objects
 from jaxdyn.compile.rearrange import scatter_places
 
 
@@ -31,6 +33,18 @@ def integer_pow(expansion, params, args, eqn):
         return [np.asarray(args[0] ** params["y"] if params["y"] >= 0 else 1 / args[0] ** -params["y"], args[0].dtype)]
     one = as_kind(1, kind_or_refuse(eqn.outvars[0].aval.dtype))
     return [objects([expansion.graph.power(x, params["y"], one) for x in args[0].ravel().tolist()], args[0].shape)]  # pyright: ignore[reportArgumentType]
+
+
+def convert(expansion, params, args, eqn):
+    """Conversion to another dtype."""
+    return [_as_dtype(expansion, args[0], params["new_dtype"])]
+
+
+def _as_dtype(expansion, x: np.ndarray, dtype) -> np.ndarray:
+    if x.dtype.kind != "O":
+        return convert_known(x, dtype)
+    kind = kind_or_refuse(dtype)
+    return objects([expansion.graph.convert(y, kind) for y in x.ravel().tolist()], x.shape)
 
 
 def select(expansion, params, args, eqn):
@@ -75,13 +89,13 @@ def dot_general(expansion, params, args, eqn):
         count, columns, length
     )
     # The result may have a wider type than the operands (`preferred_element_type`); then the sums are in that type.
-    a, b = (expansion.as_dtype(x, out.dtype) for x in (a, b))
+    a, b = (_as_dtype(expansion, x, out.dtype) for x in (a, b))
     if out.dtype == bool:
         raise NotNumbers("a product of bools")
     if a.dtype.kind != "O" and b.dtype.kind != "O":
         return [np.asarray(a @ b.transpose(0, 2, 1), out.dtype).reshape(out.shape)]
     zero = as_kind(0, kind_or_refuse(out.dtype))
-    return [objects(matrices.product(expansion.graph, as_objects(a), as_objects(b), zero), out.shape)]
+    return [objects(_products(expansion.graph, as_objects(a), as_objects(b), zero), out.shape)]
 
 
 def scatter(expansion, params, args, eqn):
@@ -112,7 +126,7 @@ def cumsum(expansion, params, args, eqn):
 def cholesky(expansion, params, args, eqn):
     """Lower Cholesky factors of symmetric matrices."""
     given = as_objects(args[0]).reshape(-1, *args[0].shape[-2:])
-    return [np.stack([matrices.cholesky(expansion.graph, x) for x in given]).reshape(args[0].shape)]
+    return [np.stack([_cholesky_factor(expansion.graph, x) for x in given]).reshape(args[0].shape)]
 
 
 def triangular_solve(expansion, params, args, eqn):
@@ -125,6 +139,129 @@ def triangular_solve(expansion, params, args, eqn):
     if not params["left_side"]:  # x a = b is a^T x^T = b^T
         a, b, lower = np.swapaxes(a, -1, -2), np.swapaxes(b, -1, -2), not lower
     pairs = zip(a.reshape(-1, *a.shape[-2:]), b.reshape(-1, *b.shape[-2:]), strict=True)
-    solutions = [matrices.triangular_solve(expansion.graph, x, y, lower, params["unit_diagonal"]) for x, y in pairs]
+    solutions = [_solve_triangle(expansion.graph, x, y, lower, params["unit_diagonal"]) for x, y in pairs]
     solutions = np.stack(solutions).reshape(b.shape)
     return [solutions if params["left_side"] else np.swapaxes(solutions, -1, -2)]
+
+
+# --- matrices whose entries are single numbers ---
+
+
+def _products(graph: Graph, a: np.ndarray, b: np.ndarray, zero) -> list:
+    """Entries of a_k b_k^T, one matrix after the other, for a (count, rows, n) and b (count, columns, n).
+
+    `zero` is an empty sum.
+    """
+    entries, add, mul = [], graph.add, graph.mul
+    for rows, columns in zip(a.tolist(), b.tolist(), strict=True):
+        # Known zeros are most of it: they are looked for once.
+        nonzero = [[(k, y) for k, y in enumerate(column) if type(y) is Number or y != 0] for column in columns]
+        for row in rows:
+            for column in nonzero:
+                total = zero
+                for k, y in column:
+                    x = row[k]
+                    if type(x) is Number or x != 0:
+                        total = add(total, mul(x, y))
+                entries.append(total)
+    return entries
+
+
+def _cholesky_factor(graph: Graph, matrix: np.ndarray) -> np.ndarray:
+    """The lower factor L of a symmetric matrix L L^T; reads the lower triangle."""
+    n = matrix.shape[0]
+    lower = np.full((n, n), 0.0, object)
+    # Reciprocals of the diagonal are kept: n divisions, not n^2/2, and `_solve_triangle` finds the same numbers again.
+    inverse = []
+    for j in range(n):
+        for i in range(j, n):
+            entry = matrix[i, j]
+            for k in range(j):
+                entry = graph.sub(entry, graph.mul(lower[i, k], lower[j, k]))
+            if i == j:
+                lower[j, j] = graph.function("sqrt", entry)
+                inverse.append(graph.div(1.0, lower[j, j]))
+            else:
+                lower[i, j] = graph.mul(entry, inverse[j])
+    return lower
+
+
+def _solve_triangle(graph: Graph, a: np.ndarray, b: np.ndarray, lower: bool, unit: bool) -> np.ndarray:
+    """x with a x = b, for a triangular matrix (n, n), whose diagonal is taken as ones if `unit`, and b (n, columns)."""
+    n = a.shape[0]
+    rows: list = [None] * n
+    for i in range(n) if lower else reversed(range(n)):
+        row = b[i].tolist()
+        for k in range(i) if lower else range(i + 1, n):
+            # Known zeros of a factor are the branches of a tree.
+            if type(a[i, k]) is Number or a[i, k] != 0:
+                row = [graph.sub(x, graph.mul(a[i, k], y)) for x, y in zip(row, rows[k], strict=True)]
+        inverse = 1.0 if unit else graph.div(1.0, a[i, i])
+        rows[i] = [graph.mul(x, inverse) for x in row]
+    return objects([x for row in rows for x in row], b.shape)
+
+
+# --- arrays whose numbers are all known ---
+
+_NUMPY: dict[str, Callable] = {
+    "add": np.add, "add_any": np.add, "sub": np.subtract, "mul": np.multiply, "neg": np.negative, "square": np.square,
+    "and": np.bitwise_and, "or": np.bitwise_or, "not": np.invert, "is_finite": np.isfinite,
+    "rsqrt": lambda x: 1 / np.sqrt(x),
+} | {name: f for name, f in numbers.COMPARISONS.items()} | numbers.FUNCTIONS | numbers.FUNCTIONS_OF_TWO  # fmt: skip
+# Remainders by zero and negative powers of integers, which numpy computes otherwise than XLA or refuses.
+_OTHER_OF_INTEGERS = ("rem", "pow")
+_NUMPY_REDUCTIONS: dict[str, Callable] = {
+    "reduce_sum": np.sum, "reduce_prod": np.prod, "reduce_max": np.max, "reduce_min": np.min, "reduce_and": np.all,
+    "reduce_or": np.any,
+}  # fmt: skip
+
+
+def empty_reduction(name: str, dtype):
+    """A reduction of no entries."""
+    if name in ("reduce_max", "reduce_min"):
+        if dtype.kind == "b":
+            return name == "reduce_min"
+        ends = (-np.inf, np.inf) if dtype.kind == "f" else (np.iinfo(dtype).min, np.iinfo(dtype).max)
+        return ends[name == "reduce_min"]
+    return name in ("reduce_prod", "reduce_and")
+
+
+def convert_known(x: np.ndarray, dtype) -> np.ndarray:
+    """An array as one of a dtype, by XLA's rules: floats that no integer is near become its ends, or zero if they are none."""
+    dtype = np.dtype(dtype)
+    if x.dtype.kind != "f" or dtype.kind not in "iu":
+        return x.astype(dtype)
+    # NumPy's own conversion of a float that is out of range is undefined and differs between processors.
+    ends = np.iinfo(dtype)
+    is_low, is_high = x <= ends.min, x >= ends.max
+    inside = np.where(is_low | is_high | np.isnan(x), 0, x).astype(dtype)
+    return np.where(is_high, dtype.type(ends.max), np.where(is_low, dtype.type(ends.min), inside))
+
+
+def evaluate_known(eqn, args) -> np.ndarray:
+    """An operation on known arrays; by NumPy where that does the same, as JAX would compile it for each new shape."""
+    name, out = eqn.primitive.name, eqn.outvars[0].aval
+    with np.errstate(all="ignore"):
+        if name in _NUMPY and not (name in _OTHER_OF_INTEGERS and out.dtype.kind in "iu"):
+            return np.asarray(_NUMPY[name](*args)).astype(out.dtype, copy=False)
+        if name == "div" and out.dtype.kind == "f":
+            return np.asarray(args[0] / args[1], out.dtype)
+        if name in _NUMPY_REDUCTIONS and not args[0].size:
+            return np.full(out.shape, empty_reduction(name, out.dtype), out.dtype)
+        if name in _NUMPY_REDUCTIONS:
+            return np.asarray(_NUMPY_REDUCTIONS[name](args[0], axis=tuple(eqn.params["axes"]))).astype(out.dtype)
+        if name == "iota":
+            return np.indices(out.shape)[eqn.params["dimension"]].astype(out.dtype)
+    return bind_known(eqn, args)
+
+
+def bind_known(eqn, args) -> np.ndarray:
+    """The same by JAX itself."""
+    # The expansion may run within a user's trace, which must not see this operation.
+    with jax.ensure_compile_time_eval():
+        value = eqn.primitive.bind(*args, **eqn.params)
+    if eqn.primitive.multiple_results:
+        raise NotNumbers(eqn.primitive.name)
+    if jax.numpy.issubdtype(value.dtype, jax.dtypes.extended):
+        raise NotNumbers(f"an array of {value.dtype}")
+    return np.asarray(value)

@@ -93,7 +93,7 @@ def map_rows(function: Callable, rows):
 
     @jax.jit  # which traces it before any transformation around this call adds an axis
     def at_once(rows):
-        with in_rows():
+        with in_rows(True):
             return jax.vmap(function)(rows)
 
     count = jax.tree.leaves(rows)[0].shape[0]

@@ -11,9 +11,9 @@ from typing import Any
 
 import numpy as np
 
-from jaxdyn.compile.graph import Graph, inline
-from jaxdyn.compile.number import is_number, objects
-from jaxdyn.compile.program import FLOATS, Constant, NotNumbers, Program
+from jaxdyn.compile.graph import Graph
+from jaxdyn.compile.inlining import inline, replay
+from jaxdyn.compile.program import FLOATS, Constant, NotNumbers, Program, is_number, objects
 
 
 def tangent(program: Program, moving: Sequence[bool]) -> Program:
@@ -37,7 +37,7 @@ def _tangent(program: Program, moving: tuple[bool, ...]) -> Program:
     entries = [graph.inputs(index, array) for index, array in enumerate(arrays)]
     primal, input_changes = entries[: len(moving)], iter(entries[len(moving) :])
     changes_in = [next(input_changes).ravel().tolist() if varies else None for varies in moving]
-    values, _ = graph.replay(program, primal)
+    values, _ = replay(graph, program, primal)
     changes: list = []  # of each operation: a Number, or 0.0 where it does not change
     for operation, value in zip(program.operations, values, strict=True):
         if operation.op == "input":

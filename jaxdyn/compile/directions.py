@@ -11,9 +11,9 @@ from typing import Any
 
 from jaxdyn.compile.code import Body
 from jaxdyn.compile.graph import Graph
+from jaxdyn.compile.inlining import replay
 from jaxdyn.compile.llvm import Emitter
-from jaxdyn.compile.number import Number, objects
-from jaxdyn.compile.program import Array, Constant, NotNumbers, Program, dtype_of, kind_of
+from jaxdyn.compile.program import Array, Constant, NotNumbers, Number, Program, dtype_of, kind_of, objects
 
 
 class Directions:
@@ -38,8 +38,8 @@ class Directions:
                 graph.inputs(count + i, x) if i == place else objects([0.0] * x.size, x.shape)
                 for i, x in enumerate(self.varied)
             ]
-            changes.append([x.ravel().tolist() for x in graph.replay(change, [*primal, *steps])[1]])
-        flag = graph.replay(program, primal)[1][-1]
+            changes.append([x.ravel().tolist() for x in replay(graph, change, [*primal, *steps])[1]])
+        flag = replay(graph, program, primal)[1][-1]
         reach = _reach(graph, count)
         needed = _dependencies(reach, [x for rows in changes for row in rows for x in row])
         kept: dict[str, dict[Number, int]] = {}

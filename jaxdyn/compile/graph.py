@@ -13,7 +13,6 @@ from typing import Any
 
 import numpy as np
 
-from jaxdyn.compile.number import Number, objects, with_type
 from jaxdyn.compile.program import (
     COMPARISONS,
     FUNCTIONS,
@@ -21,6 +20,7 @@ from jaxdyn.compile.program import (
     Array,
     Constant,
     NotNumbers,
+    Number,
     Operation,
     Program,
     TooLong,
@@ -28,6 +28,8 @@ from jaxdyn.compile.program import (
     dtype_of,
     kind_of,
     kind_or_refuse,
+    objects,
+    with_type,
 )
 
 # Numbers that may be made for each operation that is allowed: those that no output needs are dropped at the end. Without a
@@ -37,13 +39,9 @@ _LEAST_NORMAL = {"f8": 2.0**-1022, "f4": 2.0**-126}
 
 
 class Graph:
-    """A program while it is written. **Raises:** `TooLong` beyond `most` operations.
+    """A program while it is written. **Raises:** `TooLong` beyond `most` operations."""
 
-    Without `branches` those of a program that is replayed are computed for all samples, and selected.
-    """
-
-    def __init__(self, most: int = 10**9, branches: bool = True):
-        self.branches = branches
+    def __init__(self, most: int = 10**9):
         self.most, self.most_made = most, _MADE_FOR_ONE_KEPT * most
         self.numbers: list[Number] = []
         # For each operation and kind, numbers by their operands, by identity: equal numbers are made once.
@@ -81,14 +79,6 @@ class Graph:
         """The outputs of a subprogram where the flag is set, else `otherwise`; it is called if the flag is set at all."""
         if type(flag) is not Number:
             return self.call(program, inputs) if flag else list(otherwise)
-        if not self.branches:
-            return [
-                objects(
-                    [self.select(flag, x, y, kind_of(array.dtype)) for x, y in zip(old.flat, new.flat, strict=True)],
-                    array.shape,
-                )
-                for old, new, array in zip(otherwise, self.replay(program, inputs)[1], program.outputs, strict=True)
-            ]
         entries = [entry for x in (*inputs, *otherwise) for entry in x.ravel().tolist()]
         return self._parts("call_where", program, [flag, *entries])
 
@@ -307,6 +297,20 @@ class Graph:
             return as_kind(a, kind)
         return a if a.kind == kind else self.make("convert", kind, a)
 
+    def apply(self, op: str, kind: str, args: Sequence):
+        """An operation by its name."""
+        if op in _BY_NAME:
+            return _BY_NAME[op](self, *args)
+        if op in FUNCTIONS:
+            return self.function(op, *args)
+        if op in FUNCTIONS_OF_TWO:
+            return self.function_of_two(op, *args)
+        if op in COMPARISONS:
+            return self.compare(op, *args)
+        if op in ("reduce_max", "reduce_min"):
+            return self.extreme(op, args)
+        return self.select(args[0], args[1], args[2], kind) if op == "select" else self.convert(args[0], kind)
+
     # --- finishing ---
 
     def finish(
@@ -343,63 +347,6 @@ class Graph:
         results = [tuple(index[x] if type(x) is Number else Constant(x) for x in row) for row in flat]
         return Program(inputs, outputs, operations, results, self.subprograms, **more)
 
-    def replay(self, program: Program, inputs: Sequence[np.ndarray]) -> tuple[list, list[np.ndarray]]:
-        """The numbers of all operations of a program for the given entries of its inputs, and its outputs."""
-        numbers: list = []
-        flat = [x.ravel().tolist() for x in inputs]
-        for operation in program.operations:
-            if operation.op == "input":
-                place, entry = operation.args
-                numbers.append(flat[place][entry])
-            elif operation.op == "call":  # operands are the number of the subprogram, then all entries of its inputs
-                which, *given = (x.value if type(x) is Constant else numbers[x] for x in operation.args)
-                numbers.append(self._replay_call(program.subprograms[which], given))
-            elif operation.op == "call_where":
-                which, *given = (x.value if type(x) is Constant else numbers[x] for x in operation.args)
-                numbers.append([x for row in self._replay_call_where(program.subprograms[which], *given) for x in row])
-            elif operation.op == "part":
-                call, entry = operation.args
-                numbers.append(numbers[call][entry.value])
-            else:
-                args = [x.value if type(x) is Constant else numbers[x] for x in operation.args]
-                numbers.append(self.apply(operation.op, operation.kind, args))
-        outputs = [
-            objects([x.value if type(x) is Constant else numbers[x] for x in row], array.shape)
-            for row, array in zip(program.results, program.outputs, strict=True)
-        ]
-        return numbers, outputs
-
-    def _replay_call(self, program: Program, given: list) -> list:
-        if program.is_called:  # no numbers to write out
-            return [entry for x in self.call(program, [objects(given, (len(given),))]) for entry in x.ravel().tolist()]
-        ends = np.cumsum([array.size for array in program.inputs])
-        parts = [
-            objects(given[end - array.size : end], array.shape) for end, array in zip(ends, program.inputs, strict=True)
-        ]
-        return [entry for x in self.replay(program, parts)[1] for entry in x.ravel().tolist()]
-
-    def _replay_call_where(self, program: Program, flag, *given) -> list[list]:
-        arrays, at = [], 0
-        for array in (*program.inputs, *program.outputs):
-            arrays.append(objects(list(given[at : at + array.size]), array.shape))
-            at += array.size
-        count = len(program.inputs)
-        return [x.ravel().tolist() for x in self.call_where(flag, program, arrays[:count], arrays[count:])]
-
-    def apply(self, op: str, kind: str, args: Sequence):
-        """An operation by its name."""
-        if op in _BY_NAME:
-            return _BY_NAME[op](self, *args)
-        if op in FUNCTIONS:
-            return self.function(op, *args)
-        if op in FUNCTIONS_OF_TWO:
-            return self.function_of_two(op, *args)
-        if op in COMPARISONS:
-            return self.compare(op, *args)
-        if op in ("reduce_max", "reduce_min"):
-            return self.extreme(op, args)
-        return self.select(args[0], args[1], args[2], kind) if op == "select" else self.convert(args[0], kind)
-
 
 _BY_NAME: dict[str, Callable] = {
     "add": Graph.add, "sub": Graph.sub, "neg": Graph.neg, "mul": Graph.mul, "div": Graph.div, "and": Graph.both,
@@ -424,13 +371,3 @@ def _is_negative(x) -> bool:
 def _are_same(a, b) -> bool:
     """Decide whether two known numbers are equal, zeros with the same sign."""
     return type(a) is not Number and type(b) is not Number and a == b and _is_negative(a) == _is_negative(b)
-
-
-def inline(program: Program) -> Program:
-    """The same without subprograms and branches, except subprograms that have loops."""
-    if all(x.is_called for x in program.subprograms):
-        return program
-    graph = Graph(branches=False)
-    with np.errstate(all="ignore"):  # known numbers may overflow, as they do in XLA
-        _, outputs = graph.replay(program, [graph.inputs(i, array) for i, array in enumerate(program.inputs)])
-    return graph.finish(program.inputs, program.outputs, outputs, name=program.name)

@@ -164,9 +164,9 @@ def is_linear(operand) -> bool:
     return ad.is_undefined_primal(operand)
 
 
-def lower_function(function: Callable, context, *operands, **params) -> Any:
-    """Lower a call of a function of arrays, within a lowering rule."""
-    return mlir.lower_fun(function, multiple_results=True)(context, *operands, **params)
+def lowering_of(function: Callable) -> Any:
+    """Lowering rule of a function of arrays: rule(context, *operands, **params)."""
+    return mlir.lower_fun(function, multiple_results=True)
 
 
 def function_of(closed) -> Callable:

@@ -18,7 +18,7 @@ from jaxdyn.compile.flags import is_float, mark_invalid
 from jaxdyn.compile.known import is_known, partition, partition_tracers
 from jaxdyn.compile.primitive import kernel_p, target
 from jaxdyn.compile.repair import compute_where, rank_safe, repair
-from jaxdyn.compile.trace import inline_call, name_of, program_of, trace_program
+from jaxdyn.compile.trace import flat_function, inline_call, name_of, program_of, trace_program
 
 
 def kernel(
@@ -80,16 +80,15 @@ def _call(function, static, tree, args, fallback, rule, is_differentiated: bool,
     if valid is True:
         return values
     traced, known = partition_tracers(tree)
-
-    def careful(traced, args):
-        return again(*static, known(traced), *args)
-
+    leaves, structure = jax.tree.flatten(args)
+    given, careful = (*traced, *leaves), flat_function(again, static, known, len(traced), structure)
     if not is_differentiated:
         valid = valid if where is None else valid | ~where
-        return compute_where(jnp.logical_not(valid), careful, values, (traced, args))
+        return compute_where(jnp.logical_not(valid), careful, values, given)
 
-    def fast(traced, args):
-        results = _by_kernel(function, static, known(traced), args, fallback, tangent=rule)
+    def fast(*given):
+        args = jax.tree.unflatten(structure, given[len(traced) :])
+        results = _by_kernel(function, static, known(given[: len(traced)]), args, fallback, tangent=rule)
         assert results is not None, "the function that was a kernel for the values is none for the derivative"
         return _split_floats(results[0])[0]
 
@@ -97,10 +96,10 @@ def _call(function, static, tree, args, fallback, rule, is_differentiated: bool,
     # intermediates are computed again instead.
     safe = jax.checkpoint(lambda *given: _split_floats(rank_safe(careful)(*given)), prevent_cse=False)
     differentiable, rest = _split_floats(values)
-    floats, rest = repair(jnp.logical_not(valid), safe, fast, (differentiable, rest), (traced, args))
+    floats, rest = repair(jnp.logical_not(valid), safe, fast, (differentiable, rest), given)
     floats, rest = iter(floats), iter(rest)
-    leaves = [next(floats if is_float else rest) for is_float in map(is_float, jax.tree.leaves(values))]
-    return jax.tree.unflatten(jax.tree.structure(values), leaves)
+    results = [next(floats if is_float else rest) for is_float in map(is_float, jax.tree.leaves(values))]
+    return jax.tree.unflatten(jax.tree.structure(values), results)
 
 
 def _split_floats(tree) -> tuple[list, list]:
@@ -140,7 +139,7 @@ def _bind(function, static, tree, args, **how) -> tuple[Any, Any] | str | None:
         return traced
     (program, places), out_structure = without_unread(traced[0]), traced[1]
     leaves = [leaves[i] for i in places]
-    if program.reports_validity and mode.is_rank_safe():
+    if program.reports_validity and mode.rank_safe.value:
         # A part of another function's fallback: the fast path has failed for the sample, and may fail it here again.
         return None
     # A kernel takes flat arrays. Under a trace reshapes are free.
@@ -189,7 +188,7 @@ def evaluate(function: Callable, tree, *args, static: tuple = (), is_input: bool
     that takes the tree as an argument: it is the same kernel then.
     """
     leaves, structure = jax.tree.flatten(args)
-    inputs, known = partition(tree, lambda leaf: is_input and isinstance(leaf, jax.Array))
+    inputs, known = partition(tree, jax.Array if is_input else ())
     leaves = [np.asarray(x) for x in (*inputs, *leaves)]
     leaves = [x.astype(jax.dtypes.canonicalize_dtype(x.dtype)) for x in leaves]
     if mode.current() != "plain" and target is not None:

@@ -1,6 +1,5 @@
 """Known and traced leaves of pytrees, and functions that keep known values known."""
 
-from collections.abc import Callable
 from typing import Any, NamedTuple
 
 import jax
@@ -88,12 +87,12 @@ def partition_tracers(tree) -> tuple[list, Known]:
 
     Arguments of functions that JAX traces become tracers. Known leaves that are captured in a `Known` stay known.
     """
-    return partition(tree, lambda leaf: isinstance(leaf, Tracer))
+    return partition(tree, Tracer)
 
 
-def partition(tree, is_apart: Callable) -> tuple[list, Known]:
-    """The leaves of a tree for which `is_apart` holds, and the rest of it."""
+def partition(tree, types: type | tuple[type, ...]) -> tuple[list, Known]:
+    """The leaves of a tree that are of these types, and the rest of it."""
     leaves, structure = jax.tree.flatten(tree)
-    places = tuple(i for i, leaf in enumerate(leaves) if is_apart(leaf))
+    places = tuple(i for i, leaf in enumerate(leaves) if isinstance(leaf, types))
     known = _Leaves([None if i in places else leaf for i, leaf in enumerate(leaves)])
     return [leaves[i] for i in places], Known(structure, places, known)

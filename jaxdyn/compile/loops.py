@@ -12,14 +12,14 @@ from typing import Any, NamedTuple
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jax import lax
 from jaxtyping import Array as Numbers
 
 from jaxdyn.compile import mode
 from jaxdyn.compile.jax_adapter import forgive, vary_alike
 from jaxdyn.compile.known import Known, partition_tracers
 from jaxdyn.compile.loop_text import loop_ir
-from jaxdyn.compile.operations import over_batch
-from jaxdyn.compile.primitive import kernel_p, target
+from jaxdyn.compile.primitive import kernel_p, over_batch, target
 from jaxdyn.compile.program import Array, Constant, Program
 from jaxdyn.compile.trace import program_of
 
@@ -97,6 +97,27 @@ def run_loop(task: Task, tree, constants, given: Given, carry: Carry) -> tuple[C
         if not forgive(error):
             raise
         return None
+
+
+def run_to_end(
+    task: Task, tree, constants, given: Given, carry: Carry, once: Callable, by_fallback: Callable, is_running: Callable
+) -> Carry:
+    """Iterate until every sample has ended, by `run_loop` as far as it goes.
+
+    **Arguments:** as of `run_loop`; `once(carry)`, an iteration where there is no native loop; `by_fallback(carry)`, one that the
+    native loop has refused, after which it continues; `is_running(carry)`, one decision for a batch.
+    """
+    after = run_loop(task, tree, constants, given, carry)
+    if after is None:
+        return lax.while_loop(is_running, once, carry)
+    carry, always_ends = after
+    if always_ends:  # no code for the fallback is compiled
+        return carry
+
+    def resume(carry):
+        return run_loop(task, tree, constants, given, by_fallback(carry))[0]  # pyright: ignore[reportOptionalSubscript]
+
+    return lax.while_loop(is_running, resume, carry)
 
 
 def _run_loop(task: Task, tree, constants, given: Given, carry: Carry) -> tuple[Carry, bool] | None:
@@ -177,6 +198,11 @@ class Loop:
         self.subprograms = turn.subprograms
         self.derived: dict = {}
         self.name = f"loop of {turn.name}"
+        self.cost = turn.cost  # of one iteration
+        # Identity of the code, as `Program.digest`.
+        sizes = [(x.size, x.dtype.name) for x in (*self.inputs, *self.outputs)]
+        of_row = None if row is None else row.digest
+        self.digest = f"loop {turn.digest} {of_row} {sizes} {task.strides} {self.turn_places} {self.given}"
 
     @property
     def always_ends(self) -> bool:
@@ -184,25 +210,8 @@ class Loop:
         valid = self.turn.results[-1][0]
         return type(valid) is Constant and bool(valid.value)
 
-    @property
-    def digest(self) -> str:
-        """Identity of the code, as `Program.digest`."""
-        sizes = [(x.size, x.dtype.name) for x in (*self.inputs, *self.outputs)]
-        row = None if self.row is None else self.row.digest
-        return f"loop {self.turn.digest} {row} {sizes} {self.task.strides} {self.turn_places} {self.given}"
-
-    @property
-    def cost(self) -> int:
-        """Operations of one iteration."""
-        return self.turn.cost
-
-    def lanes(self, samples) -> int:
-        """Vector width, that of an iteration's program."""
-        return target.width_of(self.turn, samples)
-
-    def ir(self, width: int, uniform) -> str:
-        """The text of the kernel (see `code.kernel_ir`)."""
-        return loop_ir(self, width, uniform)
+    # The text of the kernel for a width (see `code.kernel_ir`).
+    ir = loop_ir
 
     def as_operations(self, *arrays):
         """The same by JAX."""

@@ -47,11 +47,6 @@ class MatrixProgram:
         # A hash, as programs that call it make its symbol from it.
         return hashlib.sha256(self.title.encode()).hexdigest()
 
-    # A vector of samples would go on until the last one of them has converged, and exchange rows for all of them.
-    def lanes(self, samples) -> int:
-        """Samples take different paths: one after the other."""
-        return 1
-
     def compute(self, matrix: jax.Array) -> jax.Array:
         """The result of a matrix (..., rows, columns) by operations of JAX."""
         raise NotImplementedError

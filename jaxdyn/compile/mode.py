@@ -22,8 +22,10 @@ MAX_OPERATIONS = 60_000
 # None: the environment decides, which is read at each use, so that a test can set it.
 _mode = jax.make_user_context(None)
 _expanding = jax.make_user_context("")
-_rank_safe = jax.make_user_context(False)
-_in_rows = jax.make_user_context(False)
+# Whether the traced function computes samples again for which a kernel was not valid.
+rank_safe = jax.make_user_context(False)
+# Whether an axis that `vmap` adds to a kernel is one of rows (see `batch.map_rows`).
+in_rows = jax.make_user_context(False)
 _standalone = jax.make_user_context("")
 _by_rules = jax.make_user_context(False)
 _said: set[str] = set()
@@ -82,16 +84,6 @@ def expanding(branches: bool = False):
     return _expanding("branches" if branches else "straight")
 
 
-def is_rank_safe() -> bool:
-    """Decide whether the traced function computes samples again for which a kernel was not valid."""
-    return _rank_safe.value
-
-
-def rank_safe(is_safe: bool = True):
-    """Context in which a function is traced for samples for which a kernel was not valid."""
-    return _rank_safe(is_safe)
-
-
 def is_standalone() -> bool:
     """Decide whether a function is traced for code that runs without JAX."""
     return bool(_standalone.value)
@@ -115,16 +107,6 @@ def has_values_of_rules() -> bool:
 def values_of_rules(is_wanted: bool = True):
     """Context in which functions with rules for their derivatives have the values of these rules."""
     return _by_rules(is_wanted)
-
-
-def is_row() -> bool:
-    """Decide whether an axis that `vmap` adds to a kernel now is one of rows (see `batch.map_rows`)."""
-    return _in_rows.value
-
-
-def in_rows():
-    """Context in which an axis that `vmap` adds to a kernel is one of rows."""
-    return _in_rows(True)
 
 
 def wants_usual_options() -> bool:

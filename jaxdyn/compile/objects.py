@@ -22,6 +22,7 @@ from jaxdyn.compile.mode import wants_least_optimisation
 logger = logging.getLogger("jaxdyn")
 MAX_CACHE_BYTES = 512 * 2**20
 ANNOUNCED_LINES = 100_000  # of LLVM's text, which compile in some five seconds
+LONG_LINES = 6000  # of LLVM's text, beyond which a kernel is straight code of one program but for few lines
 _CHECKSUM_BYTES = 32
 
 
@@ -64,6 +65,7 @@ def key_of(text: str) -> bytes:
         features(),
         llvm.get_process_triple(),
         str(_level()),
+        str(LONG_LINES),
     )
     return hashlib.sha256("\0".join(parts).encode()).digest()
 
@@ -113,7 +115,12 @@ def _compile(text: str) -> bytes:
     # The text is vectors already, in one block of thousands of lines: LLVM's vectorisers would only take time.
     options.loop_vectorization = options.slp_vectorization = options.loop_unrolling = False
     builder = llvm.create_pass_builder(machine, options)
-    builder.getModulePassManager().run(module, builder)
+    passes = builder.getModulePassManager()
+    if text.count("\n") > LONG_LINES:
+        # Only this pass shortens straight code, by a few per cent. All of them take ten times as long, a third of the whole.
+        passes = llvm.create_new_module_pass_manager()
+        passes.add_instruction_combine_pass()
+    passes.run(module, builder)
     return machine.emit_object(module)
 
 

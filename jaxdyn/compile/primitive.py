@@ -9,17 +9,20 @@ of `vmap`, are kernels. On a CPU the primitive is lowered to a call of native co
 import contextlib
 import functools
 import math
+from collections.abc import Callable, Sequence
+from typing import Any
 
 import jax
 import jax.numpy as jnp
 from jax import lax
 
-from jaxdyn.compile import ahead, derive, jax_adapter, mode, sharding
-from jaxdyn.compile.jax_adapter import define_primitive, is_linear, is_zero, lower_function, zero_tangent
-from jaxdyn.compile.operations import as_operations, by_jax
-from jaxdyn.compile.program import NotNumbers, Program, TooLong
+from jaxdyn.compile import ahead, derive, jax_adapter, mode
+from jaxdyn.compile.inlining import inline
+from jaxdyn.compile.jax_adapter import ShapedArray, define_primitive, is_linear, is_zero, lowering_of, zero_tangent
+from jaxdyn.compile.program import COMPARISONS, Constant, NotNumbers, Program, TooLong, dtype_of
 from jaxdyn.compile.shared import split_program
 from jaxdyn.compile.trace import tangent_program
+from jaxdyn.compile.trigonometry import cosine, sine
 
 try:
     from jaxdyn.compile import target
@@ -50,7 +53,7 @@ def _result_types(*avals, program, rows):
         # its message, where the kernel is lowered.
         with contextlib.suppress(target.Unsupported):
             target.make_ahead(target.kernel(program, target.width_of(program, 1), [False] * len(avals)))
-    return sharding.results_of(avals, program.outputs)
+    return _results_of(avals, program.outputs)
 
 
 def _batch(args, axes, *, program, rows):
@@ -69,9 +72,76 @@ def _batch(args, axes, *, program, rows):
         elif v and lead != inner:
             x = jnp.broadcast_to(x.reshape(size, *[1] * len(inner), x.shape[-1]), (size, *inner, x.shape[-1]))
         full.append(x)
-    rows += mode.is_row() and not mode.is_expanding()
+    rows += mode.in_rows.value and not mode.is_expanding()
+    if program.turns > 1 and not mode.is_expanding() and target is not None and jax.default_backend() == "cpu":
+        # A loop is the main part of a program: LLVM works on it while Python traces on.
+        target.publish_ahead(program, target.width_of(program, size))
     results = kernel_p.bind(*full, program=program, rows=rows)
     return results, [0] * len(results)
+
+
+# --- the program as operations of JAX ---
+
+_OPERATIONS: dict[str, Callable] = {
+    "add": lax.add, "sub": lax.sub, "mul": lax.mul, "div": lax.div, "neg": lax.neg, "max": lax.max, "min": lax.min,
+    "pow": lax.pow, "atan2": lax.atan2, "rem": lax.rem, "and": lax.bitwise_and, "or": lax.bitwise_or, "not": lax.bitwise_not,
+    "is_finite": lax.is_finite, "select": lambda which, no, yes: lax.select(which, yes, no), "sqrt": lax.sqrt, "sin": sine,
+    "cos": cosine, "tan": lax.tan, "asin": lax.asin, "acos": lax.acos, "atan": lax.atan, "sinh": lax.sinh, "cosh": lax.cosh,
+    "tanh": lax.tanh, "exp": lax.exp, "exp2": lax.exp2, "expm1": lax.expm1, "log": lax.log, "log1p": lax.log1p, "abs": lax.abs,
+    "floor": lax.floor, "ceil": lax.ceil, "sign": lax.sign, "cbrt": lax.cbrt, "stop_gradient": lax.stop_gradient,
+    "round": lambda x: lax.round(x, lax.RoundingMethod.TO_NEAREST_EVEN), "reduce_max": lambda *x: functools.reduce(lax.max, x),
+    "reduce_min": lambda *x: functools.reduce(lax.min, x), "clamp": lambda low, x, high: lax.min(lax.max(x, low), high),
+} | {name: getattr(lax, name) for name in COMPARISONS}  # fmt: skip
+
+
+def as_operations(*args, program: Program, rows: int = 0):
+    """Compute a program's results by operations of JAX, one for each number, on arrays over the batch."""
+    if not isinstance(program, Program):  # a loop or a pseudo-inverse, which stand in the place of a program
+        return program.as_operations(*args)
+    lead = max((x.shape[:-1] for x in args), key=len, default=())
+    program = inline(program)
+    columns = [jnp.broadcast_to(x, (*lead, x.shape[-1])) for x in args]
+    values: list = []
+
+    def constant(value, kind):
+        return jnp.full(lead, value, dtype_of(kind))
+
+    for op, kind, operands in program.operations:
+        if op == "input":
+            place, entry = operands
+            values.append(columns[place][..., entry])
+        elif op == "convert":
+            values.append(lax.convert_element_type(values[operands[0]], dtype_of(kind)))
+        else:
+            # The kind of a comparison's result is bool: its constants have the kind of the other operand.
+            kinds = [program.operations[x].kind for x in operands if type(x) is not Constant]
+            constant_kind = kinds[-1] if op in COMPARISONS else kind
+            operand_values = (constant(x.value, constant_kind) if type(x) is Constant else values[x] for x in operands)
+            values.append(_OPERATIONS[op](*operand_values))
+    results = []
+    for row, array in zip(program.results, program.outputs, strict=True):
+        entries = [jnp.full(lead, x.value, array.dtype) if type(x) is Constant else values[x] for x in row]
+        # Without the barrier XLA fuses everything into the stack, and each of its entries becomes a branch in which all
+        # operations that the entry needs are computed again: 17 to 100 times the arithmetic on a GPU.
+        entries = lax.optimization_barrier(entries) if entries else entries
+        results.append(jnp.stack(entries, -1) if entries else jnp.zeros((*lead, 0), array.dtype))
+    return results
+
+
+def by_jax(*args, program, rows: int = 0):
+    """Compute a program's results by JAX: by the function that was traced where that is there, else by its numbers.
+
+    The function's arrays are a few hundred operations for XLA; the numbers, tens of thousands, take it minutes to compile.
+    """
+    return as_operations(*args, program=program) if program.fallback is None else over_batch(program.fallback, args)
+
+
+def over_batch(one: Callable, arrays) -> Any:
+    """one(*arrays) of one sample, for arrays with the axes of a batch or without them."""
+    axes = [0 if x.ndim > 1 else None for x in arrays]
+    for _ in max((x.shape[:-1] for x in arrays), key=len, default=()):
+        one = jax.vmap(one, axes)
+    return one(*arrays)
 
 
 # --- derivatives ---
@@ -182,6 +252,60 @@ def _transpose(cotangents, *operands, program, rows):
     return out
 
 
+# --- batches that are sharded over devices ---
+#
+# Samples do not know of each other, so a call is divided along the axes of its batch and nothing is exchanged. Without the two
+# attributes below XLA would gather the batch on every device around a call of machine code.
+#
+# - `num_batch_dims`: how many leading axes a target that is registered as batch-partitionable (`jax.ffi`) is divided along.
+# - `sdy.sharding_rule`: which axes of arguments and results are the same ones, for Shardy, which spreads shardings over programs.
+#
+# Axes of meshes are of three kinds in JAX. Along automatic ones XLA divides, by these attributes. Along explicit ones, which
+# `jax.make_mesh` makes, shardings are a part of types: results have the batch axes of the arguments. Along manual ones, within
+# `jax.shard_map`, a result varies as the arguments do.
+
+
+def _results_of(avals: Sequence, arrays: Sequence) -> list:
+    """Types of the results, one sample each of `arrays`, with the batch axes and the shardings of the arguments."""
+    longest = max(avals, key=lambda x: x.ndim, default=None)
+    lead = () if longest is None else longest.shape[:-1]
+    if longest is None or jax_adapter.mesh_of(longest) is None:
+        return [ShapedArray((*lead, array.size), array.dtype) for array in arrays]
+    # Operands with the batch's axes agree along them, or leave an axis open: the first that says something decides.
+    specs = [jax_adapter.spec_of(x) for x in avals if x.ndim == longest.ndim]
+    along = [next((spec[k] for spec in specs if spec[k] is not None), None) for k in range(len(lead))]
+    return [jax_adapter.type_like(longest, (*lead, array.size), array.dtype, (*along, None)) for array in arrays]
+
+
+def _is_divisible(avals: Sequence, lead: Sequence) -> bool:
+    """Decide whether XLA may partition this call; False too where its batch has a last axis of length one.
+
+    Such an axis is put there, as the partitioner counts batch axes from the front: the only axis of an argument that all samples
+    share would be divided as if it were that of the batch; with fewer axes than the batch has, the argument is left alone. And an
+    argument that is on every device becomes one that can be divided, by its reshape.
+    """
+    if not lead or lead[-1] == 1 or jax.device_count() == 1:
+        return False
+    mesh = jax_adapter.mesh_of(avals[0]) if avals else None
+    return mesh is None or not jax_adapter.is_all_manual(mesh)
+
+
+def _partition_attributes(avals: Sequence, results: Sequence) -> dict | None:
+    """Attributes of the call; None where nothing can be divided."""
+    lead = results[0].shape[:-1] if results else ()
+    if not lead or not all(isinstance(n, int) for n in lead):  # `jax.export` has sizes without a number
+        return None
+    sizes = list(lead)
+
+    # The entries of each array are an axis of its own in the rule, so that nothing is ever divided along them.
+    def axes(x):
+        sizes.append(x.shape[-1])  # an axis of its own, which is in no other array
+        return [*range(len(lead)), len(sizes) - 1] if x.ndim > 1 else [len(sizes) - 1]
+
+    operands, outputs = [axes(x) for x in avals], [axes(x) for x in results]
+    return jax_adapter.sharding_attributes(len(lead), sizes, operands, outputs)
+
+
 # --- lowering ---
 
 
@@ -191,7 +315,7 @@ def _lower_on_cpu(ctx, *operands, program, rows):
     except Exception as error:
         if not jax_adapter.forgive(error):
             raise
-        return lower_function(by_jax, ctx, *operands, program=program, rows=rows)
+        return lowering_of(by_jax)(ctx, *operands, program=program, rows=rows)
 
 
 def _lower_to_call(ctx, *operands, program, rows):
@@ -200,32 +324,32 @@ def _lower_to_call(ctx, *operands, program, rows):
     uniform = [bool(lead) and len(x.shape) == 1 for x in ctx.avals_in]
     if any(uniform) and not all(uniform) and len(lead) == rows:
         # Rows go through the kernel of one sample, which is compiled already and has no notion of shared operands.
-        return lower_function(_broadcast_rows, ctx, *operands, program=program, rows=rows)
+        return lowering_of(_broadcast_rows)(ctx, *operands, program=program, rows=rows)
     batch = lead[: len(lead) - rows]
     samples = math.prod(batch) if all(isinstance(n, int) for n in batch) else None  # `jax.export` has symbolic sizes
     if samples != 1 and target is not None and target.is_available() and split_program(program, uniform) is not None:
-        return lower_function(_call_in_two, ctx, *operands, program=program, rows=rows)
+        return lowering_of(_call_in_two)(ctx, *operands, program=program, rows=rows)
     try:
         assert target is not None
         width = target.width_of(program, samples)
         # A loop is the main part of a program and certain to be called: LLVM works on it while XLA compiles the rest. Another
         # kernel of the same width continues a run whose step has needed the fallback.
-        is_certain = program.turns > 1 and all(key[1] != width for key in program.derived)
+        is_certain = program.turns > 1 and all(key[:2] != ("kernel", width) for key in program.derived)
         number = target.kernel(program, width, uniform)
     except target.Unsupported as reason:  # pyright: ignore[reportOptionalMemberAccess]
         mode.say_once(f"functions run on JAX's own operations: {reason}")
-        return lower_function(as_operations, ctx, *operands, program=program, rows=rows)
+        return lowering_of(as_operations)(ctx, *operands, program=program, rows=rows)
     if is_certain:
         target.make_ahead(number)
-    if sharding.is_divisible(ctx.avals_in, lead):
-        return lower_function(_with_last_axis, ctx, *operands, program=program, rows=rows and rows + 1)
+    if _is_divisible(ctx.avals_in, lead):
+        return lowering_of(_with_last_axis)(ctx, *operands, program=program, rows=rows and rows + 1)
     order = target.varying_first(uniform)
-    attributes = functools.partial(sharding.attributes, [ctx.avals_in[i] for i in order], ctx.avals_out)
-    return jax_adapter.lower_call(target.TARGET, ctx, operands, order, attributes(), program=number)
+    attributes = _partition_attributes([ctx.avals_in[i] for i in order], ctx.avals_out)
+    return jax_adapter.lower_call(target.TARGET, ctx, operands, order, attributes, program=number)
 
 
 def _with_last_axis(*args, program, rows):
-    """The call with one more batch axis, of length one (see `sharding.is_divisible`)."""
+    """The call with one more batch axis, of length one (see `_is_divisible`)."""
     results = kernel_p.bind(
         *(x if x.ndim == 1 else lax.expand_dims(x, [x.ndim - 1]) for x in args), program=program, rows=rows
     )

@@ -4,8 +4,7 @@ from collections.abc import Callable
 
 import numpy as np
 
-from jaxdyn.compile.number import as_objects
-from jaxdyn.compile.program import NotNumbers
+from jaxdyn.compile.program import NotNumbers, as_objects
 
 
 def _slice(params, args, out):

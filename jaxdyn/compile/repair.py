@@ -29,7 +29,7 @@ def rank_safe(function: Callable) -> Callable:
 
     @functools.wraps(function)
     def call(*args):
-        with mode.rank_safe():
+        with mode.rank_safe(True):
             return function(*args)
 
     return call

@@ -14,11 +14,11 @@ import numpy as np
 from jaxdyn.compile import derive
 from jaxdyn.compile.code import ATTRIBUTES, Body, symbol_of
 from jaxdyn.compile.directions import Directions
-from jaxdyn.compile.graph import Graph, inline
+from jaxdyn.compile.graph import Graph
+from jaxdyn.compile.inlining import inline, replay
 from jaxdyn.compile.llvm import Emitter
 from jaxdyn.compile.mode import standalone
-from jaxdyn.compile.number import objects
-from jaxdyn.compile.program import FLOATS, Array, Constant, Program, kind_of
+from jaxdyn.compile.program import FLOATS, Array, Constant, Program, kind_of, objects
 from jaxdyn.compile.trace import program_of
 
 # Operations of a directional derivative times the number of directions. A Panda's forward dynamics has 63 000: by columns its
@@ -126,10 +126,10 @@ def jacobian_program(program: Program | Directions, name: str) -> Program | Dire
             # Steps are known zeros and a one, so that the graph folds what this column does not need and shares all values.
             steps = [objects([0.0] * x.size, x.shape) for x in varied]
             steps[place].reshape(-1)[entry] = 1.0
-            columns = graph.replay(change, [*primal, *steps])[1]
+            columns = replay(graph, change, [*primal, *steps])[1]
             for row, column in zip(blocks, columns, strict=True):
                 row[place][:, entry] = column.ravel()
-    flag = graph.replay(program, primal)[1][-1]
+    flag = replay(graph, program, primal)[1][-1]
     arrays = [Array(block.shape, y.dtype) for y, row in zip(outputs, blocks, strict=True) for block in row]
     entries = [block for row in blocks for block in row]
     return graph.finish(program.inputs, [*arrays, program.outputs[-1]], [*entries, flag], name=name)

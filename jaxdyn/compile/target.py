@@ -108,11 +108,13 @@ def vector_bytes() -> int:
 
 def width_of(program, samples: int | None) -> int:
     """Samples that a kernel computes in one vector: one for a single sample, else as many as a register holds."""
-    if not isinstance(program, Program):
-        return program.lanes(samples)
+    program = getattr(program, "turn", program)  # the width of a loop is that of its iterations
+    # Samples of a `MatrixProgram` take different paths: a vector would go on until the last one has converged.
+    if samples == 1 or not isinstance(program, Program):
+        return 1
     # Twice as many samples in float32, but only where no float64 is passed: vectors of both would have different lengths.
     kinds = {kind_of(array.dtype) for array in (*program.inputs, *program.outputs)} & set(FLOATS)
-    return 1 if samples == 1 else vector_bytes() // (4 if kinds == {"f4"} else 8)
+    return vector_bytes() // (4 if kinds == {"f4"} else 8)
 
 
 def kernel(program, width: int, uniform: Sequence[bool]) -> int:
@@ -182,6 +184,20 @@ def make_ahead(number: int) -> None:
     if made.code is None and not made.is_awaited:
         made.is_awaited = True
         ahead.make_later(made.address)
+
+
+def publish_ahead(program, width: int) -> None:
+    """Let another thread make the subprograms of a loop, whichever of its operands all samples share."""
+    key = ("ahead", width)
+    if key not in program.derived:
+        program.derived[key] = True
+
+        def make() -> None:
+            for called in program.subprograms:
+                with _making:
+                    _publish(called, width)
+
+        ahead.make_later(make)
 
 
 def _publish(called: Program, width: int) -> None:

@@ -11,7 +11,7 @@ import jax
 import jax.numpy as jnp
 
 from jaxdyn.compile import jax_adapter, mode
-from jaxdyn.compile.expand import expand
+from jaxdyn.compile.expansion import expand
 from jaxdyn.compile.known import Known, partition_tracers
 from jaxdyn.compile.program import NotNumbers, Program, TooLong
 
@@ -61,7 +61,7 @@ def _trace_program(function, static, known: Known, count, structure, shapes, tan
     try:
         with mode.expanding(calls):
             # Subprograms are the functions under `jit` within this one; itself it is not a call.
-            traced = _flat_function(function, static, known, count, structure) if calls else flat
+            traced = flat_function(function, static, known, count, structure) if calls else flat
             closed, out = jax.make_jaxpr(traced, return_shape=True)(*avals)
         program, has_rules = expand(closed, most, name_of(function), calls, flags)
     except (NotNumbers, TooLong) as reason:
@@ -87,10 +87,12 @@ def name_of(function) -> str:
 @functools.lru_cache(maxsize=1024)
 def function_of_leaves(function, static, known: Known, count: int, structure):
     """The function of its operands, flat and under `jax.jit`; JAX traces it once for all programs that it is part of."""
-    return jax.jit(_flat_function(function, static, known, count, structure))
+    return jax.jit(flat_function(function, static, known, count, structure))
 
 
-def _flat_function(function, static, known: Known, count: int, structure) -> Callable:
+def flat_function(function, static, known: Known, count: int, structure) -> Callable:
+    """The function of its operands: the traced leaves of the tree, then those of the arguments."""
+
     def flat(*leaves):
         return function(*static, known(leaves[:count]), *jax.tree.unflatten(structure, leaves[count:]))
 

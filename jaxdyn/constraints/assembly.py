@@ -181,7 +181,9 @@ def _assemble(locked, q, v, t, rank_tol, atol, steps, is_rounded, scene):
     """Assemble the scene `locked`; velocities satisfy the constraints of `scene`, or of `locked` if it is None."""
     bare = Scene(locked.system, locked.constraints)
     start, passed = _follow_path(bare, q, t, rank_tol, steps)
-    selection = _selection(bare, start, t, rank_tol, is_rounded)
+    selection: Any = _selection(bare, start, t, rank_tol, is_rounded)
+    if is_concrete(selection) and np.all(selection.kept):
+        selection = None
     if scene is not None:
         scene = Scene(scene.system, scene.constraints)
         scene = keep_rows(scene, _selection(scene, start, t, rank_tol, is_rounded))
@@ -208,10 +210,12 @@ def _follow_path(scene, q, t, rank_tol, steps):
 @entry_point
 def _close(bare, guess, start, passed, selection, v, t, rank_tol, atol, scene):
     """The assembly from the end of a path, which starts at the guess; `scene`: see `_assemble`."""
-    kept, rounding, _ = selection
-    # Rows that contradict the others must not be dropped in silence: all are kept, and the result is their least-squares point.
-    kept = jnp.where(rounding <= most_rounding(guess.dtype), kept, jnp.ones_like(kept))
-    whole, locked = bare, keep_rows(bare, Selection(kept, rounding, jnp.zeros_like(rounding)))
+    whole, locked, kept = bare, bare, jnp.ones(sum(place.end - place.start for place in layout(bare)), guess.dtype)
+    if selection is not None:
+        kept, rounding, _ = selection
+        # Rows that contradict the others must not be dropped in silence: with all rows the result is the least-squares point.
+        kept = jnp.where(rounding <= most_rounding(guess.dtype), kept, jnp.ones_like(kept))
+        locked = keep_rows(bare, Selection(kept, rounding, jnp.zeros_like(rounding)))
     q = guess
     if holonomic_rows(layout(locked)).size:
         q = _unwind_hinges(locked, guess, nearest_configuration(locked, guess, start, t, rank_tol), t)
@@ -220,7 +224,9 @@ def _close(bare, guess, start, passed, selection, v, t, rank_tol, atol, scene):
     v = _with_velocity(scene, q, v, t, rank_tol)
     limits = row_limits(locked, q, jnp.zeros_like(v), t, closing_tolerance(q.dtype))[0]
     phi = position_residual(locked, q, t)
-    is_closed = jnp.all(jnp.abs(phi) <= limits) & (opening_of_redundant(locked, q, t) <= most_rounding(q.dtype))
+    is_closed = jnp.all(jnp.abs(phi) <= limits)
+    if selection is not None:
+        is_closed &= opening_of_redundant(locked, q, t) <= most_rounding(q.dtype)
     is_admissible = jnp.all(
         jnp.abs(velocity_residual(scene, q, v, t)) <= row_limits(scene, q, v, t, closing_tolerance(q.dtype))[1]
     )

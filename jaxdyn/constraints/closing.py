@@ -23,7 +23,8 @@ from jaxdyn.constraints.rank import eps_of, passes_singular, solve_square
 from jaxdyn.constraints.tolerances import coordinate_sizes
 from jaxdyn.dynamics.quantities import mass_matrix
 from jaxdyn.lie.so3 import matmul
-from jaxdyn.model.tree import Model, difference
+from jaxdyn.model.configuration import difference
+from jaxdyn.model.tree import Model
 from jaxdyn.systems.mass_factor import mass_factor
 from jaxdyn.systems.scene import Scene
 from jaxdyn.systems.system import displace, displacement, retract

@@ -27,7 +27,7 @@ from jaxdyn.dynamics.kinematics import BodyFrames, body_frames, take
 from jaxdyn.lie import se3, so3
 from jaxdyn.lie.so3 import matmul
 from jaxdyn.model.arguments import Number, SystemLike
-from jaxdyn.model.names import frame_index
+from jaxdyn.model.topology import frame_index
 from jaxdyn.model.tree import Model
 
 

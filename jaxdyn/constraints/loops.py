@@ -22,8 +22,8 @@ from jaxdyn.constraints.base import Constraint
 from jaxdyn.constraints.frames import Pair
 from jaxdyn.model.arguments import Checked, DType, Number, Numbers, pose_leaf
 from jaxdyn.model.joints import KINDS, SCREW_KINDS, joint_difference
-from jaxdyn.model.names import body_index
 from jaxdyn.model.numbers import as_number
+from jaxdyn.model.topology import body_index
 from jaxdyn.model.tree import Model
 
 

@@ -51,7 +51,11 @@ def project_step(scene: Scene, q, v, t, errors: tuple = (), rank_tol: float | No
     """
 
     def project(scene, q, v, t, *errors):
-        return _project(scene, rank_tol, q, v, t, errors)
+        q = retract(scene.system, q)
+        if layout(scene)[-1].end > scene.nv and not has_selection(scene):
+            return _by_rank(rank_tol, scene, q, v, t, errors)
+        by_kernel = kernel(_by_pivots, static=1, fallback=_by_rank_in_full, derivative=False)
+        return _in_rounds(lambda q, v: by_kernel(rank_tol, scene, q, v, t, errors), q, v, errors)
 
     def tangent(scene, q, v, t, *rest):
         *errors, steps = rest
@@ -67,29 +71,13 @@ def project_step(scene: Scene, q, v, t, errors: tuple = (), rank_tol: float | No
     return implicit(Scene(scene.system, scene.constraints), (q, v, t, *errors), project, tangent)
 
 
-def _project(scene: Scene, rank_tol, q, v, t, errors):
-    """Rounds of a few steps each with one factorisation of the rows."""
-    q = retract(scene.system, q)
-    is_wide = layout(scene)[-1].end > scene.nv and not has_selection(scene)
-    return (_by_rank if is_wide else _rounds)(rank_tol, scene, q, v, t, errors)
-
-
-def _rounds(rank_tol, scene: Scene, q, v, t, errors):
-    by_kernel = kernel(_by_pivots, static=1, fallback=_by_rank_in_full, derivative=False)
-
-    def again(q, v):
-        return by_kernel(rank_tol, scene, q, v, t, errors)
-
-    return _in_rounds(again, q, v, errors)
-
-
 def _in_rounds(again: Callable, q, v, errors):
-    """Repeat again(q, v) -> (q, v, errors, more) while `more`, once at least and `_MOST_ROUNDS` times at most."""
+    """Rounds of a few steps, each with one factorisation of the rows.
 
-    def step(state):
-        return tuple(again(*state[:2]))
-
-    return batch.repeat_while(lambda state: state[3], step, (q, v, errors, True), _MOST_ROUNDS)[:3]
+    Repeats again(q, v) -> (q, v, errors, more) while `more`, once at least and `_MOST_ROUNDS` times at most.
+    """
+    start = q, v, errors, True
+    return batch.repeat_while(lambda state: state[3], lambda state: tuple(again(*state[:2])), start, _MOST_ROUNDS)[:3]
 
 
 def _by_rank(rank_tol, scene: Scene, q, v, t, errors):

@@ -21,22 +21,23 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import lax
-from jaxtyping import Array, Float
+from jaxtyping import Array, Float, Int
 
 from jaxdyn.compile import entry_point, evaluate, kernel, mark_invalid, pseudo_inverse_by_rotations, variant
 from jaxdyn.compile.batch import cond
 from jaxdyn.compile.known import is_concrete, is_tracing, stop_gradient
 from jaxdyn.constraints.base import constraint_jacobian, holonomic_rows, layout, position_residual
-from jaxdyn.constraints.rank import eps_of, least_pivot_of, tolerance
+from jaxdyn.constraints.rank import check_tolerance, eps_of, least_pivot_of, pseudo_inverse, rank_of, tolerance
 from jaxdyn.constraints.redundancy import Selection, all_rows, largest_of_each, largest_opening, rows_of
 from jaxdyn.constraints.tolerances import coordinate_sizes
 from jaxdyn.dynamics.quantities import mass_matrix
 from jaxdyn.lie.so3 import matmul
-from jaxdyn.model.arguments import Number, state_dtype
-from jaxdyn.model.tree import Model, neutral
+from jaxdyn.model.arguments import Number, Numbers, check_state, state_dtype
+from jaxdyn.model.configuration import neutral
+from jaxdyn.model.tree import Model
 from jaxdyn.systems.mass_factor import cholesky, mass_factor
-from jaxdyn.systems.scene import Scene
-from jaxdyn.systems.system import displace, retract
+from jaxdyn.systems.scene import Scene, as_scene
+from jaxdyn.systems.system import SceneLike, displace, retract
 
 # Rows whose distance from the span of the others is below this part of their length may be redundant. Numbers written with four
 # digits leave 1e-4.
@@ -322,3 +323,43 @@ def pivoted_rows(B: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         along = rest[rows[-1]] / pivots[-1]
         rest = rest - np.outer(rest @ along, along)
     return np.asarray(rows, int), np.asarray(pivots)
+
+
+def degrees_of_freedom(
+    scene: SceneLike, q: Float[Array, " nq"], t: Numbers = 0.0, *, rank_tol: float | None = None
+) -> int | Int[Array, ""]:
+    r"""Degrees of freedom at a configuration: nv minus the rank of the constraints' rows A(q, t).
+
+    Dependent rows count once, so that the count is right for overconstrained linkages. It counts independent velocities at
+    this q: it is larger in singular positions, and rolling reduces it though all configurations remain reachable. Loops whose
+    rows are dependent only where the loops are closed need a q of `jd.assemble`. Distances are compared in
+    units of the mechanism's length, each row scaled to length 1; rows at rounding level count as zero.
+
+    **Arguments:** `scene`, a `Scene` or a system; `q` (nq,); `t`, s; `rank_tol`: singular values below `rank_tol` times the
+    largest count as zero, by default $\epsilon^{4/7}$, 1e-9 in float64.
+
+    **Returns:** an int for concrete arguments, an integer array () for traced ones.
+
+    **Raises:** ValueError for shapes that do not fit, or a `rank_tol` outside (0, 1).
+
+    Source: EQUATIONS section 7; the rank is the trace of $A A^+$.
+
+    ```python
+    count = jd.degrees_of_freedom(jd.scenes.four_bar(), jd.scenes.four_bar.start()[0])  # 1
+    ```
+    """
+    scene = as_scene(scene)
+    q, t = check_state(scene.system, q=q, t=t)
+    rank_tol = check_tolerance(rank_tol)
+    if not layout(scene):
+        return scene.nv
+    rank = _rank(scene, q, t, rank_tol)
+    return scene.nv - int(rank) if is_concrete(rank) else scene.nv - rank
+
+
+@entry_point
+def _rank(scene: Scene, q, t, rank_tol: float | None) -> Int[Array, ""]:
+    # Scaled rows: the singular values of metres next to radians depend on the unit. The rank is by the
+    # pseudo-inverse that all other rank decisions use, so that they agree.
+    A = unit_rows(scene, q, t)
+    return rank_of(A, pseudo_inverse(A, tolerance(rank_tol, A), True)).astype(jnp.int32)

@@ -9,13 +9,13 @@ from jaxdyn.contact.closure import force_closure_of_map as force_closure_of_map
 from jaxdyn.contact.cones import FrictionCone as FrictionCone
 from jaxdyn.contact.cones import friction_cone as friction_cone
 from jaxdyn.contact.cones import surface_cone as surface_cone
+from jaxdyn.contact.contact_equations import ContactKinematics as ContactKinematics
+from jaxdyn.contact.contact_equations import montana as montana
+from jaxdyn.contact.contact_equations import relative_pose as relative_pose
 from jaxdyn.contact.coordinates import contact_coordinates as contact_coordinates
 from jaxdyn.contact.forces import ContactForces as ContactForces
 from jaxdyn.contact.forces import contact_forces as contact_forces
 from jaxdyn.contact.kinds import wrench_basis as wrench_basis
-from jaxdyn.contact.montana import ContactKinematics as ContactKinematics
-from jaxdyn.contact.montana import montana as montana
-from jaxdyn.contact.montana import relative_pose as relative_pose
 from jaxdyn.contact.optimal import optimal_forces as optimal_forces
 from jaxdyn.contact.qp import QPSolution as QPSolution
 from jaxdyn.contact.qp import solve_qp as solve_qp

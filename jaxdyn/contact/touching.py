@@ -22,7 +22,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
-from jaxdyn.contact.montana import inverse_2x2, is_positive
+from jaxdyn.contact.contact_equations import inverse_2x2, is_positive
 from jaxdyn.contact.surfaces import Surface
 from jaxdyn.lie.so3 import cross, matmul
 

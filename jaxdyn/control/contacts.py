@@ -10,7 +10,7 @@ from jaxdyn.dynamics.kinematics import frame_pose
 from jaxdyn.lie import se3
 from jaxdyn.lie.so3 import matmul
 from jaxdyn.model.arguments import Checked, Numbers, pose_leaf
-from jaxdyn.model.names import frame_index
+from jaxdyn.model.topology import frame_index
 from jaxdyn.model.tree import Model
 from jaxdyn.systems.system import velocity_to_rate
 

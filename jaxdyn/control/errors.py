@@ -27,7 +27,7 @@ from jaxdyn.lie import so3
 from jaxdyn.lie.series import safe_sqrt
 from jaxdyn.lie.so3 import matmul
 from jaxdyn.model.arguments import Number, Numbers, as_array, batch_hint
-from jaxdyn.model.names import frame_index
+from jaxdyn.model.topology import frame_index
 from jaxdyn.model.tree import Model
 from jaxdyn.systems.mass_factor import mass_factor
 from jaxdyn.systems.scene import Scene, as_pytree

@@ -15,7 +15,7 @@ from jaxdyn.dynamics.kinematics import body_jacobian, frame_pose
 from jaxdyn.lie import se3
 from jaxdyn.lie.so3 import matmul
 from jaxdyn.model.arguments import Checked, Numbers, as_array, is_concrete
-from jaxdyn.model.names import frame_index
+from jaxdyn.model.topology import frame_index
 from jaxdyn.model.tree import Model
 
 # A surface fixes the same six components as a rigid contact; it differs by its cone of wrenches.

@@ -14,7 +14,7 @@ from jaxdyn.control.gains import as_matrix, gain, times
 from jaxdyn.dynamics.quantities import bias_force, coriolis_matrix, mass_matrix
 from jaxdyn.lie.so3 import matmul
 from jaxdyn.model.arguments import Function, Number, Numbers, check_state
-from jaxdyn.reduction.gauge_invariant import gauge_invariant
+from jaxdyn.reduction.quasi_velocities import gauge_invariant
 from jaxdyn.systems.scene import Scene, as_pytree
 from jaxdyn.systems.system import SceneLike, velocity_to_rate
 

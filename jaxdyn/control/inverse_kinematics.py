@@ -24,7 +24,7 @@ from jaxdyn.constraints.closing import nearest_configuration
 from jaxdyn.constraints.codes import RESULTS, Outcome, name_of, require_success
 from jaxdyn.constraints.redundancy import KeptRows
 from jaxdyn.constraints.tolerances import own_length
-from jaxdyn.control.search import Aims, clip_to_limits, screw_joints, search
+from jaxdyn.control.least_squares import Aims, clip_to_limits, screw_joints, search
 from jaxdyn.control.targets import as_targets, target_rows
 from jaxdyn.model.arguments import Checked, Number, Numbers, as_array, check_state
 from jaxdyn.model.tree import Model

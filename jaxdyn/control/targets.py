@@ -20,7 +20,7 @@ from jaxdyn.control.errors import CenterError, Fixed
 from jaxdyn.lie import so3
 from jaxdyn.lie.so3 import matmul
 from jaxdyn.model.arguments import as_array, batch_hint
-from jaxdyn.model.names import frame_index
+from jaxdyn.model.topology import frame_index
 from jaxdyn.model.tree import Model
 
 CENTER = "center_of_mass"

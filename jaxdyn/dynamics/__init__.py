@@ -7,17 +7,17 @@ Imports `systems` and what is below it. The four algorithms do not import each o
 """
 
 from jaxdyn._renamed import old_names as _old_names
-from jaxdyn.dynamics.articulated_bodies import ArticulatedBodies as ArticulatedBodies
-from jaxdyn.dynamics.articulated_bodies import articulated_bodies as articulated_bodies
-from jaxdyn.dynamics.base_twists import base_twists as base_twists
-from jaxdyn.dynamics.base_twists import link_adjoints as link_adjoints
+from jaxdyn.dynamics.articulated_motion import ArticulatedBodies as ArticulatedBodies
+from jaxdyn.dynamics.articulated_motion import articulated_bodies as articulated_bodies
+from jaxdyn.dynamics.base_frame import base_twists as base_twists
+from jaxdyn.dynamics.base_frame import link_adjoints as link_adjoints
+from jaxdyn.dynamics.center_of_mass import ComDynamics as ComDynamics
+from jaxdyn.dynamics.center_of_mass import com_dynamics as com_dynamics
 from jaxdyn.dynamics.centroidal import centroidal_momentum as centroidal_momentum
 from jaxdyn.dynamics.centroidal import centroidal_momentum_matrix as centroidal_momentum_matrix
-from jaxdyn.dynamics.com_dynamics import ComDynamics as ComDynamics
-from jaxdyn.dynamics.com_dynamics import com_dynamics as com_dynamics
 from jaxdyn.dynamics.frame_motion import frame_acceleration as frame_acceleration
+from jaxdyn.dynamics.frame_motion import jacobian_dot_v as jacobian_dot_v
 from jaxdyn.dynamics.joint_wrenches import joint_wrench as joint_wrench
-from jaxdyn.dynamics.kinematics import jacobian_dot_v as jacobian_dot_v
 from jaxdyn.dynamics.kinematics import spatial_jacobian as spatial_jacobian
 from jaxdyn.dynamics.link_frame import NewtonEulerMatrices as NewtonEulerMatrices
 from jaxdyn.dynamics.quantities import aba as aba

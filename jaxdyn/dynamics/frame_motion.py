@@ -1,4 +1,4 @@
-"""Velocity and acceleration of a frame's origin in world axes, as instruments measure them."""
+"""Velocity and acceleration of frames: of their origins in world axes, as instruments measure them, and of body twists."""
 
 import jax.numpy as jnp
 from jaxtyping import Array, Float
@@ -128,3 +128,35 @@ def _acceleration(body: int, tree, q, v, a):
     # From the rate of the body twist to the acceleration of the origin: dv/dt + omega x v.
     linear = rate[:3] + cross(twist[3:], twist[:3])
     return jnp.concatenate([matmul(turn, linear[:, None])[:, 0], matmul(turn, rate[3:, None])[:, 0]])
+
+
+def jacobian_dot_v(
+    model: Model, q: Float[Array, " nq"], v: Float[Array, " nv"], frame: str | None
+) -> Float[Array, "6"]:
+    r"""Velocity-dependent part of a frame's body acceleration, with the body Jacobian J.
+
+    $$\dot V_b = J a + \dot J v$$
+
+    In a fixed frame the second part is the sum of $\mathrm{ad}_V S_k v_k$ over the coordinates that move the frame; its adjoint
+    maps the sum into the frame.
+
+    **Arguments:** `q` (nq,); `v` (nv,); `frame`, one of `model.frame_names` (None: the world, zero).
+
+    **Returns:** (6,), linear then angular, in the frame's axes (m/s^2, rad/s^2). It is the rate of the body twist, not
+    the acceleration of the origin: that is its linear part plus omega x v.
+
+    **Raises:** ValueError for an unknown name or shapes that do not fit.
+    """
+    q, v = check_shapes(model, q=q, v=v)
+    body, offset = named_frame(model, frame)
+    if body < 0:
+        return jnp.zeros((6,), model.home.dtype)
+    return _jacobian_dot_v(body, (kinematic_part(model), offset), q, v)
+
+
+@kernel(static=1)
+def _jacobian_dot_v(body: int, tree, q, v):
+    model, offset = tree
+    frame = tree_frame(model, q)
+    rate = subspace_rate(model, frame, body_twists(model, frame, v)) * v[:, None]
+    return jnp.sum(twist_columns(model, frame, body, offset, rate), axis=0)

@@ -11,7 +11,7 @@ from jaxdyn.dynamics.world_frame import joint_wrenches
 from jaxdyn.lie import se3
 from jaxdyn.lie.so3 import matmul
 from jaxdyn.model.arguments import check_shapes
-from jaxdyn.model.names import joint_index
+from jaxdyn.model.topology import joint_index
 from jaxdyn.model.tree import Model
 
 

@@ -25,7 +25,7 @@ from jaxdyn.lie import se3
 from jaxdyn.lie.so3 import matmul
 from jaxdyn.model.arguments import Given, check_shapes
 from jaxdyn.model.joints import KINDS, SCREW_KINDS, joint_transform, screw_transform
-from jaxdyn.model.names import frame_index
+from jaxdyn.model.topology import frame_index
 from jaxdyn.model.tree import Model, Topology, geometry
 
 
@@ -337,38 +337,6 @@ def _spatial_jacobian(body: int, model: Model, q):
     frame = tree_frame(model, q)
     shift = se3.from_parts(jnp.eye(3, dtype=model.home.dtype), frame.origin[body])
     return jax.vmap(se3.Ad_apply, (None, 0), 1)(shift, _mask_path(model, body, frame.subspace))
-
-
-def jacobian_dot_v(
-    model: Model, q: Float[Array, " nq"], v: Float[Array, " nv"], frame: str | None
-) -> Float[Array, "6"]:
-    r"""Velocity-dependent part of a frame's body acceleration, with the body Jacobian J.
-
-    $$\dot V_b = J a + \dot J v$$
-
-    In a fixed frame the second part is the sum of $\mathrm{ad}_V S_k v_k$ over the coordinates that move the frame; its adjoint
-    maps the sum into the frame.
-
-    **Arguments:** `q` (nq,); `v` (nv,); `frame`, one of `model.frame_names` (None: the world, zero).
-
-    **Returns:** (6,), linear then angular, in the frame's axes (m/s^2, rad/s^2). It is the rate of the body twist, not
-    the acceleration of the origin: that is its linear part plus omega x v.
-
-    **Raises:** ValueError for an unknown name or shapes that do not fit.
-    """
-    q, v = check_shapes(model, q=q, v=v)
-    body, offset = named_frame(model, frame)
-    if body < 0:
-        return jnp.zeros((6,), model.home.dtype)
-    return _jacobian_dot_v(body, (kinematic_part(model), offset), q, v)
-
-
-@kernel(static=1)
-def _jacobian_dot_v(body: int, tree, q, v):
-    model, offset = tree
-    frame = tree_frame(model, q)
-    rate = subspace_rate(model, frame, body_twists(model, frame, v)) * v[:, None]
-    return jnp.sum(twist_columns(model, frame, body, offset, rate), axis=0)
 
 
 def kinematic_part(model: Model) -> Model:

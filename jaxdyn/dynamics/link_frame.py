@@ -23,7 +23,7 @@ from jaxdyn.lie import se3
 from jaxdyn.lie.so3 import matmul
 from jaxdyn.model.arguments import as_array, check_shapes
 from jaxdyn.model.inertia import spatial_inertia
-from jaxdyn.model.names import frame_index
+from jaxdyn.model.topology import frame_index
 from jaxdyn.model.tree import Model
 
 

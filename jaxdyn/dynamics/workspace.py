@@ -25,7 +25,8 @@ from jaxdyn.dynamics.frame_motion import frame_jacobian
 from jaxdyn.dynamics.quantities import coriolis_matrix, gravity_force, mass_matrix
 from jaxdyn.lie.so3 import matmul
 from jaxdyn.model.arguments import check_shapes
-from jaxdyn.model.tree import Model, configuration_rate
+from jaxdyn.model.configuration import configuration_rate
+from jaxdyn.model.tree import Model
 from jaxdyn.systems.mass_factor import mass_factor, solve_positive
 
 

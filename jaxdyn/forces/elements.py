@@ -14,8 +14,9 @@ from jaxtyping import Array, Float
 
 from jaxdyn.dynamics.kinematics import body_jacobian, frame_pose, take
 from jaxdyn.model.arguments import Number, SystemLike, batch_hint, is_concrete
-from jaxdyn.model.names import frame_index
-from jaxdyn.model.tree import Model, difference, neutral
+from jaxdyn.model.configuration import difference, neutral
+from jaxdyn.model.topology import frame_index
+from jaxdyn.model.tree import Model
 
 
 class _Indices(NamedTuple):

@@ -26,8 +26,7 @@ from jaxdyn.lie.so3 import matmul
 from jaxdyn.model.arguments import Checked, Function, Numbers, check_state
 from jaxdyn.model.numbers import check_count
 from jaxdyn.systems.scene import Scene, as_pytree, as_scene, check_force
-from jaxdyn.systems.start import describe_state
-from jaxdyn.systems.system import SceneLike, System, rate_to_velocity
+from jaxdyn.systems.system import SceneLike, System, describe_state, rate_to_velocity
 
 
 class PullBack(eqx.Module):

@@ -19,7 +19,7 @@ from jaxdyn.constraints.frames import Pair
 from jaxdyn.constraints.loops import attitude, check_bodies
 from jaxdyn.constraints.rolling import RollingSphere, RollingWheel
 from jaxdyn.contact.kinds import components
-from jaxdyn.model import float64 as f64
+from jaxdyn.model import host_math
 from jaxdyn.model.arguments import DType, Numbers, SystemLike, pose_leaf
 
 
@@ -145,11 +145,11 @@ def point_contacts(places: dict, *, kind: str = "hard-finger") -> list[Contact]:
         point, normal = parts
         if is_concrete(normal) and not (np.isfinite(normal).all() and normal.any()):
             raise ValueError(f"places[{finger!r}]: normal is {normal.tolist()}; give a direction into the object")
-        xp, normal = array_namespace(normal), f64.unit(normal, f"places[{finger!r}]: normal")
+        xp, normal = array_namespace(normal), host_math.unit(normal, f"places[{finger!r}]: normal")
         # The axis of the frame farthest from the normal, so that the cross product is never small.
-        across = f64.unit(xp.cross(normal, xp.eye(3)[xp.argmin(xp.abs(normal))]), "across")
+        across = host_math.unit(xp.cross(normal, xp.eye(3)[xp.argmin(xp.abs(normal))]), "across")
         # Right-handed: across x (normal x across) = normal.
-        pose = f64.pose_of(xp.stack([across, xp.cross(normal, across), normal], 1), point)
+        pose = host_math.pose_of(xp.stack([across, xp.cross(normal, across), normal], 1), point)
         contacts.append(contact(kind, finger, pose))
     return contacts
 

@@ -14,7 +14,7 @@ from jaxdyn.contact.cones import Cones
 from jaxdyn.contact.forces import contacts_with_cones
 from jaxdyn.grasp.contacts import on_object
 from jaxdyn.lie.so3 import matmul
-from jaxdyn.model import float64 as f64
+from jaxdyn.model import host_math
 from jaxdyn.model.arguments import Checked, Numbers, as_array, batch_hint
 from jaxdyn.model.joining import join_all
 from jaxdyn.model.tree import Model
@@ -164,7 +164,7 @@ def _check_object(model: Model, name: str) -> None:
     if is_concrete(model.inertias):
         # Coordinates of the spatial inertia that the joint's velocities see; other joints get no inertia check.
         moved = {"free": range(6), "planar": (0, 1, 5)}.get(top.kinds[body], ())
-        matrix = f64.spatial_inertia(np.asarray(model.inertias, float)[body])[np.ix_(moved, moved)]
+        matrix = host_math.spatial_inertia(np.asarray(model.inertias, float)[body])[np.ix_(moved, moved)]
         if len(moved) and not (least := np.linalg.eigvalsh(matrix)[0]) > 0:
             raise ValueError(
                 f"inertia of the object {name!r} is not positive definite: the least eigenvalue of its spatial inertia is "

@@ -42,8 +42,8 @@ from jaxdyn.identify.uncertainty import Whiteness as Whiteness
 from jaxdyn.identify.uncertainty import whiteness as whiteness
 from jaxdyn.identify.workflows.drive_gains import DriveGains as DriveGains
 from jaxdyn.identify.workflows.drive_gains import fit_gains as fit_gains
-from jaxdyn.identify.workflows.exciting_motion import Excitation as Excitation
-from jaxdyn.identify.workflows.exciting_motion import exciting_motion as exciting_motion
+from jaxdyn.identify.workflows.excitation_search import Excitation as Excitation
+from jaxdyn.identify.workflows.excitation_search import exciting_motion as exciting_motion
 from jaxdyn.identify.workflows.log_repair import LogWarning as LogWarning
 from jaxdyn.identify.workflows.payload import Payload as Payload
 from jaxdyn.identify.workflows.payload import fit_payload as fit_payload

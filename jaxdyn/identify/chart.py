@@ -22,7 +22,7 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from jaxdyn.compile import gram_eigenvectors
-from jaxdyn.model import float64 as _f64
+from jaxdyn.model import host_math
 from jaxdyn.model import inertia as _inertia
 from jaxdyn.model.tree import Model
 
@@ -85,7 +85,7 @@ def make_chart(model: Model, inertia: str, bodies=None) -> Chart:
     numbers = np.asarray(model.inertias, np.float64)
     massive = tuple(int(i) for i in np.flatnonzero(numbers[:, 0] > 0)) if inertia != "fixed" else ()
     bodies = massive if bodies is None else tuple(i for i in massive if i in tuple(bodies))
-    matrices = [_f64.pseudo_inertia(numbers[i]) for i in bodies]
+    matrices = [host_math.pseudo_inertia(numbers[i]) for i in bodies]
     bad = [model.body_names[i] for i, P in zip(bodies, matrices, strict=True) if not _is_feasible(P, inertia)]
     if bad:
         raise ValueError(

@@ -8,15 +8,10 @@ without its samples.
 
 import dataclasses
 import itertools
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
-
-from jaxdyn.identify.logs import Log
-
-# Samples whose regressor is held at a time.
-_SAMPLES = 1024
 
 
 class Condensed(NamedTuple):
@@ -146,43 +141,3 @@ def block_slices(lengths: Sequence[int], total: int) -> list[tuple[int, slice]]:
         edges = np.linspace(0, length, count + 1).astype(int)
         result += [(which, slice(a, b)) for a, b in itertools.pairwise(edges)]
     return result
-
-
-def condense_blocks(
-    logs: Sequence[Log],
-    rows: Callable[[int, slice], np.ndarray],
-    shared: int,
-    *,
-    extra: Sequence[np.ndarray] = (),
-    blocks: int = 1,
-    weights: Sequence[np.ndarray] | None = None,
-) -> Blocks:
-    """Condense logs, block by block.
-
-    **Arguments:** `logs`; `rows(which, piece)`, the regressor (n, nv, s + k nv) of some samples of a log, whose terms are
-    diagonal blocks; `shared`, its number s of columns before the terms; `extra`: for each log, more terms (n, nv, k');
-    `blocks`: their approximate number, over all logs; `weights`: for each log, those of its torques (n, nv), ones by default.
-    """
-    triangles, samples, owners = [], [], []
-    for which, part in block_slices([len(log) for log in logs], blocks):
-        nv = logs[which].nv
-        triangle_of_row = [np.zeros((0, 0))] * nv
-        for start in range(part.start, part.stop, _SAMPLES):
-            piece = slice(start, min(start + _SAMPLES, part.stop))
-            log = logs[which][piece]
-            W, tau = rows(which, piece), np.asarray(log.tau, np.float64)
-            # Each term is a diagonal block: a torque keeps its own column, the others are zero.
-            own = W[:, :, shared:].reshape(len(log), nv, -1, nv)
-            more = np.zeros((len(log), nv, 0)) if not len(extra) else extra[which][piece]
-            for j in range(nv):
-                table = np.concatenate([W[:, j, :shared], own[:, j, :, j], more[:, j], tau[:, j, None]], axis=1)
-                # The torque is the last column, so that it is weighted with its row.
-                table = table if weights is None else table * weights[which][piece, j, None]
-                before = triangle_of_row[j] if triangle_of_row[j].size else np.zeros((0, table.shape[1]))
-                # Sequential QR: the triangle so far joins the next rows, so that memory does not grow with the log.
-                triangle_of_row[j] = np.asarray(np.linalg.qr(np.concatenate([before, table]), mode="r"))
-        triangles.append(triangle_of_row)
-        samples.append(part.stop - part.start)
-        owners.append(which)
-    terms = triangles[0][0].shape[1] - 1 - shared
-    return Blocks(triangles, shared, terms, np.array(samples), np.array(owners))

@@ -12,17 +12,19 @@ reversals, the choice between them decides their values and no interval shows it
 """
 
 from collections.abc import Callable, Sequence
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 
 from jaxdyn.identify.condensed import Blocks, condense_rows, pad_triangle
-from jaxdyn.identify.interior import LOG_CHOLESKY_BASIS, LinearChart, Minimum, TorqueProblem, newton
+from jaxdyn.identify.descent import Watch, descend
+from jaxdyn.identify.interior import LOG_CHOLESKY_BASIS, InteriorPoint, LinearChart, TorqueProblem
 from jaxdyn.identify.logs import Log, root_mean_square
 from jaxdyn.identify.regression import (
     BaseParameters,
     base_parameters,
     condense_model,
+    coordinate_names,
     free_columns,
     noise_level,
     parameter_names,
@@ -74,6 +76,24 @@ class Data(NamedTuple):
                 result += [self.basic + column * self.blocks.nv + joint for joint in places]
             start += count
         return np.array(result, int)
+
+
+class Minimum(NamedTuple):
+    """Minimum by `minimize_torque_error`: `origin` (bodies, 4, 4) and `terms` (n,) of the chart, losses, and the result."""
+
+    origin: np.ndarray
+    terms: np.ndarray
+    history: np.ndarray
+    result: Any
+
+
+def minimize_torque_error(
+    problem: TorqueProblem, steps: int, tolerance: float, callback: Callable | None = None
+) -> Minimum:
+    """Minimise by `InteriorPoint` from the start of the chart; `callback(step, loss, (origin, terms))` before each step."""
+    end = descend(InteriorPoint(problem, tolerance), problem.chart.start, Watch(steps, callback))
+    origin, terms = end.last.point
+    return Minimum(origin, terms, end.history, end.result)
 
 
 class Estimate(NamedTuple):
@@ -129,7 +149,7 @@ def fit_blocks(
 ) -> Estimate:
     """Fit all blocks, or those that `rows` and `count` of `Blocks` were given for; `is_rough` for a comparison of settings.
 
-    `sizes` as of `signal_sizes`, `callback` as of `newton`.
+    `sizes` as of `signal_sizes`, `callback` as of `minimize_torque_error`.
 
     **Raises:** ValueError for logs with torques of zero alone, or with fewer of them than unknowns.
     """
@@ -152,7 +172,7 @@ def fit_blocks(
     # Noise-free logs stay well posed by a small share of the torque.
     sigma = max(float(sigma), _FINEST * float(np.sqrt(np.mean(sizes[0] ** 2))))
     problem = TorqueProblem.of(chart, condensed, sigma, setting.prior)
-    minimum = newton(problem, _STEPS, _ROUGH if is_rough else _FINE, callback)
+    minimum = minimize_torque_error(problem, _STEPS, _ROUGH if is_rough else _FINE, callback)
     # Interior points never reach a bound. Exact zeros let `intervals` recognise the terms that are held there.
     minimum = minimum._replace(terms=chart.clip_terms(minimum.terms))
     x = np.zeros(size)
@@ -267,7 +287,7 @@ def intervals(
     names = list(parameter_names(model))
     for term, number in data.counts.items():
         for k in range(number):
-            names += [f"{joint}.{term}{k + 1 if number > 1 else ''}" for joint in _joints(model)]
+            names += [f"{joint}.{term}{k + 1 if number > 1 else ''}" for joint in coordinate_names(model)]
     fitted = np.concatenate([free, np.zeros(blocks.size - len(free), bool)])
     fitted[data.places(setting.extra)] = True
     shown = np.flatnonzero(fitted | (np.arange(blocks.size) < data.basic))
@@ -356,8 +376,3 @@ def _root(matrix: np.ndarray) -> np.ndarray:
     # Semidefinite: coordinates without a prior have no curvature, which a Cholesky factorisation would refuse.
     values, vectors = np.linalg.eigh(matrix)
     return vectors * np.sqrt(np.maximum(values, 0))
-
-
-def _joints(model: Model) -> list[str]:
-    start = 10 * model.nb
-    return [name.rpartition(".")[0] for name in parameter_names(model)[start : start + model.nv]]

@@ -4,15 +4,14 @@ A fit takes some tens of steps with matrices of a few hundred rows, and a search
 takes about a millisecond, and nothing is compiled.
 """
 
-from collections.abc import Callable
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 
 from jaxdyn.constraints.codes import RESULTS
 from jaxdyn.identify.chart import make_chart
 from jaxdyn.identify.condensed import Condensed
-from jaxdyn.identify.descent import Iterate, Method, Watch, descend
+from jaxdyn.identify.descent import Iterate, Method
 from jaxdyn.identify.regression import free_columns, nominal_parameters
 from jaxdyn.identify.torque_terms import POSITIVE
 from jaxdyn.model.tree import Model
@@ -45,15 +44,6 @@ class TorqueProblem(NamedTuple):
         diagonal = np.diagonal(origin, axis1=1, axis2=2)
         divergence = np.sum(origin**2) - 2 * np.sum(np.log(diagonal)) - 4.0 * len(origin)
         return float(0.5 * (residual @ residual + self.rest) + self.prior * divergence)
-
-
-class Minimum(NamedTuple):
-    """Minimum by `newton`: `origin` (bodies, 4, 4) and `terms` (n,) of the chart, losses, and the result."""
-
-    origin: np.ndarray
-    terms: np.ndarray
-    history: np.ndarray
-    result: Any
 
 
 class _State(NamedTuple):
@@ -227,23 +217,6 @@ class InteriorPoint(Method):
     def _iterate(self, state: _State, targets: tuple[float, float]) -> Iterate:
         loss = self.problem.loss(state.origin, state.terms)
         return Iterate((state.origin, state.terms), loss, (state, targets))
-
-
-def newton(
-    problem: TorqueProblem,
-    steps: int,
-    tolerance: float,
-    callback: Callable[[int, float, np.ndarray, np.ndarray], None] | None = None,
-) -> Minimum:
-    """Minimise by `InteriorPoint` from the start of the chart; `callback(step, loss, origin, terms)` before each step."""
-
-    def report(step: int, loss: float, point: tuple[np.ndarray, np.ndarray]) -> None:
-        if callback is not None:
-            callback(step, loss, *point)
-
-    end = descend(InteriorPoint(problem, tolerance), problem.chart.start, Watch(steps, report))
-    origin, terms = end.last.point
-    return Minimum(origin, terms, end.history, end.result)
 
 
 def _step(problem: TorqueProblem, linear: LinearChart, state: _State, weight: float, barrier: float):

@@ -160,17 +160,15 @@ def pad_length(rate: float, cutoff: float, count: int) -> int:
     return min(int(3 * rate / cutoff), count - 1)
 
 
-def low_pass_columns(log: Log, columns: Callable[[Log], np.ndarray]) -> np.ndarray:
-    """Columns (n, ...) of a function of a log, with the log's low-pass applied to them.
+def samples_for_jumps(log: Log) -> tuple[Log, int]:
+    """Log on which columns that jump are evaluated before `filter_like_log`, and its samples per sample of this one.
 
     The low-pass has smoothed the measured torque, also where friction jumps because a joint reverses. The column of friction must
     be smoothed in the same way, or each jump leaves an error. The column is evaluated on a finer grid first: the log has some
     fifteen samples in a period of the cut-off, which locate a jump too coarsely. The errors that remained there made other terms
     and robust losses seem useful.
     """
-    if not _has_filter(log):
-        return columns(log)
-    return filter_like_log(log, columns(refine_log(log, _REFINEMENT)), factor=_REFINEMENT)
+    return (refine_log(log, _REFINEMENT), _REFINEMENT) if _has_filter(log) else (log, 1)
 
 
 def refine_log(log: Log, factor: int) -> Log:

@@ -12,10 +12,10 @@ from jaxtyping import Array, Float
 from jaxdyn.constraints.assembly import Assembly, assemble
 from jaxdyn.constraints.base import layout, position_residual, rows
 from jaxdyn.constraints.codes import RESULTS
-from jaxdyn.constraints.mobility import degrees_of_freedom
+from jaxdyn.constraints.selection import degrees_of_freedom
 from jaxdyn.identify.logs import Log
 from jaxdyn.model.arguments import Numbers, as_array, state_dtype, warn
-from jaxdyn.model.names import velocity_indices
+from jaxdyn.model.topology import velocity_indices
 from jaxdyn.model.tree import Model
 from jaxdyn.systems.mass_factor import solve_positive
 from jaxdyn.systems.scene import Scene, as_scene

@@ -28,7 +28,7 @@ from jaxdyn.identify.blocks import (
 )
 from jaxdyn.identify.chart import METRICS, make_chart
 from jaxdyn.identify.sensors import FitSystem, with_sensors
-from jaxdyn.model import float64 as f64
+from jaxdyn.model import host_math
 from jaxdyn.model.arguments import Function, Number, state_dtype, warn
 from jaxdyn.model.arguments import Numbers as Values
 from jaxdyn.model.tree import Model
@@ -307,7 +307,7 @@ class Parameters(eqx.Module):
             # With x = (r, 1) and D the inverse squares of the semi-axes, x^T Q x = 1 - (r - c)^T D (r - c), positive inside.
             quadrics[k, :3, :3], quadrics[k, :3, 3] = -inverse, inverse @ centre
             quadrics[k, 3, :3], quadrics[k, 3, 3] = inverse @ centre, 1 - centre @ inverse @ centre
-            P = f64.pseudo_inertia(np.asarray(model.inertias, np.float64)[chart.bodies[k]])
+            P = host_math.pseudo_inertia(np.asarray(model.inertias, np.float64)[chart.bodies[k]])
             if not np.sum(P * quadrics[k]) > 0:
                 raise ValueError(f"the ellipsoid of {body!r} does not contain the body; give larger semi-axes")
         return quadrics

@@ -9,12 +9,13 @@ import jax.numpy as jnp
 import numpy as np
 
 from jaxdyn.dynamics import quantities as dynamics
-from jaxdyn.identify.condensed import Blocks, Condensed, condense_blocks, condense_rows
+from jaxdyn.identify.condensed import Blocks, Condensed, block_slices, condense_rows
 from jaxdyn.identify.logs import Log, as_logs
 from jaxdyn.identify.torque_terms import TERMS, Terms, check_terms, friction_regressor
 from jaxdyn.model.arguments import Number, Numbers, as_array, check_shapes, is_concrete
+from jaxdyn.model.configuration import integrate, neutral
 from jaxdyn.model.joints import KINDS
-from jaxdyn.model.tree import Model, integrate, neutral
+from jaxdyn.model.tree import Model
 
 _NUMBERS = ("m", "mcx", "mcy", "mcz", "Ixx", "Ixy", "Iyy", "Ixz", "Iyz", "Izz")
 # The order of elimination of a body's ten numbers, for a joint about z: Khalil & Dombre keep the first ones and group m, m cz and
@@ -23,14 +24,19 @@ _KEPT_FIRST = (9, 1, 2, 4, 5, 7, 8)
 _KEPT_LAST = (6, 3, 0)
 # Samples of one compiled call: without blocks of one size every length of a log would be compiled again.
 _BLOCK = 256
+# Samples whose regressor is held at a time while logs are condensed.
+_SAMPLES = 1024
+
+
+def coordinate_names(model: Model) -> list[str]:
+    """Names (nv,) of the velocity coordinates: of their joints, with an index where a joint has several."""
+    sizes = zip(model.joint_names, (KINDS[kind].nv for kind in model.topology.kinds), strict=True)
+    return [name if n == 1 else f"{name}[{i}]" for name, n in sizes for i in range(n)]
 
 
 def parameter_names(model: Model, terms: Terms = TERMS) -> tuple[str, ...]:
     """Names of x: the ten numbers of each body (`body.m`, `body.mcx`, ...), then the terms (`joint.viscous`)."""
-    joints = []
-    for name, kind in zip(model.joint_names, model.topology.kinds, strict=True):
-        n = KINDS[kind].nv
-        joints += [name] if n == 1 else [f"{name}[{i}]" for i in range(n)]
+    joints = coordinate_names(model)
     bodies = [f"{body}.{number}" for body in model.body_names for number in _NUMBERS]
     return tuple(bodies + [f"{joint}.{term}" for term in terms for joint in joints])
 
@@ -117,22 +123,37 @@ def condense_model(
     blocks: int = 1,
     weights: Sequence[np.ndarray] | None = None,
 ) -> Blocks:
-    """`condense_blocks` of the regressor with all terms.
+    """Condense logs, block by block, by the regressor with all terms.
 
-    `coulomb`: for each log, columns (n, nv) of Coulomb friction instead of tanh(v / v_s); `extra`: more terms (n, nv, k);
-    `weights`: for each log, those of its torques (n, nv).
+    **Arguments:** for each log, `coulomb`: columns (n, nv) of Coulomb friction instead of tanh(v / v_s); `extra`: more terms
+    (n, nv, k); `weights`: those of its torques (n, nv), ones by default. `blocks`: their approximate number, over all logs.
     """
-    start = 10 * model.nb + model.nv * TERMS.index("coulomb")
-
-    def rows(which, piece):
-        log = logs[which][piece]
-        W = log_regressor(model, log, v_s=v_s)
-        if coulomb is not None:
-            joints = np.arange(model.nv)
-            W[:, joints, start + joints] = coulomb[which][piece]
-        return W
-
-    return condense_blocks(logs, rows, 10 * model.nb, extra=extra, blocks=blocks, weights=weights)
+    shared, joints = 10 * model.nb, np.arange(model.nv)
+    of_coulomb = shared + model.nv * TERMS.index("coulomb") + joints
+    triangles, samples, owners = [], [], []
+    for which, part in block_slices([len(log) for log in logs], blocks):
+        triangle_of_row = [np.zeros((0, 0))] * model.nv
+        for start in range(part.start, part.stop, _SAMPLES):
+            piece = slice(start, min(start + _SAMPLES, part.stop))
+            log = logs[which][piece]
+            W, tau = log_regressor(model, log, v_s=v_s), np.asarray(log.tau, np.float64)
+            if coulomb is not None:
+                W[:, joints, of_coulomb] = coulomb[which][piece]
+            # Each term is a diagonal block: a torque keeps its own column, the others are zero.
+            own = W[:, :, shared:].reshape(len(log), model.nv, -1, model.nv)
+            more = np.zeros((len(log), model.nv, 0)) if not len(extra) else extra[which][piece]
+            for j in joints:
+                table = np.concatenate([W[:, j, :shared], own[:, j, :, j], more[:, j], tau[:, j, None]], axis=1)
+                # The torque is the last column, so that it is weighted with its row.
+                table = table if weights is None else table * weights[which][piece, j, None]
+                before = triangle_of_row[j] if triangle_of_row[j].size else np.zeros((0, table.shape[1]))
+                # Sequential QR: the triangle so far joins the next rows, so that memory does not grow with the log.
+                triangle_of_row[j] = np.asarray(np.linalg.qr(np.concatenate([before, table]), mode="r"))
+        triangles.append(triangle_of_row)
+        samples.append(part.stop - part.start)
+        owners.append(which)
+    terms = triangles[0][0].shape[1] - 1 - shared
+    return Blocks(triangles, shared, terms, np.array(samples), np.array(owners))
 
 
 class BaseParameters(eqx.Module):

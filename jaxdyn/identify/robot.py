@@ -1,8 +1,7 @@
 """Fit of a robot to one log or several, with cross-validated terms, prior and smoothing and weights by noise."""
 
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Sequence
 from functools import partial
-from typing import NamedTuple
 
 import equinox as eqx
 import numpy as np
@@ -13,13 +12,13 @@ from jaxdyn.identify.delays import Delays, find_delays, shift_torques, with_dela
 from jaxdyn.identify.logs import Log, as_logs
 from jaxdyn.identify.regression import check_weights
 from jaxdyn.identify.result import Fit
-from jaxdyn.identify.robot_problem import RobotProblem
+from jaxdyn.identify.robot_problem import RobotProblem, cross_validation
 from jaxdyn.identify.selection import PRIORS, ROBUST, VELOCITIES, Choice, Search, folds, search
 from jaxdyn.identify.threads import on_one_thread
 from jaxdyn.identify.torque_terms import EXTRA, TERMS, RobotTerms, Terms, check_terms, split_terms
 from jaxdyn.model.arguments import Checked, Numbers, warn
 from jaxdyn.model.tree import Model
-from jaxdyn.tasks import DaskClient, Engine, open_engine, results
+from jaxdyn.tasks import DaskClient, open_engine
 
 # At least two blocks form a jackknife group: about ten groups at most, nine degrees of freedom for Student's t.
 _BLOCKS = 20
@@ -141,7 +140,7 @@ def fit_robot(
     if any(isinstance(value, str) and value == "auto" for value in (terms, v_s, prior, robust)):
         parts, by = folds(problem.data(setting).blocks)
         with open_engine(client) as engine:
-            trying = Search(_cross_validation(problem, engine), parts, problem.torque, callback)
+            trying = Search(cross_validation(problem, engine), parts, problem.torque, callback)
             setting = search(
                 trying,
                 setting,
@@ -230,31 +229,3 @@ def check_prior(prior) -> None:
     """Check the weight of the prior. **Raises:** ValueError for a prior that is not positive."""
     if not prior > 0:
         raise ValueError(f"prior is {prior}; it must be positive: torques alone do not determine single bodies")
-
-
-class _Folds(NamedTuple):
-    """The fits of a cross-validation as tasks."""
-
-    problem: RobotProblem
-
-    @on_one_thread
-    def squares(self, pair: tuple[Setting, np.ndarray]) -> np.ndarray:
-        """Squared errors on some blocks of a fit to the others."""
-        return self.problem.validation_squares(*pair)
-
-
-def _cross_validation(problem: RobotProblem, engine: Engine) -> Callable:
-    """Function from pairs of a setting and left-out blocks to the squared errors of these, by an engine of tasks."""
-    sent = None
-
-    def squares(pairs: list[tuple[Setting, np.ndarray]]) -> Iterator[np.ndarray]:
-        nonlocal sent
-        # Weights of samples are those of the first setting with its loss: found here, so that they do not depend on the worker.
-        for setting, _ in pairs:
-            problem.weigh_samples(setting)
-        # Workers hold a copy of the problem: it is sent again only when it has new weights of samples.
-        if sent != (sent := tuple(problem.sample_weights)):
-            engine.send(partial(_Folds, problem))
-        return results(engine, "squares", pairs)
-
-    return squares

@@ -1,6 +1,8 @@
 """Logs of a robot's fit, with the weights and loads that are updated between fits."""
 
-from collections.abc import Sequence
+from collections.abc import Callable, Iterator, Sequence
+from functools import partial
+from typing import NamedTuple
 
 import jax.numpy as jnp
 import numpy as np
@@ -10,9 +12,11 @@ from jaxdyn.identify.interior import LinearChart
 from jaxdyn.identify.logs import Log, idle_coordinates, log_rate, signal_sizes
 from jaxdyn.identify.regression import log_regressor
 from jaxdyn.identify.result import Fit
+from jaxdyn.identify.threads import on_one_thread
 from jaxdyn.identify.torque_terms import TERMS, ExtraTorque, Friction, TorqueTerm
 from jaxdyn.identify.uncertainty import effective_sample_size, is_white
 from jaxdyn.model.tree import Model
+from jaxdyn.tasks import Engine, results
 
 # Share of errors beyond three standard deviations from which on their tails are heavy: 0.3 % of normal ones are, and of those of
 # two recorded robots 5 to 15 % at some joint. Between, unresolved reversals of simulated friction make up to 4 %.
@@ -66,7 +70,8 @@ class RobotProblem:
     def weigh_samples(self, setting: Setting) -> None:
         """Find the weights of samples for the loss of a setting, unless they are known."""
         if setting.robust is not None and setting.robust not in self.sample_weights:
-            self.reweigh(setting)
+            for _ in range(2):
+                self._weigh(setting, self.fit(setting))
 
     def refine(self, setting: Setting, fixed: np.ndarray | None, rounds: int) -> Estimate:
         """Fit several times; after each but the last, update weights and loads."""
@@ -108,11 +113,6 @@ class RobotProblem:
         """Indices of the torques whose errors are not white, of joints that move: where another term may explain something."""
         errors = self._errors(setting, self.fit(setting))
         return tuple(int(j) for j in np.flatnonzero(~is_white(self.logs, errors)) if j not in self.still)
-
-    def reweigh(self, setting: Setting, rounds: int = 2) -> None:
-        """Update the weights of samples for a setting with a robust loss."""
-        for _ in range(rounds):
-            self._weigh(setting, self.fit(setting))
 
     def curvature_data(self, setting: Setting) -> Data | None:
         """Logs without the samples beyond the threshold of a robust loss, where it has no curvature."""
@@ -184,6 +184,34 @@ class RobotProblem:
             extra=extra,
             as_measured=True,
         )
+
+
+class _Folds(NamedTuple):
+    """The fits of a cross-validation as tasks."""
+
+    problem: RobotProblem
+
+    @on_one_thread
+    def squares(self, pair: tuple[Setting, np.ndarray]) -> np.ndarray:
+        """Squared errors on some blocks of a fit to the others."""
+        return self.problem.validation_squares(*pair)
+
+
+def cross_validation(problem: RobotProblem, engine: Engine) -> Callable:
+    """Function from pairs of a setting and left-out blocks to the squared errors of these, by an engine of tasks."""
+    sent = None
+
+    def squares(pairs: list[tuple[Setting, np.ndarray]]) -> Iterator[np.ndarray]:
+        nonlocal sent
+        # Weights of samples are those of the first setting with its loss: found here, so that they do not depend on the worker.
+        for setting, _ in pairs:
+            problem.weigh_samples(setting)
+        # Workers hold a copy of the problem: it is sent again only when it has new weights of samples.
+        if sent != (sent := tuple(problem.sample_weights)):
+            engine.send(partial(_Folds, problem))
+        return results(engine, "squares", pairs)
+
+    return squares
 
 
 def model_with_parameters(model: Model, x: np.ndarray, terms, v_s: float) -> tuple[Model, Friction]:

@@ -13,7 +13,6 @@ Source: Dahl (1968), "A solid friction model"; Hamon, Gautier & Garrec (2010), l
 
 import itertools
 from collections.abc import Callable, Iterable, Sequence
-from functools import partial
 from typing import TYPE_CHECKING, Any
 
 import equinox as eqx
@@ -21,7 +20,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from jaxdyn.identify.logs import Log, low_pass_columns, refine_samples
+from jaxdyn.identify.logs import Log, filter_like_log, refine_samples, samples_for_jumps
 from jaxdyn.model.arguments import Number, SystemLike, warn
 
 TERMS = ("viscous", "coulomb", "offset", "armature")
@@ -124,7 +123,8 @@ def coulomb_column(log: Log, v_s: float) -> np.ndarray:
 
 def coulomb_through_filter(log: Log, v_s: float) -> np.ndarray:
     """Column tanh(v / v_s), (n, nv), low-passed like the log."""
-    return low_pass_columns(log, lambda fine: coulomb_column(fine, v_s))
+    fine, factor = samples_for_jumps(log)
+    return filter_like_log(log, coulomb_column(fine, v_s), factor=factor)
 
 
 def _load(log, load, v_s):
@@ -219,14 +219,12 @@ def split_terms(
 
 def term_columns(terms: Sequence[TorqueTerm], log: Log, load: np.ndarray, v_s: float) -> np.ndarray:
     """Columns of all terms (n, nv, k) side by side, low-passed like the log."""
-
-    def columns(term: TorqueTerm, fine: Log) -> np.ndarray:
-        # Refinement makes (n - 1) factor + 1 samples of n. The load is known at the log's own samples only.
-        factor = (len(fine) - 1) // max(len(log) - 1, 1)
-        return term(fine, load if len(fine) == len(log) else refine_samples(load, factor), v_s)
-
+    fine, factor = (log, 1) if all(term.is_smooth for term in terms) else samples_for_jumps(log)
+    # The load is known at the log's own samples only.
+    fine_load = load if factor == 1 else refine_samples(load, factor)
     parts = [
-        term(log, load, v_s) if term.is_smooth else low_pass_columns(log, partial(columns, term)) for term in terms
+        term(log, load, v_s) if term.is_smooth else filter_like_log(log, term(fine, fine_load, v_s), factor=factor)
+        for term in terms
     ]
     # The empty part gives the shape where there are no terms.
     return np.concatenate([np.zeros((len(log), log.nv, 0)), *parts], axis=2)

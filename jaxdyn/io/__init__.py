@@ -1,7 +1,7 @@
 """Reading and writing mechanisms. File libraries are imported here alone, and only when a file is read."""
 
 from jaxdyn._renamed import old_names as _old_names
-from jaxdyn.io.load import load as load
+from jaxdyn.io.formats import load as load
 from jaxdyn.io.loaded import Actuators as Actuators
 from jaxdyn.io.loaded import LoadedScene as LoadedScene
 from jaxdyn.io.loaded import NotTakenWarning as NotTakenWarning

@@ -15,7 +15,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from jaxdyn.model import float64 as f64
+from jaxdyn.model import host_math
 from jaxdyn.model.builder import ModelBuilder
 from jaxdyn.model.joints import SCREW_KINDS
 from jaxdyn.model.tree import Model
@@ -91,7 +91,7 @@ def add_chain(
             screw = np.concatenate([slide, joint.axis if turns else np.zeros(3)])
             if joint.reference:
                 # D(x - r) = D(-r) D(x): the reference position moves into the home pose, and q keeps the file's zero.
-                home = home @ f64.joint_pose(joint.kind, screw, np.array([-joint.reference]))
+                home = home @ host_math.joint_pose(joint.kind, screw, np.array([-joint.reference]))
         # Only the body itself carries the inertia; intermediate bodies are massless.
         last = k == len(joints) - 1 and not anchor[:3, 3].any()
         # Default joint names contain the body's name already; repeating it would give BODY_BODY_joint.
@@ -103,6 +103,6 @@ def add_chain(
         if last:
             return
         # The next joint is given in the body's axes, and Trans(-a_k) of D_k comes after J_k.
-        here, carrier = f64.inverse(anchor), name
+        here, carrier = host_math.inverse(anchor), name
     # The last anchor is off the origin: a fixed body brings the frame back to the file's own.
     builder.add_body(body, carrier, "fixed", inertia, joint_name=joint_names.new(f"{body}_fixed"), pose=here)

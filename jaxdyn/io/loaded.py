@@ -10,7 +10,7 @@ from jaxtyping import Array, Float
 
 from jaxdyn.constraints.base import Constraint
 from jaxdyn.dynamics.kinematics import body_jacobian
-from jaxdyn.model import float64 as f64
+from jaxdyn.model import host_math
 from jaxdyn.model.arguments import Checked, Function, Number, Numbers, as_array, warn
 from jaxdyn.model.tree import Model
 from jaxdyn.sensors import Sensor
@@ -238,9 +238,8 @@ class LoadedScene(Scene):
         self.sensors = tuple(sensors)
 
 
-def summarize(what: str, names: Iterable[str], most: int = 8) -> list[str]:
+def summarize(what: str, names: Sequence[str], most: int = 8) -> list[str]:
     """One entry of `not_taken`: a description and the first names; empty when there are none."""
-    names = list(names)
     if not names:
         return []
     # A warning that lists hundreds of geoms hides the other entries.
@@ -272,7 +271,7 @@ def warn_of_units(path, model: Model) -> None:
         if (far := np.linalg.norm(home[:3, 3])) > _LONGEST:
             doubts.append(f"body {name!r} {far:g} m from its parent (millimetres?)")
         # sqrt(I/m) is a length whatever the mass: kg mm^2 gives a radius 1000 times too large.
-        mass, _, moment = f64.about_com(parameters)
+        mass, _, moment = host_math.about_com(parameters)
         if mass > 0 and (radius := np.sqrt(np.abs(moment).max() / mass)) > _LONGEST:
             doubts.append(f"radius of gyration {radius:g} m of body {name!r} (inertia in kg mm^2 or g mm^2?)")
     if doubts:

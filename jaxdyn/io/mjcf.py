@@ -29,7 +29,7 @@ from jaxdyn.io.mjcf_file import (
 )
 from jaxdyn.io.mjcf_parts import actuators, constraints, tendon_forces
 from jaxdyn.io.mjcf_sensors import sensors
-from jaxdyn.model import float64 as f64
+from jaxdyn.model import host_math
 from jaxdyn.model.arguments import DType, as_path
 from jaxdyn.model.builder import ModelBuilder
 from jaxdyn.model.joints import joint_neutral
@@ -213,7 +213,7 @@ def _state(file: CompiledFile, model: Model, qpos, qvel) -> tuple[np.ndarray, np
             here[-4:] /= np.linalg.norm(here[-4:])
         # World-frame linear velocity there, body-frame here.
         if nq == 7:
-            rate[:3] = f64.joint_pose("free", np.zeros(6), here)[:3, :3].T @ rate[:3]
+            rate[:3] = host_math.joint_pose("free", np.zeros(6), here)[:3, :3].T @ rate[:3]
         q[model.topology.q_slices[i]], v[model.topology.v_slices[i]] = here, rate
     return q, v
 
@@ -248,9 +248,9 @@ def _elements_without_effect(file: CompiledFile) -> list[str]:
             [name for name in dofs(m.dof_armature) if name in free],
         ),
         *summarize(
-            "gravity compensation of bodies", (str(file.bodies[b]) for b in np.flatnonzero(m.body_gravcomp) if b)
+            "gravity compensation of bodies", [str(file.bodies[b]) for b in np.flatnonzero(m.body_gravcomp) if b]
         ),
-        *summarize("mocap bodies, fixed here", (str(file.bodies[b]) for b in range(m.nbody) if m.body_mocapid[b] >= 0)),
+        *summarize("mocap bodies, fixed here", [str(file.bodies[b]) for b in range(m.nbody) if m.body_mocapid[b] >= 0]),
         *summarize("fluid forces", fluid),
         *summarize("flexible bodies", flexes),
         *(["plugins"] if m.nplugin else []),

@@ -7,7 +7,7 @@ import numpy as np
 
 from jaxdyn.io.chains import Names
 from jaxdyn.io.xml_lines import XmlFile
-from jaxdyn.model import float64 as f64
+from jaxdyn.model import host_math
 
 FREE, BALL, SLIDE, HINGE = range(4)  # mjtJoint
 SIZES = ((7, 6), (4, 3), (1, 1), (1, 1))  # sizes of q and v of each
@@ -154,4 +154,4 @@ def assign_names(mujoco, m, path: str) -> CompiledFile:
 
 def pose_of(position, quaternion) -> np.ndarray:
     """Pose (4, 4) from a position and a quaternion (w, x, y, z) of any length."""
-    return f64.joint_pose("free", np.zeros(6), np.concatenate([position, quaternion]))
+    return host_math.joint_pose("free", np.zeros(6), np.concatenate([position, quaternion]))

@@ -8,7 +8,7 @@ from jaxdyn.constraints.loops import gear, lock_joint, loop
 from jaxdyn.io.loaded import Actuators, summarize
 from jaxdyn.io.mjcf_file import HINGE, SLIDE, CompiledFile, pose_of
 from jaxdyn.io.tendons import PolynomialCoupling, TendonForce
-from jaxdyn.model.names import body_index
+from jaxdyn.model.topology import body_index
 from jaxdyn.model.tree import Model
 
 _CONNECT, _WELD, _JOINT, _TENDON = range(4)  # mjtEq
@@ -154,12 +154,12 @@ def actuators(file: CompiledFile, model: Model) -> tuple[Actuators | None, list[
     lines = [line for reason, names in left.items() for line in summarize(f"actuators {reason}", names)]
     lines += summarize(
         "armature or damping of actuators on tendons and sites",
-        (
+        [
             file.actuators[i]
             for i in range(m.nactuator)
             if (m.actuator_armature[i] or m.actuator_damping[i] or m.actuator_dampingpoly[i].any())
             and (m.actuator_trntype[i] not in (_ON_JOINT, _IN_PARENT) or m.actuator_dampingpoly[i].any())
-        ),
+        ],
     )
     if not taken:
         return None, lines

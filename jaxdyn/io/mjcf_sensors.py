@@ -7,7 +7,7 @@ import numpy as np
 from jaxdyn.dynamics.kinematics import named_frame
 from jaxdyn.io.loaded import summarize
 from jaxdyn.io.mjcf_file import CompiledFile, pose_of
-from jaxdyn.model import float64 as f64
+from jaxdyn.model import host_math
 from jaxdyn.model.tree import Model
 from jaxdyn.sensors import (
     Accelerometer,
@@ -109,7 +109,9 @@ def _mount(file: CompiledFile, model: Model, body: int) -> dict | None:
         inertial = poses[b] @ pose_of(m.body_ipos[b], m.body_iquat[b])
         turn = inertial[:3, :3]
         moment = turn @ np.diag(m.body_inertia[b]) @ turn.T
-        parameters = parameters + f64.inertia_numbers((m.body_mass[b], inertial[:3, 3], moment), "inertia of a body")
+        parameters = parameters + host_math.inertia_numbers(
+            (m.body_mass[b], inertial[:3, 3], moment), "inertia of a body"
+        )
     # A joint beside the body's origin has put the model's body frame there.
     _, offset = named_frame(model, file.bodies[carrier])
-    return {"inertia": f64.move_inertia(np.asarray(offset, float), parameters), "joints": joints}
+    return {"inertia": host_math.move_inertia(np.asarray(offset, float), parameters), "joints": joints}

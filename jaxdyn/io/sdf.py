@@ -14,11 +14,11 @@ from jaxdyn.io.loaded import LoadedScene, Start, summarize, warn_not_taken, warn
 from jaxdyn.io.sdf_frames import SdfFile
 from jaxdyn.io.sdf_joints import LOOPS, Axis, Edge, Joint, read_joints, spanning_tree
 from jaxdyn.io.urdf import ROOT_JOINT
-from jaxdyn.model import float64 as f64
+from jaxdyn.model import host_math
 from jaxdyn.model.arguments import DType
 from jaxdyn.model.builder import GRAVITY, ModelBuilder
 from jaxdyn.model.joints import joint_neutral
-from jaxdyn.model.names import body_index
+from jaxdyn.model.topology import body_index
 from jaxdyn.model.tree import Model
 
 _KINDS = dict(revolute="revolute", continuous="revolute", revolute2="revolute", universal="revolute")
@@ -118,7 +118,7 @@ def _model(file: SdfFile, edges: list[Edge], static: set[str], floating: bool, d
         if edge.joint is not None:
             links = _links(edge, place)
             # All poses of the file are resolved to the world; home poses are relative to the carrier.
-            place = f64.inverse(file.pose(edge.carrier)) @ place if edge.carrier is not None else place
+            place = host_math.inverse(file.pose(edge.carrier)) @ place if edge.carrier is not None else place
         elif edge.body in free:
             root = names.new(ROOT_JOINT if len(free) == 1 else f"{edge.body}_{ROOT_JOINT}")
             # The free joint's coordinates are the world pose of the link, so its home pose is the identity.
@@ -133,7 +133,7 @@ def _model(file: SdfFile, edges: list[Edge], static: set[str], floating: bool, d
     # Frames come after all links, so that a clash of names renames the frame and not the link.
     for frame, (_, _) in file.frames.items():
         carrier = file.link_of(frame)
-        pose = file.pose(frame) if carrier is None else f64.inverse(file.pose(carrier)) @ file.pose(frame)
+        pose = file.pose(frame) if carrier is None else host_math.inverse(file.pose(carrier)) @ file.pose(frame)
         builder.add_frame(frames.new(frame), carrier, pose)
     return build_model(builder, file.path), roots
 
@@ -149,7 +149,7 @@ def _links(edge: Edge, place: np.ndarray) -> list[Link]:
     if joint is None or joint.kind == "fixed":
         return []
     # The joint's axis passes through its own origin, which need not be the child's.
-    anchor = np.asarray(f64.inverse(place) @ joint.pose)[:3, 3]
+    anchor = np.asarray(host_math.inverse(place) @ joint.pose)[:3, 3]
     kind, sign = _KINDS[joint.kind], -1.0 if edge.backwards else 1.0
     if kind == "spherical":
         return [Link(joint.name, kind, np.zeros(3), anchor, 0.0, {})]
@@ -169,7 +169,7 @@ def _inertia(file: SdfFile, link: str) -> np.ndarray:
     inertial = element.find("inertial")
     if inertial is None:
         # The format's default inertial: 1 kg and the unit matrix.
-        return np.asarray(f64.inertia_numbers((1.0, np.zeros(3), np.ones(3)), what))
+        return np.asarray(host_math.inertia_numbers((1.0, np.zeros(3), np.ones(3)), what))
     # Version 1.11 of the format computes inertias from shapes where this attribute is set.
     if (inertial.get("auto") or "").strip().lower() in ("1", "true"):
         raise file.fault(
@@ -184,7 +184,9 @@ def _inertia(file: SdfFile, link: str) -> np.ndarray:
     mass = file.number(inertial, "mass", 1.0, what)
     try:
         about_com = (mass, np.zeros(3), np.array([[xx, xy, xz], [xy, yy, yz], [xz, yz, zz]]))
-        return np.asarray(f64.move_inertia(file.raw_pose(inertial, what), f64.inertia_numbers(about_com, what)))
+        return np.asarray(
+            host_math.move_inertia(file.raw_pose(inertial, what), host_math.inertia_numbers(about_com, what))
+        )
     except ValueError as error:
         raise error if str(error).startswith(file.path) else file.fault(inertial, str(error)) from error
 
@@ -212,9 +214,9 @@ def _loops(file: SdfFile, model: Model, cut: list[Joint]) -> tuple[list[Constrai
             # A universal joint has one axis on each body; other joints share theirs.
             axis = joint.axes[min(k, len(joint.axes) - 1)].direction if joint.axes else joint.pose[:3, 2]
             # The file's placement closes the loop: both frames are at the joint, z along the end's own axis.
-            place = f64.rotation_from_z(axis)
+            place = host_math.rotation_from_z(axis)
             place[:3, 3] = joint.pose[:3, 3]
-            poses.append(place if end is None else f64.inverse(file.pose(end)) @ place)
+            poses.append(place if end is None else host_math.inverse(file.pose(end)) @ place)
         taken.append(loop(ends[0], poses[0], ends[1], poses[1], LOOPS[joint.kind], name=joint.name))
     return taken, [line for reason, names in left.items() for line in summarize(reason, names)]
 
@@ -306,7 +308,7 @@ def _start(file: SdfFile, model: Model, roots: dict[str, str]) -> Start:
     for joint, link in roots.items():
         pose = file.pose(link)
         q[model.topology.q_slices[model.joint_names.index(joint)]] = np.concatenate(
-            [pose[:3, 3], f64.quaternion(pose[:3, :3])]
+            [pose[:3, 3], host_math.quaternion(pose[:3, :3])]
         )
     return Start(jnp.asarray(q, model.home.dtype), jnp.zeros(model.nv, model.home.dtype))
 

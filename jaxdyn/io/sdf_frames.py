@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 
 from jaxdyn.io.xml_lines import XmlFile
-from jaxdyn.model import float64 as f64
+from jaxdyn.model import host_math
 from jaxdyn.model.builder import unknown
 
 WORLD = "world"
@@ -142,7 +142,7 @@ class SdfFile(XmlFile):
         if placement:
             inner = self.models[name]
             # `placement_frame` (1.8) states where that inner frame is put, and not the model's own.
-            placed = placed @ f64.inverse(self.pose(self.find(placement, inner, element), name))
+            placed = placed @ host_math.inverse(self.pose(self.find(placement, inner, element), name))
         return placed
 
     def _entry(self, name: str) -> tuple[Any, Scope]:

@@ -7,7 +7,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from jaxdyn.io.sdf_frames import SdfFile
-from jaxdyn.model import float64 as f64
+from jaxdyn.model import host_math
 from jaxdyn.model.builder import unknown
 
 # Axes of each kind. A gearbox is a coupling of two other joints, not a joint.
@@ -111,7 +111,7 @@ def _axis(file: SdfFile, name: str, joint, scope, tag: str, kind: str, pose: np.
             leaves[key] = value
     stiffness, rest = get("dynamics/spring_stiffness", 0.0), get("dynamics/spring_reference", 0.0)
     mimic = None if element is None else element.find("mimic")
-    return Axis(turn @ f64.unit(values, what), stiffness, rest, leaves, limited, mimic)
+    return Axis(turn @ host_math.unit(values, what), stiffness, rest, leaves, limited, mimic)
 
 
 def _pitch(file: SdfFile, name: str, joint) -> float:

@@ -15,7 +15,7 @@ from jaxdyn.io.loaded import warn_of_units
 from jaxdyn.io.urdf_check import JOINTS
 from jaxdyn.io.urdf_parts import Inertial, Joint, Mimic, read_parts
 from jaxdyn.io.xml_lines import XmlFile
-from jaxdyn.model import float64 as f64
+from jaxdyn.model import host_math
 from jaxdyn.model.arguments import DType, Numbers
 from jaxdyn.model.builder import GRAVITY, ModelBuilder, unknown
 from jaxdyn.model.inertia_checks import inertia_problems
@@ -132,7 +132,7 @@ def urdf_model(
     builder.places = {name: urdf.places[f"link {name}"] for name in urdf.links}
     free = floating_base and root_joint not in locked
     # A locked base is a fixed body at the pose of the given coordinates.
-    base = f64.joint_pose("free", np.zeros(6), locked[root_joint]) if root_joint in locked else None
+    base = host_math.joint_pose("free", np.zeros(6), locked[root_joint]) if root_joint in locked else None
     inertia = _inertia(urdf, urdf.root)
     builder.add_body(urdf.root, None, "free" if free else "fixed", inertia, joint_name=root_joint, pose=base)
     # A stack in reverse gives depth-first order with siblings in the file's order; the builder sorts them by name.
@@ -190,21 +190,23 @@ def _add_joint(
     name = joint.child
     pose, parent, axis, turn = joint.origin, joint.parent, _Z, np.eye(4)
     if kind in SCREW_KINDS or kind == "planar":
-        axis = np.asarray(f64.unit(joint.axis, f"joint {joint.name!r}: axis"))
+        axis = np.asarray(host_math.unit(joint.axis, f"joint {joint.name!r}: axis"))
     # A planar joint moves in the x-y plane of its body; another normal needs an intermediate body.
     if kind == "planar":
-        turn, axis = f64.rotation_from_z(axis), _Z
+        turn, axis = host_math.rotation_from_z(axis), _Z
     if joint.name in locked:
         screw = np.concatenate([axis, np.zeros(3)] if kind == "prismatic" else [np.zeros(3), axis])
         # The same rotation before and after: the link stays in the axes of the file.
-        pose = pose @ turn @ f64.joint_pose(kind, screw, locked[joint.name]) @ f64.inverse(turn)
+        pose = pose @ turn @ host_math.joint_pose(kind, screw, locked[joint.name]) @ host_math.inverse(turn)
         kind, axis, turn = "fixed", _Z, np.eye(4)
     leaves = {} if kind == "fixed" else _leaves(joint, kind)
     if not np.array_equal(turn, np.eye(4)):
         carrier = f"{name}_plane"
         # The intermediate body is massless and carries the link, whose frame keeps the file's axes.
         builder.add_body(carrier, parent, kind, joint_name=joint.name, pose=pose @ turn, **leaves)
-        builder.add_body(name, carrier, "fixed", inertia, joint_name=f"{joint.name}_plane", pose=f64.inverse(turn))
+        builder.add_body(
+            name, carrier, "fixed", inertia, joint_name=f"{joint.name}_plane", pose=host_math.inverse(turn)
+        )
         return
     builder.add_body(name, parent, kind, inertia, joint_name=joint.name, pose=pose, axis=axis, **leaves)
 
@@ -231,10 +233,10 @@ def _inertia(urdf: _Description, link: str) -> np.ndarray:
     # A missing <mass> or <inertia> inside <inertial> means zero.
     parts = (inertial.mass or 0.0, np.zeros(3), np.zeros((3, 3)) if inertial.inertia is None else inertial.inertia)
     try:
-        parameters = np.asarray(f64.inertia_numbers(parts, f"link {link!r}"))
+        parameters = np.asarray(host_math.inertia_numbers(parts, f"link {link!r}"))
     except ValueError as error:
         raise ValueError(f"{urdf.places[f'link {link}']}: {error}") from error
-    return parameters if inertial.origin is None else np.asarray(f64.move_inertia(inertial.origin, parameters))
+    return parameters if inertial.origin is None else np.asarray(host_math.move_inertia(inertial.origin, parameters))
 
 
 def _lock_values(kinds: dict[str, str], lock, path) -> dict[str, np.ndarray]:
@@ -252,7 +254,7 @@ def _lock_values(kinds: dict[str, str], lock, path) -> dict[str, np.ndarray]:
             locked[name] = joint_neutral(kinds[name])
             continue
         shapes = {(nq,): f"({nq},)"} | ({(): "a number"} if nq == 1 else {})
-        locked[name] = f64.numbers(value, shapes, f"lock: value of joint {name!r}").reshape(nq)
+        locked[name] = host_math.numbers(value, shapes, f"lock: value of joint {name!r}").reshape(nq)
         if kinds[name] == "free" and not locked[name][3:].any():
             raise ValueError(f"lock: value of joint {name!r} is {value!r}; its quaternion (qw, qx, qy, qz) is zero")
     return locked

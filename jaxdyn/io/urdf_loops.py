@@ -25,10 +25,10 @@ from jaxdyn.io.loaded import Actuators, summarize
 from jaxdyn.io.sdf_joints import LOOPS
 from jaxdyn.io.urdf_parts import Mimic
 from jaxdyn.io.xml_lines import XmlFile
-from jaxdyn.model import float64 as f64
+from jaxdyn.model import host_math
 from jaxdyn.model.arguments import as_path
 from jaxdyn.model.joints import KINDS
-from jaxdyn.model.names import frame_index, joint_index
+from jaxdyn.model.topology import frame_index, joint_index
 from jaxdyn.model.tree import Model
 
 _SUFFIXES = (".yaml", ".yml")
@@ -119,7 +119,7 @@ def _read(path: pathlib.Path, wanted: bool) -> Closures:
         tuple(
             summarize(
                 f"kinds of joints in {path.name}, which stay as in the URDF",
-                (f"{name} ({word})" for name, word in chosen if word not in ("SPHERICAL", "FIXED")),
+                [f"{name} ({word})" for name, word in chosen if word not in ("SPHERICAL", "FIXED")],
             )
         ),
     )
@@ -228,7 +228,7 @@ def _gazebo_loop(file: XmlFile, joint, name: str, kind: str, model: Model) -> Co
     for place, turn in zip(places, turns, strict=True):
         frame = world.copy()
         frame[:3, :3] = turn if kind in ("revolute", "prismatic", "universal") else world[:3, :3]
-        poses.append(f64.inverse(place) @ frame)
+        poses.append(host_math.inverse(place) @ frame)
     return loop(ends[0], poses[0], ends[1], poses[1], kind, name=name)
 
 
@@ -244,7 +244,7 @@ def _axis_rotation(file: XmlFile, joint, tag: str, world: np.ndarray, what: str)
     axis = np.array(default) if xyz is None else file.numbers(xyz, 3, f"<{tag}> of {what}")
     if not axis.any():
         raise file.fault(xyz, f"<xyz> of <{tag}> of {what} is zero; give a direction")
-    return f64.rotation_from_z(world[:3, :3] @ f64.unit(axis, what))[:3, :3]
+    return host_math.rotation_from_z(world[:3, :3] @ host_math.unit(axis, what))[:3, :3]
 
 
 def plugin_followers(file: XmlFile) -> dict[str, tuple[Mimic, str]]:

@@ -6,7 +6,7 @@ import numpy as np
 
 from jaxdyn.io.urdf_check import NUMBERS, check_elements
 from jaxdyn.io.xml_lines import XmlFile
-from jaxdyn.model import float64 as f64
+from jaxdyn.model import host_math
 
 # Attributes of <inertia>, in the order of the entries of the matrix.
 _INERTIA_ATTRIBUTES = np.array([["ixx", "ixy", "ixz"], ["ixy", "iyy", "iyz"], ["ixz", "iyz", "izz"]])
@@ -110,7 +110,10 @@ def _origin(element) -> np.ndarray | None:
     if origin is None:
         return None
     pose = np.eye(4)
-    pose[:3, :3], pose[:3, 3] = f64.rotation_from_rpy(_vector(origin, "rpy", "0 0 0")), _vector(origin, "xyz", "0 0 0")
+    pose[:3, :3], pose[:3, 3] = (
+        host_math.rotation_from_rpy(_vector(origin, "rpy", "0 0 0")),
+        _vector(origin, "xyz", "0 0 0"),
+    )
     return pose
 
 

@@ -10,7 +10,7 @@ import numpy as np
 from jaxdyn.io.files import replacing
 from jaxdyn.io.urdf import NO_LIMIT, ROOT_JOINT
 from jaxdyn.io.xml_lines import XmlFile
-from jaxdyn.model import float64 as f64
+from jaxdyn.model import host_math
 from jaxdyn.model.arguments import as_path, check_shapes, parse_number
 from jaxdyn.model.tree import Model
 
@@ -136,7 +136,7 @@ def _edges(model: Model) -> tuple[str, list[_Edge]]:
         for (link, pose), run in zip(holders, runs, strict=False):
             for i in (topology.joint_names.index(joint) for joint in run):
                 edges.append(
-                    _Edge(topology.joint_names[i], link, topology.body_names[i], f64.inverse(pose) @ home[i], i)
+                    _Edge(topology.joint_names[i], link, topology.body_names[i], host_math.inverse(pose) @ home[i], i)
                 )
     # The smallest key is -1 for the world, or 0 for the body of a floating base.
     return names[min(names)], edges
@@ -178,7 +178,7 @@ def _write_link(robot: ET.Element, name: str, parameters: np.ndarray | None) -> 
     if parameters is None or not parameters.any():
         return
     # URDF states inertia about the centre of mass, the model about the frame's origin.
-    mass, com, inertia = f64.about_com(parameters)
+    mass, com, inertia = host_math.about_com(parameters)
     if mass == 0 and parameters[1:4].any():
         raise ValueError(
             f"body {name!r} has first moments {parameters[1:4].tolist()} kg m without mass; URDF cannot express them"
@@ -193,7 +193,7 @@ def _write_link(robot: ET.Element, name: str, parameters: np.ndarray | None) -> 
 def _write_joint(robot: ET.Element, model: Model, edge: _Edge) -> None:
     kind = "fixed" if edge.body is None else model.topology.kinds[edge.body]
     joint = ET.SubElement(robot, "joint", name=edge.joint, type="floating" if kind == "free" else kind)
-    rpy = f64.rpy_from_rotation(edge.pose[:3, :3])
+    rpy = host_math.rpy_from_rotation(edge.pose[:3, :3])
     ET.SubElement(joint, "origin", xyz=_text(edge.pose[:3, 3]), rpy=_text(rpy))
     ET.SubElement(joint, "parent", link=edge.parent)
     ET.SubElement(joint, "child", link=edge.child)

@@ -14,7 +14,7 @@ from xml.parsers import expat
 
 import numpy as np
 
-from jaxdyn.model import float64 as f64
+from jaxdyn.model import host_math
 from jaxdyn.model.arguments import as_path, parse_number
 
 
@@ -134,10 +134,10 @@ class XmlFile:
             if not values[3:].any():
                 raise self.fault(pose, f"<pose> of {what} has the quaternion zero; give x y z qx qy qz qw")
             # The format writes (x, y, z, w); the library has (w, x, y, z).
-            return f64.joint_pose("free", np.zeros(6), np.concatenate([values[:3], values[6:], values[3:6]]))
+            return host_math.joint_pose("free", np.zeros(6), np.concatenate([values[:3], values[6:], values[3:6]]))
         values = self.numbers(pose, 6, what)
         turn = np.deg2rad(values[3:]) if (pose.get("degrees") or "").lower() in ("1", "true") else values[3:]
-        return np.asarray(f64.pose_matrix((values[:3], turn), what))
+        return np.asarray(host_math.pose_matrix((values[:3], turn), what))
 
     def number(self, element, tag: str, default: float, what: str, *, finite: bool = True) -> float:
         """Read a number in a child element `tag` (a path), or the default where it is missing or empty."""

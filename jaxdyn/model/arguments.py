@@ -4,7 +4,7 @@ import os
 import pathlib
 import sys
 import warnings
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Sequence
 from typing import TYPE_CHECKING, Annotated, Any, Protocol, TypeVar
 
 import equinox as eqx
@@ -15,7 +15,7 @@ from jax.typing import ArrayLike, DTypeLike
 from jaxtyping import Array, Float
 
 from jaxdyn.compile.known import is_concrete as is_concrete
-from jaxdyn.model import float64 as f64
+from jaxdyn.model import host_math
 
 _T = TypeVar("_T")
 _OPTIONAL = ("a", "external")
@@ -120,19 +120,6 @@ def warn(text: str, category: type[Warning]) -> None:
     warnings.warn(text, category, stacklevel=level)
 
 
-def warn_unphysical_inertias(inertias: Mapping[str, Any], places: Mapping[str, str] | None = None) -> None:
-    """Give one warning for all bodies whose inertia (10,) is unphysical; `places` gives file:line of bodies."""
-    faults = []
-    for name, parameters in inertias.items():
-        if is_concrete(parameters) and (fault := f64.inertia_fault(np.asarray(parameters))):
-            place = f"{places[name]}: " if places and name in places else ""
-            faults.append(f"{place}body {name!r}: {fault}")
-    if faults:
-        more = f"; and {len(faults) - 5} more bodies" if len(faults) > 5 else ""
-        fix = "correct the numbers, or use jd.model.repair_inertias(model)"
-        warn(f"{'; '.join(faults[:5])}{more}. No body has such an inertia: {fix}", UserWarning)
-
-
 def state_dtype(system, q=None):
     """Floating-point type of a system's states: that of its leaves, else of q, else jax's default."""
     # A Model has one dtype for all leaves; its home poses show it without a walk over the tree.
@@ -223,8 +210,8 @@ def pose_leaf(pose, what: str) -> Float[Array, "4 4"]:
         return pose
     # A position keeps its own dtype; the route through `pose_matrix` would give it the default one.
     if isinstance(pose, jax.Array) and pose.shape == (3,):
-        return store_leaf(f64.pose_of(np.eye(3), pose), pose.dtype)
-    return store_leaf(f64.pose_matrix(pose, what), float)
+        return store_leaf(host_math.pose_of(np.eye(3), pose), pose.dtype)
+    return store_leaf(host_math.pose_matrix(pose, what), float)
 
 
 def store_leaf(value, dtype) -> jax.Array:

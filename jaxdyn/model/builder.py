@@ -14,10 +14,10 @@ import jax.numpy as jnp
 import numpy as np
 
 from jaxdyn.compile.known import array_namespace, is_concrete
-from jaxdyn.model import float64 as f64
-from jaxdyn.model.arguments import DType, Number, Numbers, store_leaf, warn_unphysical_inertias
-from jaxdyn.model.joints import KINDS, SCREW_KINDS, joint_neutral
-from jaxdyn.model.tree import Model, Topology
+from jaxdyn.model import host_math
+from jaxdyn.model.arguments import DType, Number, Numbers, store_leaf
+from jaxdyn.model.joints import KINDS, SCREW_KINDS
+from jaxdyn.model.tree import Model, Topology, warn_unphysical_inertias
 
 GRAVITY = (0.0, 0.0, -9.81)
 _JOINT_LEAVES = {"armature": "nv", "damping": "nv", "friction": "nv"}
@@ -35,10 +35,10 @@ class _Body:
     parent: str | None
     kind: str
     joint_name: str
-    pose: f64.Values
-    screw: f64.Values
-    inertia: f64.Values
-    leaves: dict[str, f64.Values | None]
+    pose: host_math.Values
+    screw: host_math.Values
+    inertia: host_math.Values
+    leaves: dict[str, host_math.Values | None]
 
 
 class ModelBuilder:
@@ -72,12 +72,12 @@ class ModelBuilder:
     def __init__(self, name: str = "mechanism", *, gravity: Numbers | None = GRAVITY, dtype: DType | None = None):
         self._name = name
         three = {(3,): "three numbers (3,) or None"}
-        self._gravity = None if gravity is None else f64.numbers(gravity, three, "gravity")
+        self._gravity = None if gravity is None else host_math.numbers(gravity, three, "gravity")
         self._dtype = _float_dtype(dtype)
         self._bodies: dict[str, _Body] = {}
         self._joints: dict[str, str] = {}  # joint name -> body name
-        self._frames: dict[str, tuple[str | None, f64.Values]] = {}
-        self._couplings: dict[str, tuple[str, f64.Values]] = {}
+        self._frames: dict[str, tuple[str | None, host_math.Values]] = {}
+        self._couplings: dict[str, tuple[str, host_math.Values]] = {}
         self.places: dict[str, str] = {}  # file:line of bodies that come from a file, for messages
 
     def add_body(
@@ -155,9 +155,9 @@ class ModelBuilder:
             parent,
             joint,
             joint_name,
-            f64.pose_matrix(pose, f"{what}: pose"),
+            host_math.pose_matrix(pose, f"{what}: pose"),
             _screw(joint, axis, pitch, screw, what),
-            f64.inertia_numbers(inertia, f"{what}: inertia"),
+            host_math.inertia_numbers(inertia, f"{what}: inertia"),
             leaves,
         )
         self._bodies[name] = body
@@ -170,7 +170,7 @@ class ModelBuilder:
         Returns the builder. **Raises:** ValueError for a name in use, an unknown parent or a bad pose.
         """
         self._check_new(name, parent)
-        self._frames[name] = (parent, f64.pose_matrix(pose, f"frame {name!r}: pose"))
+        self._frames[name] = (parent, host_math.pose_matrix(pose, f"frame {name!r}: pose"))
         return self
 
     def add_coupling(self, joint: str, source: str, multiplier: Number = 1.0, offset: Number = 0.0) -> "ModelBuilder":
@@ -197,7 +197,7 @@ class ModelBuilder:
             if followed == joint:
                 raise ValueError(f"{what}: the joint would follow itself; leave one coupling out")
             followed = self._couplings[followed][0] if followed in self._couplings else None
-        values = f64.numbers([multiplier, offset], {(2,): "two numbers"}, f"{what}: (multiplier, offset)")
+        values = host_math.numbers([multiplier, offset], {(2,): "two numbers"}, f"{what}: (multiplier, offset)")
         self._couplings[joint] = (source, values)
         return self
 
@@ -234,7 +234,7 @@ class ModelBuilder:
         screws = _rows([body.screw for body in moving], (6,))
         leaves = {key: _joint_leaf(moving, key, size, 0.0) for key, size in _JOINT_LEAVES.items()}
         # Before the limits are added: they do not matter for regularity, and the check reads few arrays.
-        _check_regular(topology, home, screws, inertias, leaves["armature"])
+        host_math.check_regular(topology, home, screws, inertias, leaves["armature"])
         leaves |= {key: _joint_leaf(moving, key, size, fill, always=True) for key, (size, fill) in _LIMITS.items()}
         leaves |= dict(home=home, screws=screws, inertias=inertias, gravity=self._gravity)
         # The frame of each body comes first, at the body's own origin, so that frame i is body i for i < nb.
@@ -263,7 +263,7 @@ class ModelBuilder:
         for body in sorted(self._bodies.values(), key=lambda body: body.joint_name, reverse=True):
             children.setdefault(body.parent, []).append(body)
         moving, parents, home, inertias = [], [], [], []
-        carriers: dict[str | None, tuple[int, f64.Values]] = {None: (-1, np.eye(4))}
+        carriers: dict[str | None, tuple[int, host_math.Values]] = {None: (-1, np.eye(4))}
         stack = list(children.get(None, ()))
         while stack:
             body = stack.pop()
@@ -281,24 +281,24 @@ class ModelBuilder:
             carriers[body.name] = (carrier, pose)
             # Inertia that is fixed to the world never moves and has no place in the model.
             if carrier >= 0:
-                inertias[carrier] = _sum(inertias[carrier], f64.move_inertia(pose, body.inertia))
+                inertias[carrier] = _sum(inertias[carrier], host_math.move_inertia(pose, body.inertia))
         return moving, carriers, parents, _rows(home, (4, 4)), _rows(inertias, (10,))
 
 
 # One operand may be traced and the other known, in float64: each sum and product takes the module that both need.
 
 
-def _compose(first: f64.Values, second: f64.Values) -> f64.Values:
+def _compose(first: host_math.Values, second: host_math.Values) -> host_math.Values:
     xp = array_namespace(first, second)
     return xp.asarray(first, float) @ xp.asarray(second, float)
 
 
-def _sum(one: f64.Values, other: f64.Values) -> f64.Values:
+def _sum(one: host_math.Values, other: host_math.Values) -> host_math.Values:
     xp = array_namespace(one, other)
     return xp.asarray(one, float) + xp.asarray(other, float)
 
 
-def _rows(values, shape: tuple[int, ...]) -> f64.Values:
+def _rows(values, shape: tuple[int, ...]) -> host_math.Values:
     """Stack arrays of one shape as rows; without any, an empty array of that shape."""
     return array_namespace(values).asarray(values, float).reshape(-1, *shape)
 
@@ -323,7 +323,7 @@ def unknown(role: str, name, known) -> str:
     return f"{role} {name!r} is unknown" + (f" (did you mean {', '.join(near)}?)" if near else "")
 
 
-def _joint_numbers(value, size: int, kind: str, key: str, what: str) -> f64.Values:
+def _joint_numbers(value, size: int, kind: str, key: str, what: str) -> host_math.Values:
     if size == 0:
         raise ValueError(f"{what}: {key} is {value!r}, but the joint is fixed; leave it out")
     limit = key in _LIMITS
@@ -333,15 +333,15 @@ def _joint_numbers(value, size: int, kind: str, key: str, what: str) -> f64.Valu
     # One number cannot bound metres, radians and quaternion entries at once.
     if size == 1 or key not in ("lower", "upper"):
         shapes = {(): "a number", **shapes}
-    array = f64.numbers(value, shapes, f"{what}: {key}", finite=not limit)
+    array = host_math.numbers(value, shapes, f"{what}: {key}", finite=not limit)
     if not limit and is_concrete(array) and np.any(array < 0):
         raise ValueError(f"{what}: {key} is {value!r}; it must not be negative")
     return array_namespace(array).broadcast_to(array, (size,))
 
 
-def _screw(kind: str, axis, pitch, screw, what: str) -> f64.Values:
-    axis = f64.numbers(axis, {(3,): "(3,)"}, f"{what}: axis")
-    pitch = f64.numbers(pitch, {(): "a number"}, f"{what}: pitch")
+def _screw(kind: str, axis, pitch, screw, what: str) -> host_math.Values:
+    axis = host_math.numbers(axis, {(3,): "(3,)"}, f"{what}: axis")
+    pitch = host_math.numbers(pitch, {(): "a number"}, f"{what}: pitch")
     # A traced axis counts as given: its value cannot be compared with the default.
     turned = not is_concrete(axis) or not np.array_equal(axis, [0, 0, 1])
     pitched = not is_concrete(pitch) or bool(pitch)
@@ -354,12 +354,12 @@ def _screw(kind: str, axis, pitch, screw, what: str) -> f64.Values:
         raise ValueError(f"{what}: pitch is {pitch}, but the joint is {kind}; use joint='helical'")
     if screw is None:
         # An axis of any length is a direction; v = pitch * axis places the screw through the body's origin.
-        axis = f64.unit(axis, f"{what}: axis")
+        axis = host_math.unit(axis, f"{what}: axis")
         axis = xp.asarray(axis, float)
         return xp.concatenate([axis, xp.zeros(3)] if kind == "prismatic" else [xp.asarray(pitch, float) * axis, axis])
     if turned or pitched:
         raise ValueError(f"{what}: screw is given together with axis or pitch; give one of them")
-    screw = f64.numbers(screw, {(6,): "(v, omega) (6,)"}, f"{what}: screw")
+    screw = host_math.numbers(screw, {(6,): "(v, omega) (6,)"}, f"{what}: screw")
     v, omega = screw[:3], screw[3:]
     # The kind cannot be checked against traced numbers; any screw with rotation is helical, so that kind alone is safe.
     if not is_concrete(screw):
@@ -392,31 +392,3 @@ def _joint_leaf(moving: list[_Body], key: str, size: str, fill: float, *, always
     xp = array_namespace(values)
     parts = [xp.full(n, fill) if value is None else xp.asarray(value) for value, n in zip(values, sizes, strict=True)]
     return xp.concatenate(parts) if parts else np.zeros(0)
-
-
-def _check_regular(topology: Topology, home, screws, inertias, armature) -> None:
-    if not is_concrete(home, screws, inertias, armature):
-        return
-    # A mass matrix that is singular at one configuration is legitimate; at a random one too, it is so at all of them.
-    # A fixed seed, so that the same file is always accepted or always refused.
-    rng = np.random.default_rng(0)
-    neutral = [joint_neutral(kind) for kind in topology.kinds]
-    if not f64.idle_joints(topology, home, screws, inertias, armature, neutral):
-        return
-    # Quaternions need not be of unit length here: `joint_pose` divides by the norm.
-    elsewhere = [q + rng.uniform(-1, 1, q.size) for q in neutral]
-    if not (idle := f64.idle_joints(topology, home, screws, inertias, armature, elsewhere)):
-        return
-    names = [topology.joint_names[i] for i in sorted(idle)]
-    # Joints are visited from the leaves, so the first one is the outermost cause.
-    i, alone = next(iter(idle.items()))
-    fault = (
-        "moves no inertia: S^T I S = 0 for all that it carries"
-        if alone
-        else "can move (together with joints beyond it, if any) without moving any inertia"
-    )
-    others = "" if len(idle) == 1 else f" (so it is, in all, with {', '.join(names)})"
-    raise ValueError(
-        f"joint {topology.joint_names[i]!r} (body {topology.body_names[i]!r}) {fault}, so the mass matrix is singular"
-        f"{others}; give the bodies an inertia, give the joints an armature, or fix them (of a URDF: lock={names})"
-    )

@@ -14,7 +14,7 @@ from jaxtyping import Array, Float
 from jaxdyn.compile import kernel
 from jaxdyn.compile.known import array_namespace
 from jaxdyn.lie import so3
-from jaxdyn.model import float64 as _f64
+from jaxdyn.model import host_math
 from jaxdyn.model.arguments import Checked, Number, Numbers, Row
 
 # Positions of (xx, xy, yy, xz, yz, zz) in a symmetric 3x3 matrix, row by row.
@@ -184,7 +184,7 @@ def is_feasible(parameters: Numbers, *, tolerance: float = 0.0) -> bool:
 
     `tolerance` is relative to its largest eigenvalue.
     """
-    values = np.linalg.eigvalsh(_f64.pseudo_inertia(np.asarray(parameters, np.float64)))
+    values = np.linalg.eigvalsh(host_math.pseudo_inertia(np.asarray(parameters, np.float64)))
     # A matrix without a positive eigenvalue gives no scale for the tolerance.
     return bool(values[0] >= -tolerance * max(values[-1], 0.0))
 
@@ -197,12 +197,12 @@ def nearest_feasible(parameters: Numbers, *, floor: float = 1e-6) -> np.ndarray:
     parameters = np.asarray(parameters, np.float64)
     if not parameters[0] > 0:
         raise ValueError(f"mass is {parameters[0]}, cannot be repaired; give the body a positive mass")
-    values, vectors = np.linalg.eigh(_f64.pseudo_inertia(parameters))
+    values, vectors = np.linalg.eigh(host_math.pseudo_inertia(parameters))
     # Raising eigenvalues changes the trace, and with it the mass; the scaling below restores the given mass.
     values = np.maximum(values, floor * values[-1])
     repaired = (vectors * values) @ vectors.T
     repaired *= parameters[0] / repaired[3, 3]
-    return _f64.parameters_from_pseudo(repaired).astype(_dtypes.canonicalize_dtype(float))
+    return host_math.parameters_from_pseudo(repaired).astype(_dtypes.canonicalize_dtype(float))
 
 
 # Bodies of simple shapes. Traced numbers give arrays of jax, known ones arrays of numpy in float64.
@@ -246,8 +246,8 @@ def displaced(parameters: Numbers, position: Numbers, rotation: Numbers | None =
     """Parameters (10,) of the same body placed at `position` (3,), rotated by `rotation` (3, 3), in a new frame."""
     rotation = np.eye(3) if rotation is None else rotation
     _check_shapes(parameters=(parameters, (10,)), position=(position, (3,)), rotation=(rotation, (3, 3)))
-    pose = _f64.pose_of(rotation, position)
-    return _f64.move_inertia(pose, array_namespace(parameters).asarray(parameters, float))
+    pose = host_math.pose_of(rotation, position)
+    return host_math.move_inertia(pose, array_namespace(parameters).asarray(parameters, float))
 
 
 def _from_moments(mass, moments) -> Array | np.ndarray:

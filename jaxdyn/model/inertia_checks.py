@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from jaxdyn.model import float64 as f64
+from jaxdyn.model import host_math
 from jaxdyn.model.arguments import store_leaf
 from jaxdyn.model.inertia import nearest_feasible
 from jaxdyn.model.tree import Model
@@ -33,8 +33,8 @@ def inertia_problems(parameters) -> list[str]:
         return ["massless"]
     if parameters[0] <= 0:
         return [f"mass {parameters[0]} kg with first moments and inertia {parameters[1:].tolist()}"]
-    moments = np.linalg.eigvalsh(f64.about_com(parameters)[2])
-    slack = rounding * np.abs(f64.rotational_inertia(parameters)).max()
+    moments = np.linalg.eigvalsh(host_math.about_com(parameters)[2])
+    slack = rounding * np.abs(host_math.rotational_inertia(parameters)).max()
     text = ", ".join(f"{moment:.6g}" for moment in moments)
     if moments[0] <= slack:
         return [f"not positive definite: principal moments {text} kg m^2"]

@@ -18,9 +18,9 @@ from jaxdyn.contact.rolling import RollingContact
 from jaxdyn.contact.surfaces import Cylinder, Ellipsoid
 from jaxdyn.grasp.contacts import Contact
 from jaxdyn.grasp.hand import Grasp
-from jaxdyn.model import float64 as f64
+from jaxdyn.model import host_math
 from jaxdyn.model.joints import joint_neutral
-from jaxdyn.model.names import frame_index
+from jaxdyn.model.topology import frame_index
 from jaxdyn.model.tree import Model
 from jaxdyn.pictures.solids import Shape, Shapes, rod
 from jaxdyn.systems.scene import Scene
@@ -67,7 +67,7 @@ def extent(scene: Scene) -> float:
     # Where all bodies are attached to the world, the size includes the world's origin.
     points = [np.zeros(3)] if (np.array(model.topology.parents) == -1).all() and model.nb > 1 else []
     for i in range(model.nb):
-        mass, com, moment = f64.about_com(np.asarray(model.inertias, float)[i])
+        mass, com, moment = host_math.about_com(np.asarray(model.inertias, float)[i])
         points += [poses[i, :3, 3], poses[i, :3, :3] @ com + poses[i, :3, 3]]
         if mass > 0:
             # A radius of gyration, so that a single body has a size too.
@@ -85,7 +85,7 @@ def home_poses(model: Model) -> np.ndarray:
     poses = np.zeros((model.nb, 4, 4))
     home, screws = np.asarray(model.home, float), np.asarray(model.screws, float)
     for i, (parent, kind) in enumerate(zip(model.topology.parents, model.topology.kinds, strict=True)):
-        here = home[i] @ f64.joint_pose(kind, screws[i], joint_neutral(kind))
+        here = home[i] @ host_math.joint_pose(kind, screws[i], joint_neutral(kind))
         poses[i] = here if parent < 0 else poses[parent] @ here
     return poses
 
@@ -142,7 +142,7 @@ def _has_middles(constraint: Pair) -> bool:
 def _rods(model: Model, i: int, points: list[np.ndarray], thin: float) -> list[Shape]:
     """Rods from a body's own joint to its child joints, or to its centre of mass where it has none."""
     name = model.body_names[i]
-    mass, com, _ = f64.about_com(np.asarray(model.inertias, float)[i])
+    mass, com, _ = host_math.about_com(np.asarray(model.inertias, float)[i])
     start = points[0] if points else com
     # A rod ends at the home position of the child joint.
     ends = points[1:] if len(points) > 1 or not mass else [com]
@@ -161,7 +161,7 @@ def _or_mark(solid: Shape, longest: float, thin: float) -> Shape:
 def _of_inertia(model: Model, i: int, thin: float, rolls: bool) -> list[Shape]:
     """Uniform solid with a body's mass, centre of mass and inertia."""
     parameters = np.asarray(model.inertias, float)[i]
-    mass, com, moment = f64.about_com(parameters)
+    mass, com, moment = host_math.about_com(parameters)
     name = model.body_names[i]
     if mass <= 0 or rolls:
         return []
@@ -223,7 +223,10 @@ def _rolling(scene: Scene, carried: set[int]) -> tuple[list[Shape], set[int]]:
             shapes.append(Shape(constraint.body, "ellipsoid", (radius,) * 3, pose, source="constraint"))
         centre = (np.asarray(model.frame_poses, float)[index] @ pose)[:3, 3]
         # A wheel around the centre of mass shows the body; one at a corner does not.
-        if body >= 0 and np.linalg.norm(f64.about_com(np.asarray(model.inertias, float)[body])[1] - centre) < radius:
+        if (
+            body >= 0
+            and np.linalg.norm(host_math.about_com(np.asarray(model.inertias, float)[body])[1] - centre) < radius
+        ):
             bodies.add(body)
         reach = getattr(constraint, "surface_radius", None)
         if reach is not None and not constraint.inside and constraint.surface_body is not None:  # pyright: ignore[reportAttributeAccessIssue]
@@ -264,7 +267,7 @@ def _object_solids(scene: Grasp, solids: list[Shape], thin: float) -> list[Shape
     model, name = scene.system, scene.object
     places = [np.asarray(one.pose, float)[:3, 3] for one in scene.constraints if isinstance(one, Contact)]
     body = model.body_names.index(name)
-    mass, com, moment = f64.about_com(np.asarray(model.inertias, float)[body])
+    mass, com, moment = host_math.about_com(np.asarray(model.inertias, float)[body])
     if places and model.topology.kinds[body] == "planar":
         return [rod(name, com, place, 1.5 * thin, source="inertia") for place in places]
     ball = solids[0] if len(solids) == 1 and solids[0].kind == "ellipsoid" and len(set(solids[0].size)) == 1 else None

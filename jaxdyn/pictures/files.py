@@ -15,7 +15,7 @@ from jaxdyn.io.loaded import NotTakenWarning
 from jaxdyn.io.mjcf_file import assign_names, compile_file, import_mujoco, pose_of
 from jaxdyn.io.sdf_frames import SdfFile
 from jaxdyn.io.xml_lines import XmlFile
-from jaxdyn.model import float64 as f64
+from jaxdyn.model import host_math
 from jaxdyn.model.arguments import warn
 from jaxdyn.pictures.meshes import MeshError, find_mesh, read_mesh
 from jaxdyn.pictures.solids import Shape, Shapes
@@ -114,7 +114,7 @@ def _urdf(file: XmlFile) -> Shapes:
             pose = np.eye(4)
             if origin is not None:
                 place = tuple(file.numbers(origin, 3, what, key, np.zeros(3)) for key in ("xyz", "rpy"))
-                pose = np.asarray(f64.pose_matrix(place, what))
+                pose = np.asarray(host_math.pose_matrix(place, what))
             # A colour in the element itself wins over the named one.
             rgba = None if material is None else rgba_of(material) or materials.get(material.get("name"))
             color, opacity = (None, 1.0) if rgba is None else (rgba[:3], rgba[3])

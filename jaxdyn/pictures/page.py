@@ -2,32 +2,35 @@
 
 import contextlib
 import html
-import io
 import itertools
-import logging
 import os
-import socket
-import sys
 import threading
 import time
-import webbrowser
 from collections.abc import Iterator
 from typing import Any
 
 import numpy as np
 
 from jaxdyn.model.arguments import Checked, Numbers, as_path
-from jaxdyn.model.float64 import quaternion
+from jaxdyn.model.host_math import quaternion
 from jaxdyn.pictures.default_solids import frame_poses
 from jaxdyn.pictures.drawing import CONE_HEIGHT, arrow_length, cone_sides, scale_forces
 from jaxdyn.pictures.motion import Cone, Motion, cones, forces, marks, motion_of, select_rows
+from jaxdyn.pictures.server import (
+    HOST,
+    free_port,
+    is_interactive,
+    open_browser,
+    recording_server,
+    start_server,
+    stop_server,
+)
 from jaxdyn.pictures.solids import Shapes, by_frame, merge_meshes, sharpen, simplify
 from jaxdyn.pictures.stage import FORCE, LOOP, TORQUE, Stage, all_solids, color_of, rgb, stage_of
 from jaxdyn.simulation.solution import Solution
 from jaxdyn.systems.system import SceneLike
 
 MOST_BYTES = 2_000_000  # of a file
-_HOST = "127.0.0.1"
 _FIELD_OF_VIEW = np.deg2rad(40.0)
 _GHOSTS = 7  # motions of a batch in addition to the first
 _GHOST_OPACITY = 0.25
@@ -68,13 +71,13 @@ def view(
     """
     motion = motion_of(scene, solution, rows=_SERVED[1], most=1 + _GHOSTS)
     parts = all_solids(motion, shapes)
-    viewer = Viewer(motion, parts, _free_port(port))
+    viewer = Viewer(motion, parts, free_port(port))
     print(f"Showing the motion at {viewer.url}")
-    if browser and not _open(viewer.url):
+    if browser and not open_browser(viewer.url):
         print(
             "No browser could be opened; open that address in one, or write a file: jd.pictures.save_html(path, scene, solution)"
         )
-    if (not _interactive()) if block is None else block:
+    if (not is_interactive()) if block is None else block:
         # Ctrl-C closes the page, and the script continues.
         with contextlib.suppress(KeyboardInterrupt):
             while True:
@@ -124,10 +127,10 @@ class Viewer:
 
     def __init__(self, motion: Motion, parts: Shapes, port: int):
         self._motion, self._parts = motion, parts
-        self._server = _server(port)
+        self._server = start_server(port)
         self._content = _Content(self._server, motion, parts, _SERVED[0])
         self._stopped = threading.Event()
-        self.url = f"http://{_HOST}:{self._server.get_port()}"
+        self.url = f"http://{HOST}:{self._server.get_port()}"
         if len(motion.ts) > 1:
             self._add_controls()
 
@@ -136,7 +139,7 @@ class Viewer:
         # Users may call `stop` after Ctrl-C has stopped the server already.
         if not self._stopped.is_set():
             self._stopped.set()
-            _stop(self._server)
+            stop_server(self._server)
 
     def _repr_html_(self) -> str:
         return embed(_document(self._motion, self._parts))
@@ -179,7 +182,7 @@ def _document(motion: Motion, parts: Shapes) -> str:
     text = ""
     for vertices, rows in _FILED:
         # Each try records anew, on a server of its own.
-        with _recording_server() as server:
+        with recording_server() as server:
             kept = select_rows(motion.ts, min(rows, 1 + int(np.ptp(motion.ts) * _PICTURES)))
             content = _Content(server, motion, parts, vertices)
             serializer = server.get_scene_serializer()
@@ -335,81 +338,3 @@ def _set_stage(server, stage: Stage) -> None:
     camera.near, camera.far = float(0.01 * stage.size), float(100 * stage.size)
     camera.look_at = stage.centre
     camera.position = stage.centre + distance * stage.eye
-
-
-def _server(port: int) -> Any:
-    try:
-        import viser
-    except ImportError as error:
-        raise ImportError("the viewer needs viser: pip install jaxdyn[view]") from error
-    # Before the server starts, since browsers may connect at once.
-    _port_filter.ports.add(port)
-    logging.getLogger("websockets.server").addFilter(_port_filter)
-    with contextlib.redirect_stdout(io.StringIO()):  # viser prints a banner
-        return viser.ViserServer(host=_HOST, port=port, label="jaxdyn", verbose=False)
-
-
-def _stop(server) -> None:
-    with contextlib.redirect_stdout(io.StringIO()):
-        server.stop()
-    _port_filter.ports.discard(server.get_port())
-    if not _port_filter.ports:
-        logging.getLogger("websockets.server").removeFilter(_port_filter)
-
-
-class _PortFilter(logging.Filter):
-    """Log filter for our own ports, to which probes connect without a request (a browser's, a test's).
-
-    Records of other servers in the process pass.
-    """
-
-    def __init__(self):
-        super().__init__()
-        self.ports: set[int] = set()
-
-    def filter(self, record: logging.LogRecord) -> bool:
-        address = getattr(getattr(record, "websocket", None), "local_address", None)
-        return not (isinstance(address, tuple) and len(address) > 1 and address[1] in self.ports)
-
-
-_port_filter = _PortFilter()
-
-
-@contextlib.contextmanager
-def _recording_server() -> Iterator[Any]:
-    """Temporary server for recording a page; viser records only from a server."""
-    server = _server(_free_port(None))
-    try:
-        yield server
-    finally:
-        _stop(server)
-
-
-def _free_port(port: int | None) -> int:
-    """Check that a port is free, or find a free one. **Raises:** ValueError for one in use or out of range."""
-    if port is not None and not (isinstance(port, int) and 0 < port < 65536):
-        raise ValueError(f"port is {port!r}; give a number from 1 to 65535, or None for a free one")
-    with socket.socket() as probe:
-        # A port in TIME_WAIT, of a viewer just closed, counts as free.
-        probe.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
-        try:
-            probe.bind((_HOST, port or 0))
-        except OSError as error:
-            raise ValueError(
-                f"port {port} cannot be used ({error.strerror}); give another one, or None for a free one"
-            ) from error
-        return probe.getsockname()[1]
-
-
-def _open(url: str) -> bool:
-    """Open a graphical browser; return False where there is none."""
-    if sys.platform.startswith("linux") and not any(
-        os.environ.get(x) for x in ("DISPLAY", "WAYLAND_DISPLAY", "BROWSER")
-    ):
-        return False
-    return webbrowser.open(url)
-
-
-def _interactive() -> bool:
-    # sys.ps1 exists at a prompt only.
-    return hasattr(sys, "ps1") or "ipykernel" in sys.modules

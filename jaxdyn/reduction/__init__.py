@@ -4,9 +4,9 @@ Imports `constraints` and the layers below. Source: EQUATIONS sections 6, 7 and 
 """
 
 from jaxdyn.reduction.bases import tangent_basis as tangent_basis
-from jaxdyn.reduction.gauge_invariant import gauge_invariant as gauge_invariant
 from jaxdyn.reduction.integrability import involutive as involutive
 from jaxdyn.reduction.integrability import spurious_terms as spurious_terms
+from jaxdyn.reduction.quasi_velocities import gauge_invariant as gauge_invariant
 
 __all__ = [
     "gauge_invariant",

@@ -29,7 +29,7 @@ from jaxdyn.constraints.rank import check_tolerance, eps_of, pseudo_inverse, ran
 from jaxdyn.dynamics.quantities import bias_force, mass_matrix
 from jaxdyn.lie.so3 import matmul
 from jaxdyn.model.arguments import Numbers, as_array, batch_hint, check_state
-from jaxdyn.model.names import velocity_indices
+from jaxdyn.model.topology import velocity_indices
 from jaxdyn.model.tree import Model
 from jaxdyn.systems.mass_factor import mass_factor
 from jaxdyn.systems.scene import Scene, as_scene

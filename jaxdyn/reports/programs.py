@@ -15,9 +15,9 @@ from jaxdyn.dynamics.quantities import kinetic_energy, potential_energy
 from jaxdyn.lie.so3 import quat_to_matrix
 from jaxdyn.model.tree import Model
 from jaxdyn.reports.case import Case, Reference
+from jaxdyn.simulation.checks import choose_method
 from jaxdyn.simulation.run import simulate
 from jaxdyn.simulation.solvers import RK4, Rodas5P
-from jaxdyn.simulation.start import choose_method
 from jaxdyn.systems.scene import Scene
 
 # Solvers by name; those in FIXED run with fixed steps.

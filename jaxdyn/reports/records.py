@@ -5,7 +5,7 @@ import json
 from collections.abc import Iterable
 from typing import Any
 
-from jaxdyn.model.text_table import short, table
+from jaxdyn.model.description import short, table
 
 
 @dataclasses.dataclass(frozen=True)

@@ -10,13 +10,13 @@ import jax.numpy as jnp
 import numpy as np
 
 from jaxdyn.reports.case import Case, case_of_scene
-from jaxdyn.reports.measure import Contestant, ladder, measure
+from jaxdyn.reports.measurement import Contestant, ladder, measure
 from jaxdyn.reports.page import write
 from jaxdyn.reports.plotting import new_figure
 from jaxdyn.reports.programs import FIXED, SOLVERS, Prepared, prepare
 from jaxdyn.reports.records import Record, Report, SceneReference
 from jaxdyn.reports.timing import machine
-from jaxdyn.simulation.start import choose_method
+from jaxdyn.simulation.checks import choose_method
 
 # Contestants of other libraries for a scene, a dtype and starts (q, v, ts); see `Contestant`.
 Peers = Callable[[Prepared, str, tuple], Sequence[Contestant]]

@@ -14,8 +14,7 @@ from jaxdyn.contact import Sphere, montana
 from jaxdyn.dynamics.kinematics import body_jacobian, frame_pose
 from jaxdyn.grasp import Grasp, contact, grasp_map, hand_jacobian
 from jaxdyn.lie import se3
-from jaxdyn.model import float64 as f64
-from jaxdyn.model import inertia, robots
+from jaxdyn.model import host_math, inertia, robots
 from jaxdyn.model.arguments import Checked, Number, Row, store_leaf
 from jaxdyn.model.builder import ModelBuilder
 from jaxdyn.model.joining import join
@@ -58,7 +57,7 @@ def _joint_angles(pose, links, height):
     pose = xp.asarray(pose, float)
     # The three wrist axes meet in this point, so position and orientation are solved one after the other.
     wrist = pose[:3, 3] - links[2] * pose[:3, 0]
-    base = f64.pose_of(np.eye(3), (0.0, 0.0, height))
+    base = host_math.pose_of(np.eye(3), (0.0, 0.0, height))
     # The velocity is zero, and the rates are not used.
     angles, _ = finger_angles(base, links[:2], wrist, wrist + xp.asarray([0.0, 0.0, 0.1]), np.zeros(3))
     yaw, elevation = angles[0], angles[1] + angles[2]
@@ -91,7 +90,7 @@ def _sphere_arm_start(
     kinematics = montana(*_surfaces(radius, tip_radius), as_leaf(eta))
     g_of = array_namespace(kinematics.g_of).asarray(kinematics.g_of)
     # The contact kinematics are relative to the sphere, which is only shifted in the world.
-    pose = f64.pose_of(g_of[:3, :3], g_of[:3, 3] + array_namespace(center).asarray(center, float))
+    pose = host_math.pose_of(g_of[:3, :3], g_of[:3, 3] + array_namespace(center).asarray(center, float))
     q = as_state(_joint_angles(pose, links, height))
     twist = as_leaf([*slide, 0.0, *rolling, spin])
     # Masses and gravity do not enter the kinematics of the start.
@@ -216,10 +215,10 @@ def coordinated_lifting(
     whole, grips = ModelBuilder("no arm", gravity=fall).build(), []
     for i in range(count):
         # The arms are copies of the first one, rotated about the z axis through the plate's centre.
-        turn = xp.asarray(f64.pose_of(rotation_about_z(2 * np.pi / count * i), np.zeros(3)))
+        turn = xp.asarray(host_math.pose_of(rotation_about_z(2 * np.pi / count * i), np.zeros(3)))
         # The flange of each arm reaches the rim when the plate's centre is on the z axis.
-        base = xp.asarray(f64.pose_of(np.eye(3), (-radius - flange[0, 3], 0.0, 0.0)))
-        grip = xp.asarray(f64.pose_of(flange[:3, :3], (-radius, 0.0, 0.0)))
+        base = xp.asarray(host_math.pose_of(np.eye(3), (-radius - flange[0, 3], 0.0, 0.0)))
+        grip = xp.asarray(host_math.pose_of(flange[:3, :3], (-radius, 0.0, 0.0)))
         whole = join(whole, arm, prefix=f"arm{i + 1}_", pose=turn @ base)
         grips.append(contact("rigid", f"arm{i + 1}_{_FLANGE}", turn @ grip, name=f"arm{i + 1}"))
     plate = ModelBuilder("plate", gravity=fall)

@@ -10,11 +10,10 @@ from jaxdyn.compile.known import array_namespace, is_concrete
 from jaxdyn.contact.cones import friction_cone, surface_cone
 from jaxdyn.contact.wrench_cones import wrench_cone
 from jaxdyn.grasp import Grasp, contact, point_contacts
-from jaxdyn.model import float64 as f64
-from jaxdyn.model import inertia, robots
+from jaxdyn.model import host_math, inertia, robots
 from jaxdyn.model.arguments import Number, Row
 from jaxdyn.model.builder import ModelBuilder
-from jaxdyn.model.names import frame_index
+from jaxdyn.model.topology import frame_index
 from jaxdyn.scenes._named import as_state, register_scene, solve_gram
 from jaxdyn.scenes.hands import point_velocity, quaternion_and_matrix
 
@@ -54,7 +53,7 @@ def _tip(model, joints, offset, angles):
     for k, joint in enumerate(joints):
         axis = screws[joint, 3:]
         # Joint axes pass through the origins of their frames.
-        pose = pose @ home[joint] @ f64.pose_of(f64.rotation_matrix(axis, angles[k]), np.zeros(3))
+        pose = pose @ home[joint] @ host_math.pose_of(host_math.rotation_matrix(axis, angles[k]), np.zeros(3))
         axes.append(pose[:3, :3] @ axis)
         origins.append(pose[:3, 3])
     place = (pose @ offset)[:3, 3]

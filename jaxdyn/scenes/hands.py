@@ -7,8 +7,7 @@ from jaxdyn.compile.known import array_namespace
 from jaxdyn.constraints import rolling_sphere, rolling_wheel
 from jaxdyn.contact.cones import friction_cone
 from jaxdyn.grasp import Grasp, contact
-from jaxdyn.model import float64 as f64
-from jaxdyn.model import inertia
+from jaxdyn.model import host_math, inertia
 from jaxdyn.model.arguments import Number, Row
 from jaxdyn.model.builder import ModelBuilder
 from jaxdyn.scenes._named import as_state, register_scene, solve_gram
@@ -38,7 +37,7 @@ def point_velocity(position, velocity, omega, point):
 
 def rotation_about_z(angle):
     """Rotation matrix (3, 3) about z."""
-    return f64.rotation_matrix((0.0, 0.0, 1.0), angle)
+    return host_math.rotation_matrix((0.0, 0.0, 1.0), angle)
 
 
 def cones_of(mu, kind="hard-finger", in_plane=False):
@@ -132,7 +131,7 @@ def hand_with_bar(
     for i, side in ((1, -1.0), (2, 1.0)):
         # Columns of the transpose: z into the bar along its axis, x along its y.
         turned = np.array([[0.0, 1.0, 0.0], [0.0, 0.0, -side], [-side, 0.0, 0.0]]).T
-        pose = f64.pose_of(turned, (side * length / 2, 0.0, 0.0))
+        pose = host_math.pose_of(turned, (side * length / 2, 0.0, 0.0))
         contacts.append(contact(kind, f"tip{i}", pose, in_plane=True))
     return Grasp(builder.build(), "bar", contacts, cones=cones_of(mu, kind, in_plane=True))
 
@@ -198,7 +197,7 @@ def finger_directions(count=3):
 
 def finger_base(direction, circle):
     """Pose of a finger's base: z up, x to the axis."""
-    return f64.pose_of(np.stack([-direction, -np.cross(_UP, direction), _UP], 1), circle * direction)
+    return host_math.pose_of(np.stack([-direction, -np.cross(_UP, direction), _UP], 1), circle * direction)
 
 
 def hand_builder(name, links, masses, circle, gravity):
@@ -246,7 +245,7 @@ def quaternion_and_matrix(turned):
     factor = xp.where(small, 0.5 - square / 48 + square**2 / 3840, xp.sin(angle / 2) / angle)
     w = xp.where(small, 1 - square / 8 + square**2 / 384, xp.cos(angle / 2))
     x, y, z = factor * turned
-    cross = f64.hat(xp.stack([x, y, z]))
+    cross = host_math.hat(xp.stack([x, y, z]))
     return [w, x, y, z], xp.eye(3) + 2 * w * cross + 2 * cross @ cross
 
 
@@ -301,7 +300,7 @@ def hand_with_ball(
     for i, direction in enumerate(finger_directions(), 1):
         turned = np.stack([np.cross(_UP, -direction), _UP, -direction], 1)
         # z of a contact frame is the inward normal.
-        pose = f64.pose_of(turned, radius * direction)
+        pose = host_math.pose_of(turned, radius * direction)
         contacts.append(contact("hard-finger", f"tip{i}", pose))
     return Grasp(builder.build(), "ball", contacts, cones=cones_of(mu))
 

@@ -5,7 +5,7 @@ from jaxtyping import Array
 
 from jaxdyn.compile.known import array_namespace, is_concrete
 from jaxdyn.constraints import loop
-from jaxdyn.model import float64 as f64
+from jaxdyn.model import host_math
 from jaxdyn.model.arguments import Checked, Number, Numbers, Row
 from jaxdyn.model.builder import ModelBuilder
 from jaxdyn.scenes._named import as_state, register_scene
@@ -72,7 +72,7 @@ def sarrus(
         c, s, zero = xp.cos(angle), xp.sin(angle), 0.0 * xp.cos(angle)
         # x outwards, y up, hinges along z.
         turns.append(xp.stack([xp.stack([c, zero, s]), xp.stack([s, zero, -c]), xp.stack([zero, zero + 1, zero])]))
-        places.append(f64.pose_of(turns[-1], radius * xp.stack([c, s, zero])))
+        places.append(host_math.pose_of(turns[-1], radius * xp.stack([c, s, zero])))
     builder = ModelBuilder("Sarrus linkage", gravity=gravity)
     for name, place, length in zip("ab", places, lengths, strict=True):
         builder.add_body(f"{name}1", None, "continuous", thin_bar(bar, length), joint_name=f"{name}1", pose=place)
@@ -83,7 +83,7 @@ def sarrus(
     disk = platform, (-radius, 0.0, 0.0), (across, 2 * across, across)
     builder.add_body("platform", "a2", "continuous", disk, pose=(lengths[0], 0.0, 0.0))
     # The second hinge in the platform's frame: both places are at the same height.
-    other = f64.inverse(places[0]) @ places[1]
+    other = host_math.inverse(places[0]) @ places[1]
     closing = loop("b2", (lengths[1], 0.0, 0.0), "platform", other, name="second chain")
     return Scene(builder.build(), (closing,))
 
@@ -145,12 +145,12 @@ def hinge_platform(
     manipulator, for three legs.
     """
     bar, mass = masses
-    plane = f64.pose_of(f64.rotation_matrix((1.0, 0.0, 0.0), tilt), (0.0, 0.0, 0.0))
+    plane = host_math.pose_of(host_math.rotation_matrix((1.0, 0.0, 0.0), tilt), (0.0, 0.0, 0.0))
     hinges = _around(count, radii[1])
     legs = [f"leg{k + 1:0{len(str(count))}d}" for k in range(count)]
     builder = ModelBuilder(f"platform on {count} legs of hinges", gravity=gravity)
     for name, (x, y) in zip(legs, _around(count, radii[0]), strict=True):
-        place = plane @ f64.pose_of(np.eye(3), (x, y, 0.0))
+        place = plane @ host_math.pose_of(np.eye(3), (x, y, 0.0))
         builder.add_body(f"{name}_lower", None, "continuous", thin_bar(bar, length), joint_name=name, pose=place)
         builder.add_body(f"{name}_upper", f"{name}_lower", "continuous", thin_bar(bar, length), pose=(length, 0.0, 0.0))
     # The platform's origin is its hinge on the first leg, from which its centre lies at minus that hinge.

@@ -7,8 +7,7 @@ from jaxtyping import Array
 from jaxdyn.compile.known import array_namespace
 from jaxdyn.contact import Ellipsoid, RollingModel, rolling_contact
 from jaxdyn.grasp import Grasp
-from jaxdyn.model import float64 as f64
-from jaxdyn.model import inertia
+from jaxdyn.model import host_math, inertia
 from jaxdyn.model.arguments import Number, Row
 from jaxdyn.scenes._named import as_state, register_scene
 from jaxdyn.scenes.hands import (
@@ -51,7 +50,7 @@ def _finger_state(base, links, tip_axes, point, normal, velocity):
     # point. The tip is small against the links, so that each iteration reduces the error.
     def iterate(center):
         (yaw, low, bend), rates = finger_angles(base, links, center, point, velocity)
-        pitch = f64.rotation_matrix((0.0, -1.0, 0.0), low + bend)
+        pitch = host_math.rotation_matrix((0.0, -1.0, 0.0), low + bend)
         rotation = base[:3, :3] @ xp.asarray(rotation_about_z(yaw)) @ xp.asarray(pitch)
         # The outward normal of the tip at the contact is opposite to the object's.
         return point - rotation @ _support(tip_axes, -rotation.T @ normal), ([yaw, low, bend], rates)

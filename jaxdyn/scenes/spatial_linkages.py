@@ -4,7 +4,7 @@ from jaxtyping import Array
 
 from jaxdyn.compile.known import array_namespace, is_concrete
 from jaxdyn.constraints import loop
-from jaxdyn.model import float64 as f64
+from jaxdyn.model import host_math
 from jaxdyn.model.arguments import Checked, Number, Numbers, Row
 from jaxdyn.model.builder import ModelBuilder
 from jaxdyn.scenes._named import as_state, register_scene
@@ -15,7 +15,7 @@ from jaxdyn.systems.scene import Scene
 def _link(length, twist):
     """Pose of a link's end relative to its start: translation by the length along x, rotation by the twist about x."""
     # Denavit and Hartenberg's length and twist; offsets along the axes are zero in these linkages.
-    return f64.pose_of(f64.rotation_matrix((1.0, 0.0, 0.0), twist), (length, 0.0, 0.0))
+    return host_math.pose_of(host_math.rotation_matrix((1.0, 0.0, 0.0), twist), (length, 0.0, 0.0))
 
 
 def _second(length, twist, other):
@@ -70,7 +70,7 @@ def bennett(
     builder.add_body("link1", None, "continuous", bars[0])
     builder.add_body("link2", "link1", "continuous", bars[1], pose=poses[0])
     builder.add_body("link3", "link2", "continuous", bars[0], pose=poses[1])
-    return Scene(builder.build(), (loop("link3", poses[0], None, f64.inverse(poses[1]), name="fourth joint"),))
+    return Scene(builder.build(), (loop("link3", poses[0], None, host_math.inverse(poses[1]), name="fourth joint"),))
 
 
 def _goldberg_twists(lengths, twist):
@@ -129,7 +129,7 @@ def goldberg(
     builder.add_body("link2", "link1", "continuous", thin_bar(density * b, b), pose=long)
     builder.add_body("link3", "link2", "continuous", thin_bar(density * a, a), pose=middle)
     builder.add_body("link4", "link3", "continuous", thin_bar(density * c, c), pose=_link(a, first))
-    closing = loop("link4", _link(c, other), None, f64.inverse(middle), name="fifth joint")
+    closing = loop("link4", _link(c, other), None, host_math.inverse(middle), name="fifth joint")
     return Scene(builder.build(), (closing,))
 
 
@@ -185,4 +185,4 @@ def bricard(
         before = None if parent is None else poses[(k - 1) % 2]
         builder.add_body(f"link{k + 1}", parent, "continuous", thin_bar(mass, length), pose=before)
         parent = f"link{k + 1}"
-    return Scene(builder.build(), (loop("link5", poses[0], None, f64.inverse(poses[1]), name="sixth joint"),))
+    return Scene(builder.build(), (loop("link5", poses[0], None, host_math.inverse(poses[1]), name="sixth joint"),))

@@ -10,7 +10,7 @@ from jaxdyn.dynamics.frame_motion import frame_acceleration, frame_velocity
 from jaxdyn.dynamics.kinematics import frame_pose
 from jaxdyn.lie import so3
 from jaxdyn.lie.so3 import matmul
-from jaxdyn.model.names import frame_index
+from jaxdyn.model.topology import frame_index
 from jaxdyn.sensors.base import Motion, Sensor, check_part
 from jaxdyn.systems.scene import Scene
 

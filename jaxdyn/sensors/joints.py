@@ -13,8 +13,8 @@ from jaxdyn.dynamics.joint_wrenches import joint_wrench
 from jaxdyn.dynamics.kinematics import named_frame
 from jaxdyn.lie import se3
 from jaxdyn.model.arguments import Numbers
-from jaxdyn.model.names import joint_index
 from jaxdyn.model.numbers import as_float, as_number
+from jaxdyn.model.topology import joint_index
 from jaxdyn.model.tree import Model
 from jaxdyn.sensors.base import Motion, Sensor, check_part, constraint_place
 from jaxdyn.systems.scene import Scene

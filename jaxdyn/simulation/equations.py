@@ -1,4 +1,4 @@
-"""Differential equation of a run: rates of the state, the projection after a step, and the allowances that end a run."""
+"""Differential equation of a run: rates of the state, the projection after a step, allowances that end a run, and outputs."""
 
 import functools
 from typing import Any
@@ -7,10 +7,15 @@ import jax
 import jax.numpy as jnp
 
 from jaxdyn.compile.known import partition_tracers
+from jaxdyn.constraints.assembly import residuals
 from jaxdyn.constraints.redundancy import exchange_rows
 from jaxdyn.constraints.selection import project_after_exchange, renew_rows
+from jaxdyn.contact.forces import contact_forces
+from jaxdyn.dynamics.kinematics import frame_pose
+from jaxdyn.dynamics.quantities import kinetic_energy, potential_energy
 from jaxdyn.forces.piecewise import Pieces, fix_pieces, guards, pieces_of, values_and_levels
 from jaxdyn.simulation import controls
+from jaxdyn.simulation.checks import CONTACT_OUTPUTS, POSE
 from jaxdyn.simulation.methods import Method, Projected
 from jaxdyn.simulation.terminal_events import Conditions, contact_allowances, limit_allowances
 from jaxdyn.systems.scene import Scene
@@ -113,9 +118,11 @@ class Equations:
 
     def _derivative(self, t, y, args):
         scene, _, method = self.unpack(args, y)
-        rates, force, v = method.evaluate(scene, y, t, functools.partial(self.generalized_force, args, y))
+        q, v, in_basis = method.to_qv_and_basis(scene, y, t)
+        force = self.generalized_force(args, y, q, v, t)
+        rates = method.rates(scene, y, q, v, t, force, in_basis)
         if self._added:
-            rates = rates | self._extra_rates(args, y, retract(scene.system, y["q"]), v, t, force)
+            rates = rates | self._extra_rates(args, y, q, v, t, force)
         if KEPT in y:
             # Constant during a step; `project` renews it at the end.
             rates = rates | {KEPT: jnp.zeros_like(y[KEPT])}
@@ -192,3 +199,44 @@ class Equations:
         q, v = method.to_qv(scene, y, t)
         values = self.allowances(args, y, q, v, t)
         return values, jnp.zeros_like(values)  # allowances have the rounding in them
+
+
+def state_outputs(system, outputs, q, v, t) -> dict[str, Any]:
+    """Outputs that depend on the state alone: the energy, and the poses of frames."""
+    values: dict[str, Any] = {}
+    if "energy" in outputs:
+        values["energy"] = kinetic_energy(system, q, v, t) + potential_energy(system, q, t)
+    frames = [name.removeprefix(POSE) for name in outputs if name.startswith(POSE)]
+    return values | {"poses": {frame: frame_pose(system, q, frame) for frame in frames}}
+
+
+def at_save_point(
+    scene: Scene, control: Any, method: Method, eqs: Equations, args, outputs, q, v, t, of_control
+) -> dict[str, Any]:
+    """Outputs at one state; `of_control`: entries of the control and the drives in the state."""
+    values = state_outputs(scene.system, outputs, q, v, t)
+    of_force = {"power", "acceleration", "multipliers", *CONTACT_OUTPUTS} & set(outputs)
+    force = eqs.generalized_force(args, of_control, q, v, t) if of_force else None
+    if "power" in outputs:
+        values["power"] = power(force, v)
+    if "acceleration" in outputs:
+        values["acceleration"] = method.acceleration(scene, q, v, t, force)
+    if {"multipliers", *CONTACT_OUTPUTS} & set(outputs):
+        multipliers = method.multipliers(scene, q, v, t, force)
+        contacts = contact_forces(scene, multipliers) if set(CONTACT_OUTPUTS) & set(outputs) else None
+        if "multipliers" in outputs:
+            values["multipliers"] = multipliers
+        if contacts is not None and "contact_forces" in outputs:
+            values["contact_forces"] = contacts.forces
+        if contacts is not None and "contact_margins" in outputs:
+            values["contact_margins"] = contacts.margins
+    if "constraint_residual" in outputs:
+        values["constraint_residual"] = residuals(scene, q, v, t)
+    if "torque" in outputs:
+        tau = eqs.torque(args, of_control, q, v, t)
+        values["torque"] = jnp.zeros_like(v) if tau is None else tau
+    if "control_state" in outputs:
+        values["control_state"] = controls.state_of(control, of_control, q, v, t)
+    if "drive_state" in outputs:
+        values["drive_state"] = of_control.get(DRIVES)
+    return values

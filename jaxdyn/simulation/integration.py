@@ -17,8 +17,9 @@ from jaxdyn.simulation.solvers import ExplicitSteps, ProjectedSolver
 from jaxdyn.simulation.solvers.choice import is_explicit, is_step_length, label, progress_meter, solver_and_control
 from jaxdyn.simulation.solvers.differentiable import ROOM, run, run_adaptively
 from jaxdyn.simulation.solvers.driver import step_control
-from jaxdyn.simulation.solvers.explicit_run import ExplicitRun
+from jaxdyn.simulation.solvers.explicit import Plan
 from jaxdyn.simulation.solvers.guards import SEARCH_STEPS, delay
+from jaxdyn.simulation.solvers.integrator import ExplicitRun
 from jaxdyn.simulation.solvers.step_control import Adaptive, ErrorMonitoredSteps, too_coarse
 
 
@@ -57,9 +58,9 @@ def integrate(term, project, eqs: Equations, args, method, y0, ts, steps, option
     if eqs.pieces.names and not of_kinks:
         system = PiecewiseSystem(solver.plan(y0), eqs.pieces, eqs.switching)
         return _by_pieces(system, inputs, controller, steps, options)
-    plan = solver.plan(y0)._replace(quality=quality, guards=guards)
-    run = _explicit_run(plan, solver, controller, steps, options)
-    return _by_steps(run, inputs, _is_direct(adjoint))
+    return _by_steps(
+        solver, solver.plan(y0)._replace(quality=quality, guards=guards), controller, inputs, steps, options
+    )
 
 
 def _monitors(eqs: Equations, method) -> tuple[Callable | None, Callable | None]:
@@ -157,23 +158,22 @@ def _by_pieces(system, inputs, controller, steps, options) -> Outcome:
     return Outcome(rows, end.result, end.counts, end.t)
 
 
-def _by_steps(run: ExplicitRun, inputs, is_direct: bool) -> Outcome:
+def _by_steps(solver: ExplicitSteps, plan: Plan, controller, inputs, steps, options) -> Outcome:
     """Integrate by explicit steps in the library's own loop."""
-    rows, (result, counts, reached) = (run.direct if is_direct else run)(*inputs)
-    plan = run.plan
+    # Attempts that locate the end do not count among the user's steps.
+    most = options["max_steps"] + (0 if plan.guards is None else 2 * SEARCH_STEPS)
+    if isinstance(controller, Adaptive):
+        room, control = (
+            most if options["limit_is_given"] else min(most, ROOM),
+            step_control(solver, None, controller.norm),
+        )
+        run = ExplicitRun(plan, control, controller.rtol, controller.atol, None, most, room=room)
+    else:
+        run = ExplicitRun(plan, step_control(solver, steps[-1]), None, None, steps[-1], most, room=most)
+    rows, (result, counts, reached) = (run.direct if _is_direct(options["adjoint"]) else run)(*inputs)
     if plan.guards is None:
         return Outcome(rows, result, counts, reached)
     rows, end = (jax.tree.map(lambda x, at=at: x[at], rows) for at in (slice(-1), -1))
     args, y = inputs[1], ravel_pytree(end)[0]
     late = delay(lambda t, y: jnp.min(plan.guards_of(args, t, y)[0]), plan.field_of(args, reached, y), reached, y)
     return Outcome(rows, result, counts, reached + jnp.where(result == RESULTS.event_occurred, late, 0.0), end)
-
-
-def _explicit_run(plan, solver: ExplicitSteps, controller, steps, options) -> ExplicitRun:
-    """Integrator of the library's own loop."""
-    # Attempts that locate the end do not count among the user's steps.
-    most = options["max_steps"] + (0 if plan.guards is None else 2 * SEARCH_STEPS)
-    if not isinstance(controller, Adaptive):
-        return ExplicitRun(plan, step_control(solver, steps[-1]), None, None, steps[-1], most, room=most)
-    room, control = most if options["limit_is_given"] else min(most, ROOM), step_control(solver, None, controller.norm)
-    return ExplicitRun(plan, control, controller.rtol, controller.atol, None, most, room=room)

@@ -10,7 +10,6 @@ A method defines the state y of the equation, its rate, and its correction after
     variational  no differential equation: steps of its own, for y = (q, v)
 """
 
-from collections.abc import Callable
 from typing import Any, ClassVar, TypeAlias
 
 import equinox as eqx
@@ -39,6 +38,7 @@ from jaxdyn.reduction.bases import (
     BasisLike,
     Orthonormal,
     UserBasis,
+    VelocityAndDrift,
     as_basis,
     least_quality,
     minimal_velocity,
@@ -54,7 +54,6 @@ State: TypeAlias = dict[str, Any]  # arrays, and pytrees of them, by name
 Q: TypeAlias = Float[Array, " nq"]
 V: TypeAlias = Float[Array, " nv"]
 Force: TypeAlias = Float[Array, " nv"] | None
-ForceLaw: TypeAlias = Callable[[Array, Array, Number], Array | None]
 
 
 class Method(eqx.Module):
@@ -76,20 +75,18 @@ class Method(eqx.Module):
         """Configuration q, with unit quaternions, and velocity v of a state."""
         return retract(scene.system, y["q"]), y["v"]
 
-    def rates(self, scene: Scene, y: State, q: Q, v: V, t: Number, force: Force) -> State:
-        """Rate dy/dt; q and v are those of `to_qv`, `force` (nv,) is tau plus the scene's forces, or None."""
+    def to_qv_and_basis(self, scene: Scene, y: State, t: Number) -> tuple[Array, Array, VelocityAndDrift | None]:
+        """Configuration and velocity of `to_qv`, and the velocity in the basis of minimal velocities, None without one."""
+        return *self.to_qv(scene, y, t), None
+
+    def rates(
+        self, scene: Scene, y: State, q: Q, v: V, t: Number, force: Force, in_basis: VelocityAndDrift | None = None
+    ) -> State:
+        """Rate dy/dt; q, v are those of `to_qv`, and `in_basis` of `to_qv_and_basis`; `force` (nv,) as of `acceleration`."""
         return {"q": velocity_to_rate(scene.system, q, v), "v": self.acceleration(scene, q, v, t, force)}
 
-    def evaluate(
-        self, scene: Scene, y: State, t: Number, generalized_force: ForceLaw
-    ) -> tuple[State, Array | None, Array]:
-        """Rate dy/dt under generalized_force(q, v, t); that force (nv,) or None; and v (nv,)."""
-        q, v = self.to_qv(scene, y, t)
-        force = generalized_force(q, v, t)
-        return self.rates(scene, y, q, v, t, force), force, v
-
     def acceleration(self, scene: Scene, q: Q, v: V, t: Number, force: Force) -> Array:
-        """Rate of v, (nv,)."""
+        """Rate of v, (nv,); `force` (nv,) is tau plus the scene's forces, or None."""
         return forward_dynamics(scene.system, q, v, jnp.zeros_like(v) if force is None else force, t)
 
     def multipliers(self, scene: Scene, q: Q, v: V, t: Number, force: Force) -> Array:
@@ -280,21 +277,17 @@ class Reduced(Method):
         basis = self._at(scene, y, q, t)
         return q, matmul(basis.N, y["nu"]) + basis.v0
 
-    def evaluate(
-        self, scene: Scene, y: State, t: Number, generalized_force: ForceLaw
-    ) -> tuple[State, Array | None, Array]:
-        """Rate of the reduced equations, which share one factorisation of the rows with v."""
-        # v = N nu + v0 and dv/dt = N dnu/dt + drift come from one decomposition of the rows.
+    def to_qv_and_basis(self, scene: Scene, y: State, t: Number) -> tuple[Array, Array, VelocityAndDrift | None]:
+        """Configuration, and v = N nu + v0 with dv/dt = N dnu/dt + drift from one decomposition of the rows."""
         q = retract(scene.system, y["q"])
-        motion = velocity_and_drift(scene, self._basis(y), q, y["nu"], t)
-        force = generalized_force(q, motion.v, t)
-        return self._rates(scene, y, motion, q, t, force), force, motion.v
+        in_basis = velocity_and_drift(scene, self._basis(y), q, y["nu"], t)
+        return q, in_basis.v, in_basis
 
-    def rates(self, scene: Scene, y: State, q: Q, v: V, t: Number, force: Force) -> State:
-        """Rate of the reduced equations; v is computed again."""
-        return self._rates(scene, y, velocity_and_drift(scene, self._basis(y), q, y["nu"], t), q, t, force)
-
-    def _rates(self, scene, y, motion, q, t, force):
+    def rates(
+        self, scene: Scene, y: State, q: Q, v: V, t: Number, force: Force, in_basis: VelocityAndDrift | None = None
+    ) -> State:
+        """Rate of the reduced equations."""
+        motion = velocity_and_drift(scene, self._basis(y), q, y["nu"], t) if in_basis is None else in_basis
         # Without the scene's forces, which `force` includes.
         reduced = solve_in_basis(Scene(scene.system, scene.constraints), motion, q, force, t)
         fixed = {name: jnp.zeros_like(y[name]) for name in self.step_constants}

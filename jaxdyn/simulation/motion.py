@@ -15,16 +15,14 @@ from jaxdyn.constraints.codes import first_of
 from jaxdyn.constraints.redundancy import exchange_rows, gap_of_redundant, has_selection, keep_rows, row_mask, rows_of
 from jaxdyn.constraints.selection import most_rounding, select_rows
 from jaxdyn.simulation import controls
-from jaxdyn.simulation.checks import angle_coordinates, largest_angle
-from jaxdyn.simulation.equations import DRIVES, KEPT, Equations, equations
+from jaxdyn.simulation.checks import Inputs, angle_coordinates, has_definite_mass, largest_angle, safe_inputs
+from jaxdyn.simulation.equations import DRIVES, KEPT, Equations, at_save_point, equations
 from jaxdyn.simulation.integration import integrate
 from jaxdyn.simulation.methods import Method, consistent, is_regular, satisfies_redundant_rows, start_limit
-from jaxdyn.simulation.outputs import at_save_point
 from jaxdyn.simulation.solution import RESULTS, Solution, rows_where
 from jaxdyn.simulation.solvers import LieGroup, Stepper
 from jaxdyn.simulation.solvers.choice import is_split, is_step_length, label
 from jaxdyn.simulation.solvers.differentiable import COUNTS
-from jaxdyn.simulation.start import Inputs, has_definite_mass, safe_inputs
 from jaxdyn.simulation.terminal_events import Conditions, Violation, first_violation
 from jaxdyn.systems.scene import Scene, check_callback
 from jaxdyn.systems.system import displace, has_dependent_coordinates

@@ -18,6 +18,7 @@ from jaxdyn.constraints.selection import may_have_redundant_rows
 from jaxdyn.contact.unilateral import has_modes
 from jaxdyn.model.arguments import Numbers, as_array, state_dtype
 from jaxdyn.simulation import checks, controls
+from jaxdyn.simulation.checks import check_constraints, choose_method, may_have_singular_mass
 from jaxdyn.simulation.controls import Control
 from jaxdyn.simulation.hybrid.motion import hybrid_motion
 from jaxdyn.simulation.methods import Method
@@ -32,7 +33,6 @@ from jaxdyn.simulation.solvers.choice import (
     solver_for_start,
     step_limit,
 )
-from jaxdyn.simulation.start import check_constraints, choose_method, may_have_singular_mass
 from jaxdyn.simulation.terminal_events import report_limits
 from jaxdyn.systems.scene import Scene, as_scene
 from jaxdyn.systems.system import SceneLike, System, has_dependent_coordinates

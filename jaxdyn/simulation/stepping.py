@@ -15,14 +15,14 @@ from jaxdyn.constraints.selection import may_have_redundant_rows, select_rows
 from jaxdyn.contact.unilateral import has_modes
 from jaxdyn.forces.piecewise import fix_pieces, guards, pieces_of, values_and_levels
 from jaxdyn.model.arguments import Numbers, as_array, check_shape, state_dtype
+from jaxdyn.simulation.checks import choose_method
 from jaxdyn.simulation.equations import DRIVES
 from jaxdyn.simulation.hybrid.piecewise import PiecewiseSystem, piecewise_motion
 from jaxdyn.simulation.solvers import ExplicitSteps
 from jaxdyn.simulation.solvers.driver import step_control
 from jaxdyn.simulation.solvers.explicit import take_step
-from jaxdyn.simulation.solvers.explicit_run import ExplicitRun
 from jaxdyn.simulation.solvers.fixed_steps import RK4
-from jaxdyn.simulation.start import choose_method
+from jaxdyn.simulation.solvers.integrator import ExplicitRun
 from jaxdyn.systems.scene import Scene, as_scene, check_force
 from jaxdyn.systems.system import SceneLike
 
@@ -122,15 +122,11 @@ def _advance(scene: Scene, length, substeps: int, is_direct: bool) -> tuple[Any,
     @jax.jit
     def field(t, y, args):
         scene, tau = unpack(args)
-        of_drive = {}
-
-        def generalized_force(q, v, t):
-            force, (torque, rates) = scene.applied_force(q, v, t), scene.drive_torque(q, v, t, tau, y.get(DRIVES))
-            # `evaluate` takes a force alone, so that the rates of the drives leave by this dictionary.
-            of_drive.update({} if rates is None else {DRIVES: rates})
-            return torque if force is None else torque + force
-
-        return method.evaluate(scene, y, t, generalized_force)[0] | of_drive
+        q, v, in_basis = method.to_qv_and_basis(scene, y, t)
+        force, (torque, of_drives) = scene.applied_force(q, v, t), scene.drive_torque(q, v, t, tau, y.get(DRIVES))
+        force = torque if force is None else torque + force
+        rates = method.rates(scene, y, q, v, t, force, in_basis)
+        return rates if of_drives is None else rates | {DRIVES: of_drives}
 
     def project(t, y, error, args):
         y, error = method.end_step(unpack(args)[0], y, t, error)

@@ -13,8 +13,7 @@ from jaxdyn.compile.known import is_known
 from jaxdyn.model.arguments import Checked, Function, Number
 from jaxdyn.model.numbers import check_count
 from jaxdyn.systems.scene import as_pytree
-from jaxdyn.systems.start import check_mass_matrix, describe_state
-from jaxdyn.systems.system import System, as_parameter, evaluate_callback
+from jaxdyn.systems.system import System, as_parameter, check_mass_matrix, describe_state, evaluate_callback
 
 
 class LagrangianSystem(System):

@@ -7,7 +7,7 @@ import pytest
 
 from jaxdyn import compile as backend
 from jaxdyn.compile import target
-from jaxdyn.compile.expand import expand
+from jaxdyn.compile.expansion import expand
 from jaxdyn.compile.jax_adapter import select_options
 
 # XLA compiles fast code that runs slowly: tests compile much and run little.

@@ -23,8 +23,8 @@ from kernel_helpers import native, quick, refuse
 from jaxdyn import compile as backend
 from jaxdyn.compile import derive, evaluate, kernels, known, mode, objects, program, target, trace, trigonometry
 from jaxdyn.compile.code import kernel_ir
-from jaxdyn.compile.expand import NotNumbers, expand
-from jaxdyn.compile.operations import as_operations
+from jaxdyn.compile.expansion import NotNumbers, expand
+from jaxdyn.compile.primitive import as_operations
 from jaxdyn.compile.trace import program_of
 
 pytestmark = pytest.mark.native

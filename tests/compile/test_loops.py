@@ -7,7 +7,8 @@ import pytest
 
 from jaxdyn.compile import kernel, target
 from jaxdyn.compile.batch import repeat_while, while_loop
-from jaxdyn.compile.expand import expand
+from jaxdyn.compile.code import symbol_of
+from jaxdyn.compile.expansion import expand
 from jaxdyn.compile.loops import Carry, Given, Iteration, Task, run_loop
 
 
@@ -170,3 +171,24 @@ def test_llvm_works_on_a_loop_while_xla_compiles(monkeypatch):
     for axes, matrix in (((None, None, 0), x[:2]), ((0, None, 0), np.ones((3, 2, 2)))):
         jax.jit(jax.vmap(iterate, axes)).lower(matrix, x[0], x)
     assert len(made) == 1
+
+
+@pytest.mark.native
+def test_llvm_works_on_the_subprograms_of_a_batched_loop_while_it_is_traced(monkeypatch):
+    """Once for each width of vectors, whatever is batched further; a loop of one sample may be batched later and waits."""
+    tasks = []
+    monkeypatch.setattr(target.ahead, "make_later", tasks.append)
+    task = Task(lambda *args: _branching_turn(*args), _branching_by_turns, ())
+
+    def iterate(x):
+        state = x, jnp.zeros(()), jnp.zeros((), jnp.int64), jnp.zeros((), jnp.int32)
+        return run_loop(task, jnp.asarray(0.6), jnp.asarray(1.3), Given(), Carry(state))[0].state[1]
+
+    (call,) = [x for x in jax.make_jaxpr(iterate)(1.0).eqns if "program" in x.params]
+    assert not tasks
+    for _ in range(2):
+        jax.make_jaxpr(jax.vmap(jax.vmap(iterate)))(jnp.ones((2, 3)))
+    assert len(tasks) == 1
+    tasks[0]()
+    width = target.width_of(call.params["program"], 3)
+    assert {symbol_of(x, width) for x in call.params["program"].subprograms} <= set(target._called)

@@ -12,8 +12,9 @@ import pytest
 from jax import lax
 from jax.extend.core import Primitive, primitives
 
-from jaxdyn.compile import expand, jax_adapter
+from jaxdyn.compile import expansion, jax_adapter
 from jaxdyn.compile.graph import Graph
+from jaxdyn.compile.inlining import replay
 
 X, Y = np.array([0.3, -0.7, 0.9]), np.array([1.2, 0.4, -0.6])
 POSITIVE, SQUARE = np.array([0.3, 1.7, 2.9]), np.array([[4.0, 1.0, 0.5], [1.0, 3.0, 0.2], [0.5, 0.2, 2.0]])
@@ -160,14 +161,14 @@ INSTALLED = installed()
 
 def with_rules() -> set[str]:
     """Primitives for which there is a rule."""
-    of_numbers = expand._Expansion(Graph(), calls=False, branches=False)
+    of_numbers = expansion._Expansion(Graph(), calls=False, branches=False)
     tables = (
         of_numbers.elementwise,
         of_numbers.reductions,
-        expand._OTHER,
-        expand._INNER,
-        expand.AT_PLACES,
-        expand.REARRANGEMENTS,
+        expansion._OTHER,
+        expansion._INNER,
+        expansion.AT_PLACES,
+        expansion.REARRANGEMENTS,
     )
     return {"div", *(name for table in tables for name in table)}
 
@@ -206,9 +207,9 @@ def test_numbers_are_those_of_jax(name):
     function, *args = EXPANDED[name]
     closed = jax.make_jaxpr(function)(*args)
     assert name in names_in(closed.jaxpr)
-    program, _ = expand.expand(closed, 10_000)
+    program, _ = expansion.expand(closed, 10_000)
     entries = [np.array(x.ravel().tolist(), object).reshape(x.shape) for x in args]
-    _, outputs = Graph().replay(program, entries)
+    _, outputs = replay(Graph(), program, entries)
     wanted = jax.tree.leaves(function(*map(jnp.asarray, args)))
     for computed, y in zip(outputs, wanted, strict=True):
         tolerance = 1e-6 if y.dtype == jnp.float32 else 1e-14
@@ -219,7 +220,7 @@ def test_calls_of_jaxprs():
     closed = jax.make_jaxpr(jnp.sin)(X)
     for name in CALLS:
         equation = SimpleNamespace(primitive=SimpleNamespace(name=name), params={"call_jaxpr": closed})
-        (computed,) = expand._Expansion(Graph(), calls=False, branches=False).one(equation, [X])
+        (computed,) = expansion._Expansion(Graph(), calls=False, branches=False).one(equation, [X])
         np.testing.assert_allclose(computed, np.sin(X), rtol=1e-15)
 
 
@@ -230,7 +231,7 @@ def test_one_less_a_square_is_exact_near_one_and_its_slope_near_zero():
 
     near_one, near_zero = np.array([1 - 1e-12, -1 + 1e-13]), np.array([1e-9, -1e-17])
     for function, x in ((lax.one_minus_square, near_one), (slope, near_zero)):
-        program, _ = expand.expand(jax.make_jaxpr(function)(x), 100)
-        computed = Graph().replay(program, [x.astype(object)])[1][0].astype(float)
+        program, _ = expansion.expand(jax.make_jaxpr(function)(x), 100)
+        computed = replay(Graph(), program, [x.astype(object)])[1][0].astype(float)
         exact = (1 - x) * (1 + x) if function is lax.one_minus_square else -2 * x
         np.testing.assert_allclose(computed, exact, rtol=1e-15)

@@ -15,7 +15,7 @@ from kernel_helpers import by_kernel
 from benchmarks.numpy_jaxprs import CONTRACTION, EQUAL_DIFFERENCE, ZERO_PRODUCT, ZERO_SIGN, trace_and_evaluate
 from benchmarks.random_functions import BINARY, NAMES, SPECIAL, UNARY, Function, differentiated, judge
 from jaxdyn.compile import kernel, target
-from jaxdyn.compile.expand import expand
+from jaxdyn.compile.expansion import expand
 
 pytestmark = pytest.mark.native
 NUMBERS = st.sampled_from([0.0, -0.0, 1.0, -1.0, 0.5, 2.0, 3.25, -0.75, np.nan, np.inf, -np.inf, 1e30])

@@ -11,7 +11,7 @@ from kernel_helpers import assert_close, quick
 from jaxdyn import compile as backend
 from jaxdyn.compile import target
 from jaxdyn.compile.batch import any_sample
-from jaxdyn.compile.mode import is_rank_safe
+from jaxdyn.compile.mode import rank_safe
 from jaxdyn.compile.repair import compute_where, repair
 from jaxdyn.compile.trace import program_of
 
@@ -35,7 +35,7 @@ def test_samples_that_are_not_valid_are_computed_again():
     calls, safe, size = [], [], np.arange(1.0, 4.0)
 
     def again(x):
-        safe.append(is_rank_safe())
+        safe.append(rank_safe.value)
         jax.debug.callback(lambda: calls.append(1))
         return {"matrix": jnp.full((2, 2), -x), "n": 7}
 
@@ -51,7 +51,7 @@ def test_samples_that_are_not_valid_are_computed_again():
         np.testing.assert_array_equal(computed["matrix"], np.broadcast_to(signed[:, None, None], (3, 2, 2)))
         assert computed["n"].tolist() == [7 if flag else 3 for flag in flags] and bool(calls) == any(flags)
         assert computed["n"].dtype == jnp.asarray(3).dtype
-    assert safe and all(safe) and not is_rank_safe()
+    assert safe and all(safe) and not rank_safe.value
     alone = jax.jit(one)
     assert alone(2.0, False)["matrix"][0, 0] == -2 and alone(2.0, True)["matrix"][0, 0] == 2
 

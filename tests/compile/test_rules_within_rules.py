@@ -14,7 +14,7 @@ from kernel_helpers import assert_close, native, quick, root, root_derivatives
 
 from jaxdyn import compile as backend
 from jaxdyn.compile import target
-from jaxdyn.compile.expand import NotNumbers, expand
+from jaxdyn.compile.expansion import NotNumbers, expand
 from jaxdyn.compile.repair import repair
 
 pytestmark = pytest.mark.native

@@ -24,7 +24,7 @@ from jaxdyn.constraints.rank import pseudo_inverse
 from jaxdyn.constraints.reactions import constraint_forces, constraint_wrenches
 from jaxdyn.dynamics.kinematics import forward_kinematics
 from jaxdyn.dynamics.quantities import bias_force, coriolis_matrix, gravity_force, mass_matrix
-from jaxdyn.model.tree import difference, integrate
+from jaxdyn.model.configuration import difference, integrate
 from jaxdyn.systems.lagrangian import LagrangianSystem
 from jaxdyn.systems.scene import Scene
 

@@ -15,7 +15,7 @@ from jaxdyn.constraints.base import rows
 from jaxdyn.constraints.dynamics import constrained_dynamics, solve_rows
 from jaxdyn.constraints.projection import project_state
 from jaxdyn.dynamics.quantities import bias_force, mass_matrix
-from jaxdyn.model.tree import integrate
+from jaxdyn.model.configuration import integrate
 from jaxdyn.simulation.methods import consistent
 from jaxdyn.systems.scene import Scene
 from jaxdyn.systems.system import retract

@@ -23,7 +23,7 @@ from jaxdyn.constraints import (
 from jaxdyn.constraints.base import Constraint, constraint_jacobian, layout, position_residual, rows, velocity_residual
 from jaxdyn.dynamics.kinematics import forward_kinematics
 from jaxdyn.model.builder import ModelBuilder
-from jaxdyn.model.tree import configuration_rate, difference, integrate
+from jaxdyn.model.configuration import configuration_rate, difference, integrate
 from jaxdyn.systems.scene import Scene
 
 # Twists (v, omega) that each joint leaves free, in frame B.

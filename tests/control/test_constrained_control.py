@@ -11,7 +11,7 @@ from test_control import KD, KP, assert_decays, decayed
 import jaxdyn as jd
 from jaxdyn import scenes
 from jaxdyn.contact import Sphere, montana
-from jaxdyn.reduction.gauge_invariant import gauge_invariant
+from jaxdyn.reduction.quasi_velocities import gauge_invariant
 
 TS = jnp.linspace(0.0, 2.0, 21)
 PRESS = jnp.asarray([2.0])

@@ -19,7 +19,7 @@ from jaxdyn.dynamics.kinematics import frame_pose
 from jaxdyn.dynamics.quantities import mass_matrix
 from jaxdyn.model import robots
 from jaxdyn.model.builder import ModelBuilder
-from jaxdyn.model.tree import random_configuration
+from jaxdyn.model.configuration import random_configuration
 from jaxdyn.systems.scene import Scene
 
 TIP = "iiwa_link_7"

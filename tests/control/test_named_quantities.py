@@ -12,7 +12,7 @@ from test_constrained_control import circle, first_two
 import jaxdyn as jd
 from jaxdyn import scenes
 from jaxdyn.lie import se3
-from jaxdyn.reduction.gauge_invariant import gauge_invariant
+from jaxdyn.reduction.quasi_velocities import gauge_invariant
 
 KINDS = ["revolute", "prismatic", "helical", "continuous"]
 

@@ -25,8 +25,8 @@ from jaxdyn import se3
 from jaxdyn.dynamics import centroidal, kinematics
 from jaxdyn.dynamics import quantities as dynamics
 from jaxdyn.dynamics import world_frame as matrix_form
+from jaxdyn.model.configuration import configuration_rate, neutral
 from jaxdyn.model.inertia import transform_inertia
-from jaxdyn.model.tree import configuration_rate, neutral
 
 ALL_KINDS = ["free", "revolute", "spherical", "planar", "helical", "prismatic", "continuous", "revolute"]
 TREES = {

@@ -177,6 +177,23 @@ def test_the_least_optimisation_gives_other_code_and_the_same_numbers(request):
     assert options is not None and options["xla_backend_optimization_level"] == 0
 
 
+def test_long_texts_are_compiled_by_one_pass_to_the_same_numbers(monkeypatch, request):
+    """Forward dynamics of an arm, whose text is short, as if it were long."""
+    request.getfixturevalue("usual")
+    model, q = jd.robots.chain(3), jnp.asarray([0.4, 0.3, -0.5])
+
+    def acceleration():
+        function = native(lambda q: jd.forward_dynamics(model, q, 0.1 * q, 0 * q))
+        return np.asarray(backend.entry_point(function)(q)), objects.Code("", stored=False).key
+
+    usual, key = acceleration()
+    monkeypatch.setattr(objects, "LONG_LINES", 0)
+    model = model.replace(gravity=model.gravity * (1 + 1e-15))  # a program of its own
+    long, other_key = acceleration()
+    np.testing.assert_allclose(long, usual, rtol=1e-13)
+    assert key != other_key
+
+
 def test_options_that_do_not_exist_are_refused(monkeypatch):
     monkeypatch.setenv("JAXDYN_COMPILATION_OPTIONS", "fast")
     with pytest.raises(ValueError, match="JAXDYN_COMPILATION_OPTIONS is 'fast'; choose from 'usual', 'least'"):

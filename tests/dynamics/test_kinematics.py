@@ -23,7 +23,7 @@ from scipy.linalg import expm
 from jaxdyn import se3
 from jaxdyn.compile import compilation
 from jaxdyn.dynamics import frame_motion, kinematics
-from jaxdyn.model.tree import configuration_rate
+from jaxdyn.model.configuration import configuration_rate
 
 ALL_KINDS = ["free", "revolute", "spherical", "planar", "helical", "prismatic", "continuous", "revolute"]
 CASES = {
@@ -51,7 +51,7 @@ def case(name):
             out[f"pose{i}"] = kinematics.frame_pose(model, q, frame)
             out[f"body{i}"] = kinematics.body_jacobian(model, q, frame)
             out[f"spatial{i}"] = kinematics.spatial_jacobian(model, q, frame)
-            out[f"rate{i}"] = kinematics.jacobian_dot_v(model, q, v, frame)
+            out[f"rate{i}"] = frame_motion.jacobian_dot_v(model, q, v, frame)
             out[f"aligned{i}"] = frame_motion.frame_jacobian(model, q, frame)
             out[f"velocity{i}"] = frame_motion.frame_velocity(model, q, v, frame)
             out[f"acceleration{i}"] = frame_motion.frame_acceleration(model, q, v, jnp.cos(v), frame)
@@ -202,7 +202,7 @@ def test_far_robot_is_as_exact_as_at_home(dtype):
 
         @quick
         def values(model, q, v=v, frame=frame):
-            rate = kinematics.jacobian_dot_v(model, q, v, frame)
+            rate = frame_motion.jacobian_dot_v(model, q, v, frame)
             return kinematics.body_jacobian(model, q, frame), rate, kinematics.spatial_jacobian(model, q, frame)
 
         at_home, there = values(near, q), values(far, q_far)
@@ -213,7 +213,7 @@ def test_far_robot_is_as_exact_as_at_home(dtype):
 
 def test_batch_equals_loop():
     _, model, _, frames, q, v, ours = case("every_kind")
-    one = quick(lambda q, v: kinematics.jacobian_dot_v(model, q, v, frames[-1]))
+    one = quick(lambda q, v: frame_motion.jacobian_dot_v(model, q, v, frames[-1]))
     loop = jnp.stack([one(x, y) for x, y in zip(q, v, strict=True)])
     assert_close(ours["rate2"], loop, 1e-13)
 
@@ -224,7 +224,7 @@ def test_frames_of_the_world():
     np.testing.assert_array_equal(kinematics.frame_pose(model, q, None), np.eye(4))
     np.testing.assert_array_equal(kinematics.body_jacobian(model, q, None), np.zeros((6, 2)))
     np.testing.assert_array_equal(kinematics.spatial_jacobian(model, q, None), np.zeros((6, 2)))
-    np.testing.assert_array_equal(kinematics.jacobian_dot_v(model, q, q, None), np.zeros(6))
+    np.testing.assert_array_equal(frame_motion.jacobian_dot_v(model, q, q, None), np.zeros(6))
 
 
 def test_one_body_on_a_screw():
@@ -245,4 +245,4 @@ def test_refusals():
         with pytest.raises(ValueError, match="'nothing' is not in model"):
             function(model, jnp.zeros(2), "nothing")
     with pytest.raises(ValueError, match=r"v has shape \(1,\)"):
-        kinematics.jacobian_dot_v(model, jnp.zeros(2), jnp.zeros(1), "f1")
+        frame_motion.jacobian_dot_v(model, jnp.zeros(2), jnp.zeros(1), "f1")

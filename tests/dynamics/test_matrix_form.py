@@ -13,7 +13,7 @@ from jaxdyn.dynamics import kinematics
 from jaxdyn.dynamics import quantities as dynamics
 from jaxdyn.dynamics import world_frame as matrix_form
 from jaxdyn.dynamics.link_frame import newton_euler_matrices
-from jaxdyn.model.tree import configuration_rate
+from jaxdyn.model.configuration import configuration_rate
 
 ALL_KINDS = ["free", "revolute", "spherical", "planar", "helical", "prismatic", "continuous", "revolute"]
 CASES = {

@@ -17,7 +17,7 @@ import jaxdyn
 from jaxdyn import neutral
 from jaxdyn.dynamics import recursions, scans
 from jaxdyn.dynamics import world_frame as matrix_form
-from jaxdyn.dynamics.recursions import frames, inertias, links, transforms
+from jaxdyn.dynamics.recursions import frames, links, transforms
 from jaxdyn.model.joints import KINDS
 
 # Every kind, as a root, inside the tree and at its end; with and without armature.
@@ -337,9 +337,9 @@ def test_nearly_parallel_axes():
 
 def test_masses_on_a_joint_axis_belong_to_the_parent():
     model = random_tree(1, ["revolute", "revolute", "prismatic"], parents=[-1, 0, 1])
-    moments = inertias.pseudo_inertias(model, frames.canonical_frames(model))
+    moments = frames.pseudo_inertias(model, frames.canonical_frames(model))
     for J, kind in zip(moments, model.topology.kinds, strict=True):
-        assert not J[inertias.SHARED[kind]].any()
+        assert not J[frames.SHARED[kind]].any()
 
 
 def test_congruence_by_twice_the_angle():

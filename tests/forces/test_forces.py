@@ -10,7 +10,7 @@ from jaxdyn.dynamics.kinematics import forward_kinematics, frame_pose
 from jaxdyn.dynamics.quantities import generalized_force
 from jaxdyn.forces.elements import CoulombFriction, Drive, ExternalWrench, JointDamping, JointSpring
 from jaxdyn.model.builder import ModelBuilder
-from jaxdyn.model.tree import difference, integrate, neutral
+from jaxdyn.model.configuration import difference, integrate, neutral
 from jaxdyn.simulation.run import simulate
 from jaxdyn.systems.scene import Scene
 

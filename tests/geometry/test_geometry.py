@@ -16,7 +16,7 @@ from jaxdyn.dynamics import quantities as dynamics
 from jaxdyn.forces.elements import JointDamping
 from jaxdyn.geometry.immersion import constrain_by_immersion, pull_back, reaction_force
 from jaxdyn.model.builder import ModelBuilder
-from jaxdyn.model.tree import configuration_rate
+from jaxdyn.model.configuration import configuration_rate
 from jaxdyn.simulation.run import simulate
 from jaxdyn.systems.lagrangian import LagrangianSystem
 from jaxdyn.systems.scene import Scene

@@ -19,7 +19,7 @@ from jaxdyn.dynamics.kinematics import body_jacobian, frame_pose
 from jaxdyn.dynamics.quantities import kinetic_energy, mass_matrix, potential_energy
 from jaxdyn.grasp import Grasp, contact, grasp_map, hand_jacobian, internal_forces, object_dynamics, wrench_basis
 from jaxdyn.model.builder import ModelBuilder
-from jaxdyn.model.tree import configuration_rate, integrate
+from jaxdyn.model.configuration import configuration_rate, integrate
 from jaxdyn.reduction.integrability import involutive
 from jaxdyn.simulation.methods import Reduced
 from jaxdyn.simulation.run import simulate

@@ -345,9 +345,9 @@ def test_every_iterate_is_feasible(wrong_iiwa, noisy):
     log, fit = noisy
     problem, lowest, losses = RobotProblem(wrong_iiwa, (log,), identify.TERMS, (), "full", 1), [], []
 
-    def watch(step, loss, origin, terms):
+    def watch(step, loss, point):
         losses.append(loss)
-        model, friction = model_with_parameters(wrong_iiwa, problem.chart.x(origin, terms), identify.TERMS, 0.01)
+        model, friction = model_with_parameters(wrong_iiwa, problem.chart.x(*point), identify.TERMS, 0.01)
         lowest.append(lowest_eigenvalue(model))
         assert min(float(x.min()) for x in (friction.viscous, friction.coulomb, model.armature)) >= 0
 

@@ -10,7 +10,7 @@ from benchmarks.identify_selection import false_choices
 from jaxdyn import identify, inertia
 from jaxdyn.identify.condensed import block_slices, condense_rows
 from jaxdyn.identify.condensed_fit import eliminate, share_of_extra
-from jaxdyn.identify.logs import filter_like_log, idle_coordinates, low_pass_columns, travel_ranges
+from jaxdyn.identify.logs import filter_like_log, idle_coordinates, samples_for_jumps, travel_ranges
 from jaxdyn.identify.regression import condense, condense_model
 from jaxdyn.identify.robot_problem import huber_weights
 from jaxdyn.identify.selection import folds, improving_torques, standard_error
@@ -206,13 +206,14 @@ def test_columns_that_jump_are_low_passed_as_when_they_were_sampled():
     t = np.linspace(0, 20, 10001)[:, None]
     q, v = np.sin(2 * t) + 0.3 * np.sin(3.1 * t), 2 * np.cos(2 * t) + 0.93 * np.cos(3.1 * t)
     log = identify.from_raw(t[:, 0], q, np.sign(v), cutoff=5.0, trim=250, every=6)
-    fine = low_pass_columns(log, lambda log: np.tanh(log.v / 1e-3))
+    finer, factor = samples_for_jumps(log)
+    fine = filter_like_log(log, np.tanh(finer.v / 1e-3), factor=factor)
     coarse = filter_like_log(log, np.tanh(log.v / 1e-3))
     inner = slice(40, -40)  # without the transients of the filter at the ends of the log
     errors = [np.sqrt(np.mean((x - log.tau)[inner] ** 2)) for x in (fine, coarse)]
     assert errors[0] < 0.005 and errors[0] < 0.3 * errors[1]
     unfiltered = identify.Log(t[:, 0], q, v, v, v)
-    np.testing.assert_array_equal(low_pass_columns(unfiltered, lambda log: log.v), v)
+    assert samples_for_jumps(unfiltered) == (unfiltered, 1)
 
 
 def test_choice_by_cross_validation(truth):

@@ -13,7 +13,7 @@ from scipy.linalg import expm
 import jaxdyn as jd
 from jaxdyn.constraints.loops import JointLock
 from jaxdyn.io import NotTakenWarning, UnitsWarning, load_sdf
-from jaxdyn.model import float64 as f64
+from jaxdyn.model import host_math
 
 INERTIAL = """<inertial><pose>0.1 0.02 0.03 0.2 0.1 0.3</pose><mass>2</mass><inertia>
 <ixx>0.3</ixx><iyy>0.4</iyy><izz>0.5</izz><ixy>0.01</ixy><ixz>0.02</ixz><iyz>0.03</iyz></inertia></inertial>"""
@@ -49,7 +49,7 @@ def poses(scene, q) -> dict[str, np.ndarray]:
     model, moved = scene.system, [np.eye(4)]  # the last of the bodies is the world
     top = model.topology
     for i, (kind, parent) in enumerate(zip(top.kinds, top.parents, strict=True)):
-        step = f64.joint_pose(kind, np.asarray(model.screws[i]), np.asarray(q)[top.q_slices[i]])
+        step = host_math.joint_pose(kind, np.asarray(model.screws[i]), np.asarray(q)[top.q_slices[i]])
         moved.insert(-1, moved[parent] @ np.asarray(model.home[i]) @ step)
     frames = zip(top.frame_names, top.frame_bodies, np.asarray(model.frame_poses), strict=True)
     return {name: moved[body] @ pose for name, body, pose in frames}
@@ -59,7 +59,7 @@ def residual(scene, constraint, q) -> float:
     """Largest residual of a loop."""
     ends = zip(constraint.ends(), ({None: np.eye(4)} | poses(scene, q),) * 2, strict=True)
     first, second = (computed[body] @ np.asarray(pose) for (body, pose), computed in ends)
-    relative = jnp.asarray(f64.inverse(first) @ second)
+    relative = jnp.asarray(host_math.inverse(first) @ second)
     return float(np.abs(constraint.pose_residual(relative[:3, :3], relative[:3, 3])).max())
 
 
@@ -103,7 +103,7 @@ def test_axes_in_the_models_frame_in_every_version(tmp_path, version, axis):
 def test_axes_in_the_joints_frame(tmp_path):
     scene = silent(write(tmp_path, two_links(AXIS), "1.5"))
     same(scene, silent(write(tmp_path, two_links(AXIS), "1.7")))
-    turn = f64.rotation_from_rpy(np.array([0, 0, 0.4]))
+    turn = host_math.rotation_from_rpy(np.array([0, 0, 0.4]))
     i = scene.system.joint_names.index("j")
     np.testing.assert_allclose(scene.system.screws[i, 3:], turn @ [0.6, 0, 0.8], atol=1e-14)
 
@@ -163,7 +163,7 @@ def test_worlds_static_models_and_free_roots(tmp_path):
     }
     np.testing.assert_allclose(model.gravity, [0, 0, -3.7])
     computed = poses(scene, scene.starts["reference"].q)
-    expected = f64.pose_matrix(((0, 0, 2), (0, 0, 0.5)), "") @ f64.pose_matrix((0.1, 0, 0), "")
+    expected = host_math.pose_matrix(((0, 0, 2), (0, 0, 0.5)), "") @ host_math.pose_matrix((0.1, 0, 0), "")
     np.testing.assert_allclose(computed["ball::core"], expected, atol=1e-15)
     # A link without <inertial> has the format's default.
     np.testing.assert_allclose(model.inertias[model.body_names.index("ball::core")], [1, 0, 0, 0, 1, 0, 1, 0, 0, 1])
@@ -195,12 +195,12 @@ def test_joints_of_one_axis_move_as_screws_at_their_frame(tmp_path, kind, option
         + joint("j", "a", "b", kind, place, **options)
     )
     scene = silent(write(tmp_path, f"<model name='m'>{text}</model>"))
-    shift = f64.pose_matrix(np.reshape([float(x) for x in place.split()], (2, 3)), "")
-    home = f64.pose_matrix(np.reshape([float(x) for x in TURNED.split()], (2, 3)), "")
+    shift = host_math.pose_matrix(np.reshape([float(x) for x in place.split()], (2, 3)), "")
+    home = host_math.pose_matrix(np.reshape([float(x) for x in TURNED.split()], (2, 3)), "")
     v = np.array(motion(0.7), float)
     step = np.zeros((4, 4))
-    step[:3, :3], step[:3, 3] = f64.hat(v[3:]), v[:3]
-    expected = home @ shift @ expm(step) @ f64.inverse(shift)
+    step[:3, :3], step[:3, 3] = host_math.hat(v[3:]), v[:3]
+    expected = home @ shift @ expm(step) @ host_math.inverse(shift)
     np.testing.assert_allclose(poses(scene, jnp.array([0.7]))["b"], expected, atol=1e-14)
 
 
@@ -210,7 +210,7 @@ def test_joints_of_two_axes_turn_first_about_the_parents(tmp_path, kind):
     text = link("a") + link("b") + joint("w", "world", "a", "fixed", axis="") + joint("j", "a", "b", kind, rest=rest)
     scene = silent(write(tmp_path, f"<model name='m'>{text}</model>"))
     assert scene.system.joint_names == ("j", "j_axis2")
-    turn = f64.rotation_matrix(np.array([0, 0, 1.0]), 0.3) @ f64.rotation_matrix(np.array([0, 1.0, 0]), 0.5)
+    turn = host_math.rotation_matrix(np.array([0, 0, 1.0]), 0.3) @ host_math.rotation_matrix(np.array([0, 1.0, 0]), 0.5)
     np.testing.assert_allclose(poses(scene, jnp.array([0.3, 0.5]))["b"][:3, :3], turn, atol=1e-15)
 
 
@@ -231,7 +231,7 @@ def test_a_tree_that_runs_against_a_joint_keeps_its_angle(tmp_path):
     )
     wanted = poses(plain, jnp.array([0.0, 0.4]))
     np.testing.assert_allclose(
-        f64.inverse(computed["a"]) @ computed["b"], f64.inverse(wanted["a"]) @ wanted["b"], atol=1e-14
+        host_math.inverse(computed["a"]) @ computed["b"], host_math.inverse(wanted["a"]) @ wanted["b"], atol=1e-14
     )
 
 
@@ -471,7 +471,9 @@ class Exponentials:
             text = element.findtext("pose")
             values = np.array([float(x) for x in text.split()]) if text else np.zeros(6)
             pose = np.eye(4)
-            r, p, y = (f64.rotation_matrix(axis, angle) for axis, angle in zip(np.eye(3), values[3:], strict=True))
+            r, p, y = (
+                host_math.rotation_matrix(axis, angle) for axis, angle in zip(np.eye(3), values[3:], strict=True)
+            )
             pose[:3, :3], pose[:3, 3] = y @ p @ r, values[:3]
             return pose
 
@@ -511,8 +513,8 @@ class Exponentials:
             twist = self.twists[name]
             before = np.eye(4) if top.parents[i] < 0 else moved[top.parents[i]]
             step = np.zeros((4, 4))
-            step[:3, :3], step[:3, 3] = f64.hat(twist[3:]), twist[:3]
-            columns.append(f64.adjoint(before) @ twist)
+            step[:3, :3], step[:3, 3] = host_math.hat(twist[3:]), twist[:3]
+            columns.append(host_math.adjoint(before) @ twist)
             moved.append(before @ expm(step * float(q[i])))
         M, gravity, places = np.zeros((model.nv, model.nv)), np.zeros(model.nv), {}
         for name, home in self.home.items():
@@ -521,7 +523,7 @@ class Exponentials:
             mass, com, moment = self.inertia[name]
             J = np.array(columns).T * (top.ancestors[body] if body >= 0 else 0.0)
             turn, point = places[name][:3, :3], places[name][:3, :3] @ com + places[name][:3, 3]
-            velocity = J[:3] - f64.hat(point) @ J[3:]
+            velocity = J[:3] - host_math.hat(point) @ J[3:]
             M += mass * velocity.T @ velocity + J[3:].T @ turn @ moment @ turn.T @ J[3:]
             gravity -= mass * velocity.T @ np.asarray(model.gravity)
         return places, M, gravity
@@ -544,7 +546,7 @@ def check_cassie(path: Path, *, dynamics: bool = True) -> jd.io.LoadedScene:
     assert max(np.abs(computed[name] - place).max() for name, place in places.items()) < 1e-13
     for name, (mass, com, moment) in exponentials.inertia.items():
         if name in model.body_names:
-            expected = f64.inertia_numbers((mass, com, moment), name)
+            expected = host_math.inertia_numbers((mass, com, moment), name)
             np.testing.assert_allclose(model.inertias[model.body_names.index(name)], expected, atol=1e-15)
     if not dynamics:
         return scene

@@ -16,9 +16,8 @@ from jaxdyn import inertia, robots
 from jaxdyn.dynamics import kinematics
 from jaxdyn.dynamics.centroidal import center_of_mass
 from jaxdyn.io import load_urdf
-from jaxdyn.model import float64 as f64
-from jaxdyn.model import joints
-from jaxdyn.model import tree as mdl
+from jaxdyn.model import configuration as mdl
+from jaxdyn.model import host_math, joints
 from jaxdyn.model.builder import ModelBuilder
 from jaxdyn.model.inertia_checks import inertia_report, repair_inertias
 from tests.pinocchio_bridge import quick, to_pinocchio
@@ -515,7 +514,7 @@ def test_inertias_that_no_body_has_are_named(moments, words):
     """However a model is made of them, at the line that makes it; limits of bodies are none of them."""
     inertia = (1.0, (0.3, 0.2, 1.0), moments)
     builder = jd.ModelBuilder().add_body("a", axis=(0, 1, 0), inertia=inertia)
-    numbers = np.asarray(f64.inertia_numbers(inertia, "a"))
+    numbers = np.asarray(host_math.inertia_numbers(inertia, "a"))
     sound = jd.ModelBuilder().add_body("a", inertia=jd.inertia.sphere(1.0, 1.0)).build()
     for make in (builder.build, lambda: sound.replace(inertias=numbers[None])):
         with warnings.catch_warnings(record=True) as caught:

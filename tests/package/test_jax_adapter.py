@@ -21,7 +21,7 @@ from jax.extend.core import Primitive
 
 import jaxdyn as jd
 from jaxdyn import compile as backend
-from jaxdyn.compile import expand, jax_adapter, kernels, mode, target
+from jaxdyn.compile import expansion, jax_adapter, kernels, mode, target
 from jaxdyn.compile.trial import run_trial
 
 ADAPTER = Path(jax_adapter.__file__)
@@ -258,7 +258,7 @@ def test_a_new_version_in_which_nothing_has_changed_has_kernels(future):
 @pytest.fixture
 def renamed(monkeypatch) -> None:
     """`scan` has its parameters under other names."""
-    one = expand._Expansion.one
+    one = expansion._Expansion.one
 
     def with_other_names(self, eqn, args):
         if eqn.primitive.name == "scan":
@@ -266,7 +266,7 @@ def renamed(monkeypatch) -> None:
             eqn = SimpleNamespace(primitive=eqn.primitive, params=params, invars=eqn.invars, outvars=eqn.outvars)
         return one(self, eqn, args)
 
-    monkeypatch.setattr(expand._Expansion, "one", with_other_names)
+    monkeypatch.setattr(expansion._Expansion, "one", with_other_names)
 
 
 def test_a_renamed_parameter_leaves_a_function_to_jax(future, renamed):

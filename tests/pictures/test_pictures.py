@@ -11,7 +11,7 @@ import pytest
 
 import jaxdyn as jd
 from jaxdyn.io import NotTakenWarning
-from jaxdyn.model import float64 as f64
+from jaxdyn.model import host_math
 from jaxdyn.pictures import default_solids, motion
 from jaxdyn.pictures.drawing import cone_sides
 from jaxdyn.pictures.solids import SIZES, Shape, Shapes, merge_meshes, refine, sharpen, simplify
@@ -42,7 +42,7 @@ def inertia_of(vertices, faces, mass: float) -> np.ndarray:
     ],
 )
 def test_triangles_of_solids_enclose_their_volume(kind, size, exact):
-    pose = f64.pose_matrix(((0.3, -0.2, 0.1), (0.3, 0.2, 0.5)), "pose")
+    pose = host_math.pose_matrix(((0.3, -0.2, 0.1), (0.3, 0.2, 0.5)), "pose")
     assert kind in SIZES
     vertices, faces = Shape("body", kind, size, pose).triangles()
     # Polygons of 24 sides lie inside of their circles: 1.1 % of the area, 3 % of a ball.
@@ -64,7 +64,7 @@ def test_simplified_meshes_are_small_and_close():
 
 @pytest.mark.parametrize("moments", [(0.01, 0.02, 0.025), (0.02, 0.02, 0.03), (0.02, 0.02, 0.005), (0.02, 0.02, 0.02)])
 def test_solids_of_inertia_have_that_inertia(moments):
-    turn = f64.rotation_from_rpy((0.3, -0.4, 0.9))
+    turn = host_math.rotation_from_rpy((0.3, -0.4, 0.9))
     com, mass = np.array([0.1, 0.05, -0.02]), 2.0
     inertia = (mass, com, turn @ np.diag(moments) @ turn.T)
     model = jd.ModelBuilder("one").add_body("body", joint="spherical", inertia=inertia).build()
@@ -141,7 +141,7 @@ def test_solids_of_urdf(urdf, solids):
     assert box.color == (0.8, 0.1, 0.1)
     assert volume(*box.triangles()) == pytest.approx(0.005, rel=1e-12)
     assert volume(*mesh.triangles()) == pytest.approx(8 / 6, rel=1e-12)  # twice as large as in its file
-    np.testing.assert_allclose(box.pose[:3, :3], f64.rotation_from_rpy((0, 0, 0.3)))
+    np.testing.assert_allclose(box.pose[:3, :3], host_math.rotation_from_rpy((0, 0, 0.3)))
     # The lower arm has the tip's ball; nothing of inertia is added to bodies that have a solid.
     model = jd.load_urdf(urdf)
     assert {shape.source for shape in default_solids.complete_solids(jd.Scene(model), solids)} == {"file"}
@@ -504,7 +504,7 @@ def test_bodies_with_a_slash_in_their_names_are_where_they_are(monkeypatch):
             for step in handles[name].name.strip("/").split("/"):
                 path += f"/{step}"
                 if (handle := node(path)) is not None:
-                    placed = placed @ f64.joint_pose(
+                    placed = placed @ host_math.joint_pose(
                         "free", np.zeros(6), np.concatenate([handle.position, handle.wxyz])
                     )
             np.testing.assert_allclose(placed, jd.frame_pose(model, q, name), atol=1e-6)  # viser sends float32

@@ -16,7 +16,7 @@ from jaxdyn.constraints.dynamics import constrained_dynamics
 from jaxdyn.dynamics.quantities import forward_dynamics, inverse_dynamics
 from jaxdyn.forces.elements import JointDamping, JointSpring
 from jaxdyn.model import robots
-from jaxdyn.model.names import velocity_indices
+from jaxdyn.model.topology import velocity_indices
 from jaxdyn.reduction.inverse_dynamics import constrained_inverse_dynamics
 from jaxdyn.systems.scene import Scene
 

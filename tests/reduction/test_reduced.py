@@ -16,7 +16,7 @@ from jaxdyn.dynamics.kinematics import forward_kinematics
 from jaxdyn.dynamics.quantities import bias_force, forward_dynamics, mass_matrix
 from jaxdyn.forces.elements import JointDamping
 from jaxdyn.model import robots
-from jaxdyn.model.tree import configuration_rate
+from jaxdyn.model.configuration import configuration_rate
 from jaxdyn.reduction.bases import as_basis, independent_velocities, tangent_basis
 from jaxdyn.reduction.minimal import reduced_dynamics
 from jaxdyn.simulation.methods import Baumgarte, Reduced

@@ -36,13 +36,13 @@ from jaxdyn.contact.unilateral import has_modes
 from jaxdyn.reports import Record, Report, html_page, pareto_front
 from jaxdyn.reports import run as running
 from jaxdyn.reports.case import Case, Reference
-from jaxdyn.reports.measure import Contestant, Motion, evaluations, ladder, measure
+from jaxdyn.reports.measurement import Contestant, Motion, evaluations, ladder, measure
 from jaxdyn.reports.programs import FIXED, SOLVERS, Programs, prepare
 from jaxdyn.reports.records import SceneReference
 from jaxdyn.reports.timing import time_interleaved
+from jaxdyn.simulation.checks import choose_method
 from jaxdyn.simulation.solvers import RK4
 from jaxdyn.simulation.solvers.choice import choose_solver
-from jaxdyn.simulation.start import choose_method
 from jaxdyn.systems.scene import Scene
 
 MOMENTS = np.array([1.0, 2.0, 3.0])

@@ -17,7 +17,7 @@ from jaxdyn.dynamics.kinematics import frame_pose
 from jaxdyn.dynamics.quantities import forward_dynamics, kinetic_energy, potential_energy
 from jaxdyn.forces.elements import CoulombFriction, JointDamping, JointSpring
 from jaxdyn.model.builder import ModelBuilder
-from jaxdyn.model.tree import integrate, neutral
+from jaxdyn.model.configuration import integrate, neutral
 from jaxdyn.simulation import integration
 from jaxdyn.simulation.run import simulate
 from jaxdyn.simulation.solution import RESULTS

@@ -187,3 +187,32 @@ def test_reverse_mode_takes_a_single_step_once(substeps, forward, monkeypatch):
     h = 1e-6
     ends = [[jnp.sum(step((q + s * h * e, v), TAU)[0] ** 2) for s in (1, -1)] for e in jnp.eye(2)]
     np.testing.assert_allclose(run(q), [(up - down) / (2 * h) for up, down in ends], rtol=1e-8)
+
+
+@pytest.mark.long
+def test_steps_and_derivatives_where_rows_are_dependent():
+    """Samples of a batch whose two rows are the same, which the native loops refuse, beside others; without kernels."""
+
+    def rows(q, t):
+        return jnp.stack([jnp.asarray([1.0, 1.0, 0.0]), jnp.stack([1.0, 1.0, jnp.where(q[2] > 0, 1.0 + q[2], 0.0)])])
+
+    scene = jd.Scene(jd.robots.chain(3), (jd.Pfaffian(rows),))
+    qs = jnp.asarray([[0.3, -0.2, -0.5], [0.3, -0.2, 0.5], [0.1, 0.4, -0.7], [-0.2, 0.3, 0.2], [0.2, 0.1, -0.3]])
+    vs = jnp.asarray([[0.5, -0.5, 0.2], [0.5, -0.5, 0.0], [0.1, -0.1, -0.4], [0.3, -0.3, 0.0], [0.0, 0.0, 0.1]])
+
+    def end(q, v, tau):
+        def advance(state, _):
+            return jd.stepper(scene, 0.02)(state, tau), None
+
+        q, v = jax.lax.scan(advance, (q, v), length=3)[0]
+        return jnp.sum(jnp.sin(q)) + jnp.sum(v * jnp.arange(1.0, 4.0))
+
+    def compute():
+        return jax.jit(jax.vmap(jax.value_and_grad(end, (0, 1, 2))))(qs, vs, jnp.ones((5, 3)))
+
+    computed = compute()
+    with jd.compilation("plain"):
+        plain = compute()
+    for mine, theirs in zip(jax.tree.leaves(computed), jax.tree.leaves(plain), strict=True):
+        assert jnp.isfinite(mine).all()
+        np.testing.assert_allclose(mine, theirs, rtol=1e-10, atol=1e-11)

@@ -11,7 +11,7 @@ from pinocchio_bridge import quick
 import jaxdyn as jd
 from benchmarks.extremes import name_of
 from benchmarks.stiff import SOLVERS, cases, program, reference, runner
-from jaxdyn.model.tree import map_joints
+from jaxdyn.model.configuration import map_joints
 from jaxdyn.simulation.solvers.lie import _local_rate
 from jaxdyn.simulation.solvers.rosenbrock import _A, _C, _GAMMA, _RATE, _TIME, Rodas5P
 

@@ -13,7 +13,7 @@ from jaxdyn.constraints import Holonomic, Pfaffian
 from jaxdyn.dynamics.centroidal import center_of_mass, centroidal_momentum
 from jaxdyn.dynamics.quantities import kinetic_energy, potential_energy
 from jaxdyn.model.builder import ModelBuilder
-from jaxdyn.model.tree import integrate, random_configuration
+from jaxdyn.model.configuration import integrate, random_configuration
 from jaxdyn.simulation import variational
 from jaxdyn.simulation.run import simulate
 from jaxdyn.simulation.solution import RESULTS

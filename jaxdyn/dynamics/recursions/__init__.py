@@ -1,14 +1,12 @@
 """Recursions over a tree of rigid bodies, in link frames, written with 3-vectors, 6-vectors and small matrices.
 
-| module        | equations                                                                                    |
-|---------------|----------------------------------------------------------------------------------------------|
-| `frames`      | canonical link frames (joint axis on z, Denavit-Hartenberg) and masses transferred between bodies    |
-| `transforms`  | changes of frame of twists, wrenches and inertias                                            |
-| `links`       | joint transforms and motion subspaces of every joint kind                                    |
-| `rnea`        | recursive Newton-Euler: inverse dynamics, bias and gravity force                             |
-| `crba`        | composite rigid bodies: the mass matrix                                                      |
-| `articulated` | articulated-body inertias: M = W W^T, and M^-1 times a vector by an inward and an outward sweep |
-| `aba`         | forward dynamics and its tangent                                                             |
+| module             | equations                                                                                    |
+|--------------------|----------------------------------------------------------------------------------------------|
+| `frames`           | canonical link frames (joint axis on z, Denavit-Hartenberg) and masses transferred between bodies    |
+| `transforms`       | changes of frame of twists, wrenches and inertias                                            |
+| `links`            | joint transforms and motion subspaces of every joint kind                                    |
+| `newton_euler`     | recursive Newton-Euler: inverse dynamics, bias and gravity force; composite bodies: the mass matrix |
+| `articulated`      | articulated-body inertias: M = W W^T, and M^-1 times a vector; forward dynamics and its tangent |
 
 EQUATIONS sections 4 and 5; Featherstone (2008), chapters 5 to 7. Twists are (v, omega) and wrenches (f, n), linear part first.
 
@@ -20,12 +18,12 @@ This package imports `jaxdyn.compile`, the Lie groups and `jaxdyn.model.tree`. I
 `jaxdyn.dynamics.world_frame` and `jaxdyn.dynamics.scans`, and imports neither.
 """
 
-from jaxdyn.dynamics.recursions.aba import aba as aba
-from jaxdyn.dynamics.recursions.aba import aba_tangent as aba_tangent
-from jaxdyn.dynamics.recursions.aba import aba_with_columns as aba_with_columns
-from jaxdyn.dynamics.recursions.aba import mass_matrix_inverse_times as mass_matrix_inverse_times
-from jaxdyn.dynamics.recursions.aba import mass_matrix_sqrt as mass_matrix_sqrt
-from jaxdyn.dynamics.recursions.crba import crba as crba
-from jaxdyn.dynamics.recursions.rnea import bias_force as bias_force
-from jaxdyn.dynamics.recursions.rnea import gravity_force as gravity_force
-from jaxdyn.dynamics.recursions.rnea import rnea as rnea
+from jaxdyn.dynamics.recursions.articulated import aba as aba
+from jaxdyn.dynamics.recursions.articulated import aba_tangent as aba_tangent
+from jaxdyn.dynamics.recursions.articulated import aba_with_columns as aba_with_columns
+from jaxdyn.dynamics.recursions.articulated import mass_matrix_inverse_times as mass_matrix_inverse_times
+from jaxdyn.dynamics.recursions.articulated import mass_matrix_sqrt as mass_matrix_sqrt
+from jaxdyn.dynamics.recursions.newton_euler import bias_force as bias_force
+from jaxdyn.dynamics.recursions.newton_euler import crba as crba
+from jaxdyn.dynamics.recursions.newton_euler import gravity_force as gravity_force
+from jaxdyn.dynamics.recursions.newton_euler import rnea as rnea

@@ -8,15 +8,10 @@ from jax import lax
 from jaxdyn.compile.known import is_concrete
 
 
-def is_known(*arrays) -> bool:
-    """Decide whether the values of all arrays are known while tracing."""
-    return is_concrete(*arrays)
-
-
 def as_numpy_if_known(array):
     """Convert a leaf with known values to numpy; a traced leaf is returned unchanged."""
     # Numpy operations on known numbers run at trace time, so their zeros are dropped before anything is compiled.
-    return np.asarray(array) if array is not None and is_known(array) else array
+    return np.asarray(array) if array is not None and is_concrete(array) else array
 
 
 def contract(a, b, axes_a: tuple[int, ...], axes_b: tuple[int, ...]):

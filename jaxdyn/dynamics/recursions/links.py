@@ -22,8 +22,7 @@ from jaxdyn.dynamics.recursions._arrays import (
     part,
     transpose,
 )
-from jaxdyn.dynamics.recursions.frames import Frames, PlaneAngle, canonical_frames
-from jaxdyn.dynamics.recursions.inertias import pseudo_inertias
+from jaxdyn.dynamics.recursions.frames import Frames, PlaneAngle, canonical_frames, pseudo_inertias
 from jaxdyn.dynamics.recursions.transforms import (
     Chain,
     GeneralRotation,

@@ -22,9 +22,9 @@ from jaxdyn.identify.logs import Log, as_logs
 from jaxdyn.identify.regression import (
     base_parameters,
     condense_model,
+    coordinate_names,
     free_columns,
     log_regressor,
-    parameter_names,
 )
 from jaxdyn.identify.selection import VELOCITIES
 from jaxdyn.identify.threads import on_one_thread
@@ -147,7 +147,7 @@ def fit_gains(
             f"the payload of {mass:g} kg on {body} identifies the gain of no joint; use a heavier one, move more joints against "
             "gravity, or give its inertia"
         )
-    names = tuple(name for name, yes in zip(_joint_names(model), is_identifiable, strict=True) if yes)
+    names = tuple(name for name, yes in zip(coordinate_names(model), is_identifiable, strict=True) if yes)
     return DriveGains(gains, std, factor, names, error, velocity)
 
 
@@ -302,7 +302,3 @@ def _descend(problem: _Problem, triangles, state: _State, start: np.ndarray) -> 
             break
         now = min(now, after)
     return state._replace(z=z, u=u)
-
-
-def _joint_names(model: Model) -> list[str]:
-    return [name.rpartition(".")[0] for name in parameter_names(model)[10 * model.nb : 10 * model.nb + model.nv]]

@@ -10,15 +10,15 @@ import numpy as np
 from jaxdyn.constraints.codes import RESULTS, name_of
 from jaxdyn.identify.chart import check_bodies
 from jaxdyn.identify.condensed import Blocks, condense_rows
-from jaxdyn.identify.condensed_fit import eliminate, gather
-from jaxdyn.identify.interior import LOG_CHOLESKY_BASIS, LinearChart, TorqueProblem, newton
+from jaxdyn.identify.condensed_fit import eliminate, gather, minimize_torque_error
+from jaxdyn.identify.interior import LOG_CHOLESKY_BASIS, LinearChart, TorqueProblem
 from jaxdyn.identify.logs import Log, as_logs
 from jaxdyn.identify.regression import least_squares_by_svd, log_regressor, noise_level
 from jaxdyn.identify.robot import RobotFit, fit_robot
 from jaxdyn.identify.threads import on_one_thread
 from jaxdyn.identify.torque_terms import RobotTerms, split_terms
 from jaxdyn.identify.uncertainty import effective_sample_size, jackknife
-from jaxdyn.model import float64 as _f64
+from jaxdyn.model import host_math
 from jaxdyn.model import inertia as _inertia
 from jaxdyn.model.builder import ModelBuilder
 from jaxdyn.model.tree import Model
@@ -62,7 +62,7 @@ class Payload(eqx.Module):
     @property
     def rotational(self) -> np.ndarray:
         """Rotational inertia (3, 3) about the centre of mass, in axes of that frame (kg m^2)."""
-        return _f64.about_com(self.inertia)[2]
+        return host_math.about_com(self.inertia)[2]
 
 
 @on_one_thread
@@ -156,7 +156,8 @@ def _solve(blocks: Blocks, is_loaded, own: slice, kept, weights, rows, size):
     # No terms are fitted, so that their units do not matter.
     sizes = [np.ones(alone.nv)] * 3
     chart = LinearChart(alone, (), "full", sizes)
-    minimum = newton(TorqueProblem.of(chart, condense_rows(table, blocks.count()), sigma, 1.0), 200, 1e-6)
+    problem = TorqueProblem.of(chart, condense_rows(table, blocks.count()), sigma, 1.0)
+    minimum = minimize_torque_error(problem, 200, 1e-6)
     if minimum.result is not RESULTS.successful:
         raise ValueError(f"the payload's fit ended {name_of(minimum.result)!r}; do the loaded logs move the robot?")
     payload = chart.x(minimum.origin, minimum.terms)[:10]

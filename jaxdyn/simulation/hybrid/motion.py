@@ -14,18 +14,18 @@ from jaxdyn.compile.known import partition_tracers
 from jaxdyn.constraints.base import velocity_residual
 from jaxdyn.constraints.codes import RESULTS, first_of
 from jaxdyn.forces.piecewise import Pieces, fix_pieces, guards, pieces_of
+from jaxdyn.simulation.checks import safe_inputs
+from jaxdyn.simulation.equations import state_outputs
 from jaxdyn.simulation.hybrid.dynamics import by_element, directions, gaps, motion_at, slides, terms_at
 from jaxdyn.simulation.hybrid.modes import KINDS, Elements, Events, Mode, elements_of, extend, force_at
 from jaxdyn.simulation.hybrid.replay import HybridRun
 from jaxdyn.simulation.hybrid.system import ModalSystem, project
 from jaxdyn.simulation.hybrid.transitions import length
 from jaxdyn.simulation.methods import consistent
-from jaxdyn.simulation.outputs import state_outputs
 from jaxdyn.simulation.solution import Solution, rows_where
 from jaxdyn.simulation.solvers.choice import label
 from jaxdyn.simulation.solvers.differentiable import ROOM
 from jaxdyn.simulation.solvers.guards import SEARCH_STEPS
-from jaxdyn.simulation.start import safe_inputs
 from jaxdyn.systems.scene import Scene, check_callback, check_force
 
 

@@ -25,9 +25,8 @@ from jaxdyn.simulation.hybrid.modes import Mode
 from jaxdyn.simulation.hybrid.records import Records
 from jaxdyn.simulation.hybrid.system import HybridSystem
 from jaxdyn.simulation.solvers.driver import step_control
-from jaxdyn.simulation.solvers.explicit_run import ExplicitRun
 from jaxdyn.simulation.solvers.guards import delay
-from jaxdyn.simulation.solvers.integrator import Integrator, zeros_or
+from jaxdyn.simulation.solvers.integrator import ExplicitRun, Integrator, zeros_or
 
 
 class HybridRun(Integrator):

@@ -20,7 +20,7 @@ from jaxtyping import Array
 
 from jaxdyn.compile import kernel
 from jaxdyn.compile.batch import any_sample, while_loop
-from jaxdyn.compile.loops import Carry, Given, Iteration, Passed, Task, run_loop
+from jaxdyn.compile.loops import Carry, Given, Iteration, Passed, Task, run_to_end
 from jaxdyn.compile.repair import compute_where
 from jaxdyn.constraints.codes import RESULTS
 from jaxdyn.simulation.solvers import reverse
@@ -128,14 +128,9 @@ def run_to_event(
     """Make steps to the end of the run, or to an event."""
     static = plan, control, max_steps, strides
     task = Task(_iterate, _iterate_in_jax, static, dense_output, (plan,), strides)
-    return reverse.run_to_end(
-        lambda carry: run_loop(task, args, limits, given, carry),
-        partial(_iterate_once, *static, args, limits, given),
-        # A step that the kernel cannot compute is computed by JAX, and the native loop continues behind it.
-        partial(_iterate_by_fallback(*static), args, limits, given),
-        partial(_is_running, max_steps, limits),
-        carry,
-    )
+    once = partial(_iterate_once, *static, args, limits, given)
+    by_fallback = partial(_iterate_by_fallback(*static), args, limits, given)
+    return run_to_end(task, args, limits, given, carry, once, by_fallback, partial(_is_running, max_steps, limits))
 
 
 def cases_of(limits: Limits, control, state: State) -> list[tuple[Array, Any]]:
@@ -211,8 +206,11 @@ def _advance_by_kernel(plan: Plan, control, args, limits: Limits, state: State, 
 def _advance_by_fallback(plan: Plan, control, args, limits: Limits, state: State, active):
     """State after a step that the native loop has refused, for every trajectory that is active."""
     none, stages = jnp.zeros_like(state.y), jnp.zeros((plan.count, state.y.size), state.y.dtype)
-    unchanged = state, jnp.zeros_like(active), Step(none, none, none, none, stages, none)
-    return compute_where(active, partial(_advance, plan, control), unchanged, (args, limits, state, active))
+    ends = state.t, state.t_next, state.y, state.rate
+    step = compute_where(active, partial(take_step, plan), Step(none, none, none, none, stages, none), (args, *ends))
+    # The step alone is what a program cannot compute. XLA would compile the decision about it for longer than it runs.
+    accept: Any = kernel(_accept, static=2, derivative=False)
+    return *accept(plan, control, args, limits, state, active, step), step
 
 
 def _accept(plan: Plan, control, args, limits: Limits, state: State, active, step: Step) -> tuple[State, Array]:

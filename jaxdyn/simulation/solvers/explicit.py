@@ -22,8 +22,7 @@ from jaxdyn.compile import implicit, kernel, value_and_jvp
 from jaxdyn.constraints.projection import enlarge
 from jaxdyn.lie.so3 import matmul
 from jaxdyn.model.arguments import Number
-from jaxdyn.simulation.solvers.base import DenseOutput, Flag, StepOutput
-from jaxdyn.simulation.solvers.projected import ProjectedInterpolation, ProjectedSolver
+from jaxdyn.simulation.solvers.base import DenseOutput, Flag, ProjectedInterpolation, ProjectedSolver, StepOutput
 
 
 class _Interpolation(DenseOutput):

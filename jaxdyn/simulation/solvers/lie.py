@@ -13,8 +13,9 @@ from jaxtyping import PyTree
 from jaxdyn.lie import se2, se3, so3
 from jaxdyn.lie.so3 import matmul
 from jaxdyn.model.arguments import Number, SystemLike
+from jaxdyn.model.configuration import map_joints
 from jaxdyn.model.joints import SCREW_KINDS, joint_integrate, joint_rate
-from jaxdyn.model.tree import Model, Topology, map_joints
+from jaxdyn.model.tree import Model, Topology
 from jaxdyn.simulation.solvers.base import DenseOutput, Flag, StepOutput, Wrapped
 from jaxdyn.systems.system import has_dependent_coordinates
 

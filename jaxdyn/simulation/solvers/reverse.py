@@ -8,7 +8,6 @@ or every third and so on, and those between are computed again, so that memory i
 `replay_rows` takes the same steps as operations of JAX, which have derivatives of any order in both modes.
 """
 
-from collections.abc import Callable
 from functools import partial
 from typing import Any, NamedTuple
 
@@ -20,7 +19,7 @@ from jaxtyping import Array
 
 from jaxdyn.compile import kernel, values_of_rules
 from jaxdyn.compile.batch import any_sample, cond
-from jaxdyn.compile.loops import Carry, Given, Iteration, Task, run_loop
+from jaxdyn.compile.loops import Carry, Given, Iteration, Task, run_loop, run_to_end
 from jaxdyn.compile.repair import compute_where
 from jaxdyn.simulation.solvers.explicit import Plan, dense_output, differentiable_step, take_step
 
@@ -85,20 +84,6 @@ def write(rows: tuple, strides: tuple[int, ...], new: tuple, index, active) -> t
     return tuple(map(one, rows, new, strides))
 
 
-def run_to_end(run: Callable, otherwise: Callable, by_fallback: Callable, is_running: Callable, carry: Carry) -> Carry:
-    """Iterate by a native loop to the end.
-
-    **Arguments:** `run(carry)`, see `run_loop`; `otherwise(carry)`, an iteration where there is no native loop; `by_fallback`,
-    one that the native loop has refused, after which it continues; `is_running(carry)`.
-    """
-    after = run(carry)
-    if after is None:
-        return lax.while_loop(is_running, otherwise, carry)
-    carry, always_ends = after
-    # A loop whose iterations are all valid has ended: no code for the fallback is compiled.
-    return carry if always_ends else lax.while_loop(is_running, lambda carry: run(by_fallback(carry))[0], carry)
-
-
 class _Ends(NamedTuple):
     """Constants of the way back: the first step, the ends of the run, and the number of fixed steps or None."""
 
@@ -146,17 +131,17 @@ def pull(plan: Plan, history: History, y0, args, ts, steps, rows, varies) -> tup
         ends = _Ends(first, ts[0], ts[-1], steps)
         cotangents = cotangents._replace(places=_places(last - 1, first, cotangents.saved))
         given = Given(None, (states, history.times, history.kept, rows, ts, ts))
-        task = Task(_iterate_back, _loop_back, static)
         args = *static, (fixed, free_leaves), ends, given
         once, by_fallback = partial(_iterate_back_in_jax, *args), partial(_iterate_by_fallback, *args)
-        run = partial(run_loop, task, (fixed, free_leaves), ends, given)
-        return run_to_end(run, once, by_fallback, partial(_is_running, ends), Carry(cotangents)).state
+        task = Task(_iterate_back, _loop_back, static)
+        carry, is_running = Carry(cotangents), partial(_is_running, ends)
+        return run_to_end(task, (fixed, free_leaves), ends, given, carry, once, by_fallback, is_running).state
 
     def replay(first, last, y):
         """States from which the steps first .. last - 1 begin, (stride, n), the first of them y."""
         given = Given(None, (history.times, history.kept))
-        task = Task(_iterate_replay, _replay_in_jax, (plan,), strides=(1,))
         carry = Carry(_Replay(y, jnp.stack([first, first])), records=(jnp.zeros((stride, y.size), y.dtype),))
+        task = Task(_iterate_replay, _replay_in_jax, (plan,), strides=(1,))
         after = run_loop(task, args, (first, last), given, carry)
         carry, always_ends = (carry, False) if after is None else after
         return (carry if always_ends else _replay_in_jax(plan, args, (first, last), given, carry)).records[0]
@@ -202,8 +187,8 @@ def _read(given: Given, places):
 
 def _iterate_back(plan: Plan, times_move, structure, args, ends: _Ends, cotangents: _Cotangents, read) -> Iteration:
     """Go back through a step, or to the next row within it."""
-    pull = partial(_pull_without_loop, plan, times_move, structure, *args)
-    return _go_back(pull, times_move, ends, cotangents, read)
+    back = partial(_pull_without_loop, plan, times_move, structure, *args)(*_step_arguments((), ends, cotangents, read))
+    return _accumulate(times_move, (), ends, cotangents, read, back)
 
 
 def _iterate_back_in_jax(plan: Plan, times_move, structure, args, ends: _Ends, given: Given, carry: Carry) -> Carry:
@@ -224,7 +209,10 @@ def _iterate_by_fallback(plan: Plan, times_move, structure, args, ends: _Ends, g
 
 
 def _iterate_by(pull, times_move, ends: _Ends, given: Given, carry: Carry) -> Carry:
-    after = _go_back(pull, times_move, ends, carry.state, _read(given, carry.state.places))
+    read = _read(given, carry.state.places)
+    # Kernels around what a program cannot compute: XLA would compile their operations for longer than they run.
+    back = pull(*kernel(_step_arguments, derivative=False)((), ends, carry.state, read))
+    after = kernel(_accumulate, static=1, derivative=False)(times_move, (), ends, carry.state, read, back)
     return Carry(jax.tree.map(lambda new, old: jnp.where(after.active, new, old), after.state, carry.state))
 
 
@@ -233,23 +221,28 @@ def _loop_back(plan: Plan, times_move, structure, args, ends: _Ends, given: Give
     return lax.while_loop(partial(_is_running, ends), once, carry)
 
 
-def _go_back(pull, times_move: bool, ends: _Ends, cotangents: _Cotangents, read) -> Iteration:
-    """Add the cotangents of a step, pull(t0, t1, y, at, after, row), and choose what follows."""
-    y, (t0, t1), kept, row, at_row, at_next = read
-    step, active = cotangents.places[1], cotangents.places[1] >= ends.first
-    kept = kept & active
+def _step_arguments(_, ends: _Ends, cotangents: _Cotangents, read):
+    """The last arguments of `_pull_step`."""
+    y, (t0, t1), _, row, at_row, _ = read
+    kept, here = _flags(ends, cotangents, read)
+    return t0, t1, y, jnp.where(here, at_row, t1), jnp.where(kept, cotangents.after, 0.0), jnp.where(here, row, 0.0)
 
-    def when(flag, x):
-        return jnp.where(flag, x, jnp.zeros_like(x))
 
+def _flags(ends: _Ends, cotangents: _Cotangents, read):
+    """Whether the step was kept, and whether there is a row within it."""
+    kept = read[2] & (cotangents.places[1] >= ends.first)
     # A step with several rows is visited once for each: the last visit adds the cotangent of its end.
-    here = kept & (cotangents.saved > 0) & (at_row > t0)
-    row, after = when(here, row), when(kept, cotangents.after)
-    at = jnp.where(here, at_row, t1)
+    return kept, kept & (cotangents.saved > 0) & (read[4] > read[1][0])
+
+
+def _accumulate(times_move: bool, _, ends: _Ends, cotangents: _Cotangents, read, back) -> Iteration:
+    """Add the cotangents `back` of a step, and choose what follows."""
+    step, active = cotangents.places[1], cotangents.places[1] >= ends.first
+    t0, t1, _, _, after, row = _step_arguments((), ends, cotangents, read)
+    (kept, here), at_next = _flags(ends, cotangents, read), read[-1]
     # What nothing depends on gets nothing, even where a step has no derivative.
     asked = kept & ((after != 0).any() | (row != 0).any())
-    back = jax.tree.map(lambda x: when(asked, x), pull(t0, t1, y, at, after, row))
-    of_args, of_y, of_t0, of_t1, of_at = back
+    of_args, of_y, of_t0, of_t1, of_at = jax.tree.map(lambda x: jnp.where(asked, x, 0.0), back)
     from_start, to_end = (step_share(i, t, ends.end, ends.steps) for i, t in ((step, t0), (step + 1, t1)))
     saved = cotangents.saved - here.astype(jnp.int32)
     again = here & (saved > 0) & (at_next > t0)
@@ -257,11 +250,11 @@ def _go_back(pull, times_move: bool, ends: _Ends, cotangents: _Cotangents, read)
     following = jnp.where(again, step, step - 1)
     state = _Cotangents(
         jnp.where(again, jnp.zeros_like(before), jnp.where(kept, before, cotangents.after)),
-        when(again, before),
+        jnp.where(again, before, 0.0),
         [total + x for total, x in zip(cotangents.args, of_args, strict=True)],
         cotangents.start + of_t0 * (1 - from_start) + of_t1 * (1 - to_end),
         cotangents.end + of_t0 * from_start + of_t1 * to_end,
-        cotangents.ts.at[cotangents.saved].add(when(here, of_at)) if times_move else cotangents.ts,
+        cotangents.ts.at[cotangents.saved].add(jnp.where(here, of_at, 0.0)) if times_move else cotangents.ts,
         saved,
         _places(following, step - cotangents.places[0], saved),
     )

@@ -18,7 +18,8 @@ from jaxdyn.identify.regression import base_parameters, free_columns
 from jaxdyn.identify.torque_terms import TERMS, Terms, check_terms, friction_regressor
 from jaxdyn.identify.workflows.excitation import FourierMotion, random_motion
 from jaxdyn.model.arguments import Numbers
-from jaxdyn.model.tree import Model, neutral
+from jaxdyn.model.configuration import neutral
+from jaxdyn.model.tree import Model
 
 OBJECTIVES = ("logdet", "condition")
 # Range and speed of a joint without limits of its own (rad, rad/s).

@@ -22,7 +22,8 @@ from jaxdyn.dynamics.centroidal import com_jacobian
 from jaxdyn.dynamics.quantities import coriolis_matrix, mass_matrix
 from jaxdyn.lie.so3 import matmul
 from jaxdyn.model.arguments import check_shapes, is_concrete
-from jaxdyn.model.tree import Model, configuration_rate
+from jaxdyn.model.configuration import configuration_rate
+from jaxdyn.model.tree import Model
 
 
 class ComDynamics(eqx.Module):

@@ -1,19 +1,32 @@
-"""Inverse dynamics by the recursive Newton-Euler algorithm, with the acceleration of a body as one matrix.
+"""Inverse dynamics by the recursive Newton-Euler algorithm, and the mass matrix by composite rigid bodies.
 
 Every point r of a body (in its frame) has the acceleration a + K r, where a is that of the frame's origin and
 
     K = hat(dw) + hat(w)^2.
 
-Multiplied by the body's moments J (4 x 4, see `inertias`), Y = [K a] J = sum of m (a + K r)(r, 1)^T collects the
+Multiplied by the body's moments J (4 x 4, see `frames`), Y = [K a] J = sum of m (a + K r)(r, 1)^T collects the
 inertial forces: its last column is the inertial force, and vee(Y - Y^T) the moment. The velocity of the origin is not needed.
 
 Source: Luh, Walker & Paul (1980); K as in Balafoutis, Patel & Misra (1988); EQUATIONS section 4.
 """
 
+from typing import Any
+
+import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from jaxdyn.dynamics.recursions._arrays import constants, contract, dot, dot_transpose, entry, join, part
+from jaxdyn.dynamics.recursions._arrays import (
+    constants,
+    contract,
+    dot,
+    dot_transpose,
+    entry,
+    join,
+    part,
+    select,
+    transpose,
+)
 from jaxdyn.dynamics.recursions.links import (
     Links,
     as_vector,
@@ -24,7 +37,13 @@ from jaxdyn.dynamics.recursions.links import (
     unit_velocity,
     wrench_in_link,
 )
-from jaxdyn.dynamics.recursions.transforms import Chain, origin_in_parent, rotate_to_child, wrench_to_parent
+from jaxdyn.dynamics.recursions.transforms import (
+    Chain,
+    moments_to_parent,
+    origin_in_parent,
+    rotate_to_child,
+    wrench_to_parent,
+)
 from jaxdyn.model.arguments import check_shapes
 from jaxdyn.model.tree import Model
 
@@ -151,3 +170,61 @@ def gravity_force(model: Model, q: Float[Array, " nq"]) -> Float[Array, " nv"]:
     """Gravity force N = +dV/dq (nv,), N m or N: `rnea` at rest."""
     check_shapes(model, q=q)
     return _inverse(model, q)
+
+
+def momentum_columns(moments, S):
+    """Wrenches I S (6, nj) of unit joint accelerations of a composite body with the given moments (4, 4)."""
+    table = constants(moments.dtype)
+    # Y = [hat(w) v] J for each column (v, w) of S, as in `rnea`.
+    rates = join([contract(table.hat, part(S, 3, 6), (2,), (0,)), part(S, 0, 3).reshape(3, 1, -1)], 1)
+    Y = contract(rates, moments, (1,), (0,))  # (3, nj, 4)
+    return contract(table.moment, Y, (1, 2), (0, 2))
+
+
+def ancestor_rows(links: Links, chains: list[Chain], i: int, columns) -> list:
+    """Blocks (nj of the ancestor, k) of S^T F along the path from the parent of body i to the root, for wrenches F (6, k)."""
+    pieces, at = [], i
+    while links.parents[at] >= 0:
+        columns = wrench_to_parent(chains[at], columns)
+        at = links.parents[at]
+        pieces.append((at, dot_transpose(links.subspaces[at], columns)))
+    return pieces
+
+
+def place_rows(links: Links, pieces: dict, width: int, dtype):
+    """Assemble rows (nv, width) from blocks at their joints, zero for all other joints."""
+    rows = []
+    for i, place in enumerate(links.model.topology.v_slices):
+        # Numpy zeros are known, so the sparsity of branches survives in the scalar program.
+        rows.append(pieces[i] if i in pieces else np.zeros((place.stop - place.start, width), dtype))
+    return join(rows, 0)
+
+
+def crba(model: Model, q: Float[Array, " nq"]) -> Float[Array, "nv nv"]:
+    """Mass matrix M(q) (nv, nv), armature included, in kg m^2, kg m or kg by the kinds of the two joints.
+
+    Entries between joints on different branches are zeros that are never computed.
+
+    Source: Featherstone (2008), table 6.2.
+    """
+    check_shapes(model, q=q)
+    links = links_of(model)
+    chains = joint_transforms(links, q)
+    total = list(links.moments)
+    columns: list = [None] * model.nb
+    for i in reversed(range(model.nb)):
+        force = momentum_columns(total[i], links.subspaces[i])
+        own = dot_transpose(links.subspaces[i], force)
+        pieces = dict([(i, own), *ancestor_rows(links, chains, i, force)])
+        columns[i] = place_rows(links, pieces, own.shape[1], q.dtype)
+        if links.parents[i] >= 0:
+            total[links.parents[i]] = total[links.parents[i]] + moments_to_parent(chains[i], total[i])
+    if not columns:
+        return jnp.zeros((0, 0), q.dtype)
+    # Each column holds the entries of its joint's ancestors only: the upper triangle.
+    above = join(columns, 1)
+    M: Any = select(np.triu(np.ones((model.nv, model.nv), bool)), above, transpose(above))
+    if links.armature is not None:
+        M = M + links.armature[:, None] * np.eye(model.nv, dtype=q.dtype)
+    # An M that does not depend on q is a numpy array up to here.
+    return jnp.asarray(M if links.scale is None else links.scale[:, None] * M * links.scale[None, :])

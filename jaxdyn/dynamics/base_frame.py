@@ -19,7 +19,8 @@ from jaxdyn.dynamics.kinematics import body_subspace, forward_kinematics, take
 from jaxdyn.lie import se3
 from jaxdyn.lie.so3 import matmul
 from jaxdyn.model.arguments import check_shapes
-from jaxdyn.model.tree import Model, neutral
+from jaxdyn.model.configuration import neutral
+from jaxdyn.model.tree import Model
 
 
 def base_twists(model: Model) -> Float[Array, "nv 6"]:

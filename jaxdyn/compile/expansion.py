@@ -15,12 +15,22 @@ import numpy as np
 
 from jaxdyn.compile import array_rules, mode
 from jaxdyn.compile import program as numbers
-from jaxdyn.compile.constants import bind_known, convert_known, empty_reduction, evaluate_known
+from jaxdyn.compile.array_rules import bind_known, empty_reduction, evaluate_known
 from jaxdyn.compile.derive import without_unread
 from jaxdyn.compile.graph import Graph
+from jaxdyn.compile.inlining import replay
 from jaxdyn.compile.jax_adapter import ClosedJaxpr, Literal, Tracer, scan_counts  # pyright: ignore[reportPrivateImportUsage]
-from jaxdyn.compile.number import Number, as_objects, is_number, objects
-from jaxdyn.compile.program import Array, NotNumbers, Program, as_kind, kind_or_refuse
+from jaxdyn.compile.program import (
+    Array,
+    NotNumbers,
+    Number,
+    Program,
+    as_kind,
+    as_objects,
+    is_number,
+    kind_or_refuse,
+    objects,
+)
 from jaxdyn.compile.rearrange import AT_PLACES, REARRANGEMENTS
 
 # A function of fewer operations is scatter_places where it is called.
@@ -50,7 +60,7 @@ def expand(
     expansion = _Expansion(graph, calls, calls)
     entries = [graph.inputs(place, array) for place, array in enumerate(inputs)]
     with np.errstate(all="ignore"):  # known numbers may be none, as in branches that are not taken
-        results = expansion.evaluate(closed.jaxpr, closed.consts, entries)
+        results = expansion.evaluate(closed, entries)
     if expansion.flagged is not False and flags == "refuse":
         raise NotNumbers("samples that a program without branches cannot compute")
     reports = flags == "report_always" or (flags == "report" and expansion.flagged is not False)
@@ -90,7 +100,9 @@ class _Expansion:
         self.reductions = {f"reduce_{name}": functools.partial(functools.reduce, f) for name, f in chains.items()}
         self.reductions |= {name: functools.partial(graph.extreme, name) for name in ("reduce_max", "reduce_min")}
 
-    def evaluate(self, jaxpr, consts, args) -> list:
+    def evaluate(self, inner, args) -> list:
+        """The results of a jaxpr: a closed one, or one without constants."""
+        jaxpr, consts = (inner.jaxpr, inner.consts) if isinstance(inner, ClosedJaxpr) else (inner, ())
         values = dict(zip(jaxpr.constvars, (_constant(x) for x in consts), strict=True))
         values.update(zip(jaxpr.invars, args, strict=True))
 
@@ -105,9 +117,6 @@ class _Expansion:
             values.update(zip(eqn.outvars, results, strict=True))
         return [read(x) for x in jaxpr.outvars]
 
-    def evaluate_inner(self, closed: ClosedJaxpr, args) -> list:
-        return self.evaluate(closed.jaxpr, closed.consts, args)
-
     def one(self, eqn, args) -> list:
         name, params = eqn.primitive.name, eqn.params
         # A kernel's reverse mode is the transpose of its forward mode, which such a function has not.
@@ -118,9 +127,7 @@ class _Expansion:
             self.has_rules |= name.startswith("custom_")
             if self.calls and name == "jit":
                 return self._call(inner, args)
-            return (
-                self.evaluate_inner(inner, args) if isinstance(inner, ClosedJaxpr) else self.evaluate(inner, (), args)
-            )
+            return self.evaluate(inner, args)
         rule = _OTHER.get(name)
         if rule is not None:
             return rule(self, params, args, eqn)
@@ -154,7 +161,7 @@ class _Expansion:
         program, given = self._subprogram(inner, args)
         # A short one is written in its place, where zeros of its arguments are seen. A call does not know them.
         is_short = program.cost < MIN_SUBPROGRAM_OPERATIONS
-        results = self.graph.replay(program, given)[1] if is_short else self.graph.call(program, given)
+        results = replay(self.graph, program, given)[1] if is_short else self.graph.call(program, given)
         count = len(inner.jaxpr.outvars)
         for flagged in results[count:]:
             self.flagged = self.graph.either(self.flagged, flagged.item())
@@ -213,16 +220,6 @@ class _Expansion:
         chosen = [self.graph.select(flag, x, math.nan, kind) for flag, x in zip(flags, entries, strict=True)]
         return [objects(chosen, args[1].shape)]
 
-    def _convert(self, params, args, eqn):
-        return [self.as_dtype(args[0], params["new_dtype"])]
-
-    def as_dtype(self, x: np.ndarray, dtype) -> np.ndarray:
-        """An array, known or not, as one of a dtype."""
-        if x.dtype.kind != "O":
-            return convert_known(x, dtype)
-        kind = kind_or_refuse(dtype)
-        return objects([self.graph.convert(y, kind) for y in x.ravel().tolist()], x.shape)
-
     def _scan(self, params, args, eqn):
         count, carried = scan_counts(params)
         consts, carry, rows = args[:count], args[count : count + carried], args[count + carried :]
@@ -230,7 +227,7 @@ class _Expansion:
         length = params["length"]
         # Unrolled: the length is known, and zeros of a first step are seen in the following ones.
         for i in reversed(range(length)) if params["reverse"] else range(length):
-            results = self.evaluate_inner(params["jaxpr"], [*consts, *carry, *(x[i, ...] for x in rows)])
+            results = self.evaluate(params["jaxpr"], [*consts, *carry, *(x[i, ...] for x in rows)])
             carry = results[:carried]
             saved.append(results[carried:])
         if params["reverse"]:
@@ -244,13 +241,13 @@ class _Expansion:
         count, more = params["cond_nconsts"], params["body_nconsts"]
         of_cond, of_body, carry = args[:count], args[count : count + more], args[count + more :]
         while True:
-            (going,) = self.evaluate_inner(params["cond_jaxpr"], [*of_cond, *carry])
+            (going,) = self.evaluate(params["cond_jaxpr"], [*of_cond, *carry])
             going = as_objects(going).item()
             if type(going) is Number:
                 raise NotNumbers("a while_loop whose end is not known")
             if not going:
                 return carry
-            carry = self.evaluate_inner(params["body_jaxpr"], [*of_body, *carry])
+            carry = self.evaluate(params["body_jaxpr"], [*of_body, *carry])
 
     def _cond(self, params, args, eqn):
         which, branches = as_objects(args[0]).item(), params["branches"]
@@ -258,11 +255,11 @@ class _Expansion:
             if not self.branches or len(branches) != 2:
                 raise NotNumbers("a cond whose branch is not known")
             return self._branch(which, branches[0], branches[1], args[1:])
-        return self.evaluate_inner(branches[min(max(int(which), 0), len(branches) - 1)], args[1:])
+        return self.evaluate(branches[min(max(int(which), 0), len(branches) - 1)], args[1:])
 
     def _branch(self, which, usual: ClosedJaxpr, rare: ClosedJaxpr, args) -> list:
         """The results of `usual`, or where `which` is not 0 those of `rare`, a subprogram that hardly any sample calls."""
-        otherwise = [as_objects(x) for x in self.evaluate_inner(usual, args)]
+        otherwise = [as_objects(x) for x in self.evaluate(usual, args)]
         program, given = self._subprogram(rare, args)
         if len(program.outputs) > len(otherwise):  # the branch may flag numbers
             otherwise.append(objects([False], ()))
@@ -281,7 +278,7 @@ class _Expansion:
         right = args[before + counts.solve + counts.transpose_solve :]
         # Derivatives are those of the solved equations (JAX's rule), not those of how they are solved.
         self.has_rules = True
-        return self.evaluate_inner(jaxprs.solve, [*solve_consts, *right])
+        return self.evaluate(jaxprs.solve, [*solve_consts, *right])
 
     def _kernel(self, params, args, eqn):
         inner = params["program"]
@@ -299,7 +296,7 @@ class _Expansion:
         # A kernel within this one: called where it is long, else written out.
         if self.calls and inner.cost >= MIN_SUBPROGRAM_OPERATIONS and not inner.subprograms:
             return [x.ravel() for x in self.graph.call(inner, shaped)]
-        return [x.ravel() for x in self.graph.replay(inner, shaped)[1]]
+        return [x.ravel() for x in replay(self.graph, inner, shaped)[1]]
 
 
 def _innermost(inner: ClosedJaxpr, args: Sequence) -> tuple[ClosedJaxpr, list]:
@@ -330,7 +327,7 @@ def _subprogram(inner: ClosedJaxpr, known: tuple, most: int) -> tuple[Program, b
     # A subprogram makes no calls of its own but branches: only programs that have both call it.
     expansion = _Expansion(graph, False, True)
     args = [next(entries) if x is None else np.frombuffer(x[2], x[1]).reshape(x[0]) for x in known]
-    results = [as_objects(x) for x in expansion.evaluate_inner(inner, args)]
+    results = [as_objects(x) for x in expansion.evaluate(inner, args)]
     outputs = [Array(x.aval.shape, np.dtype(x.aval.dtype)) for x in inner.jaxpr.outvars]  # pyright: ignore[reportAttributeAccessIssue]
     if expansion.flagged is not False:
         outputs.append(_FLAG)
@@ -346,7 +343,7 @@ _OTHER: dict[str, Callable] = {
     "copy": _Expansion._same,
     "optimization_barrier": _Expansion._same,
     "pvary": _Expansion._same,
-    "convert_element_type": _Expansion._convert,
+    "convert_element_type": array_rules.convert,
     "integer_pow": array_rules.integer_pow,
     "select_n": array_rules.select,
     "clamp": array_rules.clamp,

@@ -20,7 +20,7 @@ from jaxdyn.io.urdf_loops import loop_constraints, motors_of, plugin_followers, 
 from jaxdyn.io.xml_lines import XmlFile
 from jaxdyn.model.arguments import Checked, DType, FilePath, Numbers, as_path
 from jaxdyn.model.builder import GRAVITY
-from jaxdyn.model.tree import neutral
+from jaxdyn.model.configuration import neutral
 
 _BY_SUFFIX = {".urdf": "urdf", ".xacro": "urdf", ".sdf": "sdf", ".world": "sdf", ".mjcf": "mjcf"}
 _BY_ROOT = {"robot": "urdf", "sdf": "sdf", "gazebo": "sdf", "mujoco": "mjcf", "mujocoinclude": "mjcf"}

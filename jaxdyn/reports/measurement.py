@@ -12,9 +12,9 @@ from jaxdyn.constraints.codes import CODES, code_of
 from jaxdyn.reports.programs import FIXED, SOLVERS, Prepared
 from jaxdyn.reports.records import Record
 from jaxdyn.reports.timing import time_interleaved
+from jaxdyn.simulation.checks import choose_method
 from jaxdyn.simulation.methods import Method
 from jaxdyn.simulation.solvers.explicit import keeps_fsal
-from jaxdyn.simulation.start import choose_method
 from jaxdyn.systems.scene import Scene
 
 

@@ -1,6 +1,6 @@
-"""Rigid-body arithmetic of a build: known numbers by numpy in float64, traced ones by JAX.
+"""Rigid-body arithmetic on the host: known numbers by NumPy in float64, traced ones by JAX.
 
-Builds do not use the functions of `se3` and `inertia`: a chain of fixed links merged in float32 would lose
+Builds of models do not use the functions of `se3` and `inertia`: a chain of fixed links merged in float32 would lose
 digits before the model exists, and refusals need concrete numbers. Traced numbers (by `jax.grad`,
 `jax.vmap`, `jax.jit`) go through the same formulas; faults that only values show are then not refused.
 """
@@ -12,7 +12,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from jaxdyn.compile.known import array_namespace, is_concrete
-from jaxdyn.model.joints import KINDS, SCREW_KINDS
+from jaxdyn.model.joints import KINDS, SCREW_KINDS, joint_neutral
 
 _SYMMETRIC = np.array([[0, 1, 3], [1, 2, 4], [3, 4, 5]])
 _TRIANGLE = (np.array([0, 0, 1, 0, 1, 2]), np.array([0, 1, 1, 2, 2, 2]))
@@ -338,3 +338,32 @@ def idle_joints(topology, home, screws, inertias, armature, q) -> dict[int, bool
             composite[parent] += X.T @ composite[i] @ X
             articulated[parent] += X.T @ carried @ X
     return idle
+
+
+def check_regular(topology, home, screws, inertias, armature) -> None:
+    """Refuse a tree whose mass matrix is singular in every configuration. **Raises:** ValueError that names the joints."""
+    if not is_concrete(home, screws, inertias, armature):
+        return
+    # A mass matrix that is singular at one configuration is legitimate; at a random one too, it is so at all of them.
+    # A fixed seed, so that the same file is always accepted or always refused.
+    rng = np.random.default_rng(0)
+    neutral = [joint_neutral(kind) for kind in topology.kinds]
+    if not idle_joints(topology, home, screws, inertias, armature, neutral):
+        return
+    # Quaternions need not be of unit length here: `joint_pose` divides by the norm.
+    elsewhere = [q + rng.uniform(-1, 1, q.size) for q in neutral]
+    if not (idle := idle_joints(topology, home, screws, inertias, armature, elsewhere)):
+        return
+    names = [topology.joint_names[i] for i in sorted(idle)]
+    # Joints are visited from the leaves, so the first one is the outermost cause.
+    i, alone = next(iter(idle.items()))
+    fault = (
+        "moves no inertia: S^T I S = 0 for all that it carries"
+        if alone
+        else "can move (together with joints beyond it, if any) without moving any inertia"
+    )
+    others = "" if len(idle) == 1 else f" (so it is, in all, with {', '.join(names)})"
+    raise ValueError(
+        f"joint {topology.joint_names[i]!r} (body {topology.body_names[i]!r}) {fault}, so the mass matrix is singular"
+        f"{others}; give the bodies an inertia, give the joints an armature, or fix them (of a URDF: lock={names})"
+    )

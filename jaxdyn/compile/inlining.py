@@ -1,0 +1,77 @@
+"""Programs written out once more in the graph of another one, where equal numbers and known ones are folded again."""
+
+from collections.abc import Sequence
+
+import numpy as np
+
+from jaxdyn.compile.graph import Graph
+from jaxdyn.compile.program import Array, Constant, Program, kind_of, objects
+
+
+def replay(
+    graph: Graph, program: Program, inputs: Sequence[np.ndarray], branches: bool = True
+) -> tuple[list, list[np.ndarray]]:
+    """The numbers of all operations of a program for the given entries of its inputs, and its outputs.
+
+    Without `branches` both results of a branch are computed for all samples, and selected.
+    """
+    numbers: list = []
+    flat = [x.ravel().tolist() for x in inputs]
+    for operation in program.operations:
+        if operation.op == "input":
+            place, entry = operation.args
+            numbers.append(flat[place][entry])
+        elif operation.op in (
+            "call",
+            "call_where",
+        ):  # operands: the number of the subprogram, then entries one after the other
+            which, *given = (x.value if type(x) is Constant else numbers[x] for x in operation.args)
+            called, write = program.subprograms[which], _call if operation.op == "call" else _call_where
+            numbers.append([x for row in write(graph, called, given, branches) for x in row.ravel().tolist()])
+        elif operation.op == "part":
+            call, entry = operation.args
+            numbers.append(numbers[call][entry.value])
+        else:
+            args = [x.value if type(x) is Constant else numbers[x] for x in operation.args]
+            numbers.append(graph.apply(operation.op, operation.kind, args))
+    outputs = [
+        objects([x.value if type(x) is Constant else numbers[x] for x in row], array.shape)
+        for row, array in zip(program.results, program.outputs, strict=True)
+    ]
+    return numbers, outputs
+
+
+def _call(graph: Graph, program: Program, given: list, branches: bool) -> list[np.ndarray]:
+    inputs = _arrays(program.inputs, given)
+    return graph.call(program, inputs) if program.is_called else replay(graph, program, inputs, branches)[1]
+
+
+def _call_where(graph: Graph, program: Program, given: list, branches: bool) -> list[np.ndarray]:
+    flag, *entries = given
+    arrays, count = _arrays((*program.inputs, *program.outputs), entries), len(program.inputs)
+    inputs, otherwise = arrays[:count], arrays[count:]
+    if branches:
+        return graph.call_where(flag, program, inputs, otherwise)
+    return [
+        objects(
+            [graph.select(flag, x, y, kind_of(array.dtype)) for x, y in zip(old.flat, new.flat, strict=True)],
+            array.shape,
+        )
+        for old, new, array in zip(otherwise, replay(graph, program, inputs, branches)[1], program.outputs, strict=True)
+    ]
+
+
+def _arrays(types: Sequence[Array], entries: list) -> list[np.ndarray]:
+    """Arrays of entries that are given one after the other."""
+    ends = np.cumsum([array.size for array in types]).tolist()
+    return [objects(entries[end - array.size : end], array.shape) for end, array in zip(ends, types, strict=True)]
+
+
+def inline(program: Program) -> Program:
+    """The same without subprograms and branches, except subprograms that have loops."""
+    if all(x.is_called for x in program.subprograms):
+        return program
+    graph = Graph()
+    with np.errstate(all="ignore"):  # known numbers may overflow, as they do in XLA
+        _, outputs = replay(graph, program, [graph.inputs(i, array) for i, array in enumerate(program.inputs)], False)
+    return graph.finish(program.inputs, program.outputs, outputs, name=program.name)
