@@ -72,7 +72,7 @@ def _find(old: str, name: str, module: str) -> Any:
 
 
 class RenamedMethod:
-    """Old name of a method, as `placed = RenamedMethod("contacts_at")` in the class that has the new one."""
+    """Old name of a method or field, as `placed = RenamedMethod("contacts_at")` in the class that has the new one."""
 
     def __init__(self, new: str):
         self.new = new
@@ -84,5 +84,5 @@ class RenamedMethod:
         # The class itself is asked by tools that list its names.
         if instance is None:
             return self
-        warnings.warn(f"{self.old} is deprecated; call {self.new}", DeprecationWarning, stacklevel=2)
+        warnings.warn(f"{self.old} is deprecated; its name is {self.new}", DeprecationWarning, stacklevel=2)
         return getattr(instance, self.new)

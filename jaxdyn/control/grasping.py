@@ -144,6 +144,7 @@ class GraspForce(ForceIntegral):
         return self._forces(q, t, torque_for(self.scene, q, v, self.acceleration(q, v, t), t), None)
 
     wanted_forces = RenamedMethod("reference_forces")
+    grasp = RenamedMethod("scene")
 
     def __call__(
         self,

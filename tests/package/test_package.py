@@ -360,7 +360,7 @@ def test_public_namespaces_list_their_names():
 
 def test_old_names_of_methods_warn():
     scene, tau = jaxdyn.Scene(jaxdyn.robots.chain(2)), jnp.ones(2)
-    with pytest.warns(DeprecationWarning, match="Scene.limited is deprecated; call clip_effort"):
+    with pytest.warns(DeprecationWarning, match="Scene.limited is deprecated; its name is clip_effort"):
         np.testing.assert_array_equal(scene.limited(tau), scene.clip_effort(tau))
 
 
