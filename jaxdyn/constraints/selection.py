@@ -298,7 +298,7 @@ def select_concrete_rows(
     if 0 < B.shape[0] <= B.shape[1] and np.linalg.svd(B, compute_uv=False)[-1] > apart:
         return every, B.shape[0]
     # The SVD is sufficient, not necessary: the least singular value may be far below the least pivot.
-    pivots = pivoted_rows(B)[1]
+    pivots = pivot_rows(B)[1]
     if np.sum(pivots > apart) == B.shape[0]:
         return every, B.shape[0]
     with jax.ensure_compile_time_eval():
@@ -311,7 +311,7 @@ def _select_by_program(scene: Scene, q, t, rank_tol, is_rounded):
     return select_rows(scene, q, t, rank_tol, is_rounded)
 
 
-def pivoted_rows(B: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+def pivot_rows(B: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Indices of the rows that `eliminate` takes one after the other, and their pivots, of a concrete B."""
     rest, rows, pivots = np.array(B), [], []
     for _ in range(min(B.shape)):

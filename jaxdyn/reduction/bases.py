@@ -18,7 +18,7 @@ from jaxdyn.compile import entry_point, gram_eigenvectors
 from jaxdyn.compile.known import is_known
 from jaxdyn.constraints.base import constraint_jacobian, layout, velocity_residual
 from jaxdyn.constraints.rank import condition_number, pseudo_inverse, rank_of, sign_of_determinant, tolerance
-from jaxdyn.constraints.selection import pivoted_rows
+from jaxdyn.constraints.selection import pivot_rows
 from jaxdyn.lie.so3 import matmul
 from jaxdyn.model.arguments import Number, Numbers, batch_hint, check_state
 from jaxdyn.systems.mass_factor import cholesky, solve_cholesky, solve_lower
@@ -334,7 +334,7 @@ def independent_velocities(scene: Scene, q, t: Number = 0.0) -> tuple[int, ...]:
     # In NumPy, since the pivots are indices that a caller stores as static.
     A = np.asarray(constraint_jacobian_compiled(scene, q, jnp.asarray(t, q.dtype)), float)
     # The pivots of its columns are the dependent velocities.
-    columns, pivots = pivoted_rows(A.T)
+    columns, pivots = pivot_rows(A.T)
     dependent = columns[pivots > 1e-9 * np.linalg.norm(A)]
     return tuple(np.setdiff1d(np.arange(scene.nv), dependent).tolist())
 
