@@ -8,6 +8,7 @@ Where such a solid would hide the rods of its body, a small ball marks the centr
 """
 
 import dataclasses
+from typing import Any
 
 import numpy as np
 
@@ -211,7 +212,8 @@ def _rolling(scene: Scene, carried: set[int]) -> tuple[list[Shape], set[int]]:
             continue
         if not isinstance(constraint, RollingWheel | RollingSphere):
             continue
-        index = frame_index(model, constraint.body)
+        name: Any = constraint.body  # a wheel and a ball have one
+        index = frame_index(model, name)
         body = model.topology.frame_bodies[index]
         # The file's own solid shows the wheel already.
         if body in carried:

@@ -62,7 +62,7 @@ def run(inputs, *, term, solver, controller, event, adjoint, max_steps, progress
     return solved.ys[0], (solved.result, counts, solved.ts[1][0], *end), solved
 
 
-def run_adaptively(inputs, options, limit_is_given: bool):
+def run_adaptively(inputs, options, limit_is_given: bool) -> tuple[Any, tuple]:
     """Rows and facts of `run` with adaptive steps whose ends are constants to reverse mode.
 
     The time of an event then follows from the state at its end.
