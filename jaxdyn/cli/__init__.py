@@ -31,7 +31,11 @@ class _Parser(argparse.ArgumentParser):
     """Parser whose files of options, @FILE, are split as by a shell, with comments after #."""
 
     def convert_arg_line_to_args(self, arg_line: str) -> list[str]:
-        return shlex.split(arg_line, comments=True)
+        """Options of a line."""
+        try:
+            return shlex.split(arg_line, comments=True)
+        except ValueError:
+            self.error(f"a line in a file of options is {arg_line!r}; close its quotation marks")
 
 
 def main(argv: Sequence[str] | None = None) -> int:
@@ -60,7 +64,10 @@ def main(argv: Sequence[str] | None = None) -> int:
         command.add_argument("--debug", action="store_true", help="show the traceback of an error")
         # argparse then selects the function together with the command.
         command.set_defaults(run=module.run)
-    args = parser.parse_args(argv)
+    try:
+        args = parser.parse_args(argv)
+    except RecursionError:
+        parser.error("a file of options names itself in a line that begins with @; leave this line out")
     # Commands are programs of their own, so they may choose float64; the library never does.
     jax.config.update("jax_enable_x64", True)
     try:

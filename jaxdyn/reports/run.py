@@ -65,7 +65,7 @@ def report(
     - `integrators`: pairs of a method and a solver instead of the usual ones.
     - `rounds`: timings of each run, at least 20 for a figure to be quoted.
     - `out`: directory for report.json, report.txt and report.html.
-    - `peers(prepared, dtype, starts)` -> contestants that are timed in the same loop; see `jaxdyn.reports.measure`.
+    - `peers(prepared, dtype, starts)` -> contestants that are timed in the same loop; see `jaxdyn.reports.measurement.measure`.
     - `echo`: receives lines of progress, e.g. `print`.
     - `ways`: the former name of `integrators`.
 
@@ -85,6 +85,7 @@ def report(
     chosen = _check_arguments(scenes, dtypes, batches, integrators, rounds)
     if out is not None:
         new_figure(1.0, 1.0)  # fails now without matplotlib
+        Path(out).mkdir(parents=True, exist_ok=True)
     say = echo or (lambda line: None)
     now = datetime.datetime.now(datetime.UTC).isoformat(timespec="seconds")
     head = {"machine": machine(), "date": now}

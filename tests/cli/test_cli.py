@@ -374,6 +374,20 @@ def test_identify_from_one_file_and_the_robot_it_writes(arm, tmp_path, capsys, m
         jd.save_urdf(truth, tmp_path / "x.urdf", torques={"elbow": {"offset": 1.0}})
 
 
+@pytest.mark.parametrize(
+    ("text", "error"),
+    [('--train "0.6\n', r"a line in a file of options is '--train \"0\.6'; close"), ("@fit.txt\n", "names itself")],
+)
+def test_files_of_options_are_refused(text, error, tmp_path, monkeypatch, capsys):
+    """An open quotation mark, and a file that includes itself: one line and status 2."""
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "fit.txt").write_text(text)
+    with pytest.raises(SystemExit) as stop:
+        main(["identify", "@fit.txt"])
+    assert stop.value.code == 2
+    assert re.search(error, capsys.readouterr().err)
+
+
 @pytest.mark.long
 def test_identify_finds_delays(arm, tmp_path, capsys, monkeypatch):
     """20 ms: found, printed, in both reports, judged on shifted logs, counted in a payload; given as a number, the same fit."""

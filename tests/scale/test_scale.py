@@ -704,7 +704,7 @@ def test_sweep_runs_a_study_and_goes_on_with_it(tmp_path, capsys):
 @pytest.mark.parametrize(
     ("old", "new", "error"),
     [
-        ('"study.py"', '"no_scene"', "name one of .*, andrews, "),
+        ('"study.py"', '"no_scene"', "name one of .*, four_bar, "),
         ('"study.py"', '"other.py"', "there is no file"),
         ("samples = 12", "", "has no samples"),
         ("samples = 12", "sample = 12", "has sample; a study has"),

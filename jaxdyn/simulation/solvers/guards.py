@@ -132,7 +132,7 @@ def search_root(search: Search, t0, t1, at_end, in_middle, good, usual) -> tuple
 
 
 def delay(guard, rate, t, y) -> Any:
-    """Delay of an event, (), s: zero, with its derivative.
+    """Delay of an event, (), s: zero, with its first derivative; the second one lacks the change of the rate.
 
     Where guard(t, y) is zero, a change of the guard by de moves the root by dt = -de/(de/dt), with de/dt along the motion, whose
     `rate` is dy/dt before the event.
