@@ -100,6 +100,7 @@ def test_info_locks_floats_and_repairs(arm, tmp_path, capsys):
     assert "root_joint" in capsys.readouterr().err
 
 
+@pytest.mark.long
 def test_info_of_a_real_robot_says_what_is_not_used(panda, capsys):
     assert main(["info", str(panda)]) == 0
     text = capsys.readouterr().out
@@ -288,6 +289,7 @@ def test_identify_chooses_the_cutoff_and_warns_of_vibration(arm, tmp_path, capsy
     assert main([*args, "--cutoff", "low"]) == 2
 
 
+@pytest.mark.long
 def test_identify_from_several_logs_judged_on_another(arm, tmp_path, capsys):
     """Two logs fitted, one only predicted; JSON, page and URDF; what is not asked for is not tried."""
     truth = jd.model.repair_inertias(jd.load_urdf(arm))

@@ -61,6 +61,7 @@ def test_known_integers_wrap(dtype):
 DTYPES = st.sampled_from(["float32", "float64", "int32", "int64"])
 
 
+@pytest.mark.long
 @settings(max_examples=12, deadline=None, derandomize=True)
 @given(DTYPES, DTYPES, st.booleans())
 def test_products_have_the_dtype_that_is_asked_for(given_dtype, wanted, is_known):

@@ -827,6 +827,7 @@ def test_where_kernels_cannot_be_called_their_numbers_are_operations(monkeypatch
     assert caplog.text.count("no such processor") == 1
 
 
+@pytest.mark.long
 def test_operations_of_jax_are_the_same_numbers():
     """What is lowered on other devices than a CPU, with operations of every kind."""
     batch = jnp.asarray(RNG.uniform(0.1, 0.9, (2, 2)))

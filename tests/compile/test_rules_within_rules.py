@@ -93,6 +93,7 @@ def _compare(functions: dict) -> None:
             assert_close(value, wanted[name][word], 1e-10, f"{name} {word}")
 
 
+@pytest.mark.long
 def test_some_functions_of_jax_with_rules():
     """All orders of modes agree with plain mode: a choice, a removable singularity."""
     _compare({"relu": jax.nn.relu, "sinc": jnp.sinc})

@@ -63,6 +63,7 @@ def test_targets_all_over_the_workspace_are_reached_on_the_branch_of_the_guess(t
     np.testing.assert_allclose(turn, 0.0, atol=1e-10)
 
 
+@pytest.mark.long
 def test_shorter_paths_do_not_arrive():
     target = jnp.asarray([-0.5, -0.3])
     one, many = (jd.assemble(arm(target), GUESS, steps=steps, guesses=1, throw=False) for steps in (1, 100))

@@ -336,6 +336,7 @@ def test_pseudo_inverse_of_any_rank(shape):
         np.testing.assert_allclose(slope, want, atol=1e-7 * max(1, np.abs(want).max()))  # h^4 of the differences
 
 
+@pytest.mark.long
 def test_printed_numbers():
     """Planar pendulum of EQUATIONS section 6, Andrews' mechanism at its start, the coin's contact force."""
     angle, rate, mass, length = 0.5, 1.7, 0.7, 1.2
@@ -411,6 +412,7 @@ def test_rolling_disk_with_torques():
     assert_close(dynamics.multipliers, 2.0 * forward, 1e-13)
 
 
+@pytest.mark.long
 def test_assemble_finds_the_nearest_configuration():
     """From a rough guess: closed to rounding, the least change in the metric M(guess), admissible velocity."""
     scene = scenes.four_bar()

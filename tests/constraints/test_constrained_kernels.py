@@ -207,6 +207,7 @@ def test_gradients_beside_a_singular_sample():
         assert np.isfinite(np.asarray(x)).all()
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("name", ["windows", *(pytest.param(x, marks=pytest.mark.slow) for x in ("few", "turning"))])
 def test_residuals_of_open_loops(name):
     """Under nested `vmap`s, their derivatives, and the check of a motion's states, in both modes."""

@@ -69,6 +69,7 @@ def in_fixed_steps(rank_tol, scene, q, v, t):
     return q, jnp.where(better, projected, v)
 
 
+@pytest.mark.long
 @pytest.mark.parametrize(
     "name, parameters",
     [
@@ -135,6 +136,7 @@ def test_errors_of_a_step_lose_what_the_projection_removes(name, parameters, mod
     assert_close(computed[0], jnp.stack([q] * 3), 1e-14)
 
 
+@pytest.mark.long
 @BOTH
 def test_what_a_projection_leaves_open_is_an_error(mode):
     """States so far off that all steps are not enough, or one would lead away; beside them one that is closed."""
@@ -154,6 +156,7 @@ def test_what_a_projection_leaves_open_is_an_error(mode):
     assert (error > 0.3 * left)[1:].all()
 
 
+@pytest.mark.long
 @BOTH
 def test_a_singular_sample_of_a_batch_is_projected_by_its_rank(mode):
     scene, q, v = drifted("windows", count=2)
@@ -167,6 +170,7 @@ def test_a_singular_sample_of_a_batch_is_projected_by_its_rank(mode):
             assert_close(x, y, 1e-12)
 
 
+@pytest.mark.long
 @pytest.mark.parametrize(
     "name",
     ["andrews", "car_axis", "rolling_disk", "chaplygin_sleigh", pytest.param("rolling_coin", marks=pytest.mark.slow)],

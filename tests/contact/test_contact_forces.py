@@ -22,6 +22,7 @@ def held_ball():
     return hand, quick(lambda q: grasp_map(hand, q))(q)
 
 
+@pytest.mark.long
 def test_optimal_forces_hold_the_ball():
     hand, G = held_ball()
     computed = quick(lambda G, w: optimal_forces(G, w, [CONE] * 3, preload=0.2))(G, -WEIGHT)
@@ -70,6 +71,7 @@ def test_optimal_forces_are_differentiable_in_friction_and_wrench():
     assert values[1] > values[0]
 
 
+@pytest.mark.long
 def test_a_wrench_that_no_forces_balance_is_told():
     _, G = held_ball()
     G = jnp.where(jnp.arange(9)[None] < 3, G, 0.0)  # one finger alone

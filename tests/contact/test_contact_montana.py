@@ -127,6 +127,7 @@ def test_ball_on_a_plane_rolls_by_its_radius():
     np.testing.assert_allclose(np.linalg.norm((kinematics.rolling @ np.array([0.6, -0.8]))[:2]), 0.1, rtol=1e-12)
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("name", [pytest.param(x, marks=[pytest.mark.slow] * (x not in FAST)) for x in PAIRS])
 def test_twists_are_those_of_the_relative_pose(name):
     o, f = PAIRS[name]
@@ -206,6 +207,7 @@ def test_batches_compile_and_differentiate_in_the_shape():
     np.testing.assert_allclose(slopes[0], (high - low) / (2 * step), rtol=1e-6)
 
 
+@pytest.mark.long
 def test_where_a_chart_ends_traced_numbers_are_finite_and_told():
     ball = Sphere(0.1)
     pole = jnp.array([jnp.pi / 2, 0.0])

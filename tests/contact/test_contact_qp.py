@@ -64,6 +64,7 @@ def largest_residual(data, computed):
     return max((part.max(1) / scale).max() for part in wrong)
 
 
+@pytest.mark.long
 def test_conditions_of_optimality_hold():
     data = problems(200, 1)
     computed = many(*data)

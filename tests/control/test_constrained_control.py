@@ -113,6 +113,7 @@ def test_velocities_of_a_rolling_disk():
     np.testing.assert_allclose(solution.multipliers, np.tile(force, (TS.size, 1)), atol=1e-10)
 
 
+@pytest.mark.long
 def test_three_motors_of_a_parallel_manipulator():
     """The carried point follows; torques are the shortest that do it, and internal ones move nothing."""
     scene = scenes.parallel_manipulator()

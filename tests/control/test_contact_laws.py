@@ -21,6 +21,7 @@ PAIRS = {
 }
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("pair", [pytest.param(p, marks=pytest.mark.slow if p == "ellipsoids" else ()) for p in PAIRS])
 def test_contact_coordinates_are_the_inverse_of_the_pose(pair):
     """Of touching surfaces, also with a gap along the normal; their rates are those of Montana's forward form."""

@@ -35,6 +35,7 @@ def final(x):
     return 0.5 * x @ jnp.asarray(QF) @ x
 
 
+@pytest.mark.long
 def test_one_iteration_is_the_riccati_equation():
     n, x0 = 15, np.array([1.0, -2.0, 0.5])
     P, gains = QF, []
@@ -55,6 +56,7 @@ def test_one_iteration_is_the_riccati_equation():
     assert full.result == RESULTS.successful and int(full.iterations) == 2
 
 
+@pytest.mark.long
 def test_limits_are_those_of_a_quadratic_program():
     """A double integrator with bounded force: least squares with bounds in all controls, by SciPy."""
     dt, n, x0 = 0.1, 30, np.array([3.0, 0.0])
@@ -217,6 +219,7 @@ def test_four_bar_by_its_crank():
     assert np.abs(jax.vmap(lambda q: position_residual(scene, q))(q)).max() < 1e-10
 
 
+@pytest.mark.long
 def test_warm_start_needs_fewer_iterations():
     """The next problem of a controller: the state a step on, the controls shifted."""
     x0, us = jnp.array([1.0, 0.0]), jnp.zeros((25, 1))
@@ -243,6 +246,7 @@ def test_warm_start_needs_fewer_iterations():
         ilqr(lambda x, u: x, lambda x, u, k: u @ u, lambda x: x @ x, jnp.zeros(3), first)
 
 
+@pytest.mark.long
 def test_refusals_and_codes():
     x0, us = jnp.zeros(3), jnp.zeros((4, 2))
     with pytest.raises(ValueError, match=r"us has shape \(4,\); give controls"):

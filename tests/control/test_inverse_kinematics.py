@@ -107,6 +107,7 @@ def test_posture_is_the_nearest_configuration():
     assert np.all((limited.q >= model.lower - 1e-12) & (limited.q <= model.upper + 1e-12))
 
 
+@pytest.mark.long
 def test_stewart_platform_in_closed_form():
     """The legs' lengths are distances; the loops hold to rounding; along a path the branch stays."""
     scene, guess = stewart()
@@ -173,6 +174,7 @@ def test_directions_and_the_centre_of_mass():
     assert other.errors.shape == (5,)
 
 
+@pytest.mark.long
 def test_out_of_reach():
     """The nearest place, its code, no derivative; limits bind there too."""
     model = two_bars(lower=-1.0, upper=0.5)

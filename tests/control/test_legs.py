@@ -76,6 +76,7 @@ def test_centre_of_mass_agrees_with_pinocchio(file):
     assert_close(gravity, -mass * np.asarray(J).T @ np.asarray(model.gravity), 1e-9)
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("file", CASES)
 def test_inverse_dynamics_agrees_with_pinocchio(file):
     """Pinocchio's rnea under the feet's wrenches gives our torques, and none at the base; forces are in their cones."""
@@ -102,6 +103,7 @@ def test_inverse_dynamics_agrees_with_pinocchio(file):
     assert not np.asarray(legged.tau)[:6].any()
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("file", CASES)
 def test_standing_agrees_with_pinocchios_constraint_dynamics(file):
     """Held feet: acceleration and forces under given torques."""
@@ -143,6 +145,7 @@ def _local_wrench(source, contact, data, one):
     return wrench if one.is_flat else np.concatenate([wrench[:3], np.zeros(3)])
 
 
+@pytest.mark.long
 def test_solo_stands_with_forces_in_its_cones(solo):
     """The torques of the program, applied: the held robot does not move, and the multipliers are the program's forces."""
     model, _, _, q, feet = solo

@@ -198,6 +198,7 @@ def test_composite_error(pendulum):
     assert_close(reverse, forward, 1e-9)
 
 
+@pytest.mark.long
 def test_equivalent_gains(pendulum):
     """Of numbers the closed form; of a matrix Kd the torque of the law, which they give back."""
     scene, q, v = pendulum

@@ -142,6 +142,7 @@ def printed_J_f(eta):
     return se3.Ad(at.finger.pose) @ jnp.concatenate([jnp.zeros((3, 2)), bent, jnp.zeros((1, 2))])
 
 
+@pytest.mark.long
 def test_rolling_motion_is_that_of_the_printed_equations(solved):
     """Equation E22: the two rates of the contact's place on the tip, and four multipliers."""
 

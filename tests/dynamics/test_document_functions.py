@@ -72,6 +72,7 @@ def test_a_base_at_rest_changes_nothing(fixed):
         jaxtyping.config.update("jaxtyping_disable", False)
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("armature", [False, True])
 def test_articulated_bodies(armature):
     """F_i = Mh_i Vdot_i + b_i in the motion, the block equation of section 5 or its pivots, and det M."""
@@ -106,6 +107,7 @@ def test_articulated_bodies(armature):
             assert_close(total[6 * i : 6 * i + 6, 6 * i : 6 * i + 6], inertia, 1e-10)
 
 
+@pytest.mark.long
 def test_articulated_bodies_in_batches_and_without_bodies():
     model = random_tree(6, ["free", "revolute", "prismatic"])
     q, v, tau = random_states(model, 3, 2)[:3]
@@ -124,6 +126,7 @@ def floating():
     return model, q, v, tau, jd.dynamics.com_dynamics(model, q, v)
 
 
+@pytest.mark.long
 def test_centre_of_mass_coordinates_decouple(floating):
     """The block structure, gravity, the velocity of the centre of mass, and the accelerations of forward dynamics."""
     model, q, v, F, terms = floating

@@ -240,6 +240,7 @@ def _mjcf(model) -> str:
     )
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("first", ["free", pytest.param("revolute", marks=pytest.mark.slow)])
 def test_agrees_with_mujoco(first):
     kinds = [first, "revolute", "spherical", "prismatic", "revolute", "spherical", "revolute"]
@@ -355,6 +356,7 @@ def test_far_robot_is_as_exact_as_at_home(name):
                 assert_close(there[key], exact[key], 1e-4, key)
 
 
+@pytest.mark.long
 def test_without_gravity_and_armature_nothing_of_them_is_compiled():
     model = random_tree(61, ["revolute", "spherical", "revolute"])
     bare = model.replace(gravity=None, armature=None)
@@ -396,6 +398,7 @@ def test_batch_equals_loop_and_eager_equals_jit():
     assert_close(matrix_form.forward_dynamics(small, q, v, tau), compiled, 1e-12)
 
 
+@pytest.mark.long
 def test_the_public_functions_are_the_matrix_form():
     # Or the recursion, for large batches: the same answer.
     model = random_tree(35, ["revolute", "spherical"])

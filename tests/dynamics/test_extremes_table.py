@@ -60,6 +60,7 @@ def test_the_longest_stable_step():
     assert not verdicts(CASES["steps"](ONE, False, solvers={"RK4": SOLVERS["RK4"], "Tsit5": SOLVERS["Tsit5"]}))
 
 
+@pytest.mark.long
 def test_beyond_the_longest_stable_step():
     """Steps that are too long are refused before the state overflows, and then too."""
     computed = verdicts(CASES["beyond"](ONE, False))

@@ -125,6 +125,7 @@ def test_others_import_the_names_of_the_package_alone():
     assert not wrong, wrong
 
 
+@pytest.mark.long
 def test_energies_of_lagrangian_systems():
     """Kinetic energy with a metric sinc q: half of the metric's second derivative. Acceleration along a rail given by a root."""
     system = jd.LagrangianSystem(lambda q, v: 0.5 * v @ v * jnp.sinc(q[0]), 1)

@@ -61,6 +61,7 @@ def case(name):
     return source, model, bridge, frames, q, v, jax.tree.map(np.asarray, compiled(model, q, v))
 
 
+@pytest.mark.long
 @pytest.mark.parametrize(
     "name", [pytest.param(name, marks=[pytest.mark.slow] * (name != "every_kind")) for name in CASES]
 )
@@ -122,6 +123,7 @@ def test_jacobians_are_derivatives_of_the_pose():
     assert_close(ours["spatial2"], adjoint @ ours["body2"])
 
 
+@pytest.mark.long
 def test_acceleration_is_the_rate_of_the_velocity():
     # The second derivative of the pose's origin along a motion q(t) with dq/dt = H v, dv/dt = a, and that of its rotation.
     _, model, _, frames, q, v, ours = case("every_kind")

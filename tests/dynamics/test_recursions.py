@@ -270,6 +270,7 @@ def test_root_of_a_chain_is_triangular():
     assert (np.diag(root) > 0).all()
 
 
+@pytest.mark.long
 def test_results_keep_the_dtype():
     """No conversion of numbers anywhere, with known and with traced leaves."""
     dtype = jnp.float32

@@ -24,6 +24,7 @@ def program_of(function, *args):
     return eqn.params["program"]
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("dtype", [jnp.float64, pytest.param(jnp.float32, marks=pytest.mark.slow)])
 def test_forward_dynamics_of_every_joint(dtype):
     """Against the world-frame matrix form, for one sample, a few and nested batches."""

@@ -48,6 +48,7 @@ def test_numbers_that_do_not_vary(monkeypatch, least):
     assert len(called(jax.vmap(compute), jnp.stack([a] * 11), b)) == 1  # nothing is shared
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("dtype", [jnp.float64, jnp.float32])
 def test_dynamics_of_one_model_given_to_a_batch(dtype):
     """As with a model of its own for every sample; 2000 operations are of the model alone."""

@@ -106,6 +106,7 @@ def cases(slow):
         yield pytest.param(name, shape, id=label, marks=marks)
 
 
+@pytest.mark.long
 @pytest.mark.parametrize(("name", "shape"), list(cases(slow=False)))
 def test_every_number_of_every_scene_and_start_can_be_traced(name, shape):
     build, numbers, start, of_start = parts(name, shape)
@@ -158,6 +159,7 @@ NUMBERS = {
 }
 
 
+@pytest.mark.long
 def test_a_builder_takes_traced_numbers_everywhere():
     gradient = check_slopes(lambda numbers: weigh(arm(numbers)), NUMBERS)
     assert np.count_nonzero(gradient) == gradient.size
@@ -253,6 +255,7 @@ def test_float32_numbers():
     assert model.inertias.dtype == jnp.float64
 
 
+@pytest.mark.long
 def test_gradient_of_a_motion_by_a_length():
     """A pendulum whose inertia goes with its length: q = f(t sqrt(g / l)), so that dq/dl = -t v / (2 l) from rest."""
 

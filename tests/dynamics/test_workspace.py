@@ -117,6 +117,7 @@ def elbow(angle):
     return jnp.stack([jnp.full_like(angle, 0.4), angle])
 
 
+@pytest.mark.long
 def test_near_a_singularity_it_is_damped_and_says_so():
     """Two bars that are nearly straight: M_x by hand away from it; there bounded, with a gradient that is finite."""
     arm = jd.ModelBuilder("two bars", gravity=None)

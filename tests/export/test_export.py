@@ -177,6 +177,7 @@ def test_forward_dynamics_in_single_precision(arm, exported, tmp_path):
     run_c(tmp_path, "small")
 
 
+@pytest.mark.long
 def test_constrained_dynamics_and_projections(tmp_path):
     scene = jd.scenes.four_bar()
     q, v = map(np.asarray, jd.scenes.four_bar.start())
@@ -204,6 +205,7 @@ def crossing():
     return jd.Scene(jd.scenes.planar_arm().system, [jd.Holonomic(lambda q, t: jnp.stack([q[0] ** 2 - q[1] ** 2]))])
 
 
+@pytest.mark.long
 def test_samples_where_rows_lose_rank_are_computed_by_the_pseudo_inverse():
     scene = crossing()
 
@@ -351,6 +353,7 @@ def test_a_step_of_an_arm_behind_drives(tmp_path):
         jd.export(lambda q, v, z, tau: limited((q, v, z), tau), q, v, z, tau, name="limited")
 
 
+@pytest.mark.long
 def test_jacobians_by_columns_equal_those_that_are_written_out(arm, exported, monkeypatch, tmp_path):
     assert isinstance(exported.derivative.program, standalone.Directions)
     monkeypatch.setattr(standalone, "MAX_WRITTEN_OUT", 10**9)

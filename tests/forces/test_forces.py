@@ -61,6 +61,7 @@ def oscillation(x0, v0, k, c, m, t):
     return (a * np.exp(r1 * t) + b * np.exp(r2 * t)).real, (a * r1 * np.exp(r1 * t) + b * r2 * np.exp(r2 * t)).real
 
 
+@pytest.mark.long
 def test_motions_against_closed_forms(sliders):
     ts = np.linspace(0.0, 3.0, 16)
     scene = Scene(
@@ -269,6 +270,7 @@ def test_scenes_are_arguments_and_batches(arm):
     np.testing.assert_allclose(batch, one_by_one, rtol=1e-13)
 
 
+@pytest.mark.long
 def test_float32(arm):
     single = jax.tree.map(lambda x: x.astype(jnp.float32), arm)
     q, v = sample(arm, 11)

@@ -203,6 +203,7 @@ def test_float32_bounces_to_rest():
         np.testing.assert_array_equal(motion.v[:, -1], 0.0)
 
 
+@pytest.mark.long
 def test_friction_under_a_negative_normal_force_drives_nothing():
     for make in (lambda n: jd.contact.DryFriction(0.5, normal=n), lambda n: jd.forces.SlidingFriction(0.5, n, 1)):
         with pytest.raises(ValueError, match=r"normal is -1\.0"):

@@ -103,6 +103,7 @@ def torus(q, large=2.0, small=0.6):
     return jnp.stack([out * jnp.cos(q[1]), out * jnp.sin(q[1]), small * jnp.sin(q[0])])
 
 
+@pytest.mark.long
 def test_surfaces_have_their_curvature():
     """Sphere, torus, plane in polar coordinates, hyperbolic plane; embedded ones by pull-back of the flat metric."""
     flat = lambda x: jnp.eye(x.shape[0])  # noqa: E731
@@ -239,6 +240,7 @@ def on_helix(q, t):
     return jnp.stack([q[0] - jnp.cos(angle), q[1] - jnp.sin(angle), q[4], q[5], turned])
 
 
+@pytest.mark.long
 def test_immersion_of_a_body_with_a_quaternion_equals_multipliers():
     """A body off its centre of mass on a helix, damped: velocities are body twists and not rates of coordinates."""
     builder = ModelBuilder("nut")
@@ -293,6 +295,7 @@ def test_moving_immersion_is_a_bead_on_a_turning_hoop():
         assert_close(got, want, 1e-11, name)
 
 
+@pytest.mark.long
 def test_geodesic_of_the_sphere_is_a_great_circle():
     """Simulated, in float64; and the acceleration in float32."""
     q0, v0, ts = jnp.asarray([1.1, 0.3]), jnp.asarray([0.4, 0.9]), jnp.asarray([0.0, 0.5, 1.0])

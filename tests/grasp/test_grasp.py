@@ -158,6 +158,7 @@ def test_contact_forces_balance_the_object(name):
     assert_close(forces + at["tau"][at["objects"]], wrench, 1e-10)
 
 
+@pytest.mark.long
 def test_planar_hand_by_hand():
     """G and J_h of the bar: MLS's two-finger grasp, and the Jacobian of a 2R arm in axes of the contacts."""
     at = solved("hand_with_bar")

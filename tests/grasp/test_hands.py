@@ -155,6 +155,7 @@ def gripped():
     return grasp, q, v, compute
 
 
+@pytest.mark.long
 def test_forces_for_a_wrench():
     """G lam = F with the preload as internal force; power balance tau . thetadot = F . V; a basis of internal forces."""
     grasp, q, v, compute = gripped()
@@ -218,6 +219,7 @@ def test_force_closure_of_a_hand():
     assert not jd.grasp.force_closure(two, q).closed
 
 
+@pytest.mark.long
 def test_manipulability_in_closed_form():
     """The ball's G has the axes sqrt(3), sqrt(3) and sqrt(3/2) r; J_h is a product of three-joint fingers."""
     grasp, q, v, _ = gripped()

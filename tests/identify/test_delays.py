@@ -63,6 +63,7 @@ def test_delays_are_found_to_their_intervals():
     np.testing.assert_allclose(given.fit.vector, fit.fit.vector, rtol=1e-8, atol=1e-10)
 
 
+@pytest.mark.long
 def test_a_delay_that_is_not_there_is_not_found():
     fit = identify.fit_robot(arm(), [late(1, (0, 0)), late(2, (0, 0))], delay="auto", **GIVEN)
     assert np.all(np.abs(fit.delays.seconds) <= fit.delays.factor * fit.delays.std)

@@ -281,6 +281,7 @@ def test_torque_loss_is_the_sum_over_samples(wrong_iiwa, iiwa_log):
         np.testing.assert_allclose(problem.loss(stretched(seed), chart.start), expected, rtol=1e-10)
 
 
+@pytest.mark.long
 def test_the_linear_map_on_the_host_is_the_chart(wrong_iiwa):
     """x, its Jacobian and the basis of the interior-point method against the chart, by automatic differentiation."""
     model = wrong_iiwa.replace(damping=jnp.full(7, 0.5))

@@ -216,6 +216,7 @@ def test_columns_that_jump_are_low_passed_as_when_they_were_sampled():
     assert samples_for_jumps(unfiltered) == (unfiltered, 1)
 
 
+@pytest.mark.long
 def test_choice_by_cross_validation(truth):
     """What is there is chosen where it is, what is not there is left out, and every trial is told."""
     model = arm()
@@ -452,6 +453,7 @@ def test_dahl_friction_is_confounded_with_coulomb_friction(truth):
     assert "confounded" not in plain.sources
 
 
+@pytest.mark.long
 def test_a_joint_that_hardly_moved_has_no_friction_from_data(truth):
     """0.005 rad in 6 s: its friction and rotor are marked, a warning names it, and it gets no extra terms."""
     model, bare = arm(), motion(1, 300)
@@ -561,6 +563,7 @@ def test_payload_is_what_loaded_logs_differ_by(truth):
 # --- outliers ---------------------------------------------------------------------------------------------------------
 
 
+@pytest.mark.long
 def test_a_robust_loss_is_bent_less_by_torques_that_no_robot_makes(truth):
     """Bursts at one joint: Huber's fit is nearer to the truth, and is what cross-validation takes; weights are closed forms."""
     model = arm()

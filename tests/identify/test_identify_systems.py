@@ -97,6 +97,7 @@ def test_parameters_of_a_lagrangian_are_recovered(swung, error, method):
     )
 
 
+@pytest.mark.long
 def test_trajectory_error_of_a_system(swung):
     errors = [
         max(identify.trajectory_error(scene, swung, horizon=20, substeps=4))
@@ -296,6 +297,7 @@ def test_what_the_log_does_not_determine_is_said(swung):
     assert short.result == RESULTS.max_steps_reached and len(short.history) == 3
 
 
+@pytest.mark.long
 def test_damping_of_a_model():
     builder = ModelBuilder("arm").add_body("a", axis=(0, 1, 0), inertia=(1.0, (0, 0, -0.5), (0.1, 0.1, 0.1)))
     t = jnp.linspace(0, 1, 21)
@@ -355,6 +357,7 @@ def test_trajectories_on_constraints():
     np.testing.assert_allclose(fit.values, [G, 0.3], rtol=1e-8)
 
 
+@pytest.mark.long
 def test_options_by_their_own_names_are_deprecated(oscillation):
     """One release long they are those of the groups, and the warning names these."""
     start, pick = oscillator(inertia=2.0), lambda s: s.system.parameters["inertia"]

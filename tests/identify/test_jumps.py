@@ -261,6 +261,7 @@ def test_files(clean, tmp_path, suffix):
         np.testing.assert_allclose(read_log(path, outliers="drop").q, clean.q, atol=1e-4)
 
 
+@pytest.mark.long
 def test_command_line(clean, tmp_path, capsys):
     """The first moments, which torques determine, are those of 2 and 1 kg, and messages name the joint and the options."""
     urdf, path, out = tmp_path / "arm.urdf", tmp_path / "log.csv", tmp_path / "fitted.urdf"
@@ -302,6 +303,7 @@ def recorded(data_dir):
             yield identify.Log(rec.time_cont, np.deg2rad(rec.act_pos_mot_deg.T), tau=rec.act_torque_abs_nm.T)
 
 
+@pytest.mark.long
 @pytest.mark.data
 def test_recorded_logs_are_left_alone(data_dir):
     """With noise, jitter and rounding added, parts of them, and with as few samples as hold the motion."""
@@ -324,6 +326,7 @@ def test_recorded_logs_are_left_alone(data_dir):
                     assert repair_log(one) is one
 
 
+@pytest.mark.long
 @pytest.mark.data
 def test_corrupted_samples_of_recorded_logs_are_found(data_dir):
     generator = np.random.default_rng(4)

@@ -95,6 +95,7 @@ def _steps(path):
     return descent.read(path)[0]["arrays"]["history"][0][0]
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("method", ["gauss-newton", "levenberg-marquardt", "lbfgs"])
 def test_a_stopped_fit_resumes_to_the_same_numbers(tmp_path, method):
     path = tmp_path / "fit.ckpt"
@@ -155,6 +156,7 @@ def test_solvers_agree_and_progress_is_shown(capsys):
     assert "step 0 of at most 200: loss" in capsys.readouterr().err
 
 
+@pytest.mark.long
 def test_many_starts_reach_what_one_does_not():
     far = system(size=0.5, rate=7.0)
     options = dict(free=pick, objective=jd.identify.Objective("torque"))
@@ -170,6 +172,7 @@ def root_push(q, v, t, p):
     return jnp.sqrt(p["square"]) * jnp.where(t > 2.0, jnp.sqrt(1.0 - p["late"]), 1.0)[None] * jnp.ones_like(q)
 
 
+@pytest.mark.long
 def test_a_nan_names_its_log_sample_and_parameter():
     log = recorded()
     early = jd.identify.Log(log.t / 3, log.q, log.v, log.a, log.tau)

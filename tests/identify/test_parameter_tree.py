@@ -67,6 +67,7 @@ def tree(scene):
     return whole.directions(lambda s: s.system.gravity, std=0.1).directions(lambda s: s.system.screws, rows=["link2"])
 
 
+@pytest.mark.long
 def test_every_point_is_a_system_that_can_exist():
     model = arm().replace(lower=-jnp.ones(3), upper=jnp.ones(3))
     scene, points = scene_of(model), tree(scene_of(model))
@@ -158,6 +159,7 @@ def test_barrier_residual_has_one_branch():
     np.testing.assert_allclose(2 * got * slope, np.expm1(np.asarray(x)), rtol=1e-11, atol=1e-15)
 
 
+@pytest.mark.long
 def test_balances_vanish_along_a_motion(log):
     """Momentum and energy of a motion of the model, by an integral of fourth order less on finer samples."""
     scene, left = scene_of(arm()), []
@@ -195,6 +197,7 @@ def covered(branching, count):
     return inside, total
 
 
+@pytest.mark.long
 def test_intervals_cover_the_truth_on_a_few_trees():
     inside, total = covered(2.0, 4)
     assert total == 32 and inside >= 27  # fewer than 27 of 32 at 95 % has a probability of 1 %

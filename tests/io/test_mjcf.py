@@ -104,6 +104,7 @@ def mixed(tmp_path_factory):
     return path, silent(path)
 
 
+@pytest.mark.long
 def test_every_kind_of_joint_and_part_agrees_with_mujoco(mixed):
     """Free, ball, three joints on one body, references, anchors, inertial frames, tendons, drives, equalities."""
     errors = agreement(*mixed)

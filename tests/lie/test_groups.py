@@ -338,6 +338,7 @@ def test_log_to_second_order(name, dtype):
     check(derivatives, want, path[0])
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("dtype", ["float64", "float32"])
 def test_quaternions_to_second_order(dtype):
     a, b = directions("so3")
@@ -412,6 +413,7 @@ def random_elements(name, count):
     return rng.uniform(-1.2, 1.2, (count, DIM[name]))
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("name", GROUPS)
 def test_group_identities(name):
     g = GROUPS[name]
@@ -543,6 +545,7 @@ def public_calls(name, x, y):
     return out
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("name", GROUPS)
 def test_every_function_batches_and_keeps_its_dtype(name):
     xs, ys = random_elements(name, 6)[::2], random_elements(name, 6)[1::2]

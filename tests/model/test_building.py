@@ -131,6 +131,7 @@ def test_models_with_the_same_tree_share_compiled_code():
     assert built().topology != built(joint="continuous").topology
 
 
+@pytest.mark.long
 @settings(max_examples=40, deadline=None, derandomize=True)
 @given(
     st.lists(st.floats(-1e3, 1e3), min_size=3, max_size=3).filter(lambda x: max(map(abs, x)) > 1e-6),
@@ -545,6 +546,7 @@ def test_swapped_arguments_of_inertias_are_named():
             function(jnp.eye(4))
 
 
+@pytest.mark.long
 def test_a_motion_that_starts_where_a_gimbal_locks_says_so():
     """Three hinges with massless links: where the first and the last are parallel, no inertia answers to their difference."""
     builder = ModelBuilder("gimbal", gravity=None)

@@ -106,6 +106,7 @@ def test_an_accelerator_has_the_numbers_of_the_cpu(name, batch):
 SLOW = "four-bar's gradient", "Bennett's linkage", "four-bar"
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("name", [pytest.param(x, marks=pytest.mark.slow) if x in SLOW else x for x in CASES])
 def test_programs_can_be_written_for_a_gpu(name):
     """Nothing in them is for the CPU alone, such as native kernels and calls of Python."""

@@ -39,6 +39,7 @@ def test_a_motion_has_the_same_bits_after_one_of_other_masses():
     np.testing.assert_array_equal(run(1.1), after)
 
 
+@pytest.mark.long
 def test_jit_keeps_a_program_for_each_mode():
     """Also of functions that this package has under `jax.jit`: kernels stand in no program that is traced under "plain"."""
     scene, (q, v) = jd.scenes.four_bar(), jd.scenes.four_bar.start()

@@ -117,6 +117,7 @@ def test_each_name_that_the_adapter_uses_is_listed_with_its_documentation():
         pkgutil.resolve_name(name)
 
 
+@pytest.mark.long
 def test_no_other_module_depends_on_the_version_of_jax():
     package = Path(jd.__file__).parent
     wrong = [
@@ -269,6 +270,7 @@ def renamed(monkeypatch) -> None:
     monkeypatch.setattr(expansion._Expansion, "one", with_other_names)
 
 
+@pytest.mark.long
 def test_a_renamed_parameter_leaves_a_function_to_jax(future, renamed):
     function = fresh(sums)
     with one_warning("KeyError: 'num_consts'"):

@@ -233,6 +233,7 @@ def recipe(section: str, least: int = 2) -> dict:
     return run("docs/recipes.md", section, least, head=True)
 
 
+@pytest.mark.long
 def test_recipe_environment_step():
     names = recipe("Environment step")
     assert names["after"] > names["before"] + 5
@@ -299,6 +300,7 @@ def test_recipe_sampled_controller():
     assert names["left"].max() < 1e-3 and np.isfinite(names["regulated"].torque).all()
 
 
+@pytest.mark.long
 def test_recipe_payloads():
     names = recipe("Monte Carlo of payloads")
     assert np.isfinite(names["sags"]).all() and 0.01 < names["quantiles"][1] < 0.1

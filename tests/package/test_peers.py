@@ -62,6 +62,7 @@ def test_car_axis_by_hand_has_the_printed_multipliers():
     np.testing.assert_allclose(multipliers, (-0.473688659084893324729e-2, -0.110468033125734368808e-2), rtol=1e-10)
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("count", [2, 40])
 def test_windows_by_hand_turn_as_a_pendulum(count):
     """th'' = g G sin th/I for the uprights, and the couplers stay level."""

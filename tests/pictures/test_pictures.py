@@ -257,6 +257,7 @@ def test_marks_and_forces_of_a_loop(turning):
     np.testing.assert_allclose(sizes, solution.torque, atol=1e-12)
 
 
+@pytest.mark.long
 def test_force_of_a_wheel_is_at_its_contact_and_as_newton_has_it():
     scene = jd.scenes.rolling_coin()
     q, v = jd.scenes.rolling_coin.start()
@@ -324,6 +325,7 @@ def test_forces_are_drawn_where_they_are_given(tmp_path):
         jd.draw(scene, q, multipliers=np.ones(4))
 
 
+@pytest.mark.long
 def test_draw_and_animate(turning, solids, urdf, tmp_path):
     pytest.importorskip("matplotlib")
     scene, solution = turning

@@ -63,6 +63,7 @@ def test_mixed_rows_count_the_holonomic_ones():
     assert computed.ranks[0] == 1 and computed.value  # one direction is left, and one field is always integrable
 
 
+@pytest.mark.long
 def test_prescribed_slip_is_part_of_the_test():
     """xdot = y in the plane: ker A = d/dy alone is integrable, the affine row is not; xdot = sin t is."""
     row = lambda q, t: jnp.stack([1.0 + 0 * t, 0 * t])  # noqa: E731
@@ -72,6 +73,7 @@ def test_prescribed_slip_is_part_of_the_test():
     assert involutive(Scene(free(2), (Pfaffian(row, lambda q, t: jnp.sin(t)),)), place, 0.3).ranks == (1, 1)
 
 
+@pytest.mark.long
 def test_bodies_on_a_manifold():
     """A body on a ball joint that cannot spin about its own z axis turns about all three by 2, 3; about one only by 1, 1."""
     builder = ModelBuilder("ball joint", gravity=None)
@@ -120,6 +122,7 @@ def blade(q, t):
     return jnp.stack([jnp.sin(q[2]), -jnp.cos(q[2]), 0 * t])
 
 
+@pytest.mark.long
 def test_spurious_terms_of_the_sleigh():
     """Right: forward speed u with u' = a w^2, w' = -m a u w/(I + m a^2). Wrong: another motion, by terms worked out here.
 

@@ -118,6 +118,7 @@ def test_torques_of_a_delta_robot_are_those_of_virtual_work():
         np.testing.assert_allclose(along @ inverse.torques, whole @ left, atol=1e-10)
 
 
+@pytest.mark.long
 def test_more_motors_than_degrees_of_freedom():
     """The least weighted sum of squares, by a dense solve of the saddle point; equal weights by default."""
     scene, q, motors, independent = redundant()

@@ -86,6 +86,7 @@ def kane(scene, q, nu, tau, basis):
     return mass, bias, force
 
 
+@pytest.mark.long
 @pytest.mark.parametrize(
     ("name", "kept"), [("four_bar", (0,)), ("chaplygin_sleigh", (0, 2))], ids=["four-bar", "sleigh"]
 )
@@ -133,6 +134,7 @@ def test_rolling_disk_in_two_velocities():
         assert_close(computed.acceleration, [*forward, *rate], 1e-13)
 
 
+@pytest.mark.long
 def test_constraints_that_move_with_a_prescribed_slip():
     """A(q, t) v = b(q, t) with all of them varying, against the saddle-point system; a basis of one's own with its v0."""
 

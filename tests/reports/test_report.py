@@ -258,6 +258,7 @@ def counting():
     return force, calls
 
 
+@pytest.mark.long
 @pytest.mark.parametrize(
     ("name", "solver"),
     [
@@ -486,6 +487,7 @@ def test_scenes_that_cannot_be_compared_are_refused():
         jd.report([cases()["free_body"], "free_body"])
 
 
+@pytest.mark.long
 def test_a_scene_of_ones_own(rungs, monkeypatch):
     """A pendulum with its exact motion for a small angle, and without: then a converged solution is the reference."""
     monkeypatch.setattr(running, "settings", lambda *args, **options: [1e-4, 1e-9])
@@ -508,6 +510,7 @@ def test_a_page_without_matplotlib_is_refused_before_the_runs(small, tmp_path, m
     assert small == []
 
 
+@pytest.mark.long
 def test_a_batch_fails_with_any_of_its_trajectories(body):
     q, v, ts = body.programs.batch_starts(2)
     bad = np.stack([v[0], np.nan * v[1]])

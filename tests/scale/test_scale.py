@@ -99,6 +99,7 @@ def pendulums(tmp_path_factory):
     return again(), build, starts, lengths, ts, again
 
 
+@pytest.mark.long
 def test_rows_are_those_of_simulate_with_names_and_units(pendulums):
     run, build, starts, damping, ts, _ = pendulums
     assert run.success and run.codes == {"successful": 21} and run.computed == 21

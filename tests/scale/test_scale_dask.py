@@ -159,6 +159,7 @@ def test_the_same_bits_as_in_this_process(client, whole, tmp_path, capfd):
     assert not list(tmp_path.glob("*.owner"))
 
 
+@pytest.mark.long
 def test_motions_are_the_same(client, tmp_path):
     """Kernels, models and controls travel; so does float64, which the processes of workers do not have."""
     stiffness = np.linspace(1.0, 9.0, 12)
@@ -577,6 +578,7 @@ def test_lists_of_tasks(client):
     assert item == 7 and isinstance(failure, Failure) and "ValueError" in failure.traceback
 
 
+@pytest.mark.long
 def test_starts_of_a_fit(client):
     """Two workers share the starts, and the fit from the best one is that of this process."""
 
@@ -611,6 +613,7 @@ def robot_and_log():
     return model, jd.identify.Log(t, q, v, a, np.asarray(tau) + 0.02 * noise)
 
 
+@pytest.mark.long
 def test_cross_validation_of_a_fit(client):
     """The fits of all folds on workers: the trials of this process, in their order and to the last bit."""
     model, log = robot_and_log()

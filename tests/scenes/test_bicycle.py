@@ -97,6 +97,7 @@ def linear():
     }
 
 
+@pytest.mark.long
 def test_matrices(linear):
     """M, C1, K0, K2 as printed, and the same ones at all speeds."""
     for name, want in PRINTED.items():

@@ -65,6 +65,7 @@ def test_rank_and_freedom(name, rows, rank, freedom):
     assert (singular > 1e-9 * singular[0]).sum() == rank
 
 
+@pytest.mark.long
 @chosen("goldberg", "sarrus")
 def test_energies_and_accelerations_in_minimal_coordinates(name):
     """Energies by the places of all bars, and accelerations by Lagrange's equations: dv/dt along the motion x(t)."""

@@ -50,6 +50,7 @@ def parallel():
     return {"solve": solve, "M": M, "h": h, "J": J, "carried": carried, "v": v, "velocity": velocity}
 
 
+@pytest.mark.long
 def test_parallel_manipulator(parallel):
     """Two equations for the carried point, J^T (M (J xdd + Jdot xd) + h) = J^T tau, with torques on all joints."""
     M, h, J, carried = (parallel[name] for name in ("M", "h", "J", "carried"))

@@ -84,6 +84,7 @@ def test_suslov():
     np.testing.assert_allclose(computed.v, want, atol=1e-10)
 
 
+@pytest.mark.long
 def test_accelerations_of_balls_on_planes():
     """5/7 of the acceleration of a body that slides, with the contact forces."""
     slope, pull = 0.4, 9.81 * np.sin(0.4)
@@ -144,6 +145,7 @@ def test_differential_drive():
     assert_close(a, [forward, 0.0, yaw, (forward - b * yaw) / r, (forward + b * yaw) / r], 1e-12)
 
 
+@pytest.mark.long
 def test_car():
     """Accelerations against the rows of Murray & Sastry and a mass matrix by hand, with drive and steering torques."""
     mass, moment, d, fork, wheel, r, b, l = 60.0, 12.0, 0.5, 0.2, 2.0, 0.15, 0.4, 1.2

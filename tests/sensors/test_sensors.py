@@ -64,6 +64,7 @@ FILE = """
 """
 
 
+@pytest.mark.long
 def test_mujoco_reads_the_same(tmp_path):
     """All sensors of a file in a random motion, of a floating tree with a tool that is welded to its arm."""
     mujoco = pytest.importorskip("mujoco")

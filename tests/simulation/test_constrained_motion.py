@@ -195,6 +195,7 @@ def test_projection_keeps_the_order(solver, order):
     np.testing.assert_allclose(jnp.sum(run(steps[1]) ** 2, axis=1), 1.0, atol=1e-13)  # dense output is projected too
 
 
+@pytest.mark.long
 def test_without_projection_the_constraint_opens():
     """The same accelerations, method "multipliers": the residual is that of the integration and not zero."""
     scene, (q, v) = scenes.pendulum_in_plane(), scenes.pendulum_in_plane.start()

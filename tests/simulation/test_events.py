@@ -335,6 +335,7 @@ def test_friction_in_proportion_to_a_multiplier_of_both_sides():
         np.testing.assert_allclose(computed.multipliers[:, 0], -sign * speed**2, rtol=1e-9)
 
 
+@pytest.mark.long
 def test_smooth_friction_creeps_as_it_says():
     """Under a load below mu N: v_s artanh(load/(mu N)); while it slides the force is tanh(|w|/v_s) of mu N."""
     scene, speed = block(smoothing=0.01), 0.01 * np.arctanh(0.5)

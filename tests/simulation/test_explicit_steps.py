@@ -262,6 +262,7 @@ def test_times_that_do_not_increase_have_a_code():
         assert jnp.isnan(computed.q).all()
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("adjoint", ["forward", pytest.param("direct", marks=pytest.mark.slow)])
 def test_forward_mode_over_a_batch_is_that_of_its_samples(adjoint):
     """A loop that is batched first and differentiated then, and the other way round."""

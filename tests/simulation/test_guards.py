@@ -208,6 +208,7 @@ def test_a_start_behind_the_guard_is_the_end():
     assert np.isfinite(beyond.q[0]).all() and np.isnan(beyond.q[1:]).all()
 
 
+@pytest.mark.long
 def test_the_same_without_kernels():
     with jd.compilation("plain"):
         solution = limit(jnp.asarray(0.5), **TIGHT)

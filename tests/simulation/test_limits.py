@@ -53,6 +53,7 @@ def test_lanes_end_at_their_own_times(cart):
     np.testing.assert_allclose(computed.stats["time_reached"][ends], times[ends], rtol=1e-7)
 
 
+@pytest.mark.long
 def test_a_motion_that_goes_on_tells(cart):
     with pytest.warns(
         jd.simulation.JointLimitWarning, match=r"'cart_joint' is at 1.5625, its upper limit is 1, at t = 2.5 s"

@@ -75,6 +75,7 @@ def test_derivatives_without_kernels():
         np.testing.assert_allclose(x, y, rtol=1e-11, atol=1e-11)
 
 
+@pytest.mark.long
 def test_a_bad_lane_leaves_the_others_alone():
     gradient = jax.jit(jax.vmap(jax.grad(lambda q, v: weighted(q, v, 0.3, TS, stepsize=0.05, throw=False))))
     q = jnp.stack([Q, Q.at[0].set(jnp.nan), Q + 0.1])

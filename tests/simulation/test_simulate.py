@@ -175,6 +175,7 @@ def test_order_of_convergence_with_retraction(solver, order, steps):
 # Against an independent trajectory, and against balances
 
 
+@pytest.mark.long
 def test_panda_against_pinocchio_and_scipy():
     """One second of a Panda under damping and a torque, integrated by DOP853 on Pinocchio's ABA."""
     robot = pin.buildModelFromUrdf(f"{ROBOTS}/panda_description/urdf/panda.urdf")
@@ -363,6 +364,7 @@ def lane(leg, q0, v0, mass, control):
     return simulate(scene, q0, v0, np.linspace(0, 1, 5), control=control, stepsize=0.01, outputs=("energy", "work"))
 
 
+@pytest.mark.long
 def test_batch_is_the_loop_and_one_bad_lane_stops_no_other(leg):
     """States, masses and controls in one batch; starts with NaN and with a null quaternion are reported as such."""
     q0 = np.tile(Q0, (5, 1)) + 0.1 * np.arange(5)[:, None] * [0, 0, 0, 0, 1]
@@ -434,6 +436,7 @@ def test_known_numbers_stay_known_in_a_trace(pendulum):
     assert seen and not any(seen)
 
 
+@pytest.mark.long
 def test_failures_are_codes_or_errors(pendulum):
     """Too few steps and a control that turns NaN, alone and in a batch; rows not reached are NaN."""
     ts = [0.0, 0.1, 0.5, 4.0]

@@ -46,6 +46,7 @@ def run(scene, start, taus, **options):
 START = jnp.asarray([0.45, 0.1]), jnp.asarray([1.0, -2.0])
 
 
+@pytest.mark.long
 def test_steps_are_those_of_simulate(scene):
     """With friction, a stop that is hit, a drive, and an effort above its limit."""
     q, v = jax.jit(lambda taus: run(scene, START, taus, substeps=2))(jnp.broadcast_to(TAU, (30, 2)))

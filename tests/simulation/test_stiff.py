@@ -135,6 +135,7 @@ def bodies():
     return builder.build()
 
 
+@pytest.mark.long
 def test_local_coordinates_move_as_the_velocity_says(bodies):
     """The derivative of q0 exp(e) along de/dt is the dq/dt that it was made from."""
     rng = np.random.default_rng(0)
@@ -312,6 +313,7 @@ def test_stiffness_counts_the_poles_of_drives():
         jd.stiffness(slider(mass), [0.1], [0.2], drive_state=[0.0])
 
 
+@pytest.mark.long
 def test_stiffness_has_derivatives():
     """Of the decay d/m of a damper alone."""
     decay = lambda d: jd.stiffness(jd.Scene(slider(2.0), forces=(jd.forces.JointDamping(d),)), [0.0], [0.0]).decay  # noqa: E731
@@ -421,6 +423,7 @@ def test_gradient_of_a_whole_motion_of_adaptive_steps(solver):
     np.testing.assert_allclose(reverse, differences, rtol=1e-4)
 
 
+@pytest.mark.long
 def test_transient_at_the_start_in_single_precision():
     """A start that is over within a microsecond: steps there may be shorter than the end of the run could tell apart."""
     scene = jd.Scene(slider(), forces=(jd.forces.JointDamping(4e6), jd.forces.JointSpring(4e6)))

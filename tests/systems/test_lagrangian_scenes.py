@@ -102,6 +102,7 @@ def first_pages(q, v, a):
     }
 
 
+@pytest.mark.long
 def test_first_pages_of_mechanics():
     check(first_pages(*states(4)))
     arm = scenes.planar_arm().system
@@ -336,6 +337,7 @@ def test_double_pendulum_in_four_formulations():
     assert_close(dynamics.forward_dynamics(points, q, v, 0 * q), [-7.48670516, 11.47569246], 1e-8)  # digits given
 
 
+@pytest.mark.long
 def test_lagrangian_takes_no_more_operations_than_bodies():
     """As operations of JAX, which XLA counts; and the bias of a metric takes fewer than its Christoffel symbols."""
 
@@ -435,6 +437,7 @@ def test_block_sticks_where_it_stops():
         assert_close(solution.v[1:, 0], [2.0 - 0.15 * G, 0.0], 1e-12)
 
 
+@pytest.mark.long
 def test_a_block_that_has_stopped_gains_no_energy():
     """Past its stop adaptive steps end with a code, and fixed ones stay at rest to the change of a step."""
     stop, h = 2.0 / (0.3 * G), 1e-3
