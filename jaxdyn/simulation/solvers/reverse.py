@@ -229,10 +229,11 @@ def _step_arguments(_, ends: _Ends, cotangents: _Cotangents, read):
 
 
 def _flags(ends: _Ends, cotangents: _Cotangents, read):
-    """Whether the step was kept, and whether there is a row within it."""
-    kept = read[2] & (cotangents.places[1] >= ends.first)
+    """Two flags, (): the step was kept; there is a row within it."""
+    _, (t0, _), kept, _, at_row, _ = read
+    kept = kept & (cotangents.places[1] >= ends.first)
     # A step with several rows is visited once for each: the last visit adds the cotangent of its end.
-    return kept, kept & (cotangents.saved > 0) & (read[4] > read[1][0])
+    return kept, kept & (cotangents.saved > 0) & (at_row > t0)
 
 
 def _accumulate(times_move: bool, _, ends: _Ends, cotangents: _Cotangents, read, back) -> Iteration:
