@@ -11,6 +11,7 @@ from typing import Any
 
 import numpy as np
 
+from jaxdyn.compile import stored
 from jaxdyn.compile.graph import Graph
 from jaxdyn.compile.inlining import inline, replay
 from jaxdyn.compile.program import FLOATS, Constant, NotNumbers, Program, is_number, objects
@@ -26,7 +27,11 @@ def tangent(program: Program, moving: Sequence[bool]) -> Program:
         rule = program.derivative
         # Known numbers are folded by NumPy, which warns of overflows and NaN that XLA computes without a word.
         with np.errstate(all="ignore"):
-            program.derived[moving] = _tangent(program, moving) if rule is None else rule(moving)
+            make = functools.partial(_tangent, program, moving)
+            # A rule keeps its program itself, as that may have a rule again.
+            program.derived[moving] = (
+                stored.derived(program, ("tangent", moving), make) if rule is None else rule(moving)
+            )
     return program.derived[moving]
 
 
@@ -168,7 +173,8 @@ def transpose(program: Program, linear: Sequence[bool], given: Sequence[bool]) -
     key = ("transposed", tuple(linear), tuple(given))
     if key not in program.derived:
         with np.errstate(all="ignore"):
-            program.derived[key] = _transpose(program, tuple(linear), tuple(given))
+            make = functools.partial(_transpose, program, tuple(linear), tuple(given))
+            program.derived[key] = stored.derived(program, key, make)
     return program.derived[key]
 
 
@@ -275,10 +281,7 @@ def without_unread(program: Program) -> tuple[Program, tuple[int, ...]]:
     """
     key = ("read",)
     if key not in program.derived:
-        read = {x.args[0] for x in program.operations if x.op == "input"}
-        # A call without operands would have no batch.
-        places = tuple(sorted(read)) or tuple(range(len(program.inputs)))
-        program.derived[key] = _with_inputs(program, places), places
+        program.derived[key] = _with_inputs(program, program.read_places), program.read_places
     return program.derived[key]
 
 
@@ -287,6 +290,16 @@ def _with_inputs(program: Program, places: tuple[int, ...]) -> Program:
     if len(places) == len(program.inputs):
         return program
     index = {place: i for i, place in enumerate(places)}
+    few = stored.derived(program, ("inputs", places), lambda: _renumber_inputs(program, index))
+    few.reports_validity = program.reports_validity
+    if program.derivative is not None:
+        few.derivative = functools.partial(_tangent_of_few, program, places)
+    if program.fallback is not None:
+        few.fallback = functools.partial(_fallback_of_few, program, index)
+    return few
+
+
+def _renumber_inputs(program: Program, index: dict[int, int]) -> Program:
     operations = []
     for operation in program.operations:
         if operation.op == "input":
@@ -295,14 +308,8 @@ def _with_inputs(program: Program, places: tuple[int, ...]) -> Program:
                 raise NotNumbers("a derivative of what the values do not depend on")
             operation = operation._replace(args=(index[place], entry))
         operations.append(operation)
-    inputs = [program.inputs[i] for i in places]
-    few = Program(inputs, program.outputs, operations, program.results, program.subprograms, name=program.name)
-    few.reports_validity = program.reports_validity
-    if program.derivative is not None:
-        few.derivative = functools.partial(_tangent_of_few, program, places)
-    if program.fallback is not None:
-        few.fallback = functools.partial(_fallback_of_few, program, index)
-    return few
+    inputs = [program.inputs[i] for i in index]
+    return Program(inputs, program.outputs, operations, program.results, program.subprograms, name=program.name)
 
 
 def _tangent_of_few(program: Program, places: tuple[int, ...], moving) -> Program:

@@ -92,6 +92,12 @@ def reason_against_kernels() -> str | None:
     return _against_kernels
 
 
+def configuration() -> tuple:
+    """JAX's options that are in force in this thread: all of them, as any may change what a trace becomes."""
+    names = sorted(jax.config.values)
+    return tuple((name, repr(getattr(jax.config, name, None))) for name in names)
+
+
 # --- extension points ---
 
 try:

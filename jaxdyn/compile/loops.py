@@ -207,8 +207,7 @@ class Loop:
     @property
     def always_ends(self) -> bool:
         """True where no iteration can be invalid, so that the caller compiles no fallback."""
-        valid = self.turn.results[-1][0]
-        return type(valid) is Constant and bool(valid.value)
+        return self.turn.is_always_valid
 
     # The text of the kernel for a width (see `code.kernel_ir`).
     ir = loop_ir

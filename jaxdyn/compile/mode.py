@@ -109,6 +109,11 @@ def values_of_rules(is_wanted: bool = True):
     return _by_rules(is_wanted)
 
 
+def state() -> tuple:
+    """All modes that the trace of a function depends on."""
+    return current(), *(x.value for x in (_expanding, rank_safe, in_rows, _standalone, _by_rules))
+
+
 def wants_usual_options() -> bool:
     """Decide whether the environment asks for XLA's usual options instead of those that shorten a first call."""
     return _options() == "usual"

@@ -1,29 +1,26 @@
-"""Machine code from LLVM IR, kept on disk: a second start of a script compiles no kernel again.
+"""Machine code from LLVM IR, kept on disk: a second start of a script compiles no kernel again, nor writes its text.
 
-An object file is found by the hash of the IR, of LLVM's version and level, and of the processor's name and features. Files
-are written under another name and moved to their final one, so that two processes that build one at once do not disturb
-each other. Each ends with a checksum, and one that is damaged is built anew. Where the folder cannot be written, code stays in
-memory, with one warning.
+An object file is found by the identity of the program that it computes, and by what its code depends on beside that: the sources
+of this subpackage, which write the text, the versions of LLVM, and the processor's name and features.
 """
 
-import contextlib
 import functools
 import hashlib
+import json
 import logging
-import os
-import tempfile
+from collections.abc import Sequence
 from pathlib import Path
+from typing import NamedTuple
 
 import llvmlite
 import llvmlite.binding as llvm
 
+from jaxdyn.compile import disk
 from jaxdyn.compile.mode import wants_least_optimisation
 
 logger = logging.getLogger("jaxdyn")
-MAX_CACHE_BYTES = 512 * 2**20
 ANNOUNCED_LINES = 100_000  # of LLVM's text, which compile in some five seconds
 LONG_LINES = 6000  # of LLVM's text, beyond which a kernel is straight code of one program but for few lines
-_CHECKSUM_BYTES = 32
 
 
 @functools.cache
@@ -54,36 +51,51 @@ def _level() -> int:
     return 0 if wants_least_optimisation() else 1
 
 
-def key_of(text: str) -> bytes:
-    """Hash of a kernel's IR and of everything else that its machine code depends on."""
+def name_of_file(identity: str) -> str:
+    """Name of the file with the machine code of a program with this identity."""
+    parts = (identity, _environment(), str(_level()))
+    return hashlib.sha256("\0".join(parts).encode()).hexdigest() + ".o"
+
+
+@functools.cache
+def _environment() -> str:
     version = ".".join(map(str, llvm.llvm_version_info))
-    parts = (
-        text,
-        version,
-        llvmlite.__version__,
-        llvm.get_host_cpu_name(),
-        features(),
-        llvm.get_process_triple(),
-        str(_level()),
-        str(LONG_LINES),
-    )
-    return hashlib.sha256("\0".join(parts).encode()).digest()
+    sources = disk.hash_of_sources(Path(__file__).parent).hex()
+    processor = llvm.get_host_cpu_name(), features(), llvm.get_process_triple()
+    return "\0".join((version, llvmlite.__version__, sources, *processor))
+
+
+class ObjectFile(NamedTuple):
+    """Machine code as bytes, and the symbols of the subprograms that it calls."""
+
+    binary: bytes
+    calls: tuple[str, ...]
+
+
+def find(identity: str) -> ObjectFile | None:
+    """The machine code of a program from the folder, or None."""
+    contents = disk.read(name_of_file(identity))
+    if contents is None:
+        return None
+    calls, _, binary = contents.partition(b"\n")
+    return ObjectFile(binary, tuple(json.loads(calls)))
+
+
+def make(identity: str, text: str, calls: Sequence[str], name: str = "") -> ObjectFile:
+    """Compile a text, and keep the code in the folder."""
+    if (lines := text.count("\n")) > ANNOUNCED_LINES:
+        message = "jaxdyn: compiling %s, %d lines; the next start of this script reads it from the cache"
+        logger.warning(message, name or "a function", lines)
+    binary = compile_text(text)
+    disk.write(name_of_file(identity), json.dumps(list(calls)).encode() + b"\n" + binary)
+    return ObjectFile(binary, tuple(calls))
 
 
 class Code:
     """Machine code in memory, as long as it is held."""
 
-    def __init__(self, text: str, stored: bool = True, name: str = ""):
+    def __init__(self, binary: bytes):
         initialize()
-        self.key = key_of(text)
-        binary = _read(self.key) if stored else None
-        if binary is None:
-            if (lines := text.count("\n")) > ANNOUNCED_LINES:
-                message = "jaxdyn: compiling %s, %d lines; the next start of this script reads it from the cache"
-                logger.warning(message, name or "a function", lines)
-            binary = _compile(text)
-            if stored:
-                _write(self.key, binary)
         # The engine is given the object file alone: it would keep the text that it compiles for as long as it lives.
         self.engine = llvm.create_mcjit_compiler(_module("", machine := target_machine()), machine)
         self.engine.add_object_file(llvm.ObjectFileRef.from_data(binary))
@@ -105,8 +117,8 @@ def _module(text: str, machine):
     return module
 
 
-def _compile(text: str) -> bytes:
-    """The object file of a kernel."""
+def compile_text(text: str) -> bytes:
+    """The object file of a text of LLVM."""
     machine = target_machine()
     module = _module(text, machine)
     if wants_least_optimisation():
@@ -122,83 +134,3 @@ def _compile(text: str) -> bytes:
         passes.add_instruction_combine_pass()
     passes.run(module, builder)
     return machine.emit_object(module)
-
-
-# --- files ---
-
-_folder: Path | None = None
-_is_off = False
-
-
-def cache_folder() -> Path:
-    """Folder of the object files: `jaxdyn/kernels` in the user's folder for caches."""
-    if _folder is not None:
-        return _folder
-    base = os.environ.get("XDG_CACHE_HOME") or os.environ.get("LOCALAPPDATA") or Path.home() / ".cache"
-    return Path(base) / "jaxdyn" / "kernels"
-
-
-def set_cache_folder(folder) -> None:
-    """Keep object files elsewhere; None for the default place."""
-    global _folder, _is_off
-    _folder, _is_off = None if folder is None else Path(folder), False
-
-
-def _path(key: bytes) -> Path:
-    return cache_folder() / f"{key.hex()}.o"
-
-
-def _read(key: bytes) -> bytes | None:
-    try:
-        path = _path(key)
-        binary = path.read_bytes()
-    except (OSError, RuntimeError):  # a home that cannot be determined is a RuntimeError
-        return None
-    code, checksum = binary[:-_CHECKSUM_BYTES], binary[-_CHECKSUM_BYTES:]
-    if hashlib.sha256(code).digest() != checksum:
-        logger.warning("jaxdyn: %s is damaged and is built again", path)
-        return None
-    # The time of last use, by which the folder is pruned: file systems often do not note reads.
-    with contextlib.suppress(OSError):
-        os.utime(path)
-    return code
-
-
-def _write(key: bytes, code: bytes) -> None:
-    global _is_off
-    if _is_off:
-        return
-    try:
-        folder = cache_folder()
-        folder.mkdir(parents=True, exist_ok=True)
-        handle, name = tempfile.mkstemp(dir=folder, suffix=".part")
-        try:
-            with os.fdopen(handle, "wb") as file:
-                file.write(code + hashlib.sha256(code).digest())
-            os.replace(name, _path(key))
-        except BaseException:
-            with contextlib.suppress(OSError):
-                os.unlink(name)
-            raise
-        _prune(folder)
-    except (OSError, RuntimeError) as error:
-        # A full disk or a read-only home must not stop a computation.
-        _is_off = True
-        logger.warning("jaxdyn: kernels are not kept on disk, and are compiled again at the next start: %s", error)
-
-
-@functools.cache  # once in a process
-def _prune(folder: Path) -> None:
-    """Remove the files that were used longest ago where all of them are more than `MAX_CACHE_BYTES`."""
-    files = []
-    for path in folder.glob("*"):
-        with contextlib.suppress(OSError):
-            status = path.stat()
-            files.append((status.st_mtime, status.st_size, path))
-    excess = sum(size for _, size, _ in files) - MAX_CACHE_BYTES
-    for _, size, path in sorted(files):
-        if excess <= 0:
-            return
-        with contextlib.suppress(OSError):
-            path.unlink()
-        excess -= size

@@ -66,15 +66,20 @@ class Program:
     def __init__(
         self, inputs, outputs, operations, results, subprograms=(), derivative: Callable | None = None, name: str = ""
     ):
-        self.inputs: tuple[Array, ...] = tuple(inputs)
-        self.outputs: tuple[Array, ...] = tuple(outputs)
+        self.start(inputs, outputs, subprograms, name, derivative)
         self.operations: list[Operation] = operations
         self.results: tuple[tuple, ...] = tuple(results)
+
+    def start(self, inputs, outputs, subprograms, name: str, derivative: Callable | None = None) -> None:
+        """Set all but the operations and the results."""
+        self.inputs: tuple[Array, ...] = tuple(inputs)
+        self.outputs: tuple[Array, ...] = tuple(outputs)
         self.subprograms: tuple[Program, ...] = tuple(subprograms)
         self.derivative = derivative
         self.name = name
         self.fallback: Callable | None = None
         self.reports_validity = False
+        self.key: str | None = None  # under which it is kept on disk (see `stored`)
         # Derivatives, transposes and kernels of this program, which live as long as it does.
         self.derived: dict = {}
 
@@ -87,6 +92,18 @@ class Program:
         # Signs merge with sums and products of LLVM, and inputs are operands in memory.
         own = sum(_weight(x) for x in self.operations if x.op not in ("input", "neg", "call", "call_where", "part"))
         return own + sum(self.subprograms[x.args[0].value].cost for x in self.operations if x.op == "call")
+
+    @functools.cached_property
+    def read_places(self) -> tuple[int, ...]:
+        """Inputs that are read; all of them where none is, as a call without operands would have no batch."""
+        read = {x.args[0] for x in self.operations if x.op == "input"}
+        return tuple(sorted(read)) or tuple(range(len(self.inputs)))
+
+    @functools.cached_property
+    def is_always_valid(self) -> bool:
+        """True where the last result, which says whether a sample is valid, is known to be true."""
+        valid = self.results[-1][0] if self.results and self.results[-1] else None
+        return type(valid) is Constant and valid.value is True
 
     @functools.cached_property
     def digest(self) -> str:

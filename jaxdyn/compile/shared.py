@@ -4,10 +4,13 @@ A program is split in two. The first runs once and computes the shared numbers; 
 that it needs. For forward dynamics of a given robot the first program has a third of the operations.
 """
 
+import functools
 from collections.abc import Sequence
 
 from jaxdyn.compile.code import MIN_SHARED_OPERATIONS
 from jaxdyn.compile.program import Array, Constant, Operation, Program, Renumbering, dtype_of
+
+from jaxdyn.compile.stored import derived_key, load_or_make
 
 
 def split_program(program, uniform: Sequence[bool]) -> tuple[Program, Program] | None:
@@ -20,7 +23,10 @@ def split_program(program, uniform: Sequence[bool]) -> tuple[Program, Program] |
         return None
     key = ("split", tuple(uniform))
     if key not in program.derived:
-        program.derived[key] = _split(program, uniform)
+        # A program or two, or none.
+        make = functools.partial(_split, program, uniform)
+        both, _ = load_or_make(derived_key(program, *key), lambda: (make() or (), None))
+        program.derived[key] = tuple(both) or None
     return program.derived[key]
 
 

@@ -5,17 +5,17 @@ import functools
 import hashlib
 import logging
 import threading
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from importlib import resources
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
-from jaxdyn.compile import ahead
+from jaxdyn.compile import ahead, objects
 from jaxdyn.compile.code import calls_itself, kernel_ir, subprogram_ir, symbol_of, varying_first
 from jaxdyn.compile.jax_adapter import Unsupported as Unsupported
 from jaxdyn.compile.jax_adapter import ffi_version, register_handler
-from jaxdyn.compile.objects import Code, features
+from jaxdyn.compile.objects import Code, compile_text, features
 from jaxdyn.compile.program import FLOATS, Program, kind_of
 
 TARGET = "jaxdyn_kernel"
@@ -78,7 +78,7 @@ def register() -> None:
     for name, value in fields.items():
         text = text.replace("{" + name + "}", str(value))
     # Its addresses are those of this process: it is not kept on disk.
-    code = Code(text, stored=False)
+    code = Code(compile_text(text))
     register_handler(TARGET, code.address("handler"))
     _handler.append(code)
 
@@ -124,58 +124,116 @@ def kernel(program, width: int, uniform: Sequence[bool]) -> int:
     with _lock:
         register()
         if key not in program.derived:
-            content = f"{program.digest} {width} {uniform}"
+            identity = f"{program.digest} {width} {uniform}"
             # A hash, not a counter: a program in XLA's persistent cache finds its kernel in another process. 63 bits, as the
             # attribute is signed; odd, as zero marks an empty slot.
-            number = int.from_bytes(hashlib.sha256(content.encode()).digest()[:8], "little") >> 1 | 1
+            number = int.from_bytes(hashlib.sha256(identity.encode()).digest()[:8], "little") >> 1 | 1
             if number not in _kernels:
-                _kernels[number] = _Kernel(number, program, width, uniform)
+                _kernels[number] = _Kernel(number, Row.of(program, identity, width, uniform))
+            _kernels[number].attach(program, uniform)
             program.derived[key] = number
         return program.derived[key]
+
+
+class Row(NamedTuple):
+    """What the table holds of a kernel beside its code; plain data, which can be kept on disk.
+
+    - `identity`: of the code. `width`: samples in a vector. `chunk`: samples that a thread takes at a time.
+    - `sizes`: entries of the buffers, against which the handler checks them; a negative one is one row for all samples.
+    """
+
+    identity: str
+    width: int
+    chunk: int
+    sizes: tuple[int, ...]
+    name: str
+
+    @classmethod
+    def of(cls, program, identity: str, width: int, uniform: tuple[bool, ...]) -> "Row":
+        """The row of a program."""
+        order = varying_first(uniform)
+        sizes = [-1 - program.inputs[i].size if uniform[i] else program.inputs[i].size for i in order]
+        sizes += [array.size for array in program.outputs]
+        chunk = width * max(1, round(OPERATIONS_PER_CHUNK / max(1, program.turns * program.cost)))
+        return cls(identity, width, chunk, tuple(sizes), program.name)
 
 
 class _Kernel:
     """A kernel of the table; its program until there is code."""
 
-    def __init__(self, number: int, program, width: int, uniform: tuple[bool, ...]):
+    def __init__(self, number: int, row: Row):
         # Half-full at most: searches stay short, and one that fails ends at an empty slot.
         if len(_kernels) > SLOTS // 2:
             raise Unsupported(f"more than {SLOTS // 2} kernels in one process")
-        self.program: Any = program
-        self.width, self.uniform = width, uniform
+        self.row = row
+        self.program: Any = None
+        self.uniform: tuple[bool, ...] = ()
+        self.recover: Callable | None = None  # makes the program again, of a kernel that was read from disk
         self.code: Code | None = None
         self.is_awaited = False  # whether a worker is to compile it (see `ahead`)
-        order = varying_first(uniform)
-        # The handler checks buffers against these; a negative size is one row for all samples.
-        sizes = [-1 - program.inputs[i].size if uniform[i] else program.inputs[i].size for i in order]
-        sizes += [array.size for array in program.outputs]
-        self.sizes = (ctypes.c_int64 * len(sizes))(*sizes)
+        self.sizes = (ctypes.c_int64 * len(row.sizes))(*row.sizes)
         slot = number % SLOTS
         while _table[slot].hash:
             slot = (slot + 1) % SLOTS
         self.entry = _table[slot]
-        chunk = width * max(1, round(OPERATIONS_PER_CHUNK / max(1, program.turns * program.cost)))
-        self.entry.kernel, self.entry.chunk, self.entry.least = 0, chunk, 2 * chunk
-        self.entry.buffers, self.entry.sizes = len(sizes), ctypes.addressof(self.sizes)
+        self.entry.kernel, self.entry.chunk, self.entry.least = 0, row.chunk, 2 * row.chunk
+        self.entry.buffers, self.entry.sizes = len(row.sizes), ctypes.addressof(self.sizes)
         self.entry.hash = number  # last: from here on it is found
+
+    def attach(self, program, uniform: tuple[bool, ...]) -> None:
+        """Take the program of which the code can be made."""
+        if self.code is None and self.program is None:
+            self.program, self.uniform = program, uniform
 
     def address(self) -> int:
         """Address of the code, which is compiled where there is none."""
         if self.code is None:
             with _making:
-                if self.code is None:
-                    self._make()
+                made = self.code is not None or self._make()
+            if not made:
+                # Not under the lock: tracing compiles kernels too.
+                assert self.recover is not None, "a kernel has neither code nor a program"
+                self.recover()
+                with _making:
+                    made = self.code is not None or self._make()
+                assert made, "a program that was traced again has other kernels than before"
         return self.entry.kernel
 
-    def _make(self) -> None:
-        program, width = self.program, self.width
-        is_program = isinstance(program, Program)
-        for called in (program,) if is_program and calls_itself(program, width) else program.subprograms:
-            _publish(called, width)
-        text = kernel_ir(program, width, self.uniform) if is_program else program.ir(width, self.uniform)
-        code = Code(text, name=program.name)
+    def _make(self) -> bool:
+        """Compile the code, or find it on disk; False where that takes a program that is not here."""
+        program, width = self.program, self.row.width
+        found = objects.find(self.row.identity)
+        programs = {} if program is None else {symbol_of(x, width): x for x in self._calls(program)}
+        if found is None and program is None:
+            return False
+        if not all(_publish(symbol, width, programs) for symbol in (programs if found is None else found.calls)):
+            return False
+        if found is None:
+            is_program = isinstance(program, Program)
+            text = kernel_ir(program, width, self.uniform) if is_program else program.ir(width, self.uniform)
+            found = objects.make(self.row.identity, text, tuple(programs), program.name)
+        code = Code(found.binary)
         self.entry.kernel = code.address("kernel")
-        self.code, self.program = code, None  # a program of a large robot takes megabytes
+        self.code, self.program, self.recover = code, None, None  # a program of a large robot takes megabytes
+        return True
+
+    def _calls(self, program) -> Sequence[Program]:
+        itself = isinstance(program, Program) and calls_itself(program, self.row.width)
+        return (program,) if itself else program.subprograms
+
+
+def restore(number: int, row: Row, recover: Callable) -> None:
+    """Put a kernel into the table whose code is on disk; `recover()` traces its program again, should the code be missing."""
+    with _lock:
+        register()
+        if number not in _kernels:
+            _kernels[number] = _Kernel(number, row)
+        _kernels[number].recover = recover
+
+
+def row_of(number: int) -> Row:
+    """The row of a kernel."""
+    return _kernels[number].row
 
 
 def make_ahead(number: int) -> None:
@@ -193,21 +251,30 @@ def publish_ahead(program, width: int) -> None:
         program.derived[key] = True
 
         def make() -> None:
-            for called in program.subprograms:
+            programs = {symbol_of(x, width): x for x in program.subprograms}
+            for symbol in programs:
                 with _making:
-                    _publish(called, width)
+                    _publish(symbol, width, programs)
 
         ahead.make_later(make)
 
 
-def _publish(called: Program, width: int) -> None:
-    """Compile a subprogram where that has not been done."""
-    symbol = symbol_of(called, width)
-    if symbol not in _called:
-        for inner in called.subprograms:
-            _publish(inner, width)
-        _called[symbol] = Code(subprogram_ir(called, width), name=called.name)
-        _called[symbol].publish("called", symbol)
+def _publish(symbol: str, width: int, programs: dict[str, Program]) -> bool:
+    """Compile a subprogram, or find it on disk; False where it is in neither place."""
+    if symbol in _called:
+        return True
+    called, found = programs.get(symbol), objects.find(symbol)
+    if called is None and found is None:
+        return False
+    inner = {} if called is None else {symbol_of(x, width): x for x in called.subprograms}
+    if not all(_publish(x, width, inner) for x in (inner if found is None else found.calls)):
+        return False
+    if found is None:
+        assert called is not None
+        found = objects.make(symbol, subprogram_ir(called, width), tuple(inner), called.name)
+    _called[symbol] = Code(found.binary)
+    _called[symbol].publish("called", symbol)
+    return True
 
 
 def _prepare(number: int) -> int:

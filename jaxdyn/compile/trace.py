@@ -10,7 +10,7 @@ from collections.abc import Callable
 import jax
 import jax.numpy as jnp
 
-from jaxdyn.compile import jax_adapter, mode
+from jaxdyn.compile import jax_adapter, mode, stored
 from jaxdyn.compile.expansion import expand
 from jaxdyn.compile.known import Known, partition_tracers
 from jaxdyn.compile.program import NotNumbers, Program, TooLong
@@ -58,25 +58,37 @@ def _trace_program(function, static, known: Known, count, structure, shapes, tan
     del has_x64  # part of the key alone
     avals = [jax.ShapeDtypeStruct(*shape) for shape in shapes]
     flat = function_of_leaves(function, static, known, count, structure)
-    try:
-        with mode.expanding(calls):
-            # Subprograms are the functions under `jit` within this one; itself it is not a call.
-            traced = flat_function(function, static, known, count, structure) if calls else flat
-            closed, out = jax.make_jaxpr(traced, return_shape=True)(*avals)
-        program, has_rules = expand(closed, most, name_of(function), calls, flags)
-    except (NotNumbers, TooLong) as reason:
-        return str(reason)
-    except Exception as error:
-        if not jax_adapter.forgive(error):
-            raise
-        return str(error)
+
+    def make():
+        """The program, and plain data: whether it has rules, and the structure of its results, or why there is none."""
+        try:
+            with mode.expanding(calls):
+                # Subprograms are the functions under `jit` within this one; itself it is not a call.
+                traced = flat_function(function, static, known, count, structure) if calls else flat
+                closed, out = jax.make_jaxpr(traced, return_shape=True)(*avals)
+            program, has_rules = expand(closed, most, name_of(function), calls, flags)
+        except (NotNumbers, TooLong) as reason:
+            return [], str(reason)
+        except Exception as error:
+            if not jax_adapter.forgive(error):
+                raise
+            return [], str(error)
+        return [program], (has_rules, jax.tree.structure(out))
+
+    # Programs without JAX contain pseudo-inverses, which are no operations.
+    parts = function, static, known.structure, known.places, known.leaves.leaves, count, structure, shapes, most, calls, flags
+    key = None if mode.is_standalone() else stored.key_of("trace", *parts)
+    programs, data = stored.load_or_make(key, make)
+    if isinstance(data, str):
+        return data
+    (program,), (has_rules, results) = programs, data
     if tangent is not None:
         rule = functools.partial(tangent, *static)
-        program.derivative = _derivative_by_rule(rule, known, count, structure, avals, flags)
+        program.derivative = _derivative_by_rule(rule, known, count, structure, avals, flags, program)
     elif has_rules:
-        program.derivative = _derivative_by_jax(flat, avals, flags)
+        program.derivative = _derivative_by_jax(flat, avals, flags, program)
     program.fallback = _fallback(function, static, known, count, structure, avals, program.reports_validity)
-    return program, jax.tree.structure(out)
+    return program, results
 
 
 def name_of(function) -> str:
@@ -123,7 +135,7 @@ def _fallback(function, static, known: Known, count: int, structure, avals, repo
 # --- derivatives ---
 
 
-def _derivative_by_rule(tangent: Callable, known: Known, count: int, structure, avals, flags: str):
+def _derivative_by_rule(tangent: Callable, known: Known, count: int, structure, avals, flags: str, program: Program):
     """The derivative of a program by a rule that is given by hand."""
 
     def derivative(moving):
@@ -137,12 +149,14 @@ def _derivative_by_rule(tangent: Callable, known: Known, count: int, structure, 
             args = jax.tree.unflatten(structure, primal[count:])
             return tangent(known(primal[:count]), *args, [*tree_steps, *steps[count:]])
 
-        return tangent_program(change, avals, moving, flags)
+        of_rule = stored.key_of(tangent)
+        key = None if of_rule is None else stored.derived_key(program, "rule", moving, of_rule)
+        return tangent_program(change, avals, moving, flags, key)
 
     return derivative
 
 
-def _derivative_by_jax(flat: Callable, avals, flags: str):
+def _derivative_by_jax(flat: Callable, avals, flags: str, program: Program):
     """The derivative of a program by `jax.jvp`, which asks functions within the function for their own rules."""
 
     def derivative(moving):
@@ -158,24 +172,30 @@ def _derivative_by_jax(flat: Callable, avals, flags: str):
 
             return jax.jvp(at_values, [primal[i] for i in places], list(steps))[1]
 
-        return tangent_program(change, avals, moving, flags)
+        return tangent_program(change, avals, moving, flags, stored.derived_key(program, "jvp", moving))
 
     return derivative
 
 
-def tangent_program(change: Callable, avals, moving, flags: str) -> Program:
+def tangent_program(change: Callable, avals, moving, flags: str, key: str | None = None) -> Program:
     """The program of a tangent; NaN at flagged samples, which the program of the values reports.
 
     A rule may call functions with rules of their own, itself included, and then the tangent is differentiated by JAX again:
-    its numbers would give the derivative of how a value is computed, where the rule says another one.
+    its numbers would give the derivative of how a value is computed, where the rule says another one. `key`: under which the
+    program is kept on disk, if it is.
     """
     avals = [*avals, *(aval for aval, varies in zip(avals, moving, strict=True) if varies)]
-    with mode.expanding():
-        closed = jax.make_jaxpr(change)(*avals)
-    # A tangent has two to four times the operations of the values. The bound is there for those that explode.
-    program, has_rules = expand(
-        closed, 10 * mode.MAX_OPERATIONS, "change", flags="refuse" if flags == "refuse" else "ignore"
-    )
+
+    def make():
+        with mode.expanding():
+            closed = jax.make_jaxpr(change)(*avals)
+        # A tangent has two to four times the operations of the values. The bound is there for those that explode.
+        program, has_rules = expand(
+            closed, 10 * mode.MAX_OPERATIONS, "change", flags="refuse" if flags == "refuse" else "ignore"
+        )
+        return [program], has_rules
+
+    (program,), has_rules = stored.load_or_make(key, make)
     if has_rules:
-        program.derivative = _derivative_by_jax(change, avals, flags)
+        program.derivative = _derivative_by_jax(change, avals, flags, program)
     return program

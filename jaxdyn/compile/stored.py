@@ -1,0 +1,157 @@
+"""Scalar programs on disk: a second process neither traces nor expands a function, nor derives its derivatives.
+
+A program is found by the hash of what made it: the function with all that it reaches, its known numbers, the shapes of its
+arguments, the modes in force and the sources of the package. A derivative is found by the key of its program. Two files belong to
+a program. The first, under that key, has all that is needed to call machine code which is on disk too. The second has the
+operations, under their own hash, and is read when a derivative has to be made, or code that is missing.
+"""
+
+import contextlib
+import functools
+import hashlib
+import os
+import pickle
+import sys
+from collections.abc import Callable, Sequence
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import jax
+
+from jaxdyn.compile import disk, mode
+from jaxdyn.compile.fingerprint import NoFingerprint, fingerprint
+from jaxdyn.compile.jax_adapter import configuration
+from jaxdyn.compile.program import Array, Operation, Program
+
+_PACKAGES = ("jax", "jaxlib", "numpy", "equinox", "diffrax", "optimistix", "lineax", "optax", "jaxtyping", "llvmlite")
+_VARIABLES = ("XLA_FLAGS", "JAXDYN_COMPILATION", "JAXDYN_COMPILATION_OPTIONS")
+
+
+@functools.cache
+def environment() -> bytes:
+    """Hash of the package's sources, and of the versions of what it calls."""
+    versions = [disk.version_of(name) for name in _PACKAGES]
+    return fingerprint(disk.hash_of_sources(Path(__file__).parents[1]), sys.version, tuple(versions))
+
+
+def key_of(*parts: Any) -> str | None:
+    """Name under which what depends on these parts alone is kept; None where they cannot be hashed."""
+    variables = tuple(os.environ.get(name) for name in _VARIABLES)
+    try:
+        return fingerprint(environment(), variables, mode.state(), configuration(), parts).hex()
+    except (NoFingerprint, RecursionError) as reason:
+        disk.logger.debug("jaxdyn: not kept on disk, as it depends on %s", reason)
+        return None
+
+
+class Description(NamedTuple):
+    """A program without its operations."""
+
+    inputs: tuple[Array, ...]
+    outputs: tuple[Array, ...]
+    name: str
+    reports_validity: bool
+    known: dict[str, Any]
+    subprograms: tuple["Description", ...]
+
+    @classmethod
+    def of(cls, program: Program) -> "Description":
+        """The description of a program."""
+        known = {name: getattr(program, name) for name in ("digest", "cost", "is_always_valid", "read_places")}
+        inner = tuple(map(cls.of, program.subprograms))
+        return cls(program.inputs, program.outputs, program.name, program.reports_validity, known, inner)
+
+
+class StoredProgram(Program):
+    """A program whose operations are read from disk when they are needed.
+
+    `remake()` makes the program from the function, should its file be missing.
+    """
+
+    def __init__(self, description: Description, remake: Callable[[], Program]):
+        inner = [
+            StoredProgram(x, functools.partial(_subprogram_of, remake, i)) for i, x in enumerate(description.subprograms)
+        ]
+        self._remake = remake
+        self.start(description.inputs, description.outputs, inner, description.name)
+        self.reports_validity = description.reports_validity
+        # Properties that are computed from the operations elsewhere.
+        self.__dict__ |= description.known
+
+    @functools.cached_property
+    def operations(self) -> list[Operation]:  # pyright: ignore[reportIncompatibleVariableOverride]
+        """Operations of the program."""
+        return self._body[0]
+
+    @functools.cached_property
+    def results(self) -> tuple[tuple, ...]:  # pyright: ignore[reportIncompatibleVariableOverride]
+        """Entries of its outputs."""
+        return self._body[1]
+
+    @functools.cached_property
+    def _body(self) -> tuple[list[Operation], tuple[tuple, ...]]:
+        found = _load(f"{self.digest}.operations")
+        if found is not None:
+            return [Operation(*x) for x in found[0]], found[1]
+        made = self._remake()
+        assert made.digest == self.digest, f"{self.name} has another program when it is traced again"
+        return made.operations, made.results
+
+
+def _subprogram_of(remake: Callable[[], Program], i: int) -> Program:
+    return remake().subprograms[i]
+
+
+def load_or_make(key: str | None, make: Callable[[], tuple[Sequence[Program], Any]]) -> tuple[Sequence[Program], Any]:
+    """make(), some programs and plain data about them, from disk where they are there.
+
+    Derivatives and fallbacks of the programs are not kept: they are functions, which the caller sets.
+    """
+    if key is None:
+        return make()
+    found = _load(f"{key}.program")
+    if found is not None:
+        programs = [StoredProgram(x, functools.partial(_program_of, make, i)) for i, x in enumerate(found[0])]
+        data = found[1]
+    else:
+        programs, data = make()
+        for one in programs:
+            for written in (one, *one.subprograms):
+                _save(f"{written.digest}.operations", ([tuple(x) for x in written.operations], written.results))
+        _save(f"{key}.program", ([*map(Description.of, programs)], data))
+    for i, one in enumerate(programs):
+        one.key = f"{key}-{i}"
+    return programs, data
+
+
+def _program_of(make: Callable, i: int) -> Program:
+    return make()[0][i]
+
+
+def derived(program: Program, parts: tuple, make: Callable[[], Program]) -> Program:
+    """A program that is made of another one's operations, from disk where it is there."""
+    return load_or_make(derived_key(program, *parts), lambda: ([make()], None))[0][0]
+
+
+def derived_key(program: Program, *parts: Any) -> str | None:
+    """Key of what is derived from a program."""
+    return None if program.key is None else hashlib.sha256(f"{program.key} {parts}".encode()).hexdigest()
+
+
+def _load(name: str) -> Any:
+    contents = disk.read(name)
+    if contents is None:
+        return None
+    # A class that has moved, in a package that says the same version, makes a file as good as missing.
+    with contextlib.suppress(Exception):
+        return pickle.loads(contents)
+    return None
+
+
+def _save(name: str, value: Any) -> None:
+    try:
+        contents = pickle.dumps(value, protocol=5)
+    except Exception as reason:  # objects may raise anything when they are pickled
+        disk.logger.debug("jaxdyn: %s is not kept on disk: %s", name, reason)
+        return
+    disk.write(name, contents)
