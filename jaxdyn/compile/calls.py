@@ -7,7 +7,7 @@ from typing import Any
 import equinox as eqx
 import jax
 
-from jaxdyn.compile import ahead, mode
+from jaxdyn.compile import ahead, executables, mode
 from jaxdyn.compile.jax_adapter import function_of as function_of
 from jaxdyn.compile.jax_adapter import select_options
 from jaxdyn.compile.known import is_concrete, is_tracing
@@ -29,10 +29,20 @@ def entry_point(function: Callable) -> Callable:
         # JAX refuses compiler options under a transformation such as `grad`, whose arguments are traced.
         if not (_is_glue(jax.default_backend()) and is_concrete(args)):
             return usual(*args)
+        if _is_plain_call():
+            found = executables.call(function, args, quick_options)
+            if found is not None:
+                return found
         with ahead.worker(not mode.wants_usual_options()):
             return quick()(*args)
 
     return call
+
+
+def _is_plain_call() -> bool:
+    """Decide whether JAX is to run what it has compiled, without checks within the call."""
+    options = ("jax_disable_jit", "jax_debug_nans", "jax_debug_infs", "jax_check_tracer_leaks", "jax_default_device")
+    return not any(getattr(jax.config, name) for name in options)
 
 
 _jit: Any = eqx.filter_jit

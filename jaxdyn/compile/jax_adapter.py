@@ -23,6 +23,7 @@ from jax import lax
 from jax.core import ShapedArray as ShapedArray
 from jax.core import Tracer as Tracer
 from jax.core import eval_jaxpr
+from jax.experimental import serialize_executable
 from jax.sharding import AxisType, NamedSharding, PartitionSpec
 
 logger = logging.getLogger("jaxdyn")
@@ -94,8 +95,12 @@ def reason_against_kernels() -> str | None:
 
 def configuration() -> tuple:
     """JAX's options that are in force in this thread: all of them, as any may change what a trace becomes."""
-    names = sorted(jax.config.values)
-    return tuple((name, repr(getattr(jax.config, name, None))) for name in names)
+    return tuple([getattr(jax.config, name, None) for name in _options()])
+
+
+@functools.cache
+def _options() -> tuple[str, ...]:
+    return tuple(sorted(jax.config.values))
 
 
 # --- extension points ---
@@ -362,6 +367,19 @@ def lower_call(name: str, context, operands: Sequence, order: Sequence[int], att
         attributes = {**(attributes or {}), "jaxdyn": mlir.ir_attribute(_EXPORT_HINT)}
     lower = jax.ffi.ffi_lowering(name, extra_attributes=attributes)
     return lower(context, *(operands[i] for i in order), **{key: np.int64(value) for key, value in static.items()})
+
+
+# --- executables ---
+
+
+def dump_executable(compiled: Any) -> Any:
+    """A compiled function of flat arrays as data that can be pickled; `load_executable` makes it a function again."""
+    return serialize_executable.serialize(compiled)
+
+
+def load_executable(data: Any) -> Callable:
+    """The function of `dump_executable`, of a process with the same jaxlib and processor."""
+    return serialize_executable.deserialize_and_load(*data)
 
 
 # --- compiler options ---

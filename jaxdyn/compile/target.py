@@ -228,7 +228,12 @@ def restore(number: int, row: Row, recover: Callable) -> None:
         register()
         if number not in _kernels:
             _kernels[number] = _Kernel(number, row)
-        _kernels[number].recover = recover
+        restored = _kernels[number]
+        restored.recover = recover
+    if restored.code is None:
+        # Now, not in the handler: a process that ends while a thread of XLA waits for Python would wait for ever.
+        with _making:
+            restored.code is None and restored._make()
 
 
 def row_of(number: int) -> Row:

@@ -73,7 +73,7 @@ def _trace_program(function, static, known: Known, count, structure, shapes, tan
             if not jax_adapter.forgive(error):
                 raise
             return [], str(error)
-        return [program], (has_rules, jax.tree.structure(out))
+        return [program], (has_rules, jax.tree.map(lambda _: 0, out))
 
     # Programs without JAX contain pseudo-inverses, which are no operations.
     parts = function, static, known.structure, known.places, known.leaves.leaves, count, structure, shapes, most, calls, flags
@@ -88,7 +88,7 @@ def _trace_program(function, static, known: Known, count, structure, shapes, tan
     elif has_rules:
         program.derivative = _derivative_by_jax(flat, avals, flags, program)
     program.fallback = _fallback(function, static, known, count, structure, avals, program.reports_validity)
-    return program, results
+    return program, jax.tree.structure(results)
 
 
 def name_of(function) -> str:

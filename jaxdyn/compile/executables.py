@@ -1,0 +1,154 @@
+"""Entry points as executables that are kept on disk: in a second process nothing of them is traced, lowered or compiled.
+
+An executable belongs to a function, the structure and the types of its arguments, everything static in them, and JAX's options.
+In this process it is found by these, on disk by the hash of their contents (`stored.key_of`).
+"""
+
+import contextlib
+import functools
+import pickle
+import re
+from collections.abc import Callable, Sequence
+from typing import Any, NamedTuple
+
+import jax
+import numpy as np
+
+from jaxdyn.compile import ahead, disk, jax_adapter, mode, stored
+
+# What a stored executable may call: kernels, which are restored with it, and functions that every jaxlib has. A call of
+# anything else may hold an address of the process that made it.
+_CALLS = re.compile(r"custom_call @(?:\"([^\"]*)\"|([\w.$]+))")
+_SAFE = re.compile(r"jaxdyn_kernel|lapack_\w+|Sharding|annotate_device_placement|TopK|Qr|ProductOfElementaryHouseholderReflectors")
+_NUMBERS = re.compile(r"program = (\d+) : i64")
+
+
+class Static(NamedTuple):
+    """An argument that is no array: a constant of the executable."""
+
+    value: Any
+
+
+class Executable(NamedTuple):
+    """A compiled function of flat arrays, and how to make the results' tree of its flat results.
+
+    `static`: in the place of each leaf of the results its value, or None where it is an array.
+    """
+
+    run: Callable
+    static: tuple[Static | None, ...]
+    structure: Any
+
+    def __call__(self, arrays: Sequence) -> Any:
+        results = iter(self.run(*arrays))
+        leaves = [next(results) if x is None else x.value for x in self.static]
+        return jax.tree.unflatten(self.structure, leaves)
+
+
+def call(function: Callable, args: tuple, options: Callable) -> Any:
+    """function(*args) by its executable, for arrays on the default device; None where it has to be called otherwise.
+
+    `options()`: XLA's options, which take time to find out.
+    """
+    leaves, structure = jax.tree.flatten(args)
+    device, kinds, arrays = _default_sharding(), [], []
+    for x in leaves:
+        if isinstance(x, jax.Array):
+            if x.sharding != device:
+                return None
+            kinds.append((x.shape, x.dtype, x.weak_type))
+            arrays.append(x)
+        elif isinstance(x, (np.ndarray, np.generic)):
+            kinds.append((x.shape, jax.dtypes.canonicalize_dtype(x.dtype), False))
+            arrays.append(x)
+        else:
+            # With its type: 1 and 1.0 and True are equal, and are other constants.
+            kinds.append((type(x), Static(x)))
+    context = jax_adapter.configuration(), mode.state()
+    try:
+        found = _executable(function, structure, tuple(kinds), options, context)
+    except _Unhashable:
+        return None
+    return found(arrays)
+
+
+class _Unhashable(Exception):
+    pass
+
+
+@functools.cache
+def _default_sharding() -> Any:
+    return jax.sharding.SingleDeviceSharding(jax.devices()[0])
+
+
+def _executable(*key) -> Executable:
+    try:
+        hash(key)
+    except TypeError:
+        raise _Unhashable from None
+    return _find(*key)
+
+
+@functools.lru_cache(maxsize=1024)
+def _find(function, structure, kinds, options, context) -> Executable:
+    del context  # part of the key alone
+    key = stored.key_of("entry", function, structure, kinds)
+
+    def trace() -> tuple[Any, list]:
+        """The function, lowered, and its results' static leaves and structure."""
+        results = []
+
+        def flat(*arrays):
+            given = iter(arrays)
+            leaves = [x[1].value if isinstance(x[1], Static) else next(given) for x in kinds]
+            found, out = jax.tree.flatten(function(*jax.tree.unflatten(structure, leaves)))
+            is_array = [isinstance(x, (jax.Array, np.ndarray, np.generic)) for x in found]
+            results[:] = [tuple(None if y else Static(x) for x, y in zip(found, is_array, strict=True)), out]
+            return [x for x, y in zip(found, is_array, strict=True) if y]
+
+        types = [jax.ShapeDtypeStruct(x[0], x[1], weak_type=x[2]) for x in kinds if not isinstance(x[1], Static)]
+        jitted = jax.jit(flat, compiler_options=options(), keep_unused=True)
+        return jitted.lower(*types), results
+
+    if key is not None and (found := _load(key, trace)) is not None:
+        return found
+    with ahead.worker(not mode.wants_usual_options()):
+        lowered, results = trace()
+        made = Executable(lowered.compile(), *results)
+    if key is not None:
+        _save(key, lowered, made)
+    return made
+
+
+def _load(key: str, trace: Callable) -> Executable | None:
+    contents = disk.read(f"{key}.executable")
+    if contents is None:
+        return None
+    from jaxdyn.compile import target
+
+    # Whatever is wrong with a file, the function is compiled again.
+    try:
+        payload, rows, static, results = pickle.loads(contents)
+        for number, row in rows:
+            target.restore(number, target.Row(*row), trace)
+        return Executable(jax_adapter.load_executable(payload), static, jax.tree.structure(results))
+    except Exception as reason:
+        disk.logger.debug("jaxdyn: an executable on disk is made again: %s", reason)
+        return None
+
+
+def _save(key: str, lowered: Any, made: Executable) -> None:
+    from jaxdyn.compile import target
+
+    text = lowered.as_text()
+    called = {a or b for a, b in _CALLS.findall(text)}
+    if unsafe := [name for name in called if not _SAFE.fullmatch(name)]:
+        disk.logger.debug("jaxdyn: an entry point is not kept on disk, as it calls %s", ", ".join(unsafe))
+        return
+    numbers = sorted({int(x) for x in _NUMBERS.findall(text)})
+    rows = [(number, tuple(target.row_of(number))) for number in numbers]
+    with contextlib.suppress(Exception):  # results may be of classes that cannot be pickled
+        payload = jax_adapter.dump_executable(made.run)
+        # An instance, not its structure: pickled ones do not know the marks of equinox for fields that are missing.
+        results = jax.tree.unflatten(made.structure, [0] * len(made.static))
+        disk.write(f"{key}.executable", pickle.dumps((payload, rows, made.static, results), protocol=5))
