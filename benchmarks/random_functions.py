@@ -286,12 +286,12 @@ def main(argv: list[str] | None = None) -> int:
         "--through-xla", type=int, default=50, metavar="N", help="each Nth function within XLA (default: 50)"
     )
     options = parser.parse_args(argv)
-    from jaxdyn.compile import objects
+    from jaxdyn.compile import disk
 
     jax.config.update("jax_enable_x64", True)
     total: collections.Counter = collections.Counter()
     with tempfile.TemporaryDirectory() as folder:
-        objects.set_cache_folder(folder)
+        disk.set_cache_folder(folder)
         try:
             for seed in range(options.seed, options.seed + options.count):
                 for verdict, count in compare(seed, seed % options.through_xla == 0).items():
@@ -300,7 +300,7 @@ def main(argv: list[str] | None = None) -> int:
                     jax.clear_caches()  # the traces of 10 000 functions fill the memory
                     print(f"{seed + 1 - options.seed} functions: {dict(total)}", flush=True)
         finally:
-            objects.set_cache_folder(None)
+            disk.set_cache_folder(None)
     print(f"{options.count} functions, {sum(total.values())} results of three numbers: {dict(total)}")
     return int(total["different"] > 0)
 

@@ -4,7 +4,6 @@ An executable belongs to a function, the structure and the types of its argument
 In this process it is found by these, on disk by the hash of their contents (`stored.key_of`).
 """
 
-import contextlib
 import functools
 import pickle
 import re
@@ -19,7 +18,9 @@ from jaxdyn.compile import ahead, disk, jax_adapter, mode, stored
 # What a stored executable may call: kernels, which are restored with it, and functions that every jaxlib has. A call of
 # anything else may hold an address of the process that made it.
 _CALLS = re.compile(r"custom_call @(?:\"([^\"]*)\"|([\w.$]+))")
-_SAFE = re.compile(r"jaxdyn_kernel|lapack_\w+|Sharding|annotate_device_placement|TopK|Qr|ProductOfElementaryHouseholderReflectors")
+_SAFE = re.compile(
+    r"jaxdyn_kernel|lapack_\w+|Sharding|annotate_device_placement|TopK|Qr|ProductOfElementaryHouseholderReflectors"
+)
 _NUMBERS = re.compile(r"program = (\d+) : i64")
 
 
@@ -147,8 +148,12 @@ def _save(key: str, lowered: Any, made: Executable) -> None:
         return
     numbers = sorted({int(x) for x in _NUMBERS.findall(text)})
     rows = [(number, tuple(target.row_of(number))) for number in numbers]
-    with contextlib.suppress(Exception):  # results may be of classes that cannot be pickled
+    try:
         payload = jax_adapter.dump_executable(made.run)
         # An instance, not its structure: pickled ones do not know the marks of equinox for fields that are missing.
         results = jax.tree.unflatten(made.structure, [0] * len(made.static))
-        disk.write(f"{key}.executable", pickle.dumps((payload, rows, made.static, results), protocol=5))
+        contents = pickle.dumps((payload, rows, made.static, results), protocol=5)
+    except Exception as reason:  # results may be of classes that cannot be pickled, and raise anything
+        disk.logger.debug("jaxdyn: an entry point is not kept on disk: %r", reason)
+        return
+    disk.write(f"{key}.executable", contents)

@@ -26,7 +26,15 @@ _PACKAGES = {
     "builtins", "types", "fractions", "statistics",
 }  # fmt: skip
 # Their parts that read files, or have a state that no argument holds.
-_IMPURE_MODULES = ("numpy.random", "numpy.lib._npyio_impl", "numpy.lib.npyio", "numpy.memmap", "jaxdyn.io", "jaxdyn.cli", "jaxdyn.scale")
+_IMPURE_MODULES = (
+    "numpy.random",
+    "numpy.lib._npyio_impl",
+    "numpy.lib.npyio",
+    "numpy.memmap",
+    "jaxdyn.io",
+    "jaxdyn.cli",
+    "jaxdyn.scale",
+)
 _IMPURE_NAMES = {"load", "loadtxt", "genfromtxt", "fromfile", "memmap", "pure_callback", "io_callback", "global_rng"}
 _IMPURE_BUILTINS = {"open", "eval", "exec", "compile", "globals", "locals", "vars", "input", "id", "hash", "__import__"}
 # Entries of classes that say nothing about what instances do.
@@ -143,7 +151,9 @@ class _Hasher:
         cls, package = type(x), _package(type(x))
         is_own = package not in _PACKAGES
         fields = [field.name for field in dataclasses.fields(x)] if dataclasses.is_dataclass(x) else None
-        if package in ("jax", "jaxlib") and not isinstance(x, (jax.custom_jvp, jax.custom_vjp, jax.ShapeDtypeStruct, tuple)):
+        if package in ("jax", "jaxlib") and not isinstance(
+            x, (jax.custom_jvp, jax.custom_vjp, jax.ShapeDtypeStruct, tuple)
+        ):
             raise NoFingerprint(f"an instance of {cls.__module__}.{cls.__qualname__}")
         self.write("instance")
         self.add(cls)
@@ -182,7 +192,9 @@ class _Hasher:
         self.add(type(cls))
         self.add(cls.__bases__)
         for name, value in sorted(vars(cls).items()):
-            if name not in _CLASS_NOISE and not isinstance(value, (types.MemberDescriptorType, types.GetSetDescriptorType)):
+            if name not in _CLASS_NOISE and not isinstance(
+                value, (types.MemberDescriptorType, types.GetSetDescriptorType)
+            ):
                 self.write(name)
                 self.add(value)
 
@@ -261,7 +273,9 @@ def _check_pure(module: str, names: set[str]) -> None:
 def _names(code: types.CodeType) -> set[str]:
     """Global names and attributes in code, and in the code within it. **Raises:** `NoFingerprint` for imports."""
     names = set(code.co_names)
-    if any(x.opname == "IMPORT_NAME" and x.argval.partition(".")[0] not in _PACKAGES for x in dis.get_instructions(code)):
+    if any(
+        x.opname == "IMPORT_NAME" and x.argval.partition(".")[0] not in _PACKAGES for x in dis.get_instructions(code)
+    ):
         raise NoFingerprint("a function that imports a module")
     for constant in code.co_consts:
         if isinstance(constant, types.CodeType):
@@ -284,7 +298,11 @@ def _name_of(x: Any) -> tuple[str, str] | None:
         module = "builtins" if isinstance(x, types.BuiltinFunctionType) else "numpy"
     if not isinstance(module, str) or not isinstance(name, str) or module.partition(".")[0] not in _PACKAGES:
         return None
-    if module.startswith(_IMPURE_MODULES) or name in _IMPURE_NAMES or (module == "builtins" and name in _IMPURE_BUILTINS):
+    if (
+        module.startswith(_IMPURE_MODULES)
+        or name in _IMPURE_NAMES
+        or (module == "builtins" and name in _IMPURE_BUILTINS)
+    ):
         raise NoFingerprint(f"{module}.{name}, which may read more than its arguments")
     found: Any = sys.modules.get(module)
     for part in name.split("."):

@@ -379,7 +379,7 @@ def dump_executable(compiled: Any) -> Any:
 
 def load_executable(data: Any) -> Callable:
     """The function of `dump_executable`, of a process with the same jaxlib and processor."""
-    return serialize_executable.deserialize_and_load(*data)
+    return serialize_executable.deserialize_and_load(*data, execution_devices=jax.devices()[:1])
 
 
 # --- compiler options ---

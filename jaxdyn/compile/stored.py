@@ -70,7 +70,8 @@ class StoredProgram(Program):
 
     def __init__(self, description: Description, remake: Callable[[], Program]):
         inner = [
-            StoredProgram(x, functools.partial(_subprogram_of, remake, i)) for i, x in enumerate(description.subprograms)
+            StoredProgram(x, functools.partial(_subprogram_of, remake, i))
+            for i, x in enumerate(description.subprograms)
         ]
         self._remake = remake
         self.start(description.inputs, description.outputs, inner, description.name)

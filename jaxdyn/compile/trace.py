@@ -76,7 +76,19 @@ def _trace_program(function, static, known: Known, count, structure, shapes, tan
         return [program], (has_rules, jax.tree.map(lambda _: 0, out))
 
     # Programs without JAX contain pseudo-inverses, which are no operations.
-    parts = function, static, known.structure, known.places, known.leaves.leaves, count, structure, shapes, most, calls, flags
+    parts = (
+        function,
+        static,
+        known.structure,
+        known.places,
+        known.leaves.leaves,
+        count,
+        structure,
+        shapes,
+        most,
+        calls,
+        flags,
+    )
     key = None if mode.is_standalone() else stored.key_of("trace", *parts)
     programs, data = stored.load_or_make(key, make)
     if isinstance(data, str):

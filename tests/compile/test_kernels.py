@@ -21,7 +21,7 @@ from jax import lax
 from kernel_helpers import native, quick, refuse
 
 from jaxdyn import compile as backend
-from jaxdyn.compile import derive, evaluate, kernels, known, mode, objects, program, target, trace, trigonometry
+from jaxdyn.compile import derive, disk, evaluate, kernels, known, mode, objects, program, target, trace, trigonometry
 from jaxdyn.compile.code import kernel_ir
 from jaxdyn.compile.expansion import NotNumbers, expand
 from jaxdyn.compile.primitive import as_operations
@@ -920,8 +920,8 @@ import json, sys
 import jax, jax.numpy as jnp
 jax.config.update("jax_enable_x64", True)
 from jaxdyn.compile import kernel, objects
-count, compiled = [], objects._compile
-objects._compile = lambda *args: count.append(args) or compiled(*args)
+count, compiled = [], objects.compile_text
+objects.compile_text = lambda *args: count.append(args) or compiled(*args)
 function = kernel(lambda _, x, y, z: jnp.sin(x) * 1.2345 + y * z)
 a = jax.jit(lambda *x: function((), *x))(*[jnp.full(2, 0.1 * k) for k in range(3)])
 told = {"compiled": len(count), "acceleration": a.tolist(), "refused": ""}
@@ -940,13 +940,13 @@ def second_process(tmp_path_factory):
     """An acceleration that this process computed by a kernel, the files that it left in a new folder of machine code, and what
     a second process says that has the same folder and is given an exported program of this one.
     """
-    cache, before = tmp_path_factory.mktemp("cache"), (objects._folder, objects._is_off)
+    cache, before = tmp_path_factory.mktemp("cache"), (disk._folder, disk._is_off)
     function = native(lambda x, y, z: jnp.sin(x) * 1.2345 + y * z)  # of no other test
-    objects.set_cache_folder(cache / "jaxdyn" / "kernels")
+    disk.set_cache_folder(cache / "jaxdyn" / "kernels")
     try:
         own = jax.jit(function)(*[jnp.full(2, 0.1 * k) for k in range(3)]).tolist()
     finally:
-        objects._folder, objects._is_off = before
+        disk._folder, disk._is_off = before
     files = sorted(path.name for path in cache.rglob("*.o"))
     stored = bytes(_exported().serialize()) if importlib.util.find_spec("flatbuffers") else b""
     env, command = os.environ | {"XDG_CACHE_HOME": str(cache)}, [sys.executable, "-c", SECOND]
@@ -1028,11 +1028,11 @@ def test_a_batch_on_two_devices():
 @pytest.fixture
 def folder(tmp_path):
     """A folder of its own for object files."""
-    before = objects._folder, objects._is_off
+    before = disk._folder, disk._is_off
     backend_folder = tmp_path / "kernels"
-    objects.set_cache_folder(backend_folder)
+    disk.set_cache_folder(backend_folder)
     yield backend_folder
-    objects._folder, objects._is_off = before
+    disk._folder, disk._is_off = before
 
 
 IR = "define double @f(double %x) {\n  %y = fmul double %x, CONSTANT\n  ret double %y\n}"
@@ -1041,81 +1041,84 @@ IR = "define double @f(double %x) {\n  %y = fmul double %x, CONSTANT\n  ret doub
 def code_of(number: float):
     import ctypes
 
-    made = objects.Code(IR.replace("CONSTANT", f"{number:.6e}"))
-    return made, ctypes.CFUNCTYPE(ctypes.c_double, ctypes.c_double)(made.address("f"))
+    identity = f"times {number}"
+    text = IR.replace("CONSTANT", f"{number:.6e}")
+    made = objects.Code((objects.find(identity) or objects.make(identity, text, ())).binary)
+    return objects.name_of_file(identity), made, ctypes.CFUNCTYPE(ctypes.c_double, ctypes.c_double)(made.address("f"))
 
 
 def built(monkeypatch):
     """A list that grows when LLVM compiles."""
     seen = []
-    compiled = objects._compile
-    monkeypatch.setattr(objects, "_compile", lambda *args: seen.append(args) or compiled(*args))
+    compiled = objects.compile_text
+    monkeypatch.setattr(objects, "compile_text", lambda *args: seen.append(args) or compiled(*args))
     return seen
 
 
 def test_files_are_written_found_and_checked(folder, monkeypatch, caplog):
     seen = built(monkeypatch)
-    first, f = code_of(3.5)
+    name, _first, f = code_of(3.5)
     assert f(2.0) == 7.0 and len(seen) == 1
     (path,) = folder.glob("*.o")
-    assert path.stem == first.key.hex() and not list(folder.glob("*.part"))
-    _, again = code_of(3.5)
+    assert path.name == name and not list(folder.glob("*.part"))
+    _, _held, again = code_of(3.5)
     assert again(2.0) == 7.0 and len(seen) == 1  # from the file
     good = path.read_bytes()
     for damaged in (good[:-1], good[:40] + b"x" + good[41:], b"", b"short"):
         path.write_bytes(damaged)
         caplog.clear()
-        _, rebuilt = code_of(3.5)
+        _, _held, rebuilt = code_of(3.5)
         assert rebuilt(2.0) == 7.0 and "damaged" in caplog.text
         assert path.read_bytes() == good
     assert len(seen) == 5
 
 
 def test_another_processor_or_version_has_other_files(monkeypatch):
-    before = objects.key_of(IR)
+    before = objects.name_of_file("a program")
+    assert objects.name_of_file("another program") != before
     monkeypatch.setattr(objects, "features", lambda: "+other")
-    assert objects.key_of(IR) != before != objects.key_of(IR + " ")
+    monkeypatch.setattr(objects, "_environment", objects._environment.__wrapped__)
+    assert objects.name_of_file("a program") != before
 
 
 def test_a_folder_that_cannot_be_written_is_said_once(tmp_path, caplog):
-    before = objects._folder, objects._is_off
+    before = disk._folder, disk._is_off
     (tmp_path / "file").write_text("no folder")
     try:
-        objects.set_cache_folder(tmp_path / "file" / "kernels")
-        assert objects.cache_folder() == tmp_path / "file" / "kernels"
+        disk.set_cache_folder(tmp_path / "file" / "kernels")
+        assert disk.cache_folder() == tmp_path / "file" / "kernels"
         for number in (4.5, 5.5):
-            _held, f = code_of(number)
+            _, _held, f = code_of(number)
             assert f(2.0) == 2 * number
     finally:
-        objects._folder, objects._is_off = before
-    assert caplog.text.count("not kept on disk") == 1
+        disk._folder, disk._is_off = before
+    assert caplog.text.count("nothing is kept on disk") == 1
 
 
 def test_old_files_are_removed(folder, monkeypatch):
     for age, number in enumerate((1.5, 2.5, 3.5)):
-        code, _ = code_of(number)
-        os.utime(folder / f"{code.key.hex()}.o", (1000 - age, 1000 - age))
-    size = (folder / f"{code.key.hex()}.o").stat().st_size
-    monkeypatch.setattr(objects, "MAX_CACHE_BYTES", int(2.5 * size))
-    objects._prune.__wrapped__(folder)
+        name, _, _ = code_of(number)
+        os.utime(folder / name, (1000 - age, 1000 - age))
+    size = (folder / name).stat().st_size
+    monkeypatch.setattr(disk, "MAX_CACHE_BYTES", int(2.5 * size))
+    disk._prune.__wrapped__(folder)
     assert len(list(folder.glob("*.o"))) == 2
-    assert not (folder / f"{code.key.hex()}.o").exists()  # the one used longest ago
+    assert not (folder / name).exists()  # the one used longest ago
 
 
 def test_the_folder_is_the_users_unless_set(monkeypatch, tmp_path):
-    before = objects._folder, objects._is_off
+    before = disk._folder, disk._is_off
     try:
-        objects.set_cache_folder(None)
+        disk.set_cache_folder(None)
         monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
-        assert objects.cache_folder() == tmp_path / "jaxdyn" / "kernels"
+        assert disk.cache_folder() == tmp_path / "jaxdyn" / "kernels"
     finally:
-        objects._folder, objects._is_off = before
+        disk._folder, disk._is_off = before
 
 
 def test_a_second_process_compiles_no_kernel(second_process):
     own, files, told = second_process
-    # The handler holds addresses of its process and is always built.
-    assert len(files) == 1 and told["compiled"] == 1
+    assert len(files) == 1 and told["compiled"] == 0
     assert own == told["acceleration"]
 
 
@@ -1131,7 +1134,7 @@ def test_an_interruption_leaves_nothing_half_made(monkeypatch, folder):
     def function(x):
         return jnp.sin(x) * 7.654321
 
-    for place, name in ((objects, "_compile"), (target, "kernel_ir"), (trace, "expand")):
+    for place, name in ((objects, "compile_text"), (target, "kernel_ir"), (trace, "expand")):
         with monkeypatch.context() as patched, contextlib.suppress(KeyboardInterrupt, jax.errors.JaxRuntimeError):
             patched.setattr(place, name, interrupted)
             jax.jit(native(lambda x: function(x)))(jnp.ones(3))
@@ -1140,7 +1143,7 @@ def test_an_interruption_leaves_nothing_half_made(monkeypatch, folder):
     assert_same(jax.jit(native(lambda x: function(x)))(jnp.ones(3)), function(jnp.ones(3)))
     with monkeypatch.context() as patched, pytest.raises(KeyboardInterrupt):
         patched.setattr(os, "replace", interrupted)
-        objects._write(b"key", b"code")
+        disk.write("key", b"code")
     assert not list(folder.glob("*.part"))
 
 
