@@ -30,7 +30,7 @@ def tangent(program: Program, moving: Sequence[bool]) -> Program:
             make = functools.partial(_tangent, program, moving)
             # A rule keeps its program itself, as that may have a rule again.
             program.derived[moving] = (
-                stored.derived(program, ("tangent", moving), make) if rule is None else rule(moving)
+                stored.make_within(program, ("tangent", moving), make) if rule is None else rule(moving)
             )
     return program.derived[moving]
 
@@ -174,7 +174,7 @@ def transpose(program: Program, linear: Sequence[bool], given: Sequence[bool]) -
     if key not in program.derived:
         with np.errstate(all="ignore"):
             make = functools.partial(_transpose, program, tuple(linear), tuple(given))
-            program.derived[key] = stored.derived(program, key, make)
+            program.derived[key] = stored.make_within(program, key, make)
     return program.derived[key]
 
 
@@ -290,7 +290,7 @@ def _with_inputs(program: Program, places: tuple[int, ...]) -> Program:
     if len(places) == len(program.inputs):
         return program
     index = {place: i for i, place in enumerate(places)}
-    few = stored.derived(program, ("inputs", places), lambda: _renumber_inputs(program, index))
+    few = stored.make_within(program, ("inputs", places), lambda: _renumber_inputs(program, index))
     few.reports_validity = program.reports_validity
     if program.derivative is not None:
         few.derivative = functools.partial(_tangent_of_few, program, places)

@@ -51,6 +51,8 @@ def call(function: Callable, args: tuple, options: Callable) -> Any:
 
     `options()`: XLA's options, which take time to find out.
     """
+    if not jax_adapter.is_version_known():
+        return None
     leaves, structure = jax.tree.flatten(args)
     device, kinds, arrays = _default_sharding(), [], []
     for x in leaves:
@@ -64,7 +66,7 @@ def call(function: Callable, args: tuple, options: Callable) -> Any:
             arrays.append(x)
         else:
             # With its type: 1 and 1.0 and True are equal, and are other constants.
-            kinds.append((type(x), Static(x)))
+            kinds.append((type(x), Static(x), repr(x) if isinstance(x, float) else None))  # 0.0 and -0.0 are equal too
     context = jax_adapter.configuration(), mode.state()
     try:
         found = _executable(function, structure, tuple(kinds), options, context)

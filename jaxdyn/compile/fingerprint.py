@@ -2,8 +2,8 @@
 
 Two objects with one hash behave alike when they are traced. Functions are hashed by their code, defaults, cells and the globals
 that they name; functions and classes of the packages below by their names, since the versions of these packages are a part of
-every key (`stored.environment`). What cannot be hashed so, such as a file or a function that may read one, raises `NoFingerprint`:
-what depends on it is not stored. A key that is wrong thus can only miss.
+every key (`stored.environment`). What cannot be hashed so, such as a file or a function that may read one, raises
+`NoFingerprint`: what depends on it is not stored. A key that is wrong thus can only miss.
 """
 
 import builtins
@@ -18,6 +18,8 @@ from typing import Any
 
 import jax
 import numpy as np
+
+from jaxdyn.compile.jax_adapter import Tracer
 
 # Packages whose functions depend on their arguments alone, by their top-level names.
 _PACKAGES = {
@@ -74,7 +76,7 @@ class _Hasher:
             self.write(type(x).__name__, x)
         elif isinstance(x, np.dtype):
             self.write("dtype", x.str, x.names)
-        elif isinstance(x, jax.core.Tracer):
+        elif isinstance(x, Tracer):
             raise NoFingerprint("a traced value")
         elif isinstance(x, (np.ndarray, np.generic, jax.Array)):
             self.add_array(x)
@@ -137,7 +139,7 @@ class _Hasher:
         else:
             self.add_instance(x)
 
-    def add_structure(self, x: jax.tree_util.PyTreeDef) -> None:
+    def add_structure(self, x: Any) -> None:
         """The structure of a pytree: its nodes, with what is static in them."""
         data = x.node_data()
         self.write("tree", x.num_nodes, x.num_leaves, data is None)

@@ -23,7 +23,6 @@ from jax import lax
 from jax.core import ShapedArray as ShapedArray
 from jax.core import Tracer as Tracer
 from jax.core import eval_jaxpr
-from jax.experimental import serialize_executable
 from jax.sharding import AxisType, NamedSharding, PartitionSpec
 
 logger = logging.getLogger("jaxdyn")
@@ -374,11 +373,15 @@ def lower_call(name: str, context, operands: Sequence, order: Sequence[int], att
 
 def dump_executable(compiled: Any) -> Any:
     """A compiled function of flat arrays as data that can be pickled; `load_executable` makes it a function again."""
+    from jax.experimental import serialize_executable
+
     return serialize_executable.serialize(compiled)
 
 
 def load_executable(data: Any) -> Callable:
     """The function of `dump_executable`, of a process with the same jaxlib and processor."""
+    from jax.experimental import serialize_executable
+
     return serialize_executable.deserialize_and_load(*data, execution_devices=jax.devices()[:1])
 
 

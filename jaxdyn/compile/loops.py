@@ -20,7 +20,7 @@ from jaxdyn.compile.jax_adapter import forgive, vary_alike
 from jaxdyn.compile.known import Known, partition_tracers
 from jaxdyn.compile.loop_text import loop_ir
 from jaxdyn.compile.primitive import kernel_p, over_batch, target
-from jaxdyn.compile.program import Array, Constant, Program
+from jaxdyn.compile.program import Array, Program
 from jaxdyn.compile.trace import program_of
 
 

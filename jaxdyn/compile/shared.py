@@ -9,8 +9,7 @@ from collections.abc import Sequence
 
 from jaxdyn.compile.code import MIN_SHARED_OPERATIONS
 from jaxdyn.compile.program import Array, Constant, Operation, Program, Renumbering, dtype_of
-
-from jaxdyn.compile.stored import derived_key, load_or_make
+from jaxdyn.compile.stored import key_within, load_or_make
 
 
 def split_program(program, uniform: Sequence[bool]) -> tuple[Program, Program] | None:
@@ -25,7 +24,7 @@ def split_program(program, uniform: Sequence[bool]) -> tuple[Program, Program] |
     if key not in program.derived:
         # A program or two, or none.
         make = functools.partial(_split, program, uniform)
-        both, _ = load_or_make(derived_key(program, *key), lambda: (make() or (), None))
+        both, _ = load_or_make(key_within(program, *key), lambda: (make() or (), None))
         program.derived[key] = tuple(both) or None
     return program.derived[key]
 

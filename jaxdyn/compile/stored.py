@@ -16,11 +16,8 @@ from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
-import jax
-
-from jaxdyn.compile import disk, mode
+from jaxdyn.compile import disk, jax_adapter, mode
 from jaxdyn.compile.fingerprint import NoFingerprint, fingerprint
-from jaxdyn.compile.jax_adapter import configuration
 from jaxdyn.compile.program import Array, Operation, Program
 
 _PACKAGES = ("jax", "jaxlib", "numpy", "equinox", "diffrax", "optimistix", "lineax", "optax", "jaxtyping", "llvmlite")
@@ -36,9 +33,11 @@ def environment() -> bytes:
 
 def key_of(*parts: Any) -> str | None:
     """Name under which what depends on these parts alone is kept; None where they cannot be hashed."""
+    if not jax_adapter.is_version_known():
+        return None
     variables = tuple(os.environ.get(name) for name in _VARIABLES)
     try:
-        return fingerprint(environment(), variables, mode.state(), configuration(), parts).hex()
+        return fingerprint(environment(), variables, mode.state(), jax_adapter.configuration(), parts).hex()
     except (NoFingerprint, RecursionError) as reason:
         disk.logger.debug("jaxdyn: not kept on disk, as it depends on %s", reason)
         return None
@@ -129,12 +128,12 @@ def _program_of(make: Callable, i: int) -> Program:
     return make()[0][i]
 
 
-def derived(program: Program, parts: tuple, make: Callable[[], Program]) -> Program:
+def make_within(program: Program, parts: tuple, make: Callable[[], Program]) -> Program:
     """A program that is made of another one's operations, from disk where it is there."""
-    return load_or_make(derived_key(program, *parts), lambda: ([make()], None))[0][0]
+    return load_or_make(key_within(program, *parts), lambda: ([make()], None))[0][0]
 
 
-def derived_key(program: Program, *parts: Any) -> str | None:
+def key_within(program: Program, *parts: Any) -> str | None:
     """Key of what is derived from a program."""
     return None if program.key is None else hashlib.sha256(f"{program.key} {parts}".encode()).hexdigest()
 

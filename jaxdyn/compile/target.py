@@ -209,6 +209,7 @@ class _Kernel:
         if not all(_publish(symbol, width, programs) for symbol in (programs if found is None else found.calls)):
             return False
         if found is None:
+            assert program is not None
             is_program = isinstance(program, Program)
             text = kernel_ir(program, width, self.uniform) if is_program else program.ir(width, self.uniform)
             found = objects.make(self.row.identity, text, tuple(programs), program.name)
@@ -233,7 +234,8 @@ def restore(number: int, row: Row, recover: Callable) -> None:
     if restored.code is None:
         # Now, not in the handler: a process that ends while a thread of XLA waits for Python would wait for ever.
         with _making:
-            restored.code is None and restored._make()
+            if restored.code is None:
+                restored._make()
 
 
 def row_of(number: int) -> Row:

@@ -162,7 +162,7 @@ def _derivative_by_rule(tangent: Callable, known: Known, count: int, structure, 
             return tangent(known(primal[:count]), *args, [*tree_steps, *steps[count:]])
 
         of_rule = stored.key_of(tangent)
-        key = None if of_rule is None else stored.derived_key(program, "rule", moving, of_rule)
+        key = None if of_rule is None else stored.key_within(program, "rule", moving, of_rule)
         return tangent_program(change, avals, moving, flags, key)
 
     return derivative
@@ -184,7 +184,7 @@ def _derivative_by_jax(flat: Callable, avals, flags: str, program: Program):
 
             return jax.jvp(at_values, [primal[i] for i in places], list(steps))[1]
 
-        return tangent_program(change, avals, moving, flags, stored.derived_key(program, "jvp", moving))
+        return tangent_program(change, avals, moving, flags, stored.key_within(program, "jvp", moving))
 
     return derivative
 

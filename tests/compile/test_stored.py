@@ -86,7 +86,7 @@ def test_the_hash_tells_values_apart():
     "law",
     [
         lambda x: x * float(os.environ.get("GAIN", "1")),
-        lambda x: x * float(open("gain").read()),  # noqa: SIM115
+        lambda x: x * float(open("gain").read()),
         lambda x: x * np.loadtxt("gain"),
         lambda x: x * np.random.rand(),  # noqa: NPY002
         lambda x: x * json.loads("1"),
