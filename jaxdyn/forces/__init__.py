@@ -19,6 +19,7 @@ from jaxdyn.forces.limits import JointStops as JointStops
 from jaxdyn.forces.limits import TorqueSpeedLimits as TorqueSpeedLimits
 from jaxdyn.forces.piecewise import PiecewiseForce as PiecewiseForce
 from jaxdyn.systems.drives import DriveDynamics as DriveDynamics
+from jaxdyn.forces.wrenches import applied_wrenches as applied_wrenches
 
 __all__ = [
     "CoulombFriction",
@@ -36,6 +37,7 @@ __all__ = [
     "SecondOrderDrive",
     "SlidingFriction",
     "TorqueSpeedLimits",
+    "applied_wrenches",
     "elastic_joints",
 ]
 

@@ -19,13 +19,14 @@ from jaxdyn.systems.system import SceneLike
 
 
 class Motion(NamedTuple):
-    """An instant of a motion: `q` (nq,), `v` (nv,), `a` (nv,), its rate, and `multipliers` (nc,) of the scene's constraints."""
+    """An instant `t` (s) of a motion: `q` (nq,), `v` (nv,), `a` (nv,), its rate, and `multipliers` (nc,) of the constraints."""
 
     scene: Scene
     q: Array
     v: Array
     a: Array
     multipliers: Array
+    t: Numbers = 0.0
 
 
 class Noise(eqx.Module):
@@ -158,7 +159,7 @@ def measure(
     q, v, tau, t = check_state(scene.system, q=q, v=v, tau=zeros_if_none(tau, scene.nv), t=t)
     # Solved once for all sensors: accelerations and multipliers belong to the same motion.
     dynamics = constrained_dynamics(scene, q, v, tau, t)
-    return readings_of(sensors, Motion(scene, q, v, dynamics.acceleration, dynamics.multipliers))
+    return readings_of(sensors, Motion(scene, q, v, dynamics.acceleration, dynamics.multipliers, t))
 
 
 def readings_of(sensors: Sequence[Sensor], motion: Motion) -> dict[str, Array]:

@@ -60,7 +60,7 @@ def record(
     def read(q, v, tau, t):
         # Accelerations are solved for, and not differences of v, which would amplify its rounding.
         dynamics = constrained_dynamics(scene, q, v, tau, t)
-        motion = Motion(scene, q, v, dynamics.acceleration, dynamics.multipliers)
+        motion = Motion(scene, q, v, dynamics.acceleration, dynamics.multipliers, t)
         return [sensor.read(motion) for sensor in sensors]
 
     readings = jax.vmap(read)(q, v, tau, ts)

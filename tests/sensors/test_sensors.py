@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 from pinocchio_bridge import assert_close, quick
 
+import jaxdyn as jd
 from jaxdyn import scenes, sensors
 from jaxdyn.constraints.dynamics import constrained_dynamics
 from jaxdyn.dynamics.joint_wrenches import joint_wrench
@@ -246,3 +247,62 @@ def test_refusals():
         sensors.record(model, [sensors.Imu("tip")], [0.0, 0.0], jnp.zeros((2, 1)), jnp.zeros((2, 1)))
     with pytest.raises(ValueError, match=r"v has shape \(3, 1\), expected \(2, 1\)"):
         sensors.record(model, [sensors.Imu("tip")], [0.0, 1.0], jnp.zeros((2, 1)), np.zeros((3, 1)))
+
+
+PUSHED = """
+<mujoco>
+  <option timestep="0.001"><flag contact="disable" limit="disable"/></option>
+  <worldbody>
+    <body name="upper" pos="0 0 1">
+      <joint name="a" axis="0 1 0" stiffness="7" damping="0.3"/>
+      <inertial pos="0.1 0 0.05" mass="3" diaginertia="0.1 0.2 0.15"/>
+      <body name="lower" pos="0.3 0 0" euler="0 20 0">
+        <joint name="b" axis="0 0 1" stiffness="5" springref="0.4" range="-28.64788975654116 28.64788975654116"/>
+        <inertial pos="0 0.05 -0.2" mass="1" diaginertia="0.02 0.02 0.01"/>
+        <site name="s" pos="0.1 0.02 0.03" euler="10 20 30"/>
+        <body name="hand" pos="0 0 -0.4" euler="0 0 30">
+          <joint name="c" axis="1 0 0" damping="0.2"/>
+          <inertial pos="0.05 0.02 -0.1" mass="0.5" fullinertia="0.01 0.012 0.008 0.001 0.0005 -0.0002"/>
+        </body>
+        <body name="tool" pos="0.1 0 -0.1" euler="20 0 0">
+          <inertial pos="0.05 0 0" mass="0.3" diaginertia="1e-3 2e-3 2e-3"/>
+          <site name="flange" pos="0 0.01 0" euler="0 40 0"/>
+        </body>
+      </body>
+    </body>
+  </worldbody>
+  <sensor>
+    <accelerometer name="acc" site="s"/><force name="f" site="s"/><torque name="t" site="s"/>
+    <force name="flange_f" site="flange"/><torque name="flange_t" site="flange"/>
+  </sensor>
+</mujoco>
+"""
+
+
+@pytest.mark.long
+def test_outer_forces_springs_and_stops_against_mujoco(tmp_path):
+    """Wrenches of a scene on the sensor's body, before a mount on it and beyond, springs, dampers, and a stop that is hit."""
+    mujoco = pytest.importorskip("mujoco")
+    path = tmp_path / "pushed.xml"
+    path.write_text(PUSHED)
+    m, loaded = mujoco.MjModel.from_xml_path(str(path)), jd.io.load_mjcf(path)
+    data = mujoco.MjData(m)
+    q, v = np.array([0.3, -0.7, 0.5]), np.array([1.2, -0.8, 0.9])
+    data.qpos[:], data.qvel[:] = q, v
+    mujoco.mj_forward(m, data)
+    # Of MuJoCo as a torque of the size that the closed form has: its own stops are soft constraints.
+    forces = [*loaded.forces, jd.forces.JointStops(1e3, 2.0, joints="b")]
+    data.qfrc_applied[1] = 1e3 * 0.2 + 2.0 * 0.8
+    pushes = {"lower": [3, -2, 5, 0.1, 0.2, -0.3], "hand": [-1, 4, 2, 0.3, -0.1, 0.2], "tool": [2, 1, -3, 0.2, 0, 0.1]}
+    for name, push in pushes.items():
+        i = m.body(name).id
+        data.xfrc_applied[i] = push
+        # MuJoCo pushes at the centre of mass.
+        torque = push[3:] + np.cross(data.xipos[i] - data.xpos[i], push[:3])
+        forces.append(jd.forces.ExternalWrench(name, np.append(push[:3], torque)))
+    mujoco.mj_forward(m, data)
+    scene = Scene(loaded.system, forces=forces)
+    readings = sensors.measure(scene, loaded.sensors, jnp.asarray(q), jnp.asarray(v))
+    for i in range(m.nsensor):
+        want = data.sensordata[m.sensor_adr[i] :][:3]
+        np.testing.assert_allclose(readings[m.sensor(i).name], want, atol=1e-10 * max(1, np.abs(want).max()))
