@@ -32,6 +32,9 @@ class Motion(NamedTuple):
 class Noise(eqx.Module):
     r"""Errors of a sensor: reading + bias + walk(t) + white noise.
 
+    Errors of an orientation are small rotations, so that it stays a unit quaternion: three angles, rad, about the axes of the
+    frame in place of its four numbers.
+
     **Arguments:** each a number or one for each entry of the reading, in its units.
 
     - `std`: standard deviation of the white noise of a sample. A density d (per root of Hz) sampled every dt is $d / \sqrt{dt}$.
@@ -103,6 +106,10 @@ class Sensor(eqx.Module):
     def quantize(self, readings: Float[Array, "*n k"]) -> Float[Array, "*n k"]:
         """Readings in steps of the resolution; unchanged for sensors without one."""
         return readings
+
+    def quaternion_start(self, scene: Scene) -> int | None:
+        """Index of the first of the four numbers of a unit quaternion in the readings, None without one."""
+        return None
 
     def check(self, scene: Scene) -> None:
         """Refuse a scene that has not what the sensor is on. **Raises:** ValueError."""

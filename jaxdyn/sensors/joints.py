@@ -1,6 +1,6 @@
 """Sensors of joints and of forces: encoder, tachometer, force and torque in a joint or a mount, contact force."""
 
-from typing import Any
+from typing import Any, cast
 
 import equinox as eqx
 import jax.numpy as jnp
@@ -67,6 +67,11 @@ class Encoder(Sensor):
         """Coordinates of the joint."""
         model: Any = motion.scene.system
         return motion.q[model.topology.q_slices[joint_index(model, self.joint)]]
+
+    def quaternion_start(self, scene: Scene) -> int | None:
+        """Index of the quaternion of a spherical or a free joint."""
+        top = cast(Model, scene.system).topology
+        return {"spherical": 0, "free": 3}.get(top.kinds[top.joint_names.index(self.joint)])
 
     def quantize(self, readings: Float[Array, "*n k"]) -> Float[Array, "*n k"]:
         """Readings rounded down to multiples of the resolution."""

@@ -1,5 +1,6 @@
 """Sensors against MuJoCo's, against closed forms, and by the statistics of their noise."""
 
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -12,6 +13,7 @@ from jaxdyn.constraints.dynamics import constrained_dynamics
 from jaxdyn.dynamics.joint_wrenches import joint_wrench
 from jaxdyn.dynamics.kinematics import frame_pose
 from jaxdyn.dynamics.quantities import forward_dynamics
+from jaxdyn.lie import so3
 from jaxdyn.model import inertia, robots
 from jaxdyn.model.builder import ModelBuilder
 from jaxdyn.systems.scene import Scene
@@ -306,3 +308,49 @@ def test_outer_forces_springs_and_stops_against_mujoco(tmp_path):
     for i in range(m.nsensor):
         want = data.sensordata[m.sensor_adr[i] :][:3]
         np.testing.assert_allclose(readings[m.sensor(i).name], want, atol=1e-10 * max(1, np.abs(want).max()))
+
+
+@pytest.mark.long
+@pytest.mark.parametrize("mode", ["delay", "noise"])
+def test_orientations_are_delayed_and_disturbed_on_the_group(mode):
+    """A body that turns about a fixed axis beyond a full turn: its delayed orientation is that of an earlier time."""
+    axis, rate, late = np.array([2.0, -1.0, 2.0]) / 3, 5.7, 0.0123
+    ball = ModelBuilder("ball", gravity=None).add_body("ball", None, "free", inertia.sphere(1.0, 0.1)).build()
+    ts = np.linspace(0, 2, 201)
+    half = rate * ts / 2
+    turns = np.column_stack([np.cos(half), np.sin(half)[:, None] * axis])
+    # Rows of either sign, as files have them.
+    q = np.column_stack([ts, 2 * ts, 0 * ts, turns * np.where(np.arange(201) % 7 < 3, -1, 1)[:, None]])
+    v = np.tile([0.0, 0, 0, *(rate * axis)], (201, 1))
+    std = np.array([0.01, 0.02, 0.03, 0.001, 0.002, 0.003])
+    noise, delay = (sensors.Noise(std, bias=0.1 * std), 0.0) if mode == "noise" else (None, late)
+    list_of = [
+        sensors.FramePose("ball", delay=delay, noise=noise),
+        sensors.FramePose("ball", name="turn", part="orientation", delay=delay),
+        sensors.Encoder("ball_joint" if "ball_joint" in ball.joint_names else "ball", delay=delay, noise=noise),
+    ]
+    read = quick(lambda delay: sensors.record(
+        ball, [eqx.tree_at(lambda s: s.delay, s, delay) for s in list_of], ts, q, v, key=jax.random.key(3)))
+    readings = read(jnp.asarray(delay))
+    before = np.maximum(ts - delay, 0)
+    truth = np.column_stack([np.cos(rate * before / 2), np.sin(rate * before / 2)[:, None] * axis])
+    assert_close(readings["turn"], truth, 1e-12)
+    for sensor in (list_of[0], list_of[2]):
+        got = np.asarray(readings[sensor.name])
+        np.testing.assert_allclose(np.linalg.norm(got[:, 3:], axis=1), 1, atol=1e-12)
+        assert (np.sum(got[1:, 3:] * got[:-1, 3:], 1) > 0.9).all()
+        place = got[:, :3] - np.column_stack([before, 2 * before, 0 * before])
+        error = jax.vmap(so3.quat_multiply)(jax.vmap(so3.quat_conjugate)(jnp.asarray(truth)), got[:, 3:])
+        errors = np.column_stack([place, jax.vmap(so3.quat_log)(error)])
+        if mode == "delay":
+            np.testing.assert_allclose(errors, 0, atol=1e-12)
+        else:
+            # Five standard errors of a deviation, of 201 samples.
+            np.testing.assert_allclose(errors.std(0), std, rtol=5 / np.sqrt(2 * 201))
+    if mode == "delay":
+        slope = jax.jacfwd(lambda delay: read(delay)["turn"][100])(jnp.asarray(delay))
+        turned = rate * before[100] / 2
+        assert_close(slope, -rate / 2 * np.array([-np.sin(turned), *(np.cos(turned) * axis)]), 1e-12)
+    else:
+        with pytest.raises(ValueError, match=r"noise has std of shape \(7,\); give one number, or 6"):
+            sensors.record(ball, [sensors.FramePose("ball", noise=sensors.Noise(np.ones(7)))], ts, q, v, key=jax.random.key(0))
