@@ -53,14 +53,18 @@ def integrate(term, project, eqs: Equations, args, method, y0, ts, steps, option
         inputs = undifferentiable(inputs, of_kinks)
     if reason:
         controller = diffrax.ConstantStepSize() if continuous and has_length else controller
+        if guards is not None:
+            solver = terminal_events.GuardedSolver(solver, guards)
+            y0 = y0 | {terminal_events.WITHIN: jnp.ones_like(ts[0])}
+            inputs = y0, *inputs[1:]
         event = terminal_events.event(quality, guards, ts[0], y0, args)
-        return _by_diffrax(term, solver, controller, event, dt0, inputs, steps, options)
+        outcome = _by_diffrax(term, solver, controller, event, dt0, inputs, steps, options)
+        return outcome._replace(rows=_without_mark(outcome.rows), last=_without_mark(outcome.last))
     if eqs.pieces.names and not of_kinks:
         system = PiecewiseSystem(solver.plan(y0), eqs.pieces, eqs.switching)
         return _by_pieces(system, inputs, controller, steps, options)
-    return _by_steps(
-        solver, solver.plan(y0)._replace(quality=quality, guards=guards), controller, inputs, steps, options
-    )
+    plan = solver.plan(y0)._replace(quality=quality, guards=guards, is_terminal=guards is not None)
+    return _by_steps(solver, plan, controller, inputs, steps, options)
 
 
 def _monitors(eqs: Equations, method) -> tuple[Callable | None, Callable | None]:
@@ -91,6 +95,11 @@ def _reason_for_crossing(quality, guards) -> str | None:
     if guards is not None:
         return "contacts, limits or the control may end the run; pass contacts='report' and limits=None"
     return None if quality is None else "method is 'reduced'; take 'projected'"
+
+
+def _without_mark(y):
+    """State without the mark of `GuardedSolver`."""
+    return y and {name: y[name] for name in y if name != terminal_events.WITHIN}
 
 
 def undifferentiable(tree, reason: str):

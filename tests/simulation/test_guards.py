@@ -229,3 +229,60 @@ def test_a_guard_that_is_violated_within_a_step_ends_the_motion():
     assert solution.result == jd.RESULTS.joint_limit_passed
     time = 2 * (v - np.sqrt(v * v - 1 - ROUNDING))
     np.testing.assert_allclose(solution.stats["time_reached"], time, rtol=1e-10)
+
+
+def there_and_back(depth, **options):
+    """q = v t - t^2/4, whose top is above the end of the rail by `depth`, in steps that are not told of it."""
+    top = 1.0 + depth
+    v = np.sqrt(top)
+    ts = np.linspace(0.0, 4 * v, options.pop("saves", 2))
+    back = lambda q, v, t: -jnp.ones_like(v)  # noqa: E731
+    run = jd.simulate(RAIL, jnp.zeros(1), jnp.asarray([v]), ts, control=back, limits="stop", throw=False, **options)
+    return run, 2 * (v - np.sqrt(v * v - 1 - ROUNDING))
+
+
+LONG = {
+    "explicit": {},
+    "fixed": {"stepsize": 5.0},
+    "Rodas5P": {"solver": jd.solvers.Rodas5P()},
+    "fixed Rodas5P": {"solver": jd.solvers.Rodas5P(), "stepsize": 5.0},
+    "forward": {"adjoint": "forward"},
+}
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("saves", [2, 12])
+@pytest.mark.parametrize("how", LONG)
+def test_a_passage_within_one_step_ends_the_motion_at_its_time(how, saves):
+    """A parabola is exact in one step of every method; the passage lasts a twentieth of it, with and without save points in it."""
+    solution, time = there_and_back(2e-3, saves=saves, **LONG[how])
+    assert solution.result == jd.RESULTS.joint_limit_passed
+    np.testing.assert_allclose(solution.stats["time_reached"], time, rtol=1e-10)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("solver", [diffrax.Kvaerno5(), diffrax.KenCarp4(), jd.solvers.LieGroup(diffrax.Tsit5())])
+def test_other_methods_find_the_passage_too(solver):
+    """Their dense output of third order gives the time to 1e-6."""
+    solution, time = there_and_back(2e-3, saves=12, solver=solver, stepsize=1.5)
+    assert solution.result == jd.RESULTS.joint_limit_passed
+    np.testing.assert_allclose(solution.stats["time_reached"], time, rtol=1e-6)
+
+
+@pytest.mark.slow
+def test_short_passages_of_an_oscillation_are_found():
+    """q = 1.001 sin(w t): a passage of 1e-3 of the amplitude, whose time no step knows, for 20 frequencies in plain mode too."""
+    frequencies = jnp.linspace(0.9, 2.1, 20)
+
+    def time(w):
+        law = jax.tree_util.Partial(lambda w, q, v, t: -2.0 * w * w * q, w)
+        run = jd.simulate(RAIL, jnp.zeros(1), 1.001 * w[None], TS, control=law, limits="stop", throw=False)
+        return run.stats["time_reached"], run.result == jd.RESULTS.joint_limit_passed
+
+    wanted = np.arcsin((1 + ROUNDING) / 1.001) / np.asarray(frequencies)
+    for mode in ("auto", "plain"):
+        with jd.compilation(mode):
+            times, found = jax.jit(jax.vmap(time))(frequencies)
+        assert np.asarray(found).all()
+        # The passage is slow, 0.045 w: an error of the motion of 1e-8 is one of 1e-6 of the time.
+        np.testing.assert_allclose(times, wanted, rtol=2e-6)
