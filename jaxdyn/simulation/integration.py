@@ -184,5 +184,5 @@ def _by_steps(solver: ExplicitSteps, plan: Plan, controller, inputs, steps, opti
         return Outcome(rows, result, counts, reached)
     rows, end = (jax.tree.map(lambda x, at=at: x[at], rows) for at in (slice(-1), -1))
     args, y = inputs[1], ravel_pytree(end)[0]
-    late = delay(lambda t, y: jnp.min(plan.guards_of(args, t, y)[0]), plan.field_of(args, reached, y), reached, y)
+    late = delay(lambda args, t, y: jnp.min(plan.guards_of(args, t, y)[0]), plan.field_of, args, reached, y)
     return Outcome(rows, result, counts, reached + jnp.where(result == RESULTS.event_occurred, late, 0.0), end)

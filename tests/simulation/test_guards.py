@@ -286,3 +286,40 @@ def test_short_passages_of_an_oscillation_are_found():
         assert np.asarray(found).all()
         # The passage is slow, 0.045 w: an error of the motion of 1e-8 is one of 1e-6 of the time.
         np.testing.assert_allclose(times, wanted, rtol=2e-6)
+
+
+def limit_of(p, **options):
+    """q(t) = v t + F t^2/4 of both numbers, and the end of the save points."""
+    law = jax.tree_util.Partial(lambda force, q, v, t: force[None], p[1])
+    ts = jnp.linspace(0.0, p[2], 4)
+    run = jd.simulate(RAIL, jnp.zeros(1), p[:1], ts, control=law, limits="stop", throw=False, **options)
+    return run.stats["time_reached"]
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("adjoint", ["reverse", "forward"])
+def test_the_time_has_second_derivatives(adjoint):
+    """Mixed ones too; of a run that does not end there the time is that of the last save point."""
+    options: dict[str, Any] = TIGHT | {"adjoint": adjoint}
+    outer, inner = jax.jacfwd, jax.jacfwd if adjoint == "forward" else jax.grad
+
+    def both(p):
+        return inner(lambda p: limit_of(p, **options))(p), outer(inner(lambda p: limit_of(p, **options)))(p)
+
+    gradients, hessians = jax.jit(jax.vmap(both))(jnp.asarray([[0.3, 1.0, 3.0], [0.3, 1.2, 1.0]]))
+    closed = lambda p: 2 * (-p[0] + jnp.sqrt(p[0] ** 2 + p[1] * (1 + ROUNDING))) / p[1]  # noqa: E731
+    at = jnp.asarray([0.3, 1.0, 3.0])
+    np.testing.assert_allclose(gradients[0], jax.grad(closed)(at), atol=1e-9)
+    np.testing.assert_allclose(hessians[0], jax.hessian(closed)(at), atol=1e-8)
+    np.testing.assert_allclose(gradients[1], [0, 0, 1], atol=1e-12)
+    np.testing.assert_allclose(hessians[1], 0, atol=1e-12)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", ["cone", "controller"])
+def test_other_times_have_second_derivatives(name):
+    """T = c/r of the cone, and c/k^(1/2) of the spring."""
+    case = CASES[name]
+    x = case.numbers[0]
+    second = jax.jit(jax.jacfwd(jax.grad(lambda x: case.move(x, **TIGHT).stats["time_reached"])))(jnp.asarray(x))
+    np.testing.assert_allclose(second, case.time(x) / x**2 * (2 if name == "cone" else 0.75), rtol=1e-9)

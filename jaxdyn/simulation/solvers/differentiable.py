@@ -120,9 +120,16 @@ def _with_end(solved, args, options):
         return solved
     codes: Any = diffrax.RESULTS
     event, term, (end,) = options["event"], options["term"], last
-    rate = term.vf_prod(reached, end, args, term.contr(reached, reached + 1))
     y, unravel = ravel_pytree(end)
-    late = delay(lambda t, y: event.cond_fn(t, unravel(y), args), ravel_pytree(rate)[0], reached, y)
+
+    def guard(given, t, y):
+        args, condition = given
+        return condition(t, unravel(y), args)
+
+    def field(given, t, y):
+        return ravel_pytree(term.vf_prod(t, unravel(y), given[0], term.contr(t, t + 1)))[0]
+
+    late = delay(guard, field, (args, event.cond_fn), reached, y)
     return rows, (result, counts, reached + jnp.where(result == codes.event_occurred, late, 0.0), end)
 
 

@@ -7,8 +7,10 @@ points so far has its least value (`look_within`). What is violated and satisfie
 """
 
 from collections.abc import Callable
+from functools import partial
 from typing import Any, NamedTuple
 
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 from jax import lax
@@ -190,15 +192,44 @@ def search_root(search: Search, t0, t1, at_end, within, good, usual) -> tuple[Se
     return after, kept, located, bracket.next(is_narrow)
 
 
-def delay(guard, rate, t, y) -> Any:
-    """Delay of an event, (), s: zero, with its first derivative; the second one lacks the change of the rate.
+def delay(guard: Callable, field: Callable, args, t, y) -> Any:
+    """Delay of an event, (), s: zero, with its first and second derivatives.
 
-    Where guard(t, y) is zero, a change of the guard by de moves the root by dt = -de/(de/dt), with de/dt along the motion, whose
-    `rate` is dy/dt before the event.
+    Where guard(args, t, y) is zero, a change of the guard by z moves the root by s with z + g' s + g'' s^2 / 2 = 0. The rates g'
+    and g'' are those along the motion, whose rate is field(args, t, y) before the event.
     """
-    fixed, value = lax.stop_gradient((t, y)), guard(t, y)
-    _, guard_rate = jax.jvp(guard, fixed, (jnp.ones_like(t), lax.stop_gradient(rate)))
-    is_regular = guard_rate != 0
-    guard_rate = lax.stop_gradient(jnp.where(is_regular, guard_rate, jnp.ones_like(guard_rate)))
-    # The value is zero up to rounding: only its derivative is used.
-    return jnp.where(is_regular, (lax.stop_gradient(value) - value) / guard_rate, jnp.zeros_like(value))
+    return _delay((args, t, y), guard, field)
+
+
+# The value needs no rates: runs that are not differentiated do not pay for them.
+@eqx.filter_custom_jvp
+def _delay(inputs, guard, field):
+    return jnp.zeros_like(inputs[1])
+
+
+@_delay.def_jvp
+def _(primals, tangents):
+    inputs, guard, field = primals
+    # The time of the event is that of the values: derivatives are those of the guard there.
+    changes = tangents[0][0], None, tangents[0][2]
+    _, change = eqx.filter_jvp(partial(_expand_delay, guard, field), (inputs,), (changes,))
+    return _delay(*primals), change
+
+
+def _expand_delay(guard: Callable, field: Callable, inputs) -> Array:
+    """Expansion of the delay to second order at an event."""
+    args, t, y = inputs
+
+    def along(function, t, y):
+        return jax.jvp(function, (t, y), (jnp.ones_like(t), field(args, t, y)))
+
+    def rate(t, y):
+        return along(partial(guard, args), t, y)[1]
+
+    # In the second derivative of the delay the value of g'' is all that counts.
+    first, second = rate(t, y), lax.stop_gradient(along(rate, t, y)[1])
+    value = guard(args, t, y)
+    change, is_regular = value - lax.stop_gradient(value), first != 0
+    first = jnp.where(is_regular, first, jnp.ones_like(first))
+    late = -change / first - second / (2 * first**3) * change**2
+    return jnp.where(is_regular, late, jnp.zeros_like(late)).astype(t.dtype)
