@@ -120,6 +120,8 @@ class Actuators(eqx.Module):
         **Raises:** ValueError for controls or activations of another shape.
         """
         activation = jnp.asarray(self._check_activation(activation), float)
+        if not self._active:
+            return activation
         wanted = self._clipped(control, activation.dtype)[np.array(self._active, int)]
         is_filter = np.array([self.dynamics[i] == "filter" for i in self._active])
         # Integrators have no time constant: a 0 in the file would divide by zero and give NaN in gradients.
@@ -130,7 +132,7 @@ class Actuators(eqx.Module):
         return jnp.where((activation >= high) & (rate > 0) | (activation <= low) & (rate < 0), 0.0, rate)
 
     def drive(self, law: Function, activation: Numbers | None = None) -> "ActuatorDrive":
-        """Force of a scene under law(q, v, t) -> (nu,) for the controls, with the activations as its state.
+        """Force of a scene under law(q, v, t) -> (nu,) for the controls, with the activations as its state (none of plain motors).
 
         `activation` (na,) at the start; zeros by default. `outputs=("drive_state",)` of `jd.simulate` are those of the motion.
 
