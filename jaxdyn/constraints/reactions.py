@@ -1,5 +1,7 @@
 """Generalised force and wrench of each constraint, from the multipliers."""
 
+from collections.abc import Callable
+
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
@@ -89,6 +91,11 @@ def body_wrenches(scene: Scene, q: Float[Array, " nq"], multipliers: Float[Array
     """
     scene = as_scene(scene)
     (q,) = check_shapes(scene.system, q=q)
+    return body_wrenches_where(scene, q, multipliers, lambda frame: True)
+
+
+def body_wrenches_where(scene: Scene, q, multipliers, counts: Callable[[str], bool]) -> Float[Array, "nb 6"]:
+    """`body_wrenches` on those frames alone whose name counts."""
     wrenches = constraint_wrenches(scene, q, multipliers)
     total = jnp.zeros((scene.system.nb, 6), q.dtype)
     for constraint, place in zip(scene.constraints, layout(scene), strict=True):
@@ -100,8 +107,9 @@ def body_wrenches(scene: Scene, q: Float[Array, " nq"], multipliers: Float[Array
         at_b = se3.AdT_apply(se3.from_parts(rotation[0], position[0]), wrench)
         ends = constraint.ends()
         bodies, poses = places_on(scene.system, [body for body, _ in ends], [pose for _, pose in ends], q.dtype)
-        for body, pose, pull in zip(bodies, poses, (-wrench, at_b), strict=True):
-            total = total if body < 0 else total.at[body].add(se3.Ad_inv_T_apply(pose, pull))
+        for (frame, _), body, pose, pull in zip(ends, bodies, poses, (-wrench, at_b), strict=True):
+            if body >= 0 and counts(str(frame)):
+                total = total.at[body].add(se3.Ad_inv_T_apply(pose, pull))
     return total
 
 

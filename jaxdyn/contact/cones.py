@@ -37,7 +37,8 @@ class FrictionCone(eqx.Module):
     - `rows` (k, 6): U of a surface, $U w \le 0$.
 
     It has `linear_rows` and `second_order_rows`, which together describe the cone exactly, `pyramid`, a linear cone
-    inside or around it, and `margins` and `margin`, the distance of a force from the boundary.
+    inside or around it, and `margins` and `margin`, by how much a force satisfies the inequalities: $\mu f_n - |f_t|$. The
+    distance of the force from the boundary of the cone is that over $\sqrt{1 + \mu^2}$.
     """
 
     kind: str = eqx.field(static=True)

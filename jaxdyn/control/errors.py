@@ -26,7 +26,8 @@ from jaxdyn.dynamics.quantities import mass_matrix
 from jaxdyn.lie import so3
 from jaxdyn.lie.series import safe_sqrt
 from jaxdyn.lie.so3 import matmul
-from jaxdyn.model.arguments import Number, Numbers, as_array, batch_hint
+from jaxdyn.model.arguments import Number, Numbers, batch_hint
+from jaxdyn.model.numbers import as_float
 from jaxdyn.model.topology import frame_index
 from jaxdyn.model.tree import Model
 from jaxdyn.systems.mass_factor import mass_factor
@@ -58,9 +59,7 @@ def as_target(target: Target, name: str = "target") -> Callable:
     """
     if callable(target):
         return as_pytree(target, name, "t")
-    array = as_array(target, name)
-    # Integers become floating-point leaves: `jax.grad` refuses integers.
-    return Fixed(jnp.asarray(array, array.dtype if jnp.issubdtype(array.dtype, jnp.floating) else float))
+    return Fixed(as_float(target, name))
 
 
 def target_value(target: Callable, t, shape: tuple, like) -> Array:

@@ -8,8 +8,8 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, PyTree
 
 from jaxdyn._renamed import RenamedMethod
-from jaxdyn.constraints.base import Constraint, constraint_jacobian, layout, rows
-from jaxdyn.control.errors import row_rank, target_rows
+from jaxdyn.constraints.base import Constraint, layout, rows
+from jaxdyn.control.errors import hierarchical_acceleration, row_rank, target_rows
 from jaxdyn.control.gains import times
 from jaxdyn.model.arguments import Number, batch_hint
 from jaxdyn.simulation.controls import Controller
@@ -32,16 +32,19 @@ class ForceIntegral(Controller):
     def is_regular(self, q: Float[Array, " nq"], v: Float[Array, " nv"], t: Number = 0.0) -> Bool[Array, ""]:
         """Decide whether task and constraints are independent, as the error equations require."""
         t = jnp.asarray(t, q.dtype)
-        A = constraint_jacobian(self.scene, q, t)
-        both, _ = self._rows(q, v, t)
+        (A, _), (T, _) = self._orders(q, v, t)
         # Ranks add exactly where no direction of the task is fixed by the constraints.
-        return row_rank(both) == row_rank(A) + both.shape[0] - A.shape[0]
+        return row_rank(jnp.concatenate([A, T])) == row_rank(A) + T.shape[0]
 
-    def _rows(self, q, v, t):
+    def _orders(self, q, v, t):
         """Rows A and right-hand sides of A a = ..., those of the constraints before those of the task."""
         row = rows(self.scene, q, v, t)
-        A, wanted = target_rows(self.scene.system, self.error, self.kp, self.kd, q, v, t)
-        return jnp.concatenate([row.A, A]), jnp.concatenate([row.gamma, wanted])
+        return (row.A, row.gamma), target_rows(self.scene.system, self.error, self.kp, self.kd, q, v, t)
+
+    def _acceleration(self, q, v, t, start) -> Array:
+        """Acceleration closest to `start` (nv,) that satisfies the constraints, and the task in what these leave free."""
+        # A task that depends on the constraints is met in the least-squares sense; the constraints hold in any case.
+        return hierarchical_acceleration(self.scene.system, q, t, self._orders(q, v, t), start)
 
 
 class ForceLoop(ForceIntegral):

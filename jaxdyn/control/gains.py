@@ -8,6 +8,7 @@ from jaxtyping import Array, Float
 
 from jaxdyn.lie.so3 import matmul
 from jaxdyn.model.arguments import as_array, is_concrete
+from jaxdyn.model.numbers import as_float
 
 
 def gain(value: Any, name: str) -> Array:
@@ -29,7 +30,7 @@ def gain(value: Any, name: str) -> Array:
         if not (np.isfinite(known).all() and least > 0):
             raise ValueError(f"{name} is {known.tolist()}, which is not positive definite; give positive gains")
     # Integer gains become floating-point leaves: `jax.grad` refuses integers.
-    return jnp.asarray(array, array.dtype if jnp.issubdtype(array.dtype, jnp.floating) else float)
+    return as_float(array, name)
 
 
 def times(gain: Array, error: Float[Array, " n"], name: str) -> Float[Array, " n"]:

@@ -164,20 +164,24 @@ class GaugeInvariant(ForceLoop):
         # The tangent of t is 1, because constraints and targets may depend on time.
         motion = velocity_to_rate(system, q, v), jnp.ones_like(t)
 
-        def both(q, t):
-            return jnp.concatenate([constraint_jacobian(scene, q, t), constraint_jacobian(errors, q, t)])
-
         def reference(q, t):
             """Reference rates xd_d - Kp e."""
             # At v = 0 the rate of e = x - x_d is -xd_d.
             speed = -rows(errors, q, jnp.zeros_like(v), t).velocity
             return speed - times(self.kp, self.error.position(system, q, t), "kp")  # pyright: ignore[reportArgumentType]
 
-        stacked, turning = jax.jvp(both, (q, t), motion)
-        # The inverse of the stacked rows gives J = d v / d xd on the constraints as its last columns.
-        inverse = pseudo_inverse(stacked, tolerance(None, stacked))
-        J = inverse[:, -m:]
+        A, turning = jax.jvp(lambda q, t: constraint_jacobian(scene, q, t), (q, t), motion)
+        T, turning_of_task = jax.jvp(lambda q, t: constraint_jacobian(errors, q, t), (q, t), motion)
+        # Constraints first: J = d v / d xd is the inverse of the task's rows in the motions that these leave. It is the last
+        # columns of the inverse of the stacked rows where that exists; elsewhere J s still satisfies the constraints.
+        inverse = pseudo_inverse(A, tolerance(None, A))
+        left = T - matmul(matmul(T, inverse), A)
+        # Rounding errors of rows that depend on the constraints are no directions. Decisions on rank have no derivative.
+        sizes = [jnp.sum(jax.lax.stop_gradient(x) ** 2) for x in (left, T)]
+        left = jnp.where(sizes[0] > tolerance(None, T) ** 2 * sizes[1], left, jnp.zeros_like(left))
+        J = pseudo_inverse(left, tolerance(None, left))
         s, sdot = jax.jvp(reference, (q, t), motion)
         along = matmul(J, s)
-        # d/dt of [A; T]^-1 [0; s]: the rate of the inverse enters as -inverse (turning) inverse.
-        return J, along, matmul(J, sdot) - matmul(inverse, matmul(turning, along))
+        # The rate of A v = 0, T v = s for v = J s.
+        change = -matmul(inverse, matmul(turning, along))
+        return J, along, change + matmul(J, sdot - matmul(turning_of_task, along) - matmul(T, change))

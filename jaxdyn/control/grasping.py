@@ -19,7 +19,7 @@ from jaxtyping import Array, Float, PyTree
 
 from jaxdyn._renamed import RenamedMethod
 from jaxdyn.constraints.base import Constraint, constraint_jacobian
-from jaxdyn.control.errors import Target, as_target, least_acceleration
+from jaxdyn.control.errors import Target, as_target
 from jaxdyn.control.force_loop import ForceIntegral
 from jaxdyn.control.gains import gain, times
 from jaxdyn.control.motion import torque_for
@@ -133,9 +133,7 @@ class GraspForce(ForceIntegral):
 
     def acceleration(self, q: Float[Array, " nq"], v: Float[Array, " nv"], t: Number = 0.0) -> Float[Array, " nv"]:
         """Commanded acceleration (nv,), consistent with the contacts and the object's error equation."""
-        t = jnp.asarray(t, q.dtype)
-        A, wanted = self._rows(q, v, t)
-        return least_acceleration(self.scene.system, q, t, A, wanted, -self.damping.astype(v.dtype) * v)
+        return self._acceleration(q, v, jnp.asarray(t, q.dtype), -self.damping.astype(v.dtype) * v)
 
     def reference_forces(self, q: Float[Array, " nq"], v: Float[Array, " nv"], t: Number = 0.0) -> Float[Array, " nc"]:
         """Reference contact forces (nc,) that carry the object, with the internal part of the preload."""

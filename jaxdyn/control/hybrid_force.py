@@ -25,10 +25,9 @@ from jaxdyn.control.errors import (
     Target,
     TaskError,
     as_target,
-    least_acceleration,
     regularity,
 )
-from jaxdyn.control.force_loop import ForceLoop, constrained, row_count
+from jaxdyn.control.force_loop import ForceLoop, constrained
 from jaxdyn.control.gains import gain
 from jaxdyn.control.motion import torque_for
 from jaxdyn.lie.so3 import matmul
@@ -47,7 +46,8 @@ class HybridForce(ForceLoop):
     For constraints of every kind. A task of positions x(q), `of="position"`, follows x_d(t) by the gains `kp` and `kd`; a task
     of velocities u(q, v), linear in v, `of="velocity"`, follows u_d(t) by $\dot u - \dot u_d = -K_p (u - u_d)$: for nonholonomic
     constraints, whose velocities $v = J u$ are free and whose positions are not. Where task and constraints together leave
-    some motion undetermined, it has the least acceleration in the metric M.
+    some motion undetermined, it has the least acceleration in the metric M. Constraints come first: where the task depends
+    on them, it is followed in the least-squares sense by the motions that they leave, and the force is that of the reference.
 
     Errors decay as set by the gains for an exact model. With model errors, M' and h' in the law, the force is
     off by $-(A M^{-1} A^T)^{-1} A M^{-1} ((M' - M) a + h' - h)$, which integral action removes: $\lambda - \lambda_d$ decays
@@ -118,9 +118,7 @@ class HybridForce(ForceLoop):
 
     def acceleration(self, q: Float[Array, " nq"], v: Float[Array, " nv"], t: Number = 0.0) -> Float[Array, " nv"]:
         """Commanded acceleration (nv,), consistent with the constraints."""
-        t = jnp.asarray(t, q.dtype)
-        A, wanted = self._rows(q, v, t)
-        return least_acceleration(self.scene.system, q, t, A, wanted, jnp.zeros_like(v))
+        return self._acceleration(q, v, jnp.asarray(t, q.dtype), jnp.zeros_like(v))
 
     def regularity(self, q: Float[Array, " nq"], v: Float[Array, " nv"], t: Number = 0.0) -> Float[Array, ""]:
         """Distance of the law from a singularity of task and constraints, 1 to 0.
@@ -129,10 +127,8 @@ class HybridForce(ForceLoop):
         the rows of the task before it. Close to a singularity the law's accelerations grow as its inverse.
         """
         t = jnp.asarray(t, q.dtype)
-        # Constraints come first: the rows are split at their count.
-        both, _ = self._rows(q, v, t)
-        count = row_count(self.scene)
-        return regularity(self.scene.system, q, t, both[:count], both[count:])
+        (A, _), (T, _) = self._orders(q, v, t)
+        return regularity(self.scene.system, q, t, A, T)
 
     def allowance(self, q: Float[Array, " nq"], v: Float[Array, " nv"], t: Number) -> Float[Array, ""] | None:
         """Margin of `regularity` above the least one."""

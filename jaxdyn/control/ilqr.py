@@ -28,7 +28,7 @@ from jaxdyn.constraints.rank import eps_of
 from jaxdyn.control.box_qp import minimize_in_box
 from jaxdyn.lie.so3 import matmul
 from jaxdyn.model.arguments import Checked, Function, Numbers, as_array, batch_hint
-from jaxdyn.model.numbers import as_number, check_count
+from jaxdyn.model.numbers import as_float, as_number, check_count
 from jaxdyn.systems.mass_factor import cholesky, solve_cholesky
 from jaxdyn.systems.scene import as_pytree
 
@@ -141,9 +141,7 @@ def ilqr(
     ```
     """
     plan = us if isinstance(us, OptimalControl) else None
-    us = as_array(us if plan is None else plan.us, "us")
-    # Integers become floating-point numbers: `jax.grad` refuses integers.
-    us = jnp.asarray(us, us.dtype if jnp.issubdtype(us.dtype, jnp.floating) else float)
+    us = as_float(us if plan is None else plan.us, "us")
     if us.ndim != 2 or 0 in us.shape:
         raise ValueError(f"us has shape {us.shape}; give controls (n, nu), one row per step{batch_hint(us, (1, 1))}")
     check_count(iterations, "iterations")

@@ -27,10 +27,11 @@ from jaxdyn.model.tree import Model
 
 
 class LeggedDynamics(Outcome):
-    """Torques and ground forces for a given acceleration.
+    r"""Torques and ground forces for a given acceleration.
 
     - `tau` (nv,), N m: zero for unactuated velocities. `forces` (m,), N and N m: of all feet, in their order, each in its
-      contact frame (`Foot`). `margins` (k,): distance of each foot's force from the boundary of its cone; negative outside.
+      contact frame (`Foot`). `margins` (k,): of each foot's force in its cone (`FrictionCone.margin`), $\mu f_n - |f_t|$;
+      negative outside.
     - `result`: one of `jd.RESULTS`; `infeasible` where no forces in the cones balance the motion within the
       limits of the torques (`missing_wrench` gives the remainder). Forces are then those of least norm without cones and
       limits, of which one is violated.

@@ -172,13 +172,21 @@ def forward_dynamics(
 
 def _kernel_with_checks(recursion: Callable) -> Callable:
     """Compile a recursion as a kernel with checks of its arguments."""
-    by_kernel, signature = kernel(recursion), inspect.signature(recursion)
+    signature = inspect.signature(recursion)
+
+    # One kernel for each set of arguments that are given: kernels take them by position, and recursions some by name alone.
+    @functools.cache
+    def by_kernel(names: tuple[str, ...]) -> Callable:
+        def function(model, *args):
+            return recursion(model, **dict(zip(names, args, strict=True)))
+
+        return kernel(functools.update_wrapper(function, recursion))
 
     @functools.wraps(recursion)
     def call(*args, **named):
         # Bound by name, so that positional and named arguments pass the same checks.
         (_, model), *rest = signature.bind(*args, **named).arguments.items()
-        return by_kernel(model, *check_shapes(model, **dict(rest)))
+        return by_kernel(tuple(name for name, _ in rest))(model, *check_shapes(model, **dict(rest)))
 
     return call
 

@@ -18,6 +18,7 @@ from jaxdyn.forces.limits import EffortLimits as EffortLimits
 from jaxdyn.forces.limits import JointStops as JointStops
 from jaxdyn.forces.limits import TorqueSpeedLimits as TorqueSpeedLimits
 from jaxdyn.forces.piecewise import PiecewiseForce as PiecewiseForce
+from jaxdyn.forces.wrenches import external_wrenches as external_wrenches
 from jaxdyn.systems.drives import DriveDynamics as DriveDynamics
 
 __all__ = [
@@ -37,6 +38,7 @@ __all__ = [
     "SlidingFriction",
     "TorqueSpeedLimits",
     "elastic_joints",
+    "external_wrenches",
 ]
 
 

@@ -5,7 +5,7 @@ Each is a frozen equinox Module called as `force(system, q, v, t) -> (nv,)`; its
 selected joints (all of them when None); per-coordinate values are then listed in the order of these names.
 """
 
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, cast
 
 import equinox as eqx
 import jax.numpy as jnp
@@ -278,18 +278,29 @@ class ExternalWrench(eqx.Module):
     def __call__(
         self, system: SystemLike, q: Float[Array, " nq"], v: Float[Array, " nv"], t: Number
     ) -> Float[Array, " nv"]:
+        # Wrench and Jacobian are both in the frame's axes, at its origin.
+        wrench, model = self._in_frame(system, q), cast(Model, system)
+        return body_jacobian(model, q, self.frame).T @ wrench
+
+    def frame_wrenches(
+        self, system: SystemLike, q: Float[Array, " nq"], v: Float[Array, " nv"], t: Number
+    ) -> dict[str, Float[Array, "6"]]:
+        """The wrench (f, tau) by the name of its frame, at the frame's origin and in its axes, N and N m."""
+        return {self.frame: self._in_frame(system, q)}
+
+    def _in_frame(self, system, q) -> Float[Array, "6"]:
+        """The wrench at the frame's origin, in its axes."""
         if not isinstance(system, Model):
             raise ValueError(f"ExternalWrench: needs a Model with named frames, not a {type(system).__name__}")
         # Checked first, for its message with similar names.
         frame_index(system, self.frame)
         wrench = jnp.asarray(self.wrench, q.dtype)
+        if self.axes == "body":
+            return wrench
         # A constant direction in the world: only the rotation of the frame enters, the point of attack stays its
         # origin.
-        if self.axes == "world":
-            to_body = frame_pose(system, q, self.frame)[:3, :3].T
-            wrench = jnp.concatenate([to_body @ wrench[:3], to_body @ wrench[3:]])
-        # Wrench and Jacobian are both in the frame's axes, at its origin.
-        return body_jacobian(system, q, self.frame).T @ wrench
+        to_body = frame_pose(system, q, self.frame)[:3, :3].T
+        return jnp.concatenate([to_body @ wrench[:3], to_body @ wrench[3:]])
 
 
 def is_positive(value) -> bool:

@@ -68,6 +68,11 @@ class PiecewiseForce(eqx.Module):
         return self.force(system, q, v, t, self.guards(system, q, v, t) > 0)
 
 
+def has_pieces(force: Any) -> bool:
+    """Decide whether a force has switching functions."""
+    return isinstance(force, PiecewiseForce) or hasattr(force, "effort_guards")
+
+
 class _FixedPiece(eqx.Module):
     """Force of a scene fixed to one piece."""
 
@@ -124,7 +129,7 @@ def pieces_of(scene: Scene, y, q, v, t, tau_of: Callable | None) -> Pieces:
     """
 
     # Smooth scenes end here: their control need not be traced.
-    if not any(isinstance(force, PiecewiseForce) or hasattr(force, "effort_guards") for force in scene.forces):
+    if not any(map(has_pieces, scene.forces)):
         return Pieces(((0, 0),) * len(scene.forces), ())
 
     def shapes(y, q, v, t):

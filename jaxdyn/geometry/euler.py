@@ -1,12 +1,12 @@
 """Arnold's form of Euler's equations on the groups SO(3) and SE(3) with a left-invariant metric."""
 
-import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from jaxdyn.compile import entry_point
 from jaxdyn.lie import se3, so3
 from jaxdyn.lie.so3 import matmul
 from jaxdyn.model.arguments import as_array, batch_hint
+from jaxdyn.model.numbers import as_float
 from jaxdyn.systems.mass_factor import solve_positive
 
 
@@ -29,8 +29,7 @@ def arnold_form(inertia: Float[Array, "n n"], c: Float[Array, " n"], a: Float[Ar
     section 12.
     """
     # Integer inertias are promoted first: their dtype must not round c and a.
-    given = as_array(inertia, "inertia")
-    inertia = as_array(given, "inertia", given.dtype if jnp.issubdtype(given.dtype, jnp.floating) else float)
+    inertia = as_float(inertia, "inertia")
     c, a = as_array(c, "c", inertia.dtype), as_array(a, "a", inertia.dtype)
     if inertia.shape not in ((3, 3), (6, 6)):
         raise ValueError(f"inertia has shape {inertia.shape}; give (3, 3) or (6, 6){batch_hint(inertia, (3, 3))}")

@@ -120,6 +120,8 @@ class Actuators(eqx.Module):
         **Raises:** ValueError for controls or activations of another shape.
         """
         activation = jnp.asarray(self._check_activation(activation), float)
+        if not self._active:
+            return activation
         wanted = self._clipped(control, activation.dtype)[np.array(self._active, int)]
         is_filter = np.array([self.dynamics[i] == "filter" for i in self._active])
         # Integrators have no time constant: a 0 in the file would divide by zero and give NaN in gradients.

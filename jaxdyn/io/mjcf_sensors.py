@@ -114,4 +114,11 @@ def _mount(file: CompiledFile, model: Model, body: int) -> dict | None:
         )
     # A joint beside the body's origin has put the model's body frame there.
     _, offset = named_frame(model, file.bodies[carrier])
-    return {"inertia": host_math.move_inertia(np.asarray(offset, float), parameters), "joints": joints}
+    # Forces on bodies before the weld do not load it, although the model has merged them with those beyond.
+    frames = [file.bodies[b] for b in poses]
+    frames += [site for site, b in zip(file.sites, m.site_bodyid, strict=True) if int(b) in poses]
+    return {
+        "inertia": host_math.move_inertia(np.asarray(offset, float), parameters),
+        "joints": joints,
+        "frames": frames,
+    }

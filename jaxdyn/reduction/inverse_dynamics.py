@@ -47,7 +47,8 @@ class ConstrainedInverseDynamics(Outcome):
     - `torques` (nm,), N m or N, in the order of the motors; `tau` (nv,), the generalised force that they are.
     - `velocity` (nv,) and its rate `acceleration` (nv,); `q_dot` (nq,), the rate of q.
     - `multipliers` (nc,), as of `constrained_dynamics`; of least norm where rows are dependent.
-    - `result`: one of `RESULTS`. `contradictory_rows`: no motion has all the values given. `underactuated`: the motors cannot
+    - `result`: one of `RESULTS`. `contradictory_rows`: no motion has all the values given, to the root of the rounding error of
+      their size or `rank_tol`. `underactuated`: the motors cannot
       produce the motion; the torques are then those of least squares. `singular_basis`: v was given by the independent
       velocities, which do not determine the others here.
     """
@@ -85,8 +86,8 @@ def constrained_inverse_dynamics(
     **Arguments:**
 
     - `q` (nq,), on the constraints (`assemble`).
-    - `v`: (nv,), admissible, or (ni,), the independent velocities, from which the others follow.
-    - `a_independent` (ni,): rates of the independent velocities. `t`, s.
+    - `v`: (nv,), admissible, in the model's order, or (ni,), the independent velocities, from which the others follow.
+    - `a_independent` (ni,): rates of the independent velocities, in the order in which these are named. `t`, s.
     - `motors`: names of joints, indices of velocities, or a matrix S (nv, nm) whose columns are the generalised forces of
       motors of 1 N m or 1 N. None: one on each velocity.
     - `independent`: names of joints or indices of velocities. None: those of the motors. More than the degrees of freedom are
@@ -96,8 +97,8 @@ def constrained_inverse_dynamics(
 
     **Returns:** `ConstrainedInverseDynamics`. Differentiable where the ranks are constant.
 
-    **Raises:** ValueError for inconsistent shapes, unknown joints, weights that are not positive, and, if `throw`, for values
-    that no motion has and a motion that the motors cannot produce.
+    **Raises:** ValueError for inconsistent shapes, unknown joints, all velocities in another order than the model's, weights
+    that are not positive, and, if `throw`, for values that no motion has and a motion that the motors cannot produce.
 
     Source: Nakamura & Ghodoussi (1989), eqs. 12 to 20; EQUATIONS sections 7 and 8.
 
@@ -122,6 +123,12 @@ def constrained_inverse_dynamics(
         raise ValueError(
             f"v has shape {v.shape}, expected {(scene.nv,)} = (nv,) or {(len(chosen),)}, the independent velocities"
             f"{batch_hint(v, (1,))}"
+        )
+    if len(chosen) == scene.nv and chosen != tuple(range(scene.nv)):
+        # v would have two meanings: the velocities in the model's order, and the independent ones in the order named.
+        names = "independent" if independent is not None else "motors"
+        raise ValueError(
+            f"{names} has all velocities, in the order {list(chosen)}; name them in the order of the model, in which v is given"
         )
     dynamics = _solve_by_program(
         scene, q, v, a_independent, S, _weights(weights, S.shape[1], q.dtype), t, tuple(chosen), rank_tol
@@ -219,10 +226,15 @@ def _solve(chosen: tuple[int, ...], rank_tol, scene: Scene, q, v, a_independent,
         x = start + matmul(inverse.T, right - matmul(Y.T, start))
         # In the null space of Y, so that the constraints remain satisfied.
         x = x + matmul(free.T, independent - matmul(Z.T, x))
-        size = jnp.sqrt(jnp.sum(x * x))
+        size = jnp.sqrt(jnp.sum(x * x)) + jnp.sqrt(jnp.sum(start * start))
+        # Rounding of what is quadratic in the velocities may be all that a right-hand side has.
+        least = 100 * eps_of(q) * (eps_of(q) + jnp.sum(v * v))
         # By Cauchy-Schwarz a residual is compared with the sizes that cancel in it.
         fits = [
-            jnp.all(jnp.abs(matmul(B.T, x) - wanted) <= limit * (1 + jnp.sqrt(jnp.sum(B * B, 0)) * size))
+            jnp.all(
+                jnp.abs(matmul(B.T, x) - wanted)
+                <= limit * (jnp.abs(wanted) + jnp.sqrt(jnp.sum(B * B, 0)) * size) + least
+            )
             for B, wanted in ((Y, right), (Z, independent))
             if B.shape[1]
         ]

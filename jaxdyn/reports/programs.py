@@ -67,7 +67,7 @@ class Programs:
             steps = {"stepsize": setting} if solver in FIXED else {"rtol": setting, "atol": setting}
             # Only the integration is measured: contacts that pull are reported and do not end it.
             options = {"method": method, "solver": SOLVERS[solver](), "max_steps": MOST_STEPS, "throw": False}
-            options["contacts"] = "report"
+            options["contacts"] = None if scene.cones is None else "report"
             solution = simulate(scene, q, v, ts, **steps, **options)
             return solution.q, solution.v, solution.result, solution.stats
 

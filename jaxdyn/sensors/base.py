@@ -19,17 +19,21 @@ from jaxdyn.systems.system import SceneLike
 
 
 class Motion(NamedTuple):
-    """An instant of a motion: `q` (nq,), `v` (nv,), `a` (nv,), its rate, and `multipliers` (nc,) of the scene's constraints."""
+    """An instant `t` (s) of a motion: `q` (nq,), `v` (nv,), `a` (nv,), its rate, and `multipliers` (nc,) of the constraints."""
 
     scene: Scene
     q: Array
     v: Array
     a: Array
     multipliers: Array
+    t: Numbers = 0.0
 
 
 class Noise(eqx.Module):
     r"""Errors of a sensor: reading + bias + walk(t) + white noise.
+
+    Errors of an orientation are small rotations, so that it stays a unit quaternion: three angles, rad, about the axes of the
+    frame in place of its four numbers.
 
     **Arguments:** each a number or one for each entry of the reading, in its units.
 
@@ -103,6 +107,10 @@ class Sensor(eqx.Module):
         """Readings in steps of the resolution; unchanged for sensors without one."""
         return readings
 
+    def quaternion_start(self, scene: Scene) -> int | None:
+        """Index of the first of the four numbers of a unit quaternion in the readings, None without one."""
+        return None
+
     def check(self, scene: Scene) -> None:
         """Refuse a scene that has not what the sensor is on. **Raises:** ValueError."""
 
@@ -158,7 +166,7 @@ def measure(
     q, v, tau, t = check_state(scene.system, q=q, v=v, tau=zeros_if_none(tau, scene.nv), t=t)
     # Solved once for all sensors: accelerations and multipliers belong to the same motion.
     dynamics = constrained_dynamics(scene, q, v, tau, t)
-    return readings_of(sensors, Motion(scene, q, v, dynamics.acceleration, dynamics.multipliers))
+    return readings_of(sensors, Motion(scene, q, v, dynamics.acceleration, dynamics.multipliers, t))
 
 
 def readings_of(sensors: Sequence[Sensor], motion: Motion) -> dict[str, Array]:

@@ -134,6 +134,10 @@ class FramePose(_OnFrame):
     def __check_init__(self):
         check_part(self.part, _POSES)
 
+    def quaternion_start(self, scene: Scene) -> int | None:
+        """Index of the quaternion."""
+        return {None: 3, "orientation": 0}.get(self.part)
+
     def read(self, motion: Motion) -> Float[Array, " k"]:
         """Position and quaternion."""
         # The pose of the frame in the world. Its quaternion has the real part first, as those of q.

@@ -1,6 +1,6 @@
 """Sensors of joints and of forces: encoder, tachometer, force and torque in a joint or a mount, contact force."""
 
-from typing import Any
+from typing import Any, cast
 
 import equinox as eqx
 import jax.numpy as jnp
@@ -8,9 +8,10 @@ import numpy as np
 from jax import lax
 from jaxtyping import Array, Float
 
-from jaxdyn.constraints.reactions import body_wrenches
+from jaxdyn.constraints.reactions import body_wrenches_where
 from jaxdyn.dynamics.joint_wrenches import joint_wrench
 from jaxdyn.dynamics.kinematics import named_frame
+from jaxdyn.forces.wrenches import wrenches_where
 from jaxdyn.lie import se3
 from jaxdyn.model.arguments import Numbers
 from jaxdyn.model.numbers import as_float, as_number
@@ -26,6 +27,10 @@ def _as_resolution(resolution: Numbers | None) -> Array | None:
 
 def _as_inertia(inertia: Numbers | None) -> Array | None:
     return None if inertia is None else as_float(inertia, "inertia", (10,), float)
+
+
+def _as_frames(frames: Any) -> tuple[str, ...] | None:
+    return None if frames is None else tuple(frames)
 
 
 class Encoder(Sensor):
@@ -62,6 +67,11 @@ class Encoder(Sensor):
         """Coordinates of the joint."""
         model: Any = motion.scene.system
         return motion.q[model.topology.q_slices[joint_index(model, self.joint)]]
+
+    def quaternion_start(self, scene: Scene) -> int | None:
+        """Index of the quaternion of a spherical or a free joint."""
+        top = cast(Model, scene.system).topology
+        return {"spherical": 0, "free": 3}.get(top.kinds[top.joint_names.index(self.joint)])
 
     def quantize(self, readings: Float[Array, "*n k"]) -> Float[Array, "*n k"]:
         """Readings rounded down to multiples of the resolution."""
@@ -100,17 +110,20 @@ class ForceTorque(Sensor):
     Without `inertia` that is all that the joint of the frame's body carries: the wrench through the joint, drive included. With
     it the frame is a mount inside a rigid body, and beyond it are a part of that body and the joints named.
 
-    Wrenches of the scene's constraints between frames act too; those on the mount's own body count as acting beyond it, as the
-    ground does on a foot under an ankle.
+    Wrenches of the scene's constraints between frames act too, and those of its forces on bodies
+    (`jd.forces.external_wrenches`). On the mount's own body they count as acting beyond it, as the ground does on a foot under
+    an ankle, unless `frames` says which of them do. Springs, stops, friction, drives and tau act in the joints, between a body
+    and its parent, as do constraints on coordinates, and forces of the user without `frame_wrenches`.
 
     **Arguments:**
 
     - `frame`: a name. `name`, `noise`, `delay` (s) as of `Sensor`.
     - `inertia` (10,): inertial parameters of the part of the frame's body beyond the mount, about the body's origin in its axes,
-      in the order of `jd.Model.inertias`. `joints`: names of joints that this part carries.
+      in the order of `jd.Model.inertias`. `joints`: names of joints that this part carries. `frames`: names of the frames of
+      the body, its own among them, that belong to this part, so that wrenches on others do not count (None: all).
     - `part`: "force" or "torque" for three of the numbers, None for all.
 
-    **Raises:** ValueError for joints without an inertia, and for inertias of another shape.
+    **Raises:** ValueError for joints or frames without an inertia, and for inertias of another shape.
 
     Source: EQUATIONS section 4, the backward recursion of Newton and Euler.
 
@@ -122,15 +135,17 @@ class ForceTorque(Sensor):
     frame: str = eqx.field(static=True)
     inertia: Array | None = eqx.field(converter=_as_inertia, default=None, kw_only=True)
     joints: tuple[str, ...] = eqx.field(static=True, converter=tuple, default=(), kw_only=True)
+    frames: tuple[str, ...] | None = eqx.field(static=True, converter=_as_frames, default=None, kw_only=True)
     part: str | None = eqx.field(static=True, default=None, kw_only=True)
 
     def __check_init__(self):
         check_part(self.part, _PARTS)
         # Without an inertia all that the frame's body carries lies beyond it: there is no choice of joints.
-        if self.inertia is None and self.joints:
-            raise ValueError(
-                "joints are given without inertia; give the inertia of the part beyond the mount, or omit joints"
-            )
+        for name, given in (("joints", self.joints), ("frames", self.frames is not None)):
+            if self.inertia is None and given:
+                raise ValueError(
+                    f"{name} are given without inertia; give the inertia of the part beyond the mount, or omit {name}"
+                )
 
     def default_name(self) -> str:
         """Name "wrench of FRAME"."""
@@ -143,6 +158,11 @@ class ForceTorque(Sensor):
         # -1 is the world, which has no joint.
         if body < 0:
             raise ValueError(f"{self.name!r}: frame {self.frame!r} stands on the ground, no joint carries it")
+        for frame in self.frames or ():
+            if named_frame(model, frame)[0] != body:
+                raise ValueError(
+                    f"{self.name!r}: frame {frame!r} is not on the frame's body {model.body_names[body]!r}"
+                )
         for joint in self.joints:
             # A mount divides one body: only joints on that body can be on its far side.
             if model.topology.parents[joint_index(model, joint)] != body:
@@ -155,8 +175,7 @@ class ForceTorque(Sensor):
         scene, q = motion.scene, motion.q
         model: Any = scene.system
         body, offset = named_frame(model, self.frame)
-        # Loops and feet carry loads past the joint, so that the recursion over the tree needs their wrenches.
-        pulls = body_wrenches(scene, q, motion.multipliers) if scene.constraints else None
+        pulls = self._outer_wrenches(motion, body)
         if self.inertia is not None:
             # With all other inertias zero the wrench through the joint is that on the part beyond the mount.
             model, beyond = _beyond(model, body, self.inertia, self.joints)
@@ -165,6 +184,21 @@ class ForceTorque(Sensor):
         # At the origin and in the axes of the body; AdT takes it to those of the frame, which may be displaced and rotated.
         wrench = joint_wrench(model, q, motion.v, motion.a, model.joint_names[body], external=pulls)
         return se3.AdT_apply(jnp.asarray(offset, q.dtype), wrench)[_PARTS[self.part]]
+
+    def _outer_wrenches(self, motion: Motion, body: int) -> Float[Array, "nb 6"] | None:
+        """Wrenches on each body past the joints, of loops, feet and outer forces; None without any."""
+        scene, q = motion.scene, motion.q
+        model: Any = scene.system
+
+        def counts(frame: str) -> bool:
+            return self.frames is None or frame in self.frames or named_frame(model, frame)[0] != body
+
+        parts = []
+        if any(hasattr(force, "frame_wrenches") for force in scene.forces):
+            parts.append(wrenches_where(scene, q, motion.v, motion.t, counts))
+        if scene.constraints:
+            parts.append(body_wrenches_where(scene, q, motion.multipliers, counts))
+        return sum(parts[1:], parts[0]) if parts else None
 
 
 _PARTS = {None: slice(0, 6), "force": slice(0, 3), "torque": slice(3, 6)}

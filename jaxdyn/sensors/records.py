@@ -1,15 +1,18 @@
 """Readings of sensors along a motion, with their delay and noise."""
 
 from collections.abc import Sequence
+from typing import cast
 
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jax import lax
 from jaxtyping import Array, Float
 
 from jaxdyn.constraints.dynamics import constrained_dynamics
+from jaxdyn.lie import so3
 from jaxdyn.model.arguments import Checked, Numbers, as_array, is_concrete, state_dtype
-from jaxdyn.sensors.base import Motion, Sensor, check_sensors
+from jaxdyn.sensors.base import Motion, Noise, Sensor, check_sensors
 from jaxdyn.systems.scene import as_scene
 from jaxdyn.systems.system import SceneLike
 
@@ -27,7 +30,8 @@ def record(
     """Readings of sensors along a motion: delayed, with noise, then in steps of their resolution.
 
     A reading at t is that of t - delay, between samples by straight lines, and before the first one that of the first. It then
-    gets the sensor's noise. Each sensor draws by its own key, of its place in the list.
+    gets the sensor's noise. Each sensor draws by its own key, of its place in the list. Orientations are interpolated and
+    disturbed on the group: they stay unit quaternions, whose sign is that of the sample before.
 
     **Arguments:** `scene` of a `Model`; `sensors`, a list; `ts` (n,), s, increasing; `q` (n, nq), `v` (n, nv), `tau` (n, nv), N m
     or N (None: zero), as of a `Solution`; `key` of `jax.random` for the noise, None for readings without it.
@@ -60,7 +64,7 @@ def record(
     def read(q, v, tau, t):
         # Accelerations are solved for, and not differences of v, which would amplify its rounding.
         dynamics = constrained_dynamics(scene, q, v, tau, t)
-        motion = Motion(scene, q, v, dynamics.acceleration, dynamics.multipliers)
+        motion = Motion(scene, q, v, dynamics.acceleration, dynamics.multipliers, t)
         return [sensor.read(motion) for sensor in sensors]
 
     readings = jax.vmap(read)(q, v, tau, ts)
@@ -68,11 +72,48 @@ def record(
     keys = [None] * len(sensors) if key is None else list(jax.random.split(key, len(sensors)))
     results = {}
     for sensor, values, one in zip(sensors, readings, keys, strict=True):
-        # Readings are interpolated at ts - delay. Before the first time `jnp.interp` returns the first one.
-        late = ts - sensor.delay.astype(dtype)
-        values = jax.vmap(lambda column, late=late: jnp.interp(late, ts, column), 1, 1)(values)
-        if one is not None and sensor.noise is not None:
-            values = sensor.noise(values, ts, one)
+        at, late = sensor.quaternion_start(scene), ts - sensor.delay.astype(dtype)
+        noise = None if one is None else sensor.noise
+        if at is None:
+            # Before the first time `jnp.interp` returns the first reading.
+            values = jax.vmap(lambda column, late=late: jnp.interp(late, ts, column), 1, 1)(values)
+            values = values if noise is None else noise(values, ts, cast(Array, one))
+        else:
+            values = _interpolate_pose(values, at, ts, late)
+            values = values if noise is None else _disturb_pose(values, at, noise, ts, one, sensor.name)
         # The converter is the last element of the chain: it rounds the noise as well.
         results[sensor.name] = sensor.quantize(values)
     return results
+
+
+def _interpolate_pose(values, at: int, ts, late) -> Float[Array, "n k"]:
+    """Readings with a quaternion from index `at` on, at the times `late`: orientations along the shortest rotations."""
+    turns = values[:, at : at + 4]
+    # A quaternion and its negative are one orientation: neighbours get the signs by which they are close.
+    flips = jnp.where(jnp.sum(turns[1:] * turns[:-1], 1) < 0, -1.0, 1.0).astype(values.dtype)
+    turns = turns * jnp.cumprod(jnp.concatenate([jnp.ones_like(flips[:1]), flips]))[:, None]
+    if len(ts) > 1:
+        i = jnp.clip(jnp.searchsorted(ts, lax.stop_gradient(late), side="right") - 1, 0, len(ts) - 2)
+        share = jnp.clip((late - ts[i]) / (ts[i + 1] - ts[i]), 0.0, 1.0)
+
+        def between(first, second, share):
+            step = so3.quat_log(so3.quat_multiply(so3.quat_conjugate(first), second))
+            return so3.quat_multiply(first, so3.quat_exp(share * step))
+
+        turns = jax.vmap(between)(turns[i], turns[i + 1], share)
+    rest = jax.vmap(lambda column: jnp.interp(late, ts, column), 1, 1)(values[:, :at]) if at else values[:, :0]
+    return jnp.concatenate([rest, turns], 1)
+
+
+def _disturb_pose(values, at: int, noise: Noise, ts, key, name: str) -> Float[Array, "n k"]:
+    """Readings with a quaternion from index `at` on, with errors: its are rotations about the axes of the frame."""
+    for field in ("std", "bias", "walk"):
+        shape = getattr(noise, field).shape
+        if shape not in ((), (1,), (at + 3,)):
+            raise ValueError(
+                f"{name!r}: noise has {field} of shape {shape}; give one number, or {at + 3}: an orientation has three "
+                "angles (rad)"
+            )
+    errors = noise(jnp.zeros((len(ts), at + 3), values.dtype), ts, key)
+    turns = jax.vmap(lambda q, angles: so3.quat_multiply(q, so3.quat_exp(angles)))(values[:, at:], errors[:, at:])
+    return jnp.concatenate([values[:, :at] + errors[:, :at], turns], 1)

@@ -19,6 +19,7 @@ from jaxdyn.constraints.redundancy import keep_rows
 from jaxdyn.constraints.selection import most_rounding, select_concrete_rows
 from jaxdyn.contact.forces import contacts_with_cones
 from jaxdyn.dynamics.quantities import mass_matrix
+from jaxdyn.forces.piecewise import has_pieces
 from jaxdyn.model import host_math
 from jaxdyn.model.arguments import batch_hint, check_shape
 from jaxdyn.model.configuration import neutral
@@ -28,7 +29,7 @@ from jaxdyn.simulation.controls import Controller, Sampled
 from jaxdyn.simulation.methods import Baumgarte, Free, Method, Multipliers, Projected, Reduced, is_regular, start_limit
 from jaxdyn.simulation.solution import RESULTS
 from jaxdyn.simulation.solvers import Stepper
-from jaxdyn.simulation.solvers.choice import is_explicit, is_step_length, label
+from jaxdyn.simulation.solvers.choice import has_name, is_explicit, is_step_length, label, uses_tolerances
 from jaxdyn.simulation.variational import Variational
 from jaxdyn.systems.mass_factor import mass_factor
 from jaxdyn.systems.scene import Scene, has_drives
@@ -190,7 +191,7 @@ def check_drives(scene: Scene, control, solver, modal: bool) -> None:
         raise ValueError(f"{what}, behind which multipliers do not depend on the command; use a control without them")
 
 
-def check_modal_options(control, stepsize, solver, adjoint, outputs, max_events: Any) -> None:
+def check_modal_options(control, stepsize, solver, adjoint, outputs) -> None:
     """Refuse options that motions with modes do not support."""
     what = "the scene has forces with modes (jd.contact.DryFriction, jd.contact.UnilateralContact)"
     if isinstance(control, (Controller, Sampled)):
@@ -206,13 +207,37 @@ def check_modal_options(control, stepsize, solver, adjoint, outputs, max_events:
         )
     if isinstance(adjoint, diffrax.BacksolveAdjoint):
         raise ValueError(f"adjoint is 'backsolve', which does not go back through events, and {what}; take 'reverse'")
+    if not has_name(adjoint):
+        raise ValueError(f"adjoint is {adjoint}, which does not go back through events, and {what}; take 'reverse'")
     for name in outputs:
         if name not in MODAL_OUTPUTS and not name.startswith(POSE):
             raise ValueError(
                 f"outputs has {name!r}, and {what}; choose from {', '.join(MODAL_OUTPUTS)} and 'pose:<frame>'"
             )
-    if isinstance(max_events, bool) or not isinstance(max_events, (int, np.integer)) or max_events < 1:
-        raise ValueError(f"max_events is {max_events!r}; pass a positive integer, such as 64")
+
+
+def check_effects(scene: Scene, solver, stepsize, modal: bool, given: dict[str, Any]) -> None:
+    """Refuse options that were given (not None) and have no effect on this run, and a bad number of events."""
+    if stepsize is not None and not uses_tolerances(solver):
+        steps = "fixed" if is_step_length(stepsize) else "their own"
+        for name in ("rtol", "atol"):
+            if given[name] is not None:
+                raise ValueError(
+                    f"{name} is given, and {label(solver)} has no use for it with {steps} steps (stepsize); omit one of them"
+                )
+    most = given["max_events"]
+    if most is not None:
+        if isinstance(most, bool) or not isinstance(most, (int, np.integer)) or most < 1:
+            raise ValueError(f"max_events is {most!r}; pass a positive integer, such as 64")
+        if not modal and not any(has_pieces(force) for force in scene.forces):
+            raise ValueError(
+                f"max_events is {most}, and no force of the scene has events (jd.contact.DryFriction, "
+                "jd.contact.UnilateralContact, jd.forces.PiecewiseForce); omit it"
+            )
+    if given["contacts"] in ("stop", "report") and scene.cones is None:
+        raise ValueError(
+            f"contacts is {given['contacts']!r}, and the scene has no cones; omit it, or give jd.Scene(cones=...)"
+        )
 
 
 def check_contacts(scene: Scene, contacts: str, outputs) -> None:

@@ -17,7 +17,7 @@ from jaxdyn.forces.piecewise import Pieces, fix_pieces, guards, pieces_of, value
 from jaxdyn.simulation import controls
 from jaxdyn.simulation.checks import CONTACT_OUTPUTS, POSE
 from jaxdyn.simulation.methods import Method, Projected
-from jaxdyn.simulation.terminal_events import Conditions, contact_allowances, limit_allowances
+from jaxdyn.simulation.terminal_events import WITHIN, Conditions, contact_allowances, limit_allowances
 from jaxdyn.systems.scene import Scene
 from jaxdyn.systems.system import retract, velocity_to_rate
 
@@ -123,9 +123,7 @@ class Equations:
         rates = method.rates(scene, y, q, v, t, force, in_basis)
         if self._added:
             rates = rates | self._extra_rates(args, y, q, v, t, force)
-        if KEPT in y:
-            # Constant during a step; `project` renews it at the end.
-            rates = rates | {KEPT: jnp.zeros_like(y[KEPT])}
+        rates = rates | _constants(y)
         return rates | {"work": power(force, v)} if "work" in y else rates
 
     def _explicit_part(self, t, y, args):
@@ -133,7 +131,7 @@ class Equations:
         scene, _, method = self.unpack(args, y)
         q, v = method.to_qv(scene, y, t)
         rates = method.rates(scene, y, q, v, t, self.torque(args, y, q, v, t)) | {"q": jnp.zeros_like(y["q"])}
-        rates = rates | ({KEPT: jnp.zeros_like(y[KEPT])} if KEPT in y else {})
+        rates = rates | _constants(y)
         # Controllers and the work see the whole force, although the rate of v has a share of it only.
         force = self.generalized_force(args, y, q, v, t) if self._added or "work" in y else None
         rates = rates | self._extra_rates(args, y, q, v, t, force)
@@ -199,6 +197,11 @@ class Equations:
         q, v = method.to_qv(scene, y, t)
         values = self.allowances(args, y, q, v, t)
         return values, jnp.zeros_like(values)  # allowances have the rounding in them
+
+
+def _constants(y) -> dict[str, Any]:
+    """Rates of what is constant during a step and renewed at its end."""
+    return {name: jnp.zeros_like(y[name]) for name in (KEPT, WITHIN) if name in y}
 
 
 def state_outputs(system, outputs, q, v, t) -> dict[str, Any]:

@@ -14,7 +14,14 @@ from jaxdyn.simulation.hybrid.piecewise import MIN_EVENTS, PiecewiseSystem, piec
 from jaxdyn.simulation.methods import Reduced, is_regular
 from jaxdyn.simulation.solution import RESULTS, from_diffrax
 from jaxdyn.simulation.solvers import ExplicitSteps, ProjectedSolver
-from jaxdyn.simulation.solvers.choice import is_explicit, is_step_length, label, progress_meter, solver_and_control
+from jaxdyn.simulation.solvers.choice import (
+    has_name,
+    is_explicit,
+    is_step_length,
+    label,
+    progress_meter,
+    solver_and_control,
+)
 from jaxdyn.simulation.solvers.differentiable import ROOM, run, run_adaptively
 from jaxdyn.simulation.solvers.driver import step_control
 from jaxdyn.simulation.solvers.explicit import Plan
@@ -53,14 +60,18 @@ def integrate(term, project, eqs: Equations, args, method, y0, ts, steps, option
         inputs = undifferentiable(inputs, of_kinks)
     if reason:
         controller = diffrax.ConstantStepSize() if continuous and has_length else controller
+        if guards is not None:
+            solver = terminal_events.GuardedSolver(solver, guards)
+            y0 = y0 | {terminal_events.WITHIN: jnp.ones_like(ts[0])}
+            inputs = y0, *inputs[1:]
         event = terminal_events.event(quality, guards, ts[0], y0, args)
-        return _by_diffrax(term, solver, controller, event, dt0, inputs, steps, options)
+        outcome = _by_diffrax(term, solver, controller, event, dt0, inputs, steps, options)
+        return outcome._replace(rows=_without_mark(outcome.rows), last=_without_mark(outcome.last))
     if eqs.pieces.names and not of_kinks:
         system = PiecewiseSystem(solver.plan(y0), eqs.pieces, eqs.switching)
         return _by_pieces(system, inputs, controller, steps, options)
-    return _by_steps(
-        solver, solver.plan(y0)._replace(quality=quality, guards=guards), controller, inputs, steps, options
-    )
+    plan = solver.plan(y0)._replace(quality=quality, guards=guards, is_terminal=guards is not None)
+    return _by_steps(solver, plan, controller, inputs, steps, options)
 
 
 def _monitors(eqs: Equations, method) -> tuple[Callable | None, Callable | None]:
@@ -81,7 +92,7 @@ def _reason_for_diffrax(solver, controller, adjoint, options) -> str | None:
     # Subclasses and wrappers, such as a clip to samples, have rules that our loops do not know.
     if type(controller) not in (Adaptive, ErrorMonitoredSteps):
         return "stepsize is a controller; leave it out"
-    if not isinstance(adjoint, (diffrax.RecursiveCheckpointAdjoint, diffrax.ForwardMode, diffrax.DirectAdjoint)):
+    if isinstance(adjoint, diffrax.BacksolveAdjoint) or not has_name(adjoint):
         return f"adjoint is {type(adjoint).__name__}; take 'reverse'"
     return "progress is shown; leave it out" if options["progress"] else None
 
@@ -91,6 +102,11 @@ def _reason_for_crossing(quality, guards) -> str | None:
     if guards is not None:
         return "contacts, limits or the control may end the run; pass contacts='report' and limits=None"
     return None if quality is None else "method is 'reduced'; take 'projected'"
+
+
+def _without_mark(y):
+    """State without the mark of `GuardedSolver`."""
+    return y and {name: y[name] for name in y if name != terminal_events.WITHIN}
 
 
 def undifferentiable(tree, reason: str):
@@ -175,5 +191,5 @@ def _by_steps(solver: ExplicitSteps, plan: Plan, controller, inputs, steps, opti
         return Outcome(rows, result, counts, reached)
     rows, end = (jax.tree.map(lambda x, at=at: x[at], rows) for at in (slice(-1), -1))
     args, y = inputs[1], ravel_pytree(end)[0]
-    late = delay(lambda t, y: jnp.min(plan.guards_of(args, t, y)[0]), plan.field_of(args, reached, y), reached, y)
+    late = delay(lambda args, t, y: jnp.min(plan.guards_of(args, t, y)[0]), plan.field_of, args, reached, y)
     return Outcome(rows, result, counts, reached + jnp.where(result == RESULTS.event_occurred, late, 0.0), end)

@@ -80,6 +80,8 @@ def smooth_motion(scene: Scene, control, method: Method, numbers, options) -> So
         ends.insert(0, (~follows.all(), RESULTS.no_single_contact))
         reached = reached & follows
         time_reached = jnp.where(follows.all(), time_reached, jnp.max(jnp.where(reached, ts, ts[0])))
+    # The end of a run is an input, which has derivatives; the time in the loop has none.
+    time_reached = jnp.where(reached.all() & (time_reached >= ts[-1]), ts[-1], time_reached)
     result = first_of([*ends, (result == RESULTS.event_occurred, RESULTS.singular_basis)], result)
     has_ended = (result == RESULTS.successful) | (result == RESULTS.coarse_steps)
     nonfinite = has_ended & ~reached.all()

@@ -48,13 +48,13 @@ def simulate(
     method: str | Method = "auto",
     solver: Solver = None,
     stepsize: Stepsize = None,
-    rtol: Numbers = 1e-8,
-    atol: Numbers = 1e-8,
+    rtol: Numbers | None = None,
+    atol: Numbers | None = None,
     adjoint: str | diffrax.AbstractAdjoint | None = None,
     outputs: Sequence[str] = (),
-    contacts: str = "stop",
+    contacts: str | None = None,
     limits: str | None = None,
-    max_events: int = 64,
+    max_events: int | None = None,
     progress: bool = False,
     max_steps: int | None = None,
     throw: bool | None = None,
@@ -90,26 +90,29 @@ def simulate(
       for adaptive ones `Dopri8`, or `Rodas5P` where the scene lists forces, all inputs are concrete and `jd.stiffness` at
       the start says that explicit steps would have to be shorter than a thousandth of the time.
     - `stepsize`: None for adaptive steps, a number (s) for fixed ones, or a diffrax step-size controller.
-    - `rtol`, `atol`: local error of a step, relative to the size of each entry of (q, v), and absolute. Values below ten
-      times the rounding error of the dtype are raised to that. With fixed steps, tolerances of an implicit solver.
+    - `rtol`, `atol`: local error of a step, relative to the size of each entry of (q, v), and absolute; by default 1e-8. Values
+      below ten times the rounding error of the dtype are raised to that. With fixed steps, tolerances of an implicit solver.
     - `adjoint`: "reverse" (default) for reverse mode with checkpoints, and Hessians over it; "forward" for jvp, jacfwd and
       Hessians by forward over forward mode; "direct" for both modes, at a cost that grows with `max_steps`; "backsolve" for the
-      continuous adjoint, whose gradients are approximate; or a diffrax adjoint.
+      continuous adjoint, whose gradients are approximate; or a diffrax adjoint, with which diffrax makes the steps.
     - `outputs`: any of "energy", "power", "work" (one more state, under the same error control), "acceleration" (the rate
       of v: of a free joint that of its body twist; `jd.dynamics.frame_acceleration` gives those of frames in world axes),
       "multipliers", "constraint_residual", "contact_forces", "contact_margins", "torque" (of the control, behind drives
       and limits), "control_state" (of a controller), "drive_state" (of drives) and "pose:<frame>". They are computed only if
       asked for.
-    - `contacts`: of a scene with `cones`. "stop": where a contact pulls or leaves its cone (a margin below zero by more than
-      rounding, $\epsilon^{1/2}$ of its force) the run ends, with the code `contact_lost` and the time, which is found within the
-      step. "report": it continues, with contacts that hold on both sides.
+    - `contacts`: of a scene with `cones`. "stop", the default: where a contact pulls or leaves its cone (a margin below zero by
+      more than rounding, $\epsilon^{1/2}$ of its force) the run ends, with the code `contact_lost` and the time, which is found
+      within the step. "report": it continues, with contacts that hold on both sides.
     - `limits`: of the model's joints (`model.lower`, `model.upper`), which nothing enforces. None: they are ignored.
       "stop": where a joint passes one the run ends, with the code `joint_limit_passed` and the time, found within the step.
+      So are passages that end within the same step, except short ones: of less than about 1e-3 of what the joint moves in the
+      step with explicit methods, which predict where it comes nearest to the limit, and of less than an eighth of the step's
+      time with others. If only a save point shows a passage, its time is that of the save point. The same holds for contacts.
       "report": the run continues; `stats["passed_limit"]` is the entry of q of the first limit that is passed at a save point, or
       -1, and a concrete run warns (`JointLimitWarning`).
     - `max_events`: of a scene with forces that have modes (`jd.contact.DryFriction`, `jd.contact.UnilateralContact`), after
-      which the run ends with the code `too_many_events`. Such scenes take explicit methods with adaptive or fixed steps,
-      which end at events.
+      which the run ends with the code `too_many_events`; by default 64. Such scenes take explicit methods with adaptive or fixed
+      steps, which end at events. Of piecewise forces, the events that derivatives follow (`jd.forces.PiecewiseForce`).
     - `progress`: show a meter (tqdm if installed, else lines of text).
     - `max_steps`: most steps to take, rejected ones included. Default: what fixed steps need; 65536 for adaptive ones,
       4096 with "direct", and where derivatives go through adaptive steps: the end of each one is recorded, 8 bytes a step
@@ -121,7 +124,7 @@ def simulate(
 
     **Raises:** ValueError for wrong shapes, NaN, times that do not increase, quaternions far from unit length, angles of
     too many turns for the dtype, a start off the constraints or without a motion (a singular mass matrix of a
-    `System`), constraints that remove all degrees of freedom, unknown options, with names and values.
+    `System`), constraints that remove all degrees of freedom, unknown options and those without effect, with names and values.
     RuntimeError with the time reached, the cause and the fix, if it fails and `throw`.
 
     ```python
@@ -129,6 +132,9 @@ def simulate(
     ```
     """
     scene, control = as_scene(scene), controls.as_control(control)
+    given = {"rtol": rtol, "atol": atol, "max_events": max_events, "contacts": contacts}
+    rtol, atol = (1e-8 if x is None else x for x in (rtol, atol))
+    contacts, max_events = "stop" if contacts is None else contacts, 64 if max_events is None else max_events
     arrays, stepsize = _check_numbers(scene, q0, v0, ts, rtol, atol, stepsize)
     q0, v0, ts, *_ = arrays
     modal, start = has_modes(scene), (q0, v0, ts)
@@ -137,7 +143,8 @@ def simulate(
     solver, adjoint = _choose(scene, control, method, solver, stepsize, adjoint, start, modal)
     outputs = checks.sort_outputs(scene, outputs)
     if modal:
-        checks.check_modal_options(control, stepsize, solver, adjoint, outputs, max_events)
+        checks.check_modal_options(control, stepsize, solver, adjoint, outputs)
+    checks.check_effects(scene, solver, stepsize, modal, given)
     checks.check_contacts(scene, contacts, () if modal else outputs)
     checks.check_limits(scene, limits, modal)
     options = {

@@ -1,11 +1,13 @@
 """Terminal events of a run: contacts that leave their cones, joints that pass their limits, controls that become singular.
 
 The rows of a contact are two-sided; whether its cone admits the multipliers is tested during the motion. Each of these conditions
-has an allowance, which is negative where it is violated. The run ends at the first zero of the least allowance that a step or a
-save point shows, located by bisection of the step's dense output. A violation that begins and ends within one step is not seen.
+has an allowance, which is negative where it is violated. The run ends at the first zero of the least allowance that a step shows
+at its end or within. The library's own loops locate it by shorter steps (`solvers/guards.py`); diffrax's by bisection of the
+step's dense output. Where a save point alone shows a violation, its time is that of the save point.
 """
 
 import warnings
+from collections.abc import Callable
 from typing import Any, NamedTuple
 
 import diffrax
@@ -14,11 +16,13 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import optimistix
-from jaxtyping import Array, Bool, Float, Int
+from jaxtyping import Array, Bool, Float, Int, PyTree
 
 from jaxdyn.contact.forces import contact_forces, contacts_with_cones
+from jaxdyn.model.arguments import Number
 from jaxdyn.model.tree import Model
 from jaxdyn.simulation.solution import RESULTS, Solution, joint_of
+from jaxdyn.simulation.solvers.base import Flag, StepOutput, Wrapped
 from jaxdyn.systems.scene import Scene
 
 
@@ -112,6 +116,49 @@ def first_violation(rows: Float[Array, "nt k"], reached, ts, within) -> Violatio
     return violation._replace(entry=jnp.where(violation.happened, violation.entry, -1))
 
 
+# Entry of the state in diffrax's loop: -1 where an allowance has been negative within the last step, else 1.
+WITHIN = "within_step"
+# Fractions of a step at which diffrax's loop evaluates the allowances.
+_FRACTIONS = tuple(i / 8 for i in range(1, 8))
+
+
+class GuardedSolver(Wrapped):
+    """A method whose steps mark in the state if an allowance has been negative within them.
+
+    The condition of an event of diffrax knows the state at the end of a step alone.
+    """
+
+    guards: Callable
+
+    @property
+    def term_compatible_contr_kwargs(self) -> PyTree:
+        """Arguments of the terms of the wrapped method."""
+        return self.solver.term_compatible_contr_kwargs
+
+    @property
+    def interpolation_cls(self) -> Callable[..., diffrax.AbstractLocalInterpolation]:  # pyright: ignore[reportIncompatibleVariableOverride]
+        """Dense output of the wrapped method."""
+        return self.solver.interpolation_cls
+
+    def step(
+        self, terms: PyTree, t0: Number, t1: Number, y0: PyTree, args: PyTree, solver_state: PyTree, made_jump: Flag
+    ) -> StepOutput:
+        """Make one step of the wrapped method and look within it."""
+        y1, error, dense_info, state, result = self.solver.step(terms, t0, t1, y0, args, solver_state, made_jump)
+        # The mark has no derivative, and neither have the guards that make it.
+        arrays, rest_of_args = eqx.partition(args, eqx.is_array)
+        start, end, info, arrays = jax.lax.stop_gradient((t0, t1, dense_info, arrays))
+        dense, args = self.interpolation_cls(t0=start, t1=end, **info), eqx.combine(arrays, rest_of_args)
+
+        def least(fraction):
+            t = start + fraction * (end - start)
+            return jnp.min(self.guards(t, dense.evaluate(t), args)[0])
+
+        passed = (jax.vmap(least)(jnp.asarray(_FRACTIONS, jnp.result_type(t0))) < 0).any()
+        mark = jnp.where(passed, -1.0, 1.0).astype(y1[WITHIN].dtype)
+        return y1 | {WITHIN: mark}, error, dense_info, state, result
+
+
 def event(quality, guards, t0, y0, args) -> diffrax.Event | None:
     """Event of a run in diffrax's loop, from the quality (t, y, args) of a basis and the guards, each a function or None."""
     if guards is None:
@@ -120,7 +167,7 @@ def event(quality, guards, t0, y0, args) -> diffrax.Event | None:
 
     def condition(start, t, y, args, **_):
         # One event for all conditions: the first one that is violated ends the run.
-        least = jnp.min(guards(t, y, args)[0])
+        least = jnp.minimum(jnp.min(guards(t, y, args)[0]), y[WITHIN])
         if quality is not None:
             # A run has one event: a basis that has become singular counts as a violation, whatever the allowances.
             least = jnp.where(quality(t, y, args) * start > 0, least, -jnp.ones_like(least))
@@ -135,6 +182,20 @@ def event(quality, guards, t0, y0, args) -> diffrax.Event | None:
 
 class Bisection(optimistix.Bisection):
     """Bisection of a function that falls through zero, until the interval is at rounding, however steep the function is."""
+
+    def init(self, fn, y, args, options, f_struct, aux_struct, tags):
+        """Begin with the interval up to the first point at which the function is negative."""
+        lower, upper = options["lower"], options["upper"]
+        # The function may be positive again at the end. From the last point to the first, so that the first one stays.
+        points = [lower + fraction * (upper - lower) for fraction in _FRACTIONS]
+        values = jax.vmap(lambda t: fn(t, args)[0])(jnp.stack(points))
+        for point, value in zip(reversed(points), reversed(list(values)), strict=True):
+            upper = jnp.where(value < 0, point, upper)
+        return super().init(fn, y, args, options | {"upper": upper}, f_struct, aux_struct, tags)
+
+    def step(self, fn, y, args, options, state, tags):
+        """Halve the interval; the first point, the end of the step, may be behind it."""
+        return super().step(fn, jnp.minimum(y, state.upper), args, options, state, tags)
 
     # optimistix also asks for a small value of the function, which a steep one does not reach.
     def terminate(self, fn, y, args, options, state, tags):

@@ -238,6 +238,29 @@ def test_rank_loss_is_told(pendulum):
 
 
 @pytest.mark.long
+def test_constraints_hold_where_the_task_depends_on_them():
+    """A stretched arm whose tip is on a wall: the height is given up, and the wall keeps its row and its force."""
+    model, angle = jd.robots.chain(2), 0.5
+    tip = lambda q: jnp.stack([jnp.sin(q[0]) + jnp.sin(q[0] + q[1]), -jnp.cos(q[0]) - jnp.cos(q[0] + q[1])])  # noqa: E731
+    wall = jd.Holonomic(lambda q, t: tip(q)[:1] - 2 * jnp.sin(angle), name="wall")
+    scene = jd.Scene(model, (wall,))
+    hybrid = jd.control.HybridForce(scene, lambda q: tip(q)[1:], [-1.5], 9.0, 4.0, force=[5.0])
+    gauge = jd.control.GaugeInvariant(scene, lambda q: tip(q)[1:], [-1.5], 3.0, 4.0, force=[5.0])
+    # Along the wall, which is the direction in which the arm folds: (1, -2) does not move the tip.
+    q, v = jnp.array([angle, 0.0]), jnp.array([0.3, -0.6])
+    row = jd.constrained_dynamics(scene, q, v)
+    A = jd.constraint_jacobian(scene, q)
+    gamma = A @ row.acceleration
+    np.testing.assert_allclose(A @ v, 0, atol=1e-15)
+    np.testing.assert_allclose(A @ hybrid.acceleration(q, v), gamma, rtol=1e-12)
+    for law in (hybrid, gauge):
+        plant = jd.constrained_dynamics(scene, q, v, law(q, v))
+        np.testing.assert_allclose(plant.multipliers, 5.0, rtol=1e-12)
+        if law is hybrid:
+            np.testing.assert_allclose(plant.acceleration, law.acceleration(q, v), atol=1e-12)
+
+
+@pytest.mark.long
 def test_a_motion_into_rank_loss_ends_with_a_code(pendulum):
     """A target beside the sphere: x goes as the gains say until z is 0.1, where the run ends."""
     scene, reach = pendulum[0], jnp.asarray([1.5, 0.0])

@@ -83,6 +83,18 @@ def test_integral_action_takes_the_error_of_the_internal_force_away():
     assert ends[1] < 0.02 * ends[0]
 
 
+@pytest.mark.long
+def test_contacts_hold_where_a_stretched_finger_cannot_follow(ball):
+    """The least-squares error is all in the object's motion, and none in the rows of the contacts."""
+    grasp, q, v, _, law = ball
+    q = q.at[:3].set(0.0)
+    v = 0.1 * jnp.ones_like(v)
+    assert not bool(law.is_regular(q, v))
+    free = jd.constrained_dynamics(grasp, q, v).acceleration
+    A = jd.constraint_jacobian(grasp, q)
+    np.testing.assert_allclose(A @ law.acceleration(q, v), A @ free, atol=1e-10)
+
+
 def test_refusals(ball):
     """What does not fit is refused by name."""
     grasp, q, v, target, _ = ball

@@ -372,8 +372,8 @@ def test_options_by_their_own_names_are_deprecated(oscillation):
     ]
     np.testing.assert_array_equal(fit.history, want.history)
     with pytest.warns(DeprecationWarning, match=r"horizon, substeps, simulation: pass jd\.identify\.Objective"):
-        error = identify.parameter_error(start, oscillation, horizon=20, substeps=2, rtol=1e-6)
-    objective = identify.Objective(horizon=20, substeps=2, simulation={"rtol": 1e-6})
+        error = identify.parameter_error(start, oscillation, horizon=20, substeps=2, max_steps=64)
+    objective = identify.Objective(horizon=20, substeps=2, simulation={"max_steps": 64})
     assert error == identify.parameter_error(start, oscillation, objective)
 
 

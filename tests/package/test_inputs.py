@@ -167,6 +167,19 @@ def test_a_batch_without_vmap_is_told_so():
         jd.simulate(ARM, [0, 0], [0, 0], [0, 1], stepsize=[0.1, 0.2])
 
 
+def test_frames_have_one_name():
+    with pytest.warns(DeprecationWarning, match=r"frame_pose\(name=\) is now frame_pose\(frame=\)"):
+        old = jd.frame_pose(ARM, jnp.zeros(2), name=BODY)
+    np.testing.assert_array_equal(old, jd.frame_pose(ARM, jnp.zeros(2), frame=BODY))
+
+
+def test_a_scene_in_place_of_its_system_is_told_where_to_go():
+    with pytest.raises(
+        ValueError, match=r"model is a Scene; pass scene.system.*jd\.constrained_dynamics.*jd\.reduced_dynamics"
+    ):
+        jd.mass_matrix(CHAIN, Q)
+
+
 def stiffer(q, v, t):
     return -q if t < 0.5 else q
 
@@ -179,6 +192,11 @@ OPTIONS = [
     ({"rtol": [1e-8, 1e-6]}, r"rtol has shape \(2,\); pass one number.*vmap"),
     ({"stepsize": "0.1"}, "stepsize is .*; pass an array of numbers"),
     ({"stepsize": -0.1}, "stepsize is -0.1; pass a positive number"),
+    ({"stepsize": 0.1, "rtol": 1e-6}, "rtol is given, and RK4 has no use for it with fixed steps"),
+    ({"stepsize": 0.1, "atol": 1e-6, "solver": diffrax.Tsit5()}, "atol is given, and Tsit5 has no use"),
+    ({"stepsize": diffrax.StepTo(jnp.linspace(0, 1, 5)), "rtol": 1e-6}, "rtol is given, and Dopri8 .* their own steps"),
+    ({"max_events": 8}, "max_events is 8, and no force of the scene has events"),
+    ({"contacts": "stop"}, "contacts is 'stop', and the scene has no cones"),
     ({"control": lambda q, v, t: np.sin(q)}, "control needs the values .* jax.numpy"),
     ({"control": stiffer}, r"control needs the values .* jax\.lax\.cond instead of if"),
     ({"control": lambda q, v: q}, r"control takes \(q, v\), but is called as control\(q, v, t\)"),

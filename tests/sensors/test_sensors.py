@@ -1,16 +1,19 @@
 """Sensors against MuJoCo's, against closed forms, and by the statistics of their noise."""
 
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
 from pinocchio_bridge import assert_close, quick
 
+import jaxdyn as jd
 from jaxdyn import scenes, sensors
 from jaxdyn.constraints.dynamics import constrained_dynamics
 from jaxdyn.dynamics.joint_wrenches import joint_wrench
 from jaxdyn.dynamics.kinematics import frame_pose
 from jaxdyn.dynamics.quantities import forward_dynamics
+from jaxdyn.lie import so3
 from jaxdyn.model import inertia, robots
 from jaxdyn.model.builder import ModelBuilder
 from jaxdyn.systems.scene import Scene
@@ -246,3 +249,113 @@ def test_refusals():
         sensors.record(model, [sensors.Imu("tip")], [0.0, 0.0], jnp.zeros((2, 1)), jnp.zeros((2, 1)))
     with pytest.raises(ValueError, match=r"v has shape \(3, 1\), expected \(2, 1\)"):
         sensors.record(model, [sensors.Imu("tip")], [0.0, 1.0], jnp.zeros((2, 1)), np.zeros((3, 1)))
+
+
+PUSHED = """
+<mujoco>
+  <option timestep="0.001"><flag contact="disable" limit="disable"/></option>
+  <worldbody>
+    <body name="upper" pos="0 0 1">
+      <joint name="a" axis="0 1 0" stiffness="7" damping="0.3"/>
+      <inertial pos="0.1 0 0.05" mass="3" diaginertia="0.1 0.2 0.15"/>
+      <body name="lower" pos="0.3 0 0" euler="0 20 0">
+        <joint name="b" axis="0 0 1" stiffness="5" springref="0.4" range="-28.64788975654116 28.64788975654116"/>
+        <inertial pos="0 0.05 -0.2" mass="1" diaginertia="0.02 0.02 0.01"/>
+        <site name="s" pos="0.1 0.02 0.03" euler="10 20 30"/>
+        <body name="hand" pos="0 0 -0.4" euler="0 0 30">
+          <joint name="c" axis="1 0 0" damping="0.2"/>
+          <inertial pos="0.05 0.02 -0.1" mass="0.5" fullinertia="0.01 0.012 0.008 0.001 0.0005 -0.0002"/>
+        </body>
+        <body name="tool" pos="0.1 0 -0.1" euler="20 0 0">
+          <inertial pos="0.05 0 0" mass="0.3" diaginertia="1e-3 2e-3 2e-3"/>
+          <site name="flange" pos="0 0.01 0" euler="0 40 0"/>
+        </body>
+      </body>
+    </body>
+  </worldbody>
+  <sensor>
+    <accelerometer name="acc" site="s"/><force name="f" site="s"/><torque name="t" site="s"/>
+    <force name="flange_f" site="flange"/><torque name="flange_t" site="flange"/>
+  </sensor>
+</mujoco>
+"""
+
+
+@pytest.mark.long
+def test_outer_forces_springs_and_stops_against_mujoco(tmp_path):
+    """Wrenches of a scene on the sensor's body, before a mount on it and beyond, springs, dampers, and a stop that is hit."""
+    mujoco = pytest.importorskip("mujoco")
+    path = tmp_path / "pushed.xml"
+    path.write_text(PUSHED)
+    m, loaded = mujoco.MjModel.from_xml_path(str(path)), jd.io.load_mjcf(path)
+    data = mujoco.MjData(m)
+    q, v = np.array([0.3, -0.7, 0.5]), np.array([1.2, -0.8, 0.9])
+    data.qpos[:], data.qvel[:] = q, v
+    mujoco.mj_forward(m, data)
+    # Of MuJoCo as a torque of the size that the closed form has: its own stops are soft constraints.
+    forces = [*loaded.forces, jd.forces.JointStops(1e3, 2.0, joints="b")]
+    data.qfrc_applied[1] = 1e3 * 0.2 + 2.0 * 0.8
+    pushes = {"lower": [3, -2, 5, 0.1, 0.2, -0.3], "hand": [-1, 4, 2, 0.3, -0.1, 0.2], "tool": [2, 1, -3, 0.2, 0, 0.1]}
+    for name, push in pushes.items():
+        i = m.body(name).id
+        data.xfrc_applied[i] = push
+        # MuJoCo pushes at the centre of mass.
+        torque = push[3:] + np.cross(data.xipos[i] - data.xpos[i], push[:3])
+        forces.append(jd.forces.ExternalWrench(name, np.append(push[:3], torque)))
+    mujoco.mj_forward(m, data)
+    scene = Scene(loaded.system, forces=forces)
+    readings = sensors.measure(scene, loaded.sensors, jnp.asarray(q), jnp.asarray(v))
+    for i in range(m.nsensor):
+        want = data.sensordata[m.sensor_adr[i] :][:3]
+        np.testing.assert_allclose(readings[m.sensor(i).name], want, atol=1e-10 * max(1, np.abs(want).max()))
+
+
+@pytest.mark.long
+@pytest.mark.parametrize("mode", ["delay", "noise"])
+def test_orientations_are_delayed_and_disturbed_on_the_group(mode):
+    """A body that turns about a fixed axis beyond a full turn: its delayed orientation is that of an earlier time."""
+    axis, rate, late = np.array([2.0, -1.0, 2.0]) / 3, 5.7, 0.0123
+    ball = ModelBuilder("ball", gravity=None).add_body("ball", None, "free", inertia.sphere(1.0, 0.1)).build()
+    ts = np.linspace(0, 2, 201)
+    half = rate * ts / 2
+    turns = np.column_stack([np.cos(half), np.sin(half)[:, None] * axis])
+    # Rows of either sign, as files have them.
+    q = np.column_stack([ts, 2 * ts, 0 * ts, turns * np.where(np.arange(201) % 7 < 3, -1, 1)[:, None]])
+    v = np.tile([0.0, 0, 0, *(rate * axis)], (201, 1))
+    std = np.array([0.01, 0.02, 0.03, 0.001, 0.002, 0.003])
+    noise, delay = (sensors.Noise(std, bias=0.1 * std), 0.0) if mode == "noise" else (None, late)
+    list_of = [
+        sensors.FramePose("ball", delay=delay, noise=noise),
+        sensors.FramePose("ball", name="turn", part="orientation", delay=delay),
+        sensors.Encoder("ball_joint" if "ball_joint" in ball.joint_names else "ball", delay=delay, noise=noise),
+    ]
+    read = quick(
+        lambda delay: sensors.record(
+            ball, [eqx.tree_at(lambda s: s.delay, s, delay) for s in list_of], ts, q, v, key=jax.random.key(3)
+        )
+    )
+    readings = read(jnp.asarray(delay))
+    before = np.maximum(ts - delay, 0)
+    truth = np.column_stack([np.cos(rate * before / 2), np.sin(rate * before / 2)[:, None] * axis])
+    assert_close(readings["turn"], truth, 1e-12)
+    for sensor in (list_of[0], list_of[2]):
+        got = np.asarray(readings[sensor.name])
+        np.testing.assert_allclose(np.linalg.norm(got[:, 3:], axis=1), 1, atol=1e-12)
+        assert (np.sum(got[1:, 3:] * got[:-1, 3:], 1) > 0.9).all()
+        place = got[:, :3] - np.column_stack([before, 2 * before, 0 * before])
+        error = jax.vmap(so3.quat_multiply)(jax.vmap(so3.quat_conjugate)(jnp.asarray(truth)), got[:, 3:])
+        errors = np.column_stack([place, jax.vmap(so3.quat_log)(error)])
+        if mode == "delay":
+            np.testing.assert_allclose(errors, 0, atol=1e-12)
+        else:
+            # Five standard errors of a deviation, of 201 samples.
+            np.testing.assert_allclose(errors.std(0), std, rtol=5 / np.sqrt(2 * 201))
+    if mode == "delay":
+        slope = jax.jacfwd(lambda delay: read(delay)["turn"][100])(jnp.asarray(delay))
+        turned = rate * before[100] / 2
+        assert_close(slope, -rate / 2 * np.array([-np.sin(turned), *(np.cos(turned) * axis)]), 1e-12)
+    else:
+        with pytest.raises(ValueError, match=r"noise has std of shape \(7,\); give one number, or 6"):
+            sensors.record(
+                ball, [sensors.FramePose("ball", noise=sensors.Noise(np.ones(7)))], ts, q, v, key=jax.random.key(0)
+            )

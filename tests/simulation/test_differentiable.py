@@ -176,3 +176,34 @@ def test_hessian_of_a_motion_over_the_default_adjoint(options):
     exact = jax.hessian(lambda x: x[0] * jnp.cos(x[2]) + x[1] * jnp.sin(x[2]) / x[2])(x)
     np.testing.assert_allclose(jax.hessian(end)(x), exact, atol=1e-8)
     np.testing.assert_allclose(jax.jacrev(jax.jacrev(end))(x), exact, atol=1e-8)
+
+
+class Counted(diffrax.RecursiveCheckpointAdjoint):
+    """An adjoint of a user, which records that it was used."""
+
+    def loop(self, *args, **options):
+        USED.append(type(self).__name__)
+        return super().loop(*args, **options)
+
+
+USED: list[str] = []
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("steps", [{}, {"stepsize": 0.05}])
+def test_an_adjoint_object_is_used(steps):
+    """With explicit methods too, whose loops are else the library's own; scenes with modes refuse it by its name."""
+    model, ts = jd.robots.chain(2), jnp.linspace(0.0, 0.5, 3)
+
+    def end(v, adjoint):
+        return jnp.sum(jd.simulate(model, jnp.ones(2), v, ts, adjoint=adjoint, **steps).q[-1] ** 2)
+
+    given = Counted(checkpoints=5)
+    USED.clear()
+    gradient = jax.grad(end)(jnp.array([0.3, -0.2]), given)
+    assert USED
+    # Of the local errors of adaptive steps, 1e-8: fixed ones are the same.
+    want = jax.grad(end)(jnp.array([0.3, -0.2]), "reverse")
+    np.testing.assert_allclose(gradient, want, rtol=1e-12 if steps else 1e-6)
+    with pytest.raises(ValueError, match=r"adjoint is Counted.*does not go back through events"):
+        jd.simulate(jd.scenes.sliding_block(), [0.0], [2.0], ts, adjoint=given)

@@ -296,6 +296,28 @@ def test_gradients_go_through_events():
 
 
 @pytest.mark.slow
+def test_second_derivatives_go_through_events():
+    """Of rows and times of a block that turns, sticks and slips: differences of the gradients."""
+    ts = jnp.linspace(0.0, 2.5, 4)
+
+    def slides(p):
+        motion = jd.simulate(
+            block(p[0], p[1]), jnp.zeros(1), p[2:], ts, control=load, rtol=1e-12, atol=1e-12, max_events=3
+        )
+        return (
+            jnp.sum(jnp.sin(motion.q[:, 0]))
+            + jnp.sum(motion.v[1:, 0] ** 2)
+            + motion.events.time[:2] @ jnp.array([1, 0.3])
+        )
+
+    at = jnp.asarray([MU, MU_S, 2.0])
+    gradient = jax.jit(jax.grad(slides))
+    want = differences(gradient, at, 3e-4 * jnp.eye(3))
+    computed = jax.jit(jax.jacfwd(jax.grad(slides)))(at)
+    np.testing.assert_allclose(computed, want, rtol=1e-6, atol=1e-6)  # of the differences
+
+
+@pytest.mark.slow
 def test_gradients_go_through_an_impact():
     """Of the box that lands on a corner while it turns: start and friction."""
     ts = jnp.linspace(0.0, 0.35, 3)

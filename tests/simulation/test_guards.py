@@ -229,3 +229,97 @@ def test_a_guard_that_is_violated_within_a_step_ends_the_motion():
     assert solution.result == jd.RESULTS.joint_limit_passed
     time = 2 * (v - np.sqrt(v * v - 1 - ROUNDING))
     np.testing.assert_allclose(solution.stats["time_reached"], time, rtol=1e-10)
+
+
+def there_and_back(depth, **options):
+    """q = v t - t^2/4, whose top is above the end of the rail by `depth`, in steps that are not told of it."""
+    top = 1.0 + depth
+    v = np.sqrt(top)
+    ts = np.linspace(0.0, 4 * v, options.pop("saves", 2))
+    back = lambda q, v, t: -jnp.ones_like(v)  # noqa: E731
+    run = jd.simulate(RAIL, jnp.zeros(1), jnp.asarray([v]), ts, control=back, limits="stop", throw=False, **options)
+    return run, 2 * (v - np.sqrt(v * v - 1 - ROUNDING))
+
+
+LONG = {
+    "explicit": {},
+    "fixed": {"stepsize": 5.0},
+    "Rodas5P": {"solver": jd.solvers.Rodas5P()},
+    "fixed Rodas5P": {"solver": jd.solvers.Rodas5P(), "stepsize": 5.0},
+    "forward": {"adjoint": "forward"},
+}
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("saves", [2, 12])
+@pytest.mark.parametrize("how", LONG)
+def test_a_passage_within_one_step_ends_the_motion_at_its_time(how, saves):
+    """A parabola is exact in one step of every method; the passage lasts a twentieth of it, with save points in it or not."""
+    solution, time = there_and_back(2e-3, saves=saves, **LONG[how])
+    assert solution.result == jd.RESULTS.joint_limit_passed
+    np.testing.assert_allclose(solution.stats["time_reached"], time, rtol=1e-10)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("solver", [diffrax.Kvaerno5(), diffrax.KenCarp4(), jd.solvers.LieGroup(diffrax.Tsit5())])
+def test_other_methods_find_the_passage_too(solver):
+    """Their dense output of third order gives the time to 1e-6."""
+    solution, time = there_and_back(2e-3, saves=12, solver=solver, stepsize=1.5)
+    assert solution.result == jd.RESULTS.joint_limit_passed
+    np.testing.assert_allclose(solution.stats["time_reached"], time, rtol=1e-6)
+
+
+@pytest.mark.slow
+def test_short_passages_of_an_oscillation_are_found():
+    """q = 1.001 sin(w t): a passage of 1e-3 of the amplitude, whose time no step knows, for 20 frequencies in plain mode too."""
+    frequencies = jnp.linspace(0.9, 2.1, 20)
+
+    def time(w):
+        law = jax.tree_util.Partial(lambda w, q, v, t: -2.0 * w * w * q, w)
+        run = jd.simulate(RAIL, jnp.zeros(1), 1.001 * w[None], TS, control=law, limits="stop", throw=False)
+        return run.stats["time_reached"], run.result == jd.RESULTS.joint_limit_passed
+
+    wanted = np.arcsin((1 + ROUNDING) / 1.001) / np.asarray(frequencies)
+    for mode in ("auto", "plain"):
+        with jd.compilation(mode):
+            times, found = jax.jit(jax.vmap(time))(frequencies)
+        assert np.asarray(found).all()
+        # The passage is slow, 0.045 w: an error of the motion of 1e-8 is one of 1e-6 of the time.
+        np.testing.assert_allclose(times, wanted, rtol=2e-6)
+
+
+def limit_of(p, **options):
+    """q(t) = v t + F t^2/4 of both numbers, and the end of the save points."""
+    law = jax.tree_util.Partial(lambda force, q, v, t: force[None], p[1])
+    ts = jnp.linspace(0.0, p[2], 4)
+    run = jd.simulate(RAIL, jnp.zeros(1), p[:1], ts, control=law, limits="stop", throw=False, **options)
+    return run.stats["time_reached"]
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("adjoint", ["reverse", "forward"])
+def test_the_time_has_second_derivatives(adjoint):
+    """Mixed ones too; of a run that does not end there the time is that of the last save point."""
+    options: dict[str, Any] = TIGHT | {"adjoint": adjoint}
+    outer, inner = jax.jacfwd, jax.jacfwd if adjoint == "forward" else jax.grad
+
+    def both(p):
+        return inner(lambda p: limit_of(p, **options))(p), outer(inner(lambda p: limit_of(p, **options)))(p)
+
+    gradients, hessians = jax.jit(jax.vmap(both))(jnp.asarray([[0.3, 1.0, 3.0], [0.3, 1.2, 1.0]]))
+    closed = lambda p: 2 * (-p[0] + jnp.sqrt(p[0] ** 2 + p[1] * (1 + ROUNDING))) / p[1]  # noqa: E731
+    at = jnp.asarray([0.3, 1.0, 3.0])
+    np.testing.assert_allclose(gradients[0], jax.grad(closed)(at), atol=1e-9)
+    np.testing.assert_allclose(hessians[0], jax.hessian(closed)(at), atol=1e-8)
+    np.testing.assert_allclose(gradients[1], [0, 0, 1], atol=1e-12)
+    np.testing.assert_allclose(hessians[1], 0, atol=1e-12)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", ["cone", "controller"])
+def test_other_times_have_second_derivatives(name):
+    """T = c/r of the cone, and c/k^(1/2) of the spring."""
+    case = CASES[name]
+    x = case.numbers[0]
+    second = jax.jit(jax.jacfwd(jax.grad(lambda x: case.move(x, **TIGHT).stats["time_reached"])))(jnp.asarray(x))
+    np.testing.assert_allclose(second, case.time(x) / x**2 * (2 if name == "cone" else 0.75), rtol=1e-9)

@@ -116,7 +116,9 @@ def hybrid_motion(scene: Scene, control, numbers, options) -> Solution:
     ended = (end.result == RESULTS.successful) & ~reached.all()
     cases = [*inputs.faults, (~start_ok, RESULTS.inconsistent_start), (ended, RESULTS.nonfinite_state)]
     result = first_of(cases, end.result)
-    stats = end.counts | {"time_reached": jnp.where(good, end.t, ts[0])}
+    # The end of a run is an input, which has derivatives; the time in the loop has none.
+    time_reached = jnp.where(end.t >= ts[-1], ts[-1], end.t)
+    stats = end.counts | {"time_reached": jnp.where(good, time_reached, ts[0])}
     touched = _impacts_at_start(scene, elements, q0, v0, ts[0], mode)
     events = _events(elements, touched, ts[0], times, records.name[:most], good & start_ok)
     rows = jax.tree.map(lambda rows: rows_where(reached, rows, jnp.nan), {"q": y["q"], "v": y["v"], **values})

@@ -4,10 +4,10 @@ For derivatives the motion is replayed in parts, from each save point or event t
 then; steps of fixed length begin anew with each part. Each part is differentiated as motions without events are. At an event the
 guard e of the mode falls to zero, so its time follows the change of e at that moment,
 
-    dt = -de / (de/dt),
+    dt = -de / (de/dt)
 
-the state is taken to that time by its rate before the event, goes through the impact, and begins the next part there. These are
-the saltation matrices of the literature.
+to first order (`delay` has the second one too). The state is taken to that time by the motion before the event, goes through the
+impact, and begins the next part there. To first order these are the saltation matrices of the literature.
 """
 
 from typing import Any
@@ -118,12 +118,26 @@ def _cross(system: HybridSystem, unknown, mode: Mode, record: Records, t, known_
     """Time and state behind an event; y is the state at the time that is known."""
     hit, which = record.trigger >= 0, jnp.maximum(record.trigger, 0)
 
-    def guard(t, y):
-        return guards_at(system.plan, (unknown, mode), t, y)[0][which]
+    def guard(given, t, y):
+        *args, which = given
+        return guards_at(system.plan, tuple(args), t, y)[0][which]
 
-    rate = lax.stop_gradient(system.plan.field_of((unknown, mode), known_time, y))
-    late = jnp.where(hit, delay(guard, rate, known_time, y), 0.0)
+    def field(given, t, y):
+        return system.plan.field_of(given[:2], t, y)
+
+    late = jnp.where(hit, delay(guard, field, (unknown, mode, which), known_time, y), 0.0)
     time = jnp.where(hit, known_time + late, t)
-    # To the event by the rate before it: a shift of value zero, with the derivative of the time.
-    y = system.impact(unknown, record.impact, record.impact_slip, time, y + late * rate)
+    # To the event by the motion before it: a shift of value zero, with the first and second derivatives of the time.
+    y = _shift(system.plan, (unknown, mode), known_time, y, late)
+    y = system.impact(unknown, record.impact, record.impact_slip, time, y)
     return time, system.with_slip(y, None, lax.stop_gradient(record.slip))
+
+
+def _shift(plan, args, t, y, late):
+    """State `late` after t, which is zero in value: y + late y' + late^2 y''/2."""
+
+    def field(t, y):
+        return plan.field_of(args, t, y)
+
+    rate, change = jax.jvp(field, (t, y), (jnp.ones_like(t), lax.stop_gradient(plan.field_of(args, t, y))))
+    return y + late * rate + late**2 / 2 * lax.stop_gradient(change)

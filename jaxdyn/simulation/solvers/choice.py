@@ -142,6 +142,16 @@ def choose_adjoint(adjoint, solver) -> diffrax.AbstractAdjoint:
     raise ValueError(f"adjoint is {adjoint!r}; choose one of {', '.join(ADJOINTS)}, or pass a diffrax adjoint")
 
 
+def has_name(adjoint: diffrax.AbstractAdjoint) -> bool:
+    """True for the adjoints that have a name, whose derivatives the library's own loops give too.
+
+    Others, and those with settings of their own, are for diffrax.
+    """
+    if type(adjoint) is diffrax.RecursiveCheckpointAdjoint:
+        return adjoint.checkpoints is None
+    return type(adjoint) in (diffrax.ForwardMode, diffrax.DirectAdjoint, diffrax.BacksolveAdjoint)
+
+
 def step_limit(max_steps, ts, stepsize, adjoint: diffrax.AbstractAdjoint) -> int:
     """Limit on the number of steps: as given, else what fixed steps need, else 65536 (4096 where each allowed step costs).
 
@@ -160,13 +170,18 @@ def step_limit(max_steps, ts, stepsize, adjoint: diffrax.AbstractAdjoint) -> int
     return 4096 if isinstance(adjoint, diffrax.DirectAdjoint) else 65536
 
 
+def uses_tolerances(solver) -> bool:
+    """True for an implicit method whose equations are solved to the tolerances of the run."""
+    return isinstance(solver, diffrax.AbstractImplicitSolver) and not eqx.is_array_like(solver.root_finder.rtol)
+
+
 def solver_and_control(solver, term, ts, rtol, atol, stepsize):
     """Solver, step-size control and first step for diffrax, with tolerances above the rounding of the dtype."""
     eps = float(jnp.finfo(ts.dtype).eps)
     rtol, atol = jnp.maximum(rtol, 10 * eps), jnp.maximum(atol, 10 * eps)
     # The default of diffrax keeps the Jacobian of the step's start, gives up after two iterations and relies on a shorter step.
     # Fixed steps cannot be shorter, and adaptive ones lose more by it than by new Jacobians (the car axis: 9 times the steps).
-    if isinstance(solver, diffrax.AbstractImplicitSolver) and not eqx.is_array_like(solver.root_finder.rtol):
+    if uses_tolerances(solver):
         newton = optimistix.Newton(rtol, atol)  # pyright: ignore[reportArgumentType]
         solver = eqx.tree_at(lambda s: s.root_finder, solver, newton)
     if is_step_length(stepsize):

@@ -25,7 +25,7 @@ from jaxdyn.compile.repair import compute_where
 from jaxdyn.constraints.codes import RESULTS
 from jaxdyn.simulation.solvers import reverse
 from jaxdyn.simulation.solvers.explicit import Plan, Step, dense_output, take_step
-from jaxdyn.simulation.solvers.guards import Search, search_root
+from jaxdyn.simulation.solvers.guards import Point, Search, look_within, search_root
 from jaxdyn.simulation.solvers.step_control import (
     NextStep,
     add_error,
@@ -268,13 +268,24 @@ def _search(
     plan: Plan, args, state: State, search: Search, t_next, step: Step, decided: NextStep, is_adaptive: bool
 ) -> tuple[NextStep, Search]:
     """Decision about a step by its guards, after that by its error, and the search for an event."""
-    middle = (state.t + t_next) / 2
-    # The dense output only finds that a guard was negative: the event is located by steps of its own.
-    between = dense_output(plan, None, middle, state.t, t_next, state.y, step.raw, step.stages, step.shift)
-    at_end, in_middle = plan.guards_of(args, t_next, step.projected), plan.guards_of(args, middle, between)
+    length = t_next - state.t
+
+    def guards(fraction):
+        # The dense output only finds that a guard was negative: the event is located by steps of its own.
+        t = state.t + fraction * length
+        y = dense_output(plan, None, t, state.t, t_next, state.y, step.raw, step.stages, step.shift)
+        return plan.guards_of(args, t, y)
+
+    at_end = plan.guards_of(args, t_next, step.projected)
+    if plan.is_terminal:
+        ends = (jnp.zeros_like(length), search.values), (jnp.ones_like(length), at_end[0])
+        within = look_within(guards, *(Point(*end, jnp.zeros_like(search.values)) for end in ends))
+    else:
+        middle = jnp.asarray(0.5, length.dtype)
+        within = [Point(middle, *guards(middle))]
     # Fixed steps fail where the state is not finite.
     good = decided.kept if is_adaptive else jnp.isfinite(step.projected).all()
-    after, kept, located, length = search_root(search, state.t, t_next, at_end, in_middle, good, decided.length)
+    after, kept, located, length = search_root(search, state.t, t_next, at_end, within, good, decided.length)
     after = after if is_adaptive else after._replace(usual=search.usual)
     # Steps that an event has cut may be shorter than the least one of the control.
     at_least, failed = decided.at_least & ~after.locating & ~located, decided.failed | (not is_adaptive)

@@ -2,11 +2,15 @@
 
 A step that ends where a guard is negative is repeated with a shorter length, until its end is the event: the root is bracketed by
 the steps before and behind it. So the state at the event is that of a step of full order, and not of an interpolation. Guards are
-evaluated in the middle and at the end of every step: what is violated and satisfied again between them is not seen.
+evaluated in the middle and at the end of every step. Those that end a run are also evaluated twice where a parabola through the
+points so far has its least value (`look_within`). What is violated and satisfied again between these points is not seen.
 """
 
+from collections.abc import Callable
+from functools import partial
 from typing import Any, NamedTuple
 
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 from jax import lax
@@ -82,21 +86,78 @@ class Search(NamedTuple):
         )
 
 
-def search_root(search: Search, t0, t1, at_end, in_middle, good, usual) -> tuple[Search, Array, Array, Array]:
+class Point(NamedTuple):
+    """Guards and their levels (k,) at a fraction (), of a step."""
+
+    fraction: Array
+    values: Array
+    levels: Array
+
+
+def _least_of_parabola(left: Point, middle: Point, right: Point) -> Array:
+    """Fraction of a step at which a guard is predicted to be least, of the guard that is then the lowest in its own size.
+
+    By parabolas through three points; between the last two points where no guard has its least value within.
+    """
+    tiny = float(jnp.finfo(middle.values.dtype).tiny)
+    before, after = middle.fraction - left.fraction, right.fraction - middle.fraction
+    first, second = (middle.values - left.values) / before, (right.values - middle.values) / after
+    curvature = (second - first) / (before + after)
+    is_convex = curvature > tiny
+    safe = jnp.where(is_convex, curvature, 1.0)
+    # The vertex, from the middle of the first interval, where the slope is `first`.
+    fraction = (left.fraction + middle.fraction) / 2 - first / (2 * safe)
+    within = is_convex & (fraction > left.fraction) & (fraction < right.fraction)
+    least = middle.values + (fraction - middle.fraction) * (first + (fraction - left.fraction) * safe)
+    size = jnp.maximum(jnp.maximum(jnp.abs(left.values), jnp.abs(right.values)), tiny)
+    least = jnp.where(within, least / size, jnp.ones_like(least) * 2)
+    at = jnp.where(within & (least <= jnp.min(least)), fraction, right.fraction)
+    return jnp.where(within.any(), jnp.min(at), (middle.fraction + right.fraction) / 2)
+
+
+def look_within(guards: Callable, start: Point, end: Point) -> list[Point]:
+    """Guards in the middle of a step, and twice near the least value that parabolas predict.
+
+    guards(fraction) gives values and levels within the step. The depth of a passage that is not seen is of the order of 1e-3 of
+    the range of the guard over the step.
+    """
+
+    def look(fraction):
+        return Point(fraction, *guards(fraction))
+
+    middle = look(jnp.asarray(0.5, start.fraction.dtype))
+    one = look(_least_of_parabola(start, middle, end))
+    is_left = one.fraction < middle.fraction
+
+    def choose(a, b):
+        return jax.tree.map(lambda a, b: jnp.where(is_left, a, b), a, b)
+
+    # A point at the middle itself has no parabola of its own.
+    apart = jnp.abs(one.fraction - middle.fraction) > 1e-3
+    fraction = _least_of_parabola(choose(start, middle), one, choose(middle, end))
+    return [middle, one, look(jnp.where(apart, fraction, 0.75))]
+
+
+def search_root(search: Search, t0, t1, at_end, within, good, usual) -> tuple[Search, Array, Array, Array]:
     """Narrow the bracket of an event by an attempt whose error is `good`, or begin one.
 
     **Returns:** the search; whether the step is kept, and whether it ends at an event; the length of the next attempt.
 
-    **Arguments:** `at_end`, `in_middle`: guards and their levels (k,); `usual`: length of the next step without event.
+    **Arguments:** `at_end`: guards and their levels (k,); `within`: points of the step between its ends; `usual`: length of the
+    next step without event.
     """
-    (values, levels), (middle, middle_levels) = at_end, in_middle
+    values, levels = at_end
     length, eps, strict = t1 - t0, float(jnp.finfo(values.dtype).eps), ~search.loose
     # Within its rounding level the sign of a guard is not known.
     violated = (values < -levels).any()
-    # In the middle alone: the step is halved first.
-    inside = good & ~search.locating & strict & (middle < -middle_levels).any()
+    # Within the step: it is cut at the first of the points first.
+    first, at = jnp.ones_like(length), values
+    for point in within:
+        is_first = (point.values < -point.levels).any() & (point.fraction < first)
+        first, at = jnp.where(is_first, point.fraction, first), jnp.where(is_first, point.values, at)
+    inside = good & ~search.locating & strict & (first < 1)
     crosses, violated = good & search.loose & violated, (violated & strict) | inside
-    at = jnp.where(inside, middle, values)
+    at = jnp.where(inside, at, values)
     level = jnp.maximum(levels, float(jnp.finfo(values.dtype).tiny))
     # Guards have units of their own: each is measured by its size at the ends of the step where the search begins.
     sizes = jnp.maximum(jnp.maximum(jnp.abs(search.values), jnp.abs(at)), level)
@@ -106,14 +167,14 @@ def search_root(search: Search, t0, t1, at_end, in_middle, good, usual) -> tuple
     begins = good & violated & ~search.locating
     fresh = Bracket.begin(length, jnp.min(search.values / scale).astype(length.dtype))
     bracket = jax.tree.map(lambda a, b: jnp.where(begins, a, b), fresh, search.bracket)
-    before, point = good & ~violated & search.locating, jnp.where(inside, length / 2, length)
+    before, point = good & ~violated & search.locating, jnp.where(inside, first * length, length)
     bracket = bracket.narrow(point, value.astype(length.dtype), before, good & violated)
     locating, width = (search.locating & good) | begins, bracket.high - bracket.low
     is_narrow = width <= 4 * eps * jnp.maximum(jnp.abs(t1), search.usual)
-    # The root is known when a guard is zero, or when its time is, up to rounding. A zero in the middle may have been an error of
-    # the dense output: then the bracket closes on its end, before which no guard is negative.
+    # The root is known when a guard is zero, or when its time is, up to rounding. A zero within the step may have been an error
+    # of the dense output: then the bracket closes on its end, before which no guard is negative.
     is_known = (jnp.abs(value) <= 64 * eps) | (is_narrow & (violated | (width <= 0)))
-    # A zero in the middle is not at the end of this step, which is where a step can be cut.
+    # A zero within the step is not at the end of it, which is where a step can be cut.
     located = locating & is_known & ~inside
     kept = good & ((~violated & ~search.locating) | located)
     real = located & (value <= eps**_REAL)
@@ -131,15 +192,44 @@ def search_root(search: Search, t0, t1, at_end, in_middle, good, usual) -> tuple
     return after, kept, located, bracket.next(is_narrow)
 
 
-def delay(guard, rate, t, y) -> Any:
-    """Delay of an event, (), s: zero, with its first derivative; the second one lacks the change of the rate.
+def delay(guard: Callable, field: Callable, args, t, y) -> Any:
+    """Delay of an event, (), s: zero, with its first and second derivatives.
 
-    Where guard(t, y) is zero, a change of the guard by de moves the root by dt = -de/(de/dt), with de/dt along the motion, whose
-    `rate` is dy/dt before the event.
+    Where guard(args, t, y) is zero, a change of the guard by z moves the root by s with z + g' s + g'' s^2 / 2 = 0. The rates g'
+    and g'' are those along the motion, whose rate is field(args, t, y) before the event.
     """
-    fixed, value = lax.stop_gradient((t, y)), guard(t, y)
-    _, guard_rate = jax.jvp(guard, fixed, (jnp.ones_like(t), lax.stop_gradient(rate)))
-    is_regular = guard_rate != 0
-    guard_rate = lax.stop_gradient(jnp.where(is_regular, guard_rate, jnp.ones_like(guard_rate)))
-    # The value is zero up to rounding: only its derivative is used.
-    return jnp.where(is_regular, (lax.stop_gradient(value) - value) / guard_rate, jnp.zeros_like(value))
+    return _delay((args, t, y), guard, field)
+
+
+# The value needs no rates: runs that are not differentiated do not pay for them.
+@eqx.filter_custom_jvp
+def _delay(inputs, guard, field):
+    return jnp.zeros_like(inputs[1])
+
+
+@_delay.def_jvp
+def _(primals, tangents):
+    inputs, guard, field = primals
+    # The time of the event is that of the values: derivatives are those of the guard there.
+    changes = tangents[0][0], None, tangents[0][2]
+    _, change = eqx.filter_jvp(partial(_expand_delay, guard, field), (inputs,), (changes,))
+    return _delay(*primals), change
+
+
+def _expand_delay(guard: Callable, field: Callable, inputs) -> Array:
+    """Expansion of the delay to second order at an event."""
+    args, t, y = inputs
+
+    def along(function, t, y):
+        return jax.jvp(function, (t, y), (jnp.ones_like(t), field(args, t, y)))
+
+    def rate(t, y):
+        return along(partial(guard, args), t, y)[1]
+
+    # In the second derivative of the delay the value of g'' is all that counts.
+    first, second = rate(t, y), lax.stop_gradient(along(rate, t, y)[1])
+    value = guard(args, t, y)
+    change, is_regular = value - lax.stop_gradient(value), first != 0
+    first = jnp.where(is_regular, first, jnp.ones_like(first))
+    late = -change / first - second / (2 * first**3) * change**2
+    return jnp.where(is_regular, late, jnp.zeros_like(late)).astype(t.dtype)
