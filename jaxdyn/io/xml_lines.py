@@ -35,6 +35,32 @@ _MARKS += (
 _DECLARED = re.compile(rb"""<\?xml[^>]*?\sencoding\s*=\s*["']([^"'>]+)["']""")
 
 
+# Attributes and elements of URDF, MJCF and SDF that place links and joints.
+_PLACES = {"xyz", "rpy", "pos", "quat", "euler", "axisangle", "xyaxes", "zaxis", "axis", "anchor", "relpose", "pose"}
+_NUMBER = re.compile(r"[-+]?(\d*)\.?(\d*)(?:[eE]([-+]?\d+))?$")
+# Numbers of one or two digits (1, 0.5, -1.2) are meant as they stand. Coarser rounding than the largest one is never told from
+# a mechanism that does not close, and finer rounding than the least one is lost in that of the computation.
+_PLAIN_DIGITS, _LEAST_ROUNDING, LARGEST_ROUNDING = 2, 1e-12, 1e-3
+
+
+def written_rounding(root: ElementTree.Element) -> float:
+    """Rounding of the numbers that place links and joints: half a unit of the last digit of the coarsest one, m or rad.
+
+    0 where all numbers are plain ones, or have the digits of float64.
+    """
+    texts = [value for element in root.iter() for name, value in element.items() if name in _PLACES]
+    texts += [element.text or "" for element in root.iter() if element.tag in _PLACES]
+    largest = 0.0
+    for word in " ".join(texts).split():
+        match = _NUMBER.match(word)
+        if match is None:
+            continue
+        whole, decimals, exponent = match.groups()
+        if decimals and len((whole + decimals.rstrip("0")).lstrip("0")) > _PLAIN_DIGITS:
+            largest = max(largest, 0.5 * 10.0 ** (int(exponent or 0) - len(decimals)))
+    return min(largest, LARGEST_ROUNDING) if largest > _LEAST_ROUNDING else 0.0
+
+
 class XmlFile:
     """XML file with its root element, and readers of numbers and words whose errors name file and line.
 
