@@ -249,7 +249,7 @@ def _differentiable(whole: Scene, q, posture, t: Number, aims: Aims, constraints
         # Rows of weight zero are masked: q does not satisfy them, so that they have no derivative there.
         counted = is_counted[first : first + sum(target_rows(rows[i]))].astype(q.dtype)
         none = jnp.zeros((), q.dtype)
-        rows[i] = KeptRows(rows[i], counted, none, none, rows[i].name)  # pyright: ignore[reportArgumentType]
+        rows[i] = KeptRows(rows[i], counted, none, none, none, rows[i].name)  # pyright: ignore[reportArgumentType]
     joints = _joints_with_limits(model, aims)
     at = np.asarray(joints, int)
     lower, upper = aims.lower[at], aims.upper[at]

@@ -7,7 +7,7 @@ Python's codecs, since expat knows only four encodings, none of them the multi-b
 import codecs
 import os
 import re
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from typing import Any, NoReturn
 from xml.etree import ElementTree
 from xml.parsers import expat
@@ -37,6 +37,8 @@ _DECLARED = re.compile(rb"""<\?xml[^>]*?\sencoding\s*=\s*["']([^"'>]+)["']""")
 
 # Attributes and elements of URDF, MJCF and SDF that place links and joints.
 _PLACES = {"xyz", "rpy", "pos", "quat", "euler", "axisangle", "xyaxes", "zaxis", "axis", "anchor", "relpose", "pose"}
+# Elements whose places do not matter for the closing of loops.
+_NO_PLACES = {"inertial", "visual", "collision", "geom", "camera", "light", "asset"}
 _NUMBER = re.compile(r"[-+]?(\d*)\.?(\d*)(?:[eE]([-+]?\d+))?$")
 # Numbers of one or two digits (1, 0.5, -1.2) are meant as they stand. Coarser rounding than the largest one is never told from
 # a mechanism that does not close, and finer rounding than the least one is lost in that of the computation.
@@ -48,10 +50,8 @@ def written_rounding(root: ElementTree.Element) -> float:
 
     0 where all numbers are plain ones, or have the digits of float64.
     """
-    texts = [value for element in root.iter() for name, value in element.items() if name in _PLACES]
-    texts += [element.text or "" for element in root.iter() if element.tag in _PLACES]
     largest = 0.0
-    for word in " ".join(texts).split():
+    for word in " ".join(_placing_texts(root)).split():
         match = _NUMBER.match(word)
         if match is None:
             continue
@@ -59,6 +59,15 @@ def written_rounding(root: ElementTree.Element) -> float:
         if decimals and len((whole + decimals.rstrip("0")).lstrip("0")) > _PLAIN_DIGITS:
             largest = max(largest, 0.5 * 10.0 ** (int(exponent or 0) - len(decimals)))
     return min(largest, LARGEST_ROUNDING) if largest > _LEAST_ROUNDING else 0.0
+
+
+def _placing_texts(element: ElementTree.Element) -> Iterator[str]:
+    yield from (value for name, value in element.items() if name in _PLACES)
+    if element.tag in _PLACES:
+        yield element.text or ""
+    for child in element:
+        if child.tag not in _NO_PLACES:
+            yield from _placing_texts(child)
 
 
 class XmlFile:
