@@ -201,14 +201,10 @@ def _follow_path(scene, q, t, rank_tol, steps):
 @entry_point
 def _close(bare, guess, start, passed, selection, v, t, rank_tol, atol, scene):
     """The assembly from the end of a path, which starts at the guess; `scene`: see `_assemble`."""
-    whole, locked, is_clear, kept = (
-        bare,
-        bare,
-        True,
-        jnp.ones(sum(place.end - place.start for place in layout(bare)), guess.dtype),
-    )
+    whole, locked, is_clear = bare, bare, jnp.asarray(True)
+    kept = jnp.ones(sum(place.end - place.start for place in layout(bare)), guess.dtype)
     if selection is not None:
-        kept, rounding, is_clear = selection.kept, selection.rounding, selection.gap >= LEAST_GAP
+        kept, rounding, is_clear = selection.kept, selection.rounding, jnp.asarray(selection.gap >= LEAST_GAP)
         # Rows that contradict the others must not be dropped in silence: with all rows the result is the least-squares point.
         kept = jnp.where(rounding <= most_rounding(guess.dtype), kept, jnp.ones_like(kept))
         locked = keep_rows(bare, selection._replace(kept=kept))
@@ -236,7 +232,7 @@ def _close(bare, guess, start, passed, selection, v, t, rank_tol, atol, scene):
         q,
         v,
         residual,
-        first_of([(~good, RESULTS.not_assembled), (~jnp.asarray(is_clear), RESULTS.unclear_rank)], RESULTS.successful),
+        first_of([(~good, RESULTS.not_assembled), (~is_clear, RESULTS.unclear_rank)], RESULTS.successful),
         jnp.max(distances, initial=0.0),
         passed,
         1 - kept,

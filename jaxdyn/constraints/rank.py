@@ -195,8 +195,8 @@ def rank_of(A: Float[Array, "n m"], inverse: Float[Array, "m n"]) -> Float[Array
 def has_clear_rank(A: Float[Array, "n m"], inverse: Float[Array, "m n"], rank_tol: float | None) -> Bool[Array, ""]:
     """Decide whether the rank of rows A, with their pseudo-inverse, is clear; a constant.
 
-    The least singular value that counts has to be `LEAST_GAP` times the largest that does not. Rows that leave no motion have to be
-    independent beyond doubt: a row that differs by the rounding of its numbers from a combination of others would do so, too.
+    The least singular value that counts has to be `LEAST_GAP` times the largest that does not. Rows that leave no motion have to
+    be independent beyond doubt: a row that differs from a combination of others by the rounding of its numbers leaves none, too.
     """
     (A, inverse), least = lax.stop_gradient((A, inverse)), tolerance(rank_tol, A)
     is_full = (rank_of(A, inverse) >= A.shape[1]) & (rank_tol is None and A.shape[0] >= A.shape[1])

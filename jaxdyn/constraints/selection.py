@@ -51,7 +51,7 @@ from jaxdyn.constraints.redundancy import (
 from jaxdyn.constraints.tolerances import coordinate_sizes
 from jaxdyn.dynamics.quantities import mass_matrix
 from jaxdyn.lie.so3 import matmul
-from jaxdyn.model.arguments import Number, Numbers, check_state, state_dtype
+from jaxdyn.model.arguments import Numbers, check_state, state_dtype
 from jaxdyn.model.configuration import neutral
 from jaxdyn.model.tree import Model
 from jaxdyn.systems.mass_factor import cholesky, mass_factor
@@ -88,7 +88,7 @@ def eliminate(B: Float[Array, "nc nv"], least: float, first: Float[Array, " nc"]
     The pivot of a row is its distance from the span of those that were kept before it. Rows with `first` = 1 come before all
     others; a row is kept where its pivot is above `least`, and `most` rows at most.
 
-    **Returns:** a mask (nc,) of 1 and 0, the largest distance () of a row that is not kept, and the least pivot () of one that is.
+    **Returns:** a mask (nc,) of 1 and 0, the largest distance () of a row that is not kept, and the least pivot () of the others.
     """
 
     # Not an SVD: it counts independent rows but does not name them, and LAPACK in a batch can deadlock (see `solve_square`).
@@ -97,7 +97,7 @@ def eliminate(B: Float[Array, "nc nv"], least: float, first: Float[Array, " nc"]
         # Rounding leaves a kept row a length of eps; it must not be chosen again.
         lengths = jnp.sqrt(jnp.sum(rest * rest, 1)) * (1 - kept)
         order = jnp.where((first > 0) & (lengths > least), lengths + jnp.max(lengths), lengths)
-        # Rows of symmetric mechanisms are equally far, but for rounding, which differs between programs: the first of them counts.
+        # Rows of symmetric mechanisms are equally far but for rounding, which differs between programs: the first one counts.
         row = jnp.argmax(order >= (1 - _ALIKE) * jnp.max(order))
         pivot = lengths[row]
         along = rest[row] / jnp.where(pivot > 0, pivot, jnp.ones_like(pivot))
@@ -114,10 +114,10 @@ def eliminate(B: Float[Array, "nc nv"], least: float, first: Float[Array, " nc"]
 def independent_rows(scene: Scene, q, t, rank_tol: float | None = None) -> Scene:
     """The scene with the rows that count at a configuration: what every function with constraints computes with.
 
-    Numbers of a file are rounded, so that rows which repeat others do so but for the rounding: no tolerance of the dtype tells them
-    from independent ones. They are set to zero here (`keep_rows`); all rows are NaN where rounding hides which ones these are.
-    Scenes of exact numbers, and those that have a choice of rows or a `rank_tol`, are returned as they are: there singular values
-    below the tolerance count as zero.
+    Numbers of a file are rounded, so that rows repeat others but for the rounding: no tolerance of the dtype tells them from
+    independent ones. They are set to zero here (`keep_rows`); all rows are NaN where rounding hides which ones these are.
+    Scenes of exact numbers, and those that have a choice of rows or a `rank_tol`, are returned as they are: there singular
+    values below the tolerance count as zero.
     """
     if not (scene.rounding and scene.constraints) or rank_tol is not None or has_selection(scene):
         return scene
@@ -152,11 +152,11 @@ def rank_code(scene: Scene, result: Any) -> Any:
     return RESULTS.where(is_clear, result, RESULTS.unclear_rank)  # pyright: ignore[reportArgumentType]
 
 
-def select_rows(scene: Scene, q: Float[Array, " nq"], t: Number, rank_tol: float | None = None) -> Selection:
+def select_rows(scene: Scene, q, t: Any, rank_tol: float | None = None) -> Selection:
     """The independent rows of a mechanism at a configuration on its constraints; a constant.
 
-    With `rank_tol` rows count whose pivots are above it, at this configuration; without it as the module says. Concrete and traced
-    arguments give the same rows. Infinite or NaN rows are all kept; `assemble` and `simulate` report such states.
+    With `rank_tol` rows count whose pivots are above it, at this configuration; without it as the module says. Concrete and
+    traced arguments give the same rows. Infinite or NaN rows are all kept; `assemble` and `simulate` report such states.
     """
     # A choice has no derivative: forces do not select rows, and the scene, q and t enter without tangents.
     bare = stop_gradient(Scene(scene.system, scene.constraints))
@@ -166,8 +166,7 @@ def select_rows(scene: Scene, q: Float[Array, " nq"], t: Number, rank_tol: float
         return every
     apart = rank_tol if rank_tol is not None else clear_pivot(q)
     if is_concrete(bare, q, t):
-        # NumPy decides first, so that nothing is compiled for independent rows. LAPACK raises an error of its own for NaN. No pivot
-        # is below the least singular value, which may be far below the least pivot.
+        # NumPy decides first, so that nothing is compiled for independent rows.
         B = evaluate(unit_rows, bare, np.asarray(q), np.asarray(t, q.dtype), is_input=not is_tracing())
         if not np.isfinite(B).all() or np.sum(pivot_rows(B)[1] > apart) == count:
             return every
@@ -279,8 +278,8 @@ def _pivot_of(scene: Scene, q, t, kept):
 def may_have_redundant_rows(scene: Scene) -> bool:
     """True where some set of coupled coordinates has at least as many rows as coordinates: it moves only if rows are redundant.
 
-    True for a scene of rounded numbers, and for one that is traced, too. A motion with redundant rows among fewer than that is right
-    without a selection, by the rank at every evaluation, in short steps.
+    True for a scene of rounded numbers, and for one that is traced, too. A motion of exact numbers with redundant rows among
+    fewer than that is right without a selection, by the rank at every evaluation, in short steps.
     """
     bare = Scene(scene.system, scene.constraints)
     if scene.rounding or not is_concrete(bare):
@@ -393,8 +392,8 @@ def degrees_of_freedom(
     **Arguments:** `scene`, a `Scene` or a system; `q` (nq,); `t`, s; `rank_tol`: singular values below `rank_tol` times the
     largest count as zero, by default $\epsilon^{4/7}$, 1e-9 in float64.
 
-    **Returns:** an int for concrete arguments, an integer array () for traced ones. Where rounding of the numbers hides what the rank
-    is, traced ones give -1.
+    **Returns:** an int for concrete arguments, an integer array () for traced ones, which is -1 where rounding of the numbers
+    hides the rank.
 
     **Raises:** ValueError for shapes that do not fit, a `rank_tol` outside (0, 1), and for a rank that is not clear.
 
