@@ -19,7 +19,7 @@ from jaxdyn.constraints.dynamics import correction
 from jaxdyn.constraints.loops import lock_joint
 from jaxdyn.constraints.rank import LEAST_GAP, check_tolerance, clear_pivot, tolerance
 from jaxdyn.constraints.redundancy import keep_rows, opening_of_redundant
-from jaxdyn.constraints.selection import most_rounding, select_rows
+from jaxdyn.constraints.selection import independent_rows, most_rounding, select_rows
 from jaxdyn.constraints.tolerances import coordinate_sizes, largest_ratio, row_limits
 from jaxdyn.lie.so3 import matmul
 from jaxdyn.model.arguments import Numbers, check_state, zeros_if_none
@@ -188,6 +188,13 @@ def _assemble(locked, q, v, t, rank_tol, atol, steps, scene):
         scene = Scene(scene.system, scene.constraints)
         scene = keep_rows(scene, select_rows(scene, start, t, rank_tol))
     return _close(bare, q, start, passed, selection, v, t, rank_tol, atol, scene)
+
+
+def independent_rows_near(scene: Scene, guess, t) -> Scene:
+    """`independent_rows` where the path from a guess meets the constraints: off them all rows are independent."""
+    if not (scene.rounding and scene.constraints):
+        return scene
+    return independent_rows(scene, _follow_path(Scene(scene.system, scene.constraints), guess, t, None, 100)[0], t)
 
 
 @entry_point

@@ -135,8 +135,8 @@ def constrained_dynamics(
     # invalid. A selection leaves independent rows and zeros in the place of the dropped ones, so that the count says nothing.
     is_wide = places[-1].end > scene.nv and not has_selection(scene)
     a, lam, rank, result = (_by_rank if is_wide else _by_pivots)(rank_tol, scene, *state)
-    if has_selection(scene):  # redundant rows share the constraint force: the one of least norm is unique
-        lam = distribute_multipliers(scene, q, t, lam)
+    # Redundant rows share the constraint force: the one of least norm is unique.
+    lam = distribute_multipliers(scene, q, t, lam)
     return ConstrainedDynamics(a, lam, rank, rank_code(scene, result), places)
 
 
@@ -330,6 +330,7 @@ def projections(
     """
     scene = as_scene(scene)
     q, t = check_state(scene.system, q=q, t=t)
+    scene = independent_rows(scene, q, t, rank_tol)
     metric, Y = kernel(whiten_rows)(scene, q, t)
     inverse = pseudo_inverse(Y, tolerance(rank_tol, Y))
     tangential = jnp.eye(Y.shape[0], dtype=Y.dtype) - matmul(Y, inverse)
@@ -362,6 +363,7 @@ def second_fundamental_form(
     """
     scene = as_scene(scene)
     q, v, t = check_state(scene.system, q=q, v=v, t=t)
+    scene = independent_rows(scene, q, t, rank_tol)
     # C v without forming C: the bias force h = C v + gravity, less its value at v = 0.
     coriolis = bias_force(scene.system, q, v, t) - bias_force(scene.system, q, jnp.zeros_like(v), t)
     metric, Y = kernel(whiten_rows)(scene, q, t)

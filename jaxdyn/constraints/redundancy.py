@@ -198,12 +198,14 @@ def gap_of_redundant(scene: Scene, q, t) -> Float[Array, ""]:
 
 
 def distribute_multipliers(scene: Scene, q, t, lam: Float[Array, " nc"]) -> Float[Array, " nc"]:
-    """Multipliers of least norm of all rows, with the same force as `lam` of the kept ones.
+    """Multipliers of least norm of all rows, with the same force as `lam` of the kept ones, if some were dropped.
 
     With the dropped rows as combinations A_d = C A_k of the kept ones, lam_k + C^T lam_d = lam, whose shortest solution is
     [1; C] (1 + C^T C)^-1 lam.
     """
     # Without this the loads of redundant bearings would depend on the choice of rows, and jump where it changes.
+    if not has_selection(scene):
+        return lam
     kept, whole = row_mask(scene), all_rows(scene)
     return _distribute(Scene(whole.system, whole.constraints), q, jnp.asarray(t, q.dtype), lam, kept)
 

@@ -9,6 +9,7 @@ from jaxtyping import Array, Bool, Float, PyTree
 
 from jaxdyn._renamed import RenamedMethod
 from jaxdyn.constraints.base import Constraint, constraint_jacobian, layout, rows
+from jaxdyn.constraints.selection import independent_rows
 from jaxdyn.control.errors import row_rank, target_rows
 from jaxdyn.control.gains import times
 from jaxdyn.model.arguments import Number, batch_hint
@@ -32,14 +33,14 @@ class ForceIntegral(Controller):
     def is_regular(self, q: Float[Array, " nq"], v: Float[Array, " nv"], t: Number = 0.0) -> Bool[Array, ""]:
         """Decide whether task and constraints are independent, as the error equations require."""
         t = jnp.asarray(t, q.dtype)
-        A = constraint_jacobian(self.scene, q, t)
+        A = constraint_jacobian(independent_rows(self.scene, q, t), q, t)
         both, _ = self._rows(q, v, t)
         # Ranks add exactly where no direction of the task is fixed by the constraints.
         return row_rank(both) == row_rank(A) + both.shape[0] - A.shape[0]
 
     def _rows(self, q, v, t):
         """Rows A and right-hand sides of A a = ..., those of the constraints before those of the task."""
-        row = rows(self.scene, q, v, t)
+        row = rows(independent_rows(self.scene, q, t), q, v, t)
         A, wanted = target_rows(self.scene.system, self.error, self.kp, self.kd, q, v, t)
         return jnp.concatenate([row.A, A]), jnp.concatenate([row.gamma, wanted])
 
