@@ -25,6 +25,7 @@ from jaxdyn.constraints.base import constraint_jacobian, layout, rows
 from jaxdyn.constraints.codes import RESULTS, Outcome, require_finite
 from jaxdyn.constraints.dynamics import total_force
 from jaxdyn.constraints.rank import pseudo_inverse, rank_of, tolerance
+from jaxdyn.constraints.redundancy import distribute_multipliers
 from jaxdyn.constraints.selection import independent_rows, rank_code
 from jaxdyn.dynamics.quantities import bias_force, coriolis_matrix, mass_matrix
 from jaxdyn.lie.so3 import matmul
