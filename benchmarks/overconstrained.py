@@ -19,7 +19,7 @@ import numpy as np
 from scipy.integrate import solve_ivp
 
 import jaxdyn as jd
-from jaxdyn.constraints.selection import select_concrete_rows
+from jaxdyn.constraints.selection import select_rows
 
 TOLERANCES = (1e-6, 1e-8, 1e-10)
 GRAVITY = 9.81
@@ -233,7 +233,7 @@ def distance(q, exact) -> float:
 def row(title: str, mechanism: Mechanism) -> list[str]:
     """Of the table."""
     scene, (q, v) = mechanism.scene, mechanism.start(np.asarray(mechanism.x), np.asarray(mechanism.rate))
-    kept = select_concrete_rows(scene, np.asarray(q), 0.0, None)[0].kept
+    kept = select_rows(scene, np.asarray(q), 0.0).kept
     times = np.array([0.0, mechanism.span])
     exact = mechanism.states(mechanism.minimal(times, 1e-13)[0])[0][-1]
 

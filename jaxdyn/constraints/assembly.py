@@ -14,12 +14,12 @@ from jaxdyn.compile import entry_point, evaluate, kernel
 from jaxdyn.compile.known import is_concrete, is_tracing, stop_gradient
 from jaxdyn.constraints.base import Layout, holonomic_rows, layout, position_residual, velocity_residual
 from jaxdyn.constraints.closing import follow_path, nearest_configuration
-from jaxdyn.constraints.codes import RESULTS, Outcome, name_of, require_success
+from jaxdyn.constraints.codes import RESULTS, Outcome, first_of, name_of, require_success
 from jaxdyn.constraints.dynamics import correction
 from jaxdyn.constraints.loops import lock_joint
-from jaxdyn.constraints.rank import check_tolerance, tolerance
-from jaxdyn.constraints.redundancy import Selection, keep_rows, opening_of_redundant
-from jaxdyn.constraints.selection import clear_pivot, most_rounding, select_concrete_rows, select_rows
+from jaxdyn.constraints.rank import LEAST_GAP, check_tolerance, clear_pivot, tolerance
+from jaxdyn.constraints.redundancy import keep_rows, opening_of_redundant
+from jaxdyn.constraints.selection import independent_rows, most_rounding, select_rows
 from jaxdyn.constraints.tolerances import coordinate_sizes, largest_ratio, row_limits
 from jaxdyn.lie.so3 import matmul
 from jaxdyn.model.arguments import Numbers, check_state, zeros_if_none
@@ -131,7 +131,7 @@ def assemble(
     atol = None if atol is None else float(atol)
 
     def from_guess(q):
-        return _assemble(locked, q, v, t, rank_tol, atol, steps, scene.is_rounded, scene if hold else None)
+        return _assemble(locked, q, v, t, rank_tol, atol, steps, scene if hold else None)
 
     assembly = from_guess(q)
     # Only concrete inputs allow more guesses, which need to know whether the first guess has failed.
@@ -177,26 +177,24 @@ def _from_elsewhere(assembly: Assembly, guesses: int, from_guess: Callable, scen
     return assembly
 
 
-def _assemble(locked, q, v, t, rank_tol, atol, steps, is_rounded, scene):
+def _assemble(locked, q, v, t, rank_tol, atol, steps, scene):
     """Assemble the scene `locked`; velocities satisfy the constraints of `scene`, or of `locked` if it is None."""
     bare = Scene(locked.system, locked.constraints)
     start, passed = _follow_path(bare, q, t, rank_tol, steps)
-    selection: Any = _selection(bare, start, t, rank_tol, is_rounded)
+    selection: Any = select_rows(bare, start, t, rank_tol)
     if is_concrete(selection) and np.all(selection.kept):
         selection = None
     if scene is not None:
         scene = Scene(scene.system, scene.constraints)
-        scene = keep_rows(scene, _selection(scene, start, t, rank_tol, is_rounded))
+        scene = keep_rows(scene, select_rows(scene, start, t, rank_tol))
     return _close(bare, q, start, passed, selection, v, t, rank_tol, atol, scene)
 
 
-def _selection(scene: Scene, q, t, rank_tol, is_rounded) -> Selection:
-    """The independent rows at the end of a path."""
-    # Concrete rows are tested by NumPy first: most scenes have no dependent rows, and compile no program to choose some.
-    if is_concrete(scene, q, t):
-        q = np.asarray(q)
-        return select_concrete_rows(scene, q, np.asarray(t, q.dtype), rank_tol, is_rounded)[0]
-    return select_rows(scene, q, t, rank_tol, is_rounded)
+def independent_rows_near(scene: Scene, guess, t) -> Scene:
+    """`independent_rows` where the path from a guess meets the constraints: off them all rows are independent."""
+    if not (scene.rounding and scene.constraints):
+        return scene
+    return independent_rows(scene, _follow_path(Scene(scene.system, scene.constraints), guess, t, None, 100)[0], t)
 
 
 @entry_point
@@ -210,12 +208,13 @@ def _follow_path(scene, q, t, rank_tol, steps):
 @entry_point
 def _close(bare, guess, start, passed, selection, v, t, rank_tol, atol, scene):
     """The assembly from the end of a path, which starts at the guess; `scene`: see `_assemble`."""
-    whole, locked, kept = bare, bare, jnp.ones(sum(place.end - place.start for place in layout(bare)), guess.dtype)
+    whole, locked, is_clear = bare, bare, jnp.asarray(True)
+    kept = jnp.ones(sum(place.end - place.start for place in layout(bare)), guess.dtype)
     if selection is not None:
-        kept, rounding, _ = selection
+        kept, rounding, is_clear = selection.kept, selection.rounding, jnp.asarray(selection.gap >= LEAST_GAP)
         # Rows that contradict the others must not be dropped in silence: with all rows the result is the least-squares point.
         kept = jnp.where(rounding <= most_rounding(guess.dtype), kept, jnp.ones_like(kept))
-        locked = keep_rows(bare, Selection(kept, rounding, jnp.zeros_like(rounding)))
+        locked = keep_rows(bare, selection._replace(kept=kept))
     q = guess
     if holonomic_rows(layout(locked)).size:
         q = _unwind_hinges(locked, guess, nearest_configuration(locked, guess, start, t, rank_tol), t)
@@ -240,7 +239,7 @@ def _close(bare, guess, start, passed, selection, v, t, rank_tol, atol, scene):
         q,
         v,
         residual,
-        RESULTS.where(good, RESULTS.successful, RESULTS.not_assembled),  # pyright: ignore[reportArgumentType]
+        first_of([(~good, RESULTS.not_assembled), (~is_clear, RESULTS.unclear_rank)], RESULTS.successful),
         jnp.max(distances, initial=0.0),
         passed,
         1 - kept,

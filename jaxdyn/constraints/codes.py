@@ -72,6 +72,11 @@ class RESULTS(eqx.Enumeration):
     indefinite = "The matrix Q of the quadratic program is not positive definite."
     # Of fits.
     stopped = "The callback or the time limit stopped the fit."
+    # Of constrained dynamics; at the end, see `CODES`.
+    unclear_rank = (
+        "The rank of the constraint rows is unclear: singular values that count and those that do not differ by less than a "
+        "factor of 100. Give more digits, or a rank_tol."
+    )
 
     # An enumeration of equinox does not list its names.
     _names.extend(name for name in vars() if not name.startswith("_"))

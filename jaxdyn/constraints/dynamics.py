@@ -22,6 +22,8 @@ from jaxdyn.constraints.codes import RESULTS, Outcome, require_finite
 from jaxdyn.constraints.rank import (
     check_tolerance,
     eps_of,
+    fill_diagonal,
+    has_clear_rank,
     least_pivot,
     least_refinable_pivot,
     pseudo_inverse,
@@ -30,7 +32,8 @@ from jaxdyn.constraints.rank import (
     regular_gram,
     tolerance,
 )
-from jaxdyn.constraints.redundancy import has_selection
+from jaxdyn.constraints.redundancy import distribute_multipliers, has_selection, row_mask
+from jaxdyn.constraints.selection import independent_rows, rank_code
 from jaxdyn.dynamics.quantities import bias_force, mass_matrix
 from jaxdyn.dynamics.recursions import aba_with_columns
 from jaxdyn.lie.so3 import matmul
@@ -124,6 +127,7 @@ def constrained_dynamics(
     if not places:
         return _free_dynamics(scene, q, v, total_force(scene, q, v, tau, t), t)
     state = q, v, tau, t
+    scene = independent_rows(scene, q, t, rank_tol)
     if method != "rank_aware":
         return _by_schur(scene, *state, method=method)
     # If there are more rows than velocities, they are dependent at every state, and Cholesky would fail for all samples: such
@@ -131,7 +135,9 @@ def constrained_dynamics(
     # invalid. A selection leaves independent rows and zeros in the place of the dropped ones, so that the count says nothing.
     is_wide = places[-1].end > scene.nv and not has_selection(scene)
     a, lam, rank, result = (_by_rank if is_wide else _by_pivots)(rank_tol, scene, *state)
-    return ConstrainedDynamics(a, lam, rank, result, places)
+    # Redundant rows share the constraint force: the one of least norm is unique.
+    lam = distribute_multipliers(scene, q, t, lam)
+    return ConstrainedDynamics(a, lam, rank, rank_code(scene, result), places)
 
 
 def _by_rank(rank_tol, scene: Scene, q, v, tau, t):
@@ -158,6 +164,9 @@ def _by_pivots(rank_tol, scene: Scene, q, v, tau, t):
     normal = cholesky(regular_gram(Y) if has_selection(scene) else matmul(Y.T, Y))
     quality = jnp.where(metric.is_definite(), quality_of(normal), jnp.nan)
     lam, is_poor = _solve_with_refinement(normal, Y, deficit, quality, rank_tol)
+    if Y.shape[1] == Y.shape[0] and not has_selection(scene):
+        # Rows that leave no motion unless some repeat others: the fallback tells whether they do.
+        is_poor = is_poor | ~(quality > least_pivot(q, rank_tol))
     a, lam = (mark_invalid(is_poor, x) for x in (metric.unwhiten(free + matmul(Y, lam)), lam))
     rank, result = _rank_and_result(scene, q, quality)
     return a, lam, rank, require_finite(result, a)
@@ -174,9 +183,15 @@ def _rank_and_result(scene: Scene, q, quality):
     """Rank and code of rows that are treated as independent, from the ratio of their pivots."""
     # Rounding makes zero pivots of a singular matrix about nv eps times the largest; the limit is ten times that. NaN marks a
     # mass matrix that is not positive definite.
-    rank = jnp.asarray(layout(scene)[-1].end, jnp.int32)
+    rank = _count_rows(scene)
     result = RESULTS.where(quality > 10 * scene.nv * eps_of(q), RESULTS.successful, RESULTS.dependent_rows)  # pyright: ignore[reportArgumentType]
     return rank, RESULTS.where(jnp.isfinite(quality), result, RESULTS.singular_mass_matrix)
+
+
+def _count_rows(scene: Scene) -> Array:
+    """Number of rows that count, of independent ones."""
+    count = jnp.sum(row_mask(scene)) if has_selection(scene) else layout(scene)[-1].end
+    return jnp.asarray(count).astype(jnp.int32)
 
 
 def total_force(scene: Scene, q, v, tau, t) -> Array:
@@ -202,7 +217,7 @@ def solve_rows(scene: Scene, q, v, force, t, row: Rows, rank_tol: float | None =
 
 def _constrain_acceleration(scene: Scene, metric: MassFactor, Y, free, deficit, gamma, rank_tol) -> ConstrainedDynamics:
     """Dynamics by Gauss's principle: the least change of the free acceleration, in the metric M, that satisfies the rows."""
-    lam, w, rank = _min_norm_solution(Y, deficit, rank_tol)
+    lam, w, inverse = _min_norm_solution(Y, deficit, rank_tol)
     # For contradictory rows the pseudo-inverse silently returns a least-squares compromise, which leaves a residual. The residual
     # is compared with the terms that cancel in it, whose sizes are bounded by Cauchy-Schwarz: |Y_i . w| <= |Y_i| |w|.
     residual = jnp.abs(deficit - matmul(Y.T, w))
@@ -210,12 +225,13 @@ def _constrain_acceleration(scene: Scene, metric: MassFactor, Y, free, deficit, 
     # Rows that count as dependent may differ by the rank tolerance, and leave a residual of that size.
     limit = max(eps_of(Y) ** 0.5, tolerance(rank_tol, Y))
     are_satisfied = jnp.all(residual <= limit * (sizes + jnp.max(sizes)))
-    result = RESULTS.where(are_satisfied, RESULTS.successful, RESULTS.contradictory_rows)  # pyright: ignore[reportArgumentType]
+    result = RESULTS.where(has_clear_rank(Y.T, inverse.T, rank_tol), RESULTS.successful, RESULTS.unclear_rank)  # pyright: ignore[reportArgumentType]
+    result = RESULTS.where(are_satisfied, result, RESULTS.contradictory_rows)
     result = RESULTS.where(metric.is_definite(), result, RESULTS.singular_mass_matrix)
     a = metric.unwhiten(free + w)
     if is_standalone():  # exported code has no `result`; it returns a status, which invalid values set
         a = mark_invalid(~(are_satisfied & metric.is_definite()), a)
-    return ConstrainedDynamics(a, lam, rank, result, layout(scene))
+    return ConstrainedDynamics(a, lam, rank_of(Y, inverse).astype(jnp.int32), result, layout(scene))
 
 
 def _whiten_columns(scene: Scene, q, v, force, t, A):
@@ -248,27 +264,29 @@ def _solve_with_refinement(factor, Y, right, quality, rank_tol):
 
 
 def _min_norm_solution(Y, deficit, rank_tol):
-    """lam of least norm, w = Y lam, which is the shortest w with Y^T w = deficit, and the rank of Y."""
+    """lam of least norm, w = Y lam, which is the shortest w with Y^T w = deficit, and the pseudo-inverse of Y."""
     # More rows than velocities are always dependent: the normal equations would fail for all samples, and are not tried.
     inverse = pseudo_inverse(Y, tolerance(rank_tol, Y), Y.shape[1] > Y.shape[0])
     w = matmul(inverse.T, deficit)
-    return matmul(inverse, w), w, rank_of(Y, inverse).astype(jnp.int32)
+    return matmul(inverse, w), w, inverse
 
 
 def _by_schur(scene: Scene, q, v, tau, t, *, method: str) -> ConstrainedDynamics:
     """Dynamics with independent rows, by the Cholesky factor of A M^-1 A^T."""
     by_tree = method == "range_space" and isinstance(scene.system, Model)
     a, lam, independent, is_definite = kernel(_by_aba if by_tree else _by_delassus)(scene, q, v, tau, t)
+    if has_selection(scene):
+        independent = independent & (_count_rows(scene) == lam.shape[0])
     result = RESULTS.where(independent, RESULTS.successful, RESULTS.dependent_rows)  # pyright: ignore[reportArgumentType]
     result = RESULTS.where(is_definite, result, RESULTS.singular_mass_matrix)
-    rank = jnp.asarray(lam.shape[0], jnp.int32)
-    return ConstrainedDynamics(a, lam, rank, require_finite(result, a), layout(scene))
+    result = rank_code(scene, require_finite(result, a))
+    return ConstrainedDynamics(a, lam, _count_rows(scene), result, layout(scene))
 
 
 def _by_delassus(scene: Scene, q, v, tau, t):
     """Acceleration, multipliers, whether the rows are independent, and whether M is definite."""
     metric, Y, free, deficit, _ = _gauss_problem(scene, q, v, tau, t)
-    lam, independent = _solve_delassus(matmul(Y.T, Y), deficit, scene.nv)
+    lam, independent = _solve_delassus(scene, matmul(Y.T, Y), deficit)
     return metric.unwhiten(free + matmul(Y, lam)), lam, independent, metric.is_definite()
 
 
@@ -279,17 +297,18 @@ def _by_aba(scene: Scene, q, v, tau, t):
     """
     row, force = rows(scene, q, v, t), total_force(scene, q, v, tau, t)
     free, X = aba_with_columns(scene.system, q, v, force, row.A.T)
-    lam, independent = _solve_delassus(matmul(row.A, X), row.gamma - matmul(row.A, free), scene.nv)
+    lam, independent = _solve_delassus(scene, matmul(row.A, X), row.gamma - matmul(row.A, free))
     return free + matmul(X, lam), lam, independent, jnp.isfinite(free).all()
 
 
-def _solve_delassus(delassus, deficit, nv: int):
+def _solve_delassus(scene: Scene, delassus, deficit):
     """lam with A M^-1 A^T lam = deficit by Cholesky, and whether the rows were independent."""
     # A X is symmetric up to rounding. Cholesky reads one triangle only; the mean gives both the same weight.
-    factor = cholesky(0.5 * (delassus + delassus.T))
+    delassus = 0.5 * (delassus + delassus.T)
+    factor = cholesky(fill_diagonal(delassus) if has_selection(scene) else delassus)
     # The same limit for pivots as in `_rank_and_result`. The factor's diagonal has their square roots.
     roots = jnp.diagonal(factor)
-    independent = jnp.min(roots) > (10 * nv * eps_of(delassus)) ** 0.5 * jnp.max(roots)
+    independent = jnp.min(roots) > (10 * scene.nv * eps_of(delassus)) ** 0.5 * jnp.max(roots)
     return solve_cholesky(factor, deficit), independent
 
 
@@ -311,6 +330,7 @@ def projections(
     """
     scene = as_scene(scene)
     q, t = check_state(scene.system, q=q, t=t)
+    scene = independent_rows(scene, q, t, rank_tol)
     metric, Y = kernel(whiten_rows)(scene, q, t)
     inverse = pseudo_inverse(Y, tolerance(rank_tol, Y))
     tangential = jnp.eye(Y.shape[0], dtype=Y.dtype) - matmul(Y, inverse)
@@ -343,6 +363,7 @@ def second_fundamental_form(
     """
     scene = as_scene(scene)
     q, v, t = check_state(scene.system, q=q, v=v, t=t)
+    scene = independent_rows(scene, q, t, rank_tol)
     # C v without forming C: the bias force h = C v + gravity, less its value at v = 0.
     coriolis = bias_force(scene.system, q, v, t) - bias_force(scene.system, q, jnp.zeros_like(v), t)
     metric, Y = kernel(whiten_rows)(scene, q, t)

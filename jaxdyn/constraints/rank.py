@@ -8,7 +8,7 @@ import jax.numpy as jnp
 from jax import lax
 from jaxtyping import Array, Bool, Float
 
-from jaxdyn.compile import batch, kernel, mark_invalid, pseudo_inverse_by_rotations, variant
+from jaxdyn.compile import batch, gram_eigenvectors, kernel, mark_invalid, pseudo_inverse_by_rotations, variant
 from jaxdyn.compile.known import is_concrete
 from jaxdyn.lie.so3 import matmul
 from jaxdyn.systems.mass_factor import cholesky, solve_cholesky
@@ -17,6 +17,12 @@ from jaxdyn.systems.mass_factor import cholesky, solve_cholesky
 _MAX_OPERATIONS = 10_000
 # Columns up to which Jacobi rotations take about as long as the normal equations in blocks, and compile faster.
 _MAX_COLUMNS = 40
+# Rows whose distance from the span of the others is below this part of their length may be redundant. Numbers written with four
+# digits leave 1e-4.
+_DOUBTFUL = 1e-3
+# Factor between the least singular value that counts and the largest that does not, or between distances of rows from the span of
+# the others, below which the numbers of a scene do not say what its rank is.
+LEAST_GAP = 100.0
 
 
 def check_tolerance(rank_tol: float | None) -> float | None:
@@ -53,12 +59,21 @@ def least_refinable_pivot(like, rank_tol: float | None) -> float:
     return max(eps_of(like) ** 0.75, (100 * tolerance(rank_tol, like)) ** 2)
 
 
-def regular_gram(Y: Float[Array, "n m"]) -> Float[Array, "m m"]:
-    """Y^T Y, with the largest entry of its diagonal in place of zeros there: a zero column is a row that was dropped.
+def clear_pivot(like) -> float:
+    """Pivot above which a row is independent beyond doubt."""
+    return max(_DOUBTFUL, 10 * tolerance(None, like))
 
-    Solutions with right-hand sides that are zero there, such as (Y^T Y)^-1 Y^T, are those of the other columns.
+
+def regular_gram(Y: Float[Array, "n m"]) -> Float[Array, "m m"]:
+    """Y^T Y, made regular by `fill_diagonal`."""
+    return fill_diagonal(matmul(Y.T, Y))
+
+
+def fill_diagonal(gram: Float[Array, "m m"]) -> Float[Array, "m m"]:
+    """A Gram matrix with the largest entry of its diagonal in place of zeros there, which are of rows that were dropped.
+
+    Solutions with right-hand sides that are zero there, such as (Y^T Y)^-1 Y^T, are those of the other rows.
     """
-    gram = matmul(Y.T, Y)
     squares = jnp.diagonal(gram)
     largest = jnp.max(squares)
     # The largest entry, so that the filled pivots never are the least one in `quality_of`.
@@ -174,6 +189,30 @@ def rank_of(A: Float[Array, "n m"], inverse: Float[Array, "m n"]) -> Float[Array
     """Rank of a matrix with a pseudo-inverse A^+: the trace of A^+ A, rounded to an integer."""
     # Each singular value above the tolerance contributes 1 up to rounding.
     return jnp.round(jnp.sum(inverse * A.T))
+
+
+@variant(lambda *_: jnp.asarray(True))  # programs of single numbers have no code to say it with
+def has_clear_rank(A: Float[Array, "n m"], inverse: Float[Array, "m n"], rank_tol: float | None) -> Bool[Array, ""]:
+    """Decide whether the rank of rows A, with their pseudo-inverse, is clear; a constant.
+
+    The least singular value that counts has to be `LEAST_GAP` times the largest that does not. Rows that leave no motion have to
+    be independent beyond doubt: a row that differs from a combination of others by the rounding of its numbers leaves none, too.
+    """
+    (A, inverse), least = lax.stop_gradient((A, inverse)), tolerance(rank_tol, A)
+    is_full = (rank_of(A, inverse) >= A.shape[1]) & (rank_tol is None and A.shape[0] >= A.shape[1])
+
+    def compare():
+        values = jnp.sqrt(gram_eigenvectors(A)[0])
+        counts = values > least * values[0]
+        kept = jnp.min(jnp.where(counts, values, jnp.inf))
+        squares = jnp.sum(A * A, 1, keepdims=True)
+        unit = A / jnp.sqrt(jnp.where(squares > 0, squares, jnp.ones_like(squares)))
+        is_sure = jnp.sqrt(gram_eigenvectors(unit)[0][-1]) > clear_pivot(A)
+        return (kept >= LEAST_GAP * jnp.max(jnp.where(counts, 0.0, values))) & (~is_full | is_sure)
+
+    # 1 / |A^+| is below the least singular value that counts. No other one is above the tolerance.
+    sizes = LEAST_GAP * least * jnp.sqrt(jnp.sum(A * A)) * jnp.sqrt(jnp.sum(inverse * inverse))
+    return batch.cond(is_full | ~(sizes <= 1), compare, lambda: jnp.asarray(True))
 
 
 def condition_number(A: Float[Array, "n m"], inverse: Float[Array, "k l"]) -> Float[Array, ""]:

@@ -30,15 +30,16 @@ from jaxdyn.systems.scene import Scene
 class KeptRows(Constraint):
     """A constraint whose dropped rows are zero.
 
-    `kept` (n,) is 1 for rows that stay, 0 for dropped ones; `rounding` () and `least` () as in `Selection`.
+    `kept` (n,) is 1 for rows that stay, 0 for dropped ones; `rounding`, `least` and `gap` () as in `Selection`.
     """
 
-    # Arrays, not static: another choice of rows in the course of a motion runs the same program. The two numbers belong to the
+    # Arrays, not static: another choice of rows in the course of a motion runs the same program. The three numbers belong to the
     # scene; each constraint has them because a scene has no place of its own for them.
     inner: Constraint
     kept: Float[Array, " n"]
     rounding: Float[Array, ""]
     least: Float[Array, ""]
+    gap: Float[Array, ""]
     name: str = eqx.field(static=True)
 
     def position(self, system: SystemLike, q: Float[Array, " nq"], t: Number) -> Array | None:
@@ -90,18 +91,22 @@ class Selection(NamedTuple):
 
     `rounding` (): the part of their size by which the dropped rows are open, or differ from combinations of the kept ones.
     `least` (): the least pivot of the kept rows, in the metric of the mass matrix, below which they are chosen anew.
+    `gap` (): least distance of a kept row from the others over the largest of a dropped one, where they were told apart, and
+    `gap_here` () at the configuration.
     """
 
     kept: Float[Array, " nc"]
     rounding: Float[Array, ""]
     least: Float[Array, ""]
+    gap: Float[Array, ""]
+    gap_here: Float[Array, ""]
 
 
 def keep_rows(scene: Scene, selection: Selection) -> Scene:
     """The scene with the rows that are not kept set to zero."""
-    kept, rounding, least = map(jnp.asarray, selection)
+    kept, *numbers = map(jnp.asarray, selection[:4])
     constraints = tuple(
-        KeptRows(constraint, kept[place.start : place.end], rounding, least, constraint.name)  # pyright: ignore[reportArgumentType]
+        KeptRows(constraint, kept[place.start : place.end], *numbers, constraint.name)  # pyright: ignore[reportArgumentType]
         for constraint, place in zip(scene.constraints, layout(scene), strict=True)
     )
     return eqx.tree_at(lambda scene: scene.constraints, scene, constraints, is_leaf=lambda x: isinstance(x, tuple))
@@ -114,7 +119,8 @@ def has_selection(scene: Scene) -> bool:
 
 def exchange_rows(scene: Scene, rows: Float[Array, " n"]) -> Scene:
     """A scene of `keep_rows` with another choice of rows, in the form of `rows_of`."""
-    return keep_rows(all_rows(scene), Selection(rows[:-1], rounding_of(scene), rows[-1]))
+    gap = scene.constraints[0].gap
+    return keep_rows(all_rows(scene), Selection(rows[:-1], rounding_of(scene), rows[-1], gap, gap))
 
 
 def all_rows(scene: Scene) -> Scene:
@@ -192,12 +198,14 @@ def gap_of_redundant(scene: Scene, q, t) -> Float[Array, ""]:
 
 
 def distribute_multipliers(scene: Scene, q, t, lam: Float[Array, " nc"]) -> Float[Array, " nc"]:
-    """Multipliers of least norm of all rows, with the same force as `lam` of the kept ones.
+    """Multipliers of least norm of all rows, with the same force as `lam` of the kept ones, if some were dropped.
 
     With the dropped rows as combinations A_d = C A_k of the kept ones, lam_k + C^T lam_d = lam, whose shortest solution is
     [1; C] (1 + C^T C)^-1 lam.
     """
     # Without this the loads of redundant bearings would depend on the choice of rows, and jump where it changes.
+    if not has_selection(scene):
+        return lam
     kept, whole = row_mask(scene), all_rows(scene)
     return _distribute(Scene(whole.system, whole.constraints), q, jnp.asarray(t, q.dtype), lam, kept)
 

@@ -27,27 +27,45 @@ from jaxdyn.compile import entry_point, evaluate, kernel, mark_invalid, pseudo_i
 from jaxdyn.compile.batch import cond
 from jaxdyn.compile.known import is_concrete, is_tracing, stop_gradient
 from jaxdyn.constraints.base import constraint_jacobian, holonomic_rows, layout, position_residual
-from jaxdyn.constraints.rank import check_tolerance, eps_of, least_pivot_of, pseudo_inverse, rank_of, tolerance
-from jaxdyn.constraints.redundancy import Selection, all_rows, largest_of_each, largest_opening, rows_of
+from jaxdyn.constraints.codes import RESULTS
+from jaxdyn.constraints.rank import (
+    LEAST_GAP,
+    check_tolerance,
+    clear_pivot,
+    eps_of,
+    has_clear_rank,
+    least_pivot_of,
+    pseudo_inverse,
+    rank_of,
+    tolerance,
+)
+from jaxdyn.constraints.redundancy import (
+    Selection,
+    all_rows,
+    has_selection,
+    keep_rows,
+    largest_of_each,
+    largest_opening,
+    rows_of,
+)
 from jaxdyn.constraints.tolerances import coordinate_sizes
 from jaxdyn.dynamics.quantities import mass_matrix
 from jaxdyn.lie.so3 import matmul
-from jaxdyn.model.arguments import Number, Numbers, check_state, state_dtype
+from jaxdyn.model.arguments import Numbers, check_state, state_dtype
 from jaxdyn.model.configuration import neutral
 from jaxdyn.model.tree import Model
 from jaxdyn.systems.mass_factor import cholesky, mass_factor
 from jaxdyn.systems.scene import Scene, as_scene
 from jaxdyn.systems.system import SceneLike, displace, retract
 
-# Rows whose distance from the span of the others is below this part of their length may be redundant. Numbers written with four
-# digits leave 1e-4.
-_DOUBTFUL = 1e-3
 # Distance at which doubtful rows are tested, rad or lengths of the mechanism, and Newton's steps that go there. Far enough for
 # the rows of a singular position to separate, near enough for Newton's method to stay on the branch.
 _FAR, _NEWTON_STEPS = 0.2, 12
 # The rows are chosen anew when their least pivot has fallen to this part of its value at their choice. A pivot is the square of a
 # sine, so that the sine of the angle between rows has halved.
 _EXCHANGED_AT = 0.25
+# Rows whose distances differ by less than this part are equally far.
+_ALIKE = 1e-3
 # A row below this part of the largest one of its constraint has no direction of its own: rounding is all that it holds.
 _TINY_ROW = 1e-3
 
@@ -64,61 +82,134 @@ def unit_rows(scene: Scene, q, t) -> Float[Array, "nc nv"]:
     return A * jnp.where(some, 1 / jnp.sqrt(jnp.where(some, squares, jnp.ones_like(squares))), squares)[:, None]
 
 
-def eliminate(B: Float[Array, "nc nv"], least: float, first: Float[Array, " nc"], most=None) -> tuple[Array, Array]:
-    """Independent rows of B by Gram-Schmidt with pivots: a mask (nc,) of 1 and 0, and the largest distance () of another row.
+def eliminate(B: Float[Array, "nc nv"], least: float, first: Float[Array, " nc"], most=None) -> tuple[Array, ...]:
+    """Independent rows of B by Gram-Schmidt with pivots.
 
     The pivot of a row is its distance from the span of those that were kept before it. Rows with `first` = 1 come before all
     others; a row is kept where its pivot is above `least`, and `most` rows at most.
+
+    **Returns:** a mask (nc,) of 1 and 0, the largest distance () of a row that is not kept, and the least pivot () of the others.
     """
 
     # Not an SVD: it counts independent rows but does not name them, and LAPACK in a batch can deadlock (see `solve_square`).
     def keep_next(_, state):
-        rest, kept = state
+        rest, kept, least_kept = state
         # Rounding leaves a kept row a length of eps; it must not be chosen again.
         lengths = jnp.sqrt(jnp.sum(rest * rest, 1)) * (1 - kept)
-        row = jnp.argmax(jnp.where((first > 0) & (lengths > least), lengths + jnp.max(lengths), lengths))
+        order = jnp.where((first > 0) & (lengths > least), lengths + jnp.max(lengths), lengths)
+        # Rows of symmetric mechanisms are equally far but for rounding, which differs between programs: the first one counts.
+        row = jnp.argmax(order >= (1 - _ALIKE) * jnp.max(order))
         pivot = lengths[row]
         along = rest[row] / jnp.where(pivot > 0, pivot, jnp.ones_like(pivot))
         is_kept = pivot > least if most is None else (pivot > least) & (jnp.sum(kept) < most)
         rest = jnp.where(is_kept, rest - matmul(rest, along)[:, None] * along[None], rest)
-        return rest, kept.at[row].add(is_kept.astype(B.dtype))
+        least_kept = jnp.where(is_kept, jnp.minimum(least_kept, pivot), least_kept)
+        return rest, kept.at[row].add(is_kept.astype(B.dtype)), least_kept
 
-    rest, kept = lax.fori_loop(0, min(B.shape), keep_next, (B, jnp.zeros_like(B[:, 0])))
-    return kept, jnp.max(jnp.sqrt(jnp.sum(rest * rest, 1)) * (1 - kept))
+    start = B, jnp.zeros_like(B[:, 0]), jnp.full((), jnp.inf, B.dtype)
+    rest, kept, least_kept = lax.fori_loop(0, min(B.shape), keep_next, start)
+    return kept, jnp.max(jnp.sqrt(jnp.sum(rest * rest, 1)) * (1 - kept)), least_kept
 
 
-def select_rows(
-    scene: Scene, q: Float[Array, " nq"], t: Number, rank_tol: float | None, is_rounded: bool | None = None
-) -> Selection:
+def independent_rows(scene: Scene, q, t, rank_tol: float | None = None) -> Scene:
+    """The scene with the rows that count at a configuration: what every function with constraints computes with.
+
+    Numbers of a file are rounded, so that rows repeat others but for the rounding: no tolerance of the dtype tells them from
+    independent ones. They are set to zero here (`keep_rows`); all rows are NaN where rounding hides which ones these are.
+    Scenes of exact numbers, and those that have a choice of rows or a `rank_tol`, are returned as they are: there singular
+    values below the tolerance count as zero.
+    """
+    if not (scene.rounding and scene.constraints) or rank_tol is not None or has_selection(scene):
+        return scene
+    selection = _select_for_state(scene, q, t)
+    if is_concrete(selection) and np.all(selection.kept == 1):
+        return scene
+    return keep_rows(scene, hide_unclear(selection)._replace(gap=jnp.minimum(selection.gap, selection.gap_here)))
+
+
+def hide_unclear(selection: Selection) -> Selection:
+    """The selection with NaN for all rows where it is not clear which ones are independent, so that no result is a guess."""
+    return selection._replace(kept=jnp.where(selection.gap < LEAST_GAP, jnp.nan, selection.kept))
+
+
+def _select_in_kernel(scene: Scene, q, t) -> Selection:
+    """All rows; invalid where some may repeat others. The choice of rows takes places that depend on data."""
+    every, least = _every_row(scene, q.dtype), clear_pivot(q)
+    is_doubtful = ~(_least_distance(Scene(scene.system, scene.constraints), q, t) > least)
+    return every._replace(kept=mark_invalid(is_doubtful, jnp.where(is_doubtful, jnp.nan, jnp.asarray(every.kept))))
+
+
+@variant(_select_in_kernel)
+def _select_for_state(scene: Scene, q, t) -> Selection:
+    return select_rows(scene, q, t, None)
+
+
+def rank_code(scene: Scene, result: Any) -> Any:
+    """The result, or `unclear_rank` where the rows of a scene of `independent_rows` are not told apart by a factor of 100."""
+    if not has_selection(scene):
+        return result
+    is_clear = scene.constraints[0].gap >= LEAST_GAP
+    return RESULTS.where(is_clear, result, RESULTS.unclear_rank)  # pyright: ignore[reportArgumentType]
+
+
+def select_rows(scene: Scene, q, t: Any, rank_tol: float | None = None) -> Selection:
     """The independent rows of a mechanism at a configuration on its constraints; a constant.
 
-    With `rank_tol` rows count whose pivots are above it, at this configuration; without it as the module says. `is_rounded`: that
-    of the scene by default.
+    With `rank_tol` rows count whose pivots are above it, at this configuration; without it as the module says. Concrete and
+    traced arguments give the same rows. Infinite or NaN rows are all kept; `assemble` and `simulate` report such states.
     """
     # A choice has no derivative: forces do not select rows, and the scene, q and t enter without tangents.
-    is_rounded = scene.is_rounded if is_rounded is None else is_rounded
     bare = stop_gradient(Scene(scene.system, scene.constraints))
-    q, t = stop_gradient((q, jnp.asarray(t, q.dtype)))
-    count = layout(bare)[-1].end if scene.constraints else 0
-    none = jnp.zeros((), q.dtype)
-    every = jnp.ones((count,), q.dtype), none, none
-    apart = rank_tol if rank_tol is not None else clear_pivot(q)
-
-    def select():
-        # First the rows that are independent beyond doubt, then the others a finite distance away.
-        kept, rest = eliminate(kernel(unit_rows)(bare, q, t), apart, jnp.zeros_like(every[0]))
-        if rank_tol is None:
-            kept, rest = _select_far_away(bare, q, t, kept, apart, is_rounded)
-        least = _EXCHANGED_AT * kernel(_pivot_of)(bare, q, t, kept)
-        return kept, jnp.maximum(rest, kernel(largest_opening)(bare, q, t, kept)), least
-
+    q, t = stop_gradient((q, t))
+    every, count = _every_row(bare, q.dtype), layout(bare)[-1].end if scene.constraints else 0
     if count == 0:
-        return Selection(*every)
+        return every
+    apart = rank_tol if rank_tol is not None else clear_pivot(q)
+    if is_concrete(bare, q, t):
+        # NumPy decides first, so that nothing is compiled for independent rows.
+        B = evaluate(unit_rows, bare, np.asarray(q), np.asarray(t, q.dtype), is_input=not is_tracing())
+        if not np.isfinite(B).all() or np.sum(pivot_rows(B)[1] > apart) == count:
+            return every
+        with jax.ensure_compile_time_eval():
+            chosen = _select_by_program(bare, jnp.asarray(q), jnp.asarray(t, q.dtype), rank_tol)
+        return Selection(*map(np.asarray, chosen))  # pyright: ignore[reportArgumentType]
+    t = jnp.asarray(t, q.dtype)
     if count > scene.nv:
-        return Selection(*select())
+        return _select(bare, q, t, rank_tol)
     # Most scenes have independent rows: one Cholesky factorisation says so, and the search is skipped.
-    doubtful = ~(_least_distance(bare, q, t) > apart)
-    return Selection(*cond(doubtful, select, lambda: every))
+    is_doubtful = ~(_least_distance(bare, q, t) > apart)
+    return Selection(
+        *cond(is_doubtful, lambda: _select(bare, q, t, rank_tol), lambda: Selection(*map(jnp.asarray, every)))
+    )
+
+
+def _every_row(scene: Scene, dtype) -> Selection:
+    none, far = np.zeros((), dtype), np.full((), np.inf, dtype)
+    count = layout(scene)[-1].end if scene.constraints else 0
+    return Selection(np.ones(count, dtype), none, none, far, far)  # pyright: ignore[reportArgumentType]
+
+
+@entry_point
+def _select_by_program(scene: Scene, q, t, rank_tol):
+    return _select(scene, q, t, rank_tol)
+
+
+def _select(scene: Scene, q, t, rank_tol) -> Selection:
+    """Rows that are independent beyond doubt at q, and of the others those that are independent a finite distance away."""
+    B = kernel(unit_rows)(scene, q, t)
+    apart = rank_tol if rank_tol is not None else clear_pivot(q)
+    kept, rest, pivot = sure, _, pivot_here = eliminate(B, apart, jnp.zeros_like(B[:, 0]))
+    if rank_tol is None:
+        kept, rest, far = _select_far_away(scene, q, t, sure, apart)
+        has_more = jnp.any(kept > sure)
+        pivot = jnp.where(has_more, far, jnp.maximum(far, pivot))
+        pivot_here = jnp.where(has_more, eliminate(kept[:, None] * B, 0.0, sure)[2], pivot_here)
+    rounding = jnp.maximum(rest, kernel(largest_opening)(scene, q, t, kept))
+    # A gap to nothing is one to the rounding of the numbers: where no row is dropped, those in doubt may be dependent here.
+    below = jnp.maximum(rest, eps_of(q))
+    below_here = jnp.where(jnp.all(kept == 1), jnp.maximum(below, scene.rounding), jnp.maximum(below, rounding))
+    least = _EXCHANGED_AT * kernel(_pivot_of)(scene, q, t, kept)
+    return Selection(kept, rounding, least, pivot / below, pivot_here / below_here)
 
 
 def renew_rows(scene: Scene, q, t, is_projected: bool) -> Float[Array, " n"]:
@@ -187,11 +278,11 @@ def _pivot_of(scene: Scene, q, t, kept):
 def may_have_redundant_rows(scene: Scene) -> bool:
     """True where some set of coupled coordinates has at least as many rows as coordinates: it moves only if rows are redundant.
 
-    True for a scene that is traced, too. A motion with redundant rows among fewer than that is right without a selection,
-    by the rank at every evaluation, in short steps.
+    True for a scene of rounded numbers, and for one that is traced, too. A motion of exact numbers with redundant rows among
+    fewer than that is right without a selection, by the rank at every evaluation, in short steps.
     """
     bare = Scene(scene.system, scene.constraints)
-    if not is_concrete(bare):
+    if scene.rounding or not is_concrete(bare):
         return True
     # Away from the neutral configuration, at which entries of A may vanish that do not vanish elsewhere.
     step = np.random.default_rng(0).uniform(0.1, 0.9, scene.nv).astype(state_dtype(scene.system))
@@ -221,12 +312,7 @@ def _least_distance(scene: Scene, q, t):
     return jnp.min(jnp.diagonal(cholesky(matmul(B, B.T))))
 
 
-def clear_pivot(like) -> float:
-    """Pivot above which a row is independent beyond doubt."""
-    return max(_DOUBTFUL, 10 * tolerance(None, like))
-
-
-def _select_far_away(scene: Scene, q, t, sure, apart: float, is_rounded: bool):
+def _select_far_away(scene: Scene, q, t, sure, apart: float):
     """`eliminate` at a configuration a finite distance away; the rows in `sure` are independent already.
 
     A row that differs little from a combination of the others, there too, counts as independent only in a scene of exact numbers,
@@ -262,53 +348,21 @@ def _select_far_away(scene: Scene, q, t, sure, apart: float, is_rounded: bool):
         place = retract(scene.system, lax.fori_loop(0, _NEWTON_STEPS, close, place))
     B = kernel(unit_rows)(scene, place, t)
     # Twice the threshold at q: a row at the threshold has to have separated, not to have changed by rounding.
-    kept, rest = eliminate(B, 2 * apart, sure)
+    kept, rest, pivot = eliminate(B, 2 * apart, sure)
     kept = jnp.maximum(sure, kept)  # pivots of sure rows may be smaller there; they stay
-    if is_rounded:
-        return kept, rest
+    if scene.rounding:
+        return kept, rest, pivot
     # Exact numbers: what is left of a row is its true direction, unless the row contradicts the others, or would leave no motion
     # at all. In both cases the difference is rounding in the numbers of the scene after all.
-    every, least_rest = eliminate(B, least, kept)
+    every, least_rest, least_pivot = eliminate(B, least, kept)
     met = largest_opening(scene, q, t, 1 - every * (1 - kept)) <= eps_of(q) ** 0.4
     counts = met & (jnp.sum(every) < scene.nv)
-    return jnp.where(counts, every, kept), jnp.where(counts, least_rest, rest)
+    return tuple(jnp.where(counts, x, y) for x, y in ((every, kept), (least_rest, rest), (least_pivot, pivot)))
 
 
 def most_rounding(dtype) -> float:
     """Opening of dropped rows above which they are not redundant but contradict the others."""
     return 10 * clear_pivot(jnp.zeros((), dtype))
-
-
-def select_concrete_rows(
-    scene: Scene, q, t, rank_tol: float | None, is_rounded: bool | None = None
-) -> tuple[Selection, int]:
-    """`select_rows` for concrete arguments, and the number of rows that are independent there.
-
-    Infinite or NaN rows are all kept, and none of them counts as independent; `assemble` and `simulate` report such states.
-    """
-    is_rounded = scene.is_rounded if is_rounded is None else is_rounded
-    bare = Scene(scene.system, scene.constraints)
-    B = evaluate(unit_rows, bare, q, t, is_input=not is_tracing())
-    apart = clear_pivot(B) if rank_tol is None else rank_tol
-    none = np.zeros((), B.dtype)
-    every = Selection(np.ones(B.shape[0], B.dtype), none, none)  # pyright: ignore[reportArgumentType]
-    if not np.isfinite(B).all():  # the path of `assemble` has diverged; LAPACK raises an error of its own
-        return every, 0
-    # No pivot is below the least singular value. NumPy decides here, so that nothing is compiled for independent rows.
-    if 0 < B.shape[0] <= B.shape[1] and np.linalg.svd(B, compute_uv=False)[-1] > apart:
-        return every, B.shape[0]
-    # The SVD is sufficient, not necessary: the least singular value may be far below the least pivot.
-    pivots = pivot_rows(B)[1]
-    if np.sum(pivots > apart) == B.shape[0]:
-        return every, B.shape[0]
-    with jax.ensure_compile_time_eval():
-        selection = _select_by_program(bare, jnp.asarray(q), jnp.asarray(t, q.dtype), rank_tol, is_rounded)
-    return Selection(*map(np.asarray, selection)), int(np.sum(pivots > tolerance(rank_tol, B)))  # pyright: ignore[reportArgumentType]
-
-
-@entry_point
-def _select_by_program(scene: Scene, q, t, rank_tol, is_rounded):
-    return select_rows(scene, q, t, rank_tol, is_rounded)
 
 
 def pivot_rows(B: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -338,9 +392,10 @@ def degrees_of_freedom(
     **Arguments:** `scene`, a `Scene` or a system; `q` (nq,); `t`, s; `rank_tol`: singular values below `rank_tol` times the
     largest count as zero, by default $\epsilon^{4/7}$, 1e-9 in float64.
 
-    **Returns:** an int for concrete arguments, an integer array () for traced ones.
+    **Returns:** an int for concrete arguments, an integer array () for traced ones, which is -1 where rounding of the numbers
+    hides the rank.
 
-    **Raises:** ValueError for shapes that do not fit, or a `rank_tol` outside (0, 1).
+    **Raises:** ValueError for shapes that do not fit, a `rank_tol` outside (0, 1), and for a rank that is not clear.
 
     Source: EQUATIONS section 7; the rank is the trace of $A A^+$.
 
@@ -353,13 +408,25 @@ def degrees_of_freedom(
     rank_tol = check_tolerance(rank_tol)
     if not layout(scene):
         return scene.nv
-    rank = _rank(scene, q, t, rank_tol)
-    return scene.nv - int(rank) if is_concrete(rank) else scene.nv - rank
+    free = count_free(independent_rows(scene, q, t, rank_tol), q, t, rank_tol)
+    if not is_concrete(free):
+        return free
+    if free < 0:
+        raise ValueError(
+            "the rank of the constraints is not clear at this q: singular values that count differ by less than a factor of "
+            f"{LEAST_GAP:g} from those that do not; give numbers with more digits, or a rank_tol between them"
+        )
+    return int(free)
 
 
 @entry_point
-def _rank(scene: Scene, q, t, rank_tol: float | None) -> Int[Array, ""]:
+def count_free(scene: Scene, q, t, rank_tol: float | None) -> Int[Array, ""]:
+    """`degrees_of_freedom` by rows that are taken as they are; -1 where the rank is not clear."""
     # Scaled rows: the singular values of metres next to radians depend on the unit. The rank is by the
     # pseudo-inverse that all other rank decisions use, so that they agree.
     A = unit_rows(scene, q, t)
-    return rank_of(A, pseudo_inverse(A, tolerance(rank_tol, A), True)).astype(jnp.int32)
+    inverse = pseudo_inverse(A, tolerance(rank_tol, A), True)
+    is_clear = has_clear_rank(A, inverse, rank_tol)
+    if has_selection(scene):
+        is_clear = is_clear & (scene.constraints[0].gap >= LEAST_GAP)
+    return jnp.where(is_clear, scene.nv - rank_of(A, inverse), -1).astype(jnp.int32)

@@ -19,6 +19,7 @@ from jaxdyn.compile.known import stop_gradient
 from jaxdyn.constraints.base import constraint_jacobian, holonomic_rows, layout
 from jaxdyn.constraints.codes import Outcome, require_success
 from jaxdyn.constraints.rank import condition_number, passes_singular, rank_of, tolerance
+from jaxdyn.constraints.selection import independent_rows
 from jaxdyn.constraints.tolerances import coordinate_sizes
 from jaxdyn.control.inverse_kinematics import inverse_kinematics, row_weights
 from jaxdyn.control.targets import as_targets
@@ -103,7 +104,8 @@ def follow(
         """A configuration, and its rows."""
         # A scan cannot raise: places that were not reached are reported after it, by their index.
         reached = inverse_kinematics(scene, at(row), guess, guesses=guesses, t=t, throw=False, **options)
-        whole = Scene(scene.system, (*scene.constraints, *as_targets(scene.system, at(row))))
+        counted = independent_rows(scene, lax.stop_gradient(reached.q), t)
+        whole = Scene(scene.system, (*counted.constraints, *as_targets(scene.system, at(row))))
         return reached, _unit_rows(whole, lax.stop_gradient(reached.q), t, factors)
 
     def go_on(carry, row):

@@ -9,6 +9,7 @@ from jaxtyping import Array, Bool, Float, PyTree
 
 from jaxdyn._renamed import RenamedMethod
 from jaxdyn.constraints.base import Constraint, layout, rows
+from jaxdyn.constraints.selection import independent_rows
 from jaxdyn.control.errors import hierarchical_acceleration, row_rank, target_rows
 from jaxdyn.control.gains import times
 from jaxdyn.model.arguments import Number, batch_hint
@@ -38,7 +39,7 @@ class ForceIntegral(Controller):
 
     def _orders(self, q, v, t):
         """Rows A and right-hand sides of A a = ..., those of the constraints before those of the task."""
-        row = rows(self.scene, q, v, t)
+        row = rows(independent_rows(self.scene, q, t), q, v, t)
         return (row.A, row.gamma), target_rows(self.scene.system, self.error, self.kp, self.kd, q, v, t)
 
     def _acceleration(self, q, v, t, start) -> Array:

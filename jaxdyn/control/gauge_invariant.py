@@ -8,6 +8,7 @@ from jaxtyping import Array, Float, PyTree
 
 from jaxdyn.constraints.base import Constraint, constraint_jacobian, rows
 from jaxdyn.constraints.rank import pseudo_inverse, solve_square, tolerance
+from jaxdyn.constraints.selection import independent_rows
 from jaxdyn.control.errors import Target, TaskError, as_target
 from jaxdyn.control.force_loop import ForceLoop, constrained, row_count
 from jaxdyn.control.gains import as_matrix, gain, times
@@ -152,7 +153,7 @@ class GaugeInvariant(ForceLoop):
 
     def _reference_motion(self, q, v, t):
         """Jacobian J (nv, nr), velocity J s for the reference rates s = xd_d - Kp e, and its rate, (nv,) each."""
-        scene, system = self.scene, self.scene.system
+        scene, system = independent_rows(self.scene, q, t), self.scene.system
         errors = Scene(system, (self.error,))
         m = self.error.sizes(system, q.dtype)[0]
         # Stacked rows of task and constraints must determine v. More of them than nv are allowed: constraints may be dependent.

@@ -18,11 +18,12 @@ from jaxtyping import Array, Float, Int
 
 from jaxdyn.compile import entry_point
 from jaxdyn.compile.known import is_concrete, stop_gradient
-from jaxdyn.constraints.assembly import check_search, closing_tolerance
+from jaxdyn.constraints.assembly import check_search, closing_tolerance, independent_rows_near
 from jaxdyn.constraints.base import Constraint, holonomic_rows, layout, position_residual
 from jaxdyn.constraints.closing import nearest_configuration
 from jaxdyn.constraints.codes import RESULTS, Outcome, name_of, require_success
-from jaxdyn.constraints.redundancy import KeptRows
+from jaxdyn.constraints.redundancy import KeptRows, has_selection, opening_of_redundant
+from jaxdyn.constraints.selection import most_rounding
 from jaxdyn.constraints.tolerances import own_length
 from jaxdyn.control.least_squares import Aims, clip_to_limits, screw_joints, search
 from jaxdyn.control.targets import as_targets, target_rows
@@ -172,7 +173,8 @@ def _solve_by_program(scene, rows, guess, factors, posture, t, limits: bool, ste
 
 
 def _solve(scene: Scene, rows, guess, factors, posture, t, limits: bool, steps: int, guesses: int, atol):
-    model = scene.system
+    model, every = scene.system, scene
+    scene = independent_rows_near(scene, guess, t)
     whole = Scene(model, (*scene.constraints, *rows))
     # The search is not differentiated: `_differentiable` attaches the derivatives of its result.
     fixed, start, factors, time = stop_gradient((whole, guess, factors, t))
@@ -199,8 +201,11 @@ def _solve(scene: Scene, rows, guess, factors, posture, t, limits: bool, steps: 
     errors = values[np.flatnonzero(_is_target(scene, whole))]
     counted = jnp.where(factors > 0, jnp.abs(errors), jnp.zeros_like(errors))
     opening = jnp.max(jnp.where(exact, jnp.abs(values), jnp.zeros_like(values)), initial=0.0)
+    if has_selection(scene):
+        opening = jnp.maximum(opening, jnp.max(jnp.abs(position_residual(every, q, t))))
     # Evaluated again, because sliding towards the posture has changed q.
     reached = _reaches_targets(fixed, lax.stop_gradient(q), time, aims)
+    reached = reached & (opening_of_redundant(scene, q, t) <= most_rounding(q.dtype))
     closed = jnp.all(~exact | (jnp.abs(lax.stop_gradient(values)) <= aims.tolerances))
     result = RESULTS.where(closed, RESULTS.targets_not_reached, RESULTS.not_assembled)  # pyright: ignore[reportArgumentType]
     result = RESULTS.where(reached, RESULTS.successful, result)
@@ -249,7 +254,7 @@ def _differentiable(whole: Scene, q, posture, t: Number, aims: Aims, constraints
         # Rows of weight zero are masked: q does not satisfy them, so that they have no derivative there.
         counted = is_counted[first : first + sum(target_rows(rows[i]))].astype(q.dtype)
         none = jnp.zeros((), q.dtype)
-        rows[i] = KeptRows(rows[i], counted, none, none, rows[i].name)  # pyright: ignore[reportArgumentType]
+        rows[i] = KeptRows(rows[i], counted, none, none, none, rows[i].name)  # pyright: ignore[reportArgumentType]
     joints = _joints_with_limits(model, aims)
     at = np.asarray(joints, int)
     lower, upper = aims.lower[at], aims.upper[at]

@@ -17,6 +17,7 @@ from jaxtyping import Array, Float
 
 from jaxdyn.compile.known import is_concrete
 from jaxdyn.constraints.base import rows
+from jaxdyn.constraints.selection import independent_rows
 from jaxdyn.control.errors import (
     CenterError,
     FrameError,
@@ -178,7 +179,8 @@ class WholeBody(eqx.Module):
     def _orders(self, q, v, t):
         """Rows and right-hand sides of the feet, then of the tasks."""
         # Held at their present poses: the rows fix accelerations only, and do not correct a drift of the feet.
-        feet = rows(Scene(self.model, [one.hold(self.model, q) for one in self.feet]), q, v, t)
+        holds = Scene(self.model, [one.hold(self.model, q) for one in self.feet])
+        feet = rows(independent_rows(holds, q, jnp.asarray(t, q.dtype)), q, v, t)
         tasks = [target_rows(self.model, self.center, self.kp, self.kd, q, v, t)]
         if self.turn is not None:
             tasks.append(target_rows(self.model, self.turn, self.turn_kp, self.turn_kd, q, v, t))

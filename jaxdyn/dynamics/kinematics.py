@@ -203,6 +203,7 @@ def _prune(model: Model, kept: list[int]) -> Model:
         velocity_limit=take(model.velocity_limit, at_v),
         effort_limit=take(model.effort_limit, at_v),
         topology=topology,
+        rounding=model.rounding,
     )
 
 

@@ -22,6 +22,8 @@ from jaxdyn.constraints.base import Layout, constraint_jacobian, layout
 from jaxdyn.constraints.codes import RESULTS, Outcome
 from jaxdyn.constraints.dynamics import total_force
 from jaxdyn.constraints.rank import condition_number, pseudo_inverse, rank_of, tolerance
+from jaxdyn.constraints.redundancy import distribute_multipliers
+from jaxdyn.constraints.selection import independent_rows
 from jaxdyn.dynamics.quantities import coriolis_matrix, gravity_force, mass_matrix
 from jaxdyn.grasp.hand import Grasp, check_grasp
 from jaxdyn.grasp.motions import HandMotions, hand_motions, velocity_rows
@@ -167,7 +169,7 @@ def hand_dynamics(
             f"nu has shape {nu.shape}, expected {(motions.size(grasp),)}: {motions.object.shape[1]} velocities of the object and "
             f"{motions.internal.shape[1]} of the hand{batch_hint(nu, (1,))}"
         )
-    return _solve_motions(grasp, motions, q, nu, tau, t)
+    return _solve_motions(independent_rows(grasp, q, t), motions, q, nu, tau, t)
 
 
 @entry_point
@@ -202,7 +204,11 @@ def _solve_motions(grasp: Grasp, motions: HandMotions, q, nu, tau, t) -> ObjectD
     is_regular = place.quality > least_quality(q.dtype)
     A = constraint_jacobian(grasp, q, t)
     inverse = pseudo_inverse(A, tolerance(None, A))
-    return _solve_dynamics(grasp, q, nu, tau, t, place.N, Ndot, is_regular, lambda left: matmul(inverse.T, left))
+
+    def multipliers(left):
+        return distribute_multipliers(grasp, q, t, matmul(inverse.T, left))
+
+    return _solve_dynamics(grasp, q, nu, tau, t, place.N, Ndot, is_regular, multipliers)
 
 
 def _solve_dynamics(grasp: Grasp, q, nu, tau, t, N, Ndot, is_regular, multipliers) -> ObjectDynamics:

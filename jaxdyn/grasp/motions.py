@@ -21,6 +21,7 @@ from jaxdyn.compile import entry_point
 from jaxdyn.compile.known import is_known
 from jaxdyn.constraints.base import constraint_jacobian, layout
 from jaxdyn.constraints.rank import condition_number, eps_of, pseudo_inverse, rank_of, tolerance
+from jaxdyn.constraints.selection import independent_rows
 from jaxdyn.grasp.hand import Grasp, check_grasp
 from jaxdyn.lie.so3 import matmul
 from jaxdyn.model.arguments import Number, Numbers, check_state
@@ -124,7 +125,7 @@ def hand_motions(
     check_grasp(grasp)
     q, t = check_state(grasp.system, q=q, t=t)
     nh, no = len(grasp.hand_velocities), len(grasp.object_velocities)
-    on_object, on_hand, ranks = _projections(grasp, q, t)
+    on_object, on_hand, ranks = _projections(independent_rows(grasp, q, t), q, t)
     count = layout(grasp)[-1].end
     if sizes is None:
         if is_known(grasp, q, t):

@@ -12,7 +12,7 @@ from jaxtyping import Array, Float
 from jaxdyn.constraints.assembly import Assembly, assemble
 from jaxdyn.constraints.base import layout, position_residual, rows
 from jaxdyn.constraints.codes import RESULTS
-from jaxdyn.constraints.selection import degrees_of_freedom
+from jaxdyn.constraints.selection import degrees_of_freedom, independent_rows
 from jaxdyn.identify.logs import Log
 from jaxdyn.model.arguments import Numbers, as_array, state_dtype, warn
 from jaxdyn.model.topology import velocity_indices
@@ -57,11 +57,13 @@ def on_constraints(scene: Scene, q, v, t, columns: tuple[int, ...] | None) -> As
     if columns is None:
         return assemble(scene, q, v, t, throw=False)
 
+    counted = independent_rows(scene, q, t)
+
     def improve(at, _):
         # Nonholonomic rows restrict velocities alone: they have no residual of positions.
-        jacobian = rows(scene, at, jnp.zeros_like(v), t).A[holonomic]
+        jacobian = rows(counted, at, jnp.zeros_like(v), t).A[holonomic]
         misfit = displacement(scene.system, at, q)[measured]
-        targets = jnp.concatenate([-_CONSTRAINT_WEIGHT * position_residual(scene, at, t), misfit])
+        targets = jnp.concatenate([-_CONSTRAINT_WEIGHT * position_residual(counted, at, t), misfit])
         return displace(scene.system, at, _least_squares(jacobian, selector, targets)), None
 
     measured = np.array(columns)
@@ -73,11 +75,11 @@ def on_constraints(scene: Scene, q, v, t, columns: tuple[int, ...] | None) -> As
 
 def nearest_velocity(scene: Scene, q, v, t, columns: tuple[int, ...]) -> Float[Array, " nv"]:
     """Velocity (nv,) on a scene's constraints whose `columns` fit those of v by least squares."""
-    selector = jnp.eye(scene.nv, dtype=q.dtype)[np.array(columns)]
+    selector, counted = jnp.eye(scene.nv, dtype=q.dtype)[np.array(columns)], independent_rows(scene, q, t)
 
     # The rows are affine in v. Repetition removes the effect of the regularisation, which pulls each change towards zero.
     def improve(estimate, _):
-        at = rows(scene, q, estimate, t)
+        at = rows(counted, q, estimate, t)
         targets = jnp.concatenate([-_CONSTRAINT_WEIGHT * at.velocity, (v - estimate)[np.array(columns)]])
         return estimate + _least_squares(at.A, selector, targets), None
 

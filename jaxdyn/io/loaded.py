@@ -1,7 +1,7 @@
 """Contents of a file beyond the mechanism: starts, named actuators, and a list of unsupported elements."""
 
 from collections.abc import Iterable, Mapping, Sequence
-from typing import Any, ClassVar
+from typing import Any
 
 import equinox as eqx
 import jax.numpy as jnp
@@ -214,7 +214,6 @@ class LoadedScene(Scene):
     - `not_taken`: descriptions of the file's elements that the scene does not represent, as in `NotTakenWarning`.
     """
 
-    is_rounded: ClassVar[bool] = True
     # Dataclass fields after `Scene`'s defaults need defaults; `__init__` sets all of them.
     starts: dict[str, Start] = eqx.field(default_factory=dict)
     actuators: Actuators | None = None

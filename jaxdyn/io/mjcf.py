@@ -29,6 +29,7 @@ from jaxdyn.io.mjcf_file import (
 )
 from jaxdyn.io.mjcf_parts import actuators, constraints, tendon_forces
 from jaxdyn.io.mjcf_sensors import sensors
+from jaxdyn.io.xml_lines import LARGEST_ROUNDING, XmlFile, written_rounding
 from jaxdyn.model import host_math
 from jaxdyn.model.arguments import DType, as_path
 from jaxdyn.model.builder import ModelBuilder
@@ -85,13 +86,23 @@ def load_mjcf(path: str | os.PathLike, *, dtype: DType | None = None) -> LoadedS
     return LoadedScene(model, rows, forces, starts=starts, actuators=drives, not_taken=not_taken, sensors=readings)
 
 
+def _rounding(path: str) -> float:
+    """`written_rounding` of a file that mujoco has read; the largest one for a file that it alone can read."""
+    try:
+        root = XmlFile(path, "MJCF").root
+    except ValueError:
+        return LARGEST_ROUNDING
+    # Included files may hold numbers of any digits.
+    return LARGEST_ROUNDING if root.find(".//include") is not None else written_rounding(root)
+
+
 def _model(file: CompiledFile, dtype) -> Model:
     m = file.m
     # Without gravity its terms are not compiled.
     gravity = None if file.off("GRAVITY") or not m.opt.gravity.any() else m.opt.gravity
     # The buffer of names begins with that of the model, ended by a zero byte.
     name = m.names.split(b"\0", 1)[0].decode() or "mechanism"
-    builder = ModelBuilder(name, gravity=gravity, dtype=dtype)
+    builder = ModelBuilder(name, gravity=gravity, dtype=dtype, rounding=_rounding(file.path))
     frames, joint_names = Names(), Names()
     # All names of the file are reserved before any intermediate body takes one. Body 0 is the world.
     for taken in (*file.bodies[1:], *file.sites):

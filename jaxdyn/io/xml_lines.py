@@ -7,7 +7,7 @@ Python's codecs, since expat knows only four encodings, none of them the multi-b
 import codecs
 import os
 import re
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from typing import Any, NoReturn
 from xml.etree import ElementTree
 from xml.parsers import expat
@@ -33,6 +33,41 @@ _MARKS += (
     (b"\0<", "utf-16-be"),
 )
 _DECLARED = re.compile(rb"""<\?xml[^>]*?\sencoding\s*=\s*["']([^"'>]+)["']""")
+
+
+# Attributes and elements of URDF, MJCF and SDF that place links and joints.
+_PLACES = {"xyz", "rpy", "pos", "quat", "euler", "axisangle", "xyaxes", "zaxis", "axis", "anchor", "relpose", "pose"}
+# Elements whose places do not matter for the closing of loops.
+_NO_PLACES = {"inertial", "visual", "collision", "geom", "camera", "light", "asset"}
+_NUMBER = re.compile(r"[-+]?(\d*)\.?(\d*)(?:[eE]([-+]?\d+))?$")
+# Numbers of one or two digits (1, 0.5, -1.2) are meant as they stand. Coarser rounding than the largest one is never told from
+# a mechanism that does not close, and finer rounding than the least one is lost in that of the computation.
+_PLAIN_DIGITS, _LEAST_ROUNDING, LARGEST_ROUNDING = 2, 1e-12, 1e-3
+
+
+def written_rounding(root: ElementTree.Element) -> float:
+    """Rounding of the numbers that place links and joints: half a unit of the last digit of the coarsest one, m or rad.
+
+    0 where all numbers are plain ones, or have the digits of float64.
+    """
+    largest = 0.0
+    for word in " ".join(_placing_texts(root)).split():
+        match = _NUMBER.match(word)
+        if match is None:
+            continue
+        whole, decimals, exponent = match.groups()
+        if decimals and len((whole + decimals.rstrip("0")).lstrip("0")) > _PLAIN_DIGITS:
+            largest = max(largest, 0.5 * 10.0 ** (int(exponent or 0) - len(decimals)))
+    return min(largest, LARGEST_ROUNDING) if largest > _LEAST_ROUNDING else 0.0
+
+
+def _placing_texts(element: ElementTree.Element) -> Iterator[str]:
+    yield from (value for name, value in element.items() if name in _PLACES)
+    if element.tag in _PLACES:
+        yield element.text or ""
+    for child in element:
+        if child.tag not in _NO_PLACES:
+            yield from _placing_texts(child)
 
 
 class XmlFile:

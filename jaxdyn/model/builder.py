@@ -17,7 +17,7 @@ from jaxdyn.compile.known import array_namespace, is_concrete
 from jaxdyn.model import host_math
 from jaxdyn.model.arguments import DType, Number, Numbers, store_leaf
 from jaxdyn.model.joints import KINDS, SCREW_KINDS
-from jaxdyn.model.tree import Model, Topology, warn_unphysical_inertias
+from jaxdyn.model.tree import Model, Topology, check_rounding, warn_unphysical_inertias
 
 GRAVITY = (0.0, 0.0, -9.81)
 _JOINT_LEAVES = {"armature": "nv", "damping": "nv", "friction": "nv"}
@@ -49,6 +49,7 @@ class ModelBuilder:
     - `name`: name of the mechanism.
     - `gravity`: gravitational acceleration (3,) in world axes, m/s^2; with None no gravity terms are compiled.
     - `dtype`: floating-point type of the leaves; jax's default when None.
+    - `rounding`: size of the rounding of poses and axes (m or rad); 0 for exact ones, 5e-5 for an angle written as 1.5708.
 
     Every number of `add_body`, `add_frame`, `add_coupling` and of the gravity may be traced, so that `jax.grad` and `jax.vmap`
     differentiate and batch the construction. Names, kinds, and which numbers are given are structure and stay known. Faults that
@@ -69,8 +70,16 @@ class ModelBuilder:
     ```
     """
 
-    def __init__(self, name: str = "mechanism", *, gravity: Numbers | None = GRAVITY, dtype: DType | None = None):
+    def __init__(
+        self,
+        name: str = "mechanism",
+        *,
+        gravity: Numbers | None = GRAVITY,
+        dtype: DType | None = None,
+        rounding: float = 0.0,
+    ):
         self._name = name
+        self._rounding = check_rounding(rounding)
         three = {(3,): "three numbers (3,) or None"}
         self._gravity = None if gravity is None else host_math.numbers(gravity, three, "gravity")
         self._dtype = _float_dtype(dtype)
@@ -246,7 +255,7 @@ class ModelBuilder:
         }
         # Sorted, as static fields are compared: another order of a file must not compile another program.
         fixed_joints = tuple((self._bodies[name].joint_name, name) for name in sorted(fixed))
-        return Model(**kept, topology=topology, fixed_joints=fixed_joints)
+        return Model(**kept, topology=topology, fixed_joints=fixed_joints, rounding=self._rounding)
 
     def _check_new(self, name, parent) -> None:
         if not isinstance(name, str) or not name:

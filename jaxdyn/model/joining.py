@@ -172,7 +172,8 @@ def _side_by_side(models: Sequence[Model], name: str, fix: str, by_name: bool) -
     values = [_as_known(models[k].coupling_values)[row][None] for _, k, row in couplings]
     leaves["coupling_values"] = _concatenate(values, jnp.result_type(*values)) if values else None
     fixed = tuple(pair for model in models for pair in model.fixed_joints)
-    return Model(**leaves, gravity=_common_gravity(models), topology=topology, fixed_joints=fixed)
+    rounding = max(model.rounding for model in models)
+    return Model(**leaves, gravity=_common_gravity(models), topology=topology, fixed_joints=fixed, rounding=rounding)
 
 
 def _coordinates(kinds, order, size: str) -> np.ndarray:

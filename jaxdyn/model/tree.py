@@ -38,6 +38,8 @@ class Model(eqx.Module):
     - `coupling_values` (nc, 2): multiplier and offset (m or rad) of each coupling q[joint] = multiplier q[source] + offset in
       `topology.couplings`, or None when there are none. They are data for a scene's constraints; the joints stay free here.
     - `fixed_joints`: (joint, frame) for each fixed joint: its name is a second name of the link's frame. Static.
+    - `rounding`: size of the rounding of its poses (m or rad), 0 for exact ones; that of a file by its digits. Static. Rows of
+      constraints that differ by rounding from combinations of others repeat them.
     """
 
     home: Float[Array, "nb 4 4"]
@@ -55,6 +57,7 @@ class Model(eqx.Module):
     topology: Topology = eqx.field(static=True)
     coupling_values: Float[Array, "nc 2"] | None = None
     fixed_joints: tuple[tuple[str, str], ...] = eqx.field(static=True, default=())
+    rounding: float = eqx.field(static=True, default=0.0)
 
     def __str__(self) -> str:
         return tree_table(self)
@@ -95,7 +98,7 @@ class Model(eqx.Module):
         return self.topology.frame_names
 
     def replace(self, **leaves: PyTree) -> "Model":
-        """Copy with some leaves replaced, e.g. `model.replace(gravity=None)`.
+        """Copy with some leaves, or the `rounding` of its poses, replaced, e.g. `model.replace(gravity=None)`.
 
         **Raises:** ValueError for a name that is not a leaf or for a shape that differs from the present one.
 
@@ -203,7 +206,9 @@ def _payload(inertia: Any, dtype) -> Array:
 
 
 def _replace(model: Model, leaves: dict) -> Model:
-    names = [field.name for field in dataclasses.fields(Model) if field.name not in ("topology", "fixed_joints")]
+    rounding = check_rounding(leaves.pop("rounding", model.rounding))
+    static = "topology", "fixed_joints", "rounding"
+    names = [field.name for field in dataclasses.fields(Model) if field.name not in static]
     sizes = {"gravity": (3,), "armature": (model.nv,), "damping": (model.nv,), "friction": (model.nv,)}
     # Without couplings in the static topology there is nothing that the values could belong to.
     if model.topology.couplings == ():
@@ -223,7 +228,15 @@ def _replace(model: Model, leaves: dict) -> Model:
         # Arrays of jax keep their dtype: the caller may differentiate a leaf of another precision.
         leaves[name] = jnp.asarray(value, model.home.dtype) if not isinstance(value, jax.Array) else value
     leaves = {name: leaves.get(name, getattr(model, name)) for name in names}
-    return Model(**leaves, topology=model.topology, fixed_joints=model.fixed_joints)
+    return Model(**leaves, topology=model.topology, fixed_joints=model.fixed_joints, rounding=rounding)
+
+
+def check_rounding(rounding: Any) -> float:
+    """Check the rounding of poses. **Raises:** ValueError for anything but a number from 0 to 0.01."""
+    # Above that redundant rows could not be told from independent ones, whatever the mechanism.
+    if not isinstance(rounding, (int, float, np.number)) or not 0 <= rounding <= 1e-2:
+        raise ValueError(f"rounding is {rounding!r}; give the size of the poses' rounding errors, 0 to 0.01 (m or rad)")
+    return float(rounding)
 
 
 def warn_unphysical_inertias(inertias: Mapping[str, Any], places: Mapping[str, str] | None = None) -> None:

@@ -18,7 +18,7 @@ from jaxdyn.compile import entry_point, gram_eigenvectors
 from jaxdyn.compile.known import is_known
 from jaxdyn.constraints.base import constraint_jacobian, layout, velocity_residual
 from jaxdyn.constraints.rank import condition_number, pseudo_inverse, rank_of, sign_of_determinant, tolerance
-from jaxdyn.constraints.selection import pivot_rows
+from jaxdyn.constraints.selection import independent_rows, pivot_rows
 from jaxdyn.lie.so3 import matmul
 from jaxdyn.model.arguments import Number, Numbers, batch_hint, check_state
 from jaxdyn.systems.mass_factor import cholesky, solve_cholesky, solve_lower
@@ -291,6 +291,7 @@ def tangent_basis(
     q, t = check_state(scene.system, q=q, t=t)
     if not layout(scene):
         raise ValueError("the scene has no constraints, so every velocity is tangent; add some")
+    scene = independent_rows(scene, q, t, rank_tol)
     dof = count_dof(scene, q, t, dof, rank_tol)
     projector, _ = _tangent_projection(scene, q, t, rank_tol)
     return split_directions(projector)[:, scene.nv - dof :]
@@ -332,6 +333,7 @@ def split_directions(projection: Float[Array, "n n"]) -> Float[Array, "n n"]:
 def independent_velocities(scene: Scene, q, t: Number = 0.0) -> tuple[int, ...]:
     """Indices of independent velocities at a concrete configuration: those without pivots of A's columns."""
     # In NumPy, since the pivots are indices that a caller stores as static.
+    scene = independent_rows(scene, q, t)
     A = np.asarray(constraint_jacobian_compiled(scene, q, jnp.asarray(t, q.dtype)), float)
     # The pivots of its columns are the dependent velocities.
     columns, pivots = pivot_rows(A.T)

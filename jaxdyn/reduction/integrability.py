@@ -13,6 +13,7 @@ from jaxdyn.compile import entry_point
 from jaxdyn.compile.known import is_concrete, is_known
 from jaxdyn.constraints.base import constraint_jacobian, holonomic_rows, layout, velocity_residual
 from jaxdyn.constraints.dynamics import tolerance
+from jaxdyn.constraints.selection import independent_rows
 from jaxdyn.dynamics.quantities import kinetic_energy, potential_energy
 from jaxdyn.lie.so3 import matmul
 from jaxdyn.model.arguments import Numbers, as_array, batch_hint, check_state, zeros_if_none
@@ -66,6 +67,7 @@ def involutive(
         raise ValueError("the scene has no constraints; every velocity is admissible")
     if not is_known(scene, q, t):
         raise ValueError("involutive branches on ranks and needs concrete numbers; call it outside of jit and vmap")
+    scene = independent_rows(scene, q, t, rank_tol)
     reference = tangent_basis(scene, q, t, dof=dof, rank_tol=rank_tol)
     count, limit = reference.shape[1], tolerance(rank_tol, q)
     # Brackets stay tangent to the holonomic constraints.
@@ -193,7 +195,7 @@ def spurious_terms(
     choice = as_basis(tuple(independent), scene)
     if not isinstance(choice, Independent) or nu.shape != (choice.size(scene),):
         raise ValueError(f"nu has shape {nu.shape}, expected {(choice.size(scene),)} = (nr,){batch_hint(nu, (1,))}")
-    terms, depends = _substitute(scene, choice, q, nu, tau, t)
+    terms, depends = _substitute(independent_rows(scene, q, t), choice, q, nu, tau, t)
     if is_concrete(depends) and float(depends) > 1e-9:
         raise ValueError(
             f"L or the rows depend on the eliminated coordinates (by {float(depends):.3g}), or the rows prescribe a slip; "

@@ -26,6 +26,8 @@ from jaxdyn.constraints.base import layout, rows, velocity_residual
 from jaxdyn.constraints.codes import RESULTS, Outcome, name_of, require_success
 from jaxdyn.constraints.dynamics import total_force, whiten_rows
 from jaxdyn.constraints.rank import check_tolerance, eps_of, pseudo_inverse, rank_of, tolerance
+from jaxdyn.constraints.redundancy import distribute_multipliers
+from jaxdyn.constraints.selection import independent_rows, rank_code
 from jaxdyn.dynamics.quantities import bias_force, mass_matrix
 from jaxdyn.lie.so3 import matmul
 from jaxdyn.model.arguments import Numbers, as_array, batch_hint, check_state
@@ -130,6 +132,7 @@ def constrained_inverse_dynamics(
         raise ValueError(
             f"{names} has all velocities, in the order {list(chosen)}; name them in the order of the model, in which v is given"
         )
+    scene = independent_rows(scene, q, t, rank_tol)
     dynamics = _solve_by_program(
         scene, q, v, a_independent, S, _weights(weights, S.shape[1], q.dtype), t, tuple(chosen), rank_tol
     )
@@ -143,6 +146,7 @@ def _reason(dynamics, chosen) -> str:
         "contradictory_rows": f"a_independent or v: no motion has the values given for the velocities {list(chosen)}; give as "
         "many as there are degrees of freedom (jd.degrees_of_freedom), and none that a dead centre holds",
         "underactuated": "motors: they cannot produce this motion; name more motors, or give accelerations that they can",
+        "unclear_rank": "scene: rounding of its numbers hides which rows repeat others; give more digits, or a rank_tol",
         "singular_mass_matrix": "scene: its mass matrix is not positive definite at this q; give every joint some inertia",
     }
     return f"constrained_inverse_dynamics: {reasons.get(name, name)}. throw=False returns the least-squares solution"
@@ -195,7 +199,8 @@ def _solve_by_program(scene: Scene, q, v, a_independent, S, weights, t, chosen: 
     result = RESULTS.where(agrees, result, RESULTS.contradictory_rows)
     result = RESULTS.where(is_determined, result, RESULTS.singular_basis)
     result = RESULTS.where(definite, result, RESULTS.singular_mass_matrix)
-    q_dot = velocity_to_rate(scene.system, q, v)
+    result = rank_code(scene, result)
+    lam, q_dot = distribute_multipliers(scene, q, t, lam), velocity_to_rate(scene.system, q, v)
     return ConstrainedInverseDynamics(torques, matmul(jnp.asarray(S), torques), v, a, q_dot, lam, result)
 
 

@@ -11,6 +11,7 @@ Source: Murray, Li & Sastry (1994), section 6.1; EQUATIONS section 6.
 
 from typing import Any
 
+import equinox as eqx
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
@@ -19,6 +20,7 @@ from jaxdyn.compile.known import is_concrete
 from jaxdyn.constraints.base import layout
 from jaxdyn.constraints.codes import RESULTS, Outcome, require_finite
 from jaxdyn.constraints.dynamics import total_force
+from jaxdyn.constraints.selection import independent_rows, rank_code
 from jaxdyn.dynamics.quantities import inverse_dynamics, mass_matrix
 from jaxdyn.lie.so3 import matmul
 from jaxdyn.model.arguments import Numbers, as_array, batch_hint, check_state, zeros_if_none
@@ -90,7 +92,7 @@ def reduced_dynamics(
     q, tau, time = check_state(scene.system, q=q, tau=tau, t=t)
     nu = as_array(nu, "nu", q.dtype)
     if layout(scene):
-        choice = as_basis(basis, scene)
+        scene, choice = independent_rows(scene, q, time), as_basis(basis, scene)
     elif basis is None:
         choice = FullBasis()
     else:
@@ -99,6 +101,7 @@ def reduced_dynamics(
     if size is not None and nu.shape != (size,):
         raise ValueError(f"nu has shape {nu.shape}, expected {(size,)} as the basis has columns{batch_hint(nu, (1,))}")
     dynamics = _reduce_compiled(scene, choice, q, nu, tau, time)
+    dynamics = eqx.tree_at(lambda x: x.result, dynamics, rank_code(scene, dynamics.result))
     singular = dynamics.result == RESULTS.singular_basis
     # Under tracing only the code `singular_basis` can report it.
     if is_concrete(singular) and bool(singular):

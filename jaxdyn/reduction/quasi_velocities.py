@@ -25,6 +25,8 @@ from jaxdyn.constraints.base import constraint_jacobian, layout, rows
 from jaxdyn.constraints.codes import RESULTS, Outcome, require_finite
 from jaxdyn.constraints.dynamics import total_force
 from jaxdyn.constraints.rank import pseudo_inverse, rank_of, tolerance
+from jaxdyn.constraints.redundancy import distribute_multipliers
+from jaxdyn.constraints.selection import independent_rows, rank_code
 from jaxdyn.dynamics.quantities import bias_force, coriolis_matrix, mass_matrix
 from jaxdyn.lie.so3 import matmul
 from jaxdyn.model.arguments import Numbers, batch_hint, check_state, zeros_if_none
@@ -103,6 +105,7 @@ def gauge_invariant(
     q, v, tau, t = check_state(scene.system, q=q, v=v, tau=tau, t=t)
     if not layout(scene):
         raise ValueError("the scene has no constraints, so there is nothing to decouple; use jd.forward_dynamics")
+    scene = independent_rows(scene, q, t, rank_tol)
     dof = count_dof(scene, q, t, dof, rank_tol)
     for name, value, size in (("rotation", rotation, scene.nv), ("motion_rotation", motion_rotation, dof)):
         if value is not None and value.shape != (size, size):
@@ -153,6 +156,7 @@ def _decouple(scene, q, v, tau, t, rotation, motion_rotation, dof, rank_tol) -> 
     rank = rank_of(Lambda, back)
     # The bases have a static number of columns, which is valid for this rank alone.
     result = RESULTS.where(rank == scene.nv - dof, RESULTS.successful, RESULTS.singular_basis)  # pyright: ignore[reportArgumentType]
+    result = rank_code(scene, result)
     a = matmul(inverse.T, change - matmul(Wdot.T, v))
     return GaugeInvariantDynamics(
         W=W,
@@ -171,6 +175,6 @@ def _decouple(scene, q, v, tau, t, rotation, motion_rotation, dof, rank_tol) -> 
         Lambda_r=Lambda_r,
         acceleration=a,
         # (Lam^T)^+ gives the multipliers of least norm where rows are dependent.
-        multipliers=matmul(back.T, matmul(back, wanted) - free),
+        multipliers=distribute_multipliers(scene, q, t, matmul(back.T, matmul(back, wanted) - free)),
         result=require_finite(result, a),
     )

@@ -15,8 +15,9 @@ from jaxtyping import Array, Bool
 from jaxdyn.compile.known import is_concrete
 from jaxdyn.constraints.assembly import largest_residuals, open_constraints, start_openness
 from jaxdyn.constraints.base import layout
+from jaxdyn.constraints.rank import LEAST_GAP
 from jaxdyn.constraints.redundancy import keep_rows
-from jaxdyn.constraints.selection import most_rounding, select_concrete_rows
+from jaxdyn.constraints.selection import count_free, most_rounding, select_rows
 from jaxdyn.contact.forces import contacts_with_cones
 from jaxdyn.dynamics.quantities import mass_matrix
 from jaxdyn.forces.piecewise import has_pieces
@@ -308,7 +309,7 @@ def check_constraints(scene: Scene, method: Method, q, v, t) -> tuple[Scene, Met
     at the start.
     """
     limit, t = start_limit(q.dtype), np.asarray(t, q.dtype)
-    selection, here = select_concrete_rows(scene, q, t, method.rank_tol)
+    selection = select_rows(scene, q, t, method.rank_tol)
     rank = int(np.sum(selection.kept))
     selected = scene if rank == len(selection.kept) else keep_rows(scene, selection)
     ratio = start_openness(selected, q, v, t, limit)
@@ -324,6 +325,11 @@ def check_constraints(scene: Scene, method: Method, q, v, t) -> tuple[Scene, Met
             f"{float(residuals[0]):.3g}, velocity residual {float(residuals[1]):.3g}); start from "
             "state = jd.assemble(scene, q0, v0), with state.q and state.v"
         )
+    if selection.gap < LEAST_GAP:
+        raise ValueError(
+            "the rank of the constraints is not clear: rows that are independent of the others differ by less than a factor of "
+            f"{LEAST_GAP:g} from rows that repeat them; give numbers with more digits, or method=jd.Projected(rank_tol=...)"
+        )
     if rank == scene.nv:
         names = ", ".join(repr(place.name) for place in layout(scene))
         raise ValueError(
@@ -335,7 +341,9 @@ def check_constraints(scene: Scene, method: Method, q, v, t) -> tuple[Scene, Met
     # Inside a jit, jax would trace operations on known numbers too.
     with jax.ensure_compile_time_eval():
         q, t = jnp.asarray(q), jnp.asarray(t, q.dtype)
-        method = method.for_scene(scene, scene.nv - (here if selected is scene else rank))
+        # At a singular position the rows that are kept leave more velocities than the mechanism has elsewhere.
+        free = count_free(scene, q, t, method.rank_tol) if selected is scene else scene.nv - rank
+        method = method.for_scene(scene, int(free))
         if method.basis is not None and not bool(_is_regular_at(selected, method.basis, q, t)):
             raise ValueError(f"the basis is not regular at q0: {method.basis.advice(selected, q, t)}")
     return selected, method

@@ -21,13 +21,7 @@ from jaxdyn.constraints.codes import RESULTS
 from jaxdyn.constraints.dynamics import constrained_dynamics, solve_rows
 from jaxdyn.constraints.projection import project_state, project_step
 from jaxdyn.constraints.rank import check_tolerance
-from jaxdyn.constraints.redundancy import (
-    distribute_multipliers,
-    has_selection,
-    most_opening,
-    opening_of_redundant,
-    residual_of_redundant,
-)
+from jaxdyn.constraints.redundancy import most_opening, opening_of_redundant, residual_of_redundant
 from jaxdyn.constraints.selection import most_rounding
 from jaxdyn.constraints.tolerances import openness
 from jaxdyn.dynamics.quantities import forward_dynamics
@@ -328,12 +322,7 @@ def _position_error(scene: Scene, q, error) -> Array:
 def dynamics(scene: Scene, q, v, t, force, rank_tol: float | None = None):
     """Acceleration and multipliers at a state; `force` (nv,) is tau plus the scene's forces, or None."""
     # `force` includes the scene's forces, so that the scene is passed without them: they would act twice.
-    motion = constrained_dynamics(Scene(scene.system, scene.constraints), q, v, force, t, rank_tol=rank_tol)
-    if not has_selection(scene):
-        return motion
-    # Redundant rows share the constraint force: the one of least norm is unique.
-    shared = distribute_multipliers(scene, q, t, motion.multipliers)
-    return eqx.tree_at(lambda motion: motion.multipliers, motion, shared)
+    return constrained_dynamics(Scene(scene.system, scene.constraints), q, v, force, t, rank_tol=rank_tol)
 
 
 def is_regular(quality) -> Array:

@@ -12,6 +12,7 @@ from jaxtyping import Array
 from jaxdyn.compile import entry_point, kernel
 from jaxdyn.compile.batch import map_rows
 from jaxdyn.constraints.codes import first_of
+from jaxdyn.constraints.rank import LEAST_GAP
 from jaxdyn.constraints.redundancy import exchange_rows, gap_of_redundant, has_selection, keep_rows, row_mask, rows_of
 from jaxdyn.constraints.selection import most_rounding, select_rows
 from jaxdyn.simulation import controls
@@ -122,6 +123,7 @@ def _project_start(scene: Scene, method: Method, inputs: Inputs, selects_rows: b
         selection = select_rows(scene, q0, t0, method.rank_tol)
         scene = keep_rows(scene, selection)
         start_ok = selection.rounding <= most_rounding(q0.dtype)
+        faults.append((selection.gap < LEAST_GAP, RESULTS.unclear_rank))
         faults.append((~(jnp.sum(selection.kept) < scene.nv), RESULTS.no_freedom))
     if scene.constraints:
         start_ok = start_ok & consistent(scene, q0, v0, t0)

@@ -11,7 +11,7 @@ from jax.flatten_util import ravel_pytree
 from jaxdyn.compile import is_standalone
 from jaxdyn.compile.known import is_concrete, partition_tracers
 from jaxdyn.constraints.redundancy import keep_rows
-from jaxdyn.constraints.selection import may_have_redundant_rows, select_rows
+from jaxdyn.constraints.selection import hide_unclear, may_have_redundant_rows, select_rows
 from jaxdyn.contact.unilateral import has_modes
 from jaxdyn.forces.piecewise import fix_pieces, guards, pieces_of, values_and_levels
 from jaxdyn.model.arguments import Numbers, as_array, check_shape, state_dtype
@@ -153,7 +153,7 @@ def _advance(scene: Scene, length, substeps: int, is_direct: bool) -> tuple[Any,
     def advance(q, v, tau, t, *z):
         y = method.start(scene, q, v, t) | dict(zip(of_drives, z, strict=True))
         # Once, at the start on the constraints: between the stages of a step the rank would change.
-        selection = select_rows(known(unknown), q, t, None) if selects_rows else None
+        selection = hide_unclear(select_rows(known(unknown), q, t, None)) if selects_rows else None
         plan, args, ts, size = solver.plan(y), (unknown, tau, selection), jnp.stack([t, t + length]), length / substeps
         if pieces.names:
             _refuse_export(pieces)

@@ -4,7 +4,7 @@ import functools
 import inspect
 import types
 from collections.abc import Callable, Sequence
-from typing import TYPE_CHECKING, Any, ClassVar
+from typing import TYPE_CHECKING, Any
 
 import equinox as eqx
 import jax
@@ -147,8 +147,6 @@ class Scene(eqx.Module):
     constraints: tuple = ()
     forces: tuple = ()
     cones: Any = None
-    # Whether numbers have the digits of a file: rows that differ by so little then repeat each other.
-    is_rounded: ClassVar[bool] = False
 
     def __init__(
         self,
@@ -176,6 +174,12 @@ class Scene(eqx.Module):
     def nv(self) -> int:
         """Number of velocity coordinates."""
         return self.system.nv
+
+    @property
+    def rounding(self) -> float:
+        """Size of the rounding of the system's poses (`Model.rounding`), 0 for exact ones."""
+        # Of the system, so that a scene made of a file's system and other constraints or forces keeps it.
+        return getattr(self.system, "rounding", 0.0)
 
     def applied_force(
         self, q: Float[Array, " nq"], v: Float[Array, " nv"], t: Number = 0.0

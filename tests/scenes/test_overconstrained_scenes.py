@@ -15,7 +15,7 @@ from benchmarks.overconstrained import MECHANISMS, distance
 from jaxdyn.constraints.assembly import residuals
 from jaxdyn.constraints.base import constraint_jacobian
 from jaxdyn.constraints.dynamics import RESULTS, constrained_dynamics
-from jaxdyn.constraints.selection import select_concrete_rows
+from jaxdyn.constraints.selection import select_rows
 from jaxdyn.dynamics.quantities import kinetic_energy, potential_energy
 
 # Name, rows, rank, freedom.
@@ -57,8 +57,8 @@ def test_rank_and_freedom(name, rows, rank, freedom):
     """Starts are on the constraints, with the freedom that the mechanism has and not the one that counting joints gives."""
     one = mechanism(name)
     q, v = begin(one)
-    selection, here = select_concrete_rows(one.scene, np.asarray(q), 0.0, None)
-    assert selection.kept.shape == (rows,) and selection.kept.sum() == rank == here
+    selection = select_rows(one.scene, np.asarray(q), 0.0)
+    assert selection.kept.shape == (rows,) and selection.kept.sum() == rank
     assert jd.degrees_of_freedom(one.scene, q) == freedom == one.scene.nv - rank
     assert float(jnp.max(jnp.asarray(residuals(one.scene, q, v)))) < 1e-14 * (1 + float(jnp.abs(v).max()))
     singular = np.linalg.svd(constraint_jacobian(one.scene, q), compute_uv=False)
@@ -227,12 +227,6 @@ def test_rows_that_lose_rank_on_the_way_are_exchanged(tolerance):
     assert int(motion.stats["num_steps"]) < 20 and np.ptp(motion.energy) < 1e3 * tolerance
 
 
-class _Rounded(jd.Scene):
-    """A scene whose numbers are rounded, as those of a file."""
-
-    is_rounded = True
-
-
 @pytest.mark.slow
 @pytest.mark.parametrize("digits", [6, 8])
 def test_rounded_rows_are_exchanged(digits):
@@ -246,7 +240,7 @@ def test_rounded_rows_are_exchanged(digits):
     system, constraints = jax.tree.map(
         lambda x: jnp.round(x, digits) if eqx.is_inexact_array(x) else x, (scene.system, scene.constraints)
     )
-    rounded = _Rounded(system, constraints)
+    rounded = jd.Scene(system.replace(rounding=0.5 * 10.0**-digits), constraints)
     start = jd.assemble(rounded, q, v=v)
     assert bool(start.success)
     motion = jd.simulate(rounded, start.q, start.v, times, rtol=1e-9, atol=1e-9, throw=False)
