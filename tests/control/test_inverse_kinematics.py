@@ -174,6 +174,19 @@ def test_directions_and_the_centre_of_mass():
     assert other.errors.shape == (5,)
 
 
+@pytest.mark.parametrize("guesses", [1, 16])
+def test_opposite_direction_is_half_a_turn_away(guesses):
+    """From upright, where each component of a cross product is zero; and the error of a frame that cannot turn."""
+    model = robots.iiwa()
+    reached = inverse_kinematics(model, {TIP: {"direction": [0, 0, -1.0]}}, jnp.zeros(7), guesses=guesses)
+    np.testing.assert_allclose(frame_pose(model, reached.q, TIP)[:3, 2], [0, 0, -1], atol=1e-11)
+    builder = ModelBuilder("slider")
+    builder.add_body("slide", None, "prismatic", jd.inertia.box(1.0, (0.1, 0.1, 0.1)), axis=(1, 0, 0))
+    held = inverse_kinematics(builder.build(), {"slide": {"direction": [0, 0, -1.0]}}, jnp.zeros(1), throw=False)
+    assert held.result == RESULTS.targets_not_reached
+    np.testing.assert_allclose(held.residual, np.pi, atol=1e-7)  # the axis of half a turn is chosen by the root of rounding
+
+
 @pytest.mark.long
 def test_out_of_reach():
     """The nearest place, its code, no derivative; limits bind there too."""
