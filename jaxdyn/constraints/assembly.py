@@ -14,7 +14,7 @@ from jaxdyn.compile import entry_point, evaluate, kernel
 from jaxdyn.compile.known import is_concrete, is_tracing, stop_gradient
 from jaxdyn.constraints.base import Layout, holonomic_rows, layout, position_residual, velocity_residual
 from jaxdyn.constraints.closing import follow_path, nearest_configuration
-from jaxdyn.constraints.codes import RESULTS, Outcome, name_of, require_success
+from jaxdyn.constraints.codes import RESULTS, Outcome, first_of, name_of, require_success
 from jaxdyn.constraints.dynamics import correction
 from jaxdyn.constraints.loops import lock_joint
 from jaxdyn.constraints.rank import check_tolerance, tolerance
@@ -216,9 +216,10 @@ def _close(bare, guess, start, passed, selection, v, t, rank_tol, atol, scene):
         # Rows that contradict the others must not be dropped in silence: with all rows the result is the least-squares point.
         kept = jnp.where(rounding <= most_rounding(guess.dtype), kept, jnp.ones_like(kept))
         locked = keep_rows(bare, Selection(kept, rounding, jnp.zeros_like(rounding)))
-    q = guess
+    q, is_nearest = guess, jnp.asarray(True)
     if holonomic_rows(layout(locked)).size:
-        q = _unwind_hinges(locked, guess, nearest_configuration(locked, guess, start, t, rank_tol), t)
+        q, nearest = nearest_configuration(locked, guess, start, t, rank_tol)
+        q, is_nearest = _unwind_hinges(locked, guess, q, t), nearest > 0
     if scene is None:
         scene = locked
     v = _with_velocity(scene, q, v, t, rank_tol)
@@ -240,7 +241,7 @@ def _close(bare, guess, start, passed, selection, v, t, rank_tol, atol, scene):
         q,
         v,
         residual,
-        RESULTS.where(good, RESULTS.successful, RESULTS.not_assembled),  # pyright: ignore[reportArgumentType]
+        first_of([(~good, RESULTS.not_assembled), (~is_nearest, RESULTS.not_nearest)], RESULTS.successful),
         jnp.max(distances, initial=0.0),
         passed,
         1 - kept,

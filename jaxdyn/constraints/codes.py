@@ -72,6 +72,11 @@ class RESULTS(eqx.Enumeration):
     indefinite = "The matrix Q of the quadratic program is not positive definite."
     # Of fits.
     stopped = "The callback or the time limit stopped the fit."
+    # Of searches for the nearest configuration.
+    not_nearest = (
+        "The configuration satisfies the constraints, but the search for the nearest one to the guess or the posture did not "
+        "converge."
+    )
 
     # An enumeration of equinox does not list its names.
     _names.extend(name for name in vars() if not name.startswith("_"))
