@@ -218,8 +218,11 @@ def _close(bare, guess, start, passed, selection, v, t, rank_tol, atol, scene):
         locked = keep_rows(bare, Selection(kept, rounding, jnp.zeros_like(rounding)))
     q, is_nearest = guess, jnp.asarray(True)
     if holonomic_rows(layout(locked)).size:
-        q, nearest = nearest_configuration(locked, guess, start, t, rank_tol)
-        q, is_nearest = _unwind_hinges(locked, guess, q, t), nearest > 0
+        # Before the search, for which another number of turns is another place.
+        start = lax.stop_gradient(_unwind_hinges(locked, guess, start, t))
+        end, nearest = nearest_configuration(locked, guess, start, t, rank_tol)
+        q = _unwind_hinges(locked, guess, end, t)
+        is_nearest = (nearest > 0) & jnp.all(q == end)
     if scene is None:
         scene = locked
     v = _with_velocity(scene, q, v, t, rank_tol)

@@ -186,6 +186,14 @@ def slide_to_nearest(scene: Scene, guess, start, t, rank_tol) -> Slide:
     return Slide(jnp.where(better, e, first), (better & has_converged).astype(guess.dtype))
 
 
+def multipliers_of(scene: Scene, guess, q, t, rank_tol):
+    """Multipliers lam of the nearest configuration q: M(guess) e + A^T lam = 0, of least size in that metric."""
+    mass = mass_matrix(scene.system, guess, t)
+    e = displacement(scene.system, guess, q)
+    _, A = _linearize_rows(scene, guess, t, e)
+    return -matmul(right_inverse(mass_factor(mass), A, rank_tol).T, matmul(mass, e))
+
+
 def _curvature(scene: Scene, guess, t, e, lam):
     """Second derivative of lam . phi in the displacement e, (nv, nv)."""
 

@@ -16,12 +16,13 @@ import numpy as np
 from jax import lax
 from jaxtyping import Array, Float, Int
 
-from jaxdyn.compile import entry_point
+from jaxdyn.compile import entry_point, invalidate_derivatives
 from jaxdyn.compile.known import is_concrete, stop_gradient
 from jaxdyn.constraints.assembly import check_search, closing_tolerance
 from jaxdyn.constraints.base import Constraint, holonomic_rows, layout, position_residual
-from jaxdyn.constraints.closing import nearest_configuration
+from jaxdyn.constraints.closing import multipliers_of, nearest_configuration
 from jaxdyn.constraints.codes import RESULTS, Outcome, name_of, require_success
+from jaxdyn.constraints.rank import eps_of
 from jaxdyn.constraints.redundancy import KeptRows
 from jaxdyn.constraints.tolerances import own_length
 from jaxdyn.control.least_squares import Aims, clip_to_limits, screw_joints, search
@@ -31,7 +32,8 @@ from jaxdyn.model.tree import Model
 from jaxdyn.systems.scene import Scene, as_scene
 from jaxdyn.systems.system import SceneLike
 
-_ACTIVE_ROUNDS = 3
+# Changes of the set of joints at a limit on the way to a posture; each adds those that pass one, or releases one.
+_ACTIVE_ROUNDS = 20
 
 
 class InverseKinematics(Outcome):
@@ -41,7 +43,8 @@ class InverseKinematics(Outcome):
     - `errors` (m,): all rows of the targets, in their order: positions in m, in the axes of the target; orientations as rotation
       vectors, rad. `constraint_residual` (): the largest |phi| of the scene's constraints, m or rad.
     - `result`: one of `RESULTS`; `targets_not_reached`: q is then the best place that was met; `not_assembled`: it is not
-      even on the constraints. `guesses` (): how many places the search began at.
+      even on the constraints; `not_nearest`: q reaches the targets, but the search for the nearest one to the posture did not
+      converge. `guesses` (): how many places the search began at.
     """
 
     q: Float[Array, " nq"]
@@ -53,9 +56,9 @@ class InverseKinematics(Outcome):
 
 
 class _HeldAtLimits(Constraint):
-    """Joints of one degree of freedom that are held at a limit: rows q - limit where `active` is 1, else zero."""
+    """Joints of one degree of freedom that are held at a limit: rows q - limit where `active` is not 0, else zero."""
 
-    active: Float[Array, " n"]
+    active: Float[Array, " n"]  # -1 at the lower limit, 1 at the upper one
     limit: Float[Array, " n"]
     joints: tuple[int, ...] = eqx.field(static=True)
     name: str = eqx.field(static=True, default="limits")
@@ -67,7 +70,7 @@ class _HeldAtLimits(Constraint):
     def position(self, system, q, t):
         """Distances from the limits, (n,)."""
         # Rows of inactive joints are zero and not left out: the set changes while shapes stay fixed.
-        return jnp.where(self.active > 0, q[np.asarray(self.joints)] - self.limit, jnp.zeros_like(self.limit))
+        return jnp.where(self.active != 0, q[np.asarray(self.joints)] - self.limit, jnp.zeros_like(self.limit))
 
 
 def inverse_kinematics(
@@ -191,8 +194,10 @@ def _solve(scene: Scene, rows, guess, factors, posture, t, limits: bool, steps: 
     q, tried = search(fixed, start, time, aims, guesses)
     q = lax.stop_gradient(q)
     is_reached = _reaches_targets(fixed, q, time, aims)
-    # The implicit function theorem holds at a solution only. Elsewhere q is a constant, with zero derivatives.
-    q = jnp.where(is_reached, _differentiable(whole, q, posture, t, aims, len(scene.constraints)), q)
+    # The implicit function theorem holds at a solution only. Elsewhere q is a constant, and its derivatives are NaN.
+    solution, is_nearest = _differentiable(whole, q, posture, t, aims, len(scene.constraints))
+    q = jnp.where(is_reached & is_nearest, solution, q)
+    q = invalidate_derivatives(q, ~(is_reached & is_nearest), (whole, guess, factors, posture, t))
 
     values = position_residual(whole, q, t)
     exact = aims.is_exact > 0
@@ -203,7 +208,7 @@ def _solve(scene: Scene, rows, guess, factors, posture, t, limits: bool, steps: 
     reached = _reaches_targets(fixed, lax.stop_gradient(q), time, aims)
     closed = jnp.all(~exact | (jnp.abs(lax.stop_gradient(values)) <= aims.tolerances))
     result = RESULTS.where(closed, RESULTS.targets_not_reached, RESULTS.not_assembled)  # pyright: ignore[reportArgumentType]
-    result = RESULTS.where(reached, RESULTS.successful, result)
+    result = RESULTS.where(reached, RESULTS.where(is_nearest, RESULTS.successful, RESULTS.not_nearest), result)  # pyright: ignore[reportArgumentType]
     return InverseKinematics(q, jnp.max(counted, initial=0.0), errors, opening, result, tried)
 
 
@@ -254,35 +259,61 @@ def _differentiable(whole: Scene, q, posture, t: Number, aims: Aims, constraints
     at = np.asarray(joints, int)
     lower, upper = aims.lower[at], aims.upper[at]
 
-    def scene_at(place, active) -> Scene:
-        """With the joints that are `active` held at the limits that are near them."""
+    def scene_at(active) -> Scene:
+        """With the joints that are `active` held at their lower (-1) or upper (1) limits."""
         if not joints:
             return Scene(model, tuple(rows))
-        limit = jnp.where(place[at] - lower < upper - place[at], lower, upper)
-        at_limit = jnp.where(active, limit, jnp.zeros_like(limit))
-        held = _HeldAtLimits(active.astype(q.dtype), at_limit, joints)  # pyright: ignore[reportCallIssue]
-        return Scene(model, (*rows, held))
+        limit = jnp.where(active < 0, lower, upper)
+        at_limit = jnp.where(active != 0, limit, jnp.zeros_like(limit))
+        return Scene(model, (*rows, _HeldAtLimits(active, at_limit, joints)))  # pyright: ignore[reportCallIssue]
 
-    def beyond(place):
-        return (place[at] < lower) | (place[at] > upper)
+    def sides(below, above):
+        return above.astype(q.dtype) - below.astype(q.dtype)
 
     if posture is None:
         # Joints at a limit are held there, so that derivatives do not lead out of it.
-        scene = scene_at(q, (q[at] <= lower) | (q[at] >= upper))
+        scene = scene_at(sides(q[at] <= lower, q[at] >= upper))
         # q is the configuration nearest to itself: `solve` returns the start, and only the derivative is computed.
-        return nearest_configuration(scene, q, q, t, None, solve=lambda scene, guess, start, t: start)
-    active, place, time = jnp.zeros(at.shape, bool), q, stop_gradient(t)
-    # The set of joints at a limit is a decision without derivative. The last `nearest_configuration` alone is differentiated.
-    guess = lax.stop_gradient(posture)
-    for _ in range(
-        _ACTIVE_ROUNDS if joints else 0
-    ):  # joints that pass a limit on the way to the posture are held there
-        passed = nearest_configuration(stop_gradient(scene_at(place, active)), guess, q, time, None)
-        active = active | beyond(passed)
-        place = jnp.where(jnp.any(beyond(passed)), clip_to_limits(model, passed, aims), place)
-    place = nearest_configuration(scene_at(place, active), posture, q, t, None)
-    # If a joint is still beyond a limit after all rounds, the q of the search, within its limits, is kept.
-    return jnp.where(jnp.any(beyond(clip_rounding(place, at, lower, upper))), q, place)
+        one = jnp.ones((), q.dtype)
+        place, _ = nearest_configuration(scene, q, q, t, None, solve=lambda scene, guess, start, t: (start, one))
+        return place, jnp.asarray(True)
+
+    near = closing_tolerance(q.dtype)
+    guess, time = stop_gradient((posture, t))
+
+    def wrong(place, active):
+        """Sides of limits that are passed, and by how much the multiplier of a joint at a limit pushes it there, else zero."""
+        passed = sides(place[at] < lower - near, place[at] > upper + near)
+        lam = multipliers_of(stop_gradient(scene_at(active)), guess, place, time, None)
+        push = -active * lam[lam.size - at.size :]
+        # Relative to the largest multiplier, and to rounding where all are zero.
+        least = eps_of(q) ** 0.5 * jnp.max(jnp.abs(lam), initial=0.0)
+        return passed, jnp.where(push > least, push, jnp.zeros_like(push))
+
+    def change(state):
+        place, active, _, count = state
+        passed, push = wrong(place, active)
+        released = (jnp.arange(at.size) == jnp.argmax(push)) & (push > 0) & ~jnp.any(passed != 0)
+        active = jnp.where(passed != 0, passed, jnp.where(released, jnp.zeros_like(active), active))
+        place, is_nearest = nearest_configuration(stop_gradient(scene_at(active)), guess, q, time, None)
+        passed, push = wrong(place, active)
+        is_done = jnp.all(passed == 0) & jnp.all(push == 0) | (is_nearest < 1)
+        return place, active, ~is_done, count + 1
+
+    active = jnp.zeros(at.shape, q.dtype)
+    place = q
+    if joints:
+        # The set of joints at a limit is a decision without derivative. The last `nearest_configuration` alone is differentiated.
+        begin = q, active, jnp.asarray(True), 0
+        place, active, *_ = lax.while_loop(lambda state: state[2] & (state[3] < _ACTIVE_ROUNDS), change, begin)
+    active = lax.stop_gradient(active)
+    place, is_nearest = nearest_configuration(scene_at(active), posture, place, t, None)
+    if not joints:
+        return place, is_nearest > 0
+    passed, push = wrong(lax.stop_gradient(place), active)
+    # If a joint is beyond a limit, or held at one for no reason, the q of the search, within its limits, is kept.
+    is_nearest = (is_nearest > 0) & jnp.all(passed == 0) & jnp.all(push == 0)
+    return clip_rounding(place, at, lower, upper), is_nearest
 
 
 def clip_rounding(q, at: np.ndarray, lower, upper):
