@@ -94,8 +94,8 @@ def assemble(
     $$\phi(q, t) = 0, \quad A v = b$$
 
     q minimises |q - guess| in the metric M(guess) among the configurations on the constraints: a local minimum, on the branch
-    that is reached by short steps which reduce all residuals together. Hinges stay within half a turn of the guess. v is the
-    guess plus the least change in the metric M(q). Rows that are redundant but for the digits of a file stay open by these
+    that is reached by short steps which reduce all residuals together. Hinges stay within half a turn of the guess, unless they
+    are nearer to it beyond, together with the other joints. v is the guess plus the least change in the metric M(q). Rows that are redundant but for the digits of a file stay open by these
     digits; the others are closed to rounding (see `Assembly.dropped`).
 
     **Arguments:**
@@ -218,11 +218,8 @@ def _close(bare, guess, start, passed, selection, v, t, rank_tol, atol, scene):
         locked = keep_rows(bare, Selection(kept, rounding, jnp.zeros_like(rounding)))
     q, is_nearest = guess, jnp.asarray(True)
     if holonomic_rows(layout(locked)).size:
-        # Before the search, for which another number of turns is another place.
-        start = lax.stop_gradient(_unwind_hinges(locked, guess, start, t))
-        end, nearest = nearest_configuration(locked, guess, start, t, rank_tol)
-        q = _unwind_hinges(locked, guess, end, t)
-        is_nearest = (nearest > 0) & jnp.all(q == end)
+        q, nearest = nearest_configuration(locked, guess, start, t, rank_tol)
+        is_nearest = nearest > 0
     if scene is None:
         scene = locked
     v = _with_velocity(scene, q, v, t, rank_tol)
@@ -251,24 +248,6 @@ def _close(bare, guess, start, passed, selection, v, t, rank_tol, atol, scene):
         lax.stop_gradient(jnp.zeros_like(kept).at[holonomic_rows(places)].set(gaps)),
         places,
     )
-
-
-def _unwind_hinges(scene, guess, q, t):
-    """q with its hinges within half a turn of the guess, where full turns make no difference to the constraints."""
-    # A gear or a mimic joint counts turns: there the residual increases, and q stays.
-    if not isinstance(scene.system, Model):
-        return q
-    topology = scene.system.topology
-    hinges = [s.start for kind, s in zip(topology.kinds, topology.q_slices, strict=True) if kind == "revolute"]
-    if not hinges:
-        return q
-    places = np.asarray(hinges)
-    turns = jnp.round(lax.stop_gradient(q - guess)[places] / (2 * np.pi))
-    back = q.at[places].add(-2 * np.pi * turns)
-    before, after = (jnp.max(jnp.abs(position_residual(scene, x, t))) for x in (q, back))
-    _, length = coordinate_sizes(scene.system, q.dtype)
-    rounding = 64 * float(jnp.finfo(q.dtype).eps) * jnp.maximum(length, 1.0)
-    return jnp.where(lax.stop_gradient(after <= before + rounding), back, q)
 
 
 def _with_velocity(scene, q, v, t, rank_tol):

@@ -35,7 +35,7 @@ _LONGEST = 0.2
 # After so many steps, and after each further half of them, a path at an obstacle is pushed aside once. Paths without an obstacle
 # are at most pi long, 16 steps, and converge in a few more.
 _PATIENCE = 40
-_NEAREST_STEPS = 50
+_NEAREST_STEPS = 100
 _NEWTON_STEPS = 40
 # Shares of the curvature of the constraints in the Hessian: the largest one with a positive definite matrix is taken.
 _CURVATURES = (1.0, 0.7, 0.4, 0.2, 0.0)
@@ -121,24 +121,40 @@ def _near(dtype) -> tuple[float, float]:
 
 
 class Slide(NamedTuple):
-    """End of a slide, the displacement from the guess, and 1 where it satisfies the conditions of a minimum, else 0."""
+    """End of a slide: displacement from the guess, sides of the bounds it is held at, and 1 for a minimum, else 0."""
 
     e: Array
+    held: Array  # (nv,): -1 at a lower bound, 1 at an upper one, else 0
     is_nearest: Array
 
 
-def slide_to_nearest(scene: Scene, guess, start, t, rank_tol) -> Slide:
+class _State(NamedTuple):
+    e: Array
+    held: Array
+    moves: Array  # whether the last step has reduced the distance, or has released a bound
+    done: Array
+    count: Array
+
+
+def slide_to_nearest(scene: Scene, guess, start, t, rank_tol, bounds=None) -> Slide:
     """The displacement of least length in the metric M(guess) with phi = 0, from a start near it.
 
     Newton's steps, limited, and shortened until they reduce |e|^2 / 2 + nu |phi|. Without the curvature of the constraints, the
     second derivative of lam . phi, the iteration of Gauss and Newton converges to minima close to the guess alone.
+
+    `bounds`: two (nv,) of the displacement, within which the start has to be. A step ends at the first bound that it meets, which
+    is held from then on, until a minimum where its multiplier has the sign of a pull inwards (an active-set method).
     """
     mass = mass_matrix(scene.system, guess, t)
     metric = mass_factor(mass)
     sizes, length = coordinate_sizes(scene.system, guess.dtype)
+    start = unwind_hinges(scene, guess, start, t) if bounds is None else start
     first = displacement(scene.system, guess, start)
+    endless = jnp.full_like(first, jnp.inf)
+    lower, upper = (-endless, endless) if bounds is None else bounds
     converged, is_close = _near(guess.dtype)
     lengths = jnp.asarray(_SLIDE_LENGTHS, guess.dtype)
+    nh = holonomic_rows(layout(scene)).size
 
     def residual(e):
         return position_residual(scene, displace(scene.system, guess, e), t)
@@ -146,52 +162,68 @@ def slide_to_nearest(scene: Scene, guess, start, t, rank_tol) -> Slide:
     def half_square(e):
         return 0.5 * jnp.sum(e * matmul(mass, e))
 
-    def improve(state):
-        e, _, _, _, count = state
+    def rows(e, held):
+        """phi and its derivative, with a row for each coordinate that may be held, zero where it is not."""
         phi, A = _linearize_rows(scene, guess, t, e)
+        if bounds is None:
+            return phi, A
+        return jnp.append(phi, jnp.zeros_like(e)), jnp.concatenate([A, jnp.diag(jnp.abs(held))])
+
+    def improve(state: _State):
+        e, held, _, _, count = state
+        phi, A = rows(e, held)
         B = right_inverse(metric, A, rank_tol)
         lam = -matmul(B.T, matmul(mass, e))
-        step, is_convex = _newton_step(mass, _curvature(scene, guess, t, e, lam), A, B, matmul(mass, e), phi)
+        step, is_convex = _newton_step(mass, _curvature(scene, guess, t, e, lam[:nh]), A, B, matmul(mass, e), phi)
         step, size = _limit_step(step, sizes)
         weight = 2 * jnp.max(jnp.abs(lam), initial=0.0)
+        way = jnp.where(held != 0, jnp.inf, jnp.where(step < 0, lower, upper) - e)
+        way = jnp.where(step != 0, way / jnp.where(step != 0, step, jnp.ones_like(step)), jnp.inf)
+        longest = jnp.clip(jnp.min(way), 0.0, 1.0)
+        bound = B[:, :nh]
 
         def try_length(s):
-            tried = e + s * step
+            tried = e + s * longest * step
             # A correction of second order: along a curved surface the merit of a good step would otherwise increase.
-            tried = tried - matmul(B, residual(tried))
+            tried = jnp.clip(tried - matmul(bound, residual(tried)), lower, upper)
             return tried, half_square(tried) + weight * jnp.sum(jnp.abs(residual(tried)))
 
         tried, merits = lax.map(try_length, lengths)
         best = jnp.argmin(jnp.where(jnp.isfinite(merits), merits, jnp.full_like(merits, jnp.inf)))
         falls = merits[best] < half_square(e) + weight * jnp.sum(jnp.abs(phi))
         # Below rounding of the merit its fall cannot be seen.
-        is_newton = is_convex & (size <= is_close)
+        is_newton = is_convex & (size <= is_close) & (longest >= 1)
         after = jnp.where(is_newton, tried[0], jnp.where(falls, tried[best], e))
-        return after, size, is_convex, falls | is_newton, count + 1
+        is_minimum = is_convex & (size <= converged)
+        if bounds is None:
+            # A hinge that goes on beyond half a turn is nearer to the guess by a full turn less.
+            unwound = unwind_hinges(scene, guess, displace(scene.system, guess, after), t)
+            shorter = displacement(scene.system, guess, unwound)
+            after = jnp.where(half_square(shorter) < (1 - 1e-6) * half_square(after), shorter, after)
+            return _State(after, held, falls | is_newton, is_minimum, count + 1)
+        meets = (way <= longest) & (longest < 1)
+        after = jnp.where(meets, jnp.where(step < 0, lower, upper), after)
+        pull = held * -lam[nh:]
+        pull = jnp.where(pull > eps_of(e) ** 0.5 * jnp.max(jnp.abs(lam)), pull, jnp.zeros_like(pull))
+        released = is_minimum & (pull > 0) & (jnp.arange(e.size) == jnp.argmax(pull))
+        held = jnp.where(released, jnp.zeros_like(held), jnp.where(meets, jnp.sign(step), held))
+        moves = falls | is_newton | jnp.any(released) | jnp.any(meets)
+        return _State(after, held, moves, is_minimum & ~jnp.any(released), count + 1)
 
-    def goes_on(state):
-        e, size, is_convex, moves, count = state
-        has_converged = is_convex & (size <= converged)
-        return (count < _NEAREST_STEPS) & moves & ~has_converged & jnp.isfinite(e).all()
+    def goes_on(state: _State):
+        return (state.count < _NEAREST_STEPS) & state.moves & ~state.done & jnp.isfinite(state.e).all()
 
-    begin = first, jnp.asarray(jnp.inf, guess.dtype), jnp.asarray(False), jnp.asarray(True), 0
-    e, size, is_convex, *_ = lax.while_loop(goes_on, improve, begin)
-    has_converged = is_convex & (size <= converged) & jnp.isfinite(e).all()
+    begin = _State(first, jnp.zeros_like(first), jnp.asarray(True), jnp.asarray(False), jnp.zeros((), jnp.int32))
+    e, held, _, done, _ = lax.while_loop(goes_on, improve, begin)
+    has_converged = done & jnp.isfinite(e).all()
     # A start off the constraints, before an obstacle such as the end of the reach, may be nearer than any place on them.
     open_by = [jnp.max(jnp.abs(residual(x)), initial=0.0) for x in (e, first)]
     limit = eps_of(guess) ** 0.4 * jnp.minimum(length, 1.0)
     is_nearer = half_square(e) <= half_square(first) * (1 + 1e-6) + float(jnp.finfo(guess.dtype).tiny)
     # What the slide has gained is kept even where it has not converged.
     better = (has_converged | (open_by[0] <= limit)) & (is_nearer | (open_by[1] > limit)) & jnp.isfinite(e).all()
-    return Slide(jnp.where(better, e, first), (better & has_converged).astype(guess.dtype))
-
-
-def multipliers_of(scene: Scene, guess, q, t, rank_tol):
-    """Multipliers lam of the nearest configuration q: M(guess) e + A^T lam = 0, of least size in that metric."""
-    mass = mass_matrix(scene.system, guess, t)
-    e = displacement(scene.system, guess, q)
-    _, A = _linearize_rows(scene, guess, t, e)
-    return -matmul(right_inverse(mass_factor(mass), A, rank_tol).T, matmul(mass, e))
+    is_nearest = (better & has_converged).astype(guess.dtype)
+    return Slide(jnp.where(better, e, first), jnp.where(better, held, jnp.zeros_like(held)), is_nearest)
 
 
 def _curvature(scene: Scene, guess, t, e, lam):
@@ -222,6 +254,24 @@ def _newton_step(mass, curvature, A, B, slope, phi):
     steps, definite = jax.vmap(solve)(jnp.asarray(_CURVATURES, A.dtype))
     chosen = jnp.argmax(definite)
     return along + steps[chosen], definite[0]
+
+
+def unwind_hinges(scene, guess, q, t):
+    """q with its hinges within half a turn of the guess, where full turns make no difference to the constraints."""
+    # A gear or a mimic joint counts turns: there the residual increases, and q stays.
+    if not isinstance(scene.system, Model):
+        return q
+    topology = scene.system.topology
+    hinges = [s.start for kind, s in zip(topology.kinds, topology.q_slices, strict=True) if kind == "revolute"]
+    if not hinges:
+        return q
+    places = np.asarray(hinges)
+    turns = jnp.round(lax.stop_gradient(q - guess)[places] / (2 * np.pi))
+    back = q.at[places].add(-2 * np.pi * turns)
+    before, after = (jnp.max(jnp.abs(position_residual(scene, x, t))) for x in (q, back))
+    _, length = coordinate_sizes(scene.system, q.dtype)
+    rounding = 64 * float(jnp.finfo(q.dtype).eps) * jnp.maximum(length, 1.0)
+    return jnp.where(lax.stop_gradient(after <= before + rounding), back, q)
 
 
 def polish(scene: Scene, q, t, rank_tol):

@@ -20,9 +20,8 @@ from jaxdyn.compile import entry_point, invalidate_derivatives
 from jaxdyn.compile.known import is_concrete, stop_gradient
 from jaxdyn.constraints.assembly import check_search, closing_tolerance
 from jaxdyn.constraints.base import Constraint, holonomic_rows, layout, position_residual
-from jaxdyn.constraints.closing import multipliers_of, nearest_configuration
+from jaxdyn.constraints.closing import nearest_configuration, polish, slide_to_nearest
 from jaxdyn.constraints.codes import RESULTS, Outcome, name_of, require_success
-from jaxdyn.constraints.rank import eps_of
 from jaxdyn.constraints.redundancy import KeptRows
 from jaxdyn.constraints.tolerances import own_length
 from jaxdyn.control.least_squares import Aims, clip_to_limits, screw_joints, search
@@ -30,10 +29,8 @@ from jaxdyn.control.targets import as_targets, target_rows
 from jaxdyn.model.arguments import Checked, Number, Numbers, as_array, check_state
 from jaxdyn.model.tree import Model
 from jaxdyn.systems.scene import Scene, as_scene
-from jaxdyn.systems.system import SceneLike
+from jaxdyn.systems.system import SceneLike, displace
 
-# Changes of the set of joints at a limit on the way to a posture; each adds those that pass one, or releases one.
-_ACTIVE_ROUNDS = 20
 
 
 class InverseKinematics(Outcome):
@@ -278,42 +275,22 @@ def _differentiable(whole: Scene, q, posture, t: Number, aims: Aims, constraints
         place, _ = nearest_configuration(scene, q, q, t, None, solve=lambda scene, guess, start, t: (start, one))
         return place, jnp.asarray(True)
 
-    near = closing_tolerance(q.dtype)
-    guess, time = stop_gradient((posture, t))
-
-    def wrong(place, active):
-        """Sides of limits that are passed, and by how much the multiplier of a joint at a limit pushes it there, else zero."""
-        passed = sides(place[at] < lower - near, place[at] > upper + near)
-        lam = multipliers_of(stop_gradient(scene_at(active)), guess, place, time, None)
-        push = -active * lam[lam.size - at.size :]
-        # Relative to the largest multiplier, and to rounding where all are zero.
-        least = eps_of(q) ** 0.5 * jnp.max(jnp.abs(lam), initial=0.0)
-        return passed, jnp.where(push > least, push, jnp.zeros_like(push))
-
-    def change(state):
-        place, active, _, count = state
-        passed, push = wrong(place, active)
-        released = (jnp.arange(at.size) == jnp.argmax(push)) & (push > 0) & ~jnp.any(passed != 0)
-        active = jnp.where(passed != 0, passed, jnp.where(released, jnp.zeros_like(active), active))
-        place, is_nearest = nearest_configuration(stop_gradient(scene_at(active)), guess, q, time, None)
-        passed, push = wrong(place, active)
-        is_done = jnp.all(passed == 0) & jnp.all(push == 0) | (is_nearest < 1)
-        return place, active, ~is_done, count + 1
-
-    active = jnp.zeros(at.shape, q.dtype)
-    place = q
+    fixed, guess, time = stop_gradient((Scene(model, tuple(rows)), posture, t))
+    bounds = None
     if joints:
-        # The set of joints at a limit is a decision without derivative. The last `nearest_configuration` alone is differentiated.
-        begin = q, active, jnp.asarray(True), 0
-        place, active, *_ = lax.while_loop(lambda state: state[2] & (state[3] < _ACTIVE_ROUNDS), change, begin)
-    active = lax.stop_gradient(active)
-    place, is_nearest = nearest_configuration(scene_at(active), posture, place, t, None)
+        at_v = np.asarray([slot for place, slot in zip(*screw_joints(model), strict=True) if place in joints])
+        endless = jnp.full((model.nv,), jnp.inf, q.dtype)
+        bounds = (-endless).at[at_v].set(lower - guess[at]), endless.at[at_v].set(upper - guess[at])
+    end = slide_to_nearest(fixed, guess, q, time, None, bounds)
+    # The set of joints at a limit is a decision without derivative.
+    scene = scene_at(end.held[at_v] if joints else jnp.zeros((0,), q.dtype))
+    found = polish(stop_gradient(scene), displace(model, guess, end.e), time, None), end.is_nearest
+    place, is_nearest = nearest_configuration(scene, posture, q, t, None, solve=lambda *_: found)
     if not joints:
         return place, is_nearest > 0
-    passed, push = wrong(lax.stop_gradient(place), active)
-    # If a joint is beyond a limit, or held at one for no reason, the q of the search, within its limits, is kept.
-    is_nearest = (is_nearest > 0) & jnp.all(passed == 0) & jnp.all(push == 0)
-    return clip_rounding(place, at, lower, upper), is_nearest
+    place = clip_rounding(place, at, lower, upper)
+    is_within = jnp.all((place[at] >= lower) & (place[at] <= upper))
+    return place, (is_nearest > 0) & is_within
 
 
 def clip_rounding(q, at: np.ndarray, lower, upper):
