@@ -131,6 +131,7 @@ class Slide(NamedTuple):
 class _State(NamedTuple):
     e: Array
     held: Array
+    fresh: Array  # bounds that were met since the rows were closed
     moves: Array  # whether the last step has reduced the distance, or has released a bound
     done: Array
     count: Array
@@ -155,6 +156,7 @@ def slide_to_nearest(scene: Scene, guess, start, t, rank_tol, bounds=None) -> Sl
     converged, is_close = _near(guess.dtype)
     lengths = jnp.asarray(_SLIDE_LENGTHS, guess.dtype)
     nh = holonomic_rows(layout(scene)).size
+    limit = eps_of(guess) ** 0.4 * jnp.minimum(length, 1.0)
 
     def residual(e):
         return position_residual(scene, displace(scene.system, guess, e), t)
@@ -170,14 +172,14 @@ def slide_to_nearest(scene: Scene, guess, start, t, rank_tol, bounds=None) -> Sl
         return jnp.append(phi, jnp.zeros_like(e)), jnp.concatenate([A, jnp.diag(jnp.abs(held))])
 
     def improve(state: _State):
-        e, held, _, _, count = state
+        e, held, fresh, _, _, count = state
         phi, A = rows(e, held)
         B = right_inverse(metric, A, rank_tol)
         lam = -matmul(B.T, matmul(mass, e))
         step, is_convex = _newton_step(mass, _curvature(scene, guess, t, e, lam[:nh]), A, B, matmul(mass, e), phi)
-        step, size = _limit_step(step, sizes)
+        step, size = _limit_step(jnp.where(held != 0, jnp.zeros_like(step), step), sizes)
         weight = 2 * jnp.max(jnp.abs(lam), initial=0.0)
-        way = jnp.where(held != 0, jnp.inf, jnp.where(step < 0, lower, upper) - e)
+        way = jnp.where(step < 0, lower, upper) - e
         way = jnp.where(step != 0, way / jnp.where(step != 0, step, jnp.ones_like(step)), jnp.inf)
         longest = jnp.clip(jnp.min(way), 0.0, 1.0)
         bound = B[:, :nh]
@@ -200,25 +202,29 @@ def slide_to_nearest(scene: Scene, guess, start, t, rank_tol, bounds=None) -> Sl
             unwound = unwind_hinges(scene, guess, displace(scene.system, guess, after), t)
             shorter = displacement(scene.system, guess, unwound)
             after = jnp.where(half_square(shorter) < (1 - 1e-6) * half_square(after), shorter, after)
-            return _State(after, held, falls | is_newton, is_minimum, count + 1)
+            return _State(after, held, fresh, falls | is_newton, is_minimum, count + 1)
+        # A bound that is met while the rows are closed again behind another one was the first of the two.
+        fresh = fresh & (jnp.max(jnp.abs(phi)) > limit)
         meets = (way <= longest) & (longest < 1)
         after = jnp.where(meets, jnp.where(step < 0, lower, upper), after)
         pull = held * -lam[nh:]
         pull = jnp.where(pull > eps_of(e) ** 0.5 * jnp.max(jnp.abs(lam)), pull, jnp.zeros_like(pull))
         released = is_minimum & (pull > 0) & (jnp.arange(e.size) == jnp.argmax(pull))
+        released = released | (fresh & jnp.any(meets))
+        fresh = jnp.where(jnp.any(meets), meets, fresh)
         held = jnp.where(released, jnp.zeros_like(held), jnp.where(meets, jnp.sign(step), held))
         moves = falls | is_newton | jnp.any(released) | jnp.any(meets)
-        return _State(after, held, moves, is_minimum & ~jnp.any(released), count + 1)
+        return _State(after, held, fresh, moves, is_minimum & ~jnp.any(released) & ~jnp.any(meets), count + 1)
 
     def goes_on(state: _State):
         return (state.count < _NEAREST_STEPS) & state.moves & ~state.done & jnp.isfinite(state.e).all()
 
-    begin = _State(first, jnp.zeros_like(first), jnp.asarray(True), jnp.asarray(False), jnp.zeros((), jnp.int32))
-    e, held, _, done, _ = lax.while_loop(goes_on, improve, begin)
+    none = jnp.zeros(first.shape, bool)
+    begin = _State(first, jnp.zeros_like(first), none, jnp.asarray(True), jnp.asarray(False), jnp.zeros((), jnp.int32))
+    e, held, _, _, done, _ = lax.while_loop(goes_on, improve, begin)
     has_converged = done & jnp.isfinite(e).all()
     # A start off the constraints, before an obstacle such as the end of the reach, may be nearer than any place on them.
     open_by = [jnp.max(jnp.abs(residual(x)), initial=0.0) for x in (e, first)]
-    limit = eps_of(guess) ** 0.4 * jnp.minimum(length, 1.0)
     is_nearer = half_square(e) <= half_square(first) * (1 + 1e-6) + float(jnp.finfo(guess.dtype).tiny)
     # What the slide has gained is kept even where it has not converged.
     better = (has_converged | (open_by[0] <= limit)) & (is_nearer | (open_by[1] > limit)) & jnp.isfinite(e).all()
