@@ -10,7 +10,7 @@ import numpy as np
 from jax import lax
 from jaxtyping import Array, Bool, Float
 
-from jaxdyn.compile import entry_point, evaluate, kernel
+from jaxdyn.compile import entry_point, evaluate, invalidate_derivatives, kernel
 from jaxdyn.compile.known import is_concrete, is_tracing, stop_gradient
 from jaxdyn.constraints.base import Layout, holonomic_rows, layout, position_residual, velocity_residual
 from jaxdyn.constraints.closing import follow_path, nearest_configuration
@@ -113,7 +113,8 @@ def assemble(
     - `throw`: raise when it fails, by default if all inputs are concrete.
 
     **Returns:** `Assembly`. Derivatives, of any order, with respect to the guess and the scene's parameters are those of the
-    minimum, by the implicit function theorem.
+    minimum, by the implicit function theorem. `result` is `not_nearest` where q satisfies the constraints and the search for the
+    minimum did not converge. Derivatives are NaN where it is not `successful`.
 
     **Raises:** ValueError that names the open constraints and their residuals, if the assembly fails and `throw`; for joints in
     `hold` that do not exist, and for less than one guess.
@@ -139,6 +140,11 @@ def assemble(
         assembly = _from_elsewhere(assembly, guesses, from_guess, locked, q)
 
     def message() -> str:
+        if name_of(assembly.result) == "not_nearest":
+            return (
+                f"assembled with residuals {np.asarray(assembly.residual)}, but the search for the configuration nearest to the "
+                "guess did not converge; give a better guess, or throw=False"
+            )
         left = open_constraints(locked, assembly.q, assembly.v, t, closing_tolerance(q.dtype))
         tried = f" (nor are they from {guesses - 1} configurations around it)" if guesses > 1 else ""
         return f"not assembled: {left}{tried}; give a better guess"
@@ -222,7 +228,7 @@ def _close(bare, guess, start, passed, selection, v, t, rank_tol, atol, scene):
         is_nearest = nearest > 0
     if scene is None:
         scene = locked
-    v = _with_velocity(scene, q, v, t, rank_tol)
+    v0, v = v, _with_velocity(scene, q, v, t, rank_tol)
     limits = row_limits(locked, q, jnp.zeros_like(v), t, closing_tolerance(q.dtype))[0]
     phi = position_residual(locked, q, t)
     is_closed = jnp.all(jnp.abs(phi) <= limits)
@@ -236,6 +242,8 @@ def _close(bare, guess, start, passed, selection, v, t, rank_tol, atol, scene):
     sizes, _ = coordinate_sizes(whole.system, q.dtype)
     distances = jnp.abs(displacement(whole.system, lax.stop_gradient(guess), lax.stop_gradient(q))) / sizes
     places = layout(whole)
+    # Open rows have no solution whose derivatives could be taken; the least-squares point within `atol` counts as one.
+    q, v = invalidate_derivatives((q, v), ~(good & is_nearest), (bare, guess, v0, t))
     gaps = jnp.abs(position_residual(bare, q, t)) * (1 - kept)[holonomic_rows(places)]
     return Assembly(
         q,
