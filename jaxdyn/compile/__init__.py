@@ -24,5 +24,6 @@ from jaxdyn.compile.mode import current as compilation_mode  # noqa: F401 (under
 from jaxdyn.compile.mode import is_standalone as is_standalone
 from jaxdyn.compile.mode import values_of_rules as values_of_rules
 from jaxdyn.compile.rules import implicit as implicit
+from jaxdyn.compile.rules import invalidate_derivatives as invalidate_derivatives
 from jaxdyn.compile.rules import value_and_jvp as value_and_jvp
 from jaxdyn.compile.trial import run_trial as _run_trial  # noqa: F401 (it registers itself)

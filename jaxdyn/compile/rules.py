@@ -1,12 +1,15 @@
 """Functions whose derivatives are given by another computation than their values."""
 
 from collections.abc import Callable
+from typing import Any
 
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 
 from jaxdyn.compile import mode
-from jaxdyn.compile.known import partition_tracers
+from jaxdyn.compile.jax_adapter import ShapedArray, define_primitive, is_zero
+from jaxdyn.compile.known import is_concrete, partition_tracers
 
 
 def implicit(tree, args: tuple, solve: Callable, tangent: Callable):
@@ -71,3 +74,77 @@ def value_and_jvp(function: Callable, args: tuple, steps):
         return function(*jax.tree.unflatten(structure, here))
 
     return jax.jvp(at_values, [base[i] for i in moving], [steps[i] for i in moving])
+
+
+def invalidate_derivatives(values: Any, failed: Any, inputs: Any) -> Any:
+    """The values, a pytree, with derivatives of NaN by all inputs where `failed`, in forward and reverse mode.
+
+    Without it a failure would be a constant, whose derivative of zero leaves no trace in the gradient of a batch. Cotangents of
+    zero remain zero, so that a loss may leave failed elements out. `failed` is one flag, or one for each leading index.
+    """
+    arrays, rest = eqx.partition(values, eqx.is_inexact_array)
+    leaves = [x for x in jax.tree.leaves(eqx.filter(inputs, eqx.is_inexact_array)) if not is_concrete(x)]
+    if leaves:
+        arrays = _with_invalid_derivatives(arrays, jnp.asarray(failed), leaves)
+    return eqx.combine(arrays, rest)
+
+
+@jax.custom_jvp
+def _with_invalid_derivatives(values, failed, leaves):
+    return values
+
+
+def _invalid_tangents(primals, tangents):
+    values, failed, _ = primals
+    of_values, _, of_leaves = tangents
+    zero = jax.custom_derivatives.SymbolicZero
+    moving = [x for x in of_leaves if not isinstance(x, zero)]
+
+    def add(value, tangent):
+        tangent = jnp.zeros_like(value) if isinstance(tangent, zero) else tangent
+        here = failed.reshape(failed.shape + (1,) * (value.ndim - failed.ndim))
+        # At both ends, so that neither tangents nor cotangents that cancel in the sum hide the failure.
+        total = sum((jnp.sum(_nan_where(failed.any(), x)) for x in moving), jnp.zeros(()))
+        return tangent + _nan_where(here, jnp.broadcast_to(total.astype(value.dtype), value.shape))
+
+    return values, jax.tree.map(add, values, of_values, is_leaf=lambda x: isinstance(x, zero))
+
+
+_with_invalid_derivatives.defjvp(_invalid_tangents, symbolic_zeros=True)
+
+
+
+def _nan_where(failed, x):
+    """A linear function of x: NaN where it has failed and x is not zero, else zero."""
+    return _nan_where_p.bind(jnp.broadcast_to(failed, x.shape), x)
+
+
+def _batch(args, axes):
+    size = next(x.shape[axis] for x, axis in zip(args, axes, strict=True) if axis is not None)
+    full = [
+        jnp.broadcast_to(x, (size, *x.shape)) if axis is None else jnp.moveaxis(x, axis, 0)
+        for x, axis in zip(args, axes, strict=True)
+    ]
+    return _nan_where_p.bind(*full), 0
+
+
+def _jvp(primals, tangents):
+    failed, x = primals
+    step = tangents[1]
+    return _nan_where_p.bind(failed, x), step if is_zero(step) else _nan_where_p.bind(failed, step)
+
+
+def _transpose(cotangent, failed, x):
+    return [None, cotangent if is_zero(cotangent) else _nan_where_p.bind(failed, cotangent)]
+
+
+# A primitive, as no sum of products that JAX could transpose is zero for zeros and NaN for all other numbers.
+_nan_where_p = define_primitive(
+    "jaxdyn_nan_where",
+    lambda failed, x: ShapedArray(x.shape, x.dtype),
+    implement=jax.jit(lambda failed, x: jnp.where(failed & (x != 0), jnp.nan, jnp.zeros_like(x))),
+    lower=lambda failed, x: jnp.where(failed & (x != 0), jnp.nan, jnp.zeros_like(x)),
+    batch=_batch,
+    jvp=_jvp,
+    transpose=_transpose,
+)

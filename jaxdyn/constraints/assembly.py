@@ -10,7 +10,7 @@ import numpy as np
 from jax import lax
 from jaxtyping import Array, Bool, Float
 
-from jaxdyn.compile import entry_point, evaluate, kernel
+from jaxdyn.compile import entry_point, evaluate, invalidate_derivatives, kernel
 from jaxdyn.compile.known import is_concrete, is_tracing, stop_gradient
 from jaxdyn.constraints.base import Layout, holonomic_rows, layout, position_residual, velocity_residual
 from jaxdyn.constraints.closing import follow_path, nearest_configuration
@@ -94,8 +94,8 @@ def assemble(
     $$\phi(q, t) = 0, \quad A v = b$$
 
     q minimises |q - guess| in the metric M(guess) among the configurations on the constraints: a local minimum, on the branch
-    that is reached by short steps which reduce all residuals together. Hinges stay within half a turn of the guess. v is the
-    guess plus the least change in the metric M(q). Rows that are redundant but for the digits of a file stay open by these
+    that is reached by short steps which reduce all residuals together. Hinges stay within half a turn of the guess, unless they
+    are nearer to it beyond, together with the other joints. v is the guess plus the least change in the metric M(q). Rows that are redundant but for the digits of a file stay open by these
     digits; the others are closed to rounding (see `Assembly.dropped`).
 
     **Arguments:**
@@ -113,7 +113,8 @@ def assemble(
     - `throw`: raise when it fails, by default if all inputs are concrete.
 
     **Returns:** `Assembly`. Derivatives, of any order, with respect to the guess and the scene's parameters are those of the
-    minimum, by the implicit function theorem.
+    minimum, by the implicit function theorem. `result` is `not_nearest` where q satisfies the constraints and the search for the
+    minimum did not converge. Derivatives are NaN where it is not `successful`.
 
     **Raises:** ValueError that names the open constraints and their residuals, if the assembly fails and `throw`; for joints in
     `hold` that do not exist, and for less than one guess.
@@ -139,6 +140,11 @@ def assemble(
         assembly = _from_elsewhere(assembly, guesses, from_guess, locked, q)
 
     def message() -> str:
+        if name_of(assembly.result) == "not_nearest":
+            return (
+                f"assembled with residuals {np.asarray(assembly.residual)}, but the search for the configuration nearest to the "
+                "guess did not converge; give a better guess, or throw=False"
+            )
         left = open_constraints(locked, assembly.q, assembly.v, t, closing_tolerance(q.dtype))
         tried = f" (nor are they from {guesses - 1} configurations around it)" if guesses > 1 else ""
         return f"not assembled: {left}{tried}; give a better guess"
@@ -215,12 +221,13 @@ def _close(bare, guess, start, passed, selection, v, t, rank_tol, atol, scene):
         # Rows that contradict the others must not be dropped in silence: with all rows the result is the least-squares point.
         kept = jnp.where(rounding <= most_rounding(guess.dtype), kept, jnp.ones_like(kept))
         locked = keep_rows(bare, selection._replace(kept=kept))
-    q = guess
+    q, is_nearest = guess, jnp.asarray(True)
     if holonomic_rows(layout(locked)).size:
-        q = _unwind_hinges(locked, guess, nearest_configuration(locked, guess, start, t, rank_tol), t)
+        q, nearest = nearest_configuration(locked, guess, start, t, rank_tol)
+        is_nearest = nearest > 0
     if scene is None:
         scene = locked
-    v = _with_velocity(scene, q, v, t, rank_tol)
+    v0, v = v, _with_velocity(scene, q, v, t, rank_tol)
     limits = row_limits(locked, q, jnp.zeros_like(v), t, closing_tolerance(q.dtype))[0]
     phi = position_residual(locked, q, t)
     is_closed = jnp.all(jnp.abs(phi) <= limits)
@@ -234,36 +241,27 @@ def _close(bare, guess, start, passed, selection, v, t, rank_tol, atol, scene):
     sizes, _ = coordinate_sizes(whole.system, q.dtype)
     distances = jnp.abs(displacement(whole.system, lax.stop_gradient(guess), lax.stop_gradient(q))) / sizes
     places = layout(whole)
+    # Open rows have no solution whose derivatives could be taken; the least-squares point within `atol` counts as one.
+    q, v = invalidate_derivatives((q, v), ~(good & is_nearest), (bare, guess, v0, t))
     gaps = jnp.abs(position_residual(bare, q, t)) * (1 - kept)[holonomic_rows(places)]
     return Assembly(
         q,
         v,
         residual,
-        first_of([(~good, RESULTS.not_assembled), (~is_clear, RESULTS.unclear_rank)], RESULTS.successful),
+        first_of(
+            [
+                (~good, RESULTS.not_assembled),
+                (~is_clear, RESULTS.unclear_rank),
+                (~is_nearest, RESULTS.not_nearest),
+            ],
+            RESULTS.successful,
+        ),
         jnp.max(distances, initial=0.0),
         passed,
         1 - kept,
         lax.stop_gradient(jnp.zeros_like(kept).at[holonomic_rows(places)].set(gaps)),
         places,
     )
-
-
-def _unwind_hinges(scene, guess, q, t):
-    """q with its hinges within half a turn of the guess, where full turns make no difference to the constraints."""
-    # A gear or a mimic joint counts turns: there the residual increases, and q stays.
-    if not isinstance(scene.system, Model):
-        return q
-    topology = scene.system.topology
-    hinges = [s.start for kind, s in zip(topology.kinds, topology.q_slices, strict=True) if kind == "revolute"]
-    if not hinges:
-        return q
-    places = np.asarray(hinges)
-    turns = jnp.round(lax.stop_gradient(q - guess)[places] / (2 * np.pi))
-    back = q.at[places].add(-2 * np.pi * turns)
-    before, after = (jnp.max(jnp.abs(position_residual(scene, x, t))) for x in (q, back))
-    _, length = coordinate_sizes(scene.system, q.dtype)
-    rounding = 64 * float(jnp.finfo(q.dtype).eps) * jnp.maximum(length, 1.0)
-    return jnp.where(lax.stop_gradient(after <= before + rounding), back, q)
 
 
 def _with_velocity(scene, q, v, t, rank_tol):

@@ -2,7 +2,8 @@
 
 1. `follow_path`: Newton's steps of limited length. Short steps follow the curve along which all residuals shrink in proportion.
    It stays on the branch of the guess as long as it meets no singular position.
-2. `slide_to_nearest`: along the constraints, to the minimum of |q - guess| in the metric M(guess).
+2. `slide_to_nearest`: along the constraints, to the minimum of |q - guess| in the metric M(guess), by Newton's method on the
+   conditions M e + A^T lam = 0, phi = 0 of that minimum (sequential quadratic programming).
 3. `polish`: Newton's steps down to rounding.
 """
 
@@ -15,7 +16,7 @@ import numpy as np
 from jax import lax
 from jaxtyping import Array
 
-from jaxdyn.compile import implicit, kernel, pseudo_inverse_by_rotations, value_and_jvp
+from jaxdyn.compile import implicit, invalidate_derivatives, kernel, pseudo_inverse_by_rotations, value_and_jvp
 from jaxdyn.compile.known import stop_gradient
 from jaxdyn.constraints.base import constraint_jacobian, holonomic_rows, layout, position_residual
 from jaxdyn.constraints.dynamics import correction, right_inverse, whiten_rows
@@ -25,7 +26,7 @@ from jaxdyn.dynamics.quantities import mass_matrix
 from jaxdyn.lie.so3 import matmul
 from jaxdyn.model.configuration import difference
 from jaxdyn.model.tree import Model
-from jaxdyn.systems.mass_factor import mass_factor
+from jaxdyn.systems.mass_factor import cholesky, is_definite, mass_factor, solve_cholesky
 from jaxdyn.systems.scene import Scene
 from jaxdyn.systems.system import displace, displacement, retract
 
@@ -34,8 +35,12 @@ _LONGEST = 0.2
 # After so many steps, and after each further half of them, a path at an obstacle is pushed aside once. Paths without an obstacle
 # are at most pi long, 16 steps, and converge in a few more.
 _PATIENCE = 40
-_NEAREST_STEPS = 30
+_NEAREST_STEPS = 100
 _NEWTON_STEPS = 40
+# Shares of the curvature of the constraints in the Hessian: the largest one with a positive definite matrix is taken.
+_CURVATURES = (1.0, 0.7, 0.4, 0.2, 0.0)
+# Lengths of a step of the slide. A step that is shorter than the second of `_near` is Newton's, and needs no proof of a descent.
+_SLIDE_LENGTHS = (1.0, 0.5, 0.2, 0.05)
 # A full step for quadratic convergence, the others where a singular position is near and full steps overshoot.
 _STEP_LENGTHS = (1.0, 0.5, 0.2, 0.05, 0.01)
 
@@ -108,37 +113,171 @@ def _linearize_rows(scene: Scene, guess, t, e):
     return position_residual(scene, place, t), A
 
 
-def slide_to_nearest(scene: Scene, guess, start, t, rank_tol):
-    """The displacement of least length in the metric M(guess) with phi = 0, by sequential linearisation from a start near it.
+def _near(dtype) -> tuple[float, float]:
+    """Step of Newton's method behind which it has converged, and one from which it converges, rad or lengths of the mechanism."""
+    # 1e-7 in float64: convergence is quadratic, so that what is left is rounding.
+    eps = float(jnp.finfo(dtype).eps)
+    return eps**0.45, eps**0.3
 
-    Steps are limited. The start is kept if the iteration does not converge, or if it ends farther from the guess. The second does
-    not apply to a start that is off the constraints, before an obstacle such as the end of the reach.
+
+class Slide(NamedTuple):
+    """End of a slide: displacement from the guess, sides of the bounds it is held at, and 1 for a minimum, else 0."""
+
+    e: Array
+    held: Array  # (nv,): -1 at a lower bound, 1 at an upper one, else 0
+    is_nearest: Array
+
+
+class _State(NamedTuple):
+    e: Array
+    held: Array
+    fresh: Array  # bounds that were met since the rows were closed
+    moves: Array  # whether the last step has reduced the distance, or has released a bound
+    done: Array
+    count: Array
+
+
+def slide_to_nearest(scene: Scene, guess, start, t, rank_tol, bounds=None) -> Slide:
+    """The displacement of least length in the metric M(guess) with phi = 0, from a start near it.
+
+    Newton's steps, limited, and shortened until they reduce |e|^2 / 2 + nu |phi|. Without the curvature of the constraints, the
+    second derivative of lam . phi, the iteration of Gauss and Newton converges to minima close to the guess alone.
+
+    `bounds`: two (nv,) of the displacement, within which the start has to be. A step ends at the first bound that it meets, which
+    is held from then on, until a minimum where its multiplier has the sign of a pull inwards (an active-set method).
     """
-    metric, _ = kernel(whiten_rows)(scene, guess, t)
-    sizes, _ = coordinate_sizes(scene.system, guess.dtype)
+    mass = mass_matrix(scene.system, guess, t)
+    metric = mass_factor(mass)
+    sizes, length = coordinate_sizes(scene.system, guess.dtype)
+    start = unwind_hinges(scene, guess, start, t) if bounds is None else start
     first = displacement(scene.system, guess, start)
+    endless = jnp.full_like(first, jnp.inf)
+    lower, upper = (-endless, endless) if bounds is None else bounds
+    converged, is_close = _near(guess.dtype)
+    lengths = jnp.asarray(_SLIDE_LENGTHS, guess.dtype)
+    nh = holonomic_rows(layout(scene)).size
+    limit = eps_of(guess) ** 0.4 * jnp.minimum(length, 1.0)
 
-    def improve(state):
-        e, _, count = state
+    def residual(e):
+        return position_residual(scene, displace(scene.system, guess, e), t)
+
+    def half_square(e):
+        return 0.5 * jnp.sum(e * matmul(mass, e))
+
+    def rows(e, held):
+        """phi and its derivative, with a row for each coordinate that may be held, zero where it is not."""
         phi, A = _linearize_rows(scene, guess, t, e)
-        # The shortest displacement that satisfies the linearised rows, all of it and not its change: Gauss-Newton on the minimum.
-        step = matmul(right_inverse(metric, A, rank_tol), matmul(A, e) - phi) - e
-        step, size = _limit_step(step, sizes)
-        return e + step, size, count + 1
+        if bounds is None:
+            return phi, A
+        return jnp.append(phi, jnp.zeros_like(e)), jnp.concatenate([A, jnp.diag(jnp.abs(held))])
 
-    def is_far(state):
-        e, size, count = state
-        return (count < _NEAREST_STEPS) & (size > 1e-7) & jnp.isfinite(e).all()
+    def improve(state: _State):
+        e, held, fresh, _, _, count = state
+        phi, A = rows(e, held)
+        B = right_inverse(metric, A, rank_tol)
+        lam = -matmul(B.T, matmul(mass, e))
+        step, is_convex = _newton_step(mass, _curvature(scene, guess, t, e, lam[:nh]), A, B, matmul(mass, e), phi)
+        step, size = _limit_step(jnp.where(held != 0, jnp.zeros_like(step), step), sizes)
+        weight = 2 * jnp.max(jnp.abs(lam), initial=0.0)
+        way = jnp.where(step < 0, lower, upper) - e
+        way = jnp.where(step != 0, way / jnp.where(step != 0, step, jnp.ones_like(step)), jnp.inf)
+        longest = jnp.clip(jnp.min(way), 0.0, 1.0)
+        bound = B[:, :nh]
 
-    # 1e-7 leaves a distance that is minimal to 1e-14; `polish` closes the rows, which have no such slack.
-    e, size, _ = lax.while_loop(is_far, improve, (first, jnp.asarray(jnp.inf, guess.dtype), 0))
-    whitened = metric.momentum(jnp.stack([e, first], axis=1))
-    is_nearer = jnp.sum(whitened[:, 0] ** 2) <= jnp.sum(whitened[:, 1] ** 2) * (1 + 1e-6)
-    phi = position_residual(scene, displace(scene.system, guess, first), t)
-    _, length = coordinate_sizes(scene.system, guess.dtype)
-    is_stuck = jnp.max(jnp.abs(phi)) > eps_of(guess) ** 0.4 * jnp.minimum(length, 1.0)
-    better = (size <= 1e-6) & (is_nearer | is_stuck) & jnp.isfinite(e).all()
-    return displace(scene.system, guess, jnp.where(better, e, first))
+        def try_length(s):
+            tried = e + s * longest * step
+            # A correction of second order: along a curved surface the merit of a good step would otherwise increase.
+            tried = jnp.clip(tried - matmul(bound, residual(tried)), lower, upper)
+            return tried, half_square(tried) + weight * jnp.sum(jnp.abs(residual(tried)))
+
+        tried, merits = lax.map(try_length, lengths)
+        best = jnp.argmin(jnp.where(jnp.isfinite(merits), merits, jnp.full_like(merits, jnp.inf)))
+        falls = merits[best] < half_square(e) + weight * jnp.sum(jnp.abs(phi))
+        # Below rounding of the merit its fall cannot be seen.
+        is_newton = is_convex & (size <= is_close) & (longest >= 1)
+        after = jnp.where(is_newton, tried[0], jnp.where(falls, tried[best], e))
+        is_minimum = is_convex & (size <= converged)
+        if bounds is None:
+            # A hinge that goes on beyond half a turn is nearer to the guess by a full turn less.
+            unwound = unwind_hinges(scene, guess, displace(scene.system, guess, after), t)
+            shorter = displacement(scene.system, guess, unwound)
+            after = jnp.where(half_square(shorter) < (1 - 1e-6) * half_square(after), shorter, after)
+            return _State(after, held, fresh, falls | is_newton, is_minimum, count + 1)
+        # A bound that is met while the rows are closed again behind another one was the first of the two.
+        fresh = fresh & (jnp.max(jnp.abs(phi)) > limit)
+        meets = (way <= longest) & (longest < 1)
+        after = jnp.where(meets, jnp.where(step < 0, lower, upper), after)
+        pull = held * -lam[nh:]
+        pull = jnp.where(pull > eps_of(e) ** 0.5 * jnp.max(jnp.abs(lam)), pull, jnp.zeros_like(pull))
+        released = is_minimum & (pull > 0) & (jnp.arange(e.size) == jnp.argmax(pull))
+        released = released | (fresh & jnp.any(meets))
+        fresh = jnp.where(jnp.any(meets), meets, fresh)
+        held = jnp.where(released, jnp.zeros_like(held), jnp.where(meets, jnp.sign(step), held))
+        moves = falls | is_newton | jnp.any(released) | jnp.any(meets)
+        return _State(after, held, fresh, moves, is_minimum & ~jnp.any(released) & ~jnp.any(meets), count + 1)
+
+    def goes_on(state: _State):
+        return (state.count < _NEAREST_STEPS) & state.moves & ~state.done & jnp.isfinite(state.e).all()
+
+    none = jnp.zeros(first.shape, bool)
+    begin = _State(first, jnp.zeros_like(first), none, jnp.asarray(True), jnp.asarray(False), jnp.zeros((), jnp.int32))
+    e, held, _, _, done, _ = lax.while_loop(goes_on, improve, begin)
+    has_converged = done & jnp.isfinite(e).all()
+    # A start off the constraints, before an obstacle such as the end of the reach, may be nearer than any place on them.
+    open_by = [jnp.max(jnp.abs(residual(x)), initial=0.0) for x in (e, first)]
+    is_nearer = half_square(e) <= half_square(first) * (1 + 1e-6) + float(jnp.finfo(guess.dtype).tiny)
+    # What the slide has gained is kept even where it has not converged.
+    better = (has_converged | (open_by[0] <= limit)) & (is_nearer | (open_by[1] > limit)) & jnp.isfinite(e).all()
+    is_nearest = (better & has_converged).astype(guess.dtype)
+    return Slide(jnp.where(better, e, first), jnp.where(better, held, jnp.zeros_like(held)), is_nearest)
+
+
+def _curvature(scene: Scene, guess, t, e, lam):
+    """Second derivative of lam . phi in the displacement e, (nv, nv)."""
+
+    def along(direction):
+        return matmul(jax.jvp(lambda e: _linearize_rows(scene, guess, t, e)[1], (e,), (direction,))[1].T, lam)
+
+    curvature = jax.vmap(along)(jnp.eye(e.size, dtype=e.dtype))
+    return 0.5 * (curvature + curvature.T)
+
+
+def _newton_step(mass, curvature, A, B, slope, phi):
+    """Step to the stationary point of the quadratic model on A e + phi = 0, and whether its whole Hessian is definite there."""
+    null_projector = jnp.eye(slope.size, dtype=A.dtype) - matmul(B, A)
+    across = matmul(B, A)
+    along = -matmul(B, phi)
+    fixed = matmul(across.T, matmul(mass, across)) + matmul(null_projector.T, matmul(mass, null_projector))
+    bent = matmul(null_projector.T, matmul(curvature, null_projector))
+
+    def solve(share):
+        # Across the null space M replaces the Hessian, so that the matrix is regular; that part of the solution is projected out.
+        matrix = fixed + share * bent
+        factor = cholesky(matrix)
+        right = -matmul(null_projector.T, slope + matmul(mass, along) + share * matmul(curvature, along))
+        return matmul(null_projector, solve_cholesky(factor, right)), is_definite(matrix, factor)
+
+    steps, definite = jax.vmap(solve)(jnp.asarray(_CURVATURES, A.dtype))
+    chosen = jnp.argmax(definite)
+    return along + steps[chosen], definite[0]
+
+
+def unwind_hinges(scene, guess, q, t):
+    """q with its hinges within half a turn of the guess, where full turns make no difference to the constraints."""
+    # A gear or a mimic joint counts turns: there the residual increases, and q stays.
+    if not isinstance(scene.system, Model):
+        return q
+    topology = scene.system.topology
+    hinges = [s.start for kind, s in zip(topology.kinds, topology.q_slices, strict=True) if kind == "revolute"]
+    if not hinges:
+        return q
+    places = np.asarray(hinges)
+    turns = jnp.round(lax.stop_gradient(q - guess)[places] / (2 * np.pi))
+    back = q.at[places].add(-2 * np.pi * turns)
+    before, after = (jnp.max(jnp.abs(position_residual(scene, x, t))) for x in (q, back))
+    _, length = coordinate_sizes(scene.system, q.dtype)
+    rounding = 64 * float(jnp.finfo(q.dtype).eps) * jnp.maximum(length, 1.0)
+    return jnp.where(lax.stop_gradient(after <= before + rounding), back, q)
 
 
 def polish(scene: Scene, q, t, rank_tol):
@@ -167,26 +306,29 @@ def polish(scene: Scene, q, t, rank_tol):
 def nearest_configuration(scene: Scene, guess, start, t, rank_tol, solve: Callable | None = None):
     """The configuration on the constraints nearest to a guess, from a start close to it, with the derivatives of a minimum.
 
-    `solve(scene, guess, start, t)` finds it in place of `slide_to_nearest`.
+    With it 1 where it satisfies the conditions of a minimum, else 0: its derivatives are then NaN.
+    `solve(scene, guess, start, t)` finds both in place of `slide_to_nearest`.
     """
 
     def slide(scene, guess, start, t):
-        return polish(scene, slide_to_nearest(scene, guess, start, t, rank_tol), t, rank_tol)
+        end = slide_to_nearest(scene, guess, start, t, rank_tol)
+        return polish(scene, displace(scene.system, guess, end.e), t, rank_tol), end.is_nearest
 
     solve = solve or slide
 
     def differentiable(scene, q, start, t):
         fixed, guess, *others = stop_gradient((scene, q, start, t))
-        place = lax.stop_gradient(solve(fixed, guess, *others))
+        place, is_nearest = lax.stop_gradient(solve(fixed, guess, *others))
         end = displace(scene.system, q, _stationary(scene, q, t, displacement(scene.system, guess, place), rank_tol))
         # Only the derivative of `end` is used: from the guess to the solution and back, its value has lost digits.
-        return retract(scene.system, place + (end - lax.stop_gradient(end)))
+        return retract(scene.system, place + (end - lax.stop_gradient(end))), is_nearest
 
     def tangent(scene, q, start, t, steps):
-        place, change = value_and_jvp(differentiable, (scene, q, start, t), steps)
-        return place, jnp.zeros_like(place) if change is None else change
+        places, changes = value_and_jvp(differentiable, (scene, q, start, t), steps)
+        return places, jax.tree.map(jnp.zeros_like, places) if changes is None else changes
 
-    return implicit(scene, (guess, lax.stop_gradient(start), t), solve, tangent)
+    q, is_nearest = implicit(scene, (guess, lax.stop_gradient(start), t), solve, tangent)
+    return invalidate_derivatives(q, is_nearest < 1, (scene, guess, t)), lax.stop_gradient(is_nearest)
 
 
 def _stationary(scene: Scene, guess, t, e, rank_tol):

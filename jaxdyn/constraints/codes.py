@@ -77,6 +77,11 @@ class RESULTS(eqx.Enumeration):
         "The rank of the constraint rows is unclear: singular values that count and those that do not differ by less than a "
         "factor of 100. Give more digits, or a rank_tol."
     )
+    # Of searches for the nearest configuration.
+    not_nearest = (
+        "The configuration satisfies the constraints, but the search for the nearest one to the guess or the posture did not "
+        "converge."
+    )
 
     # An enumeration of equinox does not list its names.
     _names.extend(name for name in vars() if not name.startswith("_"))

@@ -27,27 +27,31 @@ from jaxdyn.model.topology import body_index
 from jaxdyn.model.tree import Model
 
 
-def _floor(x):
-    # Only exactly upside down is the denominator zero. The residual is then huge, as it has to be: the way back is half a turn.
+def _above_zero(x):
+    """x, and at least rounding, with what to add to the numerators of the quotients by it: 1 where x is zero, else 0."""
+    # Exactly upside down the numerators vanish too: without the addition a mechanism would count as closed there. With it the
+    # residual is huge, as it is nearby, and a Newton step turns the frames by about a radian.
     tiny = float(jnp.finfo(x.dtype).eps)
-    return jnp.where(x < tiny, jnp.full_like(x, tiny), x)
+    is_zero = x < tiny
+    return jnp.where(is_zero, jnp.full_like(x, tiny), x), jnp.where(is_zero, jnp.ones_like(x), jnp.zeros_like(x))
 
 
 def _axis(R):
     """Twice the tangent of half the angle between the axes z, split along x and y."""
-    height = _floor(1.0 + R[2][2])
-    return 2.0 * R[0][2] / height, 2.0 * R[1][2] / height
+    height, push = _above_zero(1.0 + R[2][2])
+    return 2.0 * (R[0][2] + push) / height, 2.0 * R[1][2] / height
 
 
 def attitude(R):
     """Twice the tangent of half the angle, along the axis of the rotation: three numbers."""
-    size = _floor(1.0 + R[0][0] + R[1][1] + R[2][2])
-    return tuple(2.0 * (R[j][i] - R[i][j]) / size for i, j in ((1, 2), (2, 0), (0, 1)))
+    size, push = _above_zero(1.0 + R[0][0] + R[1][1] + R[2][2])
+    return tuple(2.0 * (R[j][i] - R[i][j] + push) / size for i, j in ((1, 2), (2, 0), (0, 1)))
 
 
 def _turn(R):
     """Twice the tangent of half the angle about z, when that is the only angle."""
-    return ((R[1][0] - R[0][1]) / _floor(1.0 + 0.5 * (R[0][0] + R[1][1])),)
+    size, push = _above_zero(1.0 + 0.5 * (R[0][0] + R[1][1]))
+    return ((R[1][0] - R[0][1] + push) / size,)
 
 
 class Kind(NamedTuple):

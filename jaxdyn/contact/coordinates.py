@@ -8,6 +8,7 @@ import jax.numpy as jnp
 from jax import lax
 from jaxtyping import Array, Float
 
+from jaxdyn.constraints.rank import eps_of
 from jaxdyn.contact.surfaces import Plane, Sphere, Surface, check_surface, geometry_at
 from jaxdyn.contact.touching import newton_steps, patch_at
 from jaxdyn.lie.so3 import matmul
@@ -30,7 +31,8 @@ def contact_coordinates(surface_o: Surface, surface_f: Surface, pose: Numbers) -
     - `surface_o`, `surface_f`: of the object and of the finger, each in its body's frame, with outward normals.
     - `pose` (4, 4): of the finger's frame in the object's, m.
 
-    **Returns:** eta = (u_o, v_o, u_f, v_f, psi) (5,), in the units of the charts and rad; differentiable three times.
+    **Returns:** eta = (u_o, v_o, u_f, v_f, psi) (5,), in the units of the charts and rad; differentiable three times. NaN where
+    the search for the closest points did not converge.
 
     **Raises:** ValueError for an invalid surface, a pose of another shape, two planes, and a `Parametrised` surface, whose
     closest points are not known.
@@ -77,6 +79,11 @@ def _by_newton(surface_o: Surface, surface_f: Surface, R, p, places):
     # theorem).
     constants = lax.stop_gradient((R, p))
     places = lax.fori_loop(0, _ROUNDS, lambda _, places: step(*constants, places), lax.stop_gradient(places))
-    for _ in range(_DIFFERENTIATED):
+    for _ in range(_DIFFERENTIATED - 1):
         places = step(R, p, places)
-    return places
+    last = newton_steps(patch_at(surface_o, places[0]), patch_at(surface_f, places[1]), R, p)
+    # The last step of a search that has converged is rounding. Another one has no closest points: NaN, and so its derivatives.
+    size = jnp.max(jnp.abs(jnp.concatenate(lax.stop_gradient((last.on_a, last.on_b)))))
+    converged = size <= eps_of(p) ** 0.6 * (1 + jnp.max(jnp.abs(lax.stop_gradient(p))))
+    invalid = jnp.where(converged, jnp.ones_like(size), jnp.nan)
+    return surface_o.displace(places[0], last.on_a) * invalid, surface_f.displace(places[1], last.on_b) * invalid

@@ -155,17 +155,29 @@ class ProjectionDerivative(NamedTuple):
         return jnp.concatenate([(up + down)[..., None], rest], -1)
 
 
-def projection_derivative(v, width) -> ProjectionDerivative:
-    """Derivative of the projection, smoothed over `width` about its kinks, where it is the mean of both sides.
+def projection_derivative(v, width, at_kink) -> ProjectionDerivative:
+    """Derivative of the projection; at its kinks, eigenvalues v0 -+ |v1| of at most `width`, that of one side or between.
 
-    With the eigenvalues v0 -+ |v1| and p(x) = (x + sqrt(x^2 + 4 width^2)) / 2 instead of max(x, 0): p' along (1, -+u), and
-    the divided difference of p across.
+    Along (1, -+u) it is the derivative of max(x, 0), across its divided difference. `at_kink`: 1 for the derivative of the
+    side where the eigenvalue is positive, 0 for that of the other one, 1/2 for their mean.
     """
     norm = _norm(v[..., 1:])
     high, low = v[..., 0] + norm, v[..., 0] - norm
-    root_high, root_low = (jnp.sqrt(x * x + 4 * width * width) for x in (high, low))
-    # (p(high) - p(low)) / (high - low), without the difference.
-    across = (1 + (high + low) / (root_high + root_low)) / 2
+
+    def one_sided(x):
+        return jnp.where(jnp.abs(x) <= width, at_kink, (x > 0).astype(x.dtype))
+
+    # (max(high, 0) - max(low, 0)) / (high - low), without the difference. At the apex both are kinks.
+    sizes = jnp.abs(high) + jnp.abs(low)
+    is_apex = (jnp.abs(high) <= width) & (jnp.abs(low) <= width)
+    quotient = (1 + (high + low) / jnp.where(sizes > 0, sizes, 1)) / 2
+    across = jnp.where(is_apex, at_kink, quotient)
     # On the axis u is zero: the three eigenvalues agree there, and D is a multiple of the unit matrix.
     u = v[..., 1:] / jnp.where(norm > 0, norm, 1)[..., None]
-    return ProjectionDerivative((1 + high / root_high) / 2, (1 + low / root_low) / 2, across, u)
+    return ProjectionDerivative(one_sided(high), one_sided(low), across, u)
+
+
+def is_near_kink(v, width):
+    """Decide whether an eigenvalue v0 -+ |v1| is at most `width`, (k,)."""
+    norm = _norm(v[..., 1:])
+    return (jnp.abs(v[..., 0] - norm) <= width) | (jnp.abs(v[..., 0] + norm) <= width)

@@ -14,7 +14,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Int
 
-from jaxdyn.compile import entry_point
+from jaxdyn.compile import entry_point, invalidate_derivatives
 from jaxdyn.compile.known import is_concrete, is_tracing
 from jaxdyn.constraints.codes import RESULTS, Outcome
 from jaxdyn.constraints.rank import pseudo_inverse, tolerance
@@ -72,8 +72,9 @@ def solve_qp(
 
     An interior-point method whose steps are kernels (see `compilation`): it compiles, batches (`jax.vmap`) and is
     differentiated in all arrays, forward and reverse, by the equations of the solution, also where forces are on the
-    boundary of their cone or at its apex. Where a row is active with a multiplier of zero, the solution has only one-sided
-    derivatives, and their mean is returned. Zeros of G and S that are known while tracing cost nothing,
+    boundary of their cone or at its apex. Where rows are active with a multiplier of zero, the solution has only one-sided
+    derivatives, and the mean of those with and without these rows is returned. Derivatives are NaN where `result` is not
+    `successful`. Zeros of G and S that are known while tracing cost nothing,
     if there are no equality rows.
 
     **Arguments:**
@@ -258,16 +259,10 @@ def _solve(Q, q, G, h, A, b, cones, pattern: tuple[bytes | None, ...], tol: floa
     finite = finite & (jnp.isfinite(point.x).all() | (result != RESULTS.successful))
     result = RESULTS.where(finite, result, RESULTS.nonfinite)  # pyright: ignore[reportArgumentType]
     x, y, z, s = _unscale(scaled, point, kept)
-    return QPSolution(
-        x=x,
-        multipliers=jnp.where(bounded, z[0][:, 0], 0),
-        slack=jnp.where(bounded, s[0][:, 0], h),
-        equality_multipliers=y,
-        cone_multipliers=tuple(z[1:]),
-        cone_slack=tuple(s[1:]),
-        steps=steps,
-        result=result,
-    )
+    solution = x, jnp.where(bounded, z[0][:, 0], 0), jnp.where(bounded, s[0][:, 0], h), y, tuple(z[1:]), tuple(s[1:])
+    failed = result != RESULTS.successful
+    x, *rest = invalidate_derivatives(solution, failed, (Q, q, G, h, A, b, cones))
+    return QPSolution(x, *rest, steps=steps, result=result)
 
 
 def _unscale(scaled: _Scaled, point: Point, kept: list[int]):

@@ -35,6 +35,7 @@ from jaxdyn.systems.scene import as_pytree
 # Eleven lengths from 1 to 1e-3. They and the schedule of mu are those of the program iLQG of Tassa, Erez & Todorov (2012).
 _LENGTHS = tuple(10.0 ** (-3 * i / 10) for i in range(11))
 _LEAST_PART = 1e-4  # of the reduction that the expansion predicts
+_LARGEST_PART = 1e2  # of `tol`, that a step may predict which brings less than `tol`
 _FACTOR, _LEAST_DAMPING, _LARGEST_DAMPING = 1.6, 1e-6, 1e10
 _RUNNING, _CONVERGED, _NO_DESCENT, _NOT_FINITE = range(4)
 
@@ -117,7 +118,8 @@ def ilqr(
     - `x0`: the initial state. `us` (n, nu): the guess; or a plan, for a warm start, whose feedback is followed from x0 on:
       `plan.shift()` of the last problem.
     - `limits`: (lower, upper), each a number, (nu,) or (n, nu); None: none.
-    - `iterations`: at most. `tol`: converged where a step reduces the cost, or is predicted to, by less than this part.
+    - `iterations`: at most. `tol`: converged where an undamped step is predicted to reduce the cost by less than this part, or a
+      full one does.
     - `regularization`: mu of the first iteration.
     - `second_order`: whether to keep the second derivatives of the step (DDP): fewer iterations near the solution, each of
       them dearer.
@@ -247,7 +249,8 @@ def _iterate(problem: _Problem, state: _State, tol: float) -> _State:
     # What is left of a cost that goes to zero is rounding of the first one.
     size = jnp.maximum(jnp.abs(state.cost), eps_of(state.cost) * jnp.abs(state.costs[0]))
     # With large damping a small step is no sign of a minimum; 1e-5 is the bound of iLQG.
-    is_small = is_definite & (predicted <= tol * size) & (state.damping <= 1e-5)
+    is_damped_little = state.damping <= 1e-5
+    is_small = is_definite & (predicted <= tol * size) & is_damped_little
 
     def try_length(carry):
         _, count = carry
@@ -262,7 +265,7 @@ def _iterate(problem: _Problem, state: _State, tol: float) -> _State:
         return ~carry[0][3] & (carry[1] < len(_LENGTHS)) & is_definite & ~is_small
 
     before = state.xs, state.us, state.cost, jnp.asarray(False)
-    (xs, us, cost, falls), _ = lax.while_loop(goes_on, try_length, (before, jnp.zeros((), jnp.int32)))
+    (xs, us, cost, falls), count = lax.while_loop(goes_on, try_length, (before, jnp.zeros((), jnp.int32)))
     xs, us, cost = (jnp.where(falls, x, y) for x, y in zip((xs, us, cost), before[:3], strict=True))
 
     # Repeated successes or failures change mu ever faster (Tassa, Erez & Todorov 2012, section II).
@@ -272,7 +275,9 @@ def _iterate(problem: _Problem, state: _State, tol: float) -> _State:
     # Below its least value mu is exactly zero, so that steps close to the minimum are undamped.
     less = jnp.where(state.damping * ratio > _LEAST_DAMPING, state.damping * ratio, jnp.zeros_like(ratio))
     damping = jnp.where(falls, less, jnp.maximum(state.damping * ratio, _LEAST_DAMPING))
-    converged = is_small | (falls & (state.cost - cost <= tol * size))
+    # A small reduction is a sign of a minimum only if it is that of a full step, little damped, from which little was expected.
+    is_full = (count == 1) & is_damped_little & (predicted <= _LARGEST_PART * tol * size)
+    converged = is_small | (falls & is_full & (state.cost - cost <= tol * size))
     code = jnp.where(converged, _CONVERGED, jnp.where(damping > _LARGEST_DAMPING, _NO_DESCENT, _RUNNING))
     # An indefinite pass has gains of NaN: those of the pass before remain.
     kept = is_definite
@@ -342,7 +347,9 @@ def _backward(problem: _Problem, state: _State):
             k, K = -solve_cholesky(factor, Qu), -solve_cholesky(factor, Qux)
         else:
             u = z[nx:]
-            k, free, factor = minimize_in_box(damped, Qu, problem.lower[i] - u, problem.upper[i] - u)
+            k, free, factor, found = minimize_in_box(damped, Qu, problem.lower[i] - u, problem.upper[i] - u)
+            # A search that gave up is no step: like an indefinite matrix it makes the damping grow.
+            is_definite = is_definite & found
             # A control at a limit has no feedback: its row of the gain is zero.
             K = -solve_cholesky(factor, jnp.where(free[:, None], Qux, jnp.zeros_like(Qux)))
         # The Cholesky factor of an indefinite matrix is NaN.

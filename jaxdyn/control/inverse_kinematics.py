@@ -16,11 +16,11 @@ import numpy as np
 from jax import lax
 from jaxtyping import Array, Float, Int
 
-from jaxdyn.compile import entry_point
+from jaxdyn.compile import entry_point, invalidate_derivatives
 from jaxdyn.compile.known import is_concrete, stop_gradient
 from jaxdyn.constraints.assembly import check_search, closing_tolerance, independent_rows_near
 from jaxdyn.constraints.base import Constraint, holonomic_rows, layout, position_residual
-from jaxdyn.constraints.closing import nearest_configuration
+from jaxdyn.constraints.closing import nearest_configuration, polish, slide_to_nearest
 from jaxdyn.constraints.codes import RESULTS, Outcome, name_of, require_success
 from jaxdyn.constraints.redundancy import KeptRows, has_selection, opening_of_redundant
 from jaxdyn.constraints.selection import most_rounding
@@ -30,9 +30,8 @@ from jaxdyn.control.targets import as_targets, target_rows
 from jaxdyn.model.arguments import Checked, Number, Numbers, as_array, check_state
 from jaxdyn.model.tree import Model
 from jaxdyn.systems.scene import Scene, as_scene
-from jaxdyn.systems.system import SceneLike
+from jaxdyn.systems.system import SceneLike, displace
 
-_ACTIVE_ROUNDS = 3
 
 
 class InverseKinematics(Outcome):
@@ -42,7 +41,8 @@ class InverseKinematics(Outcome):
     - `errors` (m,): all rows of the targets, in their order: positions in m, in the axes of the target; orientations as rotation
       vectors, rad. `constraint_residual` (): the largest |phi| of the scene's constraints, m or rad.
     - `result`: one of `RESULTS`; `targets_not_reached`: q is then the best place that was met; `not_assembled`: it is not
-      even on the constraints. `guesses` (): how many places the search began at.
+      even on the constraints; `not_nearest`: q reaches the targets, but the search for the nearest one to the posture did not
+      converge. `guesses` (): how many places the search began at.
     """
 
     q: Float[Array, " nq"]
@@ -54,9 +54,9 @@ class InverseKinematics(Outcome):
 
 
 class _HeldAtLimits(Constraint):
-    """Joints of one degree of freedom that are held at a limit: rows q - limit where `active` is 1, else zero."""
+    """Joints of one degree of freedom that are held at a limit: rows q - limit where `active` is not 0, else zero."""
 
-    active: Float[Array, " n"]
+    active: Float[Array, " n"]  # -1 at the lower limit, 1 at the upper one
     limit: Float[Array, " n"]
     joints: tuple[int, ...] = eqx.field(static=True)
     name: str = eqx.field(static=True, default="limits")
@@ -68,7 +68,7 @@ class _HeldAtLimits(Constraint):
     def position(self, system, q, t):
         """Distances from the limits, (n,)."""
         # Rows of inactive joints are zero and not left out: the set changes while shapes stay fixed.
-        return jnp.where(self.active > 0, q[np.asarray(self.joints)] - self.limit, jnp.zeros_like(self.limit))
+        return jnp.where(self.active != 0, q[np.asarray(self.joints)] - self.limit, jnp.zeros_like(self.limit))
 
 
 def inverse_kinematics(
@@ -193,8 +193,10 @@ def _solve(scene: Scene, rows, guess, factors, posture, t, limits: bool, steps: 
     q, tried = search(fixed, start, time, aims, guesses)
     q = lax.stop_gradient(q)
     is_reached = _reaches_targets(fixed, q, time, aims)
-    # The implicit function theorem holds at a solution only. Elsewhere q is a constant, with zero derivatives.
-    q = jnp.where(is_reached, _differentiable(whole, q, posture, t, aims, len(scene.constraints)), q)
+    # The implicit function theorem holds at a solution only. Elsewhere q is a constant, and its derivatives are NaN.
+    solution, is_nearest = _differentiable(whole, q, posture, t, aims, len(scene.constraints))
+    q = jnp.where(is_reached & is_nearest, solution, q)
+    q = invalidate_derivatives(q, ~(is_reached & is_nearest), (whole, guess, factors, posture, t))
 
     values = position_residual(whole, q, t)
     exact = aims.is_exact > 0
@@ -208,7 +210,7 @@ def _solve(scene: Scene, rows, guess, factors, posture, t, limits: bool, steps: 
     reached = reached & (opening_of_redundant(scene, q, t) <= most_rounding(q.dtype))
     closed = jnp.all(~exact | (jnp.abs(lax.stop_gradient(values)) <= aims.tolerances))
     result = RESULTS.where(closed, RESULTS.targets_not_reached, RESULTS.not_assembled)  # pyright: ignore[reportArgumentType]
-    result = RESULTS.where(reached, RESULTS.successful, result)
+    result = RESULTS.where(reached, RESULTS.where(is_nearest, RESULTS.successful, RESULTS.not_nearest), result)  # pyright: ignore[reportArgumentType]
     return InverseKinematics(q, jnp.max(counted, initial=0.0), errors, opening, result, tried)
 
 
@@ -259,35 +261,41 @@ def _differentiable(whole: Scene, q, posture, t: Number, aims: Aims, constraints
     at = np.asarray(joints, int)
     lower, upper = aims.lower[at], aims.upper[at]
 
-    def scene_at(place, active) -> Scene:
-        """With the joints that are `active` held at the limits that are near them."""
+    def scene_at(active) -> Scene:
+        """With the joints that are `active` held at their lower (-1) or upper (1) limits."""
         if not joints:
             return Scene(model, tuple(rows))
-        limit = jnp.where(place[at] - lower < upper - place[at], lower, upper)
-        at_limit = jnp.where(active, limit, jnp.zeros_like(limit))
-        held = _HeldAtLimits(active.astype(q.dtype), at_limit, joints)  # pyright: ignore[reportCallIssue]
-        return Scene(model, (*rows, held))
+        limit = jnp.where(active < 0, lower, upper)
+        at_limit = jnp.where(active != 0, limit, jnp.zeros_like(limit))
+        return Scene(model, (*rows, _HeldAtLimits(active, at_limit, joints)))  # pyright: ignore[reportCallIssue]
 
-    def beyond(place):
-        return (place[at] < lower) | (place[at] > upper)
+    def sides(below, above):
+        return above.astype(q.dtype) - below.astype(q.dtype)
 
     if posture is None:
         # Joints at a limit are held there, so that derivatives do not lead out of it.
-        scene = scene_at(q, (q[at] <= lower) | (q[at] >= upper))
+        scene = scene_at(sides(q[at] <= lower, q[at] >= upper))
         # q is the configuration nearest to itself: `solve` returns the start, and only the derivative is computed.
-        return nearest_configuration(scene, q, q, t, None, solve=lambda scene, guess, start, t: start)
-    active, place, time = jnp.zeros(at.shape, bool), q, stop_gradient(t)
-    # The set of joints at a limit is a decision without derivative. The last `nearest_configuration` alone is differentiated.
-    guess = lax.stop_gradient(posture)
-    for _ in range(
-        _ACTIVE_ROUNDS if joints else 0
-    ):  # joints that pass a limit on the way to the posture are held there
-        passed = nearest_configuration(stop_gradient(scene_at(place, active)), guess, q, time, None)
-        active = active | beyond(passed)
-        place = jnp.where(jnp.any(beyond(passed)), clip_to_limits(model, passed, aims), place)
-    place = nearest_configuration(scene_at(place, active), posture, q, t, None)
-    # If a joint is still beyond a limit after all rounds, the q of the search, within its limits, is kept.
-    return jnp.where(jnp.any(beyond(clip_rounding(place, at, lower, upper))), q, place)
+        one = jnp.ones((), q.dtype)
+        place, _ = nearest_configuration(scene, q, q, t, None, solve=lambda scene, guess, start, t: (start, one))
+        return place, jnp.asarray(True)
+
+    fixed, guess, time = stop_gradient((Scene(model, tuple(rows)), posture, t))
+    bounds = None
+    if joints:
+        at_v = np.asarray([slot for place, slot in zip(*screw_joints(model), strict=True) if place in joints])
+        endless = jnp.full((model.nv,), jnp.inf, q.dtype)
+        bounds = (-endless).at[at_v].set(lower - guess[at]), endless.at[at_v].set(upper - guess[at])
+    end = slide_to_nearest(fixed, guess, q, time, None, bounds)
+    # The set of joints at a limit is a decision without derivative.
+    scene = scene_at(end.held[at_v] if joints else jnp.zeros((0,), q.dtype))
+    found = polish(stop_gradient(scene), displace(model, guess, end.e), time, None), end.is_nearest
+    place, is_nearest = nearest_configuration(scene, posture, q, t, None, solve=lambda *_: found)
+    if not joints:
+        return place, is_nearest > 0
+    place = clip_rounding(place, at, lower, upper)
+    is_within = jnp.all((place[at] >= lower) & (place[at] <= upper))
+    return place, (is_nearest > 0) & is_within
 
 
 def clip_rounding(q, at: np.ndarray, lower, upper):

@@ -158,7 +158,7 @@ def missing_wrench(
     $$(M a + h)_\mathrm{base} - G f$$
 
     f in the cones minimises its norm. Zero, up to the tolerance of the program and about 1e-6 of its
-    norm, where the feet can carry the robot.
+    norm, where the feet can carry the robot. NaN where the program was not solved.
 
     **Arguments:** as of `underactuated_inverse_dynamics`.
 
@@ -177,7 +177,8 @@ def missing_wrench(
     Q = matmul(G.T, G) + 1e-6 * jnp.eye(G.shape[1], dtype=q.dtype)
     # Without preload, which would count as a missing wrench where the feet carry little.
     bounds = cone_bounds([one.cone for one in feet], jnp.zeros((), q.dtype), q.dtype)
-    return needed - matmul(G, solve_qp(Q, -matmul(G.T, needed), **bounds).x)
+    optimum = solve_qp(Q, -matmul(G.T, needed), **bounds)
+    return jnp.where(optimum.success, needed - matmul(G, optimum.x), jnp.nan)
 
 
 def passive_velocities(model: Model, passive: Sequence[int] | None) -> np.ndarray:

@@ -54,10 +54,15 @@ class FrameTarget(Pair):
         if self.task == "position":
             return p
         if self.task == "direction":
-            # The rotation of least angle that takes the target's z axis to the frame's, of quaternion (w, -y/2w, x/2w, 0).
+            # The rotation of least angle that takes the target's z axis to the frame's, of quaternion (w, -y/2w, x/2w, 0) with
+            # w = cos(theta / 2). For opposite directions every axis orthogonal to z is one of half a turn: y is taken. Without
+            # a choice the residual of half a turn would be zero there.
             x, y, z = R[0, 2], R[1, 2], R[2, 2]
-            # For opposite directions w is 0. The least value keeps the quotients and their derivatives finite.
-            w = jnp.sqrt(jnp.maximum(0.5 * (1 + z), float(jnp.finfo(R.dtype).eps)))
+            near = float(jnp.finfo(R.dtype).eps) ** 0.5
+            x = jnp.where((z < 0) & (x * x + y * y < near * near), x + near, x)
+            # w^2 = (1 + z) / 2; below the horizon by (1 + z) (1 - z) = x^2 + y^2, which does not cancel.
+            square = jnp.where(z < 0, (x * x + y * y) / (2 * (1 - jnp.minimum(z, 0))), 0.5 * (1 + jnp.maximum(z, 0)))
+            w = jnp.sqrt(square)
             vector = so3.quat_log(jnp.stack([w, -0.5 * y / w, 0.5 * x / w, jnp.zeros_like(x)]))
             return vector[:2]
         turned = so3.log(R)

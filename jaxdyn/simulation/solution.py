@@ -4,10 +4,12 @@ from typing import TYPE_CHECKING, Any
 
 import diffrax
 import equinox as eqx
+import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
+from jaxdyn.compile import invalidate_derivatives
 from jaxdyn.constraints.codes import RESULTS as RESULTS
 from jaxdyn.constraints.codes import Outcome, first_of, name_of
 from jaxdyn.contact.forces import contacts_with_cones
@@ -42,6 +44,19 @@ def from_diffrax(result) -> Any:
     # By name, because the numbers of codes differ between the two enumerations and between versions of diffrax.
     cases = [(result == getattr(diffrax.RESULTS, name), getattr(RESULTS, name)) for name in OF_DIFFRAX]
     return first_of(cases, RESULTS.internal_error)
+
+
+# Codes of runs whose rows, as far as they come, are a motion, with its derivatives.
+_OF_MOTIONS = (
+    "successful", "coarse_steps", "contact_lost", "joint_limit_passed", "control_singular", "no_single_contact", "singular_basis",
+)  # fmt: skip
+
+
+def invalidate_failed(rows, times, result, reached, inputs):
+    """Rows (nt, ...) and times (...) of a run, with NaN in rows that were not reached and for the derivatives of what failed."""
+    has_failed = ~jnp.stack([result == getattr(RESULTS, name) for name in _OF_MOTIONS]).any(0)
+    rows = jax.tree.map(lambda x: rows_where(reached, x, jnp.nan), rows)
+    return invalidate_derivatives(rows, has_failed | ~reached, inputs), invalidate_derivatives(times, has_failed, inputs)
 
 
 ADVICE = {

@@ -132,3 +132,35 @@ def test_a_delta_robot_from_a_file_keeps_its_branch(count, tmp_path):
     error = np.abs((computed - hips + np.pi) % (2 * np.pi) - np.pi).max(1)
     # Elbows stay outwards as in the guess; at the edge of the reach, where both branches meet, a change of the branch is said.
     assert np.all((error < 1e-8) | passed) and np.mean(error < 1e-8) > 0.99
+
+
+@pytest.mark.long
+def test_far_guesses_end_at_the_least_change():
+    """The guess in the null space of the rows at the end, in the metric M(guess), up to 1 rad away; derivatives by differences."""
+    model, tip = jd.robots.iiwa(), "iiwa_link_7"
+    place = jnp.array([0.3, 0.6, -0.2, -1.2, 0.4, 0.9, 0.1])
+    goal = jd.frame_pose(model, place, tip)[:3, 3]
+    scene = jd.Scene(model, [jd.Holonomic(lambda q, t=0.0: jd.frame_pose(model, q, tip)[:3, 3] - goal, name="tip")])
+    directions = np.random.default_rng(0).normal(size=(100, 7))
+    directions /= np.linalg.norm(directions, axis=1)[:, None]
+    guesses = jnp.asarray(place + np.repeat([0.05, 0.3, 1.0, 1.0], 25)[:, None] * directions)
+    solve = jax.jit(jax.vmap(lambda guess: jd.assemble(scene, guess, throw=False)))
+    found = solve(guesses)
+    assert bool(found.success.all())
+    masses = np.asarray(jax.vmap(lambda q: jd.mass_matrix(model, q))(guesses))
+    rows = np.asarray(jax.vmap(jax.jacfwd(lambda q: jd.frame_pose(model, q, tip)[:3, 3]))(found.q))
+    for M, A, e in zip(masses, rows, np.asarray(found.q - guesses), strict=True):
+        null = np.linalg.svd(A)[2][3:]
+        assert np.abs(null @ M @ e).max() < 1e-11 * (1 + np.abs(M @ e).max())
+    along = jnp.asarray(directions[::-1])
+    slopes = jax.jit(jax.vmap(lambda q, d: jax.jvp(lambda q: jd.assemble(scene, q, throw=False).q, (q,), (d,))[1]))(guesses, along)
+    difference = (solve(guesses + 1e-6 * along).q - solve(guesses - 1e-6 * along).q) / 2e-6
+    near = np.abs(difference).max(1) < 20  # not beside a guess from which two places are equally far
+    np.testing.assert_allclose(slopes[near], difference[near], rtol=1e-4, atol=1e-5)
+    assert near.sum() > 95
+    # Too far for the search: a code, and derivatives of NaN.
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr("jaxdyn.constraints.closing._NEAREST_STEPS", 1)
+        short = jax.jit(lambda q: jd.assemble(scene, q, throw=False))(guesses[-1])
+        assert short.result == jd.RESULTS.not_nearest and float(short.residual[0]) < 1e-11
+        assert np.isnan(jax.jit(jax.jacrev(lambda q: jd.assemble(scene, q, throw=False).q))(guesses[-1])).all()

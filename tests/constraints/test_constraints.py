@@ -302,3 +302,23 @@ def test_former_names_are_taken_with_a_warning():
 
     system = jd.MetricSystem(lambda q: jnp.eye(2), 2)
     np.testing.assert_array_equal(jd.constraint_jacobian(jd.Scene(system, (Mine(),)), jnp.zeros(2)), [[1.0, -2.0]])
+
+
+@pytest.mark.parametrize(
+    ("joint", "turn", "planar"),
+    [("revolute", "x", False), ("cylindrical", "y", False), ("planar", "x", False)]
+    + [("weld", axis, False) for axis in "xyz"]
+    + [("prismatic", "z", False), ("weld", "z", True), ("prismatic", "z", True)],
+)
+def test_upside_down_is_not_closed(joint, turn, planar):
+    """A frame at exactly half a turn from its place: the residual is huge, not zero, and assembly turns it back."""
+    builder = jd.ModelBuilder("free", gravity=None)
+    builder.add_body("body", None, "free", jd.inertia.box(1.0, (0.1, 0.2, 0.3)))
+    model = builder.build()
+    scene = jd.Scene(model, (jd.loop(None, None, "body", None, joint, in_plane=planar),))
+    q = jnp.zeros(7).at[3 + 1 + "xyz".index(turn)].set(1.0)  # half a turn
+    assert np.abs(position_residual(scene, q)).max() > 1e8
+    if not planar:
+        assembled = jd.assemble(scene, q)
+        R = np.asarray(jd.frame_pose(model, assembled.q, "body"))[:3, :3]
+        np.testing.assert_allclose(R[2, 2], 1.0, atol=1e-10)

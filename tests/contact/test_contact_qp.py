@@ -4,7 +4,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from pinocchio_bridge import quick
+from pinocchio_bridge import assert_close, quick
 from scipy.optimize import linprog
 
 from jaxdyn.constraints.codes import RESULTS
@@ -343,3 +343,52 @@ def test_data_that_are_not_finite_have_a_code():
     batch = [jnp.stack([row[i] for row in rows]) for i in range(6)]
     results = jax.jit(jax.vmap(lambda *given: solve_qp(*given).result))(*batch)
     np.testing.assert_array_equal(np.flatnonzero(results != RESULTS.nonfinite), [0, 8])
+
+
+def test_projection_on_a_cone_near_its_apex():
+    """Closed form (t + |u|) / 2 (1, u / |u|), at distances from the apex down to 1e-8 of y, of any size; values and derivatives."""
+    rng = np.random.default_rng(0)
+    outside = np.concatenate([sign * 10 ** rng.uniform(-8, 0, 150) for sign in (1, -1)])
+    angle, size = rng.uniform(0, 2 * np.pi, 300), 10 ** rng.uniform(-2, 2, 300)
+    u = (1 + outside)[:, None] * np.stack([np.cos(angle), np.sin(angle)], 1)
+    y = size[:, None] * np.concatenate([-np.ones((300, 1)), u], 1)
+
+    def nearest(y):
+        return solve_qp(jnp.eye(3), -y, cones=(-jnp.eye(3)[None], jnp.zeros((1, 3))))
+
+    found = jax.jit(jax.vmap(nearest))(jnp.asarray(y))
+    assert bool(found.success.all())
+    length = np.linalg.norm(y[:, 1:], axis=1)
+    edge = np.concatenate([np.ones((300, 1)), y[:, 1:] / length[:, None]], 1)
+    want = np.where(outside[:, None] > 0, (y[:, :1] + length[:, None]) / 2 * edge, 0.0)
+    np.testing.assert_allclose(found.x / size[:, None], want / size[:, None], atol=1e-13)
+    slope = jax.jit(jax.vmap(jax.jacrev(lambda y: nearest(y).x)))(jnp.asarray(y))[:, 0, 0]
+    clear = np.abs(outside) > 1e-7  # nearer to the apex than 1.5e-8 a solution counts as at it
+    np.testing.assert_allclose(slope[clear], np.where(outside > 0, 0.5, 0.0)[clear], atol=1e-10)
+
+
+def test_derivative_at_a_kink_is_the_mean_of_both_sides():
+    """Rows that are active with a multiplier of zero: the mean of the solutions with and without them, by NumPy."""
+    rng = np.random.default_rng(2)
+    root, x, rows = rng.normal(size=(4, 4)), rng.normal(size=4), rng.normal(size=(2, 4))
+    Q = root @ root.T + np.eye(4)
+    inverse = np.linalg.inv(Q)
+    for count in (1, 2):
+        G = rows[:count]
+        solve = lambda q, G=G: solve_qp(Q, q, G, G @ x).x  # noqa: E731
+        held = inverse - inverse @ G.T @ np.linalg.solve(G @ inverse @ G.T, G @ inverse)
+        for derivative in (jax.jacfwd, jax.jacrev):
+            assert_close(derivative(solve)(jnp.asarray(-Q @ x)), -(inverse + held) / 2, 1e-10)
+    cone = jax.jacrev(lambda y: solve_qp(jnp.eye(3), -y, cones=(-jnp.eye(3)[None], jnp.zeros((1, 3)))).x)
+    np.testing.assert_allclose(cone(jnp.array([1.0, 0.6, 0.8]))[0, 0], 0.75, rtol=1e-10)
+
+
+def test_derivatives_of_a_program_without_solution_are_nan():
+    """Infeasible rows in a batch; the other element keeps its derivative."""
+
+    def solve(q):
+        return solve_qp(jnp.eye(1), q[:1], jnp.array([[1.0], [-1.0]]), jnp.stack([q[1], 0.0 * q[1]])).x[0]
+
+    slopes = jax.jit(jax.vmap(jax.grad(solve)))(jnp.array([[-0.5, 1.0], [-0.5, -1.0]]))
+    np.testing.assert_allclose(slopes[0], [-1.0, 0.0], atol=1e-10)
+    assert np.isnan(slopes[1]).all()

@@ -1,5 +1,7 @@
 """Iterated LQR: Riccati's equation, quadratic programs with bounds, known swing-ups, mechanisms, batches, refusals."""
 
+import itertools
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -88,11 +90,65 @@ def test_quadratic_programs_in_a_box():
     rng = np.random.default_rng(0)
     roots, g = rng.normal(size=(50, 5, 5)), 3 * rng.normal(size=(50, 5))
     H = roots @ roots.transpose(0, 2, 1) + 0.1 * np.eye(5)
-    x, free, _ = quick(jax.vmap(lambda H, g: minimize_in_box(H, g, -jnp.ones(5), 0.5 * jnp.ones(5))))(H, g)
+    x, free, *_ = quick(jax.vmap(lambda H, g: minimize_in_box(H, g, -jnp.ones(5), 0.5 * jnp.ones(5))))(H, g)
     slope = np.einsum("nij,nj->ni", H, x) + g
     assert np.all((x >= -1) & (x <= 0.5))
     np.testing.assert_allclose(np.where(free, slope, 0), 0, atol=1e-9)
     assert np.all(np.where(free, True, np.where(np.isclose(x, -1), slope > 0, slope < 0)))
+
+
+@pytest.mark.parametrize("n", [1, 2, 3, 5])
+def test_boxes_at_condition_numbers_up_to_1e8(n):
+    """The least value of all 3^n sets of bounds, by NumPy, and the flag; no end of NaN."""
+    rng = np.random.default_rng(n)
+    count, sizes = 60, np.logspace(0, 8, 5)
+    eigenvalues = np.concatenate([np.tile(np.logspace(0, -np.log10(size), n), (count, 1)) for size in sizes])
+    Q = np.linalg.qr(rng.normal(size=(len(eigenvalues), n, n)))[0]
+    H = Q @ (eigenvalues[:, :, None] * Q.transpose(0, 2, 1))
+    H = (H + H.transpose(0, 2, 1)) / 2
+    g, lower, upper = rng.normal(size=(len(H), n)), *rng.uniform([[-2], [0]], [[0], [2]], (len(H), 2, n)).swapaxes(0, 1)
+    found = quick(jax.vmap(minimize_in_box))(H, g, lower, upper)
+    assert bool(found.converged.all())
+    x = np.asarray(found.x)
+    assert np.all((x >= lower) & (x <= upper))
+    values = 0.5 * np.einsum("ni,nij,nj->n", x, H, x) + np.sum(g * x, 1)
+    least = np.full(len(H), np.inf)
+    for bounds in itertools.product((None, 0, 1), repeat=n):
+        free = [i for i in range(n) if bounds[i] is None]
+        y = np.stack([np.zeros(len(H)) if b is None else (lower, upper)[b][:, i] for i, b in enumerate(bounds)], 1)
+        if free:
+            right = -(g + np.einsum("nij,nj->ni", H, y))[:, free]
+            y[:, free] = np.linalg.solve(H[:, free][:, :, free], right[..., None])[..., 0]
+        inside = np.all((y >= lower - 1e-12) & (y <= upper + 1e-12), 1)
+        value = 0.5 * np.einsum("ni,nij,nj->n", y, H, y) + np.sum(g * y, 1)
+        least = np.where(inside, np.minimum(least, value), least)
+    # Solutions by NumPy may pass a bound by 1e-12, hence lie lower by as much.
+    np.testing.assert_allclose(values, least, rtol=1e-10, atol=1e-11)
+
+
+def test_boxes_without_a_minimum_have_a_flag():
+    for H, g in ((-jnp.eye(2), jnp.ones(2)), (jnp.eye(2) * jnp.nan, jnp.ones(2)), (jnp.eye(2), jnp.array([1.0, jnp.nan]))):
+        assert not bool(minimize_in_box(H, g, -jnp.ones(2), jnp.ones(2)).converged)
+
+
+def test_limits_with_an_ill_conditioned_cost():
+    """One step of controls whose Hessian has a condition number of 1e6: the minimum in the box, by SciPy."""
+    rng = np.random.default_rng(3)
+    for _ in range(8):
+        Q = np.linalg.qr(rng.normal(size=(4, 4)))[0]
+        roots = np.sqrt(np.logspace(0, -6, 4))[:, None] * Q.T
+        target = rng.normal(size=4) * np.array([1.0, 0.3, 0.1, 0.03])
+        plan = ilqr(
+            lambda x, u: x,
+            lambda x, u, k: 0.5 * jnp.sum((jnp.asarray(roots) @ u - target) ** 2),
+            lambda x: 0.0 * x[0],
+            jnp.zeros(1),
+            jnp.zeros((1, 4)),
+            limits=(-1.0, 1.0),
+        )
+        want = lsq_linear(roots, target, (-1.0, 1.0), method="bvls", tol=1e-14)
+        assert plan.result == RESULTS.successful
+        np.testing.assert_allclose(plan.cost, want.cost, rtol=1e-9)
 
 
 def cart_pole():

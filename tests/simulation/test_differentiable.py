@@ -207,3 +207,69 @@ def test_an_adjoint_object_is_used(steps):
     np.testing.assert_allclose(gradient, want, rtol=1e-12 if steps else 1e-6)
     with pytest.raises(ValueError, match=r"adjoint is Counted.*does not go back through events"):
         jd.simulate(jd.scenes.sliding_block(), [0.0], [2.0], ts, adjoint=given)
+
+
+def _end_of_pendulum(adjoint, **options):
+    """End (2,) of a run by a factor of the inertia and the start, and whether it succeeded."""
+    model = jd.robots.chain(1)
+
+    def end(k, q0, steps=400):
+        here = model.replace(inertias=model.inertias * k)
+        given = {"adjoint": adjoint, "throw": False, "max_steps": steps} | options
+        motion = jd.simulate(here, q0[None], jnp.zeros(1), jnp.linspace(0, 2.0, 3), **given)
+        return jnp.stack([motion.q[-1, 0], motion.v[-1, 0]]), motion.success
+
+    return end
+
+
+RUNS = {
+    "native": ("reverse", {}),
+    "direct": ("direct", {}),
+    "forward": ("forward", {}),
+    "backsolve": ("backsolve", {}),
+    "diffrax": ("reverse", {"solver": diffrax.Kvaerno5()}),
+    "diffrax direct": ("direct", {"solver": jd.solvers.Rodas5P()}),
+    "limits": ("reverse", {"limits": "stop"}),
+}
+
+
+@pytest.mark.long
+@pytest.mark.parametrize("name", RUNS)
+def test_cotangents_of_a_failed_run_are_nan(name):
+    """Those of a start of NaN and of too few steps; the others of the batch keep theirs, as does a loss that leaves them out."""
+    adjoint, options = RUNS[name]
+    end = _end_of_pendulum(adjoint, **options)
+    starts = jnp.asarray([1.0, np.nan, 0.5])
+    k = jnp.ones(3)
+    if adjoint == "forward":
+        derivative = jax.jacfwd(lambda x, *steps: end(x[0], x[1], *steps)[0][0])
+        slopes = jax.jit(jax.vmap(derivative))(jnp.stack([k, starts], 1))
+        short = jax.jit(lambda x: derivative(x, 3))(jnp.ones(2))
+    else:
+        slopes = jax.jit(jax.vmap(jax.grad(lambda x: end(x[0], x[1])[0][0])))(jnp.stack([k, starts], 1))
+        short = jax.jit(jax.grad(lambda x: end(x[0], x[1], 3)[0][0]))(jnp.ones(2))
+        shared = jax.jit(jax.vmap(end, (None, 0)))
+
+        def loss(k, masked):
+            ends, good = shared(k, starts)
+            return jnp.sum(jnp.where(good, ends[:, 0], 0.0) if masked else ends[:, 0])
+
+        assert np.isnan(jax.grad(loss)(1.0, False))
+        np.testing.assert_allclose(jax.grad(loss)(1.0, True), slopes[0, 0] + slopes[2, 0], atol=1e-9)
+    assert np.isnan(slopes[1]).all()
+    assert np.isnan(short).all() or name == "limits"  # where steps that look for an event are not counted
+    assert np.isfinite(slopes[::2]).all() and np.all(np.abs(slopes[::2, 1]) > 0.1)
+
+
+@pytest.mark.parametrize("adjoint", ["reverse", "direct"])
+def test_cotangents_of_a_step_that_failed_are_nan(adjoint):
+    """A stepper has no code: its values are NaN, and so are its derivatives, by the state, the torque and the parameters."""
+    model = jd.robots.chain(2)
+
+    def end(q, k, tau):
+        step = jd.stepper(model.replace(inertias=model.inertias * k), 0.01, adjoint=adjoint)
+        return step((q, jnp.zeros(2)), tau)[0].sum()
+
+    every = jax.jit(jax.vmap(jax.grad(end, (0, 1, 2))))(jnp.asarray([[0.1, 0.2], [np.nan, 0.2]]), jnp.ones(2), jnp.ones((2, 2)))
+    for slope in every:
+        assert np.isfinite(slope[0]).all() and np.isnan(slope[1]).all()

@@ -219,6 +219,19 @@ def test_ball_bounces_as_newton_says():
     np.testing.assert_allclose(motion.q[-1, 0], speed * last - G * last**2 / 2, atol=1e-9)
 
 
+@pytest.mark.long
+def test_cotangents_of_a_run_with_too_many_events_are_nan():
+    """Behind the last event that there was room for, and before it; the other ball of the batch keeps its own."""
+
+    def heights(e, h, row):
+        return bounce(e, h, most=1, end=1.0).q[row, 0]
+
+    slopes = jax.jit(jax.vmap(jax.grad(heights, (0, 1)), (0, 0, None)))(jnp.array([0.8, 0.8]), jnp.array([1.0, 0.05]), 8)
+    late = jax.jit(jax.vmap(jax.grad(heights, (0, 1)), (0, 0, None)))(jnp.array([0.8, 0.8]), jnp.array([1.0, 0.05]), 1)
+    for slope in (*slopes, *late):
+        assert np.isfinite(slope[0]) and np.isnan(slope[1])
+
+
 @pytest.mark.slow
 def test_gradient_of_a_bounce_and_its_end():
     """Against the closed form; a ball that bounces to rest ends with a code, or rests below rounding."""

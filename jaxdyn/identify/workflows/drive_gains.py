@@ -296,6 +296,8 @@ def _descend(problem: _Problem, triangles, state: _State, start: np.ndarray) -> 
         share = 1.0
         while (after := loss(z + share * dz, u + share * du)) > now and share > 1e-6:
             share /= 2
+        if after > now:  # no step in the direction of the gradient reduces the loss: at its minimum, to rounding
+            break
         z, u = z + share * dz, u + share * du
         # The first step leaves the gains alone: its decrease says nothing about convergence.
         if step > 1 and now - after <= 1e-12 * now:

@@ -22,7 +22,7 @@ from jaxdyn.simulation.hybrid.replay import HybridRun
 from jaxdyn.simulation.hybrid.system import ModalSystem, project
 from jaxdyn.simulation.hybrid.transitions import length
 from jaxdyn.simulation.methods import consistent
-from jaxdyn.simulation.solution import Solution, rows_where
+from jaxdyn.simulation.solution import Solution, invalidate_failed, rows_where
 from jaxdyn.simulation.solvers.choice import label
 from jaxdyn.simulation.solvers.differentiable import ROOM
 from jaxdyn.simulation.solvers.guards import SEARCH_STEPS
@@ -118,10 +118,11 @@ def hybrid_motion(scene: Scene, control, numbers, options) -> Solution:
     result = first_of(cases, end.result)
     # The end of a run is an input, which has derivatives; the time in the loop has none.
     time_reached = jnp.where(end.t >= ts[-1], ts[-1], end.t)
-    stats = end.counts | {"time_reached": jnp.where(good, time_reached, ts[0])}
     touched = _impacts_at_start(scene, elements, q0, v0, ts[0], mode)
     events = _events(elements, touched, ts[0], times, records.name[:most], good & start_ok)
-    rows = jax.tree.map(lambda rows: rows_where(reached, rows, jnp.nan), {"q": y["q"], "v": y["v"], **values})
+    rows, times = {"q": y["q"], "v": y["v"], **values}, (jnp.where(good, time_reached, ts[0]), events)
+    rows, (time_reached, events) = invalidate_failed(rows, times, result, reached, (scene, control, numbers))
+    stats = end.counts | {"time_reached": time_reached}
     return Solution(ts=inputs.given, result=result, stats=stats, events=events, solver=label(options["solver"]), **rows)
 
 
