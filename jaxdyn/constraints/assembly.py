@@ -138,8 +138,9 @@ def assemble(
     if is_concrete(assembly.result) and not bool(assembly.success):
         assembly = _from_elsewhere(assembly, guesses, from_guess, locked, q)
 
-    def message() -> str:
-        left = open_constraints(locked, assembly.q, assembly.v, t, closing_tolerance(q.dtype))
+    def message(assembly: Assembly) -> str:
+        fixed, time = stop_gradient((locked, t))
+        left = open_constraints(fixed, assembly.q, assembly.v, time, closing_tolerance(q.dtype))
         tried = f" (nor are they from {guesses - 1} configurations around it)" if guesses > 1 else ""
         return f"not assembled: {left}{tried}; give a better guess"
 
