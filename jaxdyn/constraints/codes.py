@@ -36,7 +36,9 @@ class Result:
 
     def __eq__(self, other) -> Any:
         if not isinstance(other, Result):
-            raise ValueError(f"a result is compared with {other!r}; compare it with jd.RESULTS.successful or another code")
+            raise ValueError(
+                f"a result is compared with {other!r}; compare it with jd.RESULTS.successful or another code"
+            )
         # Known codes are compared at once, within a trace too.
         with jax.ensure_compile_time_eval():
             return jnp.asarray(self.index == other.index)

@@ -192,7 +192,7 @@ def _solve(scene: Scene, rows, guess, factors, posture, t, limits: bool, steps: 
     q = lax.stop_gradient(q)
     is_reached = _reaches_targets(fixed, q, time, aims)
     if len(scene.constraints):
-        # Out of reach, the last steps trade errors of targets for openings far below them: the constraints alone are closed after.
+        # Out of reach, the last steps trade errors of targets for small openings, which are closed after.
         q = jnp.where(is_reached, q, lax.stop_gradient(search(fixed, q, time, _exact_rows_only(aims), 1)[0]))
     # The implicit function theorem holds at a solution only. Elsewhere q is a constant, with zero derivatives.
     q = jnp.where(is_reached, _differentiable(whole, q, posture, t, aims, len(scene.constraints)), q)

@@ -97,8 +97,8 @@ class Model(eqx.Module):
     def replace(self, **leaves: PyTree) -> "Model":
         """Copy with some leaves replaced, e.g. `model.replace(gravity=None)`.
 
-        **Raises:** ValueError for a name that is not a leaf, for a shape that differs from the present one, and for NaN or infinity
-        (but of limits), with the body, joint or frame that they belong to.
+        **Raises:** ValueError for a name that is not a leaf, for a shape that differs from the present one, and for NaN or
+        infinity (limits may be infinite), with the body, joint or frame that they belong to.
 
         **Warns:** UserWarning naming bodies whose new `inertias` are unphysical, as `ModelBuilder.build` does.
         """
@@ -240,7 +240,12 @@ def _check_finite(model: Model, name: str, values: np.ndarray) -> None:
         return
     row = int(np.argwhere(bad)[0, 0])
     top = model.topology
-    owners = {"home": top.body_names, "screws": top.body_names, "inertias": top.body_names, "frame_poses": top.frame_names}
+    owners = {
+        "home": top.body_names,
+        "screws": top.body_names,
+        "inertias": top.body_names,
+        "frame_poses": top.frame_names,
+    }
     if name in owners:
         what = f"{name} of {'frame' if name == 'frame_poses' else 'body'} {owners[name][row]!r}"
     elif name in ("gravity", "coupling_values"):
