@@ -52,6 +52,11 @@ class Result:
             return f"Result({self.index})"
         return str(np.asarray(CODES)[np.asarray(self.index)])
 
+    @property
+    def message(self) -> str:
+        """The sentence of a concrete code; of a batch, the list of them."""
+        return str(np.asarray(_messages)[np.asarray(self.index)]) if is_concrete(self.index) else "traced"
+
     def error_if(self, token: PyTree, condition: Bool[ArrayLike, ""]) -> PyTree:
         """The `token`, which raises this code's sentence at run time where the condition holds."""
         return eqx.branched_error_if(token, condition, self.index, _messages)
@@ -64,10 +69,7 @@ def _code(message: str) -> Result:
 
 class _Enumeration(type):
     def __getitem__(cls, result: Result) -> str:
-        """The sentence of a code; of a batch, the list of them."""
-        if not is_concrete(result.index):
-            return "traced"
-        return str(np.asarray(_messages)[np.asarray(result.index)])
+        return result.message
 
     def __len__(cls) -> int:
         return len(CODES)
@@ -79,7 +81,7 @@ class _Enumeration(type):
 class RESULTS(metaclass=_Enumeration):
     """Result codes of constrained dynamics, simulations, quadratic programs, searches and fits.
 
-    `RESULTS[result]` is the sentence of a code. `print(result)` shows its name.
+    `print(result)` shows the name of a code, and `RESULTS[result]` its sentence.
     """
 
     successful = _code("successful")
