@@ -88,7 +88,9 @@ def follow(
     axes = {name: value.pop("axis") for name, value in rows.items() if "axis" in value}
     for name, value in rows.items():
         if not value:
-            raise ValueError(f"targets[{name!r}] is {targets[name]}, which names no target; give some of {', '.join(TASKS)}")
+            raise ValueError(
+                f"targets[{name!r}] is {targets[name]}, which names no target; give some of {', '.join(TASKS)}"
+            )
     lengths = {name: np.shape(x)[0] if np.ndim(x) else 0 for name, value in rows.items() for x in value.values()}
     if len(set(lengths.values())) != 1 or 0 in lengths.values():
         raise ValueError(f"targets have the lengths {lengths}; give every target one row for each place of the path")

@@ -203,12 +203,23 @@ def test_reasons_under_derivatives():
 
     def by_motors(x):
         return jd.constrained_inverse_dynamics(
-            jd.Scene(two_bars()), jnp.zeros(2), jnp.zeros(2), [x, 1.0], motors=["a_joint"], independent=["a_joint", "b_joint"]
+            jd.Scene(two_bars()),
+            jnp.zeros(2),
+            jnp.zeros(2),
+            [x, 1.0],
+            motors=["a_joint"],
+            independent=["a_joint", "b_joint"],
         ).torque.sum()
 
     cases = (
-        (lambda x: inverse_kinematics(model, {"end": point(x)}, jnp.ones(2), **given).q.sum(), "targets_not_reached: errors"),
-        (lambda x: follow(model, {"end": point(x)[None]}, jnp.ones(2), **given).q.sum(), "follow: 1 places of 1 were not"),
+        (
+            lambda x: inverse_kinematics(model, {"end": point(x)}, jnp.ones(2), **given).q.sum(),
+            "targets_not_reached: errors",
+        ),
+        (
+            lambda x: follow(model, {"end": point(x)[None]}, jnp.ones(2), **given).q.sum(),
+            "follow: 1 places of 1 were not",
+        ),
         (lambda x: jd.assemble(four_bar, q, hold={"1": 0.5, "2": x}, guesses=1).q.sum(), "not assembled: jointlock"),
         (by_motors, "motors: they cannot produce"),
     )

@@ -182,21 +182,36 @@ REFUSED = {
         sdf(joint="<axis><xyz>0 1 0</xyz><use_parent_model_frame>1</use_parent_model_frame></axis>"),
         "is of versions 1.5 and 1.6; write expressed_in='__model__'",
     ),
-    "frame of a pose": (sdf("<pose frame='m'>1 0 0 0 0 0</pose>"), "no settled meaning before version 1.7 and none after"),
-    "rotation": (sdf("<pose rotation_format='axis'>1 0 0 0 0 0</pose>"), "rotation_format 'axis'; give euler_rpy, or quat_xyzw"),
+    "frame of a pose": (
+        sdf("<pose frame='m'>1 0 0 0 0 0</pose>"),
+        "no settled meaning before version 1.7 and none after",
+    ),
+    "rotation": (
+        sdf("<pose rotation_format='axis'>1 0 0 0 0 0</pose>"),
+        "rotation_format 'axis'; give euler_rpy, or quat_xyzw",
+    ),
     "degrees of a quaternion": (
         sdf("<pose degrees='1' rotation_format='quat_xyzw'>1 0 0 0 0 0 1</pose>"),
         "quat_xyzw' in degrees; give euler_rpy",
     ),
-    "reserved link": (sdf(model="<link name='__model__'/>"), "the link name '__model__' is reserved by the format; rename it"),
+    "reserved link": (
+        sdf(model="<link name='__model__'/>"),
+        "the link name '__model__' is reserved by the format; rename it",
+    ),
     "reserved root": (sdf(model="<link name='__root__'/>"), "the link name '__root__' is reserved"),
     "reserved frame": (sdf(model="<frame name='world'/>"), "the frame name 'world' is reserved"),
     "reserved joint": (
         sdf(model="<joint name='__x__' type='fixed'><parent>world</parent><child>a</child></joint>"),
         "the joint name '__x__' is reserved",
     ),
-    "world that moves": (sdf(model="<link name='world'><pose>1 0 0 0 0 0</pose></link>"), "has a <pose>, but its name is that"),
-    "world with a mass": (sdf(model=f"<link name='world'>{INERTIAL}</link>"), "has an <inertial>, but its name is that of the world"),
+    "world that moves": (
+        sdf(model="<link name='world'><pose>1 0 0 0 0 0</pose></link>"),
+        "has a <pose>, but its name is that",
+    ),
+    "world with a mass": (
+        sdf(model=f"<link name='world'>{INERTIAL}</link>"),
+        "has an <inertial>, but its name is that of the world",
+    ),
 }
 
 
@@ -249,7 +264,9 @@ DERIVED = """
 
 def test_arrays_of_compiled_models_are_read_or_without_effect():
     """A release of mujoco with another array has it here, or fails."""
-    model = mujoco.MjModel.from_xml_string("<mujoco><worldbody><body><joint/><geom size='1'/></body></worldbody></mujoco>")
+    model = mujoco.MjModel.from_xml_string(
+        "<mujoco><worldbody><body><joint/><geom size='1'/></body></worldbody></mujoco>"
+    )
     text = "".join(path.read_text() for path in sorted(SOURCES.glob("mjcf*.py")))
     known = {*WITHOUT_EFFECT.split(), *DERIVED.split()}
     prefixes = ("body_", "jnt_", "dof_", "site_", "tendon_", "wrap_", "actuator_", "eq_", "sensor_", "key_")

@@ -821,7 +821,9 @@ def test_published_arms_without_inertias_load_for_kinematics(robots_dir):
     pin.framesForwardKinematics(oracle, data, q)
     for name in ("l_wrist", "LFinger13_link", "r_ankle"):
         if oracle.existFrame(name):
-            np.testing.assert_allclose(jd.frame_pose(model, jnp.asarray(q), name), data.oMf[oracle.getFrameId(name)].homogeneous, atol=1e-12)
+            np.testing.assert_allclose(
+                jd.frame_pose(model, jnp.asarray(q), name), data.oMf[oracle.getFrameId(name)].homogeneous, atol=1e-12
+            )
 
 
 def test_packages_of_xacro_files_without_ros(tmp_path):
