@@ -227,8 +227,10 @@ class _Expansion:
 
     def _high(self, params, args, eqn):
         """A function that JAX keeps whole, such as searchsorted from version 0.12 on."""
-        inner, is_differentiated = jax_adapter.expand_high(params, [x.aval for x in eqn.invars])
-        self.has_rules |= is_differentiated
+        expand_whole, tree, has_rule = jax_adapter.expand_high(params)
+        types = [jax.ShapeDtypeStruct(x.aval.shape, x.aval.dtype) for x in eqn.invars]
+        inner = jax.make_jaxpr(lambda *x: jax.tree.leaves(expand_whole(*jax.tree.unflatten(tree, x))))(*types)
+        self.has_rules |= has_rule and any(x.dtype.kind == "f" for x in inner.out_avals)
         return self.evaluate(inner, args)
 
     def _invalid(self, params, args, eqn):
@@ -381,6 +383,7 @@ _OTHER: dict[str, Callable] = {
     "cond": _Expansion._cond,
     "custom_linear_solve": _Expansion._linear_solve,
     "cholesky": array_rules.cholesky,
+    "lu": look_ups.lu,
     "triangular_solve": array_rules.triangular_solve,
     "jaxdyn_kernel": _Expansion._kernel,
     "jaxdyn_invalid": _Expansion._invalid,

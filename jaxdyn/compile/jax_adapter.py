@@ -186,20 +186,15 @@ def scan_counts(params: dict) -> tuple[int, int]:
     return params["num_consts"], params["num_carry"]
 
 
-def expand_high(params: dict, types: Sequence) -> tuple[Any, bool]:
-    """The jaxpr of a primitive that JAX keeps whole (since 0.12), and whether its derivative has a rule of its own."""
+def expand_high(params: dict) -> tuple[Callable, Any, bool]:
+    """Of a primitive that JAX keeps whole (since 0.12): its function, the tree of its arguments, and whether its derivative has a
+    rule of its own."""
     primitive = params["_prim"]
     if "compare_all" in getattr(primitive, "valid_methods", ()):  # searchsorted: a count has no bisection
         primitive = copy.copy(primitive)
         primitive.method = "compare_all"
-
-    def flat(*leaves):
-        return jax.tree.leaves(primitive.expand(*jax.tree.unflatten(primitive.in_tree, leaves)))
-
-    closed = jax.make_jaxpr(flat)(*(jax.ShapeDtypeStruct(x.shape, x.dtype) for x in types))
     own = {name for kind in type(primitive).__mro__[:-2] for name in vars(kind)}
-    has_floats = any(np.issubdtype(x.dtype, np.inexact) for x in closed.out_avals)
-    return closed, has_floats and bool(own & {"jvp", "lin", "vjp_fwd"})
+    return primitive.expand, primitive.in_tree, bool(own & {"jvp", "lin", "vjp_fwd"})
 
 
 _NOT_USERS = re.compile(r"site-packages/(jax|jaxlib|equinox|jaxtyping)/|/lib/python3[^/]*/(?!site-packages)|^<")

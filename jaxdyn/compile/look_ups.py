@@ -1,4 +1,5 @@
-"""Rules for places that are not known while tracing: entries of tables, sums into them, indices of extremes.
+"""Rules for places that are not known while tracing: entries of tables, sums into them, indices of extremes,
+exchanges of rows.
 
 A scalar program has no addresses. An entry at an unknown place is a chain of selections over all places that it can have, which
 pays for tables of some hundred entries. Operands are as in `array_rules`.
@@ -120,6 +121,44 @@ def cumulative(expansion, params, args, eqn):
         total = x[i] if total is None else step(total, x[i])
         results[i] = total
     return [np.moveaxis(results, 0, params["axis"])]
+
+
+def lu(expansion, params, args, eqn):
+    """Factors of matrices with their rows exchanged for the largest pivots, the exchanges, and the permutations."""
+    matrix, pivot, permutation = (x.aval for x in eqn.outvars)
+    kinds = kind_or_refuse(matrix.dtype), kind_or_refuse(pivot.dtype)
+    given = as_objects(args[0]).reshape(-1, *args[0].shape[-2:])
+    factored = [_lu_of_one(expansion.graph, x.tolist(), *kinds) for x in given]
+    return [
+        objects([y for one in factored for y in one[i]], aval.shape)
+        for i, aval in enumerate((matrix, pivot, permutation))
+    ]
+
+
+def _lu_of_one(g: Graph, rows: list[list], kind: str, index: str) -> tuple[list, list, list]:
+    pivots = []
+    # The permutation is one more column, which is exchanged with the others.
+    order = [as_kind(i, index) for i in range(len(rows))]
+    for k in range(min(len(rows), len(rows[0]))):
+        largest, place = g.function("abs", rows[k][k]), as_kind(k, index)
+        for i in range(k + 1, len(rows)):
+            size = g.function("abs", rows[i][k])
+            is_larger = g.compare("gt", size, largest)
+            largest = g.select(is_larger, largest, size, kind)
+            place = g.select(is_larger, place, as_kind(i, index), index)
+        pivots.append(place)
+        for i in range(k + 1, len(rows)):
+            flag = g.compare("eq", place, as_kind(i, index))
+            upper, lower = rows[k], rows[i]
+            rows[k] = [g.select(flag, x, y, kind) for x, y in zip(upper, lower, strict=True)]
+            rows[i] = [g.select(flag, y, x, kind) for x, y in zip(upper, lower, strict=True)]
+            order[k], order[i] = g.select(flag, order[k], order[i], index), g.select(flag, order[i], order[k], index)
+        inverse = g.div(1.0, rows[k][k])
+        for i in range(k + 1, len(rows)):
+            factor = g.mul(rows[i][k], inverse)
+            changed = [g.sub(x, g.mul(factor, y)) for x, y in zip(rows[i][k + 1 :], rows[k][k + 1 :], strict=True)]
+            rows[i] = [*rows[i][:k], factor, *changed]
+    return [x for row in rows for x in row], pivots, order
 
 
 def select_among(expansion, which, cases, out):

@@ -5,7 +5,6 @@ from jaxdyn.compile import mode
 # By the first words of a reason (see `NotNumbers`).
 _REMEDIES = {
     "sort": "take jnp.minimum, jnp.maximum or jnp.argmax, or sort outside of the function",
-    "lu": "factor a positive definite matrix by jnp.linalg.cholesky and jax.scipy.linalg.cho_solve",
     "svd": "decompose a constant matrix once, outside of the function",
     "eigh": "decompose a constant matrix once, outside of the function",
     "qr": "decompose a constant matrix once, outside of the function",
@@ -20,6 +19,11 @@ _REMEDIES = {
 _USUAL = "write it by arithmetic, products of matrices, jnp.where, and indices that are known while tracing"
 
 
+def remedy_of(reason: str) -> str:
+    """What to write instead of a part that has no kernel."""
+    return next((text for words, text in _REMEDIES.items() if reason.startswith(words)), _USUAL)
+
+
 def say_without_kernel(name: str, reason: str) -> None:
     """Log once that a function runs on JAX's operations: the user's function at fault and the remedy, if it is not ours."""
     cause, mark, place = reason.partition(", in ")
@@ -28,10 +32,9 @@ def say_without_kernel(name: str, reason: str) -> None:
         if not mode.has_said(cause):
             mode.say_once(f"{name} runs on JAX's own operations: {reason}")
         return
-    remedy = next((text for words, text in _REMEDIES.items() if cause.startswith(words)), _USUAL)
     # By the user's function, and not by ours that call it, of which there are several.
     mode.say_once(
         f"{place}: {cause} has no kernel, so what calls this function runs on JAX's own operations, several times slower; "
-        f"{remedy}",
+        f"{remedy_of(cause)}",
         subject=cause,
     )

@@ -187,7 +187,8 @@ def _assemble(locked, q, v, t, rank_tol, atol, steps, is_rounded, scene):
         selection = None
     if scene is not None:
         scene = Scene(scene.system, scene.constraints)
-        scene = keep_rows(scene, _selection(scene, start, t, rank_tol, is_rounded))
+        # A tree has no rows: its velocities are free, whatever is held.
+        scene = keep_rows(scene, _selection(scene, start, t, rank_tol, is_rounded)) if scene.constraints else scene
     return _close(bare, q, start, passed, selection, v, t, rank_tol, atol, scene)
 
 
@@ -222,16 +223,18 @@ def _close(bare, guess, start, passed, selection, v, t, rank_tol, atol, scene):
         q = _unwind_hinges(locked, guess, nearest_configuration(locked, guess, start, t, rank_tol), t)
     if scene is None:
         scene = locked
-    v = _with_velocity(scene, q, v, t, rank_tol)
+    slips = admissible = jnp.zeros(0, q.dtype)
+    if scene.constraints:
+        v = _with_velocity(scene, q, v, t, rank_tol)
+        slips = velocity_residual(scene, q, v, t)
+        admissible = row_limits(scene, q, v, t, closing_tolerance(q.dtype))[1]
     limits = row_limits(locked, q, jnp.zeros_like(v), t, closing_tolerance(q.dtype))[0]
     phi = position_residual(locked, q, t)
     is_closed = jnp.all(jnp.abs(phi) <= limits)
     if selection is not None:
         is_closed &= opening_of_redundant(locked, q, t) <= most_rounding(q.dtype)
-    is_admissible = jnp.all(
-        jnp.abs(velocity_residual(scene, q, v, t)) <= row_limits(scene, q, v, t, closing_tolerance(q.dtype))[1]
-    )
-    residual = _sizes(position_residual(whole, q, t), velocity_residual(scene, q, v, t))
+    is_admissible = jnp.all(jnp.abs(slips) <= admissible)
+    residual = _sizes(position_residual(whole, q, t), slips)
     good = (is_closed if atol is None else is_closed | (residual[0] <= atol)) & is_admissible
     sizes, _ = coordinate_sizes(whole.system, q.dtype)
     distances = jnp.abs(displacement(whole.system, lax.stop_gradient(guess), lax.stop_gradient(q))) / sizes

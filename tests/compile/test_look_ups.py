@@ -54,6 +54,9 @@ CASES = {
     "cummax": lambda x: lax.cummax(jnp.outer(x, x), axis=0) - lax.cummin(x, reverse=True)[None],
     "cut": lambda x: lax.pad(jnp.outer(x, x), 0.5, ((-1, 2, 0), (1, -2, 1))),
     "cut of one entry": lambda x: lax.pad(x, 0.0, ((-2, -1, 0),)),
+    "solve": lambda x: jnp.linalg.solve(jnp.sin(9 * jnp.outer(x, jnp.arange(1.0, 5.0))), x),
+    "solve of columns": lambda x: jnp.linalg.solve(jnp.cos(9 * jnp.outer(x, jnp.arange(1.0, 5.0))), TABLE[:4]),
+    "inverse": lambda x: jnp.linalg.inv(jnp.sin(9 * jnp.outer(x, jnp.arange(1.0, 5.0)))),
     "block_diag": lambda x: block_diag(jnp.outer(x, x)[:2, :2], x[:3, None] * x[None, :2]),
 }
 
@@ -64,15 +67,19 @@ def test_kernels_of_unknown_places(case):
     function = CASES[case]
     fast = kernel(lambda _, x: function(x))
     assert not isinstance(program_of(lambda _, x: function(x), (), None, (jnp.ones(4),))[1], str)
+    # Matrices of condition numbers up to 1e4 magnify the rounding of both.
+    loose = 1e5 if case.startswith(("solve", "inverse")) else 1.0
     x = jnp.asarray(np.random.default_rng(1).uniform(-0.7, 1.6, (40, 4)))
     x = x.at[0, 1].set(0.0) if "sorted" in case else x  # on a knot; elsewhere a tie, whose derivative is a choice
     np.testing.assert_allclose(
-        jax.jit(jax.vmap(lambda x: fast(None, x)))(x), jax.vmap(function)(x), rtol=1e-13, atol=1e-14
+        jax.jit(jax.vmap(lambda x: fast(None, x)))(x), jax.vmap(function)(x), rtol=loose * 1e-13, atol=loose * 1e-14
     )
     if case not in ("argmax of NaN", "filled"):
         for derivative in (jax.jacfwd, jax.jacrev):
             found = jax.jit(jax.vmap(derivative(lambda x: fast(None, x))))(x)
-            np.testing.assert_allclose(found, jax.jit(jax.vmap(jax.jacfwd(function)))(x), rtol=1e-12, atol=1e-13)
+            np.testing.assert_allclose(
+                found, jax.jit(jax.vmap(jax.jacfwd(function)))(x), rtol=loose * 1e-12, atol=loose * 1e-13
+            )
 
 
 def law_by_sorting(q, v, t):

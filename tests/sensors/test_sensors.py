@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 from pinocchio_bridge import assert_close, quick
 
+import jaxdyn as jd
 from jaxdyn import scenes, sensors
 from jaxdyn.constraints.dynamics import constrained_dynamics
 from jaxdyn.dynamics.joint_wrenches import joint_wrench
@@ -246,3 +247,13 @@ def test_refusals():
         sensors.record(model, [sensors.Imu("tip")], [0.0, 0.0], jnp.zeros((2, 1)), jnp.zeros((2, 1)))
     with pytest.raises(ValueError, match=r"v has shape \(3, 1\), expected \(2, 1\)"):
         sensors.record(model, [sensors.Imu("tip")], [0.0, 1.0], jnp.zeros((2, 1)), np.zeros((3, 1)))
+
+
+def test_noise_of_another_size_than_the_reading_is_refused():
+    arm, q = jd.robots.iiwa(), jnp.zeros((2, 7))
+    for options in ({"std": [1.0, 2.0, 3.0]}, {"bias": [1.0, 2.0]}, {"walk": jnp.ones(7)}):
+        imu = jd.sensors.Imu("iiwa_link_7", noise=jd.sensors.Noise(**options))
+        (name, value), *_ = options.items()
+        words = f"sensor '{imu.name}': {name} of its Noise has {len(value)} entries, its readings have 6; give one number, or one"
+        with pytest.raises(ValueError, match=words):
+            jd.sensors.record(arm, [imu], [0.0, 0.1], q, q, key=jax.random.key(0))
