@@ -16,7 +16,6 @@ from jaxdyn.simulation.solvers import driver, reverse
 from jaxdyn.simulation.solvers.driver import AdaptiveSteps, FixedSteps
 from jaxdyn.simulation.solvers.explicit import Plan
 
-
 FORWARD = (
     'forward mode (jax.jvp, jax.jacfwd) through a run or a step needs adjoint="forward", of jd.simulate or jd.stepper'
 )
