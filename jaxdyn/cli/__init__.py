@@ -4,6 +4,7 @@ import argparse
 import shlex
 import sys
 from collections.abc import Sequence
+from typing import NoReturn
 
 import jax
 
@@ -29,6 +30,13 @@ Exit status: 0 done; 1 the computation failed; 2 wrong input or arguments.
 
 class _Parser(argparse.ArgumentParser):
     """Parser whose files of options, @FILE, are split as by a shell, with comments after #."""
+
+    def error(self, message: str) -> NoReturn:
+        """End with a message; a file of options without its @ is named with it."""
+        words = message.removeprefix("unrecognized arguments: ").split() if message.startswith("unrecognized") else []
+        if any(word.endswith((".txt", ".toml", ".yaml", ".yml", ".ini", ".cfg")) for word in words):
+            message += "; a file of options is given as @fit.txt, with lines such as --urdf arm.urdf"
+        super().error(message)
 
     def convert_arg_line_to_args(self, arg_line: str) -> list[str]:
         """Options of a line."""

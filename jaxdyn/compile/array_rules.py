@@ -14,6 +14,7 @@ import numpy as np
 
 from jaxdyn.compile import program as numbers
 from jaxdyn.compile.graph import Graph
+from jaxdyn.compile.look_ups import scatter_at, select_among
 from jaxdyn.compile.program import NotNumbers, Number, as_kind, as_objects, kind_or_refuse, objects
 from jaxdyn.compile.rearrange import scatter_places
 
@@ -62,7 +63,7 @@ def select(expansion, params, args, eqn):
             chosen = np.where(which == i, cases[i], chosen)
         return [as_objects(chosen)]
     if len(cases) != 2 or eqn.invars[0].aval.dtype != bool:
-        raise NotNumbers("a selection among more than two cases")
+        return select_among(expansion, which, cases, out)
     kind = kind_or_refuse(out.dtype)
     columns = (np.broadcast_to(as_objects(x), out.shape).ravel().tolist() for x in args)
     return [objects([expansion.graph.select(a, b, c, kind) for a, b, c in zip(*columns, strict=True)], out.shape)]
@@ -99,8 +100,10 @@ def dot_general(expansion, params, args, eqn):
 
 
 def scatter(expansion, params, args, eqn):
-    """Write or add updates at known indices; updates out of bounds are dropped, as in JAX."""
+    """Write or add updates at indices; updates out of bounds are dropped, as in JAX."""
     operand, indices, updates = args
+    if indices.dtype.kind == "O":
+        return scatter_at(expansion, params, args, eqn)
     # In the order of the updates: where two of them have the same index, JAX leaves open which one stays; here the last one does.
     entries, adds = as_objects(operand).ravel().tolist(), eqn.primitive.name != "scatter"
     places = scatter_places(eqn, operand, indices, updates)
@@ -108,19 +111,6 @@ def scatter(expansion, params, args, eqn):
         if i is not None:
             entries[i] = expansion.graph.add(entries[i], value) if adds else value
     return [objects(entries, operand.shape)]
-
-
-def cumsum(expansion, params, args, eqn):
-    """Partial sums, from either end."""
-    # Sequential, because every partial sum is a result. XLA sums in a tree, whose rounding differs.
-    x = np.moveaxis(as_objects(args[0]), params["axis"], 0)
-    order = range(x.shape[0])
-    order = reversed(order) if params["reverse"] else order
-    sums, total = np.empty(x.shape, object), None
-    for i in order:
-        total = x[i] if total is None else expansion.elementwise["add"](total, x[i])
-        sums[i] = total
-    return [np.moveaxis(sums, 0, params["axis"])]
 
 
 def cholesky(expansion, params, args, eqn):

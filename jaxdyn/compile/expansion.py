@@ -13,7 +13,7 @@ from typing import Any
 import jax
 import numpy as np
 
-from jaxdyn.compile import array_rules, mode
+from jaxdyn.compile import array_rules, jax_adapter, look_ups, mode
 from jaxdyn.compile import program as numbers
 from jaxdyn.compile.array_rules import bind_known, empty_reduction, evaluate_known
 from jaxdyn.compile.derive import without_unread
@@ -86,6 +86,7 @@ class _Expansion:
         binary |= {"and": graph.both, "or": graph.either}
         binary |= {name: functools.partial(graph.compare, name) for name in numbers.COMPARISONS}
         binary |= {name: functools.partial(graph.function_of_two, name) for name in numbers.FUNCTIONS_OF_TWO}
+        binary |= {"lt_to": functools.partial(self._precedes, "lt"), "le_to": functools.partial(self._precedes, "le")}
         unary = {"neg": graph.neg, "not": graph.invert, "is_finite": graph.is_finite}
         unary |= {name: functools.partial(graph.function, name) for name in numbers.FUNCTIONS}
         unary |= {"square": lambda x: graph.mul(x, x), "rsqrt": lambda x: graph.div(1.0, graph.function("sqrt", x))}
@@ -113,7 +114,12 @@ class _Expansion:
             # A side effect would happen while the program is written, once, instead of at every call.
             if eqn.effects:
                 raise NotNumbers(f"{eqn.primitive.name} has side effects")
-            results = self.one(eqn, [read(x) for x in eqn.invars])
+            try:
+                results = self.one(eqn, [read(x) for x in eqn.invars])
+            except NotNumbers as reason:
+                # From the inside out: JAX keeps the jaxprs of its own functions, with the places of their first calls.
+                reason.place = jax_adapter.place_of(eqn) or reason.place
+                raise
             values.update(zip(eqn.outvars, results, strict=True))
         return [read(x) for x in jaxpr.outvars]
 
@@ -132,6 +138,8 @@ class _Expansion:
         if rule is not None:
             return rule(self, params, args, eqn)
         if name in AT_PLACES:
+            if any(x.dtype.kind == "O" for x in args[_ARRAYS[name] :]):
+                return look_ups.at_place(AT_PLACES[name], self, params, args, eqn)
             return AT_PLACES[name](params, args, eqn)
         out = eqn.outvars[0].aval
         known = all(x.dtype.kind != "O" for x in args)
@@ -199,6 +207,12 @@ class _Expansion:
 
         return objects([round_one(x) for x in array.ravel().tolist()], array.shape)
 
+    def _precedes(self, op, a, b):
+        """Whether a comes before b in the total order of JAX, in which NaN is the last."""
+        g = self.graph
+        last = g.both(g.compare("ne", b, b), g.compare("eq", a, a) if op == "lt" else True)
+        return g.either(g.compare(op, a, b), last)
+
     def _one_less(self, x):
         """1 - x^2; the square where its rounding is small, else the product that is exact near one."""
         g = self.graph
@@ -210,6 +224,14 @@ class _Expansion:
 
     def _same(self, params, args, eqn):
         return args
+
+    def _high(self, params, args, eqn):
+        """A function that JAX keeps whole, such as searchsorted from version 0.12 on."""
+        expand_whole, tree, has_rule = jax_adapter.expand_high(params)
+        types = [jax.ShapeDtypeStruct(x.aval.shape, x.aval.dtype) for x in eqn.invars]
+        inner = jax.make_jaxpr(lambda *x: jax.tree.leaves(expand_whole(*jax.tree.unflatten(tree, x))))(*types)
+        self.has_rules |= has_rule and any(x.dtype.kind == "f" for x in inner.out_avals)
+        return self.evaluate(inner, args)
 
     def _invalid(self, params, args, eqn):
         flags, entries = (as_objects(x).ravel().tolist() for x in args)
@@ -350,18 +372,25 @@ _OTHER: dict[str, Callable] = {
     "dot_general": array_rules.dot_general,
     "scatter-add": array_rules.scatter,
     "scatter": array_rules.scatter,
-    "cumsum": array_rules.cumsum,
+    "gather": look_ups.gather_at,
+    "argmax": look_ups.extreme_place,
+    "argmin": look_ups.extreme_place,
+    "call_hi_primitive": _Expansion._high,
     "polynomial": array_rules.polynomial,
+    **dict.fromkeys(("cumsum", "cumprod", "cummax", "cummin"), look_ups.cumulative),
     "scan": _Expansion._scan,
     "while": _Expansion._while,
     "cond": _Expansion._cond,
     "custom_linear_solve": _Expansion._linear_solve,
     "cholesky": array_rules.cholesky,
+    "lu": look_ups.lu,
     "triangular_solve": array_rules.triangular_solve,
     "jaxdyn_kernel": _Expansion._kernel,
     "jaxdyn_invalid": _Expansion._invalid,
 }
 
+# The arrays before the places.
+_ARRAYS = {"dynamic_slice": 1, "dynamic_update_slice": 2}
 # Maxima and minima are of integers too.
 _OF_FLOATS = {*numbers.FUNCTIONS, *numbers.FUNCTIONS_OF_TWO, "log2", "one_minus_square"} - {
     "max",

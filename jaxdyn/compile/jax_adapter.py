@@ -7,6 +7,7 @@ then runs on JAX's own operations, and one warning names the version and the rea
 """
 
 import contextlib
+import copy
 import ctypes
 import functools
 import logging
@@ -194,6 +195,35 @@ def scan_counts(params: dict) -> tuple[int, int]:
         return len(constants), len(carry)
     return params["num_consts"], params["num_carry"]
 
+
+def expand_high(params: dict) -> tuple[Callable, Any, bool]:
+    """Of a primitive that JAX keeps whole (since 0.12): its function, the tree of its arguments, and whether its derivative has a
+    rule of its own."""
+    primitive = params["_prim"]
+    if "compare_all" in getattr(primitive, "valid_methods", ()):  # searchsorted: a count has no bisection
+        primitive = copy.copy(primitive)
+        primitive.method = "compare_all"
+    own = {name for kind in type(primitive).__mro__[:-2] for name in vars(kind)}
+    return primitive.expand, primitive.in_tree, bool(own & {"jvp", "lin", "vjp_fwd"})
+
+
+_NOT_USERS = re.compile(r"site-packages/(jax|jaxlib|equinox|jaxtyping)/|/lib/python3[^/]*/(?!site-packages)|^<")
+
+
+def place_of(eqn) -> str:
+    """The function of the user that an equation comes from, with file and line; "" for those of jaxdyn."""
+    traceback = getattr(eqn.source_info, "traceback", None)
+    for frame in getattr(traceback, "frames", ()):
+        file = frame.file_name.replace("\\", "/")
+        if _NOT_USERS.search(file):
+            continue
+        if file.startswith(_OWN):
+            return ""
+        return f"{frame.function_name} ({file.rpartition('/')[2]}:{frame.line_num})"
+    return ""
+
+
+_OWN = Path(__file__).parent.parent.as_posix() + "/"
 
 # --- types of arrays on meshes of devices ---
 

@@ -16,6 +16,7 @@ from jaxdyn.compile import jax_adapter, mode
 from jaxdyn.compile.derive import without_unread
 from jaxdyn.compile.flags import is_float, mark_invalid
 from jaxdyn.compile.known import is_known, partition, partition_tracers
+from jaxdyn.compile.messages import say_without_kernel
 from jaxdyn.compile.primitive import kernel_p, target
 from jaxdyn.compile.repair import compute_where, rank_safe, repair
 from jaxdyn.compile.trace import flat_function, inline_call, name_of, program_of, trace_program
@@ -127,7 +128,7 @@ def _by_kernel(function, static, tree, args, fallback: Callable | None, **how) -
         return values, True
     if isinstance(results, str):
         if fallback is None:
-            mode.say_once(f"{name_of(function)} runs on JAX's own operations: {results}")
+            say_without_kernel(name_of(function), results)
         return None
     return results
 

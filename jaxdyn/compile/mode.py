@@ -134,8 +134,14 @@ def _options() -> str:
     return options
 
 
-def say_once(message: str) -> None:
-    """Log a warning that has not been logged before in this process."""
+def say_once(message: str, subject: str = "") -> None:
+    """Log a warning that has not been logged before in this process; `subject`: what it is about, as `has_said` knows it."""
+    _said.add(subject)
     if message not in _said:
         _said.add(message)
         logger.warning("jaxdyn: %s", message)
+
+
+def has_said(subject: str) -> bool:
+    """Decide whether a warning about a subject has been logged in this process."""
+    return subject in _said

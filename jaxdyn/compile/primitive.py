@@ -19,6 +19,7 @@ from jax import lax
 from jaxdyn.compile import ahead, derive, jax_adapter, mode
 from jaxdyn.compile.inlining import inline
 from jaxdyn.compile.jax_adapter import ShapedArray, define_primitive, is_linear, is_zero, lowering_of, zero_tangent
+from jaxdyn.compile.messages import say_without_kernel
 from jaxdyn.compile.program import COMPARISONS, Constant, NotNumbers, Program, TooLong, dtype_of
 from jaxdyn.compile.shared import split_program
 from jaxdyn.compile.trace import tangent_program
@@ -168,7 +169,7 @@ def _tangent_or_none(program, moving: tuple[bool, ...]) -> Program | None:
     except (NotNumbers, TooLong) as reason:
         if program.fallback is None:
             raise
-        mode.say_once(f"the derivative of {program.name} runs on JAX's own operations: {reason}")
+        say_without_kernel(f"the derivative of {program.name}", str(reason))
     except Exception as error:
         if program.fallback is None or not jax_adapter.forgive(error):
             raise

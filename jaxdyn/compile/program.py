@@ -16,7 +16,12 @@ class TooLong(Exception):
 
 
 class NotNumbers(Exception):
-    """A function that cannot be written as a program of single numbers, and why."""
+    """A function that cannot be written as a program of single numbers, and why; `place`: the user's function at fault."""
+
+    place = ""
+
+    def __str__(self) -> str:
+        return super().__str__() + (f", in {self.place}" if self.place else "")
 
 
 class Operation(NamedTuple):

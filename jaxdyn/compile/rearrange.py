@@ -1,6 +1,7 @@
 """Operations that only move entries of arrays, known or not: slices, transposes, gathers and scatters at known places."""
 
 from collections.abc import Callable
+from typing import NamedTuple
 
 import numpy as np
 
@@ -33,12 +34,24 @@ def _split(params, args, out):
     return np.split(args[0], np.cumsum(params["sizes"])[:-1], params["axis"])
 
 
+class _Shaped(NamedTuple):
+    shape: tuple[int, ...]
+
+
 def _pad(params, args, out):
     padded = np.full(out.shape, args[1].item(), args[0].dtype)
     # Gaps between entries occur in transposes of strided slices.
     config = params["padding_config"]
+    # A negative width cuts: the array is padded without it and cut after that.
     if any(low < 0 or high < 0 for low, high, _ in config):
-        raise NotNumbers("padding that cuts")
+        kept = tuple((max(low, 0), max(high, 0), gap) for low, high, gap in config)
+        shape = [
+            low + high + max(n + (n - 1) * gap, 0) for (low, high, gap), n in zip(kept, args[0].shape, strict=True)
+        ]
+        whole = _pad({"padding_config": kept}, args, _Shaped(tuple(shape)))
+        return whole[
+            tuple(slice(max(-low, 0), n - max(-high, 0)) for (low, high, _), n in zip(config, shape, strict=True))
+        ]
     where = tuple(
         slice(low, low + (n - 1) * (gap + 1) + 1, gap + 1)
         for (low, _, gap), n in zip(config, args[0].shape, strict=True)
@@ -168,5 +181,5 @@ def scatter_places(eqn, operand, indices, updates) -> list:
 
 # Rules that need the whole equation.
 AT_PLACES: dict[str, Callable] = {
-    "gather": gather, "dynamic_slice": dynamic_slice, "dynamic_update_slice": dynamic_update_slice,
+    "dynamic_slice": dynamic_slice, "dynamic_update_slice": dynamic_update_slice,
 }  # fmt: skip

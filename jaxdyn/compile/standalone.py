@@ -17,6 +17,7 @@ from jaxdyn.compile.directions import Directions
 from jaxdyn.compile.graph import Graph
 from jaxdyn.compile.inlining import inline, replay
 from jaxdyn.compile.llvm import Emitter
+from jaxdyn.compile.messages import remedy_of
 from jaxdyn.compile.mode import standalone
 from jaxdyn.compile.program import FLOATS, Array, Constant, Program, kind_of, objects
 from jaxdyn.compile.trace import program_of
@@ -88,7 +89,8 @@ def _scalar_program(function: Callable, examples: Sequence[Any], name: str) -> t
         made = f"shapes, branches or conversions to numpy that depend on data ({str(error).splitlines()[0]})"
     if isinstance(made, str):
         raise ValueError(
-            f"function cannot be exported: it has {made}; only functions without callbacks and data-dependent loops can"
+            f"function cannot be exported: it has {made}; {remedy_of(made)}. Only functions without callbacks and "
+            "data-dependent loops can be exported"
         )
     program, structure = made
     return inline(program), structure

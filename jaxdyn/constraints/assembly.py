@@ -139,13 +139,14 @@ def assemble(
     if is_concrete(assembly.result) and not bool(assembly.success):
         assembly = _from_elsewhere(assembly, guesses, from_guess, locked, q)
 
-    def message() -> str:
+    def message(assembly: Assembly) -> str:
         if name_of(assembly.result) == "not_nearest":
             return (
                 f"assembled with residuals {np.asarray(assembly.residual)}, but the search for the configuration nearest to the "
                 "guess did not converge; give a better guess, or throw=False"
             )
-        left = open_constraints(locked, assembly.q, assembly.v, t, closing_tolerance(q.dtype))
+        fixed, time = stop_gradient((locked, t))
+        left = open_constraints(fixed, assembly.q, assembly.v, time, closing_tolerance(q.dtype))
         tried = f" (nor are they from {guesses - 1} configurations around it)" if guesses > 1 else ""
         return f"not assembled: {left}{tried}; give a better guess"
 
@@ -192,7 +193,8 @@ def _assemble(locked, q, v, t, rank_tol, atol, steps, scene):
         selection = None
     if scene is not None:
         scene = Scene(scene.system, scene.constraints)
-        scene = keep_rows(scene, select_rows(scene, start, t, rank_tol))
+        # A tree has no rows: its velocities are free, whatever is held.
+        scene = keep_rows(scene, select_rows(scene, start, t, rank_tol)) if scene.constraints else scene
     return _close(bare, q, start, passed, selection, v, t, rank_tol, atol, scene)
 
 
@@ -227,16 +229,19 @@ def _close(bare, guess, start, passed, selection, v, t, rank_tol, atol, scene):
         is_nearest = nearest > 0
     if scene is None:
         scene = locked
-    v0, v = v, _with_velocity(scene, q, v, t, rank_tol)
+    v0 = v
+    slips = admissible = jnp.zeros(0, q.dtype)
+    if scene.constraints:
+        v = _with_velocity(scene, q, v, t, rank_tol)
+        slips = velocity_residual(scene, q, v, t)
+        admissible = row_limits(scene, q, v, t, closing_tolerance(q.dtype))[1]
     limits = row_limits(locked, q, jnp.zeros_like(v), t, closing_tolerance(q.dtype))[0]
     phi = position_residual(locked, q, t)
     is_closed = jnp.all(jnp.abs(phi) <= limits)
     if selection is not None:
         is_closed &= opening_of_redundant(locked, q, t) <= most_rounding(q.dtype)
-    is_admissible = jnp.all(
-        jnp.abs(velocity_residual(scene, q, v, t)) <= row_limits(scene, q, v, t, closing_tolerance(q.dtype))[1]
-    )
-    residual = _sizes(position_residual(whole, q, t), velocity_residual(scene, q, v, t))
+    is_admissible = jnp.all(jnp.abs(slips) <= admissible)
+    residual = _sizes(position_residual(whole, q, t), slips)
     good = (is_closed if atol is None else is_closed | (residual[0] <= atol)) & is_admissible
     sizes, _ = coordinate_sizes(whole.system, q.dtype)
     distances = jnp.abs(displacement(whole.system, lax.stop_gradient(guess), lax.stop_gradient(q))) / sizes

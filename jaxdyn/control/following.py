@@ -22,7 +22,7 @@ from jaxdyn.constraints.rank import condition_number, passes_singular, rank_of, 
 from jaxdyn.constraints.selection import independent_rows
 from jaxdyn.constraints.tolerances import coordinate_sizes
 from jaxdyn.control.inverse_kinematics import inverse_kinematics, row_weights
-from jaxdyn.control.targets import as_targets
+from jaxdyn.control.targets import TASKS, as_targets
 from jaxdyn.model.arguments import Checked, Numbers, check_state
 from jaxdyn.systems.scene import Scene, as_scene
 from jaxdyn.systems.system import SceneLike, displacement
@@ -87,9 +87,14 @@ def follow(
     rows = _rows(targets)
     # An axis is one vector for the whole path: it must not be scanned over like the rows of the targets.
     axes = {name: value.pop("axis") for name, value in rows.items() if "axis" in value}
-    lengths = {np.shape(x)[0] if np.ndim(x) else None for x in jax.tree.leaves(rows)}
-    if len(lengths) != 1 or None in lengths or 0 in lengths:
-        raise ValueError(f"targets have {lengths} rows; give every target one row for each place of the path")
+    for name, value in rows.items():
+        if not value:
+            raise ValueError(
+                f"targets[{name!r}] is {targets[name]}, which names no target; give some of {', '.join(TASKS)}"
+            )
+    lengths = {name: np.shape(x)[0] if np.ndim(x) else 0 for name, value in rows.items() for x in value.values()}
+    if len(set(lengths.values())) != 1 or 0 in lengths.values():
+        raise ValueError(f"targets have the lengths {lengths}; give every target one row for each place of the path")
 
     def at(row):
         """Targets of one place, as `inverse_kinematics` takes them."""
@@ -128,7 +133,7 @@ def follow(
     changes = jnp.concatenate([jnp.zeros(1, bool), changes])
     path = Following(every.q, every.residual, every.result, regularity, changes)
 
-    def message() -> str:
+    def message(path: Following) -> str:
         lost = np.flatnonzero(~np.asarray(path.success))
         return (
             f"follow: {lost.size} places of {path.q.shape[0]} were not reached, the first one number {lost[0]}, with errors "

@@ -136,7 +136,7 @@ def inverse_kinematics(
         Scene(model, scene.constraints), rows, guess, factors, posture, t, bool(limits), steps, guesses, atol
     )
 
-    def message() -> str:
+    def message(place: InverseKinematics) -> str:
         return (
             f"inverse_kinematics: {name_of(place.result)}: errors {np.array2string(np.asarray(place.errors), precision=3)} "
             f"(m, rad) are left, and {float(place.constraint_residual):.3g} of the constraints, from {int(place.guesses)} "
@@ -193,6 +193,9 @@ def _solve(scene: Scene, rows, guess, factors, posture, t, limits: bool, steps: 
     q, tried = search(fixed, start, time, aims, guesses)
     q = lax.stop_gradient(q)
     is_reached = _reaches_targets(fixed, q, time, aims)
+    if len(scene.constraints):
+        # Out of reach, the last steps trade errors of targets for small openings, which are closed after.
+        q = jnp.where(is_reached, q, lax.stop_gradient(search(fixed, q, time, _exact_rows_only(aims), 1)[0]))
     # The implicit function theorem holds at a solution only. Elsewhere q is a constant, and its derivatives are NaN.
     solution, is_nearest = _differentiable(whole, q, posture, t, aims, len(scene.constraints))
     q = jnp.where(is_reached & is_nearest, solution, q)
@@ -244,6 +247,12 @@ def _aims(whole: Scene, constraints: int, factors, limits: bool, atol) -> Aims:
     endless = jnp.full_like(model.lower, jnp.inf)
     lower, upper = (model.lower, model.upper) if limits else (-endless, endless)
     return Aims(weights, jnp.zeros((nh,), dtype), tolerances, exact, *stop_gradient((lower, upper)))
+
+
+def _exact_rows_only(aims: Aims) -> Aims:
+    """Aims that any errors of the targets satisfy."""
+    tolerances = jnp.where(aims.is_exact > 0, aims.tolerances, jnp.full_like(aims.tolerances, jnp.inf))
+    return aims._replace(weights=aims.weights * aims.is_exact, tolerances=tolerances)
 
 
 def _differentiable(whole: Scene, q, posture, t: Number, aims: Aims, constraints: int):

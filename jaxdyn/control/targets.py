@@ -25,6 +25,7 @@ from jaxdyn.model.tree import Model
 
 CENTER = "center_of_mass"
 _SHAPES = {"pose": (4, 4), "orientation": (3, 3), "position": (3,), "direction": (3,)}
+TASKS = tuple(_SHAPES)
 _ROWS = {"pose": (3, 3), "orientation": (0, 3), "position": (3, 0), "direction": (0, 2)}
 
 
@@ -86,14 +87,14 @@ def as_targets(model: Any, targets: Any) -> tuple[Constraint, ...]:
             rows.append(CenterError(target=target, name=CENTER))
             continue
         frame_index(model, name)  # refuses unknown names
-        tasks = value if isinstance(value, Mapping) else {_task_of(name, value): value}
-        axis = np.array([0.0, 0.0, 1.0])
-        if isinstance(value, Mapping) and "axis" in tasks:
-            tasks = dict(tasks)
-            axis = np.asarray(tasks.pop("axis"), float)
+        tasks = dict(value) if isinstance(value, Mapping) else {_task_of(name, value): value}
+        axis = tasks.pop("axis", (0.0, 0.0, 1.0))
+        axis = _numbers(axis, f"targets[{name!r}]: axis", (3,), model.home.dtype)
+        if not tasks:
+            raise ValueError(f"targets[{name!r}] is {value}, which names no target; give some of {', '.join(TASKS)}")
         for task, number in tasks.items():
             if task not in _SHAPES:
-                raise ValueError(f"targets[{name!r}] has the key {task!r}; choose from {', '.join(_SHAPES)}, axis")
+                raise ValueError(f"targets[{name!r}] has the key {task!r}; choose from {', '.join(TASKS)}, axis")
             number = _numbers(number, f"targets[{name!r}]", _SHAPES[task], model.home.dtype)
             label = name if len(tasks) == 1 else f"{name} {task}"
             rows.append(_frame_target(label, name, task, number, axis))
@@ -112,7 +113,7 @@ def _task_of(name: str, value) -> str:
         hint = batch_hint(value, (4, 4)) or batch_hint(value, (3,))
         raise ValueError(
             f"targets[{name!r}] has shape {shape}; give a pose (4, 4), an orientation (3, 3), a position (3,), or a "
-            f"dictionary with some of {', '.join(_SHAPES)}, axis{hint}"
+            f"dictionary with some of {', '.join(TASKS)}, axis{hint}"
         )
     return kinds[shape]
 

@@ -90,6 +90,10 @@ def _segments(log: Log, horizon: int | None, dtype, restart: bool) -> Segments:
         raise ValueError(
             "the log has no v; a simulation starts from velocities: measure them or use jd.identify.from_raw"
         )
+    if len(log) < 2:
+        raise ValueError(
+            f"the log has {len(log)} sample; a motion is replayed from one sample to the next, so log two or more"
+        )
     horizon = len(log) - 1 if horizon is None else int(horizon)
     if not 1 <= horizon <= len(log) - 1:
         raise ValueError(f"horizon={horizon} steps; a log of {len(log)} samples allows 1 to {len(log) - 1}")

@@ -17,6 +17,7 @@ from jaxdyn.io.mjcf import load_mjcf
 from jaxdyn.io.sdf import load_sdf
 from jaxdyn.io.urdf import urdf_model
 from jaxdyn.io.urdf_loops import loop_constraints, motors_of, plugin_followers, read_closures
+from jaxdyn.io.urdf_parts import elements_without_effect
 from jaxdyn.io.xml_lines import XmlFile
 from jaxdyn.model.arguments import Checked, DType, FilePath, Numbers, as_path
 from jaxdyn.model.builder import GRAVITY
@@ -34,7 +35,9 @@ def load(
     mimic: str | None = None,
     gravity: Numbers | None = GRAVITY,
     loops: str | os.PathLike | bool | None = None,
+    missing_inertia: Numbers | None = None,
     arguments: Mapping[str, Any] | None = None,
+    packages: Mapping[str, str | os.PathLike] | None = None,
     dtype: DType | None = None,
 ) -> LoadedScene:
     """Load the scene of a URDF, xacro, MJCF or SDF file, or of a robot by its name in the package robot_descriptions.
@@ -52,7 +55,7 @@ def load(
       cache. Files missing there are downloaded by git once, if there is a network.
     - `floating_base`: whether the root moves freely. None: the default of the format: fixed in URDF, free in SDF. MJCF files
       state it.
-    - `lock`, `gravity`, of a URDF: as for `load_urdf`.
+    - `lock`, `gravity`, `missing_inertia`, `packages`, of a URDF: as for `load_urdf`.
     - `mimic`, of a URDF: "couple" (the default), "ignore" or "error", as for `load_urdf`; plugins in `<gazebo>` elements that
       mimic a joint count too. "ignore" loads files whose joints follow missing ones.
     - `loops`: the YAML file of a URDF's loops. None: the one with the URDF's name in its folder, if there is one;
@@ -80,11 +83,12 @@ def load(
     kind = format_of(path)
     if kind == "urdf":
         return _urdf_scene(
-            XmlFile(path, "URDF", arguments),
+            XmlFile(path, "URDF", arguments, packages),
             floating_base=bool(floating_base),
             lock=lock,
             mimic="couple" if mimic is None else mimic,
             gravity=gravity,
+            missing_inertia=missing_inertia,
             loops=loops,
             dtype=dtype,
         )
@@ -93,7 +97,8 @@ def load(
             f"loops is {loops!r}, but {path} is {kind.upper()}, which states its loops in the file; leave it out"
         )
     of_urdf = {"lock": (lock or (), ()), "mimic": (mimic, None), "gravity": (gravity, GRAVITY)}
-    of_urdf["arguments"] = (arguments or None, None)
+    of_urdf |= {"arguments": (arguments or None, None), "packages": (packages or None, None)}
+    of_urdf["missing_inertia"] = (missing_inertia, None)
     for name, (value, default) in of_urdf.items():
         # An option that the format ignores would silently change nothing, so it is refused.
         if value is not default:
@@ -117,6 +122,7 @@ def _urdf_scene(
     lock: Iterable[str] | Mapping[str, Any],
     mimic: str,
     gravity: Numbers | None,
+    missing_inertia: Numbers | None,
     loops: Checked[FilePath | bool | None],
     dtype: DType | None,
 ) -> LoadedScene:
@@ -134,8 +140,10 @@ def _urdf_scene(
         dtype=dtype,
         balls=closures.balls,
         followers=plugin_followers(file),
+        missing_inertia=missing_inertia,
     )
     rows, not_taken = loop_constraints(closures, file, model)
+    not_taken = [*not_taken, *elements_without_effect(file)]
     warn_not_taken(file.path, not_taken)
     # Zeros in <dynamics> are common; a force of zeros would be compiled and evaluated in every step.
     forces: list = []

@@ -183,7 +183,8 @@ def _joint_forces(file: CompiledFile, model: Model) -> list:
     # Damping disabled by the file is already zero, and zeros give no leaf.
     if model.damping is not None:
         forces.append(JointDamping())
-    if model.friction is not None and not file.off("FRICTIONLOSS"):
+    # Dry friction is a constraint of MuJoCo's solver.
+    if model.friction is not None and not (file.off("FRICTIONLOSS") or file.off("CONSTRAINT")):
         forces.append(CoulombFriction())
     return forces
 

@@ -39,7 +39,7 @@ _WRENCHES = {"FORCE": "force", "TORQUE": "torque"}
 def sensors(file: CompiledFile, model: Model) -> tuple[tuple[Sensor, ...], list[str]]:
     """The sensors of a file, and descriptions of those that are not taken."""
     m, mujoco = file.m, file.mujoco
-    taken, left, clipped = [], [], []
+    taken, left, clipped, sampled = [], [], [], []
     for i in range(m.nsensor):
         name = mujoco.mj_id2name(m, mujoco.mjtObj.mjOBJ_SENSOR, i) or f"sensor{i}"
         kind = mujoco.mjtSensor(int(m.sensor_type[i])).name.removeprefix("mjSENS_")
@@ -54,7 +54,10 @@ def sensors(file: CompiledFile, model: Model) -> tuple[tuple[Sensor, ...], list[
         # The sensor is taken without its clipping, and a warning says so.
         if m.sensor_cutoff[i] > 0:
             clipped.append(name)
-    return tuple(taken), [*summarize("sensors", left), *summarize("cutoff of sensors", clipped)]
+        if getattr(m, "sensor_interval", np.zeros((m.nsensor, 1)))[i].any():
+            sampled.append(name)
+    more = [*summarize("cutoff of sensors", clipped), *summarize("interval of sensors", sampled)]
+    return tuple(taken), [*summarize("sensors", left), *more]
 
 
 def _sensor(file: CompiledFile, model: Model, i: int, kind: str, options: dict) -> Sensor | None:

@@ -13,6 +13,7 @@ from jaxdyn.io.chains import Link, Names, add_chain, build_model
 from jaxdyn.io.loaded import LoadedScene, Start, summarize, warn_not_taken, warn_of_units
 from jaxdyn.io.sdf_frames import SdfFile
 from jaxdyn.io.sdf_joints import LOOPS, Axis, Edge, Joint, read_joints, spanning_tree
+from jaxdyn.io.unread import SDF_FRAME, SDF_JOINT, SDF_LINK, SDF_MODEL, SDF_ROOT, SDF_WORLD, unread_parts
 from jaxdyn.io.urdf import ROOT_JOINT
 from jaxdyn.io.xml_lines import written_rounding
 from jaxdyn.model import host_math
@@ -27,7 +28,6 @@ _KINDS |= dict(prismatic="prismatic", screw="helical", ball="spherical")
 _SECOND = "_axis2"  # suffix of a two-axis joint's second coordinate
 _PARALLEL = 1e-4  # files give right angles with four or five digits
 _MIMIC = (("multiplier", 1.0), ("offset", 0.0), ("reference", 0.0))
-_SKIPPED = ("collision", "sensor", "plugin", "battery", "particle_emitter", "projector", "audio_source")
 
 
 def load_sdf(path: str | os.PathLike, *, floating_base: bool = True, dtype: DType | None = None) -> LoadedScene:
@@ -62,11 +62,13 @@ def load_sdf(path: str | os.PathLike, *, floating_base: bool = True, dtype: DTyp
     **Warns:** `NotTakenWarning` naming unsupported elements: collisions, sensors, plugins, includes, screws that
     close loops, springs and damping of joints that close loops, and the like.
 
+    Elements and attributes that the format does not have are named too.
+
     `UnitsWarning` where limits look like degrees, or lengths and inertias like millimetres.
 
     **Raises:** ValueError with file and line for a file that cannot be read, malformed XML, entity declarations,
-    another version, unknown names or types, cyclic poses, bad numbers, inertias to be computed from
-    shapes; for a joint that moves no inertia.
+    another version, unknown names or types, reserved names, a part that is given twice, cyclic poses, bad numbers, an inertia
+    that is to be computed from shapes, or whose pose is relative to another frame; for a joint that moves no inertia.
     """
     file = SdfFile(path)
     joints = read_joints(file)
@@ -96,7 +98,9 @@ def _model(file: SdfFile, edges: list[Edge], static: set[str], floating: bool, d
     name = name or (file.world.get("name") if file.world is not None else "") or "mechanism"
     gravity: np.ndarray | tuple | None = GRAVITY
     if file.world is not None:
-        gravity_element = file.world.find("gravity")
+        # Up to version 1.5 gravity is an element of <physics>.
+        gravity_element = file.world.find("gravity" if file.minor > 5 else "physics/gravity")
+        gravity_element = file.world.find("gravity") if gravity_element is None else gravity_element
         gravity = (
             # The format's default is 9.8, not 9.81.
             np.array([0.0, 0.0, -9.8]) if gravity_element is None else file.numbers(gravity_element, 3, "the world")
@@ -183,6 +187,13 @@ def _inertia(file: SdfFile, link: str) -> np.ndarray:
     xx, yy, zz = get("ixx", 1.0), get("iyy", 1.0), get("izz", 1.0)
     xy, xz, yz = get("ixy", 0.0), get("ixz", 0.0), get("iyz", 0.0)
     mass = file.number(inertial, "mass", 1.0, what)
+    pose = inertial.find("pose")
+    # The format has no frames here; a file that names one means another centre of mass than it says.
+    if pose is not None and (named := pose.get("relative_to")):
+        raise file.fault(
+            pose,
+            f"<pose> of <inertial> of {what} is relative to {named!r}; give it in the link's frame, without relative_to",
+        )
     try:
         about_com = (mass, np.zeros(3), np.array([[xx, xy, xz], [xy, yy, yz], [xz, yz, zz]]))
         return np.asarray(
@@ -315,26 +326,13 @@ def _start(file: SdfFile, model: Model, roots: dict[str, str]) -> Start:
 
 
 def _elements_without_effect(file: SdfFile) -> list[str]:
-    """Elements of the file that the scene does not represent, apart from joints."""
-    unused: dict[str, list[str]] = {}
-    for link, (element, _) in file.links.items():
-        for tag in _SKIPPED:
-            if element.find(tag) is not None:
-                unused.setdefault(f"<{tag}> of links", []).append(link)
-        if element.find("gravity") is not None and not file.flag(element, "gravity", f"link {link!r}"):
-            unused.setdefault("links without gravity (simulated with gravity)", []).append(link)
-        if file.flag(element, "kinematic", f"link {link!r}"):
-            unused.setdefault("kinematic links", []).append(link)
-        if element.find("inertial/fluid_added_mass") is not None:
-            unused.setdefault("fluid added mass of links", []).append(link)
-    for joint, (element, _) in file.joints.items():
-        if element.find("sensor") is not None:
-            unused.setdefault("<sensor> of joints", []).append(joint)
-        if any(file.number(element, f"{tag}/initial_position", 0.0, f"joint {joint!r}") for tag in ("axis", "axis2")):
-            unused.setdefault("initial position of joints", []).append(joint)
-    for model, scope in file.models.items():
-        for tag in ("plugin", "gripper"):
-            if scope.element.find(tag) is not None:
-                unused.setdefault(f"<{tag}> of models", []).append(scope.element.get("name") or model)
-    lines = [line for reason, names in unused.items() for line in summarize(reason, names)]
+    """Elements of the file that the scene does not represent."""
+    elements = [(element, name, SDF_LINK) for name, (element, _) in file.links.items()]
+    elements += [(element, name, SDF_JOINT) for name, (element, _) in file.joints.items()]
+    elements += [(element, name, SDF_FRAME) for name, (element, _) in file.frames.items()]
+    elements += [(scope.element, scope.element.get("name") or name, SDF_MODEL) for name, scope in file.models.items()]
+    elements += [] if file.world is None else [(file.world, file.world.get("name") or "world", SDF_WORLD)]
+    elements += [(file.root, os.path.basename(file.path), SDF_ROOT)]
+    lines = [line for reason, names in unread_parts(file, elements).items() for line in summarize(reason, names)]
+    lines += summarize("links with the reserved name of the world, which they stand for", file.of_world)
     return [*lines, *summarize("includes", file.includes)]

@@ -54,6 +54,7 @@ class SdfFile(XmlFile):
         self.frames: dict[str, tuple[Any, Scope]] = {}
         self.models: dict[str, Scope] = {}
         self.includes: list[str] = []
+        self.of_world: list[str] = []  # links that stand for the world
         worlds = root.findall("world")
         if len(worlds) > 1:
             raise self.fault(worlds[1], "the file holds several worlds; keep one")
@@ -72,7 +73,15 @@ class SdfFile(XmlFile):
                 self.includes.append(self.word(element, "uri", "(no uri)"))
             if element.tag not in ("link", "joint", "frame", "model"):
                 continue
-            name = scope.prefix + self.name(element, scope.frame)
+            own = self.name(element, scope.frame)
+            if own == WORLD and element.tag == "link":
+                self._check_world_link(element)
+                self.of_world.append(scope.prefix + own)
+                continue
+            # `find` takes these names for others.
+            if own == WORLD or (own.startswith("__") and own.endswith("__")):
+                raise self.fault(element, f"the {element.tag} name {own!r} is reserved by the format; rename it")
+            name = scope.prefix + own
             known = {"link": self.links, "joint": self.joints, "frame": self.frames, "model": self.models}[element.tag]
             if name in known:
                 raise self.fault(element, f"the {element.tag} name {name!r} is taken; rename one")
@@ -87,6 +96,17 @@ class SdfFile(XmlFile):
             inner = Scope(element, "" if alone else f"{name}::", frame, scope, static)
             self.models[frame] = inner
             self._collect(inner)
+
+    def _check_world_link(self, element) -> None:
+        """Refuse a link named "world" that moves: in files made from URDF it stands for the world, as joints to it do."""
+        what = f"link {WORLD!r}"
+        pose = self.raw_pose(element, what)
+        heavy = element.find("inertial") is not None
+        if heavy or not np.array_equal(pose, np.eye(4)):
+            part = "an <inertial>" if heavy else "a <pose>"
+            raise self.fault(
+                element, f"the {what} has {part}, but its name is that of the world, to which joints go; rename it"
+            )
 
     def find(self, name: str, scope: Scope, element) -> str:
         """Resolve a name within a scope to the frame's full name. **Raises:** ValueError for an unknown one."""
@@ -106,11 +126,11 @@ class SdfFile(XmlFile):
         pose = element.find("pose")
         if pose is None or not (pose.text or "").strip():
             return np.eye(4)
-        if (pose.get("frame") or "").strip() and self.minor < 7:
+        if (pose.get("frame") or "").strip():
             raise self.fault(
                 pose,
                 f"<pose> of {what} is in the frame {pose.get('frame')!r}, which has no settled meaning before "
-                "version 1.7; write version 1.7 and relative_to",
+                "version 1.7 and none after; write version 1.7 and relative_to",
             )
         return self.pose_numbers(pose, what)
 
@@ -203,5 +223,7 @@ class SdfFile(XmlFile):
         for tag in ("link", "model"):
             for element in model.element.findall(tag):
                 name = model.prefix + self.name(element, model.frame)
+                if tag == "link" and name not in self.links:
+                    continue  # it stands for the world
                 return name if tag == "link" else self.canonical_link(self.models[name])
         return None

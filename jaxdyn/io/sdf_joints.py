@@ -89,6 +89,11 @@ def _axis(file: SdfFile, name: str, joint, scope, tag: str, kind: str, pose: np.
     # From 1.5 on, axes are in the joint's own frame by default.
     turn = pose[:3, :3]
     inside = (xyz.get("expressed_in") or "").strip() if xyz is not None else ""
+    if file.minor >= 7 and file.flag(element, "use_parent_model_frame", what):
+        raise file.fault(
+            element,
+            f"<use_parent_model_frame> of {what} is of versions 1.5 and 1.6; write expressed_in='__model__' in its <xyz>",
+        )
     # Up to 1.4 axes are in the model's frame; in 1.5 and 1.6 where the file says so.
     if file.minor < 7 and (file.minor == 4 or file.flag(element, "use_parent_model_frame", what)):
         turn = file.pose(scope.frame)[:3, :3]

@@ -44,7 +44,9 @@ def load_urdf(
     lock: Iterable[str] | Mapping[str, Any] = (),
     mimic: str = "ignore",
     gravity: Numbers = GRAVITY,
+    missing_inertia: Numbers | None = None,
     arguments: Mapping[str, Any] | None = None,
+    packages: Mapping[str, str | os.PathLike] | None = None,
     dtype: DType | None = None,
 ) -> Model:
     """Load the mechanism of a URDF file, or of a xacro file that expands to one. Meshes are not read.
@@ -65,7 +67,11 @@ def load_urdf(
     - `mimic`: treatment of mimic joints. "ignore" leaves them free, "couple" leaves them free and
       records the couplings for a scene to impose (and locks those that follow a locked or a fixed joint, the latter at their
       offset), "error" refuses them.
+    - `missing_inertia`: the inertia of links that a joint moves and that have none, as `inertia` of `ModelBuilder.add_body`:
+      `jd.inertia.sphere(1.0, 0.1)` loads an arm without inertias for kinematics. None: they are massless.
     - `arguments`: of the `<xacro:arg>` elements of a file that ends in .xacro, which the package xacro expands.
+    - `packages`: folders of packages that such a file names by `$(find NAME)`, by name. Those beside the file or above it, and
+      those of an installed ROS, are found without.
     - `gravity`, `dtype`: as for `ModelBuilder`.
 
     **Raises:** ValueError with file and line for a file that cannot be read, malformed XML, links that are not a tree,
@@ -73,11 +79,14 @@ def load_urdf(
     velocity or effort, a zero axis; for names in `lock` that are not movable joints;
     for a joint that moves no inertia. ImportError for a xacro file without the package xacro.
 
+    Elements and attributes that the model does not represent are those of `jd.load(path).not_taken`.
+
     **Warns:** UserWarning naming the links with an unphysical inertia; `UnitsWarning` where limits look like degrees,
     or lengths and inertias like millimetres.
     """
-    file = XmlFile(path, "URDF", arguments)
-    return urdf_model(file, floating_base=floating_base, lock=lock, mimic=mimic, gravity=gravity, dtype=dtype)
+    file = XmlFile(path, "URDF", arguments, packages)
+    options: dict[str, Any] = {"gravity": gravity, "dtype": dtype, "missing_inertia": missing_inertia}
+    return urdf_model(file, floating_base=floating_base, lock=lock, mimic=mimic, **options)
 
 
 def urdf_model(
@@ -90,6 +99,7 @@ def urdf_model(
     dtype,
     balls: Iterable[str] = (),
     followers: Mapping[str, tuple[Mimic, str]] | None = None,
+    missing_inertia: Numbers | None = None,
 ) -> Model:
     """Build the model of a URDF file, with options as of `load_urdf`.
 
@@ -133,14 +143,16 @@ def urdf_model(
     free = floating_base and root_joint not in locked
     # A locked base is a fixed body at the pose of the given coordinates.
     base = host_math.joint_pose("free", np.zeros(6), locked[root_joint]) if root_joint in locked else None
-    inertia = _inertia(urdf, urdf.root)
+    missing = None if missing_inertia is None else host_math.inertia_numbers(missing_inertia, "missing_inertia")
+    inertia = _inertia(urdf, urdf.root, missing if free else None)
     builder.add_body(urdf.root, None, "free" if free else "fixed", inertia, joint_name=root_joint, pose=base)
     # A stack in reverse gives depth-first order with siblings in the file's order; the builder sorts them by name.
     stack = list(reversed(urdf.children[urdf.root]))
     while stack:
         joint = urdf.joints[stack.pop()]
         stack.extend(reversed(urdf.children[joint.child]))
-        inertia = _inertia(urdf, joint.child)
+        moves = kinds[joint.name] != "fixed" and joint.name not in locked
+        inertia = _inertia(urdf, joint.child, missing if moves else None)
         try:
             _add_joint(builder, joint, kinds[joint.name], inertia, urdf, locked)
         except ValueError as error:
@@ -157,22 +169,26 @@ def urdf_model(
         # The builder names the joint that moves no inertia; its line is looked up here.
         named = re.match(r"joint '(.*?)' \(body", str(error))
         where = urdf.places.get(f"joint {named[1]}", path) if named else path
-        raise ValueError(f"{where}: {error}") from error
+        kinematic = "; or give missing_inertia=jd.inertia.sphere(1.0, 0.1) to load it for kinematics" if named else ""
+        raise ValueError(f"{where}: {error}{kinematic}") from error
     warn_of_units(path, model)
     return model
 
 
 def urdf_inertia_report(
-    path: str | os.PathLike, *, arguments: Mapping[str, Any] | None = None
+    path: str | os.PathLike,
+    *,
+    arguments: Mapping[str, Any] | None = None,
+    packages: Mapping[str, str | os.PathLike] | None = None,
 ) -> list[tuple[str, str]]:
     """Unphysical inertias stated in a URDF file, as (link, problem), before links are merged.
 
-    Links without `<inertial>` are listed only where a joint moves them: a fixed one is only a frame. `arguments` are as for
-    `load_urdf`.
+    Links without `<inertial>` are listed only where a joint moves them: a fixed one is only a frame. `arguments` and
+    `packages` are as for `load_urdf`.
 
     **Raises:** ValueError as `load_urdf` does for a file that cannot be read.
     """
-    urdf = _read(XmlFile(path, "URDF", arguments))
+    urdf = _read(XmlFile(path, "URDF", arguments, packages))
     # A massless link on a fixed joint is a frame, as of a tool or a sensor.
     moved = {joint.child for joint in urdf.joints.values() if joint.type != "fixed"}
     report = []
@@ -226,10 +242,14 @@ def _leaves(joint: Joint, kind: str) -> dict[str, Any]:
     return leaves
 
 
-def _inertia(urdf: _Description, link: str) -> np.ndarray:
+def _inertia(urdf: _Description, link: str, missing: host_math.Values | None = None) -> host_math.Values:
+    """Ten inertial parameters of a link; `missing` of one that has no mass and no inertia."""
     inertial = urdf.links[link]
+    none = np.zeros(10) if missing is None else missing
     if inertial is None:
-        return np.zeros(10)
+        return none
+    if not inertial.mass and (inertial.inertia is None or not inertial.inertia.any()):
+        return none
     # A missing <mass> or <inertia> inside <inertial> means zero.
     parts = (inertial.mass or 0.0, np.zeros(3), np.zeros((3, 3)) if inertial.inertia is None else inertial.inertia)
     try:

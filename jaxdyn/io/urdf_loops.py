@@ -188,6 +188,12 @@ def _gazebo(file: XmlFile, model: Model) -> tuple[list[Constraint], list[str]]:
     taken: list[Constraint] = []
     left: dict[str, list[str]] = {}
     for element in file.root.iter("gazebo"):
+        for tag in ("plugin", "sensor"):
+            for part in element.findall(tag):
+                if part.find("mimicJoint") is None:
+                    left.setdefault(f"<{tag}> in <gazebo>", []).append(
+                        part.get("name") or element.get("reference") or tag
+                    )
         for joint in element.findall("joint"):
             name = file.name(joint, "<gazebo>")
             kind = joint.get("type") or ""

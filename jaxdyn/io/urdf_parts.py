@@ -4,6 +4,8 @@ from typing import NamedTuple
 
 import numpy as np
 
+from jaxdyn.io.loaded import summarize
+from jaxdyn.io.unread import URDF_GAZEBO, URDF_JOINT, URDF_LINK, URDF_ROBOT, unread_parts
 from jaxdyn.io.urdf_check import NUMBERS, check_elements
 from jaxdyn.io.xml_lines import XmlFile
 from jaxdyn.model import host_math
@@ -72,6 +74,17 @@ def read_parts(file: XmlFile) -> Parts:
     links = {part.get("name"): _inertial(part.find("inertial")) for part in elements if part.tag == "link"}
     joints = {part.get("name"): _joint(part) for part in elements if part.tag == "joint"}
     return Parts(file.root.get("name") or "", links, joints, places)
+
+
+def elements_without_effect(file: XmlFile) -> list[str]:
+    """Descriptions of elements and attributes of a file that a model does not represent."""
+    robot = file.root.get("name") or "robot"
+    elements: list = [(file.root, robot, URDF_ROBOT)]
+    tables = {"link": URDF_LINK, "joint": URDF_JOINT, "gazebo": URDF_GAZEBO}
+    for element in file.root:
+        if element.tag in tables:
+            elements.append((element, element.get("name") or element.get("reference") or robot, tables[element.tag]))
+    return [line for reason, names in unread_parts(file, elements).items() for line in summarize(reason, names)]
 
 
 def _inertial(element) -> Inertial | None:

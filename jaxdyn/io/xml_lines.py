@@ -14,6 +14,7 @@ from xml.parsers import expat
 
 import numpy as np
 
+from jaxdyn.io.xacro_files import expand
 from jaxdyn.model import host_math
 from jaxdyn.model.arguments import as_path, parse_number
 
@@ -74,25 +75,34 @@ class XmlFile:
     """XML file with its root element, and readers of numbers and words whose errors name file and line.
 
     The text is decoded by the declared encoding, if Python knows it, else as UTF-8. `is_utf8` is true when the
-    bytes are UTF-8. A file whose name ends in .xacro is expanded first, with `arguments` for its `<xacro:arg>`; lines are then
-    those of the expanded text.
+    bytes are UTF-8. A file whose name ends in .xacro is expanded first, with `arguments` for its `<xacro:arg>` and the folders of
+    `packages`; lines are then those of the expanded text.
 
     **Raises:** ValueError with file and line for a file that cannot be read, decoded or expanded, is malformed or declares
-    entities; for `arguments` of a file that is no xacro. ImportError for a xacro file without the package xacro.
+    entities; for `arguments` and `packages` of a file that is no xacro. ImportError for a xacro file without the package xacro.
     """
 
-    def __init__(self, path: str | os.PathLike, kind: str, arguments: Mapping[str, Any] | None = None):
+    def __init__(
+        self,
+        path: str | os.PathLike,
+        kind: str,
+        arguments: Mapping[str, Any] | None = None,
+        packages: Mapping[str, str | os.PathLike] | None = None,
+    ):
         self.source = as_path(path)
         self.path = str(self.source)
         is_xacro = self.source.suffix.lower() == ".xacro"
-        if arguments and not is_xacro:
-            raise ValueError(f"arguments is {dict(arguments)}, but {self.path} is no .xacro file; leave it out")
+        for name, given in (("arguments", arguments), ("packages", packages)):
+            if given and not is_xacro:
+                raise ValueError(f"{name} is {dict(given)}, but {self.path} is no .xacro file; leave it out")
         try:
             with open(self.path, "rb") as file:
                 data = file.read()
         except OSError as error:
             raise ValueError(f"{kind} file {self.path!r} cannot be read ({error.strerror}); check the path") from error
-        text, encoding = (_expand(self.path, arguments or {}), "utf-8") if is_xacro else _decode(self.path, data)
+        text, encoding = (
+            (expand(self.source, arguments or {}, packages or {}), "utf-8") if is_xacro else _decode(self.path, data)
+        )
         self.path += " (expanded)" * is_xacro
         self.is_utf8 = data.isascii() or encoding.lower().replace("_", "-") in ("utf-8", "utf8", "utf-8-sig")
         # A text handed to expat is UTF-8, whatever it declares.
@@ -164,14 +174,18 @@ class XmlFile:
 
     def pose_numbers(self, pose, what: str) -> np.ndarray:
         """Matrix (4, 4) of an SDF <pose>: x y z and roll pitch yaw, in degrees or as a quaternion where stated."""
-        if pose.get("rotation_format") == "quat_xyzw":
+        kind, degrees = pose.get("rotation_format") or "euler_rpy", (pose.get("degrees") or "").lower() in ("1", "true")
+        if kind not in ("euler_rpy", "quat_xyzw") or (degrees and kind == "quat_xyzw"):
+            fault = f"rotation_format {kind!r}" + " in degrees" * degrees
+            raise self.fault(pose, f"<pose> of {what} has the {fault}; give euler_rpy, or quat_xyzw without degrees")
+        if kind == "quat_xyzw":
             values = self.numbers(pose, 7, what)
             if not values[3:].any():
                 raise self.fault(pose, f"<pose> of {what} has the quaternion zero; give x y z qx qy qz qw")
             # The format writes (x, y, z, w); the library has (w, x, y, z).
             return host_math.joint_pose("free", np.zeros(6), np.concatenate([values[:3], values[6:], values[3:6]]))
         values = self.numbers(pose, 6, what)
-        turn = np.deg2rad(values[3:]) if (pose.get("degrees") or "").lower() in ("1", "true") else values[3:]
+        turn = np.deg2rad(values[3:]) if degrees else values[3:]
         return np.asarray(host_math.pose_matrix((values[:3], turn), what))
 
     def number(self, element, tag: str, default: float, what: str, *, finite: bool = True) -> float:
@@ -220,18 +234,3 @@ def _decode(path: str, data: bytes) -> tuple[str, str]:
             "encoding in the XML declaration"
         ) from error
     return text, encoding
-
-
-def _expand(path: str, arguments: Mapping[str, Any]) -> str:
-    """Expand a xacro file to text, with the line numbers of `xacro FILE`."""
-    try:
-        import xacro
-    except ImportError as error:
-        raise ImportError(f"{path}: reading xacro files needs the package xacro: pip install jaxdyn[xacro]") from error
-    # xacro reads "true" and "false" in lower case.
-    words = {name: str(value).lower() if isinstance(value, bool) else str(value) for name, value in arguments.items()}
-    try:
-        return xacro.process_file(path, mappings=words).toprettyxml(indent="  ")  # pyright: ignore[reportAttributeAccessIssue]
-    except Exception as error:  # expressions of a file raise anything
-        reason = " ".join(str(error).split()) or type(error).__name__
-        raise ValueError(f"{path}: xacro: {reason}; correct the file, or give its arguments={{NAME: VALUE}}") from error

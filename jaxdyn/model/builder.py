@@ -158,7 +158,10 @@ class ModelBuilder:
         # Concrete limits only: traced ones cannot decide the structure.
         low, high = leaves["lower"], leaves["upper"]
         if low is not None and high is not None and is_concrete(low, high) and np.any(low > high):
-            raise ValueError(f"{what}: lower limit {lower} is above upper limit {upper}; swap them")
+            raise ValueError(
+                f"{what}: lower limit {lower} is above upper limit {upper}; swap them, or leave both out where there is no "
+                "limit, which is how other simulators read such a pair"
+            )
         body = _Body(
             name,
             parent,

@@ -74,8 +74,7 @@ def solution_lines(solution) -> str:
             "traced" if not is_concrete(solution) else f"{int(np.sum(solution.success))} of {np.size(count)} successful"
         )
         return f"Solution: {ended}; q {solution.q.shape}, v {solution.v.shape}; {solution.solver}"
-    # An enumeration prints as name<text>.
-    words = str(solution.result).partition("<")[2].rstrip(">")
+    words = solution.result.message
     steps, rejected = int(count), int(solution.stats["num_rejected_steps"])
     given = [name for name in ("energy", "power", "work", "acceleration", "multipliers", "constraint_residual",
                           "torque", "control_state")

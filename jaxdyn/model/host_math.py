@@ -222,8 +222,12 @@ def inertia_numbers(inertia, what: str) -> Values:
         xp = array_namespace(mass, com, at_com)
         mass, com, at_com = (xp.asarray(x, float) for x in (mass, com, at_com))
         # Steiner's theorem, with the symmetric part taken row by row: an asymmetry below the tolerance is dropped.
-        about_origin = at_com + mass * (com @ com * xp.eye(3) - xp.outer(com, com))
-        parameters = xp.concatenate([mass[None], mass * com, about_origin[_TRIANGLE]])
+        with np.errstate(over="ignore", invalid="ignore"):
+            about_origin = at_com + mass * (com @ com * xp.eye(3) - xp.outer(com, com))
+            parameters = xp.concatenate([mass[None], mass * com, about_origin[_TRIANGLE]])
+        # Finite factors can have an infinite product.
+        if is_concrete(parameters) and not np.isfinite(parameters).all():
+            raise ValueError(f"{what}: mass {mass} kg at {com.tolist()} m overflows; give numbers in kg and m")
     else:
         parameters = numbers(inertia, {(10,): "ten numbers (10,), (mass, com, inertia about the com) or None"}, what)
     if is_concrete(parameters) and parameters[0] < 0:
@@ -238,6 +242,8 @@ _DIGITS = 1e-3
 def inertia_fault(parameters: np.ndarray) -> str:
     """Description of the fault of unphysical inertial parameters (10,); empty for those of bodies, points, rods and plates."""
     mass, _, moment = about_com(np.asarray(parameters, np.float64))
+    if mass < 0:
+        return f"its mass is negative ({mass:.6g} kg)"
     if mass == 0 and np.any(parameters[1:4]):
         return f"it has first moments {np.asarray(parameters[1:4]).tolist()} kg m and no mass"
     low, middle, high = np.linalg.eigvalsh(moment)

@@ -184,7 +184,10 @@ def is_feasible(parameters: Numbers, *, tolerance: float = 0.0) -> bool:
 
     `tolerance` is relative to its largest eigenvalue.
     """
-    values = np.linalg.eigvalsh(host_math.pseudo_inertia(np.asarray(parameters, np.float64)))
+    parameters = np.asarray(parameters, np.float64)
+    if not np.isfinite(parameters).all():
+        return False
+    values = np.linalg.eigvalsh(host_math.pseudo_inertia(parameters))
     # A matrix without a positive eigenvalue gives no scale for the tolerance.
     return bool(values[0] >= -tolerance * max(values[-1], 0.0))
 
@@ -192,9 +195,11 @@ def is_feasible(parameters: Numbers, *, tolerance: float = 0.0) -> bool:
 def nearest_feasible(parameters: Numbers, *, floor: float = 1e-6) -> np.ndarray:
     """Feasible parameters close to infeasible ones: pseudo-inertia eigenvalues raised to `floor` times the largest.
 
-    **Raises:** ValueError when the mass is not positive, because then there is no body to repair.
+    **Raises:** ValueError when the mass is not positive, because then there is no body to repair, and for NaN or infinity.
     """
     parameters = np.asarray(parameters, np.float64)
+    if not np.isfinite(parameters).all():
+        raise ValueError(f"parameters is {parameters.tolist()}, cannot be repaired; give finite numbers")
     if not parameters[0] > 0:
         raise ValueError(f"mass is {parameters[0]}, cannot be repaired; give the body a positive mass")
     values, vectors = np.linalg.eigh(host_math.pseudo_inertia(parameters))

@@ -29,6 +29,8 @@ def inertia_problems(parameters) -> list[str]:
     # The shift from the origin to the centre of mass leaves a few roundings of the precision the numbers came in.
     rounding = 64 * np.finfo(parameters.dtype).eps
     parameters = parameters.astype(np.float64)
+    if not np.isfinite(parameters).all():
+        return [f"not finite: {parameters.tolist()}"]
     if not parameters.any():
         return ["massless"]
     if parameters[0] <= 0:
@@ -47,10 +49,15 @@ def repair_inertias(model: Model) -> Model:
     """Copy of a model in which every body with mass has physical inertial parameters (`inertia.nearest_feasible`).
 
     Bodies that `inertia_report` does not list and massless ones stay unchanged.
+
+    **Raises:** ValueError that names the body for NaN or infinity.
     """
     inertias = np.array(model.inertias)
     for i, parameters in enumerate(inertias):
         # A massless body has no inertia to repair: only the file's author knows the mass.
         if parameters[0] > 0 and inertia_problems(parameters):
-            inertias[i] = nearest_feasible(parameters)
+            try:
+                inertias[i] = nearest_feasible(parameters)
+            except ValueError as error:
+                raise ValueError(f"body {model.body_names[i]!r}: {error}") from error
     return model.replace(inertias=store_leaf(inertias, inertias.dtype))

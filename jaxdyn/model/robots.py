@@ -6,9 +6,10 @@ import jax
 import numpy as np
 from jaxtyping import Array
 
+from jaxdyn.model import host_math
 from jaxdyn.model.arguments import DType, Number, Numbers
 from jaxdyn.model.builder import GRAVITY, ModelBuilder
-from jaxdyn.model.inertia import box, cylinder, displaced, sphere
+from jaxdyn.model.inertia import box, cylinder, displaced, nearest_feasible, sphere
 from jaxdyn.model.joints import KINDS
 from jaxdyn.model.tree import Model
 
@@ -148,7 +149,8 @@ def allegro(*, gravity: Numbers | None = GRAVITY, dtype: DType | None = None) ->
     finger and 12 .. 15 of the thumb; they move bodies link_0.0 .. link_15.0. The frames link_3.0_tip, link_7.0_tip, link_11.0_tip
     and link_15.0_tip are in the middles of the fingertips, 12 mm balls; the frame palm_link is the palm.
 
-    Source: allegro_right_hand.urdf of Wonik Robotics (allegro_hand_linux_v4, BSD); its damping and friction are left out.
+    Source: allegro_right_hand.urdf of Wonik Robotics (allegro_hand_linux_v4, BSD); its damping and friction are left out. The moments
+    of inertia of its last links break the triangle inequality; they are those of `jd.model.repair_inertias`.
     """
     palm = (0.4154, (0, 0, 0.0475), (1e-4, 1e-4, 1e-4))
     builder = ModelBuilder("allegro", gravity=gravity, dtype=dtype).add_body(
@@ -159,11 +161,14 @@ def allegro(*, gravity: Numbers | None = GRAVITY, dtype: DType | None = None) ->
         for i, (axis, (mass, moments, products, length, (lower, upper))) in enumerate(zip(axes, links, strict=True)):
             number, (xy, yz, xz) = 4 * finger + i, products
             moment = np.diag(moments) + np.array([[0, xy, xz], [xy, 0, yz], [xz, yz, 0]])
+            body = host_math.inertia_numbers((mass, np.zeros(3), moment), "link")
+            # Of the file's numbers those that no body has are replaced by the nearest ones that a body has.
+            body = np.asarray(nearest_feasible(body), float) if host_math.inertia_fault(body) else body
             builder.add_body(
                 f"link_{number}.0",
                 parent,
                 "revolute",
-                (mass, (0, 0, 0), moment),
+                body,
                 joint_name=f"joint_{number}.0",
                 axis=axis,
                 pose=pose,

@@ -100,7 +100,8 @@ class Model(eqx.Module):
     def replace(self, **leaves: PyTree) -> "Model":
         """Copy with some leaves, or the `rounding` of its poses, replaced, e.g. `model.replace(gravity=None)`.
 
-        **Raises:** ValueError for a name that is not a leaf or for a shape that differs from the present one.
+        **Raises:** ValueError for a name that is not a leaf, for a shape that differs from the present one, and for NaN or
+        infinity (limits may be infinite), with the body, joint or frame that they belong to.
 
         **Warns:** UserWarning naming bodies whose new `inertias` are unphysical, as `ModelBuilder.build` does.
         """
@@ -140,7 +141,7 @@ class Model(eqx.Module):
         numbers (10,) about its origin, or (mass, centre of mass (3,), rotational inertia (3, 3) about it); kg, m, kg m^2.
         They may be traced: a batch of payloads is a `jax.vmap` over them.
 
-        **Raises:** ValueError for an unknown frame, one fixed to the world, and for an inertia of other shapes.
+        **Raises:** ValueError for an unknown frame, one fixed to the world, and for an inertia of other shapes, NaN or infinity.
 
         Source: Steiner's theorem, `jd.inertia.transform_inertia`.
 
@@ -198,10 +199,13 @@ def _payload(inertia: Any, dtype) -> Array:
         parts = [as_array(part, "inertia", dtype) for part in inertia]
         if [part.shape for part in parts] != [(), (3,), (3, 3)]:
             raise ValueError(f"inertia has parts of shapes {[part.shape for part in parts]}; {ask}")
-        return inertial_parameters(*parts)
-    ten = as_array(inertia, "inertia", dtype)
+        ten = inertial_parameters(*parts)
+    else:
+        ten = as_array(inertia, "inertia", dtype)
     if ten.shape != (10,):
         raise ValueError(f"inertia has shape {ten.shape}; {ask}{batch_hint(ten, (10,))}")
+    if is_concrete(ten) and not np.isfinite(np.asarray(ten)).all():
+        raise ValueError(f"inertia is {np.asarray(ten).tolist()}; give finite numbers")
     return ten
 
 
@@ -223,6 +227,8 @@ def _replace(model: Model, leaves: dict) -> Model:
         want = sizes.get(name) or getattr(model, name).shape
         if np.shape(value) != want:
             raise ValueError(f"replace: {name} has shape {np.shape(value)}, expected {want}")
+        if is_concrete(value):
+            _check_finite(model, name, np.asarray(value))
         if name == "inertias" and is_concrete(value):
             warn_unphysical_inertias(dict(zip(model.body_names, np.asarray(value), strict=True)))
         # Arrays of jax keep their dtype: the caller may differentiate a leaf of another precision.
@@ -237,6 +243,31 @@ def check_rounding(rounding: Any) -> float:
     if not isinstance(rounding, (int, float, np.number)) or not 0 <= rounding <= 1e-2:
         raise ValueError(f"rounding is {rounding!r}; give the size of the poses' rounding errors, 0 to 0.01 (m or rad)")
     return float(rounding)
+
+
+def _check_finite(model: Model, name: str, values: np.ndarray) -> None:
+    """Refuse NaN, and infinity where it is no limit. **Raises:** ValueError that names what the first such row belongs to."""
+    limits = {"lower": -np.inf, "upper": np.inf, "velocity_limit": np.inf, "effort_limit": np.inf}
+    bad = ~np.isfinite(values) & (values != limits.get(name, np.nan))
+    if not bad.any():
+        return
+    row = int(np.argwhere(bad)[0, 0])
+    top = model.topology
+    owners = {
+        "home": top.body_names,
+        "screws": top.body_names,
+        "inertias": top.body_names,
+        "frame_poses": top.frame_names,
+    }
+    if name in owners:
+        what = f"{name} of {'frame' if name == 'frame_poses' else 'body'} {owners[name][row]!r}"
+    elif name in ("gravity", "coupling_values"):
+        what = name
+    else:
+        slices = top.q_slices if name in ("lower", "upper") else top.v_slices
+        what = f"{name} of joint {next(j for j, s in zip(top.joint_names, slices, strict=True) if s.start <= row < s.stop)!r}"
+    shown = values if name == "gravity" else values[row]
+    raise ValueError(f"replace: {what} is {shown.tolist()}; give finite numbers")
 
 
 def warn_unphysical_inertias(inertias: Mapping[str, Any], places: Mapping[str, str] | None = None) -> None:

@@ -136,7 +136,7 @@ def constrained_inverse_dynamics(
     dynamics = _solve_by_program(
         scene, q, v, a_independent, S, _weights(weights, S.shape[1], q.dtype), t, tuple(chosen), rank_tol
     )
-    return require_success(dynamics, throw, lambda: _reason(dynamics, chosen))
+    return require_success(dynamics, throw, lambda dynamics: _reason(dynamics, chosen))
 
 
 def _reason(dynamics, chosen) -> str:

@@ -11,6 +11,7 @@ import numpy as np
 from jaxtyping import PyTree
 
 from jaxdyn.model.arguments import as_array
+from jaxdyn.model.numbers import check_count
 
 MAX_MEMBERS = 2**32  # `fold_in` takes 32 bits
 
@@ -61,7 +62,7 @@ def members(named: dict[str, Any], draw: Callable | None, samples: int | None, s
             sizes[name] = len(array)
         rows[argument] = jax.tree.unflatten(structure, arrays.values())
     if samples is not None:
-        sizes["samples"] = samples
+        sizes["samples"] = check_count(samples, "samples")
     if draw is not None and samples is None:
         raise ValueError("parameters is a function that draws, and samples is None; say how many rollouts to draw")
     if not sizes:

@@ -61,6 +61,15 @@ class Noise(eqx.Module):
                 raise ValueError(f"{name} is {value}; give standard deviations, which are not negative")
         self.std, self.bias, self.walk = (jnp.asarray(value, float) for value in values.values())
 
+    def check(self, name: str, entries: int) -> None:
+        """Refuse errors of another number of entries than the readings of a sensor. **Raises:** ValueError."""
+        for key in ("std", "bias", "walk"):
+            if (size := getattr(self, key).size) not in (1, entries):
+                raise ValueError(
+                    f"sensor {name!r}: {key} of its Noise has {size} entries, its readings have {entries}; give one number, or "
+                    "one per entry of the reading"
+                )
+
     def __call__(self, readings: Float[Array, "n k"], ts: Float[Array, " n"], key: Array) -> Float[Array, "n k"]:
         """Readings (n, k) at the times ts (n,), s, with errors drawn by a key."""
         # Two keys: the white noise and the walk of the bias are independent.

@@ -68,6 +68,9 @@ def record(
         return [sensor.read(motion) for sensor in sensors]
 
     readings = jax.vmap(read)(q, v, tau, ts)
+    for sensor, values in zip(sensors, readings, strict=True):
+        if sensor.noise is not None:
+            sensor.noise.check(sensor.name, values.shape[1])
     # One key for each sensor: the noise of one does not depend on the number of readings of another.
     keys = [None] * len(sensors) if key is None else list(jax.random.split(key, len(sensors)))
     results = {}

@@ -49,7 +49,7 @@ def stepper(scene: SceneLike, dt: Numbers, substeps: int = 1, remat: bool = True
       substeps that costs a step. A run of n steps then keeps 8 (nq + 2 nv) n bytes a sample in float64; with a law as tau,
       which is computed again too, 8 (nq + nv) n bytes and no intermediates of the law.
     - `adjoint`: "reverse" (default), for `jax.grad`, `jax.jacrev` and, over them, `jax.hessian`; "forward" or "direct", for
-      forward mode too (`jax.jvp`, `jax.jacfwd`), in which reverse mode takes longer.
+      forward mode too (`jax.jvp`, `jax.jacfwd`), in which reverse mode takes longer. Forward mode of "reverse" is refused.
 
     **Raises:** ValueError for a dt that is not positive, substeps that are no count, another adjoint, forces with modes; (when
     called) for shapes that do not fit.

@@ -376,6 +376,14 @@ def test_identify_from_one_file_and_the_robot_it_writes(arm, tmp_path, capsys, m
         jd.save_urdf(truth, tmp_path / "x.urdf", torques={"elbow": {"offset": 1.0}})
 
 
+@pytest.mark.parametrize("name", ["fit.toml", "fit.txt"])
+def test_file_of_options_without_its_mark_is_named_with_it(name, capsys):
+    with pytest.raises(SystemExit):
+        main(["identify", name])
+    words = f"unrecognized arguments: {name}; a file of options is given as @fit.txt, with lines such as --urdf"
+    assert words in " ".join(capsys.readouterr().err.split())
+
+
 @pytest.mark.parametrize(
     ("text", "error"),
     [('--train "0.6\n', r"a line in a file of options is '--train \"0\.6'; close"), ("@fit.txt\n", "names itself")],

@@ -473,6 +473,21 @@ def test_assembling_with_a_joint_held():
         assemble(scene, q, hold={names[0]: wanted, names[1]: 2.9}, guesses=4)
 
 
+def test_a_tree_without_constraints_holds_what_it_is_told():
+    """The other joints go where the change is least in the mass metric; velocities are those that are given."""
+    arm, wanted = jd.robots.iiwa(), 0.5
+    q, v = jnp.linspace(0.1, 0.4, 7), jnp.linspace(-1.0, 1.0, 7)
+    for held in (
+        assemble(jd.Scene(arm), q, v, hold={"iiwa_joint_2": wanted}),
+        assemble(arm, q, v, hold={"iiwa_joint_2": wanted}),
+    ):
+        # The least |e| in M with one entry given: e = M^-1 row^T (row M^-1 row^T)^-1 (wanted - q).
+        column = jnp.linalg.inv(jd.mass_matrix(arm, q))[:, 1]
+        np.testing.assert_allclose(held.q, q + column / column[1] * (wanted - q[1]), atol=1e-12)
+        np.testing.assert_array_equal(held.v, v)
+        assert held.success and held.residual[0] < 1e-12 and held.residual[1] == 0
+
+
 def test_assembling_from_a_bad_guess():
     """Stretched out, the loop's equations do not say to which side it closes; a configuration beside it does."""
     scene, straight = scenes.four_bar(), jnp.zeros(3)

@@ -240,6 +240,57 @@ def test_out_of_reach():
         inverse_kinematics(model, {"end": [3.0, 0.3, 0.0]}, jnp.array([0.2, 0.1]))
 
 
+@pytest.mark.long
+def test_reasons_under_derivatives():
+    """Outside of jit a failing search gives its reason under jax.grad, jacfwd and hessian too."""
+    model, four_bar = two_bars(), scenes.four_bar()
+    q = scenes.four_bar.start()[0]
+    given = {"weights": {"end": [1, 1, 0]}, "guesses": 1}
+
+    def point(x):
+        return jnp.stack([x, x, 0 * x])
+
+    def by_motors(x):
+        return jd.constrained_inverse_dynamics(
+            jd.Scene(two_bars()),
+            jnp.zeros(2),
+            jnp.zeros(2),
+            [x, 1.0],
+            motors=["a_joint"],
+            independent=["a_joint", "b_joint"],
+        ).torque.sum()
+
+    cases = (
+        (
+            lambda x: inverse_kinematics(model, {"end": point(x)}, jnp.ones(2), **given).q.sum(),
+            "targets_not_reached: errors",
+        ),
+        (
+            lambda x: follow(model, {"end": point(x)[None]}, jnp.ones(2), **given).q.sum(),
+            "follow: 1 places of 1 were not",
+        ),
+        (lambda x: jd.assemble(four_bar, q, hold={"1": 0.5, "2": x}, guesses=1).q.sum(), "not assembled: jointlock"),
+        (by_motors, "motors: they cannot produce"),
+    )
+    for search, reason in cases:
+        for derivative in (jax.grad, jax.jacfwd, jax.hessian):
+            with pytest.raises(ValueError, match=reason):
+                derivative(search)(10.0)
+
+
+@pytest.mark.long
+def test_unreachable_target_on_a_linkage_leaves_it_closed():
+    """The constraints hold to rounding at the place of least error, and the code is that of the target."""
+    for scene, start, frame in (
+        (scenes.four_bar(), scenes.four_bar.start()[0], "coupler"),
+        (*delta(), "platform"),
+    ):
+        for far in ([9.0, 1.0, 0.0], [1.0, 0.0, 0.2], [-4.0, 4.0, 1.0]):
+            place = inverse_kinematics(scene, {frame: far}, start, throw=False)
+            assert place.result == RESULTS.targets_not_reached
+            assert float(place.constraint_residual) < 1e-11
+
+
 def test_steps_keep_the_branch():
     """Equal parts of the way: the elbow stays on its side where one long step may change it."""
     model = two_bars()
@@ -287,6 +338,12 @@ def test_refusals():
         inverse_kinematics(model, {TIP: {"speed": [0, 0, 1.0]}}, q)
     with pytest.raises(ValueError, match=r"direction is \[0. 0. 0.\]; give a vector"):
         inverse_kinematics(model, {TIP: {"direction": [0.0, 0, 0]}}, q)
+    for nothing in ({}, {"axis": [0, 0, 1.0]}):
+        for search in (inverse_kinematics, follow):
+            with pytest.raises(ValueError, match=r"names no target; give some of pose"):
+                search(model, {TIP: nothing}, q)
+    with pytest.raises(ValueError, match=r"axis has shape \(2,\), expected \(3,\)"):
+        inverse_kinematics(model, {TIP: {"direction": [0, 0, 1.0], "axis": [0, 1.0]}}, q)
     with pytest.raises(ValueError, match="weights names"):
         inverse_kinematics(model, {TIP: np.eye(4)}, q, weights={"hand": 1.0})
     with pytest.raises(ValueError, match=r"weights\['iiwa_link_7'\] has shape \(2,\)"):

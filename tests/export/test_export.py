@@ -596,3 +596,23 @@ def test_refusals_of_saving_and_calling(exported, tmp_path):
         exported(X, V)
     with pytest.raises(ValueError, match="was exported without its Jacobian"):
         jd.export(lambda x: x, X, name="f").jacobian(X)
+
+
+def test_solutions_of_equations_and_what_to_write_in_place_of_other_factors():
+    """LU with pivots is exported; what is not is refused with the function and the remedy."""
+
+    def solved(x, b):
+        return jnp.linalg.solve(jnp.sin(jnp.outer(x, jnp.arange(1.0, 5.0))), b)
+
+    x, b = np.array([0.3, 1.1, -0.7, 2.0]), np.array([1.0, -2.0, 0.5, 3.0])
+    code = jd.export(solved, x, b, name="solved")
+    np.testing.assert_allclose(code(x, b), np.linalg.solve(np.sin(np.outer(x, np.arange(1.0, 5.0))), b), rtol=1e-11)
+
+    def decomposed(x):
+        return jnp.linalg.svd(jnp.outer(x, x) + jnp.eye(4), compute_uv=False)
+
+    words = (
+        r"it has svd, in .*decomposed \(test_export.py:\d+\); decompose a constant matrix once, outside of the function"
+    )
+    with pytest.raises(ValueError, match=words):
+        jd.export(decomposed, x, name="decomposed")

@@ -12,6 +12,7 @@ import numpy as np
 import pinocchio as pin
 import pytest
 
+import jaxdyn as jd
 from jaxdyn import robots
 from jaxdyn.dynamics import kinematics
 from jaxdyn.io import UnitsWarning, load, load_urdf, save_urdf, urdf_inertia_report
@@ -784,3 +785,78 @@ def test_load_takes_every_robot_or_says_how(name):
             assert not set(names) & set(load(path, lock=names).system.joint_names)
         elif "mimic=" in str(refusal.value):
             assert load(path, mimic="ignore").system.nb > 0
+
+
+ARM_WITHOUT_INERTIAS = """<robot name='r'><link name='base'/><link name='arm'/><link name='tool'/><link name='hand'/>
+<joint name='j' type='continuous'><origin xyz='0 0 0.3'/><parent link='base'/><child link='arm'/><axis xyz='0 1 0'/></joint>
+<joint name='f' type='fixed'><parent link='arm'/><child link='tool'/></joint>
+<joint name='k' type='continuous'><origin xyz='0.5 0 0'/><parent link='tool'/><child link='hand'/><axis xyz='0 1 0'/></joint></robot>"""
+
+
+def test_arms_without_inertias_load_for_kinematics(tmp_path):
+    """The error names the option, which counts for links that move; kinematics do not depend on it."""
+    path = tmp_path / "arm.urdf"
+    path.write_text(ARM_WITHOUT_INERTIAS)
+    with pytest.raises(ValueError, match=r"moves no inertia.*missing_inertia=jd.inertia.sphere\(1.0, 0.1\)"):
+        load_urdf(path)
+    ball = jd.inertia.sphere(2.0, 0.1)
+    for model in (load_urdf(path, missing_inertia=ball), jd.load(path, missing_inertia=ball).system):
+        np.testing.assert_array_equal(model.inertias, np.stack([ball, ball]))
+    hand = jd.frame_pose(model, jnp.array([0.4, 0.2]), "hand")[:3, 3]
+    np.testing.assert_allclose(hand, [0.5 * np.cos(0.4), 0, 0.3 - 0.5 * np.sin(0.4)], atol=1e-15)
+    free = load_urdf(path, missing_inertia=ball, floating_base=True, lock=["k"])
+    np.testing.assert_allclose(free.inertias[:, 0], [2.0, 2.0])
+    for bad in (np.nan, "1 kg"):
+        with pytest.raises(ValueError, match="missing_inertia"):
+            load_urdf(path, missing_inertia=bad)
+
+
+def test_published_arms_without_inertias_load_for_kinematics(robots_dir):
+    """Romeo's fingers have none."""
+    path = robots_dir / "romeo_description/urdf/romeo.urdf"
+    model = load_urdf(path, missing_inertia=jd.inertia.sphere(0.1, 0.02))
+    oracle = pin.buildModelFromUrdf(str(path))
+    q = np.random.default_rng(0).uniform(-1, 1, model.nq)
+    data = oracle.createData()
+    pin.framesForwardKinematics(oracle, data, q)
+    for name in ("l_wrist", "LFinger13_link", "r_ankle"):
+        if oracle.existFrame(name):
+            np.testing.assert_allclose(
+                jd.frame_pose(model, jnp.asarray(q), name), data.oMf[oracle.getFrameId(name)].homogeneous, atol=1e-12
+            )
+
+
+def test_packages_of_xacro_files_without_ros(tmp_path):
+    """$(find NAME) is a folder of `packages`, or one beside or above the file; includes are expanded alike."""
+    pytest.importorskip("xacro", reason="xacro is not installed")
+    robot, parts = tmp_path / "robot_description" / "urdf", tmp_path / "parts" / "xacro"
+    robot.mkdir(parents=True)
+    parts.mkdir(parents=True)
+    head = "<robot xmlns:xacro='http://www.ros.org/wiki/xacro' name='r'>"
+    (robot / "r.urdf.xacro").write_text(
+        f"{head}<xacro:include filename='$(find parts)/xacro/parts.xacro'/>"
+        "<xacro:include filename=\"$(find robot_description)/urdf/base.xacro\"/><xacro:hinge length='0.5'/></robot>"
+    )
+    (robot / "base.xacro").write_text(f"{head}<link name='base'/></robot>")
+    (parts / "sizes.xacro").write_text(f"{head}<xacro:property name='mass' value='3'/></robot>")
+    (parts / "parts.xacro").write_text(
+        f"{head}<xacro:include filename='sizes.xacro'/><xacro:macro name='hinge' params='length'>"
+        "<link name='arm'><inertial><origin xyz='${length} 0 0'/><mass value='${mass}'/>"
+        "<inertia ixx='1' ixy='0' ixz='0' iyy='1' iyz='0' izz='1'/></inertial></link>"
+        "<joint name='j' type='continuous'><parent link='base'/><child link='arm'/></joint></xacro:macro></robot>"
+    )
+    path = robot / "r.urdf.xacro"
+    for model in (load_urdf(path), jd.load(path, packages={"parts": tmp_path / "parts"}).system):
+        np.testing.assert_allclose(model.inertias[0, :2], [3.0, 1.5])
+    text = path.read_text()
+    path.write_text(text.replace("find parts", "find elsewhere"))
+    reason = r"the folder of package 'elsewhere', which the file names by \$\(find elsewhere\), is not known.*give packages=\{'elsewhere'"
+    with pytest.raises(ValueError, match=reason):
+        load_urdf(path)
+    np.testing.assert_allclose(load_urdf(path, packages={"elsewhere": str(tmp_path / "parts")}).inertias[0, 0], 3.0)
+    with pytest.raises(ValueError, match=r"packages\['elsewhere'\] is 'nowhere', which is no folder"):
+        load_urdf(path, packages={"elsewhere": "nowhere"})
+    other = tmp_path / "r.urdf"
+    other.write_text("<robot name='r'><link name='a'/></robot>")
+    with pytest.raises(ValueError, match=r"packages is .* is no .xacro file; leave it out"):
+        load_urdf(other, packages={"a": "b"})

@@ -3,6 +3,7 @@
 import re
 import warnings
 
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -525,6 +526,48 @@ def test_inertias_that_no_body_has_are_named(moments, words):
         if words:
             assert re.match(words, str(caught[0].message)) and "jd.model.repair_inertias" in str(caught[0].message)
             assert caught[0].filename == __file__
+
+
+@pytest.mark.parametrize("bad", [np.nan, np.inf, -np.inf])
+def test_numbers_that_are_not_finite_are_refused_with_their_body(bad):
+    """Whatever entry is bad, however the model is made of it."""
+    sound = jd.ModelBuilder().add_body("a", inertia=jd.inertia.sphere(1.0, 1.0), damping=0.1)
+    sound = sound.add_body("b", "a", inertia=jd.inertia.sphere(2.0, 1.0)).add_frame("tip", "b").build()
+    for i in range(10):
+        numbers = np.array(sound.inertias)
+        numbers[1, i] = bad
+        for make, words in (
+            (lambda x: jd.ModelBuilder().add_body("b", inertia=x[1]), "body 'b': inertia is .*must be finite"),
+            (lambda x: sound.replace(inertias=x), "replace: inertias of body 'b' is"),
+            (lambda x: sound.replace(inertias=jnp.asarray(x, jnp.float32)), "replace: inertias of body 'b' is"),
+            # One bad number among those of a sound body, and of one that needs repair.
+            (lambda x: jd.model.repair_inertias(eqx.tree_at(lambda m: m.inertias, sound, jnp.asarray(x))), "body 'b'"),
+            (lambda x: sound.with_payload("tip", x[1]), "inertia is .*; give finite numbers"),
+            (lambda x: jd.inertia.nearest_feasible(x[1]), "parameters is .* cannot be repaired"),
+        ):
+            with pytest.raises(ValueError, match=words):
+                make(numbers)
+        broken = eqx.tree_at(lambda m: m.inertias, sound, jnp.asarray(numbers))
+        assert jd.model.inertia_report(broken)[0][0] == "b" and not jd.inertia.is_feasible(numbers[1])
+    for leaf, words in (
+        ("gravity", "gravity is"),
+        ("home", "home of body 'b'"),
+        ("screws", "screws of body 'b'"),
+        ("frame_poses", "frame_poses of frame 'tip'"),
+        ("damping", "damping of joint 'b_joint'"),
+    ):
+        values = np.array(getattr(sound, leaf))
+        values.flat[-1] = bad
+        with pytest.raises(ValueError, match=f"replace: {words}"):
+            sound.replace(**{leaf: values})
+    upper = np.array([np.inf, bad])
+    if bad == np.inf:
+        assert sound.replace(upper=upper).upper[1] == np.inf
+    else:
+        with pytest.raises(ValueError, match="replace: upper of joint 'b_joint'"):
+            sound.replace(upper=upper)
+    with pytest.raises(ValueError, match=r"body 'b': inertia: mass 1e\+308 kg at .* overflows"):
+        jd.ModelBuilder().add_body("b", inertia=(1e308, (10, 0, 0), (1, 1, 1)))
 
 
 @pytest.mark.parametrize("text", ["1_0", "1", 1j])

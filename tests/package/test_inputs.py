@@ -2,6 +2,7 @@
 
 # pyright: reportArgumentType=false
 
+import pickle
 import subprocess
 import sys
 import traceback
@@ -434,7 +435,13 @@ def test_codes_of_a_batch_print_as_words():
     lanes = jax.vmap(lambda q: jd.constrained_dynamics(CHAIN, q, jnp.zeros(2)))(jnp.zeros((3, 2)))
     assert jd.RESULTS[lanes.result] == "['successful' 'successful' 'successful']" and lanes.success.all()
     one = jd.constrained_dynamics(CHAIN, jnp.zeros(2), jnp.zeros(2))
-    assert jd.RESULTS[one.result] == "successful" and "successful" in str(one.result)
+    assert jd.RESULTS[one.result] == "successful" and str(one.result) == repr(one.result) == "successful"
+    assert str(lanes.result) == "['successful' 'successful' 'successful']" and "result=successful" in repr(one)
+    stalled = jax.jit(lambda x: jd.RESULTS.where(x > 0, jd.RESULTS.successful, jd.RESULTS.stalled))(0.0)
+    assert f"{stalled}" == "stalled" and "not solved to the tolerance" in jd.RESULTS[stalled]
+    assert repr(pickle.loads(pickle.dumps(stalled))) == "stalled"
+    with pytest.raises(ValueError, match=r"compared with 0; compare it with jd.RESULTS.successful"):
+        one.result == 0  # noqa: B015
 
 
 @pytest.mark.parametrize(

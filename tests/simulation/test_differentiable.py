@@ -78,8 +78,8 @@ def test_reverse_mode_takes_the_steps_of_the_forward_run(kind, solver):
     def repeated(x, r, ts):
         how = options(kind, solver, ts)
         fixed = jax.lax.stop_gradient((x, r, ts))
-        taken = differentiable._record(moving(*fixed), how, 4096)[2]
-        again = differentiable._repeat(how, taken) | {"adjoint": diffrax.ForwardMode()}
+        _, facts, taken = differentiable._record(moving(*fixed), how, 4096)
+        again = differentiable._repeat(how, taken, facts[2]) | {"adjoint": diffrax.ForwardMode()}
         return jnp.sum(WEIGHTS * differentiable.run(moving(x, r, ts), **again)[0]["x"])
 
     @jax.jit

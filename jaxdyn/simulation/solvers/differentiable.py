@@ -14,8 +14,10 @@ import jax
 import jax.numpy as jnp
 from jax.flatten_util import ravel_pytree
 
+from jaxdyn.compile import reverse_only
 from jaxdyn.simulation.solvers.choice import innermost
 from jaxdyn.simulation.solvers.guards import delay
+from jaxdyn.simulation.solvers.integrator import FORWARD
 
 COUNTS = ("num_steps", "num_accepted_steps", "num_rejected_steps")
 ROOM = 4096  # steps that are recorded where the user gives no limit: 32 kB a trajectory
@@ -87,7 +89,7 @@ def run_adaptively(inputs, options, limit_is_given: bool) -> tuple[Any, tuple]:
     options = eqx.combine(jax.lax.stop_gradient(numbers), rest)
     room = options["max_steps"] if limit_is_given else min(options["max_steps"], ROOM)
     if isinstance(options["adjoint"], diffrax.RecursiveCheckpointAdjoint):
-        return _with_end(_run(inputs, options, room), inputs[1], options)
+        return _with_end(_run(reverse_only(inputs, FORWARD), options, room), inputs[1], options)
     if isinstance(options["adjoint"], diffrax.DirectAdjoint):
         numbers, rest = eqx.partition(inputs, eqx.is_array)
         facts, steps = _record(eqx.combine(jax.lax.stop_gradient(numbers), rest), options, options["max_steps"])[1:]

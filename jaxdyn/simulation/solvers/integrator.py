@@ -9,11 +9,16 @@ import jax.numpy as jnp
 from jax import lax
 from jax.flatten_util import ravel_pytree
 
+from jaxdyn.compile import reverse_only
 from jaxdyn.compile.loops import Given
 from jaxdyn.constraints.codes import RESULTS, first_of
 from jaxdyn.simulation.solvers import driver, reverse
 from jaxdyn.simulation.solvers.driver import AdaptiveSteps, FixedSteps
 from jaxdyn.simulation.solvers.explicit import Plan
+
+FORWARD = (
+    'forward mode (jax.jvp, jax.jacfwd) through a run or a step needs adjoint="forward", of jd.simulate or jd.stepper'
+)
 
 
 class Integrator(eqx.Module):
@@ -27,7 +32,7 @@ class Integrator(eqx.Module):
     room: int = eqx.field(static=True, kw_only=True)  # steps that a history holds
 
     def __call__(self, y0, args, ts):
-        return _integrate((y0, args, ts), jax.lax.stop_gradient(self))
+        return _integrate(reverse_only((y0, args, ts), FORWARD), jax.lax.stop_gradient(self))
 
     def direct(self, y0, args, ts):
         """Integrate with derivatives of any order in both modes."""

@@ -1,0 +1,43 @@
+"""Forward mode of runs and steps whose derivatives exist in reverse mode: refused with the option that allows it."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import jaxdyn as jd
+
+TS = jnp.linspace(0.0, 0.1, 3)
+Q = jnp.array([0.3, -0.2])
+
+
+def simulated(q, **options):
+    return jd.simulate(jd.scenes.double_pendulum(), q, jnp.zeros(2), TS, **options).q[-1]
+
+
+def stepped(q, **options):
+    return jd.stepper(jd.scenes.double_pendulum(), 0.01, substeps=2, **options)((q, jnp.zeros(2)), jnp.zeros(2))[0]
+
+
+def stiffly(q, **options):
+    return simulated(q, solver=jd.solvers.Rodas5P(), **options)
+
+
+@pytest.mark.long
+@pytest.mark.parametrize("function", [simulated, stepped, stiffly])
+def test_forward_mode_names_its_option(function):
+    """Under jit and outside, and for a single direction; the option gives the Jacobian of reverse mode."""
+    for derivative in (jax.jacfwd(function), jax.jit(jax.jacfwd(function)), lambda q: jax.jvp(function, (q,), (q,))):
+        with pytest.raises(ValueError, match=r'forward mode .* needs adjoint="forward", of jd.simulate or jd.stepper'):
+            derivative(Q)
+    by_rows = jax.jit(jax.jacrev(function))(Q)
+    np.testing.assert_allclose(
+        jax.jit(jax.jacfwd(lambda q: function(q, adjoint="forward")))(Q), by_rows, rtol=1e-9, atol=1e-12
+    )
+    if function is not stiffly:
+        hessian = jax.jit(jax.hessian(lambda q: function(q, adjoint="forward").sum()))(Q)
+        np.testing.assert_allclose(
+            jax.jit(jax.jacfwd(jax.grad(lambda q: function(q).sum())))(Q), hessian, rtol=1e-8, atol=1e-10
+        )
+    batch = jax.jit(jax.vmap(jax.grad(lambda q: function(q).sum())))(jnp.stack([Q, Q]))
+    np.testing.assert_allclose(batch[1], by_rows.sum(0), rtol=1e-9, atol=1e-12)
