@@ -4,7 +4,9 @@ from collections.abc import Callable, Sequence
 from typing import Any
 
 import equinox as eqx
+import jax
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array, Bool
 
 from jaxdyn.compile.known import is_concrete
@@ -91,6 +93,11 @@ def code_of(result: Any) -> Array:
     """Index of a result, traced or batched, in `CODES` (uint8)."""
     # An item of an enumeration is no array that could be stored; comparisons of it are.
     return jnp.argmax(jnp.stack([result == getattr(RESULTS, name) for name in CODES]), 0).astype(jnp.uint8)
+
+
+def is_successful(result: Any) -> bool:
+    """Decide whether one concrete result is `successful`, without a program of XLA."""
+    return np.array_equal(jax.tree.leaves(result), jax.tree.leaves(RESULTS.successful))
 
 
 def name_of(result: Any) -> str:

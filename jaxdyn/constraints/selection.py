@@ -276,7 +276,7 @@ def _select_far_away(scene: Scene, q, t, sure, apart: float, is_rounded: bool):
 
 def most_rounding(dtype) -> float:
     """Opening of dropped rows above which they are not redundant but contradict the others."""
-    return 10 * clear_pivot(jnp.zeros((), dtype))
+    return 10 * clear_pivot(np.zeros((), dtype))
 
 
 def select_concrete_rows(

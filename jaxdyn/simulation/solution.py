@@ -9,7 +9,7 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from jaxdyn.constraints.codes import RESULTS as RESULTS
-from jaxdyn.constraints.codes import Outcome, first_of, name_of
+from jaxdyn.constraints.codes import Outcome, first_of, is_successful, name_of
 from jaxdyn.contact.forces import contacts_with_cones
 from jaxdyn.forces.dissipation import SlidingFriction
 from jaxdyn.model.arguments import FilePath
@@ -170,7 +170,7 @@ def joint_of(model: Model, entry: int) -> str:
 
 def raise_failure(solution: Solution, scene: Scene, control, options) -> None:
     """Raise RuntimeError with the time reached, the cause and the fix, if a concrete run failed."""
-    if bool(solution.success):
+    if is_successful(solution.result):
         return
     name = name_of(solution.result)
     reached, end = float(solution.stats["time_reached"]), float(solution.ts[-1])

@@ -275,6 +275,26 @@ assert simulate is jd.simulate and "ast" not in dir(jd)
 """)
 
 
+@pytest.mark.long
+def test_first_simulate_compiles_one_program():
+    """Programs of XLA beside the motion's own are only those that ask XLA for its options (`select_options`)."""
+    run_in_new_process("""
+import jax
+import jax._src.compiler as compiler
+import numpy as np
+import jaxdyn as jd
+names, compile_and_load = [], compiler.backend_compile_and_load
+def record(backend, module, *args, **options):
+    names.append(module.operation.attributes["sym_name"].value)
+    return compile_and_load(backend, module, *args, **options)
+compiler.backend_compile_and_load = record
+scene, start = jd.scenes.four_bar(), jd.scenes.four_bar.start()
+for _ in range(2):
+    jd.simulate(scene, *start[:2], np.linspace(0.0, 0.1, 3))
+assert [name for name in names if "lambda" not in name] == ["jit_smooth_motion"], names
+""")
+
+
 def test_excluded_jax_is_neither_installed_nor_allowed():
     assert "0.10.2" not in {metadata.version("jax"), metadata.version("jaxlib")}
     project = tomllib.loads((PACKAGE.parent / "pyproject.toml").read_text(encoding="utf-8"))["project"]
