@@ -1,170 +1,44 @@
 """Rigid-body dynamics in JAX: pure functions of one sample, to be batched, compiled and differentiated."""
 
-from jaxdyn import (
-    constraints,
-    contact,
-    control,
-    dynamics,
-    forces,
-    geometry,
-    grasp,
-    identify,
-    io,
-    model,
-    pictures,
-    reduction,
-    scale,
-    scenes,
-    sensors,
-    simulation,
-)
-from jaxdyn._renamed import __getattr__ as __getattr__
-from jaxdyn.compile import compilation
-from jaxdyn.constraints import Holonomic, Pfaffian, constraint_jacobian, loop, rolling_sphere, rolling_wheel
-from jaxdyn.constraints.assembly import assemble
-from jaxdyn.constraints.codes import RESULTS
-from jaxdyn.constraints.dynamics import constrained_dynamics
-from jaxdyn.constraints.reactions import constraint_forces
-from jaxdyn.constraints.selection import degrees_of_freedom
-from jaxdyn.control.following import follow
-from jaxdyn.control.inverse_kinematics import inverse_kinematics
-from jaxdyn.dynamics.centroidal import center_of_mass, com_jacobian
-from jaxdyn.dynamics.frame_motion import frame_jacobian, frame_velocity
-from jaxdyn.dynamics.kinematics import body_jacobian, forward_kinematics, frame_pose
-from jaxdyn.dynamics.link_frame import newton_euler_matrices
-from jaxdyn.dynamics.quantities import (
-    bias_force,
-    coriolis_matrix,
-    forward_dynamics,
-    gravity_force,
-    inverse_dynamics,
-    kinetic_energy,
-    mass_matrix,
-    potential_energy,
-)
-from jaxdyn.export import Exported, export
-from jaxdyn.io import load, load_urdf, read_log, save_urdf
-from jaxdyn.lie import se2, se3, so3
-from jaxdyn.model import inertia, robots
-from jaxdyn.model.builder import ModelBuilder
-from jaxdyn.model.configuration import (
-    configuration_rate,
-    difference,
-    integrate,
-    neutral,
-    normalize,
-    random_configuration,
-)
-from jaxdyn.model.joining import join
-from jaxdyn.model.tree import Model
-from jaxdyn.pictures import animate, draw, plot, view
-from jaxdyn.reduction.inverse_dynamics import constrained_inverse_dynamics
-from jaxdyn.reduction.minimal import reduced_dynamics
-from jaxdyn.reports import report
-from jaxdyn.simulation import solvers
-from jaxdyn.simulation.controls import Controller, Sampled
-from jaxdyn.simulation.methods import Baumgarte, Multipliers, Projected, Reduced
-from jaxdyn.simulation.run import simulate
-from jaxdyn.simulation.solution import Solution
-from jaxdyn.simulation.stepping import stepper
-from jaxdyn.simulation.stiffness import stiffness
-from jaxdyn.simulation.variational import Variational
-from jaxdyn.systems.lagrangian import LagrangianSystem
-from jaxdyn.systems.scene import Scene
-from jaxdyn.systems.system import ExplicitSystem, MetricSystem
+import ast
+import importlib
+import importlib.util
+import pkgutil
+from typing import Any
 
 __version__ = "0.2.0"
-__all__ = [
-    "RESULTS",
-    "Baumgarte",
-    "Controller",
-    "ExplicitSystem",
-    "Exported",
-    "Holonomic",
-    "LagrangianSystem",
-    "MetricSystem",
-    "Model",
-    "ModelBuilder",
-    "Multipliers",
-    "Pfaffian",
-    "Projected",
-    "Reduced",
-    "Sampled",
-    "Scene",
-    "Solution",
-    "Variational",
-    "animate",
-    "assemble",
-    "bias_force",
-    "body_jacobian",
-    "center_of_mass",
-    "com_jacobian",
-    "compilation",
-    "configuration_rate",
-    "constrained_dynamics",
-    "constrained_inverse_dynamics",
-    "constraint_forces",
-    "constraint_jacobian",
-    "constraints",
-    "contact",
-    "control",
-    "coriolis_matrix",
-    "degrees_of_freedom",
-    "difference",
-    "draw",
-    "dynamics",
-    "export",
-    "follow",
-    "forces",
-    "forward_dynamics",
-    "forward_kinematics",
-    "frame_jacobian",
-    "frame_pose",
-    "frame_velocity",
-    "geometry",
-    "grasp",
-    "gravity_force",
-    "identify",
-    "inertia",
-    "integrate",
-    "inverse_dynamics",
-    "inverse_kinematics",
-    "io",
-    "join",
-    "kinetic_energy",
-    "load",
-    "load_urdf",
-    "loop",
-    "mass_matrix",
-    "model",
-    "neutral",
-    "newton_euler_matrices",
-    "normalize",
-    "pictures",
-    "plot",
-    "potential_energy",
-    "random_configuration",
-    "read_log",
-    "reduced_dynamics",
-    "reduction",
-    "report",
-    "robots",
-    "rolling_sphere",
-    "rolling_wheel",
-    "save_urdf",
-    "scale",
-    "scenes",
-    "se2",
-    "se3",
-    "sensors",
-    "simulate",
-    "simulation",
-    "so3",
-    "solvers",
-    "stepper",
-    "stiffness",
-    "view",
-]
+
+
+def _read_stub() -> tuple[dict[str, tuple[str, str]], list[str]]:
+    """Names in the package's type stub, each with its module and its name there, and those that are public.
+
+    The stub is the only list of names: type checkers and editors see what `__getattr__` finds, as in SPEC 1 of Scientific Python.
+    """
+    homes, public = {}, []
+    for node in ast.parse(pkgutil.get_data(__name__, "__init__.pyi") or b"").body:
+        if isinstance(node, ast.ImportFrom):
+            homes |= {alias.asname or alias.name: (node.module or "", alias.name) for alias in node.names}
+        elif isinstance(node, ast.Assign):
+            public = ast.literal_eval(node.value)
+    return homes, public
+
+
+_HOMES, __all__ = _read_stub()
+
+
+def __getattr__(name: str) -> Any:
+    """Import a name at its first use (PEP 562), or find one that has moved, with a warning; AttributeError for others."""
+    if name not in _HOMES or name not in __all__:
+        from jaxdyn._renamed import find
+
+        # Subpackages that are not public are attributes too, as after `import jaxdyn.compile`.
+        is_module = not name.startswith("_") and importlib.util.find_spec(f"{__name__}.{name}") is not None
+        return importlib.import_module(f"{__name__}.{name}") if is_module else find(name)
+    module, present = _HOMES[name]
+    home = None if module == __name__ else importlib.import_module(module)
+    value = getattr(home, present) if hasattr(home, present) else importlib.import_module(f"{module}.{present}")
+    globals()[name] = value
+    return value
 
 
 def __dir__() -> list[str]:

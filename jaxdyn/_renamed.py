@@ -47,12 +47,13 @@ _HOME = {name: namespace for namespace, names in _MOVED.items() for name in name
 _MODULES = {"solvers": "simulation.solvers"}
 
 
-def __getattr__(name: str) -> Any:
+def find(name: str) -> Any:
     """Find a name of `jaxdyn` that has moved, and warn; AttributeError for others."""
+    # Warnings name the caller of the package's `__getattr__`, which calls this.
     if name not in _HOME:
-        return _find(name, name, "jaxdyn")
+        return _find(name, name, "jaxdyn", stacklevel=4)
     namespace = _HOME[name]
-    warnings.warn(f"jd.{name} is now jd.{namespace}.{name}", DeprecationWarning, stacklevel=2)
+    warnings.warn(f"jd.{name} is now jd.{namespace}.{name}", DeprecationWarning, stacklevel=3)
     return getattr(importlib.import_module(f"jaxdyn.{_MODULES.get(namespace, namespace)}"), name)
 
 
@@ -62,12 +63,11 @@ def old_names(module: str) -> Callable[[str], Any]:
     return lambda name: _find(f"{namespace}.{name}", name, module)
 
 
-def _find(old: str, name: str, module: str) -> Any:
+def _find(old: str, name: str, module: str, stacklevel: int = 3) -> Any:
     if old not in _RENAMED:
         raise AttributeError(f"module {module!r} has no attribute {name!r}")
     place, new = _RENAMED[old]
-    # The caller of the `__getattr__` that called this.
-    warnings.warn(f"jd.{old} is now {new}", DeprecationWarning, stacklevel=3)
+    warnings.warn(f"jd.{old} is now {new}", DeprecationWarning, stacklevel=stacklevel)
     home, _, present = place.rpartition(".")
     return getattr(importlib.import_module(f"jaxdyn.{home}"), present)
 

@@ -7,7 +7,7 @@ import numpy as np
 
 import jaxdyn as jd
 from jaxdyn.cli.common import FILE, add_model_options, load_scene
-from jaxdyn.export.exported import ABIS, HOST, TARGETS
+from jaxdyn.exports.exported import ABIS, HOST, TARGETS
 
 HELP = "write a function of a robot as an object file for C or CasADi"
 DESCRIPTION = """\

@@ -8,7 +8,7 @@ native code, operations of JAX do the same (`primitive`).
 
 Nothing of jaxdyn is imported here. Other rooms import the names below, and those of the modules `known` (known and traced
 values), `batch` (decisions for a batch, repetitions), `loops` and `repair`. Only `jaxdyn.scale`, which compiles programs around
-kernels ahead of time, and `jaxdyn.export`, which writes object files, import the compiler's own modules.
+kernels ahead of time, and `jaxdyn.exports`, which writes object files, import the compiler's own modules.
 """
 
 from jaxdyn.compile.calls import entry_point as entry_point

@@ -177,6 +177,11 @@ def code_of(result: Any) -> Array:
     return jnp.asarray(result.index, jnp.uint8)
 
 
+def is_successful(result: Any) -> bool:
+    """Decide whether one concrete result is `successful`, without a program of XLA."""
+    return np.array_equal(jax.tree.leaves(result), jax.tree.leaves(RESULTS.successful))
+
+
 def name_of(result: Any) -> str:
     """Name of one concrete result."""
     return CODES[int(code_of(result))]

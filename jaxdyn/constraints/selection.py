@@ -362,7 +362,7 @@ def _select_far_away(scene: Scene, q, t, sure, apart: float):
 
 def most_rounding(dtype) -> float:
     """Opening of dropped rows above which they are not redundant but contradict the others."""
-    return 10 * clear_pivot(jnp.zeros((), dtype))
+    return 10 * clear_pivot(np.zeros((), dtype))
 
 
 def pivot_rows(B: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

@@ -284,7 +284,9 @@ def pseudo_inertia(parameters: np.ndarray) -> np.ndarray:
     """Pseudo-inertia (4, 4) in float64, so that decisions about float32 models and factors of theirs keep their digits."""
     rotational = rotational_inertia(parameters)
     sigma = 0.5 * np.trace(rotational) * np.eye(3) - rotational
-    return np.block([[sigma, parameters[1:4, None]], [parameters[None, 1:4], parameters[:1, None]]])
+    matrix = np.empty((4, 4), parameters.dtype)
+    matrix[:3, :3], matrix[:3, 3], matrix[3, :3], matrix[3, 3] = sigma, parameters[1:4], parameters[1:4], parameters[0]
+    return matrix
 
 
 def parameters_from_pseudo(matrix: np.ndarray) -> np.ndarray:

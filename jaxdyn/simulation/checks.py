@@ -356,8 +356,8 @@ def may_have_singular_mass(system) -> bool:
     if not is_concrete(system.inertias):
         return True
     # Positive definite pseudo-inertias make the mass matrix positive definite, whatever the configuration.
-    sizes = [np.linalg.eigvalsh(host_math.pseudo_inertia(x)) for x in np.asarray(system.inertias, float)]
-    return not all(least > 1e-12 * largest for least, *_, largest in sizes)
+    sizes = np.linalg.eigvalsh([host_math.pseudo_inertia(x) for x in np.asarray(system.inertias, float)])
+    return not (sizes[:, 0] > 1e-12 * sizes[:, -1]).all()
 
 
 def has_definite_mass(system, q, t):
@@ -386,7 +386,8 @@ def safe_inputs(system, numbers) -> Inputs:
 
     `numbers`: q0, v0, ts, rtol, atol, and the length of steps or their controller.
     """
-    q0, v0, ts, rtol, atol, stepsize = numbers
+    # Known numbers are NumPy arrays where nothing is traced, as under `jax.disable_jit`.
+    q0, v0, ts, rtol, atol, stepsize = (jnp.asarray(x) if isinstance(x, np.ndarray) else x for x in numbers)
     # Before `retract`, which gives every quaternion the length one.
     unit_start = has_unit_quaternions(system, q0)
     q0 = retract(system, q0)

@@ -161,9 +161,11 @@ def simulate(
         "selects_rows": _selects_rows(scene, method, *start),
     }
     dtype, has_length = state_dtype(scene.system), is_step_length(stepsize)
-    numbers: list[Any] = [jnp.asarray(x, dtype) for x in arrays]
-    numbers.append(jnp.asarray(stepsize, dtype) if has_length else stepsize)
-    concrete = is_known(scene, control, method, numbers)
+    concrete = is_known(scene, control, method, arrays, stepsize)
+    # Known numbers go to the compiled program as they are: each array of JAX made before would be a transfer of its own.
+    to_array = np.asarray if concrete and not modal else jnp.asarray
+    numbers: list[Any] = [x if _is_array(x, dtype) else to_array(x, dtype) for x in arrays]
+    numbers.append(to_array(stepsize, dtype) if has_length else stepsize)
     if modal:
         solution = hybrid_motion(scene, control, numbers, options)
     else:
@@ -174,6 +176,10 @@ def simulate(
     if throw and concrete:
         raise_failure(solution, scene, control, options)
     return solution.result.error_if(solution, ~solution.success) if throw and not concrete else solution
+
+
+def _is_array(x, dtype) -> bool:
+    return isinstance(x, jax.Array) and x.dtype == dtype
 
 
 def _check_numbers(scene: Scene, q0, v0, ts, rtol, atol, stepsize) -> tuple:

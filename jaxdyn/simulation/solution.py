@@ -11,7 +11,7 @@ from jaxtyping import Array, Float
 
 from jaxdyn.compile import invalidate_derivatives
 from jaxdyn.constraints.codes import RESULTS as RESULTS
-from jaxdyn.constraints.codes import Outcome, first_of, name_of
+from jaxdyn.constraints.codes import Outcome, first_of, is_successful, name_of
 from jaxdyn.contact.forces import contacts_with_cones
 from jaxdyn.forces.dissipation import SlidingFriction
 from jaxdyn.model.arguments import FilePath
@@ -56,7 +56,9 @@ def invalidate_failed(rows, times, result, reached, inputs):
     """Rows (nt, ...) and times (...) of a run, with NaN in rows that were not reached and for the derivatives of what failed."""
     has_failed = ~jnp.stack([result == getattr(RESULTS, name) for name in _OF_MOTIONS]).any(0)
     rows = jax.tree.map(lambda x: rows_where(reached, x, jnp.nan), rows)
-    return invalidate_derivatives(rows, has_failed | ~reached, inputs), invalidate_derivatives(times, has_failed, inputs)
+    return invalidate_derivatives(rows, has_failed | ~reached, inputs), invalidate_derivatives(
+        times, has_failed, inputs
+    )
 
 
 ADVICE = {
@@ -185,7 +187,7 @@ def joint_of(model: Model, entry: int) -> str:
 
 def raise_failure(solution: Solution, scene: Scene, control, options) -> None:
     """Raise RuntimeError with the time reached, the cause and the fix, if a concrete run failed."""
-    if bool(solution.success):
+    if is_successful(solution.result):
         return
     name = name_of(solution.result)
     reached, end = float(solution.stats["time_reached"]), float(solution.ts[-1])

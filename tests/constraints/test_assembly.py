@@ -153,7 +153,9 @@ def test_far_guesses_end_at_the_least_change():
         null = np.linalg.svd(A)[2][3:]
         assert np.abs(null @ M @ e).max() < 1e-11 * (1 + np.abs(M @ e).max())
     along = jnp.asarray(directions[::-1])
-    slopes = jax.jit(jax.vmap(lambda q, d: jax.jvp(lambda q: jd.assemble(scene, q, throw=False).q, (q,), (d,))[1]))(guesses, along)
+    slopes = jax.jit(jax.vmap(lambda q, d: jax.jvp(lambda q: jd.assemble(scene, q, throw=False).q, (q,), (d,))[1]))(
+        guesses, along
+    )
     difference = (solve(guesses + 1e-6 * along).q - solve(guesses - 1e-6 * along).q) / 2e-6
     near = np.abs(difference).max(1) < 20  # not beside a guess from which two places are equally far
     np.testing.assert_allclose(slopes[near], difference[near], rtol=1e-4, atol=1e-5)

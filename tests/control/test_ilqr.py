@@ -127,7 +127,11 @@ def test_boxes_at_condition_numbers_up_to_1e8(n):
 
 
 def test_boxes_without_a_minimum_have_a_flag():
-    for H, g in ((-jnp.eye(2), jnp.ones(2)), (jnp.eye(2) * jnp.nan, jnp.ones(2)), (jnp.eye(2), jnp.array([1.0, jnp.nan]))):
+    for H, g in (
+        (-jnp.eye(2), jnp.ones(2)),
+        (jnp.eye(2) * jnp.nan, jnp.ones(2)),
+        (jnp.eye(2), jnp.array([1.0, jnp.nan])),
+    ):
         assert not bool(minimize_in_box(H, g, -jnp.ones(2), jnp.ones(2)).converged)
 
 

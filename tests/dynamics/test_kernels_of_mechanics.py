@@ -99,13 +99,13 @@ def test_without_jit_kernels_are_still_compiled():
 def test_others_import_the_names_of_the_package_alone():
     """Modules of `jaxdyn.compile` are its own affair, and so are those of JAX that it needs, which others do not need.
 
-    Those for others are `MODULES`. `jaxdyn.export`, which writes code of its own, and `jaxdyn.scale` are the exceptions.
+    Those for others are `MODULES`. `jaxdyn.exports`, which writes code of its own, and `jaxdyn.scale` are the exceptions.
     """
     names = {alias.asname or alias.name for node in ast.parse((PACKAGE / "compile/__init__.py").read_text()).body
              for alias in getattr(node, "names", ())}  # fmt: skip
     wrong = []
     for path in PACKAGE.rglob("*.py"):
-        inside, exports = path.parent == PACKAGE / "compile", path.parent in (PACKAGE / "export", PACKAGE / "scale")
+        inside, exports = path.parent == PACKAGE / "compile", path.parent in (PACKAGE / "exports", PACKAGE / "scale")
         for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
             if isinstance(node, ast.Import):
                 used = [alias.name for alias in node.names]

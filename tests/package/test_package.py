@@ -30,7 +30,7 @@ FLOORS = (
     "contact reduction sensors",
     "grasp simulation",
     "control identify scenes",
-    "export io reports scale",
+    "exports io reports scale",
     "pictures",
     "cli demo",
     "__main__",
@@ -81,6 +81,8 @@ def sources() -> dict[str, ast.Module]:
     for path in sorted(PACKAGE.rglob("*.py")):
         parts = path.relative_to(PACKAGE).with_suffix("").parts
         name = ".".join(parts[:-1] if parts[-1] == "__init__" else parts)
+        # The stub of the package lists what it exports; the module beside it imports that on demand.
+        path = path.with_suffix(".pyi") if name == "" else path
         trees[name] = ast.parse(path.read_text(encoding="utf-8"), filename=str(path))
     return trees
 
@@ -210,23 +212,87 @@ def test_only_programs_switch_to_float64():
     assert not wrong, wrong
 
 
+def run_in_new_process(program: str) -> None:
+    done = subprocess.run([sys.executable, "-c", program], cwd=PACKAGE.parent, capture_output=True, text=True)
+    assert done.returncode == 0, done.stderr
+
+
 @pytest.mark.long
 def test_import_is_light_and_leaves_jax_unconfigured():
-    """In a fresh interpreter: no plotting, optax or scipy, and no array made before the user chooses devices and dtype."""
-    program = """
+    """In a fresh interpreter: no optional or heavy package, and no array made before the user chooses devices and dtype."""
+    run_in_new_process("""
 import sys
 import jaxdyn
-heavy = {"matplotlib", "mujoco", "optax", "scipy", "trimesh", "viser", "xarray", "zarr"} & sys.modules.keys()
+heavy = {"diffrax", "equinox", "lineax", "llvmlite", "matplotlib", "optax", "optimistix", "scipy"} & sys.modules.keys()
 assert not heavy, f"importing jaxdyn imports {heavy}"
+assert dir(jaxdyn) == sorted(jaxdyn.__all__)
+for name in jaxdyn.__all__:
+    getattr(jaxdyn, name)
+heavy = {"matplotlib", "mujoco", "optax", "scipy", "trimesh", "viser", "xarray", "zarr"} & sys.modules.keys()
+assert not heavy, f"names of jaxdyn import {heavy}"
 import jax
 try:
     jax.config.update("jax_num_cpu_devices", 3)
 except RuntimeError:
     raise SystemExit("importing jaxdyn runs jax: a module makes an array or calls a jax function when it is imported")
 assert not jax.config.jax_enable_x64
-"""
-    done = subprocess.run([sys.executable, "-c", program], cwd=PACKAGE.parent, capture_output=True, text=True)
-    assert done.returncode == 0, done.stderr
+""")
+
+
+@pytest.mark.long
+def test_dynamics_and_scenes_import_no_integrator():
+    run_in_new_process("""
+import sys
+import jax
+import numpy as np
+import jaxdyn as jd
+model = jd.robots.chain(2)
+jd.forward_dynamics(model, np.ones(2), np.ones(2), np.ones(2))
+jax.jit(jax.grad(lambda q: jd.potential_energy(model, q)))(np.ones(2, np.float32))
+jd.scenes.four_bar()
+names = {"diffrax", "lineax", "matplotlib", "optax", "optimistix", "scipy", "jaxdyn.simulation"}
+assert not names & sys.modules.keys(), names & sys.modules.keys()
+""")
+
+
+@pytest.mark.long
+def test_names_are_the_same_in_every_order_of_imports():
+    """A function and a subpackage must not share a name: Python binds the subpackage to it when that is imported."""
+    modules = {path.stem for path in PACKAGE.iterdir() if path.suffix == ".py" or (path / "__init__.py").exists()}
+    assert not [name for name in modules & set(jaxdyn.__all__) if not isinstance(getattr(jaxdyn, name), ModuleType)]
+    run_in_new_process("""
+import pickle
+import jaxdyn.control
+assert jaxdyn.control.OperationalSpace.__name__ == "OperationalSpace"
+import jaxdyn.exports.exported
+from jaxdyn import Scene, export, solvers
+import jaxdyn as jd
+assert export is jd.export is jaxdyn.exports.exported.export and solvers is jaxdyn.simulation.solvers
+assert pickle.loads(pickle.dumps(jd.simulate)) is jd.simulate and pickle.loads(pickle.dumps(Scene)) is jd.Scene
+assert jd.lie.so3 is jd.so3
+from jaxdyn import *
+assert simulate is jd.simulate and "ast" not in dir(jd)
+""")
+
+
+@pytest.mark.long
+def test_first_simulate_compiles_one_program():
+    """Programs of XLA beside the motion's own are only those that ask XLA for its options (`select_options`)."""
+    run_in_new_process("""
+import jax
+import jax._src.compiler as compiler
+import numpy as np
+import jaxdyn as jd
+names, compile_and_load = [], compiler.backend_compile_and_load
+def record(backend, module, *args, **options):
+    names.append(module.operation.attributes["sym_name"].value)
+    return compile_and_load(backend, module, *args, **options)
+compiler.backend_compile_and_load = record
+scene, start = jd.scenes.four_bar(), jd.scenes.four_bar.start()
+for _ in range(2):
+    jd.simulate(scene, *start[:2], np.linspace(0.0, 0.1, 3))
+assert [name for name in names if "lambda" not in name] == ["jit_smooth_motion"], names
+""")
 
 
 def test_excluded_jax_is_neither_installed_nor_allowed():

@@ -17,7 +17,7 @@ from jaxdyn.compile.object_files import TARGETS as TARGETS
 from jaxdyn.compile.objects import Code
 from jaxdyn.compile.program import Program
 from jaxdyn.compile.standalone import DEGENERATE, Routine
-from jaxdyn.export.arguments import (
+from jaxdyn.exports.arguments import (
     Argument,
     arguments_of,
     check_identifier,
@@ -25,9 +25,9 @@ from jaxdyn.export.arguments import (
     fields_of,
     system_of,
 )
-from jaxdyn.export.batch import batch_ir
-from jaxdyn.export.casadi import casadi_ir
-from jaxdyn.export.files import write_files
+from jaxdyn.exports.batch import batch_ir
+from jaxdyn.exports.casadi import casadi_ir
+from jaxdyn.exports.files import write_files
 from jaxdyn.model.tree import Model
 
 DERIVATIVES = ("jacobian",)

@@ -6,7 +6,7 @@ from jaxdyn.compile.code import Body
 from jaxdyn.compile.llvm import Emitter
 from jaxdyn.compile.program import kind_of
 from jaxdyn.compile.standalone import DEGENERATE, NOT_FINITE, Text, all_finite
-from jaxdyn.export.arguments import fields_of
+from jaxdyn.exports.arguments import fields_of
 
 
 def batch_ir(exported: Any, width: int) -> Text:

@@ -1,6 +1,6 @@
 """Functions of the library outside of Python: object files with C headers, CasADi's interface, and calls from NumPy."""
 
-from jaxdyn.export.exported import Exported as Exported
-from jaxdyn.export.exported import export as export
+from jaxdyn.exports.exported import Exported as Exported
+from jaxdyn.exports.exported import export as export
 
 __all__ = ["Exported", "export"]

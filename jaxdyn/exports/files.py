@@ -11,7 +11,7 @@ import numpy as np
 
 from jaxdyn.compile.object_files import ObjectFile, Triple
 from jaxdyn.compile.standalone import DEGENERATE, NOT_FINITE
-from jaxdyn.export.arguments import C_TYPES, Argument
+from jaxdyn.exports.arguments import C_TYPES, Argument
 
 TOLERANCE = 1e-12  # of the test program, relative: other processors round fused operations otherwise
 _TOLERANCE_SINGLE = 1e-4  # a thousand roundings of float32, which accelerations of long chains lose

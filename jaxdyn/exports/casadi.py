@@ -16,7 +16,7 @@ from jaxdyn.compile import standalone
 from jaxdyn.compile.directions import Directions
 from jaxdyn.compile.program import Array, Constant
 from jaxdyn.compile.standalone import Routine, Text
-from jaxdyn.export.arguments import fields_of
+from jaxdyn.exports.arguments import fields_of
 
 
 class Pattern(NamedTuple):
