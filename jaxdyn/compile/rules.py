@@ -113,7 +113,6 @@ def _invalid_tangents(primals, tangents):
 _with_invalid_derivatives.defjvp(_invalid_tangents, symbolic_zeros=True)
 
 
-
 def _nan_where(failed, x):
     """A linear function of x: NaN where it has failed and x is not zero, else zero."""
     return _nan_where_p.bind(jnp.broadcast_to(failed, x.shape), x)

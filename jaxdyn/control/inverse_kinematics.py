@@ -32,7 +32,6 @@ from jaxdyn.systems.scene import Scene, as_scene
 from jaxdyn.systems.system import SceneLike, displace
 
 
-
 class InverseKinematics(Outcome):
     """A configuration that reaches targets.
 

@@ -56,7 +56,9 @@ def invalidate_failed(rows, times, result, reached, inputs):
     """Rows (nt, ...) and times (...) of a run, with NaN in rows that were not reached and for the derivatives of what failed."""
     has_failed = ~jnp.stack([result == getattr(RESULTS, name) for name in _OF_MOTIONS]).any(0)
     rows = jax.tree.map(lambda x: rows_where(reached, x, jnp.nan), rows)
-    return invalidate_derivatives(rows, has_failed | ~reached, inputs), invalidate_derivatives(times, has_failed, inputs)
+    return invalidate_derivatives(rows, has_failed | ~reached, inputs), invalidate_derivatives(
+        times, has_failed, inputs
+    )
 
 
 ADVICE = {

@@ -124,7 +124,9 @@ def test_postures_far_away_satisfy_the_optimality_conditions():
     assert np.all((q >= low) & (q <= high))
     forces = jax.vmap(lambda p, q: mass_matrix(model, p) @ (q - p))(jnp.asarray(postures), found.q)
     held = 0
-    for force, J, x in zip(np.asarray(forces), jax.vmap(lambda q: frame_jacobian(model, q, TIP))(found.q), q, strict=True):
+    for force, J, x in zip(
+        np.asarray(forces), jax.vmap(lambda q: frame_jacobian(model, q, TIP))(found.q), q, strict=True
+    ):
         at_low, at_high = np.eye(7)[:, x <= low], -np.eye(7)[:, x >= high]
         held += at_low.shape[1] + at_high.shape[1]
         pushes = np.concatenate([J.T, -J.T, at_low, at_high], 1)
@@ -220,7 +222,9 @@ def test_opposite_direction_is_half_a_turn_away(guesses):
     builder.add_body("slide", None, "prismatic", jd.inertia.box(1.0, (0.1, 0.1, 0.1)), axis=(1, 0, 0))
     held = inverse_kinematics(builder.build(), {"slide": {"direction": [0, 0, -1.0]}}, jnp.zeros(1), throw=False)
     assert held.result == RESULTS.targets_not_reached
-    np.testing.assert_allclose(held.residual, np.pi, atol=1e-7)  # the axis of half a turn is chosen by the root of rounding
+    np.testing.assert_allclose(
+        held.residual, np.pi, atol=1e-7
+    )  # the axis of half a turn is chosen by the root of rounding
 
 
 @pytest.mark.long

@@ -239,6 +239,8 @@ def test_cotangents_of_a_step_that_failed_are_nan(adjoint):
         step = jd.stepper(model.replace(inertias=model.inertias * k), 0.01, adjoint=adjoint)
         return step((q, jnp.zeros(2)), tau)[0].sum()
 
-    every = jax.jit(jax.vmap(jax.grad(end, (0, 1, 2))))(jnp.asarray([[0.1, 0.2], [np.nan, 0.2]]), jnp.ones(2), jnp.ones((2, 2)))
+    every = jax.jit(jax.vmap(jax.grad(end, (0, 1, 2))))(
+        jnp.asarray([[0.1, 0.2], [np.nan, 0.2]]), jnp.ones(2), jnp.ones((2, 2))
+    )
     for slope in every:
         assert np.isfinite(slope[0]).all() and np.isnan(slope[1]).all()
