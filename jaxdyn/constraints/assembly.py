@@ -24,7 +24,6 @@ from jaxdyn.constraints.tolerances import coordinate_sizes, largest_ratio, row_l
 from jaxdyn.lie.so3 import matmul
 from jaxdyn.model.arguments import Numbers, check_state, zeros_if_none
 from jaxdyn.model.numbers import check_count
-from jaxdyn.model.tree import Model
 from jaxdyn.systems.scene import Scene, as_scene
 from jaxdyn.systems.system import displace, displacement
 
@@ -95,8 +94,9 @@ def assemble(
 
     q minimises |q - guess| in the metric M(guess) among the configurations on the constraints: a local minimum, on the branch
     that is reached by short steps which reduce all residuals together. Hinges stay within half a turn of the guess, unless they
-    are nearer to it beyond, together with the other joints. v is the guess plus the least change in the metric M(q). Rows that are redundant but for the digits of a file stay open by these
-    digits; the others are closed to rounding (see `Assembly.dropped`).
+    are nearer to it beyond, together with the other joints. v is the guess plus the least change in the
+    metric M(q). Rows that are redundant but for the digits of a file stay open by these digits; the others are closed to rounding
+    (see `Assembly.dropped`).
 
     **Arguments:**
 
@@ -246,7 +246,7 @@ def _close(bare, guess, start, passed, selection, v, t, rank_tol, atol, scene):
     sizes, _ = coordinate_sizes(whole.system, q.dtype)
     distances = jnp.abs(displacement(whole.system, lax.stop_gradient(guess), lax.stop_gradient(q))) / sizes
     places = layout(whole)
-    # Open rows have no solution whose derivatives could be taken; the least-squares point within `atol` counts as one.
+    # The conditions of the minimum hold on the constraints alone: a point of least squares has no derivatives either.
     q, v = invalidate_derivatives((q, v), ~(good & is_nearest), (bare, guess, v0, t))
     gaps = jnp.abs(position_residual(bare, q, t)) * (1 - kept)[holonomic_rows(places)]
     return Assembly(
@@ -257,7 +257,7 @@ def _close(bare, guess, start, passed, selection, v, t, rank_tol, atol, scene):
             [
                 (~good, RESULTS.not_assembled),
                 (~is_clear, RESULTS.unclear_rank),
-                (~is_nearest, RESULTS.not_nearest),
+                (is_closed & ~is_nearest, RESULTS.not_nearest),
             ],
             RESULTS.successful,
         ),

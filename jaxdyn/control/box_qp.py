@@ -18,7 +18,6 @@ from jaxdyn.constraints.rank import eps_of
 from jaxdyn.lie.so3 import matmul
 from jaxdyn.systems.mass_factor import cholesky, solve_cholesky
 
-
 # Rounding errors, in the terms of a gradient, up to which it counts as zero. 16 are the most at condition numbers up to 1e10.
 _ROUNDING = 1e3
 

@@ -70,7 +70,9 @@ def record(
     readings = jax.vmap(read)(q, v, tau, ts)
     for sensor, values in zip(sensors, readings, strict=True):
         if sensor.noise is not None:
-            sensor.noise.check(sensor.name, values.shape[1])
+            at = sensor.quaternion_start(scene)
+            # An orientation has four numbers and three angles of error.
+            sensor.noise.check(sensor.name, values.shape[1] if at is None else at + 3)
     # One key for each sensor: the noise of one does not depend on the number of readings of another.
     keys = [None] * len(sensors) if key is None else list(jax.random.split(key, len(sensors)))
     results = {}
@@ -83,7 +85,7 @@ def record(
             values = values if noise is None else noise(values, ts, cast(Array, one))
         else:
             values = _interpolate_pose(values, at, ts, late)
-            values = values if noise is None else _disturb_pose(values, at, noise, ts, one, sensor.name)
+            values = values if noise is None else _disturb_pose(values, at, noise, ts, one)
         # The converter is the last element of the chain: it rounds the noise as well.
         results[sensor.name] = sensor.quantize(values)
     return results
@@ -108,15 +110,8 @@ def _interpolate_pose(values, at: int, ts, late) -> Float[Array, "n k"]:
     return jnp.concatenate([rest, turns], 1)
 
 
-def _disturb_pose(values, at: int, noise: Noise, ts, key, name: str) -> Float[Array, "n k"]:
+def _disturb_pose(values, at: int, noise: Noise, ts, key) -> Float[Array, "n k"]:
     """Readings with a quaternion from index `at` on, with errors: its are rotations about the axes of the frame."""
-    for field in ("std", "bias", "walk"):
-        shape = getattr(noise, field).shape
-        if shape not in ((), (1,), (at + 3,)):
-            raise ValueError(
-                f"{name!r}: noise has {field} of shape {shape}; give one number, or {at + 3}: an orientation has three "
-                "angles (rad)"
-            )
     errors = noise(jnp.zeros((len(ts), at + 3), values.dtype), ts, key)
     turns = jax.vmap(lambda q, angles: so3.quat_multiply(q, so3.quat_exp(angles)))(values[:, at:], errors[:, at:])
     return jnp.concatenate([values[:, :at] + errors[:, :at], turns], 1)

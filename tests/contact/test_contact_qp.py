@@ -346,7 +346,7 @@ def test_data_that_are_not_finite_have_a_code():
 
 
 def test_projection_on_a_cone_near_its_apex():
-    """Closed form (t + |u|) / 2 (1, u / |u|), at distances from the apex down to 1e-8 of y, of any size; values and derivatives."""
+    """Closed form (t + |u|) / 2 (1, u / |u|) at distances from the apex down to 1e-8 of y, of any size; and its derivatives."""
     rng = np.random.default_rng(0)
     outside = np.concatenate([sign * 10 ** rng.uniform(-8, 0, 150) for sign in (1, -1)])
     angle, size = rng.uniform(0, 2 * np.pi, 300), 10 ** rng.uniform(-2, 2, 300)

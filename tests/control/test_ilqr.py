@@ -144,7 +144,7 @@ def test_limits_with_an_ill_conditioned_cost():
         target = rng.normal(size=4) * np.array([1.0, 0.3, 0.1, 0.03])
         plan = ilqr(
             lambda x, u: x,
-            lambda x, u, k: 0.5 * jnp.sum((jnp.asarray(roots) @ u - target) ** 2),
+            lambda x, u, k, A=roots, b=target: 0.5 * jnp.sum((jnp.asarray(A) @ u - b) ** 2),
             lambda x: 0.0 * x[0],
             jnp.zeros(1),
             jnp.zeros((1, 4)),

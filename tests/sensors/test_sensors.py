@@ -355,7 +355,7 @@ def test_orientations_are_delayed_and_disturbed_on_the_group(mode):
         turned = rate * before[100] / 2
         assert_close(slope, -rate / 2 * np.array([-np.sin(turned), *(np.cos(turned) * axis)]), 1e-12)
     else:
-        with pytest.raises(ValueError, match=r"noise has std of shape \(7,\); give one number, or 6"):
+        with pytest.raises(ValueError, match=r"std of its Noise has 7 entries, its readings have 6 errors"):
             sensors.record(
                 ball, [sensors.FramePose("ball", noise=sensors.Noise(np.ones(7)))], ts, q, v, key=jax.random.key(0)
             )
@@ -366,6 +366,6 @@ def test_noise_of_another_size_than_the_reading_is_refused():
     for options in ({"std": [1.0, 2.0, 3.0]}, {"bias": [1.0, 2.0]}, {"walk": jnp.ones(7)}):
         imu = jd.sensors.Imu("iiwa_link_7", noise=jd.sensors.Noise(**options))
         (name, value), *_ = options.items()
-        words = f"sensor '{imu.name}': {name} of its Noise has {len(value)} entries, its readings have 6; give one number, or one"
+        words = f"sensor '{imu.name}': {name} of its Noise has {len(value)} entries, its readings have 6 errors; give one number, or one"
         with pytest.raises(ValueError, match=words):
             jd.sensors.record(arm, [imu], [0.0, 0.1], q, q, key=jax.random.key(0))
