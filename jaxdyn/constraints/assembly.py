@@ -2,9 +2,11 @@
 
 import dataclasses
 from collections.abc import Callable, Mapping
+from functools import partial
 from typing import Any
 
 import equinox as eqx
+import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import lax
@@ -13,6 +15,7 @@ from jaxtyping import Array, Bool, Float
 from jaxdyn.compile import entry_point, evaluate, invalidate_derivatives, kernel
 from jaxdyn.compile.known import is_concrete, is_tracing, stop_gradient
 from jaxdyn.constraints.base import Layout, holonomic_rows, layout, position_residual, velocity_residual
+from jaxdyn.constraints.branches import changes_branch, unit_rows
 from jaxdyn.constraints.closing import follow_path, nearest_configuration
 from jaxdyn.constraints.codes import RESULTS, Outcome, first_of, name_of, require_success
 from jaxdyn.constraints.dynamics import correction
@@ -62,6 +65,28 @@ class Assembly(Outcome):
                     f"{float(gaps[rows].max()):.2g} (m or rad)"
                 )
         return lines
+
+    def changes_branch(
+        self, scene: Scene, hold: Mapping[str, Any] | None = None, t: Numbers = 0.0
+    ) -> Bool[Array, " n"]:
+        """Mask (n,) of the places of a sweep, a batch of assemblies in order, that are on another branch than the one before.
+
+        Between both a combination of the rows then went through zero, or a coordinate jumped by more than a radian or a length
+        of the mechanism. The first place is False. `scene`, `t`, and the joints in `hold` are those of the sweep; the values
+        of these joints do not matter.
+
+        ```python
+        scene, angles = jd.scenes.four_bar(), jnp.linspace(0.0, 1.0, 11)
+        sweep = jax.vmap(lambda angle: jd.assemble(scene, jnp.zeros(3), hold={"1": angle}))(angles)
+        sweep.changes_branch(scene, {"1": angles})
+        ```
+        """
+        scene = as_scene(scene)
+        held = {} if hold is None else {name: _first(value) for name, value in hold.items()}
+        whole = Scene(scene.system, (*scene.constraints, *(lock_joint(*joint) for joint in held.items())))
+        R, inverse = jax.vmap(lambda q: unit_rows(whole, q, t))(self.q)
+        changes = jax.vmap(partial(changes_branch, scene.system))(self.q[:-1], self.q[1:], R[1:], R[:-1], inverse[:-1])
+        return jnp.concatenate([jnp.zeros(1, bool), changes])
 
     def __str__(self) -> str:
         if not is_concrete(self.q) or np.ndim(self.q) > 1:
@@ -151,6 +176,11 @@ def assemble(
         return f"not assembled: {left}{tried}; give a better guess"
 
     return require_success(assembly, throw, message)
+
+
+def _first(values) -> Any:
+    """The first of several values of a joint, or the only one."""
+    return values if np.ndim(values) == 0 else values[0]
 
 
 def check_search(steps: Any, guesses: Any, atol: Any) -> None:

@@ -14,20 +14,15 @@ import numpy as np
 from jax import lax
 from jaxtyping import Array, Bool, Float
 
-from jaxdyn.compile import pseudo_inverse_by_rotations
-from jaxdyn.compile.known import stop_gradient
-from jaxdyn.constraints.base import constraint_jacobian, holonomic_rows, layout
+from jaxdyn.constraints.branches import changes_branch, unit_rows
 from jaxdyn.constraints.codes import Outcome, require_success
-from jaxdyn.constraints.rank import condition_number, passes_singular, rank_of, tolerance
+from jaxdyn.constraints.rank import condition_number, rank_of
 from jaxdyn.constraints.selection import independent_rows
-from jaxdyn.constraints.tolerances import coordinate_sizes
 from jaxdyn.control.inverse_kinematics import inverse_kinematics, row_weights
 from jaxdyn.control.targets import TASKS, as_targets
 from jaxdyn.model.arguments import Checked, Numbers, check_state
 from jaxdyn.systems.scene import Scene, as_scene
-from jaxdyn.systems.system import SceneLike, displacement
-
-_JUMP = 1.0  # rad or lengths of the mechanism: a longer way between two configurations is no small step
+from jaxdyn.systems.system import SceneLike
 
 
 class Following(Outcome):
@@ -111,14 +106,14 @@ def follow(
         reached = inverse_kinematics(scene, at(row), guess, guesses=guesses, t=t, throw=False, **options)
         counted = independent_rows(scene, lax.stop_gradient(reached.q), t)
         whole = Scene(scene.system, (*counted.constraints, *as_targets(scene.system, at(row))))
-        return reached, _unit_rows(whole, lax.stop_gradient(reached.q), t, factors)
+        return reached, unit_rows(whole, lax.stop_gradient(reached.q), t, factors)
 
     def go_on(carry, row):
         q, R, inverse = carry
         reached, (R_after, inverse_after) = place(row, q, guesses)
         # Derivatives are those of each place by its own targets: the chain through the places before it is cut.
         after = lax.stop_gradient(reached.q)
-        changes = _changes_branch(scene.system, q, after, R_after, R, inverse)
+        changes = changes_branch(scene.system, q, after, R_after, R, inverse)
         regularity = _regularity(R_after, inverse_after, rank)
         return (after, R_after, inverse_after), (reached, regularity, changes)
 
@@ -148,18 +143,6 @@ def _rows(targets: Mapping[str, Any]) -> dict[str, dict]:
     return {name: dict(value) if isinstance(value, Mapping) else {"": value} for name, value in targets.items()}
 
 
-def _unit_rows(whole: Scene, q, t: Any, factors):
-    """Rows of constraints and targets in coordinates scaled by their sizes, and their pseudo-inverse; constants."""
-    # Only decisions follow from these rows, so they are constants under differentiation.
-    whole, q = stop_gradient((whole, q))
-    sizes, _ = coordinate_sizes(whole.system, q.dtype)
-    R = constraint_jacobian(whole, q, t)[holonomic_rows(layout(whole))] * sizes[None]
-    # Rows of constraints come before those of targets and have the weight 1.
-    count = R.shape[0] - factors.size
-    R = R * jnp.concatenate([jnp.ones((count,), q.dtype), lax.stop_gradient(factors)])[:, None]
-    return R, pseudo_inverse_by_rotations(R, tolerance(None, R))
-
-
 def _regularity(R, inverse, rank):
     """r / (|R| |R^+|) in Frobenius' norm, and 0 where the rank r is less than `rank`."""
     size = condition_number(R, inverse)
@@ -167,10 +150,3 @@ def _regularity(R, inverse, rank):
     regular = jnp.minimum(rank / jnp.where(size > 0, size, jnp.ones_like(size)), 1.0)
     # R^+ omits singular values below the tolerance: a drop of rank does not make |R^+| large and needs a test of its own.
     return jnp.where(rank_of(R, inverse) >= rank, regular, jnp.zeros_like(regular))
-
-
-def _changes_branch(system, before, after, R_after, R, inverse):
-    sizes, _ = coordinate_sizes(system, before.dtype)
-    return passes_singular(R, inverse, R_after) | (
-        jnp.max(jnp.abs(displacement(system, before, after)) / sizes) > _JUMP
-    )

@@ -149,8 +149,8 @@ def allegro(*, gravity: Numbers | None = GRAVITY, dtype: DType | None = None) ->
     finger and 12 .. 15 of the thumb; they move bodies link_0.0 .. link_15.0. The frames link_3.0_tip, link_7.0_tip, link_11.0_tip
     and link_15.0_tip are in the middles of the fingertips, 12 mm balls; the frame palm_link is the palm.
 
-    Source: allegro_right_hand.urdf of Wonik Robotics (allegro_hand_linux_v4, BSD); its damping and friction are left out. The moments
-    of inertia of its last links break the triangle inequality; they are those of `jd.model.repair_inertias`.
+    Source: allegro_right_hand.urdf of Wonik Robotics (allegro_hand_linux_v4, BSD); its damping and friction are left out. The
+    moments of inertia of its last links break the triangle inequality; they are those of `jd.model.repair_inertias`.
     """
     palm = (0.4154, (0, 0, 0.0475), (1e-4, 1e-4, 1e-4))
     builder = ModelBuilder("allegro", gravity=gravity, dtype=dtype).add_body(

@@ -66,8 +66,8 @@ class Noise(eqx.Module):
         for key in ("std", "bias", "walk"):
             if (size := getattr(self, key).size) not in (1, entries):
                 raise ValueError(
-                    f"sensor {name!r}: {key} of its Noise has {size} entries, its readings have {entries} errors; give one number, or "
-                    "one for each: an orientation has three angles (rad)"
+                    f"sensor {name!r}: {key} of its Noise has {size} entries, its readings have {entries} errors; give "
+                    "one number, or one for each: an orientation has three angles (rad)"
                 )
 
     def __call__(self, readings: Float[Array, "n k"], ts: Float[Array, " n"], key: Array) -> Float[Array, "n k"]:

@@ -166,3 +166,24 @@ def test_far_guesses_end_at_the_least_change():
         short = jax.jit(lambda q: jd.assemble(scene, q, throw=False))(guesses[-1])
         assert short.result == jd.RESULTS.not_nearest and float(short.residual[0]) < 1e-11
         assert np.isnan(jax.jit(jax.jacrev(lambda q: jd.assemble(scene, q, throw=False).q))(guesses[-1])).all()
+
+
+@pytest.mark.long
+def test_sweep_tells_where_it_changes_the_branch():
+    """A four-bar's crank, each place from the same guess but some from its mirror image: exactly these steps change."""
+    scene, (q, _) = jd.scenes.four_bar(), jd.scenes.four_bar.start()
+    angles = float(q[0]) + jnp.linspace(0.0, 0.5, 7)
+    # The other assembly of the loop: coupler and rocker mirrored at the line from the crank's end to the rocker's foot.
+    mirrored = next(
+        found
+        for x in np.random.default_rng(0).uniform(-3, 3, (40, 3))
+        if (found := jd.assemble(scene, jnp.asarray(x), hold={"1": q[0]}, guesses=1, throw=False)).success
+        and np.abs(np.sin((found.q - q)[1:] / 2)).max() > 0.2
+    ).q
+    guesses = jnp.stack([mirrored if i in (3, 4) else q for i in range(7)])
+    sweep = jax.vmap(lambda guess, x: jd.assemble(scene, guess, hold={"1": x}))(guesses, angles)
+    assert sweep.success.all()
+    found = sweep.changes_branch(scene, {"1": angles})
+    np.testing.assert_array_equal(found, [False, False, False, True, False, True, False])
+    same = jax.vmap(lambda x: jd.assemble(scene, q, hold={"1": x}))(angles)
+    assert not same.changes_branch(scene, {"1": angles}).any()

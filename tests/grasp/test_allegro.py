@@ -23,7 +23,7 @@ def hand():
 
 
 def test_the_hand_is_that_of_its_file(robots_dir):
-    """Every number of the built-in hand is the URDF's, but for inertias that no body has, which are repaired; it has no friction."""
+    """Every number of the built-in hand is the URDF's, but for inertias that no body has; it has no friction."""
     path = robots_dir / "allegro_hand_description" / "urdf" / "allegro_right_hand.urdf"
     read, hand = jd.load_urdf(path), jd.robots.allegro()
     for name in ("parents", "kinds", "joint_names", "body_names", "frame_names", "frame_bodies", "couplings"):

@@ -1,4 +1,4 @@
-"""What files have and models have not: each element and attribute is read, refused, in `not_taken`, or has no effect on the motion."""
+"""Each element and attribute of a file is read, refused, in `not_taken`, or has no effect on the motion."""
 
 import pathlib
 import re
@@ -17,23 +17,24 @@ SOURCES = pathlib.Path(jd.__file__).parent / "io"
 
 # The elements of the formats' own descriptions (sdformat.org, versions 1.4 to 1.12; wiki.ros.org/urdf/XML).
 FORMATS = {
-    "SDF_LINK": "pose inertial gravity enable_wind self_collide kinematic must_be_base_link velocity_decay collision visual sensor "
-    "projector audio_sink audio_source battery light particle_emitter",
+    "SDF_LINK": "pose inertial gravity enable_wind self_collide kinematic must_be_base_link velocity_decay collision "
+    "visual sensor projector audio_sink audio_source battery light particle_emitter",
     "SDF_LINK inertial": "pose mass inertia density auto_inertia_params fluid_added_mass",
     "SDF_LINK inertial inertia": "ixx ixy ixz iyy iyz izz",
     "SDF_LINK velocity_decay": "linear angular",
-    "SDF_JOINT": "parent child gearbox_ratio gearbox_reference_body thread_pitch screw_thread_pitch axis axis2 physics pose sensor",
+    "SDF_JOINT": "parent child gearbox_ratio gearbox_reference_body thread_pitch screw_thread_pitch axis axis2 physics "
+    "pose sensor",
     "SDF_JOINT axis": "xyz dynamics limit mimic use_parent_model_frame initial_position",
     "SDF_JOINT axis dynamics": "damping friction spring_reference spring_stiffness",
     "SDF_JOINT axis limit": "lower upper effort velocity stiffness dissipation",
     "SDF_JOINT axis mimic": "multiplier offset reference",
     "SDF_JOINT physics": "simbody ode provide_feedback",
-    "SDF_JOINT physics ode": "provide_feedback cfm_damping implicit_spring_damper fudge_factor cfm erp bounce max_force velocity limit "
-    "suspension",
+    "SDF_JOINT physics ode": "provide_feedback cfm_damping implicit_spring_damper fudge_factor cfm erp bounce max_force "
+    "velocity limit suspension",
     "SDF_MODEL": "static self_collide allow_auto_disable frame pose link joint plugin gripper include model enable_wind",
     "SDF_FRAME": "pose",
-    "SDF_WORLD": "audio wind include gravity magnetic_field atmosphere gui physics scene light frame joint model actor plugin road "
-    "spherical_coordinates state population",
+    "SDF_WORLD": "audio wind include gravity magnetic_field atmosphere gui physics scene light frame joint model actor "
+    "plugin road spherical_coordinates state population",
     "URDF_LINK": "inertial visual collision",
     "URDF_LINK inertial": "origin mass inertia",
     "URDF_JOINT": "origin parent child axis calibration dynamics limit mimic safety_controller",
@@ -244,21 +245,23 @@ def test_gravity_of_old_worlds(tmp_path):
 # Of the arrays of mujoco's compiled model: those without an effect on the motion of bodies (rendering, contacts and their solver,
 # user data), those that the compiler derives from others, and those that the reader reads.
 WITHOUT_EFFECT = """
-    body_bvhadr body_bvhnum body_conaffinity body_contype body_margin body_user body_plugin jnt_group jnt_margin jnt_solimp jnt_solref
-    jnt_user jnt_actgravcomp dof_solimp dof_solref site_dataid site_group site_matid site_rgba site_size site_type site_user
-    tendon_group tendon_margin tendon_matid tendon_range tendon_rgba tendon_width tendon_user tendon_solimp_fri tendon_solimp_lim
-    tendon_solref_fri tendon_solref_lim actuator_user actuator_actearly eq_solimp eq_solref sensor_user sensor_history
-    sensor_historyadr sensor_plugin key_time key_mpos key_mquat key_plastic opt_ccd_iterations opt_ccd_tolerance opt_cone
-    opt_enableflags opt_impratio opt_integrator opt_iterations opt_jacobian opt_ls_iterations opt_ls_tolerance opt_magnetic
-    opt_noslip_iterations opt_noslip_tolerance opt_o_friction opt_o_margin opt_o_solimp opt_o_solref opt_sdf_initpoints
-    opt_sdf_iterations opt_sleep_tolerance opt_solver opt_timestep opt_tolerance opt_wind opt_apirate
+    body_bvhadr body_bvhnum body_conaffinity body_contype body_margin body_user body_plugin jnt_group jnt_margin jnt_solimp
+    jnt_solref jnt_user jnt_actgravcomp dof_solimp dof_solref site_dataid site_group site_matid site_rgba site_size site_type
+    site_user tendon_group tendon_margin tendon_matid tendon_range tendon_rgba tendon_width tendon_user tendon_solimp_fri
+    tendon_solimp_lim tendon_solref_fri tendon_solref_lim actuator_user actuator_actearly eq_solimp eq_solref sensor_user
+    sensor_history sensor_historyadr sensor_plugin key_time key_mpos key_mquat key_plastic opt_ccd_iterations
+    opt_ccd_tolerance opt_cone opt_enableflags opt_impratio opt_integrator opt_iterations opt_jacobian opt_ls_iterations
+    opt_ls_tolerance opt_magnetic opt_noslip_iterations opt_noslip_tolerance opt_o_friction opt_o_margin opt_o_solimp
+    opt_o_solref opt_sdf_initpoints opt_sdf_iterations opt_sleep_tolerance opt_solver opt_timestep opt_tolerance opt_wind
+    opt_apirate
 """
 DERIVED = """
-    body_dofadr body_dofnum body_geomadr body_geomnum body_invweight0 body_rootid body_simple body_subtreemass body_treeid body_weldid
-    jnt_actuatorid jnt_springyield dof_M0 dof_Madr dof_bodyid dof_invweight0 dof_length dof_parentid dof_simplenum dof_treeid
-    site_sameframe tendon_actfrcrange tendon_actuatorid tendon_invweight0 tendon_springyield tendon_treeid tendon_treenum tendon_type
-    actuator_acc0 actuator_cranklength actuator_ctrlspec actuator_history actuator_historyadr actuator_length0 actuator_lengthrange
-    actuator_outadr sensor_adr sensor_datatype sensor_dim sensor_intprm sensor_needstage sensor_reftype body_dofnum tendon_dampingpoly
+    body_dofadr body_dofnum body_geomadr body_geomnum body_invweight0 body_rootid body_simple body_subtreemass body_treeid
+    body_weldid jnt_actuatorid jnt_springyield dof_M0 dof_Madr dof_bodyid dof_invweight0 dof_length dof_parentid dof_simplenum
+    dof_treeid site_sameframe tendon_actfrcrange tendon_actuatorid tendon_invweight0 tendon_springyield tendon_treeid
+    tendon_treenum tendon_type actuator_acc0 actuator_cranklength actuator_ctrlspec actuator_history actuator_historyadr
+    actuator_length0 actuator_lengthrange actuator_outadr sensor_adr sensor_datatype sensor_dim sensor_intprm sensor_needstage
+    sensor_reftype body_dofnum tendon_dampingpoly
 """
 
 

@@ -790,7 +790,8 @@ def test_load_takes_every_robot_or_says_how(name):
 ARM_WITHOUT_INERTIAS = """<robot name='r'><link name='base'/><link name='arm'/><link name='tool'/><link name='hand'/>
 <joint name='j' type='continuous'><origin xyz='0 0 0.3'/><parent link='base'/><child link='arm'/><axis xyz='0 1 0'/></joint>
 <joint name='f' type='fixed'><parent link='arm'/><child link='tool'/></joint>
-<joint name='k' type='continuous'><origin xyz='0.5 0 0'/><parent link='tool'/><child link='hand'/><axis xyz='0 1 0'/></joint></robot>"""
+<joint name='k' type='continuous'><origin xyz='0.5 0 0'/><parent link='tool'/><child link='hand'/><axis xyz='0 1 0'/></joint>
+</robot>"""
 
 
 def test_arms_without_inertias_load_for_kinematics(tmp_path):
@@ -850,7 +851,7 @@ def test_packages_of_xacro_files_without_ros(tmp_path):
         np.testing.assert_allclose(model.inertias[0, :2], [3.0, 1.5])
     text = path.read_text()
     path.write_text(text.replace("find parts", "find elsewhere"))
-    reason = r"the folder of package 'elsewhere', which the file names by \$\(find elsewhere\), is not known.*give packages=\{'elsewhere'"
+    reason = r"the folder of package 'elsewhere', which the file names by \$\(find elsewhere\), is not known"
     with pytest.raises(ValueError, match=reason):
         load_urdf(path)
     np.testing.assert_allclose(load_urdf(path, packages={"elsewhere": str(tmp_path / "parts")}).inertias[0, 0], 3.0)

@@ -366,6 +366,6 @@ def test_noise_of_another_size_than_the_reading_is_refused():
     for options in ({"std": [1.0, 2.0, 3.0]}, {"bias": [1.0, 2.0]}, {"walk": jnp.ones(7)}):
         imu = jd.sensors.Imu("iiwa_link_7", noise=jd.sensors.Noise(**options))
         (name, value), *_ = options.items()
-        words = f"sensor '{imu.name}': {name} of its Noise has {len(value)} entries, its readings have 6 errors; give one number, or one"
+        words = f"sensor '{imu.name}': {name} of its Noise has {len(value)} entries, its readings have 6 errors; give"
         with pytest.raises(ValueError, match=words):
             jd.sensors.record(arm, [imu], [0.0, 0.1], q, q, key=jax.random.key(0))
