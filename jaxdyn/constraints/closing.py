@@ -225,7 +225,9 @@ def slide_to_nearest(scene: Scene, guess, start, t, rank_tol, bounds=None) -> Sl
     has_converged = done & jnp.isfinite(e).all()
     # A start off the constraints, before an obstacle such as the end of the reach, may be nearer than any place on them.
     open_by = [jnp.max(jnp.abs(residual(x)), initial=0.0) for x in (e, first)]
-    is_nearer = half_square(e) <= half_square(first) * (1 + 1e-6) + float(jnp.finfo(guess.dtype).tiny)
+    # A guess on the constraints has a distance of rounding.
+    rounding = eps_of(guess) ** 1.5 * half_square(sizes)
+    is_nearer = half_square(e) <= half_square(first) * (1 + 1e-6) + rounding
     # What the slide has gained is kept even where it has not converged.
     better = (has_converged | (open_by[0] <= limit)) & (is_nearer | (open_by[1] > limit)) & jnp.isfinite(e).all()
     is_nearest = (better & has_converged).astype(guess.dtype)
