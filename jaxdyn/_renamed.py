@@ -1,5 +1,6 @@
 """Names that have moved or changed. They are found with a warning until the next release."""
 
+import functools
 import importlib
 import warnings
 from collections.abc import Callable
@@ -69,6 +70,24 @@ def _find(old: str, name: str, module: str) -> Any:
     warnings.warn(f"jd.{old} is now {new}", DeprecationWarning, stacklevel=3)
     home, _, present = place.rpartition(".")
     return getattr(importlib.import_module(f"jaxdyn.{home}"), present)
+
+
+def renamed_argument(old: str, new: str) -> Callable[[Callable], Callable]:
+    """Decorator of a function whose argument `new` was called `old`: the old keyword warns."""
+
+    def decorate(function: Callable) -> Callable:
+        @functools.wraps(function)
+        def call(*args: Any, **named: Any) -> Any:
+            if old in named:
+                if new in named:
+                    raise TypeError(f"{function.__name__} got {new!r} and {old!r}, its old name; give {new!r}")
+                warnings.warn(f"{function.__name__}({old}=) is now {function.__name__}({new}=)", DeprecationWarning, 2)
+                named[new] = named.pop(old)
+            return function(*args, **named)
+
+        return call
+
+    return decorate
 
 
 class RenamedMethod:

@@ -19,6 +19,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
+from jaxdyn._renamed import renamed_argument
 from jaxdyn.compile import kernel, variant
 from jaxdyn.compile.known import array_namespace
 from jaxdyn.lie import se3
@@ -260,17 +261,18 @@ def _translate(pose: Float[Array, "*n 4 4"], shift: Float[Array, "*n 3"]) -> Flo
     return jnp.concatenate([pose[..., :3], pose[..., 3:] + step], -1)
 
 
-def frame_pose(model: Model, q: Float[Array, " nq"], name: str | None) -> Float[Array, "4 4"]:
+@renamed_argument("name", "frame")
+def frame_pose(model: Model, q: Float[Array, " nq"], frame: str | None) -> Float[Array, "4 4"]:
     """Pose of a named frame in the world.
 
-    **Arguments:** `q` (nq,); `name`, one of `model.frame_names` (None: the world itself).
+    **Arguments:** `q` (nq,); `frame`, one of `model.frame_names` (None: the world itself).
 
     **Returns:** (4, 4), maps frame coordinates to world coordinates (m).
 
     **Raises:** ValueError for an unknown name (similar names are listed) or a q that does not fit.
     """
     (q,) = check_shapes(model, q=q)
-    body, offset = named_frame(model, name)
+    body, offset = named_frame(model, frame)
     if body < 0:
         return jnp.asarray(offset, model.home.dtype)
     return _pose_in_body(body, (kinematic_part(model), offset), q)

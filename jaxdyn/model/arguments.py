@@ -187,7 +187,9 @@ def check_system(system: Any, name: str = "model") -> None:
     # A scene has nq and nv too, so that its constraints and forces would silently be ignored.
     if hasattr(system, "system") and hasattr(system, "constraints"):
         raise ValueError(
-            f"{name} is a {type(system).__name__}; pass scene.system: this function accepts no constraints and forces"
+            f"{name} is a {type(system).__name__}; pass scene.system: this function accepts no constraints and forces. With "
+            "these, jd.constrained_dynamics gives accelerations, jd.constrained_inverse_dynamics torques, and "
+            "jd.reduced_dynamics the equations and the mass matrix in minimal velocities"
         )
     if not (hasattr(system, "nq") and hasattr(system, "nv")):
         raise ValueError(f"{name} is a {type(system).__name__}, which has no nq and nv; pass a Model or another system")

@@ -145,14 +145,18 @@ class GuardedSolver(Wrapped):
     ) -> StepOutput:
         """Make one step of the wrapped method and look within it."""
         y1, error, dense_info, *rest = self.solver.step(terms, t0, t1, y0, args, solver_state, made_jump)
-        dense = self.interpolation_cls(t0=t0, t1=t1, **dense_info)
+        # The mark has no derivative, and neither have the guards that make it.
+        arrays, rest_of_args = eqx.partition(args, eqx.is_array)
+        start, end, info, arrays = jax.lax.stop_gradient((t0, t1, dense_info, arrays))
+        dense, args = self.interpolation_cls(t0=start, t1=end, **info), eqx.combine(arrays, rest_of_args)
 
         def least(fraction):
-            t = t0 + fraction * (t1 - t0)
+            t = start + fraction * (end - start)
             return jnp.min(self.guards(t, dense.evaluate(t), args)[0])
 
         passed = (jax.vmap(least)(jnp.asarray(_FRACTIONS, jnp.result_type(t0))) < 0).any()
-        return y1 | {WITHIN: jax.lax.stop_gradient(jnp.where(passed, -1.0, 1.0)).astype(y1[WITHIN].dtype)}, error, dense_info, *rest
+        mark = jnp.where(passed, -1.0, 1.0).astype(y1[WITHIN].dtype)
+        return y1 | {WITHIN: mark}, error, dense_info, *rest
 
 
 def event(quality, guards, t0, y0, args) -> diffrax.Event | None:

@@ -226,6 +226,6 @@ def test_numbers_of_numpy_make_no_float64_in_a_float32_process():
         assert torque(jnp.ones(2), jnp.zeros(2)).dtype == np.float32
         assert jd.geometry.arnold_form(jnp.asarray(np.eye(3)), jnp.ones(3), jnp.ones(3)).dtype == np.float32
         plan = jd.control.ilqr(
-            lambda x, u: x + u, lambda x, u: u @ u, lambda x: x @ x, np.ones(1), np.zeros((2, 1)), iterations=2
+            lambda x, u: x + u, lambda x, u, k: u @ u, lambda x: x @ x, np.ones(1), np.zeros((2, 1)), iterations=2
         )
         assert plan.us.dtype == np.float32

@@ -361,3 +361,19 @@ def test_a_loop_of_a_file_assembles_from_a_rough_guess(tmp_path):
     assembly = jd.assemble(scene, q)
     assert assembly.residual.max() < 1e-12
     assert np.abs(assembly.q - scene.starts["reference"].q).max() > 0.1
+
+
+@pytest.mark.long
+def test_plain_motors_behind_a_drive(tmp_path):
+    """Actuators without activation have no state: the motion is that under their torque."""
+    path = tmp_path / "motor.xml"
+    path.write_text("""<mujoco><worldbody><body><joint name="j" axis="0 1 0"/>
+      <geom size=".05" pos="0 0 -.5" contype="0" conaffinity="0"/></body></worldbody>
+      <actuator><motor joint="j" gear="2"/></actuator></mujoco>""")
+    robot = jd.io.load_mjcf(path)
+    drive = robot.actuators.drive(lambda q, v, t: jnp.array([0.7]))
+    scene, ts = jd.Scene(robot.system, forces=[*robot.forces, drive]), jnp.array([0.0, 1.0])
+    want = jd.simulate(robot.system, [0.0], [0.0], ts, control=lambda q, v, t: jnp.array([1.4])).q
+    driven = jd.simulate(scene, [0.0], [0.0], ts, outputs=("drive_state",))
+    np.testing.assert_allclose(driven.q, want, atol=1e-10)
+    assert driven.drive_state.shape == (2, 0)

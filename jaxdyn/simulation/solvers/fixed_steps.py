@@ -115,7 +115,8 @@ class Stepper(diffrax.AbstractSolver):
     ) -> StepOutput:
         """Make one step from t0 to t1; NaN where it failed."""
         y1, mean, carried, solved = self.advance(t0, t1, y0, args, solver_state)  # pyright: ignore[reportOptionalCall]
-        y1 = jax.tree.map(lambda y: jnp.where(solved, y, jnp.full_like(y, jnp.nan)), y1)
+        # Other entries of the state are constant within a step.
+        y1 = y0 | jax.tree.map(lambda y: jnp.where(solved, y, jnp.full_like(y, jnp.nan)), y1)
         codes: Any = diffrax.RESULTS
         result = codes.where(solved, codes.successful, codes.nonlinear_divergence)
         return y1, None, {"y0": y0, "y1": y1, "mean": mean}, carried, result
