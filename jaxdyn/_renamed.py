@@ -72,7 +72,7 @@ def _find(old: str, name: str, module: str) -> Any:
     return getattr(importlib.import_module(f"jaxdyn.{home}"), present)
 
 
-def renamed_argument(old: str, new: str) -> Callable[[Callable], Callable]:
+def rename_argument(old: str, new: str) -> Callable[[Callable], Callable]:
     """Decorator of a function whose argument `new` was called `old`: the old keyword warns."""
 
     def decorate(function: Callable) -> Callable:

@@ -19,7 +19,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from jaxdyn._renamed import renamed_argument
+from jaxdyn._renamed import rename_argument
 from jaxdyn.compile import kernel, variant
 from jaxdyn.compile.known import array_namespace
 from jaxdyn.lie import se3
@@ -261,7 +261,7 @@ def _translate(pose: Float[Array, "*n 4 4"], shift: Float[Array, "*n 3"]) -> Flo
     return jnp.concatenate([pose[..., :3], pose[..., 3:] + step], -1)
 
 
-@renamed_argument("name", "frame")
+@rename_argument("name", "frame")
 def frame_pose(model: Model, q: Float[Array, " nq"], frame: str | None) -> Float[Array, "4 4"]:
     """Pose of a named frame in the world.
 

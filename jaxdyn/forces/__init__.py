@@ -18,8 +18,8 @@ from jaxdyn.forces.limits import EffortLimits as EffortLimits
 from jaxdyn.forces.limits import JointStops as JointStops
 from jaxdyn.forces.limits import TorqueSpeedLimits as TorqueSpeedLimits
 from jaxdyn.forces.piecewise import PiecewiseForce as PiecewiseForce
+from jaxdyn.forces.wrenches import external_wrenches as external_wrenches
 from jaxdyn.systems.drives import DriveDynamics as DriveDynamics
-from jaxdyn.forces.wrenches import applied_wrenches as applied_wrenches
 
 __all__ = [
     "CoulombFriction",
@@ -37,8 +37,8 @@ __all__ = [
     "SecondOrderDrive",
     "SlidingFriction",
     "TorqueSpeedLimits",
-    "applied_wrenches",
     "elastic_joints",
+    "external_wrenches",
 ]
 
 

@@ -12,7 +12,7 @@ from jaxdyn.model.arguments import Numbers, check_state
 from jaxdyn.systems.scene import Scene, as_scene
 
 
-def applied_wrenches(
+def external_wrenches(
     scene: Scene, q: Float[Array, " nq"], v: Float[Array, " nv"], t: Numbers = 0.0
 ) -> Float[Array, "nb 6"]:
     """Sum of the wrenches (f, tau) of a scene's forces ON each body, at its frame's origin and in its axes.
@@ -31,7 +31,7 @@ def applied_wrenches(
 
     ```python
     scene = jd.Scene(model, forces=[jd.forces.ExternalWrench("tool", [0.0, 0.0, -50.0, 0.0, 0.0, 0.0])])
-    outer = jd.forces.applied_wrenches(scene, q, v)
+    outer = jd.forces.external_wrenches(scene, q, v)
     bearings = jd.dynamics.joint_wrench(model, q, v, a, external=outer)
     ```
     """
@@ -41,7 +41,7 @@ def applied_wrenches(
 
 
 def wrenches_where(scene: Scene, q, v, t, counts: Callable[[str], bool]) -> Float[Array, "nb 6"]:
-    """`applied_wrenches` on those frames alone whose name counts."""
+    """`external_wrenches` on those frames alone whose name counts."""
     model: Any = scene.system
     total = jnp.zeros((model.nb, 6), q.dtype)
     for i, force in enumerate(scene.forces):

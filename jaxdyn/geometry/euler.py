@@ -1,6 +1,5 @@
 """Arnold's form of Euler's equations on the groups SO(3) and SE(3) with a left-invariant metric."""
 
-import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from jaxdyn.compile import entry_point

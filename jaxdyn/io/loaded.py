@@ -132,7 +132,7 @@ class Actuators(eqx.Module):
         return jnp.where((activation >= high) & (rate > 0) | (activation <= low) & (rate < 0), 0.0, rate)
 
     def drive(self, law: Function, activation: Numbers | None = None) -> "ActuatorDrive":
-        """Force of a scene under law(q, v, t) -> (nu,) for the controls, with the activations as its state (none of plain motors).
+        """Force of a scene under law(q, v, t) -> (nu,) for the controls, with the activations as its state.
 
         `activation` (na,) at the start; zeros by default. `outputs=("drive_state",)` of `jd.simulate` are those of the motion.
 

@@ -111,7 +111,7 @@ class ForceTorque(Sensor):
     it the frame is a mount inside a rigid body, and beyond it are a part of that body and the joints named.
 
     Wrenches of the scene's constraints between frames act too, and those of its forces on bodies
-    (`jd.forces.applied_wrenches`). On the mount's own body they count as acting beyond it, as the ground does on a foot under
+    (`jd.forces.external_wrenches`). On the mount's own body they count as acting beyond it, as the ground does on a foot under
     an ankle, unless `frames` says which of them do. Springs, stops, friction, drives and tau act in the joints, between a body
     and its parent, as do constraints on coordinates, and forces of the user without `frame_wrenches`.
 
@@ -184,7 +184,6 @@ class ForceTorque(Sensor):
         # At the origin and in the axes of the body; AdT takes it to those of the frame, which may be displaced and rotated.
         wrench = joint_wrench(model, q, motion.v, motion.a, model.joint_names[body], external=pulls)
         return se3.AdT_apply(jnp.asarray(offset, q.dtype), wrench)[_PARTS[self.part]]
-
 
     def _outer_wrenches(self, motion: Motion, body: int) -> Float[Array, "nb 6"] | None:
         """Wrenches on each body past the joints, of loops, feet and outer forces; None without any."""

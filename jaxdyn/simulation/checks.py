@@ -29,7 +29,7 @@ from jaxdyn.simulation.controls import Controller, Sampled
 from jaxdyn.simulation.methods import Baumgarte, Free, Method, Multipliers, Projected, Reduced, is_regular, start_limit
 from jaxdyn.simulation.solution import RESULTS
 from jaxdyn.simulation.solvers import Stepper
-from jaxdyn.simulation.solvers.choice import is_explicit, is_named, is_step_length, label, uses_tolerances
+from jaxdyn.simulation.solvers.choice import has_name, is_explicit, is_step_length, label, uses_tolerances
 from jaxdyn.simulation.variational import Variational
 from jaxdyn.systems.mass_factor import mass_factor
 from jaxdyn.systems.scene import Scene, has_drives
@@ -207,7 +207,7 @@ def check_modal_options(control, stepsize, solver, adjoint, outputs) -> None:
         )
     if isinstance(adjoint, diffrax.BacksolveAdjoint):
         raise ValueError(f"adjoint is 'backsolve', which does not go back through events, and {what}; take 'reverse'")
-    if not is_named(adjoint):
+    if not has_name(adjoint):
         raise ValueError(f"adjoint is {adjoint}, which does not go back through events, and {what}; take 'reverse'")
     for name in outputs:
         if name not in MODAL_OUTPUTS and not name.startswith(POSE):
@@ -235,7 +235,9 @@ def check_effects(scene: Scene, solver, stepsize, modal: bool, given: dict[str, 
                 "jd.contact.UnilateralContact, jd.forces.PiecewiseForce); omit it"
             )
     if given["contacts"] in ("stop", "report") and scene.cones is None:
-        raise ValueError(f"contacts is {given['contacts']!r}, and the scene has no cones; omit it, or give jd.Scene(cones=...)")
+        raise ValueError(
+            f"contacts is {given['contacts']!r}, and the scene has no cones; omit it, or give jd.Scene(cones=...)"
+        )
 
 
 def check_contacts(scene: Scene, contacts: str, outputs) -> None:

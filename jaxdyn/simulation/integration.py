@@ -14,7 +14,14 @@ from jaxdyn.simulation.hybrid.piecewise import MIN_EVENTS, PiecewiseSystem, piec
 from jaxdyn.simulation.methods import Reduced, is_regular
 from jaxdyn.simulation.solution import RESULTS, from_diffrax
 from jaxdyn.simulation.solvers import ExplicitSteps, ProjectedSolver
-from jaxdyn.simulation.solvers.choice import is_explicit, is_named, is_step_length, label, progress_meter, solver_and_control
+from jaxdyn.simulation.solvers.choice import (
+    has_name,
+    is_explicit,
+    is_step_length,
+    label,
+    progress_meter,
+    solver_and_control,
+)
 from jaxdyn.simulation.solvers.differentiable import ROOM, run, run_adaptively
 from jaxdyn.simulation.solvers.driver import step_control
 from jaxdyn.simulation.solvers.explicit import Plan
@@ -85,7 +92,7 @@ def _reason_for_diffrax(solver, controller, adjoint, options) -> str | None:
     # Subclasses and wrappers, such as a clip to samples, have rules that our loops do not know.
     if type(controller) not in (Adaptive, ErrorMonitoredSteps):
         return "stepsize is a controller; leave it out"
-    if isinstance(adjoint, diffrax.BacksolveAdjoint) or not is_named(adjoint):
+    if isinstance(adjoint, diffrax.BacksolveAdjoint) or not has_name(adjoint):
         return f"adjoint is {type(adjoint).__name__}; take 'reverse'"
     return "progress is shown; leave it out" if options["progress"] else None
 

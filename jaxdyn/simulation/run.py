@@ -100,9 +100,9 @@ def simulate(
       "multipliers", "constraint_residual", "contact_forces", "contact_margins", "torque" (of the control, behind drives
       and limits), "control_state" (of a controller), "drive_state" (of drives) and "pose:<frame>". They are computed only if
       asked for.
-    - `contacts`: of a scene with `cones`. "stop", the default: where a contact pulls or leaves its cone (a margin below zero by more than
-      rounding, $\epsilon^{1/2}$ of its force) the run ends, with the code `contact_lost` and the time, which is found within the
-      step. "report": it continues, with contacts that hold on both sides.
+    - `contacts`: of a scene with `cones`. "stop", the default: where a contact pulls or leaves its cone (a margin below zero by
+      more than rounding, $\epsilon^{1/2}$ of its force) the run ends, with the code `contact_lost` and the time, which is found
+      within the step. "report": it continues, with contacts that hold on both sides.
     - `limits`: of the model's joints (`model.lower`, `model.upper`), which nothing enforces. None: they are ignored.
       "stop": where a joint passes one the run ends, with the code `joint_limit_passed` and the time, found within the step.
       So are passages that end within the same step, except short ones: of less than about 1e-3 of what the joint moves in the

@@ -219,7 +219,9 @@ def test_numbers_of_numpy_make_no_float64_in_a_float32_process():
     """Gains, targets, first plans and inertias as Python and NumPy write them; warnings are errors."""
     with jax.enable_x64(False):
         model = jd.robots.quadruped(floating_base=True)
-        feet = [jd.control.foot(name, jd.contact.friction_cone("hard-finger", mu=0.6)) for name in ("FL_foot", "RR_foot")]
+        feet = [
+            jd.control.foot(name, jd.contact.friction_cone("hard-finger", mu=0.6)) for name in ("FL_foot", "RR_foot")
+        ]
         law = jd.control.WholeBody(model, feet, np.zeros(3), kp=6.0, kd=np.array([3.0, 3.0, 3.0]))
         assert law.kp.dtype == law.kd.dtype == np.float32
         torque = jd.control.ComputedTorque(jd.robots.chain(2), np.zeros(2), 6.0, 3.0)

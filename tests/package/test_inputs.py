@@ -174,7 +174,9 @@ def test_frames_have_one_name():
 
 
 def test_a_scene_in_place_of_its_system_is_told_where_to_go():
-    with pytest.raises(ValueError, match=r"model is a Scene; pass scene.system.*jd\.constrained_dynamics.*jd\.reduced_dynamics"):
+    with pytest.raises(
+        ValueError, match=r"model is a Scene; pass scene.system.*jd\.constrained_dynamics.*jd\.reduced_dynamics"
+    ):
         jd.mass_matrix(CHAIN, Q)
 
 

@@ -216,7 +216,9 @@ def test_small_motions_are_judged_by_their_size():
     """A crank and a rocker of a four-bar at rest: values that contradict each other do at any size."""
     scene, (q, v) = scenes.four_bar(gravity=None), scenes.four_bar.start()
     still, ratio = jnp.zeros(3), v[2] / v[0]
-    solve = quick(lambda rate: constrained_inverse_dynamics(scene, q, still, rate, motors=["1"], independent=["1", "3"]).result)
+    solve = quick(
+        lambda rate: constrained_inverse_dynamics(scene, q, still, rate, motors=["1"], independent=["1", "3"]).result
+    )
     for size in (1.0, 1e-6, 1e-12):
         assert solve(size * jnp.stack([1.0, ratio])) == RESULTS.successful
         assert solve(size * jnp.stack([1.0, ratio + 1e-6])) == RESULTS.contradictory_rows
@@ -225,7 +227,9 @@ def test_small_motions_are_judged_by_their_size():
 def test_all_velocities_have_one_order():
     model = robots.chain(2)
     q, v, a = jnp.array([0.4, -0.7]), jnp.array([0.3, 0.5]), jnp.array([1.0, 2.0])
-    with pytest.raises(ValueError, match=r"motors has all velocities, in the order \[1, 0\]; name them in the order of the model"):
+    with pytest.raises(
+        ValueError, match=r"motors has all velocities, in the order \[1, 0\]; name them in the order of the model"
+    ):
         constrained_inverse_dynamics(model, q, v, a, motors=model.joint_names[::-1])
 
 

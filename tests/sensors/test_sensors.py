@@ -329,8 +329,11 @@ def test_orientations_are_delayed_and_disturbed_on_the_group(mode):
         sensors.FramePose("ball", name="turn", part="orientation", delay=delay),
         sensors.Encoder("ball_joint" if "ball_joint" in ball.joint_names else "ball", delay=delay, noise=noise),
     ]
-    read = quick(lambda delay: sensors.record(
-        ball, [eqx.tree_at(lambda s: s.delay, s, delay) for s in list_of], ts, q, v, key=jax.random.key(3)))
+    read = quick(
+        lambda delay: sensors.record(
+            ball, [eqx.tree_at(lambda s: s.delay, s, delay) for s in list_of], ts, q, v, key=jax.random.key(3)
+        )
+    )
     readings = read(jnp.asarray(delay))
     before = np.maximum(ts - delay, 0)
     truth = np.column_stack([np.cos(rate * before / 2), np.sin(rate * before / 2)[:, None] * axis])
@@ -353,4 +356,6 @@ def test_orientations_are_delayed_and_disturbed_on_the_group(mode):
         assert_close(slope, -rate / 2 * np.array([-np.sin(turned), *(np.cos(turned) * axis)]), 1e-12)
     else:
         with pytest.raises(ValueError, match=r"noise has std of shape \(7,\); give one number, or 6"):
-            sensors.record(ball, [sensors.FramePose("ball", noise=sensors.Noise(np.ones(7)))], ts, q, v, key=jax.random.key(0))
+            sensors.record(
+                ball, [sensors.FramePose("ball", noise=sensors.Noise(np.ones(7)))], ts, q, v, key=jax.random.key(0)
+            )

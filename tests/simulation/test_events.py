@@ -301,8 +301,14 @@ def test_second_derivatives_go_through_events():
     ts = jnp.linspace(0.0, 2.5, 4)
 
     def slides(p):
-        motion = jd.simulate(block(p[0], p[1]), jnp.zeros(1), p[2:], ts, control=load, rtol=1e-12, atol=1e-12, max_events=3)
-        return jnp.sum(jnp.sin(motion.q[:, 0])) + jnp.sum(motion.v[1:, 0] ** 2) + motion.events.time[:2] @ jnp.array([1, 0.3])
+        motion = jd.simulate(
+            block(p[0], p[1]), jnp.zeros(1), p[2:], ts, control=load, rtol=1e-12, atol=1e-12, max_events=3
+        )
+        return (
+            jnp.sum(jnp.sin(motion.q[:, 0]))
+            + jnp.sum(motion.v[1:, 0] ** 2)
+            + motion.events.time[:2] @ jnp.array([1, 0.3])
+        )
 
     at = jnp.asarray([MU, MU_S, 2.0])
     gradient = jax.jit(jax.grad(slides))

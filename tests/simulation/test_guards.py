@@ -254,7 +254,7 @@ LONG = {
 @pytest.mark.parametrize("saves", [2, 12])
 @pytest.mark.parametrize("how", LONG)
 def test_a_passage_within_one_step_ends_the_motion_at_its_time(how, saves):
-    """A parabola is exact in one step of every method; the passage lasts a twentieth of it, with and without save points in it."""
+    """A parabola is exact in one step of every method; the passage lasts a twentieth of it, with save points in it or not."""
     solution, time = there_and_back(2e-3, saves=saves, **LONG[how])
     assert solution.result == jd.RESULTS.joint_limit_passed
     np.testing.assert_allclose(solution.stats["time_reached"], time, rtol=1e-10)

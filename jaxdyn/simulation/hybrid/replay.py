@@ -6,8 +6,8 @@ guard e of the mode falls to zero, so its time follows the change of e at that m
 
     dt = -de / (de/dt)
 
-to first order (`delay` has the second one), the state is taken to that time by its rate before the event, goes through the impact, and begins the next part there. These are
-the saltation matrices of the literature.
+to first order (`delay` has the second one too). The state is taken to that time by the motion before the event, goes through the
+impact, and begins the next part there. To first order these are the saltation matrices of the literature.
 """
 
 from typing import Any

@@ -142,7 +142,7 @@ def choose_adjoint(adjoint, solver) -> diffrax.AbstractAdjoint:
     raise ValueError(f"adjoint is {adjoint!r}; choose one of {', '.join(ADJOINTS)}, or pass a diffrax adjoint")
 
 
-def is_named(adjoint: diffrax.AbstractAdjoint) -> bool:
+def has_name(adjoint: diffrax.AbstractAdjoint) -> bool:
     """True for the adjoints that have a name, whose derivatives the library's own loops give too.
 
     Others, and those with settings of their own, are for diffrax.

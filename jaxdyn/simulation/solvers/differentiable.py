@@ -14,6 +14,7 @@ import jax
 import jax.numpy as jnp
 from jax.flatten_util import ravel_pytree
 
+from jaxdyn.simulation.solvers.choice import innermost
 from jaxdyn.simulation.solvers.guards import delay
 
 COUNTS = ("num_steps", "num_accepted_steps", "num_rejected_steps")
@@ -40,7 +41,7 @@ def run(inputs, *, term, solver, controller, event, adjoint, max_steps, progress
     continuous = isinstance(adjoint, diffrax.BacksolveAdjoint)  # supports save points and nothing else
     solved: Any = diffrax.diffeqsolve(
         term,
-        solver,
+        _with_scan(solver, adjoint),
         t0=ts[0],
         t1=ts[-1],
         dt0=dt0,
@@ -60,6 +61,18 @@ def run(inputs, *, term, solver, controller, event, adjoint, max_steps, progress
         return solved.ys, (solved.result, counts, reached), solved
     end = (jax.tree.map(lambda rows: rows[0], solved.ys[1]),) if located or end is not None else ()
     return solved.ys[0], (solved.result, counts, solved.ts[1][0], *end), solved
+
+
+def _with_scan(solver, adjoint):
+    """The method with loops over its stages that forward mode can differentiate, where an adjoint needs these.
+
+    diffrax sets them on a method, or on one in a wrapper; in two wrappers it does not see the method.
+    """
+    kind = {diffrax.ForwardMode: "lax", diffrax.DirectAdjoint: "bounded"}.get(type(adjoint))
+    inner = innermost(solver)
+    if kind is None or not isinstance(inner, diffrax.AbstractRungeKutta) or inner.scan_kind is not None:
+        return solver
+    return eqx.tree_at(lambda solver: innermost(solver).scan_kind, solver, kind, is_leaf=lambda x: x is None)
 
 
 def run_adaptively(inputs, options, limit_is_given: bool) -> tuple[Any, tuple]:

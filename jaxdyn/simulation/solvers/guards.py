@@ -171,8 +171,8 @@ def search_root(search: Search, t0, t1, at_end, within, good, usual) -> tuple[Se
     bracket = bracket.narrow(point, value.astype(length.dtype), before, good & violated)
     locating, width = (search.locating & good) | begins, bracket.high - bracket.low
     is_narrow = width <= 4 * eps * jnp.maximum(jnp.abs(t1), search.usual)
-    # The root is known when a guard is zero, or when its time is, up to rounding. A zero within the step may have been an error of
-    # the dense output: then the bracket closes on its end, before which no guard is negative.
+    # The root is known when a guard is zero, or when its time is, up to rounding. A zero within the step may have been an error
+    # of the dense output: then the bracket closes on its end, before which no guard is negative.
     is_known = (jnp.abs(value) <= 64 * eps) | (is_narrow & (violated | (width <= 0)))
     # A zero within the step is not at the end of it, which is where a step can be cut.
     located = locating & is_known & ~inside
