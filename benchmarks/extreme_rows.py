@@ -37,7 +37,8 @@ def flat(dtypes, gradient, runs=FALLS):
             dtype = point.dtype
             v = v0.astype(dtype) * (point + x)
             at = jnp.asarray(ts, dtype)
-            options = {"method": method, "stepsize": stepsize, "rtol": tolerance, "atol": tolerance, "max_steps": 4096}
+            steps = {"rtol": tolerance, "atol": tolerance} if stepsize is None else {"stepsize": stepsize}
+            options = {"method": method, "max_steps": 4096, **steps}
             solution = jd.simulate(
                 as_dtype(base, dtype), q0.astype(dtype), v, at, outputs=("constraint_residual",), **options
             )

@@ -58,10 +58,11 @@ def scene_calls(name: str, batch: int, steps: int):
     named = getattr(jd.scenes, name)
     scene, (q, v) = named(), named.start()
     ts = jnp.asarray([0.0, STEP * steps])
+    contacts = {} if scene.cones is None else {"contacts": "report"}
 
     def motion(v, tau):
         control = jax.tree_util.Partial(_constant, tau)
-        moved = jd.simulate(scene, q, v, ts, control=control, stepsize=STEP, contacts="report")
+        moved = jd.simulate(scene, q, v, ts, control=control, stepsize=STEP, **contacts)
         return moved.q[-1], moved.v[-1]
 
     args = v * (1 + 0.01 * jnp.arange(batch) / batch)[:, None], jnp.zeros((batch, scene.nv))

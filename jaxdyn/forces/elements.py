@@ -5,7 +5,7 @@ Each is a frozen equinox Module called as `force(system, q, v, t) -> (nv,)`; its
 selected joints (all of them when None); per-coordinate values are then listed in the order of these names.
 """
 
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, cast
 
 import equinox as eqx
 import jax.numpy as jnp
@@ -279,7 +279,8 @@ class ExternalWrench(eqx.Module):
         self, system: SystemLike, q: Float[Array, " nq"], v: Float[Array, " nv"], t: Number
     ) -> Float[Array, " nv"]:
         # Wrench and Jacobian are both in the frame's axes, at its origin.
-        return body_jacobian(system, q, self.frame).T @ self._in_frame(system, q)
+        wrench, model = self._in_frame(system, q), cast(Model, system)
+        return body_jacobian(model, q, self.frame).T @ wrench
 
     def frame_wrenches(
         self, system: SystemLike, q: Float[Array, " nq"], v: Float[Array, " nv"], t: Number

@@ -1,6 +1,7 @@
 """Readings of sensors along a motion, with their delay and noise."""
 
 from collections.abc import Sequence
+from typing import cast
 
 import jax
 import jax.numpy as jnp
@@ -76,7 +77,7 @@ def record(
         if at is None:
             # Before the first time `jnp.interp` returns the first reading.
             values = jax.vmap(lambda column, late=late: jnp.interp(late, ts, column), 1, 1)(values)
-            values = values if noise is None else noise(values, ts, one)
+            values = values if noise is None else noise(values, ts, cast(Array, one))
         else:
             values = _interpolate_pose(values, at, ts, late)
             values = values if noise is None else _disturb_pose(values, at, noise, ts, one, sensor.name)

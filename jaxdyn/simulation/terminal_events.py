@@ -144,7 +144,7 @@ class GuardedSolver(Wrapped):
         self, terms: PyTree, t0: Number, t1: Number, y0: PyTree, args: PyTree, solver_state: PyTree, made_jump: Flag
     ) -> StepOutput:
         """Make one step of the wrapped method and look within it."""
-        y1, error, dense_info, *rest = self.solver.step(terms, t0, t1, y0, args, solver_state, made_jump)
+        y1, error, dense_info, state, result = self.solver.step(terms, t0, t1, y0, args, solver_state, made_jump)
         # The mark has no derivative, and neither have the guards that make it.
         arrays, rest_of_args = eqx.partition(args, eqx.is_array)
         start, end, info, arrays = jax.lax.stop_gradient((t0, t1, dense_info, arrays))
@@ -156,7 +156,7 @@ class GuardedSolver(Wrapped):
 
         passed = (jax.vmap(least)(jnp.asarray(_FRACTIONS, jnp.result_type(t0))) < 0).any()
         mark = jnp.where(passed, -1.0, 1.0).astype(y1[WITHIN].dtype)
-        return y1 | {WITHIN: mark}, error, dense_info, *rest
+        return y1 | {WITHIN: mark}, error, dense_info, state, result
 
 
 def event(quality, guards, t0, y0, args) -> diffrax.Event | None:

@@ -186,7 +186,9 @@ def test_projection_keeps_the_order(solver, order):
 
     @quick
     def run(step):
-        return simulate(scene, q, v, ts, stepsize=step, solver=solver, rtol=1e-12, atol=1e-12, max_steps=512).q
+        # Of the implicit method's inner iteration.
+        tolerances = {"rtol": 1e-12, "atol": 1e-12} if isinstance(solver, diffrax.Kvaerno5) else {}
+        return simulate(scene, q, v, ts, stepsize=step, solver=solver, max_steps=512, **tolerances).q
 
     exact = quick(lambda: simulate(scene, q, v, ts, rtol=1e-13, atol=1e-13).q)()
     steps = [0.1, 0.05] if order == 8 else [0.05, 0.025]
