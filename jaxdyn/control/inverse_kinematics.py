@@ -254,6 +254,15 @@ def _exact_rows_only(aims: Aims) -> Aims:
     return aims._replace(weights=aims.weights * aims.is_exact, tolerances=tolerances)
 
 
+def _with_derivatives(scene: Scene, guess, place, is_nearest, t: Number):
+    """The place (nq,) that a search has found, and whether it is the nearest to the guess, with the derivatives of that."""
+    # As an argument, which `solve` returns: a function with a rule may not close over traced values.
+    found = jnp.append(place, is_nearest)
+    return nearest_configuration(
+        scene, guess, found, t, None, solve=lambda scene, guess, start, t: (start[:-1], start[-1])
+    )
+
+
 def _differentiable(whole: Scene, q, posture, t: Number, aims: Aims, constraints: int):
     """q as the configuration nearest to itself, or to a posture, that reaches the targets, with its derivatives."""
     model: Model = whole.system
@@ -284,8 +293,7 @@ def _differentiable(whole: Scene, q, posture, t: Number, aims: Aims, constraints
         # Joints at a limit are held there, so that derivatives do not lead out of it.
         scene = scene_at(sides(q[at] <= lower, q[at] >= upper))
         # q is the configuration nearest to itself: `solve` returns the start, and only the derivative is computed.
-        one = jnp.ones((), q.dtype)
-        place, _ = nearest_configuration(scene, q, q, t, None, solve=lambda scene, guess, start, t: (start, one))
+        place, _ = _with_derivatives(scene, q, q, jnp.ones((), q.dtype), t)
         return place, jnp.asarray(True)
 
     fixed, guess, time = stop_gradient((Scene(model, tuple(rows)), posture, t))
@@ -297,8 +305,8 @@ def _differentiable(whole: Scene, q, posture, t: Number, aims: Aims, constraints
     end = slide_to_nearest(fixed, guess, q, time, None, bounds)
     # The set of joints at a limit is a decision without derivative.
     scene = scene_at(end.held[at_v] if joints else jnp.zeros((0,), q.dtype))
-    found = polish(stop_gradient(scene), displace(model, guess, end.e), time, None), end.is_nearest
-    place, is_nearest = nearest_configuration(scene, posture, q, t, None, solve=lambda *_: found)
+    found = polish(stop_gradient(scene), displace(model, guess, end.e), time, None)
+    place, is_nearest = _with_derivatives(scene, posture, found, end.is_nearest, t)
     if not joints:
         return place, is_nearest > 0
     place = clip_rounding(place, at, lower, upper)
