@@ -53,7 +53,7 @@ def _level() -> int:
 
 def name_of_file(identity: str) -> str:
     """Name of the file with the machine code of a program with this identity."""
-    parts = (identity, _environment(), str(_level()))
+    parts = (identity, _environment(), str(_level()), str(LONG_LINES))
     return hashlib.sha256("\0".join(parts).encode()).hexdigest() + ".o"
 
 
@@ -89,6 +89,12 @@ def make(identity: str, text: str, calls: Sequence[str], name: str = "") -> Obje
     binary = compile_text(text)
     disk.write(name_of_file(identity), json.dumps(list(calls)).encode() + b"\n" + binary)
     return ObjectFile(binary, tuple(calls))
+
+
+def code_of(text: str) -> "Code":
+    """The machine code of a text, from the folder or compiled now."""
+    identity = hashlib.sha256(text.encode()).hexdigest()
+    return Code((find(identity) or make(identity, text, ())).binary)
 
 
 class Code:

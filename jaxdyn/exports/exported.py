@@ -14,7 +14,7 @@ from jaxdyn.compile import object_files, standalone
 from jaxdyn.compile.directions import Directions
 from jaxdyn.compile.object_files import HOST as HOST
 from jaxdyn.compile.object_files import TARGETS as TARGETS
-from jaxdyn.compile.objects import Code
+from jaxdyn.compile.objects import Code, code_of
 from jaxdyn.compile.program import Program
 from jaxdyn.compile.standalone import DEGENERATE, Routine
 from jaxdyn.exports.arguments import (
@@ -206,7 +206,7 @@ class Exported:
         caller = getattr(self._local, which, None)
         if caller is None:
             if self._code is None:
-                self._code = Code(self.module("packed", object_files.resolve_target(HOST).lanes))
+                self._code = code_of(self.module("packed", object_files.resolve_target(HOST).lanes))
             routine = self._routine(which)
             address = self._code.address(f"{routine.symbol}_packed")
             caller = _make_caller(address, self, routine.program, which == "function" and self._is_one_array)

@@ -1041,10 +1041,9 @@ IR = "define double @f(double %x) {\n  %y = fmul double %x, CONSTANT\n  ret doub
 def code_of(number: float):
     import ctypes
 
-    identity = f"times {number}"
     text = IR.replace("CONSTANT", f"{number:.6e}")
-    made = objects.Code((objects.find(identity) or objects.make(identity, text, ())).binary)
-    return objects.name_of_file(identity), made, ctypes.CFUNCTYPE(ctypes.c_double, ctypes.c_double)(made.address("f"))
+    made = objects.code_of(text)
+    return objects.name_of_file(hashlib.sha256(text.encode()).hexdigest()), made, ctypes.CFUNCTYPE(ctypes.c_double, ctypes.c_double)(made.address("f"))
 
 
 def built(monkeypatch):

@@ -13,7 +13,7 @@ import pytest
 
 import jaxdyn as jd
 from jaxdyn.compile import object_files, standalone
-from jaxdyn.compile.objects import Code
+from jaxdyn.compile.objects import code_of
 
 X = np.linspace(0.1, 0.7, 7)
 V, TAU = 0.3 * np.cos(X), np.sin(3 * X)
@@ -130,7 +130,7 @@ def test_header_names_joints_units_sizes_and_stack(exported, tmp_path):
 
 def test_batch_over_vector_lanes_equals_single_samples(exported):
     lanes = object_files.resolve_target("host").lanes
-    code = Code(exported.module("c", lanes))
+    code = code_of(exported.module("c", lanes))
     for n in (0, 1, 3, 13):
         rng = np.random.default_rng(n)
         q, v, tau = (np.ascontiguousarray(rng.normal(size=(n, 7))) for _ in range(3))
@@ -224,7 +224,7 @@ def test_samples_where_rows_lose_rank_are_computed_by_the_pseudo_inverse():
 
     rows = np.stack([q, q * 0, q, -q, q * 0]), np.zeros((5, 2)), np.tile(q, (5, 1))
     lanes = object_files.resolve_target("host").lanes
-    code = Code(exported.module("c", lanes))
+    code = code_of(exported.module("c", lanes))
     batch = ctypes.CFUNCTYPE(ctypes.c_int, ctypes.c_int64, *[ctypes.c_void_p] * 4)(code.address("crossing_batch"))
     out = np.full((5, 2), np.nan)
     assert batch(5, *(x.ctypes.data for x in (*rows, out))) == 0
@@ -248,7 +248,7 @@ def test_results_that_are_not_finite_have_a_status(tmp_path):
     exported = jd.export(lambda x: (jnp.log(x), 1 / x), np.zeros(2), name="f", batch=True)
     assert np.isinf(exported(np.zeros(2))[0]).all()
     lanes = object_files.resolve_target("host").lanes
-    code = Code(exported.module("c", lanes))
+    code = code_of(exported.module("c", lanes))
     one, many = (
         ctypes.CFUNCTYPE(ctypes.c_int, *kinds)(code.address(name))
         for name, kinds in (("f", [ctypes.c_void_p] * 3), ("f_batch", [ctypes.c_int64, *[ctypes.c_void_p] * 3]))
