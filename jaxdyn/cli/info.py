@@ -11,7 +11,7 @@ import numpy as np
 from jaxdyn.cli.common import FILE, add_model_options, load_scene, output_path, short, table, xacro_arguments
 from jaxdyn.constraints.assembly import assemble
 from jaxdyn.constraints.base import constraint_jacobian, holonomic_rows, layout, position_residual
-from jaxdyn.constraints.selection import degrees_of_freedom, select_rows
+from jaxdyn.constraints.selection import count_free, independent_rows, select_rows
 from jaxdyn.io import LoadedScene, NotTakenWarning, save_urdf, urdf_inertia_report
 from jaxdyn.io.formats import format_of
 from jaxdyn.io.xml_lines import XmlFile
@@ -169,7 +169,9 @@ def _closure(scene: LoadedScene, q) -> list[str]:
         lines.append(f"The constraints cannot be assembled from the reference: {error}.")
     # Decided a finite distance away from q, because files like to put linkages flat.
     kept = select_rows(scene, np.asarray(q), 0.0).kept
-    freedom, here = scene.nv - int(kept.sum()), degrees_of_freedom(scene, q)
+    # Not `degrees_of_freedom`, which raises where rounding hides the rank of a singular position.
+    here = int(count_free(independent_rows(scene, q, 0.0), q, 0.0, None))
+    freedom = scene.nv - int(kept.sum())
     more = f" ({here} in the singular position of the reference)" if here > freedom else ""
     lines.append(f"Degrees of freedom after constraints: {freedom} of {scene.nv}{more}")
     return lines + _repeats(scene, closed, kept)

@@ -197,8 +197,10 @@ def scan_counts(params: dict) -> tuple[int, int]:
 
 
 def expand_high(params: dict) -> tuple[Callable, Any, bool]:
-    """Of a primitive that JAX keeps whole (since 0.12): its function, the tree of its arguments, and whether its derivative has a
-    rule of its own."""
+    """Parts of a primitive that JAX keeps whole (since 0.12).
+
+    Its function, the tree of its arguments, and whether its derivative has a rule of its own.
+    """
     primitive = params["_prim"]
     if "compare_all" in getattr(primitive, "valid_methods", ()):  # searchsorted: a count has no bisection
         primitive = copy.copy(primitive)

@@ -225,7 +225,8 @@ def _constrain_acceleration(scene: Scene, metric: MassFactor, Y, free, deficit, 
     # Rows that count as dependent may differ by the rank tolerance, and leave a residual of that size.
     limit = max(eps_of(Y) ** 0.5, tolerance(rank_tol, Y))
     are_satisfied = jnp.all(residual <= limit * (sizes + jnp.max(sizes)))
-    result = RESULTS.where(has_clear_rank(Y.T, inverse.T, rank_tol), RESULTS.successful, RESULTS.unclear_rank)  # pyright: ignore[reportArgumentType]
+    is_clear = has_clear_rank(Y.T, inverse.T, rank_tol, not isinstance(scene.system, Model))
+    result = RESULTS.where(is_clear, RESULTS.successful, RESULTS.unclear_rank)
     result = RESULTS.where(are_satisfied, result, RESULTS.contradictory_rows)
     result = RESULTS.where(metric.is_definite(), result, RESULTS.singular_mass_matrix)
     a = metric.unwhiten(free + w)

@@ -192,14 +192,17 @@ def rank_of(A: Float[Array, "n m"], inverse: Float[Array, "m n"]) -> Float[Array
 
 
 @variant(lambda *_: jnp.asarray(True))  # programs of single numbers have no code to say it with
-def has_clear_rank(A: Float[Array, "n m"], inverse: Float[Array, "m n"], rank_tol: float | None) -> Bool[Array, ""]:
+def has_clear_rank(
+    A: Float[Array, "n m"], inverse: Float[Array, "m n"], rank_tol: float | None, is_exact: bool = False
+) -> Bool[Array, ""]:
     """Decide whether the rank of rows A, with their pseudo-inverse, is clear; a constant.
 
     The least singular value that counts has to be `LEAST_GAP` times the largest that does not. Rows that leave no motion have to
     be independent beyond doubt: a row that differs from a combination of others by the rounding of its numbers leaves none, too.
+    Those of functions, not of bodies whose geometry may have been typed with few digits, are taken as they stand: `is_exact`.
     """
     (A, inverse), least = lax.stop_gradient((A, inverse)), tolerance(rank_tol, A)
-    is_full = (rank_of(A, inverse) >= A.shape[1]) & (rank_tol is None and A.shape[0] >= A.shape[1])
+    is_full = (rank_of(A, inverse) >= A.shape[1]) & (rank_tol is None and not is_exact and A.shape[0] >= A.shape[1])
 
     def compare():
         values = jnp.sqrt(gram_eigenvectors(A)[0])

@@ -104,9 +104,9 @@ class Selection(NamedTuple):
 
 def keep_rows(scene: Scene, selection: Selection) -> Scene:
     """The scene with the rows that are not kept set to zero."""
-    kept, *numbers = map(jnp.asarray, selection[:4])
+    kept, rounding, least, gap, _ = map(jnp.asarray, selection)
     constraints = tuple(
-        KeptRows(constraint, kept[place.start : place.end], *numbers, constraint.name)  # pyright: ignore[reportArgumentType]
+        KeptRows(constraint, kept[place.start : place.end], rounding, least, gap, constraint.name)  # pyright: ignore[reportArgumentType]
         for constraint, place in zip(scene.constraints, layout(scene), strict=True)
     )
     return eqx.tree_at(lambda scene: scene.constraints, scene, constraints, is_leaf=lambda x: isinstance(x, tuple))

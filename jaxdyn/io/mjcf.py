@@ -29,7 +29,7 @@ from jaxdyn.io.mjcf_file import (
 )
 from jaxdyn.io.mjcf_parts import actuators, constraints, tendon_forces
 from jaxdyn.io.mjcf_sensors import sensors
-from jaxdyn.io.xml_lines import LARGEST_ROUNDING, XmlFile, written_rounding
+from jaxdyn.io.xml_lines import LARGEST_ROUNDING, XmlFile, rounding_of_digits
 from jaxdyn.model import host_math
 from jaxdyn.model.arguments import DType, as_path
 from jaxdyn.model.builder import ModelBuilder
@@ -87,13 +87,13 @@ def load_mjcf(path: str | os.PathLike, *, dtype: DType | None = None) -> LoadedS
 
 
 def _rounding(path: str) -> float:
-    """`written_rounding` of a file that mujoco has read; the largest one for a file that it alone can read."""
+    """`rounding_of_digits` of a file that mujoco has read; the largest one for a file that it alone can read."""
     try:
         root = XmlFile(path, "MJCF").root
     except ValueError:
         return LARGEST_ROUNDING
     # Included files may hold numbers of any digits.
-    return LARGEST_ROUNDING if root.find(".//include") is not None else written_rounding(root)
+    return LARGEST_ROUNDING if root.find(".//include") is not None else rounding_of_digits(root)
 
 
 def _model(file: CompiledFile, dtype) -> Model:

@@ -15,7 +15,7 @@ from jaxdyn.io.sdf_frames import SdfFile
 from jaxdyn.io.sdf_joints import LOOPS, Axis, Edge, Joint, read_joints, spanning_tree
 from jaxdyn.io.unread import SDF_FRAME, SDF_JOINT, SDF_LINK, SDF_MODEL, SDF_ROOT, SDF_WORLD, unread_parts
 from jaxdyn.io.urdf import ROOT_JOINT
-from jaxdyn.io.xml_lines import written_rounding
+from jaxdyn.io.xml_lines import rounding_of_digits
 from jaxdyn.model import host_math
 from jaxdyn.model.arguments import DType
 from jaxdyn.model.builder import GRAVITY, ModelBuilder
@@ -106,7 +106,7 @@ def _model(file: SdfFile, edges: list[Edge], static: set[str], floating: bool, d
             np.array([0.0, 0.0, -9.8]) if gravity_element is None else file.numbers(gravity_element, 3, "the world")
         )
         gravity = gravity if gravity.any() else None
-    builder = ModelBuilder(name, gravity=gravity, dtype=dtype, rounding=written_rounding(file.root))
+    builder = ModelBuilder(name, gravity=gravity, dtype=dtype, rounding=rounding_of_digits(file.root))
     builder.places = {link: f"{file.path}:{element.line}" for link, (element, _) in file.links.items()}
     # Joints may have the names of links in SDF, so the two namespaces are kept apart.
     frames, names = Names(), Names()

@@ -180,7 +180,7 @@ SDF_ROOT = Part(("version",), {**_left("actor", "files"), **_without_effect("wor
 
 
 def unread_parts(file: XmlFile, elements: Iterable[tuple[Any, str, Part]]) -> dict[str, list[str]]:
-    """What is not read of elements, each with the name of its owner and its table: descriptions with the names of the owners.
+    """Descriptions, with the names of their owners, of what is not read of elements, each given with its owner and its table.
 
     **Raises:** ValueError with file and line for a part that is given twice, of which a reader takes the first, and for a value
     that is none.

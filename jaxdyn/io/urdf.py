@@ -14,7 +14,7 @@ import numpy as np
 from jaxdyn.io.loaded import warn_of_units
 from jaxdyn.io.urdf_check import JOINTS
 from jaxdyn.io.urdf_parts import Inertial, Joint, Mimic, read_parts
-from jaxdyn.io.xml_lines import XmlFile, written_rounding
+from jaxdyn.io.xml_lines import XmlFile, rounding_of_digits
 from jaxdyn.model import host_math
 from jaxdyn.model.arguments import DType, Numbers
 from jaxdyn.model.builder import GRAVITY, ModelBuilder, unknown
@@ -137,7 +137,7 @@ def urdf_model(
     if mimic == "couple":
         couplings = _resolve_couplings(couplings, kinds, locked, places)
 
-    builder = ModelBuilder(urdf.name, gravity=gravity, dtype=dtype, rounding=written_rounding(file.root))
+    builder = ModelBuilder(urdf.name, gravity=gravity, dtype=dtype, rounding=rounding_of_digits(file.root))
     # Warnings of the builder can then name lines of the file.
     builder.places = {name: urdf.places[f"link {name}"] for name in urdf.links}
     free = floating_base and root_joint not in locked

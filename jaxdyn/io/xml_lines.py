@@ -46,7 +46,7 @@ _NUMBER = re.compile(r"[-+]?(\d*)\.?(\d*)(?:[eE]([-+]?\d+))?$")
 _PLAIN_DIGITS, _LEAST_ROUNDING, LARGEST_ROUNDING = 2, 1e-12, 1e-3
 
 
-def written_rounding(root: ElementTree.Element) -> float:
+def rounding_of_digits(root: ElementTree.Element) -> float:
     """Rounding of the numbers that place links and joints: half a unit of the last digit of the coarsest one, m or rad.
 
     0 where all numbers are plain ones, or have the digits of float64.

@@ -20,7 +20,7 @@ from jaxdyn.simulation.checks import Inputs, angle_coordinates, has_definite_mas
 from jaxdyn.simulation.equations import DRIVES, KEPT, Equations, at_save_point, equations
 from jaxdyn.simulation.integration import integrate
 from jaxdyn.simulation.methods import Method, consistent, is_regular, satisfies_redundant_rows, start_limit
-from jaxdyn.simulation.solution import RESULTS, Solution, invalidate_failed, rows_where
+from jaxdyn.simulation.solution import RESULTS, Solution, invalidate_failures, rows_where
 from jaxdyn.simulation.solvers import LieGroup, Stepper
 from jaxdyn.simulation.solvers.choice import is_split, is_step_length, label
 from jaxdyn.simulation.solvers.differentiable import COUNTS
@@ -106,7 +106,7 @@ def smooth_motion(scene: Scene, control, method: Method, numbers, options) -> So
     all_finite = jnp.stack([jnp.isfinite(x).all() for x in jax.tree.leaves(rows)]).all()
     result = first_of([*faults, ((result == RESULTS.successful) & ~all_finite, RESULTS.nonfinite_state)], result)
     # NaN only now, behind all checks and outputs, to which it would spread.
-    rows, time_reached = invalidate_failed(rows, time_reached, result, reached, given)
+    rows, time_reached = invalidate_failures(rows, time_reached, result, reached, given)
     stats = {name: jnp.asarray(counts[name], jnp.int32) for name in COUNTS}
     stats["time_reached"] = jnp.where(good, time_reached, ts[0])
     stats |= _redundancy(run, y, q, ts, reached)

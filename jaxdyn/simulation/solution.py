@@ -52,7 +52,7 @@ _OF_MOTIONS = (
 )  # fmt: skip
 
 
-def invalidate_failed(rows, times, result, reached, inputs):
+def invalidate_failures(rows, times, result, reached, inputs):
     """Rows (nt, ...) and times (...) of a run, with NaN in rows that were not reached and for the derivatives of what failed."""
     has_failed = ~jnp.stack([result == getattr(RESULTS, name) for name in _OF_MOTIONS]).any(0)
     rows = jax.tree.map(lambda x: rows_where(reached, x, jnp.nan), rows)

@@ -1043,7 +1043,11 @@ def code_of(number: float):
 
     text = IR.replace("CONSTANT", f"{number:.6e}")
     made = objects.code_of(text)
-    return objects.name_of_file(hashlib.sha256(text.encode()).hexdigest()), made, ctypes.CFUNCTYPE(ctypes.c_double, ctypes.c_double)(made.address("f"))
+    return (
+        objects.name_of_file(hashlib.sha256(text.encode()).hexdigest()),
+        made,
+        ctypes.CFUNCTYPE(ctypes.c_double, ctypes.c_double)(made.address("f")),
+    )
 
 
 def built(monkeypatch):

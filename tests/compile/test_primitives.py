@@ -99,6 +99,12 @@ EXPANDED = {
     "reduce_min": (lambda x: jnp.min(x, 0), SQUARE),
     "reduce_and": (jnp.all, TRUTHS),
     "reduce_or": (jnp.any, TRUTHS),
+    **unary("cumprod", "cummax", "cummin"),
+    "argmax": (lambda x: lax.argmax(x, 0, jnp.int32), X),
+    "argmin": (lambda x: lax.argmin(x, 0, jnp.int32), X),
+    "lt_to": (lambda x, y: INSTALLED["lt_to"].bind(x, y), X, Y),
+    "le_to": (lambda x, y: INSTALLED["le_to"].bind(x, y), X, Y),
+    "lu": (lambda x: jax.lax.linalg.lu(x)[0], SQUARE),
     "cumsum": (lambda x: lax.cumsum(x, 0, True), SQUARE),
     "cholesky": (lambda x: lax.linalg.cholesky(x, symmetrize_input=False), SQUARE),
     "triangular_solve": (
@@ -124,18 +130,18 @@ CALLS = {"closed_call", "eval_jaxpr"}
 # depends on numbers.
 REFUSED = set(
     """acosh asinh atanh erf erf_inv erfc logistic lgamma digamma polygamma zeta igamma igammac igamma_grad_a
-    bessel_i0e bessel_i1e regularized_incomplete_beta nextafter reduce_precision cumprod cummax cummin cumlogsumexp
-    argmax argmin sort top_k approx_top_k reduce reduce_xor reduce_window reduce_window_max reduce_window_min reduce_window_sum
+    bessel_i0e bessel_i1e regularized_incomplete_beta nextafter reduce_precision cumlogsumexp
+    sort top_k approx_top_k reduce reduce_xor reduce_window reduce_window_max reduce_window_min reduce_window_sum
     select_and_gather_add select_and_scatter select_and_scatter_add scatter-max scatter-min scatter-mul scatter-sub
     xor shift_left shift_right_arithmetic shift_right_logical clz population_count mulhi bitcast_convert_type
     real imag complex conj fft conv_general_dilated ragged_dot_general scaled_dot composite name
-    eig eigh svd qr lu schur hessenberg householder_product tridiagonal tridiagonal_solve cholesky_update symmetric_product
+    eig eigh svd qr schur hessenberg householder_product tridiagonal tridiagonal_solve cholesky_update symmetric_product
     geqp3 geqrf ormqr lu_pivots_to_permutation empty empty2 call""".split()
 )
 # These are in no function of one sample of mechanics: devices, random keys, memory that is written, what JAX itself works with.
 # Where one occurs all the same, it is refused as well.
 NOT_APPLICABLE = set(
-    """after_all create_token custom_lin dce_sink device_put eq_to le_to lt_to from_edtype to_edtype get swap stage
+    """after_all create_token custom_lin dce_sink device_put eq_to from_edtype to_edtype get swap stage
     program_order tie platform_index iota random_bits random_fold_in random_gamma random_seed random_split random_wrap
     random_unwrap random_clone rng_bit_generator rng_uniform threefry2x32 sharding_constraint axis_index all_gather
     all_gather_done all_gather_invariant all_gather_reduced all_gather_reduced_start all_gather_start all_to_all all_to_all_done

@@ -22,7 +22,7 @@ from jaxdyn.simulation.hybrid.replay import HybridRun
 from jaxdyn.simulation.hybrid.system import ModalSystem, project
 from jaxdyn.simulation.hybrid.transitions import length
 from jaxdyn.simulation.methods import consistent
-from jaxdyn.simulation.solution import Solution, invalidate_failed, rows_where
+from jaxdyn.simulation.solution import Solution, invalidate_failures, rows_where
 from jaxdyn.simulation.solvers.choice import label
 from jaxdyn.simulation.solvers.differentiable import ROOM
 from jaxdyn.simulation.solvers.guards import SEARCH_STEPS
@@ -121,7 +121,7 @@ def hybrid_motion(scene: Scene, control, numbers, options) -> Solution:
     touched = _impacts_at_start(scene, elements, q0, v0, ts[0], mode)
     events = _events(elements, touched, ts[0], times, records.name[:most], good & start_ok)
     rows, times = {"q": y["q"], "v": y["v"], **values}, (jnp.where(good, time_reached, ts[0]), events)
-    rows, (time_reached, events) = invalidate_failed(rows, times, result, reached, (scene, control, numbers))
+    rows, (time_reached, events) = invalidate_failures(rows, times, result, reached, (scene, control, numbers))
     stats = end.counts | {"time_reached": time_reached}
     return Solution(ts=inputs.given, result=result, stats=stats, events=events, solver=label(options["solver"]), **rows)
 
