@@ -73,8 +73,8 @@ class Assembly(Outcome):
         """Whether each place (n,) of a sweep, a batch of assemblies in order, is on another branch than the one before.
 
         Between both a combination of the rows then went through zero, or a coordinate jumped by more than a radian or a length
-        of the mechanism. The first place is False. `scene`, `t`, and the joints in `hold` are those of the sweep; the values of these
-        joints do not matter.
+        of the mechanism. The first place is False. `scene`, `t`, and the joints in `hold` are those of the sweep; the values
+        of these joints do not matter.
 
         ```python
         scene, angles = jd.scenes.four_bar(), jnp.linspace(0.0, 1.0, 11)
