@@ -134,7 +134,7 @@ def test_a_delta_robot_from_a_file_keeps_its_branch(count, tmp_path):
     assert np.all((error < 1e-8) | passed) and np.mean(error < 1e-8) > 0.99
 
 
-@pytest.mark.long
+@pytest.mark.slow
 def test_sweep_tells_where_it_changes_the_branch():
     """A four-bar's crank, each place from the same guess but some from its mirror image: exactly these steps change."""
     scene, (q, _) = jd.scenes.four_bar(), jd.scenes.four_bar.start()
