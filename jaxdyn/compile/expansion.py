@@ -230,7 +230,7 @@ class _Expansion:
         expand_whole, tree, has_rule = jax_adapter.expand_high(params)
         types = [jax.ShapeDtypeStruct(x.aval.shape, x.aval.dtype) for x in eqn.invars]
         inner = jax.make_jaxpr(lambda *x: jax.tree.leaves(expand_whole(*jax.tree.unflatten(tree, x))))(*types)
-        self.has_rules |= has_rule and any(x.dtype.kind == "f" for x in inner.out_avals)
+        self.has_rules |= has_rule and any(x.aval.dtype.kind == "f" for x in eqn.outvars)
         return self.evaluate(inner, args)
 
     def _invalid(self, params, args, eqn):

@@ -28,7 +28,7 @@ from jaxdyn.lie.so3 import matmul
 from jaxdyn.model.arguments import Numbers, check_state, zeros_if_none
 from jaxdyn.model.numbers import check_count
 from jaxdyn.systems.scene import Scene, as_scene
-from jaxdyn.systems.system import displace, displacement
+from jaxdyn.systems.system import SceneLike, displace, displacement
 
 
 class Assembly(Outcome):
@@ -67,7 +67,7 @@ class Assembly(Outcome):
         return lines
 
     def changes_branch(
-        self, scene: Scene, hold: Mapping[str, Any] | None = None, t: Numbers = 0.0
+        self, scene: SceneLike, hold: Mapping[str, Any] | None = None, t: Numbers = 0.0
     ) -> Bool[Array, " n"]:
         """Mask (n,) of the places of a sweep, a batch of assemblies in order, that are on another branch than the one before.
 
@@ -101,7 +101,7 @@ class Assembly(Outcome):
 
 
 def assemble(
-    scene: Scene,
+    scene: SceneLike,
     q: Float[Array, " nq"],
     v: Float[Array, " nv"] | None = None,
     t: Numbers = 0.0,

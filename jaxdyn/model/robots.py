@@ -161,7 +161,7 @@ def allegro(*, gravity: Numbers | None = GRAVITY, dtype: DType | None = None) ->
         for i, (axis, (mass, moments, products, length, (lower, upper))) in enumerate(zip(axes, links, strict=True)):
             number, (xy, yz, xz) = 4 * finger + i, products
             moment = np.diag(moments) + np.array([[0, xy, xz], [xy, 0, yz], [xz, yz, 0]])
-            body = host_math.inertia_numbers((mass, np.zeros(3), moment), "link")
+            body = np.asarray(host_math.inertia_numbers((mass, np.zeros(3), moment), "link"))
             # Of the file's numbers those that no body has are replaced by the nearest ones that a body has.
             body = np.asarray(nearest_feasible(body), float) if host_math.inertia_fault(body) else body
             builder.add_body(

@@ -168,7 +168,7 @@ def test_far_guesses_end_at_the_least_change():
         assert np.isnan(jax.jit(jax.jacrev(lambda q: jd.assemble(scene, q, throw=False).q))(guesses[-1])).all()
 
 
-@pytest.mark.long
+@pytest.mark.slow
 def test_sweep_tells_where_it_changes_the_branch():
     """A four-bar's crank, each place from the same guess but some from its mirror image: exactly these steps change."""
     scene, (q, _) = jd.scenes.four_bar(), jd.scenes.four_bar.start()
