@@ -57,7 +57,7 @@ def call(function: Callable, args: tuple, options: Callable) -> Any:
     device, kinds, arrays = _default_sharding(), [], []
     for x in leaves:
         if isinstance(x, jax.Array):
-            if x.sharding != device:
+            if x.sharding != device or not isinstance(x.dtype, np.dtype):  # random keys have a dtype of their own
                 return None
             kinds.append((x.shape, x.dtype, x.weak_type))
             arrays.append(x)
@@ -109,6 +109,7 @@ def _find(function, structure, kinds, options, context) -> Executable:
             results[:] = [tuple(None if y else Static(x) for x, y in zip(found, is_array, strict=True)), out]
             return [x for x, y in zip(found, is_array, strict=True) if y]
 
+        flat.__name__ = getattr(function, "__name__", "flat")  # for profiles
         types = [jax.ShapeDtypeStruct(x[0], x[1], weak_type=x[2]) for x in kinds if not isinstance(x[1], Static)]
         jitted = jax.jit(flat, compiler_options=options(), keep_unused=True)
         return jitted.lower(*types), results

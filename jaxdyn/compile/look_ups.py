@@ -1,5 +1,6 @@
-"""Rules for places that are not known while tracing: entries of tables, sums into them, indices of extremes,
-exchanges of rows.
+"""Rules for places that are not known while tracing.
+
+They are entries of tables, sums into them, indices of extremes, and exchanges of rows.
 
 A scalar program has no addresses. An entry at an unknown place is a chain of selections over all places that it can have, which
 pays for tables of some hundred entries. Operands are as in `array_rules`.

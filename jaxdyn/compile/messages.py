@@ -20,7 +20,7 @@ _USUAL = "write it by arithmetic, products of matrices, jnp.where, and indices t
 
 
 def remedy_of(reason: str) -> str:
-    """What to write instead of a part that has no kernel."""
+    """Remedy for a part that has no kernel."""
     return next((text for words, text in _REMEDIES.items() if reason.startswith(words)), _USUAL)
 
 

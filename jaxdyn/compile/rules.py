@@ -6,6 +6,7 @@ from typing import Any
 import equinox as eqx
 import jax
 import jax.numpy as jnp
+from jax import lax
 
 from jaxdyn.compile import mode
 from jaxdyn.compile.jax_adapter import ShapedArray, define_primitive, is_zero
@@ -59,6 +60,22 @@ def _batch_first(tree):
     return jax.tree.map(first, tree)
 
 
+def batch_alike(value, inputs):
+    """The same arrays, with the batch axes of all inputs: results of a rule for derivatives and of its function agree in them.
+
+    Where a function was batched before it is differentiated, JAX takes the axes of the function's results for those of the
+    rule's, and a tangent may vary along more of them than the value.
+    """
+    entries = [jnp.ravel(x)[0] for x in jax.tree.leaves(inputs) if eqx.is_inexact_array(x) and x.size]
+
+    def along(x):
+        for entry in entries:
+            x = lax.select(False, jnp.broadcast_to(entry.astype(x.dtype), x.shape), x)
+        return x
+
+    return jax.tree.map(along, value)
+
+
 def value_and_jvp(function: Callable, args: tuple, steps):
     """function(*args), and its change for `steps` in the leaves of args, None where one does not move; None if none does."""
     base, structure = jax.tree.flatten(args)
@@ -91,7 +108,7 @@ def invalidate_derivatives(values: Any, failed: Any, inputs: Any) -> Any:
 
 @jax.custom_jvp
 def _with_invalid_derivatives(values, failed, leaves):
-    return values
+    return batch_alike(values, (values, failed.astype(float), leaves))
 
 
 def _invalid_tangents(primals, tangents):
@@ -107,7 +124,9 @@ def _invalid_tangents(primals, tangents):
         total = sum((jnp.sum(_nan_where(failed.any(), x)) for x in moving), jnp.zeros(()))
         return tangent + _nan_where(here, jnp.broadcast_to(total.astype(value.dtype), value.shape))
 
-    return values, jax.tree.map(add, values, of_values, is_leaf=lambda x: isinstance(x, zero))
+    return _with_invalid_derivatives(*primals), jax.tree.map(
+        add, values, of_values, is_leaf=lambda x: isinstance(x, zero)
+    )
 
 
 _with_invalid_derivatives.defjvp(_invalid_tangents, symbolic_zeros=True)

@@ -136,7 +136,7 @@ def kernel(program, width: int, uniform: Sequence[bool]) -> int:
 
 
 class Row(NamedTuple):
-    """What the table holds of a kernel beside its code; plain data, which can be kept on disk.
+    """Entry of the table beside the code of a kernel; plain data, which can be kept on disk.
 
     - `identity`: of the code. `width`: samples in a vector. `chunk`: samples that a thread takes at a time.
     - `sizes`: entries of the buffers, against which the handler checks them; a negative one is one row for all samples.

@@ -215,7 +215,8 @@ def has_clear_rank(
 
     # 1 / |A^+| is below the least singular value that counts. No other one is above the tolerance.
     sizes = LEAST_GAP * least * jnp.sqrt(jnp.sum(A * A)) * jnp.sqrt(jnp.sum(inverse * inverse))
-    return batch.cond(is_full | ~(sizes <= 1), compare, lambda: jnp.asarray(True))
+    # The second value is True where it counts, and varies along a mesh as the first one does.
+    return batch.cond(is_full | ~(sizes <= 1), compare, lambda: sizes <= 1)
 
 
 def condition_number(A: Float[Array, "n m"], inverse: Float[Array, "k l"]) -> Float[Array, ""]:

@@ -46,7 +46,7 @@ class Members:
         return {"samples": self.count, "seed": seed, "values": digest(self.rows)}
 
 
-def members(named: dict[str, Any], draw: Callable | None, samples: int | None, seed: int) -> Members:
+def members(named: dict[str, Any], draw: Callable | None, samples: int | float | None, seed: int) -> Members:
     """Members from pytrees with equal leading axes, by the arguments that hold them, and from draws.
 
     **Raises:** ValueError for axes that differ, naming two arguments; for a draw without `samples`; for no members.

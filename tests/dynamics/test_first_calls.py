@@ -112,14 +112,14 @@ def test_no_thread_outlives_the_call_and_the_collector_stays_on():
 
 def test_an_error_of_the_other_thread_is_told_to_who_calls(monkeypatch):
     """It is made again when it is called: first it fails there too, then not any more."""
-    fails, made = [True], objects._compile
+    fails, made = [True], objects.compile_text
 
     def failing(text):
         if fails[0]:
             raise MemoryError("no room")
         return made(text)
 
-    monkeypatch.setattr(objects, "_compile", failing)
+    monkeypatch.setattr(objects, "compile_text", failing)
     monkeypatch.setattr(objects, "_read", lambda key: None)
     function = backend.entry_point(native(lambda x: jnp.sin(x) * 1.47474))
     x = jnp.arange(3.0)

@@ -47,9 +47,9 @@ for kernel, program in called:
     if program is None:
         continue
     loops += hasattr(program, "turn")
-    for samples in (1,) if kernel.width == 1 else (1, kernel.width - 1, kernel.width, 2 * kernel.width + 1):
+    for samples in (1,) if kernel.row.width == 1 else (1, kernel.row.width - 1, kernel.row.width, 2 * kernel.row.width + 1):
         called_between_guards(kernel.address(), program, kernel.uniform, samples)
-    widths.add(kernel.width)
+    widths.add(kernel.row.width)
 print(len(called), sorted(widths), loops)
 """
 

@@ -506,7 +506,7 @@ def test_maxima_on_cortex_m(tmp_path):
     assert all(name.startswith("__aeabi") for name in undefined_symbols(tmp_path / "largest.o"))
     text = object_files._without_maximum(exported.module())
     assert "@llvm.maximum" not in text and "@llvm.minimum" not in text
-    code = Code(text)
+    code = code_of(text)
     function = ctypes.CFUNCTYPE(ctypes.c_int, *[ctypes.c_void_p] * 4)(code.address("largest"))
     for x in (X, -X, X[::-1].copy(), np.where(X > 0.3, np.nan, X)):
         out = [np.zeros(()), np.zeros(()), np.zeros(7)]

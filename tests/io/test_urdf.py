@@ -855,6 +855,7 @@ def test_packages_of_xacro_files_without_ros(tmp_path):
     with pytest.raises(ValueError, match=reason):
         load_urdf(path)
     np.testing.assert_allclose(load_urdf(path, packages={"elsewhere": str(tmp_path / "parts")}).inertias[0, 0], 3.0)
+    assert urdf_inertia_report(path, packages={"elsewhere": tmp_path / "parts"}) == []  # the arm's inertia is one
     with pytest.raises(ValueError, match=r"packages\['elsewhere'\] is 'nowhere', which is no folder"):
         load_urdf(path, packages={"elsewhere": "nowhere"})
     other = tmp_path / "r.urdf"

@@ -16,6 +16,8 @@ import jax.numpy as jnp
 from jax import lax
 from jaxtyping import Array
 
+from jaxdyn.compile import batch_alike
+
 _MAX_SECANTS = 30  # points after which a root is bisected
 # Powers of eps, of the size of a guard in the step: 1e-9 and 1e-6 in float64. Guards below the first are zero at the same event;
 # a root below the second is one, and not an error of the dense output.
@@ -204,7 +206,7 @@ def delay(guard: Callable, field: Callable, args, t, y) -> Any:
 # The value needs no rates: runs that are not differentiated do not pay for them.
 @eqx.filter_custom_jvp
 def _delay(inputs, guard, field):
-    return jnp.zeros_like(inputs[1])
+    return batch_alike(jnp.zeros_like(inputs[1]), inputs)
 
 
 @_delay.def_jvp
