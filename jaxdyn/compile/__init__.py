@@ -23,7 +23,7 @@ from jaxdyn.compile.mode import compilation as compilation
 from jaxdyn.compile.mode import current as compilation_mode  # noqa: F401 (under a name that says of what)
 from jaxdyn.compile.mode import is_standalone as is_standalone
 from jaxdyn.compile.mode import values_of_rules as values_of_rules
-from jaxdyn.compile.reverse_only import reverse_only as reverse_only
+from jaxdyn.compile.reverse_mode import reverse_only as reverse_only
 from jaxdyn.compile.rules import batch_alike as batch_alike
 from jaxdyn.compile.rules import implicit as implicit
 from jaxdyn.compile.rules import invalidate_derivatives as invalidate_derivatives

@@ -120,7 +120,7 @@ def test_an_error_of_the_other_thread_is_told_to_who_calls(monkeypatch):
         return made(text)
 
     monkeypatch.setattr(objects, "compile_text", failing)
-    monkeypatch.setattr(objects, "_read", lambda key: None)
+    monkeypatch.setattr(objects, "find", lambda identity: None)
     function = backend.entry_point(native(lambda x: jnp.sin(x) * 1.47474))
     x = jnp.arange(3.0)
     with pytest.raises(jax.errors.JaxRuntimeError, match="could not be compiled"):
