@@ -16,7 +16,7 @@ from jaxdyn.compile import entry_point, evaluate, invalidate_derivatives, kernel
 from jaxdyn.compile.known import is_concrete, is_tracing, stop_gradient
 from jaxdyn.constraints.base import Layout, holonomic_rows, layout, position_residual, velocity_residual
 from jaxdyn.constraints.branches import changes_branch, unit_rows
-from jaxdyn.constraints.closing import follow_path, nearest_configuration
+from jaxdyn.constraints.closing import follow_path, nearest_configuration, polish
 from jaxdyn.constraints.codes import RESULTS, Outcome, first_of, name_of, require_success
 from jaxdyn.constraints.dynamics import correction
 from jaxdyn.constraints.loops import lock_joint
@@ -161,7 +161,8 @@ def assemble(
 
     assembly = from_guess(q)
     # Only concrete inputs allow more guesses, which need to know whether the first guess has failed.
-    if is_concrete(assembly.result) and not bool(assembly.success):
+    # One on the constraints that is not the nearest is closer to the guess than those.
+    if is_concrete(assembly.result) and not bool(assembly.success) and name_of(assembly.result) != "not_nearest":
         assembly = _from_elsewhere(assembly, guesses, from_guess, locked, q)
 
     def message(assembly: Assembly) -> str:
@@ -253,6 +254,9 @@ def _close(bare, guess, start, passed, selection, v, t, rank_tol, atol, scene):
         # Rows that contradict the others must not be dropped in silence: with all rows the result is the least-squares point.
         kept = jnp.where(rounding <= most_rounding(guess.dtype), kept, jnp.ones_like(kept))
         locked = keep_rows(bare, selection._replace(kept=kept))
+        if bare.rounding:
+            # The path ends where all rows are least open; the kept ones are closed from there.
+            start = polish(*stop_gradient((locked, start, t)), rank_tol)
     q, is_nearest = guess, jnp.asarray(True)
     if holonomic_rows(layout(locked)).size:
         q, nearest = nearest_configuration(locked, guess, start, t, rank_tol)

@@ -61,7 +61,15 @@ CASES = {
 }
 
 
-@pytest.mark.parametrize("case", CASES)
+# Before jax 0.12 a search is a bisection whose indices are of a type that programs do not have: JAX runs it.
+HAS_SEARCHES = jax.__version_info__ >= (0, 12)
+needs_searches = pytest.mark.skipif(not HAS_SEARCHES, reason="jax 0.12 is the first whose searches have kernels")
+
+
+@pytest.mark.parametrize(
+    "case",
+    [pytest.param(x, marks=needs_searches) if x.startswith(("search", "interp")) else x for x in CASES],
+)
 def test_kernels_of_unknown_places(case):
     """Values in a batch, and first derivatives in both modes."""
     function = CASES[case]
@@ -107,7 +115,7 @@ def test_message_names_the_users_function_once(monkeypatch, caplog):
         assert np.isfinite(gradient).all()
         messages = [record.getMessage() for record in caplog.records if record.name == "jaxdyn"]
         if law is law_by_searching:
-            assert not messages
+            assert not (messages and HAS_SEARCHES)
         else:
             assert len(messages) == 1
             assert messages[0].startswith("jaxdyn: law_by_sorting (test_look_ups.py:")
