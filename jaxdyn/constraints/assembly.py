@@ -256,7 +256,8 @@ def _close(bare, guess, start, passed, selection, v, t, rank_tol, atol, scene):
         locked = keep_rows(bare, selection._replace(kept=kept))
         if bare.rounding:
             # The path ends where all rows are least open; the kept ones are closed from there.
-            start = polish(*stop_gradient((locked, start, t)), rank_tol)
+            fixed, start, time = stop_gradient((locked, start, t))
+            start = polish(fixed, start, time, rank_tol)
     q, is_nearest = guess, jnp.asarray(True)
     if holonomic_rows(layout(locked)).size:
         q, nearest = nearest_configuration(locked, guess, start, t, rank_tol)
