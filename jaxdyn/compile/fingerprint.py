@@ -47,6 +47,11 @@ _CLASS_NOISE = {
 _PLAIN = (type(None), bool, int, float, complex, str, bytes, type(...), type(NotImplemented), slice, range)
 
 
+# Whether code of users is hashed too. Not by default: it may reach values that its names do not show, such as attributes of
+# modules that other functions read, or results that were kept in memory before a global changed.
+hashes_user_code = False
+
+
 class NoFingerprint(Exception):
     """An object whose behaviour its contents do not determine, or not for certain."""
 
@@ -188,7 +193,7 @@ class _Hasher:
         if not cls.__flags__ & _IS_HEAP_TYPE and cls.__module__ in ("builtins", "types", "_collections"):
             self.write("builtin", cls.__qualname__)
             return
-        if not cls.__flags__ & _IS_HEAP_TYPE:
+        if not cls.__flags__ & _IS_HEAP_TYPE or not hashes_user_code:
             raise NoFingerprint(f"the class {cls.__module__}.{cls.__qualname__}")
         self.write("class", cls.__qualname__)
         self.add(type(cls))
@@ -207,6 +212,8 @@ class _Hasher:
             code = function.__code__
             self.write("closure", function.__module__, function.__qualname__, code.co_firstlineno, code.co_code)
         else:
+            if not hashes_user_code:
+                raise NoFingerprint(f"the user's function {function.__qualname__}")
             self.write("function")
             self.add(function.__code__)
             self.add_globals(function)

@@ -28,6 +28,10 @@ _VARIABLES = ("XLA_FLAGS", "JAXDYN_COMPILATION", "JAXDYN_COMPILATION_OPTIONS")
 def environment() -> bytes:
     """Hash of the package's sources, and of the versions of what it calls."""
     versions = [disk.version_of(name) for name in _PACKAGES]
+    with contextlib.suppress(ImportError):  # no llvmlite
+        from jaxdyn.compile import objects
+
+        versions.append(objects._environment())  # the processor
     return fingerprint(disk.hash_of_sources(Path(__file__).parents[1]), sys.version, tuple(versions))
 
 

@@ -19,6 +19,12 @@ from jaxdyn.compile.fingerprint import NoFingerprint, fingerprint
 GAIN = 2.0
 
 
+@pytest.fixture(autouse=True)
+def user_code(monkeypatch):
+    """Functions of these tests are hashed as those of the package."""
+    monkeypatch.setattr(sys.modules["jaxdyn.compile.fingerprint"], "hashes_user_code", True)
+
+
 def by_global(x):
     return GAIN * x
 
@@ -176,7 +182,9 @@ import sys, jax
 jax.config.update("jax_enable_x64", True)
 sys.path.insert(0, sys.argv[1])
 import jaxdyn as jd
+import jaxdyn.compile
 from test_stored import accelerate
+sys.modules["jaxdyn.compile.fingerprint"].hashes_user_code = True
 scene, (q, v) = jd.scenes.four_bar(lengths=(1.0, 3.1, 2.5, 3.5)), jd.scenes.four_bar.start()
 print([float(x).hex() for x in accelerate(scene, q, v)["acceleration"]])
 """
@@ -200,6 +208,12 @@ print([float(x).hex() for x in accelerate(scene, q, v)["acceleration"]])
     assert set(results) == {results[0]}
     numbers = [float.fromhex(x) for x in json.loads(results[0].replace("'", '"'))]
     np.testing.assert_allclose(numbers, first, rtol=1e-12)
+
+
+def test_code_of_users_is_not_kept_by_default(monkeypatch):
+    monkeypatch.setattr(sys.modules["jaxdyn.compile.fingerprint"], "hashes_user_code", False)
+    assert stored.key_of(jd.constrained_dynamics, jd.scenes.four_bar()) is not None
+    assert stored.key_of(by_global) is stored.key_of(Law(2.0)) is None
 
 
 def test_callbacks_are_not_kept(folder):
