@@ -208,7 +208,7 @@ class _Expansion:
         return objects([round_one(x) for x in array.ravel().tolist()], array.shape)
 
     def _precedes(self, op, a, b):
-        """Whether a comes before b in the total order of JAX, in which NaN is the last."""
+        """Decide whether a comes before b in the total order of JAX, in which NaN is the last."""
         g = self.graph
         last = g.both(g.compare("ne", b, b), g.compare("eq", a, a) if op == "lt" else True)
         return g.either(g.compare(op, a, b), last)

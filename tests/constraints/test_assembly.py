@@ -158,6 +158,7 @@ def test_far_guesses_end_at_the_least_change():
     )
     difference = (solve(guesses + 1e-6 * along).q - solve(guesses - 1e-6 * along).q) / 2e-6
     near = np.abs(difference).max(1) < 20  # not beside a guess from which two places are equally far
+    # Rounding of 1e-12 over the step, and slopes that change fast beside far guesses.
     np.testing.assert_allclose(slopes[near], difference[near], rtol=1e-4, atol=1e-5)
     assert near.sum() > 95
     # Too far for the search: a code, and derivatives of NaN.
