@@ -172,6 +172,39 @@ print([float(x).hex() for x in accelerate(scene, q, v).acceleration])
     np.testing.assert_allclose(numbers, first, rtol=1e-12)
 
 
+GAIN = 2.0
+
+
+def test_functions_of_users_are_found_by_their_program(folder, monkeypatch):
+    saved, made = [], executables._save
+    monkeypatch.setattr(executables, "_save", lambda *args: saved.append(args) or made(*args))
+    scene, (q, v) = jd.scenes.four_bar(), jd.scenes.four_bar.start()
+
+    def energy(scene, q, v, *, offset=None):
+        acceleration = jd.constrained_dynamics(scene, q, v).acceleration
+        return {"power": GAIN * acceleration @ v + (0.0 if offset is None else offset), "law": Law}
+
+    def run(*args, **kwargs):
+        executables._find.cache_clear()
+        return jd.jit(energy)(*args, **kwargs)
+
+    first = run(scene, q, v)
+    expected = 2.0 * jd.constrained_dynamics(scene, q, v).acceleration @ v
+    np.testing.assert_allclose(first["power"], expected, rtol=1e-12)
+    assert run(scene, q, v)["power"] == first["power"] and len(saved) == 1
+    assert first["law"] is Law
+    monkeypatch.setitem(globals(), "GAIN", 3.0)
+    np.testing.assert_allclose(run(scene, q, v)["power"], 1.5 * expected, rtol=1e-12)
+    assert len(saved) == 2
+    np.testing.assert_allclose(run(scene, q, v, offset=jnp.asarray(1.0))["power"], 1.5 * expected + 1.0, rtol=1e-12)
+    assert len(saved) == 3
+    # Where it cannot be kept, it is what JAX makes of it.
+    np.testing.assert_allclose(jax.vmap(lambda v: run(scene, q, v)["power"])(v[None])[0], 1.5 * expected, rtol=1e-12)
+    gradient = jax.grad(lambda v: run(scene, q, v)["power"])
+    np.testing.assert_allclose(gradient(v), jax.jit(gradient)(v), rtol=1e-12)
+    assert len(saved) == 3
+
+
 def test_callbacks_are_not_kept(folder, monkeypatch):
     seen = []
     monkeypatch.setattr(stored, "key_of", lambda *_: "key")
