@@ -32,7 +32,7 @@ def contact_coordinates(surface_o: Surface, surface_f: Surface, pose: Numbers) -
     - `pose` (4, 4): of the finger's frame in the object's, m.
 
     **Returns:** eta = (u_o, v_o, u_f, v_f, psi) (5,), in the units of the charts and rad; differentiable three times. NaN where
-    the search for the closest points did not converge.
+    the search for the closest points did not converge, or found no such pair.
 
     **Raises:** ValueError for an invalid surface, a pose of another shape, two planes, and a `Parametrised` surface, whose
     closest points are not known.
@@ -63,6 +63,9 @@ def contact_coordinates(surface_o: Surface, surface_f: Surface, pose: Numbers) -
         )
     if not all(isinstance(surface, Sphere | Plane) for surface in (surface_o, surface_f)):
         place_o, place_f = _by_newton(surface_o, surface_f, R, p, (place_o, place_f))
+    elif isinstance(surface_o, Sphere) and isinstance(surface_f, Sphere):
+        # Every point of concentric spheres is as close as any other.
+        place_o, place_f = (jnp.where((p != 0).any(), place, jnp.nan) for place in (place_o, place_f))
     at_o, at_f = surface_o.coordinates_at(place_o), surface_f.coordinates_at(place_f)
     frame_o, frame_f = geometry_at(surface_o, at_o).frame, geometry_at(surface_f, at_f).frame
     # R_psi = [cos psi, -sin psi; -sin psi, -cos psi]: its first row gives psi.
@@ -83,7 +86,8 @@ def _by_newton(surface_o: Surface, surface_f: Surface, R, p, places):
         places = step(R, p, places)
     last = newton_steps(patch_at(surface_o, places[0]), patch_at(surface_f, places[1]), R, p)
     # The last step of a search that has converged is rounding. Another one has no closest points: NaN, and so its derivatives.
+    # Steps are zero, too, where the normals do not face each other or the relative curvature is not positive.
     size = jnp.max(jnp.abs(jnp.concatenate(lax.stop_gradient((last.on_a, last.on_b)))))
-    converged = size <= eps_of(p) ** 0.6 * (1 + jnp.max(jnp.abs(lax.stop_gradient(p))))
+    converged = last.is_strict & (size <= eps_of(p) ** 0.6 * (1 + jnp.max(jnp.abs(lax.stop_gradient(p)))))
     invalid = jnp.where(converged, jnp.ones_like(size), jnp.nan)
     return surface_o.displace(places[0], last.on_a) * invalid, surface_f.displace(places[1], last.on_b) * invalid
