@@ -65,7 +65,8 @@ def contact_coordinates(surface_o: Surface, surface_f: Surface, pose: Numbers) -
         place_o, place_f = _by_newton(surface_o, surface_f, R, p, (place_o, place_f))
     elif isinstance(surface_o, Sphere) and isinstance(surface_f, Sphere):
         # Every point of concentric spheres is as close as any other.
-        place_o, place_f = (jnp.where((p != 0).any(), place, jnp.nan) for place in (place_o, place_f))
+        invalid = jnp.where((p != 0).any(), jnp.ones_like(p[0]), jnp.nan)
+        place_o, place_f = place_o * invalid, place_f * invalid
     at_o, at_f = surface_o.coordinates_at(place_o), surface_f.coordinates_at(place_f)
     frame_o, frame_f = geometry_at(surface_o, at_o).frame, geometry_at(surface_f, at_f).frame
     # R_psi = [cos psi, -sin psi; -sin psi, -cos psi]: its first row gives psi.

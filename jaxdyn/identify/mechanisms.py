@@ -83,9 +83,7 @@ def on_constraints(scene: Scene, q, v, t, columns: tuple[int, ...] | None) -> As
     return eqx.tree_at(lambda state: state.result, state, result)
 
 
-def nearest_velocity(
-    scene: Scene, q, v, t, columns: tuple[int, ...]
-) -> tuple[Float[Array, " nv"], Bool[Array, ""]]:
+def nearest_velocity(scene: Scene, q, v, t, columns: tuple[int, ...]) -> tuple[Float[Array, " nv"], Bool[Array, ""]]:
     """Velocity (nv,) whose `columns` and rows A v = b fit those of v and the constraints by least squares.
 
     Rows that the measured ones contradict stay open (`_CONSTRAINT_WEIGHT`).
@@ -137,8 +135,8 @@ def complete_log(scene: SceneLike, t: Numbers, measured: dict[Any, Any], tau: Nu
     `observed=` to `fit_parameters`, which then compares them alone.
 
     **Raises:** ValueError for joints that do not exist or have several degrees of freedom, wrong shapes, and for a sample at
-    which the mechanism cannot be assembled, no nearest state is found, or no velocity on the constraints has the measured ones, as
-    at a dead point of the measured joint (its number and time).
+    which the mechanism cannot be assembled, no nearest state is found, or no velocity on the constraints has the measured ones,
+    as at a dead point of the measured joint (its number and time).
 
     Source: EQUATIONS section 6 (constraints as rows).
     """

@@ -158,10 +158,10 @@ CALLS = {
     "reduction.spurious_terms": ((BAR, BQ, jnp.ones(1)), {"tau": BV, "t": 0.3, "independent": (0,)}),
     "reduction.tangent_basis": ((BAR, BQ), {"t": 0.3, "dof": 1, "rank_tol": 1e-8}),
     "scale.member": (({"g": jnp.arange(4.0)}, 3), {"seed": 2}),
-    "sensors.measure": ((ARM, [jd.sensors.Imu(HAND)], Q, V), {"tau": A, "t": 0.3}),
+    "sensors.measure": ((ARM, [jd.sensors.Imu(HAND)], Q, V), {"tau": A, "t": 0.3, "thrusts": {HAND: jnp.ones(6)}}),
     "sensors.record": (
         (ARM, [jd.sensors.Imu(HAND)], jnp.arange(2.0), jnp.stack([Q, Q]), jnp.stack([V, V])),
-        {"tau": jnp.stack([A, A]), "key": jax.random.key(0)},
+        {"tau": jnp.stack([A, A]), "thrusts": {HAND: jnp.ones((2, 6))}, "key": jax.random.key(0)},
     ),
     "so3.euler_body_jacobian": ((jnp.ones(3),), {"sequence": "xyz"}),
     "so3.euler_spatial_jacobian": ((jnp.ones(3),), {"sequence": "xyz"}),

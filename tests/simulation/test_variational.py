@@ -347,9 +347,9 @@ def test_derivatives_of_a_step_that_was_not_solved_are_nan():
         solution = simulate(scene, jnp.array([0.0, -1.0]), jnp.array([1.0, 0.0]) * v, ts, **options)
         return solution.q[-1, 0], (solution.q[-1, 0], solution.result)
 
-    (_, (x, results)), by_reverse = jax.jit(
-        jax.vmap(jax.value_and_grad(lambda v: end(v, "reverse"), has_aux=True))
-    )(speeds)
+    (_, (x, results)), by_reverse = jax.jit(jax.vmap(jax.value_and_grad(lambda v: end(v, "reverse"), has_aux=True)))(
+        speeds
+    )
     assert [CODES[i] for i in np.asarray(results.index[:2])] == ["successful", "nonlinear_divergence"]
     by_forward = jax.jit(jax.vmap(jax.jacfwd(lambda v: end(v, "forward")[0])))(speeds[:2])
     expected = (x[2] - 8 * x[3] + 8 * x[4] - x[5]) / (12 * d)
