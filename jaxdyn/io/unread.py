@@ -63,7 +63,7 @@ URDF_LINK = Part(
     },
 )
 URDF_JOINT = Part(
-    ("name", "type"),
+    ("name", "type", "dont_collapse"),  # of a converter that merges links
     {
         "origin": _ORIGIN,
         "parent": Part(("link",)),

@@ -79,8 +79,8 @@ def load_urdf(
     velocity or effort, a zero axis; for names in `lock` that are not movable joints;
     for a joint that moves no inertia. ImportError for a xacro file without the package xacro.
 
-    **Warns:** `NotTakenWarning` naming elements and attributes that are not read, as `jd.load` does (its `not_taken` is their list);
-    UserWarning naming the links with an unphysical inertia; `UnitsWarning` where limits look like degrees,
+    **Warns:** `NotTakenWarning` naming elements and attributes that are not read, as `jd.load` does (its `not_taken` is the
+    list); UserWarning naming the links with an unphysical inertia; `UnitsWarning` where limits look like degrees,
     or lengths and inertias like millimetres.
     """
     file = XmlFile(path, "URDF", arguments, packages)

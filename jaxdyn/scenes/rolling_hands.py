@@ -63,8 +63,8 @@ def _finger_state(base, links, tip_axes, point, normal, velocity):
         # A traced point cannot be refused; the residuals of the contacts then show the gap.
         if not xp.linalg.norm(center - before) <= 1e-12:
             raise ValueError(
-                f"a fingertip of semi-axes {tip_axes.tolist()} m does not reach its contact point {np.round(point, 4).tolist()} on "
-                "the object; give a position closer to the default one, longer links or smaller tips"
+                f"a fingertip of semi-axes {tip_axes.tolist()} m does not reach its contact point {np.round(point, 4).tolist()} "
+                "on the object; give a position closer to the default one, longer links or smaller tips"
             )
         return angles_and_rates
     # Each iteration is a contraction in the derivatives too, so the loop itself is differentiated.

@@ -166,9 +166,9 @@ def measure(
     Accelerations and constraint forces are those of `constrained_dynamics` under tau and the scene's forces.
 
     **Arguments:** `scene` of a `Model`; `sensors`, a list; `q` (nq,); `v` (nv,); `tau` (nv,), N m or N (None: zero); `t`, s;
-    `thrusts`: wrenches (f, tau) (6,) by the names of frames, at their origins and in their axes, whose generalised force is a part
-    of `tau`, as of propellers (`scene.actuators.thrusts` of an MJCF file). `ForceTorque` feels them where they act; all of `tau`
-    acts in the joints without them.
+    `thrusts`: wrenches (f, tau) (6,) by the names of frames, at their origins and in their axes, whose generalised force is a
+    part of `tau`, as of propellers (`scene.actuators.thrusts` of an MJCF file). `ForceTorque` feels them where they act; all of
+    `tau` acts in the joints without them.
 
     **Returns:** readings (k,) by the sensors' names, in SI units.
 

@@ -35,7 +35,8 @@ def record(
     disturbed on the group: they stay unit quaternions, whose sign is that of the sample before.
 
     **Arguments:** `scene` of a `Model`; `sensors`, a list; `ts` (n,), s, increasing; `q` (n, nq), `v` (n, nv), `tau` (n, nv), N m
-    or N (None: zero), as of a `Solution`; `thrusts`, as of `measure`, wrenches (n, 6) by the names of frames; `key` of `jax.random` for the noise, None for readings without it.
+    or N (None: zero), as of a `Solution`; `thrusts`, as of `measure`, wrenches (n, 6) by the names of frames; `key` of
+    `jax.random` for the noise, None for readings without it.
 
     **Returns:** readings (n, k) by the sensors' names.
 
@@ -65,7 +66,9 @@ def record(
     thrusts = {frame: as_array(x, f"thrusts[{frame!r}]", dtype) for frame, x in (thrusts or {}).items()}
     for frame, wrench in thrusts.items():
         if wrench.shape != (count, 6):
-            raise ValueError(f"thrusts[{frame!r}] has shape {wrench.shape}, expected {(count, 6)}, one row per time in ts")
+            raise ValueError(
+                f"thrusts[{frame!r}] has shape {wrench.shape}, expected {(count, 6)}, one row per time in ts"
+            )
 
     def read(q, v, tau, t, thrusts):
         # Accelerations are solved for, and not differences of v, which would amplify its rounding.

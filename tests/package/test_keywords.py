@@ -218,9 +218,8 @@ def test_every_keyword_is_accepted(name):
         call() if name in OF_NUMBERS else eqx.filter_eval_shape(call)
         return
     assert name.startswith(ROOMS), f"give {name} a line in CALLS"
-    missing = set(keywords) - set(passed_by_tests().get(name.rpartition(".")[2], ()))
     # Calls that pass them by **options are not seen.
-    assert missing <= NOT_YET.get(name, set())
+    assert not set(keywords) - set(passed_by_tests().get(name.rpartition(".")[2], ()))
 
 
 @pytest.mark.slow
@@ -242,32 +241,3 @@ def passed_by_tests() -> dict[str, set[str]]:
                 known = {one.arg for one in node.keywords if one.arg} | set(places.get(name, [])[: len(node.args)])
                 passed.setdefault(name, set()).update(known)
     return passed
-
-
-# Keywords of functions of files, pictures, fits and runs that no test passes yet; the list is to be emptied.
-NOT_YET: dict[str, set[str]] = {
-    "animate": {"speed", "shapes"},
-    "identify.exciting_motion": {"margin", "v_s", "learning_rate", "velocity", "callback", "terms", "seed"},
-    "identify.fit_gains": {"blocks", "body", "terms"},
-    "identify.fit_payload": {"robot"},
-    "identify.fit_robot": {"blocks", "inertia"},
-    "identify.from_raw": {"order"},
-    "identify.identifiability": {"count", "rcond", "terms"},
-    "identify.least_squares": {"blocks", "rcond", "weights"},
-    "identify.rollout": {"friction", "horizon", "hold"},
-    "identify.trajectory_error": {"friction", "hold"},
-    "io.load": {"dtype", "gravity"},
-    "io.load_mjcf": {"dtype"},
-    "io.load_sdf": {"floating_base", "dtype"},
-    "io.read_log": {"model"},
-    "io.urdf_inertia_report": {"arguments"},
-    "pictures.save_html": {"shapes"},
-    "pictures.shapes": {"arguments"},
-    "pictures.view": {"shapes"},
-    "plot.energy": {"ax"},
-    "plot.forces": {"ax"},
-    "plot.work_precision": {"ax"},
-    "report": {"batches", "ways", "dtypes"},
-    "scale.evaluate": {"rows", "seed", "units", "batch_size", "reductions"},
-    "scale.run": {"seed", "rows", "retries", "progress"},
-}
