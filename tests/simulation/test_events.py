@@ -471,3 +471,21 @@ def test_modes_that_flip_without_end_are_not_found():
     change = Transition(mode, None, mode, None, None, settled[0], jnp.asarray(False))
     ((paradox, _), (unsettled, code)) = _cases(change)
     assert bool(unsettled) and not bool(paradox) and code is jd.RESULTS.no_contact_mode
+
+
+@pytest.mark.long
+def test_constraints_are_closed_at_coarse_tolerances_too():
+    """A rod that turns by a radian a step under friction: save points are on the circle, or the steps have a code."""
+    rod_scene = jd.scenes.pendulum_in_plane()
+    along = jd.Pfaffian(lambda q, t: jnp.stack([-q[1], q[0]]), name="along")
+    friction = jd.contact.DryFriction(0.1, 1.0, along, name="friction")
+    scene = jd.Scene(rod_scene.system, rod_scene.constraints, (friction,))
+
+    def run(**options):
+        return jd.simulate(scene, [0.0, -1.0], [30.0, 0.0], jnp.linspace(0, 1.0, 3), throw=False, **options)
+
+    coarse = run(rtol=0.1, atol=0.1)
+    assert bool(coarse.success)
+    np.testing.assert_allclose(np.linalg.norm(coarse.q, axis=1), 1.0, atol=1e-10)
+    # No circle is within reach of steps of three turns.
+    assert run(stepsize=0.2).result == jd.RESULTS.coarse_steps
