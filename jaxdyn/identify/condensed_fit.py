@@ -108,14 +108,14 @@ class Estimate(NamedTuple):
     chart: LinearChart
     minimum: Minimum
 
-    def as_unsettled(self) -> "Estimate":
+    def give_up(self) -> "Estimate":
         """Copy whose result is `max_steps_reached`, unless it is another failure already."""
         if self.minimum.result is not RESULTS.successful:
             return self
         return self._replace(minimum=self.minimum._replace(result=RESULTS.max_steps_reached))
 
 
-def has_settled(W: np.ndarray, change: np.ndarray, sigma: float) -> bool:
+def is_negligible(W: np.ndarray, change: np.ndarray, sigma: float) -> bool:
     """Decide whether a change (p,) of the parameters is small against their standard deviations, with errors W dx of size sigma.
 
     Any combination c x has the deviation sigma |W^-T c|, and |c dx| <= |W^-T c| |W dx|.

@@ -15,8 +15,8 @@ from jaxdyn.identify.condensed_fit import (
     Setting,
     fit_blocks,
     gather,
-    has_settled,
     intervals,
+    is_negligible,
 )
 from jaxdyn.identify.interior import LinearChart
 from jaxdyn.identify.logs import Log, idle_coordinates, log_rate, signal_sizes
@@ -99,11 +99,11 @@ class RobotProblem:
         for remaining in reversed(range(rounds)):
             rows = self.data(setting).blocks.rows(self.weights)
             estimate = self.fit(setting, rows=rows)
-            if before is not None and has_settled(rows[:, :-1], estimate.x - before, estimate.sigma):
+            if before is not None and is_negligible(rows[:, :-1], estimate.x - before, estimate.sigma):
                 return estimate
             # No update after the last fit: intervals need the weights and loads that the estimate was made with.
             if not remaining:
-                return estimate.as_unsettled()
+                return estimate.give_up()
             before = estimate.x
             if fixed is None:
                 self.weights = self._new_weights(setting, estimate)

@@ -92,9 +92,9 @@ def test_keywords_of_drive_gains():
         log = measured(model, bare, x, noise=1e-3, seed=seed)
         logs.append(identify.Log(log.t, log.q, log.v, log.a, log.tau / gains))
 
-    def fit(**options):
-        known = {"inertia": np.zeros((3, 3)), "v_s": 0.01, "terms": (), "body": "a"} | options
-        return identify.fit_gains(model, *logs, 0.9, (0.3, 0.0, -0.4), **known)
+    def fit(body="a", terms=(), blocks=20):
+        known = {"inertia": np.zeros((3, 3)), "v_s": 0.01}
+        return identify.fit_gains(model, *logs, 0.9, (0.3, 0.0, -0.4), body=body, terms=terms, blocks=blocks, **known)
 
     found = fit()
     np.testing.assert_allclose(found.gains, gains, atol=4 * found.std.max())

@@ -815,10 +815,10 @@ def test_seed_rows_retries_and_progress_of_runs(tmp_path, capsys, monkeypatch):
     model = jd.ModelBuilder("free", gravity=None)
     model.add_body("a", None, "prismatic", (1.0, (0, 0, 0), (0.1, 0.1, 0.1)), axis=(1, 0, 0))
 
-    def simulated(name, **options):
+    def simulated(name, retries=2, progress=False):
         return jd.scale.run(
             model.build(), lambda p: (jnp.zeros(1), p["v"][None]), lambda key: {"v": jax.random.normal(key, ())},
-            np.array([0.0, 2.0]), samples=4, out=tmp_path / name, seed=3, rows=["q"], **options,
+            np.array([0.0, 2.0]), samples=4, out=tmp_path / name, seed=3, rows=["q"], retries=retries, progress=progress,
         )  # fmt: skip
 
     run = simulated("a.zarr", progress=True)
@@ -839,9 +839,9 @@ def test_seed_rows_retries_and_progress_of_runs(tmp_path, capsys, monkeypatch):
         calls.clear()
         monkeypatch.setattr(program.Program, "start", breaks_once)
         if retries:
-            again = simulated(name, retries=retries, progress=False)
+            again = simulated(name, retries)
             np.testing.assert_array_equal(again.dataset()["result"], table["result"])
         else:
             with pytest.raises(RuntimeError, match="the device was lost"):
-                simulated(name, retries=retries, progress=False)
+                simulated(name, retries)
     assert capsys.readouterr().err == ""

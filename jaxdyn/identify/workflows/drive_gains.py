@@ -19,7 +19,7 @@ import numpy as np
 
 from jaxdyn.constraints.codes import RESULTS, Outcome
 from jaxdyn.identify.condensed import Blocks
-from jaxdyn.identify.condensed_fit import MOST_ROUNDS, has_settled
+from jaxdyn.identify.condensed_fit import MOST_ROUNDS, is_negligible
 from jaxdyn.identify.logs import Log, as_logs
 from jaxdyn.identify.regression import (
     base_parameters,
@@ -228,7 +228,7 @@ def _fit(problem: _Problem, v_s: float):
         state = state._replace(weights=1 / np.maximum(rms, _FINEST * sizes / np.sqrt(samples)))
         # With these weights errors have deviations of one.
         _, J = problem.linearise(triangles, *state)
-        if has_converged and has_settled(J, np.concatenate([state.z, state.u]) - before, 1.0):
+        if has_converged and is_negligible(J, np.concatenate([state.z, state.u]) - before, 1.0):
             result = RESULTS.successful
             break
     grams, gradients = [], []

@@ -10,7 +10,7 @@ import numpy as np
 from jaxdyn.constraints.codes import RESULTS, Outcome, name_of
 from jaxdyn.identify.chart import check_bodies
 from jaxdyn.identify.condensed import Blocks, condense_rows
-from jaxdyn.identify.condensed_fit import MOST_ROUNDS, eliminate, gather, has_settled, minimize_torque_error
+from jaxdyn.identify.condensed_fit import MOST_ROUNDS, eliminate, gather, is_negligible, minimize_torque_error
 from jaxdyn.identify.interior import LOG_CHOLESKY_BASIS, LinearChart, TorqueProblem
 from jaxdyn.identify.logs import Log, as_logs
 from jaxdyn.identify.regression import least_squares_by_svd, log_regressor, noise_level
@@ -131,7 +131,7 @@ def fit_payload(
         before = payload
         sigma = noise_level(condense_rows(rows, data.blocks.count()))
         payload, std, factor = _solve(data.blocks, is_loaded, own, kept, robot.weights, rows, sigma, size)
-        if not has_loads or has_settled(rows[:, len(kept) : -1], payload - before, sigma):
+        if not has_loads or is_negligible(rows[:, len(kept) : -1], payload - before, sigma):
             result = robot.fit.result
             break
     error, without = _errors(robot, loaded, own, payload)
