@@ -3,6 +3,7 @@
 import numpy as np
 
 from jaxdyn.cli.common import short, table
+from jaxdyn.constraints.codes import is_successful, name_of
 from jaxdyn.identify import TERMS, Delays, DriveGains, LeastSquares, Payload, RobotFit, nominal_parameters
 from jaxdyn.identify.regression import free_columns
 from jaxdyn.identify.selection import Choice
@@ -160,10 +161,15 @@ def gains_text(gains: DriveGains, labels) -> str:
         for label, g, h in zip(labels, gains.gains, half, strict=True)
     )
     rest = [label for label in labels if label not in gains.identifiable]
-    line = f"Drive gains, torque = gain * logged value, from the known payload: {cells}"
+    line = f"Drive gains, torque = gain * logged value, from the known payload: {cells}" + _failure(gains.result)
     if rest:
         line += f"\nHardly identifiable from the payload, near the others' median: gains of {', '.join(rest)}"
     return line
+
+
+def _failure(result) -> str:
+    """Words about a fit that has not converged; empty for one that has."""
+    return "" if is_successful(result) else f"\n  NOT CONVERGED: {name_of(result).replace('_', ' ')}"
 
 
 def payload_text(payload: Payload) -> str:
@@ -176,7 +182,8 @@ def payload_text(payload: Payload) -> str:
     moments = ", ".join(short(float(x), 3) for x in np.linalg.eigvalsh(payload.rotational))
     centre = ", ".join(short(float(x), 3) for x in payload.centre)
     return (
-        f"Payload on {payload.body}: torque error {payload.error:.2f} % with it, {payload.without:.2f} % without\n"
+        f"Payload on {payload.body}: torque error {payload.error:.2f} % with it, {payload.without:.2f} % without"
+        f"{_failure(payload.result)}\n"
         f"  mass {short(payload.mass)} kg, centre ({centre}) m, principal moments {moments} kg m^2\n"
         f"  {', '.join(numbers)} (kg, kg m)"
     )

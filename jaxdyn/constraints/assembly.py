@@ -26,7 +26,7 @@ from jaxdyn.constraints.selection import independent_rows, most_rounding, select
 from jaxdyn.constraints.tolerances import coordinate_sizes, largest_ratio, row_limits
 from jaxdyn.lie.so3 import matmul
 from jaxdyn.model.arguments import Numbers, check_state, zeros_if_none
-from jaxdyn.model.numbers import check_count
+from jaxdyn.model.numbers import as_static, check_count
 from jaxdyn.systems.scene import Scene, as_scene
 from jaxdyn.systems.system import SceneLike, displace, displacement
 
@@ -188,8 +188,8 @@ def check_search(steps: Any, guesses: Any, atol: Any) -> None:
     """Check the extent of a search for a configuration, and its tolerance. **Raises:** ValueError."""
     check_count(steps, "steps")
     check_count(guesses, "guesses")
-    if atol is not None and (not is_concrete(atol) or not 0 <= float(atol) < np.inf):
-        raise ValueError(f"atol is {atol!r}; give a length (m) or an angle (rad) that is not negative, or None")
+    if atol is not None:
+        as_static(atol, "atol", 0, np.inf, "a length (m) or an angle (rad) that is not negative, or None")
 
 
 def closing_tolerance(dtype) -> float:

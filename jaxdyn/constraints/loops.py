@@ -164,7 +164,7 @@ def loop(
     name = f"{body_a or 'world'}-{body_b or 'world'}" if name is None else name
     what = f"loop {name!r}"
     kinds = _IN_PLANE if in_plane else _SPATIAL
-    if joint not in kinds:
+    if not isinstance(joint, str) or joint not in kinds:
         raise ValueError(f"{what}: joint {joint!r} is unknown; choose from {', '.join(kinds)}")
     if body_a == body_b:
         raise ValueError(f"{what}: both frames are on {body_a or 'the world'!r}; name two different bodies")

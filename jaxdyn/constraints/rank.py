@@ -5,12 +5,13 @@ from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jax import lax
 from jaxtyping import Array, Bool, Float
 
 from jaxdyn.compile import batch, gram_eigenvectors, kernel, mark_invalid, pseudo_inverse_by_rotations, variant
-from jaxdyn.compile.known import is_concrete
 from jaxdyn.lie.so3 import matmul
+from jaxdyn.model.numbers import as_static
 from jaxdyn.systems.mass_factor import cholesky, solve_cholesky
 
 # Operations of the normal equations up to which they are a kernel: LLVM compiles one in 50 to 100 microseconds.
@@ -29,16 +30,14 @@ def check_tolerance(rank_tol: float | None) -> float | None:
     """The rank tolerance as a float, or None for the default. **Raises:** ValueError outside (0, 1)."""
     if rank_tol is None:
         return None
-    if not is_concrete(rank_tol) or not 0 < float(rank_tol) < 1:
-        raise ValueError(f"rank_tol is {rank_tol}; give a number between 0 and 1 that is not traced, or None")
-    return float(rank_tol)
+    return as_static(rank_tol, "rank_tol", np.finfo(float).tiny, 1, "a number between 0 and 1, or None")
 
 
 def tolerance(rank_tol: float | None, like) -> float:
     """The rank tolerance as given, or the default for the dtype."""
     # 1.1e-9 in float64, 1.1e-4 in float32: above the errors of projection, below the least singular values of mechanisms that
     # move (`constrained_dynamics` has the figures).
-    return eps_of(like) ** (4 / 7) if rank_tol is None else float(rank_tol)
+    return eps_of(like) ** (4 / 7) if (given := check_tolerance(rank_tol)) is None else given
 
 
 def eps_of(like) -> float:

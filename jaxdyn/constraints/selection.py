@@ -346,6 +346,9 @@ def _select_far_away(scene: Scene, q, t, sure, apart: float):
 
     if held.size:
         place = retract(scene.system, lax.fori_loop(0, _NEWTON_STEPS, close, place))
+        # Off the constraints rows that repeat others look independent: where the search did not close them, q itself decides.
+        is_closed = largest_opening(scene, place, t, 1 - sure) <= eps_of(q) ** 0.4
+        place = jnp.where(is_closed, place, q)
     B = kernel(unit_rows)(scene, place, t)
     # Twice the threshold at q: a row at the threshold has to have separated, not to have changed by rounding.
     kept, rest, pivot = eliminate(B, 2 * apart, sure)

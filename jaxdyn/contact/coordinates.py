@@ -8,6 +8,7 @@ import jax.numpy as jnp
 from jax import lax
 from jaxtyping import Array, Float
 
+from jaxdyn.compile import invalidate_derivatives
 from jaxdyn.constraints.rank import eps_of
 from jaxdyn.contact.surfaces import Plane, Sphere, Surface, check_surface, geometry_at
 from jaxdyn.contact.touching import newton_steps, patch_at
@@ -32,7 +33,7 @@ def contact_coordinates(surface_o: Surface, surface_f: Surface, pose: Numbers) -
     - `pose` (4, 4): of the finger's frame in the object's, m.
 
     **Returns:** eta = (u_o, v_o, u_f, v_f, psi) (5,), in the units of the charts and rad; differentiable three times. NaN where
-    the search for the closest points did not converge.
+    the search for the closest points did not converge, or found no such pair.
 
     **Raises:** ValueError for an invalid surface, a pose of another shape, two planes, and a `Parametrised` surface, whose
     closest points are not known.
@@ -61,16 +62,24 @@ def contact_coordinates(surface_o: Surface, surface_f: Surface, pose: Numbers) -
             f"surface {type(which).__name__} does not give its closest point to another point; use a Sphere, Ellipsoid, "
             "Plane or Cylinder"
         )
+    is_found = jnp.asarray(True)
     if not all(isinstance(surface, Sphere | Plane) for surface in (surface_o, surface_f)):
-        place_o, place_f = _by_newton(surface_o, surface_f, R, p, (place_o, place_f))
+        place_o, place_f, is_found = _by_newton(surface_o, surface_f, R, p, (place_o, place_f))
+    elif isinstance(surface_o, Sphere) and isinstance(surface_f, Sphere):
+        # Every point of concentric spheres is as close as any other.
+        is_found = (p != 0).any()
     at_o, at_f = surface_o.coordinates_at(place_o), surface_f.coordinates_at(place_f)
     frame_o, frame_f = geometry_at(surface_o, at_o).frame, geometry_at(surface_f, at_f).frame
     # R_psi = [cos psi, -sin psi; -sin psi, -cos psi]: its first row gives psi.
     turn = matmul(frame_o.T, matmul(R, frame_f))
-    return jnp.concatenate([at_o, at_f, jnp.arctan2(-turn[0, 1], turn[0, 0])[None]])
+    eta = jnp.concatenate([at_o, at_f, jnp.arctan2(-turn[0, 1], turn[0, 0])[None]])
+    eta = jnp.where(is_found, eta, jnp.full_like(eta, jnp.nan))
+    return invalidate_derivatives(eta, ~is_found, (surface_o, surface_f, pose))
 
 
 def _by_newton(surface_o: Surface, surface_f: Surface, R, p, places):
+    """Places of the closest points, and whether they were found."""
+
     def step(R, p, places):
         steps = newton_steps(patch_at(surface_o, places[0]), patch_at(surface_f, places[1]), R, p)
         return surface_o.displace(places[0], steps.on_a), surface_f.displace(places[1], steps.on_b)
@@ -82,8 +91,8 @@ def _by_newton(surface_o: Surface, surface_f: Surface, R, p, places):
     for _ in range(_DIFFERENTIATED - 1):
         places = step(R, p, places)
     last = newton_steps(patch_at(surface_o, places[0]), patch_at(surface_f, places[1]), R, p)
-    # The last step of a search that has converged is rounding. Another one has no closest points: NaN, and so its derivatives.
+    # The last step of a search that has converged is rounding. Steps are zero, too, where the normals do not face each other or
+    # the relative curvature is not positive.
     size = jnp.max(jnp.abs(jnp.concatenate(lax.stop_gradient((last.on_a, last.on_b)))))
-    converged = size <= eps_of(p) ** 0.6 * (1 + jnp.max(jnp.abs(lax.stop_gradient(p))))
-    invalid = jnp.where(converged, jnp.ones_like(size), jnp.nan)
-    return surface_o.displace(places[0], last.on_a) * invalid, surface_f.displace(places[1], last.on_b) * invalid
+    is_found = last.is_strict & (size <= eps_of(p) ** 0.6 * (1 + jnp.max(jnp.abs(lax.stop_gradient(p)))))
+    return surface_o.displace(places[0], last.on_a), surface_f.displace(places[1], last.on_b), is_found

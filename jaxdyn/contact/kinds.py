@@ -17,8 +17,8 @@ _IN_PLANE = {"frictionless": (2,), "hard-finger": (0, 2), "rigid": (0, 2, 4)}
 def components(kind: str, in_plane: bool, what: str) -> tuple[int, ...]:
     """Indices of the transmitted components. **Raises:** ValueError for an unknown kind, naming `what`."""
     kinds = _IN_PLANE if in_plane else _SPATIAL
-    if kind not in kinds:
-        hint = "; in a plane a soft finger is a hard one" if kind in _SPATIAL else ""
+    if not isinstance(kind, str) or kind not in kinds:
+        hint = "; in a plane a soft finger is a hard one" if isinstance(kind, str) and kind in _SPATIAL else ""
         raise ValueError(f"{what}: kind {kind!r} is unknown; choose from {', '.join(kinds)}{hint}")
     return kinds[kind]
 

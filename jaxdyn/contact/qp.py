@@ -21,7 +21,7 @@ from jaxdyn.constraints.rank import pseudo_inverse, tolerance
 from jaxdyn.contact._interior_point import Point, Program, attach_derivative, solve
 from jaxdyn.lie.so3 import matmul
 from jaxdyn.model.arguments import Numbers
-from jaxdyn.model.numbers import as_float, check_count
+from jaxdyn.model.numbers import as_float, as_static, check_count
 from jaxdyn.systems.mass_factor import cholesky, is_definite, solve_cholesky
 
 
@@ -124,9 +124,8 @@ def solve_qp(
     if tol is None:
         # Convergence is superlinear near the end, so the exponent is that which float32 and float64 both reach.
         tol = max(1e-9, float(jnp.finfo(Q.dtype).eps) ** 0.575)
-    if not 0 < float(tol) < 1:
-        raise ValueError(f"tol is {tol}; give a number between 0 and 1")
-    return _solve(Q, q, G, h, A, b, tuple(checked), pattern, float(tol), check_count(max_steps, "max_steps"))
+    tol = as_static(tol, "tol", np.finfo(float).tiny, 1, "a number between 0 and 1")
+    return _solve(Q, q, G, h, A, b, tuple(checked), pattern, tol, check_count(max_steps, "max_steps"))
 
 
 def _pair(matrix, level, name: str, right: str, n: int, dtype):

@@ -90,7 +90,7 @@ _POLES = {"z": (0, 1, 2), "x": (1, 2, 0), "y": (2, 0, 1)}
 
 
 def _check_poles(poles: str) -> str:
-    if poles not in _POLES:
+    if not isinstance(poles, str) or poles not in _POLES:
         raise ValueError(f"poles is {poles!r}; choose from {', '.join(_POLES)}, the axis on which the chart ends")
     return poles
 

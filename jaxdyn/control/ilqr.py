@@ -28,7 +28,7 @@ from jaxdyn.constraints.rank import eps_of
 from jaxdyn.control.box_qp import minimize_in_box
 from jaxdyn.lie.so3 import matmul
 from jaxdyn.model.arguments import Checked, Function, Numbers, as_array, batch_hint
-from jaxdyn.model.numbers import as_float, as_number, check_count
+from jaxdyn.model.numbers import as_float, as_number, as_static, check_count
 from jaxdyn.systems.mass_factor import cholesky, solve_cholesky
 from jaxdyn.systems.scene import as_pytree
 
@@ -147,8 +147,7 @@ def ilqr(
     if us.ndim != 2 or 0 in us.shape:
         raise ValueError(f"us has shape {us.shape}; give controls (n, nu), one row per step{batch_hint(us, (1, 1))}")
     check_count(iterations, "iterations")
-    if not is_concrete(tol) or not 0 < float(tol) < 1:
-        raise ValueError(f"tol is {tol!r}; give a number between 0 and 1")
+    as_static(tol, "tol", np.finfo(float).tiny, 1, "a number between 0 and 1")
     mu = as_number(regularization, "regularization", zero=True, like=us.dtype)
     step, cost, final_cost = (
         as_pytree(f, name, takes)

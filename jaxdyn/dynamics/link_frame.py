@@ -23,7 +23,7 @@ from jaxdyn.lie import se3
 from jaxdyn.lie.so3 import matmul
 from jaxdyn.model.arguments import as_array, check_shapes
 from jaxdyn.model.inertia import spatial_inertia
-from jaxdyn.model.topology import frame_index
+from jaxdyn.model.topology import check_name, frame_index
 from jaxdyn.model.tree import Model
 
 
@@ -167,6 +167,8 @@ def newton_euler_matrices(
     Source: EQUATIONS section 4; Park, Bobrow & Ploen (1995), Murray, Li & Sastry (1994) section 4.3.
     """
     q, v = check_shapes(model, q=q, v=v)
+    if tip is not None:
+        check_name(tip, "tip")
     return _matrices(
         model, q, v, _base_vector("base_twist", base_twist, q), _base_vector("base_twist_rate", base_twist_rate, q), tip
     )

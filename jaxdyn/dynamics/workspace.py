@@ -21,11 +21,13 @@ import numpy as np
 from jaxtyping import Array, Bool, Float
 
 from jaxdyn.compile import entry_point, gram_eigenvectors
+from jaxdyn.compile.known import is_concrete
 from jaxdyn.dynamics.frame_motion import frame_jacobian
 from jaxdyn.dynamics.quantities import coriolis_matrix, gravity_force, mass_matrix
 from jaxdyn.lie.so3 import matmul
 from jaxdyn.model.arguments import check_shapes
 from jaxdyn.model.configuration import configuration_rate
+from jaxdyn.model.numbers import as_static
 from jaxdyn.model.tree import Model
 from jaxdyn.systems.mass_factor import mass_factor, solve_positive
 
@@ -93,14 +95,14 @@ def workspace_dynamics(
     """
     q, v = check_shapes(model, q=q, v=v)
     # Static, hence hashable: `rows` selects the program.
-    rows = tuple(rows)
+    given, rows = rows, tuple(np.asarray(rows).tolist()) if is_concrete(rows) and np.ndim(rows) == 1 else ()
     if not rows or len(set(rows)) < len(rows) or not set(rows) <= set(range(6)) or len(rows) > model.nv:
         raise ValueError(
-            f"rows is {rows}; give different components 0 to 5 of the twist, at most nv = {model.nv} of them"
+            f"rows is {given}; give different components 0 to 5 of the twist, at most nv = {model.nv} of them"
         )
-    limit = float(jnp.finfo(q.dtype).eps) ** 0.4 if least is None else least
-    if not 0 < limit < 1:
-        raise ValueError(f"least is {least}; give a number between 0 and 1, or None")
+    limit = float(jnp.finfo(q.dtype).eps) ** 0.4
+    if least is not None:
+        limit = as_static(least, "least", np.finfo(float).tiny, 1, "a number between 0 and 1, or None")
     frame_jacobian(model, q, frame, axes=axes)  # refuses unknown names
     return _workspace(model, _Choice(frame, axes, rows, limit), q, v)
 

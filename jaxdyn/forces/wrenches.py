@@ -1,6 +1,6 @@
 """Wrenches of a scene's forces on bodies, as sensors and bearings feel them."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from typing import Any
 
 import jax.numpy as jnp
@@ -9,6 +9,7 @@ from jaxtyping import Array, Float
 from jaxdyn.dynamics.kinematics import named_frame
 from jaxdyn.lie import se3
 from jaxdyn.model.arguments import Numbers, check_state
+from jaxdyn.model.tree import Model
 from jaxdyn.systems.scene import Scene, as_scene
 
 
@@ -48,14 +49,24 @@ def wrenches_where(scene: Scene, q, v, t, counts: Callable[[str], bool]) -> Floa
         of_frames = getattr(force, "frame_wrenches", None)
         if of_frames is None:
             continue
-        for frame, wrench in of_frames(model, q, v, t).items():
-            body, offset = named_frame(model, frame)
-            if jnp.shape(wrench) != (6,):
-                raise ValueError(
-                    f"forces[{i}].frame_wrenches gives shape {jnp.shape(wrench)} for frame {frame!r}, expected (6,)"
-                )
-            # A frame on the ground moves no body.
-            if body >= 0 and counts(frame):
-                at_body = se3.Ad_inv_T_apply(jnp.asarray(offset, q.dtype), jnp.asarray(wrench, q.dtype))
-                total = total.at[body].add(at_body)
+        total = total + sum_wrenches(model, q, of_frames(model, q, v, t), counts, f"forces[{i}].frame_wrenches")
+    return total
+
+
+def sum_wrenches(
+    model: Model, q, wrenches: Mapping[str, Any], counts: Callable[[str], bool], what: str
+) -> Float[Array, "nb 6"]:
+    """Sum on each body of wrenches (6,) by the names of frames, at their origins and in their axes, of frames that count.
+
+    **Raises:** ValueError, with `what` gives them, for other shapes and unknown frames.
+    """
+    total = jnp.zeros((model.nb, 6), q.dtype)
+    for frame, wrench in wrenches.items():
+        body, offset = named_frame(model, frame)
+        if jnp.shape(wrench) != (6,):
+            raise ValueError(f"{what} gives shape {jnp.shape(wrench)} for frame {frame!r}, expected (6,)")
+        # A frame on the ground moves no body.
+        if body >= 0 and counts(frame):
+            at_body = se3.Ad_inv_T_apply(jnp.asarray(offset, q.dtype), jnp.asarray(wrench, q.dtype))
+            total = total.at[body].add(at_body)
     return total

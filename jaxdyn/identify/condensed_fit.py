@@ -16,6 +16,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from jaxdyn.constraints.codes import RESULTS
 from jaxdyn.identify.condensed import Blocks, condense_rows, pad_triangle
 from jaxdyn.identify.descent import Watch, descend
 from jaxdyn.identify.interior import LOG_CHOLESKY_BASIS, InteriorPoint, LinearChart, TorqueProblem
@@ -37,6 +38,9 @@ from jaxdyn.model.tree import Model
 _UNIT = 0.1
 # Tolerance on the loss of a fit, and of one that only compares settings; most steps of either.
 _FINE, _ROUGH, _STEPS = 1e-6, 1e-2, 200
+# Fits with weights or loads that follow from the fit before are repeated until one changes all parameters by less than this
+# share of their standard deviations for independent errors; most of them.
+_SETTLED, MOST_ROUNDS = 0.05, 30
 # Least torque noise as a share of the torque, so that noise-free logs stay well posed.
 _FINEST = 1e-6
 
@@ -103,6 +107,20 @@ class Estimate(NamedTuple):
     sigma: float
     chart: LinearChart
     minimum: Minimum
+
+    def give_up(self) -> "Estimate":
+        """Copy whose result is `max_steps_reached`, unless it is another failure already."""
+        if self.minimum.result is not RESULTS.successful:
+            return self
+        return self._replace(minimum=self.minimum._replace(result=RESULTS.max_steps_reached))
+
+
+def is_negligible(W: np.ndarray, change: np.ndarray, sigma: float) -> bool:
+    """Decide whether a change (p,) of the parameters is small against their standard deviations, with errors W dx of size sigma.
+
+    Any combination c x has the deviation sigma |W^-T c|, and |c dx| <= |W^-T c| |W dx|.
+    """
+    return bool(np.linalg.norm(W @ change) <= _SETTLED * sigma)
 
 
 def gather(

@@ -213,7 +213,7 @@ class Method(abc.ABC):
         """Make one step.
 
         **Returns:** the next iterate and None; or the last one and the code of `RESULTS` that ends the fit,
-        `successful` or `nonfinite`.
+        `successful`, `no_descent` or `nonfinite`.
         """
 
     def arrays(self, iterate: Iterate) -> dict[str, Any]:

@@ -3,15 +3,16 @@
 from collections.abc import Sequence
 from typing import Any
 
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import lax
-from jaxtyping import Array, Float
+from jaxtyping import Array, Bool, Float
 
 from jaxdyn.constraints.assembly import Assembly, assemble
-from jaxdyn.constraints.base import layout, position_residual, rows
-from jaxdyn.constraints.codes import RESULTS
+from jaxdyn.constraints.base import layout, position_residual, rows, velocity_residual
+from jaxdyn.constraints.codes import CODES, RESULTS, code_of
 from jaxdyn.constraints.selection import degrees_of_freedom, independent_rows
 from jaxdyn.identify.logs import Log
 from jaxdyn.model.arguments import Numbers, as_array, state_dtype, warn
@@ -21,9 +22,9 @@ from jaxdyn.systems.mass_factor import solve_positive
 from jaxdyn.systems.scene import Scene, as_scene
 from jaxdyn.systems.system import SceneLike, displace, displacement
 
-# Gauss-Newton steps of a search. `on_constraints` then projects the state by `assemble`, so that its accuracy does not depend on
-# this number.
-_ITERATIONS = 5
+# Gauss-Newton steps of a search, and the power of eps, of the size of the state, that the last one must not exceed: 5e-7 in
+# float64. `on_constraints` then closes the constraints by `assemble`, so that it decides only how near the state is.
+_ITERATIONS, _CONVERGED = 10, 0.4
 # Weight of the residual of a constraint, where that of a measured coordinate has 1. A contradiction between both is divided by
 # the squares of the weights: for rows of unit size all but 1e-4 of it stays in the measured coordinates. A larger weight would
 # cost digits in the normal equations.
@@ -52,7 +53,8 @@ def on_constraints(scene: Scene, q, v, t, columns: tuple[int, ...] | None) -> As
     """State on a scene's constraints that is nearest to (q, v).
 
     Without `columns` the distance is that of the mass metric. `columns` are the indices in v of the measured coordinates: the
-    state then fits these by least squares, and the other coordinates change as little as the constraints allow.
+    state then fits these by least squares, and the other coordinates change as little as the constraints allow. The result is
+    `not_nearest` where the search for it has not converged.
     """
     if columns is None:
         return assemble(scene, q, v, t, throw=False)
@@ -64,26 +66,47 @@ def on_constraints(scene: Scene, q, v, t, columns: tuple[int, ...] | None) -> As
         jacobian = rows(counted, at, jnp.zeros_like(v), t).A[holonomic]
         misfit = displacement(scene.system, at, q)[measured]
         targets = jnp.concatenate([-_CONSTRAINT_WEIGHT * position_residual(counted, at, t), misfit])
-        return displace(scene.system, at, _least_squares(jacobian, selector, targets)), None
+        change = _least_squares(jacobian, selector, targets)
+        return displace(scene.system, at, change), change
 
     measured = np.array(columns)
     selector = jnp.eye(scene.nv, dtype=q.dtype)[measured]
     holonomic = np.concatenate([np.arange(place.start, place.nonholonomic) for place in layout(scene)])
-    near = lax.scan(improve, q, None, length=_ITERATIONS)[0] if len(holonomic) else q
-    return assemble(scene, near, nearest_velocity(scene, near, v, t, columns), t, throw=False)
+    near, is_nearest = q, jnp.asarray(True)
+    if len(holonomic):
+        near, changes = lax.scan(improve, q, None, length=_ITERATIONS)
+        is_nearest = _is_small(changes[-1], q)
+    velocity, has_velocity = nearest_velocity(scene, near, v, t, columns)
+    state = assemble(scene, near, velocity, t, throw=False)
+    missed = state.success & ~(is_nearest & has_velocity)
+    result = RESULTS.where(missed, RESULTS.not_nearest, state.result)
+    return eqx.tree_at(lambda state: state.result, state, result)
 
 
-def nearest_velocity(scene: Scene, q, v, t, columns: tuple[int, ...]) -> Float[Array, " nv"]:
-    """Velocity (nv,) on a scene's constraints whose `columns` fit those of v by least squares."""
+def nearest_velocity(scene: Scene, q, v, t, columns: tuple[int, ...]) -> tuple[Float[Array, " nv"], Bool[Array, ""]]:
+    """Velocity (nv,) whose `columns` and rows A v = b fit those of v and the constraints by least squares.
+
+    Rows that the measured ones contradict stay open (`_CONSTRAINT_WEIGHT`).
+
+    **Returns:** the velocity, and whether the search has converged.
+    """
     selector, counted = jnp.eye(scene.nv, dtype=q.dtype)[np.array(columns)], independent_rows(scene, q, t)
 
     # The rows are affine in v. Repetition removes the effect of the regularisation, which pulls each change towards zero.
     def improve(estimate, _):
         at = rows(counted, q, estimate, t)
         targets = jnp.concatenate([-_CONSTRAINT_WEIGHT * at.velocity, (v - estimate)[np.array(columns)]])
-        return estimate + _least_squares(at.A, selector, targets), None
+        change = _least_squares(at.A, selector, targets)
+        return estimate + change, change
 
-    return lax.scan(improve, v, None, length=_ITERATIONS)[0]
+    velocity, changes = lax.scan(improve, v, None, length=_ITERATIONS)
+    return velocity, _is_small(changes[-1], velocity)
+
+
+def _is_small(change, value) -> Bool[Array, ""]:
+    """True for the last step of a search that has converged; false for NaN."""
+    change, value = lax.stop_gradient((change, value))
+    return jnp.max(jnp.abs(change)) <= float(jnp.finfo(change.dtype).eps) ** _CONVERGED * (1 + jnp.max(jnp.abs(value)))
 
 
 def _least_squares(A, selector, targets):
@@ -112,7 +135,8 @@ def complete_log(scene: SceneLike, t: Numbers, measured: dict[Any, Any], tau: Nu
     `observed=` to `fit_parameters`, which then compares them alone.
 
     **Raises:** ValueError for joints that do not exist or have several degrees of freedom, wrong shapes, and for a sample at
-    which the mechanism cannot be assembled (its number and time).
+    which the mechanism cannot be assembled, no nearest state is found, or no velocity on the constraints has the measured ones,
+    as at a dead point of the measured joint (its number and time).
 
     Source: EQUATIONS section 6 (constraints as rows).
     """
@@ -143,20 +167,24 @@ def complete_log(scene: SceneLike, t: Numbers, measured: dict[Any, Any], tau: Nu
         v = jnp.zeros((system.nv,), dtype).at[np.array(columns)].set(velocity)
         if not can_hold:
             nearest = on_constraints(scene, start, v, time, columns)
-            return nearest.q, (nearest.q, nearest.v, nearest.result == RESULTS.successful)
+            return nearest.q, (nearest.q, nearest.v, nearest.result)
         held = assemble(scene, start, None, time, hold={name: position[i] for i, name in enumerate(names)}, throw=False)
-        v = nearest_velocity(scene, held.q, v, time, columns)
-        return held.q, (held.q, v, held.result == RESULTS.successful)
+        v, has_velocity = nearest_velocity(scene, held.q, v, time, columns)
+        # As many measured joints as degrees of freedom contradict no row, unless they do not determine the velocity.
+        left = velocity_residual(independent_rows(scene, held.q, time), held.q, v, time)
+        missed = held.success & ~(has_velocity & _is_small(left, v))
+        return held.q, (held.q, v, RESULTS.where(missed, RESULTS.not_nearest, held.result))
 
     # In sequence: every sample starts from the one before, which keeps the mechanism on one branch of its assembly.
-    _, (q, v, good) = jax.jit(lambda *samples: lax.scan(complete_sample, guess, samples))(
+    _, (q, v, result) = jax.jit(lambda *samples: lax.scan(complete_sample, guess, samples))(
         positions, velocities, jnp.asarray(t, dtype)
     )
-    if not bool(good.all()):
-        i = int(np.argmin(np.asarray(good)))
-        raise ValueError(
-            f"the mechanism cannot be assembled at sample {i} (t = {t[i]:.6g} s); check measured, lengths and guess"
-        )
+    codes = np.asarray(code_of(result))
+    if codes.any():
+        i = int(np.argmax(codes != 0))
+        is_open = CODES[codes[i]] != "not_nearest"
+        what = "mechanism cannot be assembled" if is_open else "measured joints do not determine the mechanism's state"
+        raise ValueError(f"the {what} at sample {i} (t = {t[i]:.6g} s); check measured, lengths and guess")
     q, v = np.array(q), np.array(v)
     q[:, np.array(q_indices)], v[:, np.array(columns)] = positions, velocities
     return Log(t, q, v, None, np.asarray(tau, np.float64))

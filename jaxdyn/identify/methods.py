@@ -159,6 +159,18 @@ class GaussNewton(Method):
         return Iterate(point, here.loss, (here, damping), here.is_finite)
 
 
+def confirm_minimum(result: Any, linear: LinearErrors, tolerance: float, rounding: float) -> Any:
+    """The result of a least-squares fit, or `no_descent` where it is `successful` at a point that is no minimum.
+
+    Steps that fail until the damping has made them small, or until none lowers the loss any more, look like convergence.
+    """
+    if result is not RESULTS.successful or linear.loss <= (10 * rounding) ** 2:
+        return result
+    # Directions of less than this share of the largest curvature are not identifiable: their derivatives may be rounding.
+    _, decrease = linear.step(_CLEAR)
+    return result if decrease <= 10 * max(tolerance, 1e3 * rounding) * linear.loss else RESULTS.no_descent
+
+
 def propose(here: LinearErrors, damping: float, tolerance: float) -> np.ndarray | None:
     """Step dy (p,) at a damping; None where it predicts no decrease beyond `tolerance`, or the damping has no effect left."""
     dy, decrease = here.step(damping)
@@ -173,6 +185,8 @@ else:
     Optimizer = Any  # optax is imported when a fit runs
 
 SOLVERS, METHODS = ("levenberg-marquardt", "dogleg"), ("lbfgs", "adam")
+# Damping, in shares of the largest curvature, with which the decrease that a step promises is judged at the end of a fit.
+_CLEAR = 1e-6
 # Steps without a lower loss after which only rounding is left to remove.
 _STALE = 10
 _OPTIONS = {"jac": "fwd"}
@@ -258,13 +272,30 @@ class GradientSteps(Method):
         """Make one step."""
         if self.is_searching and len(history) > _STALE:
             if history[-1 - _STALE] - history[-1] <= self.tolerance * abs(history[-1]):
-                return iterate, RESULTS.successful
+                return iterate, RESULTS.successful if self._is_minimum(iterate, history) else RESULTS.no_descent
         with loose_promotion():
             y, state = _update(self.optimizer, self.loss, self.args, self.is_searching, iterate.point, iterate.state)
             if not self.is_searching:
                 value, gradient = _evaluate(self.loss, y, self.args)
                 state = state._replace(value=value, gradient=gradient)
             return self._iterate(y, state), None
+
+    def _is_minimum(self, iterate, history: list[float]) -> bool:
+        """Decide whether a step along the gradient would lower the loss by less than the tolerance (Cauchy's point)."""
+        y, gradient = iterate.point, iterate.state.gradient
+        eps = float(jnp.finfo(jnp.result_type(*jax.tree.leaves(y))).eps)
+        square, size = (float(sum(jnp.sum(x**2) for x in jax.tree.leaves(tree))) for tree in (gradient, y))
+        # A loss at rounding of the first one, and a gradient of zero.
+        if abs(iterate.loss) <= 100 * eps * abs(history[0]) or square == 0:
+            return True
+        # The curvature along the gradient by a difference of gradients: a second derivative may not exist.
+        step = eps**0.5 * max(1.0, size**0.5) / square**0.5
+        with loose_promotion():
+            _, beyond = _evaluate(self.loss, jax.tree.map(lambda x, g: x + step * g, y, gradient), self.args)
+        pairs = zip(jax.tree.leaves(beyond), jax.tree.leaves(gradient), strict=True)
+        curvature = float(sum(jnp.sum((new - old) * old) for new, old in pairs)) / step
+        promised = square**2 / (2 * curvature) if curvature > 0 else np.inf
+        return promised <= 10 * max(self.tolerance, 1e3 * eps) * abs(iterate.loss)
 
     def arrays(self, iterate):
         """Array leaves of the state."""

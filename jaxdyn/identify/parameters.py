@@ -20,6 +20,7 @@ from jaxdyn.identify.methods import (
     LeastSquaresSteps,
     LinearErrors,
     Unknowns,
+    confirm_minimum,
     propose,
 )
 from jaxdyn.identify.options import GAUSS_NEWTON, Execution, Objective, Solver, merge_options
@@ -126,11 +127,14 @@ def _minimise(
     problem: Problem, unknowns: Unknowns, solver: Solver, watch: Watch
 ) -> tuple[Descent, LinearErrors | None]:
     """End of a minimisation, and the errors near it; None where the method takes no Jacobian."""
+    rounding = float(jnp.finfo(unknowns.y.dtype).eps)
     if solver.name == GAUSS_NEWTON:
-        rounding = float(jnp.finfo(unknowns.y.dtype).eps)
         end = descend(GaussNewton(partial(linearise, problem), solver.tolerance, rounding), unknowns, watch)
         # Only steps that lower the loss are accepted: the last point is the best one.
-        return end._replace(best=end.last), end.last.state[0]
+        linear = end.last.state[0]
+        return end._replace(
+            best=end.last, result=confirm_minimum(end.result, linear, solver.tolerance, rounding)
+        ), linear
     if solver.name in SOLVERS:
         steps: Method = LeastSquaresSteps(errors_of, problem, solver.name, solver.tolerance)
     else:
@@ -143,7 +147,10 @@ def _minimise(
             tolerance=solver.tolerance,
         )
     end = descend(steps, unknowns, watch)
-    return end, linearise(problem, end.best.point) if solver.name in SOLVERS else None
+    if solver.name not in SOLVERS:
+        return end, None
+    linear = linearise(problem, end.best.point)
+    return end._replace(result=confirm_minimum(end.result, linear, solver.tolerance, rounding)), linear
 
 
 def _best_start(problem: Problem, unknowns: Unknowns, solver: Solver, execution: Execution) -> Unknowns:

@@ -241,7 +241,8 @@ def simulate_segment(
         q0, v0 = displace(scene.system, q0, change[0]), v0 + change[1]
     if scene.constraints:
         state = on_constraints(scene, q0, v0, t[0], observed)
-        q0, v0 = state.q, state.v
+        # NaN, and no motion from a state that is not the one asked for.
+        q0, v0 = (jnp.where(state.success, x, jnp.nan) for x in (state.q, state.v))
     control = SampledTorque(t, one.tau, hold) if control is None else control
     # No exception under jax.vmap: one failed segment must not end the others.
     motion = simulate(scene, q0, v0, t, control=control, outputs=outputs, throw=False, **given)

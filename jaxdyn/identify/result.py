@@ -147,7 +147,8 @@ class ParameterFit(AbstractFit):
       consecutive samples twice as long as the autocorrelation time, or whole logs where there are twenty or more. `factor`: a
       95 % interval is plus and minus this many of them (Student's t).
     - `history` (steps,): loss before each step and at the end. `result`: one of `RESULTS`, `successful` where it has
-      converged, else `max_steps_reached`, `stopped` or `nonfinite`; `cause` then names the log, the sample and the parameters.
+      converged, else `max_steps_reached`, `stopped`, `no_descent` where no step lowers the loss at a point that is no minimum, or
+      `nonfinite`; `cause` then names the log, the sample and the parameters.
     """
 
     system: Any

@@ -22,15 +22,14 @@ from jaxdyn.tasks import DaskClient, open_engine
 
 # At least two blocks form a jackknife group: about ten groups at most, nine degrees of freedom for Student's t.
 _BLOCKS = 20
-# Fits after which the weights of joints and the loads of gears are updated.
-_ROUNDS = 3
 _V_S, _PRIOR = 0.01, 1.0
 
 
 class RobotFit(eqx.Module):
     """Result of `fit_robot`.
 
-    - `fit`: the `Fit`, on all logs: model, friction, extra torques, `torques(log)`, `error(log)`.
+    - `fit`: the `Fit`, on all logs: model, friction, extra torques, `torques(log)`, `error(log)`. Its `result` is
+      `max_steps_reached` where the weights of joints and samples and the loads of gears, which depend on the fit, do not settle.
     - `weights` (nv,): of each torque, one over the root mean square of its residual, of mean one; ones where not fitted.
     - `choice`: the setting (v_s, extra terms by joint, prior, loss) and all trials; none where everything was given.
     - `intervals`: standard deviations and sources of all parameters and of the base parameters; fitted delays
@@ -156,7 +155,7 @@ def fit_robot(
         delays = search_delays(setting, delays.seconds)
         logs = tuple(shift_torques(log, delays.seconds) for log in given)
         problem = RobotProblem(model, logs, basic, extra, inertia, blocks)
-    estimate = problem.refine(setting, fixed, rounds=_ROUNDS)
+    estimate = problem.refine(setting, fixed)
     fit = problem.result(setting, estimate)
     if is_found and delays is not None and delays.seconds.any():
         spread, delays = with_delays(problem, setting, estimate, fit, delays)
@@ -222,7 +221,7 @@ def fit_torques(
     logs, terms = as_logs(log, model), check_terms(terms, v_s)
     check_prior(prior)
     problem, setting = RobotProblem(model, logs, terms, (), inertia, 1), Setting(float(v_s), (), float(prior))
-    return problem.result(setting, problem.refine(setting, check_weights(weights, model.nv), rounds=1))
+    return problem.result(setting, problem.refine(setting, check_weights(weights, model.nv)))
 
 
 def check_prior(prior) -> None:

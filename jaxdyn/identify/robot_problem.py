@@ -7,7 +7,17 @@ from typing import NamedTuple
 import jax.numpy as jnp
 import numpy as np
 
-from jaxdyn.identify.condensed_fit import Data, Estimate, Intervals, Setting, fit_blocks, gather, intervals
+from jaxdyn.identify.condensed_fit import (
+    MOST_ROUNDS,
+    Data,
+    Estimate,
+    Intervals,
+    Setting,
+    fit_blocks,
+    gather,
+    intervals,
+    is_negligible,
+)
 from jaxdyn.identify.interior import LinearChart
 from jaxdyn.identify.logs import Log, idle_coordinates, log_rate, signal_sizes
 from jaxdyn.identify.regression import log_regressor
@@ -69,22 +79,32 @@ class RobotProblem:
 
     def weigh_samples(self, setting: Setting) -> None:
         """Find the weights of samples for the loss of a setting, unless they are known."""
+        # Two fits are enough to compare settings, which share these weights; the fit that counts refines its own.
         if setting.robust is not None and setting.robust not in self.sample_weights:
             for _ in range(2):
                 self._weigh(setting, self.fit(setting))
 
-    def refine(self, setting: Setting, fixed: np.ndarray | None, rounds: int) -> Estimate:
-        """Fit several times; after each but the last, update weights and loads."""
+    def refine(self, setting: Setting, fixed: np.ndarray | None, rounds: int = MOST_ROUNDS) -> Estimate:
+        """Fit and update weights and loads in turn, until the fit has settled.
+
+        **Returns:** `Estimate`, whose result is `max_steps_reached` where the last of `rounds` fits has not settled.
+        """
         if fixed is not None:
             self.weights = fixed
         # Factorised folds depend on the weights.
         self._rows = {}
-        is_iterated = bool(self.extra) or fixed is None or setting.robust is not None
-        for remaining in reversed(range(rounds if is_iterated else 1)):
-            estimate = self.fit(setting)
+        if not (self.extra or fixed is None or setting.robust is not None):
+            return self.fit(setting)
+        before = None
+        for remaining in reversed(range(rounds)):
+            rows = self.data(setting).blocks.rows(self.weights)
+            estimate = self.fit(setting, rows=rows)
+            if before is not None and is_negligible(rows[:, :-1], estimate.x - before, estimate.sigma):
+                return estimate
             # No update after the last fit: intervals need the weights and loads that the estimate was made with.
             if not remaining:
-                return estimate
+                return estimate.give_up()
+            before = estimate.x
             if fixed is None:
                 self.weights = self._new_weights(setting, estimate)
             # Loads are torques of the fitted bodies, so columns that depend on them change with the fit.
@@ -93,7 +113,7 @@ class RobotProblem:
                 self._data = {}
             if setting.robust is not None:
                 self._weigh(setting, estimate)
-        raise ValueError(f"rounds is {rounds}")
+        raise ValueError(f"rounds is {rounds}; give at least 1")
 
     def has_outliers(self, setting: Setting) -> bool:
         """Decide whether the errors of a least-squares fit have heavier tails than normal ones at any torque.

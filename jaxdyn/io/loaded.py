@@ -89,6 +89,34 @@ class Actuators(eqx.Module):
 
         **Raises:** ValueError for controls or activations of another shape.
         """
+        force, rows = self._forces(system, q, v, control, activation)
+        low, high = self.effort_range.astype(q.dtype).T
+        # MuJoCo's order: clip the control, then each force, then the sum at each coordinate.
+        return jnp.clip(force @ rows, low, high)
+
+    def thrusts(
+        self,
+        system: Model,
+        q: Float[Array, " nq"],
+        v: Float[Array, " nv"],
+        control: Float[Array, " nu"],
+        activation: Float[Array, " na"] | None = None,
+    ) -> dict[str, Float[Array, "6"]]:
+        """Wrenches (f, tau) (6,) of the actuators at sites by the sites' names, at their origins and in their axes, N and N m.
+
+        They are a part of the generalised force, and what `jd.sensors.measure` takes as `thrusts`. Arguments as of the call.
+
+        **Raises:** ValueError for controls or activations of another shape.
+        """
+        force, _ = self._forces(system, q, v, control, activation)
+        result: dict[str, Array] = {}
+        for i, site in enumerate(self.sites):
+            if site is not None:
+                result[site] = result.get(site, 0.0) + force[i] * self.wrenches[i].astype(q.dtype)
+        return result
+
+    def _forces(self, system: Model, q, v, control, activation) -> tuple[Array, Array]:
+        """Force of each actuator (nu,), and the rows (nu, nv) along which they act."""
         control = self._clipped(control, q.dtype)
         if self._active:
             low, high = jnp.asarray(self.activation_range, q.dtype).T
@@ -106,13 +134,9 @@ class Actuators(eqx.Module):
                 # A wrench fixed in the site's frame acts by the body Jacobian; such a row depends on q.
                 rows = rows.at[i].set(self.wrenches[i].astype(q.dtype) @ body_jacobian(system, q, site))
         state = jnp.stack([jnp.ones_like(length), length, rows @ v], axis=1)
-        gain, bias, limits, force_range = (
-            x.astype(q.dtype) for x in (self.gain, self.bias, self.force_range, self.effort_range)
-        )
-        # MuJoCo's order: clip the control, then each force, then the sum at each coordinate.
+        gain, bias, limits = (x.astype(q.dtype) for x in (self.gain, self.bias, self.force_range))
         force = jnp.sum(gain * state, 1) * control + jnp.sum(bias * state, 1)
-        force = jnp.clip(force, limits[:, 0], limits[:, 1])
-        return jnp.clip(force @ rows, force_range[:, 0], force_range[:, 1])
+        return jnp.clip(force, limits[:, 0], limits[:, 1]), rows
 
     def activation_rate(self, control: Float[Array, " nu"], activation: Float[Array, " na"]) -> Float[Array, " na"]:
         """Rate of the activations (na,), zero where it would lead out of their range.

@@ -63,7 +63,7 @@ URDF_LINK = Part(
     },
 )
 URDF_JOINT = Part(
-    ("name", "type"),
+    ("name", "type", "dont_collapse"),  # of a converter that merges links
     {
         "origin": _ORIGIN,
         "parent": Part(("link",)),
@@ -78,7 +78,8 @@ URDF_JOINT = Part(
 )
 URDF_ROBOT = Part(
     ("name", "version"),
-    _without_effect("link joint gazebo material transmission ros2_control sensor group mujoco kinematics"),
+    # `jaxdyn` holds the torque terms of `save_urdf`, which `read_torque_terms` reads.
+    _without_effect("link joint gazebo material transmission ros2_control sensor group mujoco kinematics jaxdyn"),
 )
 # Gazebo copies whatever it finds into its own format.
 URDF_GAZEBO = Part(

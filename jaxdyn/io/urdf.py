@@ -11,9 +11,9 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from jaxdyn.io.loaded import warn_of_units
+from jaxdyn.io.loaded import warn_not_taken, warn_of_units
 from jaxdyn.io.urdf_check import JOINTS
-from jaxdyn.io.urdf_parts import Inertial, Joint, Mimic, read_parts
+from jaxdyn.io.urdf_parts import Inertial, Joint, Mimic, elements_without_effect, read_parts
 from jaxdyn.io.xml_lines import XmlFile, rounding_of_digits
 from jaxdyn.model import host_math
 from jaxdyn.model.arguments import DType, Numbers
@@ -79,14 +79,15 @@ def load_urdf(
     velocity or effort, a zero axis; for names in `lock` that are not movable joints;
     for a joint that moves no inertia. ImportError for a xacro file without the package xacro.
 
-    Elements and attributes that the model does not represent are those of `jd.load(path).not_taken`.
-
-    **Warns:** UserWarning naming the links with an unphysical inertia; `UnitsWarning` where limits look like degrees,
+    **Warns:** `NotTakenWarning` naming elements and attributes that are not read, as `jd.load` does (its `not_taken` is the
+    list); UserWarning naming the links with an unphysical inertia; `UnitsWarning` where limits look like degrees,
     or lengths and inertias like millimetres.
     """
     file = XmlFile(path, "URDF", arguments, packages)
     options: dict[str, Any] = {"gravity": gravity, "dtype": dtype, "missing_inertia": missing_inertia}
-    return urdf_model(file, floating_base=floating_base, lock=lock, mimic=mimic, **options)
+    model = urdf_model(file, floating_base=floating_base, lock=lock, mimic=mimic, **options)
+    warn_not_taken(file.path, elements_without_effect(file))
+    return model
 
 
 def urdf_model(

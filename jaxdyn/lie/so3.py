@@ -327,7 +327,8 @@ def _axes(sequence: str, dtype) -> list[Vector]:
 
 
 def _axis_rotations(angles: Vector, sequence: str) -> list[Matrix]:
-    if len(sequence) != 3 or not set(sequence) <= set("xyz") or sequence[1] in (sequence[0], sequence[2]):
+    is_given = isinstance(sequence, str) and len(sequence) == 3 and set(sequence) <= set("xyz")
+    if not is_given or sequence[1] in (sequence[0], sequence[2]):
         raise ValueError(
             f"sequence is {sequence!r}; give three of x, y, z with different neighbours, such as 'zyz' or 'zyx'"
         )

@@ -238,6 +238,8 @@ def cylinder(mass: Number, radius: Number, length: Number) -> Array | np.ndarray
 
 def rod(mass: Number, length: Number, axis: str = "x") -> Array | np.ndarray:
     """Inertial parameters (10,) of a uniform thin rod along an axis, "x", "y" or "z", about its centre; kg, m."""
+    if not isinstance(axis, str) or axis not in tuple("xyz"):
+        raise ValueError(f"axis is {axis!r}; give 'x', 'y' or 'z'")
     along = "xyz".index(axis)
     return _from_moments(mass, [0.0 if i == along else mass * length**2 / 12 for i in range(3)])
 

@@ -8,7 +8,7 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from jaxdyn.compile.known import is_concrete
-from jaxdyn.model.arguments import as_array, store_leaf
+from jaxdyn.model.arguments import Number, as_array, store_leaf
 
 
 def as_float(value: Any, what: str, shape: tuple | None = None, like=None) -> Float[Array, "..."]:
@@ -44,6 +44,16 @@ def as_number(value: Any, what: str, unit: str = "", *, zero: bool = False, like
             sign = "zero or a positive number" if zero else "one positive number"
             raise ValueError(f"{what} is {number}; give {sign}{unit and f' ({unit})'}")
     return array
+
+
+def as_static(value: Any, what: str, low: Number, high: Number, fix: str) -> float:
+    """Check a number from `low` to below `high` on which a program depends, so that it cannot be traced.
+
+    **Raises:** ValueError for anything else, with what to give: `fix`.
+    """
+    if isinstance(value, str) or not is_concrete(value) or np.shape(value) != () or not low <= float(value) < high:
+        raise ValueError(f"{what} is {value!r}; give {fix}, not traced")
+    return float(value)
 
 
 def check_count(value: Any, what: str) -> int:

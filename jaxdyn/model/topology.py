@@ -126,6 +126,12 @@ class Topology:
         return tuple(tables)
 
 
+def check_name(name: Any, what: str) -> None:
+    """Check that a part of a model is named by a string. **Raises:** ValueError."""
+    if not isinstance(name, str):
+        raise ValueError(f"{what} is {name!r}; give its name, a string")
+
+
 def body_index(model: Any, name: str | None) -> int:
     """Index of a body by name; None means the world, -1.
 
@@ -133,6 +139,7 @@ def body_index(model: Any, name: str | None) -> int:
     """
     if name is None:
         return -1
+    check_name(name, "body")
     if name in model.topology.body_names:
         return model.topology.body_names.index(name)
     # A link merged into a body is still named by users and files.
@@ -144,6 +151,7 @@ def frame_index(model: Any, name: str) -> int:
 
     **Raises:** ValueError when there is no frame of that name; names that look alike are listed.
     """
+    check_name(name, "frame")
     # Files often name the joint where they mean its link, fixed joints included.
     carried = dict(model.fixed_joints) | dict(zip(model.topology.joint_names, model.topology.body_names, strict=True))
     try:
@@ -157,6 +165,7 @@ def joint_index(model: Any, name: str) -> int:
 
     **Raises:** ValueError for a name of no joint, or of a fixed one; names that look alike are listed.
     """
+    check_name(name, "joint")
     if name in model.topology.joint_names:
         return model.topology.joint_names.index(name)
     if name in dict(model.fixed_joints):

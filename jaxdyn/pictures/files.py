@@ -25,14 +25,20 @@ _SHOWN_GROUPS = 3
 _DEFAULT_GREY = (0.5, 0.5, 0.5, 1.0)  # MuJoCo's default colour of a geom
 
 
-def shapes(path: str | os.PathLike, *, arguments: Mapping[str, Any] | None = None) -> Shapes:
+def shapes(
+    path: str | os.PathLike,
+    *,
+    arguments: Mapping[str, Any] | None = None,
+    packages: Mapping[str, str | os.PathLike] | None = None,
+) -> Shapes:
     """Read the visual solids of a URDF, MJCF or SDF file, for `jd.view`, `jd.pictures.save_html` and `jd.draw`.
 
     A model holds no geometry, so the file is read again. Meshes are STL, DAE, OBJ, PLY or
     GLB files, searched at the path given in the file, `package://` and `model://` in the folders above the file and
     in those of ROS_PACKAGE_PATH, AMENT_PREFIX_PATH and GZ_SIM_RESOURCE_PATH.
 
-    **Arguments:** `path`, the file; its root element determines the format. `arguments`: of a xacro file, as for `jd.load`.
+    **Arguments:** `path`, the file; its root element determines the format. `arguments`, `packages`: of a xacro file, as for
+    `jd.load`.
 
     **Returns:** `Shapes`, a tuple of `Shape`s, with `.missing`, descriptions of elements that could not be drawn.
 
@@ -46,7 +52,7 @@ def shapes(path: str | os.PathLike, *, arguments: Mapping[str, Any] | None = Non
     jd.pictures.save_html("robot.html", model, solution, shapes=solids)
     ```
     """
-    file = XmlFile(path, "robot", arguments)
+    file = XmlFile(path, "robot", arguments, packages)
     readers = {"robot": _urdf, "mujoco": _mjcf, "sdf": _sdf}
     if file.root.tag not in readers:
         raise file.fault(file.root, f"the root element is <{file.root.tag}>; expected <robot>, <mujoco> or <sdf>")

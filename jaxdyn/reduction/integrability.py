@@ -53,7 +53,7 @@ def involutive(
 
     **Returns:** `Involutivity`.
 
-    **Raises:** ValueError for traced numbers and scenes without constraints.
+    **Raises:** ValueError for traced numbers, scenes without constraints, and rows whose derivatives are not finite.
 
     ```python
     jd.reduction.involutive(jd.scenes.rolling_disk(), q).ranks  # (2, 3, 4)
@@ -80,11 +80,18 @@ def involutive(
     levels: tuple[tuple[tuple[int, int], ...], ...] = ()
     new = np.asarray(_fields_compiled(scene, reference, q, t, levels), float)[:, :count]
     spanned, ranks, evidence = np.zeros((scene.nq, 0)), [], []
+    # Every pass but the last adds a dimension, of which there are at most nq.
     while True:
+        if not np.isfinite(new).all():
+            raise ValueError(
+                f"the rows have derivatives of order {len(levels)} that are not finite at q = {np.asarray(q).tolist()}; choose "
+                "another configuration"
+            )
         sizes = np.linalg.svd(np.concatenate([spanned, new], 1), compute_uv=False)
         evidence.append(sizes)
-        ranks.append(int(np.sum(sizes > limit * sizes[0])))
-        if len(ranks) > 1 and ranks[-1] in (ranks[-2], most):
+        # A level spans that before. Much longer brackets raise the threshold, which must not take dimensions away again.
+        ranks.append(max(int(np.sum(sizes > limit * sizes[0])), *ranks[-1:], 0))
+        if len(ranks) > 1 and (ranks[-1] == ranks[-2] or ranks[-1] >= most):
             return Involutivity(ranks[-1] == ranks[0], tuple(ranks), tuple(evidence))
         # With constant rank, the fields that are independent at q span the level around it.
         kept = _independent(spanned, new, limit * sizes[0])
@@ -98,14 +105,16 @@ def _independent(spanned, new, limit) -> list[int]:
     """Select columns of `new` that add a direction to those of `spanned`, the largest first."""
     # Directions in the span already are removed once; pivoting then needs only the new columns.
     rest, kept = new - spanned @ np.linalg.lstsq(spanned, new, rcond=None)[0] if spanned.shape[1] else new, []
-    while True:
+    # As many directions as there are rows or columns: at a threshold of zero what is left is rounding, without end.
+    for _ in range(min(rest.shape)):
         sizes = np.linalg.norm(rest, axis=0)
         k = int(np.argmax(sizes))
         if sizes[k] <= limit:
-            return kept
+            break
         along = rest[:, k] / sizes[k]
         rest = rest - np.outer(along, along @ rest)
         kept.append(k)
+    return kept
 
 
 def _fields(scene, reference, q, t, levels):

@@ -5,6 +5,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from jaxdyn.constraints.codes import name_of
 from jaxdyn.identify import (
     TERMS,
     DriveGains,
@@ -193,6 +194,7 @@ def gains_content(gains: DriveGains) -> dict[str, Any]:
         "told": list(gains.identifiable),  # former key, for one release
         "percent": gains.error,
         "v_s": gains.v_s,
+        "result": name_of(gains.result),
     }
 
 
@@ -208,6 +210,7 @@ def payload_content(payload: Payload) -> dict[str, Any]:
         "interval_factor": payload.factor,
         "percent": payload.error,
         "percent_without": payload.without,
+        "result": name_of(payload.result),
     }
 
 

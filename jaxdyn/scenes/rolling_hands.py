@@ -58,7 +58,14 @@ def _finger_state(base, links, tip_axes, point, normal, velocity):
     center = point + xp.max(tip_axes) * normal  # outside of the object
     if xp is np:
         for _ in range(_ITERATIONS):
+            before = center
             center, angles_and_rates = iterate(center)
+        # A traced point cannot be refused; the residuals of the contacts then show the gap.
+        if not xp.linalg.norm(center - before) <= 1e-12:
+            raise ValueError(
+                f"a fingertip of semi-axes {tip_axes.tolist()} m does not reach its contact point {np.round(point, 4).tolist()} "
+                "on the object; give a position closer to the default one, longer links or smaller tips"
+            )
         return angles_and_rates
     # Each iteration is a contraction in the derivatives too, so the loop itself is differentiated.
     center = jax.lax.scan(lambda at, _: (iterate(at)[0], None), center, None, length=_ITERATIONS - 1)[0]

@@ -1,6 +1,6 @@
 """Base class of sensors, their noise, and the readings of several at one instant."""
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from typing import Any, NamedTuple
 
 import equinox as eqx
@@ -19,7 +19,10 @@ from jaxdyn.systems.system import SceneLike
 
 
 class Motion(NamedTuple):
-    """An instant `t` (s) of a motion: `q` (nq,), `v` (nv,), `a` (nv,), its rate, and `multipliers` (nc,) of the constraints."""
+    """An instant `t` (s) of a motion: `q` (nq,), `v` (nv,), `a` (nv,), its rate, and `multipliers` (nc,) of the constraints.
+
+    `thrusts`: wrenches (6,) by the names of frames, which are a part of tau.
+    """
 
     scene: Scene
     q: Array
@@ -27,6 +30,7 @@ class Motion(NamedTuple):
     a: Array
     multipliers: Array
     t: Numbers = 0.0
+    thrusts: Mapping[str, Any] | None = None
 
 
 class Noise(eqx.Module):
@@ -154,12 +158,17 @@ def measure(
     v: Float[Array, " nv"],
     tau: Float[Array, " nv"] | None = None,
     t: Numbers = 0.0,
+    *,
+    thrusts: Mapping[str, Numbers] | None = None,
 ) -> dict[str, Float[Array, " k"]]:
     """Readings of sensors at one instant, without errors and delay, in steps of their resolution.
 
     Accelerations and constraint forces are those of `constrained_dynamics` under tau and the scene's forces.
 
-    **Arguments:** `scene` of a `Model`; `sensors`, a list; `q` (nq,); `v` (nv,); `tau` (nv,), N m or N (None: zero); `t`, s.
+    **Arguments:** `scene` of a `Model`; `sensors`, a list; `q` (nq,); `v` (nv,); `tau` (nv,), N m or N (None: zero); `t`, s;
+    `thrusts`: wrenches (f, tau) (6,) by the names of frames, at their origins and in their axes, whose generalised force is a
+    part of `tau`, as of propellers (`scene.actuators.thrusts` of an MJCF file). `ForceTorque` feels them where they act; all of
+    `tau` acts in the joints without them.
 
     **Returns:** readings (k,) by the sensors' names, in SI units.
 
@@ -175,7 +184,7 @@ def measure(
     q, v, tau, t = check_state(scene.system, q=q, v=v, tau=zeros_if_none(tau, scene.nv), t=t)
     # Solved once for all sensors: accelerations and multipliers belong to the same motion.
     dynamics = constrained_dynamics(scene, q, v, tau, t)
-    return readings_of(sensors, Motion(scene, q, v, dynamics.acceleration, dynamics.multipliers, t))
+    return readings_of(sensors, Motion(scene, q, v, dynamics.acceleration, dynamics.multipliers, t, thrusts))
 
 
 def readings_of(sensors: Sequence[Sensor], motion: Motion) -> dict[str, Array]:

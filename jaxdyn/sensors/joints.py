@@ -11,7 +11,7 @@ from jaxtyping import Array, Float
 from jaxdyn.constraints.reactions import body_wrenches_where
 from jaxdyn.dynamics.joint_wrenches import joint_wrench
 from jaxdyn.dynamics.kinematics import named_frame
-from jaxdyn.forces.wrenches import wrenches_where
+from jaxdyn.forces.wrenches import sum_wrenches, wrenches_where
 from jaxdyn.lie import se3
 from jaxdyn.model.arguments import Numbers
 from jaxdyn.model.numbers import as_float, as_number
@@ -110,8 +110,8 @@ class ForceTorque(Sensor):
     Without `inertia` that is all that the joint of the frame's body carries: the wrench through the joint, drive included. With
     it the frame is a mount inside a rigid body, and beyond it are a part of that body and the joints named.
 
-    Wrenches of the scene's constraints between frames act too, and those of its forces on bodies
-    (`jd.forces.external_wrenches`). On the mount's own body they count as acting beyond it, as the ground does on a foot under
+    Wrenches of the scene's constraints between frames act too, those of its forces on bodies (`jd.forces.external_wrenches`), and
+    the `thrusts` of `measure`. On the mount's own body they count as acting beyond it, as the ground does on a foot under
     an ankle, unless `frames` says which of them do. Springs, stops, friction, drives and tau act in the joints, between a body
     and its parent, as do constraints on coordinates, and forces of the user without `frame_wrenches`.
 
@@ -196,6 +196,8 @@ class ForceTorque(Sensor):
         parts = []
         if any(hasattr(force, "frame_wrenches") for force in scene.forces):
             parts.append(wrenches_where(scene, q, motion.v, motion.t, counts))
+        if motion.thrusts:
+            parts.append(sum_wrenches(model, q, motion.thrusts, counts, "thrusts"))
         if scene.constraints:
             parts.append(body_wrenches_where(scene, q, motion.multipliers, counts))
         return sum(parts[1:], parts[0]) if parts else None

@@ -1,6 +1,6 @@
 """Readings of sensors along a motion, with their delay and noise."""
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from typing import cast
 
 import jax
@@ -25,6 +25,7 @@ def record(
     v: Numbers,
     tau: Numbers | None = None,
     *,
+    thrusts: Mapping[str, Numbers] | None = None,
     key: Array | None = None,
 ) -> dict[str, Float[Array, "n k"]]:
     """Readings of sensors along a motion: delayed, with noise, then in steps of their resolution.
@@ -34,7 +35,8 @@ def record(
     disturbed on the group: they stay unit quaternions, whose sign is that of the sample before.
 
     **Arguments:** `scene` of a `Model`; `sensors`, a list; `ts` (n,), s, increasing; `q` (n, nq), `v` (n, nv), `tau` (n, nv), N m
-    or N (None: zero), as of a `Solution`; `key` of `jax.random` for the noise, None for readings without it.
+    or N (None: zero), as of a `Solution`; `thrusts`, as of `measure`, wrenches (n, 6) by the names of frames; `key` of
+    `jax.random` for the noise, None for readings without it.
 
     **Returns:** readings (n, k) by the sensors' names.
 
@@ -61,13 +63,20 @@ def record(
     if is_concrete(ts) and not (np.diff(np.asarray(ts)) > 0).all():
         raise ValueError("ts does not increase; give the times of the samples in order")
 
-    def read(q, v, tau, t):
+    thrusts = {frame: as_array(x, f"thrusts[{frame!r}]", dtype) for frame, x in (thrusts or {}).items()}
+    for frame, wrench in thrusts.items():
+        if wrench.shape != (count, 6):
+            raise ValueError(
+                f"thrusts[{frame!r}] has shape {wrench.shape}, expected {(count, 6)}, one row per time in ts"
+            )
+
+    def read(q, v, tau, t, thrusts):
         # Accelerations are solved for, and not differences of v, which would amplify its rounding.
         dynamics = constrained_dynamics(scene, q, v, tau, t)
-        motion = Motion(scene, q, v, dynamics.acceleration, dynamics.multipliers, t)
+        motion = Motion(scene, q, v, dynamics.acceleration, dynamics.multipliers, t, thrusts)
         return [sensor.read(motion) for sensor in sensors]
 
-    readings = jax.vmap(read)(q, v, tau, ts)
+    readings = jax.vmap(read)(q, v, tau, ts, thrusts)
     for sensor, values in zip(sensors, readings, strict=True):
         if sensor.noise is not None:
             at = sensor.quaternion_start(scene)

@@ -170,10 +170,19 @@ def check_combination(control, method: Method, solver, adjoint) -> None:
         raise ValueError(
             "adjoint is 'backsolve', which needs a differential equation; take 'reverse' or another method"
         )
-    if method.step_constants and isinstance(adjoint, diffrax.BacksolveAdjoint):
+    if isinstance(method, Reduced) and isinstance(adjoint, diffrax.BacksolveAdjoint):
         raise ValueError(
-            "adjoint is 'backsolve', which cannot follow the basis of method='reduced' backwards; take 'reverse', or "
-            "jd.Reduced with independent velocities or a function"
+            "adjoint is 'backsolve', which cannot follow the basis of method='reduced' backwards, nor see it become singular; "
+            "take 'reverse'"
+        )
+
+
+def check_conditions(conditions, adjoint) -> None:
+    """Refuse an adjoint that does not go back through the event that may end a run."""
+    if any(conditions) and isinstance(adjoint, diffrax.BacksolveAdjoint):
+        raise ValueError(
+            "adjoint is 'backsolve', which does not go back through events, and contacts, limits or the control may end the run; "
+            "take 'reverse', or contacts='report', limits=None and a control without `allowance`"
         )
 
 

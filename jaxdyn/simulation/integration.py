@@ -70,7 +70,7 @@ def integrate(term, project, eqs: Equations, args, method, y0, ts, steps, option
     if eqs.pieces.names and not of_kinks:
         system = PiecewiseSystem(solver.plan(y0), eqs.pieces, eqs.switching)
         return _by_pieces(system, inputs, controller, steps, options)
-    plan = solver.plan(y0)._replace(quality=quality, guards=guards, is_terminal=guards is not None)
+    plan = solver.plan(y0)._replace(quality=quality, guards=guards)
     return _by_steps(solver, plan, controller, inputs, steps, options)
 
 

@@ -16,7 +16,14 @@ from jaxdyn.constraints.rank import LEAST_GAP
 from jaxdyn.constraints.redundancy import exchange_rows, gap_of_redundant, has_selection, keep_rows, row_mask, rows_of
 from jaxdyn.constraints.selection import most_rounding, select_rows
 from jaxdyn.simulation import controls
-from jaxdyn.simulation.checks import Inputs, angle_coordinates, has_definite_mass, largest_angle, safe_inputs
+from jaxdyn.simulation.checks import (
+    Inputs,
+    angle_coordinates,
+    check_conditions,
+    has_definite_mass,
+    largest_angle,
+    safe_inputs,
+)
 from jaxdyn.simulation.equations import DRIVES, KEPT, Equations, at_save_point, equations
 from jaxdyn.simulation.integration import integrate
 from jaxdyn.simulation.methods import Method, consistent, is_regular, satisfies_redundant_rows, start_limit
@@ -158,6 +165,7 @@ def _set_up(scene: Scene, control, method: Method, inputs: Inputs, options) -> t
         options["limits"] == "stop",
         controls.can_end(control, *start),
     )
+    check_conditions(conditions, options["adjoint"])
     eqs, args = equations(scene, control, method, entries, *start, conditions)
     # Shapes that do not fit are reported here, with the user's function at the end of the traceback.
     eqx.filter_eval_shape(eqs.generalized_force, args, entries, *start)

@@ -94,7 +94,8 @@ def simulate(
       below ten times the rounding error of the dtype are raised to that. With fixed steps, tolerances of an implicit solver.
     - `adjoint`: "reverse" (default) for reverse mode with checkpoints, and Hessians over it; "forward" for jvp, jacfwd and
       Hessians by forward over forward mode; "direct" for both modes, at a cost that grows with `max_steps`; "backsolve" for the
-      continuous adjoint, whose gradients are approximate; or a diffrax adjoint, with which diffrax makes the steps.
+      continuous adjoint, whose gradients are approximate, of runs that no event can end; or a diffrax adjoint, with which diffrax
+      makes the steps.
     - `outputs`: any of "energy", "power", "work" (one more state, under the same error control), "acceleration" (the rate
       of v: of a free joint that of its body twist; `jd.dynamics.frame_acceleration` gives those of frames in world axes),
       "multipliers", "constraint_residual", "contact_forces", "contact_margins", "torque" (of the control, behind drives
@@ -112,7 +113,8 @@ def simulate(
       -1, and a concrete run warns (`JointLimitWarning`).
     - `max_events`: of a scene with forces that have modes (`jd.contact.DryFriction`, `jd.contact.UnilateralContact`), after
       which the run ends with the code `too_many_events`; by default 64. Such scenes take explicit methods with adaptive or fixed
-      steps, which end at events. Of piecewise forces, the events that derivatives follow (`jd.forces.PiecewiseForce`).
+      steps, which end at events; what begins and ends within one step is found as that of `limits` is. Of piecewise forces, the
+      events that derivatives follow (`jd.forces.PiecewiseForce`).
     - `progress`: show a meter (tqdm if installed, else lines of text).
     - `max_steps`: most steps to take, rejected ones included. Default: what fixed steps need; 65536 for adaptive ones,
       4096 with "direct", and where derivatives go through adaptive steps: the end of each one is recorded, 8 bytes a step

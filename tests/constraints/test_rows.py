@@ -12,6 +12,7 @@ from pinocchio_bridge import quick
 
 import jaxdyn as jd
 from jaxdyn.compile.batch import AT_ONCE, map_rows
+from jaxdyn.constraints import selection
 
 pytestmark = pytest.mark.native
 
@@ -83,3 +84,16 @@ def test_rows_are_batched_and_differentiated(count):
 
     ours, theirs = (quick(jax.vmap(partial(derivatives, way)))(many, scales) for way in (map_rows, lax.map))
     jax.tree.map(lambda x, y: np.testing.assert_allclose(x, y, rtol=1e-12, atol=1e-12), ours, theirs)
+
+
+@pytest.mark.long
+@pytest.mark.parametrize("name", ["bennett", "goldberg"])
+def test_rows_are_not_counted_where_a_search_left_them_open(name, monkeypatch):
+    """Off the constraints every row looks independent: where Newton's method has not closed them the start itself decides."""
+    scene, q = getattr(jd.scenes, name)(), jnp.asarray(getattr(jd.scenes, name).start()[0])
+    t, apart = jnp.zeros(()), 1e-5
+    sure, *_ = selection.eliminate(selection.unit_rows(scene, q, t), apart, jnp.zeros(5))
+    for steps in (12, 0):
+        monkeypatch.setattr(selection, "_NEWTON_STEPS", steps)
+        kept, *_ = selection._select_far_away(scene, q, t, sure, apart)
+        assert float(jnp.sum(kept)) == scene.nv - 1, steps

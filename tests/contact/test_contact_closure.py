@@ -161,6 +161,16 @@ def test_many_random_grasps_agree_with_the_program_over_edges():
     assert 10 < agree(200, 2) < 190
 
 
+def test_cuts_that_do_not_reach_the_margin_are_no_answer(monkeypatch):
+    """One round of tangent planes bounds the margin from above alone."""
+    cone = friction_cone("hard-finger", mu=2.0)
+    G = np.random.default_rng(3).normal(size=(6, 18))
+    assert force_closure_of_map(G, [cone] * 6).margin > 1e-3
+    monkeypatch.setattr("jaxdyn.contact.closure._ROUNDS", 1)
+    with pytest.raises(RuntimeError, match="the margin was not found to 1e-09 with 1 rounds"):
+        force_closure_of_map(G, [cone] * 6)
+
+
 def test_units_of_length_do_not_matter():
     G = grasp(*three(), "hard-finger")
     millimetres = G * np.array([1, 1, 1, 1e3, 1e3, 1e3])[:, None]

@@ -235,6 +235,12 @@ def test_rolling_reaches_all_contact_coordinates_unless_radii_are_equal(radius, 
     assert jd.reduction.involutive(scene, q).ranks == ranks
 
 
+def test_fingertips_that_cannot_reach_the_egg_are_refused():
+    """The fixed point of their angles does not converge for tips that are long against the links."""
+    with pytest.raises(ValueError, match=r"semi-axes .* does not reach its contact point"):
+        jd.scenes.hand_rolling_egg.start(tip_semi_axes=(0.08, 0.02, 0.02))
+
+
 def egg_on_plane(axes):
     """An egg that rolls on a plane, its centre of mass in the middle."""
     builder = jd.ModelBuilder("egg", gravity=(0.0, 0.0, -9.81))

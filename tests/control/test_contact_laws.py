@@ -45,6 +45,24 @@ def test_contact_coordinates_are_the_inverse_of_the_pose(pair):
     np.testing.assert_allclose(rate, want, atol=1e-10)
 
 
+@pytest.mark.long
+def test_surfaces_without_a_single_pair_of_closest_points_give_nan():
+    """Concentric ones, whose search ends where it begins, with zero steps; the other batch element keeps its numbers."""
+    flat, thin = Ellipsoid([0.1, 0.02, 0.01]), Ellipsoid([0.3, 0.01, 0.005])
+    for pair in ((flat, thin), (Sphere(0.2), Sphere(0.1))):
+
+        def first(p, pair=pair):
+            pose = jnp.eye(4).at[:3, 3].set(p)
+            eta = jd.contact.contact_coordinates(*pair, pose)
+            return eta[0], eta
+
+        both = jax.jit(jax.vmap(jax.value_and_grad(first, has_aux=True)))
+        (_, eta), slopes = both(jnp.array([[0.0, 0, 0], [0.0, 0, 0.5]]))
+        assert np.isnan(eta[0]).all() and np.isnan(slopes[0]).all()
+        # One above the other: points at the pole u = pi/2.
+        np.testing.assert_allclose(eta[1, 0], np.pi / 2, atol=1e-12)
+
+
 def task_of(scene):
     return jd.control.ContactCoordinates(scene.system, "tip", OBJECT, FINGER, CENTER)
 

@@ -334,3 +334,14 @@ def test_refusals_and_codes():
         lambda x, u: x + u, lambda x, u, k: -jnp.sum(u), lambda x: 0.0 * x[0], jnp.zeros(2), us, iterations=5
     )
     assert endless.result == RESULTS.nonlinear_max_steps_reached and endless.cost < 0
+    # A derivative of the wrong sign: no step along the search direction reduces the cost, however large the damping.
+    reversed_slope = jax.custom_jvp(lambda x: x)
+    reversed_slope.defjvp(lambda primals, tangents: (primals[0], -tangents[0]))
+    wrong = ilqr(
+        lambda x, u: x + u,
+        lambda x, u, k: 0.1 * (u @ u),
+        lambda x: jnp.sum((reversed_slope(x) - 1.0) ** 2),
+        jnp.zeros(2),
+        us,
+    )
+    assert wrong.result == RESULTS.no_descent

@@ -183,6 +183,11 @@ def test_what_the_feet_cannot_carry_has_a_code(solo):
     np.testing.assert_allclose(missing(down)[2], mass * (9.81 - 15.0), rtol=1e-5)
     # The weight is 24 N, and the regularisation 1e-6.
     np.testing.assert_allclose(missing(at_rest), 0.0, atol=1e-4)
+    # A program that was not solved has no remainder: forces beyond the largest number.
+    remainders, slopes = jax.vmap(jax.value_and_grad(lambda x: missing(down * x)[2]))(jnp.array([1.0, 1e308]))
+    np.testing.assert_allclose(remainders[0], mass * (9.81 - 15.0), rtol=1e-5)
+    np.testing.assert_allclose(slopes[0], -15.0 * mass, rtol=1e-5)
+    assert np.isnan(remainders[1]) and np.isnan(slopes[1])
     limited = solve(at_rest, 0.9)
     assert bool(limited.success) and np.abs(limited.tau).max() < 0.9 + 1e-6
     flying = jd.control.underactuated_inverse_dynamics(model, q, at_rest, at_rest, [])

@@ -64,6 +64,14 @@ def test_delays_are_found_to_their_intervals():
 
 
 @pytest.mark.long
+def test_shifts_that_do_not_settle_are_refused(monkeypatch):
+    """One round of the first-order model does not reach the delay."""
+    monkeypatch.setattr("jaxdyn.identify.delays._ROUNDS", 1)
+    with pytest.raises(ValueError, match="delays do not converge; the last ones are"):
+        identify.fit_robot(arm(), [late(1, (0.02, 0.02))], delay="auto", **GIVEN)
+
+
+@pytest.mark.long
 def test_a_delay_that_is_not_there_is_not_found():
     fit = identify.fit_robot(arm(), [late(1, (0, 0)), late(2, (0, 0))], delay="auto", **GIVEN)
     assert np.all(np.abs(fit.delays.seconds) <= fit.delays.factor * fit.delays.std)

@@ -5,6 +5,8 @@ import pytest
 from test_identify_robot import arm, motion
 
 from jaxdyn import identify, inertia
+from jaxdyn.cli.identify_tables import gains_text
+from jaxdyn.constraints.codes import RESULTS
 from jaxdyn.model.builder import ModelBuilder
 
 MASS, CENTRE = 0.9, (0.05, 0.02, -0.3)
@@ -125,3 +127,20 @@ def test_what_the_payload_does_not_tell_is_said():
     ):
         with pytest.raises(ValueError, match=words):
             identify.fit_gains(model, log, log, **{"mass": 1.0, "centre": (0, 0, 0.1), **options})
+
+
+def test_weights_that_have_not_settled_are_said(monkeypatch):
+    """One round, whose weights are not those of its fit, and one step, which leaves the gains where they start."""
+    model, gains = six(), np.linspace(0.8, 1.2, 6)
+    unloaded, loaded = logs_of(model, gains, noise=0.01, seed=1)
+    noise = np.random.default_rng(2).normal(size=unloaded.tau.shape) * np.array([1.0, 0, 0, 0, 0, 0])
+    unloaded = identify.Log(unloaded.t, unloaded.q, unloaded.v, unloaded.a, unloaded.tau + noise)
+    found = identify.fit_gains(model, unloaded, loaded, MASS, CENTRE, v_s=0.05)
+    assert bool(found.success)
+    for name, least in (("MOST_ROUNDS", 1), ("_STEPS", 1)):
+        with monkeypatch.context() as patch:
+            patch.setattr(f"jaxdyn.identify.workflows.drive_gains.{name}", least)
+            short = identify.fit_gains(model, unloaded, loaded, MASS, CENTRE, v_s=0.05)
+        assert short.result is RESULTS.max_steps_reached
+        assert "NOT CONVERGED: max steps reached" in gains_text(short, model.joint_names)
+    assert "NOT" not in gains_text(found, model.joint_names)

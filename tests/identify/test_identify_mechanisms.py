@@ -7,6 +7,8 @@ import pytest
 
 import jaxdyn as jd
 from jaxdyn.constraints.codes import RESULTS
+from jaxdyn.identify.mechanisms import on_constraints
+from jaxdyn.identify.replay import Segments, simulate_segment
 
 T = np.linspace(0.0, 1.0, 41)
 
@@ -162,3 +164,35 @@ def test_a_toss_tells_gravity_and_ratios_of_inertia():
         ratios(np.asarray(fit.system.inertias[0])), ratios(np.asarray(true.inertias[0])), rtol=1e-3
     )
     np.testing.assert_allclose(fit.system.inertias[0, 0], MASS, rtol=1e-12)
+
+
+def slides(phi):
+    """Two bodies of 1 kg on slides along x and y, with one constraint between them."""
+    builder = jd.ModelBuilder("slides")
+    for name, axis in (("x", (1, 0, 0)), ("y", (0, 1, 0))):
+        builder.add_body(name, None, "prismatic", (1.0, (0, 0, 0), (0.1, 0.1, 0.1)), axis=axis, joint_name=name)
+    return jd.Scene(builder.build(), [jd.Holonomic(phi)])
+
+
+def on_circle(q, t):
+    return (q @ q - 1.0)[None]
+
+
+@pytest.mark.long
+def test_measured_joints_that_contradict_the_rows_are_said(monkeypatch):
+    """The nearest point of a circle is on the radius; searches that stop early, and velocities that no row admits, say so."""
+    scene, q, v = slides(on_circle), jnp.array([0.8, 0.9]), jnp.array([0.3, -0.1])
+    state = on_constraints(scene, q, v, jnp.zeros(()), (0, 1))
+    n = q / jnp.linalg.norm(q)
+    np.testing.assert_allclose(state.q, n, atol=1e-10)
+    np.testing.assert_allclose(state.v, v - n * (n @ v), atol=1e-10)
+    monkeypatch.setattr("jaxdyn.identify.mechanisms._ITERATIONS", 1)
+    short = on_constraints(scene, q, v, jnp.zeros(()), (0, 1))
+    assert bool(short.result == RESULTS.not_nearest)
+    one = Segments(jnp.arange(2.0), jnp.stack([q, q]), jnp.stack([v, v]), jnp.zeros((2, 2)))
+    motion, _ = jax.jit(lambda one: simulate_segment(scene, one, None, "linear", {}, observed=(0, 1)))(one)
+    assert np.isnan(motion).all()
+    monkeypatch.undo()
+    fixed, zero = slides(lambda q, t: q[:1]), np.zeros(2)
+    with pytest.raises(ValueError, match="do not determine the mechanism's state at sample 1"):
+        jd.identify.complete_log(fixed, [0.0, 0.1], {"x": (zero, np.array([0.0, 1.0]))}, np.zeros((2, 2)), zero)

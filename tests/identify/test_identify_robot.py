@@ -8,11 +8,13 @@ import pytest
 
 from benchmarks.identify_selection import false_choices
 from jaxdyn import identify, inertia
+from jaxdyn.cli.identify_tables import payload_text
+from jaxdyn.constraints.codes import RESULTS
 from jaxdyn.identify.condensed import block_slices, condense_rows
-from jaxdyn.identify.condensed_fit import eliminate, share_of_extra
+from jaxdyn.identify.condensed_fit import Setting, eliminate, share_of_extra
 from jaxdyn.identify.logs import filter_like_log, idle_coordinates, samples_for_jumps, travel_ranges
 from jaxdyn.identify.regression import condense, condense_model
-from jaxdyn.identify.robot_problem import huber_weights
+from jaxdyn.identify.robot_problem import RobotProblem, huber_weights
 from jaxdyn.identify.selection import folds, improving_torques, standard_error
 from jaxdyn.identify.torque_terms import PRESLIDING, split_terms
 from jaxdyn.identify.uncertainty import block_groups, effective_sample_size, is_white, jackknife
@@ -182,6 +184,33 @@ def test_load_dependent_friction_follows_the_fitted_robot(truth):
     fit = identify.fit_robot(model, log(1), (*identify.TERMS, "load"), v_s=0.01, prior=1.0, robust=None)
     np.testing.assert_allclose(fit.fit.extra.coefficients, 0.1, atol=3e-3)
     assert fit.fit.error(log(2, noise=0.0)) < 0.2
+
+
+@pytest.mark.long
+def test_loads_that_have_not_settled_are_said(truth, monkeypatch):
+    """Friction in proportion to the load of the fit before: three fits leave it three standard deviations off."""
+    model = arm(0.2, 3)
+
+    def log(seed):
+        bare = measured(arm(), motion(seed), truth)
+        load = bare.tau - identify.regressor(arm(), bare.q, bare.v, bare.a)[:, :, 20:] @ truth[20:]
+        return measured(arm(), bare, truth, 0.1 * np.abs(load) * np.tanh(bare.v / 0.01), 0.002, seed)
+
+    given = {"v_s": 0.01, "prior": 1.0, "robust": None}
+    terms = (*identify.TERMS, "load")
+    fit = identify.fit_robot(model, log(1), terms, **given)
+    assert fit.fit.result is RESULTS.successful
+    loaded = truth.copy()
+    loaded[10:20] += np.asarray(inertia.displaced(inertia.sphere(0.6, 0.05), (0.02, 0, -0.7)))
+    held = measured(arm(), motion(3), loaded, noise=0.02, seed=3)
+    assert bool(identify.fit_payload(model, log(1), held, robot=fit).success)
+    monkeypatch.setattr("jaxdyn.identify.workflows.payload.MOST_ROUNDS", 1)
+    short = identify.fit_payload(model, log(1), held, robot=fit)
+    assert short.result is RESULTS.max_steps_reached and "NOT CONVERGED" in payload_text(short)
+    basic, extra, where = split_terms(terms, 2)
+    problem = RobotProblem(model, (log(1),), basic, extra, "full", 20)
+    for rounds, code in ((3, RESULTS.max_steps_reached), (30, RESULTS.successful)):
+        assert problem.refine(Setting(0.01, where, 1.0), None, rounds).minimum.result is code
 
 
 def test_friction_goes_through_the_filter_of_the_log(truth):

@@ -297,6 +297,35 @@ def test_what_the_log_does_not_determine_is_said(swung):
     assert short.result == RESULTS.max_steps_reached and len(short.history) == 3
 
 
+@jax.custom_jvp
+def reversed_slope(x):
+    """The identity with a derivative of the wrong sign: along it no step lowers a loss."""
+    return x
+
+
+reversed_slope.defjvp(lambda primals, tangents: (primals[0], -tangents[0]))
+
+
+@pytest.mark.long
+@pytest.mark.parametrize("method", ["gauss-newton", "levenberg-marquardt", "dogleg", "lbfgs"])
+def test_steps_that_lower_no_loss_are_no_solution(method):
+    """Every trial fails, until the damping or the line search has made steps too short to be seen."""
+    t = np.linspace(0, 3, 20)
+    q, v, a = np.sin(2 * t), 2 * np.cos(2 * t), -4 * np.sin(2 * t)
+    tau = a + G * np.sin(q) - 0.2 + 0.05 * np.cos(7 * t)
+    log = identify.Log(t, *(x[:, None] for x in (q, v, a, tau)))
+    for function, code in ((reversed_slope, RESULTS.no_descent), (lambda x: x, RESULTS.successful)):
+        force = Partial(lambda c, system, q, v, t, function=function: function(c), jnp.zeros(1))
+        fit = identify.fit_parameters(
+            Scene(scenes.pendulum(mass=1.0, length=1.0).system, (), (force,)),
+            log,
+            objective=identify.Objective("torque"),
+            solver=identify.Solver(method=method),
+            free=lambda s: s.forces[0].args,
+        )
+        assert fit.result is code, fit.result
+
+
 @pytest.mark.long
 def test_damping_of_a_model():
     builder = ModelBuilder("arm").add_body("a", axis=(0, 1, 0), inertia=(1.0, (0, 0, -0.5), (0.1, 0.1, 0.1)))

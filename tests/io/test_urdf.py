@@ -191,7 +191,8 @@ def test_features_of_a_joint(urdf):
         '<dynamics damping="0.5" friction="0.25" armature="0.125"/>'
     )
     path = urdf(link("a"), joint("j", "a", "b", inside), link("b"), '<gazebo:thing x="1"/>', "<!-- seen -->")
-    model = load_urdf(path, gravity=None)
+    with pytest.warns(jd.io.NotTakenWarning, match="unknown <gazebo:thing> in <robot>: r"):
+        model = load_urdf(path, gravity=None)
     assert (model.name, model.gravity, model.joint_names, model.frame_names) == ("r", None, ("j",), ("b", "a"))
     np.testing.assert_allclose(model.screws[0], [0, 0, 0, 0, 0.6, 0.8], atol=1e-16)
     np.testing.assert_allclose(model.home[0, :3, :3], pin.rpy.rpyToMatrix(0.1, 0.2, 0.3), atol=1e-15)

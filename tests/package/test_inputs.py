@@ -89,6 +89,38 @@ TAKES = [
     *((f"{name} of a metric", PLANE, *call) for name, call in OF_SYSTEMS.items()),
     *((name, CHAIN, *call) for name, call in OF_SCENES.items()),
 ]
+# Arguments that select a program: names, kinds and tolerances.
+ONES = jnp.ones(3)
+ARRAYS_FOR_STATIC = {
+    "tip": lambda x: jd.newton_euler_matrices(ARM, jnp.zeros(2), jnp.zeros(2), tip=x),
+    "frame": lambda x: jd.frame_jacobian(ARM, jnp.zeros(2), x),
+    "joint": lambda x: jd.dynamics.joint_wrench(ARM, jnp.zeros(2), jnp.zeros(2), jnp.zeros(2), joint=x),
+    "kind": lambda x: jd.contact.wrench_basis(x),
+    "joint ": lambda x: jd.constraints.loop(None, None, "a", None, joint=x),
+    "sequence": lambda x: jd.so3.euler_to_matrix(jnp.ones(3), sequence=x),
+    "rows": lambda x: jd.dynamics.workspace_dynamics(ARM, BODY, jnp.zeros(2), jnp.zeros(2), rows=x),
+    "least": lambda x: jd.dynamics.workspace_dynamics(ARM, BODY, jnp.zeros(2), jnp.zeros(2), rows=(0, 2), least=x),
+    "axis": lambda x: jd.inertia.rod(1.0, 1.0, axis=x),
+    "poles": lambda x: jd.contact.Sphere(0.1, poles=x),
+    "rank_tol": lambda x: jd.degrees_of_freedom(CHAIN, jnp.zeros(2), rank_tol=x),
+    "rank_tol ": lambda x: jd.reduction.tangent_basis(CHAIN, jnp.zeros(2), rank_tol=x),
+    "tol": lambda x: jd.contact.solve_qp(jnp.eye(2), jnp.ones(2), tol=x),
+    "tol ": lambda x: jd.control.ilqr(
+        lambda x, u: x + u, lambda x, u, k: u @ u, lambda x: x @ x, jnp.ones(1), jnp.zeros((2, 1)), tol=x
+    ),
+    "atol": lambda x: jd.assemble(CHAIN, jnp.zeros(2), atol=x),
+}
+
+
+@pytest.mark.parametrize("name", ARRAYS_FOR_STATIC)
+@pytest.mark.parametrize("value", [ONES, "zzz", None], ids=["array", "string", "traced"])
+def test_arrays_for_arguments_that_select_a_program_are_refused(name, value):
+    """By a ValueError with the argument's name; they ended in "unhashable type" or in an error of JAX's tracing."""
+    call = ARRAYS_FOR_STATIC[name]
+    with pytest.raises(ValueError, match=rf"\b{name.strip()} |frame 'zzz'|joint 'zzz'"):
+        jax.eval_shape(call, 1.0) if value is None else call(value)
+
+
 EVERY = pytest.mark.parametrize(
     ("system", "function", "args"), [(x[1], x[2], x[3:]) for x in TAKES], ids=[x[0] for x in TAKES]
 )

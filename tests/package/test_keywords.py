@@ -158,10 +158,10 @@ CALLS = {
     "reduction.spurious_terms": ((BAR, BQ, jnp.ones(1)), {"tau": BV, "t": 0.3, "independent": (0,)}),
     "reduction.tangent_basis": ((BAR, BQ), {"t": 0.3, "dof": 1, "rank_tol": 1e-8}),
     "scale.member": (({"g": jnp.arange(4.0)}, 3), {"seed": 2}),
-    "sensors.measure": ((ARM, [jd.sensors.Imu(HAND)], Q, V), {"tau": A, "t": 0.3}),
+    "sensors.measure": ((ARM, [jd.sensors.Imu(HAND)], Q, V), {"tau": A, "t": 0.3, "thrusts": {HAND: jnp.ones(6)}}),
     "sensors.record": (
         (ARM, [jd.sensors.Imu(HAND)], jnp.arange(2.0), jnp.stack([Q, Q]), jnp.stack([V, V])),
-        {"tau": jnp.stack([A, A]), "key": jax.random.key(0)},
+        {"tau": jnp.stack([A, A]), "thrusts": {HAND: jnp.ones((2, 6))}, "key": jax.random.key(0)},
     ),
     "so3.euler_body_jacobian": ((jnp.ones(3),), {"sequence": "xyz"}),
     "so3.euler_spatial_jacobian": ((jnp.ones(3),), {"sequence": "xyz"}),
@@ -218,9 +218,8 @@ def test_every_keyword_is_accepted(name):
         call() if name in OF_NUMBERS else eqx.filter_eval_shape(call)
         return
     assert name.startswith(ROOMS), f"give {name} a line in CALLS"
-    missing = set(keywords) - set(passed_by_tests().get(name.rpartition(".")[2], ()))
     # Calls that pass them by **options are not seen.
-    assert missing <= NOT_YET.get(name, set())
+    assert not set(keywords) - set(passed_by_tests().get(name.rpartition(".")[2], ()))
 
 
 @pytest.mark.slow
@@ -242,32 +241,3 @@ def passed_by_tests() -> dict[str, set[str]]:
                 known = {one.arg for one in node.keywords if one.arg} | set(places.get(name, [])[: len(node.args)])
                 passed.setdefault(name, set()).update(known)
     return passed
-
-
-# Keywords of functions of files, pictures, fits and runs that no test passes yet; the list is to be emptied.
-NOT_YET: dict[str, set[str]] = {
-    "animate": {"speed", "shapes"},
-    "identify.exciting_motion": {"margin", "v_s", "learning_rate", "velocity", "callback", "terms", "seed"},
-    "identify.fit_gains": {"blocks", "body", "terms"},
-    "identify.fit_payload": {"robot"},
-    "identify.fit_robot": {"blocks", "inertia"},
-    "identify.from_raw": {"order"},
-    "identify.identifiability": {"count", "rcond", "terms"},
-    "identify.least_squares": {"blocks", "rcond", "weights"},
-    "identify.rollout": {"friction", "horizon", "hold"},
-    "identify.trajectory_error": {"friction", "hold"},
-    "io.load": {"dtype", "gravity"},
-    "io.load_mjcf": {"dtype"},
-    "io.load_sdf": {"floating_base", "dtype"},
-    "io.read_log": {"model"},
-    "io.urdf_inertia_report": {"arguments"},
-    "pictures.save_html": {"shapes"},
-    "pictures.shapes": {"arguments"},
-    "pictures.view": {"shapes"},
-    "plot.energy": {"ax"},
-    "plot.forces": {"ax"},
-    "plot.work_precision": {"ax"},
-    "report": {"batches", "ways", "dtypes"},
-    "scale.evaluate": {"rows", "seed", "units", "batch_size", "reductions"},
-    "scale.run": {"seed", "rows", "retries", "progress"},
-}

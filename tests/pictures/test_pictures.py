@@ -513,3 +513,61 @@ def test_bodies_with_a_slash_in_their_names_are_where_they_are(monkeypatch):
             assert sum(handle.name == handles[name].name for handle in handles.values()) == 1
     finally:
         viewer.stop()
+
+
+# --- keywords ---------------------------------------------------------------------------------------------------------
+
+
+def red_box(model):
+    """One red box on the model's last body."""
+    return Shapes([Shape(model.body_names[-1], "box", (0.5, 0.5, 0.5), color=(1.0, 0.0, 0.0))])
+
+
+@pytest.mark.long
+def test_speed_and_shapes_of_an_animation(tmp_path):
+    """Two seconds of motion at twice the speed and five frames a second are six frames; a red box is red."""
+    pytest.importorskip("matplotlib")
+    image = pytest.importorskip("PIL.Image")
+    model = jd.robots.chain(2)
+    motion = jd.simulate(model, jnp.ones(2), jnp.zeros(2), jnp.linspace(0.0, 2.0, 21))
+    reds = []
+    for shapes in (None, red_box(model)):
+        jd.animate(model, motion, tmp_path / "a.gif", fps=5, speed=2.0, shapes=shapes)
+        with image.open(tmp_path / "a.gif") as picture:
+            assert picture.n_frames == 6
+            pixels = np.asarray(picture.convert("RGB"), int)
+        reds.append(int(np.sum((pixels[..., 0] > 120) & (pixels[..., 1:].max(axis=2) < 60))))
+    assert reds[1] > reds[0] + 100
+
+
+@pytest.mark.long
+def test_shapes_of_pages(tmp_path):
+    """The box's sides are in the page, and among the solids of the view; without shapes there are those of the inertias."""
+    pytest.importorskip("viser")
+    model = jd.robots.chain(2)
+    sizes = []
+    for shapes in (None, red_box(model)):
+        jd.pictures.save_html(tmp_path / "a.html", model, jnp.ones(2), shapes=shapes)
+        sizes.append((tmp_path / "a.html").stat().st_size)
+        viewer = jd.view(model, jnp.ones(2), shapes=shapes, browser=False, block=False)
+        boxes = [one for one in viewer._parts if one.kind == "box" and one.size == (0.5, 0.5, 0.5)]
+        viewer.stop()
+        assert len(boxes) == (shapes is not None)
+    assert sizes[0] != sizes[1]
+
+
+def test_solids_of_xacro_files(tmp_path):
+    """Arguments and folders of packages, as for `jd.load`."""
+    pytest.importorskip("xacro")
+    (tmp_path / "parts").mkdir()
+    head = '<robot name="r" xmlns:xacro="http://www.ros.org/wiki/xacro">'
+    (tmp_path / "parts" / "p.xacro").write_text(f"{head}<xacro:arg name='size' default='1'/></robot>")
+    path = tmp_path / "r.xacro"
+    path.write_text(
+        f"{head}<xacro:include filename='$(find parts)/p.xacro'/><link name='a'><visual><geometry>"
+        "<sphere radius='$(arg size)'/></geometry></visual></link></robot>"
+    )
+    packages = {"parts": tmp_path / "parts"}
+    (one,) = jd.pictures.shapes(path, packages=packages)
+    (two,) = jd.pictures.shapes(path, packages=packages, arguments={"size": "2.5"})
+    assert one.size == (1.0, 1.0, 1.0) and two.size == (2.5, 2.5, 2.5)

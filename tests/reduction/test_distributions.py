@@ -90,6 +90,21 @@ def test_growth_of_the_leaning_coin():
     assert computed.ranks == (3, 4, 5) and not computed.value
 
 
+@pytest.mark.long
+def test_brackets_end():
+    """A threshold below rounding, brackets that are 1e12 times as long as the fields, and derivatives that are not finite."""
+    edge = Pfaffian(lambda q, t: jnp.stack([jnp.sin(q[2]), -jnp.cos(q[2]), 0.0 * t]))
+    place = jnp.asarray([0.3, -0.2, 0.7])
+    assert involutive(Scene(free(3), (edge,)), place, rank_tol=1e-300).ranks == (2, 3)
+    # Two fields d/dx and a(x) d/dy + d/dz: the bracket a' d/dy is long, and the one after it longer.
+    fast = Pfaffian(lambda q, t: jnp.stack([0.0 * t, jnp.ones_like(t), -jnp.exp(25.0 * q[0])]))
+    computed = involutive(Scene(free(3), (fast,)), jnp.asarray([1.0, 0.0, 0.0]))
+    assert computed.ranks[-1] >= computed.ranks[0] and len(computed.ranks) <= 4
+    kink = Pfaffian(lambda q, t: jnp.stack([jnp.sqrt(jnp.abs(q[2])), jnp.ones_like(t), 0.0 * t]))
+    with pytest.raises(ValueError, match=r"derivatives of order 1 that are not finite at q = \[0.3, -0.2, 0.0\]"):
+        involutive(Scene(free(3), (kink,)), place.at[2].set(0.0))
+
+
 def test_involutive_refuses():
     with pytest.raises(ValueError, match="no constraints"):
         involutive(Scene(free(2)), jnp.zeros(2))

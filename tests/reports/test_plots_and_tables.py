@@ -169,8 +169,11 @@ def test_plots_of_batches_of_systems_without_joints_and_into_given_axes(arm, tmp
     assert "5 motions" in axes[0].get_title()
     np.testing.assert_allclose(lines(axes[0])["lift"], np.median(both.q[:, :, 1], axis=0))
     axes[0].figure.savefig(tmp_path / "states.png")
-    ax = jd.plot.energy(arm, both)
-    assert ax.get_ylabel() == "energy (J)"
+    given = Figure().subplots()
+    ax = jd.plot.energy(arm, both, ax=given)
+    assert ax is given and ax.get_ylabel() == "energy (J)"
+    given = Figure().subplots()
+    assert jd.plot.forces(arm, solution_of(arm, torque=(arm.nv,)), ax=given) is given and given.get_lines()
     scene = jd.scenes.pendulum()
     assert list(lines(jd.plot.states(scene, solution_of(scene))[0])) == ["q1"]
 
@@ -190,8 +193,11 @@ def test_work_precision_draws_each_ladder():
         )  # fmt: skip
 
     runs = [record(solver, 10.0**-k, 1e-4 * k) for solver in ("Dopri5", "Dopri8") for k in (3, 6, 9)]
-    ax = jd.plot.work_precision(runs)
-    assert ax.get_xscale() == ax.get_yscale() == "log" and ax.get_xlabel() == "error"
+    from matplotlib.figure import Figure
+
+    given = Figure().subplots()
+    ax = jd.plot.work_precision(runs, ax=given)
+    assert ax is given and ax.get_xscale() == ax.get_yscale() == "log" and ax.get_xlabel() == "error"
     np.testing.assert_allclose(lines(ax)["free, Dopri8"], [3e-4, 6e-4, 9e-4])
     with pytest.raises(ValueError, match="2 plots"):
         jd.plot.work_precision([*runs, record("Dopri5", 1e-3, 1e-3, "arm")])

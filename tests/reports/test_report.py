@@ -495,7 +495,15 @@ def test_a_scene_of_ones_own(rungs, monkeypatch):
     case = Case("mine", "A pendulum of mine", lambda: (jd.Scene(model), (np.array([0.4]), np.zeros(1))), None, ts, 20)
     measured = jd.report(case, rounds=1, integrators=[("free", "Dopri8")])
     coarse, fine = (record.error_path for record in measured.records)
+    fine_setting = measured.records[1].setting
     assert fine < 1e-8 < coarse < 1e-2
+    with pytest.warns(DeprecationWarning, match="pass `integrators`"):
+        several = jd.report(case, rounds=1, ways=[("free", "Dopri8")], dtypes=("float32", "float64"), batches=(1, 3))
+    found = {(record.dtype, record.batch, record.solver) for record in several.records}
+    assert found == {(dtype, batch, "Dopri8") for dtype in ("float32", "float64") for batch in (1, 3)}
+    # The fine rung in float64 is that of before; float32 has its rounding.
+    errors = {(r.dtype, r.batch): r.error_path for r in several.records if r.setting == fine_setting}
+    assert errors["float64", 3] == pytest.approx(fine, rel=0.5) and errors["float32", 1] > 1e-8
     off = case._replace(
         reference=lambda start: Reference(ts, np.full((3, 1), 0.4), np.zeros((3, 1)), "wrong", "a guess")
     )

@@ -782,3 +782,66 @@ def test_stores_that_cannot_be_are_refused_with_the_cause(tmp_path, monkeypatch)
         with pytest.raises(ValueError, match=f"{tmp_path} cannot be written; change its permissions"):
             jd.scale.evaluate(square, parameters, out=tmp_path / "b.zarr", **QUIET)
     assert jd.scale.evaluate(square, parameters, out=out, **QUIET).success
+
+
+@pytest.mark.long
+def test_keywords_of_evaluate_and_run(tmp_path):
+    """Members by their seed, chosen rows, units, reductions against NumPy, one more attempt for what raises, and the meter."""
+    keys = [jax.random.fold_in(jax.random.key(7), i) for i in range(6)]
+    x = np.array([drawn(key)["x"] for key in keys])
+    run = jd.scale.evaluate(
+        square,
+        drawn,
+        samples=6,
+        out=tmp_path / "a.zarr",
+        seed=7,
+        rows=["z", "parameter_x"],
+        units={"z": "1/m", "x": "m"},
+        batch_size=2,
+        reductions={"mean": jd.scale.Mean("z")},
+        progress=False,
+    )
+    table = run.dataset()
+    np.testing.assert_allclose(table["z"], 1 / x, rtol=1e-14)
+    np.testing.assert_allclose(table["parameter_x"], x, rtol=0)
+    assert "y" not in table and table["z"].attrs["units"] == "1/m" and table["parameter_x"].attrs["units"] == "m"
+    np.testing.assert_allclose(run.reductions["mean"]["mean"], np.mean(1 / x), rtol=1e-14)
+    assert run.batch_size == 2
+
+
+@pytest.mark.long
+def test_seed_rows_retries_and_progress_of_runs(tmp_path, capsys, monkeypatch):
+    """Starts drawn by a seed move freely in a straight line; a chunk that raises once is computed at the second attempt."""
+    model = jd.ModelBuilder("free", gravity=None)
+    model.add_body("a", None, "prismatic", (1.0, (0, 0, 0), (0.1, 0.1, 0.1)), axis=(1, 0, 0))
+
+    def simulated(name, retries=2, progress=False):
+        return jd.scale.run(
+            model.build(), lambda p: (jnp.zeros(1), p["v"][None]), lambda key: {"v": jax.random.normal(key, ())},
+            np.array([0.0, 2.0]), samples=4, out=tmp_path / name, seed=3, rows=["q"], retries=retries, progress=progress,
+        )  # fmt: skip
+
+    run = simulated("a.zarr", progress=True)
+    assert "4" in capsys.readouterr().err
+    v = np.array([jax.random.normal(jax.random.fold_in(jax.random.key(3), i), ()) for i in range(4)])
+    table = run.dataset()
+    np.testing.assert_allclose(np.asarray(table["q"]).reshape(4, 2)[:, -1], 2 * v, atol=1e-10)
+    assert "v" not in table
+    calls, whole = [], program.Program.start
+
+    def breaks_once(self, numbers):
+        calls.append(numbers)
+        if len(calls) == 2:  # the first measures the time of a batch
+            raise OSError("the device was lost")
+        return whole(self, numbers)
+
+    for name, retries in (("b.zarr", 1), ("c.zarr", 0)):
+        calls.clear()
+        monkeypatch.setattr(program.Program, "start", breaks_once)
+        if retries:
+            again = simulated(name, retries)
+            np.testing.assert_array_equal(again.dataset()["result"], table["result"])
+        else:
+            with pytest.raises(RuntimeError, match="the device was lost"):
+                simulated(name, retries)
+    assert capsys.readouterr().err == ""

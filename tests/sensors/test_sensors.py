@@ -369,3 +369,78 @@ def test_noise_of_another_size_than_the_reading_is_refused():
         words = f"sensor '{imu.name}': {name} of its Noise has {len(value)} entries, its readings have 6 errors; give"
         with pytest.raises(ValueError, match=words):
             jd.sensors.record(arm, [imu], [0.0, 0.1], q, q, key=jax.random.key(0))
+
+
+FLYER = """
+<mujoco>
+  <worldbody>
+    <body name="base" pos="0 0 1">
+      <joint name="j1" axis="0 1 0"/>
+      <inertial pos="0.1 0 0" mass="1" diaginertia="0.01 0.02 0.03"/>
+      <body name="arm" pos="0.4 0 0">
+        <joint name="j2" axis="0 0 1"/>
+        <inertial pos="0.1 0.02 0" mass="0.7" diaginertia="0.01 0.02 0.015"/>
+        <site name="wrist" pos="0.05 0 0" euler="10 20 30"/>
+        <site name="before" pos="0.1 0 0.02" euler="10 0 30"/>
+        <body name="tool" pos="0.3 0 0">
+          <inertial pos="0.05 0 0.02" mass="0.3" diaginertia="0.001 0.002 0.003"/>
+          <site name="mount" pos="0.01 0 0" euler="0 40 0"/>
+          <site name="propeller" pos="0.1 0.05 0" euler="0 30 20"/>
+          <body name="tip" pos="0.2 0 0">
+            <joint name="j3" axis="0 1 0"/>
+            <inertial pos="0.02 0 0" mass="0.1" diaginertia="0.0001 0.0002 0.0003"/>
+            <site name="jet" pos="0.01 0.01 0"/>
+          </body>
+        </body>
+      </body>
+    </body>
+  </worldbody>
+  <actuator>
+    <general name="p" site="propeller" gear="0.1 0 1 0 0 0.2" forcelimited="true" forcerange="-1.5 1.5"/>
+    <general name="k" site="jet" gear="1 0 0 0 0.1 0" biastype="affine" biasprm="0.2 0 -0.3"/>
+    <general name="b" site="before" gear="0 1 0 0.1 0 0"/>
+    <general name="again" site="jet" gear="0 0 1 0 0 0"/>
+    <motor name="m" joint="j1"/>
+  </actuator>
+  <sensor>
+    <force name="f" site="mount"/><torque name="t" site="mount"/>
+    <force name="fw" site="wrist"/><torque name="tw" site="wrist"/>
+  </sensor>
+</mujoco>"""
+
+
+@pytest.mark.long
+def test_thrusts_act_where_they_are(tmp_path):
+    """MuJoCo counts them where they are as `xfrc_applied` alone; its own actuators count as torques of the joints."""
+    mujoco = pytest.importorskip("mujoco")
+    path = tmp_path / "flyer.xml"
+    path.write_text(FLYER)
+    m, scene = mujoco.MjModel.from_xml_path(str(path)), jd.io.load_mjcf(path)
+    data, control = mujoco.MjData(m), np.array([2.0, 3.0, -0.7, 0.4, 0.5])
+    data.qpos[:], data.qvel[:], data.ctrl[:] = [0.3, -0.4, 0.5], [0.7, -1.0, 0.4], control
+    mujoco.mj_forward(m, data)
+    q, v = jnp.asarray(data.qpos), jnp.asarray(data.qvel)
+    tau = scene.actuators(scene.system, q, v, jnp.asarray(control))
+    thrusts = scene.actuators.thrusts(scene.system, q, v, jnp.asarray(control))
+    measured = jd.sensors.measure(scene, scene.sensors, q, v, tau)
+    np.testing.assert_allclose(np.concatenate(list(measured.values())), data.sensordata, atol=1e-10)
+    acceleration, forces = data.qacc.copy(), data.actuator_force.copy()
+    for k, site in enumerate(("propeller", "jet", "before", "jet")):
+        i = mujoco.mj_name2id(m, mujoco.mjtObj.mjOBJ_SITE, site)
+        R, body = data.site_xmat[i].reshape(3, 3), m.site_bodyid[i]
+        force, torque = R @ m.actuator_gear[k, :3] * forces[k], R @ m.actuator_gear[k, 3:] * forces[k]
+        data.xfrc_applied[body, :3] += force
+        data.xfrc_applied[body, 3:] += torque + np.cross(data.site_xpos[i] - data.xipos[body], force)
+    m.actuator_gear[:4] = 0
+    mujoco.mj_forward(m, data)
+    np.testing.assert_allclose(data.qacc, acceleration, rtol=1e-10)
+    measured = jd.sensors.measure(scene, scene.sensors, q, v, tau, thrusts=thrusts)
+    np.testing.assert_allclose(np.concatenate(list(measured.values())), data.sensordata, atol=1e-10)
+    rows = jax.tree.map(lambda x: jnp.stack([x, x]), thrusts)
+    states = (jnp.stack([x, x]) for x in (q, v, tau))
+    recorded = jd.sensors.record(scene, scene.sensors, jnp.arange(2.0), *states, thrusts=rows)
+    np.testing.assert_allclose(recorded["tw"][1], measured["tw"], atol=1e-12)
+    with pytest.raises(ValueError, match=r"thrusts gives shape \(3,\) for frame 'jet'"):
+        jd.sensors.measure(scene, scene.sensors, q, v, tau, thrusts={"jet": jnp.ones(3)})
+    with pytest.raises(ValueError, match=r"thrusts\['jet'\] has shape \(6,\)"):
+        jd.sensors.record(scene, scene.sensors, [0.0], q[None], v[None], tau[None], thrusts={"jet": jnp.ones(6)})

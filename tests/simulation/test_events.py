@@ -10,6 +10,9 @@ import pytest
 from scipy.optimize import brentq
 
 import jaxdyn as jd
+from jaxdyn.simulation.hybrid.event_loop import _cases
+from jaxdyn.simulation.hybrid.modes import Mode
+from jaxdyn.simulation.hybrid.transitions import Transition, _solve
 
 G, MU, MU_S, LOAD, RATE = 9.81, 0.3, 0.5, 6.0, 2.0
 PLANE = ((0, 0, 0), (-np.pi / 2, 0, 0))  # z of the ground along y of the world
@@ -448,3 +451,41 @@ def test_boxes_that_tumble_lose_energy_and_stay_above_the_ground():
     bottom = batch.q[..., 1] - 0.2 * jnp.abs(jnp.sin(angle)) - 0.1 * jnp.cos(angle)
     assert bottom.min() > -1e-8  # of the dense output
     np.testing.assert_allclose(batch.q[7], motion(mu[7], q0[7], v0[7]).q, atol=1e-9)
+
+
+def test_modes_that_flip_without_end_are_not_found():
+    """A contact that pulls where it is closed, and penetrates where it is open, next to one that agrees at once."""
+    closed = jnp.array([True, False])
+    mode = Mode(closed, ~closed, jnp.zeros(2, bool), jnp.zeros(0, bool))
+
+    def search(always):
+        def disagreements(mode, slip):
+            flips = jnp.array([True, False]) & always
+            wrong = jnp.stack([mode.closed & flips, ~mode.closed & flips, *[jnp.zeros(2, bool)] * 3], 1)
+            return wrong, jnp.zeros(2, bool), slip, jnp.zeros(())
+
+        return _solve(jnp.ones(2, bool), disagreements, mode, jnp.zeros((2, 2)))
+
+    settled = jax.jit(jax.vmap(lambda always: search(always)[2]))(jnp.array([True, False]))
+    assert settled.tolist() == [False, True]
+    change = Transition(mode, None, mode, None, None, settled[0], jnp.asarray(False))
+    ((paradox, _), (unsettled, code)) = _cases(change)
+    assert bool(unsettled) and not bool(paradox) and code is jd.RESULTS.no_contact_mode
+
+
+@pytest.mark.long
+def test_constraints_are_closed_at_coarse_tolerances_too():
+    """A rod that turns by a radian a step under friction: save points are on the circle, or the steps have a code."""
+    rod_scene = jd.scenes.pendulum_in_plane()
+    along = jd.Pfaffian(lambda q, t: jnp.stack([-q[1], q[0]]), name="along")
+    friction = jd.contact.DryFriction(0.1, 1.0, along, name="friction")
+    scene = jd.Scene(rod_scene.system, rod_scene.constraints, (friction,))
+
+    def run(**options):
+        return jd.simulate(scene, [0.0, -1.0], [30.0, 0.0], jnp.linspace(0, 1.0, 3), throw=False, **options)
+
+    coarse = run(rtol=0.1, atol=0.1)
+    assert bool(coarse.success)
+    np.testing.assert_allclose(np.linalg.norm(coarse.q, axis=1), 1.0, atol=1e-10)
+    # No circle is within reach of steps of three turns.
+    assert run(stepsize=0.2).result == jd.RESULTS.coarse_steps

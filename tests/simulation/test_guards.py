@@ -202,6 +202,13 @@ def test_rows_before_the_end_have_derivatives():
     np.testing.assert_allclose(computed, np.where(limit_time(0.5) >= TS, TS, 0.0), atol=1e-11)
 
 
+@pytest.mark.parametrize("name", CASES)
+def test_the_continuous_adjoint_is_refused(name):
+    """Its backward equations know no event; it saw violations at save points alone, whose time is not that of the event."""
+    with pytest.raises(ValueError, match="backsolve', which does not go back through events"):
+        CASES[name].move(jnp.asarray(1.0), adjoint="backsolve")
+
+
 def test_a_start_behind_the_guard_is_the_end():
     beyond = jd.simulate(RAIL, [1.5], [0.0], TS, control=push_cart, limits="stop", throw=False)
     assert beyond.result == jd.RESULTS.joint_limit_passed and float(beyond.stats["time_reached"]) == 0.0
@@ -286,6 +293,27 @@ def test_short_passages_of_an_oscillation_are_found():
         assert np.asarray(found).all()
         # The passage is slow, 0.045 w: an error of the motion of 1e-8 is one of 1e-6 of the time.
         np.testing.assert_allclose(times, wanted, rtol=2e-6)
+
+
+@pytest.mark.long
+def test_passages_within_one_step_switch_pieces_and_hit_contacts():
+    """The parabola above, into a spring behind the end of the rail and against a wall there, for a twentieth of a step."""
+    depth = 2e-3
+    v, u = np.sqrt(1 + depth), np.sqrt(depth)
+    into, end = 2 * (v - u), 4 * v
+    back = lambda q, v, t: -jnp.ones_like(v)  # noqa: E731
+    # In the spring x'' = -(1 + k x)/2 from x = 0 with the velocity u; it comes back with -u.
+    k = 50.0
+    w = np.sqrt(k / 2)
+    inside = 2 * np.arctan2(u / w, 1 / k) / w
+    wall = jd.contact.gap_contact(lambda q, t: 1.0 - q[0], restitution=0.5, name="wall")
+    cases = ((jd.forces.JointStops(k), u, inside), (wall, 0.5 * u, 0.0))
+    for force, speed, waits in cases:
+        scene = jd.Scene(RAIL, forces=[force])
+        motion = jd.simulate(scene, [0.0], [v], np.array([0.0, end]), control=back, **TIGHT)
+        left = end - into - waits
+        np.testing.assert_allclose(motion.q[-1, 0], 1 - speed * left - left**2 / 4, atol=1e-9)
+    np.testing.assert_allclose(motion.events.time[0], into, rtol=1e-10)
 
 
 def limit_of(p, **options):

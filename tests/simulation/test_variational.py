@@ -10,6 +10,7 @@ from pinocchio_bridge import quick
 from benchmarks.report_cases import references
 from jaxdyn import scenes
 from jaxdyn.constraints import Holonomic, Pfaffian
+from jaxdyn.constraints.codes import CODES
 from jaxdyn.dynamics.centroidal import center_of_mass, centroidal_momentum
 from jaxdyn.dynamics.quantities import kinetic_energy, potential_energy
 from jaxdyn.model.builder import ModelBuilder
@@ -331,6 +332,30 @@ def test_a_step_that_cannot_be_solved_ends_the_run():
     solution = simulate(scene, q, 0 * v, ts, method="variational", stepsize=0.125, control=push, throw=False)
     assert solution.result == RESULTS.nonlinear_divergence and float(solution.stats["time_reached"]) == 0.75
     np.testing.assert_array_equal(np.isnan(solution.q[:, 0]), [False, False, False, True])
+
+
+@pytest.mark.long
+def test_derivatives_of_a_step_that_was_not_solved_are_nan():
+    """In both modes; those of the other batch element remain, and are those of differences."""
+    scene = scenes.pendulum_in_plane()
+    # The same step on both sides of 0.5 m/s gives central differences of fourth order.
+    d, ts = 1e-3, jnp.array([0.0, 0.5])
+    speeds = jnp.concatenate([jnp.array([0.5, 30.0]), 0.5 + d * jnp.array([-2.0, -1.0, 1.0, 2.0])])
+
+    def end(v, adjoint):
+        options = {"method": "variational", "stepsize": 0.5, "throw": False, "adjoint": adjoint}
+        solution = simulate(scene, jnp.array([0.0, -1.0]), jnp.array([1.0, 0.0]) * v, ts, **options)
+        return solution.q[-1, 0], (solution.q[-1, 0], solution.result)
+
+    (_, (x, results)), by_reverse = jax.jit(jax.vmap(jax.value_and_grad(lambda v: end(v, "reverse"), has_aux=True)))(
+        speeds
+    )
+    assert [CODES[i] for i in np.asarray(results.index[:2])] == ["successful", "nonlinear_divergence"]
+    by_forward = jax.jit(jax.vmap(jax.jacfwd(lambda v: end(v, "forward")[0])))(speeds[:2])
+    expected = (x[2] - 8 * x[3] + 8 * x[4] - x[5]) / (12 * d)
+    for derivative in (by_reverse, by_forward):
+        np.testing.assert_allclose(derivative[0], expected, rtol=1e-9)  # d^4 times a fifth derivative of the order of 1
+        assert np.isnan(derivative[1])
 
 
 @pytest.mark.slow

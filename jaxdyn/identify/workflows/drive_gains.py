@@ -12,12 +12,14 @@ condensed once.
 
 import dataclasses
 from collections.abc import Sequence
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import equinox as eqx
 import numpy as np
 
+from jaxdyn.constraints.codes import RESULTS, Outcome
 from jaxdyn.identify.condensed import Blocks
+from jaxdyn.identify.condensed_fit import MOST_ROUNDS, is_negligible
 from jaxdyn.identify.logs import Log, as_logs
 from jaxdyn.identify.regression import (
     base_parameters,
@@ -34,7 +36,8 @@ from jaxdyn.model import inertia as _inertia
 from jaxdyn.model.arguments import Numbers, warn
 from jaxdyn.model.tree import Model
 
-_STEPS, _ROUNDS = 50, 3
+# Most Gauss-Newton steps.
+_STEPS = 50
 # Largest half-width of a 95 % interval, as a share of the gain, of an identifiable gain.
 _IDENTIFIABLE = 0.5
 # Standard deviation of the prior of the logarithm of a gain, about the median of the others.
@@ -45,13 +48,15 @@ _FINEST = 1e-9
 _RANK = 1e-9
 
 
-class DriveGains(eqx.Module):
+class DriveGains(Outcome):
     """Result of `fit_gains`.
 
     - `gains` (nv,): torque = gain times the logged value. `std` (nv,): standard deviations, by blocks of samples as in
       `Intervals`; `factor`: a 95 % interval is plus and minus this many of them.
     - `identifiable`: names of the joints with a half-width below half of the gain. The other gains are about their median.
     - `error`: of the logged values, in per cent, over all logs. `v_s`: smoothing velocity of Coulomb friction.
+    - `result`: one of `jd.RESULTS`, `successful` where the fit and the weights of the joints have converged, else
+      `max_steps_reached`.
     """
 
     gains: np.ndarray
@@ -60,6 +65,7 @@ class DriveGains(eqx.Module):
     identifiable: tuple[str, ...] = eqx.field(static=True)
     error: float
     v_s: float
+    result: Any
 
     def scale(self, log: Log) -> Log:
         """Scale a log of these drives to torques in N m, as all fits expect them."""
@@ -140,7 +146,7 @@ def fit_gains(
         if best is None or trial[0] < best[0]:
             best = trial
     assert best is not None
-    _, error, gains, std, factor, velocity = best
+    _, error, gains, std, factor, velocity, result = best
     is_identifiable = factor * std < _IDENTIFIABLE * gains
     if not is_identifiable.any():
         raise ValueError(
@@ -148,7 +154,7 @@ def fit_gains(
             "gravity, or give its inertia"
         )
     names = tuple(name for name, yes in zip(coordinate_names(model), is_identifiable, strict=True) if yes)
-    return DriveGains(gains, std, factor, names, error, velocity)
+    return DriveGains(gains, std, factor, names, error, velocity, result)
 
 
 class _Problem:
@@ -205,20 +211,26 @@ class _State(NamedTuple):
 
 
 def _fit(problem: _Problem, v_s: float):
-    """Score, error in per cent, gains, standard deviations, factor of an interval, v_s."""
+    """Score, error in per cent, gains, standard deviations, factor of an interval, v_s, and the result."""
     data, nv = problem.data, problem.nv
     triangles, samples = data.merge(), int(data.samples.sum())
     sizes = np.array([max(float(np.linalg.norm(R[:, -1])), 1e-300) for R in triangles])
     start = _start(problem, triangles)
     state = _State(np.zeros(problem.size), start, 1 / sizes)
-    rms = sizes
-    for _ in range(_ROUNDS):
+    rms, result = sizes, RESULTS.max_steps_reached
+    for _ in range(MOST_ROUNDS):
         # Weights depend on the errors of the fit and the fit on the weights: iterated.
-        state = _descend(problem, triangles, state, start)
+        before = np.concatenate([state.z, state.u])
+        state, has_converged = _descend(problem, triangles, state, start)
         rms = np.array(
             [np.linalg.norm(problem.rows(j, R, state.z, state.u[j])[0]) for j, R in enumerate(triangles)]
         ) / np.sqrt(samples)
         state = state._replace(weights=1 / np.maximum(rms, _FINEST * sizes / np.sqrt(samples)))
+        # With these weights errors have deviations of one.
+        _, J = problem.linearise(triangles, *state)
+        if has_converged and is_negligible(J, np.concatenate([state.z, state.u]) - before, 1.0):
+            result = RESULTS.successful
+            break
     grams, gradients = [], []
     for block in data.triangles:
         error, J = problem.linearise(block, *state)
@@ -235,7 +247,7 @@ def _fit(problem: _Problem, v_s: float):
     score = float(np.sum(np.log(np.maximum(rms, _FINEST * sizes))))
     percent = 100 * float(np.sqrt(samples * np.sum(rms**2) / np.sum(sizes**2)))
     # The deviation of a logarithm is relative.
-    return score, percent, gains, gains * np.sqrt(variance[-nv:]), factor, v_s
+    return score, percent, gains, gains * np.sqrt(variance[-nv:]), factor, v_s, result
 
 
 def _weak_prior(gram: np.ndarray, size: int) -> np.ndarray:
@@ -273,8 +285,11 @@ def _start(problem: _Problem, triangles) -> np.ndarray:
     return np.where(np.isnan(logarithms), np.nanmedian(logarithms), logarithms)
 
 
-def _descend(problem: _Problem, triangles, state: _State, start: np.ndarray) -> _State:
-    """Make Gauss-Newton steps in unknowns and gains, the first in the unknowns alone; halved until the loss decreases."""
+def _descend(problem: _Problem, triangles, state: _State, start: np.ndarray) -> tuple[_State, bool]:
+    """Make Gauss-Newton steps in unknowns and gains, the first in the unknowns alone; halved until the loss decreases.
+
+    **Returns:** the state, and whether it is a minimum.
+    """
     z, u, weights = state
 
     def loss(z, u) -> float:
@@ -292,15 +307,15 @@ def _descend(problem: _Problem, triangles, state: _State, start: np.ndarray) -> 
         # Unit columns: the test of the rank must not depend on units.
         scale = np.maximum(np.linalg.norm(A, axis=0), 1e-300)
         change = -np.linalg.lstsq(A / scale, b, rcond=_RANK)[0] / scale
+        # What the linear model promises. Errors have deviations of one from the second round on, and in no direction does a
+        # promise of 1e-8 move the unknowns by more than 1e-4 of their deviation.
+        if step and np.sum((A @ change) ** 2) <= max(1e-12 * now, 1e-8):
+            return state._replace(z=z, u=u), True
         dz, du = change[: problem.size], change[problem.size :] if step else np.zeros(problem.nv)
         share = 1.0
         while (after := loss(z + share * dz, u + share * du)) > now and share > 1e-6:
             share /= 2
-        if after > now:  # no step in the direction of the gradient reduces the loss: at its minimum, to rounding
+        if after > now:
             break
-        z, u = z + share * dz, u + share * du
-        # The first step leaves the gains alone: its decrease says nothing about convergence.
-        if step > 1 and now - after <= 1e-12 * now:
-            break
-        now = min(now, after)
-    return state._replace(z=z, u=u)
+        z, u, now = z + share * dz, u + share * du, after
+    return state._replace(z=z, u=u), False

@@ -39,6 +39,8 @@ class Excitation(NamedTuple):
     - `logdet`: natural logarithm of the determinant of the information matrix, over that of the start.
     - `history`: of the loss.
     - `used`: largest share of position, velocity and torque limits that any joint uses (at most 1).
+    - `result`: one of `jd.RESULTS`, `max_steps_reached` where all steps of the search were made, `stopped` where the callback
+      ended it, `nonfinite` where a derivative was not finite. No code says that the motion is the best one.
     """
 
     motion: FourierMotion
@@ -48,6 +50,7 @@ class Excitation(NamedTuple):
     logdet: float
     history: np.ndarray
     used: dict[str, float]
+    result: Any
 
     def log(self, rate: float = 100.0, periods: int = 1) -> Log:
         """Log of the motion at so many samples a second with the torques of the nominal model, for a controller or a file."""
@@ -162,7 +165,7 @@ def exciting_motion(
     first = [float(_loss(_amplitudes(motion), motion, task, places, objective)) for motion in motions]
     motion = motions[int(np.argmin(np.where(np.isfinite(first), first, np.inf)))]
 
-    excitation, history = _descend(motion, task, places, objective, steps, learning_rate, callback)
+    excitation, history, result = _descend(motion, task, places, objective, steps, learning_rate, callback)
     excitation = _shrink(excitation, task)
     before, after = (np.asarray(_rows(m, task, places), np.float64) for m in (motion, excitation))
     scale = np.asarray(task.scale, np.float64)
@@ -175,6 +178,7 @@ def exciting_motion(
         float(ratio[1] - ratio[0]),
         history,
         _limit_shares(excitation, task),
+        result,
     )
 
 
@@ -280,7 +284,7 @@ def _descend(motion, task, places, objective, steps, learning_rate, callback):
     )
     report = None if callback is None else lambda step, loss, _: callback(step, loss)
     end = descend(method, _scale_amplitudes(_amplitudes(motion), 1 / span), Watch(steps, report))
-    return _with_amplitudes(_scale_amplitudes(end.best.point, span), motion), end.history
+    return _with_amplitudes(_scale_amplitudes(end.best.point, span), motion), end.history, end.result
 
 
 def _scale_amplitudes(amplitudes, span):

@@ -7,10 +7,10 @@ import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
 
-from jaxdyn.constraints.codes import RESULTS, name_of
+from jaxdyn.constraints.codes import RESULTS, Outcome, name_of
 from jaxdyn.identify.chart import check_bodies
 from jaxdyn.identify.condensed import Blocks, condense_rows
-from jaxdyn.identify.condensed_fit import eliminate, gather, minimize_torque_error
+from jaxdyn.identify.condensed_fit import MOST_ROUNDS, eliminate, gather, is_negligible, minimize_torque_error
 from jaxdyn.identify.interior import LOG_CHOLESKY_BASIS, LinearChart, TorqueProblem
 from jaxdyn.identify.logs import Log, as_logs
 from jaxdyn.identify.regression import least_squares_by_svd, log_regressor, noise_level
@@ -23,14 +23,14 @@ from jaxdyn.model import inertia as _inertia
 from jaxdyn.model.builder import ModelBuilder
 from jaxdyn.model.tree import Model
 
-_BLOCKS, _ROUNDS = 20, 2
+_BLOCKS = 20
 # Weight that holds robot parameters, relative to the size of their columns: enough where no log determines them.
 _HOLD = 1e-7
 # Radius (m) of the ball from which the shape of a payload starts.
 _RADIUS = 0.1
 
 
-class Payload(eqx.Module):
+class Payload(Outcome):
     """Result of `fit_payload`.
 
     - `inertia` (10,): m, m c, I about the origin of the body that holds it, in its frame; physically feasible.
@@ -39,6 +39,8 @@ class Payload(eqx.Module):
       determine have those of the prior. `factor`: a 95 % interval is plus and minus this many of them.
     - `body`: name of the body that holds it. `robot`: the `RobotFit` of the logs without it.
     - `error` : torque error of robot and payload along the loaded logs, in per cent; `without`: of the robot alone.
+    - `result`: one of `jd.RESULTS`, `successful` where the robot's fit has converged and so have the loads of the gears, which
+      depend on the payload; else that of the robot's fit, or `max_steps_reached`.
     """
 
     inertia: np.ndarray
@@ -48,6 +50,7 @@ class Payload(eqx.Module):
     robot: RobotFit
     error: float
     without: float
+    result: Any
 
     @property
     def mass(self) -> float:
@@ -115,7 +118,8 @@ def fit_payload(
         return effective_sample_size([*residuals, *_residuals(robot, loaded, own, payload)[0]])
 
     # The load of the gears depends on the payload, which is still zero in the first round.
-    for _ in range(_ROUNDS if extra else 1):
+    has_loads, result = any(term.needs_load for term in extra), RESULTS.max_steps_reached
+    for _ in range(MOST_ROUNDS):
         loads = []
         for log, holds in zip(logs, is_loaded, strict=True):
             carried = x.copy()
@@ -124,9 +128,14 @@ def fit_payload(
         data = gather(model, logs, setting.v_s, extra, loads, _BLOCKS)
         kept = np.concatenate([np.arange(data.basic), data.places(setting.extra)]).astype(int)
         rows = _rows(data.blocks, is_loaded, own, kept, robot.weights)
-        payload, std, factor = _solve(data.blocks, is_loaded, own, kept, robot.weights, rows, size)
+        before = payload
+        sigma = noise_level(condense_rows(rows, data.blocks.count()))
+        payload, std, factor = _solve(data.blocks, is_loaded, own, kept, robot.weights, rows, sigma, size)
+        if not has_loads or is_negligible(rows[:, len(kept) : -1], payload - before, sigma):
+            result = robot.fit.result
+            break
     error, without = _errors(robot, loaded, own, payload)
-    return Payload(payload, std, factor, body, robot, error, without)
+    return Payload(payload, std, factor, body, robot, error, without, result)
 
 
 def _rows(blocks: Blocks, is_loaded, own: slice, kept, weights) -> np.ndarray:
@@ -138,13 +147,12 @@ def _rows(blocks: Blocks, is_loaded, own: slice, kept, weights) -> np.ndarray:
     return np.concatenate(parts)
 
 
-def _solve(blocks: Blocks, is_loaded, own: slice, kept, weights, rows, size):
+def _solve(blocks: Blocks, is_loaded, own: slice, kept, weights, rows, sigma: float, size):
     """Feasible payload, standard deviations (10,) and the factor of an interval.
 
-    `size(payload)`: effective sample size of the errors with it.
+    `sigma`: noise of the rows. `size(payload)`: effective sample size of the errors with it.
     """
     count = len(kept)
-    sigma = noise_level(condense_rows(rows, blocks.count()))
     hold = _HOLD * np.maximum(np.linalg.norm(rows[:, :count], axis=0), 1e-12)
     R, robot = eliminate(rows, count, hold)
     start = _ball(least_squares_by_svd(R[:, :-1], R[:, -1], 1e-6).change)

@@ -36,7 +36,9 @@ from jaxdyn.simulation.solvers.explicit import Plan
 from jaxdyn.systems.scene import Scene
 from jaxdyn.systems.system import displace, rate_to_velocity, retract, velocity_to_rate
 
-_ROUNDS = 2  # of a projection: the error of the second is quadratic in that of the first
+# Rounds of a projection at the end of a step, and of one at a save point. All have the factor of the first: each reduces what is
+# open in proportion to the first correction, which only coarse tolerances make large.
+_ROUNDS, _SAVED_ROUNDS = 2, 6
 
 
 class HybridSystem:
@@ -157,7 +159,11 @@ class ModalSystem(HybridSystem):
 
 
 def project(scene: Scene, elements: Elements, mode: Mode, t, y, error):
-    """Project q and v by the least change onto the rows that act, and the error (or None) onto their tangent space."""
+    """Project q and v by the least change onto the rows that act, and the error (or None) onto their tangent space.
+
+    The last change of q, from which what is left open follows, counts as an error too: a step that is too long for the projection
+    is rejected.
+    """
     whole, dtype = extend(scene), y["v"].dtype
     q, v = retract(scene.system, y["q"]), y["v"]
     terms = terms_at(scene, elements, q, v, t)
@@ -171,20 +177,22 @@ def project(scene: Scene, elements: Elements, mode: Mode, t, y, error):
         lam = solve_rows(terms.Y * mask[None], mask, (residual * mask)[:, None])[:, 0]
         return terms.metric.unwhiten(matmul(terms.Y, lam))
 
+    start, last, blank = q, jnp.zeros_like(v), jnp.zeros((elements.count,), dtype)
+    rounds = _SAVED_ROUNDS if error is None else _ROUNDS
+    if holonomic.size:
+        for _ in range(rounds):
+            last = change(blank.at[holonomic].set(position_residual(whole, q, t)), holds)
+            q = displace(scene.system, q, -last)
     tangent = None
     if error is not None:
-        e = rate_to_velocity(scene.system, q, error["q"])
+        e = rate_to_velocity(scene.system, start, error["q"])
         # Rows on velocities do not confine a displacement: an error of q is projected by rows on positions alone.
-        e = e - change(matmul(terms.row.A, e), holds)
+        e = e - change(matmul(terms.row.A, e), holds) + last
         tangent = error | {
-            "q": velocity_to_rate(scene.system, q, e),
+            "q": velocity_to_rate(scene.system, start, e),
             "v": error["v"] - change(matmul(terms.row.A, error["v"]), active),
         }
-    blank = jnp.zeros((elements.count,), dtype)
-    if holonomic.size:
-        for _ in range(_ROUNDS):
-            q = displace(scene.system, q, -change(blank.at[holonomic].set(position_residual(whole, q, t)), holds))
-    for _ in range(_ROUNDS):
+    for _ in range(rounds):
         v = v - change(velocity_residual(whole, q, v, t), active)
     slip = by_element(elements, velocity_residual(whole, q, v, t))
     return y | {"q": q, "v": v, "slip": align(slip, y["slip"])}, tangent

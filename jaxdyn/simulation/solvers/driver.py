@@ -277,12 +277,8 @@ def _search(
         return plan.guards_of(args, t, y)
 
     at_end = plan.guards_of(args, t_next, step.projected)
-    if plan.is_terminal:
-        ends = (jnp.zeros_like(length), search.values), (jnp.ones_like(length), at_end[0])
-        within = look_within(guards, *(Point(*end, jnp.zeros_like(search.values)) for end in ends))
-    else:
-        middle = jnp.asarray(0.5, length.dtype)
-        within = [Point(middle, *guards(middle))]
+    ends = (jnp.zeros_like(length), search.values), (jnp.ones_like(length), at_end[0])
+    within = look_within(guards, *(Point(*end, jnp.zeros_like(search.values)) for end in ends))
     # Fixed steps fail where the state is not finite.
     good = decided.kept if is_adaptive else jnp.isfinite(step.projected).all()
     after, kept, located, length = search_root(search, state.t, t_next, at_end, within, good, decided.length)

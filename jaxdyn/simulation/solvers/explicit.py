@@ -88,7 +88,7 @@ class Plan(NamedTuple):
     """Definition of a step; equal plans share their programs.
 
     `quality(t, y, args)` () changes its sign where the method fails; `guards(t, y, args)` -> values and levels of rounding (k,),
-    of which one is negative where the motion (then the plan `is_terminal`) or its mode ends.
+    of which one is negative where the motion or its mode ends.
     """
 
     solver: type
@@ -100,7 +100,6 @@ class Plan(NamedTuple):
     shapes: tuple
     quality: Callable | None = None
     guards: Callable | None = None
-    is_terminal: bool = False
 
     @property
     def tableau(self) -> Any:

@@ -2,8 +2,8 @@
 
 A step that ends where a guard is negative is repeated with a shorter length, until its end is the event: the root is bracketed by
 the steps before and behind it. So the state at the event is that of a step of full order, and not of an interpolation. Guards are
-evaluated in the middle and at the end of every step. Those that end a run are also evaluated twice where a parabola through the
-points so far has its least value (`look_within`). What is violated and satisfied again between these points is not seen.
+evaluated at the end of every step, in its middle, and twice where a parabola through the points so far has its least value
+(`look_within`). What is violated and satisfied again between these points is not seen.
 """
 
 from collections.abc import Callable
