@@ -60,7 +60,18 @@ def _tangent(program: Program, moving: tuple[bool, ...]) -> Program:
     for row, array in zip(program.results, program.outputs, strict=True):
         if array.dtype.kind == "f":
             rows.append(objects([0.0 if type(x) is Constant else changes[x] for x in row], array.shape))
-    return graph.finish(arrays, outputs, rows, name=f"change of {program.name}")
+    return _finish(graph, program, arrays, outputs, rows, values, f"change of {program.name}")
+
+
+def _finish(graph: Graph, program: Program, inputs, outputs, rows, values, name: str) -> Program:
+    """The program of a derivative, which reports the validity of the values where `program` does."""
+    if not program.reports_validity:
+        return graph.finish(inputs, outputs, rows, name=name)
+    ((valid,), array) = program.results[-1], program.outputs[-1]
+    flag = objects([valid.value if type(valid) is Constant else values[valid]], ())
+    made = graph.finish(inputs, [*outputs, array], [*rows, flag], name=name)
+    made.reports_validity = True
+    return made
 
 
 def _change(g: Graph, op: str, kind: str, value, x: list, d: list):
@@ -214,7 +225,8 @@ def _transpose(program: Program, linear: tuple[bool, ...], given: tuple[bool, ..
         for row, array, varies in zip(input_cotangents, program.inputs, linear, strict=True)
         if varies and row is not None
     ]
-    return graph.finish(arrays, [x[1] for x in rows], [x[0] for x in rows], name=f"transpose of {program.name}")
+    name = f"transpose of {program.name}"
+    return _finish(graph, program, arrays, [x[1] for x in rows], [x[0] for x in rows], values, name)
 
 
 def _coefficient_values(graph: Graph, program: Program, inputs: list) -> list:
@@ -297,7 +309,7 @@ def _with_inputs(program: Program, places: tuple[int, ...]) -> Program:
         operations.append(operation)
     inputs = [program.inputs[i] for i in places]
     few = Program(inputs, program.outputs, operations, program.results, program.subprograms, name=program.name)
-    few.reports_validity = program.reports_validity
+    few.reports_validity, few.flags = program.reports_validity, program.flags
     if program.derivative is not None:
         few.derivative = functools.partial(_tangent_of_few, program, places)
     if program.fallback is not None:

@@ -50,7 +50,7 @@ def _call_where(graph: Graph, program: Program, given: list, branches: bool) -> 
     flag, *entries = given
     arrays, count = _arrays((*program.inputs, *program.outputs), entries), len(program.inputs)
     inputs, otherwise = arrays[:count], arrays[count:]
-    if branches:
+    if branches or program.is_called:
         return graph.call_where(flag, program, inputs, otherwise)
     return [
         objects(
@@ -74,4 +74,6 @@ def inline(program: Program) -> Program:
     graph = Graph()
     with np.errstate(all="ignore"):  # known numbers may overflow, as they do in XLA
         _, outputs = replay(graph, program, [graph.inputs(i, array) for i, array in enumerate(program.inputs)], False)
-    return graph.finish(program.inputs, program.outputs, outputs, name=program.name)
+    written = graph.finish(program.inputs, program.outputs, outputs, name=program.name)
+    written.reports_validity = program.reports_validity
+    return written

@@ -69,6 +69,11 @@ class MatrixProgram:
         """The text of the kernel (see `code.kernel_ir`)."""
         return f"; {self.title}\n{self._write_kernel().module}"
 
+    def subprogram_ir(self) -> str:
+        """The text of the function `called` (see `code.subprogram_ir`)."""
+        parts = self.definition("called")
+        return "\n".join(parts.values()).replace("define internal void @called(", "define void @called(")
+
     def definition(self, symbol: str) -> dict[str, str]:
         """`void symbol(ptr matrix, ptr result)` of one sample, and what it declares, by names in a module's text."""
         loops = f"{symbol}_loops"

@@ -22,11 +22,11 @@ MAX_OPERATIONS = 60_000
 # None: the environment decides, which is read at each use, so that a test can set it.
 _mode = jax.make_user_context(None)
 _expanding = jax.make_user_context("")
-# Whether the traced function computes samples again for which a kernel was not valid.
-rank_safe = jax.make_user_context(False)
+# Whether the traced function computes the samples that a kernel has marked as not valid (see `careful`).
+_careful = jax.make_user_context(False)
 # Whether an axis that `vmap` adds to a kernel is one of rows (see `batch.map_rows`).
 in_rows = jax.make_user_context(False)
-_standalone = jax.make_user_context("")
+_standalone = jax.make_user_context(False)
 _by_rules = jax.make_user_context(False)
 _said: set[str] = set()
 
@@ -89,14 +89,22 @@ def is_standalone() -> bool:
     return bool(_standalone.value)
 
 
-def is_careful() -> bool:
-    """Decide whether a function is traced for the samples that another program of the same code marks as not valid."""
-    return _standalone.value == "careful"
-
-
-def standalone(is_careful: bool = False):
+def standalone():
     """Context in which a function is traced for code that runs without JAX, where no fallback of JAX computes a sample."""
-    return _standalone("careful" if is_careful else "fast")
+    return _standalone(True)
+
+
+def is_careful() -> bool:
+    """Decide whether a function is traced for the samples that another program marks as not valid."""
+    return bool(_careful.value)
+
+
+def careful(is_wanted: bool = True):
+    """Context in which a function is traced for the samples that another program marks as not valid.
+
+    Kernels with a fallback are that fallback, and variants that may mark are those for JAX.
+    """
+    return _careful(is_wanted)
 
 
 def has_values_of_rules() -> bool:

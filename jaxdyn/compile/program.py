@@ -57,6 +57,8 @@ class Program:
       changes of those that move.
     - `fallback`: None, or the function that was traced, from flat arrays of one sample to flat arrays.
     - `reports_validity`: whether the last output says if the sample is valid (see `flags`).
+    - `flags`: whether the last output says if the sample is not valid, in a subprogram.
+    - `fast`, `careful`: None, or the two programs of a pair (see `careful`); `operations` are those of both.
     """
 
     # Repetitions of the operations in one call, by which the cost of a `loops.Loop` is estimated.
@@ -75,6 +77,9 @@ class Program:
         self.name = name
         self.fallback: Callable | None = None
         self.reports_validity = False
+        self.flags = False
+        self.fast: Program | None = None
+        self.careful: Any = None
         # Derivatives, transposes and kernels of this program, which live as long as it does.
         self.derived: dict = {}
 

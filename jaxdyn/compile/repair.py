@@ -1,10 +1,9 @@
-"""Samples of a batch that a kernel cannot compute: computed again, a few at a time, without touching the others.
+"""Samples of a batch that a kernel cannot compute, where there is no native code: computed again, a few at a time.
 
 Under `jax.vmap` a `lax.cond` whose predicate differs between samples computes both branches for all of them. Here the marked
 samples are gathered to small blocks first, and the branch is taken for as many blocks as there are.
 """
 
-import functools
 import math
 from collections import defaultdict
 from collections.abc import Callable
@@ -14,9 +13,6 @@ import jax.numpy as jnp
 from jax import lax
 from jax.custom_batching import custom_vmap
 
-from jaxdyn.compile import ahead, mode
-from jaxdyn.compile.batch import any_sample
-from jaxdyn.compile.flags import mark_floats
 from jaxdyn.compile.jax_adapter import vary_alike
 
 # Samples that are computed again together: they pay for the overhead of a loop of XLA, and the memory of their intermediates
@@ -24,63 +20,15 @@ from jaxdyn.compile.jax_adapter import vary_alike
 SAMPLES_AT_ONCE = 32
 
 
-def rank_safe(function: Callable) -> Callable:
-    """The function, traced for samples for which a kernel was not valid."""
-
-    @functools.wraps(function)
-    def call(*args):
-        with mode.rank_safe(True):
-            return function(*args)
-
-    return call
-
-
 def compute_where(flag, function: Callable, values, args: tuple):
-    """function(*args), traced `rank_safe`, where the flag () is set, else `values`; in a batch a few of those samples at a time.
+    """function(*args) where the flag () is set, else `values`; in a batch a few of those samples at a time.
 
     The function depends on nothing traced but `args`. The result has no derivative.
     """
-    return _one(rank_safe(function))(flag, values, args)
-
-
-def repair(flag, careful: Callable, fast: Callable, values: tuple, args: tuple):
-    """`values` where the flag () is not set, else `careful(*args)`; in a batch only the samples that need it, a few at a time.
-
-    **Arguments:**
-
-    - `careful(*args)` -> a pair of pytrees like `values`. The first one is differentiated. The function depends on nothing
-      traced but `args`.
-    - `fast(*args)` -> values[0], whose derivatives are right where the flag is not set.
-
-    Derivatives are those of `fast` if the flag is set in no sample of the batch, else those of `careful` for all of them. They
-    are a branch, not a select: the derivative of `fast` at a flagged sample is NaN, which reaches gradients even times zero.
-
-    Inside of a kernel, which has no branches, floats of flagged samples are marked as not valid (see `flags`).
-    """
-    if mode.is_expanding():
-        return mark_floats(flag, values)
-
-    @jax.custom_jvp
-    def run(flag, values, args):
-        return _one(careful)(flag, values, args)
-
-    @run.defjvp
-    def _(primals, tangents):
-        flag, _, args = primals
-        _, (_, plain_step), args_step = tangents
-
-        def by(function):
-            return lambda: jax.jvp(function, args, args_step)[1]
-
-        step = lax.cond(any_sample(flag), by(lambda *args: careful(*args)[0]), by(fast))
-        return run(*primals), (step, plain_step)
-
-    return run(flag, lax.stop_gradient(values), args)
+    return _one(function)(flag, values, args)
 
 
 def _one(careful: Callable):
-    careful = _without_worker(careful)
-
     # `custom_vmap` sees the batch before JAX makes a select of the branch.
     @custom_vmap
     def one(flag, values, args):
@@ -99,16 +47,6 @@ def _one(careful: Callable):
         return one(*jax.tree.unflatten(structure, vary_alike(leaves)))
 
     return alike
-
-
-def _without_worker(careful: Callable) -> Callable:
-    """The function, whose kernels are compiled when they are called: hardly any sample needs them."""
-
-    def call(*args):
-        with ahead.worker(False):
-            return careful(*args)
-
-    return call
 
 
 def _many(careful: Callable, axes: list):

@@ -2,7 +2,6 @@
 
 import ctypes
 import functools
-import hashlib
 import logging
 import threading
 from collections.abc import Sequence
@@ -12,7 +11,8 @@ from typing import Any
 import numpy as np
 
 from jaxdyn.compile import ahead
-from jaxdyn.compile.code import calls_itself, kernel_ir, subprogram_ir, symbol_of, varying_first
+from jaxdyn.compile.careful import Careful
+from jaxdyn.compile.code import CAREFUL, calls_itself, kernel_ir, number_of, subprogram_ir, symbol_of, varying_first
 from jaxdyn.compile.jax_adapter import Unsupported as Unsupported
 from jaxdyn.compile.jax_adapter import ffi_version, register_handler
 from jaxdyn.compile.objects import Code, features
@@ -47,6 +47,7 @@ class _Entry(ctypes.Structure):
 # The handler finds a kernel by open addressing in this table, without a lock: an entry's hash is written last.
 _table = (_Entry * SLOTS)()
 _threads = ctypes.c_int64(1 << 30)
+_failures = ctypes.c_int64(0)  # kernels that could not be compiled when they were called
 _lock = threading.RLock()
 # LLVM takes one program at a time, and two threads may call the same new kernel.
 _making = threading.Lock()
@@ -70,7 +71,7 @@ def register() -> None:
     text = resources.files("jaxdyn.compile").joinpath("handler.ll").read_text()
     messages = {"MISSING": _MISSING, "FAILED": _FAILED, "MISFIT": _MISFIT}
     fields = {
-        "TABLE": ctypes.addressof(_table), "SLOT_MASK": SLOTS - 1, "LIMIT": ctypes.addressof(_threads),
+        "TABLE": ctypes.addressof(_table), "SLOT_MASK": SLOTS - 1, "LIMIT": ctypes.addressof(_threads), "FAILURES": ctypes.addressof(_failures),
         "PREPARE": ctypes.cast(_PREPARE, ctypes.c_void_p).value, "MAJOR": version[0], "MINOR": version[1],
         "RELAX": _RELAX[architecture], "RELAX_TYPE": _RELAX[architecture].replace("i32 1", "i32"),
         **messages, **{f"{name}_BYTES": len(message) + 1 for name, message in messages.items()},
@@ -80,6 +81,7 @@ def register() -> None:
     # Its addresses are those of this process: it is not kept on disk.
     code = Code(text, stored=False)
     register_handler(TARGET, code.address("handler"))
+    code.publish("careful", CAREFUL)
     _handler.append(code)
 
 
@@ -124,10 +126,7 @@ def kernel(program, width: int, uniform: Sequence[bool]) -> int:
     with _lock:
         register()
         if key not in program.derived:
-            content = f"{program.digest} {width} {uniform}"
-            # A hash, not a counter: a program in XLA's persistent cache finds its kernel in another process. 63 bits, as the
-            # attribute is signed; odd, as zero marks an empty slot.
-            number = int.from_bytes(hashlib.sha256(content.encode()).digest()[:8], "little") >> 1 | 1
+            number = number_of(program, width, uniform)
             if number not in _kernels:
                 _kernels[number] = _Kernel(number, program, width, uniform)
             program.derived[key] = number
@@ -161,16 +160,20 @@ class _Kernel:
 
     def address(self) -> int:
         """Address of the code, which is compiled where there is none."""
-        if self.code is None:
+        program = self.program
+        if self.code is None and program is not None:
+            # Before the lock is taken: another thread traces, and may call kernels that are new too.
+            program = program.program() if isinstance(program, Careful) else program
             with _making:
                 if self.code is None:
-                    self._make()
+                    self._make(program)
         return self.entry.kernel
 
-    def _make(self) -> None:
-        program, width = self.program, self.width
+    def _make(self, program) -> None:
+        width = self.width
         is_program = isinstance(program, Program)
-        for called in (program,) if is_program and calls_itself(program, width) else program.subprograms:
+        is_call = is_program and calls_itself(program, width)
+        for called in (program.fast or program, *program.subprograms) if is_call else program.subprograms:
             _publish(called, width)
         text = kernel_ir(program, width, self.uniform) if is_program else program.ir(width, self.uniform)
         code = Code(text, name=program.name)
@@ -200,13 +203,17 @@ def publish_ahead(program, width: int) -> None:
         ahead.make_later(make)
 
 
-def _publish(called: Program, width: int) -> None:
-    """Compile a subprogram where that has not been done."""
+def _publish(called, width: int) -> None:
+    """Compile a subprogram where that has not been done, or enter it in the table where it is made later."""
+    if isinstance(called, Careful):
+        kernel(called, 1, [False] * len(called.inputs))
+        return
     symbol = symbol_of(called, width)
     if symbol not in _called:
         for inner in called.subprograms:
             _publish(inner, width)
-        _called[symbol] = Code(subprogram_ir(called, width), name=called.name)
+        text = subprogram_ir(called, width) if isinstance(called, Program) else called.subprogram_ir()
+        _called[symbol] = Code(text, name=called.name)
         _called[symbol].publish("called", symbol)
 
 
@@ -216,6 +223,8 @@ def _prepare(number: int) -> int:
         return _kernels[number].address()
     except BaseException:  # an interruption too: no Python is above this call, to which it could be raised
         logger.exception("jaxdyn: a kernel could not be compiled")
+        with _lock:
+            _failures.value += 1
         return 0
 
 
@@ -229,8 +238,10 @@ def call(program, arrays: Sequence[np.ndarray]) -> list[np.ndarray]:
     given = [np.ascontiguousarray(x, array.dtype) for x, array in zip(arrays, program.inputs, strict=True)]
     results = [np.empty(array.shape, array.dtype) for array in program.outputs]
     data = (ctypes.c_void_p * (len(given) + len(results)))(*(x.ctypes.data for x in (*given, *results)))
-    address = _kernels[number].address()
+    address, failures = _kernels[number].address(), _failures.value
     _KERNEL(address)(data, 1, 0, 1)
+    if _failures.value != failures:
+        raise RuntimeError(_FAILED)
     return results
 
 

@@ -6,12 +6,15 @@ Its derivatives are traced when they are asked for.
 
 import functools
 from collections.abc import Callable
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
 
 from jaxdyn.compile import jax_adapter, mode
+from jaxdyn.compile.careful import Careful, careful, guard
 from jaxdyn.compile.expansion import expand
+from jaxdyn.compile.flags import guarded_p, has_marks
 from jaxdyn.compile.known import Known, partition_tracers
 from jaxdyn.compile.program import NotNumbers, Program, TooLong
 
@@ -26,6 +29,7 @@ def program_of(
     most: int = mode.MAX_OPERATIONS,
     calls: bool = False,
     flags: str = "refuse",
+    fallback: Callable | None = None,
 ):
     """Flat operands of a function's kernel, and (its program, the structure of its results) or the reason why there is none.
 
@@ -35,27 +39,32 @@ def program_of(
     - `tree`: pytree whose known leaves are compiled in; its traced leaves, and all of `args`, are operands.
     - `tangent(*static, tree, *args, steps)`: the function's derivative along `steps`, as of `kernel`.
     - `most`: operations beyond which there is no program. `calls`: whether long functions under `jax.jit` become subprograms.
-    - `flags`: as of `expand`.
+    - `flags`: as of `expand`; with "repair" samples that are flagged are computed by the program of `fallback`, or of the function
+      itself, that is traced when the first of them appears (see `careful`).
     """
     traced, known = partition_tracers(tree)
     leaves, structure = jax.tree.flatten(args)
     # Within `shard_map` operands of a primitive vary along the same axes of a mesh, or JAX refuses them.
     leaves = jax_adapter.vary_alike([*map(jnp.asarray, (*traced, *leaves))])
     shapes = tuple((x.shape, x.dtype) for x in leaves)
-    return leaves, trace_program(function, static, known, len(traced), structure, shapes, tangent, most, calls, flags)
+    how = tangent, most, calls, flags, fallback
+    return leaves, trace_program(function, static, known, len(traced), structure, shapes, *how)
 
 
 def trace_program(function, static, known: Known, count, structure, shapes, tangent=None, most=mode.MAX_OPERATIONS,
-                  calls=False, flags="refuse"):  # fmt: skip
+                  calls=False, flags="refuse", fallback=None):  # fmt: skip
     """The program and the structure of its results, or the reason why there is none; `count`: traced leaves of the tree."""
     # A trace depends on this setting too, which so is a part of the key under which the program is kept.
     has_x64 = jax.config.read("jax_enable_x64")
-    return _trace_program(function, static, known, count, structure, shapes, tangent, most, calls, flags, has_x64)
+    how = tangent, most, calls, flags, fallback
+    return _trace_program(function, static, known, count, structure, shapes, *how, has_x64)
 
 
 @functools.lru_cache(maxsize=1024)
-def _trace_program(function, static, known: Known, count, structure, shapes, tangent, most, calls, flags, has_x64):
+def _trace_program(function, static, known: Known, count, structure, shapes, tangent, most, calls, flags, fallback,
+                   has_x64):  # fmt: skip
     del has_x64  # part of the key alone
+    is_pair, flags = flags == "repair", "report" if flags == "repair" else flags
     avals = [jax.ShapeDtypeStruct(*shape) for shape in shapes]
     flat = function_of_leaves(function, static, known, count, structure)
     try:
@@ -76,7 +85,58 @@ def _trace_program(function, static, known: Known, count, structure, shapes, tan
     elif has_rules:
         program.derivative = _derivative_by_jax(flat, avals, flags)
     program.fallback = _fallback(function, static, known, count, structure, avals, program.reports_validity)
+    if is_pair and program.reports_validity:
+        again = Again(function if fallback is None else fallback, static, known, count, structure, shapes, calls)
+        program = guard(program, again.beside(program))
     return program, jax.tree.structure(out)
+
+
+class Again(NamedTuple):
+    """What computes the samples that a function marks as not valid: a function of the same arguments, traced to a program.
+
+    `calls`: whether it may have subprograms and branches, which have no derivatives.
+    """
+
+    function: Callable
+    static: tuple
+    known: Known
+    count: int
+    structure: Any
+    shapes: tuple
+    calls: bool
+
+    def beside(self, fast: Program) -> Careful:
+        """The careful program beside the fast one of the other function."""
+        outputs, name = fast.outputs[:-1], name_of(self.function)
+        make, by_jax = (functools.partial(f, self, outputs) for f in (_make_careful, _by_jax))
+        return careful(fast, self, f"{name} of flagged samples", make, by_jax)
+
+    def compute(self, outputs, leaves) -> list:
+        """The results, with the types of `outputs`."""
+        results = jax.tree.leaves(flat_function(*self[:5])(*leaves))
+        return [jnp.broadcast_to(jnp.asarray(x, y.dtype), y.shape) for x, y in zip(results, outputs, strict=True)]
+
+
+def _make_careful(again: Again, outputs) -> Program:
+    avals = [jax.ShapeDtypeStruct(*shape) for shape in again.shapes]
+
+    def compute(*leaves):
+        return again.compute(outputs, leaves)
+
+    with mode.expanding(again.calls):
+        closed = jax.make_jaxpr(compute)(*avals)
+    # The marks of what is left as it is are NaN, which the results then are too.
+    name = name_of(again.function)
+    program, has_rules = expand(closed, 10 * mode.MAX_OPERATIONS, name, again.calls, "ignore")
+    if has_rules:
+        program.derivative = _derivative_by_jax(compute, avals, "ignore")
+    return program
+
+
+def _by_jax(again: Again, outputs, *flat) -> list:
+    leaves = [x.reshape(shape) for x, (shape, _) in zip(flat, again.shapes, strict=True)]
+    with mode.careful():
+        return [x.reshape(-1) for x in again.compute(outputs, leaves)]
 
 
 def name_of(function) -> str:
@@ -99,11 +159,23 @@ def flat_function(function, static, known: Known, count: int, structure) -> Call
     return flat
 
 
-def inline_call(function, static, tree, args):
-    """The function within another one that becomes a program."""
+def inline_call(function, static, tree, args, fallback: Callable | None = None):
+    """The function within another one that becomes a program.
+
+    Where that may have branches, samples that the function marks as not valid are computed by its fallback there.
+    """
     traced, known = partition_tracers(tree)
     leaves, structure = jax.tree.flatten(args)
-    return function_of_leaves(function, static, known, len(traced), structure)(*traced, *leaves)
+    flat, leaves = function_of_leaves(function, static, known, len(traced), structure), [*traced, *leaves]
+    if fallback is None or not mode.has_branches() or mode.is_careful():
+        return flat(*leaves)
+    leaves = [*map(jnp.asarray, leaves)]
+    call, out = jax.make_jaxpr(flat, return_shape=True)(*leaves)
+    if not has_marks(call.jaxpr):
+        return flat(*leaves)
+    shapes = tuple((x.shape, x.dtype) for x in leaves)
+    again = Again(fallback, static, known, len(traced), structure, shapes, True)
+    return jax.tree.unflatten(jax.tree.structure(out), guarded_p.bind(*leaves, call=call, again=again))
 
 
 def _fallback(function, static, known: Known, count: int, structure, avals, reports: bool) -> Callable:
@@ -164,7 +236,7 @@ def _derivative_by_jax(flat: Callable, avals, flags: str):
 
 
 def tangent_program(change: Callable, avals, moving, flags: str) -> Program:
-    """The program of a tangent; NaN at flagged samples, which the program of the values reports.
+    """The program of a tangent, which reports flagged samples where that of the values does; else it is NaN there.
 
     A rule may call functions with rules of their own, itself included, and then the tangent is differentiated by JAX again:
     its numbers would give the derivative of how a value is computed, where the rule says another one.
@@ -173,9 +245,8 @@ def tangent_program(change: Callable, avals, moving, flags: str) -> Program:
     with mode.expanding():
         closed = jax.make_jaxpr(change)(*avals)
     # A tangent has two to four times the operations of the values. The bound is there for those that explode.
-    program, has_rules = expand(
-        closed, 10 * mode.MAX_OPERATIONS, "change", flags="refuse" if flags == "refuse" else "ignore"
-    )
+    of_tangent = flags if flags in ("refuse", "report") else "ignore"
+    program, has_rules = expand(closed, 10 * mode.MAX_OPERATIONS, "change", flags=of_tangent)
     if has_rules:
         program.derivative = _derivative_by_jax(change, avals, flags)
     return program
