@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 
 from jaxdyn.compile.graph import Graph
-from jaxdyn.compile.inlining import inline, replay
+from jaxdyn.compile.inlining import inline, repeat, replay
 from jaxdyn.compile.program import FLOATS, Constant, NotNumbers, Program, is_number, objects
 
 
@@ -233,14 +233,16 @@ def _coefficient_values(graph: Graph, program: Program, inputs: list) -> list:
     """Values of the operations that do not depend on an input given as None; None for the others."""
     flat = [None if x is None else x.ravel().tolist() for x in inputs]
     values: list = []
-    for op, kind, args in program.operations:
+    for operation in program.operations:
+        op, _, args = operation
         if op == "input":
             row = flat[args[0]]
             values.append(None if row is None else row[args[1]])
         elif any(type(x) is not Constant and values[x] is None for x in args):
             values.append(None)
         else:
-            values.append(graph.apply(op, kind, [x.value if type(x) is Constant else values[x] for x in args]))
+            operands = [x.value if type(x) is Constant else values[x] for x in args]
+            values.append(repeat(graph, program, operation, operands))
     return values
 
 
