@@ -23,6 +23,7 @@ from jaxdyn.compile.mode import compilation as compilation
 from jaxdyn.compile.mode import current as compilation_mode  # noqa: F401 (under a name that says of what)
 from jaxdyn.compile.mode import is_standalone as is_standalone
 from jaxdyn.compile.mode import values_of_rules as values_of_rules
+from jaxdyn.compile.pivots import independent_rows as independent_rows
 from jaxdyn.compile.rules import implicit as implicit
 from jaxdyn.compile.rules import value_and_jvp as value_and_jvp
 from jaxdyn.compile.trial import run_trial as _run_trial  # noqa: F401 (it registers itself)

@@ -23,19 +23,20 @@ from jaxdyn.compile.program import Array, Constant, Operation, Program, kind_of
 class Careful:
     """A subprogram that is made when it is called for the first time.
 
-    - `make()` -> its `Program`. `by_jax(*flat)`: the same by operations of JAX, from flat arrays of one sample to flat arrays.
+    - `make()` -> its `Program`, traced as `mode.careful(which)`. `by_jax(*flat)`: the same by operations of JAX, from flat arrays of
+      one sample to flat arrays.
     """
 
     is_called = True
     derivative = fallback = None
     turns, cost, subprograms = 1, 0, ()
 
-    def __init__(self, inputs, outputs, digest: str, name: str, make: Callable[[], Program], by_jax: Callable):
+    def __init__(self, inputs, outputs, digest: str, name: str, make: Callable[[], Program], by_jax: Callable, which: str):
         self.inputs: tuple[Array, ...] = tuple(inputs)
         self.outputs: tuple[Array, ...] = tuple(outputs)
         self.results = tuple(tuple(range(array.size)) for array in self.outputs)
         # Identity of the code, as `Program.digest`.
-        self.digest, self.name, self.by_jax = digest, name, by_jax
+        self.digest, self.name, self.by_jax, self.which = digest, name, by_jax, which
         self.derived: dict = {}
         self._make, self._made, self._lock = make, None, threading.Lock()
         self._has_x64 = jax.dtypes.canonicalize_dtype(np.float64) == np.float64
@@ -48,7 +49,7 @@ class Careful:
     def _program(self) -> Program:
         with self._lock:
             if self._made is None:
-                with jax.enable_x64(self._has_x64), mode.careful():
+                with jax.enable_x64(self._has_x64), mode.careful(self.which):
                     self._made = self._make()
             return self._made
 
@@ -65,6 +66,7 @@ class Careful:
                 f"change of {self.name}",
                 lambda: derive.tangent(self._program(), moving),
                 functools.partial(_tangent_by_jax, self, moving),
+                self.which,
             )
         return self.derived[moving]
 
@@ -82,6 +84,7 @@ class Careful:
                 f"transpose of {self.name}",
                 lambda: transpose(self._program(), linear, given),
                 functools.partial(_transpose_by_jax, self, linear, given),
+                self.which,
             )
         return self.derived[key]
 
@@ -93,13 +96,13 @@ def _digest(*parts) -> str:
 _taken: dict[str, object] = {}
 
 
-def careful(fast: Program, key, name: str, make: Callable[[], Program], by_jax: Callable) -> Careful:
+def careful(fast: Program, key, name: str, make: Callable[[], Program], by_jax: Callable, which: str) -> Careful:
     """The careful program beside a fast one; `key`: what it is made from, comparable."""
     # By the fast program, not by its own text, which is not known yet: it has to be found by the same number in another process.
     digest = _digest("careful", fast.digest, name)
     while _taken.setdefault(digest, key) != key:  # another fallback of the same name
         digest = _digest(digest)
-    return Careful(fast.inputs, fast.outputs[:-1], digest, name, make, by_jax)
+    return Careful(fast.inputs, fast.outputs[:-1], digest, name, make, by_jax, which)
 
 
 def guard(fast: Program, careful: Careful) -> Program:

@@ -53,7 +53,7 @@ def kernel(
     @functools.wraps(function)
     def call(*args):
         given = args[:static], args[static], args[static + 1 :]
-        if mode.is_careful() and fallback is not None and _has_marks(function, *given):
+        if mode.is_careful_within() and fallback is not None and _has_marks(function, *given):
             return fallback(*args)
         # Code without JAX is one program: others are kept by keys that do not know what they may call.
         if derivative == "program" and not mode.is_standalone():
@@ -72,7 +72,7 @@ def _has_marks(function, static, tree, args) -> bool:
     """Decide whether a function marks samples as not valid, inside of a kernel."""
     traced, known = partition_tracers(tree)
     leaves, structure = jax.tree.flatten(args)
-    with mode.careful(False), mode.expanding(mode.has_branches()):
+    with mode.careful(""), mode.expanding(mode.has_branches()):
         flat = function_of_leaves(function, static, known, len(traced), structure)
         return has_marks(jax.make_jaxpr(flat)(*traced, *leaves).jaxpr)
 
@@ -108,7 +108,7 @@ def _bind(function, static, tree, args, fallback, **how) -> Any:
         return traced
     (program, places), out_structure = without_unread(traced[0]), traced[1]
     leaves = [leaves[i] for i in places]
-    if program.careful is not None and mode.is_careful():
+    if program.careful is not None and mode.is_careful_within():
         # A part of another function's fallback: the fast path has failed for the sample, and may fail it here again.
         return None
     # A kernel takes flat arrays. Under a trace reshapes are free.

@@ -23,7 +23,7 @@ MAX_OPERATIONS = 60_000
 _mode = jax.make_user_context(None)
 _expanding = jax.make_user_context("")
 # Whether the traced function computes the samples that a kernel has marked as not valid (see `careful`).
-_careful = jax.make_user_context(False)
+_careful = jax.make_user_context("")
 # Whether an axis that `vmap` adds to a kernel is one of rows (see `batch.map_rows`).
 in_rows = jax.make_user_context(False)
 _standalone = jax.make_user_context(False)
@@ -95,16 +95,21 @@ def standalone():
 
 
 def is_careful() -> bool:
-    """Decide whether a function is traced for the samples that another program marks as not valid."""
+    """Decide whether a function is traced for the samples that another program marks as not valid: it marks none itself."""
     return bool(_careful.value)
 
 
-def careful(is_wanted: bool = True):
+def is_careful_within() -> bool:
+    """Decide whether kernels within a careful function are their fallbacks: they have failed for the sample, or may fail."""
+    return _careful.value == "within"
+
+
+def careful(which: str = "within"):
     """Context in which a function is traced for the samples that another program marks as not valid.
 
-    Kernels with a fallback are that fallback, and variants that may mark are those for JAX.
+    `which`: "within"; "own", where kernels within the function compute their own flagged samples; "" for none.
     """
-    return _careful(is_wanted)
+    return _careful(which)
 
 
 def has_values_of_rules() -> bool:

@@ -86,7 +86,8 @@ def _trace_program(function, static, known: Known, count, structure, shapes, tan
         program.derivative = _derivative_by_jax(flat, avals, flags)
     program.fallback = _fallback(function, static, known, count, structure, avals, program.reports_validity)
     if is_pair and program.reports_validity:
-        again = Again(function if fallback is None else fallback, static, known, count, structure, shapes, calls)
+        other = function if fallback is None else fallback
+        again = Again(other, static, known, count, structure, shapes, calls, other is function)
         program = guard(program, again.beside(program))
     return program, jax.tree.structure(out)
 
@@ -94,7 +95,7 @@ def _trace_program(function, static, known: Known, count, structure, shapes, tan
 class Again(NamedTuple):
     """What computes the samples that a function marks as not valid: a function of the same arguments, traced to a program.
 
-    `calls`: whether it may have subprograms and branches, which have no derivatives.
+    `calls`: whether it may have subprograms and branches, which have no derivatives. `is_itself`: whether it is the same function.
     """
 
     function: Callable
@@ -104,12 +105,18 @@ class Again(NamedTuple):
     structure: Any
     shapes: tuple
     calls: bool
+    is_itself: bool
 
     def beside(self, fast: Program) -> Careful:
         """The careful program beside the fast one of the other function."""
         outputs, name = fast.outputs[:-1], name_of(self.function)
         make, by_jax = (functools.partial(f, self, outputs) for f in (_make_careful, _by_jax))
-        return careful(fast, self, f"{name} of flagged samples", make, by_jax)
+        return careful(fast, self, f"{name} of flagged samples", make, by_jax, self.which)
+
+    @property
+    def which(self) -> str:
+        """As of `mode.careful`."""
+        return "own" if self.is_itself and self.calls else "within"
 
     def compute(self, outputs, leaves) -> list:
         """The results, with the types of `outputs`."""
@@ -135,7 +142,7 @@ def _make_careful(again: Again, outputs) -> Program:
 
 def _by_jax(again: Again, outputs, *flat) -> list:
     leaves = [x.reshape(shape) for x, (shape, _) in zip(flat, again.shapes, strict=True)]
-    with mode.careful():
+    with mode.careful(again.which):
         return [x.reshape(-1) for x in again.compute(outputs, leaves)]
 
 
@@ -167,14 +174,15 @@ def inline_call(function, static, tree, args, fallback: Callable | None = None):
     traced, known = partition_tracers(tree)
     leaves, structure = jax.tree.flatten(args)
     flat, leaves = function_of_leaves(function, static, known, len(traced), structure), [*traced, *leaves]
-    if fallback is None or not mode.has_branches() or mode.is_careful():
+    if fallback is None or not mode.has_branches() or mode.is_careful_within():
         return flat(*leaves)
     leaves = [*map(jnp.asarray, leaves)]
-    call, out = jax.make_jaxpr(flat, return_shape=True)(*leaves)
-    if not has_marks(call.jaxpr):
-        return flat(*leaves)
+    with mode.careful(""):
+        call, out = jax.make_jaxpr(flat, return_shape=True)(*leaves)
+        if not has_marks(call.jaxpr):
+            return flat(*leaves)
     shapes = tuple((x.shape, x.dtype) for x in leaves)
-    again = Again(fallback, static, known, len(traced), structure, shapes, True)
+    again = Again(fallback, static, known, len(traced), structure, shapes, True, fallback is function)
     return jax.tree.unflatten(jax.tree.structure(out), guarded_p.bind(*leaves, call=call, again=again))
 
 

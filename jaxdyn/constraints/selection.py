@@ -23,7 +23,15 @@ import numpy as np
 from jax import lax
 from jaxtyping import Array, Float, Int
 
-from jaxdyn.compile import entry_point, evaluate, kernel, mark_invalid, pseudo_inverse_by_rotations, variant
+from jaxdyn.compile import (
+    entry_point,
+    evaluate,
+    independent_rows,
+    kernel,
+    mark_invalid,
+    pseudo_inverse_by_rotations,
+    variant,
+)
 from jaxdyn.compile.batch import cond
 from jaxdyn.compile.known import is_concrete, is_tracing, stop_gradient
 from jaxdyn.constraints.base import constraint_jacobian, holonomic_rows, layout, position_residual
@@ -70,21 +78,9 @@ def eliminate(B: Float[Array, "nc nv"], least: float, first: Float[Array, " nc"]
     The pivot of a row is its distance from the span of those that were kept before it. Rows with `first` = 1 come before all
     others; a row is kept where its pivot is above `least`, and `most` rows at most.
     """
-
     # Not an SVD: it counts independent rows but does not name them, and LAPACK in a batch can deadlock (see `solve_square`).
-    def keep_next(_, state):
-        rest, kept = state
-        # Rounding leaves a kept row a length of eps; it must not be chosen again.
-        lengths = jnp.sqrt(jnp.sum(rest * rest, 1)) * (1 - kept)
-        row = jnp.argmax(jnp.where((first > 0) & (lengths > least), lengths + jnp.max(lengths), lengths))
-        pivot = lengths[row]
-        along = rest[row] / jnp.where(pivot > 0, pivot, jnp.ones_like(pivot))
-        is_kept = pivot > least if most is None else (pivot > least) & (jnp.sum(kept) < most)
-        rest = jnp.where(is_kept, rest - matmul(rest, along)[:, None] * along[None], rest)
-        return rest, kept.at[row].add(is_kept.astype(B.dtype))
-
-    rest, kept = lax.fori_loop(0, min(B.shape), keep_next, (B, jnp.zeros_like(B[:, 0])))
-    return kept, jnp.max(jnp.sqrt(jnp.sum(rest * rest, 1)) * (1 - kept))
+    kept, rest = independent_rows(B, first, least, min(B.shape) if most is None else most)
+    return kept, jnp.max(rest)
 
 
 def select_rows(
@@ -166,7 +162,7 @@ def _keep_state(old, new, project: Callable, state):
     return state
 
 
-@variant(_keep_state)
+@variant(_keep_state, marks=True)
 def project_after_exchange(old, new, project: Callable, state: Any) -> Any:
     """project(state) where the rows `new` of the next step are not the `old` ones, else the state.
 
