@@ -93,16 +93,16 @@ def _digest(*parts) -> str:
     return hashlib.sha256(" ".join(map(str, parts)).encode()).hexdigest()
 
 
-_taken: dict[str, object] = {}
+_taken: dict[str, int] = {}
 
 
-def careful(fast: Program, key, name: str, make: Callable[[], Program], by_jax: Callable, which: str) -> Careful:
-    """The careful program beside a fast one; `key`: what it is made from, comparable."""
+def digest_beside(fast: Program, content: str, key) -> str:
+    """Identity of the careful program beside a fast one; `content` and `key` are what it is made from, as text and hashable."""
     # By the fast program, not by its own text, which is not known yet: it has to be found by the same number in another process.
-    digest = _digest("careful", fast.digest, name)
-    while _taken.setdefault(digest, key) != key:  # another fallback of the same name
+    digest = _digest("careful", fast.digest, content)
+    while _taken.setdefault(digest, hash(key)) != hash(key):  # another fallback of the same name
         digest = _digest(digest)
-    return Careful(fast.inputs, fast.outputs[:-1], digest, name, make, by_jax, which)
+    return digest
 
 
 def guard(fast: Program, careful: Careful) -> Program:

@@ -10,13 +10,14 @@ from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 
 from jaxdyn.compile import jax_adapter, mode
-from jaxdyn.compile.careful import Careful, careful, guard
+from jaxdyn.compile.careful import Careful, digest_beside, guard
 from jaxdyn.compile.expansion import expand
 from jaxdyn.compile.flags import guarded_p, has_marks
 from jaxdyn.compile.known import Known, partition_tracers
-from jaxdyn.compile.program import NotNumbers, Program, TooLong
+from jaxdyn.compile.program import Array, NotNumbers, Program, TooLong
 
 
 def program_of(
@@ -110,8 +111,12 @@ class Again(NamedTuple):
     def beside(self, fast: Program) -> Careful:
         """The careful program beside the fast one of the other function."""
         outputs, name = fast.outputs[:-1], name_of(self.function)
+        inputs = [Array(shape, np.dtype(dtype)) for shape, dtype in self.shapes]
         make, by_jax = (functools.partial(f, self, outputs) for f in (_make_careful, _by_jax))
-        return careful(fast, self, f"{name} of flagged samples", make, by_jax, self.which)
+        function = self.function if "<locals>" in name else f"{getattr(self.function, '__module__', '')}.{name}"
+        content = f"{name} {inputs} {self.known.digest}"
+        digest = digest_beside(fast, content, (function, self.static, self.structure, self.calls))
+        return Careful(inputs, outputs, digest, f"{name} of flagged samples", make, by_jax, self.which)
 
     @property
     def which(self) -> str:
