@@ -190,7 +190,7 @@ def test_a_fallback_that_is_no_program_is_an_error():
 
     run = jax.jit(jax.vmap(lambda x: backend.kernel(fast, fallback=lambda _, x: jnp.sort(x[None])[0])((), x)))
     np.testing.assert_allclose(run(jnp.ones(3)), 1.5625 * np.sin(np.ones(3)), rtol=1e-15)
-    with pytest.raises(jax.errors.JaxRuntimeError, match="could not be compiled"):
+    with pytest.raises((jax.errors.JaxRuntimeError, ValueError), match="could not be compiled"):
         jax.block_until_ready(run(-jnp.ones(3)))
 
 
@@ -200,8 +200,7 @@ def test_the_same_by_operations_of_jax():
 
     def program(run):
         found = jax.make_jaxpr(run)(x, scale)
-        (call,) = [eqn for eqn in found.eqns if eqn.primitive is kernel_p and eqn.params["program"].careful is not None]
-        return call.params["program"]
+        return [eqn.params["program"] for eqn in found.eqns if eqn.primitive is kernel_p][-1]
 
     many = jax.vmap(lambda x, scale: root(x[0], scale[0])[0])
     for run in (many, lambda x, s: jax.jvp(many, (x, s), (x, s))[1], jax.grad(lambda x, s: jnp.sum(many(x, s)))):
