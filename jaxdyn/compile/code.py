@@ -9,9 +9,9 @@ it: `void called(ptr ..., ptr ...)` with the arrays of its inputs, then of its o
 sample is such an array: it is passed on without a copy.
 """
 
-import hashlib
 from collections.abc import Callable, Sequence
 
+from jaxdyn.compile import careful_text
 from jaxdyn.compile.careful import Careful
 from jaxdyn.compile.llvm import Emitter
 from jaxdyn.compile.program import COMPARISONS, FLOATS, Array, Constant, Program, kind_of
@@ -20,7 +20,6 @@ from jaxdyn.compile.program import COMPARISONS, FLOATS, Array, Constant, Program
 # call's arguments are few against them.
 MIN_SHARED_OPERATIONS = 2000
 _ALIGNED = 64  # bytes
-CAREFUL = "jaxdyn_careful"  # the handler's function that calls careful programs
 ATTRIBUTES = (
     "attributes #0 = { nounwind }",
     "attributes #1 = { nounwind willreturn memory(none) }",
@@ -40,7 +39,7 @@ class Body:
         self.parts: dict[int, list[int]] = {}  # of each call, the entries of its outputs that are needed
         # A subprogram that is called again finds its arrays at the same place: entries that have not changed stay there.
         self.regions: dict[Program, int] = {}  # where in %in and %out the arrays of a subprogram begin
-        self.bytes = self.careful = 0  # of what is passed; arrays of a careful program
+        self.bytes = self.careful = 0  # of what is passed to subprograms and to careful programs
         self.passed: dict[int, str] = {}  # what stands in %in, which subprograms do not change
         for op, _, args in program.operations:
             if op == "part":
@@ -118,8 +117,7 @@ class Body:
             at += bytes_of(array, self.e.width)
         pointers += [pointer for pointer, _, _ in outputs]
         if isinstance(called, Careful):
-            self.careful = max(self.careful, len(pointers))
-            _write_careful_call(self.e, called, flag, pointers)
+            self.careful = max(self.careful, careful_text.write_call(self.e, called, flag, pointers))
         else:
             _write_call(self.e, called, pointers)
         needed, results, first = set(self.parts.get(i, ())), {}, 0
@@ -155,7 +153,7 @@ class Body:
     def allocations(self) -> list[str]:
         """Memory for what is passed."""
         passed = [f"  %passed = alloca [{self.bytes} x i8], align {_ALIGNED}"] if self.bytes else []
-        return [*passed, *([f"  %bases = alloca [{self.careful} x ptr]"] if self.careful else [])]
+        return [*passed, *careful_text.allocation(self.careful)]
 
 
 def bytes_of(array: Array, width: int) -> int:
@@ -167,60 +165,6 @@ def _write_call(e: Emitter, called: Program, pointers: Sequence[str]) -> None:
     name = symbol_of(called, e.width)
     e.declared[name] = f"declare void @{name}({', '.join(['ptr'] * len(pointers))})"
     e.lines.append(f"  call void @{name}({', '.join(f'ptr {x}' for x in pointers)})")
-
-
-def _write_careful_call(e: Emitter, called: Careful, flag: str, pointers: Sequence[str]) -> None:
-    """Call a careful program for those of W samples whose flag is set; the arrays have the layout of a subprogram's."""
-    sizes = [x.dtype.itemsize for x in (*called.inputs, *called.outputs)]
-    fields = [(x, size * e.width, size) for x, size in zip(pointers, sizes, strict=True)]
-    _write_careful(e, called, flag, "%bases", fields, "-1")
-
-
-def _write_careful_rows(e: Emitter, called: Careful, flag: str, rows: Sequence[tuple[str, int]]) -> list[str]:
-    """The same for rows of the W samples from `%base` on, whose pointers and strides are given; memory that this needs."""
-    rare, on = f"careful{len(e.lines)}", f"on{len(e.lines)}"
-    e.lines += [f"  br i1 {e.any(flag)}, label %{rare}, label %{on}", f"{rare}:"]
-    fields = []
-    for (pointer, stride), array in zip(rows, (*called.inputs, *called.outputs), strict=True):
-        offset = e.emit(f"mul i64 %base, {stride}")
-        fields.append((e.emit(f"getelementptr i8, ptr {pointer}, i64 {offset}"), array.dtype.itemsize, stride))
-    # Samples beyond the last one are it once more.
-    left = e.emit("sub i64 %n, %base")
-    few = e.emit(f"icmp ult i64 {left}, {e.width}")
-    within = e.emit(f"select i1 {few}, i64 {left}, i64 {e.width}")
-    beyond = e.emit(f"sub i64 64, {within}")
-    _write_careful(e, called, flag, "%rows", fields, e.emit(f"lshr i64 -1, {beyond}"))
-    e.lines += [f"  br label %{on}", f"{on}:"]
-    return [f"  %rows = alloca [{len(fields)} x ptr]"]
-
-
-def _write_careful(e: Emitter, called: Careful, flag: str, bases: str, fields: Sequence[tuple[str, int, int]], within: str) -> None:
-    """The call of the handler's function `careful` for arrays: pointer, bytes from entry to entry and from sample to sample.
-
-    `bases`: memory for the pointers; `within`: bits of the samples that exist.
-    """
-    arrays = [*called.inputs, *called.outputs]
-    for k, (pointer, _, _) in enumerate(fields):
-        at = e.emit(f"getelementptr ptr, ptr {bases}, i64 {k}")
-        e.lines.append(f"  store ptr {pointer}, ptr {at}")
-    numbers = [(x.size, x.dtype.itemsize, *steps) for x, (_, *steps) in zip(arrays, fields, strict=True)]
-    name = f"@layout{len(e.declared)}"
-    flat = ", ".join(f"i64 {x}" for row in numbers for x in row)
-    e.declared[name] = f"{name} = private constant [{4 * len(numbers)} x i64] [{flat}]"
-    bits = flag if e.width == 1 else e.emit(f"bitcast {e.type('b1')} {flag} to i{e.width}")
-    mask = e.emit(f"and i64 {e.emit(f'zext i{e.width} {bits} to i64')}, {within}")
-    e.declared[CAREFUL] = f"declare void @{CAREFUL}(i64, i64, i64, i64, i64, ptr, ptr)"
-    counts = f"i64 {len(called.inputs)}, i64 {len(arrays)}"
-    number = number_of(called, 1, [False] * len(called.inputs))
-    e.lines.append(f"  call void @{CAREFUL}(i64 {number}, i64 {e.width}, i64 {mask}, {counts}, ptr {bases}, ptr {name})")
-
-
-def number_of(program, width: int, uniform: Sequence[bool]) -> int:
-    """The number by which the handler finds the kernel of a program."""
-    content = f"{program.digest} {width} {tuple(uniform)}"
-    # A hash, not a counter: a program in XLA's persistent cache finds its kernel in another process. 63 bits, as the attribute is
-    # signed; odd, as zero marks an empty slot.
-    return int.from_bytes(hashlib.sha256(content.encode()).digest()[:8], "little") >> 1 | 1
 
 
 def symbol_of(called: Program, width: int) -> str:
@@ -280,8 +224,7 @@ def kernel_ir(program: Program, width: int, uniform: Sequence[bool]) -> str:
         """The row of one sample."""
         return None if width > 1 else rows[place][0] if place in rows else f"%a{place}"
 
-    body, valid = Body(e, fast, load, array), None
-    allocations = []
+    body, valid, allocations = Body(e, fast, load, array), None, []
     # The kernel of one sample of a large program is a call: the same code serves as a subprogram of steps and rollouts.
     if calls_itself(program, width):
         pointers = [str(array(i)) for i in range(len(arrays))]
@@ -300,7 +243,7 @@ def kernel_ir(program: Program, width: int, uniform: Sequence[bool]) -> str:
         flag = e.operation("not", "b1", [valid], "b1")
         same = [*uniform, *[False] * len(program.outputs)]
         places = [(f"%a{i}", 0 if same[i] else x.size * x.dtype.itemsize) for i, x in enumerate(arrays)]
-        allocations += _write_careful_rows(e, program.careful, flag, places)
+        body.careful = max(body.careful, careful_text.write_call_of_rows(e, program.careful, flag, places))
     # Arguments that are not read are not in the code, but the handler checks their sizes, so that the hash covers them.
     sizes = " ".join(
         f"{'same' if i < count and uniform[i] else 'each'}:{x.size}x{x.dtype}" for i, x in enumerate(arrays)

@@ -316,128 +316,62 @@ new:
   ret ptr %made
 }
 
-; Copy one sample of an array, whose entries and samples are apart by strides, to a row or from it. %row: { entries, bytes of an
-; entry, bytes from entry to entry, bytes from sample to sample }.
-define internal void @copy(ptr %array, ptr %row, ptr %layout, i1 %is.back) #0 {
+; Copy one sample of arrays to rows in memory, which begins with their addresses, or back. A layout is { entries, bytes of an entry,
+; bytes from entry to entry and from sample to sample, place of the row }.
+define internal void @move(i64 %sample, i64 %first, i64 %count, ptr %bases, ptr %layouts, ptr %memory, i1 %is.back) #0 {
 entry:
-  %entries = load i64, ptr %layout
-  %bytes.at = getelementptr i64, ptr %layout, i64 1
-  %bytes = load i64, ptr %bytes.at
-  %step.at = getelementptr i64, ptr %layout, i64 2
-  %step = load i64, ptr %step.at
+  br label %arrays
+arrays:
+  %i = phi i64 [ %first, %entry ], [ %i.next, %next ]
+  %is.done = icmp sge i64 %i, %count
+  br i1 %is.done, label %out, label %array
+array:
+  %layout = getelementptr [5 x i64], ptr %layouts, i64 %i
+  %numbers = load [5 x i64], ptr %layout
+  %entries = extractvalue [5 x i64] %numbers, 0
+  %bytes = extractvalue [5 x i64] %numbers, 1
+  %step = extractvalue [5 x i64] %numbers, 2
+  %stride = extractvalue [5 x i64] %numbers, 3
+  %place = extractvalue [5 x i64] %numbers, 4
+  %base.at = getelementptr ptr, ptr %bases, i64 %i
+  %base = load ptr, ptr %base.at
+  %offset = mul i64 %sample, %stride
+  %row = getelementptr i8, ptr %memory, i64 %place
+  %row.at = getelementptr ptr, ptr %memory, i64 %i
+  store ptr %row, ptr %row.at
   br label %loop
 loop:
-  %k = phi i64 [ 0, %entry ], [ %k.next, %more ]
-  %is.done = icmp sge i64 %k, %entries
-  br i1 %is.done, label %out, label %more
+  %k = phi i64 [ 0, %array ], [ %k.next, %more ]
+  %is.last = icmp sge i64 %k, %entries
+  br i1 %is.last, label %next, label %more
 more:
   %far = mul i64 %k, %step
+  %far.offset = add i64 %far, %offset
   %near = mul i64 %k, %bytes
-  %there = getelementptr i8, ptr %array, i64 %far
+  %there = getelementptr i8, ptr %base, i64 %far.offset
   %here = getelementptr i8, ptr %row, i64 %near
   %from = select i1 %is.back, ptr %here, ptr %there
   %to = select i1 %is.back, ptr %there, ptr %here
   call void @llvm.memcpy.p0.p0.i64(ptr %to, ptr %from, i64 %bytes, i1 false)
   %k.next = add i64 %k, 1
   br label %loop
+next:
+  %i.next = add i64 %i, 1
+  br label %arrays
 out:
   ret void
 }
 
-; Call a kernel for one sample of `count` arrays, the first `inputs` of which it reads. Without a kernel, the bytes of memory for
-; rows that this takes.
-define internal i64 @sample(ptr %kernel, i64 %sample, i64 %inputs, i64 %count, ptr %bases, ptr %layouts, ptr %data, ptr %memory) #0 {
-entry:
-  %is.asked = icmp eq ptr %kernel, null
-  br label %loop
-loop:
-  %i = phi i64 [ 0, %entry ], [ %i.next, %step ]
-  %used = phi i64 [ 0, %entry ], [ %used.next, %step ]
-  %is.done = icmp sge i64 %i, %count
-  br i1 %is.done, label %gathered, label %array
-array:
-  %at = mul i64 %i, 4
-  %layout = getelementptr i64, ptr %layouts, i64 %at
-  %entries = load i64, ptr %layout
-  %bytes.at = getelementptr i64, ptr %layout, i64 1
-  %bytes = load i64, ptr %bytes.at
-  %step.at = getelementptr i64, ptr %layout, i64 2
-  %step.bytes = load i64, ptr %step.at
-  %stride.at = getelementptr i64, ptr %layout, i64 3
-  %stride = load i64, ptr %stride.at
-  %base.at = getelementptr ptr, ptr %bases, i64 %i
-  %base = load ptr, ptr %base.at
-  %offset = mul i64 %sample, %stride
-  %here = getelementptr i8, ptr %base, i64 %offset
-  %size = mul i64 %entries, %bytes
-  %more.size = add i64 %size, 63
-  %lines = and i64 %more.size, -64
-  %is.row = icmp eq i64 %step.bytes, %bytes
-  %needed = select i1 %is.row, i64 0, i64 %lines
-  %used.next = add i64 %used, %needed
-  br i1 %is.asked, label %step, label %place
-place:
-  %row = getelementptr i8, ptr %memory, i64 %used
-  %given = select i1 %is.row, ptr %here, ptr %row
-  %data.at = getelementptr ptr, ptr %data, i64 %i
-  store ptr %given, ptr %data.at
-  %is.input = icmp slt i64 %i, %inputs
-  %is.kept = xor i1 %is.row, true
-  %is.copied = and i1 %is.input, %is.kept
-  br i1 %is.copied, label %in, label %step
-in:
-  call void @copy(ptr %here, ptr %row, ptr %layout, i1 false)
-  br label %step
-step:
-  %i.next = add i64 %i, 1
-  br label %loop
-gathered:
-  br i1 %is.asked, label %out, label %run
-run:
-  call void %kernel(ptr %data, i64 1, i64 0, i64 1)
-  br label %back
-back:
-  %j = phi i64 [ %inputs, %run ], [ %j.next, %next ]
-  %is.back = icmp sge i64 %j, %count
-  br i1 %is.back, label %out, label %result
-result:
-  %at.result = mul i64 %j, 4
-  %layout.result = getelementptr i64, ptr %layouts, i64 %at.result
-  %stride.result.at = getelementptr i64, ptr %layout.result, i64 3
-  %stride.result = load i64, ptr %stride.result.at
-  %base.result.at = getelementptr ptr, ptr %bases, i64 %j
-  %base.result = load ptr, ptr %base.result.at
-  %offset.result = mul i64 %sample, %stride.result
-  %there = getelementptr i8, ptr %base.result, i64 %offset.result
-  %from.at = getelementptr ptr, ptr %data, i64 %j
-  %from = load ptr, ptr %from.at
-  %is.same = icmp eq ptr %from, %there
-  br i1 %is.same, label %next, label %copy.back
-copy.back:
-  call void @copy(ptr %there, ptr %from, ptr %layout.result, i1 true)
-  br label %next
-next:
-  %j.next = add i64 %j, 1
-  br label %back
-out:
-  ret i64 %used
-}
-
-; Compute those of `width` samples whose bits are set by the kernel of one sample with this number. Other kernels call it for
-; samples that are not valid. Where there is no code results stay as they are, and `handler` reports the failure.
-define void @careful(i64 %hash, i64 %width, i64 %mask, i64 %inputs, i64 %count, ptr %bases, ptr %layouts) #0 {
+; Compute those of `width` samples whose bits are set by the kernel of one sample with this number. Other kernels call it for samples
+; that are not valid. Where there is no code results stay as they are, and `handler` reports the failure.
+define void @careful(i64 %hash, i64 %width, i64 %mask, i64 %inputs, i64 %count, ptr %bases, ptr %layouts, ptr %memory) #0 {
 entry:
   %entry.at = call ptr @look_up(i64 %hash)
   %kernel = call ptr @code(ptr %entry.at, i64 %hash)
   %is.made = icmp ne ptr %kernel, null
-  br i1 %is.made, label %begin, label %out
-begin:
-  %data = alloca ptr, i64 %count
-  %bytes = call i64 @sample(ptr null, i64 0, i64 %inputs, i64 %count, ptr %bases, ptr %layouts, ptr %data, ptr %data)
-  %memory = alloca i8, i64 %bytes, align 64
-  br label %loop
+  br i1 %is.made, label %loop, label %out
 loop:
-  %k = phi i64 [ 0, %begin ], [ %k.next, %step ]
+  %k = phi i64 [ 0, %entry ], [ %k.next, %step ]
   %is.done = icmp sge i64 %k, %width
   br i1 %is.done, label %out, label %look
 look:
@@ -445,7 +379,9 @@ look:
   %bit = trunc i64 %shifted to i1
   br i1 %bit, label %run, label %step
 run:
-  %used = call i64 @sample(ptr %kernel, i64 %k, i64 %inputs, i64 %count, ptr %bases, ptr %layouts, ptr %data, ptr %memory)
+  call void @move(i64 %k, i64 0, i64 %count, ptr %bases, ptr %layouts, ptr %memory, i1 false)
+  call void %kernel(ptr %memory, i64 1, i64 0, i64 1)
+  call void @move(i64 %k, i64 %inputs, i64 %count, ptr %bases, ptr %layouts, ptr %memory, i1 true)
   br label %step
 step:
   %k.next = add i64 %k, 1

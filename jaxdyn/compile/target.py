@@ -12,7 +12,8 @@ import numpy as np
 
 from jaxdyn.compile import ahead
 from jaxdyn.compile.careful import Careful
-from jaxdyn.compile.code import CAREFUL, calls_itself, kernel_ir, number_of, subprogram_ir, symbol_of, varying_first
+from jaxdyn.compile.careful_text import CAREFUL, number_of
+from jaxdyn.compile.code import calls_itself, kernel_ir, subprogram_ir, symbol_of, varying_first
 from jaxdyn.compile.jax_adapter import Unsupported as Unsupported
 from jaxdyn.compile.jax_adapter import ffi_version, register_handler
 from jaxdyn.compile.objects import Code, features
