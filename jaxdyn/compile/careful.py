@@ -31,7 +31,9 @@ class Careful:
     derivative = fallback = None
     turns, cost, subprograms = 1, 0, ()
 
-    def __init__(self, inputs, outputs, digest: str, name: str, make: Callable[[], Program], by_jax: Callable, which: str):
+    def __init__(
+        self, inputs, outputs, digest: str, name: str, make: Callable[[], Program], by_jax: Callable, which: str
+    ):
         self.inputs: tuple[Array, ...] = tuple(inputs)
         self.outputs: tuple[Array, ...] = tuple(outputs)
         self.results = tuple(tuple(range(array.size)) for array in self.outputs)

@@ -331,7 +331,10 @@ def _innermost(inner: ClosedJaxpr, args: Sequence, again, given: Sequence) -> tu
     if name not in ("jit", "jaxdyn_guarded") or jaxpr.eqns[0].outvars != jaxpr.outvars or (name != "jit" and again):
         return inner, list(args), again, list(given)
     values = dict(zip([*jaxpr.constvars, *jaxpr.invars], [*map(_constant, inner.consts), *args], strict=True))
-    args, params = [np.asarray(x.val) if isinstance(x, Literal) else values[x] for x in jaxpr.eqns[0].invars], jaxpr.eqns[0].params
+    args, params = (
+        [np.asarray(x.val) if isinstance(x, Literal) else values[x] for x in jaxpr.eqns[0].invars],
+        jaxpr.eqns[0].params,
+    )
     if name == "jit":
         return _innermost(params["jaxpr"], args, again, given)
     return _innermost(params["call"], args, params["again"], args)

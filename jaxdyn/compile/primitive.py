@@ -17,12 +17,12 @@ import jax.numpy as jnp
 from jax import lax
 
 from jaxdyn.compile import ahead, derive, jax_adapter, mode
+from jaxdyn.compile.batch import cond
 from jaxdyn.compile.careful import Careful, guard
 from jaxdyn.compile.flags import mark_invalid
 from jaxdyn.compile.inlining import inline
 from jaxdyn.compile.jax_adapter import ShapedArray, define_primitive, is_linear, is_zero, lowering_of, zero_tangent
 from jaxdyn.compile.program import COMPARISONS, Constant, NotNumbers, Program, TooLong, dtype_of
-from jaxdyn.compile.repair import compute_where
 from jaxdyn.compile.shared import split_program
 from jaxdyn.compile.trace import tangent_program
 from jaxdyn.compile.trigonometry import cosine, sine
@@ -136,7 +136,10 @@ def as_operations(*args, program: Program, rows: int = 0):
 
 
 def _call_careful(program: Program, operands, values: list, lead: tuple) -> list:
-    """Entries of the results of a pair: those of the fast program, or where its flag is set those of the careful one."""
+    """Entries of the results of a pair: those of the fast program, or where its flag is set those of the careful one.
+
+    If the flag is set in no sample of the batch the careful program does not run.
+    """
     careful, flag = program.subprograms[operands[0].value], operands[1]
     assert isinstance(careful, Careful)
     entries, arrays = iter(operands[2:]), []
@@ -148,7 +151,10 @@ def _call_careful(program: Program, operands, values: list, lead: tuple) -> list
     flag = jnp.full(lead, flag.value) if type(flag) is Constant else values[flag]
 
     def one(flag, otherwise, given):
-        return compute_where(flag, careful.by_jax, otherwise, tuple(given))
+        def again():
+            return [jnp.where(flag, x, y) for x, y in zip(careful.by_jax(*given), otherwise, strict=True)]
+
+        return cond(flag, again, lambda: list(otherwise))
 
     for _ in lead:
         one = jax.vmap(one)

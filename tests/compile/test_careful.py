@@ -15,10 +15,10 @@ from jaxdyn.compile import target
 from jaxdyn.compile.batch import any_sample
 from jaxdyn.compile.loops import Carry, Given, Iteration, Task, run_loop
 from jaxdyn.compile.primitive import as_operations, kernel_p
-from jaxdyn.compile.repair import compute_where
 from jaxdyn.compile.trace import program_of
 
 pytestmark = pytest.mark.native
+
 
 def test_a_flag_of_any_sample_is_one_of_the_batch():
     def pick(x):
@@ -30,30 +30,6 @@ def test_a_flag_of_any_sample_is_one_of_the_batch():
     assert jax.vmap(jax.grad(pick))(grid[1]).tolist() == [1, 1]
     assert pick(jnp.asarray(3.0)) == 13 and pick(jnp.asarray(1.0)) == 1
     assert "select" not in str(jax.make_jaxpr(jax.vmap(pick))(grid[0]))
-
-
-def test_samples_are_computed_again_by_jax():
-    """Only those, a few at a time, with the dtypes of the values, where there is no native code."""
-    calls, size = [], np.arange(1.0, 4.0)
-
-    def again(x):
-        jax.debug.callback(lambda: calls.append(1))
-        return {"matrix": jnp.full((2, 2), -x), "n": 7}
-
-    def one(x, valid):
-        return compute_where(~jnp.asarray(valid), again, {"matrix": jnp.full((2, 2), x), "n": jnp.asarray(3)}, (x,))
-
-    many = jax.jit(jax.vmap(one))
-    for flags in ([False] * 3, [False, True, False]):
-        calls.clear()
-        computed = many(size, ~np.asarray(flags))
-        jax.effects_barrier()
-        signed = np.where(flags, -size, size)
-        np.testing.assert_array_equal(computed["matrix"], np.broadcast_to(signed[:, None, None], (3, 2, 2)))
-        assert computed["n"].tolist() == [7 if flag else 3 for flag in flags] and bool(calls) == any(flags)
-        assert computed["n"].dtype == jnp.asarray(3).dtype
-    alone = jax.jit(one)
-    assert alone(2.0, False)["matrix"][0, 0] == -2 and alone(2.0, True)["matrix"][0, 0] == 2
 
 
 def _root(_, x, scale):
@@ -100,7 +76,12 @@ def test_samples_that_need_it_are_computed_by_the_fallback(nested, few, dtype):
     want = np.sqrt(x * scale)
     assert y.dtype == dtype
     assert way.reshape(-1).tolist() == (order < few).tolist()
-    for computed, exact in ((y, want), (slope, want / (2 * x)), (moved, want / (2 * scale)), (second, -want / (4 * x * x))):
+    for computed, exact in (
+        (y, want),
+        (slope, want / (2 * x)),
+        (moved, want / (2 * scale)),
+        (second, -want / (4 * x * x)),
+    ):
         np.testing.assert_allclose(computed, exact, rtol=64 * eps)
 
 
@@ -206,8 +187,13 @@ def test_the_same_by_operations_of_jax():
     for run in (many, lambda x, s: jax.jvp(many, (x, s), (x, s))[1], jax.grad(lambda x, s: jnp.sum(many(x, s)))):
         made = program(run)
         given = [np.random.default_rng(i).uniform(0.5, 2.0, (4, array.size)) for i, array in enumerate(made.inputs)]
-        for other in (as_operations(*given, program=made), jax.jit(lambda *a, p=made: as_operations(*a, program=p))(*given)):
-            for mine, theirs in zip(jax.jit(lambda *a, p=made: kernel_p.bind(*a, program=p, rows=0))(*given), other, strict=True):
+        for other in (
+            as_operations(*given, program=made),
+            jax.jit(lambda *a, p=made: as_operations(*a, program=p))(*given),
+        ):
+            for mine, theirs in zip(
+                jax.jit(lambda *a, p=made: kernel_p.bind(*a, program=p, rows=0))(*given), other, strict=True
+            ):
                 np.testing.assert_allclose(mine, theirs, rtol=1e-13, atol=1e-13)
 
 
