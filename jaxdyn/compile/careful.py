@@ -23,8 +23,8 @@ from jaxdyn.compile.program import Array, Constant, Operation, Program, kind_of
 class Careful:
     """A subprogram that is made when it is called for the first time.
 
-    - `make()` -> its `Program`, traced as `mode.careful(which)`. `by_jax(*flat)`: the same by operations of JAX, from flat arrays of
-      one sample to flat arrays.
+    - `make()` -> its `Program`, traced as `mode.careful(which)`.
+    - `by_jax(*flat)`: the same by operations of JAX, from flat arrays of one sample to flat arrays.
     """
 
     is_called = True

@@ -324,17 +324,15 @@ class _Expansion:
 def _innermost(inner: ClosedJaxpr, args: Sequence, again, given: Sequence) -> tuple[ClosedJaxpr, list, Any, list]:
     """The function under `jax.jit` to which a function comes down, with its arguments, or the function itself.
 
-    Also what computes its flagged samples, with the arguments of that. A branch that repeats a call so shares the call's subprogram.
+    Also what computes its flagged samples, with the arguments of that. A branch that repeats a call so shares its subprogram.
     """
     jaxpr = inner.jaxpr
     name = jaxpr.eqns[0].primitive.name if len(jaxpr.eqns) == 1 else ""
     if name not in ("jit", "jaxdyn_guarded") or jaxpr.eqns[0].outvars != jaxpr.outvars or (name != "jit" and again):
         return inner, list(args), again, list(given)
     values = dict(zip([*jaxpr.constvars, *jaxpr.invars], [*map(_constant, inner.consts), *args], strict=True))
-    args, params = (
-        [np.asarray(x.val) if isinstance(x, Literal) else values[x] for x in jaxpr.eqns[0].invars],
-        jaxpr.eqns[0].params,
-    )
+    params = jaxpr.eqns[0].params
+    args = [np.asarray(x.val) if isinstance(x, Literal) else values[x] for x in jaxpr.eqns[0].invars]
     if name == "jit":
         return _innermost(params["jaxpr"], args, again, given)
     return _innermost(params["call"], args, params["again"], args)

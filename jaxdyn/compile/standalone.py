@@ -90,8 +90,10 @@ def _scalar_program(function: Callable, examples: Sequence[Any], name: str) -> t
         raise ValueError(
             f"function cannot be exported: it has {made}; only functions without callbacks and data-dependent loops can"
         )
-    program, structure = made
-    return inline(program), structure
+    program, structure = inline(made[0]), made[1]
+    # Here the flag is a result like others, which derivatives do not repeat.
+    program.reports_validity = False
+    return program, structure
 
 
 def jacobian_routine(routine: Routine, symbol: str) -> Routine:

@@ -72,8 +72,9 @@ def register() -> None:
     text = resources.files("jaxdyn.compile").joinpath("handler.ll").read_text()
     messages = {"MISSING": _MISSING, "FAILED": _FAILED, "MISFIT": _MISFIT}
     fields = {
-        "TABLE": ctypes.addressof(_table), "SLOT_MASK": SLOTS - 1, "LIMIT": ctypes.addressof(_threads), "FAILURES": ctypes.addressof(_failures),
-        "PREPARE": ctypes.cast(_PREPARE, ctypes.c_void_p).value, "MAJOR": version[0], "MINOR": version[1],
+        "TABLE": ctypes.addressof(_table), "SLOT_MASK": SLOTS - 1, "LIMIT": ctypes.addressof(_threads),
+        "FAILURES": ctypes.addressof(_failures), "PREPARE": ctypes.cast(_PREPARE, ctypes.c_void_p).value,
+        "MAJOR": version[0], "MINOR": version[1],
         "RELAX": _RELAX[architecture], "RELAX_TYPE": _RELAX[architecture].replace("i32 1", "i32"),
         **messages, **{f"{name}_BYTES": len(message) + 1 for name, message in messages.items()},
     }  # fmt: skip

@@ -40,8 +40,8 @@ def program_of(
     - `tree`: pytree whose known leaves are compiled in; its traced leaves, and all of `args`, are operands.
     - `tangent(*static, tree, *args, steps)`: the function's derivative along `steps`, as of `kernel`.
     - `most`: operations beyond which there is no program. `calls`: whether long functions under `jax.jit` become subprograms.
-    - `flags`: as of `expand`; with "repair" samples that are flagged are computed by the program of `fallback`, or of the function
-      itself, that is traced when the first of them appears (see `careful`).
+    - `flags`: as of `expand`; with "repair" samples that are flagged are computed by the program of `fallback`, or of the
+      function itself, which is traced when the first of them appears (see `careful`).
     """
     traced, known = partition_tracers(tree)
     leaves, structure = jax.tree.flatten(args)
@@ -96,7 +96,7 @@ def _trace_program(function, static, known: Known, count, structure, shapes, tan
 class Again(NamedTuple):
     """What computes the samples that a function marks as not valid: a function of the same arguments, traced to a program.
 
-    `calls`: whether it may have subprograms and branches, which have no derivatives. `is_itself`: whether it is the same function.
+    `calls`: whether it may have subprograms and branches, which have no derivatives. `is_itself`: whether it is that function.
     """
 
     function: Callable
