@@ -7,7 +7,7 @@ differentiated there (`derive`), written as LLVM IR (`code`, `llvm`), and called
 native code, operations of JAX do the same (`primitive`).
 
 Nothing of jaxdyn is imported here. Other rooms import the names below, and those of the modules `known` (known and traced
-values), `batch` (decisions for a batch, repetitions), `loops` and `repair`. Only `jaxdyn.scale`, which compiles programs around
+values), `batch` (decisions for a batch, repetitions) and `loops`. Only `jaxdyn.scale`, which compiles programs around
 kernels ahead of time, and `jaxdyn.export`, which writes object files, import the compiler's own modules.
 """
 

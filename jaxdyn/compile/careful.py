@@ -56,7 +56,7 @@ class Careful:
             return self._made
 
     def tangent(self, moving: Sequence[bool]) -> "Careful":
-        """Of the change of the outputs (see `derive.tangent`)."""
+        """The program of the change of the outputs (see `derive.tangent`)."""
         moving = tuple(moving)
         if moving not in self.derived:
             inputs = [*self.inputs, *(x for x, varies in zip(self.inputs, moving, strict=True) if varies)]
@@ -72,8 +72,8 @@ class Careful:
             )
         return self.derived[moving]
 
-    def transposed(self, linear: Sequence[bool], given: Sequence[bool], transpose: Callable) -> "Careful":
-        """Of the cotangents of the `linear` inputs (see `derive.transpose`); `transpose(program, linear, given)`."""
+    def transpose(self, linear: Sequence[bool], given: Sequence[bool], of_program: Callable) -> "Careful":
+        """The program of the cotangents of the `linear` inputs, by `of_program(program, linear, given)` (see `derive.transpose`)."""
         linear, given = tuple(linear), tuple(given)
         key = ("transposed", linear, given)
         if key not in self.derived:
@@ -84,7 +84,7 @@ class Careful:
                 [x for x, varies in zip(self.inputs, linear, strict=True) if varies],
                 _digest(self.digest, *key),
                 f"transpose of {self.name}",
-                lambda: transpose(self._program(), linear, given),
+                lambda: of_program(self._program(), linear, given),
                 functools.partial(_transpose_by_jax, self, linear, given),
                 self.which,
             )

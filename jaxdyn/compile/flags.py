@@ -2,7 +2,7 @@
 
 A kernel has no branches. Where a fast formula fails for some samples, such as a Cholesky factor of rows that depend on each
 other, the function says so by `mark_invalid(flag, x)`, which is NaN where the flag is set. The program reports which samples are
-valid, and `kernel` computes the others by the fallback. A program without marks reports nothing and compiles no fallback.
+valid, and native code computes the others by the fallback (see `careful`). A program without marks reports nothing.
 """
 
 import jax

@@ -227,7 +227,7 @@ def _transpose_program(program: Program, linear: tuple[bool, ...], given: tuple[
         key = ("transposed", linear, given)
         if key not in program.derived:
             fast = _transpose_program(program.fast, linear, (*given, False))
-            careful = program.careful.transposed(linear, given, _transpose_program)
+            careful = program.careful.transpose(linear, given, _transpose_program)
             program.derived[key] = guard(fast, careful) if fast.reports_validity else fast
         return program.derived[key]
     backwards = derive.transpose(program, linear, given)

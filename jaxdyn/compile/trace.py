@@ -94,7 +94,7 @@ def _trace_program(function, static, known: Known, count, structure, shapes, tan
 
 
 class Again(NamedTuple):
-    """What computes the samples that a function marks as not valid: a function of the same arguments, traced to a program.
+    """Function that computes the samples which another one of the same arguments marks as not valid.
 
     `calls`: whether it may have subprograms and branches, which have no derivatives. `is_itself`: whether it is that function.
     """
@@ -120,7 +120,7 @@ class Again(NamedTuple):
 
     @property
     def which(self) -> str:
-        """As of `mode.careful`."""
+        """The argument of `mode.careful`."""
         return "own" if self.is_itself and self.calls else "within"
 
     def compute(self, outputs, leaves) -> list:
