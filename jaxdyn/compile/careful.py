@@ -73,7 +73,7 @@ class Careful:
         return self.derived[moving]
 
     def transpose(self, linear: Sequence[bool], given: Sequence[bool], of_program: Callable) -> "Careful":
-        """The program of the cotangents of the `linear` inputs, by `of_program(program, linear, given)` (see `derive.transpose`)."""
+        """The program of cotangents of the `linear` inputs (see `derive.transpose`), by `of_program(program, linear, given)`."""
         linear, given = tuple(linear), tuple(given)
         key = ("transposed", linear, given)
         if key not in self.derived:

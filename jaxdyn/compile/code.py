@@ -239,7 +239,7 @@ def kernel_ir(program: Program, width: int, uniform: Sequence[bool]) -> str:
             *results, (valid,) = results
         for i, (row, output) in enumerate(zip(results, program.outputs, strict=True)):
             e.store_array(rows[count + i], kind_of(output.dtype), row)
-    if valid is not None:
+    if valid is not None and program.careful is not None:
         flag = e.operation("not", "b1", [valid], "b1")
         same = [*uniform, *[False] * len(program.outputs)]
         places = [(f"%a{i}", 0 if same[i] else x.size * x.dtype.itemsize) for i, x in enumerate(arrays)]

@@ -112,7 +112,7 @@ class Again(NamedTuple):
         """The careful program beside the fast one of the other function."""
         outputs, name = fast.outputs[:-1], name_of(self.function)
         inputs = [Array(shape, np.dtype(dtype)) for shape, dtype in self.shapes]
-        make, by_jax = (functools.partial(f, self, outputs) for f in (_make_careful, _by_jax))
+        make, by_jax = functools.partial(_make_careful, self, outputs), functools.partial(_by_jax, self, outputs)
         function = self.function if "<locals>" in name else f"{getattr(self.function, '__module__', '')}.{name}"
         content = f"{name} {inputs} {self.known.digest}"
         digest = digest_beside(fast, content, (function, self.static, self.structure, self.calls))
