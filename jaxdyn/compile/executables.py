@@ -114,7 +114,7 @@ def _find(function, structure, kinds, options, context) -> Executable:
         jitted = jax.jit(flat, compiler_options=options(), keep_unused=True)
         return jitted.lower(*types), results
 
-    if key is not None and (found := _load(key, trace)) is not None:
+    if key is not None and (found := _load(key, functools.partial(_in_modes, mode.remember(), trace))) is not None:
         return found
     with ahead.worker(not mode.wants_usual_options()):
         lowered, results = trace()
@@ -124,7 +124,13 @@ def _find(function, structure, kinds, options, context) -> Executable:
     return made
 
 
-def _load(key: str, trace: Callable) -> Executable | None:
+def _in_modes(enter: Callable, trace: Callable) -> None:
+    # From a thread of XLA, when code turns out to be missing.
+    with enter():
+        trace()
+
+
+def _load(key: str, recover: Callable) -> Executable | None:
     contents = disk.read(f"{key}.executable")
     if contents is None:
         return None
@@ -134,7 +140,7 @@ def _load(key: str, trace: Callable) -> Executable | None:
     try:
         payload, rows, static, results = pickle.loads(contents)
         for number, row in rows:
-            target.restore(number, target.Row(*row), trace)
+            target.restore(number, target.Row(*row), recover)
         return Executable(jax_adapter.load_executable(payload), static, jax.tree.structure(results))
     except Exception as reason:
         disk.logger.debug("jaxdyn: an executable on disk is made again: %s", reason)
@@ -150,12 +156,17 @@ def _save(key: str, lowered: Any, made: Executable) -> None:
         disk.logger.debug("jaxdyn: an entry point is not kept on disk, as it calls %s", ", ".join(unsafe))
         return
     numbers = sorted({int(x) for x in _NUMBERS.findall(text)})
-    rows = [(number, tuple(target.row_of(number))) for number in numbers]
+    rows = [(number, target.row_of(number)) for number in numbers]
+    if not all(row.is_kept for _, row in rows):
+        disk.logger.debug(
+            "jaxdyn: an entry point is not kept on disk, as it calls a function of the user for flagged samples"
+        )
+        return
     try:
         payload = jax_adapter.dump_executable(made.run)
         # An instance, not its structure: pickled ones do not know the marks of equinox for fields that are missing.
         results = jax.tree.unflatten(made.structure, [0] * len(made.static))
-        contents = pickle.dumps((payload, rows, made.static, results), protocol=5)
+        contents = pickle.dumps((payload, [(x, tuple(row)) for x, row in rows], made.static, results), protocol=5)
     except Exception as reason:  # results may be of classes that cannot be pickled, and raise anything
         disk.logger.debug("jaxdyn: an entry point is not kept on disk: %r", reason)
         return

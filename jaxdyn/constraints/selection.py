@@ -23,7 +23,15 @@ import numpy as np
 from jax import lax
 from jaxtyping import Array, Float, Int
 
-from jaxdyn.compile import entry_point, evaluate, kernel, mark_invalid, pseudo_inverse_by_rotations, variant
+from jaxdyn.compile import (
+    eliminate_rows,
+    entry_point,
+    evaluate,
+    kernel,
+    mark_invalid,
+    pseudo_inverse_by_rotations,
+    variant,
+)
 from jaxdyn.compile.batch import cond
 from jaxdyn.compile.known import is_concrete, is_tracing, stop_gradient
 from jaxdyn.constraints.base import constraint_jacobian, holonomic_rows, layout, position_residual
@@ -64,8 +72,6 @@ _FAR, _NEWTON_STEPS = 0.2, 12
 # The rows are chosen anew when their least pivot has fallen to this part of its value at their choice. A pivot is the square of a
 # sine, so that the sine of the angle between rows has halved.
 _EXCHANGED_AT = 0.25
-# Rows whose distances differ by less than this part are equally far.
-_ALIKE = 1e-3
 # A row below this part of the largest one of its constraint has no direction of its own: rounding is all that it holds.
 _TINY_ROW = 1e-3
 
@@ -90,25 +96,9 @@ def eliminate(B: Float[Array, "nc nv"], least: float, first: Float[Array, " nc"]
 
     **Returns:** a mask (nc,) of 1 and 0, the largest distance () of a row that is not kept, and the least pivot () of the others.
     """
-
     # Not an SVD: it counts independent rows but does not name them, and LAPACK in a batch can deadlock (see `solve_square`).
-    def keep_next(_, state):
-        rest, kept, least_kept = state
-        # Rounding leaves a kept row a length of eps; it must not be chosen again.
-        lengths = jnp.sqrt(jnp.sum(rest * rest, 1)) * (1 - kept)
-        order = jnp.where((first > 0) & (lengths > least), lengths + jnp.max(lengths), lengths)
-        # Rows of symmetric mechanisms are equally far but for rounding, which differs between programs: the first one counts.
-        row = jnp.argmax(order >= (1 - _ALIKE) * jnp.max(order))
-        pivot = lengths[row]
-        along = rest[row] / jnp.where(pivot > 0, pivot, jnp.ones_like(pivot))
-        is_kept = pivot > least if most is None else (pivot > least) & (jnp.sum(kept) < most)
-        rest = jnp.where(is_kept, rest - matmul(rest, along)[:, None] * along[None], rest)
-        least_kept = jnp.where(is_kept, jnp.minimum(least_kept, pivot), least_kept)
-        return rest, kept.at[row].add(is_kept.astype(B.dtype)), least_kept
-
-    start = B, jnp.zeros_like(B[:, 0]), jnp.full((), jnp.inf, B.dtype)
-    rest, kept, least_kept = lax.fori_loop(0, min(B.shape), keep_next, start)
-    return kept, jnp.max(jnp.sqrt(jnp.sum(rest * rest, 1)) * (1 - kept)), least_kept
+    kept, rest, pivots = eliminate_rows(B, first, least, min(B.shape) if most is None else most)
+    return kept, jnp.max(rest), jnp.min(jnp.where(kept > 0, pivots, jnp.inf))
 
 
 def independent_rows(scene: Scene, q, t, rank_tol: float | None = None) -> Scene:
@@ -257,7 +247,7 @@ def _keep_state(old, new, project: Callable, state):
     return state
 
 
-@variant(_keep_state)
+@variant(_keep_state, marks=True)
 def project_after_exchange(old, new, project: Callable, state: Any) -> Any:
     """project(state) where the rows `new` of the next step are not the `old` ones, else the state.
 
