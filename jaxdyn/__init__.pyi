@@ -20,7 +20,7 @@ from jaxdyn import (
     sensors,
     simulation,
 )
-from jaxdyn.compile import compilation
+from jaxdyn.compile import compilation, jit
 from jaxdyn.constraints import Holonomic, Pfaffian, constraint_jacobian, loop, rolling_sphere, rolling_wheel
 from jaxdyn.constraints.assembly import assemble
 from jaxdyn.constraints.codes import RESULTS
@@ -131,6 +131,7 @@ __all__ = [
     "inverse_dynamics",
     "inverse_kinematics",
     "io",
+    "jit",
     "join",
     "kinetic_energy",
     "load",

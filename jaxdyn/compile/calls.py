@@ -13,30 +13,54 @@ from jaxdyn.compile.jax_adapter import select_options
 from jaxdyn.compile.known import is_concrete, is_tracing
 
 
+def jit(function: Callable) -> Callable:
+    """Compile a function, and keep what is compiled on disk: a second process traces it and compiles nothing.
+
+    As `equinox.filter_jit`: arrays in the arguments are operands, everything else is a constant of the program. The program on
+    disk is found by what tracing gives, all numbers within included: no change of the function, or of what it reads, gives
+    another one's results. Under a transformation or another `jit`, and on devices other than CPUs, nothing is kept. Programs
+    that call Python (`jax.pure_callback`) are not kept either.
+
+    ```python
+    @jd.jit
+    def loss_gradient(model, q, v):
+        return jax.grad(lambda v: jd.simulate(model, q, v, ts).q[-1].sum())(v)
+    ```
+    """
+    return _compile(function, _usual_options)
+
+
 def entry_point(function: Callable) -> Callable:
     """Compile a function that users call once per shape, its arrays being operands; a decorator.
 
     Within a trace it is the function as it stands: a nested `jit` would hide the values of known arrays.
     """
+    return _compile(function, quick_options)
 
+
+def _compile(function: Callable, options: Callable) -> Callable:
     usual = eqx.filter_jit(function)
-    quick = functools.cache(lambda: _jit(function, compiler_options=quick_options()))
+    compiled = functools.cache(lambda: _jit(function, compiler_options=options()))
 
     @functools.wraps(function)
-    def call(*args):
+    def call(*args, **kwargs):
         if is_tracing():
-            return function(*args)
+            return function(*args, **kwargs)
         # JAX refuses compiler options under a transformation such as `grad`, whose arguments are traced.
-        if not (_is_glue(jax.default_backend()) and is_concrete(args)):
-            return usual(*args)
+        if not (_is_glue(jax.default_backend()) and is_concrete((args, kwargs))):
+            return usual(*args, **kwargs)
         if _is_plain_call():
-            found = executables.call(function, args, quick_options)
+            found = executables.call(function, args, kwargs, options)
             if found is not None:
                 return found
         with ahead.worker(not mode.wants_usual_options()):
-            return quick()(*args)
+            return compiled()(*args, **kwargs)
 
     return call
+
+
+def _usual_options() -> None:
+    """XLA's own options, for functions that are more than calls of kernels."""
 
 
 def _is_plain_call() -> bool:

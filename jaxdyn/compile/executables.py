@@ -1,7 +1,8 @@
 """Entry points as executables that are kept on disk: in a second process nothing of them is traced, lowered or compiled.
 
 An executable belongs to a function, the structure and the types of its arguments, everything static in them, and JAX's options.
-In this process it is found by these, on disk by the hash of their contents (`stored.key_of`).
+In this process it is found by these, on disk by the hash of their contents (`stored.key_of`). Where they have none, as code of
+users, the function is traced in each process, and the executable is found by the text of its program.
 """
 
 import functools
@@ -46,14 +47,14 @@ class Executable(NamedTuple):
         return jax.tree.unflatten(self.structure, leaves)
 
 
-def call(function: Callable, args: tuple, options: Callable) -> Any:
-    """function(*args) by its executable, for arrays on the default device; None where it has to be called otherwise.
+def call(function: Callable, args: tuple, kwargs: dict, options: Callable) -> Any:
+    """function(*args, **kwargs) by its executable, for arrays on the default device; None where it has to be called otherwise.
 
     `options()`: XLA's options, which take time to find out.
     """
     if not jax_adapter.is_version_known():
         return None
-    leaves, structure = jax.tree.flatten(args)
+    leaves, structure = jax.tree.flatten((args, kwargs))
     device, kinds, arrays = _default_sharding(), [], []
     for x in leaves:
         if isinstance(x, jax.Array):
@@ -104,7 +105,7 @@ def _find(function, structure, kinds, options, context) -> Executable:
         def flat(*arrays):
             given = iter(arrays)
             leaves = [x[1].value if isinstance(x[1], Static) else next(given) for x in kinds]
-            found, out = jax.tree.flatten(function(*jax.tree.unflatten(structure, leaves)))
+            found, out = jax.tree.flatten(_apply(function, structure, leaves))
             is_array = [isinstance(x, (jax.Array, np.ndarray, np.generic)) for x in found]
             results[:] = [tuple(None if y else Static(x) for x, y in zip(found, is_array, strict=True)), out]
             return [x for x, y in zip(found, is_array, strict=True) if y]
@@ -114,14 +115,26 @@ def _find(function, structure, kinds, options, context) -> Executable:
         jitted = jax.jit(flat, compiler_options=options(), keep_unused=True)
         return jitted.lower(*types), results
 
-    if key is not None and (found := _load(key, functools.partial(_in_modes, mode.remember(), trace))) is not None:
+    recover = functools.partial(_in_modes, mode.remember(), trace)
+    if key is not None and (found := _load(key, recover)) is not None:
         return found
     with ahead.worker(not mode.wants_usual_options()):
-        lowered, results = trace()
-        made = Executable(lowered.compile(), *results)
-    if key is not None:
-        _save(key, lowered, made)
+        lowered, (static, out) = trace()
+        text = lowered.as_text()
+        is_kept = _may_be_kept(text, key is None)
+        if key is None and is_kept and (key := stored.key_of("text", text, options())) is not None:
+            found = _load(key, recover)
+            if found is not None:
+                return Executable(found.run, static, out)
+        made = Executable(lowered.compile(), static, out)
+    if key is not None and is_kept:
+        _save(key, text, made)
     return made
+
+
+def _apply(function: Callable, structure: Any, leaves: list) -> Any:
+    args, kwargs = jax.tree.unflatten(structure, leaves)
+    return function(*args, **kwargs)
 
 
 def _in_modes(enter: Callable, trace: Callable) -> None:
@@ -147,26 +160,32 @@ def _load(key: str, recover: Callable) -> Executable | None:
         return None
 
 
-def _save(key: str, lowered: Any, made: Executable) -> None:
+def _may_be_kept(text: str, is_traced: bool) -> bool:
+    """Decide whether a program calls nothing but what another process has too.
+
+    `is_traced`: whether that process traces it first, so that it has the kernels which only one process knows by their numbers.
+    """
     from jaxdyn.compile import target
 
-    text = lowered.as_text()
-    called = {a or b for a, b in _CALLS.findall(text)}
-    if unsafe := [name for name in called if not _SAFE.fullmatch(name)]:
-        disk.logger.debug("jaxdyn: an entry point is not kept on disk, as it calls %s", ", ".join(unsafe))
-        return
+    unsafe = {a or b for a, b in _CALLS.findall(text) if not _SAFE.fullmatch(a or b)}
+    if not is_traced:
+        rows = (target.row_of(int(x)) for x in set(_NUMBERS.findall(text)))
+        unsafe |= {row.name for row in rows if not row.is_kept}
+    if unsafe:
+        disk.logger.debug("jaxdyn: a program is not kept on disk, as it calls %s", ", ".join(sorted(unsafe)))
+    return not unsafe
+
+
+def _save(key: str, text: str, made: Executable) -> None:
+    from jaxdyn.compile import target
+
     numbers = sorted({int(x) for x in _NUMBERS.findall(text)})
-    rows = [(number, target.row_of(number)) for number in numbers]
-    if not all(row.is_kept for _, row in rows):
-        disk.logger.debug(
-            "jaxdyn: an entry point is not kept on disk, as it calls a function of the user for flagged samples"
-        )
-        return
+    rows = [(number, tuple(target.row_of(number))) for number in numbers]
     try:
         payload = jax_adapter.dump_executable(made.run)
         # An instance, not its structure: pickled ones do not know the marks of equinox for fields that are missing.
         results = jax.tree.unflatten(made.structure, [0] * len(made.static))
-        contents = pickle.dumps((payload, [(x, tuple(row)) for x, row in rows], made.static, results), protocol=5)
+        contents = pickle.dumps((payload, rows, made.static, results), protocol=5)
     except Exception as reason:  # results may be of classes that cannot be pickled, and raise anything
         disk.logger.debug("jaxdyn: an entry point is not kept on disk: %r", reason)
         return
