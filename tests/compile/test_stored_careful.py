@@ -13,7 +13,7 @@ import numpy as np
 import pytest
 
 import jaxdyn as jd
-from jaxdyn.compile import target, trace
+from jaxdyn.compile import kernel, mark_invalid, target, trace
 
 pytestmark = [pytest.mark.native, pytest.mark.slow]
 
@@ -69,6 +69,18 @@ def careful_names() -> list[str]:
     return [x.row.name for x in target._kernels.values() if x.row.careful and x.code is not None]
 
 
+def start(folder, function: str, *arguments: str) -> dict:
+    """What a function of this module prints in a process of its own, with its files in a folder."""
+    env = os.environ | {
+        "XDG_CACHE_HOME": str(folder),
+        "PYTHONPATH": os.pathsep.join([*sys.path, os.path.dirname(__file__)]),
+    }
+    command = [sys.executable, "-c", f"import test_stored_careful as t; t.{function}()", *arguments]
+    done = subprocess.run(command, env=env, capture_output=True, text=True, timeout=600)
+    assert done.returncode == 0, done.stderr[-3000:]
+    return json.loads(done.stdout.splitlines()[-1])
+
+
 @pytest.fixture(scope="module")
 def plain():
     with jd.compilation("plain"):
@@ -77,26 +89,15 @@ def plain():
 
 def test_processes_one_after_the_other(tmp_path, plain):
     """The first has no flagged sample; the second makes careful programs, the third finds them, the fourth finds no code."""
-    env = os.environ | {
-        "XDG_CACHE_HOME": str(tmp_path),
-        "PYTHONPATH": os.pathsep.join([*sys.path, os.path.dirname(__file__)]),
-    }
-
-    def start(q_flat):
-        command = [sys.executable, "-c", "import test_stored_careful as t; t.run()", str(q_flat)]
-        done = subprocess.run(command, env=env, capture_output=True, text=True, timeout=600)
-        assert done.returncode == 0, done.stderr[-3000:]
-        return json.loads(done.stdout.splitlines()[-1])
-
-    first = start(1.0)
+    first = start(tmp_path, "run", "1.0")
     assert first["expanded"] and first["careful"] == []
-    second, third = start(0.0), start(0.0)
+    second, third = start(tmp_path, "run", "0.0"), start(tmp_path, "run", "0.0")
     # Of the functions only the careful ones are new in the second process.
     assert second["careful"] and not set(second["expanded"]) & set(first["expanded"])
     assert third["expanded"] == [] and third["careful"]
     for path in (tmp_path / "jaxdyn" / "kernels").glob("*.o"):
         path.unlink()
-    fourth = start(0.0)
+    fourth = start(tmp_path, "run", "0.0")
     for made in (second, third, fourth):
         assert made["numbers"] == second["numbers"]
         for name, numbers in made["numbers"].items():
@@ -104,3 +105,30 @@ def test_processes_one_after_the_other(tmp_path, plain):
             assert np.isfinite(computed).all()
             size = np.max(np.abs(plain[name]))
             np.testing.assert_allclose(computed, plain[name], rtol=0, atol=1e-10 * max(1.0, size), err_msg=name)
+
+
+def wave(_, x):
+    """A function of the user's own; marked where x is below zero."""
+    return mark_invalid(x < 0, jnp.sin(x))
+
+
+FALLBACKS = {"cos": lambda _, x: jnp.cos(x), "exp": lambda _, x: jnp.exp(x)}
+
+
+def run_own() -> None:
+    """Functions that are equal but for their fallbacks, in the order that the command gives."""
+    jax.config.update("jax_enable_x64", True)
+    made = {}
+    for name in sys.argv[1:]:
+        for compiled in (jax.jit, jd.jit):
+            run = compiled(lambda x, name=name: kernel(wave, fallback=FALLBACKS[name])((), x))
+            made[f"{name} {compiled.__name__}"] = [float(run(jnp.asarray(x))) for x in (0.5, -0.5)]
+    print(json.dumps(made))
+
+
+def test_fallbacks_of_users_are_not_taken_for_each_other(tmp_path):
+    """What is on disk by the order in which one process met them is not what another process calls."""
+    for names in (("cos", "exp"), ("exp", "cos"), ("exp",)):
+        for key, (valid, flagged) in start(tmp_path, "run_own", *names).items():
+            formula = {"cos": np.cos, "exp": np.exp}[key.split()[0]]
+            np.testing.assert_allclose([valid, flagged], [np.sin(0.5), formula(-0.5)], rtol=1e-14, err_msg=key)
