@@ -21,7 +21,8 @@ from jaxdyn.compile.program import COMPARISONS, FLOATS, Array, Constant, Program
 MIN_SHARED_OPERATIONS = 2000
 _ALIGNED = 64  # bytes
 ATTRIBUTES = (
-    "attributes #0 = { nounwind }",
+    # LLVM's simplifications of calls of the C library, such as pow(x, 2) = x x, are made at some levels alone.
+    'attributes #0 = { nounwind "no-builtins" }',
     "attributes #1 = { nounwind willreturn memory(none) }",
 )
 
@@ -44,6 +45,8 @@ class Body:
         for op, _, args in program.operations:
             if op == "part":
                 self.parts.setdefault(args[0], []).append(args[1].value)
+        self.fused = _find_products(program)  # of sums, the place of the operand that is a product
+        self.merged = {program.operations[i].args[place] for i, place in self.fused.items()}
 
     def name(self, i: int) -> str:
         """Name of operation i; inputs are loaded where they are first read."""
@@ -60,7 +63,7 @@ class Body:
         """Names of the program's results."""
         operations = self.program.operations
         for i, (op, kind, args) in enumerate(operations):
-            if op == "input":
+            if op == "input" or i in self.merged:
                 continue
             if op == "call":
                 self.names[i] = self._call(i, *args)
@@ -68,6 +71,10 @@ class Body:
                 self.names[i] = self._call_where(i, *args)
             elif op == "part":
                 self.names[i] = self.names[args[0]][args[1].value]
+            elif i in self.fused:
+                place = self.fused[i]
+                factors = [self.text(x, kind) for x in operations[args[place]].args]
+                self.names[i] = self.e.fused(op, kind, factors, self.text(args[1 - place], kind), place == 0)
             else:
                 kinds = [operations[x].kind for x in args if type(x) is not Constant]
                 given = kinds[-1] if kinds else kind
@@ -154,6 +161,32 @@ class Body:
         """Memory for what is passed."""
         passed = [f"  %passed = alloca [{self.bytes} x i8], align {_ALIGNED}"] if self.bytes else []
         return [*passed, *careful_text.allocation(self.careful)]
+
+
+def _find_products(program: Program) -> dict[int, int]:
+    """Sums and differences one of whose operands is a product that nothing else needs, and the place of that operand.
+
+    They are rounded once. The decision is made here, not by LLVM, whose choice depends on its level.
+    """
+    operations = program.operations
+    uses = [0] * len(operations)
+    for op, _, args in operations:
+        for x in args if op != "input" else ():
+            if type(x) is not Constant:
+                uses[x] += 1
+    for row in program.results:
+        for x in row:
+            if type(x) is not Constant:
+                uses[x] += 1
+    found = {}
+    for i, (op, kind, args) in enumerate(operations):
+        if op in ("add", "sub") and kind in FLOATS:
+            for place in (1, 0):
+                x = args[place]
+                if type(x) is not Constant and operations[x].op == "mul" and uses[x] == 1:
+                    found[i] = place
+                    break
+    return found
 
 
 def bytes_of(array: Array, width: int) -> int:
