@@ -17,8 +17,9 @@ from jaxtyping import Array, Float
 from jaxdyn.compile import entry_point, gram_eigenvectors
 from jaxdyn.compile.known import is_known
 from jaxdyn.constraints.base import constraint_jacobian, layout, velocity_residual
-from jaxdyn.constraints.rank import condition_number, pseudo_inverse, rank_of, sign_of_determinant, tolerance
-from jaxdyn.constraints.selection import independent_rows, pivot_rows
+from jaxdyn.constraints.branches import sign_of_determinant
+from jaxdyn.constraints.rank import condition_number, pseudo_inverse, rank_of, tolerance
+from jaxdyn.constraints.selection import independent_rows
 from jaxdyn.lie.so3 import matmul
 from jaxdyn.model.arguments import Number, Numbers, batch_hint, check_state
 from jaxdyn.systems.mass_factor import cholesky, solve_cholesky, solve_lower
@@ -336,9 +337,23 @@ def independent_velocities(scene: Scene, q, t: Number = 0.0) -> tuple[int, ...]:
     scene = independent_rows(scene, q, t)
     A = np.asarray(constraint_jacobian_compiled(scene, q, jnp.asarray(t, q.dtype)), float)
     # The pivots of its columns are the dependent velocities.
-    columns, pivots = pivot_rows(A.T)
+    columns, pivots = _pivots(A.T)
     dependent = columns[pivots > 1e-9 * np.linalg.norm(A)]
     return tuple(np.setdiff1d(np.arange(scene.nv), dependent).tolist())
+
+
+def _pivots(B: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Indices of the rows of a concrete B by their distance from the span of those before them, and these distances."""
+    rest, rows, pivots = np.array(B), [], []
+    for _ in range(min(B.shape)):
+        lengths = np.linalg.norm(rest, axis=1)
+        rows.append(int(np.argmax(lengths)))
+        pivots.append(lengths[rows[-1]])
+        if pivots[-1] == 0:
+            break
+        along = rest[rows[-1]] / pivots[-1]
+        rest = rest - np.outer(rest @ along, along)
+    return np.asarray(rows, int), np.asarray(pivots)
 
 
 def orthonormal(columns: Float[Array, "n k"]) -> tuple[Float[Array, "n k"], Float[Array, ""], Float[Array, "k k"]]:
