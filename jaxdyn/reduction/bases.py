@@ -286,16 +286,20 @@ def tangent_basis(
     **Arguments:** `q` (nq,); `t`, s; `dof`: nr, by default nv minus the rank of A on concrete numbers and minus the number
     of rows on traced ones; `rank_tol` as in `constrained_dynamics`.
 
-    **Raises:** ValueError when no degree of freedom remains, or when `dof` is required.
+    **Returns:** (nv, nr); NaN on traced numbers without `dof` where the rows are dependent, and where the rank is not clear.
+
+    **Raises:** ValueError when no degree of freedom remains, when `dof` is required, and for a rank that is not clear.
     """
     scene = as_scene(scene)
     q, t = check_state(scene.system, q=q, t=t)
     if not layout(scene):
         raise ValueError("the scene has no constraints, so every velocity is tangent; add some")
-    scene = independent_rows(scene, q, t, rank_tol)
+    scene, counts = independent_rows(scene, q, t, rank_tol), dof is None
     dof = count_dof(scene, q, t, dof, rank_tol)
-    projector, _ = _tangent_projection(scene, q, t, rank_tol)
-    return split_directions(projector)[:, scene.nv - dof :]
+    projector, rank = _tangent_projection(scene, q, t, rank_tol)
+    basis = split_directions(projector)[:, scene.nv - dof :]
+    # The number of columns is a shape. Where it is that of all rows, the decision on those that count has to confirm it.
+    return jnp.where(rank == scene.nv - dof, basis, jnp.nan) if counts else basis
 
 
 def count_dof(scene: Scene, q, t, dof: int | None = None, rank_tol: float | None = None) -> int:
@@ -310,7 +314,13 @@ def count_dof(scene: Scene, q, t, dof: int | None = None, rank_tol: float | None
     count = layout(scene)[-1].end
     # The number of columns is a shape: it cannot follow from a traced rank.
     known = is_known(scene, q, t)
-    dof = scene.nv - (int(_tangent_projection(scene, q, t, rank_tol)[1]) if known else count)
+    rank = _tangent_projection(scene, q, t, rank_tol)[1] if known else count
+    if np.isnan(rank):
+        raise ValueError(
+            "the rank of the constraints is not clear: rounding of the scene's numbers hides which rows repeat others; give "
+            "numbers with more digits, or a rank_tol"
+        )
+    dof = scene.nv - int(rank)
     if dof < 1:
         fix = "remove one" if known else "if some of them depend on others, give dof, the number of degrees of freedom"
         raise ValueError(f"{count} constraint rows leave no degree of freedom of nv = {scene.nv}: {fix}")
