@@ -1,7 +1,6 @@
 """Rank decisions, and pseudo-inverses of rows that may be dependent."""
 
 from functools import partial
-from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -141,37 +140,6 @@ def _pseudo_inverse(rank_tol, _, Y):
     return (_by_rotations if is_long else by_kernel)(rank_tol, None, Y)
 
 
-class LeastSquares(NamedTuple):
-    """Minimum-norm solutions w of Y^T w = r, and their coefficients in the columns of Y."""
-
-    Y: Array
-    factor: Any  # Cholesky factor of Y^T Y, in kernels; else None
-    inverse: Any  # pseudo-inverse of Y, elsewhere; else None
-
-    def shortest(self, right):
-        """The shortest w with Y^T w = right."""
-        if self.factor is None:
-            return matmul(self.inverse.T, right)
-        return matmul(self.Y, solve_cholesky(self.factor, right))
-
-    def multipliers(self, w):
-        """The smallest x with Y x = w, for w that is a sum of columns."""
-        if self.factor is None:
-            return matmul(self.inverse, w)
-        return solve_cholesky(self.factor, matmul(self.Y.T, w))
-
-
-def _least_squares_in_kernel(Y, rank_tol) -> LeastSquares:
-    factor = cholesky(regular_gram(Y))
-    return LeastSquares(Y, mark_invalid(~(quality_of(factor) > least_pivot(Y, rank_tol)), factor), None)
-
-
-@variant(_least_squares_in_kernel, marks=True)
-def least_squares(Y: Float[Array, "n m"], rank_tol: float) -> LeastSquares:
-    """Factor a matrix: its pseudo-inverse; in a kernel its Cholesky factor, with dependent columns marked as invalid."""
-    return LeastSquares(Y, None, pseudo_inverse(Y, rank_tol))
-
-
 @pseudo_inverse.defjvp
 def _pseudo_inverse_jvp(rank_tol, dependent, primals, tangents):
     (Y,), (dY,) = primals, tangents
@@ -228,41 +196,3 @@ def solve_square(A: Float[Array, "n n"], right: Float[Array, "n *k"]) -> Float[A
     """A^-1 right for a regular A, by Jacobi rotations."""
     # Without LAPACK: its calls from several samples of a batch can deadlock in XLA's thread pool.
     return matmul(pseudo_inverse(A, eps_of(A), True), right)
-
-
-def sign_of_determinant(A: Float[Array, "n n"]) -> Float[Array, ""]:
-    """-1 where the determinant is negative, else 1; a constant."""
-    return kernel(_sign, fallback=_sign_by_lapack)(None, lax.stop_gradient(A))
-
-
-def passes_singular(
-    A: Float[Array, "m n"], inverse: Float[Array, "n m"], after: Float[Array, "m n"]
-) -> Bool[Array, ""]:
-    """Decide whether a combination of rows goes through zero between A, with its pseudo-inverse, and the rows `after`.
-
-    det(A' A^+ + (1 - A A^+)) then changes its sign. The second term fills the null space of dependent rows, where the
-    determinant of the first one is zero.
-    """
-    own = jnp.eye(A.shape[0], dtype=A.dtype) - matmul(A, inverse)
-    return sign_of_determinant(matmul(after, inverse) + own) < 0
-
-
-def _sign(_, A):
-    """Sign by Gaussian elimination with row exchanges until the largest entry of a column is its pivot."""
-    # Kernels have no index that depends on data: the exchanges are selections between neighbours, as in a bubble sort.
-    sign = jnp.ones((), A.dtype)
-    rows = list(A)
-    for k in range(len(rows)):
-        for i in range(k + 1, len(rows)):
-            swap = jnp.abs(rows[i][k]) > jnp.abs(rows[k][k])
-            rows[k], rows[i] = jnp.where(swap, rows[i], rows[k]), jnp.where(swap, rows[k], rows[i])
-            sign = jnp.where(swap, -sign, sign)
-        sign = jnp.where(rows[k][k] < 0, -sign, sign)
-        scale = 1 / jnp.where(rows[k][k] == 0, 1.0, rows[k][k])
-        for i in range(k + 1, len(rows)):
-            rows[i] = rows[i] - rows[i][k] * scale * rows[k]
-    return sign
-
-
-def _sign_by_lapack(_, A):
-    return jnp.where(jnp.linalg.slogdet(A)[0] < 0, -1.0, 1.0).astype(A.dtype)

@@ -27,6 +27,7 @@ from jaxdyn.compile import (
     eliminate_rows,
     entry_point,
     evaluate,
+    is_standalone,
     kernel,
     mark_invalid,
     pseudo_inverse_by_rotations,
@@ -59,9 +60,7 @@ from jaxdyn.constraints.redundancy import (
 from jaxdyn.constraints.tolerances import coordinate_sizes
 from jaxdyn.dynamics.quantities import mass_matrix
 from jaxdyn.lie.so3 import matmul
-from jaxdyn.model.arguments import Numbers, check_state, state_dtype
-from jaxdyn.model.configuration import neutral
-from jaxdyn.model.tree import Model
+from jaxdyn.model.arguments import Numbers, check_state
 from jaxdyn.systems.mass_factor import cholesky, mass_factor
 from jaxdyn.systems.scene import Scene, as_scene
 from jaxdyn.systems.system import SceneLike, displace, retract
@@ -84,8 +83,8 @@ def unit_rows(scene: Scene, q, t) -> Float[Array, "nc nv"]:
     squares = jnp.sum(A * A, 1)
     largest = largest_of_each(scene, squares)
     squares = jnp.where(squares > _TINY_ROW**2 * largest, squares, largest)
-    some = squares > 0
-    return A * jnp.where(some, 1 / jnp.sqrt(jnp.where(some, squares, jnp.ones_like(squares))), squares)[:, None]
+    # A constraint may have rows of zeros alone.
+    return A / jnp.sqrt(jnp.maximum(squares, float(jnp.finfo(A.dtype).tiny)))[:, None]
 
 
 def eliminate(B: Float[Array, "nc nv"], least: float, first: Float[Array, " nc"], most=None) -> tuple[Array, ...]:
@@ -111,7 +110,7 @@ def independent_rows(scene: Scene, q, t, rank_tol: float | None = None) -> Scene
     """
     if not (scene.rounding and scene.constraints) or rank_tol is not None or has_selection(scene):
         return scene
-    selection = _select_for_state(scene, q, t)
+    selection = select_rows(scene, q, t)
     if is_concrete(selection) and np.all(selection.kept == 1):
         return scene
     return keep_rows(scene, hide_unclear(selection)._replace(gap=jnp.minimum(selection.gap, selection.gap_here)))
@@ -119,19 +118,7 @@ def independent_rows(scene: Scene, q, t, rank_tol: float | None = None) -> Scene
 
 def hide_unclear(selection: Selection) -> Selection:
     """The selection with NaN for all rows where it is not clear which ones are independent, so that no result is a guess."""
-    return selection._replace(kept=jnp.where(selection.gap < LEAST_GAP, jnp.nan, selection.kept))
-
-
-def _select_in_kernel(scene: Scene, q, t) -> Selection:
-    """All rows; invalid where some may repeat others. The choice of rows takes places that depend on data."""
-    every, least = _every_row(scene, q.dtype), clear_pivot(q)
-    is_doubtful = ~(_least_distance(Scene(scene.system, scene.constraints), q, t) > least)
-    return every._replace(kept=mark_invalid(is_doubtful, jnp.where(is_doubtful, jnp.nan, jnp.asarray(every.kept))))
-
-
-@variant(_select_in_kernel)
-def _select_for_state(scene: Scene, q, t) -> Selection:
-    return select_rows(scene, q, t, None)
+    return selection._replace(kept=jnp.where(selection.gap >= LEAST_GAP, selection.kept, jnp.nan))
 
 
 def rank_code(scene: Scene, result: Any) -> Any:
@@ -142,6 +129,14 @@ def rank_code(scene: Scene, result: Any) -> Any:
     return RESULTS.where(is_clear, result, RESULTS.unclear_rank)  # pyright: ignore[reportArgumentType]
 
 
+def _select_in_kernel(scene: Scene, q, t, rank_tol: float | None = None) -> Selection:
+    """All rows; invalid where some may repeat others, whose choice takes more than a kernel should hold."""
+    every = _every_row(scene, q.dtype)
+    may_repeat = _may_repeat(_least_doubtless(q, rank_tol), Scene(scene.system, scene.constraints), q, t)
+    return every._replace(kept=mark_invalid(may_repeat, jnp.asarray(every.kept)))
+
+
+@variant(_select_in_kernel, marks=True)
 def select_rows(scene: Scene, q, t: Any, rank_tol: float | None = None) -> Selection:
     """The independent rows of a mechanism at a configuration on its constraints; a constant.
 
@@ -151,26 +146,26 @@ def select_rows(scene: Scene, q, t: Any, rank_tol: float | None = None) -> Selec
     # A choice has no derivative: forces do not select rows, and the scene, q and t enter without tangents.
     bare = stop_gradient(Scene(scene.system, scene.constraints))
     q, t = stop_gradient((q, t))
-    every, count = _every_row(bare, q.dtype), layout(bare)[-1].end if scene.constraints else 0
-    if count == 0:
+    every, least = _every_row(bare, q.dtype), _least_doubtless(q, rank_tol)
+    if not every.kept.size:
         return every
-    apart = rank_tol if rank_tol is not None else clear_pivot(q)
+    # Most scenes have independent rows: one Cholesky factorisation says so, and the search is skipped.
     if is_concrete(bare, q, t):
-        # NumPy decides first, so that nothing is compiled for independent rows.
-        B = evaluate(unit_rows, bare, np.asarray(q), np.asarray(t, q.dtype), is_input=not is_tracing())
-        if not np.isfinite(B).all() or np.sum(pivot_rows(B)[1] > apart) == count:
+        place = np.asarray(q), np.asarray(t, q.dtype)
+        if not evaluate(_may_repeat, bare, *place, static=(least,), is_input=not is_tracing()):
             return every
         with jax.ensure_compile_time_eval():
-            chosen = _select_by_program(bare, jnp.asarray(q), jnp.asarray(t, q.dtype), rank_tol)
+            chosen = _select(bare, *map(jnp.asarray, place), rank_tol)
         return Selection(*map(np.asarray, chosen))  # pyright: ignore[reportArgumentType]
     t = jnp.asarray(t, q.dtype)
-    if count > scene.nv:
+    if is_standalone():  # a program without JAX has no branches
         return _select(bare, q, t, rank_tol)
-    # Most scenes have independent rows: one Cholesky factorisation says so, and the search is skipped.
-    is_doubtful = ~(_least_distance(bare, q, t) > apart)
-    return Selection(
-        *cond(is_doubtful, lambda: _select(bare, q, t, rank_tol), lambda: Selection(*map(jnp.asarray, every)))
-    )
+    return _select_doubtful(rank_tol, bare, q, t)
+
+
+@kernel(static=1, fallback=lambda rank_tol, scene, q, t: _select(scene, q, t, rank_tol))
+def _select_doubtful(rank_tol: float | None, scene: Scene, q, t) -> Selection:
+    return Selection(*map(jnp.asarray, _select_in_kernel(scene, q, t, rank_tol)))
 
 
 def _every_row(scene: Scene, dtype) -> Selection:
@@ -180,10 +175,6 @@ def _every_row(scene: Scene, dtype) -> Selection:
 
 
 @entry_point
-def _select_by_program(scene: Scene, q, t, rank_tol):
-    return _select(scene, q, t, rank_tol)
-
-
 def _select(scene: Scene, q, t, rank_tol) -> Selection:
     """Rows that are independent beyond doubt at q, and of the others those that are independent a finite distance away."""
     B = kernel(unit_rows)(scene, q, t)
@@ -199,7 +190,9 @@ def _select(scene: Scene, q, t, rank_tol) -> Selection:
     below = jnp.maximum(rest, eps_of(q))
     below_here = jnp.where(jnp.all(kept == 1), jnp.maximum(below, scene.rounding), jnp.maximum(below, rounding))
     least = _EXCHANGED_AT * kernel(_pivot_of)(scene, q, t, kept)
-    return Selection(kept, rounding, least, pivot / below, pivot_here / below_here)
+    chosen = Selection(kept, rounding, least, pivot / below, pivot_here / below_here)
+    every, is_finite = _every_row(scene, q.dtype), jnp.isfinite(B).all()
+    return jax.tree.map(lambda x, y: jnp.where(is_finite, x, y), chosen, every)
 
 
 def renew_rows(scene: Scene, q, t, is_projected: bool) -> Float[Array, " n"]:
@@ -226,9 +219,8 @@ def _check_kept_rows(bare: Scene, q, t, old, is_projected: bool):
 def _renew(bare: Scene, q, t, old, is_projected: bool):
     del is_projected
     kept, least = old[:-1], old[-1]
-    dropped = jnp.any(kept == 0)
     pivot = kernel(_pivot_of)(bare, q, t, kept)
-    poor = dropped & ~(pivot > least)
+    poor = jnp.any(kept == 0) & ~(pivot > least)
 
     def choose():
         # The number of rows is kept: only the count at the start distinguishes redundant rows from a singular position.
@@ -240,7 +232,7 @@ def _renew(bare: Scene, q, t, old, is_projected: bool):
         kept_next, next_pivot = jnp.where(better, new, kept), jnp.where(better, pivot_of_new, pivot)
         return jnp.where(poor, jnp.append(kept_next, _EXCHANGED_AT * next_pivot), old)
 
-    return cond(poor, choose, lambda: old)
+    return choose() if is_standalone() else cond(poor, choose, lambda: old)
 
 
 def _keep_state(old, new, project: Callable, state):
@@ -265,41 +257,16 @@ def _pivot_of(scene: Scene, q, t, kept):
     return least_pivot_of(mass_factor(mass_matrix(scene.system, q, t)).whiten(A.T))
 
 
-def may_have_redundant_rows(scene: Scene) -> bool:
-    """True where some set of coupled coordinates has at least as many rows as coordinates: it moves only if rows are redundant.
-
-    True for a scene of rounded numbers, and for one that is traced, too. A motion of exact numbers with redundant rows among
-    fewer than that is right without a selection, by the rank at every evaluation, in short steps.
-    """
-    bare = Scene(scene.system, scene.constraints)
-    if scene.rounding or not is_concrete(bare):
-        return True
-    # Away from the neutral configuration, at which entries of A may vanish that do not vanish elsewhere.
-    step = np.random.default_rng(0).uniform(0.1, 0.9, scene.nv).astype(state_dtype(scene.system))
-    try:
-        is_coupled = np.abs(evaluate(_generic_rows, bare, step, is_input=not is_tracing())) > 0
-    except jax.errors.JAXTypeError:  # a constraint is a function that holds a traced number
-        return True
-    # Connected components of the graph whose edges are the rows: a scene of two four-bars is two sets of coordinates.
-    groups = np.arange(scene.nv)
-    for row in is_coupled:
-        groups[np.isin(groups, groups[row])] = groups[row].min(initial=scene.nv)
-    counts = np.bincount([groups[row][0] for row in is_coupled if row.any()], minlength=scene.nv + 1)
-    return bool(any(not row.any() for row in is_coupled) or any(counts[g] >= np.sum(groups == g) for g in set(groups)))
+def _least_doubtless(like, rank_tol: float | None) -> float:
+    """Distance from the others above which a row counts, whatever the tolerance."""
+    return max(clear_pivot(like), rank_tol or 0.0)
 
 
-def _generic_rows(scene: Scene, step):
-    system = scene.system
-    start = neutral(system).astype(step.dtype) if isinstance(system, Model) else jnp.zeros((scene.nq,), step.dtype)
-    return constraint_jacobian(scene, displace(system, start, step), jnp.zeros((), step.dtype))
-
-
-@kernel
-def _least_distance(scene: Scene, q, t):
-    """Least distance of a row from the span of those before it; NaN where a row is dependent."""
-    # The diagonal of the Cholesky factor of B B^T holds these distances.
+def _may_repeat(least: float, scene: Scene, q, t):
+    """Whether the distance of some row from the span of those before it is not above `least`; True for NaN."""
+    # The diagonal of the Cholesky factor of B B^T holds these distances, NaN where a row is dependent.
     B = unit_rows(scene, q, t)
-    return jnp.min(jnp.diagonal(cholesky(matmul(B, B.T))))
+    return ~(jnp.min(jnp.diagonal(cholesky(matmul(B, B.T)))) > least)
 
 
 def _select_far_away(scene: Scene, q, t, sure, apart: float):
@@ -353,20 +320,6 @@ def _select_far_away(scene: Scene, q, t, sure, apart: float):
 def most_rounding(dtype) -> float:
     """Opening of dropped rows above which they are not redundant but contradict the others."""
     return 10 * clear_pivot(np.zeros((), dtype))
-
-
-def pivot_rows(B: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Indices of the rows that `eliminate` takes one after the other, and their pivots, of a concrete B."""
-    rest, rows, pivots = np.array(B), [], []
-    for _ in range(min(B.shape)):
-        lengths = np.linalg.norm(rest, axis=1)
-        rows.append(int(np.argmax(lengths)))
-        pivots.append(lengths[rows[-1]])
-        if pivots[-1] == 0:
-            break
-        along = rest[rows[-1]] / pivots[-1]
-        rest = rest - np.outer(rest @ along, along)
-    return np.asarray(rows, int), np.asarray(pivots)
 
 
 def degrees_of_freedom(
