@@ -107,6 +107,16 @@ def pseudo_inverse(Y: Float[Array, "n m"], rank_tol: float, dependent: bool = Fa
     return _pseudo_inverse(rank_tol, None, Y)
 
 
+def solve_damped(A: Float[Array, "m n"], right: Float[Array, " m"]) -> Float[Array, " n"]:
+    """A small x with A x = right, by normal equations with little damping: for Newton's steps, which need no more digits.
+
+    Rows may be zero. Where others depend on each other x is a compromise, not a NaN.
+    """
+    gram = regular_gram(A.T)
+    damping = eps_of(A) ** 0.75 * jnp.max(jnp.diagonal(gram))
+    return matmul(A.T, solve_cholesky(cholesky(gram + damping * jnp.eye(A.shape[0], dtype=A.dtype)), right))
+
+
 def _by_rotations(rank_tol, _, Y):
     return pseudo_inverse_by_rotations(Y, rank_tol)
 
