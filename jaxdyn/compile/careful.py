@@ -161,6 +161,9 @@ class Pair(Program):
     Its operations are made when they are read: a kernel is written from those of the fast program.
     """
 
+    fast: Program  # pyright: ignore[reportIncompatibleVariableOverride]
+    careful: Careful
+
     def __init__(self, fast: Program, careful: Careful):
         self.start(fast.inputs, careful.outputs, (*fast.subprograms, careful), fast.name)
         self.fast, self.careful = fast, careful

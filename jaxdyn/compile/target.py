@@ -51,7 +51,7 @@ _threads = ctypes.c_int64(1 << 30)
 _failures = ctypes.c_int64(0)  # kernels that could not be compiled when they were called
 _lock = threading.RLock()
 # LLVM takes one program at a time, and two threads may call the same new kernel.
-_making = threading.Lock()
+_making = threading.RLock()  # as a program whose file is missing is traced again, which compiles others
 _called: dict[str, "_Called"] = {}  # subprograms, which other kernels call too
 _kernels: dict[int, "_Kernel"] = {}  # by number, for as long as the process may call them
 _handler: list[Code] = []
@@ -360,7 +360,8 @@ def _publish(symbol: str, width: int, programs: dict[str, Any], recover: Callabl
 
     `recover()`: makes careful programs that it calls, should it be found and they be needed.
     """
-    called, found = programs.get(symbol), _called.get(symbol) or objects.find(symbol)
+    called, known = programs.get(symbol), _called.get(symbol)
+    found = objects.find(symbol) if known is None else known
     if called is None and found is None:
         return False
     calls, careful = _calls(() if called is None else called.subprograms, width)
@@ -368,9 +369,9 @@ def _publish(symbol: str, width: int, programs: dict[str, Any], recover: Callabl
     for inner in calls if found is None else found.calls:
         if not _publish(inner, width, calls, recover):
             return False
-    if symbol in _called:
+    if known is not None:
         return True
-    if found is None:
+    if not isinstance(found, objects.ObjectFile):
         assert called is not None
         text = subprogram_ir(called, width) if isinstance(called, Program) else called.subprogram_ir()
         found = objects.make(symbol, text, tuple(calls), careful, called.name)
@@ -382,8 +383,9 @@ def _publish(symbol: str, width: int, programs: dict[str, Any], recover: Callabl
 
 def _restore_careful(rows: Sequence, recover: Callable | None) -> None:
     """Enter careful programs that code from disk calls; `recover()` makes them, unless their kernels are live ones."""
-    for number, row in rows if recover is not None else ():
-        _restore(number, Row(*row), recover)
+    if recover is not None:
+        for number, row in rows:
+            _restore(number, Row(*row), recover)
 
 
 def _prepare(number: int) -> int:
