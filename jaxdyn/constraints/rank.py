@@ -1,6 +1,7 @@
 """Rank decisions, and pseudo-inverses of rows that may be dependent."""
 
 from functools import partial
+from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -10,7 +11,7 @@ from jaxtyping import Array, Bool, Float
 from jaxdyn.compile import batch, gram_eigenvectors, kernel, mark_invalid, pseudo_inverse_by_rotations, variant
 from jaxdyn.compile.known import is_concrete
 from jaxdyn.lie.so3 import matmul
-from jaxdyn.systems.mass_factor import cholesky, solve_cholesky
+from jaxdyn.systems.mass_factor import cholesky, solve_cholesky, solve_lower
 
 # Operations of the normal equations up to which they are a kernel: LLVM compiles one in 50 to 100 microseconds.
 _MAX_OPERATIONS = 10_000
@@ -96,15 +97,61 @@ def quality_of(factor):
 def pseudo_inverse(Y: Float[Array, "n m"], rank_tol: float, dependent: bool = False) -> Float[Array, "m n"]:
     """Moore-Penrose inverse of Y; singular values below `rank_tol` times the largest count as zero.
 
-    Values: (Y^T Y)^-1 Y^T, or the transpose of that of Y^T, where that is as accurate; else by singular values, for all samples
-    of a batch if one of them needs it, and always where the columns are known to be `dependent`. Derivative: Golub & Pereyra
-    (1973), eq. 4.12, valid where the rank is constant; no factorisation is differentiated.
+    Values: (Y^T Y)^-1 Y^T, or the transpose of that of Y^T, where that is as accurate; else by singular values. `dependent`:
+    whether some columns may be combinations of others everywhere. Derivative: Golub & Pereyra (1973), eq. 4.12, valid where the
+    rank is constant; no factorisation is differentiated.
     """
-    if dependent:
-        return pseudo_inverse_by_rotations(Y, rank_tol)
     if Y.shape[1] > Y.shape[0]:
-        return pseudo_inverse(Y.T, rank_tol).T
-    return _pseudo_inverse(rank_tol, None, Y)
+        return pseudo_inverse(Y.T, rank_tol, True).T
+    return _pseudo_inverse(rank_tol, dependent, None, Y)
+
+
+class Columns(NamedTuple):
+    """The columns of a matrix that are no combinations of those before them.
+
+    - `kept` (m,): 1 for these columns, 0 for the others.
+    - `factor` (m, m): Cholesky factor of the Gram matrix of the kept columns, made regular as by `regular_gram`.
+    - `combinations` (m, m): C, such that column i of the others is the sum of C_ik times the kept columns k.
+    - `is_clear` (): whether this holds to the tolerance.
+    """
+
+    kept: Float[Array, " m"]
+    factor: Float[Array, "m m"]
+    combinations: Float[Array, "m m"]
+    is_clear: Bool[Array, ""]
+
+
+def independent_columns(Y: Float[Array, "n m"], rank_tol: float) -> Columns:
+    """Independent columns of Y, by a Cholesky factorisation of Y^T Y that leaves out columns without a pivot.
+
+    Source: Higham, Analysis of the Cholesky decomposition of a semi-definite matrix, 1990; here without exchanges, as the order
+    of a program is fixed. `is_clear` and `quality_of` the factor say where that is not accurate.
+    """
+    m, gram = Y.shape[1], matmul(Y.T, Y)
+    squares = jnp.diagonal(gram)
+    L, kept = jnp.zeros_like(gram), []
+    for j in range(m):
+        rest = gram[:, j] - matmul(L, L[j])
+        # Between the rounding of the Gram matrix and what counts as independent: what is near it is not clear.
+        is_kept = rest[j] > eps_of(Y) ** 0.75 * squares[j]
+        column = jnp.where(is_kept, rest / jnp.sqrt(jnp.where(is_kept, rest[j], jnp.ones_like(rest[j]))), 0.0)
+        L = L.at[j:, j].set(column[j:])
+        kept.append(is_kept)
+    kept = jnp.stack(kept).astype(Y.dtype)
+    largest = jnp.max(squares)
+    fill = jnp.sqrt(jnp.where(largest > 0, largest, jnp.ones_like(largest)))
+    factor = kept[:, None] * L + jnp.diag((1 - kept) * fill)
+    C = solve_lower(factor, ((1 - kept)[:, None] * L).T, transposed=True).T
+    others = Y * (1 - kept)[None] - matmul(Y * kept[None], C.T)
+    is_clear = jnp.all(jnp.sum(others * others, 0) <= rank_tol**2 * largest)
+    return Columns(kept, factor, C, is_clear)
+
+
+def share(columns: Columns, coefficients: Float[Array, "m *k"]) -> Float[Array, "m *k"]:
+    """The least coefficients of all columns with the same sum as those of the kept ones: [1; C] (1 + C^T C)^-1 x."""
+    C, x = columns.combinations, coefficients
+    shared = solve_cholesky(cholesky(jnp.eye(C.shape[0], dtype=C.dtype) + matmul(C.T, C)), x)
+    return matmul(jnp.diag(columns.kept) + C, shared)
 
 
 def solve_damped(A: Float[Array, "m n"], right: Float[Array, " m"]) -> Float[Array, " n"]:
@@ -117,37 +164,45 @@ def solve_damped(A: Float[Array, "m n"], right: Float[Array, " m"]) -> Float[Arr
     return matmul(A.T, solve_cholesky(cholesky(gram + damping * jnp.eye(A.shape[0], dtype=A.dtype)), right))
 
 
-def _by_rotations(rank_tol, _, Y):
+def _by_rotations(rank_tol, dependent, _, Y):
     return pseudo_inverse_by_rotations(Y, rank_tol)
 
 
-def _solve_normal_equations(rank_tol, Y):
-    """(Y^T Y)^-1 Y^T, and whether the columns may be dependent, by the pivots of Y^T Y."""
-    factor = cholesky(regular_gram(Y))
-    inverse = solve_cholesky(factor, Y.T)
+def _solve_normal_equations(rank_tol, dependent: bool, Y):
+    """The pseudo-inverse (Y^T Y)^-1 Y^T, and whether it is doubtful, by the pivots of Y^T Y.
+
+    Of columns that may be `dependent` those that are independent, and the least coefficients of all; of others, whether they are.
+    """
+    if dependent:
+        columns = independent_columns(Y, rank_tol)
+        factor, is_doubtful = columns.factor, ~columns.is_clear
+        inverse = share(columns, solve_cholesky(factor, (Y * columns.kept[None]).T))
+    else:
+        factor, is_doubtful = cholesky(regular_gram(Y)), jnp.asarray(False)
+        inverse = solve_cholesky(factor, Y.T)
     # The normal equations square the condition number; one Newton-Schulz step restores the accuracy of an orthogonal method.
     inverse = 2 * inverse - matmul(matmul(inverse, Y), inverse)
-    return inverse, ~(quality_of(factor) > least_pivot(Y, rank_tol))
+    return inverse, is_doubtful | ~(quality_of(factor) > least_pivot(Y, rank_tol))
 
 
-def _by_normal_equations(rank_tol, _, Y):
-    inverse, is_doubtful = _solve_normal_equations(rank_tol, Y)
+def _by_normal_equations(rank_tol, dependent: bool, _, Y):
+    inverse, is_doubtful = _solve_normal_equations(rank_tol, dependent, Y)
     return mark_invalid(is_doubtful, inverse)
 
 
-def _by_blocks(rank_tol, _, Y):
-    inverse, is_doubtful = _solve_normal_equations(rank_tol, Y)
+def _by_blocks(rank_tol, dependent: bool, Y):
+    inverse, is_doubtful = _solve_normal_equations(rank_tol, dependent, Y)
     return batch.cond(is_doubtful, lambda: pseudo_inverse_by_rotations(Y, rank_tol), lambda: inverse)
 
 
 @variant(_by_normal_equations, marks=True)
-def _pseudo_inverse(rank_tol, _, Y):
+def _pseudo_inverse(rank_tol, dependent: bool, _, Y):
     # Gram matrix, factor, two triangular solves and two products: 8 n m^2 sums and products for Y (n, m).
     is_long = 8 * Y.shape[0] * Y.shape[1] ** 2 > _MAX_OPERATIONS
-    if Y.shape[1] > _MAX_COLUMNS:
-        return _by_blocks(rank_tol, None, Y)
-    by_kernel = kernel(_by_normal_equations, static=1, fallback=_by_rotations, derivative=False)
-    return (_by_rotations if is_long else by_kernel)(rank_tol, None, Y)
+    if Y.shape[1] > _MAX_COLUMNS and not dependent:
+        return _by_blocks(rank_tol, dependent, Y)
+    by_kernel = kernel(_by_normal_equations, static=2, fallback=_by_rotations, derivative=False)
+    return (_by_rotations if is_long else by_kernel)(rank_tol, dependent, None, Y)
 
 
 @pseudo_inverse.defjvp

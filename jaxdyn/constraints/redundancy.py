@@ -30,7 +30,8 @@ from jaxdyn.systems.scene import Scene
 class KeptRows(Constraint):
     """A constraint whose dropped rows are zero.
 
-    `kept` (n,) is 1 for rows that stay, 0 for dropped ones; `rounding`, `least` and `gap` () as in `Selection`.
+    `kept` (n,) is 1 for rows that stay, 0 for dropped ones; `rounding`, `least` and `gap` () as in `Selection`. `is_held`:
+    whether the choice is the user's (`choose_rows`), which every function checks and renews.
     """
 
     # Arrays, not static: another choice of rows in the course of a motion runs the same program. The three numbers belong to the
@@ -41,6 +42,7 @@ class KeptRows(Constraint):
     least: Float[Array, ""]
     gap: Float[Array, ""]
     name: str = eqx.field(static=True)
+    is_held: bool = eqx.field(static=True, default=False)
 
     def position(self, system: SystemLike, q: Float[Array, " nq"], t: Number) -> Array | None:
         """Residual of the inner constraint, zero in dropped rows."""
@@ -63,7 +65,7 @@ class KeptRows(Constraint):
     def group(self):
         """Key of the inner constraint's group, different from that of constraints with all rows."""
         group = self.inner.group()
-        return None if group is None else ("kept rows", group)
+        return None if group is None else ("kept rows", self.is_held, group)
 
     def _mask_position(self, residual):
         return None if residual is None else residual * self.kept[: residual.shape[0]].astype(residual.dtype)
@@ -102,11 +104,11 @@ class Selection(NamedTuple):
     gap_here: Float[Array, ""]
 
 
-def keep_rows(scene: Scene, selection: Selection) -> Scene:
+def keep_rows(scene: Scene, selection: Selection, *, is_held: bool = False) -> Scene:
     """The scene with the rows that are not kept set to zero."""
     kept, rounding, least, gap, _ = map(jnp.asarray, selection)
     constraints = tuple(
-        KeptRows(constraint, kept[place.start : place.end], rounding, least, gap, constraint.name)  # pyright: ignore[reportArgumentType]
+        KeptRows(constraint, kept[place.start : place.end], rounding, least, gap, constraint.name, is_held)  # pyright: ignore[reportArgumentType]
         for constraint, place in zip(scene.constraints, layout(scene), strict=True)
     )
     return eqx.tree_at(lambda scene: scene.constraints, scene, constraints, is_leaf=lambda x: isinstance(x, tuple))
@@ -115,6 +117,11 @@ def keep_rows(scene: Scene, selection: Selection) -> Scene:
 def has_selection(scene: Scene) -> bool:
     """True for a scene of `keep_rows`."""
     return any(isinstance(constraint, KeptRows) for constraint in scene.constraints)
+
+
+def holds_rows(scene: Scene) -> bool:
+    """True for a scene of `choose_rows`."""
+    return any(isinstance(constraint, KeptRows) and constraint.is_held for constraint in scene.constraints)
 
 
 def exchange_rows(scene: Scene, rows: Float[Array, " n"]) -> Scene:

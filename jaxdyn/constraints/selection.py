@@ -15,6 +15,7 @@ A dropped row stays in its place as a row of zeros (`KeptRows`), so that shapes,
 """
 
 from collections.abc import Callable
+from functools import partial
 from typing import Any
 
 import jax
@@ -51,7 +52,9 @@ from jaxdyn.constraints.rank import (
 from jaxdyn.constraints.redundancy import (
     Selection,
     all_rows,
+    exchange_rows,
     has_selection,
+    holds_rows,
     keep_rows,
     largest_of_each,
     largest_opening,
@@ -71,6 +74,10 @@ _FAR, _NEWTON_STEPS = 0.2, 12
 # The rows are chosen anew when their least pivot has fallen to this part of its value at their choice. A pivot is the square of a
 # sine, so that the sine of the angle between rows has halved.
 _EXCHANGED_AT = 0.25
+_UNCLEAR = (
+    "the rank of the constraints is not clear at this q: singular values that count differ by less than a factor of "
+    f"{LEAST_GAP:g} from those that do not"
+)
 # A row below this part of the largest one of its constraint has no direction of its own: rounding is all that it holds.
 _TINY_ROW = 1e-3
 
@@ -108,12 +115,46 @@ def independent_rows(scene: Scene, q, t, rank_tol: float | None = None) -> Scene
     Scenes of exact numbers, and those that have a choice of rows or a `rank_tol`, are returned as they are: there singular
     values below the tolerance count as zero.
     """
+    if holds_rows(scene):
+        return all_rows(scene) if rank_tol is not None else exchange_rows(scene, renew_rows(scene, q, t, False))
     if not (scene.rounding and scene.constraints) or rank_tol is not None or has_selection(scene):
         return scene
     selection = select_rows(scene, q, t)
     if is_concrete(selection) and np.all(selection.kept == 1):
         return scene
     return keep_rows(scene, hide_unclear(selection)._replace(gap=jnp.minimum(selection.gap, selection.gap_here)))
+
+
+def choose_rows(scene: SceneLike, q: Float[Array, " nq"], t: Numbers = 0.0) -> Scene:
+    """The scene with the choice of its independent rows at an assembled configuration, for many calls with redundant rows.
+
+    A scene whose rows depend on each other but for the rounding of a file finds its rows anew in every call, by a search some
+    tens of microseconds long. Which rows count is a property of the mechanism; a choice that the scene holds costs a comparison
+    of pivots in each call, and is made again, with as many rows, where they have become nearly dependent. Forces of constraints
+    remain those of least norm.
+
+    **Arguments:** `scene`; `q` (nq,), on the constraints (`jd.assemble`), not in a singular position; `t`, s.
+
+    **Returns:** a scene for every function that takes one. Without redundant rows it is the one given.
+
+    **Raises:** ValueError where rounding hides which rows are independent.
+
+    Source: docs/constraints.md, redundant rows.
+    """
+    scene = all_rows(as_scene(scene))
+    q, t = check_state(scene.system, q=q, t=t)
+    if not layout(scene):
+        return scene
+    selection = select_rows(scene, q, t)
+    if is_concrete(selection):
+        if np.all(np.asarray(selection.kept) == 1):
+            return scene
+        if not min(selection.gap, selection.gap_here) >= LEAST_GAP:
+            raise ValueError(
+                f"q: {_UNCLEAR}; give numbers with more digits, or an assembled q away from singular positions"
+            )
+    selection = hide_unclear(selection)._replace(gap=jnp.minimum(selection.gap, selection.gap_here))
+    return keep_rows(scene, selection, is_held=True)
 
 
 def hide_unclear(selection: Selection) -> Selection:
@@ -136,13 +177,20 @@ def _select_in_kernel(scene: Scene, q, t, rank_tol: float | None = None) -> Sele
     return every._replace(kept=mark_invalid(may_repeat, jnp.asarray(every.kept)))
 
 
-@variant(_select_in_kernel, marks=True)
 def select_rows(scene: Scene, q, t: Any, rank_tol: float | None = None) -> Selection:
     """The independent rows of a mechanism at a configuration on its constraints; a constant.
 
     With `rank_tol` rows count whose pivots are above it, at this configuration; without it as the module says. Concrete and
     traced arguments give the same rows. Infinite or NaN rows are all kept; `assemble` and `simulate` report such states.
     """
+    if holds_rows(scene):
+        held, gap = renew_rows(scene, q, t, False), scene.constraints[0].gap
+        return Selection(held[:-1], scene.constraints[0].rounding, held[-1], gap, gap)
+    return _search_rows(scene, q, t, rank_tol)
+
+
+@variant(_select_in_kernel, marks=True)
+def _search_rows(scene: Scene, q, t: Any, rank_tol: float | None) -> Selection:
     # A choice has no derivative: forces do not select rows, and the scene, q and t enter without tangents.
     bare = stop_gradient(Scene(scene.system, scene.constraints))
     q, t = stop_gradient((q, t))
@@ -205,7 +253,7 @@ def renew_rows(scene: Scene, q, t, is_projected: bool) -> Float[Array, " n"]:
     old = rows_of(scene, q.dtype)
     whole = all_rows(scene)
     bare, q, t = stop_gradient((Scene(whole.system, whole.constraints), q, jnp.asarray(t, q.dtype)))
-    return _renew(bare, q, t, old, is_projected)
+    return _renew(bare, q, t, old, True) if is_projected else _checked_rows(bare, q, t, old)
 
 
 def _check_kept_rows(bare: Scene, q, t, old, is_projected: bool):
@@ -218,21 +266,29 @@ def _check_kept_rows(bare: Scene, q, t, old, is_projected: bool):
 @variant(_check_kept_rows, marks=True)
 def _renew(bare: Scene, q, t, old, is_projected: bool):
     del is_projected
+    is_poor = jnp.any(old[:-1] == 0) & ~(kernel(_pivot_of)(bare, q, t, old[:-1]) > old[-1])
+    again = partial(_choose_again, bare, q, t, old)
+    return again() if is_standalone() else cond(is_poor, again, lambda: old)
+
+
+def _choose_again(bare: Scene, q, t, old):
+    """Another choice of rows where the old one is poor."""
     kept, least = old[:-1], old[-1]
     pivot = kernel(_pivot_of)(bare, q, t, kept)
-    poor = jnp.any(kept == 0) & ~(pivot > least)
+    is_poor = jnp.any(kept == 0) & ~(pivot > least)
+    # The number of rows is kept: only the count at the start distinguishes redundant rows from a singular position.
+    new = eliminate(kernel(unit_rows)(bare, q, t), 0.0, jnp.zeros_like(kept), jnp.sum(kept))[0]
+    pivot_of_new = kernel(_pivot_of)(bare, q, t, new)
+    # At a singular position no choice is good. The old rows are kept then, unless the new ones are better, and the limit is
+    # lowered with the pivot, so that the search is not repeated in every step on the way through.
+    is_better = is_poor & ~(pivot_of_new < pivot)
+    kept_next, next_pivot = jnp.where(is_better, new, kept), jnp.where(is_better, pivot_of_new, pivot)
+    return jnp.where(is_poor, jnp.append(kept_next, _EXCHANGED_AT * next_pivot), old)
 
-    def choose():
-        # The number of rows is kept: only the count at the start distinguishes redundant rows from a singular position.
-        new = eliminate(kernel(unit_rows)(bare, q, t), 0.0, jnp.zeros_like(kept), jnp.sum(kept))[0]
-        pivot_of_new = kernel(_pivot_of)(bare, q, t, new)
-        # At a singular position no choice is good. The old rows are kept then, unless the new ones are better, and the limit is
-        # lowered with the pivot, so that the search is not repeated in every step on the way through.
-        better = poor & ~(pivot_of_new < pivot)
-        kept_next, next_pivot = jnp.where(better, new, kept), jnp.where(better, pivot_of_new, pivot)
-        return jnp.where(poor, jnp.append(kept_next, _EXCHANGED_AT * next_pivot), old)
 
-    return choose() if is_standalone() else cond(poor, choose, lambda: old)
+@kernel(fallback=_choose_again)
+def _checked_rows(bare: Scene, q, t, old):
+    return _check_kept_rows(bare, q, t, old, False)
 
 
 def _keep_state(old, new, project: Callable, state):
@@ -352,10 +408,7 @@ def degrees_of_freedom(
     if not is_concrete(free):
         return free
     if free < 0:
-        raise ValueError(
-            "the rank of the constraints is not clear at this q: singular values that count differ by less than a factor of "
-            f"{LEAST_GAP:g} from those that do not; give numbers with more digits, or a rank_tol between them"
-        )
+        raise ValueError(f"{_UNCLEAR}; give numbers with more digits, or a rank_tol between them")
     return int(free)
 
 

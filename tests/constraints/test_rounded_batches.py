@@ -84,7 +84,9 @@ def test_tangent_basis_does_not_count_rows_that_repeat_others():
     scene = parallelogram(5, pendulums=3)
     q, v = at_angle(scene, 0.8)
     N = jd.reduction.tangent_basis(scene, q)
-    assert N.shape == (6, 4) and np.abs(jd.constraint_jacobian(scene, q) @ N).max() < 1e-4  # rows differ by the rounding
+    assert (
+        N.shape == (6, 4) and np.abs(jd.constraint_jacobian(scene, q) @ N).max() < 1e-4
+    )  # rows differ by the rounding
     traced = jax.jit(lambda q: jd.reduction.tangent_basis(scene, q, dof=4))(q)
     np.testing.assert_allclose(traced @ traced.T, N @ N.T, atol=1e-10)
     assert np.isnan(jax.jit(lambda q: jd.reduction.tangent_basis(scene, q))(q)).all()
@@ -141,7 +143,12 @@ def test_events_are_those_of_the_exact_mechanism(folder):
         held = jd.Scene(scene.system.replace(lower=lower, upper=jnp.full(3, jnp.inf)), scene.constraints)
         stop = jd.simulate(held, q, v, times, rtol=1e-10, atol=1e-10, limits="stop", throw=False)
         assert stop.result == jd.RESULTS.joint_limit_passed
-        ends[name] = np.asarray(run.q)[:, order], np.asarray(run.v)[:, order], float(stop.stats["time_reached"]), run.result
+        ends[name] = (
+            np.asarray(run.q)[:, order],
+            np.asarray(run.v)[:, order],
+            float(stop.stats["time_reached"]),
+            run.result,
+        )
     (q, v, time, result), (q_exact, v_exact, time_exact, wanted) = ends["rounded"], ends["exact"]
     assert result == wanted == jd.RESULTS.successful
     # Ten times the rounding of the file, and the tolerance of the runs.
