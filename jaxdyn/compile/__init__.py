@@ -7,7 +7,7 @@ differentiated there (`derive`), written as LLVM IR (`code`, `llvm`), and called
 native code, operations of JAX do the same (`primitive`).
 
 Nothing of jaxdyn is imported here. Other rooms import the names below, and those of the modules `known` (known and traced
-values), `batch` (decisions for a batch, repetitions), `loops` and `repair`. Only `jaxdyn.scale`, which compiles programs around
+values), `batch` (decisions for a batch, repetitions) and `loops`. Only `jaxdyn.scale`, which compiles programs around
 kernels ahead of time, and `jaxdyn.exports`, which writes object files, import the compiler's own modules.
 """
 
@@ -24,6 +24,7 @@ from jaxdyn.compile.mode import compilation as compilation
 from jaxdyn.compile.mode import current as compilation_mode  # noqa: F401 (under a name that says of what)
 from jaxdyn.compile.mode import is_standalone as is_standalone
 from jaxdyn.compile.mode import values_of_rules as values_of_rules
+from jaxdyn.compile.pivots import eliminate_rows as eliminate_rows
 from jaxdyn.compile.reverse_mode import reverse_only as reverse_only
 from jaxdyn.compile.rules import batch_alike as batch_alike
 from jaxdyn.compile.rules import implicit as implicit

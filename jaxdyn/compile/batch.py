@@ -17,7 +17,7 @@ from jax.custom_batching import custom_vmap
 from jaxdyn.compile.flags import mark_floats
 from jaxdyn.compile.jax_adapter import vary_alike
 from jaxdyn.compile.known import is_concrete
-from jaxdyn.compile.mode import has_branches, in_rows, is_expanding, is_standalone
+from jaxdyn.compile.mode import has_branches, in_rows, is_careful, is_expanding, is_standalone
 
 T = TypeVar("T")
 # Rows that are computed together. It bounds the memory for operands and results of kernels.
@@ -37,7 +37,8 @@ def _(size, batched, flag):
 
 def any_sample(flag) -> Any:
     """Reduce a flag () to one number for the batch: True where it is set for this sample or for any other one."""
-    return flag if is_concrete(flag) else _any_of_batch(flag)
+    # A program is that of one sample.
+    return flag if is_concrete(flag) or (is_expanding() and is_careful()) else _any_of_batch(flag)
 
 
 def cond(flag, if_true: Callable, if_false: Callable, *operands) -> Any:
@@ -72,7 +73,7 @@ def repeat_while(goes_on: Callable[[T], Any], step: Callable[[T], T], state: T, 
         return lax.while_loop(lambda carry: goes_on(carry[1]) & (carry[0] < most), again, (0, state))[1]
     if goes_on(state) is True:
         state, most = step(state), most - 1
-    if not has_branches() and (marks or not is_standalone()):
+    if not has_branches() and (marks or not is_standalone()) and not is_careful():
         return mark_floats(goes_on(state), state)
     for _ in range(most):
         flag = goes_on(state)

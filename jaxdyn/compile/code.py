@@ -11,6 +11,8 @@ sample is such an array: it is passed on without a copy.
 
 from collections.abc import Callable, Sequence
 
+from jaxdyn.compile import careful_text
+from jaxdyn.compile.careful import Careful
 from jaxdyn.compile.llvm import Emitter
 from jaxdyn.compile.program import COMPARISONS, FLOATS, Array, Constant, Program, kind_of
 
@@ -19,7 +21,8 @@ from jaxdyn.compile.program import COMPARISONS, FLOATS, Array, Constant, Program
 MIN_SHARED_OPERATIONS = 2000
 _ALIGNED = 64  # bytes
 ATTRIBUTES = (
-    "attributes #0 = { nounwind }",
+    # LLVM's simplifications of calls of the C library, such as pow(x, 2) = x x, are made at some levels alone.
+    'attributes #0 = { nounwind "no-builtins" }',
     "attributes #1 = { nounwind willreturn memory(none) }",
 )
 
@@ -37,11 +40,13 @@ class Body:
         self.parts: dict[int, list[int]] = {}  # of each call, the entries of its outputs that are needed
         # A subprogram that is called again finds its arrays at the same place: entries that have not changed stay there.
         self.regions: dict[Program, int] = {}  # where in %in and %out the arrays of a subprogram begin
-        self.bytes = 0
+        self.bytes = self.careful = 0  # of what is passed to subprograms and to careful programs
         self.passed: dict[int, str] = {}  # what stands in %in, which subprograms do not change
         for op, _, args in program.operations:
             if op == "part":
                 self.parts.setdefault(args[0], []).append(args[1].value)
+        self.fused = _find_products(program)  # of sums, the place of the operand that is a product
+        self.merged = {program.operations[i].args[place] for i, place in self.fused.items()}
 
     def name(self, i: int) -> str:
         """Name of operation i; inputs are loaded where they are first read."""
@@ -58,7 +63,7 @@ class Body:
         """Names of the program's results."""
         operations = self.program.operations
         for i, (op, kind, args) in enumerate(operations):
-            if op == "input":
+            if op == "input" or i in self.merged:
                 continue
             if op == "call":
                 self.names[i] = self._call(i, *args)
@@ -66,6 +71,10 @@ class Body:
                 self.names[i] = self._call_where(i, *args)
             elif op == "part":
                 self.names[i] = self.names[args[0]][args[1].value]
+            elif i in self.fused:
+                place = self.fused[i]
+                factors = [self.text(x, kind) for x in operations[args[place]].args]
+                self.names[i] = self.e.fused(op, kind, factors, self.text(args[1 - place], kind), place == 0)
             else:
                 kinds = [operations[x].kind for x in args if type(x) is not Constant]
                 given = kinds[-1] if kinds else kind
@@ -90,7 +99,7 @@ class Body:
         e.lines += [f"  br label %{before}", f"{before}:"]
         e.lines += [f"  br i1 {e.any(flag)}, label %{rare}, label %{after}", f"{rare}:"]
         passed = dict(self.passed)
-        new = self._call(i, which, *given)
+        new = self._call(i, which, *given, flag=flag)
         # What the branch has stored is not in memory where it is not taken.
         self.passed = {at: value for at, value in passed.items() if self.passed.get(at) == value}
         new = {k: e.emit(f"select {e.type('b1')} {flag}, {e.type(kinds[k])} {x}, {e.type(kinds[k])} {old[k]}")
@@ -98,7 +107,7 @@ class Body:
         e.lines += [f"  br label %{after}", f"{after}:"]
         return {k: e.emit(f"phi {e.type(kinds[k])} [ {old[k]}, %{before} ], [ {x}, %{rare} ]") for k, x in new.items()}
 
-    def _call(self, i: int, which, *given) -> dict[int, str]:
+    def _call(self, i: int, which, *given, flag: str = "") -> dict[int, str]:
         """Call a subprogram; names of the entries of its outputs that are needed."""
         called = self.program.subprograms[which.value]
         if called not in self.regions:
@@ -113,7 +122,11 @@ class Body:
         for array in called.outputs:
             outputs.append((self._place(at), kind_of(array.dtype), array.size))
             at += bytes_of(array, self.e.width)
-        _write_call(self.e, called, [*pointers, *(pointer for pointer, _, _ in outputs)])
+        pointers += [pointer for pointer, _, _ in outputs]
+        if isinstance(called, Careful):
+            self.careful = max(self.careful, careful_text.write_call(self.e, called, flag, pointers))
+        else:
+            _write_call(self.e, called, pointers)
         needed, results, first = set(self.parts.get(i, ())), {}, 0
         for pointer, kind, size in outputs:
             results |= {first + k: self.e.load_at(pointer, k, kind) for k in range(size) if first + k in needed}
@@ -146,7 +159,34 @@ class Body:
 
     def allocations(self) -> list[str]:
         """Memory for what is passed."""
-        return [f"  %passed = alloca [{self.bytes} x i8], align {_ALIGNED}"] if self.bytes else []
+        passed = [f"  %passed = alloca [{self.bytes} x i8], align {_ALIGNED}"] if self.bytes else []
+        return [*passed, *careful_text.allocation(self.careful)]
+
+
+def _find_products(program: Program) -> dict[int, int]:
+    """Sums and differences one of whose operands is a product that nothing else needs, and the place of that operand.
+
+    They are rounded once. The decision is made here, not by LLVM, whose choice depends on its level.
+    """
+    operations = program.operations
+    uses = [0] * len(operations)
+    for op, _, args in operations:
+        for x in args if op != "input" else ():
+            if type(x) is not Constant:
+                uses[x] += 1
+    for row in program.results:
+        for x in row:
+            if type(x) is not Constant:
+                uses[x] += 1
+    found = {}
+    for i, (op, kind, args) in enumerate(operations):
+        if op in ("add", "sub") and kind in FLOATS:
+            for place in (1, 0):
+                x = args[place]
+                if type(x) is not Constant and operations[x].op == "mul" and uses[x] == 1:
+                    found[i] = place
+                    break
+    return found
 
 
 def bytes_of(array: Array, width: int) -> int:
@@ -168,7 +208,7 @@ def symbol_of(called: Program, width: int) -> str:
 def subprogram_ir(called: Program, width: int) -> str:
     """The text of a subprogram, the function `called`."""
     e = Emitter(width)
-    body = Body(e, called, lambda place, entry, kind: e.load_at(f"%a{place}", entry, kind), lambda place: None)
+    body = Body(e, called, lambda place, entry, kind: e.load_at(f"%a{place}", entry, kind), lambda place: f"%a{place}")
     for i, (row, array) in enumerate(zip(body.results(), called.outputs, strict=True)):
         for k, name in enumerate(row):
             e.store_at(f"%r{i}", k, kind_of(array.dtype), name)
@@ -179,7 +219,8 @@ def subprogram_ir(called: Program, width: int) -> str:
 
 def calls_itself(program: Program, width: int) -> bool:
     """Decide whether a kernel is a call of its program as a subprogram, whose code other kernels share."""
-    return width == 1 and program.cost >= MIN_SHARED_OPERATIONS and not program.subprograms
+    fast = program.fast or program
+    return width == 1 and fast.cost >= MIN_SHARED_OPERATIONS and not fast.subprograms
 
 
 def varying_first(uniform: Sequence[bool]) -> list[int]:
@@ -191,9 +232,10 @@ def varying_first(uniform: Sequence[bool]) -> list[int]:
 def kernel_ir(program: Program, width: int, uniform: Sequence[bool]) -> str:
     """The text of a kernel; `uniform` says which arguments are the same for all samples."""
     e = Emitter(width)
-    count = len(program.inputs)
+    count, fast = len(program.inputs), program.fast or program
     arrays = [*program.inputs, *program.outputs]
-    entries = {x.args for x in program.operations if x.op == "input"}
+    # The careful program of a pair reads rows of the caller's memory: nothing is loaded for it.
+    entries = {x.args for x in fast.operations if x.op == "input"}
     read = {place for place, _ in entries}
     places = [i for i in range(len(arrays)) if i >= count or (i in read and not uniform[i])]
     rows = e.rows(places, [arrays[i].size * arrays[i].dtype.itemsize for i in places])
@@ -215,18 +257,31 @@ def kernel_ir(program: Program, width: int, uniform: Sequence[bool]) -> str:
         """The row of one sample."""
         return None if width > 1 else rows[place][0] if place in rows else f"%a{place}"
 
-    body = Body(e, program, load, array)
+    body, valid, allocations = Body(e, fast, load, array), None, []
     # The kernel of one sample of a large program is a call: the same code serves as a subprogram of steps and rollouts.
     if calls_itself(program, width):
-        _write_call(e, program, [str(array(i)) for i in range(len(arrays))])
+        pointers = [str(array(i)) for i in range(len(arrays))]
+        if program.careful is not None:
+            allocations.append("  %valid = alloca i8")
+            pointers.append("%valid")
+        _write_call(e, fast, pointers)
+        valid = None if program.careful is None else e.load_at("%valid", 0, "b1")
     else:
-        for i, (row, output) in enumerate(zip(body.results(), program.outputs, strict=True)):
+        results = body.results()
+        if program.careful is not None:
+            *results, (valid,) = results
+        for i, (row, output) in enumerate(zip(results, program.outputs, strict=True)):
             e.store_array(rows[count + i], kind_of(output.dtype), row)
+    if valid is not None and program.careful is not None:
+        flag = e.operation("not", "b1", [valid], "b1")
+        same = [*uniform, *[False] * len(program.outputs)]
+        places = [(f"%a{i}", 0 if same[i] else x.size * x.dtype.itemsize) for i, x in enumerate(arrays)]
+        body.careful = max(body.careful, careful_text.write_call_of_rows(e, program.careful, flag, places))
     # Arguments that are not read are not in the code, but the handler checks their sizes, so that the hash covers them.
     sizes = " ".join(
         f"{'same' if i < count and uniform[i] else 'each'}:{x.size}x{x.dtype}" for i, x in enumerate(arrays)
     )
-    return wrap_kernel(e, f"{count} {sizes}", uniform, len(program.outputs), body.allocations())
+    return wrap_kernel(e, f"{count} {sizes}", uniform, len(program.outputs), [*body.allocations(), *allocations])
 
 
 def wrap_kernel(e: Emitter, title: str, uniform: Sequence[bool], outputs: int, allocations: Sequence[str]) -> str:

@@ -13,7 +13,7 @@ import numpy as np
 
 from jaxdyn.compile import stored
 from jaxdyn.compile.graph import Graph
-from jaxdyn.compile.inlining import inline, replay
+from jaxdyn.compile.inlining import inline, repeat, replay
 from jaxdyn.compile.program import FLOATS, Constant, NotNumbers, Program, is_number, objects
 
 
@@ -65,7 +65,18 @@ def _tangent(program: Program, moving: tuple[bool, ...]) -> Program:
     for row, array in zip(program.results, program.outputs, strict=True):
         if array.dtype.kind == "f":
             rows.append(objects([0.0 if type(x) is Constant else changes[x] for x in row], array.shape))
-    return graph.finish(arrays, outputs, rows, name=f"change of {program.name}")
+    return _finish(graph, program, arrays, outputs, rows, values, f"change of {program.name}")
+
+
+def _finish(graph: Graph, program: Program, inputs, outputs, rows, values, name: str) -> Program:
+    """The program of a derivative, which reports the validity of the values where `program` does."""
+    if not program.reports_validity:
+        return graph.finish(inputs, outputs, rows, name=name)
+    ((valid,), array) = program.results[-1], program.outputs[-1]
+    flag = objects([valid.value if type(valid) is Constant else values[valid]], ())
+    made = graph.finish(inputs, [*outputs, array], [*rows, flag], name=name)
+    made.reports_validity = True
+    return made
 
 
 def _change(g: Graph, op: str, kind: str, value, x: list, d: list):
@@ -220,21 +231,24 @@ def _transpose(program: Program, linear: tuple[bool, ...], given: tuple[bool, ..
         for row, array, varies in zip(input_cotangents, program.inputs, linear, strict=True)
         if varies and row is not None
     ]
-    return graph.finish(arrays, [x[1] for x in rows], [x[0] for x in rows], name=f"transpose of {program.name}")
+    name = f"transpose of {program.name}"
+    return _finish(graph, program, arrays, [x[1] for x in rows], [x[0] for x in rows], values, name)
 
 
 def _coefficient_values(graph: Graph, program: Program, inputs: list) -> list:
     """Values of the operations that do not depend on an input given as None; None for the others."""
     flat = [None if x is None else x.ravel().tolist() for x in inputs]
     values: list = []
-    for op, kind, args in program.operations:
+    for operation in program.operations:
+        op, _, args = operation
         if op == "input":
             row = flat[args[0]]
             values.append(None if row is None else row[args[1]])
         elif any(type(x) is not Constant and values[x] is None for x in args):
             values.append(None)
         else:
-            values.append(graph.apply(op, kind, [x.value if type(x) is Constant else values[x] for x in args]))
+            operands = [x.value if type(x) is Constant else values[x] for x in args]
+            values.append(repeat(graph, program, operation, operands))
     return values
 
 
@@ -291,7 +305,7 @@ def _with_inputs(program: Program, places: tuple[int, ...]) -> Program:
         return program
     index = {place: i for i, place in enumerate(places)}
     few = stored.make_within(program, ("inputs", places), lambda: _renumber_inputs(program, index))
-    few.reports_validity = program.reports_validity
+    few.reports_validity, few.flags = program.reports_validity, program.flags
     if program.derivative is not None:
         few.derivative = functools.partial(_tangent_of_few, program, places)
     if program.fallback is not None:

@@ -115,14 +115,15 @@ def _find(function, structure, kinds, options, context) -> Executable:
         jitted = jax.jit(flat, compiler_options=options(), keep_unused=True)
         return jitted.lower(*types), results
 
-    if key is not None and (found := _load(key, trace)) is not None:
+    recover = functools.partial(_in_modes, mode.remember(), trace)
+    if key is not None and (found := _load(key, recover)) is not None:
         return found
     with ahead.worker(not mode.wants_usual_options()):
         lowered, (static, out) = trace()
         text = lowered.as_text()
-        is_kept = _may_be_kept(text)
+        is_kept = _may_be_kept(text, key is None)
         if key is None and is_kept and (key := stored.key_of("text", text, options())) is not None:
-            found = _load(key, trace)
+            found = _load(key, recover)
             if found is not None:
                 return Executable(found.run, static, out)
         made = Executable(lowered.compile(), static, out)
@@ -136,7 +137,13 @@ def _apply(function: Callable, structure: Any, leaves: list) -> Any:
     return function(*args, **kwargs)
 
 
-def _load(key: str, trace: Callable) -> Executable | None:
+def _in_modes(enter: Callable, trace: Callable) -> None:
+    # From a thread of XLA, when code turns out to be missing.
+    with enter():
+        trace()
+
+
+def _load(key: str, recover: Callable) -> Executable | None:
     contents = disk.read(f"{key}.executable")
     if contents is None:
         return None
@@ -146,16 +153,24 @@ def _load(key: str, trace: Callable) -> Executable | None:
     try:
         payload, rows, static, results = pickle.loads(contents)
         for number, row in rows:
-            target.restore(number, target.Row(*row), trace)
+            target.restore(number, target.Row(*row), recover)
         return Executable(jax_adapter.load_executable(payload), static, jax.tree.structure(results))
     except Exception as reason:
         disk.logger.debug("jaxdyn: an executable on disk is made again: %s", reason)
         return None
 
 
-def _may_be_kept(text: str) -> bool:
-    """Decide whether a program calls nothing but what another process has too."""
+def _may_be_kept(text: str, is_traced: bool) -> bool:
+    """Decide whether a program calls nothing but what another process has too.
+
+    `is_traced`: whether that process traces it first, so that it has the kernels which only one process knows by their numbers.
+    """
+    from jaxdyn.compile import target
+
     unsafe = {a or b for a, b in _CALLS.findall(text) if not _SAFE.fullmatch(a or b)}
+    if not is_traced:
+        rows = (target.row_of(int(x)) for x in set(_NUMBERS.findall(text)))
+        unsafe |= {row.name for row in rows if not row.is_kept}
     if unsafe:
         disk.logger.debug("jaxdyn: a program is not kept on disk, as it calls %s", ", ".join(sorted(unsafe)))
     return not unsafe

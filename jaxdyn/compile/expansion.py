@@ -164,26 +164,40 @@ class _Expansion:
             return [self._reduce(name, args[0], params["axes"], out)]
         raise NotNumbers(name)
 
-    def _call(self, inner: ClosedJaxpr, args) -> list:
-        """A function as a subprogram, if it is long."""
-        program, given = self._subprogram(inner, args)
+    def _call(self, inner: ClosedJaxpr, args, again=None) -> list:
+        """A function as a subprogram, if it is long; `again` as of `flags.guarded_p`."""
+        inner, inner_args, again, args = _innermost(inner, args, again, args)
+        program, given = self._subprogram(inner, inner_args)
         # A short one is written in its place, where zeros of its arguments are seen. A call does not know them.
-        is_short = program.cost < MIN_SUBPROGRAM_OPERATIONS
+        is_short = program.cost < MIN_SUBPROGRAM_OPERATIONS or not self.calls
         results = replay(self.graph, program, given)[1] if is_short else self.graph.call(program, given)
-        count = len(inner.jaxpr.outvars)
-        for flagged in results[count:]:
-            self.flagged = self.graph.either(self.flagged, flagged.item())
-        return results[:count]
+        return self._repair(results, program, again, args)
 
     def _subprogram(self, inner: ClosedJaxpr, args) -> tuple[Program, list]:
         """A function as a subprogram, and its arguments without those that are known, which are compiled in."""
-        inner, args = _innermost(inner, args)
         known = tuple(None if x.dtype.kind == "O" else (x.shape, x.dtype.str, x.tobytes()) for x in args)
         program, has_rules = _subprogram(inner, known, self.graph.most)
         self.has_rules |= has_rules
         program, places = without_unread(program)
         given = [x for x, y in zip(args, known, strict=True) if y is None]
         return program, [given[i] for i in places]
+
+    def _repair(self, results: list, program: Program, again, args) -> list:
+        """The results of a function; those that it flags, if it does, by the function `again` of `args`, if there is one."""
+        if not program.flags:
+            return results
+        *results, flagged = results
+        if again is None:
+            self.flagged = self.graph.either(self.flagged, flagged.item())
+            return results
+        # One for each: a subprogram is known by its identity.
+        if ("careful", again) not in program.derived:
+            program.derived["careful", again] = again.beside(program)
+        careful = program.derived["careful", again]
+        return self.graph.call_where(flagged.item(), careful, [*map(as_objects, args)], results)
+
+    def _guarded(self, params, args, eqn):
+        return self._call(params["call"], args, params["again"])
 
     def _reduce(self, name, array, axes, out):
         # Entries in XLA's order, one after the other: a sum of few numbers, whose order decides the rounding.
@@ -282,16 +296,14 @@ class _Expansion:
     def _branch(self, which, usual: ClosedJaxpr, rare: ClosedJaxpr, args) -> list:
         """The results of `usual`, or where `which` is not 0 those of `rare`, a subprogram that hardly any sample calls."""
         otherwise = [as_objects(x) for x in self.evaluate(usual, args)]
-        program, given = self._subprogram(rare, args)
-        if len(program.outputs) > len(otherwise):  # the branch may flag numbers
+        rare, rare_args, again, args = _innermost(rare, args, None, args)
+        program, given = self._subprogram(rare, rare_args)
+        if program.flags:
             otherwise.append(objects([False], ()))
         # JAX makes an integer of the flag.
         flag = which.args[0] if which.op == "convert" else self.graph.compare("ne", which, as_kind(0, which.kind))
         results = self.graph.call_where(flag, program, given, otherwise)
-        count = len(rare.jaxpr.outvars)
-        for flagged in results[count:]:
-            self.flagged = self.graph.either(self.flagged, flagged.item())
-        return results[:count]
+        return self._repair(results, program, again, args)
 
     def _linear_solve(self, params, args, eqn):
         counts, jaxprs = params["const_lengths"], params["jaxprs"]
@@ -305,7 +317,7 @@ class _Expansion:
     def _kernel(self, params, args, eqn):
         inner = params["program"]
         if not isinstance(inner, Program):  # loops and pseudo-inverses have branches
-            if not (inner.is_called and mode.is_standalone()):
+            if not (inner.is_called and (mode.is_standalone() or mode.is_careful())):
                 raise NotNumbers(inner.name)
             # Code of its own that this program calls. A batch has leading axes.
             self.has_rules = True
@@ -315,23 +327,37 @@ class _Expansion:
             return [np.stack(results).reshape(*lead, -1)]
         shaped = [as_objects(x).reshape(array.shape) for x, array in zip(args, inner.inputs, strict=True)]
         self.has_rules |= inner.derivative is not None
+        fast = inner if inner.fast is None else inner.fast
         # A kernel within this one: called where it is long, else written out.
-        if self.calls and inner.cost >= MIN_SUBPROGRAM_OPERATIONS and not inner.subprograms:
-            return [x.ravel() for x in self.graph.call(inner, shaped)]
-        return [x.ravel() for x in replay(self.graph, inner, shaped)[1]]
+        if self.calls and fast.cost >= MIN_SUBPROGRAM_OPERATIONS and not fast.subprograms:
+            results = self.graph.call(fast, shaped)
+        else:
+            results = replay(self.graph, fast, shaped)[1]
+        if inner.careful is not None:
+            *results, valid = results
+            flag = self.graph.invert(valid.item())
+            if self.branches:
+                results = self.graph.call_where(flag, inner.careful, shaped, results)
+            else:
+                self.flagged = self.graph.either(self.flagged, flag)
+        return [x.ravel() for x in results]
 
 
-def _innermost(inner: ClosedJaxpr, args: Sequence) -> tuple[ClosedJaxpr, list]:
+def _innermost(inner: ClosedJaxpr, args: Sequence, again, given: Sequence) -> tuple[ClosedJaxpr, list, Any, list]:
     """The function under `jax.jit` to which a function comes down, with its arguments, or the function itself.
 
-    A branch that repeats a call so shares the call's subprogram.
+    Also what computes its flagged samples, with the arguments of that. A branch that repeats a call so shares its subprogram.
     """
     jaxpr = inner.jaxpr
-    if len(jaxpr.eqns) != 1 or jaxpr.eqns[0].primitive.name != "jit" or jaxpr.eqns[0].outvars != jaxpr.outvars:
-        return inner, list(args)
+    name = jaxpr.eqns[0].primitive.name if len(jaxpr.eqns) == 1 else ""
+    if name not in ("jit", "jaxdyn_guarded") or jaxpr.eqns[0].outvars != jaxpr.outvars or (name != "jit" and again):
+        return inner, list(args), again, list(given)
     values = dict(zip([*jaxpr.constvars, *jaxpr.invars], [*map(_constant, inner.consts), *args], strict=True))
-    given = [np.asarray(x.val) if isinstance(x, Literal) else values[x] for x in jaxpr.eqns[0].invars]
-    return _innermost(jaxpr.eqns[0].params["jaxpr"], given)
+    params = jaxpr.eqns[0].params
+    args = [np.asarray(x.val) if isinstance(x, Literal) else values[x] for x in jaxpr.eqns[0].invars]
+    if name == "jit":
+        return _innermost(params["jaxpr"], args, again, given)
+    return _innermost(params["call"], args, params["again"], args)
 
 
 @functools.lru_cache(maxsize=256)
@@ -354,7 +380,9 @@ def _subprogram(inner: ClosedJaxpr, known: tuple, most: int) -> tuple[Program, b
     if expansion.flagged is not False:
         outputs.append(_FLAG)
         results.append(objects([expansion.flagged], ()))
-    return graph.finish(inputs, outputs, results), expansion.has_rules
+    program = graph.finish(inputs, outputs, results)
+    program.flags = expansion.flagged is not False
+    return program, expansion.has_rules
 
 
 _INNER = {
@@ -387,6 +415,7 @@ _OTHER: dict[str, Callable] = {
     "triangular_solve": array_rules.triangular_solve,
     "jaxdyn_kernel": _Expansion._kernel,
     "jaxdyn_invalid": _Expansion._invalid,
+    "jaxdyn_guarded": _Expansion._guarded,
 }
 
 # The arrays before the places.

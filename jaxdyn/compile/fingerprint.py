@@ -49,7 +49,10 @@ def fingerprint(*values: Any) -> bytes:
 class _Hasher:
     def __init__(self):
         self.hash = hashlib.sha256()
-        self.places: dict[int, int] = {}  # of objects that have been added, by identity
+        # By identity, of objects that have been added the hash of their contents; of those that contain this one their depth.
+        self.added: dict[int, bytes | int] = {}
+        self.depth = 0
+        self.sentinels: dict[int, int] = {}
         self.held: list = []  # so that no other object gets the identity of one of them
 
     def write(self, *parts: Any) -> None:
@@ -68,13 +71,24 @@ class _Hasher:
             raise NoFingerprint("a traced value")
         elif isinstance(x, (np.ndarray, np.generic, jax.Array)):
             self.add_array(x)
-        elif id(x) in self.places:
-            # The same object again, as in a function that calls itself.
-            self.write("again", self.places[id(x)])
+        elif isinstance(before := self.added.get(id(x)), int):
+            # Within itself, as a function that calls itself.
+            self.write("again", self.depth - before)
         else:
-            self.places[id(x)] = len(self.places)
-            self.held.append(x)
-            self.add_object(x)
+            # By a hash of its own, so that an object twice and two equal ones are the same: which of these values are depends on
+            # what JAX keeps, and on whether they were read from disk.
+            self.write(before or self.hash_of(x))
+
+    def hash_of(self, x: Any) -> bytes:
+        """Hash of an object's contents."""
+        outer, self.hash = self.hash, hashlib.sha256()
+        self.added[id(x)], self.depth = self.depth, self.depth + 1
+        self.held.append(x)
+        self.add_object(x)
+        self.depth -= 1
+        self.added[id(x)] = contents = self.hash.digest()
+        self.hash = outer
+        return contents
 
     def add_array(self, x) -> None:
         """An array by its numbers."""
@@ -94,8 +108,8 @@ class _Hasher:
                 raise NoFingerprint(f"the module {x.__name__}, passed as a value")
             self.write("module", x.__name__)
             return
-        if type(x) is object:  # a sentinel, which has no contents
-            self.write("object")
+        if type(x) is object:  # a sentinel, which has no contents: all that counts is which one it is
+            self.write("object", self.sentinels.setdefault(id(x), len(self.sentinels)))
             return
         if isinstance(x, type) or callable(x):
             if (name := _name_of(x)) is not None:

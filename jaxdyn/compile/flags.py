@@ -2,14 +2,14 @@
 
 A kernel has no branches. Where a fast formula fails for some samples, such as a Cholesky factor of rows that depend on each
 other, the function says so by `mark_invalid(flag, x)`, which is NaN where the flag is set. The program reports which samples are
-valid, and `kernel` computes the others by the fallback. A program without marks reports nothing and compiles no fallback.
+valid, and native code computes the others by the fallback (see `careful`). A program without marks reports nothing.
 """
 
 import jax
 import jax.numpy as jnp
 
 from jaxdyn.compile import mode
-from jaxdyn.compile.jax_adapter import ShapedArray, define_primitive, is_zero
+from jaxdyn.compile.jax_adapter import ShapedArray, define_primitive, function_of, is_zero, zero_tangent
 
 
 def mark_invalid(flag: jax.Array, x: jax.Array) -> jax.Array:
@@ -30,6 +30,18 @@ def is_float(x) -> bool:
 def mark_floats(flag: jax.Array, tree):
     """`mark_invalid` the float arrays of a pytree; others stay as they are."""
     return jax.tree.map(lambda x: mark_invalid(flag, x) if is_float(x) else x, tree)
+
+
+def has_marks(jaxpr) -> bool:
+    """Decide whether a jaxpr marks numbers as not valid, also within functions that it calls."""
+    for eqn in jaxpr.eqns:
+        if eqn.primitive.name == "jaxdyn_invalid" or getattr(eqn.params.get("program"), "careful", None) is not None:
+            return True
+        for value in eqn.params.values():
+            inner = (getattr(x, "jaxpr", x) for x in (value if isinstance(value, (tuple, list)) else (value,)))
+            if any(hasattr(x, "eqns") and has_marks(x) for x in inner):
+                return True
+    return False
 
 
 def _batch(args, axes):
@@ -60,4 +72,33 @@ invalid_p = define_primitive(
     batch=_batch,
     jvp=_jvp,
     transpose=_transpose,
+)
+
+
+def _batch_guarded(args, axes, *, call, again):
+    results = jax.vmap(function_of(call), axes)(*args)
+    return results, [0] * len(results)
+
+
+def _jvp_guarded(primals, tangents, *, call, again):
+    places = [i for i, x in enumerate(tangents) if not is_zero(x)]
+
+    def at_values(*values):
+        point = list(primals)
+        for i, value in zip(places, values, strict=True):
+            point[i] = value
+        return function_of(call)(*point)
+
+    results, changes = jax.jvp(at_values, [primals[i] for i in places], [tangents[i] for i in places])
+    return results, [d if is_float(x) else zero_tangent(x) for x, d in zip(results, changes, strict=True)]
+
+
+# A function `call`, whose samples that are marked as not valid are computed by `again` (see `trace.Again`). Its derivatives and
+# batches are those of the function, whose marks reach the program around it then. It is bound while a program is traced.
+guarded_p = define_primitive(
+    "jaxdyn_guarded",
+    lambda *types, call, again: list(call.out_avals),
+    multiple_results=True,
+    batch=_batch_guarded,
+    jvp=_jvp_guarded,
 )

@@ -98,6 +98,14 @@ class Graph:
             at += array.size
         return outputs
 
+    def _inputs_of_branch(self, number: Number) -> tuple:
+        """The flag of a "call_where" and the entries of its inputs."""
+        return number.args[1 : 2 + sum(array.size for array in self.subprograms[number.args[0]].inputs)]
+
+    def _otherwise(self, number: Number) -> tuple:
+        """Entries that stand for the outputs of a "call_where"."""
+        return number.args[1 + len(self._inputs_of_branch(number)) :]
+
     def add(self, a, b):
         """a + b."""
         if type(a) is not Number:
@@ -323,10 +331,13 @@ class Graph:
         waiting = [x for row in flat for x in row if type(x) is Number]
         while waiting:
             number = waiting.pop()
-            if number not in live:
+            if type(number) is Number and number not in live:
                 live.add(number)
+                if number.op == "part" and number.args[0].op == "call_where":
+                    waiting.append(self._otherwise(number.args[0])[number.args[1]])
                 if number.op != "input":
-                    waiting.extend(x for x in number.args if type(x) is Number and x not in live)
+                    # Of what stands for the outputs of a branch, that alone which has a part is needed.
+                    waiting.extend(self._inputs_of_branch(number) if number.op == "call_where" else number.args)
         index: dict[Number, int] = {}
         operations = []
         # In the order of creation, where operands precede their operation. Depth first from the outputs was tried: forward
@@ -340,6 +351,8 @@ class Graph:
                 index[number] = len(operations)
                 args = number.args
                 if number.op != "input":
+                    if number.op == "call_where":
+                        args = tuple(x if type(x) is not Number or x in live else 0 for x in args)
                     args = tuple(index[x] if type(x) is Number else Constant(x) for x in args)
                 operations.append(_check(Operation(number.op, number.kind, args), operations))
             if len(operations) > self.most:

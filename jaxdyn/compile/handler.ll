@@ -13,6 +13,7 @@
 
 declare ptr @malloc(i64)
 declare void @free(ptr)
+declare void @llvm.memcpy.p0.p0.i64(ptr, ptr, i64, i1)
 declare {RELAX_TYPE}
 
 @missing = private constant [{MISSING_BYTES} x i8] c"{MISSING}\00"
@@ -301,6 +302,97 @@ define internal void @describe(ptr %extension) #0 {
   ret void
 }
 
+; The code of an entry, made by Python where there is none yet; null where that fails, as for an entry that is null.
+define internal ptr @code(ptr %entry.at, i64 %hash) #0 {
+  %is.there = icmp ne ptr %entry.at, null
+  br i1 %is.there, label %look, label %new
+look:
+  %kernel.at = getelementptr %Entry, ptr %entry.at, i32 0, i32 1
+  %ready = load atomic ptr, ptr %kernel.at acquire, align 8
+  %is.ready = icmp ne ptr %ready, null
+  br i1 %is.ready, label %old, label %new
+old:
+  ret ptr %ready
+new:
+  %prepare = inttoptr i64 {PREPARE} to ptr
+  %made = call ptr %prepare(i64 %hash)
+  ret ptr %made
+}
+
+; Copy one sample of arrays to rows in memory, which begins with their addresses, or back. A layout is { entries, bytes of an entry,
+; bytes from entry to entry and from sample to sample, place of the row }.
+define internal void @move(i64 %sample, i64 %first, i64 %count, ptr %bases, ptr %layouts, ptr %memory, i1 %is.back) #0 {
+entry:
+  br label %arrays
+arrays:
+  %i = phi i64 [ %first, %entry ], [ %i.next, %next ]
+  %is.done = icmp sge i64 %i, %count
+  br i1 %is.done, label %out, label %array
+array:
+  %layout = getelementptr [5 x i64], ptr %layouts, i64 %i
+  %numbers = load [5 x i64], ptr %layout
+  %entries = extractvalue [5 x i64] %numbers, 0
+  %bytes = extractvalue [5 x i64] %numbers, 1
+  %step = extractvalue [5 x i64] %numbers, 2
+  %stride = extractvalue [5 x i64] %numbers, 3
+  %place = extractvalue [5 x i64] %numbers, 4
+  %base.at = getelementptr ptr, ptr %bases, i64 %i
+  %base = load ptr, ptr %base.at
+  %offset = mul i64 %sample, %stride
+  %row = getelementptr i8, ptr %memory, i64 %place
+  %row.at = getelementptr ptr, ptr %memory, i64 %i
+  store ptr %row, ptr %row.at
+  br label %loop
+loop:
+  %k = phi i64 [ 0, %array ], [ %k.next, %more ]
+  %is.last = icmp sge i64 %k, %entries
+  br i1 %is.last, label %next, label %more
+more:
+  %far = mul i64 %k, %step
+  %far.offset = add i64 %far, %offset
+  %near = mul i64 %k, %bytes
+  %there = getelementptr i8, ptr %base, i64 %far.offset
+  %here = getelementptr i8, ptr %row, i64 %near
+  %from = select i1 %is.back, ptr %here, ptr %there
+  %to = select i1 %is.back, ptr %there, ptr %here
+  call void @llvm.memcpy.p0.p0.i64(ptr %to, ptr %from, i64 %bytes, i1 false)
+  %k.next = add i64 %k, 1
+  br label %loop
+next:
+  %i.next = add i64 %i, 1
+  br label %arrays
+out:
+  ret void
+}
+
+; Compute those of `width` samples whose bits are set by the kernel of one sample with this number. Other kernels call it for samples
+; that are not valid. Where there is no code results stay as they are, and `handler` reports the failure.
+define void @careful(i64 %hash, i64 %width, i64 %mask, i64 %inputs, i64 %count, ptr %bases, ptr %layouts, ptr %memory) #0 {
+entry:
+  %entry.at = call ptr @look_up(i64 %hash)
+  %kernel = call ptr @code(ptr %entry.at, i64 %hash)
+  %is.made = icmp ne ptr %kernel, null
+  br i1 %is.made, label %loop, label %out
+loop:
+  %k = phi i64 [ 0, %entry ], [ %k.next, %step ]
+  %is.done = icmp sge i64 %k, %width
+  br i1 %is.done, label %out, label %look
+look:
+  %shifted = lshr i64 %mask, %k
+  %bit = trunc i64 %shifted to i1
+  br i1 %bit, label %run, label %step
+run:
+  call void @move(i64 %k, i64 0, i64 %count, ptr %bases, ptr %layouts, ptr %memory, i1 false)
+  call void %kernel(ptr %memory, i64 1, i64 0, i64 1)
+  call void @move(i64 %k, i64 %inputs, i64 %count, ptr %bases, ptr %layouts, ptr %memory, i1 true)
+  br label %step
+step:
+  %k.next = add i64 %k, 1
+  br label %loop
+out:
+  ret void
+}
+
 define ptr @handler(ptr %frame) #0 {
 entry:
   %extension.at = getelementptr %Frame, ptr %frame, i32 0, i32 1
@@ -335,20 +427,15 @@ not.found:
   %error.missing = call ptr @failure(ptr %api, ptr @missing, i32 5)
   ret ptr %error.missing
 found:
-  %kernel.at = getelementptr %Entry, ptr %entry.at, i32 0, i32 1
-  %ready = load atomic ptr, ptr %kernel.at acquire, align 8
-  %is.ready = icmp ne ptr %ready, null
-  br i1 %is.ready, label %go, label %first.call
-first.call:
-  %prepare = inttoptr i64 {PREPARE} to ptr
-  %made = call ptr %prepare(i64 %hash)
-  %is.made = icmp ne ptr %made, null
+  %kernel = call ptr @code(ptr %entry.at, i64 %hash)
+  %is.made = icmp ne ptr %kernel, null
   br i1 %is.made, label %go, label %not.made
 not.made:
   %error.failed = call ptr @failure(ptr %api, ptr @failed, i32 13)
   ret ptr %error.failed
 go:
-  %kernel = phi ptr [ %ready, %found ], [ %made, %first.call ]
+  %failures.at = inttoptr i64 {FAILURES} to ptr
+  %failures = load atomic i64, ptr %failures.at acquire, align 8
   %chunk.at = getelementptr %Entry, ptr %entry.at, i32 0, i32 2
   %chunk = load i64, ptr %chunk.at
   %least.at = getelementptr %Entry, ptr %entry.at, i32 0, i32 3
@@ -397,9 +484,16 @@ count.threads:
   br i1 %is.one, label %alone, label %parallel
 alone:
   call void %kernel(ptr %data, i64 %n, i64 0, i64 %n)
-  ret ptr null
+  br label %check
 parallel:
   call void @in_parallel(ptr %api, ptr %context, ptr %kernel, ptr %data, i64 %n, i64 %chunk, i64 %chunks, i64 %threads)
+  br label %check
+check:
+  ; A careful program that could not be made, of this call or of one at the same time.
+  %failures.after = load atomic i64, ptr %failures.at acquire, align 8
+  %is.failed = icmp ne i64 %failures, %failures.after
+  br i1 %is.failed, label %not.made, label %finished
+finished:
   ret ptr null
 }
 attributes #0 = { nounwind }

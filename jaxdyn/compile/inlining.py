@@ -1,11 +1,12 @@
 """Programs written out once more in the graph of another one, where equal numbers and known ones are folded again."""
 
 from collections.abc import Sequence
+from typing import Any
 
 import numpy as np
 
 from jaxdyn.compile.graph import Graph
-from jaxdyn.compile.program import Array, Constant, Program, kind_of, objects
+from jaxdyn.compile.program import Array, Constant, Operation, Program, kind_of, objects
 
 
 def replay(
@@ -21,24 +22,27 @@ def replay(
         if operation.op == "input":
             place, entry = operation.args
             numbers.append(flat[place][entry])
-        elif operation.op in (
-            "call",
-            "call_where",
-        ):  # operands: the number of the subprogram, then entries one after the other
-            which, *given = (x.value if type(x) is Constant else numbers[x] for x in operation.args)
-            called, write = program.subprograms[which], _call if operation.op == "call" else _call_where
-            numbers.append([x for row in write(graph, called, given, branches) for x in row.ravel().tolist()])
-        elif operation.op == "part":
-            call, entry = operation.args
-            numbers.append(numbers[call][entry.value])
         else:
             args = [x.value if type(x) is Constant else numbers[x] for x in operation.args]
-            numbers.append(graph.apply(operation.op, operation.kind, args))
+            numbers.append(repeat(graph, program, operation, args, branches))
     outputs = [
         objects([x.value if type(x) is Constant else numbers[x] for x in row], array.shape)
         for row, array in zip(program.results, program.outputs, strict=True)
     ]
     return numbers, outputs
+
+
+def repeat(graph: Graph, program: Program, operation: Operation, args: list, branches: bool = True) -> Any:
+    """The number of an operation of a program for these operands; of a call the list of all entries of its outputs."""
+    op, kind, _ = operation
+    if op in ("call", "call_where"):  # operands: the number of the subprogram, then entries one after the other
+        which, *given = args
+        write = _call if op == "call" else _call_where
+        return [x for row in write(graph, program.subprograms[which], given, branches) for x in row.ravel().tolist()]
+    if op == "part":
+        call, entry = args
+        return call[entry]
+    return graph.apply(op, kind, args)
 
 
 def _call(graph: Graph, program: Program, given: list, branches: bool) -> list[np.ndarray]:
@@ -50,7 +54,7 @@ def _call_where(graph: Graph, program: Program, given: list, branches: bool) -> 
     flag, *entries = given
     arrays, count = _arrays((*program.inputs, *program.outputs), entries), len(program.inputs)
     inputs, otherwise = arrays[:count], arrays[count:]
-    if branches:
+    if branches or program.is_called:
         return graph.call_where(flag, program, inputs, otherwise)
     return [
         objects(
@@ -74,4 +78,6 @@ def inline(program: Program) -> Program:
     graph = Graph()
     with np.errstate(all="ignore"):  # known numbers may overflow, as they do in XLA
         _, outputs = replay(graph, program, [graph.inputs(i, array) for i, array in enumerate(program.inputs)], False)
-    return graph.finish(program.inputs, program.outputs, outputs, name=program.name)
+    written = graph.finish(program.inputs, program.outputs, outputs, name=program.name)
+    written.reports_validity = program.reports_validity
+    return written

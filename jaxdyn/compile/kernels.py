@@ -14,12 +14,11 @@ import numpy as np
 
 from jaxdyn.compile import jax_adapter, mode
 from jaxdyn.compile.derive import without_unread
-from jaxdyn.compile.flags import is_float, mark_invalid
+from jaxdyn.compile.flags import has_marks
 from jaxdyn.compile.known import is_known, partition, partition_tracers
 from jaxdyn.compile.messages import say_without_kernel
 from jaxdyn.compile.primitive import kernel_p, target
-from jaxdyn.compile.repair import compute_where, rank_safe, repair
-from jaxdyn.compile.trace import flat_function, inline_call, name_of, program_of, trace_program
+from jaxdyn.compile.trace import function_of_leaves, inline_call, name_of, program_of, trace_program
 
 
 def kernel(
@@ -39,15 +38,12 @@ def kernel(
     **Arguments:**
 
     - `fallback(*static, tree, *args)`: computes the same where there is no kernel, and those samples that the function marks
-      by `mark_invalid`. Default: the function itself, by operations of JAX. It depends on nothing traced but its arguments.
+      by `mark_invalid` (see `careful`). Default: the function itself. It depends on nothing traced but its arguments.
     - `derivative`: None for the derivative of the function's numbers; False for functions that are never differentiated, in
       which long functions under `jax.jit` are compiled once and called, and `lax.cond` is a branch; "program" for a function that
       stays a program of its own, with the derivative of its numbers, inside another kernel too; or a rule
       `derivative(*static, tree, *args, steps)` that returns the change of the results for the `steps` of the leaves of tree and
       args (None for a leaf that does not change), where that is cheaper.
-
-    The kernel takes one argument more, `where`: a bool () that says whether the sample's results are needed. A sample that is
-    not valid and not needed is not computed again.
 
     **Raises:** whatever the function raises while it is traced.
     """
@@ -56,68 +52,41 @@ def kernel(
     rule = derivative if callable(derivative) else None
 
     @functools.wraps(function)
-    def call(*args, where=None):
+    def call(*args):
         given = args[:static], args[static], args[static + 1 :]
-        if mode.is_expanding() and mode.is_careful() and fallback is not None:
-            # The program that is traced is the fallback of another one, so that it has no marks of its own.
+        if mode.is_careful_within() and fallback is not None and _has_marks(function, *given):
             return fallback(*args)
         # Code without JAX is one program: others are kept by keys that do not know what they may call.
         if derivative == "program" and not mode.is_standalone():
-            return _call_own_program(function, *given)
+            results = _by_kernel(function, *given, fallback)
+            return function(*args) if results is None else results
         if mode.is_expanding():
-            return inline_call(function, *given)
-        return _call(function, *given, fallback, rule, derivative is not False, where)
+            return inline_call(function, *given, fallback)
+        # Derivatives of a subprogram's call would be those of its numbers, written out: calls pay where nobody differentiates.
+        results = _by_kernel(function, *given, fallback, tangent=rule, calls=derivative is False)
+        return (function if fallback is None else fallback)(*args) if results is None else results
 
     return call
 
 
-def _call(function, static, tree, args, fallback, rule, is_differentiated: bool, where):
-    # Derivatives of a subprogram's call would be those of its numbers, written out: calls pay where nobody differentiates.
-    results = _by_kernel(function, static, tree, args, fallback, tangent=rule, calls=not is_differentiated)
-    again = function if fallback is None else fallback
-    if results is None:
-        return again(*static, tree, *args)
-    values, valid = results
-    if valid is True:
-        return values
+def _has_marks(function, static, tree, args) -> bool:
+    """Decide whether a function marks samples as not valid, inside of a kernel."""
     traced, known = partition_tracers(tree)
     leaves, structure = jax.tree.flatten(args)
-    given, careful = (*traced, *leaves), flat_function(again, static, known, len(traced), structure)
-    if not is_differentiated:
-        valid = valid if where is None else valid | ~where
-        return compute_where(jnp.logical_not(valid), careful, values, given)
-
-    def fast(*given):
-        args = jax.tree.unflatten(structure, given[len(traced) :])
-        results = _by_kernel(function, static, known(given[: len(traced)]), args, fallback, tangent=rule)
-        assert results is not None, "the function that was a kernel for the values is none for the derivative"
-        return _split_floats(results[0])[0]
-
-    # In reverse mode JAX stores the residuals of a branch whether it is taken or not. This one hardly ever is, so that its
-    # intermediates are computed again instead.
-    safe = jax.checkpoint(lambda *given: _split_floats(rank_safe(careful)(*given)), prevent_cse=False)
-    differentiable, rest = _split_floats(values)
-    floats, rest = repair(jnp.logical_not(valid), safe, fast, (differentiable, rest), given)
-    floats, rest = iter(floats), iter(rest)
-    results = [next(floats if is_float else rest) for is_float in map(is_float, jax.tree.leaves(values))]
-    return jax.tree.unflatten(jax.tree.structure(values), results)
+    with mode.careful(""), mode.expanding(mode.has_branches()):
+        flat = function_of_leaves(function, static, known, len(traced), structure)
+        return has_marks(jax.make_jaxpr(flat)(*traced, *leaves).jaxpr)
 
 
-def _split_floats(tree) -> tuple[list, list]:
-    """The leaves that are differentiated, and the others: tangents of integers do not pass through a branch of JAX."""
-    leaves = [jnp.asarray(x) for x in jax.tree.leaves(tree)]
-    return [x for x in leaves if is_float(x)], [x for x in leaves if not is_float(x)]
-
-
-def _by_kernel(function, static, tree, args, fallback: Callable | None, **how) -> tuple[Any, Any] | None:
-    """The function's results by its kernel, and whether they are valid; None where there is no kernel."""
+def _by_kernel(function, static, tree, args, fallback: Callable | None, **how) -> Any:
+    """The function's results by its kernel; None where there is no kernel."""
     if target is None:
         mode.say_once("llvmlite is not installed, so functions run on JAX's own operations (pip install llvmlite)")
         return None
     if mode.current() == "plain":
         return None
     try:
-        results = _bind(function, static, tree, args, **how)
+        results = _bind(function, static, tree, args, fallback, **how)
     except Exception as error:
         # On a version of JAX that the tests have seen, an error is the function's own or a fault of ours. On another one it
         # may be that JAX has changed. The function's own errors are raised once more, before anything is forgiven.
@@ -125,7 +94,7 @@ def _by_kernel(function, static, tree, args, fallback: Callable | None, **how) -
             raise
         values = (function if fallback is None else fallback)(*static, tree, *args)
         jax_adapter.forgive(error)
-        return values, True
+        return values
     if isinstance(results, str):
         if fallback is None:
             say_without_kernel(name_of(function), results)
@@ -133,33 +102,20 @@ def _by_kernel(function, static, tree, args, fallback: Callable | None, **how) -
     return results
 
 
-def _bind(function, static, tree, args, **how) -> tuple[Any, Any] | str | None:
-    """The results of the kernel and whether they are valid, or the reason why there is no kernel, or None."""
-    leaves, traced = program_of(function, static, tree, args, flags="report", **how)
+def _bind(function, static, tree, args, fallback, **how) -> Any:
+    """The results of the kernel, or the reason why there is no kernel, or None."""
+    leaves, traced = program_of(function, static, tree, args, flags="repair", fallback=fallback, **how)
     if isinstance(traced, str):
         return traced
     (program, places), out_structure = without_unread(traced[0]), traced[1]
     leaves = [leaves[i] for i in places]
-    if program.reports_validity and mode.rank_safe.value:
+    if program.careful is not None and mode.is_careful_within():
         # A part of another function's fallback: the fast path has failed for the sample, and may fail it here again.
         return None
     # A kernel takes flat arrays. Under a trace reshapes are free.
     changes_shapes = any(x.ndim != 1 for x in leaves) or any(len(x.shape) != 1 for x in program.outputs)
     results = (_call_under_jit if changes_shapes and is_known(leaves) else call_program)(program, leaves)
-    if not program.reports_validity:
-        return jax.tree.unflatten(out_structure, results), True
-    return jax.tree.unflatten(out_structure, results[:-1]), results[-1]
-
-
-def _call_own_program(function, static, tree, args):
-    """A program that is not merged into the one around it; samples that it cannot compute are marked there."""
-    results = _by_kernel(function, static, tree, args, None)
-    if results is None:
-        return function(*static, tree, *args)
-    values, valid = results
-    if valid is True:
-        return values
-    return jax.tree.map(lambda x: mark_invalid(jnp.logical_not(valid), x), values)
+    return jax.tree.unflatten(out_structure, results)
 
 
 def call_program(program, leaves) -> list:
@@ -195,16 +151,12 @@ def evaluate(function: Callable, tree, *args, static: tuple = (), is_input: bool
     if mode.current() != "plain" and target is not None:
         shapes = tuple((x.shape, x.dtype) for x in leaves)
         # With the arguments of `_bind`, so that both share one trace.
-        traced = trace_program(function, static, known, len(inputs), structure, shapes, flags="report")
+        traced = trace_program(function, static, known, len(inputs), structure, shapes, flags="repair")
         if not isinstance(traced, str):
             program, places = without_unread(traced[0])
             try:
                 # The native code is called without XLA, as a call through XLA would be staged into the trace around it.
-                results = target.call(program, [leaves[i] for i in places])
-                if not program.reports_validity:
-                    return jax.tree.unflatten(traced[1], results)
-                if results.pop():
-                    return jax.tree.unflatten(traced[1], results)
+                return jax.tree.unflatten(traced[1], target.call(program, [leaves[i] for i in places]))
             except Exception as error:
                 if not isinstance(error, target.Unsupported) and not jax_adapter.forgive(error):
                     raise

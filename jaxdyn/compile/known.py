@@ -1,5 +1,6 @@
 """Known and traced leaves of pytrees, and functions that keep known values known."""
 
+import hashlib
 from typing import Any, NamedTuple
 
 import jax
@@ -74,6 +75,12 @@ class Known(NamedTuple):
     structure: Any
     places: tuple[int, ...]
     leaves: _Leaves
+
+    @property
+    def digest(self) -> str:
+        """Hash of the values of the known leaves."""
+        parts = [b"" if leaf is None else np.asarray(leaf).tobytes() for leaf in self.leaves.leaves]
+        return hashlib.sha256(b" ".join(parts)).hexdigest()
 
     def __call__(self, traced):
         full = list(self.leaves.leaves)

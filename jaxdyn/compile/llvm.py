@@ -90,9 +90,8 @@ class Emitter:
         """An operation; `kind` is that of its result, `given` that of its last operand."""
         of = self.type(kind)
         if op in _FLOAT and kind in FLOATS:
-            # "contract" alone of LLVM's licences: products and sums become fused multiply-adds. "reassoc" and "nnan" would change
-            # results and drop checks of NaN.
-            return self.emit(f"{_FLOAT[op]} contract {of} {args[0]}, {args[1]}")
+            # Without LLVM's licences such as "contract" or "reassoc": results are those of the text at every level.
+            return self.emit(f"{_FLOAT[op]} {of} {args[0]}, {args[1]}")
         if op in _INTEGER:
             return self.emit(f"{_INTEGER[op]} {of} {args[0]}, {args[1]}")
         if op == "neg":
@@ -135,6 +134,20 @@ class Emitter:
             return self.call(_INTRINSICS[op], kind, *args)
         return self.library(_LIBRARY[op], kind, *args)
 
+    def multiply_add(self, kind: str, a: str, b: str, c: str) -> str:
+        """a b + c, rounded once where the processor can."""
+        # Which of the two is decided by the processor's features alone, not by LLVM's level.
+        return self.call("fmuladd", kind, a, b, c)
+
+    def fused(self, op: str, kind: str, factors: Sequence[str], other: str, is_first: bool) -> str:
+        """The sum or difference, by `op`, of a product and another number; `is_first` if the product is the first operand."""
+        a, b = factors
+        if op == "sub" and is_first:
+            other = self.operation("neg", kind, (other,), kind)
+        elif op == "sub":
+            a = self.operation("neg", kind, (a,), kind)
+        return self.multiply_add(kind, a, b, other)
+
     def convert(self, x: str, source: str, target: str) -> str:
         """A number as another kind."""
         if target == "b1":
@@ -172,8 +185,8 @@ class Emitter:
         def constant(value):
             return self.constant(value, kind)
 
-        def add(a, b):
-            return self.operation("add", kind, (a, b), kind)
+        def multiply_add(a, b, c):
+            return self.multiply_add(kind, a, b, c)
 
         def mul(a, b):
             return self.operation("mul", kind, (a, b), kind)
@@ -181,20 +194,22 @@ class Emitter:
         def polynomial(coefficients, z):
             value = constant(coefficients[-1])
             for coefficient in coefficients[-2::-1]:
-                value = add(mul(z, value), constant(coefficient))
+                value = multiply_add(z, value, constant(coefficient))
             return value
 
         # Sine and cosine share the reduction and both polynomials: joints need the pair, and a second function costs two selects.
         turns = self.call("roundeven", kind, mul(x, constant(2 / np.pi)))
         r = x
         for part in HALF_PI[kind]:
-            r = add(r, mul(turns, constant(-part)))
+            r = multiply_add(turns, constant(-part), r)
         z = mul(r, r)
-        sine = add(mul(mul(r, z), polynomial(SINE[kind], z)), r)
-        cosine = add(mul(mul(z, z), polynomial(COSINE[kind], z)), add(mul(z, constant(-0.5)), constant(1)))
+        sine = multiply_add(mul(r, z), polynomial(SINE[kind], z), r)
+        cosine = multiply_add(mul(z, z), polynomial(COSINE[kind], z), multiply_add(z, constant(-0.5), constant(1)))
         # The quadrant is turns modulo 4, as bits of an integer: turns + 1.5 2^52 has them at its end.
         whole, magic = ("i8", 1.5 * 2**52) if kind == "f8" else ("i4", 1.5 * 2**23)
-        bits = self.emit(f"bitcast {self.type(kind)} {add(turns, constant(magic))} to {self.type(whole)}")
+        bits = self.emit(
+            f"bitcast {self.type(kind)} {self.operation('add', kind, (turns, constant(magic)), kind)} to {self.type(whole)}"
+        )
         of, flag = self.type(kind), self.type("b1")
 
         def bit(value, mask):

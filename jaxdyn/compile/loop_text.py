@@ -2,7 +2,7 @@
 
 entry   pointers
 block   the next samples: constants and states are copied to local memory, rows and records to the results
-turn    the program of an iteration: new states where a sample takes part and is valid; its records
+turn    the program of an iteration: new states where a sample takes part; its records
 rows    while a sample has a row to write: the program of a row
 out     after the last sample of the block has ended: states are copied to the results
 """
@@ -154,7 +154,7 @@ class _LoopText:
         """Store new states and records; flags of the samples that continue."""
         e, turn = self.e, self.loop.turn_places
         flag = e.type("b1")
-        take = self._both(self._one(results, turn.active), results[-1])
+        take = self._one(results, turn.active)
         more = self._both(take, self._one(results, turn.more))
         after = []
         for place, out in enumerate(jax.tree.leaves(turn.state), self.first_state):

@@ -7,6 +7,7 @@ numbers, which a program cannot express. `loop_text` writes the code.
 
 import functools
 from collections.abc import Callable
+from functools import partial
 from typing import Any, NamedTuple
 
 import jax
@@ -16,7 +17,9 @@ from jax import lax
 from jaxtyping import Array as Numbers
 
 from jaxdyn.compile import mode
+from jaxdyn.compile.batch import any_sample, while_loop
 from jaxdyn.compile.jax_adapter import forgive, vary_alike
+from jaxdyn.compile.kernels import kernel
 from jaxdyn.compile.known import Known, partition_tracers
 from jaxdyn.compile.loop_text import loop_ir
 from jaxdyn.compile.primitive import kernel_p, over_batch, target
@@ -61,13 +64,11 @@ class Task(NamedTuple):
 
     - `turn(*static, tree, constants, state, read) -> Iteration`; `read`: rows of tables, at the places `state.places` (k,),
       int32.
-    - `otherwise(*static, tree, constants, given, carry) -> carry`: the same by JAX, for processors without native code.
     - `row(*of_row, None, time, *dense)`: the row (n,) of a time; None if there are none.
     - `strides`: for each record, the number of iterations from one row to the next.
     """
 
     turn: Callable
-    otherwise: Callable
     static: tuple
     row: Callable | None = None
     of_row: tuple = ()
@@ -84,51 +85,72 @@ class Given(NamedTuple):
     tables: tuple = ()
 
 
-def run_loop(task: Task, tree, constants, given: Given, carry: Carry) -> tuple[Carry, bool] | None:
-    """Iterate until the sample has ended, or an iteration is not valid (see `flags`).
+def run_loop(task: Task, tree, constants, given: Given, carry: Carry) -> Carry:
+    """Iterate until every sample has ended.
 
-    **Arguments:** `tree` as of `run`; `constants`, a pytree.
-
-    **Returns:** the carry, and whether every iteration is valid for certain; None where there is no native loop.
+    **Arguments:** `tree` as of `kernels.kernel`; `constants`, a pytree.
     """
+    given, carry = jax.tree.map(jnp.asarray, (given, carry))
     try:
-        return _run_loop(task, tree, constants, given, carry)
+        after = _run_natively(task, tree, constants, given, carry)
     except Exception as error:
         if not forgive(error):
             raise
-        return None
+        after = None
+    return _run_by_jax(task, tree, constants, given, carry) if after is None else after
 
 
-def run_to_end(
-    task: Task, tree, constants, given: Given, carry: Carry, once: Callable, by_fallback: Callable, is_running: Callable
-) -> Carry:
-    """Iterate until every sample has ended, by `run_loop` as far as it goes.
+def _run_by_jax(task: Task, tree, constants, given: Given, carry: Carry) -> Carry:
+    """The same by JAX, with one decision for a batch."""
+    turn: Any = kernel(task.turn, static=len(task.static), fallback=task.turn, derivative=False)
+    of_row: Any = None if task.row is None else kernel(task.row, static=len(task.of_row), fallback=task.row)
 
-    **Arguments:** as of `run_loop`; `once(carry)`, an iteration where there is no native loop; `by_fallback(carry)`, one that the
-    native loop has refused, after which it continues; `is_running(carry)`, one decision for a batch.
-    """
-    after = run_loop(task, tree, constants, given, carry)
-    if after is None:
-        return lax.while_loop(is_running, once, carry)
-    carry, always_ends = after
-    if always_ends:  # no code for the fallback is compiled
-        return carry
+    def iterate(running):
+        _, carry = running
+        read = tuple(table[carry.state.places[i]] for i, table in enumerate(given.tables))
+        after = turn(*task.static, tree, constants, carry.state, read)
+        state = jax.tree.map(lambda new, old: jnp.where(after.active, new, old), after.state, carry.state)
+        write = partial(_write_record, after.index, after.active)
+        records = tuple(map(write, carry.records, after.written, task.strides))
+        saved, rows = carry.saved, carry.rows
+        if of_row is not None:
+            saved, rows = _write_rows(partial(of_row, *task.of_row, None), after, given.times, saved, rows)
+        return after.active & after.more, Carry(state, saved, rows, records)
 
-    def resume(carry):
-        return run_loop(task, tree, constants, given, by_fallback(carry))[0]  # pyright: ignore[reportOptionalSubscript]
-
-    return lax.while_loop(is_running, resume, carry)
+    return lax.while_loop(lambda running: any_sample(running[0]), iterate, (jnp.asarray(True), carry))[1]
 
 
-def _run_loop(task: Task, tree, constants, given: Given, carry: Carry) -> tuple[Carry, bool] | None:
+def _write_record(index, active, record, row, stride: int):
+    """Write the row of an iteration, once in as many as the stride."""
+    # Rows that are not asked for are written beyond the end of the array, where XLA drops them.
+    asked = active & (index % stride == 0)
+    return record.at[jnp.where(asked, index // stride, record.shape[0])].set(row, mode="drop")
+
+
+def _write_rows(row: Callable, after: Iteration, times, saved, rows):
+    """Write the rows of times that have been passed."""
+    count, passed = times.shape[0] - 1, after.rows
+    assert passed is not None
+
+    def is_due(saved):
+        return after.active & passed.kept & (saved < count) & (times[jnp.minimum(saved + 1, count)] <= passed.until)
+
+    def body(carry):
+        saved, rows = carry
+        here, place = is_due(saved), jnp.minimum(saved, count - 1)
+        new = row(times[place + 1], *passed.dense)
+        return saved + here.astype(jnp.int32), rows.at[place].set(jnp.where(here, new, rows[place]))
+
+    return while_loop(lambda carry: is_due(carry[0]), body, (saved, rows))
+
+
+def _run_natively(task: Task, tree, constants, given: Given, carry: Carry) -> Carry | None:
     if mode.current() == "plain" or target is None or mode.is_expanding() or not target.is_available():
         return None
     # An iteration is traced with one row of each table; the loop itself reads rows at places that the state holds.
-    given, carry = jax.tree.map(jnp.asarray, (given, carry))
     read = tuple(jnp.zeros(x.shape[1:], x.dtype) for x in given.tables)
     turn_args = constants, carry.state, read
-    # Validity is reported always: the loop ends before an iteration that is not valid, and the caller takes it by JAX.
-    leaves, expanded = program_of(task.turn, task.static, tree, turn_args, calls=True, flags="report_always")
+    leaves, expanded = program_of(task.turn, task.static, tree, turn_args, calls=True, flags="repair")
     if isinstance(expanded, str):
         return None
     program, structure = expanded
@@ -149,7 +171,7 @@ def _run_loop(task: Task, tree, constants, given: Given, carry: Carry) -> tuple[
     flat = vary_alike([x.reshape(-1) for x in (*leaves, *jax.tree.leaves(given), *after)])
     # The loop takes the place of a program in the primitive, which so batches it. It has no derivative.
     results = kernel_p.bind(*flat, program=loop, rows=0)
-    return _Form.of(carry)(results), loop.always_ends
+    return _Form.of(carry)(results)
 
 
 class _Form(NamedTuple):
@@ -205,9 +227,9 @@ class Loop:
         self.digest = f"loop {turn.digest} {of_row} {sizes} {task.strides} {self.turn_places} {self.given}"
 
     @property
-    def always_ends(self) -> bool:
-        """True where no iteration can be invalid, so that the caller compiles no fallback."""
-        return self.turn.is_always_valid
+    def is_kept(self) -> bool:
+        """As of `Program`."""
+        return self.turn.is_kept and (self.row is None or self.row.is_kept)
 
     # The text of the kernel for a width (see `code.kernel_ir`).
     ir = loop_ir
@@ -222,7 +244,7 @@ class Loop:
         constants, state = flat[self.count : first], flat[first : self.end]
         given, after = flat[self.end : self.end + tables], flat[self.end + tables :]
         constants, given, carry = self.form([*constants, *given, *state, *after])
-        carry = self.task.otherwise(*self.task.static, self.known(traced), constants, given, carry)
+        carry = _run_by_jax(self.task, self.known(traced), constants, given, carry)
         return [x.reshape(-1) for x in jax.tree.leaves(carry)]
 
 

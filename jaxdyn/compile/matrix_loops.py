@@ -26,7 +26,7 @@ class MatrixProgram:
     derivative = fallback = None
     subprograms = ()
     turns = 1
-    is_called = True
+    is_called = is_kept = True
     name: str
     cost: int
 
@@ -35,6 +35,17 @@ class MatrixProgram:
         self.inputs, self.outputs = (Array((rows, columns), self.dtype),), (Array(result, self.dtype),)
         self.results = (tuple(range(self.outputs[0].size)),)
         self.derived: dict = {}
+
+    def __getstate__(self):
+        return vars(self) | {"derived": {}}
+
+    def describe(self) -> "MatrixProgram":
+        """Itself, as what is kept of it on disk (see `stored`)."""
+        return self
+
+    def restore(self, remake) -> "MatrixProgram":
+        """The program of what is kept."""
+        return self
 
     @property
     def title(self) -> str:
@@ -68,6 +79,11 @@ class MatrixProgram:
     def ir(self, width: int, uniform) -> str:
         """The text of the kernel (see `code.kernel_ir`)."""
         return f"; {self.title}\n{self._write_kernel().module}"
+
+    def subprogram_ir(self) -> str:
+        """The text of the function `called` (see `code.subprogram_ir`)."""
+        parts = self.definition("called")
+        return "\n".join(parts.values()).replace("define internal void @called(", "define void @called(")
 
     def definition(self, symbol: str) -> dict[str, str]:
         """`void symbol(ptr matrix, ptr result)` of one sample, and what it declares, by names in a module's text."""

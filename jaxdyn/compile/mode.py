@@ -7,9 +7,10 @@ under `jax.jit` is traced once in each of them: results do not depend on how the
 import contextlib
 import logging
 import os
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 
 import jax
+import numpy as np
 
 from jaxdyn.compile import jax_adapter
 
@@ -22,11 +23,11 @@ MAX_OPERATIONS = 60_000
 # None: the environment decides, which is read at each use, so that a test can set it.
 _mode = jax.make_user_context(None)
 _expanding = jax.make_user_context("")
-# Whether the traced function computes samples again for which a kernel was not valid.
-rank_safe = jax.make_user_context(False)
+# Whether the traced function computes the samples that a kernel has marked as not valid (see `careful`).
+_careful = jax.make_user_context("")
 # Whether an axis that `vmap` adds to a kernel is one of rows (see `batch.map_rows`).
 in_rows = jax.make_user_context(False)
-_standalone = jax.make_user_context("")
+_standalone = jax.make_user_context(False)
 _by_rules = jax.make_user_context(False)
 _said: set[str] = set()
 
@@ -89,14 +90,27 @@ def is_standalone() -> bool:
     return bool(_standalone.value)
 
 
-def is_careful() -> bool:
-    """Decide whether a function is traced for the samples that another program of the same code marks as not valid."""
-    return _standalone.value == "careful"
-
-
-def standalone(is_careful: bool = False):
+def standalone():
     """Context in which a function is traced for code that runs without JAX, where no fallback of JAX computes a sample."""
-    return _standalone("careful" if is_careful else "fast")
+    return _standalone(True)
+
+
+def is_careful() -> bool:
+    """Decide whether a function is traced for the samples that another program marks as not valid: it marks none itself."""
+    return bool(_careful.value)
+
+
+def is_careful_within() -> bool:
+    """Decide whether kernels within a careful function are their fallbacks: they have failed for the sample, or may fail."""
+    return _careful.value == "within"
+
+
+def careful(which: str = "within"):
+    """Context in which a function is traced for the samples that another program marks as not valid.
+
+    `which`: "within"; "own", where kernels within the function compute their own flagged samples; "" for none.
+    """
+    return _careful(which)
 
 
 def has_values_of_rules() -> bool:
@@ -111,7 +125,28 @@ def values_of_rules(is_wanted: bool = True):
 
 def state() -> tuple:
     """All modes that the trace of a function depends on."""
-    return current(), *(x.value for x in (_expanding, rank_safe, in_rows, _standalone, _by_rules))
+    return current(), *(x.value for x in (_expanding, _careful, in_rows, _standalone, _by_rules))
+
+
+def state_of_programs() -> tuple:
+    """The modes that the program of a function depends on, wherever the function is called."""
+    return tuple(x.value for x in (_careful, _standalone, _by_rules))
+
+
+def remember() -> Callable[[], contextlib.AbstractContextManager]:
+    """The modes in force, as a context in which another thread, or a later call, finds them again."""
+    has_x64 = jax.dtypes.canonicalize_dtype(np.float64) == np.float64
+    values = [(x, x.value) for x in (_mode, _expanding, _careful, in_rows, _standalone, _by_rules)]
+
+    @contextlib.contextmanager
+    def enter() -> Iterator[None]:
+        with contextlib.ExitStack() as stack:
+            stack.enter_context(jax.enable_x64(has_x64))
+            for context, value in values:
+                stack.enter_context(context(value))
+            yield
+
+    return enter
 
 
 def wants_usual_options() -> bool:

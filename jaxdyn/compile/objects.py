@@ -66,10 +66,11 @@ def _environment() -> str:
 
 
 class ObjectFile(NamedTuple):
-    """Machine code as bytes, and the symbols of the subprograms that it calls."""
+    """Machine code as bytes, the symbols of the subprograms that it calls, and the rows of careful programs, by their numbers."""
 
     binary: bytes
     calls: tuple[str, ...]
+    careful: tuple[tuple[int, tuple], ...]
 
 
 def find(identity: str) -> ObjectFile | None:
@@ -77,18 +78,30 @@ def find(identity: str) -> ObjectFile | None:
     contents = disk.read(name_of_file(identity))
     if contents is None:
         return None
-    calls, _, binary = contents.partition(b"\n")
-    return ObjectFile(binary, tuple(json.loads(calls)))
+    head, _, binary = contents.partition(b"\n")
+    calls, careful = json.loads(head)
+    return ObjectFile(binary, tuple(calls), tuple((number, tuple(row)) for number, row in careful))
 
 
-def make(identity: str, text: str, calls: Sequence[str], name: str = "") -> ObjectFile:
+def make(identity: str, text: str, calls: Sequence[str], careful: Sequence = (), name: str = "") -> ObjectFile:
     """Compile a text, and keep the code in the folder."""
     if (lines := text.count("\n")) > ANNOUNCED_LINES:
         message = "jaxdyn: compiling %s, %d lines; the next start of this script reads it from the cache"
         logger.warning(message, name or "a function", lines)
     binary = compile_text(text)
-    disk.write(name_of_file(identity), json.dumps(list(calls)).encode() + b"\n" + binary)
-    return ObjectFile(binary, tuple(calls))
+    disk.write(name_of_file(identity), json.dumps([list(calls), list(careful)]).encode() + b"\n" + binary)
+    return ObjectFile(binary, tuple(calls), tuple(careful))
+
+
+def find_careful(digest: str) -> str | None:
+    """Identity of the code of the careful program with this digest, or None."""
+    contents = disk.read(name_of_file(f"careful {digest}"))
+    return None if contents is None else contents.decode()
+
+
+def keep_careful(digest: str, identity: str) -> None:
+    """Keep the identity of the code of a careful program."""
+    disk.write(name_of_file(f"careful {digest}"), identity.encode())
 
 
 def code_of(text: str) -> "Code":

@@ -17,6 +17,9 @@ import jax.numpy as jnp
 from jax import lax
 
 from jaxdyn.compile import ahead, derive, jax_adapter, mode
+from jaxdyn.compile.batch import cond
+from jaxdyn.compile.careful import Careful, guard
+from jaxdyn.compile.flags import mark_invalid
 from jaxdyn.compile.inlining import inline
 from jaxdyn.compile.jax_adapter import ShapedArray, define_primitive, is_linear, is_zero, lowering_of, zero_tangent
 from jaxdyn.compile.messages import say_without_kernel
@@ -111,6 +114,10 @@ def as_operations(*args, program: Program, rows: int = 0):
         if op == "input":
             place, entry = operands
             values.append(columns[place][..., entry])
+        elif op == "call_where":
+            values.append(_call_careful(program, operands, values, lead))
+        elif op == "part":
+            values.append(values[operands[0]][operands[1].value])
         elif op == "convert":
             values.append(lax.convert_element_type(values[operands[0]], dtype_of(kind)))
         else:
@@ -127,6 +134,32 @@ def as_operations(*args, program: Program, rows: int = 0):
         entries = lax.optimization_barrier(entries) if entries else entries
         results.append(jnp.stack(entries, -1) if entries else jnp.zeros((*lead, 0), array.dtype))
     return results
+
+
+def _call_careful(program: Program, operands, values: list, lead: tuple) -> list:
+    """Entries of the results of a pair: those of the fast program, or where its flag is set those of the careful one.
+
+    If the flag is set in no sample of the batch the careful program does not run.
+    """
+    careful, flag = program.subprograms[operands[0].value], operands[1]
+    assert isinstance(careful, Careful)
+    entries, arrays = iter(operands[2:]), []
+    for array in (*careful.inputs, *careful.outputs):
+        columns = (next(entries) for _ in range(array.size))
+        columns = [jnp.full(lead, x.value, array.dtype) if type(x) is Constant else values[x] for x in columns]
+        arrays.append(jnp.stack(columns, -1) if columns else jnp.zeros((*lead, 0), array.dtype))
+    count = len(careful.inputs)
+    flag = jnp.full(lead, flag.value) if type(flag) is Constant else values[flag]
+
+    def one(flag, otherwise, given):
+        def again():
+            return [jnp.where(flag, x, y) for x, y in zip(careful.by_jax(*given), otherwise, strict=True)]
+
+        return cond(flag, again, lambda: list(otherwise))
+
+    for _ in lead:
+        one = jax.vmap(one)
+    return [x for array in one(flag, arrays[count:], arrays[:count]) for x in jnp.moveaxis(array, -1, 0)]
 
 
 def by_jax(*args, program, rows: int = 0):
@@ -191,6 +224,12 @@ def _jvp_by_jax(program, moving, primals, steps) -> list:
 
 def _transpose_program(program: Program, linear: tuple[bool, ...], given: tuple[bool, ...]) -> Program:
     """The transpose of a program (see `derive`), which honours the rules of the program when it is differentiated."""
+    if program.fast is not None:
+        key = ("transposed", linear, given)
+        if key not in program.derived:
+            fast, careful = _transpose_program(program.fast, linear, (*given, False)), program.careful
+            program.derived[key] = guard(fast, lambda: careful.transpose(linear, given, _transpose_program))
+        return program.derived[key]
     backwards = derive.transpose(program, linear, given)
     # Differentiating the numbers of the transpose would ignore a rule inside the program: the second derivative of a root
     # by bisection was zero.
@@ -218,20 +257,28 @@ def _tangent_of_transpose(program, linear, given, backwards, avals, moving) -> P
             first = derive.tangent(program, [False if is_linear else next(each) for is_linear in linear])
             floats = [x.dtype.kind == "f" for x in program.outputs]
             given_floats = [is_given for is_given, is_float in zip(given, floats, strict=True) if is_float]
+            given_floats += [False] * first.reports_validity
             linear_in_first = [*linear, *[False] * sum(moving[:count])]
             by_fixed = _transpose_program(first, tuple(linear_in_first), tuple(given_floats))
-            total = kernel_p.bind(
-                *fixed, *(x for x in steps[:count] if x is not None), *cotangents, program=by_fixed, rows=0
-            )
+            total = _bind_marked(by_fixed, *fixed, *(x for x in steps[:count] if x is not None), *cotangents)
         if any(moving[count:]):
             cotangent_steps = [
                 jnp.zeros_like(c) if d is None else d for c, d in zip(cotangents, steps[count:], strict=True)
             ]
-            by_cotangents = kernel_p.bind(*fixed, *cotangent_steps, program=backwards, rows=0)
+            by_cotangents = _bind_marked(backwards, *fixed, *cotangent_steps)
             total = by_cotangents if total is None else [a + b for a, b in zip(total, by_cotangents, strict=True)]
         return total
 
-    return tangent_program(change, avals, moving, flags="refuse")
+    return tangent_program(change, avals, moving, flags="report" if program.reports_validity else "refuse")
+
+
+def _bind_marked(program: Program, *args) -> list:
+    """The results of a program within another one, marked where it reports them as not valid."""
+    results = kernel_p.bind(*args, program=program, rows=0)
+    if not program.reports_validity:
+        return results
+    *results, valid = results
+    return [mark_invalid(jnp.logical_not(valid), x) for x in results]
 
 
 def _transpose(cotangents, *operands, program, rows):

@@ -62,6 +62,8 @@ class Program:
       changes of those that move.
     - `fallback`: None, or the function that was traced, from flat arrays of one sample to flat arrays.
     - `reports_validity`: whether the last output says if the sample is valid (see `flags`).
+    - `flags`: whether the last output says if the sample is not valid, in a subprogram.
+    - `fast`, `careful`: None, or the two programs of a pair (see `careful`); `operations` are those of both.
     """
 
     # Repetitions of the operations in one call, by which the cost of a `loops.Loop` is estimated.
@@ -84,6 +86,9 @@ class Program:
         self.name = name
         self.fallback: Callable | None = None
         self.reports_validity = False
+        self.flags = False
+        self.fast: Program | None = None
+        self.careful: Any = None
         self.key: str | None = None  # under which it is kept on disk (see `stored`)
         # Derivatives, transposes and kernels of this program, which live as long as it does.
         self.derived: dict = {}
@@ -104,11 +109,10 @@ class Program:
         read = {x.args[0] for x in self.operations if x.op == "input"}
         return tuple(sorted(read)) or tuple(range(len(self.inputs)))
 
-    @functools.cached_property
-    def is_always_valid(self) -> bool:
-        """True where the last result, which says whether a sample is valid, is known to be true."""
-        valid = self.results[-1][0] if self.results and self.results[-1] else None
-        return type(valid) is Constant and valid.value is True
+    @property
+    def is_kept(self) -> bool:
+        """Decide whether another process may find what calls this program: its digest is by its contents alone."""
+        return all(x.is_kept for x in self.subprograms)
 
     @functools.cached_property
     def digest(self) -> str:

@@ -18,7 +18,7 @@ from jaxdyn.compile.graph import Graph
 from jaxdyn.compile.inlining import inline, replay
 from jaxdyn.compile.llvm import Emitter
 from jaxdyn.compile.messages import remedy_of
-from jaxdyn.compile.mode import standalone
+from jaxdyn.compile.mode import careful, standalone
 from jaxdyn.compile.program import FLOATS, Array, Constant, Program, kind_of, objects
 from jaxdyn.compile.trace import program_of
 
@@ -70,11 +70,11 @@ def make_routine(function: Callable, examples: Sequence[Any], symbol: str) -> tu
     if type(program.results[-1][0]) is Constant:
         return Routine(symbol, program, None), structure
     try:
-        with standalone(is_careful=True):
-            careful = _scalar_program(function, examples, symbol)[0]
+        with standalone(), careful():
+            again = _scalar_program(function, examples, symbol)[0]
     except ValueError:  # such as a new choice of rows: the status tells of these samples
-        careful = None
-    return Routine(symbol, program, careful), structure
+        again = None
+    return Routine(symbol, program, again), structure
 
 
 def _scalar_program(function: Callable, examples: Sequence[Any], name: str) -> tuple[Program, Any]:
@@ -92,8 +92,10 @@ def _scalar_program(function: Callable, examples: Sequence[Any], name: str) -> t
             f"function cannot be exported: it has {made}; {remedy_of(made)}. Only functions without callbacks and "
             "data-dependent loops can be exported"
         )
-    program, structure = made
-    return inline(program), structure
+    program, structure = inline(made[0]), made[1]
+    # Here the flag is a result like others, which derivatives do not repeat.
+    program.reports_validity = False
+    return program, structure
 
 
 def jacobian_routine(routine: Routine, symbol: str) -> Routine:
@@ -102,7 +104,7 @@ def jacobian_routine(routine: Routine, symbol: str) -> Routine:
         program = jacobian_program(routine.program, symbol)
     if routine.careful is None:
         return Routine(symbol, program, None)
-    with standalone(is_careful=True):
+    with standalone(), careful():
         return Routine(symbol, program, jacobian_program(routine.careful, symbol))
 
 

@@ -55,14 +55,19 @@ class Description(NamedTuple):
     name: str
     reports_validity: bool
     known: dict[str, Any]
-    subprograms: tuple["Description", ...]
+    subprograms: tuple[Any, ...]
 
     @classmethod
     def of(cls, program: Program) -> "Description":
         """The description of a program."""
-        known = {name: getattr(program, name) for name in ("digest", "cost", "is_always_valid", "read_places")}
-        inner = tuple(map(cls.of, program.subprograms))
+        known = {name: getattr(program, name) for name in ("digest", "cost", "read_places")}
+        # Careful programs and those of matrices describe themselves.
+        inner = tuple(cls.of(x) if isinstance(x, Program) else x.describe() for x in program.subprograms)
         return cls(program.inputs, program.outputs, program.name, program.reports_validity, known, inner)
+
+    def restore(self, remake: Callable[[], Program]) -> "StoredProgram":
+        """The program."""
+        return StoredProgram(self, remake)
 
 
 class StoredProgram(Program):
@@ -72,10 +77,7 @@ class StoredProgram(Program):
     """
 
     def __init__(self, description: Description, remake: Callable[[], Program]):
-        inner = [
-            StoredProgram(x, functools.partial(_subprogram_of, remake, i))
-            for i, x in enumerate(description.subprograms)
-        ]
+        inner = [x.restore(functools.partial(_subprogram_of, self, i)) for i, x in enumerate(description.subprograms)]
         self._remake = remake
         self.start(description.inputs, description.outputs, inner, description.name)
         self.reports_validity = description.reports_validity
@@ -97,13 +99,18 @@ class StoredProgram(Program):
         found = _load(f"{self.digest}.operations")
         if found is not None:
             return [Operation(*x) for x in found[0]], found[1]
+        return self.remade.operations, self.remade.results
+
+    @functools.cached_property
+    def remade(self) -> Program:
+        """The program made again."""
         made = self._remake()
         assert made.digest == self.digest, f"{self.name} has another program when it is traced again"
-        return made.operations, made.results
+        return made
 
 
-def _subprogram_of(remake: Callable[[], Program], i: int) -> Program:
-    return remake().subprograms[i]
+def _subprogram_of(program: StoredProgram, i: int) -> Any:
+    return program.remade.subprograms[i]
 
 
 def load_or_make(key: str | None, make: Callable[[], tuple[Sequence[Program], Any]]) -> tuple[Sequence[Program], Any]:
@@ -115,17 +122,26 @@ def load_or_make(key: str | None, make: Callable[[], tuple[Sequence[Program], An
         return make()
     found = _load(f"{key}.program")
     if found is not None:
-        programs = [StoredProgram(x, functools.partial(_program_of, make, i)) for i, x in enumerate(found[0])]
+        again = functools.partial(_in_modes, mode.remember(), make)
+        programs = [x.restore(functools.partial(_program_of, again, i)) for i, x in enumerate(found[0])]
         data = found[1]
     else:
         programs, data = make()
+        if not all(x.is_kept for x in programs):
+            return programs, data
         for one in programs:
             for written in (one, *one.subprograms):
-                _save(f"{written.digest}.operations", ([tuple(x) for x in written.operations], written.results))
+                if isinstance(written, Program):
+                    _save(f"{written.digest}.operations", ([tuple(x) for x in written.operations], written.results))
         _save(f"{key}.program", ([*map(Description.of, programs)], data))
     for i, one in enumerate(programs):
         one.key = f"{key}-{i}"
     return programs, data
+
+
+def _in_modes(enter: Callable, make: Callable) -> Any:
+    with enter():
+        return make()
 
 
 def _program_of(make: Callable, i: int) -> Program:

@@ -2,7 +2,6 @@
 
 import ctypes
 import functools
-import hashlib
 import logging
 import threading
 from collections.abc import Callable, Sequence
@@ -12,6 +11,8 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from jaxdyn.compile import ahead, objects
+from jaxdyn.compile.careful import Careful, run_apart
+from jaxdyn.compile.careful_text import CAREFUL, identity_of, number_of
 from jaxdyn.compile.code import calls_itself, kernel_ir, subprogram_ir, symbol_of, varying_first
 from jaxdyn.compile.jax_adapter import Unsupported as Unsupported
 from jaxdyn.compile.jax_adapter import ffi_version, register_handler
@@ -47,10 +48,11 @@ class _Entry(ctypes.Structure):
 # The handler finds a kernel by open addressing in this table, without a lock: an entry's hash is written last.
 _table = (_Entry * SLOTS)()
 _threads = ctypes.c_int64(1 << 30)
+_failures = ctypes.c_int64(0)  # kernels that could not be compiled when they were called
 _lock = threading.RLock()
 # LLVM takes one program at a time, and two threads may call the same new kernel.
-_making = threading.Lock()
-_called: dict[str, Code] = {}  # subprograms, which other kernels call too
+_making = threading.RLock()  # as a program whose file is missing is traced again, which compiles others
+_called: dict[str, "_Called"] = {}  # subprograms, which other kernels call too
 _kernels: dict[int, "_Kernel"] = {}  # by number, for as long as the process may call them
 _handler: list[Code] = []
 
@@ -60,9 +62,14 @@ def set_threads(count: int | None) -> None:
     _threads.value = 1 << 30 if count is None else count
 
 
-@functools.cache
 def register() -> None:
     """Compile the handler and tell XLA of it, once in a process. **Raises:** `Unsupported`."""
+    with _lock:
+        _register()
+
+
+@functools.cache  # which does not keep two threads from a first call at once
+def _register() -> None:
     version = ffi_version()
     architecture = _architecture()
     if architecture not in _RELAX:
@@ -71,7 +78,8 @@ def register() -> None:
     messages = {"MISSING": _MISSING, "FAILED": _FAILED, "MISFIT": _MISFIT}
     fields = {
         "TABLE": ctypes.addressof(_table), "SLOT_MASK": SLOTS - 1, "LIMIT": ctypes.addressof(_threads),
-        "PREPARE": ctypes.cast(_PREPARE, ctypes.c_void_p).value, "MAJOR": version[0], "MINOR": version[1],
+        "FAILURES": ctypes.addressof(_failures), "PREPARE": ctypes.cast(_PREPARE, ctypes.c_void_p).value,
+        "MAJOR": version[0], "MINOR": version[1],
         "RELAX": _RELAX[architecture], "RELAX_TYPE": _RELAX[architecture].replace("i32 1", "i32"),
         **messages, **{f"{name}_BYTES": len(message) + 1 for name, message in messages.items()},
     }  # fmt: skip
@@ -80,6 +88,7 @@ def register() -> None:
     # Its addresses are those of this process: it is not kept on disk.
     code = Code(compile_text(text))
     register_handler(TARGET, code.address("handler"))
+    code.publish("careful", CAREFUL)
     _handler.append(code)
 
 
@@ -124,22 +133,31 @@ def kernel(program, width: int, uniform: Sequence[bool]) -> int:
     with _lock:
         register()
         if key not in program.derived:
-            identity = f"{program.digest} {width} {uniform}"
-            # A hash, not a counter: a program in XLA's persistent cache finds its kernel in another process. 63 bits, as the
-            # attribute is signed; odd, as zero marks an empty slot.
-            number = int.from_bytes(hashlib.sha256(identity.encode()).digest()[:8], "little") >> 1 | 1
+            number = number_of(program, width, uniform)
             if number not in _kernels:
-                _kernels[number] = _Kernel(number, Row.of(program, identity, width, uniform))
+                _kernels[number] = _Kernel(number, Row.of(program, width, uniform))
             _kernels[number].attach(program, uniform)
+            _enter_careful(program)
             program.derived[key] = number
         return program.derived[key]
+
+
+def _enter_careful(program) -> None:
+    """Enter the careful programs that native code of a program calls, by their numbers."""
+    for called in program.subprograms:
+        if isinstance(called, Careful):
+            kernel(called, 1, [False] * len(called.inputs))
+        else:
+            _enter_careful(called)
 
 
 class Row(NamedTuple):
     """Entry of the table beside the code of a kernel; plain data, which can be kept on disk.
 
-    - `identity`: of the code. `width`: samples in a vector. `chunk`: samples that a thread takes at a time.
+    - `identity`: of the code; of the kernel of a careful program that is not known before the program is.
+    - `width`: samples in a vector. `chunk`: samples that a thread takes at a time.
     - `sizes`: entries of the buffers, against which the handler checks them; a negative one is one row for all samples.
+    - `careful`: None, or the digest of a careful program. `is_kept`: as of `Program`.
     """
 
     identity: str
@@ -147,15 +165,27 @@ class Row(NamedTuple):
     chunk: int
     sizes: tuple[int, ...]
     name: str
+    careful: str | None
+    is_kept: bool
 
     @classmethod
-    def of(cls, program, identity: str, width: int, uniform: tuple[bool, ...]) -> "Row":
+    def of(cls, program, width: int, uniform: tuple[bool, ...]) -> "Row":
         """The row of a program."""
         order = varying_first(uniform)
         sizes = [-1 - program.inputs[i].size if uniform[i] else program.inputs[i].size for i in order]
         sizes += [array.size for array in program.outputs]
         chunk = width * max(1, round(OPERATIONS_PER_CHUNK / max(1, program.turns * program.cost)))
-        return cls(identity, width, chunk, tuple(sizes), program.name)
+        careful = program.digest if isinstance(program, Careful) else None
+        identity = "" if careful else identity_of(program, width, uniform)
+        return cls(identity, width, chunk, tuple(sizes), program.name, careful, program.is_kept)
+
+
+class _Called(NamedTuple):
+    """The code of a subprogram, and what it calls (see `objects.ObjectFile`)."""
+
+    code: Code
+    calls: tuple[str, ...]
+    careful: tuple
 
 
 class _Kernel:
@@ -168,6 +198,7 @@ class _Kernel:
         self.row = row
         self.program: Any = None
         self.uniform: tuple[bool, ...] = ()
+        self.careful: Careful | None = None
         self.recover: Callable | None = None  # makes the program again, of a kernel that was read from disk
         self.code: Code | None = None
         self.is_awaited = False  # whether a worker is to compile it (see `ahead`)
@@ -182,60 +213,118 @@ class _Kernel:
 
     def attach(self, program, uniform: tuple[bool, ...]) -> None:
         """Take the program of which the code can be made."""
-        if self.code is None and self.program is None:
+        if isinstance(program, Careful):
+            self.careful = program
+        elif self.code is None and self.program is None:
             self.program, self.uniform = program, uniform
 
     def address(self) -> int:
         """Address of the code, which is compiled where there is none."""
-        if self.code is None:
-            with _making:
-                made = self.code is not None or self._make()
-            if not made:
-                # Not under the lock: tracing compiles kernels too.
-                assert self.recover is not None, "a kernel has neither code nor a program"
-                self.recover()
-                with _making:
-                    made = self.code is not None or self._make()
-                assert made, "a program that was traced again has other kernels than before"
+        if self.code is None and not self.make():
+            assert self.recover is not None, "a kernel has neither code nor a program"
+            run_apart(self.recover)
+            made = self.make()
+            assert made, "a program that was traced again has other kernels than before"
         return self.entry.kernel
 
-    def _make(self) -> bool:
+    def make(self) -> bool:
         """Compile the code, or find it on disk; False where that takes a program that is not here."""
-        program, width = self.program, self.row.width
-        found = objects.find(self.row.identity)
-        programs = {} if program is None else {symbol_of(x, width): x for x in self._calls(program)}
+        row = self.row
+        if row.careful is None:
+            return self._make_of(self.program, row.identity)
+        # A careful program is traced only where its code is not on disk.
+        identity = objects.find_careful(row.careful) if row.is_kept else None
+        if identity is not None and self._make_of(None, identity):
+            return True
+        if self.careful is None:
+            return False
+        program = self.careful.program()
+        identity = identity_of(program, row.width, [False] * len(program.inputs))
+        if row.is_kept and program.is_kept:
+            objects.keep_careful(row.careful, identity)
+        _enter_careful(program)
+        return self._make_of(program, identity)
+
+    def _make_of(self, program, identity: str) -> bool:
+        # Before the lock is taken: programs that are traced again compile kernels too.
+        if program is not None and objects.find(identity) is None:
+            _read_operations(program)
+        with _making:
+            return self.code is not None or self._make(program, identity)
+
+    def _make(self, program, identity: str) -> bool:
+        width, found = self.row.width, objects.find(identity)
         if found is None and program is None:
             return False
-        if not all(_publish(symbol, width, programs) for symbol in (programs if found is None else found.calls)):
-            return False
+        calls, careful = _calls(_called_by_kernel(program, width), width)
+        _restore_careful(() if found is None else found.careful, self._recover_careful)
+        for symbol in calls if found is None else found.calls:
+            if not _publish(symbol, width, calls, self._recover_careful):
+                return False
         if found is None:
-            assert program is not None
-            is_program = isinstance(program, Program)
-            text = kernel_ir(program, width, self.uniform) if is_program else program.ir(width, self.uniform)
-            found = objects.make(self.row.identity, text, tuple(programs), program.name)
+            is_program, uniform = isinstance(program, Program), self.uniform or [False] * len(program.inputs)
+            text = kernel_ir(program, width, uniform) if is_program else program.ir(width, uniform)
+            found = objects.make(identity, text, tuple(calls), careful, program.name)
         code = Code(found.binary)
         self.entry.kernel = code.address("kernel")
-        self.code, self.program, self.recover = code, None, None  # a program of a large robot takes megabytes
+        self.code, self.program = code, None  # a program of a large robot takes megabytes
         return True
 
-    def _calls(self, program) -> Sequence[Program]:
-        itself = isinstance(program, Program) and calls_itself(program, self.row.width)
-        return (program,) if itself else program.subprograms
+    def _recover_careful(self) -> None:
+        """Make the careful programs that this kernel's code calls."""
+        if self.recover is not None and self.careful is None:
+            self.recover()
+        if self.careful is not None:
+            _enter_careful(self.careful.program())
+
+
+def _called_by_kernel(program, width: int) -> Sequence:
+    if program is None:
+        return ()
+    if isinstance(program, Program) and calls_itself(program, width):
+        return (program.fast or program, *program.subprograms)
+    return program.subprograms
+
+
+def _calls(called: Sequence, width: int) -> tuple[dict[str, Any], list[tuple[int, Row]]]:
+    """Subprograms by their symbols, and numbers and rows of the careful programs among them."""
+    rows = []
+    for x in called:
+        if isinstance(x, Careful) and x.is_kept:
+            uniform = (False,) * len(x.inputs)
+            rows.append((number_of(x, 1, uniform), Row.of(x, 1, uniform)))
+    return {symbol_of(x, width): x for x in called if not isinstance(x, Careful)}, rows
+
+
+def _read_operations(program) -> None:
+    """Read the operations of a program from disk, or make them again."""
+    if isinstance(program, Program):
+        _ = (program.fast or program).operations
+    else:
+        _ = [getattr(x, "operations", None) for x in (getattr(program, "turn", None), getattr(program, "row", None))]
+    for called in program.subprograms:
+        if not isinstance(called, Careful):
+            _read_operations(called)
 
 
 def restore(number: int, row: Row, recover: Callable) -> None:
     """Put a kernel into the table whose code is on disk; `recover()` traces its program again, should the code be missing."""
+    restored = _restore(number, row, recover)
+    if restored.code is None:
+        # Now, not in the handler: a process that ends while a thread of XLA waits for Python would wait for ever.
+        with _making:
+            if restored.code is None:
+                restored._make(None, row.identity)
+
+
+def _restore(number: int, row: Row, recover: Callable) -> _Kernel:
     with _lock:
         register()
         if number not in _kernels:
             _kernels[number] = _Kernel(number, row)
         restored = _kernels[number]
-        restored.recover = recover
-    if restored.code is None:
-        # Now, not in the handler: a process that ends while a thread of XLA waits for Python would wait for ever.
-        with _making:
-            if restored.code is None:
-                restored._make()
+        restored.recover = restored.recover or recover
+    return restored
 
 
 def row_of(number: int) -> Row:
@@ -258,30 +347,45 @@ def publish_ahead(program, width: int) -> None:
         program.derived[key] = True
 
         def make() -> None:
-            programs = {symbol_of(x, width): x for x in program.subprograms}
-            for symbol in programs:
+            calls, _ = _calls(program.subprograms, width)
+            for symbol in calls:
                 with _making:
-                    _publish(symbol, width, programs)
+                    _publish(symbol, width, calls)
 
         ahead.make_later(make)
 
 
-def _publish(symbol: str, width: int, programs: dict[str, Program]) -> bool:
-    """Compile a subprogram, or find it on disk; False where it is in neither place."""
-    if symbol in _called:
-        return True
-    called, found = programs.get(symbol), objects.find(symbol)
+def _publish(symbol: str, width: int, programs: dict[str, Any], recover: Callable | None = None) -> bool:
+    """Compile a subprogram, or find it on disk; False where it is in neither place.
+
+    `recover()`: makes careful programs that it calls, should it be found and they be needed.
+    """
+    called, known = programs.get(symbol), _called.get(symbol)
+    found = objects.find(symbol) if known is None else known
     if called is None and found is None:
         return False
-    inner = {} if called is None else {symbol_of(x, width): x for x in called.subprograms}
-    if not all(_publish(x, width, inner) for x in (inner if found is None else found.calls)):
-        return False
-    if found is None:
+    calls, careful = _calls(() if called is None else called.subprograms, width)
+    _restore_careful(() if found is None else found.careful, recover)
+    for inner in calls if found is None else found.calls:
+        if not _publish(inner, width, calls, recover):
+            return False
+    if known is not None:
+        return True
+    if not isinstance(found, objects.ObjectFile):
         assert called is not None
-        found = objects.make(symbol, subprogram_ir(called, width), tuple(inner), called.name)
-    _called[symbol] = Code(found.binary)
-    _called[symbol].publish("called", symbol)
+        text = subprogram_ir(called, width) if isinstance(called, Program) else called.subprogram_ir()
+        found = objects.make(symbol, text, tuple(calls), careful, called.name)
+    code = Code(found.binary)
+    code.publish("called", symbol)
+    _called[symbol] = _Called(code, found.calls, found.careful)
     return True
+
+
+def _restore_careful(rows: Sequence, recover: Callable | None) -> None:
+    """Enter careful programs that code from disk calls; `recover()` makes them, unless their kernels are live ones."""
+    if recover is not None:
+        for number, row in rows:
+            _restore(number, Row(*row), recover)
 
 
 def _prepare(number: int) -> int:
@@ -290,6 +394,8 @@ def _prepare(number: int) -> int:
         return _kernels[number].address()
     except BaseException:  # an interruption too: no Python is above this call, to which it could be raised
         logger.exception("jaxdyn: a kernel could not be compiled")
+        with _lock:
+            _failures.value += 1
         return 0
 
 
@@ -303,8 +409,10 @@ def call(program, arrays: Sequence[np.ndarray]) -> list[np.ndarray]:
     given = [np.ascontiguousarray(x, array.dtype) for x, array in zip(arrays, program.inputs, strict=True)]
     results = [np.empty(array.shape, array.dtype) for array in program.outputs]
     data = (ctypes.c_void_p * (len(given) + len(results)))(*(x.ctypes.data for x in (*given, *results)))
-    address = _kernels[number].address()
+    address, failures = _kernels[number].address(), _failures.value
     _KERNEL(address)(data, 1, 0, 1)
+    if _failures.value != failures:
+        raise RuntimeError(_FAILED)
     return results
 
 

@@ -6,14 +6,18 @@ Its derivatives are traced when they are asked for.
 
 import functools
 from collections.abc import Callable
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 
 from jaxdyn.compile import jax_adapter, mode, stored
+from jaxdyn.compile.careful import Careful, digest_of, guard
 from jaxdyn.compile.expansion import expand
+from jaxdyn.compile.flags import guarded_p, has_marks
 from jaxdyn.compile.known import Known, partition_tracers
-from jaxdyn.compile.program import NotNumbers, Program, TooLong
+from jaxdyn.compile.program import Array, NotNumbers, Program, TooLong
 
 
 def program_of(
@@ -26,6 +30,7 @@ def program_of(
     most: int = mode.MAX_OPERATIONS,
     calls: bool = False,
     flags: str = "refuse",
+    fallback: Callable | None = None,
 ):
     """Flat operands of a function's kernel, and (its program, the structure of its results) or the reason why there is none.
 
@@ -35,27 +40,32 @@ def program_of(
     - `tree`: pytree whose known leaves are compiled in; its traced leaves, and all of `args`, are operands.
     - `tangent(*static, tree, *args, steps)`: the function's derivative along `steps`, as of `kernel`.
     - `most`: operations beyond which there is no program. `calls`: whether long functions under `jax.jit` become subprograms.
-    - `flags`: as of `expand`.
+    - `flags`: as of `expand`; with "repair" samples that are flagged are computed by the program of `fallback`, or of the
+      function itself, which is traced when the first of them appears (see `careful`).
     """
     traced, known = partition_tracers(tree)
     leaves, structure = jax.tree.flatten(args)
     # Within `shard_map` operands of a primitive vary along the same axes of a mesh, or JAX refuses them.
     leaves = jax_adapter.vary_alike([*map(jnp.asarray, (*traced, *leaves))])
     shapes = tuple((x.shape, x.dtype) for x in leaves)
-    return leaves, trace_program(function, static, known, len(traced), structure, shapes, tangent, most, calls, flags)
+    how = tangent, most, calls, flags, fallback
+    return leaves, trace_program(function, static, known, len(traced), structure, shapes, *how)
 
 
 def trace_program(function, static, known: Known, count, structure, shapes, tangent=None, most=mode.MAX_OPERATIONS,
-                  calls=False, flags="refuse"):  # fmt: skip
+                  calls=False, flags="refuse", fallback=None):  # fmt: skip
     """The program and the structure of its results, or the reason why there is none; `count`: traced leaves of the tree."""
-    # A trace depends on this setting too, which so is a part of the key under which the program is kept.
-    has_x64 = jax.config.read("jax_enable_x64")
-    return _trace_program(function, static, known, count, structure, shapes, tangent, most, calls, flags, has_x64)
+    # A trace depends on these settings too, which so are a part of the key under which the program is kept.
+    context = jax.config.read("jax_enable_x64"), mode.state_of_programs()
+    how = tangent, most, calls, flags, fallback
+    return _trace_program(function, static, known, count, structure, shapes, *how, context)
 
 
 @functools.lru_cache(maxsize=1024)
-def _trace_program(function, static, known: Known, count, structure, shapes, tangent, most, calls, flags, has_x64):
-    del has_x64  # part of the key alone
+def _trace_program(function, static, known: Known, count, structure, shapes, tangent, most, calls, flags, fallback,
+                   context):  # fmt: skip
+    del context  # part of the key alone
+    is_pair, flags = flags == "repair", "report" if flags == "repair" else flags
     avals = [jax.ShapeDtypeStruct(*shape) for shape in shapes]
     flat = function_of_leaves(function, static, known, count, structure)
 
@@ -100,7 +110,79 @@ def _trace_program(function, static, known: Known, count, structure, shapes, tan
     elif has_rules:
         program.derivative = _derivative_by_jax(flat, avals, flags, program)
     program.fallback = _fallback(function, static, known, count, structure, avals, program.reports_validity)
+    if is_pair:
+        other = function if fallback is None else fallback
+        again = Again(other, static, known, count, structure, shapes, calls, other is function)
+        program = guard(program, functools.partial(again.beside, program))
     return program, jax.tree.structure(results)
+
+
+class Again(NamedTuple):
+    """Function that computes the samples which another one of the same arguments marks as not valid.
+
+    `calls`: whether it may have subprograms and branches, which have no derivatives. `is_itself`: whether it is that function.
+    """
+
+    function: Callable
+    static: tuple
+    known: Known
+    count: int
+    structure: Any
+    shapes: tuple
+    calls: bool
+    is_itself: bool
+
+    def beside(self, fast: Program) -> Careful:
+        """The careful program beside the fast one of the other function."""
+        outputs, name = fast.outputs[:-1], name_of(self.function)
+        inputs = [Array(shape, np.dtype(dtype)) for shape, dtype in self.shapes]
+        recipe = self.function, self.static, self.structure, self.calls, self.is_itself, mode.state()
+        digest, is_kept = digest_of(self.key(outputs), f"{name} {inputs} {outputs} {self.known.digest}", recipe)
+        make = functools.partial(_make_careful, self, outputs, digest if is_kept else None)
+        by_jax = functools.partial(_by_jax, self, outputs)
+        return Careful(inputs, outputs, digest, f"{name} of flagged samples", make, by_jax, self.which, is_kept)
+
+    def key(self, outputs) -> str | None:
+        """Name under which the program is kept on disk, if it is."""
+        function, static, known, *rest = self
+        contents = known.structure, known.places, known.leaves.leaves
+        return stored.key_of("careful", function, static, *contents, *rest, outputs)
+
+    @property
+    def which(self) -> str:
+        """The argument of `mode.careful`."""
+        return "own" if self.is_itself and self.calls else "within"
+
+    def compute(self, outputs, leaves) -> list:
+        """The results, with the types of `outputs`."""
+        results = jax.tree.leaves(flat_function(*self[:5])(*leaves))
+        return [jnp.broadcast_to(jnp.asarray(x, y.dtype), y.shape) for x, y in zip(results, outputs, strict=True)]
+
+
+def _make_careful(again: Again, outputs, key: str | None) -> Program:
+    avals = [jax.ShapeDtypeStruct(*shape) for shape in again.shapes]
+
+    def compute(*leaves):
+        return again.compute(outputs, leaves)
+
+    def make():
+        with mode.expanding(again.calls):
+            closed = jax.make_jaxpr(compute)(*avals)
+        # The marks of what is left as it is are NaN, which the results then are too.
+        most, name = 10 * mode.MAX_OPERATIONS, name_of(again.function)
+        program, has_rules = expand(closed, most, name, again.calls, "ignore")
+        return [program], has_rules
+
+    (program,), has_rules = stored.load_or_make(key, make)
+    if has_rules:
+        program.derivative = _derivative_by_jax(compute, avals, "ignore", program)
+    return program
+
+
+def _by_jax(again: Again, outputs, *flat) -> list:
+    leaves = [x.reshape(shape) for x, (shape, _) in zip(flat, again.shapes, strict=True)]
+    with mode.careful(again.which):
+        return [x.reshape(-1) for x in again.compute(outputs, leaves)]
 
 
 def name_of(function) -> str:
@@ -123,11 +205,24 @@ def flat_function(function, static, known: Known, count: int, structure) -> Call
     return flat
 
 
-def inline_call(function, static, tree, args):
-    """The function within another one that becomes a program."""
+def inline_call(function, static, tree, args, fallback: Callable | None = None):
+    """The function within another one that becomes a program.
+
+    Where that may have branches, samples that the function marks as not valid are computed by its fallback there.
+    """
     traced, known = partition_tracers(tree)
     leaves, structure = jax.tree.flatten(args)
-    return function_of_leaves(function, static, known, len(traced), structure)(*traced, *leaves)
+    flat, leaves = function_of_leaves(function, static, known, len(traced), structure), [*traced, *leaves]
+    if fallback is None or not mode.has_branches() or mode.is_careful_within():
+        return flat(*leaves)
+    leaves = [*map(jnp.asarray, leaves)]
+    with mode.careful(""):
+        call, out = jax.make_jaxpr(flat, return_shape=True)(*leaves)
+        if not has_marks(call.jaxpr):
+            return flat(*leaves)
+    shapes = tuple((x.shape, x.dtype) for x in leaves)
+    again = Again(fallback, static, known, len(traced), structure, shapes, True, fallback is function)
+    return jax.tree.unflatten(jax.tree.structure(out), guarded_p.bind(*leaves, call=call, again=again))
 
 
 def _fallback(function, static, known: Known, count: int, structure, avals, reports: bool) -> Callable:
@@ -190,7 +285,7 @@ def _derivative_by_jax(flat: Callable, avals, flags: str, program: Program):
 
 
 def tangent_program(change: Callable, avals, moving, flags: str, key: str | None = None) -> Program:
-    """The program of a tangent; NaN at flagged samples, which the program of the values reports.
+    """The program of a tangent; which reports flagged samples where that of the values does; else it is NaN there.
 
     A rule may call functions with rules of their own, itself included, and then the tangent is differentiated by JAX again:
     its numbers would give the derivative of how a value is computed, where the rule says another one. `key`: under which the
@@ -202,9 +297,8 @@ def tangent_program(change: Callable, avals, moving, flags: str, key: str | None
         with mode.expanding():
             closed = jax.make_jaxpr(change)(*avals)
         # A tangent has two to four times the operations of the values. The bound is there for those that explode.
-        program, has_rules = expand(
-            closed, 10 * mode.MAX_OPERATIONS, "change", flags="refuse" if flags == "refuse" else "ignore"
-        )
+        of_tangent = flags if flags in ("refuse", "report") else "ignore"
+        program, has_rules = expand(closed, 10 * mode.MAX_OPERATIONS, "change", flags=of_tangent)
         return [program], has_rules
 
     (program,), has_rules = stored.load_or_make(key, make)

@@ -16,12 +16,14 @@ from jaxdyn.constraints.reactions import constraint_wrenches as constraint_wrenc
 from jaxdyn.constraints.rolling import knife_edge as knife_edge
 from jaxdyn.constraints.rolling import rolling_sphere as rolling_sphere
 from jaxdyn.constraints.rolling import rolling_wheel as rolling_wheel
+from jaxdyn.constraints.selection import choose_rows as choose_rows
 
 __all__ = [
     "Constraint",
     "Holonomic",
     "Pfaffian",
     "body_wrenches",
+    "choose_rows",
     "constraint_jacobian",
     "constraint_wrenches",
     "distance",

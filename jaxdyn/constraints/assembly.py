@@ -21,8 +21,8 @@ from jaxdyn.constraints.codes import RESULTS, Outcome, first_of, name_of, requir
 from jaxdyn.constraints.dynamics import correction
 from jaxdyn.constraints.loops import lock_joint
 from jaxdyn.constraints.rank import LEAST_GAP, check_tolerance, clear_pivot, tolerance
-from jaxdyn.constraints.redundancy import keep_rows, opening_of_redundant
-from jaxdyn.constraints.selection import independent_rows, most_rounding, select_rows
+from jaxdyn.constraints.redundancy import keep_rows, opening_of_redundant, row_mask
+from jaxdyn.constraints.selection import hide_unclear, most_rounding, select_rows
 from jaxdyn.constraints.tolerances import coordinate_sizes, largest_ratio, row_limits
 from jaxdyn.lie.so3 import matmul
 from jaxdyn.model.arguments import Numbers, check_state, zeros_if_none
@@ -161,11 +161,17 @@ def assemble(
 
     assembly = from_guess(q)
     # Only concrete inputs allow more guesses, which need to know whether the first guess has failed.
-    # One on the constraints that is not the nearest is closer to the guess than those.
-    if is_concrete(assembly.result) and not bool(assembly.success) and name_of(assembly.result) != "not_nearest":
+    # One on the constraints that is not the nearest is closer to the guess than those, and the digits are the same elsewhere.
+    if is_concrete(assembly.result) and name_of(assembly.result) == "not_assembled":
         assembly = _from_elsewhere(assembly, guesses, from_guess, locked, q)
 
     def message(assembly: Assembly) -> str:
+        if name_of(assembly.result) == "unclear_rank":
+            return (
+                f"assembled with residuals {np.asarray(assembly.residual)}, but the rank of the constraints is not clear: rows "
+                f"that are independent of the others differ by less than a factor of {LEAST_GAP:g} from rows that repeat them; "
+                "give numbers with more digits, a rank_tol between them, or throw=False"
+            )
         if name_of(assembly.result) == "not_nearest":
             return (
                 f"assembled with residuals {np.asarray(assembly.residual)}, but the search for the configuration nearest to the "
@@ -218,10 +224,7 @@ def _from_elsewhere(assembly: Assembly, guesses: int, from_guess: Callable, scen
 def _assemble(locked, q, v, t, rank_tol, atol, steps, scene):
     """Assemble the scene `locked`; velocities satisfy the constraints of `scene`, or of `locked` if it is None."""
     bare = Scene(locked.system, locked.constraints)
-    start, passed = _follow_path(bare, q, t, rank_tol, steps)
-    selection: Any = select_rows(bare, start, t, rank_tol)
-    if is_concrete(selection) and np.all(selection.kept):
-        selection = None
+    start, passed, selection = _select_near(bare, q, t, rank_tol, steps)
     if scene is not None:
         scene = Scene(scene.system, scene.constraints)
         # A tree has no rows: its velocities are free, whatever is held.
@@ -229,11 +232,28 @@ def _assemble(locked, q, v, t, rank_tol, atol, steps, scene):
     return _close(bare, q, start, passed, selection, v, t, rank_tol, atol, scene)
 
 
+def _select_near(bare: Scene, guess, t, rank_tol, steps: int) -> tuple[Any, Any, Any]:
+    """End of the path from a guess, whether it passed a singular position, and `select_rows` there; None for all rows."""
+    start, passed = _follow_path(bare, guess, t, rank_tol, steps)
+    selection: Any = select_rows(bare, start, t, rank_tol)
+    if is_concrete(selection) and np.all(selection.kept):
+        return start, passed, None
+    if bare.rounding and rank_tol is None:
+        # The path ends where all rows are least open; the kept ones are closed from there. On them the choice is asked again: off
+        # the constraints rows that repeat others are independent.
+        start = _close_kept_rows(bare, selection, start, t)
+        again = select_rows(bare, start, t)
+        is_clear = again.gap >= LEAST_GAP
+        selection = jax.tree.map(lambda x, y: jnp.where(is_clear, x, y), again, selection)._replace(gap=again.gap)
+    return start, passed, selection
+
+
 def independent_rows_near(scene: Scene, guess, t) -> Scene:
     """`independent_rows` where the path from a guess meets the constraints: off them all rows are independent."""
     if not (scene.rounding and scene.constraints):
         return scene
-    return independent_rows(scene, _follow_path(Scene(scene.system, scene.constraints), guess, t, None, 100)[0], t)
+    selection = _select_near(Scene(scene.system, scene.constraints), guess, t, None, 100)[2]
+    return scene if selection is None else keep_rows(scene, hide_unclear(selection))
 
 
 @entry_point
@@ -245,19 +265,26 @@ def _follow_path(scene, q, t, rank_tol, steps):
 
 
 @entry_point
+def _close_kept_rows(bare: Scene, selection, start, t):
+    """A configuration from which the kept rows have been closed; a constant."""
+    bare, selection, start, t = stop_gradient((bare, selection, start, t))
+    return polish(_drop_rows(bare, selection, start.dtype), start, t, None)
+
+
+def _drop_rows(bare: Scene, selection, dtype) -> Scene:
+    """`keep_rows`, with all rows where those to drop contradict the others: the result is then the point of least squares."""
+    kept = jnp.where(selection.rounding <= most_rounding(dtype), selection.kept, jnp.ones_like(selection.kept))
+    return keep_rows(bare, selection._replace(kept=kept))
+
+
+@entry_point
 def _close(bare, guess, start, passed, selection, v, t, rank_tol, atol, scene):
     """The assembly from the end of a path, which starts at the guess; `scene`: see `_assemble`."""
     whole, locked, is_clear = bare, bare, jnp.asarray(True)
     kept = jnp.ones(sum(place.end - place.start for place in layout(bare)), guess.dtype)
     if selection is not None:
-        kept, rounding, is_clear = selection.kept, selection.rounding, jnp.asarray(selection.gap >= LEAST_GAP)
-        # Rows that contradict the others must not be dropped in silence: with all rows the result is the least-squares point.
-        kept = jnp.where(rounding <= most_rounding(guess.dtype), kept, jnp.ones_like(kept))
-        locked = keep_rows(bare, selection._replace(kept=kept))
-        if bare.rounding:
-            # The path ends where all rows are least open; the kept ones are closed from there.
-            fixed, start, time = stop_gradient((locked, start, t))
-            start = polish(fixed, start, time, rank_tol)
+        locked, is_clear = _drop_rows(bare, selection, guess.dtype), jnp.asarray(selection.gap >= LEAST_GAP)
+        kept = row_mask(locked)
     q, is_nearest = guess, jnp.asarray(True)
     if holonomic_rows(layout(locked)).size:
         q, nearest = nearest_configuration(locked, guess, start, t, rank_tol)

@@ -130,14 +130,18 @@ def constrained_dynamics(
     scene = independent_rows(scene, q, t, rank_tol)
     if method != "rank_aware":
         return _by_schur(scene, *state, method=method)
-    # If there are more rows than velocities, they are dependent at every state, and Cholesky would fail for all samples: such
-    # scenes take the pseudo-inverse at once. Others take Cholesky, and the pseudo-inverse only for samples that Cholesky marks as
-    # invalid. A selection leaves independent rows and zeros in the place of the dropped ones, so that the count says nothing.
-    is_wide = places[-1].end > scene.nv and not has_selection(scene)
-    a, lam, rank, result = (_by_rank if is_wide else _by_pivots)(rank_tol, scene, *state)
+    a, lam, rank, result = _accelerate(rank_tol, scene, *state)
     # Redundant rows share the constraint force: the one of least norm is unique.
     lam = distribute_multipliers(scene, q, t, lam)
     return ConstrainedDynamics(a, lam, rank, rank_code(scene, result), places)
+
+
+def _accelerate(rank_tol, scene: Scene, *state):
+    """(a, lam, rank, result) by the kernel for rows of this number."""
+    # If there are more rows than velocities, they are dependent at every state, and Cholesky would fail for all samples. A
+    # selection leaves independent rows and zeros in the place of the dropped ones, so that the count says nothing.
+    is_wide = layout(scene)[-1].end > scene.nv and not has_selection(scene)
+    return (_by_columns if is_wide else _by_pivots)(rank_tol, scene, *state)
 
 
 def _by_rank(rank_tol, scene: Scene, q, v, tau, t):
@@ -148,13 +152,21 @@ def _by_rank(rank_tol, scene: Scene, q, v, tau, t):
 
 
 def _without_kernel(rank_tol, scene: Scene, q, v, tau, t):
-    """Fallback of `_by_pivots`, for scenes that cannot be a kernel and for samples that the kernel marks as invalid."""
+    """Fallback of the kernels, for scenes that cannot be one and for samples that the kernel marks as invalid."""
     if not scene.forces:
         return _by_rank(rank_tol, scene, q, v, tau, t)
     # A user's force may use operations that kernels do not have. It is evaluated here and enters as tau, so that the rest can be
     # a kernel.
     bare = Scene(scene.system, scene.constraints)
-    return _by_pivots(rank_tol, bare, q, v, total_force(scene, q, v, tau, t), t)
+    return _accelerate(rank_tol, bare, q, v, total_force(scene, q, v, tau, t), t)
+
+
+@kernel(static=1, fallback=_without_kernel)
+def _by_columns(rank_tol, scene: Scene, q, v, tau, t):
+    """`_by_rank`; samples are invalid where the pseudo-inverse is, and where rows leave no motion unless they are rounded."""
+    a, lam, rank, result = _by_rank(rank_tol, scene, q, v, tau, t)
+    a, lam = (mark_invalid(rank >= scene.nv, x) for x in (a, lam))
+    return a, lam, rank, require_finite(result, a)
 
 
 @kernel(static=1, fallback=_without_kernel)

@@ -8,7 +8,7 @@ import jax
 import jax.numpy as jnp
 from jax import lax
 
-from jaxdyn.compile import batch, implicit, kernel, mark_invalid, value_and_jvp
+from jaxdyn.compile import batch, implicit, kernel, mark_invalid, value_and_jvp, variant
 from jaxdyn.constraints.base import constraint_jacobian, holonomic_rows, layout, position_residual, velocity_residual
 from jaxdyn.constraints.dynamics import whiten_rows
 from jaxdyn.constraints.projection_derivative import ROUNDING_FACTOR, Corrections, closest_state
@@ -20,7 +20,7 @@ from jaxdyn.constraints.rank import (
     regular_gram,
     tolerance,
 )
-from jaxdyn.constraints.redundancy import has_selection, rows_of
+from jaxdyn.constraints.redundancy import has_selection, row_mask, rows_of
 from jaxdyn.lie.so3 import matmul
 from jaxdyn.systems.mass_factor import cholesky, solve_cholesky
 from jaxdyn.systems.scene import Scene
@@ -55,7 +55,8 @@ def project_step(scene: Scene, q, v, t, errors: tuple = (), rank_tol: float | No
         if layout(scene)[-1].end > scene.nv and not has_selection(scene):
             return _by_rank(rank_tol, scene, q, v, t, errors)
         by_kernel = kernel(_by_pivots, static=1, fallback=_by_rank_in_full, derivative=False)
-        return _in_rounds(lambda q, v: by_kernel(rank_tol, scene, q, v, t, errors), q, v, errors)
+        *state, is_poor = _in_rounds(lambda q, v: by_kernel(rank_tol, scene, q, v, t, errors), q, v, errors)
+        return _mark(is_poor, tuple(state)) if has_selection(scene) else tuple(state)
 
     def tangent(scene, q, v, t, *rest):
         *errors, steps = rest
@@ -74,10 +75,20 @@ def project_step(scene: Scene, q, v, t, errors: tuple = (), rank_tol: float | No
 def _in_rounds(again: Callable, q, v, errors):
     """Rounds of a few steps, each with one factorisation of the rows.
 
-    Repeats again(q, v) -> (q, v, errors, more) while `more`, once at least and `_MOST_ROUNDS` times at most.
+    Repeats again(q, v) -> (q, v, errors, are_poor, more) while `more`, once at least and `_MOST_ROUNDS` times at most.
     """
-    start = q, v, errors, True
-    return batch.repeat_while(lambda state: state[3], lambda state: tuple(again(*state[:2])), start, _MOST_ROUNDS)[:3]
+    start = q, v, errors, False, True
+    return batch.repeat_while(lambda state: state[4], lambda state: tuple(again(*state[:2])), start, _MOST_ROUNDS)[:4]
+
+
+def _mark_in_kernel(flag, state):
+    return jax.tree.map(partial(mark_invalid, flag), state)
+
+
+@variant(_mark_in_kernel, marks=True)
+def _mark(flag, state):
+    """Mark a state that was projected by rows which another choice may replace (`renew_rows`)."""
+    return state
 
 
 def _by_rank(rank_tol, scene: Scene, q, v, t, errors):
@@ -88,14 +99,16 @@ def _by_rank(rank_tol, scene: Scene, q, v, t, errors):
         metric, Y = kernel(whiten_rows)(scene, q, t)
         every = pseudo_inverse(Y, tolerance(rank_tol, Y))
         some = every if holonomic.size in (0, Y.shape[1]) else pseudo_inverse(Y[:, holonomic], tolerance(rank_tol, Y))
-        return _correct_by_matrices(scene, q, v, t, errors, metric, every, some)
+        *state, more = _correct_by_matrices(scene, q, v, t, errors, metric, every, some)
+        return *state, jnp.zeros((), bool), more
 
-    return _in_rounds(again, q, v, errors)
+    return _in_rounds(again, q, v, errors)[:3]
 
 
 def _by_rank_in_full(rank_tol, scene: Scene, q, v, t, errors):
     """`_by_rank` in the form of `_by_pivots`: it has done all rounds, so that none is left."""
-    return *_by_rank(rank_tol, scene, q, v, t, errors), jnp.zeros((), bool)
+    are_poor = jnp.any(row_mask(scene) == 0) if has_selection(scene) else jnp.zeros((), bool)
+    return *_by_rank(rank_tol, scene, q, v, t, errors), are_poor, jnp.zeros((), bool)
 
 
 @kernel
@@ -109,31 +122,34 @@ def _correct_by_matrices(scene: Scene, q, v, t, errors, metric, every, some):
 
 
 def _by_pivots(rank_tol, scene: Scene, q, v, t, errors):
-    """q, v and errors after a few steps, and whether another step would help; invalid where rows may be dependent."""
+    """q, v and errors after a few steps; whether the choice of rows is poor, and whether another step would help.
+
+    Invalid where rows may be dependent.
+    """
     holonomic = holonomic_rows(layout(scene))
     metric, Y = whiten_rows(scene, q, t)
 
     def steps(Y):
         gram = regular_gram(Y) if has_selection(scene) else matmul(Y.T, Y)
         factor = cholesky(gram)
-        quality = quality_of(factor)
+        are_poor = jnp.zeros((), bool)
         if has_selection(scene):
             # Another choice may be independent where this one is nearly dependent (`renew_rows`).
             *kept, least = rows_of(scene, Y.dtype)
-            is_poor = jnp.any(jnp.stack(kept) == 0) & ~(least_pivot_of(Y) > least)
-            quality = jnp.where(is_poor, jnp.nan, quality)
-        return (lambda residual: metric.unwhiten(matmul(Y, solve_cholesky(factor, residual)))), quality
+            are_poor = jnp.any(jnp.stack(kept) == 0) & ~(least_pivot_of(Y) > least)
+        step = lambda residual: metric.unwhiten(matmul(Y, solve_cholesky(factor, residual)))  # noqa: E731
+        return step, quality_of(factor), are_poor
 
-    every, quality = steps(Y)
+    every, quality, are_poor = steps(Y)
     some = every
     if holonomic.size not in (0, Y.shape[1]):
-        some, of_holonomic = steps(Y[:, holonomic])
-        quality = jnp.minimum(quality, of_holonomic)
+        some, of_holonomic, some_are_poor = steps(Y[:, holonomic])
+        quality, are_poor = jnp.minimum(quality, of_holonomic), are_poor | some_are_poor
     quality = jnp.where(metric.is_definite(), quality, jnp.nan)
     *state, more = _correct(scene, q, v, t, errors, every, some)
     # Not `least_pivot`: the steps correct each other, so that a factor with few digits costs a step, not accuracy.
     is_poor = ~(quality > least_refinable_pivot(q, rank_tol))
-    return *jax.tree.map(lambda x: mark_invalid(is_poor, x), tuple(state)), more
+    return *jax.tree.map(lambda x: mark_invalid(is_poor, x), tuple(state)), are_poor, more
 
 
 def _correct(scene: Scene, q, v, t, errors, every: Callable, some: Callable):

@@ -14,15 +14,15 @@ from typing import Any, NamedTuple
 
 import jax.numpy as jnp
 from jax import lax
-from jaxtyping import Array
+from jaxtyping import Array, Float
 
-from jaxdyn.compile import implicit, kernel, value_and_jvp
+from jaxdyn.compile import implicit, kernel, mark_invalid, value_and_jvp, variant
 from jaxdyn.constraints.base import constraint_jacobian, holonomic_rows, layout, position_residual, velocity_residual
 from jaxdyn.constraints.dynamics import whiten_rows
-from jaxdyn.constraints.rank import LeastSquares, least_squares, tolerance
+from jaxdyn.constraints.rank import least_pivot, pseudo_inverse, quality_of, regular_gram, tolerance
 from jaxdyn.dynamics.quantities import mass_matrix
 from jaxdyn.lie.so3 import matmul
-from jaxdyn.systems.mass_factor import MassFactor
+from jaxdyn.systems.mass_factor import MassFactor, cholesky, solve_cholesky
 from jaxdyn.systems.scene import Scene
 from jaxdyn.systems.system import displace, retract
 
@@ -49,6 +49,37 @@ class ClosestState(NamedTuple):
     v_distance: Array
     q_applied: Array
     v_applied: Array
+
+
+class LeastSquares(NamedTuple):
+    """Minimum-norm solutions w of Y^T w = r, and their coefficients in the columns of Y."""
+
+    Y: Array
+    factor: Any  # Cholesky factor of Y^T Y, in kernels; else None
+    inverse: Any  # pseudo-inverse of Y, elsewhere; else None
+
+    def shortest(self, right):
+        """The shortest w with Y^T w = right."""
+        if self.factor is None:
+            return matmul(self.inverse.T, right)
+        return matmul(self.Y, solve_cholesky(self.factor, right))
+
+    def multipliers(self, w):
+        """The smallest x with Y x = w, for w that is a sum of columns."""
+        if self.factor is None:
+            return matmul(self.inverse, w)
+        return solve_cholesky(self.factor, matmul(self.Y.T, w))
+
+
+def _least_squares_in_kernel(Y, rank_tol) -> LeastSquares:
+    factor = cholesky(regular_gram(Y))
+    return LeastSquares(Y, mark_invalid(~(quality_of(factor) > least_pivot(Y, rank_tol)), factor), None)
+
+
+@variant(_least_squares_in_kernel, marks=True)
+def least_squares(Y: Float[Array, "n m"], rank_tol: float) -> LeastSquares:
+    """Factor a matrix: its pseudo-inverse; in a kernel its Cholesky factor, with dependent columns marked as invalid."""
+    return LeastSquares(Y, None, pseudo_inverse(Y, rank_tol))
 
 
 class Corrections(NamedTuple):

@@ -1,7 +1,7 @@
 """Rank decisions, and pseudo-inverses of rows that may be dependent."""
 
 from functools import partial
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -12,7 +12,7 @@ from jaxtyping import Array, Bool, Float
 from jaxdyn.compile import batch, gram_eigenvectors, kernel, mark_invalid, pseudo_inverse_by_rotations, variant
 from jaxdyn.lie.so3 import matmul
 from jaxdyn.model.numbers import as_static
-from jaxdyn.systems.mass_factor import cholesky, solve_cholesky
+from jaxdyn.systems.mass_factor import cholesky, solve_cholesky, solve_lower
 
 # Operations of the normal equations up to which they are a kernel: LLVM compiles one in 50 to 100 microseconds.
 _MAX_OPERATIONS = 10_000
@@ -96,79 +96,112 @@ def quality_of(factor):
 def pseudo_inverse(Y: Float[Array, "n m"], rank_tol: float, dependent: bool = False) -> Float[Array, "m n"]:
     """Moore-Penrose inverse of Y; singular values below `rank_tol` times the largest count as zero.
 
-    Values: (Y^T Y)^-1 Y^T, or the transpose of that of Y^T, where that is as accurate; else by singular values, for all samples
-    of a batch if one of them needs it, and always where the columns are known to be `dependent`. Derivative: Golub & Pereyra
-    (1973), eq. 4.12, valid where the rank is constant; no factorisation is differentiated.
+    Values: (Y^T Y)^-1 Y^T, or the transpose of that of Y^T, where that is as accurate; else by singular values. `dependent`:
+    whether some columns may be combinations of others everywhere. Derivative: Golub & Pereyra (1973), eq. 4.12, valid where the
+    rank is constant; no factorisation is differentiated.
     """
-    if dependent:
-        return pseudo_inverse_by_rotations(Y, rank_tol)
     if Y.shape[1] > Y.shape[0]:
-        return pseudo_inverse(Y.T, rank_tol).T
-    return _pseudo_inverse(rank_tol, None, Y)
+        return pseudo_inverse(Y.T, rank_tol, True).T
+    return _pseudo_inverse(rank_tol, dependent, None, Y)
 
 
-def _by_rotations(rank_tol, _, Y):
+class Columns(NamedTuple):
+    """The columns of a matrix that are no combinations of those before them.
+
+    - `kept` (m,): 1 for these columns, 0 for the others.
+    - `factor` (m, m): Cholesky factor of the Gram matrix of the kept columns, made regular as by `regular_gram`.
+    - `combinations` (m, m): C, such that column i of the others is the sum of C_ik times the kept columns k.
+    - `is_clear` (): whether this holds to the tolerance.
+    """
+
+    kept: Float[Array, " m"]
+    factor: Float[Array, "m m"]
+    combinations: Float[Array, "m m"]
+    is_clear: Bool[Array, ""]
+
+
+def independent_columns(Y: Float[Array, "n m"], rank_tol: float) -> Columns:
+    """Independent columns of Y, by a Cholesky factorisation of Y^T Y that leaves out columns without a pivot.
+
+    Source: Higham, Analysis of the Cholesky decomposition of a semi-definite matrix, 1990; here without exchanges, as the order
+    of a program is fixed. `is_clear` and `quality_of` the factor say where that is not accurate.
+    """
+    m, gram = Y.shape[1], matmul(Y.T, Y)
+    squares = jnp.diagonal(gram)
+    L, kept = jnp.zeros_like(gram), []
+    for j in range(m):
+        rest = gram[:, j] - matmul(L, L[j])
+        # Between the rounding of the Gram matrix and what counts as independent: what is near it is not clear.
+        is_kept = rest[j] > eps_of(Y) ** 0.75 * squares[j]
+        column = jnp.where(is_kept, rest / jnp.sqrt(jnp.where(is_kept, rest[j], jnp.ones_like(rest[j]))), 0.0)
+        L = L.at[j:, j].set(column[j:])
+        kept.append(is_kept)
+    kept = jnp.stack(kept).astype(Y.dtype)
+    largest = jnp.max(squares)
+    fill = jnp.sqrt(jnp.where(largest > 0, largest, jnp.ones_like(largest)))
+    factor = kept[:, None] * L + jnp.diag((1 - kept) * fill)
+    C = solve_lower(factor, ((1 - kept)[:, None] * L).T, transposed=True).T
+    others = Y * (1 - kept)[None] - matmul(Y * kept[None], C.T)
+    is_clear = jnp.all(jnp.sum(others * others, 0) <= rank_tol**2 * largest)
+    return Columns(kept, factor, C, is_clear)
+
+
+def share(columns: Columns, coefficients: Float[Array, "m *k"]) -> Float[Array, "m *k"]:
+    """The least coefficients of all columns with the same sum as those of the kept ones: [1; C] (1 + C^T C)^-1 x."""
+    C, x = columns.combinations, coefficients
+    shared = solve_cholesky(cholesky(jnp.eye(C.shape[0], dtype=C.dtype) + matmul(C.T, C)), x)
+    return matmul(jnp.diag(columns.kept) + C, shared)
+
+
+def solve_damped(A: Float[Array, "m n"], right: Float[Array, " m"]) -> Float[Array, " n"]:
+    """A small x with A x = right, by normal equations with little damping: for Newton's steps, which need no more digits.
+
+    Rows may be zero. Where others depend on each other x is a compromise, not a NaN.
+    """
+    gram = regular_gram(A.T)
+    damping = eps_of(A) ** 0.75 * jnp.max(jnp.diagonal(gram))
+    return matmul(A.T, solve_cholesky(cholesky(gram + damping * jnp.eye(A.shape[0], dtype=A.dtype)), right))
+
+
+def _by_rotations(rank_tol, dependent, _, Y):
     return pseudo_inverse_by_rotations(Y, rank_tol)
 
 
-def _solve_normal_equations(rank_tol, Y):
-    """(Y^T Y)^-1 Y^T, and whether the columns may be dependent, by the pivots of Y^T Y."""
-    factor = cholesky(regular_gram(Y))
-    inverse = solve_cholesky(factor, Y.T)
+def _solve_normal_equations(rank_tol, dependent: bool, Y):
+    """The pseudo-inverse (Y^T Y)^-1 Y^T, and whether it is doubtful, by the pivots of Y^T Y.
+
+    Of columns that may be `dependent` those that are independent, and the least coefficients of all; of others, whether they are.
+    """
+    if dependent:
+        columns = independent_columns(Y, rank_tol)
+        factor, is_doubtful = columns.factor, ~columns.is_clear
+        inverse = share(columns, solve_cholesky(factor, (Y * columns.kept[None]).T))
+    else:
+        factor, is_doubtful = cholesky(regular_gram(Y)), jnp.asarray(False)
+        inverse = solve_cholesky(factor, Y.T)
     # The normal equations square the condition number; one Newton-Schulz step restores the accuracy of an orthogonal method.
     inverse = 2 * inverse - matmul(matmul(inverse, Y), inverse)
-    return inverse, ~(quality_of(factor) > least_pivot(Y, rank_tol))
+    return inverse, is_doubtful | ~(quality_of(factor) > least_pivot(Y, rank_tol))
 
 
-def _by_normal_equations(rank_tol, _, Y):
-    inverse, is_doubtful = _solve_normal_equations(rank_tol, Y)
+def _by_normal_equations(rank_tol, dependent: bool, _, Y):
+    inverse, is_doubtful = _solve_normal_equations(rank_tol, dependent, Y)
     return mark_invalid(is_doubtful, inverse)
 
 
-def _by_blocks(rank_tol, _, Y):
-    inverse, is_doubtful = _solve_normal_equations(rank_tol, Y)
+def _by_blocks(rank_tol, dependent: bool, Y):
+    inverse, is_doubtful = _solve_normal_equations(rank_tol, dependent, Y)
     return batch.cond(is_doubtful, lambda: pseudo_inverse_by_rotations(Y, rank_tol), lambda: inverse)
 
 
 @variant(_by_normal_equations, marks=True)
-def _pseudo_inverse(rank_tol, _, Y):
+def _pseudo_inverse(rank_tol, dependent: bool, _, Y):
     # Gram matrix, factor, two triangular solves and two products: 8 n m^2 sums and products for Y (n, m).
     is_long = 8 * Y.shape[0] * Y.shape[1] ** 2 > _MAX_OPERATIONS
-    if Y.shape[1] > _MAX_COLUMNS:
-        return _by_blocks(rank_tol, None, Y)
-    by_kernel = kernel(_by_normal_equations, static=1, fallback=_by_rotations, derivative=False)
-    return (_by_rotations if is_long else by_kernel)(rank_tol, None, Y)
-
-
-class LeastSquares(NamedTuple):
-    """Minimum-norm solutions w of Y^T w = r, and their coefficients in the columns of Y."""
-
-    Y: Array
-    factor: Any  # Cholesky factor of Y^T Y, in kernels; else None
-    inverse: Any  # pseudo-inverse of Y, elsewhere; else None
-
-    def shortest(self, right):
-        """The shortest w with Y^T w = right."""
-        if self.factor is None:
-            return matmul(self.inverse.T, right)
-        return matmul(self.Y, solve_cholesky(self.factor, right))
-
-    def multipliers(self, w):
-        """The smallest x with Y x = w, for w that is a sum of columns."""
-        if self.factor is None:
-            return matmul(self.inverse, w)
-        return solve_cholesky(self.factor, matmul(self.Y.T, w))
-
-
-def _least_squares_in_kernel(Y, rank_tol) -> LeastSquares:
-    factor = cholesky(regular_gram(Y))
-    return LeastSquares(Y, mark_invalid(~(quality_of(factor) > least_pivot(Y, rank_tol)), factor), None)
-
-
-@variant(_least_squares_in_kernel, marks=True)
-def least_squares(Y: Float[Array, "n m"], rank_tol: float) -> LeastSquares:
-    """Factor a matrix: its pseudo-inverse; in a kernel its Cholesky factor, with dependent columns marked as invalid."""
-    return LeastSquares(Y, None, pseudo_inverse(Y, rank_tol))
+    if Y.shape[1] > _MAX_COLUMNS and not dependent:
+        return _by_blocks(rank_tol, dependent, Y)
+    by_kernel = kernel(_by_normal_equations, static=2, fallback=_by_rotations, derivative=False)
+    return (_by_rotations if is_long else by_kernel)(rank_tol, dependent, None, Y)
 
 
 @pseudo_inverse.defjvp
@@ -227,41 +260,3 @@ def solve_square(A: Float[Array, "n n"], right: Float[Array, "n *k"]) -> Float[A
     """A^-1 right for a regular A, by Jacobi rotations."""
     # Without LAPACK: its calls from several samples of a batch can deadlock in XLA's thread pool.
     return matmul(pseudo_inverse(A, eps_of(A), True), right)
-
-
-def sign_of_determinant(A: Float[Array, "n n"]) -> Float[Array, ""]:
-    """-1 where the determinant is negative, else 1; a constant."""
-    return kernel(_sign, fallback=_sign_by_lapack)(None, lax.stop_gradient(A))
-
-
-def passes_singular(
-    A: Float[Array, "m n"], inverse: Float[Array, "n m"], after: Float[Array, "m n"]
-) -> Bool[Array, ""]:
-    """Decide whether a combination of rows goes through zero between A, with its pseudo-inverse, and the rows `after`.
-
-    det(A' A^+ + (1 - A A^+)) then changes its sign. The second term fills the null space of dependent rows, where the
-    determinant of the first one is zero.
-    """
-    own = jnp.eye(A.shape[0], dtype=A.dtype) - matmul(A, inverse)
-    return sign_of_determinant(matmul(after, inverse) + own) < 0
-
-
-def _sign(_, A):
-    """Sign by Gaussian elimination with row exchanges until the largest entry of a column is its pivot."""
-    # Kernels have no index that depends on data: the exchanges are selections between neighbours, as in a bubble sort.
-    sign = jnp.ones((), A.dtype)
-    rows = list(A)
-    for k in range(len(rows)):
-        for i in range(k + 1, len(rows)):
-            swap = jnp.abs(rows[i][k]) > jnp.abs(rows[k][k])
-            rows[k], rows[i] = jnp.where(swap, rows[i], rows[k]), jnp.where(swap, rows[k], rows[i])
-            sign = jnp.where(swap, -sign, sign)
-        sign = jnp.where(rows[k][k] < 0, -sign, sign)
-        scale = 1 / jnp.where(rows[k][k] == 0, 1.0, rows[k][k])
-        for i in range(k + 1, len(rows)):
-            rows[i] = rows[i] - rows[i][k] * scale * rows[k]
-    return sign
-
-
-def _sign_by_lapack(_, A):
-    return jnp.where(jnp.linalg.slogdet(A)[0] < 0, -1.0, 1.0).astype(A.dtype)

@@ -30,7 +30,8 @@ from jaxdyn.systems.scene import Scene
 class KeptRows(Constraint):
     """A constraint whose dropped rows are zero.
 
-    `kept` (n,) is 1 for rows that stay, 0 for dropped ones; `rounding`, `least` and `gap` () as in `Selection`.
+    `kept` (n,) is 1 for rows that stay, 0 for dropped ones; `rounding`, `least` and `gap` () as in `Selection`. `is_held`:
+    whether the choice is the user's (`choose_rows`), which every function checks and renews.
     """
 
     # Arrays, not static: another choice of rows in the course of a motion runs the same program. The three numbers belong to the
@@ -41,6 +42,7 @@ class KeptRows(Constraint):
     least: Float[Array, ""]
     gap: Float[Array, ""]
     name: str = eqx.field(static=True)
+    is_held: bool = eqx.field(static=True, default=False)
 
     def position(self, system: SystemLike, q: Float[Array, " nq"], t: Number) -> Array | None:
         """Residual of the inner constraint, zero in dropped rows."""
@@ -63,7 +65,7 @@ class KeptRows(Constraint):
     def group(self):
         """Key of the inner constraint's group, different from that of constraints with all rows."""
         group = self.inner.group()
-        return None if group is None else ("kept rows", group)
+        return None if group is None else ("kept rows", self.is_held, group)
 
     def _mask_position(self, residual):
         return None if residual is None else residual * self.kept[: residual.shape[0]].astype(residual.dtype)
@@ -102,11 +104,11 @@ class Selection(NamedTuple):
     gap_here: Float[Array, ""]
 
 
-def keep_rows(scene: Scene, selection: Selection) -> Scene:
+def keep_rows(scene: Scene, selection: Selection, *, is_held: bool = False) -> Scene:
     """The scene with the rows that are not kept set to zero."""
     kept, rounding, least, gap, _ = map(jnp.asarray, selection)
     constraints = tuple(
-        KeptRows(constraint, kept[place.start : place.end], rounding, least, gap, constraint.name)  # pyright: ignore[reportArgumentType]
+        KeptRows(constraint, kept[place.start : place.end], rounding, least, gap, constraint.name, is_held)  # pyright: ignore[reportArgumentType]
         for constraint, place in zip(scene.constraints, layout(scene), strict=True)
     )
     return eqx.tree_at(lambda scene: scene.constraints, scene, constraints, is_leaf=lambda x: isinstance(x, tuple))
@@ -117,10 +119,15 @@ def has_selection(scene: Scene) -> bool:
     return any(isinstance(constraint, KeptRows) for constraint in scene.constraints)
 
 
+def holds_rows(scene: Scene) -> bool:
+    """True for a scene of `choose_rows`."""
+    return any(isinstance(constraint, KeptRows) and constraint.is_held for constraint in scene.constraints)
+
+
 def exchange_rows(scene: Scene, rows: Float[Array, " n"]) -> Scene:
     """A scene of `keep_rows` with another choice of rows, in the form of `rows_of`."""
     gap = scene.constraints[0].gap
-    return keep_rows(all_rows(scene), Selection(rows[:-1], rounding_of(scene), rows[-1], gap, gap))
+    return keep_rows(all_rows(scene), Selection(rows[:-1], scene.constraints[0].rounding, rows[-1], gap, gap))
 
 
 def all_rows(scene: Scene) -> Scene:
@@ -136,30 +143,20 @@ def row_mask(scene: Scene) -> Array:
     return jnp.concatenate([c.kept for c in scene.constraints])
 
 
-def rounding_of(scene: Scene) -> Array:
-    """`Selection.rounding` of a scene of `keep_rows`."""
-    return scene.constraints[0].rounding
-
-
 def rows_of(scene: Scene, dtype) -> Float[Array, " n"]:
     """The choice of rows as the vector that a step carries: 1 or 0 for each row, then `Selection.least`; a constant."""
     return lax.stop_gradient(jnp.append(row_mask(scene), scene.constraints[0].least)).astype(dtype)
 
 
-def largest_opening(scene: Scene, q, t, kept):
-    """Largest phi of the dropped rows over their sizes."""
-    held = holonomic_rows(layout(scene))
+def largest_opening(scene: Scene, q, t, kept, v=None):
+    """Largest phi of the dropped rows over their sizes, or with v the largest A v - b."""
     # With zero velocities the limits of all rows are those of positions. Relative to the largest row of the constraint, because a
     # dropped row may itself be almost zero.
-    sizes = largest_of_each(scene, row_limits(scene, q, jnp.zeros((scene.nv,), q.dtype), t, 1.0)[1])[held]
-    return jnp.max(jnp.abs(position_residual(scene, q, t)) / sizes * (1 - kept)[held], initial=0.0)
-
-
-@kernel
-def _largest_opening_rate(scene: Scene, q, v, t, kept):
-    """Largest A v - b of the dropped rows over their sizes."""
-    sizes = largest_of_each(scene, row_limits(scene, q, v, t, 1.0)[1])
-    return jnp.max(jnp.abs(velocity_residual(scene, q, v, t)) / sizes * (1 - kept), initial=0.0)
+    limits = row_limits(scene, q, jnp.zeros((scene.nv,), q.dtype) if v is None else v, t, 1.0)[1]
+    ratios = (1 - kept) / largest_of_each(scene, limits)
+    if v is None:
+        return jnp.max(jnp.abs(position_residual(scene, q, t)) * ratios[holonomic_rows(layout(scene))], initial=0.0)
+    return jnp.max(jnp.abs(velocity_residual(scene, q, v, t)) * ratios, initial=0.0)
 
 
 def opening_of_redundant(scene: Scene, q, t, v=None) -> Float[Array, ""]:
@@ -168,7 +165,7 @@ def opening_of_redundant(scene: Scene, q, t, v=None) -> Float[Array, ""]:
         return jnp.zeros((), q.dtype)
     whole, kept, q, t = _constants(scene, q, t)
     opening = kernel(largest_opening)(whole, q, t, kept)
-    return opening if v is None else jnp.maximum(opening, _largest_opening_rate(whole, q, stop_gradient(v), t, kept))
+    return opening if v is None else jnp.maximum(opening, kernel(largest_opening)(whole, q, t, kept, stop_gradient(v)))
 
 
 def residual_of_redundant(scene: Scene, q, v, t, a) -> Float[Array, ""]:
@@ -179,10 +176,9 @@ def residual_of_redundant(scene: Scene, q, v, t, a) -> Float[Array, ""]:
     v, a = stop_gradient((v, a))
     A, gamma, _ = rows(whole, q, v, t)
     sizes = jnp.abs(gamma) + matmul(jnp.abs(A), jnp.abs(a))
-    sizes = sizes + jnp.max(sizes)
-    some = sizes > 0
-    ratio = jnp.abs(matmul(A, a) - gamma) / jnp.where(some, sizes, jnp.ones_like(sizes))
-    return jnp.max(jnp.where(some, ratio, jnp.zeros_like(ratio)) * (1 - kept))
+    # Where all terms are zero, so is the residual.
+    sizes = sizes + jnp.maximum(jnp.max(sizes), float(jnp.finfo(q.dtype).tiny))
+    return jnp.max(jnp.abs(matmul(A, a) - gamma) / sizes * (1 - kept))
 
 
 def _constants(scene: Scene, q, t):
@@ -224,15 +220,12 @@ def _distribute(scene: Scene, q, t, lam, kept):
 def largest_of_each(scene: Scene, sizes) -> Array:
     """For each row (nc,) the largest size among the rows of its constraint, on positions or on velocities."""
     # Apart, because their units differ: m or rad for positions, whatever the user wrote for velocities.
-    parts = []
-    for place in layout(scene):
-        for start, end in ((place.start, place.nonholonomic), (place.nonholonomic, place.end)):
-            if end > start:
-                parts.append(jnp.broadcast_to(jnp.max(sizes[start:end])[None], (end - start,)))
-    return jnp.concatenate(parts)
+    ends = [(one.start, one.nonholonomic, one.end) for one in layout(scene)]
+    parts = [sizes[a:b] for start, middle, end in ends for a, b in ((start, middle), (middle, end)) if a < b]
+    return jnp.concatenate([jnp.full_like(part, jnp.max(part)) for part in parts])
 
 
 def most_opening(scene: Scene, dtype):
     """Largest opening of dropped rows along a motion: a hundred times their opening or difference at its start, plus rounding."""
     # A hundred times, because the rounding of a file can cancel at the start: at the configuration in which it was written.
-    return 100 * rounding_of(scene) + eps_of(jnp.zeros((), dtype)) ** 0.4
+    return 100 * scene.constraints[0].rounding + eps_of(jnp.zeros((), dtype)) ** 0.4

@@ -15,6 +15,7 @@ A dropped row stays in its place as a row of zeros (`KeptRows`), so that shapes,
 """
 
 from collections.abc import Callable
+from functools import partial
 from typing import Any
 
 import jax
@@ -23,7 +24,15 @@ import numpy as np
 from jax import lax
 from jaxtyping import Array, Float, Int
 
-from jaxdyn.compile import entry_point, evaluate, kernel, mark_invalid, pseudo_inverse_by_rotations, variant
+from jaxdyn.compile import (
+    eliminate_rows,
+    entry_point,
+    evaluate,
+    is_standalone,
+    kernel,
+    mark_invalid,
+    variant,
+)
 from jaxdyn.compile.batch import cond
 from jaxdyn.compile.known import is_concrete, is_tracing, stop_gradient
 from jaxdyn.constraints.base import constraint_jacobian, holonomic_rows, layout, position_residual
@@ -37,12 +46,15 @@ from jaxdyn.constraints.rank import (
     least_pivot_of,
     pseudo_inverse,
     rank_of,
+    solve_damped,
     tolerance,
 )
 from jaxdyn.constraints.redundancy import (
     Selection,
     all_rows,
+    exchange_rows,
     has_selection,
+    holds_rows,
     keep_rows,
     largest_of_each,
     largest_opening,
@@ -51,9 +63,7 @@ from jaxdyn.constraints.redundancy import (
 from jaxdyn.constraints.tolerances import coordinate_sizes
 from jaxdyn.dynamics.quantities import mass_matrix
 from jaxdyn.lie.so3 import matmul
-from jaxdyn.model.arguments import Numbers, check_state, state_dtype
-from jaxdyn.model.configuration import neutral
-from jaxdyn.model.tree import Model
+from jaxdyn.model.arguments import Numbers, check_state
 from jaxdyn.systems.mass_factor import cholesky, mass_factor
 from jaxdyn.systems.scene import Scene, as_scene
 from jaxdyn.systems.system import SceneLike, displace, retract
@@ -64,8 +74,10 @@ _FAR, _NEWTON_STEPS = 0.2, 12
 # The rows are chosen anew when their least pivot has fallen to this part of its value at their choice. A pivot is the square of a
 # sine, so that the sine of the angle between rows has halved.
 _EXCHANGED_AT = 0.25
-# Rows whose distances differ by less than this part are equally far.
-_ALIKE = 1e-3
+_UNCLEAR = (
+    "the rank of the constraints is not clear at this q: singular values that count differ by less than a factor of "
+    f"{LEAST_GAP:g} from those that do not"
+)
 # A row below this part of the largest one of its constraint has no direction of its own: rounding is all that it holds.
 _TINY_ROW = 1e-3
 
@@ -78,8 +90,8 @@ def unit_rows(scene: Scene, q, t) -> Float[Array, "nc nv"]:
     squares = jnp.sum(A * A, 1)
     largest = largest_of_each(scene, squares)
     squares = jnp.where(squares > _TINY_ROW**2 * largest, squares, largest)
-    some = squares > 0
-    return A * jnp.where(some, 1 / jnp.sqrt(jnp.where(some, squares, jnp.ones_like(squares))), squares)[:, None]
+    # A constraint may have rows of zeros alone.
+    return A / jnp.sqrt(jnp.maximum(squares, float(jnp.finfo(A.dtype).tiny)))[:, None]
 
 
 def eliminate(B: Float[Array, "nc nv"], least: float, first: Float[Array, " nc"], most=None) -> tuple[Array, ...]:
@@ -90,25 +102,9 @@ def eliminate(B: Float[Array, "nc nv"], least: float, first: Float[Array, " nc"]
 
     **Returns:** a mask (nc,) of 1 and 0, the largest distance () of a row that is not kept, and the least pivot () of the others.
     """
-
     # Not an SVD: it counts independent rows but does not name them, and LAPACK in a batch can deadlock (see `solve_square`).
-    def keep_next(_, state):
-        rest, kept, least_kept = state
-        # Rounding leaves a kept row a length of eps; it must not be chosen again.
-        lengths = jnp.sqrt(jnp.sum(rest * rest, 1)) * (1 - kept)
-        order = jnp.where((first > 0) & (lengths > least), lengths + jnp.max(lengths), lengths)
-        # Rows of symmetric mechanisms are equally far but for rounding, which differs between programs: the first one counts.
-        row = jnp.argmax(order >= (1 - _ALIKE) * jnp.max(order))
-        pivot = lengths[row]
-        along = rest[row] / jnp.where(pivot > 0, pivot, jnp.ones_like(pivot))
-        is_kept = pivot > least if most is None else (pivot > least) & (jnp.sum(kept) < most)
-        rest = jnp.where(is_kept, rest - matmul(rest, along)[:, None] * along[None], rest)
-        least_kept = jnp.where(is_kept, jnp.minimum(least_kept, pivot), least_kept)
-        return rest, kept.at[row].add(is_kept.astype(B.dtype)), least_kept
-
-    start = B, jnp.zeros_like(B[:, 0]), jnp.full((), jnp.inf, B.dtype)
-    rest, kept, least_kept = lax.fori_loop(0, min(B.shape), keep_next, start)
-    return kept, jnp.max(jnp.sqrt(jnp.sum(rest * rest, 1)) * (1 - kept)), least_kept
+    kept, rest, pivots = eliminate_rows(B, first, least, min(B.shape) if most is None else most)
+    return kept, jnp.max(rest), jnp.min(jnp.where(kept > 0, pivots, jnp.inf))
 
 
 def independent_rows(scene: Scene, q, t, rank_tol: float | None = None) -> Scene:
@@ -119,29 +115,51 @@ def independent_rows(scene: Scene, q, t, rank_tol: float | None = None) -> Scene
     Scenes of exact numbers, and those that have a choice of rows or a `rank_tol`, are returned as they are: there singular
     values below the tolerance count as zero.
     """
+    if holds_rows(scene):
+        return all_rows(scene) if rank_tol is not None else exchange_rows(scene, renew_rows(scene, q, t, False))
     if not (scene.rounding and scene.constraints) or rank_tol is not None or has_selection(scene):
         return scene
-    selection = _select_for_state(scene, q, t)
+    selection = select_rows(scene, q, t)
     if is_concrete(selection) and np.all(selection.kept == 1):
         return scene
     return keep_rows(scene, hide_unclear(selection)._replace(gap=jnp.minimum(selection.gap, selection.gap_here)))
 
 
+def choose_rows(scene: SceneLike, q: Float[Array, " nq"], t: Numbers = 0.0) -> Scene:
+    """The scene with the choice of its independent rows at an assembled configuration, for many calls with redundant rows.
+
+    A scene whose rows depend on each other but for the rounding of a file finds its rows anew in every call, by a search some
+    tens of microseconds long. Which rows count is a property of the mechanism; a choice that the scene holds costs a comparison
+    of pivots in each call, and is made again, with as many rows, where they have become nearly dependent. Forces of constraints
+    remain those of least norm.
+
+    **Arguments:** `scene`; `q` (nq,), on the constraints (`jd.assemble`), not in a singular position; `t`, s.
+
+    **Returns:** a scene for every function that takes one. Without redundant rows it is the one given.
+
+    **Raises:** ValueError where rounding hides which rows are independent.
+
+    Source: docs/constraints.md, redundant rows.
+    """
+    scene = all_rows(as_scene(scene))
+    q, t = check_state(scene.system, q=q, t=t)
+    if not layout(scene):
+        return scene
+    selection = select_rows(scene, q, t)
+    if is_concrete(selection):
+        if np.all(np.asarray(selection.kept) == 1):
+            return scene
+        if not min(selection.gap, selection.gap_here) >= LEAST_GAP:
+            raise ValueError(
+                f"q: {_UNCLEAR}; give numbers with more digits, or an assembled q away from singular positions"
+            )
+    selection = hide_unclear(selection)._replace(gap=jnp.minimum(selection.gap, selection.gap_here))
+    return keep_rows(scene, selection, is_held=True)
+
+
 def hide_unclear(selection: Selection) -> Selection:
     """The selection with NaN for all rows where it is not clear which ones are independent, so that no result is a guess."""
-    return selection._replace(kept=jnp.where(selection.gap < LEAST_GAP, jnp.nan, selection.kept))
-
-
-def _select_in_kernel(scene: Scene, q, t) -> Selection:
-    """All rows; invalid where some may repeat others. The choice of rows takes places that depend on data."""
-    every, least = _every_row(scene, q.dtype), clear_pivot(q)
-    is_doubtful = ~(_least_distance(Scene(scene.system, scene.constraints), q, t) > least)
-    return every._replace(kept=mark_invalid(is_doubtful, jnp.where(is_doubtful, jnp.nan, jnp.asarray(every.kept))))
-
-
-@variant(_select_in_kernel)
-def _select_for_state(scene: Scene, q, t) -> Selection:
-    return select_rows(scene, q, t, None)
+    return selection._replace(kept=jnp.where(selection.gap >= LEAST_GAP, selection.kept, jnp.nan))
 
 
 def rank_code(scene: Scene, result: Any) -> Any:
@@ -152,35 +170,50 @@ def rank_code(scene: Scene, result: Any) -> Any:
     return RESULTS.where(is_clear, result, RESULTS.unclear_rank)  # pyright: ignore[reportArgumentType]
 
 
+def _select_in_kernel(scene: Scene, q, t, rank_tol: float | None = None) -> Selection:
+    """All rows; invalid where some may repeat others, whose choice takes more than a kernel should hold."""
+    every = _every_row(scene, q.dtype)
+    may_repeat = _may_repeat(_least_doubtless(q, rank_tol), Scene(scene.system, scene.constraints), q, t)
+    return every._replace(kept=mark_invalid(may_repeat, jnp.asarray(every.kept)))
+
+
 def select_rows(scene: Scene, q, t: Any, rank_tol: float | None = None) -> Selection:
     """The independent rows of a mechanism at a configuration on its constraints; a constant.
 
     With `rank_tol` rows count whose pivots are above it, at this configuration; without it as the module says. Concrete and
     traced arguments give the same rows. Infinite or NaN rows are all kept; `assemble` and `simulate` report such states.
     """
+    if holds_rows(scene):
+        held, gap = renew_rows(scene, q, t, False), scene.constraints[0].gap
+        return Selection(held[:-1], scene.constraints[0].rounding, held[-1], gap, gap)
+    return _search_rows(scene, q, t, rank_tol)
+
+
+@variant(_select_in_kernel, marks=True)
+def _search_rows(scene: Scene, q, t: Any, rank_tol: float | None) -> Selection:
     # A choice has no derivative: forces do not select rows, and the scene, q and t enter without tangents.
     bare = stop_gradient(Scene(scene.system, scene.constraints))
     q, t = stop_gradient((q, t))
-    every, count = _every_row(bare, q.dtype), layout(bare)[-1].end if scene.constraints else 0
-    if count == 0:
+    every, least = _every_row(bare, q.dtype), _least_doubtless(q, rank_tol)
+    if not every.kept.size:
         return every
-    apart = rank_tol if rank_tol is not None else clear_pivot(q)
+    # Most scenes have independent rows: one Cholesky factorisation says so, and the search is skipped.
     if is_concrete(bare, q, t):
-        # NumPy decides first, so that nothing is compiled for independent rows.
-        B = evaluate(unit_rows, bare, np.asarray(q), np.asarray(t, q.dtype), is_input=not is_tracing())
-        if not np.isfinite(B).all() or np.sum(pivot_rows(B)[1] > apart) == count:
+        place = np.asarray(q), np.asarray(t, q.dtype)
+        if not evaluate(_may_repeat, bare, *place, static=(least,), is_input=not is_tracing()):
             return every
         with jax.ensure_compile_time_eval():
-            chosen = _select_by_program(bare, jnp.asarray(q), jnp.asarray(t, q.dtype), rank_tol)
+            chosen = _select(bare, *map(jnp.asarray, place), rank_tol)
         return Selection(*map(np.asarray, chosen))  # pyright: ignore[reportArgumentType]
     t = jnp.asarray(t, q.dtype)
-    if count > scene.nv:
+    if is_standalone():  # a program without JAX has no branches
         return _select(bare, q, t, rank_tol)
-    # Most scenes have independent rows: one Cholesky factorisation says so, and the search is skipped.
-    is_doubtful = ~(_least_distance(bare, q, t) > apart)
-    return Selection(
-        *cond(is_doubtful, lambda: _select(bare, q, t, rank_tol), lambda: Selection(*map(jnp.asarray, every)))
-    )
+    return _select_doubtful(rank_tol, bare, q, t)
+
+
+@kernel(static=1, fallback=lambda rank_tol, scene, q, t: _select(scene, q, t, rank_tol))
+def _select_doubtful(rank_tol: float | None, scene: Scene, q, t) -> Selection:
+    return Selection(*map(jnp.asarray, _select_in_kernel(scene, q, t, rank_tol)))
 
 
 def _every_row(scene: Scene, dtype) -> Selection:
@@ -190,10 +223,6 @@ def _every_row(scene: Scene, dtype) -> Selection:
 
 
 @entry_point
-def _select_by_program(scene: Scene, q, t, rank_tol):
-    return _select(scene, q, t, rank_tol)
-
-
 def _select(scene: Scene, q, t, rank_tol) -> Selection:
     """Rows that are independent beyond doubt at q, and of the others those that are independent a finite distance away."""
     B = kernel(unit_rows)(scene, q, t)
@@ -209,7 +238,9 @@ def _select(scene: Scene, q, t, rank_tol) -> Selection:
     below = jnp.maximum(rest, eps_of(q))
     below_here = jnp.where(jnp.all(kept == 1), jnp.maximum(below, scene.rounding), jnp.maximum(below, rounding))
     least = _EXCHANGED_AT * kernel(_pivot_of)(scene, q, t, kept)
-    return Selection(kept, rounding, least, pivot / below, pivot_here / below_here)
+    chosen = Selection(kept, rounding, least, pivot / below, pivot_here / below_here)
+    every, is_finite = _every_row(scene, q.dtype), jnp.isfinite(B).all()
+    return jax.tree.map(lambda x, y: jnp.where(is_finite, x, y), chosen, every)
 
 
 def renew_rows(scene: Scene, q, t, is_projected: bool) -> Float[Array, " n"]:
@@ -222,7 +253,7 @@ def renew_rows(scene: Scene, q, t, is_projected: bool) -> Float[Array, " n"]:
     old = rows_of(scene, q.dtype)
     whole = all_rows(scene)
     bare, q, t = stop_gradient((Scene(whole.system, whole.constraints), q, jnp.asarray(t, q.dtype)))
-    return _renew(bare, q, t, old, is_projected)
+    return _renew(bare, q, t, old, True) if is_projected else _checked_rows(bare, q, t, old)
 
 
 def _check_kept_rows(bare: Scene, q, t, old, is_projected: bool):
@@ -235,29 +266,36 @@ def _check_kept_rows(bare: Scene, q, t, old, is_projected: bool):
 @variant(_check_kept_rows, marks=True)
 def _renew(bare: Scene, q, t, old, is_projected: bool):
     del is_projected
+    is_poor = jnp.any(old[:-1] == 0) & ~(kernel(_pivot_of)(bare, q, t, old[:-1]) > old[-1])
+    again = partial(_choose_again, bare, q, t, old)
+    return again() if is_standalone() else cond(is_poor, again, lambda: old)
+
+
+def _choose_again(bare: Scene, q, t, old):
+    """Another choice of rows where the old one is poor."""
     kept, least = old[:-1], old[-1]
-    dropped = jnp.any(kept == 0)
     pivot = kernel(_pivot_of)(bare, q, t, kept)
-    poor = dropped & ~(pivot > least)
+    is_poor = jnp.any(kept == 0) & ~(pivot > least)
+    # The number of rows is kept: only the count at the start distinguishes redundant rows from a singular position.
+    new = eliminate(kernel(unit_rows)(bare, q, t), 0.0, jnp.zeros_like(kept), jnp.sum(kept))[0]
+    pivot_of_new = kernel(_pivot_of)(bare, q, t, new)
+    # At a singular position no choice is good. The old rows are kept then, unless the new ones are better, and the limit is
+    # lowered with the pivot, so that the search is not repeated in every step on the way through.
+    is_better = is_poor & ~(pivot_of_new < pivot)
+    kept_next, next_pivot = jnp.where(is_better, new, kept), jnp.where(is_better, pivot_of_new, pivot)
+    return jnp.where(is_poor, jnp.append(kept_next, _EXCHANGED_AT * next_pivot), old)
 
-    def choose():
-        # The number of rows is kept: only the count at the start distinguishes redundant rows from a singular position.
-        new = eliminate(kernel(unit_rows)(bare, q, t), 0.0, jnp.zeros_like(kept), jnp.sum(kept))[0]
-        pivot_of_new = kernel(_pivot_of)(bare, q, t, new)
-        # At a singular position no choice is good. The old rows are kept then, unless the new ones are better, and the limit is
-        # lowered with the pivot, so that the search is not repeated in every step on the way through.
-        better = poor & ~(pivot_of_new < pivot)
-        kept_next, next_pivot = jnp.where(better, new, kept), jnp.where(better, pivot_of_new, pivot)
-        return jnp.where(poor, jnp.append(kept_next, _EXCHANGED_AT * next_pivot), old)
 
-    return cond(poor, choose, lambda: old)
+@kernel(fallback=_choose_again)
+def _checked_rows(bare: Scene, q, t, old):
+    return _check_kept_rows(bare, q, t, old, False)
 
 
 def _keep_state(old, new, project: Callable, state):
     return state
 
 
-@variant(_keep_state)
+@variant(_keep_state, marks=True)
 def project_after_exchange(old, new, project: Callable, state: Any) -> Any:
     """project(state) where the rows `new` of the next step are not the `old` ones, else the state.
 
@@ -275,41 +313,16 @@ def _pivot_of(scene: Scene, q, t, kept):
     return least_pivot_of(mass_factor(mass_matrix(scene.system, q, t)).whiten(A.T))
 
 
-def may_have_redundant_rows(scene: Scene) -> bool:
-    """True where some set of coupled coordinates has at least as many rows as coordinates: it moves only if rows are redundant.
-
-    True for a scene of rounded numbers, and for one that is traced, too. A motion of exact numbers with redundant rows among
-    fewer than that is right without a selection, by the rank at every evaluation, in short steps.
-    """
-    bare = Scene(scene.system, scene.constraints)
-    if scene.rounding or not is_concrete(bare):
-        return True
-    # Away from the neutral configuration, at which entries of A may vanish that do not vanish elsewhere.
-    step = np.random.default_rng(0).uniform(0.1, 0.9, scene.nv).astype(state_dtype(scene.system))
-    try:
-        is_coupled = np.abs(evaluate(_generic_rows, bare, step, is_input=not is_tracing())) > 0
-    except jax.errors.JAXTypeError:  # a constraint is a function that holds a traced number
-        return True
-    # Connected components of the graph whose edges are the rows: a scene of two four-bars is two sets of coordinates.
-    groups = np.arange(scene.nv)
-    for row in is_coupled:
-        groups[np.isin(groups, groups[row])] = groups[row].min(initial=scene.nv)
-    counts = np.bincount([groups[row][0] for row in is_coupled if row.any()], minlength=scene.nv + 1)
-    return bool(any(not row.any() for row in is_coupled) or any(counts[g] >= np.sum(groups == g) for g in set(groups)))
+def _least_doubtless(like, rank_tol: float | None) -> float:
+    """Distance from the others above which a row counts, whatever the tolerance."""
+    return max(clear_pivot(like), rank_tol or 0.0)
 
 
-def _generic_rows(scene: Scene, step):
-    system = scene.system
-    start = neutral(system).astype(step.dtype) if isinstance(system, Model) else jnp.zeros((scene.nq,), step.dtype)
-    return constraint_jacobian(scene, displace(system, start, step), jnp.zeros((), step.dtype))
-
-
-@kernel
-def _least_distance(scene: Scene, q, t):
-    """Least distance of a row from the span of those before it; NaN where a row is dependent."""
-    # The diagonal of the Cholesky factor of B B^T holds these distances.
+def _may_repeat(least: float, scene: Scene, q, t):
+    """Whether the distance of some row from the span of those before it is not above `least`; True for NaN."""
+    # The diagonal of the Cholesky factor of B B^T holds these distances, NaN where a row is dependent.
     B = unit_rows(scene, q, t)
-    return jnp.min(jnp.diagonal(cholesky(matmul(B, B.T))))
+    return ~(jnp.min(jnp.diagonal(cholesky(matmul(B, B.T)))) > least)
 
 
 def _select_far_away(scene: Scene, q, t, sure, apart: float):
@@ -322,14 +335,11 @@ def _select_far_away(scene: Scene, q, t, sure, apart: float):
     least = tolerance(None, q)
     held = holonomic_rows(layout(scene))
 
-    def inverse_of(A):
-        return pseudo_inverse_by_rotations(A * sizes[None], least)  # of coordinates in units of their sizes
-
     # Any admissible direction will do that moves all of the mechanism. The golden ratio's multiples are equally spread, and the
     # same in every call: a random direction would make the choice of rows, and so the bits of a motion, random.
     A = sure[:, None] * constraint_jacobian(scene, q, t)
     direction = jnp.asarray(1 + np.modf(np.arange(scene.nv) * 0.618)[0], q.dtype)
-    direction = direction - matmul(inverse_of(A), matmul(A * sizes[None], direction))
+    direction = direction - solve_damped(A * sizes[None], matmul(A * sizes[None], direction))
     length = jnp.max(jnp.abs(direction))
     # A structure (no admissible direction) is tested where it is.
     moves = length > 1e-6
@@ -339,7 +349,7 @@ def _select_far_away(scene: Scene, q, t, sure, apart: float):
     def close(_, place):
         place = retract(scene.system, place)
         A = (sure[:, None] * constraint_jacobian(scene, place, t))[held]
-        step = matmul(inverse_of(A), sure[held] * position_residual(scene, place, t)) * sizes
+        step = solve_damped(A * sizes[None], sure[held] * position_residual(scene, place, t)) * sizes
         # A step longer than the distance itself would leave the branch.
         size = jnp.max(jnp.abs(step / sizes))
         return displace(scene.system, place, -step * jnp.minimum(1.0, _FAR / jnp.where(size > 0, size, 1.0)))
@@ -366,20 +376,6 @@ def _select_far_away(scene: Scene, q, t, sure, apart: float):
 def most_rounding(dtype) -> float:
     """Opening of dropped rows above which they are not redundant but contradict the others."""
     return 10 * clear_pivot(np.zeros((), dtype))
-
-
-def pivot_rows(B: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Indices of the rows that `eliminate` takes one after the other, and their pivots, of a concrete B."""
-    rest, rows, pivots = np.array(B), [], []
-    for _ in range(min(B.shape)):
-        lengths = np.linalg.norm(rest, axis=1)
-        rows.append(int(np.argmax(lengths)))
-        pivots.append(lengths[rows[-1]])
-        if pivots[-1] == 0:
-            break
-        along = rest[rows[-1]] / pivots[-1]
-        rest = rest - np.outer(rest @ along, along)
-    return np.asarray(rows, int), np.asarray(pivots)
 
 
 def degrees_of_freedom(
@@ -415,10 +411,7 @@ def degrees_of_freedom(
     if not is_concrete(free):
         return free
     if free < 0:
-        raise ValueError(
-            "the rank of the constraints is not clear at this q: singular values that count differ by less than a factor of "
-            f"{LEAST_GAP:g} from those that do not; give numbers with more digits, or a rank_tol between them"
-        )
+        raise ValueError(f"{_UNCLEAR}; give numbers with more digits, or a rank_tol between them")
     return int(free)
 
 

@@ -17,13 +17,10 @@ Sources: Sugihara (2011), Solvability-unconcerned inverse kinematics by the Leve
 
 from typing import NamedTuple
 
-import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array
 
-from jaxdyn.compile import kernel
-from jaxdyn.compile.batch import while_loop
 from jaxdyn.compile.loops import Carry, Given, Iteration, Task, run_loop
 from jaxdyn.constraints.base import constraint_jacobian, holonomic_rows, layout, position_residual
 from jaxdyn.constraints.rank import eps_of
@@ -88,30 +85,13 @@ def search(scene: Scene, q, t, aims: Aims, guesses: int) -> tuple[Array, Array]:
     none = jnp.zeros((), jnp.int32)
     large = jnp.full((), jnp.inf, q.dtype)
     state = Search(q, jnp.full((), _DAMPING, q.dtype), none, none + 1, q, large, q, jnp.asarray(False))
-    task = Task(_turn, _by_turns, (guesses,))
-    constants, carry = (t, aims), Carry(state)
-    after = run_loop(task, scene, constants, Given(), carry)
-    if after is None or not after[1]:
-        carry = _by_turns(guesses, scene, constants, Given(), carry)
-    else:
-        carry = after[0]
-    return carry.state.best, carry.state.tried
+    state = run_loop(Task(_turn, (guesses,)), scene, (t, aims), Given(), Carry(state)).state
+    return state.best, state.tried
 
 
 def _turn(guesses: int, scene: Scene, constants, state: Search, _) -> Iteration:
     after = _improve(guesses, scene, constants, state)
     return Iteration(after, ~state.done, ~after.done)
-
-
-def _by_turns(guesses: int, scene: Scene, constants, given: Given, carry: Carry) -> Carry:
-    """All steps, as operations of JAX around kernels."""
-
-    def step(state: Search) -> Search:
-        after = kernel(_improve, static=1, derivative=False)(guesses, scene, constants, state)
-        # A batch continues until all of its samples have ended: those that have must not change.
-        return jax.tree.map(lambda new, old: jnp.where(state.done, old, new), after, state)
-
-    return Carry(while_loop(lambda state: ~state.done, step, carry.state))
 
 
 def _improve(guesses: int, scene: Scene, constants, state: Search) -> Search:

@@ -17,8 +17,9 @@ from jaxtyping import Array, Float
 from jaxdyn.compile import entry_point, gram_eigenvectors
 from jaxdyn.compile.known import is_known
 from jaxdyn.constraints.base import constraint_jacobian, layout, velocity_residual
-from jaxdyn.constraints.rank import condition_number, pseudo_inverse, rank_of, sign_of_determinant, tolerance
-from jaxdyn.constraints.selection import independent_rows, pivot_rows
+from jaxdyn.constraints.branches import sign_of_determinant
+from jaxdyn.constraints.rank import condition_number, pseudo_inverse, rank_of, tolerance
+from jaxdyn.constraints.selection import independent_rows
 from jaxdyn.lie.so3 import matmul
 from jaxdyn.model.arguments import Number, Numbers, batch_hint, check_state
 from jaxdyn.systems.mass_factor import cholesky, solve_cholesky, solve_lower
@@ -285,16 +286,20 @@ def tangent_basis(
     **Arguments:** `q` (nq,); `t`, s; `dof`: nr, by default nv minus the rank of A on concrete numbers and minus the number
     of rows on traced ones; `rank_tol` as in `constrained_dynamics`.
 
-    **Raises:** ValueError when no degree of freedom remains, or when `dof` is required.
+    **Returns:** (nv, nr); NaN on traced numbers without `dof` where the rows are dependent, and where the rank is not clear.
+
+    **Raises:** ValueError when no degree of freedom remains, when `dof` is required, and for a rank that is not clear.
     """
     scene = as_scene(scene)
     q, t = check_state(scene.system, q=q, t=t)
     if not layout(scene):
         raise ValueError("the scene has no constraints, so every velocity is tangent; add some")
-    scene = independent_rows(scene, q, t, rank_tol)
+    scene, counts = independent_rows(scene, q, t, rank_tol), dof is None
     dof = count_dof(scene, q, t, dof, rank_tol)
-    projector, _ = _tangent_projection(scene, q, t, rank_tol)
-    return split_directions(projector)[:, scene.nv - dof :]
+    projector, rank = _tangent_projection(scene, q, t, rank_tol)
+    basis = split_directions(projector)[:, scene.nv - dof :]
+    # The number of columns is a shape. Where it is that of all rows, the decision on those that count has to confirm it.
+    return jnp.where(rank == scene.nv - dof, basis, jnp.nan) if counts else basis
 
 
 def count_dof(scene: Scene, q, t, dof: int | None = None, rank_tol: float | None = None) -> int:
@@ -309,7 +314,13 @@ def count_dof(scene: Scene, q, t, dof: int | None = None, rank_tol: float | None
     count = layout(scene)[-1].end
     # The number of columns is a shape: it cannot follow from a traced rank.
     known = is_known(scene, q, t)
-    dof = scene.nv - (int(_tangent_projection(scene, q, t, rank_tol)[1]) if known else count)
+    rank = _tangent_projection(scene, q, t, rank_tol)[1] if known else count
+    if np.isnan(rank):
+        raise ValueError(
+            "the rank of the constraints is not clear: rounding of the scene's numbers hides which rows repeat others; give "
+            "numbers with more digits, or a rank_tol"
+        )
+    dof = scene.nv - int(rank)
     if dof < 1:
         fix = "remove one" if known else "if some of them depend on others, give dof, the number of degrees of freedom"
         raise ValueError(f"{count} constraint rows leave no degree of freedom of nv = {scene.nv}: {fix}")
@@ -336,9 +347,23 @@ def independent_velocities(scene: Scene, q, t: Number = 0.0) -> tuple[int, ...]:
     scene = independent_rows(scene, q, t)
     A = np.asarray(constraint_jacobian_compiled(scene, q, jnp.asarray(t, q.dtype)), float)
     # The pivots of its columns are the dependent velocities.
-    columns, pivots = pivot_rows(A.T)
+    columns, pivots = _pivots(A.T)
     dependent = columns[pivots > 1e-9 * np.linalg.norm(A)]
     return tuple(np.setdiff1d(np.arange(scene.nv), dependent).tolist())
+
+
+def _pivots(B: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Indices of the rows of a concrete B by their distance from the span of those before them, and these distances."""
+    rest, rows, pivots = np.array(B), [], []
+    for _ in range(min(B.shape)):
+        lengths = np.linalg.norm(rest, axis=1)
+        rows.append(int(np.argmax(lengths)))
+        pivots.append(lengths[rows[-1]])
+        if pivots[-1] == 0:
+            break
+        along = rest[rows[-1]] / pivots[-1]
+        rest = rest - np.outer(rest @ along, along)
+    return np.asarray(rows, int), np.asarray(pivots)
 
 
 def orthonormal(columns: Float[Array, "n k"]) -> tuple[Float[Array, "n k"], Float[Array, ""], Float[Array, "k k"]]:

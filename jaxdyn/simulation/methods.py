@@ -13,10 +13,14 @@ A method defines the state y of the equation, its rate, and its correction after
 from typing import Any, ClassVar, TypeAlias
 
 import equinox as eqx
+import jax
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array, Float
 
-from jaxdyn.constraints.base import Rows, holonomic_rows, layout, position_residual, rows
+from jaxdyn.compile import evaluate
+from jaxdyn.compile.known import is_concrete, is_tracing
+from jaxdyn.constraints.base import Rows, constraint_jacobian, holonomic_rows, layout, position_residual, rows
 from jaxdyn.constraints.codes import RESULTS
 from jaxdyn.constraints.dynamics import constrained_dynamics, solve_rows
 from jaxdyn.constraints.projection import project_state, project_step
@@ -26,7 +30,9 @@ from jaxdyn.constraints.selection import most_rounding
 from jaxdyn.constraints.tolerances import openness
 from jaxdyn.dynamics.quantities import forward_dynamics
 from jaxdyn.lie.so3 import matmul
-from jaxdyn.model.arguments import Number, Numbers
+from jaxdyn.model.arguments import Number, Numbers, state_dtype
+from jaxdyn.model.configuration import neutral
+from jaxdyn.model.tree import Model
 from jaxdyn.reduction.bases import (
     Basis,
     BasisLike,
@@ -42,7 +48,7 @@ from jaxdyn.reduction.bases import (
 from jaxdyn.reduction.minimal import solve_in_basis
 from jaxdyn.simulation.solvers.choice import Solver, Stepsize
 from jaxdyn.systems.scene import Scene, as_pytree
-from jaxdyn.systems.system import needs_retraction, rate_to_velocity, retract, velocity_to_rate
+from jaxdyn.systems.system import displace, needs_retraction, rate_to_velocity, retract, velocity_to_rate
 
 State: TypeAlias = dict[str, Any]  # arrays, and pytrees of them, by name
 Q: TypeAlias = Float[Array, " nq"]
@@ -344,3 +350,32 @@ def consistent(scene: Scene, q, v, t):
 def satisfies_redundant_rows(scene: Scene, q, v, t):
     """True if the rows that were dropped at the start of a motion are still satisfied."""
     return opening_of_redundant(scene, q, t, v) <= most_opening(scene, q.dtype)
+
+
+def may_have_redundant_rows(scene: Scene) -> bool:
+    """True where some set of coupled coordinates has at least as many rows as coordinates: it moves only if rows are redundant.
+
+    True for a scene of rounded numbers, and for one that is traced, too. A motion of exact numbers with redundant rows among
+    fewer than that is right without a selection, by the rank at every evaluation, in short steps.
+    """
+    bare = Scene(scene.system, scene.constraints)
+    if scene.rounding or not is_concrete(bare):
+        return True
+    # Away from the neutral configuration, at which entries of A may vanish that do not vanish elsewhere.
+    step = np.random.default_rng(0).uniform(0.1, 0.9, scene.nv).astype(state_dtype(scene.system))
+    try:
+        is_coupled = np.abs(evaluate(_generic_rows, bare, step, is_input=not is_tracing())) > 0
+    except jax.errors.JAXTypeError:  # a constraint is a function that holds a traced number
+        return True
+    # Connected components of the graph whose edges are the rows: a scene of two four-bars is two sets of coordinates.
+    groups = np.arange(scene.nv)
+    for row in is_coupled:
+        groups[np.isin(groups, groups[row])] = groups[row].min(initial=scene.nv)
+    counts = np.bincount([groups[row][0] for row in is_coupled if row.any()], minlength=scene.nv + 1)
+    return bool(any(not row.any() for row in is_coupled) or any(counts[g] >= np.sum(groups == g) for g in set(groups)))
+
+
+def _generic_rows(scene: Scene, step):
+    system = scene.system
+    start = neutral(system).astype(step.dtype) if isinstance(system, Model) else jnp.zeros((scene.nq,), step.dtype)
+    return constraint_jacobian(scene, displace(system, start, step), jnp.zeros((), step.dtype))

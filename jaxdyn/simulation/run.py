@@ -14,14 +14,13 @@ import jax.numpy as jnp
 import numpy as np
 
 from jaxdyn.compile.known import is_concrete, is_known
-from jaxdyn.constraints.selection import may_have_redundant_rows
 from jaxdyn.contact.unilateral import has_modes
 from jaxdyn.model.arguments import Numbers, as_array, state_dtype
 from jaxdyn.simulation import checks, controls
 from jaxdyn.simulation.checks import check_constraints, choose_method, may_have_singular_mass
 from jaxdyn.simulation.controls import Control
 from jaxdyn.simulation.hybrid.motion import hybrid_motion
-from jaxdyn.simulation.methods import Method
+from jaxdyn.simulation.methods import Method, may_have_redundant_rows
 from jaxdyn.simulation.motion import smooth_motion
 from jaxdyn.simulation.solution import Solution, raise_failure
 from jaxdyn.simulation.solvers.choice import (

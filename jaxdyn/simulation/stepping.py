@@ -11,13 +11,14 @@ from jax.flatten_util import ravel_pytree
 from jaxdyn.compile import is_standalone
 from jaxdyn.compile.known import is_concrete, partition_tracers
 from jaxdyn.constraints.redundancy import keep_rows
-from jaxdyn.constraints.selection import hide_unclear, may_have_redundant_rows, select_rows
+from jaxdyn.constraints.selection import hide_unclear, select_rows
 from jaxdyn.contact.unilateral import has_modes
 from jaxdyn.forces.piecewise import fix_pieces, guards, pieces_of, values_and_levels
 from jaxdyn.model.arguments import Numbers, as_array, check_shape, state_dtype
 from jaxdyn.simulation.checks import choose_method
 from jaxdyn.simulation.equations import DRIVES
 from jaxdyn.simulation.hybrid.piecewise import PiecewiseSystem, piecewise_motion
+from jaxdyn.simulation.methods import may_have_redundant_rows
 from jaxdyn.simulation.solvers import ExplicitSteps
 from jaxdyn.simulation.solvers.driver import step_control
 from jaxdyn.simulation.solvers.explicit import take_step

@@ -2,6 +2,7 @@
 
 import concurrent.futures
 import contextlib
+import ctypes
 import hashlib
 import importlib.util
 import json
@@ -682,6 +683,33 @@ def test_what_all_samples_share_is_read_once():
         [math.prod(map(int, re.findall(r"(\d+)x", kind))) for kind in re.findall(r"tensor<([^>]*)>", x)] for x in copied
     ]
     assert all(before == after for before, after in sizes), copied
+
+
+@pytest.mark.native
+@pytest.mark.parametrize("width", [1, 4])
+def test_results_do_not_depend_on_the_level_of_the_compiler(width, monkeypatch):
+    rng = np.random.default_rng(5)
+
+    def function(A, x):
+        y = A @ (jnp.sin(x) * x) - jnp.cos(A @ x)
+        z = jnp.exp(-jnp.abs(y)) + jnp.log1p(y * y) / (1 + y * y) + jnp.cbrt(y) * jnp.tanh(y)
+        z = z + jnp.abs(y) ** 2.0 + jnp.abs(y) ** 0.5 + jnp.exp2(z) + jnp.arctan2(y, z) + jnp.tan(y) * jnp.floor(z)
+        return jnp.linalg.solve(A @ A.T + jnp.eye(4), z), jnp.where(z > y, z * y - x, x - z * y)
+
+    A, x = rng.normal(size=(9, 4, 4)), rng.normal(size=(9, 4)) * 10
+    made = expand(jax.make_jaxpr(function)(A[0], x[0]), 10**5)[0]
+    text = kernel_ir(made, width, [False, False])
+    assert "fmuladd" in text
+    results = []
+    for level in (0, 1):
+        monkeypatch.setattr(objects, "_level", lambda level=level: level)
+        monkeypatch.setattr(objects, "wants_least_optimisation", lambda level=level: level == 0)
+        code, rows = objects.Code(objects.compile_text(text)), [np.empty((9, 4)), np.empty((9, 4))]
+        data = (ctypes.c_void_p * 4)(*(y.ctypes.data for y in (A, x, *rows)))
+        ctypes.CFUNCTYPE(None, ctypes.c_void_p, *[ctypes.c_int64] * 3)(code.address("kernel"))(data, 9, 0, 9)
+        results.append(rows)
+    np.testing.assert_array_equal(*results)
+    np.testing.assert_allclose(results[0], jax.vmap(function)(A, x), rtol=1e-11)
 
 
 def test_lanes_follow_the_batch_and_the_dtype():

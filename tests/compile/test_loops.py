@@ -5,8 +5,8 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from jaxdyn.compile import kernel, target
-from jaxdyn.compile.batch import repeat_while, while_loop
+from jaxdyn.compile import compilation, kernel, target
+from jaxdyn.compile.batch import repeat_while
 from jaxdyn.compile.code import symbol_of
 from jaxdyn.compile.expansion import expand
 from jaxdyn.compile.loops import Carry, Given, Iteration, Task, run_loop
@@ -18,20 +18,11 @@ def _turn(tree, constants, state, _):
     return Iteration((after, count + 1), count < 20, count + 1 < 20)
 
 
-def _by_turns(tree, constants, given, carry):
-    def step(state):
-        return _turn(tree, constants, state, ()).state
-
-    return Carry(while_loop(lambda state: state[1] < 20, step, carry.state))
-
-
-TASK = Task(_turn, _by_turns, ())
+TASK = Task(_turn, ())
 
 
 def _iterate(matrix, offset, x):
-    carry, always_ends = run_loop(TASK, matrix, offset, Given(), Carry((x, jnp.zeros((), jnp.int32))))
-    assert always_ends
-    return carry.state[0]
+    return run_loop(TASK, matrix, offset, Given(), Carry((x, jnp.zeros((), jnp.int32)))).state[0]
 
 
 def test_operations_of_a_loop_take_arrays_of_any_shape():
@@ -83,29 +74,21 @@ def _branching_turn(tree, constants, state, _):
     return Iteration(after, turn < 6, turn + 1 < 6)
 
 
-def _branching_by_turns(tree, constants, given, carry):
-    def step(state):
-        return _branching_turn(tree, constants, state, ()).state
-
-    return Carry(while_loop(lambda state: state[3] < 6, step, carry.state))
-
-
 @pytest.mark.native
 @pytest.mark.parametrize("count", [1, 3, 64])
 def test_branches_of_a_loop_are_taken_by_the_samples_that_need_them(count):
     """Branches of the loop and of a subprogram, against the same turns by JAX, to rounding."""
-    task = Task(_branching_turn, _branching_by_turns, ())
+    task = Task(_branching_turn, ())
 
     def native(x):
-        carry, always_ends = run_loop(task, scale, limit, Given(), Carry(start(x)))
-        assert always_ends
-        return carry.state
+        return run_loop(task, scale, limit, Given(), Carry(start(x))).state
 
     def start(x):
         return x, jnp.zeros(()), jnp.zeros((), jnp.int64), jnp.zeros((), jnp.int32)
 
     def by_jax(x):
-        return _branching_by_turns(scale, limit, None, Carry(start(x))).state
+        with compilation("plain"):
+            return native(x)
 
     scale, limit = jnp.asarray(0.75), jnp.asarray(1.2)
     x = jnp.linspace(-1.0, 3.0, count) if count > 1 else jnp.asarray([2.5])
@@ -140,8 +123,9 @@ def test_numbers_that_programs_do_not_have_run_by_jax():
         x, count = state
         return Iteration((half(x, count.astype(jnp.uint32)), count + 1), count < 3, count + 1 < 3)
 
-    task = Task(turn, _by_turns, ())
-    assert run_loop(task, (), (), Given(), Carry((jnp.ones(()), jnp.ones((), jnp.int32)))) is None
+    run = jax.jit(lambda x: run_loop(Task(turn, ()), (), (), Given(), Carry((x, jnp.ones((), jnp.int32)))).state)
+    assert "while" in run.lower(jnp.ones(())).as_text()
+    assert run(jnp.ones(()))[1] == 3
 
 
 def test_a_branch_that_repeats_a_call_shares_its_code():
@@ -162,10 +146,10 @@ def test_llvm_works_on_a_loop_while_xla_compiles(monkeypatch):
     """Once, under the user's own `jax.jit` too: a second kernel of the loop is for what the native loop refuses."""
     made = []
     monkeypatch.setattr(target, "make_ahead", made.append)
-    task = Task(lambda *args: _turn(*args), _by_turns, ())  # new, so that no other test has lowered its loop
+    task = Task(lambda *args: _turn(*args), ())  # new, so that no other test has lowered its loop
 
     def iterate(matrix, offset, x):
-        return run_loop(task, matrix, offset, Given(), Carry((x, jnp.zeros((), jnp.int32))))[0].state[0]
+        return run_loop(task, matrix, offset, Given(), Carry((x, jnp.zeros((), jnp.int32)))).state[0]
 
     x = np.ones((3, 2))
     for axes, matrix in (((None, None, 0), x[:2]), ((0, None, 0), np.ones((3, 2, 2)))):
@@ -178,11 +162,11 @@ def test_llvm_works_on_the_subprograms_of_a_batched_loop_while_it_is_traced(monk
     """Once for each width of vectors, whatever is batched further; a loop of one sample may be batched later and waits."""
     tasks = []
     monkeypatch.setattr(target.ahead, "make_later", tasks.append)
-    task = Task(lambda *args: _branching_turn(*args), _branching_by_turns, ())
+    task = Task(lambda *args: _branching_turn(*args), ())
 
     def iterate(x):
         state = x, jnp.zeros(()), jnp.zeros((), jnp.int64), jnp.zeros((), jnp.int32)
-        return run_loop(task, jnp.asarray(0.6), jnp.asarray(1.3), Given(), Carry(state))[0].state[1]
+        return run_loop(task, jnp.asarray(0.6), jnp.asarray(1.3), Given(), Carry(state)).state[1]
 
     (call,) = [x for x in jax.make_jaxpr(iterate)(1.0).eqns if "program" in x.params]
     assert not tasks

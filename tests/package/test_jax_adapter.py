@@ -340,7 +340,7 @@ def test_another_interface_of_xla_leaves_everything_to_jax(future, monkeypatch, 
     folder.mkdir(parents=True)
     (folder / "c_api.h").write_text(changed((r"API_MAJOR \d+", "API_MAJOR 1")))
     monkeypatch.setattr(jax.ffi, "include_dir", lambda: str(tmp_path))
-    monkeypatch.setattr(target, "register", target.register.__wrapped__)
+    monkeypatch.setattr(target, "_register", target._register.__wrapped__)
     function = fresh(sums)
     with one_warning(r"Unsupported: jaxlib has version 1\.\d+ of XLA's FFI"):
         computed = results(function, X)

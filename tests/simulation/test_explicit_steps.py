@@ -12,7 +12,6 @@ from benchmarks.report_cases import cases, test_set
 from jaxdyn import scenes
 from jaxdyn.compile import loops
 from jaxdyn.constraints.base import velocity_residual
-from jaxdyn.simulation.solvers import driver
 from jaxdyn.simulation.solvers.explicit import ExplicitSteps
 from jaxdyn.systems.scene import Scene
 
@@ -87,47 +86,23 @@ def twice(scene):
     "case", [pytest.param(name, marks=[pytest.mark.slow] * (name != "free body")) for name in CASES]
 )
 def test_stages_at_once_are_those_in_turn(case, monkeypatch):
-    """All steps in one kernel, a kernel a step, its stages in turn, and without kernels; a batch and one sample."""
+    """All steps in one kernel, a kernel a step, and without kernels; a batch and one sample."""
     one, vs = batch(*CASES[case]())
-    taken, looped, kernel, run_loop = [], [], driver.kernel, loops.run_loop
+    looped, run_natively = [], loops._run_natively
 
     def counted(*args):
-        computed = run_loop(*args)
+        computed = run_natively(*args)
         looped.append(computed is not None)
         return computed
 
-    monkeypatch.setattr(loops, "run_loop", counted)
-    in_one, alone = quick(jax.vmap(one))(vs), quick(one)(vs[1])
+    monkeypatch.setattr(loops, "_run_natively", counted)
+    computed, alone = quick(jax.vmap(one))(vs), quick(one)(vs[1])
     assert all(looped) and looped
-    monkeypatch.setattr(loops, "run_loop", lambda *_: None)
-
-    def refuse(*args):
-        # Where rows may be exchanged, the program has a second way: zeros show if a step takes it.
-        if case == "dependent rows":
-            return jax.tree.map(jnp.zeros_like, driver._advance_by_fallback(*args))
-        taken.append(False)
-        raise AssertionError("a step is no kernel")
-
-    def noted(function, **options):
-        if function is driver._advance:
-            taken.append(True)
-            options["fallback"] = refuse
-        return kernel(function, **options)
-
-    monkeypatch.setattr(driver, "kernel", noted)
-    computed = quick(jax.vmap(one))(vs)
-    assert all(taken) and taken
-
-    def without(function, **options):
-        if function is not driver._advance:
-            return kernel(function, **options)
-        return lambda *args, where: options["fallback"](*args)
-
-    monkeypatch.setattr(driver, "kernel", without)
+    monkeypatch.setattr(loops, "_run_natively", lambda *_: None)
     in_turn = quick(jax.vmap(one))(vs)
     with jd.compilation("plain"):
         plain = quick(jax.vmap(one))(vs)
-    for wanted in (in_one, in_turn, plain):
+    for wanted in (in_turn, plain):
         assert bool(computed.success.all()) and bool(wanted.success.all())
         np.testing.assert_allclose(computed.q, wanted.q, rtol=0, atol=1e-12)
         np.testing.assert_allclose(computed.v, wanted.v, rtol=0, atol=1e-12)

@@ -8,20 +8,16 @@ Reverse mode goes back through the same steps (see `reverse`).
 """
 
 from collections.abc import Callable
-from functools import lru_cache, partial
 from typing import Any, NamedTuple
 
 import diffrax
 import jax
 import jax.numpy as jnp
 import optimistix
-from jax import lax
 from jaxtyping import Array
 
 from jaxdyn.compile import kernel
-from jaxdyn.compile.batch import any_sample, while_loop
-from jaxdyn.compile.loops import Carry, Given, Iteration, Passed, Task, run_to_end
-from jaxdyn.compile.repair import compute_where
+from jaxdyn.compile.loops import Carry, Given, Iteration, Passed, Task, run_loop
 from jaxdyn.constraints.codes import RESULTS
 from jaxdyn.simulation.solvers import reverse
 from jaxdyn.simulation.solvers.explicit import Plan, Step, dense_output, take_step
@@ -126,11 +122,8 @@ def run_to_event(
     plan: Plan, control, max_steps: int, strides, args, limits: Limits, given: Given, carry: Carry
 ) -> Carry:
     """Make steps to the end of the run, or to an event."""
-    static = plan, control, max_steps, strides
-    task = Task(_iterate, _iterate_in_jax, static, dense_output, (plan,), strides)
-    once = partial(_iterate_once, *static, args, limits, given)
-    by_fallback = partial(_iterate_by_fallback(*static), args, limits, given)
-    return run_to_end(task, args, limits, given, carry, once, by_fallback, partial(_is_running, max_steps, limits))
+    task = Task(_iterate, (plan, control, max_steps, strides), dense_output, (plan,), strides)
+    return run_loop(task, args, limits, given, carry)
 
 
 def cases_of(limits: Limits, control, state: State) -> list[tuple[Array, Any]]:
@@ -148,43 +141,14 @@ def is_active(max_steps: int, limits: Limits, state: State):
     return active if state.search is None else active & ~state.search.hit.any()
 
 
-def _is_running(max_steps: int, limits: Limits, carry: Carry):
-    return any_sample(is_active(max_steps, limits, carry.state))
-
-
 def _iterate(plan: Plan, control, max_steps: int, strides, args, limits: Limits, state: State, _) -> Iteration:
-    """Make a step, in a native loop."""
+    """Make a step."""
     active = is_active(max_steps, limits, state)
     after, kept, step = _advance(plan, control, args, limits, state, active)
     dense = state.t, after.t, state.y, step.raw, step.stages, step.shift
     row = reverse.row(state.y, state.t, state.t_next, kept) if strides else ()
     more = is_active(max_steps, limits, after)
     return Iteration(after, active, more, Passed(kept, after.t, dense), state.tried, row)
-
-
-def _iterate_once(
-    plan: Plan, control, max_steps: int, strides, args, limits: Limits, given: Given, carry: Carry, advance=None
-) -> Carry:
-    """Make a step, as operations of JAX around kernels; by `advance` (default: `_advance_by_kernel`)."""
-    state, records = carry.state, carry.records
-    active = is_active(max_steps, limits, state)
-    after, kept, step = (advance or _advance_by_kernel)(plan, control, args, limits, state, active)
-    if records:
-        row = reverse.row(state.y, state.t, state.t_next, kept)
-        records = reverse.write(records, strides, row, state.tried, active)
-    return Carry(after, *save(plan, given.times, state, after, kept, step, carry.saved, carry.rows), records)
-
-
-@lru_cache(maxsize=256)
-def _iterate_by_fallback(plan: Plan, control, max_steps: int, strides) -> Callable:
-    # Under `jit`, as JAX traces a run several times where it is differentiated: this long part of it once.
-    return jax.jit(partial(_iterate_once, plan, control, max_steps, strides, advance=_advance_by_fallback))
-
-
-def _iterate_in_jax(plan: Plan, control, max_steps: int, strides, args, limits: Limits, given: Given, carry: Carry):
-    """All steps, as operations of JAX around kernels."""
-    step_on = partial(_iterate_once, plan, control, max_steps, strides, args, limits, given)
-    return lax.while_loop(partial(_is_running, max_steps, limits), step_on, carry)
 
 
 def number_of_steps(start, end, stepsize):
@@ -196,21 +160,6 @@ def _advance(plan: Plan, control, args, limits: Limits, state: State, active):
     """State after a step, whether the step is kept, and the step."""
     step = take_step(plan, args, state.t, jnp.where(active, state.t_next, state.t), state.y, state.rate)
     return *_accept(plan, control, args, limits, state, active, step), step
-
-
-def _advance_by_kernel(plan: Plan, control, args, limits: Limits, state: State, active):
-    advance: Any = kernel(_advance, static=2, fallback=_advance, derivative=False)
-    return advance(plan, control, args, limits, state, active, where=active)
-
-
-def _advance_by_fallback(plan: Plan, control, args, limits: Limits, state: State, active):
-    """State after a step that the native loop has refused, for every trajectory that is active."""
-    none, stages = jnp.zeros_like(state.y), jnp.zeros((plan.count, state.y.size), state.y.dtype)
-    ends = state.t, state.t_next, state.y, state.rate
-    step = compute_where(active, partial(take_step, plan), Step(none, none, none, none, stages, none), (args, *ends))
-    # The step alone is what a program cannot compute. XLA would compile the decision about it for longer than it runs.
-    accept: Any = kernel(_accept, static=2, derivative=False)
-    return *accept(plan, control, args, limits, state, active, step), step
 
 
 def _accept(plan: Plan, control, args, limits: Limits, state: State, active, step: Step) -> tuple[State, Array]:
@@ -295,24 +244,6 @@ def _grid_point(limits: Limits, number):
     done = number.astype(limits.end.dtype) / limits.steps.astype(limits.end.dtype)
     t = limits.start + (limits.end - limits.start) * done
     return jnp.where((number >= limits.steps) | (t > limits.floor), limits.end, t)
-
-
-def save(plan: Plan, ts, before: Any, after: Any, kept, step: Step, saved, rows):
-    """Number of save points up to the end of a step, and their rows."""
-    count = ts.shape[0] - 1
-
-    def is_due(saved):
-        return kept & (saved < count) & (ts[jnp.minimum(saved + 1, count)] <= after.t)
-
-    def body(carry):
-        saved, rows = carry
-        here, place = is_due(saved), jnp.minimum(saved, count - 1)
-        at = ts[place + 1], before.t, after.t, before.y, step.raw, step.stages, step.shift
-        row = kernel(dense_output, static=1)(plan, None, *at)
-        rows = rows.at[place].set(jnp.where(here, row, rows[place]))
-        return saved + here.astype(jnp.int32), rows
-
-    return while_loop(lambda carry: is_due(carry[0]), body, (saved, rows))
 
 
 @kernel(static=2, derivative=False)

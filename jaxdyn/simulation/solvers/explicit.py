@@ -1,8 +1,8 @@
 """Steps of explicit Runge-Kutta methods on one flat state, with a projection inside the step.
 
-A step is one kernel (`jaxdyn.compile`) where all of it is a scalar program, the projection included. The kernel is not valid
-for every sample, for example at rows that are close to dependent: there the step is computed again as a loop over the stages.
-Derivatives are those of that loop.
+A step is one kernel (`jaxdyn.compile`) where all of it is a scalar program, the projection included. What is not valid for a
+sample in it, for example an acceleration at rows that are close to dependent, has a second program. Elsewhere, and for
+derivatives, a step is a loop over its stages.
 """
 
 from collections.abc import Callable

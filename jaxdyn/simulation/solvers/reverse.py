@@ -18,9 +18,8 @@ from jax import lax
 from jaxtyping import Array
 
 from jaxdyn.compile import kernel, values_of_rules
-from jaxdyn.compile.batch import any_sample, cond
-from jaxdyn.compile.loops import Carry, Given, Iteration, Task, run_loop, run_to_end
-from jaxdyn.compile.repair import compute_where
+from jaxdyn.compile.batch import cond
+from jaxdyn.compile.loops import Carry, Given, Iteration, Task, run_loop
 from jaxdyn.simulation.solvers.explicit import Plan, dense_output, differentiable_step, take_step
 
 # States that are kept of a run: 4 kB a number of the state in float64, which a cache holds for small mechanisms.
@@ -131,20 +130,15 @@ def pull(plan: Plan, history: History, y0, args, ts, steps, rows, varies) -> tup
         ends = _Ends(first, ts[0], ts[-1], steps)
         cotangents = cotangents._replace(places=_places(last - 1, first, cotangents.saved))
         given = Given(None, (states, history.times, history.kept, rows, ts, ts))
-        args = *static, (fixed, free_leaves), ends, given
-        once, by_fallback = partial(_iterate_back_in_jax, *args), partial(_iterate_by_fallback, *args)
-        task = Task(_iterate_back, _loop_back, static)
-        carry, is_running = Carry(cotangents), partial(_is_running, ends)
-        return run_to_end(task, (fixed, free_leaves), ends, given, carry, once, by_fallback, is_running).state
+        task = Task(_iterate_back, static)
+        return run_loop(task, (fixed, free_leaves), ends, given, Carry(cotangents)).state
 
     def replay(first, last, y):
         """States from which the steps first .. last - 1 begin, (stride, n), the first of them y."""
         given = Given(None, (history.times, history.kept))
         carry = Carry(_Replay(y, jnp.stack([first, first])), records=(jnp.zeros((stride, y.size), y.dtype),))
-        task = Task(_iterate_replay, _replay_in_jax, (plan,), strides=(1,))
-        after = run_loop(task, args, (first, last), given, carry)
-        carry, always_ends = (carry, False) if after is None else after
-        return (carry if always_ends else _replay_in_jax(plan, args, (first, last), given, carry)).records[0]
+        task = Task(_iterate_replay, (plan,), strides=(1,))
+        return run_loop(task, args, (first, last), given, carry).records[0]
 
     zeros, nothing = [jnp.zeros_like(x) for x in free_leaves], jnp.zeros_like(y0)
     places = _places(least, least, saved)
@@ -173,52 +167,10 @@ def _places(step, first, saved):
     return jnp.stack([step - first, step, step, row, saved, row])
 
 
-def _is_active(ends: _Ends, carry: Carry):
-    return carry.state.places[1] >= ends.first
-
-
-def _is_running(ends: _Ends, carry: Carry):
-    return any_sample(_is_active(ends, carry))
-
-
-def _read(given: Given, places):
-    return tuple(table[places[i]] for i, table in enumerate(given.tables))
-
-
 def _iterate_back(plan: Plan, times_move, structure, args, ends: _Ends, cotangents: _Cotangents, read) -> Iteration:
     """Go back through a step, or to the next row within it."""
     back = partial(_pull_without_loop, plan, times_move, structure, *args)(*_step_arguments((), ends, cotangents, read))
     return _accumulate(times_move, (), ends, cotangents, read, back)
-
-
-def _iterate_back_in_jax(plan: Plan, times_move, structure, args, ends: _Ends, given: Given, carry: Carry) -> Carry:
-    """One iteration as operations of JAX around kernels."""
-    pull: Any = kernel(_pull_without_loop, static=3, fallback=_pull_step, derivative=False)
-    return _iterate_by(partial(pull, plan, times_move, structure, *args), times_move, ends, given, carry)
-
-
-def _iterate_by_fallback(plan: Plan, times_move, structure, args, ends: _Ends, given: Given, carry: Carry) -> Carry:
-    """The iteration that the native loop has refused, of every trajectory that is still running."""
-    step, active = partial(_pull_step, plan, times_move, structure), _is_active(ends, carry)
-
-    def pull(t0, t1, y, at, after, row):
-        unchanged = jax.tree.map(jnp.zeros_like, (args[1], y, t0, t1, at))
-        return compute_where(active, step, unchanged, (*args, t0, t1, y, at, after, row))
-
-    return _iterate_by(pull, times_move, ends, given, carry)
-
-
-def _iterate_by(pull, times_move, ends: _Ends, given: Given, carry: Carry) -> Carry:
-    read = _read(given, carry.state.places)
-    # Kernels around what a program cannot compute: XLA would compile their operations for longer than they run.
-    back = pull(*kernel(_step_arguments, derivative=False)((), ends, carry.state, read))
-    after = kernel(_accumulate, static=1, derivative=False)(times_move, (), ends, carry.state, read, back)
-    return Carry(jax.tree.map(lambda new, old: jnp.where(after.active, new, old), after.state, carry.state))
-
-
-def _loop_back(plan: Plan, times_move, structure, args, ends: _Ends, given: Given, carry: Carry) -> Carry:
-    once = partial(_iterate_back_in_jax, plan, times_move, structure, args, ends, given)
-    return lax.while_loop(partial(_is_running, ends), once, carry)
 
 
 def _step_arguments(_, ends: _Ends, cotangents: _Cotangents, read):
@@ -302,20 +254,6 @@ def _go_on(after, ends, replay: _Replay, kept) -> Iteration:
     step = replay.places[0]
     state = _Replay(jnp.where(kept, after, replay.y), replay.places + 1)
     return Iteration(state, step < last, step + 1 < last, None, step - first, (replay.y,))
-
-
-def _replay_in_jax(plan: Plan, args, ends, given: Given, carry: Carry) -> Carry:
-    """Take the rest of the steps again, as operations of JAX around kernels."""
-    end_of: Any = kernel(_end_of_step, static=1, fallback=_end_of_step, derivative=False)
-
-    def once(_, carry):
-        replay, (between,) = carry.state, carry.records
-        (t0, t1), kept = _read(given, replay.places)
-        after = _go_on(end_of(plan, args, t0, t1, replay.y), ends, replay, kept)
-        place = jnp.where(after.active, after.index, between.shape[0])
-        return Carry(after.state, records=(between.at[place].set(replay.y, mode="drop"),))
-
-    return lax.fori_loop(carry.state.places[0], ends[1], once, carry)
 
 
 def _end_of_step(plan: Plan, args, t0, t1, y):

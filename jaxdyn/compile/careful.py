@@ -1,0 +1,267 @@
+"""Programs for the samples that another program marks as not valid: they are made when the first such sample appears.
+
+A kernel with marks (`flags`) is two programs. The fast one says by its last output whether the sample is valid. The careful
+one computes the samples that are not: it calls pseudo-inverses, which have loops, and is compiled for one sample. Hardly any run
+needs it, so that nothing of it is traced before: native code asks for it by its number (`target`, `handler.ll`).
+Derivatives of a pair are pairs.
+"""
+
+import functools
+import hashlib
+import threading
+from collections.abc import Callable, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from typing import Any, NamedTuple, TypeVar
+
+import jax
+import jax.numpy as jnp
+
+from jaxdyn.compile import derive, mode
+from jaxdyn.compile.program import Array, Constant, Operation, Program, kind_of
+from jaxdyn.compile.stored import key_within
+
+T = TypeVar("T")
+
+
+def run_apart(function: Callable[[], T]) -> T:
+    """function() in a thread of its own: the calling one may belong to XLA, or be in the midst of a trace."""
+    with ThreadPoolExecutor(1, thread_name_prefix="jaxdyn careful") as other:
+        return other.submit(function).result()
+
+
+class Careful:
+    """A subprogram that is made when it is called for the first time.
+
+    - `make()` -> its `Program`, traced as `mode.careful(which)`.
+    - `by_jax(*flat)`: the same by operations of JAX, from flat arrays of one sample to flat arrays.
+    """
+
+    is_called = True
+    derivative = fallback = None
+    turns, cost, subprograms = 1, 0, ()
+
+    def __init__(
+        self,
+        inputs,
+        outputs,
+        digest: str,
+        name: str,
+        make: Callable[[], Program],
+        by_jax: Callable,
+        which: str,
+        is_kept: bool,
+    ):
+        self.inputs: tuple[Array, ...] = tuple(inputs)
+        self.outputs: tuple[Array, ...] = tuple(outputs)
+        self.results = tuple(tuple(range(array.size)) for array in self.outputs)
+        # Identity among careful programs; that of the code is the digest of the program. `is_kept` as of `Program`.
+        self.digest, self.is_kept = digest, is_kept
+        self.name, self.by_jax, self.which = name, by_jax, which
+        self.derived: dict = {}
+        self._make, self._made, self._lock = make, None, threading.Lock()
+        self._enter_modes = mode.remember()
+
+    def program(self) -> Program:
+        """The program."""
+        return run_apart(self._program)
+
+    def _program(self) -> Program:
+        with self._lock:
+            if self._made is None:
+                with self._enter_modes(), mode.careful(self.which):
+                    self._made = self._make()
+            return self._made
+
+    def describe(self) -> "Description":
+        """What is kept of it on disk as a subprogram (see `stored`)."""
+        return Description(self.inputs, self.outputs, self.digest, self.name, self.which)
+
+    def tangent(self, moving: Sequence[bool]) -> "Careful":
+        """The program of the change of the outputs (see `derive.tangent`)."""
+        moving = tuple(moving)
+        if moving not in self.derived:
+            inputs = [*self.inputs, *(x for x, varies in zip(self.inputs, moving, strict=True) if varies)]
+            outputs = [array for array in self.outputs if array.dtype.kind == "f"]
+            self.derived[moving] = Careful(
+                inputs,
+                outputs,
+                _digest(self.digest, "tangent", moving),
+                f"change of {self.name}",
+                lambda: derive.tangent(self._program(), moving),
+                functools.partial(_tangent_by_jax, self, moving),
+                self.which,
+                self.is_kept,
+            )
+        return self.derived[moving]
+
+    def transpose(self, linear: Sequence[bool], given: Sequence[bool], of_program: Callable) -> "Careful":
+        """The program of cotangents of the `linear` inputs (see `derive.transpose`), by `of_program(program, linear, given)`."""
+        linear, given = tuple(linear), tuple(given)
+        key = ("transposed", linear, given)
+        if key not in self.derived:
+            inputs = [x for x, varies in zip(self.inputs, linear, strict=True) if not varies]
+            inputs += [x for x, is_given in zip(self.outputs, given, strict=True) if is_given]
+            self.derived[key] = Careful(
+                inputs,
+                [x for x, varies in zip(self.inputs, linear, strict=True) if varies],
+                _digest(self.digest, *key),
+                f"transpose of {self.name}",
+                lambda: of_program(self._program(), linear, given),
+                functools.partial(_transpose_by_jax, self, linear, given),
+                self.which,
+                self.is_kept,
+            )
+        return self.derived[key]
+
+
+class Description(NamedTuple):
+    """A careful program among the subprograms of one that is kept on disk."""
+
+    inputs: tuple[Array, ...]
+    outputs: tuple[Array, ...]
+    digest: str
+    name: str
+    which: str
+
+    def restore(self, remake: Callable[[], Careful]) -> Careful:
+        """The careful program; `remake()` makes it from the function again, which hardly any process needs."""
+        inputs, outputs, digest, name, which = self
+
+        def by_jax(*flat):
+            return remake().by_jax(*flat)
+
+        return Careful(inputs, outputs, digest, name, lambda: remake()._program(), by_jax, which, True)
+
+
+def _digest(*parts) -> str:
+    return hashlib.sha256(" ".join(map(str, parts)).encode()).hexdigest()
+
+
+_taken: dict[str, Any] = {}
+
+
+def digest_of(key: str | None, content: str, recipe: Any) -> tuple[str, bool]:
+    """Identity of a careful program, and whether it is one for all processes.
+
+    `key`: under which it is kept on disk; None where that is not possible. `content` and `recipe` are then what it is made from,
+    as text and as an object that equals no other one.
+    """
+    # Not by its own text, which is not known yet. It has to be found by the same number in another process.
+    if key is not None:
+        return _digest("careful", key), True
+    digest = _digest("careful of this process", content)
+    while _taken.setdefault(digest, recipe) != recipe:
+        digest = _digest(digest)
+    return digest, False
+
+
+class Pair(Program):
+    """A program whose samples that are not valid are computed by the careful one.
+
+    Its operations are made when they are read: a kernel is written from those of the fast program.
+    """
+
+    fast: Program  # pyright: ignore[reportIncompatibleVariableOverride]
+    careful: Careful
+
+    def __init__(self, fast: Program, careful: Careful):
+        self.start(fast.inputs, careful.outputs, (*fast.subprograms, careful), fast.name)
+        self.fast, self.careful = fast, careful
+        self.derivative = functools.partial(_guarded_tangent, self)
+        if fast.fallback is not None:
+            self.fallback = functools.partial(_without_flag, fast.fallback)
+        self.key = key_within(fast, "pair", careful.digest) if careful.is_kept else None
+
+    @functools.cached_property
+    def digest(self) -> str:  # pyright: ignore[reportIncompatibleVariableOverride]
+        """As of `Program`."""
+        return _digest("pair", self.fast.digest, self.careful.digest)
+
+    @property
+    def cost(self) -> int:  # pyright: ignore[reportIncompatibleVariableOverride]
+        """As of `Program`: that of the fast program."""
+        return self.fast.cost
+
+    @property
+    def read_places(self) -> tuple[int, ...]:  # pyright: ignore[reportIncompatibleVariableOverride]
+        """All inputs: which of them the careful program reads is not known."""
+        return tuple(range(len(self.inputs)))
+
+    @property
+    def operations(self) -> list[Operation]:  # pyright: ignore[reportIncompatibleVariableOverride]
+        """Operations of both programs."""
+        return self._body[0]
+
+    @property
+    def results(self) -> tuple[tuple, ...]:  # pyright: ignore[reportIncompatibleVariableOverride]
+        """Entries of the outputs."""
+        return self._body[1]
+
+    @functools.cached_property
+    def _body(self) -> tuple[list[Operation], tuple[tuple, ...]]:
+        fast, operations = self.fast, list(self.fast.operations)
+        place = {x.args: i for i, x in enumerate(operations) if x.op == "input"}
+
+        def add(*operation) -> int:
+            operations.append(Operation(*operation))
+            return len(operations) - 1
+
+        def entry(array: int, k: int) -> int:
+            if (array, k) not in place:
+                place[array, k] = add("input", kind_of(fast.inputs[array].dtype), (array, k))
+            return place[array, k]
+
+        inputs = [entry(i, k) for i, array in enumerate(fast.inputs) for k in range(array.size)]
+        *values, (valid,) = fast.results
+        flag = Constant(not valid.value) if type(valid) is Constant else add("not", "b1", (valid,))
+        number = Constant(len(fast.subprograms))
+        call = add("call_where", "call", (number, flag, *inputs, *(x for row in values for x in row)))
+        results, at = [], 0
+        for array in self.careful.outputs:
+            kind = kind_of(array.dtype)
+            results.append(tuple(add("part", kind, (call, Constant(at + k))) for k in range(array.size)))
+            at += array.size
+        return operations, tuple(results)
+
+
+def guard(fast: Program, careful: Callable[[], Careful]) -> Program:
+    """The pair of a program and a careful one; the program itself where it does not report which samples are valid."""
+    return Pair(fast, careful()) if fast.reports_validity else fast
+
+
+def _guarded_tangent(pair: Pair, moving) -> Program:
+    return guard(derive.tangent(pair.fast, moving), lambda: pair.careful.tangent(moving))
+
+
+def _without_flag(fallback: Callable, *flat) -> list:
+    return fallback(*flat)[:-1]
+
+
+def _tangent_by_jax(base: Careful, moving, *flat) -> list:
+    count = len(base.inputs)
+    places = [i for i, varies in enumerate(moving) if varies]
+
+    def at_values(*values):
+        point = list(flat[:count])
+        for i, value in zip(places, values, strict=True):
+            point[i] = value
+        return [x for x, array in zip(base.by_jax(*point), base.outputs, strict=True) if array.dtype.kind == "f"]
+
+    return jax.jvp(at_values, [flat[i] for i in places], list(flat[count:]))[1]
+
+
+def _transpose_by_jax(base: Careful, linear, given, *flat) -> list:
+    count = linear.count(False)
+
+    def at_values(*values):
+        fixed, moved = iter(flat[:count]), iter(values)
+        return base.by_jax(*(next(moved if varies else fixed) for varies in linear))
+
+    cotangents = iter(flat[count:])
+    zeros = [jnp.zeros(x.size, x.dtype) for x, varies in zip(base.inputs, linear, strict=True) if varies]
+    _, pull = jax.vjp(at_values, *zeros)
+    of_outputs = [
+        next(cotangents) if is_given else jnp.zeros(x.size, x.dtype)
+        for x, is_given in zip(base.outputs, given, strict=True)
+    ]
+    return list(pull(of_outputs))

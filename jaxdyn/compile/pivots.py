@@ -1,0 +1,140 @@
+"""Independent rows of a matrix by Gram-Schmidt with pivots, as a kernel: which row comes next depends on the numbers."""
+
+import contextlib
+import functools
+
+import jax
+import jax.numpy as jnp
+from jax import lax
+
+from jaxdyn.compile.matrix_loops import LoopWriter, MatrixProgram
+
+with contextlib.suppress(ImportError):  # no kernels without llvmlite
+    from jaxdyn.compile.matrix_loops import INT
+
+
+# Rows whose distances differ by less than this part are equally far.
+_ALIKE = 1e-3
+
+
+class IndependentRows(MatrixProgram):
+    """Rows (n, m), and beside each `first`, `least` and `most` -> three numbers a row.
+
+    These are whether it is kept, its distance from the rows that are, and, of one that is kept, its pivot, else zero.
+    """
+
+    name = "independent_rows"
+
+    def __init__(self, rows: int, columns: int, dtype):
+        super().__init__(rows, columns + 3, (rows, 3), dtype)
+        self.width = columns
+        self.cost = 6 * min(rows, columns) * rows * columns + 1
+
+    def write(self, w: LoopWriter, matrix, result) -> None:
+        """One row after the other; the rest of each row is what the kept ones leave of it."""
+        b, n, m, zero = w.b, self.rows, self.width, w.integer(0)
+        rest, along, lengths, orders = w.buffer(n * m), w.buffer(m), w.buffer(n), w.buffer(n)
+        count = w.variable(w.float, w.number(0))
+        with w.loop(zero, w.integer(n)) as i:
+            for k in range(3):
+                b.store(w.number(0), w.at(result, (i, 3), (w.integer(k), 1)))
+            with w.loop(zero, w.integer(m)) as k:
+                b.store(w.load(w.at(matrix, (i, m + 3), (k, 1))), w.at(rest, (i, m), (k, 1)))
+
+        def enlarge(most, x):
+            """Store the larger one; what is not a number stays, as in JAX."""
+            with b.if_then(b.or_(b.fcmp_ordered(">", x, w.load(most)), b.fcmp_unordered("uno", x, x))):
+                b.store(x, most)
+
+        def measure():
+            """Lengths of what is left of each row, and the largest."""
+            most = w.variable(w.float, w.number(0))
+            with w.loop(zero, w.integer(n)) as i:
+                row = w.at(rest, (i, m))
+                # Rounding leaves a kept row a length of eps; it must not be chosen again.
+                length = b.fmul(w.root(w.product(row, row, m)), b.fsub(w.number(1), w.load(w.at(result, (i, 3)))))
+                b.store(length, w.at(lengths, (i, 1)))
+                enlarge(most, length)
+            return w.load(most)
+
+        with w.loop(zero, w.integer(min(n, m))) as _:
+            largest = measure()
+            size, index, is_found = w.variable(w.float, w.number(-1)), w.variable(INT, zero), w.variable(INT, zero)
+            with w.loop(zero, w.integer(n)) as i:
+                first, least = (w.load(w.at(matrix, (i, m + 3), (w.integer(m + k), 1))) for k in range(2))
+                length = w.load(w.at(lengths, (i, 1)))
+                is_first = b.and_(b.fcmp_ordered(">", first, w.number(0)), b.fcmp_ordered(">", length, least))
+                length = b.select(is_first, b.fadd(length, largest), length)
+                b.store(length, w.at(orders, (i, 1)))
+                enlarge(size, length)
+            bound = b.fmul(w.number(1 - _ALIKE), w.load(size))
+            with w.loop(zero, w.integer(n)) as i:
+                is_far = b.fcmp_ordered(">=", w.load(w.at(orders, (i, 1))), bound)
+                with b.if_then(b.and_(is_far, b.icmp_signed("==", b.load(is_found, typ=INT), zero))):
+                    b.store(w.integer(1), is_found)
+                    b.store(i, index)
+            row = b.load(index, typ=INT)
+            least, most = (w.load(w.at(matrix, (row, m + 3), (w.integer(m + k), 1))) for k in (1, 2))
+            pivot = w.load(w.at(lengths, (row, 1)))
+            is_kept = b.and_(b.fcmp_ordered(">", pivot, least), b.fcmp_ordered("<", w.load(count), most))
+            with b.if_then(is_kept):
+                b.store(b.fadd(w.load(count), w.number(1)), count)
+                b.store(w.number(1), w.at(result, (row, 3)))
+                b.store(pivot, w.at(result, (row, 3), (w.integer(2), 1)))
+                with w.loop(zero, w.integer(m)) as k:
+                    b.store(b.fdiv(w.load(w.at(rest, (row, m), (k, 1))), pivot), w.at(along, (k, 1)))
+                with w.loop(zero, w.integer(n)) as i:
+                    other = w.at(rest, (i, m))
+                    share = w.product(other, along, m)
+                    with w.loop(zero, w.integer(m)) as k:
+                        at = w.at(other, (k, 1))
+                        b.store(b.fsub(w.load(at), b.fmul(share, w.load(w.at(along, (k, 1))))), at)
+        measure()
+        with w.loop(zero, w.integer(n)) as i:
+            b.store(w.load(w.at(lengths, (i, 1))), w.at(result, (i, 3), (w.integer(1), 1)))
+
+    def compute(self, matrix):
+        """The same by a loop of JAX."""
+        one = self._compute_one
+        for _ in matrix.shape[:-2]:
+            one = jax.vmap(one)
+        return one(matrix)
+
+    def _compute_one(self, matrix):
+        B, (first, leasts, mosts) = matrix[:, : self.width], matrix[:, self.width :].T
+
+        def keep_next(_, state):
+            rest, kept, pivots = state
+            lengths = jnp.sqrt(jnp.sum(rest * rest, 1)) * (1 - kept)
+            order = jnp.where((first > 0) & (lengths > leasts), lengths + jnp.max(lengths), lengths)
+            # Rows of symmetric mechanisms are equally far but for rounding, which differs between programs: the first counts.
+            row = jnp.argmax(order >= (1 - _ALIKE) * jnp.max(order))
+            pivot = lengths[row]
+            along = rest[row] / jnp.where(pivot > 0, pivot, jnp.ones_like(pivot))
+            is_kept = (pivot > leasts[row]) & (jnp.sum(kept) < mosts[row])
+            shares = jnp.matmul(rest, along, precision="highest")
+            rest = jnp.where(is_kept, rest - shares[:, None] * along[None], rest)
+            pivots = pivots.at[row].add(jnp.where(is_kept, pivot, jnp.zeros_like(pivot)))
+            return rest, kept.at[row].add(is_kept.astype(B.dtype)), pivots
+
+        none = jnp.zeros_like(first)
+        rest, kept, pivots = lax.fori_loop(0, min(B.shape), keep_next, (B, none, none))
+        return jnp.stack([kept, jnp.sqrt(jnp.sum(rest * rest, 1)) * (1 - kept), pivots], 1)
+
+
+_independent_rows = functools.lru_cache(maxsize=256)(IndependentRows)
+
+
+def eliminate_rows(B: jax.Array, first: jax.Array, least, most) -> tuple[jax.Array, jax.Array, jax.Array]:
+    """Independent rows of B (n, m) by elimination with pivots.
+
+    The pivot of a row is its distance from the span of those that were kept before it. Rows with `first` (n,) = 1 come before
+    all others, and of rows that are equally far the first one. A row is kept where its pivot is above `least`, and `most` rows
+    at most.
+
+    **Returns:** a mask (n,) of 1 and 0, the distances (n,) of the others from the span of these, and the pivots (n,) of these.
+    None has a derivative.
+    """
+    numbers = [jnp.broadcast_to(jnp.asarray(x, B.dtype), first.shape) for x in (first, least, most)]
+    chosen = _independent_rows(*B.shape, B.dtype)(jnp.concatenate([B, jnp.stack(numbers, 1)], 1))
+    return chosen[:, 0], chosen[:, 1], chosen[:, 2]

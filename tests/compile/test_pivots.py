@@ -1,0 +1,61 @@
+"""Independent rows of a matrix, in native code and by JAX, against an elimination in NumPy."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import jaxdyn as jd
+from jaxdyn.compile import eliminate_rows
+
+pytestmark = pytest.mark.native
+
+
+def by_hand(B, first, least, most):
+    """The mask of the rows that are kept, the distances of the others, and the pivots, by projections onto complements."""
+    kept, pivots = [], np.zeros(len(B))
+    for _ in range(min(B.shape)):
+        basis = np.linalg.qr(B[kept].T)[0] if kept else np.zeros((B.shape[1], 0))
+        lengths = np.linalg.norm(B - B @ basis @ basis.T, axis=1)
+        lengths[kept] = 0
+        order = lengths + np.where((first > 0) & (lengths > least), lengths.max(), 0)
+        row = int(np.flatnonzero(order >= 0.999 * order.max())[0])
+        if lengths[row] <= least or len(kept) == most:
+            break
+        kept.append(row)
+        pivots[row] = lengths[row]
+    basis = np.linalg.qr(B[kept].T)[0] if kept else np.zeros((B.shape[1], 0))
+    rest = np.linalg.norm(B - B @ basis @ basis.T, axis=1)
+    rest[kept] = 0
+    mask = np.zeros(len(B))
+    mask[kept] = 1
+    return mask, rest, pivots
+
+
+@pytest.mark.parametrize("shape", [(3, 5), (6, 4), (1, 1), (7, 7)])
+@pytest.mark.parametrize("mode", ["auto", "plain"])
+def test_rows_by_elimination(mode, shape):
+    """Rows of a batch that repeat, nearly repeat and vanish; ties, rows that come first, and a bound of their number."""
+    rng, (n, _) = np.random.default_rng(shape[0]), shape
+    B = rng.normal(size=(8, *shape))
+    B[0] /= np.linalg.norm(B[0], axis=1)[:, None]  # all rows are equally far
+    B[1, -1], B[2, n // 2] = B[1, 0], 0
+    B[3, -1] = B[3, 0] * (1 + 1e-7)
+    first = np.array([rng.random(n) < 0.4 for _ in B], float)
+    most = np.array([n, n, n, n, n, 1, 2, 0], float)
+    with jd.compilation(mode):
+        computed = jax.jit(jax.vmap(eliminate_rows, (0, 0, None, 0)))(B, first, 1e-4, most)
+    for i in range(len(B)):
+        wanted = by_hand(B[i], first[i], 1e-4, most[i])
+        np.testing.assert_array_equal(computed[0][i], wanted[0])
+        for one, other in zip(computed[1:], wanted[1:], strict=True):
+            np.testing.assert_allclose(one[i], other, rtol=0, atol=1e-12)
+
+
+@pytest.mark.parametrize("mode", ["auto", "plain"])
+def test_rows_that_are_no_numbers(mode):
+    """They are not kept, and neither is what follows them; no call waits for ever."""
+    B = jnp.ones((3, 2)).at[0, 0].set(jnp.nan)
+    with jd.compilation(mode):
+        kept, rest, pivots = jax.jit(eliminate_rows)(B, jnp.zeros(3), 1e-4, 2.0)
+    assert kept.tolist() == [0, 0, 0] and pivots.tolist() == [0, 0, 0] and np.isnan(rest[0])
