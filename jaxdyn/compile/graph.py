@@ -47,6 +47,7 @@ class Graph:
         # For each operation and kind, numbers by their operands, by identity: equal numbers are made once.
         self.shared: dict[tuple[str, str], dict[tuple, Number]] = defaultdict(dict)
         self.subprograms: list[Program] = []
+        self.numbers_of_subprograms: dict[str, int] = {}  # by their digests
 
     # --- making numbers ---
 
@@ -83,9 +84,12 @@ class Graph:
         return self._parts("call_where", program, [flag, *entries])
 
     def _parts(self, op: str, program: Program, entries: list) -> list[np.ndarray]:
-        if program not in self.subprograms:
+        # By contents, not by identity: which jaxprs JAX keeps would decide how often a function is a subprogram, and with it
+        # whether a program that is traced again is the one on disk.
+        number = self.numbers_of_subprograms.setdefault(program.digest, len(self.subprograms))
+        if number == len(self.subprograms):
             self.subprograms.append(program)
-        call = self.make(op, "call", self.subprograms.index(program), *entries)
+        call = self.make(op, "call", number, *entries)
         outputs, at = [], 0
         for row, array in zip(program.results, program.outputs, strict=True):
             kind = kind_of(array.dtype)
