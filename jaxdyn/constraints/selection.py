@@ -199,7 +199,10 @@ def _select(scene: Scene, q, t, rank_tol) -> Selection:
         kept, rest, far = _select_far_away(scene, q, t, sure, apart)
         has_more = jnp.any(kept > sure)
         pivot = jnp.where(has_more, far, jnp.maximum(far, pivot))
-        pivot_here = jnp.where(has_more, eliminate(kept[:, None] * B, 0.0, sure)[2], pivot_here)
+        here, _, least_here = eliminate(kept[:, None] * B, 0.0, sure)
+        # A row that vanishes here, as in a singular position, has a pivot of zero.
+        least_here = jnp.where(jnp.sum(here) < jnp.sum(kept), jnp.zeros_like(least_here), least_here)
+        pivot_here = jnp.where(has_more, least_here, pivot_here)
     rounding = jnp.maximum(rest, kernel(largest_opening)(scene, q, t, kept))
     # A gap to nothing is one to the rounding of the numbers: where no row is dropped, those in doubt may be dependent here.
     below = jnp.maximum(rest, eps_of(q))
