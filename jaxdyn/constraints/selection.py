@@ -139,7 +139,7 @@ def hide_unclear(selection: Selection) -> Selection:
 
 
 def rank_code(scene: Scene, result: Any) -> Any:
-    """The result, or `unclear_rank` where the rows of a scene of `independent_rows` are not told apart by a factor of 100."""
+    """The result, or `unclear_rank` where kept and dropped rows of a scene of `independent_rows` differ too little."""
     if not has_selection(scene):
         return result
     is_clear = scene.constraints[0].gap >= LEAST_GAP
@@ -149,8 +149,8 @@ def rank_code(scene: Scene, result: Any) -> Any:
 def _select_in_kernel(scene: Scene, q, t, rank_tol: float | None = None) -> Selection:
     """All rows; invalid where some may repeat others, whose choice takes more than a kernel should hold."""
     every = _every_row(scene, q.dtype)
-    may_repeat = _may_repeat(_least_doubtless(q, rank_tol), Scene(scene.system, scene.constraints), q, t)
-    return every._replace(kept=mark_invalid(may_repeat, jnp.asarray(every.kept)))
+    is_doubtful = _has_doubtful_rows(_least_doubtless(q, rank_tol), Scene(scene.system, scene.constraints), q, t)
+    return every._replace(kept=mark_invalid(is_doubtful, jnp.asarray(every.kept)))
 
 
 @variant(_select_in_kernel, marks=True)
@@ -169,7 +169,7 @@ def select_rows(scene: Scene, q, t: Any, rank_tol: float | None = None) -> Selec
     # Most scenes have independent rows: one Cholesky factorisation says so, and the search is skipped.
     if is_concrete(bare, q, t):
         place = np.asarray(q), np.asarray(t, q.dtype)
-        if not evaluate(_may_repeat, bare, *place, static=(least,), is_input=not is_tracing()):
+        if not evaluate(_has_doubtful_rows, bare, *place, static=(least,), is_input=not is_tracing()):
             return every
         with jax.ensure_compile_time_eval():
             chosen = _select(bare, *map(jnp.asarray, place), rank_tol)
@@ -177,7 +177,7 @@ def select_rows(scene: Scene, q, t: Any, rank_tol: float | None = None) -> Selec
     t = jnp.asarray(t, q.dtype)
     if len(every.kept) > scene.nv or is_standalone():  # a program without JAX has no branches
         return _select(bare, q, t, rank_tol)
-    is_doubtful = kernel(_may_repeat, static=1)(least, bare, q, t)
+    is_doubtful = kernel(_has_doubtful_rows, static=1)(least, bare, q, t)
     return Selection(
         *cond(is_doubtful, lambda: _select(bare, q, t, rank_tol), lambda: Selection(*map(jnp.asarray, every)))
     )
@@ -280,8 +280,8 @@ def _least_doubtless(like, rank_tol: float | None) -> float:
     return max(clear_pivot(like), rank_tol or 0.0)
 
 
-def _may_repeat(least: float, scene: Scene, q, t):
-    """Whether the distance of some row from the span of those before it is not above `least`; True for NaN."""
+def _has_doubtful_rows(least: float, scene: Scene, q, t):
+    """Decide whether the distance of some row from the span of those before it is not above `least`; True for NaN."""
     # The diagonal of the Cholesky factor of B B^T holds these distances, NaN where a row is dependent.
     B = unit_rows(scene, q, t)
     return ~(jnp.min(jnp.diagonal(cholesky(matmul(B, B.T)))) > least)
