@@ -132,8 +132,6 @@ def exchange_rows(scene: Scene, rows: Float[Array, " n"]) -> Scene:
 
 def all_rows(scene: Scene) -> Scene:
     """The scene with all of its rows, before `keep_rows`."""
-    if not has_selection(scene):
-        return scene
     constraints = tuple(c.inner if isinstance(c, KeptRows) else c for c in scene.constraints)
     return eqx.tree_at(lambda scene: scene.constraints, scene, constraints, is_leaf=lambda x: isinstance(x, tuple))
 

@@ -163,7 +163,7 @@ def hide_unclear(selection: Selection) -> Selection:
 
 
 def rank_code(scene: Scene, result: Any) -> Any:
-    """The result, or `unclear_rank` where the rows of a scene of `independent_rows` are not told apart by a factor of 100."""
+    """The result, or `unclear_rank` where kept and dropped rows of a scene of `independent_rows` differ too little."""
     if not has_selection(scene):
         return result
     is_clear = scene.constraints[0].gap >= LEAST_GAP
@@ -173,8 +173,8 @@ def rank_code(scene: Scene, result: Any) -> Any:
 def _select_in_kernel(scene: Scene, q, t, rank_tol: float | None = None) -> Selection:
     """All rows; invalid where some may repeat others, whose choice takes more than a kernel should hold."""
     every = _every_row(scene, q.dtype)
-    may_repeat = _may_repeat(_least_doubtless(q, rank_tol), Scene(scene.system, scene.constraints), q, t)
-    return every._replace(kept=mark_invalid(may_repeat, jnp.asarray(every.kept)))
+    is_doubtful = _has_doubtful_rows(_least_doubtless(q, rank_tol), Scene(scene.system, scene.constraints), q, t)
+    return every._replace(kept=mark_invalid(is_doubtful, jnp.asarray(every.kept)))
 
 
 def select_rows(scene: Scene, q, t: Any, rank_tol: float | None = None) -> Selection:
@@ -200,7 +200,7 @@ def _search_rows(scene: Scene, q, t: Any, rank_tol: float | None) -> Selection:
     # Most scenes have independent rows: one Cholesky factorisation says so, and the search is skipped.
     if is_concrete(bare, q, t):
         place = np.asarray(q), np.asarray(t, q.dtype)
-        if not evaluate(_may_repeat, bare, *place, static=(least,), is_input=not is_tracing()):
+        if not evaluate(_has_doubtful_rows, bare, *place, static=(least,), is_input=not is_tracing()):
             return every
         with jax.ensure_compile_time_eval():
             chosen = _select(bare, *map(jnp.asarray, place), rank_tol)
@@ -232,7 +232,10 @@ def _select(scene: Scene, q, t, rank_tol) -> Selection:
         kept, rest, far = _select_far_away(scene, q, t, sure, apart)
         has_more = jnp.any(kept > sure)
         pivot = jnp.where(has_more, far, jnp.maximum(far, pivot))
-        pivot_here = jnp.where(has_more, eliminate(kept[:, None] * B, 0.0, sure)[2], pivot_here)
+        here, _, least_here = eliminate(kept[:, None] * B, 0.0, sure)
+        # A row that vanishes here, as in a singular position, has a pivot of zero.
+        least_here = jnp.where(jnp.sum(here) < jnp.sum(kept), jnp.zeros_like(least_here), least_here)
+        pivot_here = jnp.where(has_more, least_here, pivot_here)
     rounding = jnp.maximum(rest, kernel(largest_opening)(scene, q, t, kept))
     # A gap to nothing is one to the rounding of the numbers: where no row is dropped, those in doubt may be dependent here.
     below = jnp.maximum(rest, eps_of(q))
@@ -318,8 +321,8 @@ def _least_doubtless(like, rank_tol: float | None) -> float:
     return max(clear_pivot(like), rank_tol or 0.0)
 
 
-def _may_repeat(least: float, scene: Scene, q, t):
-    """Whether the distance of some row from the span of those before it is not above `least`; True for NaN."""
+def _has_doubtful_rows(least: float, scene: Scene, q, t):
+    """Decide whether the distance of some row from the span of those before it is not above `least`; True for NaN."""
     # The diagonal of the Cholesky factor of B B^T holds these distances, NaN where a row is dependent.
     B = unit_rows(scene, q, t)
     return ~(jnp.min(jnp.diagonal(cholesky(matmul(B, B.T)))) > least)

@@ -208,8 +208,9 @@ def _prepare_start(scene: Scene, method: Method, start, stepsize, modal: bool) -
     if scene.constraints and is_concrete((scene, method, q0, v0, ts)):
         state = [np.asarray(x, state_dtype(scene.system)) for x in (q0, v0, np.asarray(ts)[0])]
         selected, method = check_constraints(scene, method, *state)
-        # In a motion with modes the rows that are independent change with the contacts.
-        scene = scene if modal else selected
+        # In a motion with modes the rows that are independent change with the contacts. Rows that repeat others but for the
+        # rounding of a file are dropped there too.
+        scene = scene if modal and not scene.rounding else selected
     if isinstance(scene.system, System) and is_concrete((scene, q0, v0, ts)):
         check_system()
     if not is_step_length(stepsize) and is_concrete(q0):

@@ -587,7 +587,7 @@ def test_cassies_loops_close_from_a_rough_guess(robots_dir, name):
     assembly = jd.assemble(scene, jd.integrate(scene.system, scene.starts["reference"].q, rough), throw=False)
     counted = (1 - assembly.dropped) * position_residual(scene, assembly.q, 0.0)
     assert np.abs(counted).max() < 1e-13
-    # Rows that repeat others but for the digits of the file, by 5e-9 of their length in cassie_v2.sdf, stay open: by 1e-10 m there.
+    # Rows that repeat others but for the digits of the file stay open: by 1e-10 m in cassie_v2.sdf.
     assert assembly.gaps.max() < 5e-10
     # The rank that was decided on the way is that of the place, or a code says that the digits hide it.
     motion = jd.constrained_dynamics(scene, assembly.q, jnp.zeros(scene.nv))

@@ -13,6 +13,8 @@ from jaxdyn.compile import entry_point, kernel
 from jaxdyn.compile.known import partition_tracers
 from jaxdyn.constraints.base import velocity_residual
 from jaxdyn.constraints.codes import RESULTS, first_of
+from jaxdyn.constraints.redundancy import distribute_multipliers, has_selection
+from jaxdyn.constraints.selection import independent_rows, rank_code
 from jaxdyn.forces.piecewise import Pieces, fix_pieces, guards, pieces_of
 from jaxdyn.simulation.checks import safe_inputs
 from jaxdyn.simulation.equations import state_outputs
@@ -21,7 +23,7 @@ from jaxdyn.simulation.hybrid.modes import KINDS, Elements, Events, Mode, elemen
 from jaxdyn.simulation.hybrid.replay import HybridRun
 from jaxdyn.simulation.hybrid.system import ModalSystem, project
 from jaxdyn.simulation.hybrid.transitions import length
-from jaxdyn.simulation.methods import consistent
+from jaxdyn.simulation.methods import consistent, satisfies_redundant_rows
 from jaxdyn.simulation.solution import Solution, invalidate_failures, rows_where
 from jaxdyn.simulation.solvers.choice import label
 from jaxdyn.simulation.solvers.differentiable import ROOM
@@ -69,6 +71,8 @@ def hybrid_motion(scene: Scene, control, numbers, options) -> Solution:
     for i, force in enumerate(extend(scene).forces):
         first = numbers[0], numbers[1], numbers[2][0]
         check_callback(force, f"forces[{i}]", "force(system, q, v, t)", *first, first=(scene.system,))
+    if options["selects_rows"]:
+        scene = independent_rows(scene, numbers[0], numbers[2][0])
     unknown, known = partition_tracers((scene, control))
     unknown, bind = tuple(unknown), _Binder(known, scene.nv)
     effort = None if control is None else lambda _, q, v, t: (bind.effort(unknown, q, v, t),)
@@ -115,7 +119,11 @@ def hybrid_motion(scene: Scene, control, numbers, options) -> Solution:
     values = lax.map(partial(kernel(outputs_of), unknown), (y, modes, ts))
     ended = (end.result == RESULTS.successful) & ~reached.all()
     cases = [*inputs.faults, (~start_ok, RESULTS.inconsistent_start), (ended, RESULTS.nonfinite_state)]
-    result = first_of(cases, end.result)
+    if has_selection(scene):
+        # Rows are not exchanged between events. Where the kept ones no longer imply the dropped ones, these open.
+        agree = lax.map(lambda row: satisfies_redundant_rows(scene, *row), (y["q"], y["v"], ts)).all()
+        cases.append(((end.result == RESULTS.successful) & ~agree, RESULTS.open_constraints))
+    result = rank_code(scene, first_of(cases, end.result))
     # The end of a run is an input, which has derivatives; the time in the loop has none.
     time_reached = jnp.where(end.t >= ts[-1], ts[-1], end.t)
     touched = _impacts_at_start(scene, elements, q0, v0, ts[0], mode)
@@ -140,7 +148,7 @@ def _outputs(bind: _Binder, elements: Elements, outputs, unknown, y, mode: Mode,
         if "acceleration" in outputs:
             values["acceleration"] = motion.acceleration
         if "multipliers" in outputs:
-            values["multipliers"] = motion.reaction.multipliers[: elements.own]
+            values["multipliers"] = distribute_multipliers(scene, q, t, motion.reaction.multipliers[: elements.own])
         if "contact_forces" in outputs:
             values["contact_forces"] = _forces(scene, elements, mode, terms, motion, y["slip"])
     return values
