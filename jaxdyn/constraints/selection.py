@@ -141,10 +141,10 @@ def choose_rows(scene: SceneLike, q: Float[Array, " nq"], t: Numbers = 0.0) -> S
 
     Source: docs/constraints.md, redundant rows.
     """
-    scene = all_rows(as_scene(scene))
+    scene = as_scene(scene)
+    if has_selection(scene):
+        scene = all_rows(scene)
     q, t = check_state(scene.system, q=q, t=t)
-    if not layout(scene):
-        return scene
     selection = select_rows(scene, q, t)
     if is_concrete(selection):
         if np.all(np.asarray(selection.kept) == 1):

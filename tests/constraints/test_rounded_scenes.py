@@ -218,6 +218,9 @@ CALLS = {
     "control.GaugeInvariant": lambda s, q, v: [gauge_law(s, q, v)(q, v, 0.0)],
     "control.HybridForce": lambda s, q, v: [hybrid(s, q, v)(q, v, 0.0), hybrid(s, q, v).regularity(q, v)],
     "degrees_of_freedom": lambda s, q, v: [jd.degrees_of_freedom(s, q)],
+    "constraints.choose_rows": lambda s, q, v: [
+        jd.constrained_dynamics(jd.constraints.choose_rows(s, q), q, v).acceleration
+    ],
     "follow": followed,
     "identify.complete_log": logged,
     "inverse_kinematics": reached,
