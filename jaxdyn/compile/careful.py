@@ -73,7 +73,7 @@ class Careful:
             return self._made
 
     def describe(self) -> "Description":
-        """What is kept of it on disk as a subprogram (see `stored`)."""
+        """Its description among the subprograms that are kept on disk (see `stored`)."""
         return Description(self.inputs, self.outputs, self.digest, self.name, self.which)
 
     def tangent(self, moving: Sequence[bool]) -> "Careful":
@@ -167,19 +167,19 @@ class Pair(Program):
     def __init__(self, fast: Program, careful: Careful):
         self.start(fast.inputs, careful.outputs, (*fast.subprograms, careful), fast.name)
         self.fast, self.careful = fast, careful
-        self.derivative = functools.partial(_guarded_tangent, self)
+        self.derivative = functools.partial(_tangent_of_pair, self)
         if fast.fallback is not None:
             self.fallback = functools.partial(_without_flag, fast.fallback)
         self.key = key_within(fast, "pair", careful.digest) if careful.is_kept else None
 
     @functools.cached_property
     def digest(self) -> str:  # pyright: ignore[reportIncompatibleVariableOverride]
-        """As of `Program`."""
+        """Hash of the digests of both programs."""
         return _digest("pair", self.fast.digest, self.careful.digest)
 
     @property
     def cost(self) -> int:  # pyright: ignore[reportIncompatibleVariableOverride]
-        """As of `Program`: that of the fast program."""
+        """Cost of the fast program."""
         return self.fast.cost
 
     @property
@@ -229,7 +229,7 @@ def guard(fast: Program, careful: Callable[[], Careful]) -> Program:
     return Pair(fast, careful()) if fast.reports_validity else fast
 
 
-def _guarded_tangent(pair: Pair, moving) -> Program:
+def _tangent_of_pair(pair: Pair, moving) -> Program:
     return guard(derive.tangent(pair.fast, moving), lambda: pair.careful.tangent(moving))
 
 

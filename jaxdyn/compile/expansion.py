@@ -196,7 +196,7 @@ class _Expansion:
         careful = program.derived["careful", again]
         return self.graph.call_where(flagged.item(), careful, [*map(as_objects, args)], results)
 
-    def _guarded(self, params, args, eqn):
+    def _guard(self, params, args, eqn):
         return self._call(params["call"], args, params["again"])
 
     def _reduce(self, name, array, axes, out):
@@ -415,7 +415,7 @@ _OTHER: dict[str, Callable] = {
     "triangular_solve": array_rules.triangular_solve,
     "jaxdyn_kernel": _Expansion._kernel,
     "jaxdyn_invalid": _Expansion._invalid,
-    "jaxdyn_guarded": _Expansion._guarded,
+    "jaxdyn_guarded": _Expansion._guard,
 }
 
 # The arrays before the places.

@@ -75,12 +75,12 @@ invalid_p = define_primitive(
 )
 
 
-def _batch_guarded(args, axes, *, call, again):
+def _batch_guard(args, axes, *, call, again):
     results = jax.vmap(function_of(call), axes)(*args)
     return results, [0] * len(results)
 
 
-def _jvp_guarded(primals, tangents, *, call, again):
+def _jvp_guard(primals, tangents, *, call, again):
     places = [i for i, x in enumerate(tangents) if not is_zero(x)]
 
     def at_values(*values):
@@ -99,6 +99,6 @@ guarded_p = define_primitive(
     "jaxdyn_guarded",
     lambda *types, call, again: list(call.out_avals),
     multiple_results=True,
-    batch=_batch_guarded,
-    jvp=_jvp_guarded,
+    batch=_batch_guard,
+    jvp=_jvp_guard,
 )

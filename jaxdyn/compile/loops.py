@@ -228,7 +228,7 @@ class Loop:
 
     @property
     def is_kept(self) -> bool:
-        """As of `Program`."""
+        """Decide whether another process may find it (see `Program`)."""
         return self.turn.is_kept and (self.row is None or self.row.is_kept)
 
     # The text of the kernel for a width (see `code.kernel_ir`).

@@ -260,19 +260,19 @@ def _tangent_of_transpose(program, linear, given, backwards, avals, moving) -> P
             given_floats += [False] * first.reports_validity
             linear_in_first = [*linear, *[False] * sum(moving[:count])]
             by_fixed = _transpose_program(first, tuple(linear_in_first), tuple(given_floats))
-            total = _bind_marked(by_fixed, *fixed, *(x for x in steps[:count] if x is not None), *cotangents)
+            total = _bind_and_mark(by_fixed, *fixed, *(x for x in steps[:count] if x is not None), *cotangents)
         if any(moving[count:]):
             cotangent_steps = [
                 jnp.zeros_like(c) if d is None else d for c, d in zip(cotangents, steps[count:], strict=True)
             ]
-            by_cotangents = _bind_marked(backwards, *fixed, *cotangent_steps)
+            by_cotangents = _bind_and_mark(backwards, *fixed, *cotangent_steps)
             total = by_cotangents if total is None else [a + b for a, b in zip(total, by_cotangents, strict=True)]
         return total
 
     return tangent_program(change, avals, moving, flags="report" if program.reports_validity else "refuse")
 
 
-def _bind_marked(program: Program, *args) -> list:
+def _bind_and_mark(program: Program, *args) -> list:
     """The results of a program within another one, marked where it reports them as not valid."""
     results = kernel_p.bind(*args, program=program, rows=0)
     if not program.reports_validity:

@@ -256,7 +256,7 @@ class _Kernel:
         width, found = self.row.width, objects.find(identity)
         if found is None and program is None:
             return False
-        calls, careful = _calls(_called_by_kernel(program, width), width)
+        calls, careful = _calls(_subprograms_of_kernel(program, width), width)
         _restore_careful(() if found is None else found.careful, self._recover_careful)
         for symbol in calls if found is None else found.calls:
             if not _publish(symbol, width, calls, self._recover_careful):
@@ -278,7 +278,7 @@ class _Kernel:
             _enter_careful(self.careful.program())
 
 
-def _called_by_kernel(program, width: int) -> Sequence:
+def _subprograms_of_kernel(program, width: int) -> Sequence:
     if program is None:
         return ()
     if isinstance(program, Program) and calls_itself(program, width):

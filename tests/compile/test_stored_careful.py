@@ -70,7 +70,7 @@ def careful_names() -> list[str]:
 
 
 def start(folder, function: str, *arguments: str) -> dict:
-    """What a function of this module prints in a process of its own, with its files in a folder."""
+    """Run a function of this module in a process of its own, with its files in a folder; what it prints."""
     env = os.environ | {
         "XDG_CACHE_HOME": str(folder),
         "PYTHONPATH": os.pathsep.join([*sys.path, os.path.dirname(__file__)]),
