@@ -320,7 +320,8 @@ def check_constraints(scene: Scene, method: Method, q, v, t) -> tuple[Scene, Met
     limit, t = start_limit(q.dtype), np.asarray(t, q.dtype)
     selection = select_rows(scene, q, t, method.rank_tol)
     rank = int(np.sum(selection.kept))
-    selected = scene if rank == len(selection.kept) else keep_rows(scene, selection)
+    with jax.ensure_compile_time_eval():  # known numbers stay known while a function around is traced
+        selected = scene if rank == len(selection.kept) else keep_rows(scene, selection)
     ratio = start_openness(selected, q, v, t, limit)
     if ratio <= 1 and selection.rounding > most_rounding(q.dtype):
         raise ValueError(

@@ -28,7 +28,7 @@ TIGHT = {"rtol": 1e-12, "atol": 1e-12}
 
 def motion(scene, state, ts, **options):
     """Solution from a start, with energies and residuals; it must have succeeded and stayed on the constraints."""
-    options = TIGHT | options
+    options = options if "stepsize" in options else TIGHT | options
 
     @quick
     def run(scene, q, v, ts):
