@@ -80,6 +80,11 @@ class Elements(NamedTuple):
         """Mask of the elements that can stick, (n,)."""
         return np.array([bool(one.tangent) and not one.smooth for one in self.each])
 
+    @property
+    def smooth(self) -> np.ndarray:
+        """Mask of the elements whose friction is a function of the state, (n,)."""
+        return np.array([one.smooth for one in self.each])
+
     def active(self, mode: Mode) -> Array:
         """Mask of the rows that act in a mode, (count,)."""
         # The scene's own constraints act in every mode.
