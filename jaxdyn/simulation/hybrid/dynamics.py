@@ -172,20 +172,34 @@ def solve_rows(gram, active, right):
 
     Two steps of the proximal method x <- x + (G + eps)^-1 (right - G x), of rows scaled to unit length.
     """
-    square, eps = jnp.diagonal(gram), float(jnp.finfo(gram.dtype).eps)
-    # A row of the size of rounding is no row, as that of a direction across the plane of a planar model.
-    is_row = square > eps**1.5 * jnp.max(square)
-    scale = jnp.where(is_row, 1 / jnp.sqrt(jnp.where(is_row, square, jnp.ones_like(square))), 0.0) * active
-    gram = gram * scale[:, None] * scale[None]
-    # Large enough for Cholesky's factors of dependent rows; each step of the proximal method multiplies the error by about it.
-    shift = eps**0.5
-    # Rows that do not act have a one on the diagonal, so that the factor exists in every mode.
-    factor = cholesky(gram + jnp.diag(1.0 - active + shift * jnp.ones_like(square)))
+    factor, gram, scale = _factor_rows(gram, active)
     right = right * scale[:, None]
     x = solve_cholesky(factor, right)
     for _ in range(2):
         x = x + solve_cholesky(factor, right - matmul(gram, x))
     return x * scale[:, None]
+
+
+def _factor_rows(gram, active):
+    """Cholesky factor of the active rows scaled to unit length, their Gram matrix, and the scales, zero of rows that do not act."""
+    square, eps = jnp.diagonal(gram), float(jnp.finfo(gram.dtype).eps)
+    # A row of the size of rounding is no row, as that of a direction across the plane of a planar model.
+    is_row = square > eps**1.5 * jnp.max(square)
+    scale = jnp.where(is_row, 1 / jnp.sqrt(jnp.where(is_row, square, jnp.ones_like(square))), 0.0) * active
+    gram = gram * scale[:, None] * scale[None]
+    # Rows that do not act have a one on the diagonal, so that the factor exists in every mode. The shift is large enough for
+    # factors of dependent rows; each step of the proximal method multiplies the error by about it.
+    return cholesky(gram + jnp.diag(1.0 - active + eps**0.5 * jnp.ones_like(square))), gram, scale
+
+
+def depends_on_others(elements: Elements, gram, mode: Mode):
+    """Mask of the elements (n,) whose friction depends on that of others: only their sum is determined."""
+    active, eps = elements.active(mode).astype(gram.dtype), float(jnp.finfo(gram.dtype).eps)
+    factor, _, scale = _factor_rows(gram, active)
+    # The diagonal of eps (G + eps)^-1 is that of the projection on the vectors with G x = 0.
+    shares = eps**0.5 * jnp.diagonal(solve_cholesky(factor, jnp.eye(active.size, dtype=gram.dtype)))
+    free = (shares > 1e-3) & (scale > 0)
+    return jnp.stack([jnp.stack([free[k] for k in one.tangent] or [free[0] & False]).any() for one in elements.each])
 
 
 def _eliminate(K, right):
@@ -309,7 +323,8 @@ def guards_and_levels(
     gap, friction, dtype = gaps(scene, elements, q, t), coefficients(scene, elements, q.dtype), q.dtype
     reaction, small = motion.reaction, tolerance(dtype)
     speeds = jnp.sum(jnp.abs(terms.row.A) * jnp.abs(v)[None], 1)
-    force = force_tolerance(dtype) * (jnp.sum(jnp.abs(reaction.normal)) + jnp.sum(jnp.abs(reaction.holding)))
+    total = jnp.sum(jnp.abs(reaction.normal))
+    force = force_tolerance(dtype) * (total + jnp.sum(jnp.abs(reaction.holding)))
     reach = small * (1 + jnp.max(jnp.abs(q)))
     # Every element has all channels: the index of a guard means the same condition in every mode.
     one_, guards, levels = jnp.ones((), dtype), [], []
@@ -325,7 +340,7 @@ def guards_and_levels(
             square = jnp.sum(hold * hold)
             # The length has no derivative at zero, and an element that slides has a holding force of zero.
             size = jnp.sqrt(jnp.where(square > 0, square, one_)) * (square > 0).astype(dtype)
-            margin = friction.static[i] * reaction.normal[i] - size
+            margin = friction.static[i] * reaction.normal[i] + mode.excess[i] * total - size
             # Sliding is guarded by a signed speed, which crosses zero; the length of the velocity only touches it.
             sliding = jnp.where(mode.stick[i], margin, jnp.sum(reference[i] * terms.slip[i]))
             sliding = jnp.where(mode.closed[i], sliding, one_)

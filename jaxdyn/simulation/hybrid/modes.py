@@ -14,7 +14,7 @@ from jaxdyn.contact.unilateral import UnilateralContact, WithModes
 from jaxdyn.forces.piecewise import Pieces
 from jaxdyn.systems.scene import Scene
 
-KINDS = ("touch", "release", "stick", "slip", "turn")
+KINDS = ("touch", "release", "stick", "slip", "turn", "share")
 CHANNELS = 3  # guards of an element: its normal force or gap, its friction, the pivot of its equations
 
 
@@ -36,6 +36,7 @@ class Mode(NamedTuple):
     stick: Array
     negative: Array  # true where the normal multiplier is negative
     positive: Array  # of the switching functions of piecewise smooth forces
+    excess: Array  # friction (n,) beyond the cone, of all normal forces, by which an element that depends on others may stick
 
     def signs(self, dtype) -> Array:
         """Signs of the normal multipliers, (n,)."""
@@ -166,7 +167,8 @@ class Events(eqx.Module):
 
     - `time` (ne,), s, NaN behind the last event; differentiable. `index` (ne,) among `names`, -1 behind the last event.
     - `names`: "<element>: <kind>". The kinds of a contact are "touch" and "release"; those of friction "stick" and "slip". A
-      "turn" reverses the direction of sliding, or the sign of the normal force of a friction that holds on both sides.
+      "turn" reverses the direction of sliding, or the sign of the normal force of a friction that holds on both sides. At a
+      "share" elements that stick together share their friction anew, and nothing moves otherwise than before.
     - `count` (): number of events. Elements that change at the same time have one entry each, that of the guard which was
       crossed first in front.
     """

@@ -167,6 +167,7 @@ def _guess(scene: Scene, elements, q, v, t):
         speed <= small * (1 + jnp.max(jnp.abs(v))),
         jnp.zeros(gap.shape, bool),
         jnp.zeros((0,), bool),
+        jnp.zeros_like(gap),
     )
     limit = float(jnp.finfo(q.dtype).eps) ** 0.4
     start_ok = (~opens | (gap >= -limit * reach)).all()

@@ -31,7 +31,6 @@ from jaxdyn.simulation.hybrid.dynamics import (
     impact,
     motion_at,
     normal_loads,
-    react,
     rebounds,
     solve_rows,
     terms_at,
@@ -44,8 +43,10 @@ from jaxdyn.simulation.hybrid.transitions import (
     align,
     choose_mode,
     first_guess,
+    jammed,
     length,
     rates_of,
+    with_excess,
 )
 from jaxdyn.simulation.solvers.explicit import Plan
 from jaxdyn.systems.scene import Scene
@@ -138,7 +139,9 @@ class ModalSystem(HybridSystem):
         # Sliding that is slower than the error of its velocity has ended: its direction is not known.
         least = 2 * tolerance(q.dtype) if atol is None else jnp.maximum(2 * tolerance(q.dtype), _STOPPED * atol)
         is_impact = (jnp.asarray(self.elements.opening) & hit[:, 0] & ~mode.closed).any()
-        stopped = jnp.asarray(self.elements.rough) & mode.closed & ~mode.stick & (speed <= least * (1 + size)) & ~is_impact
+        stopped = (
+            jnp.asarray(self.elements.rough) & mode.closed & ~mode.stick & (speed <= least * (1 + size)) & ~is_impact
+        )
         mode, slip, begins = first_guess(self.elements, mode, slip, holding, hit)
         mode = mode._replace(stick=mode.stick | (stopped & mode.closed))
         after = self._pass(unknown, mode, slip, begins, stopped & mode.closed, t, q, v, atol)
@@ -159,28 +162,31 @@ class ModalSystem(HybridSystem):
         height = 4 * least if atol is None else jnp.maximum(4 * least, atol)
 
         def attempt(carry):
-            tries, (rebound, held), _, busy = carry
+            tries, (rebound, held, stopped), _, busy = carry
             problem, along = kernel(self._velocities)(unknown, rebound, held, stopped, slip, t, q, v)
-            choice = choose_mode(elements, problem, mode, along)
+            choice = choose_mode(elements, problem, mode._replace(stick=mode.stick | (stopped & mode.closed)), along)
             collision = Collision(choice.mode, choice.slip, rebound, held, stopped)
+            still = kernel(self._jammed)(problem, choice.mode, choice.slip)
             resting, at, after, gains = kernel(self._after)(unknown, collision, begins, t, q, v)
             problem, along = kernel(self._forces)(unknown, resting, at, t, q, after)
             final = choose_mode(elements, problem, resting, along)
-            soft, short, paradox = kernel(self._flights)(
+            follows, soft, short, paradox = kernel(self._flights)(
                 unknown, collision, problem, final.mode, final.slip, t, q, v, after, height
             )
             # Both choices are valid if no element disagreed in the end.
             settled = ~(choice.wrong | final.wrong)
-            new = Transition(collision, final.mode, final.slip, after, settled, paradox & ~settled)
+            new = Transition(collision, follows, final.slip, after, settled, paradox & ~settled)
             rebound = jnp.where(gains, jnp.where(rebound > 0.1, rebound / 2, 0.0), jnp.where(soft, 0.0, rebound))
-            more = gains | soft.any() | short.any()
-            after = tries + 1, (rebound, held | (short & ~gains)), new, more & (tries < n + 6)
+            more = gains | soft.any() | short.any() | still.any()
+            fate = rebound, held | (short & ~gains & ~still.any()), stopped | still
+            after = tries + 1, fate, new, more & (tries < 2 * n + 6)
             return jax.tree.map(lambda a, b: jnp.where(busy, a, b), after, carry)
 
         none, no = jnp.zeros((n,), bool), jnp.zeros((), bool)
-        start = Collision(mode, slip, jnp.ones((n,), q.dtype), none, none)
+        mode = mode._replace(excess=jnp.zeros((n,), q.dtype))
+        start = Collision(mode, slip, jnp.ones((n,), q.dtype), none, stopped)
         blank = Transition(start, mode, slip, v, no, no)
-        return while_loop(lambda carry: carry[3], attempt, (jnp.zeros((), jnp.int32), start[2:4], blank, ~no))[2]
+        return while_loop(lambda carry: carry[3], attempt, (jnp.zeros((), jnp.int32), start[2:], blank, ~no))[2]
 
     def _velocities(self, unknown, rebound, held, stopped, slip, t, q, v):
         """Problem of an impact, and directions of sliding (n, 2)."""
@@ -243,11 +249,11 @@ class ModalSystem(HybridSystem):
         return problem, directions(scene, elements, terms.slip, slip)
 
     def _flights(self, unknown, collision: Collision, problem: Problem, mode: Mode, along, t, q, v, after, height):
-        """Contacts (n,) whose rebound is too low to be followed, others whose flight is, and whether friction has lost a pivot."""
+        """Mode, contacts (n,) whose rebound is too low to be followed, others whose flight is, and whether a pivot is lost."""
         scene, elements = self._bind(unknown)[0], self.elements
         terms, of = terms_at(scene, elements, q, v, t), coefficients(scene, elements, v.dtype)
-        reaction = react(elements, mode, problem.gram, problem.sliding, problem.loads, along, -problem.free)
-        rate = rates_of(elements, matmul(problem.gram, reaction.along) + problem.free)[0]
+        still, reaction, rates = jammed(elements, problem, mode, along)
+        rate = rates_of(elements, rates)[0]
         velocity = rates_of(elements, matmul(terms.row.A, after - v) + terms.row.velocity)[0]
         flies = (
             self._touches(scene, q, t)
@@ -258,7 +264,11 @@ class ModalSystem(HybridSystem):
         low = flies & (rate < 0) & (velocity * velocity <= -2 * rate * height)
         bounces = collision.mode.closed & (rebounds(elements, terms, of.restitution * collision.rebound) > 0)
         lost = (mode.closed & ~mode.stick & (reaction.pivots <= 0)).any()
-        return low & bounces, low & ~bounces & ~collision.held, lost
+        follows = with_excess(elements, problem, mode, still)
+        return follows, low & bounces, low & ~bounces & ~collision.held, lost
+
+    def _jammed(self, problem: Problem, mode: Mode, along):
+        return jammed(self.elements, problem, mode, along)[0]
 
     def impact(self, unknown, collision, t, y):
         y = self.plan.structure(y)

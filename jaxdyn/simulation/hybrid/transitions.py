@@ -25,11 +25,20 @@ from jaxdyn.compile import kernel
 from jaxdyn.compile.batch import while_loop
 from jaxdyn.compile.loops import Carry, Given, Iteration, Task, run_loop
 from jaxdyn.lie.so3 import matmul
-from jaxdyn.simulation.hybrid.dynamics import Collision, Reaction, force_tolerance, react, tolerance
+from jaxdyn.simulation.hybrid.dynamics import (
+    Collision,
+    Reaction,
+    depends_on_others,
+    force_tolerance,
+    react,
+    tolerance,
+)
 from jaxdyn.simulation.hybrid.modes import Elements, Mode
 
 
 _ANGLE = 1e-14  # 1 - cos of the angle up to which a direction is known
+_STILL = 1e-4  # rate of slipping, of the terms that cancel in it, of what may stand still
+_ROOM = 2e-3  # of the friction of all elements, by which the friction of some that stick may grow beyond the cone
 _WEIGHT = 4  # changes of direction for which there is the same room as for one of a mode
 
 
@@ -199,6 +208,41 @@ def _disagreements(elements: Elements, problem: Problem, mode: Mode, slip, react
         ~opens & has_multiplier & (reaction.normal < -tiny),
     ]
     return jnp.stack(wrong, 1), problem.may_stick, turned
+
+
+def jammed(elements: Elements, problem: Problem, mode: Mode, along) -> tuple[Array, Reaction, Array]:
+    """Elements (n,) that slide, but stand still, since they depend on others that stick; the reaction, and rates (count,).
+
+    Their friction of least norm has left the cone, and another share of it has not.
+    """
+    reaction = react(elements, mode, problem.gram, problem.sliding, problem.loads, along, -problem.free)
+    rates = matmul(problem.gram, reaction.along) + problem.free
+    rests = mode.closed & jnp.asarray(elements.rough) & problem.may_stick
+    depends = depends_on_others(elements, problem.gram, mode._replace(stick=mode.stick | rests))
+    speed, _ = length(rates_of(elements, rates)[1])
+    sizes = matmul(jnp.abs(problem.gram), jnp.abs(reaction.along)) + jnp.abs(problem.free)
+    size = problem.rate + jnp.max(rates_of(elements, sizes)[1], 1)
+    return rests & ~mode.stick & depends & (speed <= _STILL * size), reaction, rates
+
+
+def with_excess(elements: Elements, problem: Problem, mode: Mode, still) -> Mode:
+    """Mode in which elements that stand `still` (n,) stick, with room for their friction beyond the cone."""
+    mode = mode._replace(stick=mode.stick | still)
+    reaction = react(
+        elements,
+        mode,
+        problem.gram,
+        problem.sliding,
+        problem.loads,
+        jnp.zeros_like(mode.excess[:, None] * jnp.ones(2)),
+        -problem.free,
+    )
+    hold, _ = length(reaction.holding)
+    total = jnp.sum(jnp.abs(reaction.normal))
+    beyond = hold - problem.static * jnp.abs(reaction.normal)
+    room = jnp.maximum(beyond, 0.0) / jnp.where(total > 0, total, 1.0) + _ROOM * problem.static
+    excess = jnp.where(mode.stick & mode.closed & still.any() & (beyond > -_ROOM * problem.static * total), room, 0.0)
+    return mode._replace(excess=excess)
 
 
 def rates_of(elements: Elements, rates) -> tuple[Array, Array]:
