@@ -24,6 +24,8 @@ from jaxdyn.simulation.hybrid.modes import Elements, Mode, extend, force_at
 from jaxdyn.systems.mass_factor import MassFactor, cholesky, mass_factor, solve_cholesky
 from jaxdyn.systems.scene import Scene
 
+_INDEPENDENT = 1e-2  # of the square of a row, that is left of it when others hold
+
 
 class StateTerms(NamedTuple):
     """Terms of a state that do not depend on its mode: rows, mass matrix, and sliding velocities (n, 2)."""
@@ -94,7 +96,7 @@ def normal_loads(scene: Scene, elements: Elements, q, v, t) -> Array:
     return jnp.stack(loads)
 
 
-def directions(scene: Scene, elements: Elements, slip, reference) -> Array:
+def directions(scene: Scene, elements: Elements, mode: Mode, slip, reference) -> Array:
     """Unit vectors (n, 2) of sliding; shorter ones for friction that is smooth.
 
     They continue smoothly through w = 0 to w < 0, because the event that ends a mode there is bracketed from both sides: w/|w|
@@ -106,7 +108,7 @@ def directions(scene: Scene, elements: Elements, slip, reference) -> Array:
         # A velocity that may be the rounding of others has no direction of its own: the reference is kept.
         least = 0.0 if one.smooth else tolerance(w.dtype)
         square = jnp.sum(w * w)
-        is_sliding = square > least**2
+        is_sliding = (square > least**2) & (mode.creep[i] <= 0)
         # The square root has an infinite derivative at zero, which a mask behind it would turn into NaN.
         length = jnp.sqrt(jnp.where(is_sliding, square, jnp.ones_like(square)))
         if one.smooth:
@@ -133,6 +135,7 @@ def react(elements: Elements, mode: Mode, gram, friction, loads, along, target) 
     `friction` (n,): coefficients of sliding; `loads` (n,): normal forces that are given.
     """
     dtype = target.dtype
+    gram, target = turn_gram(elements, mode, along, gram), turn_rows(elements, mode, along, target)
     # Rows that do not act are masked and not removed: every mode has the same shapes and the same program.
     active, zero = elements.active(mode).astype(dtype), jnp.zeros((), dtype)
     level = jnp.where(slides(elements, mode), friction, 0.0)
@@ -141,7 +144,8 @@ def react(elements: Elements, mode: Mode, gram, friction, loads, along, target) 
     for i, one in enumerate(elements.each):
         push = [zero] * elements.count
         for k, row in enumerate(one.tangent):
-            push[row] = -level[i] * along[i, k]
+            # Along its own line a direction is the first unit vector.
+            push[row] = -level[i] * jnp.where(mode.creep[i] > 0, 1.0 - k, along[i, k])
         pushes.append(jnp.stack(push))
     given = sum((loads[i] * pushes[i] for i, one in enumerate(elements.each) if one.normal < 0), jnp.zeros_like(target))
     Z = jnp.stack([jnp.zeros_like(target), *(pushes[i] for i in elements.frictional)])[1:].T
@@ -163,8 +167,30 @@ def react(elements: Elements, mode: Mode, gram, friction, loads, along, target) 
             pivots[i] = jnp.where(is_sliding[i], pivot, jnp.ones_like(pivot))
     lam = (base + matmul(by_normal, normal)) * active
     normals = [sign[i] * lam[one.normal] if one.normal >= 0 else loads[i] for i, one in enumerate(elements.each)]
-    forces = lam + given + matmul(Z, normal)
+    forces = turn_rows(elements, mode, along, lam + given + matmul(Z, normal), back=True)
+    lam = turn_rows(elements, mode, along, lam, back=True)
     return Reaction(forces, lam, jnp.stack(normals), by_element(elements, lam), jnp.stack(pivots))
+
+
+def turn_rows(elements: Elements, mode: Mode, along, rowwise, *, back: bool = False):
+    """Entries (count, ...) of the rows with those of elements that slide along a line turned into components along and across it.
+
+    Where an element begins to slide in a plane, its direction follows the forces: as |w| -> 0 ever faster, for which explicit
+    steps would have to be short without bound. Up to a small speed it slides along a line instead, with a force across.
+    """
+    parts = [rowwise[k] for k in range(elements.count)]
+    for i, one in enumerate(elements.each):
+        if len(one.tangent) == 2 and not one.smooth:
+            is_line, (first, second) = mode.creep[i] > 0, one.tangent
+            c, s = jnp.where(is_line, along[i, 0], 1.0), jnp.where(is_line, along[i, 1], 0.0)
+            s, (a, b) = -s if back else s, (parts[first], parts[second])
+            parts[first], parts[second] = c * a + s * b, c * b - s * a
+    return jnp.stack(parts)
+
+
+def turn_gram(elements: Elements, mode: Mode, along, gram):
+    """Gram matrix of turned rows."""
+    return turn_rows(elements, mode, along, turn_rows(elements, mode, along, gram).T)
 
 
 def solve_rows(gram, active, right):
@@ -200,6 +226,31 @@ def depends_on_others(elements: Elements, gram, mode: Mode):
     shares = eps**0.5 * jnp.diagonal(solve_cholesky(factor, jnp.eye(active.size, dtype=gram.dtype)))
     free = (shares > 1e-3) & (scale > 0)
     return jnp.stack([jnp.stack([free[k] for k in one.tangent] or [free[0] & False]).any() for one in elements.each])
+
+
+def independent_lines(elements: Elements, gram, mode: Mode, along, wanted):
+    """Those of the `wanted` elements (n,) that may slide along lines: rows across them do not depend on others that act."""
+    none = jnp.zeros((elements.count,), gram.dtype)
+    across = []
+    for i, one in enumerate(elements.each):
+        is_plane = len(one.tangent) == 2
+        across.append(
+            none.at[jnp.asarray(one.tangent)].set(jnp.stack([-along[i, 1], along[i, 0]])) if is_plane else none
+        )
+    across = jnp.stack(across, 1)
+    active = elements.active(mode._replace(creep=jnp.zeros_like(mode.creep))).astype(gram.dtype)
+    rates = matmul(gram, across)
+    # What is left of the rows across when the others hold: their Schur complement, eliminated in order.
+    held = solve_rows(gram, active, rates * active[:, None])
+    whole = matmul(across.T, rates)
+    left = whole - matmul(rates.T, held)
+    chosen = []
+    for i in range(len(elements.each)):
+        is_free = wanted[i] & (left[i, i] > _INDEPENDENT * whole[i, i])
+        chosen.append(is_free)
+        pivot = jnp.where(is_free, left[i, i], jnp.ones_like(left[i, i]))
+        left = left - jnp.where(is_free, left[:, i, None] * left[None, i] / pivot, 0.0)
+    return jnp.stack(chosen)
 
 
 def _eliminate(K, right):
@@ -250,7 +301,7 @@ def motion_at(
     scene: Scene, elements: Elements, mode: Mode, terms: StateTerms, reference, generalized_force, q, v, t
 ) -> Motion:
     """Motion in a mode; `generalized_force` as of `free_motion`."""
-    along = directions(scene, elements, terms.slip, reference)
+    along = directions(scene, elements, mode, terms.slip, reference)
     loads, friction = normal_loads(scene, elements, q, v, t), coefficients(scene, elements, v.dtype).sliding
     free, rates = free_motion(scene, terms, generalized_force, q, v, t)
     reaction = react(elements, mode, terms.gram, friction, loads, along, -rates)
@@ -297,7 +348,7 @@ def impact(scene: Scene, elements: Elements, collision: Collision, terms: StateT
     friction = jnp.where(collision.held, 0.0, of.sliding)
     # Finite forces have no impulse, nor has the friction under them.
     loads = jnp.zeros_like(rebound)
-    along = directions(scene, elements, jnp.zeros_like(collision.slip), collision.slip)
+    along = directions(scene, elements, collision.mode, jnp.zeros_like(collision.slip), collision.slip)
     target = by_normal_row(elements, rebound) - terms.row.velocity
     reaction = react(elements, collision.mode, terms.gram, friction, loads, along, target)
     return v + terms.metric.unwhiten(matmul(terms.Y, reaction.along)), reaction
@@ -342,7 +393,10 @@ def guards_and_levels(
             size = jnp.sqrt(jnp.where(square > 0, square, one_)) * (square > 0).astype(dtype)
             margin = friction.static[i] * reaction.normal[i] + mode.excess[i] * total - size
             # Sliding is guarded by a signed speed, which crosses zero; the length of the velocity only touches it.
-            sliding = jnp.where(mode.stick[i], margin, jnp.sum(reference[i] * terms.slip[i]))
+            speed = jnp.sum(reference[i] * terms.slip[i])
+            # Along a line it slides from rest to the speed of `creep`: one guard for both ends, in units of a speed.
+            share = jnp.where(mode.creep[i] > 0, 1 - speed / jnp.where(mode.creep[i] > 0, mode.creep[i], one_), one_)
+            sliding = jnp.where(mode.stick[i], margin, speed * share)
             sliding = jnp.where(mode.closed[i], sliding, one_)
         if one.tangent:
             pivot = reaction.pivots[i]

@@ -168,6 +168,7 @@ def _guess(scene: Scene, elements, q, v, t):
         jnp.zeros(gap.shape, bool),
         jnp.zeros((0,), bool),
         jnp.zeros_like(gap),
+        jnp.zeros_like(gap),
     )
     limit = float(jnp.finfo(q.dtype).eps) ** 0.4
     start_ok = (~opens | (gap >= -limit * reach)).all()
@@ -197,7 +198,7 @@ def _events(elements, touched, start, times, index, good) -> Events:
 
 def _forces(scene: Scene, elements, mode: Mode, terms, motion, slip) -> dict:
     """Static or sliding friction along the rows (2,) and normal force, (3,), by the names of the elements."""
-    along, sliding, forces = directions(scene, elements, terms.slip, slip), slides(elements, mode), {}
+    along, sliding, forces = directions(scene, elements, mode, terms.slip, slip), slides(elements, mode), {}
     friction, normals = coefficients(scene, elements, slip.dtype).sliding, motion.reaction.normal
     for i, one in enumerate(elements.each):
         level = jnp.where(sliding[i], friction[i] * normals[i], 0.0)

@@ -69,7 +69,7 @@ def piecewise_motion(
     """
     unknown, flat = tuple(args or ()), ravel_pytree(y0)[0]
     none = jnp.zeros((0,), bool)
-    mode = Mode(none, none, none, jnp.ones((system.elements.switches,), bool), jnp.zeros((0,), flat.dtype))
+    mode = Mode(none, none, none, jnp.ones((system.elements.switches,), bool), *jnp.zeros((2, 0), flat.dtype))
     values, _ = system.guards(ts[0], y0, (unknown, mode))
     rtol, atol = (jnp.asarray(x, flat.dtype) for x in (rtol, atol))
     mode = lax.stop_gradient(mode._replace(positive=values > 0))

@@ -26,7 +26,7 @@ def no_records(elements: Elements, dtype, most: int) -> Records:
     """Records before the first event."""
     n, none = len(elements.each), jnp.zeros((most + 1,), jnp.int32)
     flags, slip = jnp.zeros((most + 1, n), bool), jnp.zeros((most + 1, n, 2), dtype)
-    mode = Mode(flags, flags, flags, jnp.zeros((most + 1, elements.switches), bool), slip[..., 0])
+    mode = Mode(flags, flags, flags, jnp.zeros((most + 1, elements.switches), bool), slip[..., 0], slip[..., 0])
     impact = Collision(mode, slip, slip[..., 0], flags, flags)
     return Records(jnp.full((most + 1,), jnp.nan, dtype), none - 1, none - 1, impact, mode, slip)
 
@@ -36,14 +36,14 @@ def record_elements(
 ):
     """Records with a row for each element that an event has changed, and their number."""
     mode, number = change.mode, jnp.arange(len(elements.each), dtype=jnp.int32)
-    kind = jnp.where(mode.stick & ~before.stick, 2, jnp.where(before.stick & ~mode.stick, 3, 4))
-    kind = jnp.where(mode.stick & before.stick, 5, kind)
+    kind = jnp.where((mode.stick & before.stick) | (mode.creep != before.creep), 5, 4)
+    kind = jnp.where(mode.stick & ~before.stick, 2, jnp.where(before.stick & ~mode.stick, 3, kind))
     # A contact that is hit may let go at once.
     hits = (mode.closed | hit[:, 0]) & ~before.closed
     kind = jnp.where(hits, 0, jnp.where(before.closed & ~mode.closed, 1, kind))
     # What stands still beyond its cone is given room: the guard of a mode has changed, and its derivative.
     differs = (mode.closed != before.closed) | (mode.stick != before.stick) | (mode.negative != before.negative)
-    differs = differs | (mode.excess != before.excess)
+    differs = differs | (mode.excess != before.excess) | (mode.creep != before.creep)
     changed = happens & (hit.any(1) | differs)
     leading = jnp.argmax(hit.reshape(-1)).astype(jnp.int32)
     # First the element whose guard it was, which carries the impact; then those that came with it.

@@ -29,12 +29,15 @@ from jaxdyn.simulation.hybrid.dynamics import (
     gaps,
     guards_and_levels,
     impact,
+    independent_lines,
     motion_at,
     normal_loads,
     rebounds,
     solve_rows,
     terms_at,
     tolerance,
+    turn_gram,
+    turn_rows,
 )
 from jaxdyn.simulation.hybrid.modes import Elements, Mode, extend
 from jaxdyn.simulation.hybrid.transitions import (
@@ -142,7 +145,7 @@ class ModalSystem(HybridSystem):
         stopped = (
             jnp.asarray(self.elements.rough) & mode.closed & ~mode.stick & (speed <= least * (1 + size)) & ~is_impact
         )
-        mode, slip, begins = first_guess(self.elements, mode, slip, holding, hit)
+        mode, slip, begins = first_guess(self.elements, mode, slip, holding, speed, hit)
         mode = mode._replace(stick=mode.stick | (stopped & mode.closed))
         after = self._pass(unknown, mode, slip, begins, stopped & mode.closed, t, q, v, atol)
         # Switching functions that the impact has carried across their zeros.
@@ -163,7 +166,7 @@ class ModalSystem(HybridSystem):
 
         def attempt(carry):
             tries, (rebound, held, stopped), _, busy = carry
-            problem, along = kernel(self._velocities)(unknown, rebound, held, stopped, slip, t, q, v)
+            problem, along = kernel(self._velocities)(unknown, mode, rebound, held, stopped, slip, t, q, v)
             choice = choose_mode(elements, problem, mode._replace(stick=mode.stick | (stopped & mode.closed)), along)
             collision = Collision(choice.mode, choice.slip, rebound, held, stopped)
             still = kernel(self._jammed)(problem, choice.mode, choice.slip)
@@ -171,7 +174,7 @@ class ModalSystem(HybridSystem):
             problem, along = kernel(self._forces)(unknown, resting, at, t, q, after)
             final = choose_mode(elements, problem, resting, along)
             follows, soft, short, paradox = kernel(self._flights)(
-                unknown, collision, problem, final.mode, final.slip, t, q, v, after, height
+                unknown, collision, problem, final.mode, final.slip, t, q, v, after, (height, fast)
             )
             # Both choices are valid if no element disagreed in the end.
             settled = ~(choice.wrong | final.wrong)
@@ -183,12 +186,15 @@ class ModalSystem(HybridSystem):
             return jax.tree.map(lambda a, b: jnp.where(busy, a, b), after, carry)
 
         none, no = jnp.zeros((n,), bool), jnp.zeros((), bool)
-        mode = mode._replace(excess=jnp.zeros((n,), q.dtype))
+        none_ = jnp.zeros((n,), q.dtype)
+        mode = mode._replace(excess=none_, creep=none_)
+        # As far as the square of the speed is below the tolerance, the direction of sliding may lag behind.
+        fast = jnp.asarray(1e-4, q.dtype) if atol is None else 0.3 * jnp.sqrt(jnp.maximum(atol, least))
         start = Collision(mode, slip, jnp.ones((n,), q.dtype), none, stopped)
         blank = Transition(start, mode, slip, v, no, no)
         return while_loop(lambda carry: carry[3], attempt, (jnp.zeros((), jnp.int32), start[2:], blank, ~no))[2]
 
-    def _velocities(self, unknown, rebound, held, stopped, slip, t, q, v):
+    def _velocities(self, unknown, mode: Mode, rebound, held, stopped, slip, t, q, v):
         """Problem of an impact, and directions of sliding (n, 2)."""
         scene, elements = self._bind(unknown)[0], self.elements
         terms, of = terms_at(scene, elements, q, v, t), coefficients(scene, elements, v.dtype)
@@ -201,7 +207,7 @@ class ModalSystem(HybridSystem):
             terms.gram, rates - wanted, *friction, jnp.zeros_like(rebound), self._touches(scene, q, t), each, held, stopped, size,
             1 + self._speeds(terms, v),
         )  # fmt: skip
-        return problem, directions(scene, elements, jnp.zeros_like(slip), slip)
+        return problem, directions(scene, elements, mode, jnp.zeros_like(slip), slip)
 
     def _touches(self, scene: Scene, q, t):
         opens, gap = jnp.asarray(self.elements.opening), gaps(scene, self.elements, q, t)
@@ -246,12 +252,13 @@ class ModalSystem(HybridSystem):
         problem = Problem(
             terms.gram, rates, of.sliding, of.static, loads, rests, speed <= least, zero > 0, zero > 0, size, zero
         )  # fmt: skip
-        return problem, directions(scene, elements, terms.slip, slip)
+        return problem, directions(scene, elements, mode, terms.slip, slip)
 
-    def _flights(self, unknown, collision: Collision, problem: Problem, mode: Mode, along, t, q, v, after, height):
+    def _flights(self, unknown, collision: Collision, problem: Problem, mode: Mode, along, t, q, v, after, limits):
         """Mode, contacts (n,) whose rebound is too low to be followed, others whose flight is, and whether a pivot is lost."""
         scene, elements = self._bind(unknown)[0], self.elements
         terms, of = terms_at(scene, elements, q, v, t), coefficients(scene, elements, v.dtype)
+        height, fast = limits
         still, reaction, rates = jammed(elements, problem, mode, along)
         rate = rates_of(elements, rates)[0]
         velocity = rates_of(elements, matmul(terms.row.A, after - v) + terms.row.velocity)[0]
@@ -265,6 +272,11 @@ class ModalSystem(HybridSystem):
         bounces = collision.mode.closed & (rebounds(elements, terms, of.restitution * collision.rebound) > 0)
         lost = (mode.closed & ~mode.stick & (reaction.pivots <= 0)).any()
         follows = with_excess(elements, problem, mode, still)
+        slides = mode.closed & ~follows.stick & jnp.asarray(elements.planar)
+        speed, _ = length(rates_of(elements, matmul(terms.row.A, after - v) + terms.row.velocity)[1])
+        line = slides & (problem.may_stick | (speed < 0.9 * fast))
+        line = independent_lines(elements, problem.gram, follows, along, line)
+        follows = follows._replace(creep=jnp.where(line, fast, 0.0))
         return follows, low & bounces, low & ~bounces & ~collision.held, lost
 
     def _jammed(self, problem: Problem, mode: Mode, along):
@@ -291,14 +303,15 @@ def project(scene: Scene, elements: Elements, mode: Mode, t, y, error):
     whole, dtype = extend(scene), y["v"].dtype
     q, v = retract(scene.system, y["q"]), y["v"]
     terms = terms_at(scene, elements, q, v, t)
-    holonomic = holonomic_rows(layout(whole))
+    holonomic, gram = holonomic_rows(layout(whole)), turn_gram(elements, mode, y["slip"], terms.gram)
     # Masks keep the shapes of all modes: rows that do not act are multiplied by zero.
     active = elements.active(mode).astype(dtype)
     holds = jnp.zeros((elements.count,), dtype).at[holonomic].set(1.0) * active
 
     def change(residual, mask):
         """Least velocity that changes the rows of a mask by `residual`."""
-        lam = solve_rows(terms.gram, mask, (residual * mask)[:, None])[:, 0]
+        residual = turn_rows(elements, mode, y["slip"], residual)
+        lam = turn_rows(elements, mode, y["slip"], solve_rows(gram, mask, (residual * mask)[:, None])[:, 0], back=True)
         return terms.metric.unwhiten(matmul(terms.Y, lam))
 
     tangent = None
@@ -317,4 +330,5 @@ def project(scene: Scene, elements: Elements, mode: Mode, t, y, error):
     for _ in range(_ROUNDS):
         v = v - change(velocity_residual(whole, q, v, t), active)
     slip = by_element(elements, velocity_residual(whole, q, v, t))
-    return y | {"q": q, "v": v, "slip": align(slip, y["slip"])}, tangent
+    aligned = jnp.where((mode.creep > 0)[:, None], y["slip"], align(slip, y["slip"]))
+    return y | {"q": q, "v": v, "slip": aligned}, tangent

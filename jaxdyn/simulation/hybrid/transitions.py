@@ -35,7 +35,6 @@ from jaxdyn.simulation.hybrid.dynamics import (
 )
 from jaxdyn.simulation.hybrid.modes import Elements, Mode
 
-
 _ANGLE = 1e-14  # 1 - cos of the angle up to which a direction is known
 _STILL = 1e-4  # rate of slipping, of the terms that cancel in it, of what may stand still
 _ROOM = 2e-3  # of the friction of all elements, by which the friction of some that stick may grow beyond the cone
@@ -99,15 +98,17 @@ def align(slip, reference):
     return lax.stop_gradient(jnp.where(is_sliding[:, None], forward[:, None] * unit, reference))
 
 
-def first_guess(elements: Elements, mode: Mode, slip, holding, hit) -> tuple[Mode, Array, Array]:
+def first_guess(elements: Elements, mode: Mode, slip, holding, speed, hit) -> tuple[Mode, Array, Array]:
     """Mode and directions after the guards `hit` (n, CHANNELS), before velocities and forces are checked.
 
-    `holding` (n, 2): friction of elements that stick. The third result (n,) marks elements that begin to slide.
+    `holding` (n, 2): friction of elements that stick; `speed` (n,) of slipping. The third result (n,) marks elements that begin to slide.
     """
     opens = jnp.asarray(elements.opening)
     first, second = hit[:, 0], hit[:, 1]
     closes, releases = opens & first & ~mode.closed, opens & first & mode.closed
     begins, ends = second & mode.stick & mode.closed, second & ~mode.stick & mode.closed
+    leaves = ends & (mode.creep > 0) & (speed > mode.creep / 2)
+    ends = ends & ~leaves
     _, against = length(-holding)
     # An element that breaks loose slides against the friction that held it: its velocity is still zero.
     slip = jnp.where(begins[:, None], against, slip)
@@ -115,6 +116,7 @@ def first_guess(elements: Elements, mode: Mode, slip, holding, hit) -> tuple[Mod
         closed=(mode.closed | closes) & ~releases,
         stick=((mode.stick | closes | ends) & ~begins) & ~releases,
         negative=mode.negative ^ (first & ~opens),
+        creep=jnp.where(leaves, 0.0, mode.creep),
     )
     return changed, slip, begins
 
@@ -221,8 +223,8 @@ def jammed(elements: Elements, problem: Problem, mode: Mode, along) -> tuple[Arr
     depends = depends_on_others(elements, problem.gram, mode._replace(stick=mode.stick | rests))
     speed, _ = length(rates_of(elements, rates)[1])
     sizes = matmul(jnp.abs(problem.gram), jnp.abs(reaction.along)) + jnp.abs(problem.free)
-    size = problem.rate + jnp.max(rates_of(elements, sizes)[1], 1)
-    return rests & ~mode.stick & depends & (speed <= _STILL * size), reaction, rates
+    least = _STILL * jnp.max(rates_of(elements, sizes)[1], 1) + tolerance(speed.dtype) * problem.rate
+    return rests & ~mode.stick & depends & (speed <= least), reaction, rates
 
 
 def with_excess(elements: Elements, problem: Problem, mode: Mode, still) -> Mode:
