@@ -50,6 +50,7 @@ from jaxdyn.simulation.hybrid.transitions import (
     length,
     rates_of,
     with_excess,
+    with_lines,
 )
 from jaxdyn.simulation.solvers.explicit import Plan
 from jaxdyn.systems.scene import Scene
@@ -276,11 +277,13 @@ class ModalSystem(HybridSystem):
         speed, _ = length(rates_of(elements, matmul(terms.row.A, after - v) + terms.row.velocity)[1])
         line = slides & (problem.may_stick | (speed < 0.9 * fast))
         line = independent_lines(elements, problem.gram, follows, along, line)
-        follows = follows._replace(creep=jnp.where(line, fast, 0.0))
+        follows = with_lines(elements, problem, follows, along, jnp.where(line, fast, 0.0))
         return follows, low & bounces, low & ~bounces & ~collision.held, lost
 
     def _jammed(self, problem: Problem, mode: Mode, along):
-        return jammed(self.elements, problem, mode, along)[0]
+        """Elements (n,) whose slow slip behind an impact is only an error of their directions."""
+        still, _, rates = jammed(self.elements, problem, mode, along)
+        return still & (length(rates_of(self.elements, rates)[1])[0] > 2 * tolerance(along.dtype) * problem.rate)
 
     def impact(self, unknown, collision, t, y):
         y = self.plan.structure(y)

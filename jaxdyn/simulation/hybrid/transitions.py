@@ -247,6 +247,20 @@ def with_excess(elements: Elements, problem: Problem, mode: Mode, still) -> Mode
     return mode._replace(excess=excess)
 
 
+def with_lines(elements: Elements, problem: Problem, mode: Mode, along, creep) -> Mode:
+    """Mode in which elements slide along lines up to the speeds `creep` (n,), if all contacts push then and the forces across
+    are small."""
+    lines = mode._replace(creep=creep)
+    reaction = react(elements, lines, problem.gram, problem.sliding, problem.loads, along, -problem.free)
+    tiny = force_tolerance(creep.dtype) / 4 * jnp.sum(jnp.abs(reaction.normal))
+    across, level = length(reaction.holding)[0], problem.sliding * jnp.abs(reaction.normal)
+    pushes = ~(jnp.asarray(elements.opening) & mode.closed) | (reaction.normal >= -tiny)
+    sticks = mode.stick & mode.closed & jnp.asarray(elements.rough)
+    cone = problem.static * jnp.abs(reaction.normal) + mode.excess * jnp.sum(jnp.abs(reaction.normal)) + tiny
+    fits = jnp.where(sticks, across <= cone, (creep <= 0) | (across <= 0.5 * level))
+    return mode._replace(creep=jnp.where((pushes & fits).all(), creep, 0.0))
+
+
 def rates_of(elements: Elements, rates) -> tuple[Array, Array]:
     """Rates of the gaps (n,) and of slipping (n, 2), of the rates (count,) of all rows."""
     zero = jnp.zeros((), rates.dtype)
