@@ -41,11 +41,13 @@ from jaxdyn.simulation.hybrid.dynamics import (
 )
 from jaxdyn.simulation.hybrid.modes import Elements, Mode, extend
 from jaxdyn.simulation.hybrid.transitions import (
+    GUESSES,
     Problem,
     Transition,
     align,
     choose_mode,
     first_guess,
+    guess_again,
     jammed,
     length,
     rates_of,
@@ -166,34 +168,39 @@ class ModalSystem(HybridSystem):
         height = 4 * least if atol is None else jnp.maximum(4 * least, atol)
 
         def attempt(carry):
-            tries, (rebound, held, stopped), _, busy = carry
+            tries, guess, (rebound, held, stopped), _, busy = carry
             problem, along = kernel(self._velocities)(unknown, mode, rebound, held, stopped, slip, t, q, v)
-            choice = choose_mode(elements, problem, mode._replace(stick=mode.stick | (stopped & mode.closed)), along)
+            begin = guess_again(elements, problem, mode, guess)
+            choice = choose_mode(elements, problem, begin._replace(stick=begin.stick | (stopped & begin.closed)), along)
             collision = Collision(choice.mode, choice.slip, rebound, held, stopped)
             still = kernel(self._jammed)(problem, choice.mode, choice.slip)
             resting, at, after, gains = kernel(self._after)(unknown, collision, begins, t, q, v)
             problem, along = kernel(self._forces)(unknown, resting, at, t, q, after)
-            final = choose_mode(elements, problem, resting, along)
+            final = choose_mode(elements, problem, guess_again(elements, problem, resting, guess), along)
             follows, soft, short, paradox = kernel(self._flights)(
                 unknown, collision, problem, final.mode, final.slip, t, q, v, after, (height, fast)
             )
             # Both choices are valid if no element disagreed in the end.
             settled = ~(choice.wrong | final.wrong)
             new = Transition(collision, follows, final.slip, after, settled, paradox & ~settled)
-            rebound = jnp.where(gains, jnp.where(rebound > 0.1, rebound / 2, 0.0), jnp.where(soft, 0.0, rebound))
-            more = gains | soft.any() | short.any() | still.any()
-            fate = rebound, held | (short & ~gains & ~still.any()), stopped | still
-            after = tries + 1, fate, new, more & (tries < 2 * n + 6)
+            fate = (
+                jnp.where(gains, jnp.where(rebound > 0.1, rebound / 2, 0.0), jnp.where(soft, 0.0, rebound)),
+                held | (short & ~gains & ~still.any()),
+                stopped | still,
+            )
+            fate = jax.tree.map(lambda a, b: jnp.where(settled, a, b), fate, (rebound, held, stopped))
+            more = jnp.where(settled, gains | soft.any() | short.any() | still.any(), guess < GUESSES)
+            guess = jnp.where(settled, 0, guess + 1).astype(jnp.int32)
+            after = tries + 1, guess, fate, new, more & (tries < 4 * n + 12)
             return jax.tree.map(lambda a, b: jnp.where(busy, a, b), after, carry)
 
-        none, no = jnp.zeros((n,), bool), jnp.zeros((), bool)
-        none_ = jnp.zeros((n,), q.dtype)
-        mode = mode._replace(excess=none_, creep=none_)
+        none, no, one = jnp.zeros((n,), bool), jnp.zeros((), bool), jnp.zeros((), jnp.int32)
+        mode = mode._replace(excess=jnp.zeros((n,), q.dtype), creep=jnp.zeros((n,), q.dtype))
         # As far as the square of the speed is below the tolerance, the direction of sliding may lag behind.
         fast = jnp.asarray(1e-4, q.dtype) if atol is None else 0.3 * jnp.sqrt(jnp.maximum(atol, least))
         start = Collision(mode, slip, jnp.ones((n,), q.dtype), none, stopped)
         blank = Transition(start, mode, slip, v, no, no)
-        return while_loop(lambda carry: carry[3], attempt, (jnp.zeros((), jnp.int32), start[2:], blank, ~no))[2]
+        return while_loop(lambda carry: carry[4], attempt, (one, one, start[2:], blank, ~no))[3]
 
     def _velocities(self, unknown, mode: Mode, rebound, held, stopped, slip, t, q, v):
         """Problem of an impact, and directions of sliding (n, 2)."""

@@ -35,6 +35,7 @@ from jaxdyn.simulation.hybrid.dynamics import (
 )
 from jaxdyn.simulation.hybrid.modes import Elements, Mode
 
+GUESSES = 3  # other modes from which changes begin where the first one leads to no mode
 _ANGLE = 1e-14  # 1 - cos of the angle up to which a direction is known
 _STILL = 1e-4  # rate of slipping, of the terms that cancel in it, of what may stand still
 _ROOM = 2e-3  # of the friction of all elements, by which the friction of some that stick may grow beyond the cone
@@ -119,6 +120,14 @@ def first_guess(elements: Elements, mode: Mode, slip, holding, speed, hit) -> tu
         creep=jnp.where(leaves, 0.0, mode.creep),
     )
     return changed, slip, begins
+
+
+def guess_again(elements: Elements, problem: Problem, mode: Mode, guess) -> Mode:
+    """Mode from which changes begin, where `guess` () others before have led to no mode: all contacts open, stick, or slide."""
+    opens, others = jnp.asarray(elements.opening), guess > 0
+    closed = jnp.where(opens & others, problem.may_close & (guess > 1), mode.closed)
+    stick = jnp.where(others, closed & problem.may_stick & jnp.asarray(elements.rough) & (guess == 2), mode.stick)
+    return mode._replace(closed=closed, stick=stick)
 
 
 def choose_mode(elements: Elements, problem: Problem, mode: Mode, slip) -> Choice:
