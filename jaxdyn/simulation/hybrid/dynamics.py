@@ -207,7 +207,7 @@ def solve_rows(gram, active, right):
 
 
 def _factor_rows(gram, active):
-    """Cholesky factor of the active rows scaled to unit length, their Gram matrix, and the scales, zero of rows that do not act."""
+    """Cholesky factor of the active rows scaled to unit length, their Gram matrix, and the scales, zero of other rows."""
     square, eps = jnp.diagonal(gram), float(jnp.finfo(gram.dtype).eps)
     # A row of the size of rounding is no row, as that of a direction across the plane of a planar model.
     is_row = square > eps**1.5 * jnp.max(square)
@@ -336,8 +336,9 @@ class Collision(NamedTuple):
 def rebounds(elements: Elements, terms: StateTerms, restitution) -> Array:
     """Velocity of each gap (n,) after an impact by Newton's hypothesis: e times that with which it closes."""
     zero = jnp.zeros((), restitution.dtype)
-    rates = [jnp.maximum(-terms.row.velocity[one.normal], 0.0) if one.opens else zero for one in elements.each]
-    return restitution * jnp.stack(rates)
+    rates = jnp.stack([-terms.row.velocity[one.normal] if one.opens else zero for one in elements.each])
+    # A contact that rests closes with the rounding of its velocity.
+    return restitution * jnp.where(rates > 10 * tolerance(zero.dtype), rates, 0.0)
 
 
 def impact(scene: Scene, elements: Elements, collision: Collision, terms: StateTerms, v) -> tuple[Array, Reaction]:

@@ -102,7 +102,8 @@ def align(slip, reference):
 def first_guess(elements: Elements, mode: Mode, slip, holding, speed, hit) -> tuple[Mode, Array, Array]:
     """Mode and directions after the guards `hit` (n, CHANNELS), before velocities and forces are checked.
 
-    `holding` (n, 2): friction of elements that stick; `speed` (n,) of slipping. The third result (n,) marks elements that begin to slide.
+    `holding` (n, 2): friction of elements that stick; `speed` (n,) of slipping. The third result (n,) marks elements that begin to
+    slide.
     """
     opens = jnp.asarray(elements.opening)
     first, second = hit[:, 0], hit[:, 1]
@@ -197,8 +198,8 @@ def _disagreements(elements: Elements, problem: Problem, mode: Mode, slip, react
     sizes = matmul(jnp.abs(problem.gram), jnp.abs(reaction.along)) + jnp.abs(problem.free)
     across, beside = rates_of(elements, sizes)
     rise, small = (tolerance(dtype) * (problem.rate + x) for x in (across, jnp.max(beside, 1)))
-    # Friction mu N against a slip d is the projection of mu N d + r u, u the rate of slipping, onto its disk, for any r > 0: inside of
-    # the disk it sticks, and outside it has the direction of this vector.
+    # Friction mu N against a slip d is the projection of mu N d + r u, u the rate of slipping, onto its disk, for any r > 0:
+    # inside of the disk it sticks, and outside it has the direction of this vector.
     level = jnp.maximum(problem.sliding * reaction.normal, 0.0)
     square = rates_of(elements, jnp.diagonal(problem.gram))[1]
     share = jnp.sum(square, 1)
@@ -239,15 +240,8 @@ def jammed(elements: Elements, problem: Problem, mode: Mode, along) -> tuple[Arr
 def with_excess(elements: Elements, problem: Problem, mode: Mode, still) -> Mode:
     """Mode in which elements that stand `still` (n,) stick, with room for their friction beyond the cone."""
     mode = mode._replace(stick=mode.stick | still)
-    reaction = react(
-        elements,
-        mode,
-        problem.gram,
-        problem.sliding,
-        problem.loads,
-        jnp.zeros_like(mode.excess[:, None] * jnp.ones(2)),
-        -problem.free,
-    )
+    along = jnp.zeros((*mode.excess.shape, 2), mode.excess.dtype)
+    reaction = react(elements, mode, problem.gram, problem.sliding, problem.loads, along, -problem.free)
     hold, _ = length(reaction.holding)
     total = jnp.sum(jnp.abs(reaction.normal))
     beyond = hold - problem.static * jnp.abs(reaction.normal)
@@ -257,8 +251,8 @@ def with_excess(elements: Elements, problem: Problem, mode: Mode, still) -> Mode
 
 
 def with_lines(elements: Elements, problem: Problem, mode: Mode, along, creep) -> Mode:
-    """Mode in which elements slide along lines up to the speeds `creep` (n,), if all contacts push then and the forces across
-    are small."""
+    """Mode in which elements slide along lines up to the speeds `creep` (n,), if all contacts push and speed up then, and forces
+    across are small."""
     lines = mode._replace(creep=creep)
     reaction = react(elements, lines, problem.gram, problem.sliding, problem.loads, along, -problem.free)
     tiny = force_tolerance(creep.dtype) / 4 * jnp.sum(jnp.abs(reaction.normal))
@@ -266,7 +260,9 @@ def with_lines(elements: Elements, problem: Problem, mode: Mode, along, creep) -
     pushes = ~(jnp.asarray(elements.opening) & mode.closed) | (reaction.normal >= -tiny)
     sticks = mode.stick & mode.closed & jnp.asarray(elements.rough)
     cone = problem.static * jnp.abs(reaction.normal) + mode.excess * jnp.sum(jnp.abs(reaction.normal)) + tiny
-    fits = jnp.where(sticks, across <= cone, (creep <= 0) | (across <= 0.5 * level))
+    rates = rates_of(elements, matmul(problem.gram, reaction.along) + problem.free)[1]
+    speeds_up = jnp.sum(rates * along, 1) >= 0
+    fits = jnp.where(sticks, across <= cone, (creep <= 0) | ((across <= 0.5 * level) & speeds_up))
     return mode._replace(creep=jnp.where((pushes & fits).all(), creep, 0.0))
 
 
