@@ -48,7 +48,8 @@ def record_elements(
     leading = jnp.argmax(hit.reshape(-1)).astype(jnp.int32)
     # First the element whose guard it was, which carries the impact; then those that came with it.
     leads = hit.any() & (number == leading // CHANNELS) & changed
-    rank = jnp.where(leads, 0, leads.any() + jnp.cumsum(changed & ~leads) - 1).astype(jnp.int32)
+    rank = jnp.cumsum(changed & ~leads, dtype=jnp.int32) + leads.any().astype(jnp.int32) - 1
+    rank = jnp.where(leads, jnp.zeros_like(rank), rank)
     # A scatter needs a place for what is not kept too: the spare last row.
     places = jnp.where(changed & (count + rank < most), count + rank, most)
 
