@@ -6,7 +6,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from test_events import G, TIGHT, box
+from test_events import TIGHT, G, box
 from test_friction_scenes import bounce
 
 import jaxdyn as jd
@@ -49,7 +49,9 @@ def test_block_rocks_to_rest_and_loses_what_housner_says():
     second = (np.asarray(ts) > times[0]) & (np.asarray(ts) < times[times > times[0] + 1e-6][0])
     factor = 1 - 1.5 * half**2 / (half**2 + high**2)
     np.testing.assert_allclose(energy[first] - level, energy[0] - level, rtol=1e-9)
-    np.testing.assert_allclose(energy[second] - level, factor**2 * (energy[0] - level), rtol=1e-9)
+    np.testing.assert_allclose(
+        energy[second] - level, factor**2 * (energy[0] - level), rtol=1e-8
+    )  # of the dense output
     # To the first impact: the quarter of the period, by the energy of the block about its corner.
     moment, radius, tip = 4 / 3 * 2.0 * (half**2 + high**2), np.hypot(half, high), np.arctan(half / high)
     nodes, weights = np.polynomial.legendre.leggauss(80)

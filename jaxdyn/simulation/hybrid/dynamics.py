@@ -24,6 +24,7 @@ from jaxdyn.simulation.hybrid.modes import Elements, Mode, extend, force_at
 from jaxdyn.systems.mass_factor import MassFactor, cholesky, mass_factor, solve_cholesky
 from jaxdyn.systems.scene import Scene
 
+ROUNDING = 1e-4  # share of the levels of guards that is rounding: of gaps 1e-14 of a metre
 _INDEPENDENT = 1e-2  # of the square of a row, that is left of it when others hold
 
 
@@ -403,11 +404,15 @@ def guards_and_levels(
             pivot = reaction.pivots[i]
         guards.append(jnp.stack([normal, sliding, pivot]))
         speed = small * (1 + jnp.max(jnp.stack([speeds[k] for k in one.tangent] or [jnp.zeros((), dtype)])))
+        # Of a contact in flight the gap is known to rounding; of one that rests beside others it is as zero as its velocity.
+        moves = jnp.zeros((), bool)
+        if one.opens:
+            moves = jnp.abs(terms.row.velocity[one.normal]) > 4 * small * (1 + speeds[one.normal])
         # The pivots are of the size of one.
         levels.append(
             jnp.stack(
                 [
-                    jnp.where(mode.closed[i], force, reach),
+                    jnp.where(mode.closed[i], force, jnp.where(moves, ROUNDING * reach, reach)),
                     jnp.where(mode.stick[i], force, speed),
                     jnp.full((), float(jnp.finfo(dtype).eps), dtype),
                 ]

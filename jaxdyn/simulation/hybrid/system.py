@@ -19,6 +19,7 @@ from jaxdyn.constraints.base import holonomic_rows, layout, position_residual, v
 from jaxdyn.forces.piecewise import values_and_levels
 from jaxdyn.lie.so3 import matmul
 from jaxdyn.simulation.hybrid.dynamics import (
+    ROUNDING,
     Collision,
     StateTerms,
     by_element,
@@ -104,7 +105,7 @@ class ModalSystem(HybridSystem):
         shapes = tuple(x.shape for x in leaves)
         self._bind, self.elements = bind, elements
         plan = Plan(type(solver), jax.jit(self._field), self._project, ("slip",), False, tree, shapes)
-        self.plan = plan._replace(guards=self.guards)
+        self.plan = plan._replace(guards=self.guards, rounding=ROUNDING)
 
     def _motion(self, args, t, y):
         unknown, mode = args
@@ -133,7 +134,8 @@ class ModalSystem(HybridSystem):
         mode = args[1]
         scene, q, v, terms, motion = self._motion(args, t, y)
         own = guards_and_levels(scene, self.elements, mode, terms, motion, y["slip"], q, v, t)
-        more = self._switches(args[0], mode.positive, q, v, t)
+        values, levels = self._switches(args[0], mode.positive, q, v, t)
+        more = values, levels / ROUNDING
         return tuple(jnp.concatenate([a.reshape(-1), b]) for a, b in zip(own, more, strict=True))
 
     def reset(self, unknown, t, y, mode, slip, hit, atol):

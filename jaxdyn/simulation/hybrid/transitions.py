@@ -102,7 +102,7 @@ def align(slip, reference):
 def first_guess(elements: Elements, mode: Mode, slip, holding, speed, hit) -> tuple[Mode, Array, Array]:
     """Mode and directions after the guards `hit` (n, CHANNELS), before velocities and forces are checked.
 
-    `holding` (n, 2): friction of elements that stick; `speed` (n,) of slipping. The third result (n,) marks elements that begin to
+    `holding` (n, 2): friction of elements that stick; `speed` (n,) of slipping. The third result (n,) marks those that begin to
     slide.
     """
     opens = jnp.asarray(elements.opening)

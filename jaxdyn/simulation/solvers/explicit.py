@@ -88,7 +88,7 @@ class Plan(NamedTuple):
     """Definition of a step; equal plans share their programs.
 
     `quality(t, y, args)` () changes its sign where the method fails; `guards(t, y, args)` -> values and levels of rounding (k,),
-    of which one is negative where the motion (then the plan `is_terminal`) or its mode ends.
+    of which one is negative where the motion (then the plan `is_terminal`) or its mode ends; `rounding`, see `search_root`.
     """
 
     solver: type
@@ -101,6 +101,7 @@ class Plan(NamedTuple):
     quality: Callable | None = None
     guards: Callable | None = None
     is_terminal: bool = False
+    rounding: float = 1.0
 
     @property
     def tableau(self) -> Any:
