@@ -232,8 +232,9 @@ def failures(outcome: Outcome) -> Counter:
 
 def with_mujoco(q0, v0, mu, seconds: float) -> float:
     """Processor time of C MuJoCo per second and drop of the box, in one thread with its default step."""
-    import mujoco
+    import mujoco as _mujoco
 
+    mujoco: Any = _mujoco  # without types
     x, y, z = SIZE / 2
     source = mujoco.MjModel.from_xml_string(
         f"""<mujoco><option gravity="0 0 {-G}"/><worldbody><geom type="plane" size="9 9 1"/>

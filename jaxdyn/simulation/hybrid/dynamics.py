@@ -25,7 +25,6 @@ from jaxdyn.systems.mass_factor import MassFactor, cholesky, mass_factor, solve_
 from jaxdyn.systems.scene import Scene
 
 ROUNDING = 1e-4  # share of the levels of guards that is rounding: of gaps 1e-14 of a metre
-_INDEPENDENT = 1e-2  # of the square of a row, that is left of it when others hold
 
 
 class StateTerms(NamedTuple):
@@ -227,31 +226,6 @@ def depends_on_others(elements: Elements, gram, mode: Mode):
     shares = eps**0.5 * jnp.diagonal(solve_cholesky(factor, jnp.eye(active.size, dtype=gram.dtype)))
     free = (shares > 1e-3) & (scale > 0)
     return jnp.stack([jnp.stack([free[k] for k in one.tangent] or [free[0] & False]).any() for one in elements.each])
-
-
-def independent_lines(elements: Elements, gram, mode: Mode, along, wanted):
-    """Those of the `wanted` elements (n,) that may slide along lines: rows across them do not depend on others that act."""
-    none = jnp.zeros((elements.count,), gram.dtype)
-    across = []
-    for i, one in enumerate(elements.each):
-        is_plane = len(one.tangent) == 2
-        across.append(
-            none.at[jnp.asarray(one.tangent)].set(jnp.stack([-along[i, 1], along[i, 0]])) if is_plane else none
-        )
-    across = jnp.stack(across, 1)
-    active = elements.active(mode._replace(creep=jnp.zeros_like(mode.creep))).astype(gram.dtype)
-    rates = matmul(gram, across)
-    # What is left of the rows across when the others hold: their Schur complement, eliminated in order.
-    held = solve_rows(gram, active, rates * active[:, None])
-    whole = matmul(across.T, rates)
-    left = whole - matmul(rates.T, held)
-    chosen = []
-    for i in range(len(elements.each)):
-        is_free = wanted[i] & (left[i, i] > _INDEPENDENT * whole[i, i])
-        chosen.append(is_free)
-        pivot = jnp.where(is_free, left[i, i], jnp.ones_like(left[i, i]))
-        left = left - jnp.where(is_free, left[:, i, None] * left[None, i] / pivot, 0.0)
-    return jnp.stack(chosen)
 
 
 def _eliminate(K, right):

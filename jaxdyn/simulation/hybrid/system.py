@@ -30,9 +30,9 @@ from jaxdyn.simulation.hybrid.dynamics import (
     gaps,
     guards_and_levels,
     impact,
-    independent_lines,
     motion_at,
     normal_loads,
+    react,
     rebounds,
     solve_rows,
     terms_at,
@@ -49,6 +49,7 @@ from jaxdyn.simulation.hybrid.transitions import (
     choose_mode,
     first_guess,
     guess_again,
+    independent_lines,
     jammed,
     length,
     rates_of,
@@ -182,9 +183,10 @@ class ModalSystem(HybridSystem):
             follows, soft, short, paradox = kernel(self._flights)(
                 unknown, collision, problem, final.mode, final.slip, t, q, v, after, (height, fast)
             )
+            cornered = kernel(self._paradox)(problem, resting, along)
             # Both choices are valid if no element disagreed in the end.
             settled = ~(choice.wrong | final.wrong)
-            new = Transition(collision, follows, final.slip, after, settled, paradox & ~settled)
+            new = Transition(collision, follows, final.slip, after, settled, paradox | (cornered & ~settled))
             fate = (
                 jnp.where(gains, jnp.where(rebound > 0.1, rebound / 2, 0.0), jnp.where(soft, 0.0, rebound)),
                 held | (short & ~gains & ~still.any()),
@@ -196,13 +198,13 @@ class ModalSystem(HybridSystem):
             after = tries + 1, guess, fate, new, more & (tries < 4 * n + 12)
             return jax.tree.map(lambda a, b: jnp.where(busy, a, b), after, carry)
 
-        none, no, one = jnp.zeros((n,), bool), jnp.zeros((), bool), jnp.zeros((), jnp.int32)
+        none, no, zero = jnp.zeros((n,), bool), jnp.zeros((), bool), jnp.zeros((), jnp.int32)
         mode = mode._replace(excess=jnp.zeros((n,), q.dtype), creep=jnp.zeros((n,), q.dtype))
         # As far as the square of the speed is below the tolerance, the direction of sliding may lag behind.
         fast = jnp.asarray(1e-4, q.dtype) if atol is None else 0.3 * jnp.sqrt(jnp.maximum(atol, least))
         start = Collision(mode, slip, jnp.ones((n,), q.dtype), none, stopped)
         blank = Transition(start, mode, slip, v, no, no)
-        return while_loop(lambda carry: carry[4], attempt, (one, one, start[2:], blank, ~no))[3]
+        return while_loop(lambda carry: carry[4], attempt, (zero, zero, start[2:], blank, ~no))[3]
 
     def _velocities(self, unknown, mode: Mode, rebound, held, stopped, slip, t, q, v):
         """Problem of an impact, and directions of sliding (n, 2)."""
@@ -212,10 +214,10 @@ class ModalSystem(HybridSystem):
         wanted = by_normal_row(elements, rebounds(elements, terms, of.restitution * rebound))
         each = jnp.ones(rebound.shape, bool)
         size = (1 + jnp.max(jnp.abs(rates))) / jnp.max(jnp.diagonal(terms.gram))
-        friction = (jnp.where(held, 0.0, x) for x in (of.sliding, of.static))
+        sliding, static = jnp.where(held, 0.0, of.sliding), jnp.where(held, 0.0, of.static)
+        loads, touches, rate = jnp.zeros_like(rebound), self._touches(scene, q, t), 1 + self._speeds(terms, v)
         problem = Problem(
-            terms.gram, rates - wanted, *friction, jnp.zeros_like(rebound), self._touches(scene, q, t), each, held, stopped, size,
-            1 + self._speeds(terms, v),
+            terms.gram, rates - wanted, sliding, static, loads, touches, each, held, stopped, size, rate
         )  # fmt: skip
         return problem, directions(scene, elements, mode, jnp.zeros_like(slip), slip)
 
@@ -252,7 +254,9 @@ class ModalSystem(HybridSystem):
         scene, generalized_force, _ = self._bind(unknown, mode.positive)
         elements, zero = self.elements, jnp.zeros(slip.shape[:1], v.dtype)
         terms, of = terms_at(scene, elements, q, v, t), coefficients(scene, elements, v.dtype)
-        _, rates = free_motion(scene, terms, generalized_force(q, v, t), q, v, t)
+        free, rates = free_motion(scene, terms, generalized_force(q, v, t), q, v, t)
+        # Sizes of the terms that cancel in the rates.
+        sizes = self._speeds(terms, terms.metric.unwhiten(free)) + jnp.max(jnp.abs(terms.row.gamma))
         least = 2 * tolerance(v.dtype) * (1 + self._speeds(terms, v))
         rests = self._touches(scene, q, t) & (jnp.abs(rates_of(elements, terms.row.velocity)[0]) <= least)
         speed, _ = length(terms.slip)
@@ -260,7 +264,7 @@ class ModalSystem(HybridSystem):
         loads = normal_loads(scene, elements, q, v, t)
         # A contact in flight has no force, and an element that slides does not stick.
         problem = Problem(
-            terms.gram, rates, of.sliding, of.static, loads, rests, speed <= least, zero > 0, zero > 0, size, zero
+            terms.gram, rates, of.sliding, of.static, loads, rests, speed <= least, zero > 0, zero > 0, size, sizes
         )  # fmt: skip
         return problem, directions(scene, elements, mode, terms.slip, slip)
 
@@ -288,6 +292,11 @@ class ModalSystem(HybridSystem):
         line = independent_lines(elements, problem.gram, follows, along, line)
         follows = with_lines(elements, problem, follows, along, jnp.where(line, fast, 0.0))
         return follows, low & bounces, low & ~bounces & ~collision.held, lost
+
+    def _paradox(self, problem: Problem, mode: Mode, along):
+        """True if sliding in a mode has lost a positive pivot of its forces: then they do not exist, or are not unique."""
+        reaction = react(self.elements, mode, problem.gram, problem.sliding, problem.loads, along, -problem.free)
+        return (mode.closed & ~mode.stick & (reaction.pivots <= 0)).any()
 
     def _jammed(self, problem: Problem, mode: Mode, along):
         """Elements (n,) whose slow slip behind an impact is only an error of their directions."""

@@ -11,6 +11,9 @@ of least norm would pull is opened, and rests beside the others without force.
 The impact is plastic, or has rebounds by Newton's hypothesis (Moreau's law: friction is against the velocity after it). A plastic
 impact loses energy, p.u <= 0. With rebounds and friction Newton's law can gain some (Kane 1984): the coefficients of
 restitution of all contacts are then halved, until the work p.(u + u_free)/2 of the impulses is not positive.
+
+Where sliding leaves no forces (Painleve's paradox), the impact begins from elements that stick: there is an impulse without
+collision that stops them (Genot & Brogliato 1999).
 """
 
 from typing import NamedTuple
@@ -31,10 +34,12 @@ from jaxdyn.simulation.hybrid.dynamics import (
     depends_on_others,
     force_tolerance,
     react,
+    solve_rows,
     tolerance,
 )
 from jaxdyn.simulation.hybrid.modes import Elements, Mode
 
+_INDEPENDENT = 1e-2  # of the square of a row, that is left of it when others hold
 GUESSES = 3  # other modes from which changes begin where the first one leads to no mode
 _ANGLE = 1e-14  # 1 - cos of the angle up to which a direction is known
 _STILL = 1e-4  # rate of slipping, of the terms that cancel in it, of what may stand still
@@ -264,6 +269,31 @@ def with_lines(elements: Elements, problem: Problem, mode: Mode, along, creep) -
     speeds_up = jnp.sum(rates * along, 1) >= 0
     fits = jnp.where(sticks, across <= cone, (creep <= 0) | ((across <= 0.5 * level) & speeds_up))
     return mode._replace(creep=jnp.where((pushes & fits).all(), creep, 0.0))
+
+
+def independent_lines(elements: Elements, gram, mode: Mode, along, wanted):
+    """Those of the `wanted` elements (n,) that may slide along lines: rows across them do not depend on others that act."""
+    none = jnp.zeros((elements.count,), gram.dtype)
+    across = []
+    for i, one in enumerate(elements.each):
+        is_plane = len(one.tangent) == 2
+        across.append(
+            none.at[jnp.asarray(one.tangent)].set(jnp.stack([-along[i, 1], along[i, 0]])) if is_plane else none
+        )
+    across = jnp.stack(across, 1)
+    active = elements.active(mode._replace(creep=jnp.zeros_like(mode.creep))).astype(gram.dtype)
+    rates = matmul(gram, across)
+    # What is left of the rows across when the others hold: their Schur complement, eliminated in order.
+    held = solve_rows(gram, active, rates * active[:, None])
+    whole = matmul(across.T, rates)
+    left = whole - matmul(rates.T, held)
+    chosen = []
+    for i in range(len(elements.each)):
+        is_free = wanted[i] & (left[i, i] > _INDEPENDENT * whole[i, i])
+        chosen.append(is_free)
+        pivot = jnp.where(is_free, left[i, i], jnp.ones_like(left[i, i]))
+        left = left - jnp.where(is_free, left[:, i, None] * left[None, i] / pivot, 0.0)
+    return jnp.stack(chosen)
 
 
 def rates_of(elements: Elements, rates) -> tuple[Array, Array]:
