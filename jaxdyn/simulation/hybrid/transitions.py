@@ -44,7 +44,7 @@ GUESSES = 3  # other modes from which changes begin where the first one leads to
 _ANGLE = 1e-14  # 1 - cos of the angle up to which a direction is known
 _STILL = 1e-4  # rate of slipping, of the terms that cancel in it, of what may stand still
 _ROOM = 2e-3  # of the friction of all elements, by which the friction of some that stick may grow beyond the cone
-_WEIGHT = 4  # changes of direction for which there is the same room as for one of a mode
+_WEIGHT = 32  # changes of direction for which there is the same room as for one of a mode
 
 
 class Problem(NamedTuple):
