@@ -122,10 +122,10 @@ class UnilateralContact(WithModes):
     - `contact`: a constraint with one row for the gap (m, positive where the contact is open) and up to two rows for slip:
       `jd.rolling_sphere(...)` or `jd.rolling_wheel(...)`. `ground_contact` and `gap_contact` make such constraints.
     - `friction`: mu while it slides; `static`: mu at rest, None for the same.
-    - `restitution`: e, from 0 to 1. By Newton's hypothesis simultaneous impacts with friction and different coefficients
-      may gain energy. A body that bounces to rest has infinitely many impacts. To end the sequence, rebound velocities
-      below $\epsilon^{0.3}$ m/s (2e-5 in float64) count as zero: the flight after them would hardly be higher than the
-      rounding of the gap.
+    - `restitution`: e, from 0 to 1. Simultaneous impacts with friction could gain energy by Newton's hypothesis (Kane 1984): the
+      coefficients of all contacts are then halved, until the impulses do no work. A body that bounces to rest has infinitely
+      many impacts. A contact whose next flight would be lower than the tolerance (`atol`, or 4e-10 of a metre) is closed; the
+      impulses of all impacts to come are those of the last one and of the forces at rest.
     - `name`: name of its events; by default that of the constraint.
 
     **Raises:** ValueError for an invalid contact or coefficients.

@@ -111,7 +111,7 @@ def simulate(
       "report": the run continues; `stats["passed_limit"]` is the entry of q of the first limit that is passed at a save point, or
       -1, and a concrete run warns (`JointLimitWarning`).
     - `max_events`: of a scene with forces that have modes (`jd.contact.DryFriction`, `jd.contact.UnilateralContact`), after
-      which the run ends with the code `too_many_events`; by default 64. Such scenes take explicit methods with adaptive or fixed
+      which the run ends with the code `too_many_events`; by default 256. Such scenes take explicit methods with adaptive or fixed
       steps, which end at events; what begins and ends within one step is found as that of `limits` is. Of piecewise forces, the
       events that derivatives follow (`jd.forces.PiecewiseForce`).
     - `progress`: show a meter (tqdm if installed, else lines of text).
@@ -135,7 +135,7 @@ def simulate(
     scene, control = as_scene(scene), controls.as_control(control)
     given = {"rtol": rtol, "atol": atol, "max_events": max_events, "contacts": contacts}
     rtol, atol = (1e-8 if x is None else x for x in (rtol, atol))
-    contacts, max_events = "stop" if contacts is None else contacts, 64 if max_events is None else max_events
+    contacts, max_events = "stop" if contacts is None else contacts, 256 if max_events is None else max_events
     arrays, stepsize = _check_numbers(scene, q0, v0, ts, rtol, atol, stepsize)
     q0, v0, ts, *_ = arrays
     modal, start = has_modes(scene), (q0, v0, ts)

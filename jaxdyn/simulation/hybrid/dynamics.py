@@ -8,7 +8,8 @@ multipliers themselves,
 The first matrix is symmetric; the second term makes the equations for N lose their positive pivots where friction is strong:
 Painleve's paradox, where forces of rigid bodies do not exist or are not unique.
 
-Rows that depend on each other (a box on two corners that stick) have multipliers near those of least norm.
+All of it is in the space of the rows: forces p along the rows change their rates by G p, with the Gram matrix G = Y^T Y of all
+rows. Rows that depend on each other (a box on four corners) have multipliers near those of least norm.
 """
 
 from typing import Any, NamedTuple
@@ -23,6 +24,8 @@ from jaxdyn.simulation.hybrid.modes import Elements, Mode, extend, force_at
 from jaxdyn.systems.mass_factor import MassFactor, cholesky, mass_factor, solve_cholesky
 from jaxdyn.systems.scene import Scene
 
+ROUNDING = 1e-4  # share of the levels of guards that is rounding: of gaps 1e-14 of a metre
+
 
 class StateTerms(NamedTuple):
     """Terms of a state that do not depend on its mode: rows, mass matrix, and sliding velocities (n, 2)."""
@@ -30,16 +33,25 @@ class StateTerms(NamedTuple):
     row: Rows
     metric: MassFactor
     Y: Array
+    gram: Array  # Y^T Y (count, count)
     slip: Array
+
+
+class Coefficients(NamedTuple):
+    """Coefficients (n,) of the elements: friction while they slide and at rest, and restitution."""
+
+    sliding: Array
+    static: Array
+    restitution: Array
 
 
 class Reaction(NamedTuple):
     """Reaction of constraints and friction to a motion, as forces or as impulses."""
 
-    multipliers: Array  # (count,)
-    normal: Array  # normal forces (n,)
+    along: Array  # forces along the rows (count,), sliding friction included
+    multipliers: Array  # of the rows that act (count,)
+    normal: Array  # normal forces (n,), those that are given included
     holding: Array  # friction of elements that stick (n, 2)
-    change: Array  # share in the rate of the velocity (nv,)
     pivots: Array  # of the equations for the normal forces (n,): one without friction
 
 
@@ -48,7 +60,16 @@ def terms_at(scene: Scene, elements: Elements, q, v, t) -> StateTerms:
     row = rows(extend(scene), q, v, t)
     metric = mass_factor(mass_matrix(scene.system, q, t))
     # Whitened rows Y give A M^-1 A^T as Y^T Y: symmetric, and positive semidefinite for dependent rows too.
-    return StateTerms(row, metric, metric.whiten(row.A.T), by_element(elements, row.velocity))
+    Y = metric.whiten(row.A.T)
+    return StateTerms(row, metric, Y, matmul(Y.T, Y), by_element(elements, row.velocity))
+
+
+def coefficients(scene: Scene, elements: Elements, dtype) -> Coefficients:
+    """Coefficients of the elements."""
+    forces, zero = [force_at(scene, one) for one in elements.each], jnp.zeros((), dtype)
+    bounces = [f.restitution if one.opens else zero for f, one in zip(forces, elements.each, strict=True)]
+    lists = [f.coefficient for f in forces], [f.static for f in forces], bounces
+    return Coefficients(*(jnp.stack([x.astype(dtype) for x in values]) for values in lists))
 
 
 def by_element(elements: Elements, rowwise) -> Array:
@@ -63,16 +84,19 @@ def by_element(elements: Elements, rowwise) -> Array:
     )
 
 
-def normal_load(scene: Scene, element, q, v, t):
-    """Prescribed normal force of a friction, (), zero where it is negative: such friction would drive the motion."""
-    normal: Any = force_at(scene, element).normal
-    value: Any = normal(scene.system, q, v, t) if callable(normal) else normal
-    if jnp.shape(value) != ():
-        raise ValueError(f"friction {element.name!r}: normal gives shape {jnp.shape(value)}; expected one number, ()")
-    return jnp.maximum(jnp.asarray(value, q.dtype), 0.0)
+def normal_loads(scene: Scene, elements: Elements, q, v, t) -> Array:
+    """Given normal forces of frictions, (n,), zero where they are negative: such friction would drive the motion."""
+    loads = []
+    for one in elements.each:
+        normal: Any = force_at(scene, one).normal if one.normal < 0 else 0.0
+        value: Any = normal(scene.system, q, v, t) if callable(normal) else normal
+        if jnp.shape(value) != ():
+            raise ValueError(f"friction {one.name!r}: normal gives shape {jnp.shape(value)}; expected one number, ()")
+        loads.append(jnp.maximum(jnp.asarray(value, q.dtype), 0.0))
+    return jnp.stack(loads)
 
 
-def directions(scene: Scene, elements: Elements, slip, reference) -> Array:
+def directions(scene: Scene, elements: Elements, mode: Mode, slip, reference) -> Array:
     """Unit vectors (n, 2) of sliding; shorter ones for friction that is smooth.
 
     They continue smoothly through w = 0 to w < 0, because the event that ends a mode there is bracketed from both sides: w/|w|
@@ -81,10 +105,10 @@ def directions(scene: Scene, elements: Elements, slip, reference) -> Array:
     unit_vectors = []
     for i, one in enumerate(elements.each):
         w, s = slip[i], reference[i]
-        # A velocity below rounding has no direction of its own: the reference is kept.
-        least = 100 * float(jnp.finfo(w.dtype).eps)
+        # A velocity that may be the rounding of others has no direction of its own: the reference is kept.
+        least = 0.0 if one.smooth else tolerance(w.dtype)
         square = jnp.sum(w * w)
-        is_sliding = square > least**2
+        is_sliding = (square > least**2) & (mode.creep[i] <= 0)
         # The square root has an infinite derivative at zero, which a mask behind it would turn into NaN.
         length = jnp.sqrt(jnp.where(is_sliding, square, jnp.ones_like(square)))
         if one.smooth:
@@ -100,67 +124,108 @@ def directions(scene: Scene, elements: Elements, slip, reference) -> Array:
     return jnp.stack(unit_vectors)
 
 
-def slides(elements: Elements, mode: Mode) -> list:
-    """Flag () of each element that slides."""
-    free = [jnp.ones((), bool) if one.smooth else ~mode.stick[i] for i, one in enumerate(elements.each)]
-    return [mode.closed[i] & free[i] for i in range(len(elements.each))]
+def slides(elements: Elements, mode: Mode) -> Array:
+    """Mask of the elements that slide, (n,)."""
+    return mode.closed & (jnp.asarray(elements.smooth) | ~mode.stick)
 
 
-def react(scene: Scene, elements: Elements, mode: Mode, terms: StateTerms, along, target) -> Reaction:
-    """Forces that give the active rows the rates `target` (count,), or impulses that give them these velocities."""
+def react(elements: Elements, mode: Mode, gram, friction, loads, along, target) -> Reaction:
+    """Forces that change the rates of the active rows by `target` (count,), or impulses that so change their velocities.
+
+    `friction` (n,): coefficients of sliding; `loads` (n,): normal forces that are given.
+    """
     dtype = target.dtype
+    gram, target = turn_gram(elements, mode, along, gram), turn_rows(elements, mode, along, target)
     # Rows that do not act are masked and not removed: every mode has the same shapes and the same program.
-    active = elements.active(mode).astype(dtype)
-    sliding = slides(elements, mode)
-    Z = [
-        jnp.where(sliding[i], force_at(scene, elements.each[i]).coefficient.astype(dtype), 0.0)
-        * matmul(along[i, : len(elements.each[i].tangent)], terms.row.A[jnp.asarray(elements.each[i].tangent)])
-        for i in elements.frictional
-    ]
-    count = len(Z)
-    pushes = terms.metric.whiten(jnp.stack(Z).T) if count else jnp.zeros((scene.nv, 0), dtype)
-    right = jnp.concatenate([target[:, None], matmul(terms.Y.T, pushes)], 1) * active[:, None]
+    active, zero = elements.active(mode).astype(dtype), jnp.zeros((), dtype)
+    level = jnp.where(slides(elements, mode), friction, 0.0)
+    # Forces of sliding friction along the rows, for a normal force of one.
+    pushes = []
+    for i, one in enumerate(elements.each):
+        push = [zero] * elements.count
+        for k, row in enumerate(one.tangent):
+            # Along its own line a direction is the first unit vector.
+            push[row] = -level[i] * jnp.where(mode.creep[i] > 0, 1.0 - k, along[i, k])
+        pushes.append(jnp.stack(push))
+    given = sum((loads[i] * pushes[i] for i, one in enumerate(elements.each) if one.normal < 0), jnp.zeros_like(target))
+    Z = jnp.stack([jnp.zeros_like(target), *(pushes[i] for i in elements.frictional)])[1:].T
+    right = jnp.concatenate([(target - matmul(gram, given))[:, None], -matmul(gram, Z)], 1) * active[:, None]
     # Multipliers without sliding friction, and their change by each normal force of an element that slides.
-    lam = solve_rows(terms.Y * active[None], active, right)
+    lam = solve_rows(gram, active, right)
     base, by_normal = lam[:, 0], lam[:, 1:]
     sign = mode.signs(dtype)
     at = [elements.each[i].normal for i in elements.frictional]
-    normal = jnp.zeros((0,), dtype)
+    normal, count = jnp.zeros((0,), dtype), len(at)
     pivots = [jnp.ones((), dtype)] * len(elements.each)
     if count:
         pick = jnp.stack([sign[i] for i in elements.frictional])
         # Sliding friction changes its own normal forces: N = S (base + by_normal N), S the rows and signs of `pick`.
         K = jnp.eye(count, dtype=dtype) - pick[:, None] * by_normal[jnp.asarray(at)]
         normal, own = _eliminate(K, pick * base[jnp.asarray(at)])
+        is_sliding = slides(elements, mode)
         for i, pivot in zip(elements.frictional, own, strict=True):
-            pivots[i] = jnp.where(sliding[i], pivot, jnp.ones_like(pivot))
+            pivots[i] = jnp.where(is_sliding[i], pivot, jnp.ones_like(pivot))
     lam = (base + matmul(by_normal, normal)) * active
-    change = terms.metric.unwhiten(matmul(terms.Y, lam) - matmul(pushes, normal))
-    zero = jnp.zeros((), dtype)
-    normals = [sign[i] * lam[one.normal] if one.normal >= 0 else zero for i, one in enumerate(elements.each)]
-    return Reaction(lam, jnp.stack(normals), by_element(elements, lam), change, jnp.stack(pivots))
+    normals = [sign[i] * lam[one.normal] if one.normal >= 0 else loads[i] for i, one in enumerate(elements.each)]
+    forces = turn_rows(elements, mode, along, lam + given + matmul(Z, normal), back=True)
+    lam = turn_rows(elements, mode, along, lam, back=True)
+    return Reaction(forces, lam, jnp.stack(normals), by_element(elements, lam), jnp.stack(pivots))
 
 
-def solve_rows(Y, active, right):
-    """Solution x of Y^T Y x = right on the active rows, zero elsewhere; near the least norm where rows are dependent.
+def turn_rows(elements: Elements, mode: Mode, along, rowwise, *, back: bool = False):
+    """Entries (count, ...) of the rows with those of elements that slide along a line turned into components along and across it.
+
+    Where an element begins to slide in a plane, its direction follows the forces: as |w| -> 0 ever faster, for which explicit
+    steps would have to be short without bound. Up to a small speed it slides along a line instead, with a force across.
+    """
+    parts = [rowwise[k] for k in range(elements.count)]
+    for i, one in enumerate(elements.each):
+        if len(one.tangent) == 2 and not one.smooth:
+            is_line, (first, second) = mode.creep[i] > 0, one.tangent
+            c, s = jnp.where(is_line, along[i, 0], 1.0), jnp.where(is_line, along[i, 1], 0.0)
+            s, (a, b) = -s if back else s, (parts[first], parts[second])
+            parts[first], parts[second] = c * a + s * b, c * b - s * a
+    return jnp.stack(parts)
+
+
+def turn_gram(elements: Elements, mode: Mode, along, gram):
+    """Gram matrix of turned rows."""
+    return turn_rows(elements, mode, along, turn_rows(elements, mode, along, gram).T)
+
+
+def solve_rows(gram, active, right):
+    """Solution x of G x = right on the active rows, zero elsewhere; near the least norm where rows are dependent.
 
     Two steps of the proximal method x <- x + (G + eps)^-1 (right - G x), of rows scaled to unit length.
     """
-    square, eps = jnp.sum(Y * Y, 0), float(jnp.finfo(Y.dtype).eps)
-    # A row of the size of rounding is no row, as that of a direction across the plane of a planar model.
-    is_row = square > eps**1.5 * jnp.max(square)
-    scale = jnp.where(is_row, 1 / jnp.sqrt(jnp.where(is_row, square, jnp.ones_like(square))), 0.0)
-    Y = Y * scale[None]
-    # Large enough for Cholesky's factors of dependent rows; each step of the proximal method multiplies the error by about it.
-    shift = eps**0.5
-    count = Y.shape[1]
-    # Rows that do not act have a one on the diagonal, so that the factor exists in every mode.
-    factor = cholesky(matmul(Y.T, Y) + jnp.diag(1.0 - active + shift * jnp.ones((count,), Y.dtype)))
+    factor, gram, scale = _factor_rows(gram, active)
     right = right * scale[:, None]
     x = solve_cholesky(factor, right)
     for _ in range(2):
-        x = x + solve_cholesky(factor, (right - matmul(Y.T, matmul(Y, x))) * active[:, None])
-    return x * (scale * active)[:, None]
+        x = x + solve_cholesky(factor, right - matmul(gram, x))
+    return x * scale[:, None]
+
+
+def _factor_rows(gram, active):
+    """Cholesky factor of the active rows scaled to unit length, their Gram matrix, and the scales, zero of other rows."""
+    square, eps = jnp.diagonal(gram), float(jnp.finfo(gram.dtype).eps)
+    # A row of the size of rounding is no row, as that of a direction across the plane of a planar model.
+    is_row = square > eps**1.5 * jnp.max(square)
+    scale = jnp.where(is_row, 1 / jnp.sqrt(jnp.where(is_row, square, jnp.ones_like(square))), 0.0) * active
+    gram = gram * scale[:, None] * scale[None]
+    # Rows that do not act have a one on the diagonal, so that the factor exists in every mode. The shift is large enough for
+    # factors of dependent rows; each step of the proximal method multiplies the error by about it.
+    return cholesky(gram + jnp.diag(1.0 - active + eps**0.5 * jnp.ones_like(square))), gram, scale
+
+
+def depends_on_others(elements: Elements, gram, mode: Mode):
+    """Mask of the elements (n,) whose friction depends on that of others: only their sum is determined."""
+    active, eps = elements.active(mode).astype(gram.dtype), float(jnp.finfo(gram.dtype).eps)
+    factor, _, scale = _factor_rows(gram, active)
+    # The diagonal of eps (G + eps)^-1 is that of the projection on the vectors with G x = 0.
+    shares = eps**0.5 * jnp.diagonal(solve_cholesky(factor, jnp.eye(active.size, dtype=gram.dtype)))
+    free = (shares > 1e-3) & (scale > 0)
+    return jnp.stack([jnp.stack([free[k] for k in one.tangent] or [free[0] & False]).any() for one in elements.each])
 
 
 def _eliminate(K, right):
@@ -195,33 +260,27 @@ class Motion(NamedTuple):
 
     acceleration: Array  # (nv,)
     reaction: Reaction
-    normal: Array  # normal forces (n,), those that are prescribed included
-    rates: Array  # A a - gamma (count,)
-    sizes: Array  # sizes of the terms that cancel in these (count,)
+
+
+def free_motion(scene: Scene, terms: StateTerms, generalized_force, q, v, t) -> tuple[Array, Array]:
+    """Whitened acceleration without the elements and constraints, (nv,), and A a - gamma of the rows there, (count,).
+
+    `generalized_force` (nv,) is tau and the forces without modes, or None.
+    """
+    force = jnp.zeros_like(v) if generalized_force is None else generalized_force
+    free = terms.metric.whiten(force - bias_force(scene.system, q, v, t))
+    return free, matmul(terms.Y.T, free) - terms.row.gamma
 
 
 def motion_at(
     scene: Scene, elements: Elements, mode: Mode, terms: StateTerms, reference, generalized_force, q, v, t
 ) -> Motion:
-    """Motion in a mode; `generalized_force` (nv,) is tau and the forces without modes, or None."""
-    along = directions(scene, elements, terms.slip, reference)
-    force = jnp.zeros_like(v) if generalized_force is None else generalized_force
-    sliding = slides(elements, mode)
-    # A given normal force makes sliding friction a known force: it does not enter the equations of `react`.
-    prescribed = {}
-    for i, one in enumerate(elements.each):
-        if one.normal < 0:
-            prescribed[i] = normal_load(scene, one, q, v, t)
-            level = jnp.where(sliding[i], force_at(scene, one).coefficient.astype(v.dtype) * prescribed[i], 0.0)
-            force = force - level * matmul(along[i, : len(one.tangent)], terms.row.A[jnp.asarray(one.tangent)])
-    free = terms.metric.whiten(force - bias_force(scene.system, q, v, t))
-    reaction = react(scene, elements, mode, terms, along, terms.row.gamma - matmul(terms.Y.T, free))
-    acceleration = terms.metric.unwhiten(free) + reaction.change
-    normal = jnp.stack([prescribed.get(i, reaction.normal[i]) for i in range(len(elements.each))])
-    parts = terms.row.A * acceleration[None]
-    # A rate is zero up to the rounding of its terms, so that comparisons need their size.
-    sizes = jnp.sum(jnp.abs(parts), 1) + jnp.abs(terms.row.gamma)
-    return Motion(acceleration, reaction, normal, jnp.sum(parts, 1) - terms.row.gamma, sizes)
+    """Motion in a mode; `generalized_force` as of `free_motion`."""
+    along = directions(scene, elements, mode, terms.slip, reference)
+    loads, friction = normal_loads(scene, elements, q, v, t), coefficients(scene, elements, v.dtype).sliding
+    free, rates = free_motion(scene, terms, generalized_force, q, v, t)
+    reaction = react(elements, mode, terms.gram, friction, loads, along, -rates)
+    return Motion(terms.metric.unwhiten(free + matmul(terms.Y, reaction.along)), reaction)
 
 
 def gaps(scene: Scene, elements: Elements, q, t) -> Array:
@@ -235,59 +294,114 @@ def gaps(scene: Scene, elements: Elements, q, t) -> Array:
     return jnp.stack(gap_of_each)
 
 
-def rebounds(scene: Scene, elements: Elements, terms: StateTerms) -> Array:
-    """Velocity of each gap (n,) after an impact by Newton's hypothesis: e times that with which it closes.
+class Collision(NamedTuple):
+    """What an impact depends on beside the state: a mode, directions of sliding (n, 2), and the fate of each contact.
 
-    Slow ones are zero: the flight after them would be hardly higher than the rounding of the gap.
+    `rebound` (n,) multiplies coefficients of restitution. Contacts that are `held` (n,) rest behind the impact whatever the sign
+    of their impulse, as their flight would be too short to be seen; elements that are `stopped` (n,) stick behind it.
     """
-    zero, rates = jnp.zeros((), terms.row.velocity.dtype), []
-    least = float(jnp.finfo(zero.dtype).eps) ** 0.3
-    for one in elements.each:
-        if one.opens:
-            rebound = -force_at(scene, one).restitution.astype(zero.dtype) * terms.row.velocity[one.normal]
-            rates.append(jnp.where(rebound > least, rebound, zero))
-        else:
-            rates.append(zero)
-    return jnp.stack(rates)
+
+    mode: Mode
+    slip: Array
+    rebound: Array
+    held: Array
+    stopped: Array
 
 
-def impact(
-    scene: Scene, elements: Elements, mode: Mode, terms: StateTerms, along, v, rebound
-) -> tuple[Array, Reaction]:
-    """Velocity after impulses that end the motion of the active rows, or give gaps the velocity `rebound` (n,); and these."""
+def rebounds(elements: Elements, terms: StateTerms, restitution) -> Array:
+    """Velocity of each gap (n,) after an impact by Newton's hypothesis: e times that with which it closes."""
+    zero = jnp.zeros((), restitution.dtype)
+    rates = jnp.stack([-terms.row.velocity[one.normal] if one.opens else zero for one in elements.each])
+    # A contact that rests closes with the rounding of its velocity.
+    return restitution * jnp.where(rates > 10 * tolerance(zero.dtype), rates, 0.0)
+
+
+def impact(scene: Scene, elements: Elements, collision: Collision, terms: StateTerms, v) -> tuple[Array, Reaction]:
+    """Velocity (nv,) after an impact, and its impulses."""
     # An impact changes no positions: the rows and the mass matrix are those before it.
-    target = -terms.row.velocity
+    of = coefficients(scene, elements, v.dtype)
+    rebound = rebounds(elements, terms, of.restitution * collision.rebound)
+    friction = jnp.where(collision.held, 0.0, of.sliding)
+    # Finite forces have no impulse, nor has the friction under them.
+    loads = jnp.zeros_like(rebound)
+    along = directions(scene, elements, collision.mode, jnp.zeros_like(collision.slip), collision.slip)
+    target = by_normal_row(elements, rebound) - terms.row.velocity
+    reaction = react(elements, collision.mode, terms.gram, friction, loads, along, target)
+    return v + terms.metric.unwhiten(matmul(terms.Y, reaction.along)), reaction
+
+
+def by_normal_row(elements: Elements, values) -> Array:
+    """Values (n,) of the contacts at the rows of their gaps, (count,), zero elsewhere."""
+    rows = [jnp.zeros((), values.dtype)] * elements.count
     for i, one in enumerate(elements.each):
         if one.opens:
-            target = target.at[one.normal].add(rebound[i])
-    reaction = react(scene, elements, mode, terms, along, target)
-    return v + reaction.change, reaction
+            rows[one.normal] = values[i]
+    return jnp.stack(rows)
 
 
-def element_guards(
-    scene: Scene, elements: Elements, mode: Mode, terms: StateTerms, motion: Motion, reference, q, t
-) -> Array:
-    """Guards (n, CHANNELS), which are positive while the mode holds: 1 where it has no condition."""
-    gap, rows = gaps(scene, elements, q, t), []
+def guards_and_levels(
+    scene: Scene, elements: Elements, mode: Mode, terms: StateTerms, motion: Motion, reference, q, v, t
+):
+    """Guards (n, CHANNELS), which are positive while the mode holds, 1 where it has no condition; and their levels.
+
+    A guard below zero by less than its level does not end a mode. Levels are the tolerances with which modes are chosen, so that
+    a mode that was chosen holds: of contacts that depend on others, forces, gaps and velocities are zero up to rounding.
+    """
+    gap, friction, dtype = gaps(scene, elements, q, t), coefficients(scene, elements, q.dtype), q.dtype
+    reaction, small = motion.reaction, tolerance(dtype)
+    speeds = jnp.sum(jnp.abs(terms.row.A) * jnp.abs(v)[None], 1)
+    total = jnp.sum(jnp.abs(reaction.normal))
+    force = force_tolerance(dtype) * (total + jnp.sum(jnp.abs(reaction.holding)))
+    reach = small * (1 + jnp.max(jnp.abs(q)))
     # Every element has all channels: the index of a guard means the same condition in every mode.
-    one_ = jnp.ones((), q.dtype)
+    one_, guards, levels = jnp.ones((), dtype), [], []
     for i, one in enumerate(elements.each):
         normal = one_
         if one.opens:
-            normal = jnp.where(mode.closed[i], motion.normal[i], gap[i])
+            normal = jnp.where(mode.closed[i], reaction.normal[i], gap[i])
         elif one.normal >= 0:
-            normal = motion.normal[i]
-        friction, pivot = one_, one_
+            normal = reaction.normal[i]
+        sliding, pivot = one_, one_
         if one.tangent and not one.smooth:
-            hold = motion.reaction.holding[i]
+            hold = reaction.holding[i]
             square = jnp.sum(hold * hold)
             # The length has no derivative at zero, and an element that slides has a holding force of zero.
-            size = jnp.sqrt(jnp.where(square > 0, square, one_)) * (square > 0).astype(q.dtype)
-            margin = force_at(scene, one).static.astype(q.dtype) * motion.normal[i] - size
+            size = jnp.sqrt(jnp.where(square > 0, square, one_)) * (square > 0).astype(dtype)
+            margin = friction.static[i] * reaction.normal[i] + mode.excess[i] * total - size
             # Sliding is guarded by a signed speed, which crosses zero; the length of the velocity only touches it.
-            friction = jnp.where(mode.stick[i], margin, jnp.sum(reference[i] * terms.slip[i]))
-            friction = jnp.where(mode.closed[i], friction, one_)
+            speed = jnp.sum(reference[i] * terms.slip[i])
+            # Along a line it slides from rest to the speed of `creep`: one guard for both ends, in units of a speed.
+            share = jnp.where(mode.creep[i] > 0, 1 - speed / jnp.where(mode.creep[i] > 0, mode.creep[i], one_), one_)
+            sliding = jnp.where(mode.stick[i], margin, speed * share)
+            sliding = jnp.where(mode.closed[i], sliding, one_)
         if one.tangent:
-            pivot = motion.reaction.pivots[i]
-        rows.append(jnp.stack([normal, friction, pivot]))
-    return jnp.stack(rows)
+            pivot = reaction.pivots[i]
+        guards.append(jnp.stack([normal, sliding, pivot]))
+        speed = small * (1 + jnp.max(jnp.stack([speeds[k] for k in one.tangent] or [jnp.zeros((), dtype)])))
+        # Of a contact in flight the gap is known to rounding; of one that rests beside others it is as zero as its velocity.
+        moves = jnp.zeros((), bool)
+        if one.opens:
+            moves = jnp.abs(terms.row.velocity[one.normal]) > 4 * small * (1 + speeds[one.normal])
+        # The pivots are of the size of one.
+        levels.append(
+            jnp.stack(
+                [
+                    jnp.where(mode.closed[i], force, jnp.where(moves, ROUNDING * reach, reach)),
+                    jnp.where(mode.stick[i], force, speed),
+                    jnp.full((), float(jnp.finfo(dtype).eps), dtype),
+                ]
+            )
+        )
+    return jnp.stack(guards), jnp.stack(levels)
+
+
+def tolerance(dtype) -> float:
+    """Size below which velocities (m/s) and gaps (m) count as zero, relative to the terms that cancel in them."""
+    # 1e-10 in float64: above the rounding of a projected state, far below the changes at an event.
+    return float(jnp.finfo(dtype).eps) ** 0.64
+
+
+def force_tolerance(dtype) -> float:
+    """Size below which forces count as zero, relative to those of all elements."""
+    # 1e-7 in float64, above the rounding of the forces of dependent rows, which is eps/eps^0.5 of them.
+    return float(jnp.finfo(dtype).eps) ** 0.45

@@ -66,7 +66,7 @@ def run_events(system: HybridSystem, unknown, ts, y0, mode, rtol, atol, stepsize
     elements, plan = system.elements, system.plan
     hit = jnp.zeros((CHANNELS * len(elements.each) + elements.switches,), bool)
     # The start may be an impact, or its mode may not hold: it passes a transition before the first step.
-    begun = system.reset(unknown, ts[0], y0, mode, system.slip(y0), hit)
+    begun = system.reset(unknown, ts[0], y0, mode, system.slip(y0), hit, atol)
     y = system.with_slip(y0, begun.v, begun.slip)
     if stepsize is not None:
         # One grid for the whole run: steps that an event has cut return to it.
@@ -83,7 +83,7 @@ def run_events(system: HybridSystem, unknown, ts, y0, mode, rtol, atol, stepsize
 
     def body(run: RunState) -> RunState:
         happens = run.steps.state.search.hit.any()
-        pass_event = partial(_pass_event, system, unknown, most, stepsize is not None)
+        pass_event = partial(_pass_event, system, unknown, most, stepsize is not None, atol)
         run = cond(happens, pass_event, lambda run: run, run)
         steps = driver.run_to_event(plan, control, max_steps, (), (unknown, run.mode), limits, Given(ts), run.steps)
         return run._replace(steps=steps)
@@ -103,12 +103,12 @@ def _cases(change: Transition) -> list[tuple[Array, Any]]:
     return [(change.paradox, RESULTS.painleve_paradox), (~change.settled, RESULTS.no_contact_mode)]
 
 
-def _pass_event(system: HybridSystem, unknown, most: int, is_fixed_length: bool, run: RunState) -> RunState:
+def _pass_event(system: HybridSystem, unknown, most: int, is_fixed_length: bool, atol, run: RunState) -> RunState:
     """State in the mode behind an event, and the records with it; unchanged where there is none."""
     elements, before, state, records = system.elements, run.mode, run.steps.state, run.records
     hit, search = state.search.hit, state.search
     happens = hit.any() & ~state.stopped
-    change = system.reset(unknown, state.t, state.y, before, system.slip(state.y), hit)
+    change = system.reset(unknown, state.t, state.y, before, system.slip(state.y), hit, atol)
     mode, y = change.mode, system.with_slip(state.y, change.v, change.slip)
     y, rate, guards = _begin_mode(system, (unknown, mode), state.t, y)
     by_element, switched = elements.split(hit)

@@ -14,7 +14,7 @@ from jaxdyn.contact.unilateral import UnilateralContact, WithModes
 from jaxdyn.forces.piecewise import Pieces
 from jaxdyn.systems.scene import Scene
 
-KINDS = ("touch", "release", "stick", "slip", "turn")
+KINDS = ("touch", "release", "stick", "slip", "turn", "inner")
 CHANNELS = 3  # guards of an element: its normal force or gap, its friction, the pivot of its equations
 
 
@@ -36,6 +36,8 @@ class Mode(NamedTuple):
     stick: Array
     negative: Array  # true where the normal multiplier is negative
     positive: Array  # of the switching functions of piecewise smooth forces
+    excess: Array  # friction (n,) beyond the cone, of all normal forces, by which an element that depends on others may stick
+    creep: Array  # speed (n,) up to which an element slides along a fixed line, zero for others
 
     def signs(self, dtype) -> Array:
         """Signs of the normal multipliers, (n,)."""
@@ -80,6 +82,16 @@ class Elements(NamedTuple):
         """Mask of the elements that can stick, (n,)."""
         return np.array([bool(one.tangent) and not one.smooth for one in self.each])
 
+    @property
+    def planar(self) -> np.ndarray:
+        """Mask of the elements that slide in two directions and can stick, (n,)."""
+        return np.array([len(one.tangent) == 2 and not one.smooth for one in self.each])
+
+    @property
+    def smooth(self) -> np.ndarray:
+        """Mask of the elements whose friction is a function of the state, (n,)."""
+        return np.array([one.smooth for one in self.each])
+
     def active(self, mode: Mode) -> Array:
         """Mask of the rows that act in a mode, (count,)."""
         # The scene's own constraints act in every mode.
@@ -87,8 +99,10 @@ class Elements(NamedTuple):
         for i, one in enumerate(self.each):
             if one.opens:
                 rows[one.normal] = mode.closed[i]
-            for k in one.tangent:
-                rows[k] = jnp.zeros((), bool) if one.smooth else mode.closed[i] & mode.stick[i]
+            for k, row in enumerate(one.tangent):
+                # Along a line, the slip across it does not change; see `turn_rows`.
+                holds = mode.stick[i] | (mode.creep[i] > 0) if k else mode.stick[i]
+                rows[row] = jnp.zeros((), bool) if one.smooth else mode.closed[i] & holds
         return jnp.stack(rows)
 
 
@@ -161,7 +175,8 @@ class Events(eqx.Module):
 
     - `time` (ne,), s, NaN behind the last event; differentiable. `index` (ne,) among `names`, -1 behind the last event.
     - `names`: "<element>: <kind>". The kinds of a contact are "touch" and "release"; those of friction "stick" and "slip". A
-      "turn" reverses the direction of sliding, or the sign of the normal force of a friction that holds on both sides.
+      "turn" reverses the direction of sliding, or the sign of the normal force of a friction that holds on both sides. An
+      "inner" event changes how a mode is computed, and not the motion.
     - `count` (): number of events. Elements that change at the same time have one entry each, that of the guard which was
       crossed first in front.
     """

@@ -6,7 +6,6 @@ from typing import Any
 import diffrax
 import jax
 import jax.numpy as jnp
-import numpy as np
 from jax import lax
 
 from jaxdyn.compile import entry_point, kernel
@@ -18,8 +17,17 @@ from jaxdyn.constraints.selection import independent_rows, rank_code
 from jaxdyn.forces.piecewise import Pieces, fix_pieces, guards, pieces_of
 from jaxdyn.simulation.checks import safe_inputs
 from jaxdyn.simulation.equations import state_outputs
-from jaxdyn.simulation.hybrid.dynamics import by_element, directions, gaps, motion_at, slides, terms_at
-from jaxdyn.simulation.hybrid.modes import KINDS, Elements, Events, Mode, elements_of, extend, force_at
+from jaxdyn.simulation.hybrid.dynamics import (
+    by_element,
+    coefficients,
+    directions,
+    gaps,
+    motion_at,
+    slides,
+    terms_at,
+    tolerance,
+)
+from jaxdyn.simulation.hybrid.modes import KINDS, Elements, Events, Mode, elements_of, extend
 from jaxdyn.simulation.hybrid.replay import HybridRun
 from jaxdyn.simulation.hybrid.system import ModalSystem, project
 from jaxdyn.simulation.hybrid.transitions import length
@@ -156,7 +164,7 @@ def _outputs(bind: _Binder, elements: Elements, outputs, unknown, y, mode: Mode,
 
 def _guess(scene: Scene, elements, q, v, t):
     """Mode of a start by its position and velocity, directions of sliding, and whether no contact penetrates, ()."""
-    small = float(jnp.finfo(q.dtype).eps) ** 0.6
+    small = tolerance(q.dtype)
     # Lengths are compared with one metre and with the configuration, whichever is larger.
     gap, reach = gaps(scene, elements, q, t), 1 + jnp.max(jnp.abs(q))
     slip = by_element(elements, velocity_residual(extend(scene), q, v, t))
@@ -167,18 +175,19 @@ def _guess(scene: Scene, elements, q, v, t):
         speed <= small * (1 + jnp.max(jnp.abs(v))),
         jnp.zeros(gap.shape, bool),
         jnp.zeros((0,), bool),
+        jnp.zeros_like(gap),
+        jnp.zeros_like(gap),
     )
-    smooth = jnp.asarray(np.array([one.smooth for one in elements.each]))
     limit = float(jnp.finfo(q.dtype).eps) ** 0.4
     start_ok = (~opens | (gap >= -limit * reach)).all()
     # Smooth friction is a function of the state, which has no mode that sticks.
-    return mode._replace(stick=mode.stick & ~smooth), lax.stop_gradient(unit), start_ok
+    return mode._replace(stick=mode.stick & ~jnp.asarray(elements.smooth)), lax.stop_gradient(unit), start_ok
 
 
 def _impacts_at_start(scene: Scene, elements, q, v, t, mode: Mode):
     """Mask of the contacts that are closed by an impact at the start, (n,)."""
     rates = velocity_residual(extend(scene), q, v, t)
-    small = float(jnp.finfo(q.dtype).eps) ** 0.6 * (1 + jnp.max(jnp.abs(v)))
+    small = tolerance(q.dtype) * (1 + jnp.max(jnp.abs(v)))
     into = [rates[one.normal] < -small if one.opens else jnp.zeros((), bool) for one in elements.each]
     return mode.closed & jnp.stack(into)
 
@@ -197,9 +206,10 @@ def _events(elements, touched, start, times, index, good) -> Events:
 
 def _forces(scene: Scene, elements, mode: Mode, terms, motion, slip) -> dict:
     """Static or sliding friction along the rows (2,) and normal force, (3,), by the names of the elements."""
-    along, sliding, forces = directions(scene, elements, terms.slip, slip), slides(elements, mode), {}
+    along, sliding, forces = directions(scene, elements, mode, terms.slip, slip), slides(elements, mode), {}
+    friction, normals = coefficients(scene, elements, slip.dtype).sliding, motion.reaction.normal
     for i, one in enumerate(elements.each):
-        level = jnp.where(sliding[i], force_at(scene, one).coefficient.astype(slip.dtype) * motion.normal[i], 0.0)
-        normal = jnp.where(mode.closed[i], motion.normal[i], 0.0)
+        level = jnp.where(sliding[i], friction[i] * normals[i], 0.0)
+        normal = jnp.where(mode.closed[i], normals[i], 0.0)
         forces[one.name] = jnp.append(motion.reaction.holding[i] - level * along[i], normal)
     return forces

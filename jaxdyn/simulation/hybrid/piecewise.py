@@ -8,6 +8,7 @@ from jax import lax
 from jax.flatten_util import ravel_pytree
 
 from jaxdyn.forces.piecewise import Pieces
+from jaxdyn.simulation.hybrid.dynamics import Collision
 from jaxdyn.simulation.hybrid.modes import Elements, Mode
 from jaxdyn.simulation.hybrid.replay import HybridRun
 from jaxdyn.simulation.hybrid.system import HybridSystem
@@ -41,12 +42,13 @@ class PiecewiseSystem(HybridSystem):
         values, levels = self._switching(t, y, (*args[0], args[1].positive))
         return jnp.where(args[1].positive, values, -values), levels
 
-    def reset(self, unknown, t, y, mode, slip, hit):
+    def reset(self, unknown, t, y, mode, slip, hit, atol):
         # Forces are finite on both sides of a zero: the piece changes, and the velocity does not jump.
         mode, yes = mode._replace(positive=mode.positive ^ hit), jnp.ones((), bool)
-        return Transition(mode, slip, mode, slip, jnp.zeros((0,), y.dtype), yes, ~yes)
+        none = jnp.zeros((0,), y.dtype)
+        return Transition(Collision(mode, slip, none, none > 0, none > 0), mode, slip, none, yes, ~yes)
 
-    def impact(self, unknown, mode, slip, t, y):
+    def impact(self, unknown, collision, t, y):
         return y
 
     def slip(self, y):
@@ -67,7 +69,7 @@ def piecewise_motion(
     """
     unknown, flat = tuple(args or ()), ravel_pytree(y0)[0]
     none = jnp.zeros((0,), bool)
-    mode = Mode(none, none, none, jnp.ones((system.elements.switches,), bool))
+    mode = Mode(none, none, none, jnp.ones((system.elements.switches,), bool), *jnp.zeros((2, 0), flat.dtype))
     values, _ = system.guards(ts[0], y0, (unknown, mode))
     rtol, atol = (jnp.asarray(x, flat.dtype) for x in (rtol, atol))
     mode = lax.stop_gradient(mode._replace(positive=values > 0))

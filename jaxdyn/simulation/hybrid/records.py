@@ -6,6 +6,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array
 
+from jaxdyn.simulation.hybrid.dynamics import Collision
 from jaxdyn.simulation.hybrid.modes import CHANNELS, KINDS, Elements, Mode
 from jaxdyn.simulation.hybrid.transitions import Transition
 
@@ -16,8 +17,7 @@ class Records(NamedTuple):
     time: Array
     name: Array  # index among `Elements.names`
     trigger: Array  # the guard that fell to zero, -1 for an event that came with another one
-    impact: Mode
-    impact_slip: Array
+    impact: Collision
     mode: Mode  # after the event
     slip: Array
 
@@ -25,42 +25,49 @@ class Records(NamedTuple):
 def no_records(elements: Elements, dtype, most: int) -> Records:
     """Records before the first event."""
     n, none = len(elements.each), jnp.zeros((most + 1,), jnp.int32)
-    flags = jnp.zeros((most + 1, n), bool)
-    mode = Mode(flags, flags, flags, jnp.zeros((most + 1, elements.switches), bool))
-    slip = jnp.zeros((most + 1, n, 2), dtype)
-    return Records(jnp.full((most + 1,), jnp.nan, dtype), none - 1, none - 1, mode, slip, mode, slip)
+    flags, slip = jnp.zeros((most + 1, n), bool), jnp.zeros((most + 1, n, 2), dtype)
+    mode = Mode(flags, flags, flags, jnp.zeros((most + 1, elements.switches), bool), slip[..., 0], slip[..., 0])
+    impact = Collision(mode, slip, slip[..., 0], flags, flags)
+    return Records(jnp.full((most + 1,), jnp.nan, dtype), none - 1, none - 1, impact, mode, slip)
 
 
 def record_elements(
     elements: Elements, t, before: Mode, change: Transition, hit, happens, rows: Records, count, most: int
 ):
     """Records with a row for each element that an event has changed, and their number."""
-    mode = change.mode
-    kind = jnp.where(mode.stick & ~before.stick, 2, jnp.where(before.stick & ~mode.stick, 3, 4))
+    mode, number = change.mode, jnp.arange(len(elements.each), dtype=jnp.int32)
+    kind = jnp.where((mode.stick & before.stick) | (mode.creep != before.creep), 5, 4)
+    kind = jnp.where(mode.stick & ~before.stick, 2, jnp.where(before.stick & ~mode.stick, 3, kind))
     # A contact that is hit may let go at once.
     hits = (mode.closed | hit[:, 0]) & ~before.closed
     kind = jnp.where(hits, 0, jnp.where(before.closed & ~mode.closed, 1, kind))
+    # What stands still beyond its cone is given room: the guard of a mode has changed, and its derivative.
     differs = (mode.closed != before.closed) | (mode.stick != before.stick) | (mode.negative != before.negative)
+    differs = differs | (mode.excess != before.excess) | (mode.creep != before.creep)
     changed = happens & (hit.any(1) | differs)
     leading = jnp.argmax(hit.reshape(-1)).astype(jnp.int32)
     # First the element whose guard it was, which carries the impact; then those that came with it.
-    order = [(i, True) for i in range(len(elements.each))] + [(i, False) for i in range(len(elements.each))]
-    for i, by_trigger in order:
-        is_row = changed[i] & ((hit.any() & (leading // CHANNELS == i)) == by_trigger)
-        # A scatter needs a place for what is not kept too: the spare last row.
-        place = jnp.where(is_row & (count < most), count, most)
-        row = Records(
-            t,
-            (i * len(KINDS) + kind[i]).astype(jnp.int32),
-            jnp.where(by_trigger, leading, -1).astype(jnp.int32),
-            change.impact if by_trigger else mode,
-            change.impact_slip if by_trigger else change.slip,
-            mode,
-            change.slip,
-        )
-        rows = jax.tree.map(lambda all_, one, at=place: all_.at[at].set(one), rows, row)
-        count = count + is_row.astype(jnp.int32)
-    return rows, count
+    leads = hit.any() & (number == leading // CHANNELS) & changed
+    rank = jnp.cumsum(changed & ~leads, dtype=jnp.int32) + leads.any().astype(jnp.int32) - 1
+    rank = jnp.where(leads, jnp.zeros_like(rank), rank)
+    # A scatter needs a place for what is not kept too: the spare last row.
+    places = jnp.where(changed & (count + rank < most), count + rank, most)
+
+    def by_row(first, others):
+        """For the leading element the one, for the others the other."""
+        return jax.tree.map(lambda a, b: jnp.where(leads.reshape(-1, *[1] * a.ndim), a, b), first, others)
+
+    none = jnp.zeros_like(change.impact.rebound)
+    still = Collision(mode, change.slip, none, none > 0, none > 0)
+    new = Records(
+        jnp.broadcast_to(t, number.shape),
+        number * len(KINDS) + kind.astype(jnp.int32),
+        jnp.where(leads, leading, -1),
+        by_row(change.impact, still),
+        *by_row((mode, change.slip), (mode, change.slip)),
+    )
+    rows = jax.tree.map(lambda all_, new: all_.at[places].set(new.astype(all_.dtype)), rows, new)
+    return rows, count + jnp.sum(changed, dtype=jnp.int32)
 
 
 def record_switches(elements: Elements, t, count, mode: Mode, records: Records, switched, slip, most: int):
@@ -75,8 +82,13 @@ def record_switches(elements: Elements, t, count, mode: Mode, records: Records, 
     modes, slip = jax.tree.map(lambda x: jnp.broadcast_to(x, (k, *x.shape)), (mode, slip))
     modes = modes._replace(positive=modes.positive ^ earlier)
     rows = Records(
-        jnp.broadcast_to(t, (k,)), first * len(KINDS) + number, first * CHANNELS + number, modes, slip, modes, slip
-    )  # fmt: skip
+        jnp.broadcast_to(t, (k,)),
+        first * len(KINDS) + number,
+        first * CHANNELS + number,
+        Collision(modes, slip, slip[..., 0], slip[..., 0] > 0, slip[..., 0] > 0),
+        modes,
+        slip,
+    )
     rows = jax.tree.map(lambda all_, new: all_.at[places].set(new.astype(all_.dtype)), records, rows)
     return rows, count + jnp.sum(switched, dtype=jnp.int32)
 

@@ -101,7 +101,7 @@ def _replay(run: HybridRun, inputs, end, records, begun, direct: bool):
         return (t, y, mode), (t, here)
 
     # The start may be an impact, whose velocity follows the start.
-    y = system.impact(unknown, begun.impact, begun.impact_slip, ts[0], ravel_pytree(y0)[0])
+    y = system.impact(unknown, begun.impact, ts[0], ravel_pytree(y0)[0])
     y = system.with_slip(y, None, lax.stop_gradient(begun.slip))
     # With a checkpoint, reverse mode keeps one state a part, and the steps of one part at a time.
     _, (times, rows) = lax.scan(jax.checkpoint(part_or_none), (ts[0], y, begun.mode), order)
@@ -129,7 +129,7 @@ def _cross(system: HybridSystem, unknown, mode: Mode, record: Records, t, known_
     time = jnp.where(hit, known_time + late, t)
     # To the event by the motion before it: a shift of value zero, with the first and second derivatives of the time.
     y = _shift(system.plan, (unknown, mode), known_time, y, late)
-    y = system.impact(unknown, record.impact, record.impact_slip, time, y)
+    y = system.impact(unknown, record.impact, time, y)
     return time, system.with_slip(y, None, lax.stop_gradient(record.slip))
 
 

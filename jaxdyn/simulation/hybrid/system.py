@@ -14,24 +14,48 @@ import jax.numpy as jnp
 from jax.flatten_util import ravel_pytree
 
 from jaxdyn.compile import kernel
+from jaxdyn.compile.batch import while_loop
 from jaxdyn.constraints.base import holonomic_rows, layout, position_residual, velocity_residual
-from jaxdyn.dynamics.quantities import mass_matrix
 from jaxdyn.forces.piecewise import values_and_levels
 from jaxdyn.lie.so3 import matmul
 from jaxdyn.simulation.hybrid.dynamics import (
+    ROUNDING,
+    Collision,
     StateTerms,
     by_element,
+    by_normal_row,
+    coefficients,
     directions,
-    element_guards,
+    free_motion,
     gaps,
+    guards_and_levels,
     impact,
     motion_at,
+    normal_loads,
+    react,
     rebounds,
     solve_rows,
     terms_at,
+    tolerance,
+    turn_gram,
+    turn_rows,
 )
-from jaxdyn.simulation.hybrid.modes import Elements, Mode, extend, force_at
-from jaxdyn.simulation.hybrid.transitions import ContactState, Impact, Transition, align, first_guess, next_mode
+from jaxdyn.simulation.hybrid.modes import Elements, Mode, extend
+from jaxdyn.simulation.hybrid.transitions import (
+    GUESSES,
+    Problem,
+    Transition,
+    align,
+    choose_mode,
+    first_guess,
+    guess_again,
+    independent_lines,
+    jammed,
+    length,
+    rates_of,
+    with_excess,
+    with_lines,
+)
 from jaxdyn.simulation.solvers.explicit import Plan
 from jaxdyn.systems.scene import Scene
 from jaxdyn.systems.system import displace, rate_to_velocity, retract, velocity_to_rate
@@ -39,6 +63,7 @@ from jaxdyn.systems.system import displace, rate_to_velocity, retract, velocity_
 # Rounds of a projection at the end of a step, and of one at a save point. All have the factor of the first: each reduces what is
 # open in proportion to the first correction, which only coarse tolerances make large.
 _ROUNDS, _SAVED_ROUNDS = 2, 6
+_STOPPED = 30  # tolerances of the velocity below which sliding has ended
 
 
 class HybridSystem:
@@ -55,11 +80,11 @@ class HybridSystem:
         """Guards and their rounding levels: those of the elements by CHANNELS, then those of the switching functions."""
 
     @abstractmethod
-    def reset(self, unknown, t, y, mode: Mode, slip, hit) -> Transition:
-        """Transition after the guards `hit`."""
+    def reset(self, unknown, t, y, mode: Mode, slip, hit, atol) -> Transition:
+        """Transition after the guards `hit`; `atol` (), m: the height of flights that are not followed, None for rounding."""
 
     @abstractmethod
-    def impact(self, unknown, mode: Mode, slip, t, y) -> Any:
+    def impact(self, unknown, collision: Collision, t, y) -> Any:
         """State after an impact."""
 
     @abstractmethod
@@ -83,7 +108,7 @@ class ModalSystem(HybridSystem):
         shapes = tuple(x.shape for x in leaves)
         self._bind, self.elements = bind, elements
         plan = Plan(type(solver), jax.jit(self._field), self._project, ("slip",), False, tree, shapes)
-        self.plan = plan._replace(guards=self.guards)
+        self.plan = plan._replace(guards=self.guards, rounding=ROUNDING)
 
     def _motion(self, args, t, y):
         unknown, mode = args
@@ -111,44 +136,182 @@ class ModalSystem(HybridSystem):
     def guards(self, t, y, args):
         mode = args[1]
         scene, q, v, terms, motion = self._motion(args, t, y)
-        state = _contact_state(scene, self.elements, mode, terms, motion, y["slip"], q, v, t)
+        own = guards_and_levels(scene, self.elements, mode, terms, motion, y["slip"], q, v, t)
         values, levels = self._switches(args[0], mode.positive, q, v, t)
-        return tuple(
-            jnp.concatenate([own.reshape(-1), more]) for own, more in ((state.guards, values), (state.levels, levels))
-        )
+        more = values, levels / ROUNDING
+        return tuple(jnp.concatenate([a.reshape(-1), b]) for a, b in zip(own, more, strict=True))
 
-    def _state_at(self, unknown, mode, slip, t, q, v):
-        scene, q, v, terms, motion = self._motion((unknown, mode), t, {"q": q, "v": v, "slip": slip})
-        return _contact_state(scene, self.elements, mode, terms, motion, slip, q, v, t)
-
-    def _impact_at(self, unknown, mode, slip, t, q, v):
-        return _impact(self._bind(unknown)[0], self.elements, mode, slip, t, q, v)
-
-    def reset(self, unknown, t, y, mode, slip, hit):
+    def reset(self, unknown, t, y, mode, slip, hit, atol):
         y = self.plan.structure(y)
         q, v = y["q"], y["v"]
         hit, switched = self.elements.split(hit)
         mode = mode._replace(positive=mode.positive ^ switched)
-
-        def state_at(mode, slip, v):
-            return kernel(self._state_at)(unknown, mode, slip, t, q, v)
-
-        def impact_at(mode, slip):
-            return kernel(self._impact_at)(unknown, mode, slip, t, q, v)
-
-        mode, slip, begins = first_guess(self.elements, mode, slip, state_at(mode, slip, v), hit)
-        forces = [force_at(self._bind(unknown)[0], one) for one in self.elements.each]
-        cones = jnp.stack([force.static.astype(v.dtype) for force in forces])
-        after = next_mode(self.elements, cones, mode, slip, begins, v, impact_at, state_at)
+        holding, speed, size = kernel(self._friction)(unknown, mode, slip, t, q, v)
+        # Sliding that is slower than the error of its velocity has ended: its direction is not known.
+        least = 2 * tolerance(q.dtype) if atol is None else jnp.maximum(2 * tolerance(q.dtype), _STOPPED * atol)
+        is_impact = (jnp.asarray(self.elements.opening) & hit[:, 0] & ~mode.closed).any()
+        stopped = (
+            jnp.asarray(self.elements.rough) & mode.closed & ~mode.stick & (speed <= least * (1 + size)) & ~is_impact
+        )
+        mode, slip, begins = first_guess(self.elements, mode, slip, holding, speed, hit)
+        mode = mode._replace(stick=mode.stick | (stopped & mode.closed))
+        after = self._pass(unknown, mode, slip, begins, stopped & mode.closed, t, q, v, atol)
         # Switching functions that the impact has carried across their zeros.
         values, levels = self._switches(unknown, after.mode.positive, q, after.v, t)
         crossed = (values < -levels) & ~switched
         return after._replace(mode=after.mode._replace(positive=after.mode.positive ^ crossed))
 
-    def impact(self, unknown, mode, slip, t, y):
+    def _friction(self, unknown, mode, slip, t, q, v):
+        """Friction (n, 2) of elements that stick, speeds (n,) of those that slide, and the sizes of their terms."""
+        *_, terms, motion = self._motion((unknown, mode), t, {"q": q, "v": v, "slip": slip})
+        return motion.reaction.holding, length(terms.slip)[0], self._speeds(terms, v)
+
+    def _pass(self, unknown, mode, slip, begins, stopped, t, q, v, atol) -> Transition:
+        """Transition from a first guess of the mode; `begins` (n,) marks elements that slide from rest."""
+        elements, n = self.elements, len(self.elements.each)
+        least = tolerance(q.dtype) * (1 + jnp.max(jnp.abs(q)))
+        height = 4 * least if atol is None else jnp.maximum(4 * least, atol)
+
+        def attempt(carry):
+            tries, guess, (rebound, held, stopped), _, busy = carry
+            problem, along = kernel(self._velocities)(unknown, mode, rebound, held, stopped, slip, t, q, v)
+            begin = guess_again(elements, problem, mode, guess)
+            choice = choose_mode(elements, problem, begin._replace(stick=begin.stick | (stopped & begin.closed)), along)
+            collision = Collision(choice.mode, choice.slip, rebound, held, stopped)
+            still = kernel(self._jammed)(problem, choice.mode, choice.slip)
+            resting, at, after, gains = kernel(self._after)(unknown, collision, begins, t, q, v)
+            problem, along = kernel(self._forces)(unknown, resting, at, t, q, after)
+            final = choose_mode(elements, problem, guess_again(elements, problem, resting, guess), along)
+            follows, soft, short, paradox = kernel(self._flights)(
+                unknown, collision, problem, final.mode, final.slip, t, q, v, after, (height, fast)
+            )
+            cornered = kernel(self._paradox)(problem, resting, along)
+            # Both choices are valid if no element disagreed in the end.
+            settled = ~(choice.wrong | final.wrong)
+            new = Transition(collision, follows, final.slip, after, settled, paradox | (cornered & ~settled))
+            fate = (
+                jnp.where(gains, jnp.where(rebound > 0.1, rebound / 2, 0.0), jnp.where(soft, 0.0, rebound)),
+                held | (short & ~gains & ~still.any()),
+                stopped | still,
+            )
+            fate = jax.tree.map(lambda a, b: jnp.where(settled, a, b), fate, (rebound, held, stopped))
+            more = jnp.where(settled, gains | soft.any() | short.any() | still.any(), guess < GUESSES)
+            guess = jnp.where(settled, 0, guess + 1).astype(jnp.int32)
+            after = tries + 1, guess, fate, new, more & (tries < 4 * n + 12)
+            return jax.tree.map(lambda a, b: jnp.where(busy, a, b), after, carry)
+
+        none, no, zero = jnp.zeros((n,), bool), jnp.zeros((), bool), jnp.zeros((), jnp.int32)
+        mode = mode._replace(excess=jnp.zeros((n,), q.dtype), creep=jnp.zeros((n,), q.dtype))
+        # As far as the square of the speed is below the tolerance, the direction of sliding may lag behind.
+        fast = jnp.asarray(1e-4, q.dtype) if atol is None else 0.3 * jnp.sqrt(jnp.maximum(atol, least))
+        start = Collision(mode, slip, jnp.ones((n,), q.dtype), none, stopped)
+        blank = Transition(start, mode, slip, v, no, no)
+        return while_loop(lambda carry: carry[4], attempt, (zero, zero, start[2:], blank, ~no))[3]
+
+    def _velocities(self, unknown, mode: Mode, rebound, held, stopped, slip, t, q, v):
+        """Problem of an impact, and directions of sliding (n, 2)."""
+        scene, elements = self._bind(unknown)[0], self.elements
+        terms, of = terms_at(scene, elements, q, v, t), coefficients(scene, elements, v.dtype)
+        rates = terms.row.velocity
+        wanted = by_normal_row(elements, rebounds(elements, terms, of.restitution * rebound))
+        each = jnp.ones(rebound.shape, bool)
+        size = (1 + jnp.max(jnp.abs(rates))) / jnp.max(jnp.diagonal(terms.gram))
+        sliding, static = jnp.where(held, 0.0, of.sliding), jnp.where(held, 0.0, of.static)
+        loads, touches, rate = jnp.zeros_like(rebound), self._touches(scene, q, t), 1 + self._speeds(terms, v)
+        problem = Problem(
+            terms.gram, rates - wanted, sliding, static, loads, touches, each, held, stopped, size, rate
+        )  # fmt: skip
+        return problem, directions(scene, elements, mode, jnp.zeros_like(slip), slip)
+
+    def _touches(self, scene: Scene, q, t):
+        opens, gap = jnp.asarray(self.elements.opening), gaps(scene, self.elements, q, t)
+        return opens & (gap <= 2 * tolerance(q.dtype) * (1 + jnp.max(jnp.abs(q))))
+
+    def _speeds(self, terms: StateTerms, v):
+        """Sizes (n,) of the terms that cancel in the velocities of each element."""
+        across, beside = rates_of(self.elements, jnp.sum(jnp.abs(terms.row.A) * jnp.abs(v)[None], 1))
+        return jnp.maximum(across, jnp.max(beside, 1))
+
+    def _after(self, unknown, collision: Collision, begins, t, q, v):
+        """Mode and directions behind an impact before forces are known, the velocity (nv,), and whether it gains energy."""
+        scene, elements = self._bind(unknown)[0], self.elements
+        terms, of = terms_at(scene, elements, q, v, t), coefficients(scene, elements, v.dtype)
+        after, reaction = impact(scene, elements, collision, terms, v)
+        rates = matmul(terms.gram, reaction.along) + terms.row.velocity
+        speed, unit = length(rates_of(elements, rates)[1])
+        is_sliding = speed > 2 * tolerance(v.dtype) * (1 + self._speeds(terms, v))
+        # Elements that rebound open; those that came to rest together stick if their cones allow it.
+        opened = rebounds(elements, terms, of.restitution * collision.rebound) > 0
+        closed = collision.mode.closed & ~(jnp.asarray(elements.opening) & opened)
+        stick = (collision.mode.stick | (jnp.asarray(elements.rough) & ~is_sliding & ~begins)) & closed
+        mode = collision.mode._replace(closed=closed, stick=stick & ~is_sliding)
+        work, size = (jnp.sum(a * b) for a, b in (
+            (reaction.along, rates + terms.row.velocity), (jnp.abs(reaction.along), jnp.abs(rates) + jnp.abs(terms.row.velocity))
+        ))  # fmt: skip
+        gains = (work > 1e-6 * size) & (opened & (collision.rebound > 0)).any()
+        return mode, jnp.where(is_sliding[:, None], unit, collision.slip), after, gains
+
+    def _forces(self, unknown, mode: Mode, slip, t, q, v):
+        """Problem of the forces, and directions of sliding (n, 2)."""
+        scene, generalized_force, _ = self._bind(unknown, mode.positive)
+        elements, zero = self.elements, jnp.zeros(slip.shape[:1], v.dtype)
+        terms, of = terms_at(scene, elements, q, v, t), coefficients(scene, elements, v.dtype)
+        free, rates = free_motion(scene, terms, generalized_force(q, v, t), q, v, t)
+        # Sizes of the terms that cancel in the rates.
+        sizes = self._speeds(terms, terms.metric.unwhiten(free)) + jnp.max(jnp.abs(terms.row.gamma))
+        least = 2 * tolerance(v.dtype) * (1 + self._speeds(terms, v))
+        rests = self._touches(scene, q, t) & (jnp.abs(rates_of(elements, terms.row.velocity)[0]) <= least)
+        speed, _ = length(terms.slip)
+        size = jnp.max(jnp.abs(rates)) / jnp.max(jnp.diagonal(terms.gram))
+        loads = normal_loads(scene, elements, q, v, t)
+        # A contact in flight has no force, and an element that slides does not stick.
+        problem = Problem(
+            terms.gram, rates, of.sliding, of.static, loads, rests, speed <= least, zero > 0, zero > 0, size, sizes
+        )  # fmt: skip
+        return problem, directions(scene, elements, mode, terms.slip, slip)
+
+    def _flights(self, unknown, collision: Collision, problem: Problem, mode: Mode, along, t, q, v, after, limits):
+        """Mode, contacts (n,) whose rebound is too low to be followed, others whose flight is, and whether a pivot is lost."""
+        scene, elements = self._bind(unknown)[0], self.elements
+        terms, of = terms_at(scene, elements, q, v, t), coefficients(scene, elements, v.dtype)
+        height, fast = limits
+        still, reaction, rates = jammed(elements, problem, mode, along)
+        rate = rates_of(elements, rates)[0]
+        velocity = rates_of(elements, matmul(terms.row.A, after - v) + terms.row.velocity)[0]
+        flies = (
+            self._touches(scene, q, t)
+            & ~mode.closed
+            & (velocity > 2 * tolerance(v.dtype) * (1 + self._speeds(terms, v)))
+        )
+        # It comes back if its gap is accelerated downwards: from the height v^2/2a.
+        low = flies & (rate < 0) & (velocity * velocity <= -2 * rate * height)
+        bounces = collision.mode.closed & (rebounds(elements, terms, of.restitution * collision.rebound) > 0)
+        lost = (mode.closed & ~mode.stick & (reaction.pivots <= 0)).any()
+        follows = with_excess(elements, problem, mode, still)
+        slides = mode.closed & ~follows.stick & jnp.asarray(elements.planar)
+        speed, _ = length(rates_of(elements, matmul(terms.row.A, after - v) + terms.row.velocity)[1])
+        line = slides & (problem.may_stick | (speed < 0.9 * fast))
+        line = independent_lines(elements, problem.gram, follows, along, line)
+        follows = with_lines(elements, problem, follows, along, jnp.where(line, fast, 0.0))
+        return follows, low & bounces, low & ~bounces & ~collision.held, lost
+
+    def _paradox(self, problem: Problem, mode: Mode, along):
+        """True if sliding in a mode has lost a positive pivot of its forces: then they do not exist, or are not unique."""
+        reaction = react(self.elements, mode, problem.gram, problem.sliding, problem.loads, along, -problem.free)
+        return (mode.closed & ~mode.stick & (reaction.pivots <= 0)).any()
+
+    def _jammed(self, problem: Problem, mode: Mode, along):
+        """Elements (n,) whose slow slip behind an impact is only an error of their directions."""
+        still, _, rates = jammed(self.elements, problem, mode, along)
+        return still & (length(rates_of(self.elements, rates)[1])[0] > 2 * tolerance(along.dtype) * problem.rate)
+
+    def impact(self, unknown, collision, t, y):
         y = self.plan.structure(y)
-        after = kernel(self._impact_at)(unknown, mode, slip, t, y["q"], y["v"])
-        return ravel_pytree(y | {"v": after.v})[0]
+        return ravel_pytree(y | {"v": kernel(self._impact)(unknown, collision, t, y["q"], y["v"])})[0]
+
+    def _impact(self, unknown, collision: Collision, t, q, v):
+        scene = self._bind(unknown)[0]
+        return impact(scene, self.elements, collision, terms_at(scene, self.elements, q, v, t), v)[0]
 
     def slip(self, y):
         return self.plan.structure(y)["slip"]
@@ -167,14 +330,15 @@ def project(scene: Scene, elements: Elements, mode: Mode, t, y, error):
     whole, dtype = extend(scene), y["v"].dtype
     q, v = retract(scene.system, y["q"]), y["v"]
     terms = terms_at(scene, elements, q, v, t)
-    holonomic = holonomic_rows(layout(whole))
+    holonomic, gram = holonomic_rows(layout(whole)), turn_gram(elements, mode, y["slip"], terms.gram)
     # Masks keep the shapes of all modes: rows that do not act are multiplied by zero.
     active = elements.active(mode).astype(dtype)
     holds = jnp.zeros((elements.count,), dtype).at[holonomic].set(1.0) * active
 
     def change(residual, mask):
         """Least velocity that changes the rows of a mask by `residual`."""
-        lam = solve_rows(terms.Y * mask[None], mask, (residual * mask)[:, None])[:, 0]
+        residual = turn_rows(elements, mode, y["slip"], residual)
+        lam = turn_rows(elements, mode, y["slip"], solve_rows(gram, mask, (residual * mask)[:, None])[:, 0], back=True)
         return terms.metric.unwhiten(matmul(terms.Y, lam))
 
     start, last, blank = q, jnp.zeros_like(v), jnp.zeros((elements.count,), dtype)
@@ -195,59 +359,5 @@ def project(scene: Scene, elements: Elements, mode: Mode, t, y, error):
     for _ in range(rounds):
         v = v - change(velocity_residual(whole, q, v, t), active)
     slip = by_element(elements, velocity_residual(whole, q, v, t))
-    return y | {"q": q, "v": v, "slip": align(slip, y["slip"])}, tangent
-
-
-def _impact(scene: Scene, elements: Elements, mode: Mode, slip, t, q, v) -> Impact:
-    terms = terms_at(scene, elements, q, v, t)
-    along, rebound = directions(scene, elements, jnp.zeros_like(slip), slip), rebounds(scene, elements, terms)
-    after, reaction = impact(scene, elements, mode, terms, along, v, rebound)
-    rates = matmul(terms.row.A, after - v) + terms.row.velocity
-    gap = jnp.stack([rates[one.normal] if one.opens else jnp.zeros((), v.dtype) for one in elements.each]) - rebound
-    # Impulses are compared with the momentum, and with that of a velocity of one: at rest they are zero up to rounding.
-    M = mass_matrix(scene.system, q, t)
-    size = jnp.max(jnp.abs(matmul(M, v))) + jnp.max(jnp.abs(M)) + jnp.max(jnp.abs(reaction.multipliers))
-    return Impact(after, reaction.normal, reaction.holding, by_element(elements, rates), gap, rebound, size)
-
-
-def _contact_state(
-    scene: Scene, elements: Elements, mode: Mode, terms: StateTerms, motion, slip, q, v, t
-) -> ContactState:
-    dtype, eps = v.dtype, float(jnp.finfo(v.dtype).eps)
-    values = element_guards(scene, elements, mode, terms, motion, slip, q, t)
-    speeds = jnp.sum(jnp.abs(terms.row.A) * jnp.abs(v)[None], 1)
-    zero = jnp.zeros((), dtype)
-    reach = 1 + jnp.max(jnp.abs(q))
-    force = jnp.sum(jnp.abs(motion.normal)) + jnp.sum(jnp.abs(motion.reaction.holding))
-    # A guard is zero up to 100 roundings of the terms that cancel in it: forces of all contacts, velocities, or places. The
-    # pivots are of the size of one.
-    levels, slip_size, rate_size = [], [], []
-    for i, one in enumerate(elements.each):
-        tangent = [speeds[k] for k in one.tangent] or [zero]
-        speed = jnp.max(jnp.stack(tangent))
-        rates = [motion.sizes[k] for k in (*one.tangent, *((one.normal,) if one.opens else ()))]
-        slip_size.append(1 + speed + (speeds[one.normal] if one.opens else zero))
-        rate_size.append(jnp.max(jnp.stack(rates or [zero])))
-        normal = jnp.where(mode.closed[i], 10 * force, reach)
-        friction = jnp.where(mode.stick[i], 10 * force, speed)
-        levels.append(jnp.stack([100 * eps * normal, 100 * eps * friction, jnp.full((), eps, dtype)]))
-    cones = [force_at(scene, one).static.astype(dtype) * motion.normal[i] for i, one in enumerate(elements.each)]
-    gap_rates = [
-        (terms.row.velocity[one.normal], motion.rates[one.normal]) if one.opens else (zero, zero)
-        for one in elements.each
-    ]
-    return ContactState(
-        guards=values,
-        levels=jnp.stack(levels),
-        normal=motion.normal,
-        holding=motion.reaction.holding,
-        cone=jnp.stack(cones),
-        slip=terms.slip,
-        slip_rate=by_element(elements, motion.rates),
-        slip_size=jnp.stack(slip_size),
-        rate_size=jnp.stack(rate_size),
-        gap=gaps(scene, elements, q, t),
-        gap_velocity=jnp.stack([a for a, _ in gap_rates]),
-        gap_rate=jnp.stack([b for _, b in gap_rates]),
-        gap_size=reach,
-    )
+    aligned = jnp.where((mode.creep > 0)[:, None], y["slip"], align(slip, y["slip"]))
+    return y | {"q": q, "v": v, "slip": aligned}, tangent

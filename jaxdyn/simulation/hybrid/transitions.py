@@ -1,17 +1,21 @@
 """Mode transitions at an event: first the velocities, by an impact, then the forces.
 
-Both are problems of complementarity: a closed contact must push, an open one must not penetrate, an element that sticks must stay
-in its cone, and one that slides must not turn round. A contact that sticks and would pull slides first: then it may well push.
-They are solved by changing the first element that disagrees, one at a time, which ends for problems of one solution (Murty's
-rule); where it does not end, no mode was found.
+Both are one problem of complementarity of all elements at once: with rates u = G p + u_free of the rows under forces (or
+impulses) p, a closed contact pushes, an open one does not penetrate, an element that sticks stays in its cone, and one that
+slides does so against its friction, in space too. Which element comes first does not matter for that.
 
-The impact is that of least change in the metric of M over the bodies that are kept apart, or rebound by Newton's
-hypothesis. An impulse that leaves the cone slides, against the direction of the impulse that would have held it: exact in a
-plane, an approximation of the sliding direction in space.
+It is solved by changing the first element that disagrees, one at a time, which ends for problems of one solution (Murty's rule).
+Each time the forces of all elements are computed from their modes, those of dependent rows by least norm: a contact whose force
+of least norm would pull is opened, and rests beside the others without force.
+
+The impact is plastic, or has rebounds by Newton's hypothesis (Moreau's law: friction is against the velocity after it). A plastic
+impact loses energy, p.u <= 0. With rebounds and friction Newton's law can gain some (Kane 1984): the coefficients of
+restitution of all contacts are then halved, until the work p.(u + u_free)/2 of the impulses is not positive.
+
+Where sliding leaves no forces (Painleve's paradox), the impact begins from elements that stick: there is an impulse without
+collision that stops them (Genot & Brogliato 1999).
 """
 
-from collections.abc import Callable
-from functools import partial
 from typing import NamedTuple
 
 import jax
@@ -20,56 +24,65 @@ import numpy as np
 from jax import lax
 from jaxtyping import Array
 
-from jaxdyn.compile.batch import any_sample
+from jaxdyn.compile import kernel
+from jaxdyn.compile.batch import while_loop
+from jaxdyn.compile.loops import Carry, Given, Iteration, Task, run_loop
+from jaxdyn.lie.so3 import matmul
+from jaxdyn.simulation.hybrid.dynamics import (
+    Collision,
+    Reaction,
+    depends_on_others,
+    force_tolerance,
+    react,
+    solve_rows,
+    tolerance,
+)
 from jaxdyn.simulation.hybrid.modes import Elements, Mode
 
-
-class ContactState(NamedTuple):
-    """A state in a mode, as its guards and transitions see it; sizes are those of the terms that cancel."""
-
-    guards: Array  # (n, CHANNELS)
-    levels: Array  # their rounding (n, CHANNELS)
-    normal: Array  # normal forces (n,)
-    holding: Array  # friction of elements that stick (n, 2)
-    cone: Array  # largest friction at rest (n,)
-    slip: Array  # velocities of slipping (n, 2)
-    slip_rate: Array  # their rates (n, 2)
-    slip_size: Array  # (n,)
-    rate_size: Array  # (n,)
-    gap: Array  # (n,)
-    gap_velocity: Array  # (n,)
-    gap_rate: Array  # (n,)
-    gap_size: Array  # ()
+_INDEPENDENT = 1e-2  # of the square of a row, that is left of it when others hold
+GUESSES = 3  # other modes from which changes begin where the first one leads to no mode
+_ANGLE = 1e-14  # 1 - cos of the angle up to which a direction is known
+_STILL = 1e-4  # rate of slipping, of the terms that cancel in it, of what may stand still
+_ROOM = 2e-3  # of the friction of all elements, by which the friction of some that stick may grow beyond the cone
+_WEIGHT = 32  # changes of direction for which there is the same room as for one of a mode
 
 
-class Impact(NamedTuple):
-    """State after an impact."""
+class Problem(NamedTuple):
+    """Complementarity problem of the elements: rates u = G p + free of the rows by forces p along them."""
 
-    v: Array  # (nv,)
-    normal: Array  # impulses (n,)
-    holding: Array  # impulses (n, 2)
-    slip: Array  # velocities of slipping (n, 2)
-    gap_velocity: Array  # above the rebound (n,)
-    rebound: Array  # that restitution asks for (n,)
-    size: Array  # of the impulses, ()
+    gram: Array  # G (count, count)
+    free: Array  # (count,), less the rates that the rows which act are given
+    sliding: Array  # coefficients of friction (n,)
+    static: Array  # at rest
+    loads: Array  # normal forces that are given (n,)
+    may_close: Array  # contacts (n,) that may close: in flight they have no force
+    may_stick: Array  # elements (n,) that may stick: those that slide before and after do not
+    held: Array  # contacts (n,) that hold on both sides
+    stopped: Array  # elements (n,) that stick whatever their friction
+    force: Array  # size of forces (), beside their own,
+    rate: Array  # and of rates (n,), that count as zero when they are multiplied by the tolerance
+
+
+class Choice(NamedTuple):
+    """Choice of a mode, as it is changed: mode and directions (n, 2), number of changes, whether an
+    element disagreed, and whether it has ended."""
+
+    mode: Mode
+    slip: Array
+    changes: Array
+    wrong: Array
+    done: Array
 
 
 class Transition(NamedTuple):
-    """A transition: mode and directions (n, 2) of the impact, those that follow, and the velocity (nv,) after it."""
+    """A transition: the impact, the mode and directions (n, 2) that follow, and the velocity (nv,) after it."""
 
-    impact: Mode
-    impact_slip: Array
+    impact: Collision
     mode: Mode
     slip: Array
     v: Array
     settled: Array  # true if a mode was found
     paradox: Array  # true where friction leaves no forces
-
-
-def _tolerance(dtype) -> float:
-    """Size below which velocities and gaps count as zero, in SI units and relative to the terms that cancel in them."""
-    # 4e-10 in float64: above the rounding of a projected state, far below the changes at an event.
-    return float(jnp.finfo(dtype).eps) ** 0.6
 
 
 def length(x):
@@ -84,143 +97,208 @@ def length(x):
 def align(slip, reference):
     """Directions of slipping (n, 2) on the side of the old ones; the old ones where nothing slips."""
     size, unit = length(lax.stop_gradient(slip))
-    # A velocity of the size of rounding has no direction.
-    is_sliding = size > 100 * float(jnp.finfo(slip.dtype).eps)
+    # A velocity that may be the rounding of others has no direction.
+    is_sliding = size > tolerance(slip.dtype)
     forward = jnp.where(jnp.sum(unit * reference, 1) < 0, -1.0, 1.0).astype(slip.dtype)
     # Directions are constants of a step, for derivatives too.
     return lax.stop_gradient(jnp.where(is_sliding[:, None], forward[:, None] * unit, reference))
 
 
-def first_guess(elements: Elements, mode: Mode, slip, state: ContactState, hit) -> tuple[Mode, Array, Array]:
+def first_guess(elements: Elements, mode: Mode, slip, holding, speed, hit) -> tuple[Mode, Array, Array]:
     """Mode and directions after the guards `hit` (n, CHANNELS), before velocities and forces are checked.
 
-    The third result (n,) marks elements that begin to slide.
+    `holding` (n, 2): friction of elements that stick; `speed` (n,) of slipping. The third result (n,) marks those that begin to
+    slide.
     """
     opens = jnp.asarray(elements.opening)
     first, second = hit[:, 0], hit[:, 1]
     closes, releases = opens & first & ~mode.closed, opens & first & mode.closed
     begins, ends = second & mode.stick & mode.closed, second & ~mode.stick & mode.closed
-    _, against = length(-state.holding)
+    leaves = ends & (mode.creep > 0) & (speed > mode.creep / 2)
+    ends = ends & ~leaves
+    _, against = length(-holding)
     # An element that breaks loose slides against the friction that held it: its velocity is still zero.
     slip = jnp.where(begins[:, None], against, slip)
     changed = mode._replace(
         closed=(mode.closed | closes) & ~releases,
         stick=((mode.stick | closes | ends) & ~begins) & ~releases,
         negative=mode.negative ^ (first & ~opens),
+        creep=jnp.where(leaves, 0.0, mode.creep),
     )
     return changed, slip, begins
 
 
-def next_mode(elements: Elements, cones, mode: Mode, slip, begins, v, impact_at: Callable, state_at: Callable):
-    """Transition from a first guess of the mode at the velocity v (nv,), a `Transition`.
-
-    `begins` (n,) marks elements that slide from rest, because they could not be held.
-    `impact_at(mode, slip)` gives an `Impact`, `state_at(mode, slip, v)` a `ContactState`; `cones` (n,), coefficients at rest.
-    """
-    opens, rough = jnp.asarray(elements.opening), jnp.asarray(elements.rough)
-    mode = mode._replace(stick=mode.stick & rough)
-    before: ContactState = state_at(mode, slip, v)
-    by_velocity = partial(_disagreements_of_velocities, elements, cones, before, impact_at)
-    impact, impact_slip, hit, after = _solve(rough, by_velocity, mode, slip)
-    v = after.v
-    speed, unit = length(after.slip)
-    is_sliding = speed > _tolerance(v.dtype) * before.slip_size
-    slip = impact_slip = lax.stop_gradient(jnp.where(is_sliding[:, None], unit, impact_slip))
-    # Elements that rebound open; those that came to rest together stick if their cones allow it.
-    closed = impact.closed & ~(opens & (after.rebound > 0))
-    resting = impact._replace(closed=closed, stick=(impact.stick | (rough & ~is_sliding & ~begins)) & closed)
-    final, slip, settled, now = _solve(rough, partial(_disagreements_of_forces, elements, v, state_at), resting, slip)
-    final = final._replace(stick=final.stick & final.closed)
-    # Where sliding has no forces, no mode is found; where it has two, one is.
-    paradox = _has_lost_pivot(final, now) | (_has_lost_pivot(resting, state_at(resting, impact_slip, v)) & ~settled)
-    return Transition(impact, impact_slip, final, slip, v, hit & settled, paradox)
+def guess_again(elements: Elements, problem: Problem, mode: Mode, guess) -> Mode:
+    """Mode from which changes begin, where `guess` () others before have led to no mode: all contacts open, stick, or slide."""
+    opens, others = jnp.asarray(elements.opening), guess > 0
+    closed = jnp.where(opens & others, problem.may_close & (guess > 1), mode.closed)
+    stick = jnp.where(others, closed & problem.may_stick & jnp.asarray(elements.rough) & (guess == 2), mode.stick)
+    return mode._replace(closed=closed, stick=stick)
 
 
-def _solve(rough, disagreements: Callable, mode: Mode, slip):
-    """Change the first element that disagrees until none does: mode, directions, whether that ended, and the values there.
-
-    `disagreements(mode, slip)`: flags (n, 5) of elements that pull, penetrate, leave their cones, turn round, or change the sign
-    of their normal force; those that stick when they close (n,); directions against what held (n, 2); and values.
-    """
-    most = 4 * rough.size + 8  # an element changes a few times at most: more changes are a cycle
-
-    # All samples of a batch iterate until the last one has ended, each masked by its own flag.
-    def is_running(carry):
-        return any_sample(carry[3] & (carry[2] < most))
-
-    def flip(mode, slip, wrong, sticks, against):
-        # The first one alone: Murty's rule changes one at a time, as several changes at once may cycle.
-        first = jnp.argmax(wrong.reshape(-1))
-        # `argmax` is zero where nothing disagrees, so that the flag is masked by `wrong`.
-        one = jnp.zeros(wrong.size, bool).at[first].set(True).reshape(wrong.shape) & wrong
-        pulls, penetrates, leaves, turns, reverses = (one[:, k] for k in range(5))
-        slip = jnp.where(leaves[:, None], against, slip)
-        changed = mode._replace(
-            closed=(mode.closed | penetrates) & ~pulls,
-            stick=(mode.stick | (penetrates & sticks) | turns) & ~pulls & ~leaves & rough,
-            negative=mode.negative ^ reverses,
-        )
-        return changed, slip
-
-    def body(carry):
-        mode, slip, count, busy, _ = carry
-        wrong, sticks, against, values = disagreements(mode, slip)
-        busy = busy & wrong.any() & (count < most)
-        after = flip(mode, slip, wrong, sticks, against)
-        mode, slip = jax.tree.map(lambda a, b: jnp.where(busy, a, b), after, (mode, slip))
-        return mode, slip, count + busy.astype(jnp.int32), busy, values
-
-    # Values of the last iteration are needed: the carry begins with zeros of their shapes.
-    start = jax.eval_shape(disagreements, mode, slip)[3]
-    blank = jax.tree.map(lambda x: jnp.zeros(x.shape, x.dtype), start)
-    first = mode, slip, jnp.zeros((), jnp.int32), jnp.ones((), bool), blank
-    mode, slip, count, _, values = lax.while_loop(is_running, body, first)
-    return mode, slip, count < most, values
+def choose_mode(elements: Elements, problem: Problem, mode: Mode, slip) -> Choice:
+    """Change the first element that disagrees until none does."""
+    task = Task(_turn, _by_turns, (elements,))
+    begin = Carry(Choice(mode, slip, jnp.zeros((), jnp.int32), *jnp.zeros((2,), bool)))
+    after = run_loop(task, None, problem, Given(), begin)
+    # Every change is valid: the native loop needs no fallback.
+    carry = _by_turns(elements, None, problem, Given(), begin) if after is None else after[0]
+    return carry.state
 
 
-def _disagreements_of_velocities(
-    elements: Elements, cones, before: ContactState, impact_at: Callable, mode: Mode, slip
-):
-    opens, rough = jnp.asarray(elements.opening), jnp.asarray(elements.rough)
-    after: Impact = impact_at(mode, slip)
-    small = _tolerance(after.v.dtype)
-    hold, against = length(-after.holding)
-    cone = cones * jnp.where(opens, jnp.maximum(after.normal, 0.0), jnp.abs(after.normal))
-    tiny = small * after.size
-    touching = opens & (before.gap <= small * before.gap_size)
-    forward = jnp.sum(slip * after.slip, 1)
-    wrong = [
-        opens & mode.closed & ~mode.stick & (after.normal < -tiny),
-        touching & ~mode.closed & (after.gap_velocity < -small * before.slip_size),
-        mode.closed & mode.stick & ((hold > cone + tiny) | (opens & (after.normal < -tiny))),
-        mode.closed & ~mode.stick & rough & (forward < -small * before.slip_size),
-        jnp.zeros(opens.shape, bool),
-    ]
-    return jnp.stack(wrong, 1), jnp.ones(opens.shape, bool), against, after
+def _turn(elements: Elements, _, problem: Problem, choice: Choice, __) -> Iteration:
+    after = _change(elements, None, problem, choice)
+    return Iteration(after, ~choice.done, ~after.done)
 
 
-def _disagreements_of_forces(elements: Elements, v, state_at: Callable, mode: Mode, slip):
+def _by_turns(elements: Elements, _, problem: Problem, given: Given, carry: Carry) -> Carry:
+    def step(choice: Choice) -> Choice:
+        after = kernel(_change, static=1, derivative=False)(elements, None, problem, choice)
+        return jax.tree.map(lambda new, old: jnp.where(choice.done, old, new), after, choice)
+
+    return Carry(while_loop(lambda choice: ~choice.done, step, carry.state))
+
+
+def _change(elements: Elements, _, problem: Problem, choice: Choice) -> Choice:
+    """Change the first element that disagrees."""
+    mode, slip, changes = choice.mode, choice.slip, choice.changes
+    reaction = react(elements, mode, problem.gram, problem.sliding, problem.loads, slip, -problem.free)
+    wrong, sticks, turned = _disagreements(elements, problem, mode, slip, reaction)
+    flat = wrong.reshape(-1)
+    # The first one alone: Murty's rule changes one at a time, as several changes at once may cycle.
+    first = (flat & (jnp.cumsum(flat.astype(jnp.int32)) == 1)).reshape(wrong.shape)
+    pulls, penetrates, leaves, turns, reverses = (first[:, k] for k in range(5))
+    _, against = length(-reaction.holding)
+    rough = jnp.asarray(elements.rough)
+    changed = mode._replace(
+        closed=(mode.closed | penetrates) & ~pulls,
+        stick=(mode.stick | (penetrates & sticks) | turns) & ~pulls & ~leaves & rough,
+        negative=mode.negative != reverses,
+    )
+    # Directions follow when the modes agree.
+    moves = (jnp.sum(turned * slip, 1) < 1 - _ANGLE) & ~wrong.any()
+    slip = jnp.where(leaves[:, None], against, jnp.where(moves[:, None], turned, slip))
+    changes = changes + jnp.where(wrong.any(), _WEIGHT, 1).astype(jnp.int32)
+    done = ~(wrong.any() | moves.any()) | (changes >= _WEIGHT * most_changes(elements))
+    return Choice(changed, slip, changes, wrong.any(), done)
+
+
+def most_changes(elements: Elements) -> int:
+    """Number of changes after which no mode was found."""
+    # An element changes a few times at most: more changes are a cycle.
+    return 8 * len(elements.each) + 16
+
+
+def _disagreements(elements: Elements, problem: Problem, mode: Mode, slip, reaction: Reaction):
+    """Flags (n, 5) of elements that pull, penetrate, leave their cones, turn round, or change the sign of their normal force;
+    those that stick when they close (n,); and directions (n, 2) of sliding by what slips."""
     opens, rough = jnp.asarray(elements.opening), jnp.asarray(elements.rough)
     has_multiplier = jnp.asarray(np.array([one.normal >= 0 for one in elements.each]))
-    now: ContactState = state_at(mode, slip, v)
-    small = _tolerance(v.dtype)
-    scale = small * (jnp.sum(jnp.abs(now.normal)) + jnp.sum(jnp.abs(now.holding)))
-    hold, against = length(-now.holding)
-    speed, _ = length(now.slip)
-    at_rest = speed <= small * now.slip_size
-    # A contact in flight has no force: it can close only where gap and velocity are both zero.
-    resting = opens & (now.gap <= small * now.gap_size) & (jnp.abs(now.gap_velocity) <= small * now.slip_size)
-    turns = jnp.sum(slip * now.slip_rate, 1) < -small * now.rate_size
+    dtype, held = reaction.normal.dtype, problem.held
+    rates = matmul(problem.gram, reaction.along) + problem.free
+    normal, slipping = rates_of(elements, rates)
+    hold, _ = length(reaction.holding)
+    forces = jnp.sum(jnp.abs(reaction.normal)) + jnp.sum(jnp.abs(reaction.holding))
+    tiny = force_tolerance(dtype) / 4 * forces + tolerance(dtype) * problem.force
+    sizes = matmul(jnp.abs(problem.gram), jnp.abs(reaction.along)) + jnp.abs(problem.free)
+    across, beside = rates_of(elements, sizes)
+    rise, small = (tolerance(dtype) * (problem.rate + x) for x in (across, jnp.max(beside, 1)))
+    # Friction mu N against a slip d is the projection of mu N d + r u, u the rate of slipping, onto its disk, for any r > 0:
+    # inside of the disk it sticks, and outside it has the direction of this vector.
+    level = jnp.maximum(problem.sliding * reaction.normal, 0.0)
+    square = rates_of(elements, jnp.diagonal(problem.gram))[1]
+    share = jnp.sum(square, 1)
+    share = jnp.where(share > 0, 1 / jnp.where(share > 0, share, jnp.ones_like(share)), 0.0)
+    trial, turned = length(level[:, None] * slip + share[:, None] * slipping)
+    slides = mode.closed & ~mode.stick & rough & problem.may_stick & (level > tiny)
+    is_plane = jnp.asarray(np.array([len(one.tangent) == 2 for one in elements.each]))
+    turned = jnp.where((slides & is_plane)[:, None], turned, slip)
+    backwards = (jnp.sum(slip * slipping, 1) < -small) & (~is_plane | (trial <= level) | (level <= tiny))
+    pulls = opens & mode.closed & (reaction.normal < -tiny) & ~held
+    cone = problem.static * jnp.abs(reaction.normal)
     wrong = [
-        opens & mode.closed & ~mode.stick & (now.normal < -scale),
-        resting & ~mode.closed & (now.gap_rate < -small * now.rate_size),
-        mode.closed & mode.stick & ((hold > now.cone + scale) | (opens & (now.normal < -scale))),
-        mode.closed & ~mode.stick & rough & at_rest & turns,
-        ~opens & (now.normal < -scale) & has_multiplier,
+        pulls & ~mode.stick,
+        problem.may_close & ~mode.closed & (normal < -rise),
+        # A contact that sticks and would pull slides first: then it may well push.
+        mode.closed & mode.stick & rough & ((hold > cone + tiny) | pulls) & ~problem.stopped,
+        mode.closed & ~mode.stick & rough & problem.may_stick & backwards,
+        ~opens & has_multiplier & (reaction.normal < -tiny),
     ]
-    return jnp.stack(wrong, 1), at_rest, against, now
+    return jnp.stack(wrong, 1), problem.may_stick, turned
 
 
-def _has_lost_pivot(mode: Mode, state: ContactState):
-    """True if the equations for the forces of elements that slide have lost a positive pivot."""
-    return ((mode.closed & ~mode.stick)[:, None] & (state.guards[:, 2:] <= 0)).any()
+def jammed(elements: Elements, problem: Problem, mode: Mode, along) -> tuple[Array, Reaction, Array]:
+    """Elements (n,) that slide, but stand still, since they depend on others that stick; the reaction, and rates (count,).
+
+    Their friction of least norm has left the cone, and another share of it has not.
+    """
+    reaction = react(elements, mode, problem.gram, problem.sliding, problem.loads, along, -problem.free)
+    rates = matmul(problem.gram, reaction.along) + problem.free
+    rests = mode.closed & jnp.asarray(elements.rough) & problem.may_stick
+    depends = depends_on_others(elements, problem.gram, mode._replace(stick=mode.stick | rests))
+    speed, _ = length(rates_of(elements, rates)[1])
+    sizes = matmul(jnp.abs(problem.gram), jnp.abs(reaction.along)) + jnp.abs(problem.free)
+    least = _STILL * jnp.max(rates_of(elements, sizes)[1], 1) + tolerance(speed.dtype) * problem.rate
+    return rests & ~mode.stick & depends & (speed <= least), reaction, rates
+
+
+def with_excess(elements: Elements, problem: Problem, mode: Mode, still) -> Mode:
+    """Mode in which elements that stand `still` (n,) stick, with room for their friction beyond the cone."""
+    mode = mode._replace(stick=mode.stick | still)
+    along = jnp.zeros((*mode.excess.shape, 2), mode.excess.dtype)
+    reaction = react(elements, mode, problem.gram, problem.sliding, problem.loads, along, -problem.free)
+    hold, _ = length(reaction.holding)
+    total = jnp.sum(jnp.abs(reaction.normal))
+    beyond = hold - problem.static * jnp.abs(reaction.normal)
+    room = jnp.maximum(beyond, 0.0) / jnp.where(total > 0, total, 1.0) + _ROOM * problem.static
+    excess = jnp.where(mode.stick & mode.closed & still.any() & (beyond > -_ROOM * problem.static * total), room, 0.0)
+    return mode._replace(excess=excess)
+
+
+def with_lines(elements: Elements, problem: Problem, mode: Mode, along, creep) -> Mode:
+    """Mode in which elements slide along lines up to the speeds `creep` (n,), if all contacts push and speed up then, and forces
+    across are small."""
+    lines = mode._replace(creep=creep)
+    reaction = react(elements, lines, problem.gram, problem.sliding, problem.loads, along, -problem.free)
+    tiny = force_tolerance(creep.dtype) / 4 * jnp.sum(jnp.abs(reaction.normal))
+    across, level = length(reaction.holding)[0], problem.sliding * jnp.abs(reaction.normal)
+    pushes = ~(jnp.asarray(elements.opening) & mode.closed) | (reaction.normal >= -tiny)
+    sticks = mode.stick & mode.closed & jnp.asarray(elements.rough)
+    cone = problem.static * jnp.abs(reaction.normal) + mode.excess * jnp.sum(jnp.abs(reaction.normal)) + tiny
+    rates = rates_of(elements, matmul(problem.gram, reaction.along) + problem.free)[1]
+    speeds_up = jnp.sum(rates * along, 1) >= 0
+    fits = jnp.where(sticks, across <= cone, (creep <= 0) | ((across <= 0.5 * level) & speeds_up))
+    return mode._replace(creep=jnp.where((pushes & fits).all(), creep, 0.0))
+
+
+def independent_lines(elements: Elements, gram, mode: Mode, along, wanted):
+    """Those of the `wanted` elements (n,) that may slide along lines: rows across them do not depend on others that act."""
+    none = jnp.zeros((elements.count,), gram.dtype)
+    across = []
+    for i, one in enumerate(elements.each):
+        is_plane = len(one.tangent) == 2
+        across.append(
+            none.at[jnp.asarray(one.tangent)].set(jnp.stack([-along[i, 1], along[i, 0]])) if is_plane else none
+        )
+    across = jnp.stack(across, 1)
+    active = elements.active(mode._replace(creep=jnp.zeros_like(mode.creep))).astype(gram.dtype)
+    rates = matmul(gram, across)
+    # What is left of the rows across when the others hold: their Schur complement, eliminated in order.
+    held = solve_rows(gram, active, rates * active[:, None])
+    whole = matmul(across.T, rates)
+    left = whole - matmul(rates.T, held)
+    chosen = []
+    for i in range(len(elements.each)):
+        is_free = wanted[i] & (left[i, i] > _INDEPENDENT * whole[i, i])
+        chosen.append(is_free)
+        pivot = jnp.where(is_free, left[i, i], jnp.ones_like(left[i, i]))
+        left = left - jnp.where(is_free, left[:, i, None] * left[None, i] / pivot, 0.0)
+    return jnp.stack(chosen)
+
+
+def rates_of(elements: Elements, rates) -> tuple[Array, Array]:
+    """Rates of the gaps (n,) and of slipping (n, 2), of the rates (count,) of all rows."""
+    zero = jnp.zeros((), rates.dtype)
+    normal = jnp.stack([rates[one.normal] if one.opens else zero for one in elements.each])
+    tangent = [[rates[one.tangent[k]] if k < len(one.tangent) else zero for k in range(2)] for one in elements.each]
+    return normal, jnp.stack([jnp.stack(pair) for pair in tangent])

@@ -230,7 +230,9 @@ def _search(
     within = look_within(guards, *(Point(*end, jnp.zeros_like(search.values)) for end in ends))
     # Fixed steps fail where the state is not finite.
     good = decided.kept if is_adaptive else jnp.isfinite(step.projected).all()
-    after, kept, located, length = search_root(search, state.t, t_next, at_end, within, good, decided.length)
+    after, kept, located, length = search_root(
+        search, state.t, t_next, at_end, within, good, decided.length, plan.rounding
+    )
     after = after if is_adaptive else after._replace(usual=search.usual)
     # Steps that an event has cut may be shorter than the least one of the control.
     at_least, failed = decided.at_least & ~after.locating & ~located, decided.failed | (not is_adaptive)

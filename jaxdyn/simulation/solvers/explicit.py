@@ -88,7 +88,7 @@ class Plan(NamedTuple):
     """Definition of a step; equal plans share their programs.
 
     `quality(t, y, args)` () changes its sign where the method fails; `guards(t, y, args)` -> values and levels of rounding (k,),
-    of which one is negative where the motion or its mode ends.
+    of which one is negative where the motion or its mode ends; `rounding`, see `search_root`.
     """
 
     solver: type
@@ -100,6 +100,7 @@ class Plan(NamedTuple):
     shapes: tuple
     quality: Callable | None = None
     guards: Callable | None = None
+    rounding: float = 1.0
 
     @property
     def tableau(self) -> Any:

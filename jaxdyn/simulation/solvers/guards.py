@@ -140,22 +140,25 @@ def look_within(guards: Callable, start: Point, end: Point) -> list[Point]:
     return [middle, one, look(jnp.where(apart, fraction, 0.75))]
 
 
-def search_root(search: Search, t0, t1, at_end, within, good, usual) -> tuple[Search, Array, Array, Array]:
+def search_root(
+    search: Search, t0, t1, at_end, within, good, usual, rounding: float = 1.0
+) -> tuple[Search, Array, Array, Array]:
     """Narrow the bracket of an event by an attempt whose error is `good`, or begin one.
 
     **Returns:** the search; whether the step is kept, and whether it ends at an event; the length of the next attempt.
 
     **Arguments:** `at_end`: guards and their levels (k,); `within`: points of the step between its ends; `usual`: length of the
-    next step without event.
+    next step without event; `rounding`: share of its level that is the rounding of a guard. A guard that was within its level
+    where the step begins, as of a contact that rests beside others, is violated below the level; others are below rounding.
     """
-    values, levels = at_end
+    values, levels = at_end[0], _strict(search, at_end[1], rounding)
     length, eps, strict = t1 - t0, float(jnp.finfo(values.dtype).eps), ~search.loose
     # Within its rounding level the sign of a guard is not known.
     violated = (values < -levels).any()
     # Within the step: it is cut at the first of the points first.
     first, at = jnp.ones_like(length), values
     for point in within:
-        is_first = (point.values < -point.levels).any() & (point.fraction < first)
+        is_first = (point.values < -_strict(search, point.levels, rounding)).any() & (point.fraction < first)
         first, at = jnp.where(is_first, point.fraction, first), jnp.where(is_first, point.values, at)
     inside = good & ~search.locating & strict & (first < 1)
     crosses, violated = good & search.loose & violated, (violated & strict) | inside
@@ -192,6 +195,10 @@ def search_root(search: Search, t0, t1, at_end, within, good, usual) -> tuple[Se
         usual=jnp.where(search.locating & good, search.usual, usual),
     )
     return after, kept, located, bracket.next(is_narrow)
+
+
+def _strict(search: Search, levels, rounding: float):
+    return jnp.where(search.values > levels, rounding * levels, levels)
 
 
 def delay(guard: Callable, field: Callable, args, t, y) -> Any:
