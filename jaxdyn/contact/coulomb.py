@@ -1,0 +1,241 @@
+r"""Impulses of contacts with Coulomb's friction: the cone complementarity problem with de Saxce's correction.
+
+Contacts have impulses x in Lorentz cones K (half-lines for contacts without friction) and velocities y = W x + q, with W positive
+semidefinite, both in coordinates (normal, tangential) in which the friction coefficient is one (`scaled_rows`). Coulomb's law is
+
+    K contains x, orthogonal to s = (y0 + |y1|, y1) in K,
+
+without the term |y1| it is the convex relaxation of Anitescu, whose sliding contacts open with mu times the speed of sliding. The
+law holds where x = P(x - s), P the projection on K. `solve` takes Newton steps on these equations. Where they fail, it follows
+the solutions of the equations with smooth projections, whose width falls to zero.
+
+Redundant contacts leave W singular. Steps first solve for W + eps, whose solution is near the shortest x, and then, with the
+same matrix, for W: a proximal method, whose steps do not leave the range of W.
+
+Sources: Acary & Cadoux, Applications of an existence result for the Coulomb friction problem (2013); Anitescu, Optimization-based
+simulation of nonsmooth rigid multibody dynamics (2006); Hayashi, Yamashita & Fukushima, SIAM J. Optim. 15 (2005), 593-615.
+"""
+
+from functools import partial
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Bool, Float
+
+from jaxdyn.compile import batch
+from jaxdyn.contact import jordan
+from jaxdyn.lie.series import safe_sqrt
+from jaxdyn.lie.so3 import matmul
+
+Groups = tuple[tuple[int, int], ...]  # number and dimension of the cones of each group, in the order of the entries of x
+# First widths of the smooth projections, and their quotient from step to step, for each attempt; an attempt ends after so many
+# steps. Newton's method without a width solves 98 % of the problems of legged robots in 4 steps in the mean.
+_ATTEMPTS = ((0.0, 1.0, 14), (0.1, 0.1, 18), (1.0, 0.3, 36))
+# Lengths of a step that are tried; the one with the least residual is made.
+_LENGTHS = (1.0, 0.4, 0.1)
+_NARROW = 1e-12  # width that counts as zero
+
+
+class Solution(NamedTuple):
+    """Impulses x (m,), the residual of x = P(x - s) (), and whether it is below the tolerance."""
+
+    x: Float[Array, " m"]
+    residual: Float[Array, ""]
+    solved: Bool[Array, ""]
+
+
+class _State(NamedTuple):
+    x: Array
+    width: Array
+    error: Array  # of the equations of the attempt
+    is_exact: Array  # one where these are the equations of the law, zero while they have W + eps
+    step: Array
+    alive: Array  # one until it ends
+
+
+def split(groups: Groups, x) -> list:
+    """Entries of each group, (k, d)."""
+    parts, start = [], 0
+    for count, size in groups:
+        parts.append(x[start : start + count * size].reshape(count, size))
+        start += count * size
+    return parts
+
+
+def join(parts) -> Array:
+    """Entries of all groups, (m,)."""
+    return jnp.concatenate([part.reshape(-1) for part in parts])
+
+
+def _corrected(parts, width):
+    """Velocities s with de Saxce's correction, and the unit vectors y1 / |y1| of its derivative."""
+    corrected, along = [], []
+    for y in parts:
+        rest = y[:, 1:]
+        square = jnp.sum(rest * rest, 1) + width * width
+        speed = safe_sqrt(square)
+        unit = rest / jnp.where(speed > 0, speed, 1)[:, None]
+        corrected.append(jnp.concatenate([y[:, :1] + (speed - width)[:, None], rest], 1) if y.shape[1] > 1 else y)
+        along.append(unit)
+    return corrected, along
+
+
+def _residual(groups: Groups, x, y, width):
+    """Residual x - P(x - s) (m,), with the derivatives of the projection and of s."""
+    corrected, along = _corrected(split(groups, y), width)
+    projected, derivatives = [], []
+    for a, s in zip(split(groups, x), corrected, strict=True):
+        value, derivative = jordan.smooth_projection(a - s, width)
+        projected.append(value)
+        derivatives.append(derivative)
+    return x - join(projected), derivatives, along
+
+
+def _matrices(groups: Groups, derivatives, along, W):
+    """D S, applied to the columns of W, (m, n): D of the projection, S of the correction."""
+    rows, start = [], 0
+    for (count, size), D, unit in zip(groups, derivatives, along, strict=True):
+        block = W[start : start + count * size].reshape(count, size, -1)
+        if size > 1:
+            first = block[:, :1] + jnp.sum(unit[:, :, None] * block[:, 1:], 1, keepdims=True)
+            block = jnp.concatenate([first, block[:, 1:]], 1)
+        rows.append(jax.vmap(D.times, 2, 2)(block).reshape(count * size, -1))
+        start += count * size
+    return jnp.concatenate(rows)
+
+
+def _newton_matrix(groups: Groups, derivatives, along, W, shift):
+    """1 - D + D S (W + shift), (m, m)."""
+    unit = jnp.eye(W.shape[0], dtype=W.dtype)
+    none = [jnp.zeros_like(x) for x in along]
+    return (
+        unit - _matrices(groups, derivatives, none, unit) + _matrices(groups, derivatives, along, W + shift * unit)
+    )
+
+
+def eliminate(matrix, right):
+    """Solution of matrix x = right (n, k) by elimination without exchange of rows, which the diagonal blocks do not need."""
+    rows, tiny = [], float(jnp.finfo(matrix.dtype).tiny) ** 0.5
+    for _ in range(matrix.shape[0]):
+        pivot = matrix[0, 0]
+        # The caller sees from the residual that a step by a pivot of zero was of no use.
+        inverse = 1 / jnp.where(jnp.abs(pivot) > tiny, pivot, tiny)
+        rows.append((inverse, matrix[0, 1:], right[0]))
+        share = matrix[1:, :1] * inverse
+        matrix, right = matrix[1:, 1:] - share * matrix[:1, 1:], right[1:] - share * right[:1]
+    solution = jnp.zeros((0, right.shape[1]), right.dtype)
+    for inverse, row, value in reversed(rows):
+        rest = value - matmul(row, solution) if row.shape[0] else value
+        solution = jnp.concatenate([(rest * inverse)[None], solution])
+    return solution
+
+
+def _shift(dtype) -> float:
+    # Half of the digits for W, half for the dependent rows.
+    return float(jnp.finfo(dtype).eps) ** 0.5
+
+
+def tolerance(dtype) -> float:
+    """Residual of a solution, in scaled numbers."""
+    return float(jnp.finfo(dtype).eps) ** 0.7
+
+
+@partial(jax.jit, static_argnums=0)
+def _step(groups: Groups, W, q, floor, state: _State) -> _State:
+    x, width, error, is_exact, step, _ = state
+    dtype, eps, tol = x.dtype, float(jnp.finfo(x.dtype).eps), tolerance(x.dtype)
+    shift = _shift(dtype)
+    own = shift * (1 - is_exact)  # the share of eps in the equations
+    y = matmul(W, x) + q + own * x
+    residual, D, along = _residual(groups, x, y, width)
+    change = -eliminate(_newton_matrix(groups, D, along, W, shift), residual[:, None])[:, 0]
+    rate = matmul(W, change) + own * change
+    before = jnp.sqrt(jnp.sum(residual * residual))
+    # The best of a few lengths: each costs a projection, because y is linear.
+    best, after, length = x, jnp.full_like(before, jnp.inf), jnp.zeros_like(before)
+    for t in _LENGTHS:
+        tried = x + t * change
+        left, *_ = _residual(groups, tried, y + t * rate, width)
+        size = jnp.sqrt(jnp.sum(left * left))
+        # A full step is preferred: it converges quadratically, even if a shorter one would be better here.
+        better = size < after * (0.5 if t < 1 else 1.0)
+        best, after = jnp.where(better, tried, best), jnp.where(better, size, after)
+        length = jnp.where(better, jnp.full_like(length, t), length)
+    is_last = width <= floor
+    # On the path the width falls after a good step.
+    falls = ~is_last & ((length == 1.0) | (after < 0.3 * before))
+    quotient, first, limit = (jnp.zeros_like(step) for _ in range(3))
+    ends = 0
+    for i, (start, factor, count) in enumerate(_ATTEMPTS):
+        here = (step >= ends) & (step < ends + count)
+        ends += count
+        quotient = jnp.where(here, factor, quotient)
+        limit = jnp.where(here, ends, limit)
+        first = jnp.where(here, _ATTEMPTS[min(i + 1, len(_ATTEMPTS) - 1)][0], first)
+    narrow = width * quotient
+    narrow = jnp.where(narrow <= jnp.maximum(_NARROW, floor), floor, narrow)
+    # At rounding no step helps: only then a solution is better than its successor.
+    is_stuck = is_last & (before <= tol) & ~(after < 0.5 * before)
+    better = ~is_stuck & jnp.isfinite(after)
+    x, error = jnp.where(better, best, x), jnp.where(better, after, before)
+    done = is_last & ((error <= 8 * eps) | is_stuck)
+    exact = jnp.where(is_last & (done | (error <= tol)), 1.0, is_exact).astype(dtype)
+    # The solution for W + eps is not yet that for W: its first step is due.
+    ends_here = done & (is_exact > 0)
+    width = jnp.where(falls, narrow, width)
+    step = step + 1
+    # The next attempt begins at zero again.
+    restarts = (step == limit) & ~ends_here & ~((exact > 0) & (error <= tol))
+    x = jnp.where(restarts, jnp.zeros_like(x), x)
+    width = jnp.where(restarts, jnp.maximum(first, floor), width)
+    exact = jnp.where(restarts, 0.0, exact).astype(dtype)
+    return _State(x, width, error, exact, step, jnp.where(ends_here, 0.0, 1.0).astype(dtype))
+
+
+def solve(groups: Groups, W, q, width) -> Solution:
+    """Solve for x with W (m, m) and q (m,) of size one, and projections of a smooth `width` (), zero for Coulomb's law.
+
+    A function of kernels without a derivative (see `attach_derivative`).
+    """
+    dtype, tol = q.dtype, tolerance(q.dtype)
+    most = sum(count for *_, count in _ATTEMPTS)
+    start, *_ = _residual(groups, jnp.zeros_like(q), q, width)
+    # Where nothing touches, zero is the solution, and no step is made.
+    error = jnp.sqrt(jnp.sum(start * start))
+    alive = (error > 0).astype(dtype)
+    # A zero that the compiler does not know: the program of the first step is that of the others.
+    zero = jnp.where(error >= 0, 0.0, error).astype(dtype)
+    state = _State(jnp.full_like(q, zero), width + zero, error, zero, zero, alive)
+    state = batch.repeat_while(
+        lambda state: state.alive > 0, lambda state: _step(groups, W, q, width, state), state, most
+    )
+    left, *_ = _residual(groups, state.x, matmul(W, state.x) + q, width)
+    residual = jnp.sqrt(jnp.sum(left * left))
+    return Solution(state.x, residual, residual <= tol)
+
+
+@partial(jax.custom_jvp, nondiff_argnums=(0,))
+def attach_derivative(groups: Groups, W, y, width, x):
+    """The solution x (m,) with its derivative by the implicit function theorem; y (m,) = W x + q for a fixed x.
+
+    At a kink (a contact that only touches, friction at the boundary of its cone without sliding) the derivative of the projection is
+    the mean of both sides.
+    """
+    return x
+
+
+@attach_derivative.defjvp
+def _attach_derivative_jvp(groups: Groups, primals, tangents):
+    W, y, width, x = primals
+    # The recursion lets second derivatives account for the motion of x, which y does not contain.
+    moving = attach_derivative(groups, W, y, width, x)
+    y = y + matmul(W, moving - jax.lax.stop_gradient(moving))
+    _, D, along = _residual(groups, moving, y, width)
+    matrix = _newton_matrix(groups, D, along, W, _shift(x.dtype))
+    right = -_matrices(groups, D, along, tangents[1][:, None])
+    change = eliminate(matrix, right)
+    # One refinement, which removes the shift along the range of W.
+    rest = right - change + _matrices(groups, D, [jnp.zeros_like(a) for a in along], change)
+    rest = rest - _matrices(groups, D, along, matmul(W, change))
+    return moving, (change + eliminate(matrix, rest))[:, 0]

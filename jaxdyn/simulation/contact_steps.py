@@ -1,0 +1,347 @@
+r"""Steps of fixed length through contacts: time stepping, in which impacts and forces are impulses of a step.
+
+A step of length h from (q, v) has the velocity without contact forces by the midpoint rule, v_f = v + h a(q + h v/2, v + h a/2),
+with the multipliers of the scene's constraints in a. At the end q' = q + h v, with the rows A of the constraints and J of the
+contacts there and M at the midpoint, the velocity v' satisfies
+
+    M (v' - v_f) = A^T lam + J^T p,   A v' = b,   Coulomb's law between p and J v' (`jaxdyn.contact.coulomb`),
+
+where the normal velocity counts from a bound n . v' >= c:
+
+    c = -gap / h             the contact closes in the next step at the earliest,
+    c = min(-gap / h, -u)    for a gap below zero; u = n . v_f: no more velocity comes out than has come in,
+    c = -e u                 for an impact: the contact closes in the next step, with restitution e.
+
+If no contact closes, q' is that of the midpoint rule, q + h v/2 + h v'/2, and the step is of order two. A contact at rest has v = 0,
+and so q' = q to rounding: nothing creeps. q' is projected onto the holonomic constraints before the solve.
+
+Sources: Moreau, Unilateral contact and dry friction in finite freedom dynamics (1988); Stewart & Trinkle (1996); Acary & Brogliato,
+Numerical methods for nonsmooth dynamical systems (2008), chapters 10 and 13.
+"""
+
+from typing import Any, NamedTuple
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float
+
+from jaxdyn.compile import implicit, invalidate_derivatives, kernel, value_and_jvp
+from jaxdyn.constraints.base import constraint_jacobian, position_residual, velocity_residual
+from jaxdyn.constraints.codes import RESULTS, Outcome, Result
+from jaxdyn.constraints.dynamics import constrained_dynamics
+from jaxdyn.constraints.projection import project_state
+from jaxdyn.constraints.rank import regular_gram
+from jaxdyn.contact import coulomb
+from jaxdyn.contact.unilateral import UnilateralContact, WithModes
+from jaxdyn.dynamics.quantities import bias_force, mass_matrix
+from jaxdyn.forces.piecewise import Pieces
+from jaxdyn.lie.so3 import matmul
+from jaxdyn.model.joints import KINDS
+from jaxdyn.model.tree import Model
+from jaxdyn.simulation.hybrid.modes import elements_of, extend, force_at
+from jaxdyn.systems.mass_factor import cholesky, mass_factor, solve_cholesky
+from jaxdyn.systems.scene import Scene, has_drives
+from jaxdyn.systems.system import displace
+
+# An approach counts as an impact, with restitution, above this many times what forces change in a step: a rebound from a slower one
+# would end within a few steps.
+_IMPACT = 2.0
+
+
+class ContactStep(Outcome):
+    """Contact forces of a step.
+
+    - `forces`: by the contact's name, (n,), N: the normal force, and the friction along the rows of slip; means over the step, so
+      that those of an impact are its impulse over the step's length.
+    - `limit_forces` (nv,): of joint limits, N or N m.
+    - `result`: one of `jd.RESULTS`. Where it is not `successful` the state is NaN, with derivatives of NaN.
+    - `residual` (): of Coulomb's law, in numbers scaled to one.
+    """
+
+    forces: dict[str, Float[Array, "..."]]
+    limit_forces: Float[Array, " nv"]
+    result: Any
+    residual: Float[Array, ""]
+
+
+class Contacts(NamedTuple):
+    """Contacts of a scene in the order of the cones: those with two directions of slip, with one, and without; joint limits.
+
+    - `elements`: of `simulation.hybrid.modes`; `order`: their indices in the order of the cones.
+    - `limited`: indices in q and v of the joints whose limits hold. `own`: number of rows of the scene's constraints.
+    """
+
+    elements: tuple
+    order: tuple[int, ...]
+    limited: tuple[tuple[int, int], ...]
+    own: int
+
+    @property
+    def groups(self) -> coulomb.Groups:
+        """Numbers and dimensions of the cones."""
+        sizes = [1 + len(self.elements[i].tangent) for i in self.order]
+        groups = [(sizes.count(size), size) for size in (3, 2)]
+        return tuple(x for x in (*groups, (sizes.count(1) + len(self.limited), 1)) if x[0])
+
+    @property
+    def rows(self) -> np.ndarray:
+        """Rows of the contacts among those of the extended scene, in the order of the cones."""
+        chosen = [k for i in self.order for k in (self.elements[i].normal, *self.elements[i].tangent)]
+        return np.array(chosen, int)
+
+    @property
+    def normals(self) -> np.ndarray:
+        """Entries of the normals in the order of the cones."""
+        sizes = [1 + len(self.elements[i].tangent) for i in self.order] + [1] * len(self.limited)
+        return np.cumsum([0, *sizes])[:-1]
+
+
+def contacts_of(scene: Scene, limits: str | None) -> Contacts:
+    """Contacts of a scene. **Raises:** ValueError for other forces with modes, and drives with states."""
+    for force in scene.forces:
+        if isinstance(force, WithModes) and not isinstance(force, UnilateralContact):
+            raise ValueError(
+                f"stepper: {type(force).__name__} {force.name!r} sticks and slips by events, which steps of one length do not have; "
+                "take jd.simulate, or jd.forces.CoulombFriction in its place"
+            )
+        if isinstance(force, UnilateralContact):
+            _check_static(force)
+    if has_drives(scene):
+        raise ValueError("stepper: drives with states (jd.forces.DriveDynamics) have no steps with contacts or limits='hold'")
+    elements = elements_of(scene, Pieces((), ())) if any(isinstance(f, WithModes) for f in scene.forces) else None
+    each = () if elements is None else elements.each
+    order = sorted(range(len(each)), key=lambda i: -len(each[i].tangent))
+    return Contacts(each, tuple(order), _limited(scene, limits), 0 if elements is None else elements.own)
+
+
+def _check_static(force: UnilateralContact) -> None:
+    from jaxdyn.compile.known import is_concrete
+
+    pair = (force.coefficient, force.static)
+    if is_concrete(pair) and not np.array_equal(*map(np.asarray, pair)):
+        raise ValueError(
+            f"stepper: contact {force.name!r} has friction {pair[0]} and static {pair[1]}; time stepping has one coefficient: leave "
+            "static out, or take jd.simulate"
+        )
+
+
+def _limited(scene: Scene, limits: str | None) -> tuple[tuple[int, int], ...]:
+    """Indices in q and v of the joints of one coordinate that have a limit."""
+    if limits is None:
+        return ()
+    if limits != "hold":
+        raise ValueError(f"stepper: limits is {limits!r}; choose 'hold' or None")
+    model = scene.system
+    if not isinstance(model, Model):
+        raise ValueError(f"stepper: limits is 'hold', and a {type(model).__name__} has no joint limits; pass limits=None")
+    top, places = model.topology, []
+    for kind, at_q, at_v in zip(top.kinds, top.q_slices, top.v_slices, strict=True):
+        if KINDS[kind].nq == KINDS[kind].nv == 1:
+            places.append((at_q.start, at_v.start))
+    return tuple(places)
+
+
+class _Step(NamedTuple):
+    q: Array
+    v: Array
+    impulses: Array  # (m,), N s
+    x: Array  # of `coulomb.solve`
+    residual: Array
+    solved: Array
+    regular: Array  # whether the mass matrix is positive definite
+
+
+class _Terms(NamedTuple):
+    """Contacts at a configuration: gaps (k,), rows J (m, nv), and velocities J v - b at a velocity."""
+
+    gap: Array
+    J: Array
+    velocity: Any
+    side: Array  # of joint limits: 1 where the lower one is nearer, else -1
+
+
+def contact_step(contacts: Contacts, scene: Scene, q, v, tau, t, h, smoothing) -> tuple[Array, Array, ContactStep]:
+    """State after a step of length h (), and its contact forces; `smoothing` () in J."""
+    found = _advance(contacts, scene, q, v, tau, t, h, smoothing)
+    fine = found.solved & found.regular & jnp.isfinite(found.q).all() & jnp.isfinite(found.v).all()
+    result = RESULTS.where(found.solved, RESULTS.successful, RESULTS.no_contact_impulses)  # pyright: ignore[reportArgumentType]
+    result = RESULTS.where(fine | ~found.solved, result, RESULTS.nonfinite)  # pyright: ignore[reportArgumentType]
+    result = RESULTS.where(found.regular, result, RESULTS.singular_mass_matrix)  # pyright: ignore[reportArgumentType]
+    q1, v1, forces = (jnp.where(fine, x, jnp.nan) for x in (found.q, found.v, found.impulses / h))
+    q1, v1, forces = invalidate_derivatives((q1, v1, forces), ~fine, (scene, q, v, tau, t, h))
+    by_name, start = {}, 0
+    for i in contacts.order:
+        size = 1 + len(contacts.elements[i].tangent)
+        by_name[contacts.elements[i].name] = forces[start : start + size]
+        start += size
+    at_v = np.array([k for _, k in contacts.limited], int)
+    limit_forces = jnp.zeros_like(v).at[at_v].add(forces[start:])
+    by_name = {one.name: by_name[one.name] for one in contacts.elements}
+    return q1, v1, ContactStep(by_name, limit_forces, result, found.residual)
+
+
+def mean_of_steps(steps: ContactStep) -> ContactStep:
+    """Mean forces of several steps, the first code that is not `successful`, and the largest residual."""
+    forces, limit_forces = jax.tree.map(lambda x: jnp.mean(x, 0), (steps.forces, steps.limit_forces))
+    codes = steps.result.index
+    first = codes[jnp.argmax(codes != RESULTS.successful.index)]
+    return ContactStep(forces, limit_forces, Result(first), jnp.max(steps.residual))
+
+
+def _advance(contacts: Contacts, scene: Scene, *state) -> _Step:
+    def solve(scene, *state):
+        return kernel(_step, static=1, derivative=False)(contacts, scene, *state)
+
+    def tangent(scene, *rest):
+        *state, steps = rest
+        found = _advance(contacts, scene, *state)
+        x = jax.lax.stop_gradient(found.x)
+
+        def again(scene, *args):
+            return kernel(_step, static=1)(contacts, scene, *args)
+
+        _, change = value_and_jvp(again, (scene, *state, x), [*steps, None])
+        return found, jax.tree.map(jnp.zeros_like, found) if change is None else _fixed(found, change)
+
+    return implicit(scene, state, solve, tangent)
+
+
+def _fixed(found: _Step, change: _Step) -> _Step:
+    """The change with no derivative of flags and of the residual."""
+    float0 = lambda x: np.zeros(jnp.shape(x), jax.dtypes.float0)  # noqa: E731
+    return change._replace(
+        residual=jnp.zeros_like(found.residual), solved=float0(found.solved), regular=float0(found.regular)
+    )
+
+
+def _terms(contacts: Contacts, scene: Scene, q, v, t) -> _Terms:
+    """Contacts and joint limits at q; `scene` is the extended one."""
+    parts_gap, parts_J, parts_velocity, side = [], [], [], jnp.zeros((0,), q.dtype)
+    if contacts.elements:
+        # The rows of the contacts alone, which come behind those of the scene's constraints.
+        own = Scene(scene.system, scene.constraints[len(scene.constraints) - len(contacts.elements) :])
+        rows = contacts.rows - contacts.own
+        gaps = position_residual(own, q, t)
+        parts_gap.append(gaps[np.array(contacts.order, int)])
+        parts_J.append(constraint_jacobian(own, q, t)[rows])
+        parts_velocity.append(velocity_residual(own, q, v, t)[rows])
+    if contacts.limited:
+        at_q, at_v = (np.array(x, int) for x in zip(*contacts.limited, strict=True))
+        lower, upper = (jnp.asarray(x, q.dtype)[at_q] for x in (scene.system.lower, scene.system.upper))
+        # A joint has one row: it touches one of its limits at a time.
+        side = jnp.where(q[at_q] - lower <= upper - q[at_q], 1.0, -1.0).astype(q.dtype)
+        limit = jnp.where(side > 0, lower, upper)
+        # A joint without a limit is far from it.
+        bounded = jnp.isfinite(limit)
+        gap = jnp.where(bounded, side * (q[at_q] - jnp.where(bounded, limit, 0.0)), 1e6)
+        J = jnp.zeros((len(at_q), scene.nv), q.dtype).at[np.arange(len(at_q)), at_v].set(side)
+        parts_gap.append(gap)
+        parts_J.append(J)
+        parts_velocity.append(side * v[at_v])
+    return _Terms(*(jnp.concatenate(x) for x in (parts_gap, parts_J, parts_velocity)), side)
+
+
+def _free_velocity(scene: Scene, q, v, tau, t, h):
+    """Velocity after a step without contacts by the midpoint rule, the factor of M, and the middle of the step.
+
+    `scene` is without contacts.
+    """
+    system, middle = scene.system, t + 0.5 * h
+    place = displace(system, q, 0.5 * h * v)
+    metric = mass_factor(mass_matrix(system, place, middle))
+
+    def acceleration(v):
+        force = scene.drive_torque(place, v, middle, tau)[0]
+        if scene.constraints:
+            return constrained_dynamics(scene, place, v, force, middle).acceleration
+        applied = scene.applied_force(place, v, middle)
+        force = force if applied is None else force + applied
+        return metric.solve(force - bias_force(system, place, v, middle))
+
+    return v + h * acceleration(v + 0.5 * h * acceleration(v)), metric, place
+
+
+def _bounds(contacts: Contacts, scene: Scene, terms: _Terms, now, free, h):
+    """Bounds (k,) of the normal velocities; `now` (k,) are those at the start, `free` without contact forces."""
+    restitution = [force_at(scene, contacts.elements[i]).restitution for i in contacts.order]
+    e = jnp.stack([*restitution, *[jnp.zeros(())] * len(contacts.limited)]).astype(free.dtype)
+    reach = -terms.gap / h
+    bound = jnp.where(terms.gap < 0, jnp.minimum(reach, -free), reach)
+    # Closing in the next step, and faster than forces close it.
+    is_impact = (free < bound) & (-now > _IMPACT * jnp.abs(free - now)) & (e > 0)
+    return jnp.where(is_impact, jnp.maximum(bound, -e * free), bound)
+
+
+def _step(contacts: Contacts, scene: Scene, q, v, tau, t, h, smoothing, x=None) -> _Step:
+    """A step; with `x`, the solution of its contacts, an equation for its derivatives."""
+    whole = extend(scene)
+    bare = Scene(scene.system, scene.constraints, whole.forces)
+    free, metric, middle = _free_velocity(bare, q, v, tau, t, h)
+    end = t + h
+    place = displace(scene.system, middle, 0.5 * h * v)
+    terms = _terms(contacts, whole, place, free, end)
+    at = contacts.normals
+    now = terms.velocity[at] - matmul(terms.J[at], free - v)
+    bound = _bounds(contacts, scene, terms, now, terms.velocity[at], h)
+    closes = jnp.any(terms.velocity[at] < bound)
+    place = jnp.where(closes, place, displace(scene.system, middle, 0.5 * h * free))
+    correction, Y = jnp.zeros_like(v), metric.whiten(terms.J.T)
+    if scene.constraints:
+        place = project_state(bare, place, free, end)[0]
+        terms = _terms(contacts, whole, place, free, end)
+        now = terms.velocity[at] - matmul(terms.J[at], free - v)
+        bound = _bounds(contacts, scene, terms, now, terms.velocity[at], h)
+        # The rows of the scene's constraints are eliminated: what is left of J is orthogonal to them.
+        of_loops = metric.whiten(constraint_jacobian(bare, place, end).T)
+        factor, Y = cholesky(regular_gram(of_loops)), metric.whiten(terms.J.T)
+        correction = -matmul(of_loops, solve_cholesky(factor, velocity_residual(bare, place, free, end)))
+        rest = Y - matmul(of_loops, solve_cholesky(factor, matmul(of_loops.T, Y)))
+        relative = terms.velocity + matmul(Y.T, correction)
+        Y = rest
+    else:
+        relative = terms.velocity
+    relative = relative.at[at].add(-bound)
+    impulses, solution = _impulses(contacts, scene, Y, relative, smoothing, x)
+    velocity = free + metric.unwhiten(correction + matmul(Y, impulses))
+    signs = jnp.concatenate([jnp.ones((len(impulses) - len(contacts.limited),), q.dtype), terms.side])
+    impulses = impulses * signs
+    return _Step(place, velocity, impulses, solution.x, solution.residual, solution.solved, metric.is_definite())
+
+
+def _impulses(contacts: Contacts, scene: Scene, Y, relative, smoothing, x):
+    """Impulses (m,) of the contacts for velocities Y^T Y p + relative."""
+    dtype, groups, one = Y.dtype, contacts.groups, jnp.ones((), Y.dtype)
+    # Coordinates in which the friction coefficient is one, and the normal and tangential inertias are of size one.
+    squares, scales, start = jnp.sum(Y * Y, 0), [], 0
+    for size, mu in _sizes(contacts, scene):
+        mean = jnp.mean(jax.lax.stop_gradient(squares[start : start + size]))
+        unit = jnp.where(mean > 0, 1 / jnp.sqrt(jnp.where(mean > 0, mean, one)), one)
+        scales += [unit, *[unit * mu.astype(dtype)] * (size - 1)]
+        start += size
+    scale = jnp.stack(scales)
+    scaled = Y * scale[None]
+    q = scale * relative
+    size = jnp.max(jnp.abs(jax.lax.stop_gradient(q)))
+    size = jnp.where(size > 0, size, one)
+    width = jnp.sqrt(smoothing).astype(dtype) / size
+    W = matmul(scaled.T, scaled)
+    if x is None:
+        solution = coulomb.solve(groups, W, q / size, width)
+    else:
+        y = matmul(scaled.T, matmul(scaled, x)) + q / size
+        x = coulomb.attach_derivative(groups, W, y, jax.lax.stop_gradient(width), x)
+        solution = coulomb.Solution(x, jnp.zeros((), dtype), jnp.asarray(True))
+    return scale * solution.x * size, solution
+
+
+def _sizes(contacts: Contacts, scene: Scene):
+    """Dimension and friction coefficient of each cone."""
+    for i in contacts.order:
+        one = contacts.elements[i]
+        yield 1 + len(one.tangent), force_at(scene, one).coefficient
+    for _ in contacts.limited:
+        yield 1, jnp.ones(())
+
+
