@@ -110,7 +110,7 @@ def _newton_matrix(groups: Groups, derivatives, along, W, shift):
     unit = jnp.eye(W.shape[0], dtype=W.dtype)
     none = [jnp.zeros_like(x) for x in along]
     return (
-        unit - _matrices(groups, derivatives, none, unit) + _matrices(groups, derivatives, along, W + shift * unit)
+        unit - _matrices(groups, derivatives, none, unit) + _matrices(groups, derivatives, along, W + jnp.diag(shift))
     )
 
 
@@ -131,9 +131,13 @@ def eliminate(matrix, right):
     return solution
 
 
-def _shift(dtype) -> float:
+def _shift(scale) -> Array:
+    """Diagonal of eps, (m,), for impulses `scale` x: the solution for W + eps is near the impulses of least norm."""
+    squares = scale * scale
+    # Impulses without effect, of a friction coefficient of zero, have none: a least share keeps the matrix regular.
+    share = jnp.maximum(squares / jnp.max(squares), 1e-2)
     # Half of the digits for W, half for the dependent rows.
-    return float(jnp.finfo(dtype).eps) ** 0.5
+    return jax.lax.stop_gradient(float(jnp.finfo(scale.dtype).eps) ** 0.5 * share)
 
 
 def tolerance(dtype) -> float:
@@ -142,10 +146,9 @@ def tolerance(dtype) -> float:
 
 
 @partial(jax.jit, static_argnums=0)
-def _step(groups: Groups, W, q, floor, state: _State) -> _State:
+def _step(groups: Groups, W, q, floor, shift, state: _State) -> _State:
     x, width, error, is_exact, step, _ = state
     dtype, eps, tol = x.dtype, float(jnp.finfo(x.dtype).eps), tolerance(x.dtype)
-    shift = _shift(dtype)
     own = shift * (1 - is_exact)  # the share of eps in the equations
     y = matmul(W, x) + q + own * x
     residual, D, along = _residual(groups, x, y, width)
@@ -193,12 +196,14 @@ def _step(groups: Groups, W, q, floor, state: _State) -> _State:
     return _State(x, width, error, exact, step, jnp.where(ends_here, 0.0, 1.0).astype(dtype))
 
 
-def solve(groups: Groups, W, q, width) -> Solution:
+def solve(groups: Groups, W, q, scale, width) -> Solution:
     """Solve for x with W (m, m) and q (m,) of size one, and projections of a smooth `width` (), zero for Coulomb's law.
+
+    Of several solutions it is that with impulses `scale` x of least norm, `scale` (m,).
 
     A function of kernels without a derivative (see `attach_derivative`).
     """
-    dtype, tol = q.dtype, tolerance(q.dtype)
+    dtype, tol, shift = q.dtype, tolerance(q.dtype), _shift(scale)
     most = sum(count for *_, count in _ATTEMPTS)
     start, *_ = _residual(groups, jnp.zeros_like(q), q, width)
     # Where nothing touches, zero is the solution, and no step is made.
@@ -208,7 +213,7 @@ def solve(groups: Groups, W, q, width) -> Solution:
     zero = jnp.where(error >= 0, 0.0, error).astype(dtype)
     state = _State(jnp.full_like(q, zero), width + zero, error, zero, zero, alive)
     state = batch.repeat_while(
-        lambda state: state.alive > 0, lambda state: _step(groups, W, q, width, state), state, most
+        lambda state: state.alive > 0, lambda state: _step(groups, W, q, width, shift, state), state, most
     )
     left, *_ = _residual(groups, state.x, matmul(W, state.x) + q, width)
     residual = jnp.sqrt(jnp.sum(left * left))
@@ -216,7 +221,7 @@ def solve(groups: Groups, W, q, width) -> Solution:
 
 
 @partial(jax.custom_jvp, nondiff_argnums=(0,))
-def attach_derivative(groups: Groups, W, y, width, x):
+def attach_derivative(groups: Groups, W, y, scale, width, x):
     """The solution x (m,) with its derivative by the implicit function theorem; y (m,) = W x + q for a fixed x.
 
     At a kink (a contact that only touches, friction at the boundary of its cone without sliding) the derivative of the projection is
@@ -227,12 +232,12 @@ def attach_derivative(groups: Groups, W, y, width, x):
 
 @attach_derivative.defjvp
 def _attach_derivative_jvp(groups: Groups, primals, tangents):
-    W, y, width, x = primals
+    W, y, scale, width, x = primals
     # The recursion lets second derivatives account for the motion of x, which y does not contain.
-    moving = attach_derivative(groups, W, y, width, x)
+    moving = attach_derivative(groups, W, y, scale, width, x)
     y = y + matmul(W, moving - jax.lax.stop_gradient(moving))
     _, D, along = _residual(groups, moving, y, width)
-    matrix = _newton_matrix(groups, D, along, W, _shift(x.dtype))
+    matrix = _newton_matrix(groups, D, along, W, _shift(scale))
     right = -_matrices(groups, D, along, tangents[1][:, None])
     change = eliminate(matrix, right)
     # One refinement, which removes the shift along the range of W.

@@ -328,10 +328,10 @@ def _impulses(contacts: Contacts, scene: Scene, Y, relative, smoothing, x):
     width = jnp.sqrt(smoothing).astype(dtype) / size
     W = matmul(scaled.T, scaled)
     if x is None:
-        solution = coulomb.solve(groups, W, q / size, width)
+        solution = coulomb.solve(groups, W, q / size, scale, width)
     else:
         y = matmul(scaled.T, matmul(scaled, x)) + q / size
-        x = coulomb.attach_derivative(groups, W, y, jax.lax.stop_gradient(width), x)
+        x = coulomb.attach_derivative(groups, W, y, scale, jax.lax.stop_gradient(width), x)
         solution = coulomb.Solution(x, jnp.zeros((), dtype), jnp.asarray(True))
     return scale * solution.x * size, solution
 
