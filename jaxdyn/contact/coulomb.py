@@ -215,9 +215,14 @@ def solve(groups: Groups, W, q, scale, width) -> Solution:
     state = batch.repeat_while(
         lambda state: state.alive > 0, lambda state: _step(groups, W, q, width, shift, state), state, most
     )
-    left, *_ = _residual(groups, state.x, matmul(W, state.x) + q, width)
-    residual = jnp.sqrt(jnp.sum(left * left))
+    residual = residual_at(groups, state.x, matmul(W, state.x) + q, width)
     return Solution(state.x, residual, residual <= tol)
+
+
+def residual_at(groups: Groups, x, y, width) -> Array:
+    """Length () of x - P(x - s) for impulses x and velocities y."""
+    left, *_ = _residual(groups, x, y, width)
+    return jnp.sqrt(jnp.sum(left * left))
 
 
 @partial(jax.custom_jvp, nondiff_argnums=(0,))

@@ -10,7 +10,7 @@ where the normal velocity counts from a bound n . v' >= c:
 
     c = -gap / h             the contact closes in the next step at the earliest,
     c = min(-gap / h, -u)    for a gap below zero; u = n . v_f: no more velocity comes out than has come in,
-    c = -e u                 for an impact: the contact closes in the next step, with restitution e.
+    c = e |u|                for an impact: the contact closes in the next step, with restitution e.
 
 If no contact closes, q' is that of the midpoint rule, q + h v/2 + h v'/2, and the step is of order two. A contact at rest has v = 0,
 and so q' = q to rounding: nothing creeps. q' is projected onto the holonomic constraints before the solve.
@@ -271,7 +271,11 @@ def _bounds(contacts: Contacts, scene: Scene, terms: _Terms, now, free, h):
     bound = jnp.where(terms.gap < 0, jnp.minimum(reach, -free), reach)
     # Closing in the next step, and faster than forces close it.
     is_impact = (free < bound) & (-now > _IMPACT * jnp.abs(free - now)) & (e > 0)
-    return jnp.where(is_impact, jnp.maximum(bound, -e * free), bound)
+    # Under a constant force, which changes the velocity by d in the step, the velocity u after the way h u is the root of
+    # (u + d)^2 - d^2: so restitution of one keeps the energy.
+    change = free - now
+    speed = jnp.sqrt(jnp.where(is_impact, free * free - change * change, jnp.ones_like(free)))
+    return jnp.where(is_impact, jnp.maximum(bound, e * speed), bound)
 
 
 def _step(contacts: Contacts, scene: Scene, q, v, tau, t, h, smoothing, x=None) -> _Step:
@@ -331,8 +335,10 @@ def _impulses(contacts: Contacts, scene: Scene, Y, relative, smoothing, x):
         solution = coulomb.solve(groups, W, q / size, scale, width)
     else:
         y = matmul(scaled.T, matmul(scaled, x)) + q / size
+        # The residual is no more than a reader of all arguments: programs leave out those that no value depends on.
+        residual = coulomb.residual_at(groups, x, y, width)
         x = coulomb.attach_derivative(groups, W, y, scale, jax.lax.stop_gradient(width), x)
-        solution = coulomb.Solution(x, jnp.zeros((), dtype), jnp.asarray(True))
+        solution = coulomb.Solution(x, residual, residual >= 0)
     return scale * solution.x * size, solution
 
 
