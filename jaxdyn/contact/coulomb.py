@@ -35,23 +35,29 @@ _ATTEMPTS = ((0.0, 1.0, 14), (0.1, 0.1, 18), (1.0, 0.3, 36))
 # Lengths of a step that are tried; the one with the least residual is made.
 _LENGTHS = (1.0, 0.4, 0.1)
 _NARROW = 1e-12  # width that counts as zero
+_ROUNDING = 32  # residual that counts as rounding, in eps
 
 
 class Solution(NamedTuple):
-    """Impulses x (m,), the residual of x = P(x - s) (), and whether it is below the tolerance."""
+    """Impulses x (m,), the residual of x = P(x - s) (), whether it is below the tolerance, and the number of steps ()."""
 
     x: Float[Array, " m"]
     residual: Float[Array, ""]
     solved: Bool[Array, ""]
+    steps: Float[Array, ""]
 
 
 class _State(NamedTuple):
     x: Array
-    width: Array
-    error: Array  # of the equations of the attempt
-    is_exact: Array  # one where these are the equations of the law, zero while they have W + eps
+    width: Array  # of the projections
+    stage: Array
     step: Array
     alive: Array  # one until it ends
+
+
+# Stages of the last width. Most problems have independent rows, and end in the first one. Where the matrix has a pivot of rounding,
+# the solution is not unique: the equations with W + eps give that of least norm, and the proximal steps remove eps.
+_PLAIN, _SHIFTED, _PROXIMAL = 0.0, 1.0, 2.0
 
 
 def split(groups: Groups, x) -> list:
@@ -92,35 +98,45 @@ def _residual(groups: Groups, x, y, width):
     return x - join(projected), derivatives, along
 
 
-def _matrices(groups: Groups, derivatives, along, W):
-    """D S, applied to the columns of W, (m, n): D of the projection, S of the correction."""
-    rows, start = [], 0
-    for (count, size), D, unit in zip(groups, derivatives, along, strict=True):
-        block = W[start : start + count * size].reshape(count, size, -1)
-        if size > 1:
-            first = block[:, :1] + jnp.sum(unit[:, :, None] * block[:, 1:], 1, keepdims=True)
-            block = jnp.concatenate([first, block[:, 1:]], 1)
-        rows.append(jax.vmap(D.times, 2, 2)(block).reshape(count * size, -1))
-        start += count * size
-    return jnp.concatenate(rows)
+def _blocks(derivatives, along) -> list:
+    """D, and D S, of each group (k, d, d): D of the projection, S of the correction."""
+    blocks = []
+    for D, unit in zip(derivatives, along, strict=True):
+        size = 1 + unit.shape[1]
+        matrix = jax.vmap(D.times, 2, 2)(jnp.broadcast_to(jnp.eye(size, dtype=unit.dtype), (len(unit), size, size)))
+        # S adds the product of the unit vector with the tangential rows to the normal row.
+        corrected = matrix[:, :, 1:] + matrix[:, :, :1] * unit[:, None, :]
+        blocks.append((matrix, jnp.concatenate([matrix[:, :, :1], corrected], 2)))
+    return blocks
 
 
-def _newton_matrix(groups: Groups, derivatives, along, W, shift):
+def _apply(groups: Groups, blocks, rows) -> Array:
+    """Product of a block-diagonal matrix with rows (m, n)."""
+    parts, start = [], 0
+    for (count, size), block in zip(groups, blocks, strict=True):
+        for i in range(count):
+            parts.append(matmul(block[i], rows[start : start + size]))
+            start += size
+    return jnp.concatenate(parts)
+
+
+def _newton_matrix(groups: Groups, blocks, W, shift) -> Array:
     """1 - D + D S (W + shift), (m, m)."""
     unit = jnp.eye(W.shape[0], dtype=W.dtype)
-    none = [jnp.zeros_like(x) for x in along]
-    return (
-        unit - _matrices(groups, derivatives, none, unit) + _matrices(groups, derivatives, along, W + jnp.diag(shift))
-    )
+    D, DS = zip(*blocks, strict=True)
+    return unit - _apply(groups, D, unit) + _apply(groups, DS, W + jnp.diag(shift))
 
 
-def eliminate(matrix, right):
-    """Solution of matrix x = right (n, k) by elimination without exchange of rows, which the diagonal blocks do not need."""
-    rows, tiny = [], float(jnp.finfo(matrix.dtype).tiny) ** 0.5
+def eliminate(matrix, right) -> tuple[Array, Array]:
+    """Solution of matrix x = right (n, k) by elimination without exchange of rows, and the least size () of a pivot.
+
+    The diagonal blocks need no exchange. A pivot below the square root of rounding is replaced by that: the rows are dependent.
+    """
+    rows, pivots, least = [], [], float(jnp.finfo(matrix.dtype).eps) ** 0.5
     for _ in range(matrix.shape[0]):
         pivot = matrix[0, 0]
-        # The caller sees from the residual that a step by a pivot of zero was of no use.
-        inverse = 1 / jnp.where(jnp.abs(pivot) > tiny, pivot, tiny)
+        pivots.append(jnp.abs(pivot))
+        inverse = 1 / jnp.where(jnp.abs(pivot) > least, pivot, least)
         rows.append((inverse, matrix[0, 1:], right[0]))
         share = matrix[1:, :1] * inverse
         matrix, right = matrix[1:, 1:] - share * matrix[:1, 1:], right[1:] - share * right[:1]
@@ -128,7 +144,7 @@ def eliminate(matrix, right):
     for inverse, row, value in reversed(rows):
         rest = value - matmul(row, solution) if row.shape[0] else value
         solution = jnp.concatenate([(rest * inverse)[None], solution])
-    return solution
+    return solution, jnp.min(jnp.stack(pivots))
 
 
 def _shift(scale) -> Array:
@@ -146,13 +162,15 @@ def tolerance(dtype) -> float:
 
 
 @partial(jax.jit, static_argnums=0)
-def _step(groups: Groups, W, q, floor, shift, state: _State) -> _State:
-    x, width, error, is_exact, step, _ = state
+def _step(groups: Groups, W, q, floor, shift, first_stage, state: _State) -> _State:
+    x, width, stage, step, _ = state
     dtype, eps, tol = x.dtype, float(jnp.finfo(x.dtype).eps), tolerance(x.dtype)
-    own = shift * (1 - is_exact)  # the share of eps in the equations
+    own = jnp.where(stage == _SHIFTED, shift, 0.0)
     y = matmul(W, x) + q + own * x
     residual, D, along = _residual(groups, x, y, width)
-    change = -eliminate(_newton_matrix(groups, D, along, W, shift), residual[:, None])[:, 0]
+    matrix = _newton_matrix(groups, _blocks(D, along), W, jnp.where(stage == _PLAIN, 0.0, shift))
+    change, pivot = eliminate(matrix, -residual[:, None])
+    change = change[:, 0]
     rate = matmul(W, change) + own * change
     before = jnp.sqrt(jnp.sum(residual * residual))
     # The best of a few lengths: each costs a projection, because y is linear.
@@ -166,57 +184,61 @@ def _step(groups: Groups, W, q, floor, shift, state: _State) -> _State:
         best, after = jnp.where(better, tried, best), jnp.where(better, size, after)
         length = jnp.where(better, jnp.full_like(length, t), length)
     is_last = width <= floor
-    # On the path the width falls after a good step.
-    falls = ~is_last & ((length == 1.0) | (after < 0.3 * before))
-    quotient, first, limit = (jnp.zeros_like(step) for _ in range(3))
-    ends = 0
-    for i, (start, factor, count) in enumerate(_ATTEMPTS):
-        here = (step >= ends) & (step < ends + count)
-        ends += count
-        quotient = jnp.where(here, factor, quotient)
-        limit = jnp.where(here, ends, limit)
-        first = jnp.where(here, _ATTEMPTS[min(i + 1, len(_ATTEMPTS) - 1)][0], first)
-    narrow = width * quotient
-    narrow = jnp.where(narrow <= jnp.maximum(_NARROW, floor), floor, narrow)
-    # At rounding no step helps: only then a solution is better than its successor.
+    # At rounding no step helps.
     is_stuck = is_last & (before <= tol) & ~(after < 0.5 * before)
     better = ~is_stuck & jnp.isfinite(after)
     x, error = jnp.where(better, best, x), jnp.where(better, after, before)
-    done = is_last & ((error <= 8 * eps) | is_stuck)
-    exact = jnp.where(is_last & (done | (error <= tol)), 1.0, is_exact).astype(dtype)
-    # The solution for W + eps is not yet that for W: its first step is due.
-    ends_here = done & (is_exact > 0)
-    width = jnp.where(falls, narrow, width)
-    step = step + 1
+    is_done = is_last & ((error <= _ROUNDING * eps) | is_stuck)
+    is_unique = pivot > 1e2 * eps**0.5
+    ends = is_done & ((stage == _PROXIMAL) | ((stage == _PLAIN) & is_unique))
+    following = jnp.where(is_done & (stage == _PLAIN), _SHIFTED, stage)
+    following = jnp.where(is_last & (stage == _SHIFTED) & (error <= tol), _PROXIMAL, following)
+    # The width falls after a good step.
+    factor, start, is_over = _schedule(step)
+    narrow = jnp.where(width * factor <= jnp.maximum(_NARROW, floor), floor, width * factor)
+    width = jnp.where(~is_last & ((length == 1.0) | (after < 0.3 * before)), narrow, width)
     # The next attempt begins at zero again.
-    restarts = (step == limit) & ~ends_here & ~((exact > 0) & (error <= tol))
+    restarts = is_over & ~ends & ~(is_last & (error <= tol))
     x = jnp.where(restarts, jnp.zeros_like(x), x)
-    width = jnp.where(restarts, jnp.maximum(first, floor), width)
-    exact = jnp.where(restarts, 0.0, exact).astype(dtype)
-    return _State(x, width, error, exact, step, jnp.where(ends_here, 0.0, 1.0).astype(dtype))
+    width = jnp.where(restarts, jnp.maximum(start, floor), width)
+    following = jnp.where(restarts, first_stage, following)
+    return _State(x, width, following, step + 1, jnp.where(ends, 0.0, 1.0).astype(dtype))
 
 
-def solve(groups: Groups, W, q, scale, width) -> Solution:
+def _schedule(step):
+    """Quotient of widths in the attempt of a step, the first width of the next one, and whether the attempt ends."""
+    factor, start, is_over, end = jnp.zeros_like(step), jnp.zeros_like(step), step < 0, 0
+    for i, (_, quotient, count) in enumerate(_ATTEMPTS):
+        here = (step >= end) & (step < end + count)
+        end += count
+        factor = jnp.where(here, quotient, factor)
+        start = jnp.where(here, _ATTEMPTS[min(i + 1, len(_ATTEMPTS) - 1)][0], start)
+        is_over = is_over | (step == end - 1)
+    return factor, start, is_over
+
+
+def solve(groups: Groups, is_redundant: bool, W, q, scale, width) -> Solution:
     """Solve for x with W (m, m) and q (m,) of size one, and projections of a smooth `width` (), zero for Coulomb's law.
 
-    Of several solutions it is that with impulses `scale` x of least norm, `scale` (m,).
-
-    A function of kernels without a derivative (see `attach_derivative`).
+    Of several solutions it is that with impulses `scale` x of least norm, `scale` (m,). `is_redundant`: whether W is known to be
+    singular. A function of kernels without a derivative (see `attach_derivative`).
     """
     dtype, tol, shift = q.dtype, tolerance(q.dtype), _shift(scale)
-    most = sum(count for *_, count in _ATTEMPTS)
     start, *_ = _residual(groups, jnp.zeros_like(q), q, width)
     # Where nothing touches, zero is the solution, and no step is made.
     error = jnp.sqrt(jnp.sum(start * start))
-    alive = (error > 0).astype(dtype)
     # A zero that the compiler does not know: the program of the first step is that of the others.
     zero = jnp.where(error >= 0, 0.0, error).astype(dtype)
-    state = _State(jnp.full_like(q, zero), width + zero, error, zero, zero, alive)
+    first = zero + (_SHIFTED if is_redundant else _PLAIN)
+    state = _State(jnp.full_like(q, zero), width + zero, first, zero, (error > 0).astype(dtype))
     state = batch.repeat_while(
-        lambda state: state.alive > 0, lambda state: _step(groups, W, q, width, shift, state), state, most
+        lambda state: state.alive > 0,
+        lambda state: _step(groups, W, q, width, shift, first, state),
+        state,
+        sum(count for *_, count in _ATTEMPTS),
     )
     residual = residual_at(groups, state.x, matmul(W, state.x) + q, width)
-    return Solution(state.x, residual, residual <= tol)
+    return Solution(state.x, residual, residual <= tol, state.step)
 
 
 def residual_at(groups: Groups, x, y, width) -> Array:
@@ -242,10 +264,11 @@ def _attach_derivative_jvp(groups: Groups, primals, tangents):
     moving = attach_derivative(groups, W, y, scale, width, x)
     y = y + matmul(W, moving - jax.lax.stop_gradient(moving))
     _, D, along = _residual(groups, moving, y, width)
-    matrix = _newton_matrix(groups, D, along, W, _shift(scale))
-    right = -_matrices(groups, D, along, tangents[1][:, None])
-    change = eliminate(matrix, right)
-    # One refinement, which removes the shift along the range of W.
-    rest = right - change + _matrices(groups, D, [jnp.zeros_like(a) for a in along], change)
-    rest = rest - _matrices(groups, D, along, matmul(W, change))
-    return moving, (change + eliminate(matrix, rest))[:, 0]
+    blocks = _blocks(D, along)
+    (_, DS), shift = zip(*blocks, strict=True), _shift(scale)
+    matrix = _newton_matrix(groups, blocks, W, shift)
+    right = -_apply(groups, DS, tangents[1][:, None])
+    change, _ = eliminate(matrix, right)
+    # One refinement removes the shift along the range of W.
+    rest, _ = eliminate(matrix, _apply(groups, DS, shift[:, None] * change))
+    return moving, (change + rest)[:, 0]

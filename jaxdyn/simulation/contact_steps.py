@@ -19,9 +19,9 @@ Sources: Moreau, Unilateral contact and dry friction in finite freedom dynamics 
 Numerical methods for nonsmooth dynamical systems (2008), chapters 10 and 13.
 """
 
+from functools import partial
 from typing import Any, NamedTuple
 
-import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -41,7 +41,7 @@ from jaxdyn.lie.so3 import matmul
 from jaxdyn.model.joints import KINDS
 from jaxdyn.model.tree import Model
 from jaxdyn.simulation.hybrid.modes import elements_of, extend, force_at
-from jaxdyn.systems.mass_factor import cholesky, mass_factor, solve_cholesky
+from jaxdyn.systems.mass_factor import MassFactor, cholesky, mass_factor, solve_cholesky
 from jaxdyn.systems.scene import Scene, has_drives
 from jaxdyn.systems.system import displace
 
@@ -150,6 +150,7 @@ class _Step(NamedTuple):
     x: Array  # of `coulomb.solve`
     residual: Array
     solved: Array
+    steps: Array
     regular: Array  # whether the mass matrix is positive definite
 
 
@@ -212,7 +213,7 @@ def _fixed(found: _Step, change: _Step) -> _Step:
     """The change with no derivative of flags and of the residual."""
     float0 = lambda x: np.zeros(jnp.shape(x), jax.dtypes.float0)  # noqa: E731
     return change._replace(
-        residual=jnp.zeros_like(found.residual), solved=float0(found.solved), regular=float0(found.regular)
+        residual=jnp.zeros_like(found.residual), steps=jnp.zeros_like(found.steps), solved=float0(found.solved), regular=float0(found.regular)
     )
 
 
@@ -263,83 +264,104 @@ def _free_velocity(scene: Scene, q, v, tau, t, h):
     return v + h * acceleration(v + 0.5 * h * acceleration(v)), metric, place
 
 
-def _bounds(contacts: Contacts, scene: Scene, terms: _Terms, now, free, h):
-    """Bounds (k,) of the normal velocities; `now` (k,) are those at the start, `free` without contact forces."""
+def _bounds(contacts: Contacts, scene: Scene, terms: _Terms, v, free, h):
+    """Bounds (k,) of the normal velocities; v (nv,) is the velocity at the start, `free` that without contact forces."""
+    at = contacts.normals
+    change, free = matmul(terms.J[at], free - v), terms.velocity[at]
+    now = free - change
     restitution = [force_at(scene, contacts.elements[i]).restitution for i in contacts.order]
     e = jnp.stack([*restitution, *[jnp.zeros(())] * len(contacts.limited)]).astype(free.dtype)
     reach = -terms.gap / h
     bound = jnp.where(terms.gap < 0, jnp.minimum(reach, -free), reach)
     # Closing in the next step, and faster than forces close it.
-    is_impact = (free < bound) & (-now > _IMPACT * jnp.abs(free - now)) & (e > 0)
+    is_impact = (free < bound) & (-now > _IMPACT * jnp.abs(change)) & (e > 0)
     # Under a constant force, which changes the velocity by d in the step, the velocity u after the way h u is the root of
     # (u + d)^2 - d^2: so restitution of one keeps the energy.
-    change = free - now
     speed = jnp.sqrt(jnp.where(is_impact, free * free - change * change, jnp.ones_like(free)))
     return jnp.where(is_impact, jnp.maximum(bound, e * speed), bound)
 
 
+class _Problem(NamedTuple):
+    """Complementarity problem of a step in scaled numbers, and what its solution x changes: velocity + push x.
+
+    `W` (m, m), `q` (m,) and `scale` (m,) as of `coulomb.solve`; impulses are `scale` x `size`.
+    """
+
+    place: Array
+    velocity: Array
+    metric: MassFactor
+    Y: Array
+    W: Array
+    q: Array
+    scale: Array
+    size: Array
+    side: Array
+
+
 def _step(contacts: Contacts, scene: Scene, q, v, tau, t, h, smoothing, x=None) -> _Step:
     """A step; with `x`, the solution of its contacts, an equation for its derivatives."""
+    # One subprogram, in which the zeros of the rows are known, as far as they are.
+    problem = jax.jit(partial(_problem, contacts, scene))(q, v, tau, t, h)
+    scaled, width = problem.Y * problem.scale[None], jnp.sqrt(smoothing) / problem.size
+    if x is None:
+        is_redundant = len(problem.q) + contacts.own > scene.nv
+        solution = coulomb.solve(contacts.groups, is_redundant, problem.W, problem.q, problem.scale, width)
+        x, residual, solved, steps = solution
+    else:
+        y = matmul(scaled.T, matmul(scaled, x)) + problem.q
+        # The residual is no more than a reader of all arguments: programs leave out those that no value depends on.
+        residual = coulomb.residual_at(contacts.groups, x, y, width)
+        solved, steps = residual >= 0, residual
+        x = coulomb.attach_derivative(contacts.groups, problem.W, y, problem.scale, jax.lax.stop_gradient(width), x)
+    velocity = problem.velocity + problem.metric.unwhiten(matmul(scaled, x) * problem.size)
+    signs = jnp.concatenate([jnp.ones((len(x) - len(contacts.limited),), q.dtype), problem.side])
+    impulses = problem.scale * x * problem.size * signs
+    return _Step(problem.place, velocity, impulses, x, residual, solved, steps, problem.metric.is_definite())
+
+
+def _problem(contacts: Contacts, scene: Scene, q, v, tau, t, h) -> _Problem:
     whole = extend(scene)
     bare = Scene(scene.system, scene.constraints, whole.forces)
     free, metric, middle = _free_velocity(bare, q, v, tau, t, h)
     end = t + h
     place = displace(scene.system, middle, 0.5 * h * v)
     terms = _terms(contacts, whole, place, free, end)
-    at = contacts.normals
-    now = terms.velocity[at] - matmul(terms.J[at], free - v)
-    bound = _bounds(contacts, scene, terms, now, terms.velocity[at], h)
-    closes = jnp.any(terms.velocity[at] < bound)
+    bound = _bounds(contacts, scene, terms, v, free, h)
+    closes = jnp.any(terms.velocity[contacts.normals] < bound)
     place = jnp.where(closes, place, displace(scene.system, middle, 0.5 * h * free))
-    correction, Y = jnp.zeros_like(v), metric.whiten(terms.J.T)
-    if scene.constraints:
-        place = project_state(bare, place, free, end)[0]
-        terms = _terms(contacts, whole, place, free, end)
-        now = terms.velocity[at] - matmul(terms.J[at], free - v)
-        bound = _bounds(contacts, scene, terms, now, terms.velocity[at], h)
-        # The rows of the scene's constraints are eliminated: what is left of J is orthogonal to them.
-        of_loops = metric.whiten(constraint_jacobian(bare, place, end).T)
-        factor, Y = cholesky(regular_gram(of_loops)), metric.whiten(terms.J.T)
-        correction = -matmul(of_loops, solve_cholesky(factor, velocity_residual(bare, place, free, end)))
-        rest = Y - matmul(of_loops, solve_cholesky(factor, matmul(of_loops.T, Y)))
-        relative = terms.velocity + matmul(Y.T, correction)
-        Y = rest
-    else:
-        relative = terms.velocity
-    relative = relative.at[at].add(-bound)
-    impulses, solution = _impulses(contacts, scene, Y, relative, smoothing, x)
-    velocity = free + metric.unwhiten(correction + matmul(Y, impulses))
-    signs = jnp.concatenate([jnp.ones((len(impulses) - len(contacts.limited),), q.dtype), terms.side])
-    impulses = impulses * signs
-    return _Step(place, velocity, impulses, solution.x, solution.residual, solution.solved, metric.is_definite())
+    if not scene.constraints:
+        return _scaled(contacts, scene, metric, metric.whiten(terms.J.T), place, free, terms, terms.velocity, bound)
+    place = project_state(bare, place, free, end)[0]
+    terms = _terms(contacts, whole, place, free, end)
+    bound = _bounds(contacts, scene, terms, v, free, h)
+    # The rows of the scene's constraints are eliminated: what is left of Y is orthogonal to them.
+    of_loops, Y = metric.whiten(constraint_jacobian(bare, place, end).T), metric.whiten(terms.J.T)
+    factor = cholesky(regular_gram(of_loops))
+    closed = -matmul(of_loops, solve_cholesky(factor, velocity_residual(bare, place, free, end)))
+    rest = Y - matmul(of_loops, solve_cholesky(factor, matmul(of_loops.T, Y)))
+    velocities = terms.velocity + matmul(Y.T, closed)
+    return _scaled(
+        contacts, scene, metric, rest, place, free + metric.unwhiten(closed), terms, velocities, bound
+    )
 
 
-def _impulses(contacts: Contacts, scene: Scene, Y, relative, smoothing, x):
-    """Impulses (m,) of the contacts for velocities Y^T Y p + relative."""
-    dtype, groups, one = Y.dtype, contacts.groups, jnp.ones((), Y.dtype)
-    # Coordinates in which the friction coefficient is one, and the normal and tangential inertias are of size one.
-    squares, scales, start = jnp.sum(Y * Y, 0), [], 0
+def _scaled(
+    contacts: Contacts, scene: Scene, metric: MassFactor, Y, place, velocity, terms: _Terms, velocities, bound
+) -> _Problem:
+    """Coordinates in which the friction coefficient is one, and the mean inertia of a contact."""
+    one, scales, start = jnp.ones((), Y.dtype), [], 0
+    squares = jax.lax.stop_gradient(jnp.sum(Y * Y, 0))
     for size, mu in _sizes(contacts, scene):
-        mean = jnp.mean(jax.lax.stop_gradient(squares[start : start + size]))
+        mean = jnp.mean(squares[start : start + size])
         unit = jnp.where(mean > 0, 1 / jnp.sqrt(jnp.where(mean > 0, mean, one)), one)
-        scales += [unit, *[unit * mu.astype(dtype)] * (size - 1)]
+        scales += [unit, *[unit * mu.astype(Y.dtype)] * (size - 1)]
         start += size
     scale = jnp.stack(scales)
-    scaled = Y * scale[None]
-    q = scale * relative
+    q = scale * velocities.at[contacts.normals].add(-bound)
     size = jnp.max(jnp.abs(jax.lax.stop_gradient(q)))
     size = jnp.where(size > 0, size, one)
-    width = jnp.sqrt(smoothing).astype(dtype) / size
-    W = matmul(scaled.T, scaled)
-    if x is None:
-        solution = coulomb.solve(groups, W, q / size, scale, width)
-    else:
-        y = matmul(scaled.T, matmul(scaled, x)) + q / size
-        # The residual is no more than a reader of all arguments: programs leave out those that no value depends on.
-        residual = coulomb.residual_at(groups, x, y, width)
-        x = coulomb.attach_derivative(groups, W, y, scale, jax.lax.stop_gradient(width), x)
-        solution = coulomb.Solution(x, residual, residual >= 0)
-    return scale * solution.x * size, solution
+    W = matmul(Y.T, Y) * scale[:, None] * scale[None]
+    return _Problem(place, velocity, metric, Y, W, q / size, scale, size, terms.side)
 
 
 def _sizes(contacts: Contacts, scene: Scene):
