@@ -1,8 +1,8 @@
 r"""Steps of fixed length through contacts: time stepping, in which impacts and forces are impulses of a step.
 
-A step of length h from (q, v) has the velocity without contact forces by the midpoint rule, v_f = v + h a(q + h v/2, v + h a/2),
-with the multipliers of the scene's constraints in a. At the end q' = q + h v, with the rows A of the constraints and J of the
-contacts there and M at the midpoint, the velocity v' satisfies
+A step of length h from (q, v) has the velocity v_f = v + h a(q + h v/2, v) without contact forces, with the multipliers of the
+scene's constraints in a. At the end q' = q + h v, with the rows A of the constraints and J of the contacts there and M at the
+midpoint, the velocity v' satisfies
 
     M (v' - v_f) = A^T lam + J^T p,   A v' = b,   Coulomb's law between p and J v' (`jaxdyn.contact.coulomb`),
 
@@ -12,8 +12,8 @@ where the normal velocity counts from a bound n . v' >= c:
     c = min(-gap / h, -u)    for a gap below zero; u = n . v_f: no more velocity comes out than has come in,
     c = e |u|                for an impact: the contact closes in the next step, with restitution e.
 
-If no contact closes, q' is that of the midpoint rule, q + h v/2 + h v'/2, and the step is of order two. A contact at rest has v = 0,
-and so q' = q to rounding: nothing creeps. q' is projected onto the holonomic constraints before the solve.
+If no contact closes, v' and q' are those of the midpoint rule, v + h a(q + h v/2, v + h a/2) and q + h v/2 + h v'/2, of order two. A
+contact at rest has v = 0, and so q' = q to rounding: nothing creeps. q' is projected onto the holonomic constraints before the solve.
 
 Sources: Moreau, Unilateral contact and dry friction in finite freedom dynamics (1988); Stewart & Trinkle (1996); Acary & Brogliato,
 Numerical methods for nonsmooth dynamical systems (2008), chapters 10 and 13.
@@ -245,9 +245,9 @@ def _terms(contacts: Contacts, scene: Scene, q, v, t) -> _Terms:
 
 
 def _free_velocity(scene: Scene, q, v, tau, t, h):
-    """Velocity after a step without contacts by the midpoint rule, the factor of M, and the middle of the step.
+    """Velocities after a step without contacts, by the midpoint rule and with forces of the velocity at the start.
 
-    `scene` is without contacts.
+    Also the factor of M, and the middle of the step. `scene` is without contacts.
     """
     system, middle = scene.system, t + 0.5 * h
     place = displace(system, q, 0.5 * h * v)
@@ -261,7 +261,8 @@ def _free_velocity(scene: Scene, q, v, tau, t, h):
         force = force if applied is None else force + applied
         return metric.solve(force - bias_force(system, place, v, middle))
 
-    return v + h * acceleration(v + 0.5 * h * acceleration(v)), metric, place
+    start = acceleration(v)
+    return v + h * acceleration(v + 0.5 * h * start), v + h * start, metric, place
 
 
 def _bounds(contacts: Contacts, scene: Scene, terms: _Terms, v, free, h):
@@ -322,13 +323,17 @@ def _step(contacts: Contacts, scene: Scene, q, v, tau, t, h, smoothing, x=None) 
 def _problem(contacts: Contacts, scene: Scene, q, v, tau, t, h) -> _Problem:
     whole = extend(scene)
     bare = Scene(scene.system, scene.constraints, whole.forces)
-    free, metric, middle = _free_velocity(bare, q, v, tau, t, h)
+    free, by_start, metric, middle = _free_velocity(bare, q, v, tau, t, h)
     end = t + h
     place = displace(scene.system, middle, 0.5 * h * v)
     terms = _terms(contacts, whole, place, free, end)
     bound = _bounds(contacts, scene, terms, v, free, h)
     closes = jnp.any(terms.velocity[contacts.normals] < bound)
     place = jnp.where(closes, place, displace(scene.system, middle, 0.5 * h * free))
+    # Halfway to a velocity without contact forces, damping would be that of a motion that contacts prevent.
+    change = jnp.where(closes, by_start - free, jnp.zeros_like(free))
+    free, terms = free + change, terms._replace(velocity=terms.velocity + matmul(terms.J, change))
+    bound = _bounds(contacts, scene, terms, v, free, h)
     if not scene.constraints:
         return _scaled(contacts, scene, metric, metric.whiten(terms.J.T), place, free, terms, terms.velocity, bound)
     place = project_state(bare, place, free, end)[0]
@@ -349,16 +354,19 @@ def _scaled(
     contacts: Contacts, scene: Scene, metric: MassFactor, Y, place, velocity, terms: _Terms, velocities, bound
 ) -> _Problem:
     """Coordinates in which the friction coefficient is one, and the mean inertia of a contact."""
-    one, scales, start = jnp.ones((), Y.dtype), [], 0
+    one, zero = jnp.ones((), Y.dtype), jnp.zeros((), Y.dtype)
     squares = jax.lax.stop_gradient(jnp.sum(Y * Y, 0))
+    relative, scales, parts, sizes, start = velocities.at[contacts.normals].add(-bound), [], [], [], 0
     for size, mu in _sizes(contacts, scene):
         mean = jnp.mean(squares[start : start + size])
         unit = jnp.where(mean > 0, 1 / jnp.sqrt(jnp.where(mean > 0, mean, one)), one)
-        scales += [unit, *[unit * mu.astype(Y.dtype)] * (size - 1)]
+        scales.append(jnp.stack([unit, *[unit * mu.astype(Y.dtype)] * (size - 1)]))
+        parts.append(scales[-1] * relative[start : start + size])
+        # Contacts that are far away do not count: their large bounds would hide the velocities of the others.
+        largest = jnp.max(jnp.abs(jax.lax.stop_gradient(parts[-1])))
+        sizes.append(jnp.where(parts[-1][0] < 0, largest, zero))
         start += size
-    scale = jnp.stack(scales)
-    q = scale * velocities.at[contacts.normals].add(-bound)
-    size = jnp.max(jnp.abs(jax.lax.stop_gradient(q)))
+    scale, q, size = jnp.concatenate(scales), jnp.concatenate(parts), jnp.max(jnp.stack(sizes))
     size = jnp.where(size > 0, size, one)
     W = matmul(Y.T, Y) * scale[:, None] * scale[None]
     return _Problem(place, velocity, metric, Y, W, q / size, scale, size, terms.side)
