@@ -185,8 +185,9 @@ def _step(groups: Groups, W, q, floor, shift, state: _State) -> _State:
         best, after = jnp.where(better, tried, best), jnp.where(better, size, after)
         length = jnp.where(better, jnp.full_like(length, t), length)
     is_last = width <= floor
-    # At rounding no step helps.
-    is_stuck = is_last & (before <= tol) & ~(after < 0.5 * before)
+    # At rounding no step helps. Redundant rows may contradict each other: two corners of an edge that close their gaps in one step
+    # cannot both stick, to the second order of its slope. They are left with the least residual.
+    is_stuck = is_last & (before <= jnp.where(stage == _PROXIMAL, eps**_SHIFT, tol)) & ~(after < 0.5 * before)
     better = ~is_stuck & jnp.isfinite(after)
     x, error = jnp.where(better, best, x), jnp.where(better, after, before)
     is_done = is_last & ((error <= _ROUNDING * eps) | is_stuck)
@@ -242,7 +243,8 @@ def solve(groups: Groups, is_redundant: bool, W, q, scale, width) -> Solution:
         sum(count for *_, count in _ATTEMPTS),
     )
     residual = residual_at(groups, state.x, matmul(W, state.x) + q, width)
-    return Solution(state.x, residual, residual <= tol, state.step)
+    solved = (residual <= tol) | ((state.alive == 0) & (residual <= float(jnp.finfo(dtype).eps) ** _SHIFT))
+    return Solution(state.x, residual, solved, state.step)
 
 
 def residual_at(groups: Groups, x, y, width) -> Array:
