@@ -1,7 +1,7 @@
 r"""Steps of fixed length through contacts: time stepping, in which impacts and forces are impulses of a step.
 
-A step of length h from (q, v) has the velocity v_f = v + h a(q + h v/2, v) without contact forces, with the multipliers of the
-scene's constraints in a. At the end q' = q + h v, with the rows A of the constraints and J of the contacts there and M at the
+A step of length h from (q, v) has the velocity v_f = v + h a(q + h v/2, v + h a/2) without contact forces, by the midpoint rule, with
+the multipliers of the scene's constraints in a, and the scene's forces at v where a contact closes. At the end q' = q + h v, with the rows A of the constraints and J of the contacts there and M at the
 midpoint, the velocity v' satisfies
 
     M (v' - v_f) = A^T lam + J^T p,   A v' = b,   Coulomb's law between p and J v' (`jaxdyn.contact.coulomb`),
@@ -12,13 +12,14 @@ where the normal velocity counts from a bound n . v' >= c:
     c = min(-gap / h, -u)    for a gap below zero; u = n . v_f: no more velocity comes out than has come in,
     c = e |u|                for an impact: the contact closes in the next step, with restitution e.
 
-If no contact closes, v' and q' are those of the midpoint rule, v + h a(q + h v/2, v + h a/2) and q + h v/2 + h v'/2, of order two. A
-contact at rest has v = 0, and so q' = q to rounding: nothing creeps. q' is projected onto the holonomic constraints before the solve.
+If no contact closes, q' is that of the midpoint rule, q + h v/2 + h v'/2, and the step is of order two. A contact at rest has v = 0,
+and so q' = q to rounding: nothing creeps. q' is projected onto the holonomic constraints before the solve.
 
 Sources: Moreau, Unilateral contact and dry friction in finite freedom dynamics (1988); Stewart & Trinkle (1996); Acary & Brogliato,
 Numerical methods for nonsmooth dynamical systems (2008), chapters 10 and 13.
 """
 
+from collections.abc import Callable
 from functools import partial
 from typing import Any, NamedTuple
 
@@ -177,8 +178,9 @@ def contact_step(contacts: Contacts, scene: Scene, q, v, tau, t, h, smoothing) -
         size = 1 + len(contacts.elements[i].tangent)
         by_name[contacts.elements[i].name] = forces[start : start + size]
         start += size
-    at_v = np.array([k for _, k in contacts.limited], int)
-    limit_forces = jnp.zeros_like(v).at[at_v].add(forces[start:])
+    limit_forces = jnp.zeros_like(v)
+    if contacts.limited:
+        limit_forces = limit_forces.at[np.array([k for _, k in contacts.limited])].add(forces[start:])
     by_name = {one.name: by_name[one.name] for one in contacts.elements}
     return q1, v1, ContactStep(by_name, limit_forces, result, found.residual)
 
@@ -244,25 +246,32 @@ def _terms(contacts: Contacts, scene: Scene, q, v, t) -> _Terms:
     return _Terms(*(jnp.concatenate(x) for x in (parts_gap, parts_J, parts_velocity)), side)
 
 
-def _free_velocity(scene: Scene, q, v, tau, t, h):
-    """Velocities after a step without contacts, by the midpoint rule and with forces of the velocity at the start.
+class _Flow(NamedTuple):
+    """Motion without contacts at the middle of a step: `place`, the factor of M, and accelerations.
 
-    Also the factor of M, and the middle of the step. `scene` is without contacts.
+    `acceleration(v, w)`: at the velocity v, with forces of the scene at the velocity w.
     """
-    system, middle = scene.system, t + 0.5 * h
+
+    place: Array
+    metric: MassFactor
+    acceleration: Callable
+
+
+def _flow(scene: Scene, q, v, tau, t, h) -> _Flow:
+    """Motion of a scene without contacts."""
+    system, middle, unforced = scene.system, t + 0.5 * h, Scene(scene.system, scene.constraints)
     place = displace(system, q, 0.5 * h * v)
     metric = mass_factor(mass_matrix(system, place, middle))
 
-    def acceleration(v):
-        force = scene.drive_torque(place, v, middle, tau)[0]
-        if scene.constraints:
-            return constrained_dynamics(scene, place, v, force, middle).acceleration
-        applied = scene.applied_force(place, v, middle)
+    def acceleration(v, v_of_forces):
+        force = scene.drive_torque(place, v_of_forces, middle, tau)[0]
+        applied = scene.applied_force(place, v_of_forces, middle)
         force = force if applied is None else force + applied
+        if scene.constraints:
+            return constrained_dynamics(unforced, place, v, force, middle).acceleration
         return metric.solve(force - bias_force(system, place, v, middle))
 
-    start = acceleration(v)
-    return v + h * acceleration(v + 0.5 * h * start), v + h * start, metric, place
+    return _Flow(place, metric, acceleration)
 
 
 def _bounds(contacts: Contacts, scene: Scene, terms: _Terms, v, free, h):
@@ -323,17 +332,17 @@ def _step(contacts: Contacts, scene: Scene, q, v, tau, t, h, smoothing, x=None) 
 def _problem(contacts: Contacts, scene: Scene, q, v, tau, t, h) -> _Problem:
     whole = extend(scene)
     bare = Scene(scene.system, scene.constraints, whole.forces)
-    free, by_start, metric, middle = _free_velocity(bare, q, v, tau, t, h)
-    end = t + h
-    place = displace(scene.system, middle, 0.5 * h * v)
+    flow, end = _flow(bare, q, v, tau, t, h), t + h
+    place, metric, start = displace(scene.system, flow.place, 0.5 * h * v), flow.metric, flow.acceleration(v, v)
+    free = v + h * start
     terms = _terms(contacts, whole, place, free, end)
-    bound = _bounds(contacts, scene, terms, v, free, h)
-    closes = jnp.any(terms.velocity[contacts.normals] < bound)
-    place = jnp.where(closes, place, displace(scene.system, middle, 0.5 * h * free))
+    closes = jnp.any(terms.velocity[contacts.normals] < _bounds(contacts, scene, terms, v, free, h))
     # Halfway to a velocity without contact forces, damping would be that of a motion that contacts prevent.
-    change = jnp.where(closes, by_start - free, jnp.zeros_like(free))
+    half = v + 0.5 * h * start
+    change = h * (flow.acceleration(half, jnp.where(closes, v, half)) - start)
     free, terms = free + change, terms._replace(velocity=terms.velocity + matmul(terms.J, change))
     bound = _bounds(contacts, scene, terms, v, free, h)
+    place = jnp.where(closes, place, displace(scene.system, flow.place, 0.5 * h * free))
     if not scene.constraints:
         return _scaled(contacts, scene, metric, metric.whiten(terms.J.T), place, free, terms, terms.velocity, bound)
     place = project_state(bare, place, free, end)[0]

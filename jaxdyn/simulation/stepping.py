@@ -201,14 +201,15 @@ def _advance_contacts(scene: Scene, length, substeps: int, limits, smoothing, re
     bare = Scene(scene.system, scene.constraints)
 
     def advance(q, v, tau, t):
-        whole, size = scene, length / substeps
+        whole, size = scene, length / np.asarray(substeps, length.dtype)
         if selects_rows:
             kept = keep_rows(bare, hide_unclear(select_rows(bare, q, t, None)))
             whole = Scene(scene.system, kept.constraints, scene.forces)
-        energy = jnp.asarray(smoothing, q.dtype)
+        # Known numbers stay numpy's: an array of JAX would be an argument more of the program around the step.
+        energy = np.asarray(smoothing, q.dtype) if is_concrete(smoothing) else jnp.asarray(smoothing, q.dtype)
 
         def once(state, i):
-            q, v, of_step = contact_step(contacts, whole, *state, tau, t + i * size, jnp.asarray(size, t.dtype), energy)
+            q, v, of_step = contact_step(contacts, whole, *state, tau, t + i * size, size, energy)
             return (q, v), of_step
 
         if substeps == 1:
