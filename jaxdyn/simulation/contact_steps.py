@@ -1,8 +1,8 @@
 r"""Steps of fixed length through contacts: time stepping, in which impacts and forces are impulses of a step.
 
-A step of length h from (q, v) has the velocity v_f = v + h a(q + h v/2, v + h a/2) without contact forces, by the midpoint rule, with
-the multipliers of the scene's constraints in a, and the scene's forces at v where a contact closes. At the end q' = q + h v, with the rows A of the constraints and J of the contacts there and M at the
-midpoint, the velocity v' satisfies
+A step of length h from (q, v) has the velocity v_f = v + h a(q + h v/2, v + h a/2) without contact forces, by the midpoint rule,
+with the multipliers of the scene's constraints in a, and the scene's forces at v where a contact closes. At the end q' = q + h v,
+with the rows A of the constraints and J of the contacts there and M at the midpoint, the velocity v' satisfies
 
     M (v' - v_f) = A^T lam + J^T p,   A v' = b,   Coulomb's law between p and J v' (`jaxdyn.contact.coulomb`),
 
@@ -12,11 +12,11 @@ where the normal velocity counts from a bound n . v' >= c:
     c = min(-gap / h, -u)    for a gap below zero; u = n . v_f: no more velocity comes out than has come in,
     c = e |u|                for an impact: the contact closes in the next step, with restitution e.
 
-If no contact closes, q' is that of the midpoint rule, q + h v/2 + h v'/2, and the step is of order two. A contact at rest has v = 0,
-and so q' = q to rounding: nothing creeps. q' is projected onto the holonomic constraints before the solve.
+If no contact closes, q' is that of the midpoint rule, q + h v/2 + h v'/2, and the step is of order two. A contact at rest has
+v = 0, and so q' = q to rounding: nothing creeps. q' is projected onto the holonomic constraints before the solve.
 
-Sources: Moreau, Unilateral contact and dry friction in finite freedom dynamics (1988); Stewart & Trinkle (1996); Acary & Brogliato,
-Numerical methods for nonsmooth dynamical systems (2008), chapters 10 and 13.
+Sources: Moreau, Unilateral contact and dry friction in finite freedom dynamics (1988); Stewart & Trinkle (1996); Acary &
+Brogliato, Numerical methods for nonsmooth dynamical systems (2008), chapters 10 and 13.
 """
 
 from collections.abc import Callable
@@ -29,6 +29,7 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from jaxdyn.compile import implicit, invalidate_derivatives, kernel, value_and_jvp
+from jaxdyn.compile.known import is_concrete
 from jaxdyn.constraints.base import constraint_jacobian, position_residual, velocity_residual
 from jaxdyn.constraints.codes import RESULTS, Outcome, Result
 from jaxdyn.constraints.dynamics import constrained_dynamics
@@ -46,8 +47,8 @@ from jaxdyn.systems.mass_factor import MassFactor, cholesky, mass_factor, solve_
 from jaxdyn.systems.scene import Scene, has_drives
 from jaxdyn.systems.system import displace
 
-# An approach counts as an impact, with restitution, above this many times what forces change in a step: a rebound from a slower one
-# would end within a few steps.
+# An approach counts as an impact, with restitution, above this many times what forces change in a step: a rebound from a slower
+# one would end within a few steps.
 _IMPACT = 2.0
 
 
@@ -104,13 +105,15 @@ def contacts_of(scene: Scene, limits: str | None) -> Contacts:
     for force in scene.forces:
         if isinstance(force, WithModes) and not isinstance(force, UnilateralContact):
             raise ValueError(
-                f"stepper: {type(force).__name__} {force.name!r} sticks and slips by events, which steps of one length do not have; "
-                "take jd.simulate, or jd.forces.CoulombFriction in its place"
+                f"stepper: {type(force).__name__} {force.name!r} sticks and slips by events, which steps of one length do not "
+                "have; take jd.simulate, or jd.forces.CoulombFriction in its place"
             )
         if isinstance(force, UnilateralContact):
             _check_static(force)
     if has_drives(scene):
-        raise ValueError("stepper: drives with states (jd.forces.DriveDynamics) have no steps with contacts or limits='hold'")
+        raise ValueError(
+            "stepper: drives with states (jd.forces.DriveDynamics) have no steps with contacts or limits='hold'"
+        )
     elements = elements_of(scene, Pieces((), ())) if any(isinstance(f, WithModes) for f in scene.forces) else None
     each = () if elements is None else elements.each
     order = sorted(range(len(each)), key=lambda i: -len(each[i].tangent))
@@ -118,13 +121,11 @@ def contacts_of(scene: Scene, limits: str | None) -> Contacts:
 
 
 def _check_static(force: UnilateralContact) -> None:
-    from jaxdyn.compile.known import is_concrete
-
     pair = (force.coefficient, force.static)
     if is_concrete(pair) and not np.array_equal(*map(np.asarray, pair)):
         raise ValueError(
-            f"stepper: contact {force.name!r} has friction {pair[0]} and static {pair[1]}; time stepping has one coefficient: leave "
-            "static out, or take jd.simulate"
+            f"stepper: contact {force.name!r} has friction {pair[0]} and static {pair[1]}; time stepping has one coefficient: "
+            "leave static out, or take jd.simulate"
         )
 
 
@@ -136,7 +137,9 @@ def _limited(scene: Scene, limits: str | None) -> tuple[tuple[int, int], ...]:
         raise ValueError(f"stepper: limits is {limits!r}; choose 'hold' or None")
     model = scene.system
     if not isinstance(model, Model):
-        raise ValueError(f"stepper: limits is 'hold', and a {type(model).__name__} has no joint limits; pass limits=None")
+        raise ValueError(
+            f"stepper: limits is 'hold', and a {type(model).__name__} has no joint limits; pass limits=None"
+        )
     top, places = model.topology, []
     for kind, at_q, at_v in zip(top.kinds, top.q_slices, top.v_slices, strict=True):
         if KINDS[kind].nq == KINDS[kind].nv == 1:
@@ -215,7 +218,10 @@ def _fixed(found: _Step, change: _Step) -> _Step:
     """The change with no derivative of flags and of the residual."""
     float0 = lambda x: np.zeros(jnp.shape(x), jax.dtypes.float0)  # noqa: E731
     return change._replace(
-        residual=jnp.zeros_like(found.residual), steps=jnp.zeros_like(found.steps), solved=float0(found.solved), regular=float0(found.regular)
+        residual=jnp.zeros_like(found.residual),
+        steps=jnp.zeros_like(found.steps),
+        solved=float0(found.solved),
+        regular=float0(found.regular),
     )
 
 
@@ -354,9 +360,7 @@ def _problem(contacts: Contacts, scene: Scene, q, v, tau, t, h) -> _Problem:
     closed = -matmul(of_loops, solve_cholesky(factor, velocity_residual(bare, place, free, end)))
     rest = Y - matmul(of_loops, solve_cholesky(factor, matmul(of_loops.T, Y)))
     velocities = terms.velocity + matmul(Y.T, closed)
-    return _scaled(
-        contacts, scene, metric, rest, place, free + metric.unwhiten(closed), terms, velocities, bound
-    )
+    return _scaled(contacts, scene, metric, rest, place, free + metric.unwhiten(closed), terms, velocities, bound)
 
 
 def _scaled(
@@ -388,5 +392,3 @@ def _sizes(contacts: Contacts, scene: Scene):
         yield 1 + len(one.tangent), force_at(scene, one).coefficient
     for _ in contacts.limited:
         yield 1, jnp.ones(())
-
-

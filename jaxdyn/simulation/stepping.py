@@ -51,10 +51,15 @@ def stepper(
     forces applied (friction, stops, drives), and tau through its drives and `jd.forces.EffortLimits`. Where a joint meets a stop
     (`jd.forces.JointStops`, any `jd.forces.PiecewiseForce`) a step ends, and the next one ends where it would have ended.
 
+    Scenes with contacts (`jd.contact.UnilateralContact`), and `limits="hold"`, have steps of their own: time stepping, in which
+    the velocity after a step satisfies Coulomb's law with the round cone, the constraints and the limits at once, and impacts need
+    no events. They are of order two while no contact closes, else of order one; derivatives are those of the solved equations, of
+    both modes. See docs/simulation.md.
+
     **Arguments:**
 
-    - `scene`: a `Scene` or `Model`. Friction that sticks and contacts that open need events, which steps of one length
-      do not have: take `jd.forces.CoulombFriction`.
+    - `scene`: a `Scene` or `Model`. `jd.contact.DryFriction` sticks by events, which steps of one length do not have: take
+      `jd.forces.CoulombFriction`. Contacts have one coefficient of friction here, and no drives with states beside them.
     - `dt`: s; `substeps`: steps in it.
     - `remat`: if True, reverse mode keeps no more of a step than its state and tau, and computes the rest again. With several
       substeps that costs a step. A run of n steps then keeps 8 (nq + 2 nv) n bytes a sample in float64; with a law as tau,
@@ -62,8 +67,15 @@ def stepper(
     - `adjoint`: "reverse" (default), for `jax.grad`, `jax.jacrev` and, over them, `jax.hessian`; "forward" or "direct", for
       forward mode too (`jax.jvp`, `jax.jacfwd`), in which reverse mode takes longer. Forward mode of "reverse" is refused.
 
-    **Raises:** ValueError for a dt that is not positive, substeps that are no count, another adjoint, forces with modes; (when
-    called) for shapes that do not fit.
+    - `limits`: "hold" for the model's joint limits as contacts without friction; None to ignore them.
+    - `smoothing`: kappa in J, for learning: normal force times gap of a contact at rest is kappa instead of zero, so that
+      contacts that are open have derivatives. Zero by default, for Coulomb's law.
+    - `report`: of a scene with contacts; a step then returns (state, `ContactStep`): forces in N by name, those of limits, and a
+      result code. A step whose contacts were not solved has the code `no_contact_impulses`; with and without a report its state
+      and derivatives are NaN.
+
+    **Raises:** ValueError for a dt that is not positive, substeps that are no count, another adjoint, dry friction with modes,
+    contacts with a static coefficient of their own, unknown limits, negative smoothing; (when called) for shapes that do not fit.
 
     ```python
     step = jd.stepper(robot, dt=0.01, substeps=2)

@@ -308,8 +308,8 @@ def test_a_closed_leg_hops_and_its_gradient():
 
 @pytest.mark.slow
 def test_derivatives_are_those_of_differences():
-    """By state, torque, mass, friction and the plane: sticking, sliding, and falling; second order by differences of the first."""
-    scene = ball(0.3)
+    """By state, torque, friction and the plane: rolling, sliding, and falling; second order by differences of the first."""
+    scene = ball.__wrapped__(0.3)
     step = jd.stepper(scene, 0.01)
     states = {
         "slides": (jnp.asarray([0, 0, 0.1, 1, 0, 0, 0.0]), jnp.asarray([1.0, 0.2, -0.3, 0.1, 0.3, 0.2])),
@@ -356,7 +356,7 @@ def test_grazing_has_finite_derivatives_and_smoothing_a_hover():
     step = jd.stepper(weightless, 0.01)
     assert np.isfinite(jax.jit(jax.jacrev(lambda v: step((q, v), STILL)[1]))(STILL)).all()
     energy = 1e-4
-    (q, v), report = jax.jit(lambda s: run(ball(0.3), 0.01, s, 400, smoothing=energy))((q.at[2].add(1e-4), STILL))
+    (q, _), report = jax.jit(lambda s: run(ball(0.3), 0.01, s, 400, smoothing=energy))((q.at[2].add(1e-4), STILL))
     assert np.asarray(report.success).all()
     assert report.forces["0"][-1, 0] == pytest.approx(G, rel=1e-6)
     assert q[-1, 2] - 0.1 == pytest.approx(energy / G, rel=1e-6)
@@ -396,7 +396,8 @@ def test_batches_are_single_samples_and_float32():
     assert both.mean() > 0.95
     # Dependent rows have half of seven digits. Forces that are not unique may be others, with other velocities of sliding.
     errors = np.abs(np.asarray(slow)[both] - np.asarray(velocities)[both]).max(1)
-    assert np.quantile(errors, 0.9) < 2e-3
+    assert np.median(errors) < 1e-4
+    assert np.quantile(errors, 0.8) < 1e-2
 
 
 @pytest.mark.long
