@@ -122,7 +122,7 @@ def contacts_of(scene: Scene, limits: str | None) -> Contacts:
 
 def _check_static(force: UnilateralContact) -> None:
     pair = (force.coefficient, force.static)
-    if is_concrete(pair) and not np.array_equal(*map(np.asarray, pair)):
+    if is_concrete(pair) and (np.asarray(pair[0]) != np.asarray(pair[1])).any():
         raise ValueError(
             f"stepper: contact {force.name!r} has friction {pair[0]} and static {pair[1]}; time stepping has one coefficient: "
             "leave static out, or take jd.simulate"
@@ -249,7 +249,8 @@ def _terms(contacts: Contacts, scene: Scene, q, v, t) -> _Terms:
         parts_gap.append(gap)
         parts_J.append(J)
         parts_velocity.append(side * v[at_v])
-    return _Terms(*(jnp.concatenate(x) for x in (parts_gap, parts_J, parts_velocity)), side)
+    gap, rows, velocity = map(jnp.concatenate, (parts_gap, parts_J, parts_velocity))
+    return _Terms(gap, rows, velocity, side)
 
 
 class _Flow(NamedTuple):

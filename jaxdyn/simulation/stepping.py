@@ -52,8 +52,8 @@ def stepper(
     (`jd.forces.JointStops`, any `jd.forces.PiecewiseForce`) a step ends, and the next one ends where it would have ended.
 
     Scenes with contacts (`jd.contact.UnilateralContact`), and `limits="hold"`, have steps of their own: time stepping, in which
-    the velocity after a step satisfies Coulomb's law with the round cone, the constraints and the limits at once, and impacts need
-    no events. They are of order two while no contact closes, else of order one; derivatives are those of the solved equations, of
+    the velocity after a step satisfies Coulomb's law with the round cone, the constraints and the limits at once. Impacts need no
+    events. They are of order two while no contact closes, else of order one; derivatives are those of the solved equations, of
     both modes. See docs/simulation.md.
 
     **Arguments:**
@@ -213,6 +213,11 @@ def _advance_contacts(scene: Scene, length, substeps: int, limits, smoothing, re
     bare = Scene(scene.system, scene.constraints)
 
     def advance(q, v, tau, t):
+        if is_standalone():
+            raise ValueError(
+                "stepper: exported code has no loops, by which steps through contacts are solved; leave contacts and "
+                "limits='hold' out of the exported scene"
+            )
         whole, size = scene, length / np.asarray(substeps, length.dtype)
         if selects_rows:
             kept = keep_rows(bare, hide_unclear(select_rows(bare, q, t, None)))
@@ -221,7 +226,8 @@ def _advance_contacts(scene: Scene, length, substeps: int, limits, smoothing, re
         energy = np.asarray(smoothing, q.dtype) if is_concrete(smoothing) else jnp.asarray(smoothing, q.dtype)
 
         def once(state, i):
-            q, v, of_step = contact_step(contacts, whole, *state, tau, t + i * size, size, energy)
+            q, v = state
+            q, v, of_step = contact_step(contacts, whole, q, v, tau, t + i * size, size, energy)
             return (q, v), of_step
 
         if substeps == 1:

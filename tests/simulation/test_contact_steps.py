@@ -450,6 +450,15 @@ def test_order_two_between_contacts():
     assert errors[1] / errors[2] == pytest.approx(4, abs=0.4)
 
 
+def test_substeps_are_steps():
+    """Two in one call, with the mean of their forces."""
+    scene, start = ball(0.3), (jnp.asarray([0, 0, 0.1, 1, 0, 0, 0.0]), jnp.asarray([1.0, 0, -0.5, 0, 0, 0]))
+    state, report = jax.jit(jd.stepper(scene, 0.01, substeps=2, report=True))(start, STILL)
+    states, reports = jax.jit(lambda s: run(scene, 0.005, s, 2))(start)
+    np.testing.assert_allclose(state[1], states[1][-1], rtol=0, atol=1e-13)
+    np.testing.assert_allclose(report.forces["0"], np.mean(reports.forces["0"], 0), rtol=1e-10, atol=1e-12)
+
+
 @pytest.mark.parametrize(
     ("make", "words"),
     [
