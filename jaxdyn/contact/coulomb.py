@@ -77,7 +77,7 @@ def join(parts) -> Array:
     return jnp.concatenate([part.reshape(-1) for part in parts])
 
 
-def _corrected(parts, width):
+def _correct_velocities(parts, width):
     """Velocities s with de Saxce's correction, and the unit vectors y1 / |y1| of its derivative."""
     corrected, along = [], []
     for y in parts:
@@ -92,7 +92,7 @@ def _corrected(parts, width):
 
 def _residual(groups: Groups, x, y, width):
     """Residual x - P(x - s) (m,), with the derivatives of the projection and of s."""
-    corrected, along = _corrected(split(groups, y), width)
+    corrected, along = _correct_velocities(split(groups, y), width)
     projected, derivatives = [], []
     for a, s in zip(split(groups, x), corrected, strict=True):
         value, derivative = jordan.smooth_projection(a - s, width)

@@ -117,7 +117,7 @@ def contacts_of(scene: Scene, limits: str | None) -> Contacts:
     elements = elements_of(scene, Pieces((), ())) if any(isinstance(f, WithModes) for f in scene.forces) else None
     each = () if elements is None else elements.each
     order = sorted(range(len(each)), key=lambda i: -len(each[i].tangent))
-    return Contacts(each, tuple(order), _limited(scene, limits), 0 if elements is None else elements.own)
+    return Contacts(each, tuple(order), _joints_with_limits(scene, limits), 0 if elements is None else elements.own)
 
 
 def _check_static(force: UnilateralContact) -> None:
@@ -129,7 +129,7 @@ def _check_static(force: UnilateralContact) -> None:
         )
 
 
-def _limited(scene: Scene, limits: str | None) -> tuple[tuple[int, int], ...]:
+def _joints_with_limits(scene: Scene, limits: str | None) -> tuple[tuple[int, int], ...]:
     """Indices in q and v of the joints of one coordinate that have a limit."""
     if limits is None:
         return ()
@@ -209,12 +209,12 @@ def _advance(contacts: Contacts, scene: Scene, *state) -> _Step:
             return kernel(_step, static=1)(contacts, scene, *args)
 
         _, change = value_and_jvp(again, (scene, *state, x), [*steps, None])
-        return found, jax.tree.map(jnp.zeros_like, found) if change is None else _fixed(found, change)
+        return found, jax.tree.map(jnp.zeros_like, found) if change is None else _change_without_flags(found, change)
 
     return implicit(scene, state, solve, tangent)
 
 
-def _fixed(found: _Step, change: _Step) -> _Step:
+def _change_without_flags(found: _Step, change: _Step) -> _Step:
     """The change with no derivative of flags and of the residual."""
     float0 = lambda x: np.zeros(jnp.shape(x), jax.dtypes.float0)  # noqa: E731
     return change._replace(
@@ -351,7 +351,9 @@ def _problem(contacts: Contacts, scene: Scene, q, v, tau, t, h) -> _Problem:
     bound = _bounds(contacts, scene, terms, v, free, h)
     place = jnp.where(closes, place, displace(scene.system, flow.place, 0.5 * h * free))
     if not scene.constraints:
-        return _scaled(contacts, scene, metric, metric.whiten(terms.J.T), place, free, terms, terms.velocity, bound)
+        return _scale_problem(
+            contacts, scene, metric, metric.whiten(terms.J.T), place, free, terms, terms.velocity, bound
+        )
     place = project_state(bare, place, free, end)[0]
     terms = _terms(contacts, whole, place, free, end)
     bound = _bounds(contacts, scene, terms, v, free, h)
@@ -361,10 +363,12 @@ def _problem(contacts: Contacts, scene: Scene, q, v, tau, t, h) -> _Problem:
     closed = -matmul(of_loops, solve_cholesky(factor, velocity_residual(bare, place, free, end)))
     rest = Y - matmul(of_loops, solve_cholesky(factor, matmul(of_loops.T, Y)))
     velocities = terms.velocity + matmul(Y.T, closed)
-    return _scaled(contacts, scene, metric, rest, place, free + metric.unwhiten(closed), terms, velocities, bound)
+    return _scale_problem(
+        contacts, scene, metric, rest, place, free + metric.unwhiten(closed), terms, velocities, bound
+    )
 
 
-def _scaled(
+def _scale_problem(
     contacts: Contacts, scene: Scene, metric: MassFactor, Y, place, velocity, terms: _Terms, velocities, bound
 ) -> _Problem:
     """Coordinates in which the friction coefficient is one, and the mean inertia of a contact."""
