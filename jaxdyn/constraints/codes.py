@@ -151,6 +151,8 @@ class RESULTS(metaclass=_Enumeration):
         "The configuration satisfies the constraints, but the search for the nearest one to the guess or the posture did not "
         "converge."
     )
+    # Of steps with contacts.
+    no_contact_impulses = _code("No contact impulses that satisfy Coulomb's law were found for the step.")
 
     @staticmethod
     def where(condition: Bool[ArrayLike, ""], code: Result, otherwise: Result) -> Result:

@@ -177,6 +177,33 @@ def projection_derivative(v, width, at_kink) -> ProjectionDerivative:
     return ProjectionDerivative(one_sided(high), one_sided(low), across, u)
 
 
+def smooth_projection(v, width) -> tuple:
+    """Projection with eigenvalues (x + sqrt(x^2 + 4 width^2)) / 2 in place of max(x, 0), (k, d), and its derivative.
+
+    A width of zero is the projection, whose derivative at a kink is the mean of both sides. The smooth ones are the points of
+    the central path: P - v is in the cone too, and their Jordan product is width^2.
+
+    Source: Fukushima, Luo & Tseng, SIAM J. Optim. 12 (2002), section 4.
+    """
+    norm = _norm(v[..., 1:])
+    high, low = v[..., 0] + norm, v[..., 0] - norm
+
+    def smooth(x):
+        root = safe_sqrt(x * x + 4 * width * width)
+        return (x + root) / 2, jnp.where(root > 0, (1 + x / jnp.where(root > 0, root, 1)) / 2, 0.5), root
+
+    if v.shape[-1] == 1:
+        value, rate, _ = smooth(v[..., 0])
+        return value[..., None], ProjectionDerivative(rate, rate, rate, v[..., 1:])
+    (top, up, root), (bottom, down, other) = smooth(high), smooth(low)
+    # (top - bottom) / (high - low), without the difference.
+    sizes = root + other
+    across = jnp.where(sizes > 0, (1 + (high + low) / jnp.where(sizes > 0, sizes, 1)) / 2, 0.5)
+    u = v[..., 1:] / jnp.where(norm > 0, norm, 1)[..., None]
+    value = jnp.concatenate([((top + bottom) / 2)[..., None], across[..., None] * v[..., 1:]], -1)
+    return value, ProjectionDerivative(up, down, across, u)
+
+
 def is_near_kink(v, width):
     """Decide whether an eigenvalue v0 -+ |v1| is at most `width`, (k,)."""
     norm = _norm(v[..., 1:])

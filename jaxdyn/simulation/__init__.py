@@ -5,10 +5,12 @@
 `constraints` and what is below them.
 """
 
+from jaxdyn.simulation.contact_steps import ContactStep as ContactStep
 from jaxdyn.simulation.stiffness import Stiffness as Stiffness
 from jaxdyn.simulation.terminal_events import JointLimitWarning as JointLimitWarning
 
 __all__ = [
+    "ContactStep",
     "JointLimitWarning",
     "Stiffness",
 ]

@@ -16,6 +16,7 @@ from jaxdyn.contact.unilateral import has_modes
 from jaxdyn.forces.piecewise import fix_pieces, guards, pieces_of, values_and_levels
 from jaxdyn.model.arguments import Numbers, as_array, check_shape, state_dtype
 from jaxdyn.simulation.checks import choose_method
+from jaxdyn.simulation.contact_steps import contact_step, contacts_of, mean_of_steps
 from jaxdyn.simulation.equations import DRIVES
 from jaxdyn.simulation.hybrid.piecewise import PiecewiseSystem, piecewise_motion
 from jaxdyn.simulation.methods import may_have_redundant_rows
@@ -31,7 +32,17 @@ EVENTS = 8  # at most in a step: a force that changes its piece more often leave
 ADJOINTS = ("reverse", "forward", "direct")
 
 
-def stepper(scene: SceneLike, dt: Numbers, substeps: int = 1, remat: bool = True, adjoint: str = "reverse") -> Callable:
+def stepper(
+    scene: SceneLike,
+    dt: Numbers,
+    substeps: int = 1,
+    remat: bool = True,
+    adjoint: str = "reverse",
+    *,
+    limits: str | None = None,
+    smoothing: Numbers = 0.0,
+    report: bool = False,
+) -> Callable:
     """Function step(state, tau, t=0.0) -> state that advances a scene by dt under a constant tau, or under a law.
 
     The state is a pair (q (nq,), v (nv,)), or (q, v, z) of a scene with `jd.forces.DriveDynamics`, whose states z start as
@@ -41,10 +52,15 @@ def stepper(scene: SceneLike, dt: Numbers, substeps: int = 1, remat: bool = True
     forces applied (friction, stops, drives), and tau through its drives and `jd.forces.EffortLimits`. Where a joint meets a stop
     (`jd.forces.JointStops`, any `jd.forces.PiecewiseForce`) a step ends, and the next one ends where it would have ended.
 
+    Scenes with contacts (`jd.contact.UnilateralContact`), and `limits="hold"`, have steps of their own: time stepping, in which
+    the velocity after a step satisfies Coulomb's law with the round cone, the constraints and the limits at once. Impacts need no
+    events. They are of order two while no contact closes, else of order one; derivatives are those of the solved equations, of
+    both modes. See docs/simulation.md.
+
     **Arguments:**
 
-    - `scene`: a `Scene` or `Model`. Friction that sticks and contacts that open need events, which steps of one length
-      do not have: take `jd.forces.CoulombFriction`.
+    - `scene`: a `Scene` or `Model`. `jd.contact.DryFriction` sticks by events, which steps of one length do not have: take
+      `jd.forces.CoulombFriction`. Contacts have one coefficient of friction here, and no drives with states beside them.
     - `dt`: s; `substeps`: steps in it.
     - `remat`: if True, reverse mode keeps no more of a step than its state and tau, and computes the rest again. With several
       substeps that costs a step. A run of n steps then keeps 8 (nq + 2 nv) n bytes a sample in float64; with a law as tau,
@@ -52,8 +68,15 @@ def stepper(scene: SceneLike, dt: Numbers, substeps: int = 1, remat: bool = True
     - `adjoint`: "reverse" (default), for `jax.grad`, `jax.jacrev` and, over them, `jax.hessian`; "forward" or "direct", for
       forward mode too (`jax.jvp`, `jax.jacfwd`), in which reverse mode takes longer. Forward mode of "reverse" is refused.
 
-    **Raises:** ValueError for a dt that is not positive, substeps that are no count, another adjoint, forces with modes; (when
-    called) for shapes that do not fit.
+    - `limits`: "hold" for the model's joint limits as contacts without friction; None to ignore them.
+    - `smoothing`: kappa in J, for learning: normal force times gap of a contact at rest is kappa instead of zero, so that
+      contacts that are open have derivatives. Zero by default, for Coulomb's law.
+    - `report`: of a scene with contacts; a step then returns (state, `ContactStep`): forces in N by name, those of limits, and a
+      result code. A step whose contacts were not solved has the code `no_contact_impulses`; with and without a report its state
+      and derivatives are NaN.
+
+    **Raises:** ValueError for a dt that is not positive, substeps that are no count, another adjoint, dry friction with modes,
+    contacts with a static coefficient of their own, unknown limits, negative smoothing; (when called) for shapes that do not fit.
 
     ```python
     step = jd.stepper(robot, dt=0.01, substeps=2)
@@ -64,9 +87,14 @@ def stepper(scene: SceneLike, dt: Numbers, substeps: int = 1, remat: bool = True
     scene = as_scene(scene)
     seconds = _check_options(scene, dt, substeps, adjoint)
     system, dtype = scene.system, state_dtype(scene.system)
+    by_contacts = limits is not None or has_modes(scene)
+    _check_contact_options(by_contacts, smoothing, report)
     # In numpy a known length stays known inside a jit, where jax would trace it.
     length = np.asarray(seconds, dtype) if is_concrete(seconds) else jnp.asarray(seconds, dtype)
-    start, advance = _advance(scene, length, substeps, adjoint != "reverse")
+    if by_contacts:
+        start, advance = None, _advance_contacts(scene, length, substeps, limits, smoothing, report)
+    else:
+        start, advance = _advance(scene, length, substeps, adjoint != "reverse")
     by_numbers = jax.checkpoint(advance) if remat else advance
 
     def step(state, tau, t: Any = 0.0):
@@ -92,11 +120,6 @@ def stepper(scene: SceneLike, dt: Numbers, substeps: int = 1, remat: bool = True
 
 def _check_options(scene: Scene, dt, substeps, adjoint):
     """Length of the step, s; ValueError for options that do not fit."""
-    if has_modes(scene):
-        raise ValueError(
-            "stepper: the scene has forces with modes (jd.contact.DryFriction, jd.contact.UnilateralContact), "
-            "whose events end steps; take jd.simulate, or jd.forces.CoulombFriction in their place"
-        )
     seconds = as_array(dt, "stepper: dt")
     if seconds.shape != () or (is_concrete(seconds) and not 0 < float(seconds) < np.inf):
         raise ValueError(f"stepper: dt is {dt!r}; give one positive number (s)")
@@ -173,6 +196,48 @@ def _advance(scene: Scene, length, substeps: int, is_direct: bool) -> tuple[Any,
         return state_of(jax.tree.map(lambda x: x[0], rows), t + length)
 
     return start, advance
+
+
+def _check_contact_options(by_contacts: bool, smoothing, report) -> None:
+    energy = as_array(smoothing, "stepper: smoothing")
+    if energy.shape != () or (is_concrete(energy) and not 0 <= float(energy) < np.inf):
+        raise ValueError(f"stepper: smoothing is {smoothing!r}; give one energy (J), zero or more")
+    if not by_contacts and (report or (is_concrete(energy) and float(energy) > 0)):
+        name = "report" if report else "smoothing"
+        raise ValueError(f"stepper: {name} is for scenes with contacts, and this one has none; leave it out")
+
+
+def _advance_contacts(scene: Scene, length, substeps: int, limits, smoothing, report: bool) -> Callable:
+    """Function (q, v, tau, t) -> (q, v), or ((q, v), ContactStep) with `report`, of a step with contacts."""
+    contacts = contacts_of(scene, limits)
+    selects_rows = bool(scene.constraints) and may_have_redundant_rows(scene)
+    bare = Scene(scene.system, scene.constraints)
+
+    def advance(q, v, tau, t):
+        if is_standalone():
+            raise ValueError(
+                "stepper: exported code has no loops, by which steps through contacts are solved; leave contacts and "
+                "limits='hold' out of the exported scene"
+            )
+        whole, size = scene, length / np.asarray(substeps, length.dtype)
+        if selects_rows:
+            kept = keep_rows(bare, hide_unclear(select_rows(bare, q, t, None)))
+            whole = Scene(scene.system, kept.constraints, scene.forces)
+        # Known numbers stay numpy's: an array of JAX would be an argument more of the program around the step.
+        energy = np.asarray(smoothing, q.dtype) if is_concrete(smoothing) else jnp.asarray(smoothing, q.dtype)
+
+        def once(state, i):
+            q, v = state
+            q, v, of_step = contact_step(contacts, whole, q, v, tau, t + i * size, size, energy)
+            return (q, v), of_step
+
+        if substeps == 1:
+            state, of_step = once((q, v), 0)
+            return (state, of_step) if report else state
+        state, of_steps = jax.lax.scan(once, (q, v), jnp.arange(substeps, dtype=q.dtype))
+        return (state, mean_of_steps(of_steps)) if report else state
+
+    return advance
 
 
 def _refuse_export(pieces) -> None:
