@@ -473,7 +473,7 @@ def test_codes_of_a_batch_print_as_words():
     assert f"{stalled}" == "stalled" and "not solved to the tolerance" in jd.RESULTS[stalled]
     assert repr(pickle.loads(pickle.dumps(stalled))) == "stalled"
     with pytest.raises(ValueError, match=r"compared with 0; compare it with jd.RESULTS.successful"):
-        one.result == 0  # noqa: B015
+        assert one.result == 0
 
 
 @pytest.mark.parametrize(

@@ -18,14 +18,11 @@ collision that stops them (Genot & Brogliato 1999).
 
 from typing import NamedTuple
 
-import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import lax
 from jaxtyping import Array
 
-from jaxdyn.compile import kernel
-from jaxdyn.compile.batch import while_loop
 from jaxdyn.compile.loops import Carry, Given, Iteration, Task, run_loop
 from jaxdyn.lie.so3 import matmul
 from jaxdyn.simulation.hybrid.dynamics import (
@@ -138,25 +135,13 @@ def guess_again(elements: Elements, problem: Problem, mode: Mode, guess) -> Mode
 
 def choose_mode(elements: Elements, problem: Problem, mode: Mode, slip) -> Choice:
     """Change the first element that disagrees until none does."""
-    task = Task(_turn, _by_turns, (elements,))
     begin = Carry(Choice(mode, slip, jnp.zeros((), jnp.int32), *jnp.zeros((2,), bool)))
-    after = run_loop(task, None, problem, Given(), begin)
-    # Every change is valid: the native loop needs no fallback.
-    carry = _by_turns(elements, None, problem, Given(), begin) if after is None else after[0]
-    return carry.state
+    return run_loop(Task(_turn, (elements,)), None, problem, Given(), begin).state
 
 
 def _turn(elements: Elements, _, problem: Problem, choice: Choice, __) -> Iteration:
     after = _change(elements, None, problem, choice)
     return Iteration(after, ~choice.done, ~after.done)
-
-
-def _by_turns(elements: Elements, _, problem: Problem, given: Given, carry: Carry) -> Carry:
-    def step(choice: Choice) -> Choice:
-        after = kernel(_change, static=1, derivative=False)(elements, None, problem, choice)
-        return jax.tree.map(lambda new, old: jnp.where(choice.done, old, new), after, choice)
-
-    return Carry(while_loop(lambda choice: ~choice.done, step, carry.state))
 
 
 def _change(elements: Elements, _, problem: Problem, choice: Choice) -> Choice:
