@@ -10,9 +10,10 @@ import pytest
 from scipy.optimize import brentq
 
 import jaxdyn as jd
+from jaxdyn.forces.piecewise import Pieces
+from jaxdyn.simulation.hybrid import transitions
 from jaxdyn.simulation.hybrid.event_loop import _cases
-from jaxdyn.simulation.hybrid.modes import Mode
-from jaxdyn.simulation.hybrid.transitions import Transition, _solve
+from jaxdyn.simulation.hybrid.modes import Mode, elements_of
 
 G, MU, MU_S, LOAD, RATE = 9.81, 0.3, 0.5, 6.0, 2.0
 PLANE = ((0, 0, 0), (-np.pi / 2, 0, 0))  # z of the ground along y of the world
@@ -456,22 +457,31 @@ def test_boxes_that_tumble_lose_energy_and_stay_above_the_ground():
     np.testing.assert_allclose(batch.q[7], motion(mu[7], q0[7], v0[7]).q, atol=1e-9)
 
 
-def test_modes_that_flip_without_end_are_not_found():
+def test_modes_that_flip_without_end_are_not_found(monkeypatch):
     """A contact that pulls where it is closed, and penetrates where it is open, next to one that agrees at once."""
-    closed = jnp.array([True, False])
-    mode = Mode(closed, ~closed, jnp.zeros(2, bool), jnp.zeros(0, bool))
+    builder = jd.ModelBuilder("ball")
+    builder.add_body("ball", None, "free", (1.0, (0.0, 0.0, 0.0), (0.1, 0.1, 0.1)))
+    contacts = [jd.contact.ground_contact("ball", name=name) for name in ("a", "b")]
+    scene = jd.Scene(builder.build(), forces=contacts)
+    elements = elements_of(scene, Pieces((), ()))
+    count = elements.count
+    flags, none = jnp.ones(2, bool), jnp.zeros(2, bool)
 
     def search(always):
-        def disagreements(mode, slip):
+        def disagreements(elements, problem, mode, slip, reaction):
             flips = jnp.array([True, False]) & always
-            wrong = jnp.stack([mode.closed & flips, ~mode.closed & flips, *[jnp.zeros(2, bool)] * 3], 1)
-            return wrong, jnp.zeros(2, bool), slip, jnp.zeros(())
+            return jnp.stack([mode.closed & flips, ~mode.closed & flips, none, none, none], 1), none, slip
 
-        return _solve(jnp.ones(2, bool), disagreements, mode, jnp.zeros((2, 2)))
+        monkeypatch.setattr(transitions, "_disagreements", disagreements)
+        problem = transitions.Problem(
+            jnp.eye(count), jnp.zeros(count), *jnp.zeros((3, 2)), flags, none, none, none, *jnp.ones(2)
+        )
+        mode = Mode(flags, none, none, jnp.zeros(0, bool), *jnp.zeros((2, 2)))
+        return transitions.choose_mode(elements, problem, mode, jnp.zeros((2, 2)))
 
-    settled = jax.jit(jax.vmap(lambda always: search(always)[2]))(jnp.array([True, False]))
-    assert settled.tolist() == [False, True]
-    change = Transition(mode, None, mode, None, None, settled[0], jnp.asarray(False))
+    choice = jax.jit(jax.vmap(search))(jnp.array([True, False]))
+    assert choice.done.all() and choice.wrong.tolist() == [True, False]
+    change = transitions.Transition(None, None, None, None, ~choice.wrong[0], jnp.asarray(False))
     ((paradox, _), (unsettled, code)) = _cases(change)
     assert bool(unsettled) and not bool(paradox) and code is jd.RESULTS.no_contact_mode
 
