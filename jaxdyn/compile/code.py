@@ -74,7 +74,7 @@ class Body:
             elif i in self.fused:
                 place = self.fused[i]
                 factors = [self.text(x, kind) for x in operations[args[place]].args]
-                self.names[i] = self.e.fused(op, kind, factors, self.text(args[1 - place], kind), place == 0)
+                self.names[i] = self.e.add_product(op, kind, factors, self.text(args[1 - place], kind), place == 0)
             else:
                 kinds = [operations[x].kind for x in args if type(x) is not Constant]
                 given = kinds[-1] if kinds else kind

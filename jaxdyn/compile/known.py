@@ -78,8 +78,9 @@ class Known(NamedTuple):
 
     @property
     def digest(self) -> str:
-        """Hash of the values of the known leaves."""
-        parts = [b"" if leaf is None else np.asarray(leaf).tobytes() for leaf in self.leaves.leaves]
+        """Hash of the known leaves by their values."""
+        arrays = [None if leaf is None else np.asarray(leaf) for leaf in self.leaves.leaves]
+        parts = [b"" if x is None else f"{x.dtype} {x.shape} ".encode() + x.tobytes() for x in arrays]
         return hashlib.sha256(b" ".join(parts)).hexdigest()
 
     def __call__(self, traced):

@@ -139,7 +139,7 @@ class Emitter:
         # Which of the two is decided by the processor's features alone, not by LLVM's level.
         return self.call("fmuladd", kind, a, b, c)
 
-    def fused(self, op: str, kind: str, factors: Sequence[str], other: str, is_first: bool) -> str:
+    def add_product(self, op: str, kind: str, factors: Sequence[str], other: str, is_first: bool) -> str:
         """The sum or difference, by `op`, of a product and another number; `is_first` if the product is the first operand."""
         a, b = factors
         if op == "sub" and is_first:

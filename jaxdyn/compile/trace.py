@@ -136,7 +136,8 @@ class Again(NamedTuple):
         """The careful program beside the fast one of the other function."""
         outputs, name = fast.outputs[:-1], name_of(self.function)
         inputs = [Array(shape, np.dtype(dtype)) for shape, dtype in self.shapes]
-        recipe = self.function, self.static, self.structure, self.calls, self.is_itself, mode.state()
+        # What is static in the tree too, such as functions of the user; the numbers in it are a part of the content.
+        recipe = self.function, self.static, self.known.structure, self.known.places, *self[3:], mode.state()
         digest, is_kept = digest_of(self.key(outputs), f"{name} {inputs} {outputs} {self.known.digest}", recipe)
         make = functools.partial(_make_careful, self, outputs, digest if is_kept else None)
         by_jax = functools.partial(_by_jax, self, outputs)

@@ -153,7 +153,7 @@ def share(columns: Columns, coefficients: Float[Array, "m *k"]) -> Float[Array, 
     return matmul(jnp.diag(columns.kept) + C, shared)
 
 
-def solve_damped(A: Float[Array, "m n"], right: Float[Array, " m"]) -> Float[Array, " n"]:
+def solve_with_damping(A: Float[Array, "m n"], right: Float[Array, " m"]) -> Float[Array, " n"]:
     """A small x with A x = right, by normal equations with little damping: for Newton's steps, which need no more digits.
 
     Rows may be zero. Where others depend on each other x is a compromise, not a NaN.

@@ -46,7 +46,7 @@ from jaxdyn.constraints.rank import (
     least_pivot_of,
     pseudo_inverse,
     rank_of,
-    solve_damped,
+    solve_with_damping,
     tolerance,
 )
 from jaxdyn.constraints.redundancy import (
@@ -342,7 +342,7 @@ def _select_far_away(scene: Scene, q, t, sure, apart: float):
     # same in every call: a random direction would make the choice of rows, and so the bits of a motion, random.
     A = sure[:, None] * constraint_jacobian(scene, q, t)
     direction = jnp.asarray(1 + np.modf(np.arange(scene.nv) * 0.618)[0], q.dtype)
-    direction = direction - solve_damped(A * sizes[None], matmul(A * sizes[None], direction))
+    direction = direction - solve_with_damping(A * sizes[None], matmul(A * sizes[None], direction))
     length = jnp.max(jnp.abs(direction))
     # A structure (no admissible direction) is tested where it is.
     moves = length > 1e-6
@@ -352,7 +352,7 @@ def _select_far_away(scene: Scene, q, t, sure, apart: float):
     def close(_, place):
         place = retract(scene.system, place)
         A = (sure[:, None] * constraint_jacobian(scene, place, t))[held]
-        step = solve_damped(A * sizes[None], sure[held] * position_residual(scene, place, t)) * sizes
+        step = solve_with_damping(A * sizes[None], sure[held] * position_residual(scene, place, t)) * sizes
         # A step longer than the distance itself would leave the branch.
         size = jnp.max(jnp.abs(step / sizes))
         return displace(scene.system, place, -step * jnp.minimum(1.0, _FAR / jnp.where(size > 0, size, 1.0)))

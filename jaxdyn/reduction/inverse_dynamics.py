@@ -224,7 +224,10 @@ def _solve(chosen: tuple[int, ...], rank_tol, scene: Scene, q, v, a_independent,
         return x - matmul(Y, matmul(inverse, x))
 
     Z = metric.whiten(jnp.asarray(E.T))
-    free = pseudo_inverse(across(Z), tol)
+    # A velocity that the rows hold, as at a dead centre, leaves rounding here, which is large beside nothing else.
+    squares, driven = jnp.sum(Z * Z, 0), across(Z)
+    driven = jnp.where((jnp.sum(driven * driven, 0) > tol**2 * squares)[None], driven, jnp.zeros_like(driven))
+    free = pseudo_inverse(driven, tol)
 
     def complete(start, right, independent):
         """The solution x of Y^T x = right, Z^T x = independent nearest to the start, and whether there is one."""
@@ -252,7 +255,7 @@ def _solve(chosen: tuple[int, ...], rank_tol, scene: Scene, q, v, a_independent,
         rest = -velocity_residual(scene, q, still, t) if has_rows else Y[0]
         x, agrees = complete(still, rest, v)
         v = metric.unwhiten(x)
-        rank = rank_of(Y, inverse) + jnp.round(jnp.trace(matmul(free, across(Z))))
+        rank = rank_of(Y, inverse) + jnp.round(jnp.trace(matmul(free, driven)))
         # The rows of constraints and of independent velocities must span all velocities.
         is_determined = rank == nv
     gamma = rows(scene, q, v, t).gamma if has_rows else Y[0]

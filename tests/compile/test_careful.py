@@ -1,8 +1,10 @@
 """Samples that a kernel marks as not valid: native code computes them by a program that is made when the first one appears."""
 
 import functools
+from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
 
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -11,7 +13,7 @@ from kernel_helpers import assert_close, quick
 
 from jaxdyn import compile as backend
 from jaxdyn.compile import careful as pairs
-from jaxdyn.compile import target
+from jaxdyn.compile import kernel, mark_invalid, target
 from jaxdyn.compile.batch import any_sample
 from jaxdyn.compile.loops import Carry, Given, Iteration, Task, run_loop
 from jaxdyn.compile.primitive import as_operations, kernel_p
@@ -270,3 +272,23 @@ def test_iterations_of_a_loop(count):
     np.testing.assert_array_equal(ways, wanted[:, 1])
     text = jax.jit(jax.vmap(run)).lower(x).as_text()
     assert text.count("custom_call @jaxdyn_kernel") == 1 and "while" not in text
+
+
+class Scale(eqx.Module):
+    """A tree with a function of the user, which is static."""
+
+    rule: Callable = eqx.field(static=True)
+
+
+def test_careful_programs_of_functions_in_a_tree_are_not_taken_for_each_other():
+    def by_rule(tree, x):
+        return tree.rule(x)
+
+    @kernel(fallback=by_rule)
+    def flagged(tree, x):
+        return mark_invalid(x > 0, x)
+
+    for factor in range(2, 6):
+        scale = Scale(lambda x, factor=factor: factor * x)
+        values = jax.jit(jax.vmap(lambda x, scale=scale: flagged(scale, x)))(jnp.array([-1.0, 1.0]))
+        assert values.tolist() == [-1.0, factor]

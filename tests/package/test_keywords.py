@@ -57,6 +57,7 @@ CALLS = {
     "constraints.knife_edge": (("a",), {"plane_body": "b", "contact": False, "name": "skate"}),
     "constraints.lock_joint": (("a",), {"value": 0.2, "name": "lock"}),
     "constraints.loop": ((None, np.eye(4), "a", np.eye(4)), {"joint": "point", "in_plane": True, "name": "loop"}),
+    "constraints.choose_rows": ((BAR, BQ), {"t": 0.3}),
     "constraints.projections": ((BAR, BQ), {"t": 0.3, "rank_tol": 1e-8}),
     "constraints.rolling_sphere": (("a", (0, 0, 0), 0.2), {"name": "ball"}),
     "constraints.rolling_wheel": (("a", np.eye(4), 0.2), {"name": "wheel"}),

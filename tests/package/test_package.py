@@ -198,7 +198,7 @@ def test_only_programs_switch_to_float64():
     wrong = []
     for module, tree in SOURCES.items():
         # A careful program is traced in a thread of its own, which begins with the precision of its kernel.
-        if module in PROGRAMS or module == "compile.careful":
+        if module in PROGRAMS or module == "compile.mode":
             continue
         for node in ast.walk(tree):
             call = isinstance(node, ast.Call)

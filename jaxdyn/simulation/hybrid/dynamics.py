@@ -295,7 +295,7 @@ def gaps(scene: Scene, elements: Elements, q, t) -> Array:
 
 
 class Collision(NamedTuple):
-    """What an impact depends on beside the state: a mode, directions of sliding (n, 2), and the fate of each contact.
+    """Data of an impact beside the state: a mode, directions of sliding (n, 2), and the fate of each contact.
 
     `rebound` (n,) multiplies coefficients of restitution. Contacts that are `held` (n,) rest behind the impact whatever the sign
     of their impulse, as their flight would be too short to be seen; elements that are `stopped` (n,) stick behind it.

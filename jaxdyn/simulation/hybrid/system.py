@@ -47,10 +47,10 @@ from jaxdyn.simulation.hybrid.transitions import (
     Transition,
     align,
     choose_mode,
+    find_jams,
     first_guess,
     guess_again,
     independent_lines,
-    jammed,
     length,
     rates_of,
     with_excess,
@@ -178,7 +178,7 @@ class ModalSystem(HybridSystem):
             begin = guess_again(elements, problem, mode, guess)
             choice = choose_mode(elements, problem, begin._replace(stick=begin.stick | (stopped & begin.closed)), along)
             collision = Collision(choice.mode, choice.slip, rebound, held, stopped)
-            still = kernel(self._jammed)(problem, choice.mode, choice.slip)
+            still = kernel(self._find_jams)(problem, choice.mode, choice.slip)
             resting, at, after, gains = kernel(self._after)(unknown, collision, begins, t, q, v)
             problem, along = kernel(self._forces)(unknown, resting, at, t, q, after)
             final = choose_mode(elements, problem, guess_again(elements, problem, resting, guess), along)
@@ -275,7 +275,7 @@ class ModalSystem(HybridSystem):
         scene, elements = self._bind(unknown)[0], self.elements
         terms, of = terms_at(scene, elements, q, v, t), coefficients(scene, elements, v.dtype)
         height, fast = limits
-        still, reaction, rates = jammed(elements, problem, mode, along)
+        still, reaction, rates = find_jams(elements, problem, mode, along)
         rate = rates_of(elements, rates)[0]
         velocity = rates_of(elements, matmul(terms.row.A, after - v) + terms.row.velocity)[0]
         flies = (
@@ -300,9 +300,9 @@ class ModalSystem(HybridSystem):
         reaction = react(self.elements, mode, problem.gram, problem.sliding, problem.loads, along, -problem.free)
         return (mode.closed & ~mode.stick & (reaction.pivots <= 0)).any()
 
-    def _jammed(self, problem: Problem, mode: Mode, along):
+    def _find_jams(self, problem: Problem, mode: Mode, along):
         """Elements (n,) whose slow slip behind an impact is only an error of their directions."""
-        still, _, rates = jammed(self.elements, problem, mode, along)
+        still, _, rates = find_jams(self.elements, problem, mode, along)
         return still & (length(rates_of(self.elements, rates)[1])[0] > 2 * tolerance(along.dtype) * problem.rate)
 
     def impact(self, unknown, collision, t, y):

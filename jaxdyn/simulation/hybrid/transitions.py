@@ -61,8 +61,10 @@ class Problem(NamedTuple):
 
 
 class Choice(NamedTuple):
-    """Choice of a mode, as it is changed: mode and directions (n, 2), number of changes, whether an
-    element disagreed, and whether it has ended."""
+    """A mode while it is chosen, with directions of sliding (n, 2) and the number of changes.
+
+    `wrong`: whether an element disagreed; `done`: whether the search has ended.
+    """
 
     mode: Mode
     slip: Array
@@ -212,7 +214,7 @@ def _disagreements(elements: Elements, problem: Problem, mode: Mode, slip, react
     return jnp.stack(wrong, 1), problem.may_stick, turned
 
 
-def jammed(elements: Elements, problem: Problem, mode: Mode, along) -> tuple[Array, Reaction, Array]:
+def find_jams(elements: Elements, problem: Problem, mode: Mode, along) -> tuple[Array, Reaction, Array]:
     """Elements (n,) that slide, but stand still, since they depend on others that stick; the reaction, and rates (count,).
 
     Their friction of least norm has left the cone, and another share of it has not.
@@ -241,8 +243,10 @@ def with_excess(elements: Elements, problem: Problem, mode: Mode, still) -> Mode
 
 
 def with_lines(elements: Elements, problem: Problem, mode: Mode, along, creep) -> Mode:
-    """Mode in which elements slide along lines up to the speeds `creep` (n,), if all contacts push and speed up then, and forces
-    across are small."""
+    """Mode in which elements slide along lines up to the speeds `creep` (n,), if that is consistent.
+
+    It is if all contacts push and speed up then, and forces across are small.
+    """
     lines = mode._replace(creep=creep)
     reaction = react(elements, lines, problem.gram, problem.sliding, problem.loads, along, -problem.free)
     tiny = force_tolerance(creep.dtype) / 4 * jnp.sum(jnp.abs(reaction.normal))
