@@ -35,13 +35,17 @@ def environment() -> bytes:
     return fingerprint(disk.hash_of_sources(Path(__file__).parents[1]), sys.version, tuple(versions))
 
 
-def key_of(*parts: Any) -> str | None:
-    """Name under which what depends on these parts alone is kept; None where they cannot be hashed."""
+def key_of(*parts: Any, configuration: Any = None) -> str | None:
+    """Name under which what depends on these parts alone is kept; None where they cannot be hashed.
+
+    `configuration`: JAX's options that count; all those in force by default.
+    """
     if not jax_adapter.is_version_known():
         return None
     variables = tuple(os.environ.get(name) for name in _VARIABLES)
+    configuration = jax_adapter.configuration() if configuration is None else configuration
     try:
-        return fingerprint(environment(), variables, mode.state(), jax_adapter.configuration(), parts).hex()
+        return fingerprint(environment(), variables, mode.state(), configuration, parts).hex()
     except (NoFingerprint, RecursionError) as reason:
         disk.logger.debug("jaxdyn: not kept on disk, as it depends on %s", reason)
         return None
@@ -130,13 +134,19 @@ def load_or_make(key: str | None, make: Callable[[], tuple[Sequence[Program], An
         if not all(x.is_kept for x in programs):
             return programs, data
         for one in programs:
-            for written in (one, *one.subprograms):
-                if isinstance(written, Program):
-                    _save(f"{written.digest}.operations", ([tuple(x) for x in written.operations], written.results))
+            _save_operations(one)
         _save(f"{key}.program", ([*map(Description.of, programs)], data))
     for i, one in enumerate(programs):
         one.key = f"{key}-{i}"
     return programs, data
+
+
+def _save_operations(program: Any) -> None:
+    """Keep the operations of a program and of all that it calls, but those of careful programs, which may not be made yet."""
+    if isinstance(program, Program):
+        _save(f"{program.digest}.operations", ([tuple(x) for x in program.operations], program.results))
+        for inner in program.subprograms:
+            _save_operations(inner)
 
 
 def _in_modes(enter: Callable, make: Callable) -> Any:

@@ -147,7 +147,9 @@ class Again(NamedTuple):
         """Name under which the program is kept on disk, if it is."""
         function, static, known, *rest = self
         contents = known.structure, known.places, known.leaves.leaves
-        return stored.key_of("careful", function, static, *contents, *rest, outputs)
+        # By the one option that changes its numbers: a thread that traces it again has other options than the user's contexts.
+        has_x64 = jax.config.read("jax_enable_x64")
+        return stored.key_of("careful", function, static, *contents, *rest, outputs, configuration=has_x64)
 
     @property
     def which(self) -> str:
