@@ -146,11 +146,13 @@ def independent_columns(Y: Float[Array, "n m"], rank_tol: float) -> Columns:
     return Columns(kept, factor, C, is_clear)
 
 
-def share(columns: Columns, coefficients: Float[Array, "m *k"]) -> Float[Array, "m *k"]:
-    """The least coefficients of all columns with the same sum as those of the kept ones: [1; C] (1 + C^T C)^-1 x."""
-    C, x = columns.combinations, coefficients
-    shared = solve_cholesky(cholesky(jnp.eye(C.shape[0], dtype=C.dtype) + matmul(C.T, C)), x)
-    return matmul(jnp.diag(columns.kept) + C, shared)
+def share(kept: Float[Array, " m"], C: Float[Array, "m m"], coefficients: Float[Array, "m *k"]) -> Float[Array, "m *k"]:
+    """The least coefficients of all columns with the same sum as those of the kept ones: [1; C] (1 + C^T C)^-1 x.
+
+    `kept` and `C` as `Columns.kept` and `Columns.combinations`; the coefficients (m, ...) of other columns are zero.
+    """
+    shared = solve_cholesky(cholesky(jnp.eye(C.shape[0], dtype=C.dtype) + matmul(C.T, C)), coefficients)
+    return matmul(jnp.diag(kept) + C, shared)
 
 
 def solve_with_damping(A: Float[Array, "m n"], right: Float[Array, " m"]) -> Float[Array, " n"]:
@@ -175,7 +177,7 @@ def _solve_normal_equations(rank_tol, dependent: bool, Y):
     if dependent:
         columns = independent_columns(Y, rank_tol)
         factor, is_doubtful = columns.factor, ~columns.is_clear
-        inverse = share(columns, solve_cholesky(factor, (Y * columns.kept[None]).T))
+        inverse = share(columns.kept, columns.combinations, solve_cholesky(factor, (Y * columns.kept[None]).T))
     else:
         factor, is_doubtful = cholesky(regular_gram(Y)), jnp.asarray(False)
         inverse = solve_cholesky(factor, Y.T)

@@ -19,7 +19,7 @@ from jaxdyn.constraints.base import (
     rows,
     velocity_residual,
 )
-from jaxdyn.constraints.rank import eps_of
+from jaxdyn.constraints.rank import eps_of, share
 from jaxdyn.constraints.tolerances import row_limits
 from jaxdyn.lie.so3 import matmul
 from jaxdyn.model.arguments import Number, SystemLike
@@ -194,8 +194,8 @@ def gap_of_redundant(scene: Scene, q, t) -> Float[Array, ""]:
 def distribute_multipliers(scene: Scene, q, t, lam: Float[Array, " nc"]) -> Float[Array, " nc"]:
     """Multipliers of least norm of all rows, with the same force as `lam` of the kept ones, if some were dropped.
 
-    With the dropped rows as combinations A_d = C A_k of the kept ones, lam_k + C^T lam_d = lam, whose shortest solution is
-    [1; C] (1 + C^T C)^-1 lam.
+    With the dropped rows as combinations A_d = C A_k of the kept ones, lam_k + C^T lam_d = lam, of which `share` is the shortest
+    solution.
     """
     # Without this the loads of redundant bearings would depend on the choice of rows, and jump where it changes.
     if not has_selection(scene):
@@ -211,8 +211,7 @@ def _distribute(scene: Scene, q, t, lam, kept):
     # Ones on the diagonal of dropped rows make the matrix regular; their right-hand sides are zero.
     gram = matmul(own, own.T) + jnp.diag(1 - kept)
     C = solve_cholesky(cholesky(gram), matmul(own, ((1 - kept)[:, None] * A).T)).T
-    shared = solve_cholesky(cholesky(jnp.eye(A.shape[0], dtype=A.dtype) + matmul(C.T, C)), kept * lam)
-    return kept * shared + matmul(C, shared)
+    return share(kept, C, kept * lam)
 
 
 def largest_of_each(scene: Scene, sizes) -> Array:

@@ -52,7 +52,6 @@ from jaxdyn.constraints.rank import (
 from jaxdyn.constraints.redundancy import (
     Selection,
     all_rows,
-    exchange_rows,
     has_selection,
     holds_rows,
     keep_rows,
@@ -116,7 +115,7 @@ def independent_rows(scene: Scene, q, t, rank_tol: float | None = None) -> Scene
     values below the tolerance count as zero.
     """
     if holds_rows(scene):
-        return all_rows(scene) if rank_tol is not None else exchange_rows(scene, renew_rows(scene, q, t, False))
+        return all_rows(scene) if rank_tol is not None else keep_rows(all_rows(scene), _held_selection(scene, q, t))
     if not (scene.rounding and scene.constraints) or rank_tol is not None or has_selection(scene):
         return scene
     selection = select_rows(scene, q, t)
@@ -157,6 +156,17 @@ def choose_rows(scene: SceneLike, q: Float[Array, " nq"], t: Numbers = 0.0) -> S
     return keep_rows(scene, selection, is_held=True)
 
 
+def _held_selection(scene: Scene, q, t) -> Selection:
+    """The choice that a scene of `choose_rows` holds, made again where it is poor."""
+    held, rows = scene.constraints[0], renew_rows(scene, q, t, False)
+    gap = held.gap
+    if scene.rounding:
+        # In a singular position no choice is good, and rounding hides which rows are independent there.
+        here = jnp.sqrt(rows[-1] / _EXCHANGED_AT) / jnp.maximum(held.rounding, eps_of(q))
+        gap = jnp.minimum(gap, here)
+    return Selection(rows[:-1], held.rounding, rows[-1], gap, gap)
+
+
 def hide_unclear(selection: Selection) -> Selection:
     """The selection with NaN for all rows where it is not clear which ones are independent, so that no result is a guess."""
     return selection._replace(kept=jnp.where(selection.gap >= LEAST_GAP, selection.kept, jnp.nan))
@@ -184,8 +194,7 @@ def select_rows(scene: Scene, q, t: Any, rank_tol: float | None = None) -> Selec
     traced arguments give the same rows. Infinite or NaN rows are all kept; `assemble` and `simulate` report such states.
     """
     if holds_rows(scene):
-        held, gap = renew_rows(scene, q, t, False), scene.constraints[0].gap
-        return Selection(held[:-1], scene.constraints[0].rounding, held[-1], gap, gap)
+        return _held_selection(scene, q, t)
     return _search_rows(scene, q, t, rank_tol)
 
 
@@ -251,7 +260,7 @@ def renew_rows(scene: Scene, q, t, is_projected: bool) -> Float[Array, " n"]:
 
     Rows are chosen anew where the kept ones have become nearly dependent. There are positions at which every fixed choice of rows
     loses rank, though all rows together do not. A scalar program has no branches: it marks the sample as invalid there
-    (`project_step` does if the state `is_projected`), and the step is repeated by the operations of JAX.
+    (`project_step` does if the state `is_projected`), which another program then computes.
     """
     old = rows_of(scene, q.dtype)
     whole = all_rows(scene)
@@ -284,7 +293,7 @@ def _choose_again(bare: Scene, q, t, old):
     pivot_of_new = kernel(_pivot_of)(bare, q, t, new)
     # At a singular position no choice is good. The old rows are kept then, unless the new ones are better, and the limit is
     # lowered with the pivot, so that the search is not repeated in every step on the way through.
-    is_better = is_poor & ~(pivot_of_new < pivot)
+    is_better = is_poor & (jnp.sum(new) == jnp.sum(kept)) & ~(pivot_of_new < pivot)
     kept_next, next_pivot = jnp.where(is_better, new, kept), jnp.where(is_better, pivot_of_new, pivot)
     return jnp.where(is_poor, jnp.append(kept_next, _EXCHANGED_AT * next_pivot), old)
 
@@ -311,9 +320,11 @@ def project_after_exchange(old, new, project: Callable, state: Any) -> Any:
 
 
 def _pivot_of(scene: Scene, q, t, kept):
-    """`least_pivot_of` the kept rows in the metric of the mass matrix."""
+    """`least_pivot_of` the kept rows in the metric of the mass matrix; zero where one of them vanishes."""
     A = kept[:, None] * constraint_jacobian(scene, q, t)
-    return least_pivot_of(mass_factor(mass_matrix(scene.system, q, t)).whiten(A.T))
+    Y = mass_factor(mass_matrix(scene.system, q, t)).whiten(A.T)
+    vanishes = jnp.any((kept > 0) & (jnp.sum(Y * Y, 0) == 0))
+    return jnp.where(vanishes, 0.0, least_pivot_of(Y))
 
 
 def _least_doubtless(like, rank_tol: float | None) -> float:

@@ -84,3 +84,16 @@ def test_scenes_that_need_no_choice_and_places_that_allow_none():
     once = jd.constraints.choose_rows(scene, start)
     twice = jd.constraints.choose_rows(once, start)
     assert jax.tree.structure(once) == jax.tree.structure(twice)
+
+
+def test_a_held_choice_of_rounded_rows_has_a_code_in_a_singular_position():
+    """A flat parallelogram, whose rows have rank one there; a file of few digits does not say so."""
+    exact = jd.scenes.four_bar(lengths=(1.0, 3.0, 1.0, 3.0), gravity=None, in_plane=False)
+    scene, flat, at_rest = rounded(exact, 4), jnp.zeros(3), jnp.zeros(3)
+    chosen = jd.constraints.choose_rows(scene, jnp.array([1.0, -1.0, 1.0]))
+    for one in (scene, chosen):
+        assert jd.constrained_dynamics(one, flat, at_rest).result == jd.RESULTS.unclear_rank
+    motion = jd.constrained_dynamics(chosen, jnp.array([0.3, -0.3, 0.3]), at_rest, jnp.array([1.0, 0.3, 0.2]))
+    wanted = jd.constrained_dynamics(exact, jnp.array([0.3, -0.3, 0.3]), at_rest, jnp.array([1.0, 0.3, 0.2]))
+    assert bool(motion.success) and int(motion.rank) == int(wanted.rank) == 2
+    np.testing.assert_allclose(motion.acceleration, wanted.acceleration, atol=10 * 0.5e-4)
