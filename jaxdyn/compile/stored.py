@@ -18,6 +18,7 @@ from typing import Any, NamedTuple
 
 from jaxdyn.compile import disk, jax_adapter, mode
 from jaxdyn.compile.fingerprint import NoFingerprint, fingerprint
+from jaxdyn.compile.first_calls import phase
 from jaxdyn.compile.program import Array, Operation, Program
 
 _PACKAGES = ("jax", "jaxlib", "numpy", "equinox", "diffrax", "optimistix", "lineax", "optax", "jaxtyping", "llvmlite")
@@ -122,8 +123,11 @@ def load_or_make(key: str | None, make: Callable[[], tuple[Sequence[Program], An
 
     Derivatives and fallbacks of the programs are not kept: they are functions, which the caller sets.
     """
-    if key is None:
-        return make()
+    with phase("expansion"):
+        return make() if key is None else _load_or_make(key, make)
+
+
+def _load_or_make(key: str, make: Callable) -> tuple[Sequence[Program], Any]:
     found = _load(f"{key}.program")
     if found is not None:
         again = functools.partial(_in_modes, mode.remember(), make)
