@@ -128,8 +128,7 @@ def _find(function, structure, kinds, options, context) -> Executable:
             found = _load(key, recover)
             if found is not None:
                 return Executable(found.run, static, out)
-        with phase("XLA"):
-            made = Executable(lowered.compile(), static, out)
+        made = Executable(lowered.compile(), static, out)
     if key is not None and is_kept:
         _save(key, text, made)
     return made

@@ -14,6 +14,8 @@ import threading
 import time
 from collections.abc import Callable, Iterator
 
+import jax
+
 logger = logging.getLogger("jaxdyn")
 PHASES = "tracing", "expansion", "XLA", "LLVM"
 REPORTED_SECONDS = 2.0  # of a first call
@@ -66,6 +68,19 @@ class _FirstCall:
                 if now - self.begin > REPORTED_SECONDS:
                     self._start()
             self.inner.seconds = None if within is None else within + now - start
+
+    def add_compilation(self, event: str, seconds: float, **_) -> None:
+        """Count the time that XLA has compiled, as JAX reports it."""
+        if event != "/jax/core/compile/backend_compile_duration":
+            return
+        now = time.perf_counter()
+        with self.changed:
+            if not self.active and now - seconds - self.end > _QUIET_SECONDS:
+                return  # a program without kernels
+            self.end = now
+            self.seconds["XLA"] += seconds
+        if getattr(self.inner, "seconds", None) is not None:
+            self.inner.seconds += seconds
 
     def report(self) -> None:
         """Log how long the phases of a long first call took, once."""
@@ -127,4 +142,5 @@ class _FirstCall:
 
 _first_call = _FirstCall()
 atexit.register(_first_call.stop)
-phase, optimise_later, finish = _first_call.phase, _first_call.optimise_later, _first_call.finish
+jax.monitoring.register_event_duration_secs_listener(_first_call.add_compilation)
+phase, optimise_later, wait_for_code = _first_call.phase, _first_call.optimise_later, _first_call.finish
