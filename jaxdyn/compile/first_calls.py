@@ -28,7 +28,7 @@ class _FirstCall:
     def __init__(self):
         self.changed = threading.Condition(threading.RLock())
         self.seconds: dict[str, float] = dict.fromkeys(PHASES, 0.0)
-        self.begin = self.end = 0.0
+        self.begin = self.end = self.added = 0.0  # of the phases, and when the last task came
         self.active = self.collecting = 0  # phases in all threads, and those in which the collector rests
         self.is_collecting = True  # whether the collector runs outside of phases
         self.inner = threading.local()  # seconds of phases within the phase at hand, in this thread
@@ -98,6 +98,7 @@ class _FirstCall:
         """Call improve() in the thread that optimises code."""
         with self.changed:
             self.tasks.append(improve)
+            self.added = time.perf_counter()
             self._start()
 
     def _start(self) -> None:
@@ -109,7 +110,7 @@ class _FirstCall:
         """Seconds until the first call is over, as far as that is known."""
         if self.is_hurried or self.is_ending:
             return 0.0
-        return _QUIET_SECONDS if self.active else self.end + _QUIET_SECONDS - time.perf_counter()
+        return _QUIET_SECONDS if self.active else max(self.end, self.added) + _QUIET_SECONDS - time.perf_counter()
 
     def _run(self) -> None:
         while True:
