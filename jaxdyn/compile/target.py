@@ -313,13 +313,16 @@ def _read_operations(program) -> None:
 
 
 def restore(number: int, row: Row, recover: Callable) -> None:
-    """Put a kernel into the table whose code is on disk; `recover()` traces its program again, should the code be missing."""
+    """Put a kernel into the table whose code is on disk; `recover()` makes the careful programs that it calls.
+
+    **Raises:** LookupError where the code is missing: what calls the kernel has to be traced again.
+    """
     restored = _restore(number, row, recover)
-    if not restored.is_made:
-        # Now, not in the handler: a process that ends while a thread of XLA waits for Python would wait for ever.
-        with _making:
-            if not restored.is_made:
-                restored._make(None, row.identity)
+    # Now, not in the handler: a process that ends while a thread of XLA waits for Python would wait for ever.
+    with _making:
+        is_there = restored.is_made or restored.program is not None or row.careful or restored._make(None, row.identity)
+    if not is_there:
+        raise LookupError(f"the code of {row.name} is missing")
 
 
 def _restore(number: int, row: Row, recover: Callable) -> _Kernel:
