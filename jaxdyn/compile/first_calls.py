@@ -10,6 +10,7 @@ import collections
 import contextlib
 import gc
 import logging
+import os
 import threading
 import time
 from collections.abc import Callable, Iterator
@@ -102,7 +103,7 @@ class _FirstCall:
             self._start()
 
     def _start(self) -> None:
-        if self.thread is None or not self.thread.is_alive():  # as in a forked process
+        if self.thread is None:
             self.thread = threading.Thread(target=self._run, name="jaxdyn optimiser", daemon=True)
             self.thread.start()
 
@@ -143,5 +144,9 @@ class _FirstCall:
 
 _first_call = _FirstCall()
 atexit.register(_first_call.stop)
+if hasattr(os, "register_at_fork"):
+    os.register_at_fork(
+        after_in_child=_first_call.__init__
+    )  # which has no other threads, and may have found the lock taken
 jax.monitoring.register_event_duration_secs_listener(_first_call.add_compilation)
 phase, optimise_later, wait_for_code = _first_call.phase, _first_call.optimise_later, _first_call.finish

@@ -26,7 +26,7 @@ from jaxdyn.compile.mode import wants_least_optimisation, wants_usual_options
 logger = logging.getLogger("jaxdyn")
 ANNOUNCED_LINES = 100_000  # of LLVM's text, which compile in some five seconds
 LONG_LINES = 6000  # of LLVM's text, beyond which a kernel is straight code of one program but for few lines
-QUICK_LINES = 1000  # of LLVM's text, which take 0.05 s
+QUICK_LINES = 300  # of LLVM's text, which take 0.02 s
 QUICK_BYTES = 1 << 22  # of memory on the stack, where at the lowest level almost every number has a place of its own
 
 

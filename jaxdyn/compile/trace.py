@@ -217,6 +217,11 @@ def inline_call(function, static, tree, args, fallback: Callable | None = None):
     traced, known = partition_tracers(tree)
     leaves, structure = jax.tree.flatten(args)
     flat, leaves = function_of_leaves(function, static, known, len(traced), structure), [*traced, *leaves]
+    if mode.has_branches() and not (mode.is_careful() or mode.is_standalone()):
+        # What marks nothing takes no branches: its trace is the one of programs without them, which may be there.
+        with mode.expanding():
+            if not has_marks(jax.make_jaxpr(flat)(*leaves).jaxpr):
+                return flat(*leaves)
     if fallback is None or not mode.has_branches() or mode.is_careful_within():
         return flat(*leaves)
     leaves = [*map(jnp.asarray, leaves)]
