@@ -13,6 +13,7 @@ kernels ahead of time, and `jaxdyn.exports`, which writes object files, import t
 
 from jaxdyn.compile.calls import entry_point as entry_point
 from jaxdyn.compile.calls import jit as jit
+from jaxdyn.compile.first_calls import wait_for_code as wait_for_code
 from jaxdyn.compile.flags import mark_invalid as mark_invalid
 from jaxdyn.compile.jacobi import gram_eigenvectors as gram_eigenvectors
 from jaxdyn.compile.jacobi import inverse as inverse

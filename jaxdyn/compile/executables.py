@@ -15,6 +15,7 @@ import jax
 import numpy as np
 
 from jaxdyn.compile import ahead, disk, jax_adapter, mode, stored
+from jaxdyn.compile.first_calls import phase
 
 # What a stored executable may call: kernels, which are restored with it, and functions that every jaxlib has. A call of
 # anything else may hold an address of the process that made it.
@@ -119,7 +120,8 @@ def _find(function, structure, kinds, options, context) -> Executable:
     if key is not None and (found := _load(key, recover)) is not None:
         return found
     with ahead.worker(not mode.wants_usual_options()):
-        lowered, (static, out) = trace()
+        with phase("tracing"):
+            lowered, (static, out) = trace()
         text = lowered.as_text()
         is_kept = _may_be_kept(text, key is None)
         if key is None and is_kept and (key := stored.key_of("text", text, options())) is not None:

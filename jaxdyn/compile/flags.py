@@ -5,6 +5,8 @@ other, the function says so by `mark_invalid(flag, x)`, which is NaN where the f
 valid, and native code computes the others by the fallback (see `careful`). A program without marks reports nothing.
 """
 
+import weakref
+
 import jax
 import jax.numpy as jnp
 
@@ -32,16 +34,22 @@ def mark_floats(flag: jax.Array, tree):
     return jax.tree.map(lambda x: mark_invalid(flag, x) if is_float(x) else x, tree)
 
 
+_marked: weakref.WeakKeyDictionary = weakref.WeakKeyDictionary()  # jaxprs that were looked through
+
+
 def has_marks(jaxpr) -> bool:
     """Decide whether a jaxpr marks numbers as not valid, also within functions that it calls."""
-    for eqn in jaxpr.eqns:
-        if eqn.primitive.name == "jaxdyn_invalid" or getattr(eqn.params.get("program"), "careful", None) is not None:
-            return True
-        for value in eqn.params.values():
-            inner = (getattr(x, "jaxpr", x) for x in (value if isinstance(value, (tuple, list)) else (value,)))
-            if any(hasattr(x, "eqns") and has_marks(x) for x in inner):
-                return True
-    return False
+    if jaxpr not in _marked:
+        _marked[jaxpr] = any(map(_is_marking, jaxpr.eqns))
+    return _marked[jaxpr]
+
+
+def _is_marking(eqn) -> bool:
+    if eqn.primitive.name == "jaxdyn_invalid" or getattr(eqn.params.get("program"), "careful", None) is not None:
+        return True
+    values = (x for value in eqn.params.values() for x in (value if isinstance(value, (tuple, list)) else (value,)))
+    inner = (getattr(x, "jaxpr", x) for x in values)
+    return any(hasattr(x, "eqns") and has_marks(x) for x in inner)
 
 
 def _batch(args, axes):

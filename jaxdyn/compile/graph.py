@@ -57,12 +57,21 @@ class Graph:
         if 0.0 in args:  # zeros of both signs compare equal, and are different numbers: 1 / -0.0 is not 1 / 0.0
             key = (*key, tuple(isinstance(x, (float, np.floating)) and x == 0 and _is_negative(x) for x in args))
         number = made.get(key)
-        if number is None:
-            if len(self.numbers) >= self.most_made:
-                raise TooLong(f"more than {self.most} operations")
-            number = made[key] = Number(self, op, kind, args)
-            self.numbers.append(number)
+        return self._new(op, kind, args, key, made) if number is None else number
+
+    def _new(self, op: str, kind: str, args: tuple, key: tuple, made: dict) -> Number:
+        if len(self.numbers) >= self.most_made:
+            raise TooLong(f"more than {self.most} operations")
+        number = made[key] = Number(self, op, kind, args)
+        self.numbers.append(number)
         return number
+
+    def _commuting(self, op: str, a: Number, b: Number) -> Number:
+        """The sum or product of two numbers that are not known: one number for a + b and b + a."""
+        made = self.shared[op, a.kind]
+        key = a, b
+        number = made.get((b, a)) or made.get(key)
+        return self._new(op, a.kind, key, key, made) if number is None else number
 
     def inputs(self, place: int, array: Array) -> np.ndarray:
         """The entries of an argument. **Raises:** `NotNumbers` for a dtype that programs do not have."""
@@ -123,10 +132,7 @@ class Graph:
             return self.sub(a, b.args[0])
         if a.op == "neg":
             return self.sub(b, a.args[0])
-        # Sums commute: one number for a + b and b + a.
-        if (b, a) in self.shared["add", a.kind]:
-            a, b = b, a
-        return self.make("add", a.kind, a, b)
+        return self._commuting("add", a, b)
 
     def sub(self, a, b):
         """a - b."""
@@ -181,9 +187,7 @@ class Graph:
             return self.neg(self.mul(a.args[0], b))
         if b.op == "neg":
             return self.neg(self.mul(a, b.args[0]))
-        if (b, a) in self.shared["mul", a.kind]:
-            a, b = b, a
-        return self.make("mul", a.kind, a, b)
+        return self._commuting("mul", a, b)
 
     def div(self, a, b):
         """a / b, of floats."""
@@ -331,18 +335,16 @@ class Graph:
         """The program of those numbers that the entries of the outputs need; the graph ends with it."""
         flat = [tuple(x.ravel().tolist()) for x in entries]
         # Marked from the outputs backwards, with a list instead of recursion: programs are tens of thousands deep.
-        live: set = set()
         waiting = [x for row in flat for x in row if type(x) is Number]
         while waiting:
             number = waiting.pop()
-            if type(number) is Number and number not in live:
-                live.add(number)
+            if type(number) is Number and number.place is None:
+                number.place = -1  # needed
                 if number.op == "part" and number.args[0].op == "call_where":
                     waiting.append(self._otherwise(number.args[0])[number.args[1]])
                 if number.op != "input":
                     # Of what stands for the outputs of a branch, that alone which has a part is needed.
                     waiting.extend(self._inputs_of_branch(number) if number.op == "call_where" else number.args)
-        index: dict[Number, int] = {}
         operations = []
         # In the order of creation, where operands precede their operation. Depth first from the outputs was tried: forward
         # dynamics of a Panda took 1.6 times as long.
@@ -350,18 +352,21 @@ class Graph:
         # Numbers know their graph: with these references the collector of cycles would look for them in the whole process,
         # which was a tenth of a first call.
         self.shared.clear()
+        new = tuple.__new__  # of named tuples, a third of the time that their own constructors take
         for number in numbers:
-            if number in live:
-                index[number] = len(operations)
-                args = number.args
-                if number.op != "input":
-                    if number.op == "call_where":
-                        args = tuple(x if type(x) is not Number or x in live else 0 for x in args)
-                    args = tuple(index[x] if type(x) is Number else Constant(x) for x in args)
-                operations.append(_check(Operation(number.op, number.kind, args), operations))
-            if len(operations) > self.most:
-                raise TooLong(f"more than {self.most} operations")
-        results = [tuple(index[x] if type(x) is Number else Constant(x) for x in row) for row in flat]
+            if number.place is not None:
+                op, kind, args = number.op, number.kind, number.args
+                number.place = len(operations)
+                if op != "input":
+                    if op == "call_where":
+                        args = tuple(x if type(x) is not Number or x.place is not None else 0 for x in args)
+                    if any([type(x) is Number and x.kind != kind for x in args]):
+                        _check_kinds(number)
+                    args = tuple([x.place if type(x) is Number else new(Constant, (x,)) for x in args])
+                operations.append(new(Operation, (op, kind, args)))
+        if len(operations) > self.most:
+            raise TooLong(f"more than {self.most} operations")
+        results = [tuple([x.place if type(x) is Number else Constant(x) for x in row]) for row in flat]
         return Program(inputs, outputs, operations, results, self.subprograms, **more)
 
 
@@ -371,14 +376,13 @@ _BY_NAME: dict[str, Callable] = {
 }  # fmt: skip
 
 
-def _check(operation: Operation, operations: Sequence[Operation]) -> Operation:
-    """The operation. **Raises:** `NotNumbers` where its operands differ in kind, which LLVM would refuse with less grace."""
-    op, kind, args = operation
-    if op not in ("input", "call", "call_where", "part", "convert", "is_finite"):
-        kinds = {operations[x].kind for x in (args[1:] if op == "select" else args) if type(x) is not Constant}
+def _check_kinds(number: Number) -> None:
+    """Check the kinds of operands. **Raises:** `NotNumbers` where they differ, which LLVM would refuse with less grace."""
+    op, kind, args = number.op, number.kind, number.args
+    if op not in ("call", "call_where", "part", "convert", "is_finite"):
+        kinds = {x.kind for x in (args[1:] if op == "select" else args) if type(x) is Number}
         if len(kinds) > 1 or (kinds and op not in COMPARISONS and kinds != {kind}):
             raise NotNumbers(f"{op} of {' and '.join(dtype_of(x).name for x in sorted(kinds | {kind}))}")
-    return operation
 
 
 def _is_negative(x) -> bool:

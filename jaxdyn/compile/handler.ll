@@ -21,8 +21,9 @@ declare {RELAX_TYPE}
 @misfit = private constant [{MISFIT_BYTES} x i8] c"{MISFIT}\00"
 
 %Entry = type { i64, ptr, i64, i64, i64, ptr }
-; A batch that is shared between threads. What is counted atomically stands on cache lines of its own.
-;                kernel  data samples chunk chunks, references, -, next, -, done
+; A batch that is shared between threads. What is counted atomically stands on cache lines of its own. The first field is where the
+; address of the kernel is, which changes when there is better code.
+;               address  data samples chunk chunks, references, -, next, -, done
 %Job = type { ptr, ptr, i64, i64, i64, i64, [8 x i64], i64, [8 x i64], i64 }
 
 ; XLA's structures, as far as they are read: size of the structure, extensions, ...
@@ -39,8 +40,8 @@ declare {RELAX_TYPE}
 ; Claim chunks until there are none.
 define internal void @work(ptr %job) #0 {
 entry:
-  %kernel.at = getelementptr %Job, ptr %job, i32 0, i32 0
-  %kernel = load ptr, ptr %kernel.at
+  %address.at = getelementptr %Job, ptr %job, i32 0, i32 0
+  %address = load ptr, ptr %address.at
   %data.at = getelementptr %Job, ptr %job, i32 0, i32 1
   %data = load ptr, ptr %data.at
   %n.at = getelementptr %Job, ptr %job, i32 0, i32 2
@@ -61,6 +62,7 @@ run:
   %far = add i64 %begin, %chunk
   %is.inside = icmp slt i64 %far, %n
   %end = select i1 %is.inside, i64 %far, i64 %n
+  %kernel = load atomic ptr, ptr %address acquire, align 8
   call void %kernel(ptr %data, i64 %n, i64 %begin, i64 %end)
   %before = atomicrmw add ptr %done.at, i64 1 seq_cst
   br label %claim
@@ -228,14 +230,14 @@ some:
   ret i64 %allowed
 }
 
-define internal void @in_parallel(ptr %api, ptr %context, ptr %kernel, ptr %data, i64 %n, i64 %chunk, i64 %chunks, i64 %threads) #0 {
+define internal void @in_parallel(ptr %api, ptr %context, ptr %address, ptr %data, i64 %n, i64 %chunk, i64 %chunks, i64 %threads) #0 {
 entry:
   %args = alloca [5 x i64]
   %job.end = getelementptr %Job, ptr null, i32 1
   %job.bytes = ptrtoint ptr %job.end to i64
   %job = call ptr @malloc(i64 %job.bytes)
   store %Job zeroinitializer, ptr %job
-  store ptr %kernel, ptr %job
+  store ptr %address, ptr %job
   %data.at = getelementptr %Job, ptr %job, i32 0, i32 1
   store ptr %data, ptr %data.at
   %n.at = getelementptr %Job, ptr %job, i32 0, i32 2
@@ -486,7 +488,8 @@ alone:
   call void %kernel(ptr %data, i64 %n, i64 0, i64 %n)
   br label %check
 parallel:
-  call void @in_parallel(ptr %api, ptr %context, ptr %kernel, ptr %data, i64 %n, i64 %chunk, i64 %chunks, i64 %threads)
+  %address = getelementptr %Entry, ptr %entry.at, i32 0, i32 1
+  call void @in_parallel(ptr %api, ptr %context, ptr %address, ptr %data, i64 %n, i64 %chunk, i64 %chunks, i64 %threads)
   br label %check
 check:
   ; A careful program that could not be made, of this call or of one at the same time.

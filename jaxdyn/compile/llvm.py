@@ -6,7 +6,6 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from jaxdyn.compile.mode import wants_least_optimisation
 from jaxdyn.compile.program import COMPARISONS, FLOATS
 from jaxdyn.compile.trigonometry import COSINE, HALF_PI, MAX_ANGLE, SINE
 
@@ -310,9 +309,6 @@ class Emitter:
     def splat(self, value: str, kind: str) -> str:
         """Broadcast one number to all samples."""
         of = self.type(kind)
-        if wants_least_optimisation():
-            # LLVM 22 at level 0 aborts where it merges loads with their broadcasts ("Node is not in map!").
-            value = self.emit(f"freeze {_TYPES[kind]} {value}")
         first = self.emit(f"insertelement {of} poison, {_TYPES[kind]} {value}, i32 0")
         return self.emit(f"shufflevector {of} {first}, {of} poison, <{self.width} x i32> zeroinitializer")
 

@@ -2,12 +2,17 @@
 
 An object file is found by the identity of the program that it computes, and by what its code depends on beside that: the sources
 of this subpackage, which write the text, the versions of LLVM, and the processor's name and features.
+
+A long text is compiled twice: at LLVM's lowest level, in a quarter of the time, and later once more (see `ahead`). The bits of
+results are those of the text at every level.
 """
 
 import functools
 import hashlib
 import json
 import logging
+import re
+import zlib
 from collections.abc import Sequence
 from pathlib import Path
 from typing import NamedTuple
@@ -16,11 +21,13 @@ import llvmlite
 import llvmlite.binding as llvm
 
 from jaxdyn.compile import disk
-from jaxdyn.compile.mode import wants_least_optimisation
+from jaxdyn.compile.mode import wants_least_optimisation, wants_usual_options
 
 logger = logging.getLogger("jaxdyn")
 ANNOUNCED_LINES = 100_000  # of LLVM's text, which compile in some five seconds
 LONG_LINES = 6000  # of LLVM's text, beyond which a kernel is straight code of one program but for few lines
+QUICK_LINES = 300  # of LLVM's text, which take 0.02 s
+QUICK_BYTES = 1 << 22  # of memory on the stack, where at the lowest level almost every number has a place of its own
 
 
 @functools.cache
@@ -36,12 +43,12 @@ def features() -> str:
     return llvm.get_host_cpu_features().flatten()
 
 
-def target_machine():
+def target_machine(level: int | None = None):
     """LLVM's description of this processor; not shared, as each engine takes its own."""
     initialize()
-    target = llvm.Target.from_triple(llvm.get_process_triple())
+    target, level = llvm.Target.from_triple(llvm.get_process_triple()), _level() if level is None else level
     return target.create_target_machine(
-        cpu=llvm.get_host_cpu_name(), features=features(), opt=_level(), jit=True, reloc="pic"
+        cpu=llvm.get_host_cpu_name(), features=features(), opt=level, jit=True, reloc="pic"
     )
 
 
@@ -66,11 +73,21 @@ def _environment() -> str:
 
 
 class ObjectFile(NamedTuple):
-    """Machine code as bytes, the symbols of the subprograms that it calls, and the rows of careful programs, by their numbers."""
+    """Machine code as bytes, the symbols of the subprograms that it calls, and the rows of careful programs, by their numbers.
+
+    `text`: of quick code, which is to be compiled once more.
+    """
 
     binary: bytes
     calls: tuple[str, ...]
     careful: tuple[tuple[int, tuple], ...]
+    text: str = ""
+
+    def improve(self, identity: str) -> "ObjectFile":
+        """The optimised code, which takes the place of this one in the folder too."""
+        made = self._replace(binary=compile_text(self.text), text="")
+        _keep(identity, made)
+        return made
 
 
 def find(identity: str) -> ObjectFile | None:
@@ -78,19 +95,37 @@ def find(identity: str) -> ObjectFile | None:
     contents = disk.read(name_of_file(identity))
     if contents is None:
         return None
-    head, _, binary = contents.partition(b"\n")
-    calls, careful = json.loads(head)
-    return ObjectFile(binary, tuple(calls), tuple((number, tuple(row)) for number, row in careful))
+    head, _, rest = contents.partition(b"\n")
+    calls, careful, size = json.loads(head)
+    text = zlib.decompress(rest[size:]).decode() if len(rest) > size else ""
+    return ObjectFile(rest[:size], tuple(calls), tuple((number, tuple(row)) for number, row in careful), text)
 
 
-def make(identity: str, text: str, calls: Sequence[str], careful: Sequence = (), name: str = "") -> ObjectFile:
-    """Compile a text, and keep the code in the folder."""
+def make(
+    identity: str, text: str, calls: Sequence[str], careful: Sequence = (), name: str = "", width: int = 0
+) -> ObjectFile:
+    """Compile a text, and keep the code in the folder.
+
+    `width`: samples in a vector of code that may be quick; zero for code that is optimised at once.
+    """
     if (lines := text.count("\n")) > ANNOUNCED_LINES:
         message = "jaxdyn: compiling %s, %d lines; the next start of this script reads it from the cache"
         logger.warning(message, name or "a function", lines)
-    binary = compile_text(text)
-    disk.write(name_of_file(identity), json.dumps([list(calls), list(careful)]).encode() + b"\n" + binary)
-    return ObjectFile(binary, tuple(calls), tuple(careful))
+    is_quick = width > 0 and lines > QUICK_LINES and 8 * width * lines < QUICK_BYTES and has_two_levels()
+    made = ObjectFile(compile_text(text, is_quick), tuple(calls), tuple(careful), text if is_quick else "")
+    _keep(identity, made)
+    return made
+
+
+def has_two_levels() -> bool:
+    """Decide whether code is made quickly at first."""
+    return not wants_least_optimisation() and not wants_usual_options()
+
+
+def _keep(identity: str, made: ObjectFile) -> None:
+    head = json.dumps([list(made.calls), list(made.careful), len(made.binary)]).encode()
+    text = zlib.compress(made.text.encode(), 1) if made.text else b""
+    disk.write(name_of_file(identity), head + b"\n" + made.binary + text)
 
 
 def find_careful(digest: str) -> str | None:
@@ -126,7 +161,12 @@ class Code:
 
     def publish(self, name: str, symbol: str) -> None:
         """Let code that is made from now on call a function by this name."""
-        llvm.add_symbol(symbol, self.address(name))
+        add_symbol(symbol, self.address(name))
+
+
+def add_symbol(symbol: str, address: int) -> None:
+    """Let code that is made from now on find an address by this name."""
+    llvm.add_symbol(symbol, address)
 
 
 def _module(text: str, machine):
@@ -136,12 +176,19 @@ def _module(text: str, machine):
     return module
 
 
-def compile_text(text: str) -> bytes:
+# The first element of a vector of equal ones.
+_BROADCAST = re.compile(r"(  %\w+ = insertelement <\d+ x (\w+)> poison, \w+ )(%\w+)(, i32 0)")
+
+
+def compile_text(text: str, is_quick: bool = False) -> bytes:
     """The object file of a text of LLVM."""
+    if is_quick or wants_least_optimisation():
+        # LLVM 22 at level 0 aborts where it merges loads with their broadcasts ("Node is not in map!").
+        text = _BROADCAST.sub(r"  \3.frozen = freeze \2 \3\n\1\3.frozen\4", text)
+        machine = target_machine(0)
+        return machine.emit_object(_module(text, machine))
     machine = target_machine()
     module = _module(text, machine)
-    if wants_least_optimisation():
-        return machine.emit_object(module)
     options = llvm.create_pipeline_tuning_options(speed_level=1)
     # The text is vectors already, in one block of thousands of lines: LLVM's vectorisers would only take time.
     options.loop_vectorization = options.slp_vectorization = options.loop_unrolling = False

@@ -261,10 +261,11 @@ class Number:
     """A number of a graph that is not known before the program runs."""
 
     # Tens of thousands are made for a robot: slots save a dictionary for each.
-    __slots__ = ("args", "graph", "kind", "op")
+    __slots__ = ("args", "graph", "kind", "op", "place")
 
     def __init__(self, graph: Any, op: str, kind: str, args: tuple):
         self.graph, self.op, self.kind, self.args = graph, op, kind, args
+        self.place: int | None = None  # in the finished program
 
     def __add__(self, other):
         return self.graph.add(self, other)

@@ -18,6 +18,7 @@ from typing import Any, NamedTuple
 
 from jaxdyn.compile import disk, jax_adapter, mode
 from jaxdyn.compile.fingerprint import NoFingerprint, fingerprint
+from jaxdyn.compile.first_calls import phase
 from jaxdyn.compile.program import Array, Operation, Program
 
 _PACKAGES = ("jax", "jaxlib", "numpy", "equinox", "diffrax", "optimistix", "lineax", "optax", "jaxtyping", "llvmlite")
@@ -107,9 +108,14 @@ class StoredProgram(Program):
 
     @functools.cached_property
     def remade(self) -> Program:
-        """The program made again."""
+        """The program made again; its operations count where tracing has found another order than before."""
         made = self._remake()
-        assert made.digest == self.digest, f"{self.name} has another program when it is traced again"
+        if made.digest != self.digest:
+            if (made.inputs, made.outputs, made.read_places) != (self.inputs, self.outputs, self.read_places):
+                raise RuntimeError(
+                    f"{self.name} has another program when it is traced again; remove {disk.cache_folder()}"
+                )
+            self.subprograms = made.subprograms
         return made
 
 
@@ -122,8 +128,11 @@ def load_or_make(key: str | None, make: Callable[[], tuple[Sequence[Program], An
 
     Derivatives and fallbacks of the programs are not kept: they are functions, which the caller sets.
     """
-    if key is None:
-        return make()
+    with phase("expansion"):
+        return make() if key is None else _load_or_make(key, make)
+
+
+def _load_or_make(key: str, make: Callable) -> tuple[Sequence[Program], Any]:
     found = _load(f"{key}.program")
     if found is not None:
         again = functools.partial(_in_modes, mode.remember(), make)

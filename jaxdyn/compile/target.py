@@ -14,6 +14,7 @@ from jaxdyn.compile import ahead, objects
 from jaxdyn.compile.careful import Careful, run_apart
 from jaxdyn.compile.careful_text import CAREFUL, identity_of, number_of
 from jaxdyn.compile.code import calls_itself, kernel_ir, subprogram_ir, symbol_of, varying_first
+from jaxdyn.compile.first_calls import optimise_later, phase
 from jaxdyn.compile.jax_adapter import Unsupported as Unsupported
 from jaxdyn.compile.jax_adapter import ffi_version, register_handler
 from jaxdyn.compile.objects import Code, compile_text, features
@@ -54,7 +55,7 @@ _lock = threading.RLock()
 _making = threading.RLock()  # as a program whose file is missing is traced again, which compiles others
 _called: dict[str, "_Called"] = {}  # subprograms, which other kernels call too
 _kernels: dict[int, "_Kernel"] = {}  # by number, for as long as the process may call them
-_handler: list[Code] = []
+_codes: list[Code] = []
 
 
 def set_threads(count: int | None) -> None:
@@ -89,7 +90,7 @@ def _register() -> None:
     code = Code(compile_text(text))
     register_handler(TARGET, code.address("handler"))
     code.publish("careful", CAREFUL)
-    _handler.append(code)
+    _codes.append(code)
 
 
 @functools.cache
@@ -181,9 +182,9 @@ class Row(NamedTuple):
 
 
 class _Called(NamedTuple):
-    """The code of a subprogram, and what it calls (see `objects.ObjectFile`)."""
+    """The place in memory of a subprogram's address, and what it calls (see `objects.ObjectFile`)."""
 
-    code: Code
+    address: ctypes.c_uint64
     calls: tuple[str, ...]
     careful: tuple
 
@@ -200,7 +201,7 @@ class _Kernel:
         self.uniform: tuple[bool, ...] = ()
         self.careful: Careful | None = None
         self.recover: Callable | None = None  # makes the program again, of a kernel that was read from disk
-        self.code: Code | None = None
+        self.is_made = False
         self.is_awaited = False  # whether a worker is to compile it (see `ahead`)
         self.sizes = (ctypes.c_int64 * len(row.sizes))(*row.sizes)
         slot = number % SLOTS
@@ -215,12 +216,12 @@ class _Kernel:
         """Take the program of which the code can be made."""
         if isinstance(program, Careful):
             self.careful = program
-        elif self.code is None and self.program is None:
+        elif not self.is_made and self.program is None:
             self.program, self.uniform = program, uniform
 
     def address(self) -> int:
         """Address of the code, which is compiled where there is none."""
-        if self.code is None and not self.make():
+        if not self.is_made and not self.make():
             assert self.recover is not None, "a kernel has neither code nor a program"
             run_apart(self.recover)
             made = self.make()
@@ -249,8 +250,8 @@ class _Kernel:
         # Before the lock is taken: programs that are traced again compile kernels too.
         if program is not None and objects.find(identity) is None:
             _read_operations(program)
-        with _making:
-            return self.code is not None or self._make(program, identity)
+        with phase("LLVM"), _making:
+            return self.is_made or self._make(program, identity)
 
     def _make(self, program, identity: str) -> bool:
         width, found = self.row.width, objects.find(identity)
@@ -264,11 +265,15 @@ class _Kernel:
         if found is None:
             is_program, uniform = isinstance(program, Program), self.uniform or [False] * len(program.inputs)
             text = kernel_ir(program, width, uniform) if is_program else program.ir(width, uniform)
-            found = objects.make(identity, text, tuple(calls), careful, program.name)
-        code = Code(found.binary)
-        self.entry.kernel = code.address("kernel")
-        self.code, self.program = code, None  # a program of a large robot takes megabytes
+            # A loop may run for long, and quick code of vectors takes four times as long, that of single numbers a quarter more.
+            quick_width = 0 if program.turns > 1 and width > 1 else width
+            found = objects.make(identity, text, tuple(calls), careful, program.name, quick_width)
+        _install(found, identity, "kernel", self._enter)
+        self.is_made, self.program = True, None  # a program of a large robot takes megabytes
         return True
+
+    def _enter(self, address: int) -> None:
+        self.entry.kernel = address
 
     def _recover_careful(self) -> None:
         """Make the careful programs that this kernel's code calls."""
@@ -308,13 +313,16 @@ def _read_operations(program) -> None:
 
 
 def restore(number: int, row: Row, recover: Callable) -> None:
-    """Put a kernel into the table whose code is on disk; `recover()` traces its program again, should the code be missing."""
+    """Put a kernel into the table whose code is on disk; `recover()` makes the careful programs that it calls.
+
+    **Raises:** LookupError where the code is missing: what calls the kernel has to be traced again.
+    """
     restored = _restore(number, row, recover)
-    if restored.code is None:
-        # Now, not in the handler: a process that ends while a thread of XLA waits for Python would wait for ever.
-        with _making:
-            if restored.code is None:
-                restored._make(None, row.identity)
+    # Now, not in the handler: a process that ends while a thread of XLA waits for Python would wait for ever.
+    with _making:
+        is_there = restored.is_made or restored.program is not None or row.careful or restored._make(None, row.identity)
+    if not is_there:
+        raise LookupError(f"the code of {row.name} is missing")
 
 
 def _restore(number: int, row: Row, recover: Callable) -> _Kernel:
@@ -335,7 +343,7 @@ def row_of(number: int) -> Row:
 def make_ahead(number: int) -> None:
     """Let another thread make the code of a kernel that is going to be called soon."""
     made = _kernels[number]
-    if made.code is None and not made.is_awaited:
+    if not made.is_made and not made.is_awaited:
         made.is_awaited = True
         ahead.make_later(made.address)
 
@@ -349,7 +357,7 @@ def publish_ahead(program, width: int) -> None:
         def make() -> None:
             calls, _ = _calls(program.subprograms, width)
             for symbol in calls:
-                with _making:
+                with phase("LLVM"), _making:
                     _publish(symbol, width, calls)
 
         ahead.make_later(make)
@@ -374,11 +382,20 @@ def _publish(symbol: str, width: int, programs: dict[str, Any], recover: Callabl
     if not isinstance(found, objects.ObjectFile):
         assert called is not None
         text = subprogram_ir(called, width) if isinstance(called, Program) else called.subprogram_ir()
-        found = objects.make(symbol, text, tuple(calls), careful, called.name)
-    code = Code(found.binary)
-    code.publish("called", symbol)
-    _called[symbol] = _Called(code, found.calls, found.careful)
+        found = objects.make(symbol, text, tuple(calls), careful, called.name, width)
+    _called[symbol] = _Called(ctypes.c_uint64(), found.calls, found.careful)
+    _install(found, symbol, "called", functools.partial(setattr, _called[symbol].address, "value"))
+    objects.add_symbol(f"{symbol}_at", ctypes.addressof(_called[symbol].address))
     return True
+
+
+def _install(found: objects.ObjectFile, identity: str, name: str, enter: Callable[[int], None]) -> None:
+    """Load code and enter the address of its function; quick code is replaced later, and stays for those who run it."""
+    code = Code(found.binary)
+    _codes.append(code)
+    enter(code.address(name))
+    if found.text and objects.has_two_levels():
+        optimise_later(lambda: _install(found.improve(identity), identity, name, enter))
 
 
 def _restore_careful(rows: Sequence, recover: Callable | None) -> None:

@@ -15,6 +15,7 @@ import numpy as np
 from jaxdyn.compile import jax_adapter, mode, stored
 from jaxdyn.compile.careful import Careful, digest_of, guard
 from jaxdyn.compile.expansion import expand
+from jaxdyn.compile.first_calls import phase
 from jaxdyn.compile.flags import guarded_p, has_marks
 from jaxdyn.compile.known import Known, partition_tracers
 from jaxdyn.compile.program import Array, NotNumbers, Program, TooLong
@@ -72,7 +73,7 @@ def _trace_program(function, static, known: Known, count, structure, shapes, tan
     def make():
         """The program, and plain data: whether it has rules, and the structure of its results, or why there is none."""
         try:
-            with mode.expanding(calls):
+            with phase("tracing"), mode.expanding(calls):
                 # Subprograms are the functions under `jit` within this one; itself it is not a call.
                 traced = flat_function(function, static, known, count, structure) if calls else flat
                 closed, out = jax.make_jaxpr(traced, return_shape=True)(*avals)
@@ -169,7 +170,7 @@ def _make_careful(again: Again, outputs, key: str | None) -> Program:
         return again.compute(outputs, leaves)
 
     def make():
-        with mode.expanding(again.calls):
+        with phase("tracing"), mode.expanding(again.calls):
             closed = jax.make_jaxpr(compute)(*avals)
         # The marks of what is left as it is are NaN, which the results then are too.
         most, name = 10 * mode.MAX_OPERATIONS, name_of(again.function)
@@ -216,6 +217,11 @@ def inline_call(function, static, tree, args, fallback: Callable | None = None):
     traced, known = partition_tracers(tree)
     leaves, structure = jax.tree.flatten(args)
     flat, leaves = function_of_leaves(function, static, known, len(traced), structure), [*traced, *leaves]
+    if mode.has_branches() and not (mode.is_careful() or mode.is_standalone()):
+        # What marks nothing takes no branches: its trace is the one of programs without them, which may be there.
+        with mode.expanding():
+            if not has_marks(jax.make_jaxpr(flat)(*leaves).jaxpr):
+                return flat(*leaves)
     if fallback is None or not mode.has_branches() or mode.is_careful_within():
         return flat(*leaves)
     leaves = [*map(jnp.asarray, leaves)]
@@ -297,7 +303,7 @@ def tangent_program(change: Callable, avals, moving, flags: str, key: str | None
     avals = [*avals, *(aval for aval, varies in zip(avals, moving, strict=True) if varies)]
 
     def make():
-        with mode.expanding():
+        with phase("tracing"), mode.expanding():
             closed = jax.make_jaxpr(change)(*avals)
         # A tangent has two to four times the operations of the values. The bound is there for those that explode.
         of_tangent = flags if flags in ("refuse", "report") else "ignore"

@@ -10,6 +10,8 @@ from pathlib import Path
 
 import jax
 
+from jaxdyn.compile import wait_for_code
+
 
 def time_interleaved(contestants: dict, rounds: int = 20, least: float = 0.02, most: float = float("inf")) -> dict:
     """Seconds per call of each contestant over several rounds: {name: {"best", "median", "rounds" (their number)}}.
@@ -19,8 +21,10 @@ def time_interleaved(contestants: dict, rounds: int = 20, least: float = 0.02, m
     much time drops out once it has three rounds, enough for a median.
     """
     repeats, spent = {}, {}
-    for name, call in contestants.items():
+    for call in contestants.values():
         call()  # compiles, and is not timed
+    wait_for_code()
+    for name, call in contestants.items():
         start = time.perf_counter()
         call()
         spent[name] = time.perf_counter() - start

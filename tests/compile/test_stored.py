@@ -14,7 +14,8 @@ import numpy as np
 import pytest
 
 import jaxdyn as jd
-from jaxdyn.compile import disk, entry_point, executables, jax_adapter, stored, trace
+from jaxdyn.compile import disk, entry_point, executables, jax_adapter, stored, target, trace
+from jaxdyn.compile.expansion import expand
 from jaxdyn.compile.fingerprint import NoFingerprint, fingerprint
 
 
@@ -170,6 +171,26 @@ print([float(x).hex() for x in accelerate(scene, q, v).acceleration])
     assert set(results) == {results[0]}
     numbers = [float.fromhex(x) for x in json.loads(results[0].replace("'", '"'))]
     np.testing.assert_allclose(numbers, first, rtol=1e-12)
+
+
+def test_a_program_that_is_traced_in_another_order_takes_the_place_of_the_stored_one(folder):
+    x = np.linspace(0.1, 0.9, 3)
+
+    def tangent_first(x):
+        return [jnp.tan(x) * jnp.sin(x), jnp.sin(x)]
+
+    def sine_first(x):
+        y = jnp.sin(x)
+        return [jnp.tan(x) * y, y]
+
+    one, other = (expand(jax.make_jaxpr(f)(x), 10**4)[0] for f in (tangent_first, sine_first))
+    found = stored.Description.of(one).restore(lambda: other)
+    assert found.digest == one.digest != other.digest
+    for result, wanted in zip(target.call(found, [x]), sine_first(x), strict=True):
+        np.testing.assert_allclose(result, wanted, rtol=1e-15)
+    another = expand(jax.make_jaxpr(lambda x, y: [x * y, y])(x, x), 10**4)[0]
+    with pytest.raises(RuntimeError, match="traced again"):
+        _ = stored.Description.of(one).restore(lambda: another).operations
 
 
 GAIN = 2.0

@@ -66,7 +66,7 @@ def run() -> None:
 
 def careful_names() -> list[str]:
     """Careful programs of which there is code."""
-    return [x.row.name for x in target._kernels.values() if x.row.careful and x.code is not None]
+    return [x.row.name for x in target._kernels.values() if x.row.careful and x.is_made]
 
 
 def start(folder, function: str, *arguments: str) -> dict:

@@ -1,0 +1,116 @@
+"""First calls: quick code and what takes its place, the collector of cycles, and the message on a long call."""
+
+import gc
+import logging
+import re
+import subprocess
+import sys
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from jaxdyn.compile import first_calls, kernel, objects, target
+from jaxdyn.compile.first_calls import phase
+
+pytestmark = pytest.mark.native
+
+
+@pytest.fixture
+def two_levels(monkeypatch, tmp_path):
+    """All code is quick at first, and is not on disk."""
+    monkeypatch.delenv("JAXDYN_COMPILATION_OPTIONS", raising=False)
+    monkeypatch.setattr(objects, "QUICK_LINES", 0)
+    objects.disk.set_cache_folder(tmp_path)
+    yield
+    objects.disk.set_cache_folder(None)
+
+
+def _solve(A, x):
+    y = jnp.sin(A @ x)
+    for _ in range(4):
+        y = jnp.linalg.solve(A @ A.T + jnp.eye(6), jnp.cos(y) * x)
+    return y
+
+
+@pytest.mark.parametrize("batch", [(), (300,)])
+def test_optimised_code_takes_the_place_of_quick_code(two_levels, batch):
+    """With the same bits; also of a subprogram, whose callers stay as they are, and on disk."""
+    rng = np.random.default_rng(3)
+    A, x = rng.normal(size=(*batch, 6, 6)), rng.normal(size=(*batch, 6))
+    scale = float(rng.normal())  # programs of this test alone
+    solve = jax.jit(lambda A, x: scale * _solve(A, x))
+    function = kernel(lambda A, x: solve(A, solve(A, x)), derivative=False)
+    run = jax.jit(jax.vmap(function) if batch else function)
+    before, called_before = set(target._kernels), set(target._called)
+    quick = np.asarray(run(A, x))
+    (number,) = set(target._kernels) - before
+    symbol = next(iter(set(target._called) - called_before))
+    made, called = target._kernels[number], target._called[symbol]
+    addresses = made.entry.kernel, called.address.value
+    # The optimiser waits for a quiet second.
+    found = objects.find(made.row.identity)
+    assert found is not None and found.text
+    first_calls.wait_for_code()
+    assert made.entry.kernel != addresses[0] and called.address.value != addresses[1]
+    for name in (made.row.identity, symbol):
+        better = objects.find(name)
+        assert better is not None and not better.text
+    np.testing.assert_array_equal(np.asarray(run(A, x)), quick)
+
+
+_SCRIPT = """
+import jax, jax.numpy as jnp
+jax.config.update("jax_enable_x64", True)
+from jaxdyn.compile import kernel, objects, target
+objects.QUICK_LINES = 0
+x = jnp.linspace(0.1, 0.9, 5)
+print(repr(float(jax.jit(kernel(lambda x, y: jnp.sum(jnp.sin(x) / jnp.cos(y))))(x, x))))
+print([bool(objects.find(x.row.identity).text) for x in target._kernels.values()])
+"""
+
+
+@pytest.mark.long
+def test_quick_code_on_disk_is_optimised_by_another_process(monkeypatch, tmp_path):
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
+    monkeypatch.delenv("JAXDYN_COMPILATION_OPTIONS", raising=False)
+    # The first process ends before it optimises anything; the second one waits.
+    wait = "from jaxdyn.compile import first_calls; first_calls.wait_for_code()\n"
+    lines = []
+    for script in (_SCRIPT, _SCRIPT.replace("print([", wait + "print([")):
+        done = subprocess.run([sys.executable, "-c", script], capture_output=True, text=True, check=True)
+        lines.append(done.stdout.splitlines())
+    assert lines[0][0] == lines[1][0]
+    assert [x[1] for x in lines] == ["[True]", "[False]"]
+
+
+def test_the_collector_rests_in_a_phase():
+    with pytest.raises(ZeroDivisionError), phase("tracing"):
+        with phase("expansion"):
+            assert not gc.isenabled()
+        assert not gc.isenabled()
+        raise ZeroDivisionError
+    assert gc.isenabled()
+    gc.disable()
+    try:
+        with phase("tracing"):
+            pass
+        assert not gc.isenabled()
+    finally:
+        gc.enable()
+
+
+def test_a_long_first_call_is_reported_once(monkeypatch, caplog, two_levels):
+    first_calls.wait_for_code()
+    monkeypatch.setattr(first_calls, "REPORTED_SECONDS", 0.0)
+    scale = float(np.random.default_rng().normal())
+    run = jax.jit(kernel(lambda x: jnp.sin(scale * x) + jnp.cos(x)))
+    with caplog.at_level(logging.INFO, "jaxdyn"):
+        for _ in range(2):
+            run(jnp.arange(3.0)).block_until_ready()
+            first_calls.wait_for_code()
+    (message,) = [x.message for x in caplog.records if "first call" in x.message]
+    shares = dict(re.findall(r"(\w+) (\d+) %", message))
+    assert list(shares) == [*first_calls.PHASES, "other"]
+    assert 97 <= sum(map(int, shares.values())) <= 103 and int(shares["XLA"]) > 0 and int(shares["LLVM"]) > 0
