@@ -10,15 +10,20 @@ sample is such an array: it is passed on without a copy.
 """
 
 from collections.abc import Callable, Sequence
+from itertools import accumulate
+from typing import Any
 
 from jaxdyn.compile import careful_text
 from jaxdyn.compile.careful import Careful
 from jaxdyn.compile.llvm import Emitter
 from jaxdyn.compile.program import COMPARISONS, FLOATS, Array, Constant, Program, kind_of
+from jaxdyn.compile.scan import Scan
 
 # A program of one sample with at least so many operations is compiled once for all kernels that contain it: the copies of a
 # call's arguments are few against them.
 MIN_SHARED_OPERATIONS = 2000
+# Arrays of fewer entries are copied entry by entry.
+MIN_ENTRIES_IN_LOOP = 32
 _ALIGNED = 64  # bytes
 ATTRIBUTES = (
     # LLVM's simplifications of calls of the C library, such as pow(x, 2) = x x, are made at some levels alone.
@@ -39,9 +44,11 @@ class Body:
         self.names: list = [None] * len(program.operations)  # of inputs, those that have been read
         self.parts: dict[int, list[int]] = {}  # of each call, the entries of its outputs that are needed
         # A subprogram that is called again finds its arrays at the same place: entries that have not changed stay there.
-        self.regions: dict[Program, int] = {}  # where in %in and %out the arrays of a subprogram begin
+        self.regions: dict[Any, int] = {}  # where in %in and %out the arrays of a subprogram begin
         self.bytes = self.careful = 0  # of what is passed to subprograms and to careful programs
         self.passed: dict[int, str] = {}  # what stands in %in, which subprograms do not change
+        # Of calls of loops, the first entry, pointer and type of each output: they stay in memory, each call has its own.
+        self.in_memory: dict[int, list[tuple[int, str, Array]]] = {}
         for op, _, args in program.operations:
             if op == "part":
                 self.parts.setdefault(args[0], []).append(args[1].value)
@@ -51,9 +58,15 @@ class Body:
     def name(self, i: int) -> str:
         """Name of operation i; inputs are loaded where they are first read."""
         if self.names[i] is None:
-            _, kind, args = self.program.operations[i]
-            self.names[i] = self.load(*args, kind)
+            op, kind, args = self.program.operations[i]
+            self.names[i] = self._load_part(*args, kind) if op == "part" else self.load(*args, kind)
         return self.names[i]
+
+    def _load_part(self, call: int, entry: Constant, kind: str) -> str:
+        for first, pointer, array in self.in_memory[call]:
+            if first <= entry.value < first + array.size:
+                return self.e.load_at(pointer, entry.value - first, kind)
+        raise AssertionError("a part beyond the results of a call")
 
     def text(self, x, kind: str) -> str:
         """An entry: a name or a constant."""
@@ -61,6 +74,12 @@ class Body:
 
     def results(self) -> list[list[str]]:
         """Names of the program's results."""
+        self.compute()
+        rows = zip(self.program.results, self.program.outputs, strict=True)
+        return [[self.text(x, kind_of(array.dtype)) for x in row] for row, array in rows]
+
+    def compute(self) -> None:
+        """Write all operations."""
         operations = self.program.operations
         for i, (op, kind, args) in enumerate(operations):
             if op == "input" or i in self.merged:
@@ -70,7 +89,8 @@ class Body:
             elif op == "call_where":
                 self.names[i] = self._call_where(i, *args)
             elif op == "part":
-                self.names[i] = self.names[args[0]][args[1].value]
+                if args[0] not in self.in_memory:
+                    self.names[i] = self.names[args[0]][args[1].value]
             elif i in self.fused:
                 place = self.fused[i]
                 factors = [self.text(x, kind) for x in operations[args[place]].args]
@@ -80,8 +100,6 @@ class Body:
                 given = kinds[-1] if kinds else kind
                 known = given if op in COMPARISONS else kind
                 self.names[i] = self.e.operation(op, kind, [self.text(x, known) for x in args], given)
-        rows = zip(self.program.results, self.program.outputs, strict=True)
-        return [[self.text(x, kind_of(array.dtype)) for x in row] for row, array in rows]
 
     def _call_where(self, i: int, which, flag, *entries) -> dict[int, str]:
         """Call a subprogram if the flag of any sample is set; names of the entries of its outputs that are needed."""
@@ -110,10 +128,11 @@ class Body:
     def _call(self, i: int, which, *given, flag: str = "") -> dict[int, str]:
         """Call a subprogram; names of the entries of its outputs that are needed."""
         called = self.program.subprograms[which.value]
-        if called not in self.regions:
-            self.regions[called] = self.bytes
+        key = i if has_loop(called) else called
+        if key not in self.regions:
+            self.regions[key] = self.bytes
             self.bytes += sum(bytes_of(x, self.e.width) for x in (*called.inputs, *called.outputs))
-        at, first, pointers = self.regions[called], 0, []
+        at, first, pointers = self.regions[key], 0, []
         for array in called.inputs:
             entries = given[first : first + array.size]
             pointers.append(self._input_pointer(entries, array) or self._copy_entries(entries, array, at))
@@ -127,6 +146,10 @@ class Body:
             self.careful = max(self.careful, careful_text.write_call(self.e, called, flag, pointers))
         else:
             _write_call(self.e, called, pointers)
+        if has_loop(called):
+            ends = [0, *accumulate(array.size for array in called.outputs)]
+            self.in_memory[i] = [(x, y[0], z) for x, y, z in zip(ends, outputs, called.outputs, strict=False)]
+            return {}
         needed, results, first = set(self.parts.get(i, ())), {}, 0
         for pointer, kind, size in outputs:
             results |= {first + k: self.e.load_at(pointer, k, kind) for k in range(size) if first + k in needed}
@@ -134,19 +157,29 @@ class Body:
         return results
 
     def _input_pointer(self, entries, array: Array) -> str | None:
-        """The pointer to an input of this program that these entries are."""
+        """The pointer to an input of this program, or to an output of a loop, that these entries are."""
+        place = whole_input(self.program, entries, array)
+        return self.pointer_to(entries, array) if place is None else self.array(place)
+
+    def pointer_to(self, entries, array: Array) -> str | None:
+        """The pointer to the output of a loop that these entries are, all of it in its order."""
         operations = self.program.operations
-        if any(type(x) is Constant or operations[x].op != "input" for x in entries) or not entries:
+        if not entries or type(entries[0]) is Constant or operations[entries[0]].op != "part":
             return None
-        place = operations[entries[0]].args[0]
-        # Only a whole input in its order is passed on as it is; a slice of one would need another layout for W samples.
-        whole = [(place, k) for k in range(self.program.inputs[place].size)]
-        same = whole == [operations[x].args for x in entries] and self.program.inputs[place].dtype == array.dtype
-        return self.array(place) if same else None
+        call, (start,) = operations[entries[0]].args
+        for first, pointer, made in self.in_memory.get(call, ()):
+            if first == start and made.size == len(entries) and made.dtype == array.dtype:
+                whole = [(call, Constant(first + k)) for k in range(made.size)]
+                same = all(type(x) is not Constant and operations[x].op == "part" for x in entries)
+                return pointer if same and whole == [operations[x].args for x in entries] else None
+        return None
 
     def _copy_entries(self, entries, array: Array, at: int) -> str:
         """A pointer to memory with these entries."""
         kind, pointer = kind_of(array.dtype), self._place(at)
+        if len(entries) >= MIN_ENTRIES_IN_LOOP and all(type(x) is Constant and x.value == 0 for x in entries):
+            self.e.zero(pointer, len(entries) * array.dtype.itemsize * self.e.width)
+            return pointer
         for k, x in enumerate(entries):
             value, place = self.text(x, kind), at + k * array.dtype.itemsize * self.e.width
             if self.passed.get(place) != value:
@@ -161,6 +194,36 @@ class Body:
         """Memory for what is passed."""
         passed = [f"  %passed = alloca [{self.bytes} x i8], align {_ALIGNED}"] if self.bytes else []
         return [*passed, *careful_text.allocation(self.careful)]
+
+
+def has_loop(called) -> bool:
+    """Decide whether a subprogram is a loop, whose arrays stay in memory."""
+    return isinstance(called, Scan)
+
+
+def whole_input(program: Program, entries: Sequence, array: Array) -> int | None:
+    """The place of the input of a program that these entries are, all of it in its order; or None."""
+    operations = program.operations
+    if any(type(x) is Constant or operations[x].op != "input" for x in entries) or not entries:
+        return None
+    place = operations[entries[0]].args[0]
+    # Only a whole input in its order is passed on as it is; a slice of one would need another layout for W samples.
+    whole = [(place, k) for k in range(program.inputs[place].size)]
+    same = whole == [operations[x].args for x in entries] and program.inputs[place].dtype == array.dtype
+    return place if same else None
+
+
+def _inputs_of_loops(program: Program) -> list[int]:
+    """Inputs of a program that are passed on whole to a loop."""
+    found = set()
+    for op, _, args in program.operations:
+        if op == "call" and has_loop(called := program.subprograms[args[0].value]):
+            first = 1
+            for array in called.inputs:
+                entries, first = args[first : first + array.size], first + array.size
+                if len(entries) >= MIN_ENTRIES_IN_LOOP:
+                    found.add(whole_input(program, entries, array))
+    return sorted(found - {None})
 
 
 def _find_products(program: Program) -> dict[int, int]:
@@ -253,11 +316,20 @@ def kernel_ir(program: Program, width: int, uniform: Sequence[bool]) -> str:
             tiles[place, first] = e.load_tile(rows[place], first, kind)
         return tiles[place, first][entry - first]
 
+    packed: dict[int, str] = {}
+
     def array(place):
-        """The row of one sample."""
-        return None if width > 1 else rows[place][0] if place in rows else f"%a{place}"
+        """The row of one sample, or what has been packed."""
+        if width > 1:
+            return packed.get(place)
+        return rows[place][0] if place in rows else f"%a{place}"
 
     body, valid, allocations = Body(e, fast, load, array), None, []
+    for place in _inputs_of_loops(fast) if width > 1 else ():
+        packed[place], given = f"%packed{place}", arrays[place]
+        allocations.append(f"  {packed[place]} = alloca [{bytes_of(given, width)} x i8], align {_ALIGNED}")
+        source = [f"%a{place}"] * width if uniform[place] else rows[place]
+        e.pack(source, packed[place], given.size, kind_of(given.dtype))
     # The kernel of one sample of a large program is a call: the same code serves as a subprogram of steps and rollouts.
     if calls_itself(program, width):
         pointers = [str(array(i)) for i in range(len(arrays))]
@@ -267,11 +339,15 @@ def kernel_ir(program: Program, width: int, uniform: Sequence[bool]) -> str:
         _write_call(e, fast, pointers)
         valid = None if program.careful is None else e.load_at("%valid", 0, "b1")
     else:
-        results = body.results()
+        body.compute()
+        for i, (row, output) in enumerate(zip(fast.results, program.outputs, strict=False)):
+            kind, pointer = kind_of(output.dtype), body.pointer_to(row, output)
+            if pointer is not None and len(row) >= MIN_ENTRIES_IN_LOOP:
+                e.unpack(pointer, rows[count + i], len(row), kind)
+            else:
+                e.store_array(rows[count + i], kind, [body.text(x, kind) for x in row])
         if program.careful is not None:
-            *results, (valid,) = results
-        for i, (row, output) in enumerate(zip(results, program.outputs, strict=True)):
-            e.store_array(rows[count + i], kind_of(output.dtype), row)
+            valid = body.text(fast.results[-1][0], "b1")
     if valid is not None and program.careful is not None:
         flag = e.operation("not", "b1", [valid], "b1")
         same = [*uniform, *[False] * len(program.outputs)]

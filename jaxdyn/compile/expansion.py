@@ -13,7 +13,7 @@ from typing import Any
 import jax
 import numpy as np
 
-from jaxdyn.compile import array_rules, jax_adapter, look_ups, mode
+from jaxdyn.compile import array_rules, jax_adapter, look_ups, mode, rolled
 from jaxdyn.compile import program as numbers
 from jaxdyn.compile.array_rules import bind_known, empty_reduction, evaluate_known
 from jaxdyn.compile.derive import without_unread
@@ -33,6 +33,8 @@ from jaxdyn.compile.program import (
 )
 from jaxdyn.compile.rearrange import AT_PLACES, REARRANGEMENTS
 
+# Loops of fewer iterations are always written out.
+MIN_ITERATIONS = 8
 # A function of fewer operations is scatter_places where it is called.
 MIN_SUBPROGRAM_OPERATIONS = 300
 
@@ -258,20 +260,43 @@ class _Expansion:
 
     def _scan(self, params, args, eqn):
         count, carried = scan_counts(params)
-        consts, carry, rows = args[:count], args[count : count + carried], args[count + carried :]
-        saved: list[list] = []
         length = params["length"]
-        # Unrolled: the length is known, and zeros of a first step are seen in the following ones.
+        consts, carry, rows = args[:count], args[count : count + carried], args[count + carried :]
+        outs = [x.aval for x in eqn.outvars[carried:]]
+        if not length:
+            return [*carry, *(np.zeros(x.shape, x.dtype) for x in outs)]
+        if length >= MIN_ITERATIONS and any(x.dtype.kind == "O" for x in args):
+            results = self._roll(params["jaxpr"], [consts, carry, rows], eqn, length, params["reverse"])
+            if results is not None:
+                return results
+        saved: list[list] = []
+        # Written out: the length is known, and zeros of a first step are seen in the following ones.
         for i in reversed(range(length)) if params["reverse"] else range(length):
             results = self.evaluate(params["jaxpr"], [*consts, *carry, *(x[i, ...] for x in rows)])
             carry = results[:carried]
             saved.append(results[carried:])
         if params["reverse"]:
             saved.reverse()
-        outs = [x.aval for x in eqn.outvars[carried:]]
-        if not length:
-            return [*carry, *(np.zeros(x.shape, x.dtype) for x in outs)]
         return [*carry, *(_stack(column) for column in zip(*saved, strict=True))]
+
+    def _roll(self, inner, arrays, eqn, length: int, inward: bool, parents=None) -> list | None:
+        """The results of a loop in native code; None where it is short enough to be written out."""
+        sizes = np.cumsum([len(x) for x in arrays]).tolist()
+        of_inputs, of_results = [x.aval.dtype for x in eqn.invars], [x.aval.dtype for x in eqn.outvars]
+        dtypes = [of_inputs[: sizes[0]], of_inputs[sizes[0] : sizes[1]], of_inputs[sizes[1] :], of_results[len(arrays[1]) :]]
+        outcome: list[_Expansion] = []
+
+        def body(graph, consts, carries, rows):
+            expansion = _Expansion(graph, self.calls, self.branches)
+            results = expansion.evaluate(inner, [*consts, *carries, *rows])
+            outcome[:] = [expansion]
+            if expansion.flagged is not False:
+                raise NotNumbers("samples that an iteration of a loop cannot compute")
+            return results
+
+        results = rolled.roll(self.graph, body, arrays, dtypes, length, inward, parents)
+        self.has_rules |= results is not None and outcome[0].has_rules
+        return results
 
     def _while(self, params, args, eqn):
         count, more = params["cond_nconsts"], params["body_nconsts"]

@@ -24,6 +24,8 @@ from jaxdyn.compile.inlining import inline
 from jaxdyn.compile.jax_adapter import ShapedArray, define_primitive, is_linear, is_zero, lowering_of, zero_tangent
 from jaxdyn.compile.messages import say_without_kernel
 from jaxdyn.compile.program import COMPARISONS, Constant, NotNumbers, Program, TooLong, dtype_of
+from jaxdyn.compile.scan import Scan
+from jaxdyn.compile.scan_by_jax import scan_by_jax
 from jaxdyn.compile.shared import split_program
 from jaxdyn.compile.trace import tangent_program
 from jaxdyn.compile.trigonometry import cosine, sine
@@ -100,6 +102,8 @@ _OPERATIONS: dict[str, Callable] = {
 
 def as_operations(*args, program: Program, rows: int = 0):
     """Compute a program's results by operations of JAX, one for each number, on arrays over the batch."""
+    if isinstance(program, Scan):
+        return scan_by_jax(program, args, functools.partial(as_operations, program=program.body))
     if not isinstance(program, Program):  # a loop or a pseudo-inverse, which stand in the place of a program
         return program.as_operations(*args)
     lead = max((x.shape[:-1] for x in args), key=len, default=())
@@ -116,6 +120,8 @@ def as_operations(*args, program: Program, rows: int = 0):
             values.append(columns[place][..., entry])
         elif op == "call_where":
             values.append(_call_careful(program, operands, values, lead))
+        elif op == "call":
+            values.append(_call_loop(program, operands, values, lead))
         elif op == "part":
             values.append(values[operands[0]][operands[1].value])
         elif op == "convert":
@@ -136,6 +142,22 @@ def as_operations(*args, program: Program, rows: int = 0):
     return results
 
 
+def _call_loop(program: Program, operands, values: list, lead: tuple) -> list:
+    """Entries of the results of a loop."""
+    called = program.subprograms[operands[0].value]
+    arrays = _columns(called.inputs, operands[1:], values, lead)
+    return [x for array in as_operations(*arrays, program=called) for x in jnp.moveaxis(array, -1, 0)]
+
+
+def _columns(types: Sequence, operands, values: list, lead: tuple) -> list:
+    entries, arrays = iter(operands), []
+    for array in types:
+        columns = (next(entries) for _ in range(array.size))
+        columns = [jnp.full(lead, x.value, array.dtype) if type(x) is Constant else values[x] for x in columns]
+        arrays.append(jnp.stack(columns, -1) if columns else jnp.zeros((*lead, 0), array.dtype))
+    return arrays
+
+
 def _call_careful(program: Program, operands, values: list, lead: tuple) -> list:
     """Entries of the results of a pair: those of the fast program, or where its flag is set those of the careful one.
 
@@ -143,11 +165,7 @@ def _call_careful(program: Program, operands, values: list, lead: tuple) -> list
     """
     careful, flag = program.subprograms[operands[0].value], operands[1]
     assert isinstance(careful, Careful)
-    entries, arrays = iter(operands[2:]), []
-    for array in (*careful.inputs, *careful.outputs):
-        columns = (next(entries) for _ in range(array.size))
-        columns = [jnp.full(lead, x.value, array.dtype) if type(x) is Constant else values[x] for x in columns]
-        arrays.append(jnp.stack(columns, -1) if columns else jnp.zeros((*lead, 0), array.dtype))
+    arrays = _columns((*careful.inputs, *careful.outputs), operands[2:], values, lead)
     count = len(careful.inputs)
     flag = jnp.full(lead, flag.value) if type(flag) is Constant else values[flag]
 
