@@ -298,6 +298,26 @@ class _Expansion:
         self.has_rules |= results is not None and outcome[0].has_rules
         return results
 
+    def _sweep(self, params, args, eqn):
+        count, parents, inward = params["carries"], params["parents"], params["inward"]
+        start, rows, inner = args[:count], args[count:], params["call"]
+        results = self._roll(inner, [(), start, rows], eqn, len(parents), inward, parents)
+        if results is not None:
+            return results
+        # Written out: of each node the carry, or the sum over its children; the root is the last one.
+        carries: list = [None] * len(parents) + [None if inward else start]
+        if inward:
+            carries[len(parents) - 1] = start
+        saved: list = [None] * len(parents)
+        for i in reversed(range(len(parents))) if inward else range(len(parents)):
+            given = carries[i if inward else parents[i]]
+            given = [np.zeros(x.aval.shape, x.aval.dtype) for x in eqn.invars[:count]] if given is None else given
+            results = self.evaluate(inner, [*given, *(x[i, ...] for x in rows)])
+            own, saved[i] = results[:count], results[count:]
+            to, add = (parents[i], carries[parents[i]]) if inward else (i, None)
+            carries[to] = own if add is None else [as_objects(self.elementwise["add"](*map(as_objects, x))) for x in zip(add, own, strict=True)]
+        return [*carries[-1 if inward else len(parents) - 1], *(_stack(column) for column in zip(*saved, strict=True))]
+
     def _while(self, params, args, eqn):
         count, more = params["cond_nconsts"], params["body_nconsts"]
         of_cond, of_body, carry = args[:count], args[count : count + more], args[count + more :]
@@ -432,6 +452,7 @@ _OTHER: dict[str, Callable] = {
     "polynomial": array_rules.polynomial,
     **dict.fromkeys(("cumsum", "cumprod", "cummax", "cummin"), look_ups.cumulative),
     "scan": _Expansion._scan,
+    "jaxdyn_sweep": _Expansion._sweep,
     "while": _Expansion._while,
     "cond": _Expansion._cond,
     "custom_linear_solve": _Expansion._linear_solve,
