@@ -30,7 +30,7 @@ def roll(
     consts, carries, rows = ([as_objects(x) if x.dtype.kind == "O" else x for x in group] for group in arrays)
     of_consts, of_carries, of_rows, of_results = dtypes
     consts = [_group([[y] for y in x.ravel().tolist()], x, d) for x, d in zip(consts, of_consts, strict=True)]
-    rows = [_group(_columns(x), x[0], d) for x, d in zip(rows, of_rows, strict=True)]
+    rows = [_group(_columns(x), x[0, ...], d) for x, d in zip(rows, of_rows, strict=True)]
     classes = _Classes([as_objects(x) for x in carries], of_carries)
     while True:
         inner, types = Graph(graph.most), []
@@ -123,26 +123,21 @@ def _group(columns: list[list], one: np.ndarray, dtype) -> _Group:
     kind_or_refuse(dtype)
     places: list = []
     passed: dict[tuple, int] = {}
-    known: dict[tuple, int] = {}
-    by_key: dict[tuple, list] = {}
+    known: dict[bytes, int] = {}
+    by_key: dict[Any, list] = {}
     for column in columns:
         if any(is_number(x) for x in column):
             key, where = tuple(map(id, column)), "passed"
             places.append((where, passed.setdefault(key, len(passed))))
         else:
             # By bits: zeros of both signs are different, and NaN is equal to itself.
-            key = tuple(np.array(column, dtype).tobytes()[i :: 1] for i in (0,))
-            if len(column) == 1 or _is_constant(np.array(column, dtype)):
+            key = np.array(column, dtype).tobytes()
+            if key == key[: np.dtype(dtype).itemsize] * len(column):
                 places.append(("fixed", column[0]))
                 continue
             places.append(("known", known.setdefault(key, len(known))))
         by_key[key] = column
     return _Group(one.shape, np.dtype(dtype), places, [by_key[x] for x in passed], [by_key[x] for x in known])
-
-
-def _is_constant(column: np.ndarray) -> bool:
-    bits = column.view(np.uint8).reshape(len(column), -1)
-    return bool((bits == bits[0]).all())
 
 
 def _pairs(groups: Sequence[_Group], inputs: list):
