@@ -162,24 +162,26 @@ class _Classes:
 
     def __init__(self, carries: Sequence[np.ndarray], dtypes: Sequence):
         self.shapes = [x.shape for x in carries]
+        # Each array of carries is one of the loop: derivatives decide by arrays what they depend on.
+        self.owners = [i for i, x in enumerate(carries) for _ in range(x.size)]
         self.kinds = [kind_or_refuse(d) for d, x in zip(dtypes, carries, strict=True) for _ in range(x.size)]
         self.start = [x for array in carries for x in array.ravel().tolist()]
         self.known = [not is_number(x) for x in self.start]
         self.keys: list[Any] = [(kind, _key(x)) for kind, x in zip(self.kinds, self.start, strict=True)]
 
-    def _members(self) -> dict[str, list[int]]:
-        """First entries of the classes that are carried, by kind."""
+    def _members(self) -> dict[int, list[int]]:
+        """First entries of the classes that are carried, by array."""
         seen, members = set(), {}
-        for i, (key, known, kind) in enumerate(zip(self.keys, self.known, self.kinds, strict=True)):
+        for i, (key, known, owner) in enumerate(zip(self.keys, self.known, self.owners, strict=True)):
             if not known and key not in seen:
                 seen.add(key)
-                members.setdefault(kind, []).append(i)
+                members.setdefault(owner, []).append(i)
         return members
 
     @property
     def types(self) -> list[Array]:
-        """Arrays of the carried entries, one for each kind."""
-        return [Array((len(x),), dtype_of(kind)) for kind, x in self._members().items()]
+        """Arrays of the carried entries."""
+        return [Array((len(x),), dtype_of(self.kinds[x[0]])) for x in self._members().values()]
 
     def entries(self, inputs: Sequence[np.ndarray]) -> list[np.ndarray]:
         """Arrays of the carries from their classes' values."""
