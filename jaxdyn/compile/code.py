@@ -9,6 +9,7 @@ it: `void called(ptr ..., ptr ...)` with the arrays of its inputs, then of its o
 sample is such an array: it is passed on without a copy.
 """
 
+import re
 from collections.abc import Callable, Sequence
 from itertools import accumulate
 from typing import Any
@@ -25,6 +26,8 @@ MIN_SHARED_OPERATIONS = 2000
 # Arrays of fewer entries are copied entry by entry.
 MIN_ENTRIES_IN_LOOP = 32
 _ALIGNED = 64  # bytes
+# Larger arrays of a function are on the heap.
+MAX_STACK_BYTES = 1 << 16
 ATTRIBUTES = (
     # LLVM's simplifications of calls of the C library, such as pow(x, 2) = x x, are made at some levels alone.
     'attributes #0 = { nounwind "no-builtins" }',
@@ -44,7 +47,7 @@ class Body:
         self.names: list = [None] * len(program.operations)  # of inputs, those that have been read
         self.parts: dict[int, list[int]] = {}  # of each call, the entries of its outputs that are needed
         # A subprogram that is called again finds its arrays at the same place: entries that have not changed stay there.
-        self.regions: dict[Any, int] = {}  # where in %in and %out the arrays of a subprogram begin
+        self.regions: dict[Program, int] = {}  # where in %in and %out the arrays of a subprogram begin
         self.bytes = self.careful = 0  # of what is passed to subprograms and to careful programs
         self.passed: dict[int, str] = {}  # what stands in %in, which subprograms do not change
         # Of calls of loops, the first entry, pointer and type of each output: they stay in memory, each call has its own.
@@ -128,19 +131,21 @@ class Body:
     def _call(self, i: int, which, *given, flag: str = "") -> dict[int, str]:
         """Call a subprogram; names of the entries of its outputs that are needed."""
         called = self.program.subprograms[which.value]
-        key = i if has_loop(called) else called
-        if key not in self.regions:
-            self.regions[key] = self.bytes
-            self.bytes += sum(bytes_of(x, self.e.width) for x in (*called.inputs, *called.outputs))
-        at, first, pointers = self.regions[key], 0, []
+        at, first, pointers = self.regions.get(called, self.bytes), 0, []
+        if not has_loop(called):
+            self.regions[called] = at
         for array in called.inputs:
             entries = given[first : first + array.size]
-            pointers.append(self._input_pointer(entries, array) or self._copy_entries(entries, array, at))
-            at, first = at + bytes_of(array, self.e.width), first + array.size
+            pointer = self._input_pointer(entries, array)
+            pointers.append(pointer or self._copy_entries(entries, array, at))
+            # Of a loop, whose arrays are large and used by one call, what is passed on has no place of its own.
+            at += 0 if has_loop(called) and pointer else bytes_of(array, self.e.width)
+            first += array.size
         outputs = []
         for array in called.outputs:
             outputs.append((self._place(at), kind_of(array.dtype), array.size))
             at += bytes_of(array, self.e.width)
+        self.bytes = max(self.bytes, at)
         pointers += [pointer for pointer, _, _ in outputs]
         if isinstance(called, Careful):
             self.careful = max(self.careful, careful_text.write_call(self.e, called, flag, pointers))
@@ -192,7 +197,7 @@ class Body:
 
     def allocations(self) -> list[str]:
         """Memory for what is passed."""
-        passed = [f"  %passed = alloca [{self.bytes} x i8], align {_ALIGNED}"] if self.bytes else []
+        passed = [allocation("%passed", self.bytes)] if self.bytes else []
         return [*passed, *careful_text.allocation(self.careful)]
 
 
@@ -252,6 +257,38 @@ def _find_products(program: Program) -> dict[int, int]:
     return found
 
 
+def allocation(name: str, size: int) -> str:
+    """A line that allocates memory on the stack."""
+    return f"  {name} = alloca [{size} x i8], align {_ALIGNED}"
+
+
+_ALLOCATION = re.compile(r"  (%\w+) = alloca \[(\d+) x i8\].*")
+
+
+def _on_heap(allocations: Sequence[str]) -> tuple[list[str], list[str], list[str]]:
+    """Lines that allocate memory, large arrays on the heap; those that free it; and declarations.
+
+    The stacks of XLA's threads may be as small as half a megabyte.
+    """
+    lines, free = [], []
+    for line in allocations:
+        match = _ALLOCATION.fullmatch(line)
+        if match is None or int(match[2]) <= MAX_STACK_BYTES:
+            lines.append(line)
+            continue
+        name = match[1]
+        # malloc aligns to 16 bytes: vectors are aligned by hand.
+        lines += [
+            f"  {name}.all = call ptr @malloc(i64 {int(match[2]) + _ALIGNED})",
+            f"  {name}.int = ptrtoint ptr {name}.all to i64",
+            f"  {name}.up = add i64 {name}.int, {_ALIGNED - 1}",
+            f"  {name}.cut = and i64 {name}.up, {-_ALIGNED}",
+            f"  {name} = inttoptr i64 {name}.cut to ptr",
+        ]
+        free.append(f"  call void @free(ptr {name}.all)")
+    return lines, free, ["declare ptr @malloc(i64)", "declare void @free(ptr)"] if free else []
+
+
 def bytes_of(array: Array, width: int) -> int:
     """Bytes of an array for W samples, rounded up to whole cache lines: vector loads are aligned."""
     return -(-array.size * array.dtype.itemsize * width // _ALIGNED) * _ALIGNED
@@ -277,7 +314,9 @@ def subprogram_ir(called: Program, width: int) -> str:
             e.store_at(f"%r{i}", k, kind_of(array.dtype), name)
     names = [f"%a{i}" for i in range(len(called.inputs))] + [f"%r{i}" for i in range(len(called.outputs))]
     head = f"define void @called({', '.join(f'ptr noalias {name}' for name in names)}) #0 {{"
-    return "\n".join([head, *body.allocations(), *e.lines, "  ret void", "}", *e.declared.values(), *ATTRIBUTES])
+    allocations, free, declared = _on_heap(body.allocations())
+    lines = [head, *allocations, *e.lines, *free, "  ret void", "}"]
+    return "\n".join([*lines, *declared, *e.declared.values(), *ATTRIBUTES])
 
 
 def calls_itself(program: Program, width: int) -> bool:
@@ -327,7 +366,7 @@ def kernel_ir(program: Program, width: int, uniform: Sequence[bool]) -> str:
     body, valid, allocations = Body(e, fast, load, array), None, []
     for place in _inputs_of_loops(fast) if width > 1 else ():
         packed[place], given = f"%packed{place}", arrays[place]
-        allocations.append(f"  {packed[place]} = alloca [{bytes_of(given, width)} x i8], align {_ALIGNED}")
+        allocations.append(allocation(packed[place], bytes_of(given, width)))
         source = [f"%a{place}"] * width if uniform[place] else rows[place]
         e.pack(source, packed[place], given.size, kind_of(given.dtype))
     # The kernel of one sample of a large program is a call: the same code serves as a subprogram of steps and rollouts.
@@ -369,12 +408,13 @@ def wrap_kernel(e: Emitter, title: str, uniform: Sequence[bool], outputs: int, a
     pointers = []
     for at, i in enumerate([*varying_first(uniform), *range(len(uniform), len(uniform) + outputs)]):
         pointers += [f"  %p{i} = getelementptr ptr, ptr %data, i64 {at}", f"  %a{i} = load ptr, ptr %p{i}"]
+    lines, free, declared = _on_heap(allocations)
     return "\n".join(
         [
             f"; {title}",
             "define void @kernel(ptr %data, i64 %n, i64 %begin, i64 %end) #0 {",
             "entry:",
-            *allocations,
+            *lines,
             *pointers,
             "  %last = sub i64 %n, 1",
             "  %some = icmp ult i64 %begin, %end",
@@ -388,8 +428,10 @@ def wrap_kernel(e: Emitter, title: str, uniform: Sequence[bool], outputs: int, a
             "  %more = icmp ult i64 %next, %end",
             "  br i1 %more, label %block, label %done",
             "done:",
+            *free,
             "  ret void",
             "}",
+            *declared,
             *e.declared.values(),
             *ATTRIBUTES,
         ]

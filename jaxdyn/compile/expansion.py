@@ -33,6 +33,8 @@ from jaxdyn.compile.program import (
 )
 from jaxdyn.compile.rearrange import AT_PLACES, REARRANGEMENTS
 
+from jaxdyn.compile.scan import MAX_WRITTEN_OUT
+
 # Loops of fewer iterations are always written out.
 MIN_ITERATIONS = 8
 # A function of fewer operations is scatter_places where it is called.
@@ -266,7 +268,7 @@ class _Expansion:
         if not length:
             return [*carry, *(np.zeros(x.shape, x.dtype) for x in outs)]
         if length >= MIN_ITERATIONS and any(x.dtype.kind == "O" for x in args):
-            results = self._roll(params["jaxpr"], [consts, carry, rows], eqn, length, params["reverse"])
+            results = self._roll(params["jaxpr"], [consts, carry, rows], eqn, length, params["reverse"], None, MAX_WRITTEN_OUT)
             if results is not None:
                 return results
         saved: list[list] = []
@@ -279,7 +281,7 @@ class _Expansion:
             saved.reverse()
         return [*carry, *(_stack(column) for column in zip(*saved, strict=True))]
 
-    def _roll(self, inner, arrays, eqn, length: int, inward: bool, parents=None) -> list | None:
+    def _roll(self, inner, arrays, eqn, length: int, inward: bool, parents, most: int) -> list | None:
         """The results of a loop in native code; None where it is short enough to be written out."""
         sizes = np.cumsum([len(x) for x in arrays]).tolist()
         of_inputs, of_results = [x.aval.dtype for x in eqn.invars], [x.aval.dtype for x in eqn.outvars]
@@ -294,14 +296,17 @@ class _Expansion:
                 raise NotNumbers("samples that an iteration of a loop cannot compute")
             return results
 
-        results = rolled.roll(self.graph, body, arrays, dtypes, length, inward, parents)
+        results = rolled.roll(self.graph, body, arrays, dtypes, length, inward, parents, most)
         self.has_rules |= results is not None and outcome[0].has_rules
         return results
 
     def _sweep(self, params, args, eqn):
         count, parents, inward = params["carries"], params["parents"], params["inward"]
         start, rows, inner = args[:count], args[count:], params["call"]
-        results = self._roll(inner, [(), start, rows], eqn, len(parents), inward, parents)
+        # Whoever asks for a sweep has decided that a loop is faster. Without unknown numbers there is nothing to run.
+        results = None
+        if any(x.dtype.kind == "O" for x in args):
+            results = self._roll(inner, [(), start, rows], eqn, len(parents), inward, parents, 0)
         if results is not None:
             return results
         # Written out: of each node the carry, or the sum over its children; the root is the last one.

@@ -12,17 +12,18 @@ import numpy as np
 
 from jaxdyn.compile.graph import Graph
 from jaxdyn.compile.program import Array, as_objects, dtype_of, is_number, kind_or_refuse, objects
-from jaxdyn.compile.scan import MAX_WRITTEN_OUT, Counts, Scan
+from jaxdyn.compile.scan import Counts, Scan
 
 
 def roll(
-    graph: Graph, body: Callable, arrays: Sequence[Sequence], dtypes: Sequence[Sequence], length: int, inward: bool, parents=None
+    graph: Graph, body: Callable, arrays: Sequence[Sequence], dtypes: Sequence[Sequence], length: int, inward: bool, parents, most: int
 ) -> list | None:
     """Results of a loop as a call of a subprogram; None where it is short enough to be written out.
 
     **Arguments:**
 
     - `body(graph, consts, carries, rows)`: results of one iteration, carries and then rows, in a graph of its own.
+    - `most`: operations of a loop that is written out.
     - `arrays`, `dtypes`: of constants, carries, and rows (length, ...); `dtypes` also of the rows that are results.
 
     **Returns:** carries, and rows (length, ...), as those of `lax.scan`.
@@ -59,14 +60,14 @@ def roll(
     made = [objects([outs[i].ravel()[k] for k in distinct[i][0]], (len(distinct[i][0]),)) for i in kept]
     outputs = [*classes.types, *(Array(x.shape, np.dtype(of_results[i])) for i, x in zip(kept, made, strict=True))]
     program = inner.finish(types, outputs, [*carried, *made])
-    if program.cost * length <= MAX_WRITTEN_OUT:
+    if program.cost * length <= most:
         return None
     tables = [np.stack([np.array(y, x.dtype) for y in x.known], 1) for x in rows if x.known]
     counts = Counts(len(own_consts), len(carried), len(own_rows), len(tables), 0, len(kept))
     scan = Scan(program, counts, length, tables, inward, parents)
     passed = [np.stack([objects(y, (len(y),)) for y in x.passed], 1) for x in rows if x.passed]
     consts = [objects([y[0] for y in x.passed], (len(x.passed),)) for x in consts if x.passed]
-    found = graph.call(scan, [*consts, *classes.starts(), *passed])
+    found = scan.call(graph, [*consts, *classes.starts(), *passed])
     by_place = dict(zip(kept, found[len(carried) :], strict=True))
     stacked = []
     for i, (out, (_, places)) in enumerate(zip(outs, distinct, strict=True)):

@@ -58,7 +58,7 @@ class Scan:
     def __init__(self, body: Program, counts: Counts, length: int, tables=(), inward=False, parents=None):
         self.body, self.counts, self.length, self.inward = body, counts, length, inward
         self.tables = tuple(np.ascontiguousarray(x) for x in tables)
-        self.parents = None if parents is None or _is_chain(parents) else tuple(parents)
+        self.parents = None if parents is None or is_chain(parents) else tuple(parents)
         self.derived: dict = {}
         given, made = self.split_inputs(body.inputs), self.split_outputs(body.outputs)
         self.inputs = (*given[0], *given[1], *(_rows(x, length) for x in given[2]))
@@ -74,6 +74,32 @@ class Scan:
     def split_outputs(self, values: Sequence) -> tuple:
         """Carries, terms of sums and rows among the outputs of the body."""
         return _split(values, (self.counts.carries, self.counts.sums, self.counts.results))
+
+    def call(self, graph: Graph, arrays: Sequence[np.ndarray]) -> list[np.ndarray]:
+        """The outputs of a call with these inputs, of which those are passed that the body reads."""
+        few, places = self._made("read", self._with_read_inputs)
+        return graph.call(few, [arrays[i] for i in places])
+
+    def _with_read_inputs(self) -> tuple["Scan", list[int]]:
+        read = {x.args[0] for x in self.body.operations if x.op == "input"}
+        consts, carries, rows, tables = self.split_inputs(range(len(self.body.inputs)))
+        kept = [[i for i in consts if i in read], carries, [i for i in rows if i in read], [i for i in tables if i in read]]
+        if sum(map(len, kept)) == len(self.body.inputs):
+            return self, list(range(len(self.inputs)))
+        body = _rewrite(self.body, [i for group in kept for i in group], range(len(self.body.outputs)))
+        counts = self.counts._replace(consts=len(kept[0]), rows=len(kept[2]), tables=len(kept[3]))
+        tables = [self.tables[i - tables[0]] for i in kept[3]]
+        return Scan(body, counts, self.length, tables, self.inward, self.parents), [i for group in kept[:3] for i in group]
+
+    def with_outputs(self, needed: Sequence[bool]) -> "Scan":
+        """The scan of its carries and of those of its other outputs that are needed."""
+        return self._made(("outputs", tuple(needed)), lambda: self._with_outputs(needed))
+
+    def _with_outputs(self, needed: Sequence[bool]) -> "Scan":
+        kept = [i for i, flag in enumerate(needed) if flag or i < self.counts.carries]
+        _, sums, results = self.split_outputs(needed)
+        body = _rewrite(self.body, range(len(self.body.inputs)), kept)
+        return self._like(body, self.counts._replace(sums=sum(sums), results=sum(results)))
 
     @property
     def subprograms(self) -> tuple:
@@ -137,7 +163,7 @@ class Scan:
         moving = tuple(any(is_number(x) or x != 0 for x in step.flat) for step in steps)
         tangent, moves = self._made(("tangent", moving), lambda: self._tangent(moving))
         groups = zip(*(_split(x, self.counts[:3]) for x in (arrays, steps, moves[: len(arrays)])), strict=True)
-        made = iter(graph.call(tangent, [x for group in groups for x in _with_changes(*group)]))
+        made = iter(tangent.call(graph, [x for group in groups for x in _with_changes(*group)]))
         outs, out_steps = [], []
         for flags in _split(moves[len(arrays) :], (self.counts.carries, self.counts.sums, self.counts.results)):
             own = [next(made) for _ in flags]
@@ -268,7 +294,7 @@ class TransposedCall:
         self.parts = scan.split_linear(self.linear)
         (l_consts, _, l_rows), (consts, carries, rows) = (_split(x, scan.counts[:3]) for x in (self.linear, arrays))
         self.consts, rows = _only(consts, l_consts, False), _only(rows, l_rows, False)
-        made = graph.call(self.parts.fixed, [*self.consts, *_only(carries, self.parts.carries, False), *rows])
+        made = self.parts.fixed.call(graph, [*self.consts, *_only(carries, self.parts.carries, False), *rows])
         count = self.parts.carries.count(False)
         own, saved = iter(made[: len(made) - count]), made[len(made) - count :]
         self.rows = [*rows, *saved]
@@ -282,7 +308,7 @@ class TransposedCall:
         c, s, y = parts.rest.counts.carries, parts.rest.counts.sums, parts.rest.counts.results
         carries, sums, rows = _split(_only(_arrays(scan.outputs, given), parts.outputs), (c, s, y))
         backwards = parts.rest.transpose(parts.linear)
-        made = self.graph.call(backwards, [*self.consts, *sums, *carries, *self.rows, *rows])
+        made = backwards.call(self.graph, [*self.consts, *sums, *carries, *self.rows, *rows])
         of_carries, of_consts, of_rows = map(iter, _split(made, (c, backwards.counts.sums, backwards.counts.results)))
         l_consts, l_start, l_rows = _split(self.linear, scan.counts[:3])
         by_carry = [next(of_carries) if flag else None for flag in parts.carries]
@@ -296,7 +322,8 @@ class TransposedCall:
 # --- parts of programs ---
 
 
-def _is_chain(parents) -> bool:
+def is_chain(parents) -> bool:
+    """Decide whether the parent of each node is the one before it."""
     return all(parent == i - 1 for i, parent in enumerate(parents))
 
 

@@ -10,7 +10,7 @@ from typing import Any
 
 import numpy as np
 
-from jaxdyn.compile.code import ATTRIBUTES, Body, bytes_of, symbol_of
+from jaxdyn.compile.code import ATTRIBUTES, Body, allocation, bytes_of, symbol_of
 from jaxdyn.compile.llvm import Emitter
 from jaxdyn.compile.program import Array, kind_of
 
@@ -62,7 +62,7 @@ class _ScanText:
         scan, e = self.scan, self.e
         head, foot = "%step", "%row"
         count = 1 if self.slots is None else self.slots[0]
-        allocations = [f"  %slots = alloca [{count * self.slot_bytes} x i8], align 64"]
+        allocations = [allocation("%slots", count * self.slot_bytes)]
         self._start(count)
         e.lines += ["  br label %start", "start:", "  br label %loop", "loop:"]
         e.lines.append(f"  {head} = phi i64 [ 0, %start ], [ %following, %latch ]")

@@ -10,6 +10,7 @@ from jax import lax
 
 from jaxdyn.compile import mode
 from jaxdyn.compile.jax_adapter import ShapedArray, define_primitive, function_of, is_zero
+from jaxdyn.compile.scan import is_chain
 from jaxdyn.compile.scan_text import find_slots
 
 
@@ -25,9 +26,9 @@ def sweep(step: Callable, parents: Sequence[int], start, rows, *, inward: bool =
 
     **Returns:** outward, c of the last node, and inward, the sum of the root; and y (n, ...).
     """
-    if all(parent == i - 1 for i, parent in enumerate(parents)):
-        return lax.scan(step, start, rows, reverse=inward)
     if not mode.is_expanding():
+        if is_chain(parents):
+            return lax.scan(step, start, rows, reverse=inward)
         return _sweep_by_jax(step, parents, start, rows, inward)
     flat, structure = jax.tree.flatten((start, rows))
     count = len(jax.tree.leaves(start))
