@@ -330,10 +330,35 @@ class _Expansion:
             (going,) = self.evaluate(params["cond_jaxpr"], [*of_cond, *carry])
             going = as_objects(going).item()
             if type(going) is Number:
-                raise NotNumbers("a while_loop whose end is not known")
+                return self._roll_while(params, of_cond, of_body, carry, eqn)
             if not going:
                 return carry
             carry = self.evaluate(params["body_jaxpr"], [*of_body, *carry])
+
+    def _roll_while(self, params, of_cond, of_body, carry, eqn) -> list:
+        """The carries at the end of a loop whose number of iterations is not known."""
+        types = [x.aval.dtype for x in eqn.invars]
+        count = len(of_cond) + len(of_body)
+        outcome: list[_Expansion] = []
+
+        def evaluate(inner, graph, args):
+            expansion = _Expansion(graph, self.calls, self.branches)
+            results = expansion.evaluate(inner, args)
+            outcome[:] = [*outcome, expansion]
+            if expansion.flagged is not False:
+                raise NotNumbers("samples that an iteration of a loop cannot compute")
+            return results
+
+        def condition(graph, consts, carries):
+            return evaluate(params["cond_jaxpr"], graph, [*consts[: len(of_cond)], *carries])
+
+        def body(graph, consts, carries):
+            return evaluate(params["body_jaxpr"], graph, [*consts[len(of_cond) :], *carries])
+
+        arrays, dtypes = ([*of_cond, *of_body], carry), (types[:count], types[count:])
+        results = rolled.roll_while(self.graph, condition, body, arrays, dtypes)
+        self.has_rules |= any(x.has_rules for x in outcome)
+        return results
 
     def _cond(self, params, args, eqn):
         which, branches = as_objects(args[0]).item(), params["branches"]

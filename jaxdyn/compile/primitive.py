@@ -103,7 +103,7 @@ _OPERATIONS: dict[str, Callable] = {
 def as_operations(*args, program: Program, rows: int = 0):
     """Compute a program's results by operations of JAX, one for each number, on arrays over the batch."""
     if isinstance(program, Scan):
-        return scan_by_jax(program, args, functools.partial(as_operations, program=program.body))
+        return scan_by_jax(program, args, as_operations)
     if not isinstance(program, Program):  # a loop or a pseudo-inverse, which stand in the place of a program
         return program.as_operations(*args)
     lead = max((x.shape[:-1] for x in args), key=len, default=())

@@ -15,6 +15,10 @@ from jaxdyn.compile.program import Array, as_objects, dtype_of, is_number, kind_
 from jaxdyn.compile.scan import Counts, Scan
 
 
+# Of a loop whose end is not known, for estimates of its cost.
+GUESSED_ITERATIONS = 10
+
+
 def roll(
     graph: Graph, body: Callable, arrays: Sequence[Sequence], dtypes: Sequence[Sequence], length: int, inward: bool, parents, most: int
 ) -> list | None:
@@ -76,6 +80,38 @@ def roll(
             full[:, k] = x if place is None else by_place[i][:, place]
         stacked.append(full.reshape(length, *out.shape))
     return [*classes.entries(found[: len(carried)]), *stacked]
+
+
+def roll_while(graph: Graph, condition: Callable, body: Callable, arrays: Sequence[Sequence], dtypes: Sequence[Sequence]) -> list:
+    """Carries at the end of a `lax.while_loop`, as a call of a subprogram.
+
+    **Arguments:** `condition(graph, consts, carries)` and `body(graph, consts, carries)`: results of one iteration. `arrays`,
+    `dtypes`: of constants and carries.
+    """
+    consts, carries = ([as_objects(x) if x.dtype.kind == "O" else x for x in group] for group in arrays)
+    consts = [_group([[y] for y in x.ravel().tolist()], x, d) for x, d in zip(consts, dtypes[0], strict=True)]
+    classes = _Classes([as_objects(x) for x in carries], dtypes[1])
+
+    def inputs():
+        inner = Graph(graph.most)
+        types = [*(Array((len(x.passed),), x.dtype) for x in consts if x.passed), *classes.types]
+        made = [inner.inputs(i, x) for i, x in enumerate(types)]
+        count = len(types) - len(classes.types)
+        own = [x.entries(iter(y), None) for x, y in _pairs(consts, made[:count])]
+        return inner, types, own, classes.entries(made[count:])
+
+    while True:
+        inner, types, *given = inputs()
+        ends = [as_objects(x) for x in body(inner, *given)]
+        if not classes.refine(ends):
+            break
+    program = inner.finish(types, classes.types, classes.outputs(ends))
+    inner, types, *given = inputs()
+    until = inner.finish(types, [Array((), np.dtype(bool))], [as_objects(condition(inner, *given)[0])])
+    passed = [objects([y[0] for y in x.passed], (len(x.passed),)) for x in consts if x.passed]
+    counts = Counts(len(passed), len(classes.types), 0, 0, 0, 0)
+    scan = Scan(program, counts, GUESSED_ITERATIONS, condition=until)
+    return classes.entries(scan.call(graph, [*passed, *classes.starts()]))
 
 
 def _distinct(entries: list) -> tuple[list[int], list[int | None]]:

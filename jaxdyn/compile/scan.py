@@ -45,6 +45,8 @@ class Scan:
       outputs carries, terms of sums, and rows.
     - `tables`: known arrays (length, columns), which are data of the code.
     - `parents`: of each iteration, -1 for the root; parents precede their children. None for a chain.
+    - `condition`: None, or of a `lax.while_loop` the program of constants and carries that says whether there is another
+      iteration; there are no rows then, and `length` is a guess.
 
     Inputs are constants, the root's carries (of a chain that runs inward, those of the last iteration), and arrays of rows.
     Outputs are carries (of the last iteration; inward, of the root), sums, and arrays of rows.
@@ -55,10 +57,12 @@ class Scan:
     is_called = is_kept = True
     name = "scan"
 
-    def __init__(self, body: Program, counts: Counts, length: int, tables=(), inward=False, parents=None):
+    def __init__(self, body: Program, counts: Counts, length: int, tables=(), inward=False, parents=None,
+                 condition: Program | None = None):  # fmt: skip
         self.body, self.counts, self.length, self.inward = body, counts, length, inward
         self.tables = tuple(np.ascontiguousarray(x) for x in tables)
         self.parents = None if parents is None or is_chain(parents) else tuple(parents)
+        self.condition = condition
         self.derived: dict = {}
         given, made = self.split_inputs(body.inputs), self.split_outputs(body.outputs)
         self.inputs = (*given[0], *given[1], *(_rows(x, length) for x in given[2]))
@@ -81,6 +85,8 @@ class Scan:
         return graph.call(few, [arrays[i] for i in places])
 
     def _with_read_inputs(self) -> tuple["Scan", list[int]]:
+        if self.condition is not None:
+            return self, list(range(len(self.inputs)))
         read = {x.args[0] for x in self.body.operations if x.op == "input"}
         consts, carries, rows, tables = self.split_inputs(range(len(self.body.inputs)))
         kept = [[i for i in consts if i in read], carries, [i for i in rows if i in read], [i for i in tables if i in read]]
@@ -104,26 +110,23 @@ class Scan:
     @property
     def subprograms(self) -> tuple:
         """Loops within the body."""
-        return self.body.subprograms
+        return self.body.subprograms if self.condition is None else (*self.body.subprograms, *self.condition.subprograms)
 
     @functools.cached_property
     def digest(self) -> str:
         """Identity of the code, as `Program.digest`."""
         tables = [(x.shape, x.dtype.str, hashlib.sha256(x.tobytes()).hexdigest()) for x in self.tables]
-        text = f"{self.body.digest} {self.counts} {self.length} {tables} {self.inward} {self.parents}"
+        until = "" if self.condition is None else self.condition.digest
+        text = f"{until} {self.body.digest} {self.counts} {self.length} {tables} {self.inward} {self.parents}"
         return hashlib.sha256(text.encode()).hexdigest()
 
     # --- on disk ---
 
     def __getstate__(self):
-        body = self.body
-        parts = body.inputs, body.outputs, [tuple(x) for x in body.operations], body.results, body.subprograms
-        return vars(self) | {"derived": {}, "body": parts}
+        return vars(self) | {"derived": {}, "body": _parts(self.body), "condition": _parts(self.condition)}
 
     def __setstate__(self, state):
-        inputs, outputs, operations, results, inner = state["body"]
-        body = Program(inputs, outputs, [Operation(*x) for x in operations], results, inner)
-        self.__dict__ |= state | {"body": body}
+        self.__dict__ |= state | {name: _program_of_parts(state[name]) for name in ("body", "condition")}
 
     def describe(self) -> "Scan":
         """Itself, as what is kept of it on disk (see `stored`)."""
@@ -135,7 +138,7 @@ class Scan:
 
     # --- text ---
 
-    def subprogram_ir(self, width: int = 1) -> str:
+    def subprogram_ir(self, width: int) -> str:
         """The text of the function `called` (see `code.subprogram_ir`)."""
         from jaxdyn.compile.scan_text import scan_ir
 
@@ -150,7 +153,8 @@ class Scan:
     # --- derivatives ---
 
     def _like(self, body: Program, counts: Counts, inward: bool | None = None) -> "Scan":
-        return Scan(body, counts, self.length, self.tables, self.inward if inward is None else inward, self.parents)
+        inward = self.inward if inward is None else inward
+        return Scan(body, counts, self.length, self.tables, inward, self.parents, self.condition)
 
     def _made(self, key, make) -> Any:
         if key not in self.derived:
@@ -193,7 +197,10 @@ class Scan:
         program = graph.finish([*types, *tables], outputs, outs)
         sizes = [len(x) + sum(x) for x in (m_consts, m_carries, m_rows)]
         counts = Counts(*sizes, len(tables), len(m_sums) + sum(m_sums), len(m_results) + sum(m_results))
-        return self._like(program, counts), (*m_consts, *m_carries, *m_rows, *m_carries, *m_sums, *m_results)
+        scan = self._like(program, counts)
+        if self.condition is not None:
+            scan.condition = _with_more_inputs(self.condition, types, (m_consts, m_carries))
+        return scan, (*m_consts, *m_carries, *m_rows, *m_carries, *m_sums, *m_results)
 
     def _fixpoint(self, carries: tuple[bool, ...], find) -> tuple[Any, tuple[bool, ...]]:
         """The result of `find`, and flags of all outputs, once no further carry has a flag."""
@@ -205,7 +212,15 @@ class Scan:
             carries = found
 
     def transposed_call(self, graph: Graph, values: list) -> "TransposedCall":
-        """A call of the scan within a program that is transposed; `values` are None for what depends on linear inputs."""
+        """A call of the scan within a program that is transposed; `values` are None for what depends on linear inputs.
+
+        **Raises:** ValueError for a `lax.while_loop`, as JAX does.
+        """
+        if self.condition is not None:
+            raise ValueError(
+                "reverse-mode differentiation of a lax.while_loop, whose number of iterations is not known; use lax.scan, or a"
+                " fori_loop from and to known numbers"
+            )
         return TransposedCall(graph, self, values)
 
     def split_linear(self, linear: tuple[bool, ...]) -> "Linear":
@@ -366,6 +381,31 @@ def _tangent_of(body: Program, moving: tuple[bool, ...]) -> tuple[Program, list[
     rows = iter(change.results)
     found = [next(rows) if x.dtype.kind == "f" else () for x in body.outputs]
     return change, [any(type(x) is not Constant or x.value != 0 for x in row) for row in found]
+
+
+def _parts(program: Program | None) -> tuple | None:
+    """What is kept of a program."""
+    if program is None:
+        return None
+    operations = [tuple(x) for x in program.operations]
+    return program.inputs, program.outputs, operations, program.results, program.subprograms
+
+
+def _program_of_parts(parts: tuple | None) -> Program | None:
+    if parts is None:
+        return None
+    inputs, outputs, operations, results, inner = parts
+    return Program(inputs, outputs, [Operation(*x) for x in operations], results, inner)
+
+
+def _with_more_inputs(program: Program, types: Sequence[Array], moves: Sequence[Sequence[bool]]) -> Program:
+    """A program of two groups of inputs as one of inputs of these `types`, where changes follow each group."""
+    graph, given, at = Graph(), [], 0
+    entries = [graph.inputs(i, x) for i, x in enumerate(types)]
+    for flags in moves:
+        given += entries[at : at + len(flags)]
+        at += len(flags) + sum(flags)
+    return graph.finish(types, program.outputs, replay(graph, program, given)[1])
 
 
 def _depends(body: Program, linear: Sequence[bool]) -> list[bool]:

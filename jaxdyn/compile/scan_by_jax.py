@@ -1,6 +1,7 @@
 """Scans (see `scan`) by operations of JAX, where there is no native code: on other devices."""
 
-from collections.abc import Sequence
+import functools
+from collections.abc import Callable, Sequence
 from typing import Any
 
 import jax.numpy as jnp
@@ -9,12 +10,15 @@ from jax import lax
 from jaxdyn.compile.scan_text import find_slots
 
 
-def scan_by_jax(scan: Any, arrays: Sequence, iteration) -> list:
-    """Flat outputs of a scan of flat inputs (..., size); `iteration(*arrays)` computes its body."""
+def scan_by_jax(scan: Any, arrays: Sequence, compute: Callable) -> list:
+    """Flat outputs of a scan of flat inputs (..., size); `compute(*arrays, program=)` computes a program."""
+    iteration = functools.partial(compute, program=scan.body)
     lead = max((x.shape[:-1] for x in arrays), key=len)
     counts, n = scan.counts, scan.length
     full = [jnp.broadcast_to(x, (*lead, x.shape[-1])) for x in arrays]
     consts, start = full[: counts.consts], full[counts.consts : counts.consts + counts.carries]
+    if scan.condition is not None:
+        return _while_by_jax(consts, start, iteration, functools.partial(compute, program=scan.condition))
     given = [jnp.moveaxis(x.reshape(*lead, n, -1), -2, 0) for x in full[counts.consts + counts.carries :]]
     tables = [jnp.broadcast_to(jnp.asarray(x).reshape(n, *[1] * len(lead), -1), (n, *lead, x[0].size)) for x in scan.tables]
     count, slots = find_slots(range(-1, n - 1) if scan.parents is None else scan.parents)
@@ -39,3 +43,13 @@ def scan_by_jax(scan: Any, arrays: Sequence, iteration) -> list:
     (memory, sums), results = lax.scan(step, (memory, sums), each, reverse=scan.inward)
     rows = [jnp.moveaxis(x, 0, -2).reshape(*lead, -1) for x in results]
     return [*(x[last] for x in memory), *sums, *rows]
+
+
+def _while_by_jax(consts: list, start: list, iteration: Callable, condition: Callable) -> list:
+    """A loop that ends with the last sample."""
+
+    def step(carries):
+        flag = condition(*consts, *carries)[0]
+        return [jnp.where(flag, new, old) for new, old in zip(iteration(*consts, *carries), carries, strict=True)]
+
+    return lax.while_loop(lambda carries: jnp.any(condition(*consts, *carries)[0]), step, start)

@@ -76,6 +76,10 @@ class _ScanText:
         first = len(self.consts) + len(self.carries)
         self.pointers += [self._row(f"%a{first + j}", x) for j, x in enumerate(self.rows)]
         self.pointers += [self._table_row(j, x) for j, x in enumerate(scan.tables)]
+        if scan.condition is not None:
+            self.until = Body(e, scan.condition, self._load, self._array)
+            ((flag,),) = self.until.results()
+            e.lines += [f"  br i1 {e.any(flag)}, label %turn, label %end", "turn:"]
         body = Body(e, scan.body, self._load, self._array)
         carries, sums, results = scan.split_outputs(body.results())
         types = scan.split_outputs(scan.body.outputs)
@@ -87,15 +91,28 @@ class _ScanText:
         if scan.inward and self.slots is not None:
             for array, offset in zip(types[0], self.offsets, strict=True):
                 self._store(e.emit(f"getelementptr i8, ptr {read}, i64 {offset}"), array, None)
+        if scan.condition is not None and self.width > 1:
+            carries = [self._select(flag, *x) for x in zip(carries, types[0], self.offsets, strict=True)]
         for row, array, offset in zip(carries, types[0], self.offsets, strict=True):
             put = self._add if scan.inward and self.slots is not None else self._store
             put(e.emit(f"getelementptr i8, ptr {write}, i64 {offset}"), array, row)
         e.lines += ["  br label %latch", "latch:", f"  %following = add i64 {head}, 1"]
-        e.lines += [f"  %more = icmp ult i64 %following, {scan.length}", "  br i1 %more, label %loop, label %end", "end:"]
+        more = f"icmp ult i64 %following, {scan.length}" if scan.condition is None else "icmp eq i64 0, 0"
+        e.lines += [f"  %more = {more}", "  br i1 %more, label %loop, label %end", "end:"]
         self._finish()
         names = [f"%a{i}" for i in range(len(scan.inputs))] + [f"%r{i}" for i in range(len(scan.outputs))]
+        until = [] if scan.condition is None else self.until.allocations()
+        assert not (until and body.allocations()), "loops in a condition and in the body"
         title = f"define void @{self.symbol}({', '.join(f'ptr noalias {name}' for name in names)}) #0 {{"
-        return "\n".join([title, "entry:", *allocations, *body.allocations(), *e.lines, "  ret void", "}"])
+        return "\n".join([title, "entry:", *allocations, *body.allocations(), *until, *e.lines, "  ret void", "}"])
+
+    def _select(self, flag: str, row: Sequence[str], array: Array, offset: int) -> list[str]:
+        """New carries of the samples that take part in the iteration, old ones of those that have ended."""
+        e, kind = self.e, kind_of(array.dtype)
+        pointer = e.emit(f"getelementptr i8, ptr %slots, i64 {offset}")
+        of = e.type(kind)
+        old = [e.load_at(pointer, k, kind) for k in range(array.size)]
+        return [e.emit(f"select {e.type('b1')} {flag}, {of} {x}, {of} {y}") for x, y in zip(row, old, strict=True)]
 
     # --- before and after the loop ---
 
