@@ -9,14 +9,13 @@ it: `void called(ptr ..., ptr ...)` with the arrays of its inputs, then of its o
 sample is such an array: it is passed on without a copy.
 """
 
-import re
 from collections.abc import Callable, Sequence
 from itertools import accumulate
-from typing import Any
 
-from jaxdyn.compile import careful_text
+from jaxdyn.compile import careful_text, memory
 from jaxdyn.compile.careful import Careful
 from jaxdyn.compile.llvm import Emitter
+from jaxdyn.compile.memory import allocation, bytes_of, on_heap
 from jaxdyn.compile.program import COMPARISONS, FLOATS, Array, Constant, Program, kind_of
 from jaxdyn.compile.scan import Scan
 
@@ -25,9 +24,6 @@ from jaxdyn.compile.scan import Scan
 MIN_SHARED_OPERATIONS = 2000
 # Arrays of fewer entries are copied entry by entry.
 MIN_ENTRIES_IN_LOOP = 32
-_ALIGNED = 64  # bytes
-# Larger arrays of a function are on the heap.
-MAX_STACK_BYTES = 1 << 16
 ATTRIBUTES = (
     # LLVM's simplifications of calls of the C library, such as pow(x, 2) = x x, are made at some levels alone.
     'attributes #0 = { nounwind "no-builtins" }',
@@ -62,7 +58,7 @@ class Body:
         """Name of operation i; inputs are loaded where they are first read."""
         if self.names[i] is None:
             op, kind, args = self.program.operations[i]
-            self.names[i] = self._load_part(*args, kind) if op == "part" else self.load(*args, kind)
+            self.names[i] = self._load_part(args[0], args[1], kind) if op == "part" else self.load(*args, kind)
         return self.names[i]
 
     def _load_part(self, call: int, entry: Constant, kind: str) -> str:
@@ -183,7 +179,7 @@ class Body:
         """A pointer to memory with these entries."""
         kind, pointer = kind_of(array.dtype), self._place(at)
         if len(entries) >= MIN_ENTRIES_IN_LOOP and all(type(x) is Constant and x.value == 0 for x in entries):
-            self.e.zero(pointer, len(entries) * array.dtype.itemsize * self.e.width)
+            memory.zero(self.e, pointer, len(entries) * array.dtype.itemsize * self.e.width)
             return pointer
         for k, x in enumerate(entries):
             value, place = self.text(x, kind), at + k * array.dtype.itemsize * self.e.width
@@ -257,43 +253,6 @@ def _find_products(program: Program) -> dict[int, int]:
     return found
 
 
-def allocation(name: str, size: int) -> str:
-    """A line that allocates memory on the stack."""
-    return f"  {name} = alloca [{size} x i8], align {_ALIGNED}"
-
-
-_ALLOCATION = re.compile(r"  (%\w+) = alloca \[(\d+) x i8\].*")
-
-
-def _on_heap(allocations: Sequence[str]) -> tuple[list[str], list[str], list[str]]:
-    """Lines that allocate memory, large arrays on the heap; those that free it; and declarations.
-
-    The stacks of XLA's threads may be as small as half a megabyte.
-    """
-    lines, free = [], []
-    for line in allocations:
-        match = _ALLOCATION.fullmatch(line)
-        if match is None or int(match[2]) <= MAX_STACK_BYTES:
-            lines.append(line)
-            continue
-        name = match[1]
-        # malloc aligns to 16 bytes: vectors are aligned by hand.
-        lines += [
-            f"  {name}.all = call ptr @malloc(i64 {int(match[2]) + _ALIGNED})",
-            f"  {name}.int = ptrtoint ptr {name}.all to i64",
-            f"  {name}.up = add i64 {name}.int, {_ALIGNED - 1}",
-            f"  {name}.cut = and i64 {name}.up, {-_ALIGNED}",
-            f"  {name} = inttoptr i64 {name}.cut to ptr",
-        ]
-        free.append(f"  call void @free(ptr {name}.all)")
-    return lines, free, ["declare ptr @malloc(i64)", "declare void @free(ptr)"] if free else []
-
-
-def bytes_of(array: Array, width: int) -> int:
-    """Bytes of an array for W samples, rounded up to whole cache lines: vector loads are aligned."""
-    return -(-array.size * array.dtype.itemsize * width // _ALIGNED) * _ALIGNED
-
-
 def _write_call(e: Emitter, called: Program, pointers: Sequence[str]) -> None:
     name = symbol_of(called, e.width)
     e.declared[name] = f"declare void @{name}({', '.join(['ptr'] * len(pointers))})"
@@ -314,7 +273,7 @@ def subprogram_ir(called: Program, width: int) -> str:
             e.store_at(f"%r{i}", k, kind_of(array.dtype), name)
     names = [f"%a{i}" for i in range(len(called.inputs))] + [f"%r{i}" for i in range(len(called.outputs))]
     head = f"define void @called({', '.join(f'ptr noalias {name}' for name in names)}) #0 {{"
-    allocations, free, declared = _on_heap(body.allocations())
+    allocations, free, declared = on_heap(body.allocations())
     lines = [head, *allocations, *e.lines, *free, "  ret void", "}"]
     return "\n".join([*lines, *declared, *e.declared.values(), *ATTRIBUTES])
 
@@ -368,7 +327,7 @@ def kernel_ir(program: Program, width: int, uniform: Sequence[bool]) -> str:
         packed[place], given = f"%packed{place}", arrays[place]
         allocations.append(allocation(packed[place], bytes_of(given, width)))
         source = [f"%a{place}"] * width if uniform[place] else rows[place]
-        e.pack(source, packed[place], given.size, kind_of(given.dtype))
+        memory.pack(e, source, packed[place], given.size, kind_of(given.dtype))
     # The kernel of one sample of a large program is a call: the same code serves as a subprogram of steps and rollouts.
     if calls_itself(program, width):
         pointers = [str(array(i)) for i in range(len(arrays))]
@@ -382,7 +341,7 @@ def kernel_ir(program: Program, width: int, uniform: Sequence[bool]) -> str:
         for i, (row, output) in enumerate(zip(fast.results, program.outputs, strict=False)):
             kind, pointer = kind_of(output.dtype), body.pointer_to(row, output)
             if pointer is not None and len(row) >= MIN_ENTRIES_IN_LOOP:
-                e.unpack(pointer, rows[count + i], len(row), kind)
+                memory.unpack(e, pointer, rows[count + i], len(row), kind)
             else:
                 e.store_array(rows[count + i], kind, [body.text(x, kind) for x in row])
         if program.careful is not None:
@@ -408,7 +367,7 @@ def wrap_kernel(e: Emitter, title: str, uniform: Sequence[bool], outputs: int, a
     pointers = []
     for at, i in enumerate([*varying_first(uniform), *range(len(uniform), len(uniform) + outputs)]):
         pointers += [f"  %p{i} = getelementptr ptr, ptr %data, i64 {at}", f"  %a{i} = load ptr, ptr %p{i}"]
-    lines, free, declared = _on_heap(allocations)
+    lines, free, declared = on_heap(allocations)
     return "\n".join(
         [
             f"; {title}",

@@ -19,12 +19,13 @@ from jaxdyn.compile.array_rules import bind_known, empty_reduction, evaluate_kno
 from jaxdyn.compile.derive import without_unread
 from jaxdyn.compile.graph import Graph
 from jaxdyn.compile.inlining import replay
-from jaxdyn.compile.jax_adapter import ClosedJaxpr, Literal, Tracer, scan_counts  # pyright: ignore[reportPrivateImportUsage]
+from jaxdyn.compile.jax_adapter import ClosedJaxpr, Literal, Tracer  # pyright: ignore[reportPrivateImportUsage]
 from jaxdyn.compile.program import (
     Array,
     NotNumbers,
     Number,
     Program,
+    TooLong,
     as_kind,
     as_objects,
     is_number,
@@ -32,11 +33,10 @@ from jaxdyn.compile.program import (
     objects,
 )
 from jaxdyn.compile.rearrange import AT_PLACES, REARRANGEMENTS
+from jaxdyn.compile.scan import Scan
 
-from jaxdyn.compile.scan import MAX_WRITTEN_OUT
-
-# Loops of fewer iterations are always written out.
-MIN_ITERATIONS = 8
+# Operations of a program that calls loops.
+MAX_BESIDE_LOOPS = 40_000
 # A function of fewer operations is scatter_places where it is called.
 MIN_SUBPROGRAM_OPERATIONS = 300
 
@@ -73,6 +73,11 @@ def expand(
         results.append(objects([graph.invert(expansion.flagged)], ()))
     program = graph.finish(inputs, outputs, [as_objects(x) for x in results], name=name)
     program.reports_validity = reports
+    # Arithmetic on the arrays that loops take and return is written out, entry by entry, and LLVM takes longer for operations
+    # on memory than for others: a step of a chain of 200 links would compile for a minute.
+    written = sum(x.op not in ("input", "part") for x in program.operations)
+    if written > MAX_BESIDE_LOOPS and most <= mode.MAX_OPERATIONS and any(isinstance(x, Scan) for x in program.subprograms):
+        raise TooLong(f"more than {MAX_BESIDE_LOOPS} operations beside loops")
     numbers.prune_calls(program)
     return program, expansion.has_rules
 
@@ -126,6 +131,15 @@ class _Expansion:
                 raise
             values.update(zip(eqn.outvars, results, strict=True))
         return [read(x) for x in jaxpr.outvars]
+
+    def evaluate_in(self, graph: Graph, inner: ClosedJaxpr, args) -> list:
+        """The results of a jaxpr in another graph, that of an iteration of a loop."""
+        inside = _Expansion(graph, self.calls, self.branches)
+        results = inside.evaluate(inner, args)
+        self.has_rules |= inside.has_rules
+        if inside.flagged is not False:
+            raise NotNumbers("samples that an iteration of a loop cannot compute")
+        return results
 
     def one(self, eqn, args) -> list:
         name, params = eqn.primitive.name, eqn.params
@@ -260,106 +274,6 @@ class _Expansion:
         chosen = [self.graph.select(flag, x, math.nan, kind) for flag, x in zip(flags, entries, strict=True)]
         return [objects(chosen, args[1].shape)]
 
-    def _scan(self, params, args, eqn):
-        count, carried = scan_counts(params)
-        length = params["length"]
-        consts, carry, rows = args[:count], args[count : count + carried], args[count + carried :]
-        outs = [x.aval for x in eqn.outvars[carried:]]
-        if not length:
-            return [*carry, *(np.zeros(x.shape, x.dtype) for x in outs)]
-        if length >= MIN_ITERATIONS and any(x.dtype.kind == "O" for x in args):
-            results = self._roll(params["jaxpr"], [consts, carry, rows], eqn, length, params["reverse"], None, MAX_WRITTEN_OUT)
-            if results is not None:
-                return results
-        saved: list[list] = []
-        # Written out: the length is known, and zeros of a first step are seen in the following ones.
-        for i in reversed(range(length)) if params["reverse"] else range(length):
-            results = self.evaluate(params["jaxpr"], [*consts, *carry, *(x[i, ...] for x in rows)])
-            carry = results[:carried]
-            saved.append(results[carried:])
-        if params["reverse"]:
-            saved.reverse()
-        return [*carry, *(_stack(column) for column in zip(*saved, strict=True))]
-
-    def _roll(self, inner, arrays, eqn, length: int, inward: bool, parents, most: int) -> list | None:
-        """The results of a loop in native code; None where it is short enough to be written out."""
-        sizes = np.cumsum([len(x) for x in arrays]).tolist()
-        of_inputs, of_results = [x.aval.dtype for x in eqn.invars], [x.aval.dtype for x in eqn.outvars]
-        dtypes = [of_inputs[: sizes[0]], of_inputs[sizes[0] : sizes[1]], of_inputs[sizes[1] :], of_results[len(arrays[1]) :]]
-        outcome: list[_Expansion] = []
-
-        def body(graph, consts, carries, rows):
-            expansion = _Expansion(graph, self.calls, self.branches)
-            results = expansion.evaluate(inner, [*consts, *carries, *rows])
-            outcome[:] = [expansion]
-            if expansion.flagged is not False:
-                raise NotNumbers("samples that an iteration of a loop cannot compute")
-            return results
-
-        results = rolled.roll(self.graph, body, arrays, dtypes, length, inward, parents, most)
-        self.has_rules |= results is not None and outcome[0].has_rules
-        return results
-
-    def _sweep(self, params, args, eqn):
-        count, parents, inward = params["carries"], params["parents"], params["inward"]
-        start, rows, inner = args[:count], args[count:], params["call"]
-        # Whoever asks for a sweep has decided that a loop is faster. Without unknown numbers there is nothing to run.
-        results = None
-        if any(x.dtype.kind == "O" for x in args):
-            results = self._roll(inner, [(), start, rows], eqn, len(parents), inward, parents, 0)
-        if results is not None:
-            return results
-        # Written out: of each node the carry, or the sum over its children; the root is the last one.
-        carries: list = [None] * len(parents) + [None if inward else start]
-        if inward:
-            carries[len(parents) - 1] = start
-        saved: list = [None] * len(parents)
-        for i in reversed(range(len(parents))) if inward else range(len(parents)):
-            given = carries[i if inward else parents[i]]
-            given = [np.zeros(x.aval.shape, x.aval.dtype) for x in eqn.invars[:count]] if given is None else given
-            results = self.evaluate(inner, [*given, *(x[i, ...] for x in rows)])
-            own, saved[i] = results[:count], results[count:]
-            to, add = (parents[i], carries[parents[i]]) if inward else (i, None)
-            carries[to] = own if add is None else [as_objects(self.elementwise["add"](*map(as_objects, x))) for x in zip(add, own, strict=True)]
-        return [*carries[-1 if inward else len(parents) - 1], *(_stack(column) for column in zip(*saved, strict=True))]
-
-    def _while(self, params, args, eqn):
-        count, more = params["cond_nconsts"], params["body_nconsts"]
-        of_cond, of_body, carry = args[:count], args[count : count + more], args[count + more :]
-        while True:
-            (going,) = self.evaluate(params["cond_jaxpr"], [*of_cond, *carry])
-            going = as_objects(going).item()
-            if type(going) is Number:
-                return self._roll_while(params, of_cond, of_body, carry, eqn)
-            if not going:
-                return carry
-            carry = self.evaluate(params["body_jaxpr"], [*of_body, *carry])
-
-    def _roll_while(self, params, of_cond, of_body, carry, eqn) -> list:
-        """The carries at the end of a loop whose number of iterations is not known."""
-        types = [x.aval.dtype for x in eqn.invars]
-        count = len(of_cond) + len(of_body)
-        outcome: list[_Expansion] = []
-
-        def evaluate(inner, graph, args):
-            expansion = _Expansion(graph, self.calls, self.branches)
-            results = expansion.evaluate(inner, args)
-            outcome[:] = [*outcome, expansion]
-            if expansion.flagged is not False:
-                raise NotNumbers("samples that an iteration of a loop cannot compute")
-            return results
-
-        def condition(graph, consts, carries):
-            return evaluate(params["cond_jaxpr"], graph, [*consts[: len(of_cond)], *carries])
-
-        def body(graph, consts, carries):
-            return evaluate(params["body_jaxpr"], graph, [*consts[len(of_cond) :], *carries])
-
-        arrays, dtypes = ([*of_cond, *of_body], carry), (types[:count], types[count:])
-        results = rolled.roll_while(self.graph, condition, body, arrays, dtypes)
-        self.has_rules |= any(x.has_rules for x in outcome)
-        return results
-
     def _cond(self, params, args, eqn):
         which, branches = as_objects(args[0]).item(), params["branches"]
         if type(which) is Number:
@@ -481,9 +395,9 @@ _OTHER: dict[str, Callable] = {
     "call_hi_primitive": _Expansion._high,
     "polynomial": array_rules.polynomial,
     **dict.fromkeys(("cumsum", "cumprod", "cummax", "cummin"), look_ups.cumulative),
-    "scan": _Expansion._scan,
-    "jaxdyn_sweep": _Expansion._sweep,
-    "while": _Expansion._while,
+    "scan": rolled.scan,
+    "jaxdyn_sweep": rolled.sweep,
+    "while": rolled.while_loop,
     "cond": _Expansion._cond,
     "custom_linear_solve": _Expansion._linear_solve,
     "cholesky": array_rules.cholesky,
@@ -508,9 +422,3 @@ def _constant(x) -> np.ndarray:
     if isinstance(x, Tracer):
         raise NotNumbers("a number of an enclosing function")
     return np.asarray(x)
-
-
-def _stack(rows: Sequence) -> np.ndarray:
-    if any(x.dtype.kind == "O" for x in rows):
-        return np.stack([as_objects(x) for x in rows])
-    return np.stack(rows)

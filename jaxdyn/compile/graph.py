@@ -381,7 +381,7 @@ class Graph:
         for number in numbers:
             if number in live:
                 index[number] = len(operations)
-                args = number.args
+                args: Any = number.args
                 if number.op != "input":
                     if number.op == "call_where":
                         args = tuple(x if type(x) is not Number or x in live else 0 for x in args)

@@ -1,6 +1,5 @@
 """Operations on numbers as lines of LLVM's intermediate representation: every number is a vector over W samples of a batch."""
 
-import contextlib
 import functools
 import struct
 from collections.abc import Sequence
@@ -377,46 +376,6 @@ class Emitter:
         for row, value in zip(rows, lines, strict=True):
             at = self.emit(f"getelementptr i8, ptr {row}, i64 {entry * _BYTES[kind]}")
             self.emit_store(f"  store {of} {value}, ptr {at}, align {_BYTES[kind]}")
-
-    def zero(self, pointer: str, size: int) -> None:
-        """Fill memory with zeros."""
-        self.declared["memset"] = "declare void @llvm.memset.p0.i64(ptr, i8, i64, i1)"
-        self.lines.append(f"  call void @llvm.memset.p0.i64(ptr {pointer}, i8 0, i64 {size}, i1 false)")
-
-    def pack(self, rows: Sequence[str], array: str, size: int, kind: str) -> None:
-        """Copy the rows of all samples to an array in memory whose entries follow each other, each with its W samples."""
-        first = size // self.width * self.width if kind in FLOATS else 0
-        with self._tiles(first, rows, array, kind) as (at, inside):
-            for k, value in enumerate(self.load_tile(at, 0, kind)):
-                self.store_at(inside, k, kind, value)
-        for k in range(first, size):
-            self.store_at(array, k, kind, self.load(rows, k, kind))
-
-    def unpack(self, array: str, rows: Sequence[str], size: int, kind: str) -> None:
-        """The inverse of `pack`."""
-        first = size // self.width * self.width if kind in FLOATS else 0
-        with self._tiles(first, rows, array, kind) as (at, inside):
-            self.store_tile(at, 0, kind, [self.load_at(inside, k, kind) for k in range(self.width)])
-        for k in range(first, size):
-            self.store(rows, k, kind, self.load_at(array, k, kind))
-
-    @contextlib.contextmanager
-    def _tiles(self, size: int, rows: Sequence[str], array: str, kind: str):
-        """A loop over W entries at a time: pointers to them in the rows, and in the array."""
-        self.count += 1
-        before, loop, after = (f"{name}{self.count}" for name in ("untiled", "tile", "tiled"))
-        self.lines += [f"  br label %{before}", f"{before}:", f"  br label %{loop if size else after}", f"{loop}:"]
-        entry = self.emit(f"phi i64 [ 0, %{before} ], [ %{loop}.next, %{loop} ]")
-        offset = self.emit(f"mul i64 {entry}, {_BYTES[kind]}")
-        at = [self.emit(f"getelementptr i8, ptr {row}, i64 {offset}") for row in rows]
-        offset = self.emit(f"mul i64 {offset}, {self.width}")
-        yield at, self.emit(f"getelementptr i8, ptr {array}, i64 {offset}")
-        self.lines += [
-            f"  %{loop}.next = add i64 {entry}, {self.width}",
-            f"  %{loop}.more = icmp ult i64 %{loop}.next, {size}",
-            f"  br i1 %{loop}.more, label %{loop}, label %{after}",
-            f"{after}:",
-        ]
 
     def emit_store(self, line: str) -> None:
         """Write a store, and now and then a fence, which costs no instruction.

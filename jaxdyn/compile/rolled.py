@@ -11,16 +11,128 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from jaxdyn.compile.graph import Graph
-from jaxdyn.compile.program import Array, as_objects, dtype_of, is_number, kind_or_refuse, objects
-from jaxdyn.compile.scan import Counts, Scan
+from jaxdyn.compile.jax_adapter import scan_counts
+from jaxdyn.compile.program import Array, Number, as_objects, dtype_of, is_number, kind_or_refuse, objects
+from jaxdyn.compile.scan import MAX_WRITTEN_OUT, Counts, Scan
 
-
+# Loops of fewer iterations are always written out.
+MIN_ITERATIONS = 8
 # Of a loop whose end is not known, for estimates of its cost.
 GUESSED_ITERATIONS = 10
 
 
+def scan(expansion, params, args, eqn):
+    """`lax.scan`: as a loop, or written out where it is short."""
+    count, carried = scan_counts(params)
+    length = params["length"]
+    consts, carry, rows = args[:count], args[count : count + carried], args[count + carried :]
+    outs = [x.aval for x in eqn.outvars[carried:]]
+    if not length:
+        return [*carry, *(np.zeros(x.shape, x.dtype) for x in outs)]
+    if length >= MIN_ITERATIONS and any(x.dtype.kind == "O" for x in args):
+        results = _roll(
+            expansion, params["jaxpr"], [consts, carry, rows], eqn, length, params["reverse"], None, MAX_WRITTEN_OUT
+        )
+        if results is not None:
+            return results
+    saved: list[list] = []
+    # Written out: the length is known, and zeros of a first step are seen in the following ones.
+    for i in reversed(range(length)) if params["reverse"] else range(length):
+        results = expansion.evaluate(params["jaxpr"], [*consts, *carry, *(x[i, ...] for x in rows)])
+        carry = results[:carried]
+        saved.append(results[carried:])
+    if params["reverse"]:
+        saved.reverse()
+    return [*carry, *(_stack(column) for column in zip(*saved, strict=True))]
+
+
+def _roll(expansion, inner, arrays, eqn, length: int, inward: bool, parents, most: int) -> list | None:
+    """The results of a loop in native code; None where it is short enough to be written out."""
+    sizes = np.cumsum([len(x) for x in arrays]).tolist()
+    of_inputs, of_results = [x.aval.dtype for x in eqn.invars], [x.aval.dtype for x in eqn.outvars]
+    dtypes = [
+        of_inputs[: sizes[0]],
+        of_inputs[sizes[0] : sizes[1]],
+        of_inputs[sizes[1] :],
+        of_results[len(arrays[1]) :],
+    ]
+
+    def body(graph, consts, carries, rows):
+        return expansion.evaluate_in(graph, inner, [*consts, *carries, *rows])
+
+    return roll(expansion.graph, body, arrays, dtypes, length, inward, parents, most)
+
+
+def sweep(expansion, params, args, eqn):
+    """A sweep over a tree (see `sweeps`)."""
+    count, parents, inward = params["carries"], params["parents"], params["inward"]
+    start, rows, inner = args[:count], args[count:], params["call"]
+    # Whoever asks for a sweep has decided that a loop is faster. Without unknown numbers there is nothing to run.
+    results = None
+    if any(x.dtype.kind == "O" for x in args):
+        results = _roll(expansion, inner, [(), start, rows], eqn, len(parents), inward, parents, 0)
+    if results is not None:
+        return results
+    # Written out: of each node the carry, or the sum over its children; the root is the last one.
+    carries: list = [None] * len(parents) + [None if inward else start]
+    if inward:
+        carries[len(parents) - 1] = start
+    saved: list = [None] * len(parents)
+    for i in reversed(range(len(parents))) if inward else range(len(parents)):
+        given = carries[i if inward else parents[i]]
+        given = [np.zeros(x.aval.shape, x.aval.dtype) for x in eqn.invars[:count]] if given is None else given
+        results = expansion.evaluate(inner, [*given, *(x[i, ...] for x in rows)])
+        own, saved[i] = results[:count], results[count:]
+        to, add = (parents[i], carries[parents[i]]) if inward else (i, None)
+        carries[to] = own if add is None else [_add(expansion, x, y) for x, y in zip(add, own, strict=True)]
+    return [*carries[-1 if inward else len(parents) - 1], *(_stack(column) for column in zip(*saved, strict=True))]
+
+
+def while_loop(expansion, params, args, eqn):
+    """`lax.while_loop`: written out where its end is known."""
+    count, more = params["cond_nconsts"], params["body_nconsts"]
+    of_cond, of_body, carry = args[:count], args[count : count + more], args[count + more :]
+    while True:
+        (going,) = expansion.evaluate(params["cond_jaxpr"], [*of_cond, *carry])
+        going = as_objects(going).item()
+        if type(going) is Number:
+            return _roll_while(expansion, params, of_cond, of_body, carry, eqn)
+        if not going:
+            return carry
+        carry = expansion.evaluate(params["body_jaxpr"], [*of_body, *carry])
+
+
+def _roll_while(expansion, params, of_cond, of_body, carry, eqn) -> list:
+    """The carries at the end of a loop whose number of iterations is not known."""
+    types = [x.aval.dtype for x in eqn.invars]
+    count = len(of_cond) + len(of_body)
+
+    def condition(graph, consts, carries):
+        return expansion.evaluate_in(graph, params["cond_jaxpr"], [*consts[: len(of_cond)], *carries])
+
+    def body(graph, consts, carries):
+        return expansion.evaluate_in(graph, params["body_jaxpr"], [*consts[len(of_cond) :], *carries])
+
+    arrays, dtypes = ([*of_cond, *of_body], carry), (types[:count], types[count:])
+    return roll_while(expansion.graph, condition, body, arrays, dtypes)
+
+
+def _add(expansion, x: np.ndarray, y: np.ndarray) -> np.ndarray:
+    return as_objects(expansion.elementwise["add"](as_objects(x), as_objects(y)))
+
+
+# --- loops as subprograms ---
+
+
 def roll(
-    graph: Graph, body: Callable, arrays: Sequence[Sequence], dtypes: Sequence[Sequence], length: int, inward: bool, parents, most: int
+    graph: Graph,
+    body: Callable,
+    arrays: Sequence[Sequence],
+    dtypes: Sequence[Sequence],
+    length: int,
+    inward: bool,
+    parents,
+    most: int,
 ) -> list | None:
     """Results of a loop as a call of a subprogram; None where it is short enough to be written out.
 
@@ -82,7 +194,9 @@ def roll(
     return [*classes.entries(found[: len(carried)]), *stacked]
 
 
-def roll_while(graph: Graph, condition: Callable, body: Callable, arrays: Sequence[Sequence], dtypes: Sequence[Sequence]) -> list:
+def roll_while(
+    graph: Graph, condition: Callable, body: Callable, arrays: Sequence[Sequence], dtypes: Sequence[Sequence]
+) -> list:
     """Carries at the end of a `lax.while_loop`, as a call of a subprogram.
 
     **Arguments:** `condition(graph, consts, carries)` and `body(graph, consts, carries)`: results of one iteration. `arrays`,
@@ -147,7 +261,8 @@ class _Group(NamedTuple):
 
     def entries(self, passed, known) -> np.ndarray:
         """Entries of one iteration; `passed` and `known` are iterators over the inputs of the groups."""
-        own = {"passed": next(passed) if self.passed else None, "known": next(known) if self.known else None}
+        own: dict[str, Any] = {"passed": next(passed) if self.passed else None}
+        own["known"] = next(known) if self.known else None
         return objects([at if where == "fixed" else own[where][at] for where, at in self.places], self.shape)
 
 
@@ -258,3 +373,9 @@ class _Classes:
 def _key(x) -> Any:
     """Equal for entries that are the same number, or known numbers of the same bits."""
     return id(x) if is_number(x) else ("known", type(x), np.asarray(x).tobytes())
+
+
+def _stack(rows: Sequence) -> np.ndarray:
+    if any(x.dtype.kind == "O" for x in rows):
+        return np.stack([as_objects(x) for x in rows])
+    return np.stack(rows)

@@ -13,6 +13,7 @@ that of an inward one is outward; constants and sums change places too. So deriv
 
 import functools
 import hashlib
+import itertools
 from collections.abc import Sequence
 from typing import Any, NamedTuple
 
@@ -68,7 +69,7 @@ class Scan:
         self.inputs = (*given[0], *given[1], *(_rows(x, length) for x in given[2]))
         self.outputs = (*made[0], *made[1], *(_rows(x, length) for x in made[2]))
         ends = np.cumsum([0, *(x.size for x in self.outputs)]).tolist()
-        self.results = tuple(tuple(range(a, b)) for a, b in zip(ends, ends[1:], strict=False))
+        self.results = tuple(tuple(range(a, b)) for a, b in itertools.pairwise(ends))
         self.cost = max(1, length * body.cost)
 
     def split_inputs(self, values: Sequence) -> tuple:
@@ -89,13 +90,20 @@ class Scan:
             return self, list(range(len(self.inputs)))
         read = {x.args[0] for x in self.body.operations if x.op == "input"}
         consts, carries, rows, tables = self.split_inputs(range(len(self.body.inputs)))
-        kept = [[i for i in consts if i in read], carries, [i for i in rows if i in read], [i for i in tables if i in read]]
+        kept = [
+            [i for i in consts if i in read],
+            carries,
+            [i for i in rows if i in read],
+            [i for i in tables if i in read],
+        ]
         if sum(map(len, kept)) == len(self.body.inputs):
             return self, list(range(len(self.inputs)))
         body = _rewrite(self.body, [i for group in kept for i in group], range(len(self.body.outputs)))
         counts = self.counts._replace(consts=len(kept[0]), rows=len(kept[2]), tables=len(kept[3]))
         tables = [self.tables[i - tables[0]] for i in kept[3]]
-        return Scan(body, counts, self.length, tables, self.inward, self.parents), [i for group in kept[:3] for i in group]
+        return Scan(body, counts, self.length, tables, self.inward, self.parents), [
+            i for group in kept[:3] for i in group
+        ]
 
     def with_outputs(self, needed: Sequence[bool]) -> "Scan":
         """The scan of its carries and of those of its other outputs that are needed."""
@@ -110,7 +118,9 @@ class Scan:
     @property
     def subprograms(self) -> tuple:
         """Loops within the body."""
-        return self.body.subprograms if self.condition is None else (*self.body.subprograms, *self.condition.subprograms)
+        return (
+            self.body.subprograms if self.condition is None else (*self.body.subprograms, *self.condition.subprograms)
+        )
 
     @functools.cached_property
     def digest(self) -> str:
@@ -172,7 +182,9 @@ class Scan:
         for flags in _split(moves[len(arrays) :], (self.counts.carries, self.counts.sums, self.counts.results)):
             own = [next(made) for _ in flags]
             outs += own
-            out_steps += [next(made) if flag else np.zeros(x.shape, object) + 0.0 for x, flag in zip(own, flags, strict=True)]
+            out_steps += [
+                next(made) if flag else np.zeros(x.shape, object) + 0.0 for x, flag in zip(own, flags, strict=True)
+            ]
         return _entries(outs), _entries(out_steps)
 
     def _tangent(self, moving: tuple[bool, ...]) -> tuple["Scan", tuple[bool, ...]]:
@@ -196,7 +208,8 @@ class Scan:
         outputs = [x for _, _, y, m in zip(*groups, strict=True) for x in _with_changes(y, y, m)]
         program = graph.finish([*types, *tables], outputs, outs)
         sizes = [len(x) + sum(x) for x in (m_consts, m_carries, m_rows)]
-        counts = Counts(*sizes, len(tables), len(m_sums) + sum(m_sums), len(m_results) + sum(m_results))
+        of_outputs = [len(x) + sum(x) for x in (m_sums, m_results)]
+        counts = Counts(sizes[0], sizes[1], sizes[2], len(tables), of_outputs[0], of_outputs[1])
         scan = self._like(program, counts)
         if self.condition is not None:
             scan.condition = _with_more_inputs(self.condition, types, (m_consts, m_carries))
@@ -254,7 +267,8 @@ class Scan:
         )
         is_linear = [*l_consts, *l_carries, *l_rows, *[False] * tables]
         places = [i for group in groups for i in group]
-        counts = Counts(*map(len, groups), sum(l_sums), sum(l_results))
+        sizes = [len(x) for x in groups]
+        counts = Counts(sizes[0], sizes[1], sizes[2], sizes[3], sum(l_sums), sum(l_results))
         rest = self._like(_rewrite(body, places, _index(outputs, True)), counts)
         return Linear(fixed, rest, tuple(is_linear[i] for i in places), l_carries, outputs)
 
@@ -273,9 +287,7 @@ class Scan:
         c, s, y, t = self.counts.carries, self.counts.sums, self.counts.results, self.counts.tables
         fixed = l_consts.count(False), l_rows.count(False)
         # The inputs are fixed constants, fixed rows, tables, then cotangents of carries, sums, rows.
-        consts, rows, tables, of_carries, of_sums, of_rows = _split(
-            range(len(backwards.inputs)), (*fixed, t, c, s, y)
-        )
+        consts, rows, tables, of_carries, of_sums, of_rows = _split(range(len(backwards.inputs)), (*fixed, t, c, s, y))
         to_consts, to_carries, to_rows = _split(range(len(backwards.outputs)), (sum(l_consts), c, sum(l_rows)))
         places = [*consts, *of_sums, *of_carries, *rows, *of_rows, *tables]
         body = _rewrite(backwards, places, [*to_carries, *to_consts, *to_rows])

@@ -10,8 +10,9 @@ from typing import Any
 
 import numpy as np
 
-from jaxdyn.compile.code import ATTRIBUTES, Body, allocation, bytes_of, symbol_of
+from jaxdyn.compile.code import ATTRIBUTES, Body, symbol_of
 from jaxdyn.compile.llvm import Emitter
+from jaxdyn.compile.memory import allocation, bytes_of, zero
 from jaxdyn.compile.program import Array, kind_of
 
 
@@ -120,7 +121,7 @@ class _ScanText:
         """Given carries in their slot, zeros in all others that are added to, and in sums."""
         e, scan = self.e, self.scan
         if scan.inward and count > 1:
-            e.zero("%slots", count * self.slot_bytes)
+            zero(e, "%slots", count * self.slot_bytes)
         first, last = self._ends()
         for j, (array, offset) in enumerate(zip(self.carries, self.offsets, strict=True)):
             kind = kind_of(array.dtype)
@@ -130,7 +131,7 @@ class _ScanText:
             self._store(pointer, array, values)
         carries, sums, _ = scan.split_outputs(scan.body.outputs)
         for j, array in enumerate(sums):
-            e.zero(f"%r{len(carries) + j}", array.size * array.dtype.itemsize * self.width)
+            zero(e, f"%r{len(carries) + j}", array.size * array.dtype.itemsize * self.width)
 
     def _finish(self) -> None:
         """Results are the carries of the last iteration, or inward those of the root."""

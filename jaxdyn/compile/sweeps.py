@@ -100,7 +100,8 @@ def _jvp(primals, tangents, *, call, parents, carries, inward):
 
     def both(*leaves):
         carry, d_carry, row, d_row = _split(leaves, carries, count - carries)
-        return _merge(*jax.jvp(function_of(call), [*carry, *row], [*d_carry, *d_row]), carries)
+        values, changes = jax.jvp(function_of(call), [*carry, *row], [*d_carry, *d_row])
+        return _merge(values, changes, carries)
 
     given = [*primals[:carries], *steps[:carries], *primals[carries:], *steps[carries:]]
     results = _again(both, given, 2 * carries, parents, inward)

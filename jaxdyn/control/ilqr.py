@@ -327,7 +327,9 @@ def _backward(problem: _Problem, state: _State):
         return problem.cost(z[:nx], z[nx:], i)
 
     # Derivatives do not depend on V: they are computed for all steps at once, and not within the backward scan.
-    F, lz, lzz = batch.each_row(lambda z, i: (jax.jacrev(step)(z), jax.grad(cost)(z, i), jax.hessian(cost)(z, i)), Z, count)
+    F, lz, lzz = batch.each_row(
+        lambda z, i: (jax.jacrev(step)(z), jax.grad(cost)(z, i), jax.hessian(cost)(z, i)), Z, count
+    )
     none = jnp.zeros((), us.dtype)
 
     def go_back(carry, row):

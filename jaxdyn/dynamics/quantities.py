@@ -197,8 +197,8 @@ rnea, crba, aba, mass_matrix_sqrt = map(
     _kernel_with_checks, (recursions.rnea, recursions.crba, recursions.aba, recursions.mass_matrix_sqrt)
 )
 
-# From so many bodies on the recursions are sweeps (see `recursions.sweeps`), which are faster from some 15 on for general geometry,
-# and from some 40 on where axes are at right angles: there every body written out has zeros of its own.
+# From so many bodies on the recursions are sweeps (see `recursions.sweeps`). For general geometry these are as fast from 15 on;
+# where axes are at right angles every body that is written out has zeros of its own.
 MIN_BODIES_IN_SWEEPS = 40
 # Scalar programs of more bodies, for joints without sweeps, compile for longer than a few seconds.
 MAX_BODIES = 128

@@ -286,7 +286,8 @@ def warn_unphysical_inertias(inertias: Mapping[str, Any], places: Mapping[str, s
 def nearest_rotation(rotation: Float[Array, "*n 3 3"]) -> Float[Array, "*n 3 3"]:
     """R (3 - R^T R)/2, one Newton step towards the orthogonal factor, which is differentiable without an SVD."""
     gram = jnp.einsum("...ji,...jk->...ik", rotation, rotation)
-    return jnp.einsum("...ij,...jk->...ik", rotation, 1.5 * jnp.eye(3, dtype=rotation.dtype) - 0.5 * gram)
+    one = jnp.eye(3, dtype=rotation.dtype).reshape((1,) * (rotation.ndim - 2) + (3, 3))
+    return jnp.einsum("...ij,...jk->...ik", rotation, 1.5 * one - 0.5 * gram)
 
 
 def _geometry(model: Model) -> tuple[Array | np.ndarray, Array | np.ndarray]:

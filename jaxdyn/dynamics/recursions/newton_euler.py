@@ -75,7 +75,9 @@ def body_wrenches(links: Links, chains: list[Chain], v=None, a=None, external=No
     for i, parent in enumerate(links.parents):
         at_rest = zero, zero, np.zeros((3, 3), dtype), weight
         speed, rate = (None if x is None else x[i] for x in (speeds, rates))
-        motion.append(move_with_joint(motion[parent] if parent >= 0 else at_rest, chains[i], links.subspaces[i], speed, rate))
+        motion.append(
+            move_with_joint(motion[parent] if parent >= 0 else at_rest, chains[i], links.subspaces[i], speed, rate)
+        )
         _, _, K, acc = motion[-1]
         wrench = wrench_of_acceleration(K, acc, links.moments[i])
         if external is not None:

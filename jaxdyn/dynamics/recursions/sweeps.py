@@ -48,6 +48,7 @@ def has_sweeps(model: Model) -> bool:
 class _Bodies:
     """Data of the bodies. `rows`: arrays (nb, ...); the methods take one row of them."""
 
+    rows: Any
     scale: Any = None  # unit velocity = scale * v, (nv,), or None
 
     def __init__(self, model: Model):
@@ -178,12 +179,12 @@ def _bodies(model: Model) -> _Bodies:
     return (_Canonical if is_concrete(model.home, model.screws) else _Given)(model)
 
 
-def _scaled(bodies: _Bodies, x):
+def _scaled(bodies: _Bodies, x) -> Any:
     """Velocities of unit screws from those of the model's; equally, forces of the model's screws from those of unit ones."""
     return x if bodies.scale is None or x is None else x * bodies.scale
 
 
-def _unscaled(bodies: _Bodies, x):
+def _unscaled(bodies: _Bodies, x) -> Any:
     """The inverse of `_scaled`."""
     return x if bodies.scale is None else x / bodies.scale
 
