@@ -76,7 +76,11 @@ def expand(
     # Arithmetic on the arrays that loops take and return is written out, entry by entry, and LLVM takes longer for operations
     # on memory than for others: a step of a chain of 200 links would compile for a minute.
     written = sum(x.op not in ("input", "part") for x in program.operations)
-    if written > MAX_BESIDE_LOOPS and most <= mode.MAX_OPERATIONS and any(isinstance(x, Scan) for x in program.subprograms):
+    if (
+        written > MAX_BESIDE_LOOPS
+        and most <= mode.MAX_OPERATIONS
+        and any(isinstance(x, Scan) for x in program.subprograms)
+    ):
         raise TooLong(f"more than {MAX_BESIDE_LOOPS} operations beside loops")
     numbers.prune_calls(program)
     return program, expansion.has_rules

@@ -65,12 +65,12 @@ def _roll(expansion, inner, arrays, eqn, length: int, inward: bool, parents, mos
 
 def sweep(expansion, params, args, eqn):
     """A sweep over a tree (see `sweeps`)."""
-    count, parents, inward = params["carries"], params["parents"], params["inward"]
-    start, rows, inner = args[:count], args[count:], params["call"]
+    (before, count), parents, inward = params["counts"], params["parents"], params["inward"]
+    consts, start, rows, inner = args[:before], args[before : before + count], args[before + count :], params["call"]
     # Whoever asks for a sweep has decided that a loop is faster. Without unknown numbers there is nothing to run.
     results = None
     if any(x.dtype.kind == "O" for x in args):
-        results = _roll(expansion, inner, [(), start, rows], eqn, len(parents), inward, parents, 0)
+        results = _roll(expansion, inner, [consts, start, rows], eqn, len(parents), inward, parents, 0)
     if results is not None:
         return results
     # Written out: of each node the carry, or the sum over its children; the root is the last one.
@@ -80,8 +80,12 @@ def sweep(expansion, params, args, eqn):
     saved: list = [None] * len(parents)
     for i in reversed(range(len(parents))) if inward else range(len(parents)):
         given = carries[i if inward else parents[i]]
-        given = [np.zeros(x.aval.shape, x.aval.dtype) for x in eqn.invars[:count]] if given is None else given
-        results = expansion.evaluate(inner, [*given, *(x[i, ...] for x in rows)])
+        given = (
+            [np.zeros(x.aval.shape, x.aval.dtype) for x in eqn.invars[before : before + count]]
+            if given is None
+            else given
+        )
+        results = expansion.evaluate(inner, [*consts, *given, *(x[i, ...] for x in rows)])
         own, saved[i] = results[:count], results[count:]
         to, add = (parents[i], carries[parents[i]]) if inward else (i, None)
         carries[to] = own if add is None else [_add(expansion, x, y) for x, y in zip(add, own, strict=True)]

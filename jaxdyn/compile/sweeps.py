@@ -9,7 +9,8 @@ import numpy as np
 from jax import lax
 
 from jaxdyn.compile import mode
-from jaxdyn.compile.jax_adapter import ShapedArray, define_primitive, function_of, is_zero
+from jaxdyn.compile.jax_adapter import ShapedArray, define_primitive, eval_jaxpr, function_of, is_zero
+from jaxdyn.compile.known import is_concrete
 from jaxdyn.compile.scan import is_chain
 from jaxdyn.compile.scan_text import find_slots
 
@@ -22,7 +23,6 @@ def sweep(step: Callable, parents: Sequence[int], start, rows, *, inward: bool =
 
     **Arguments:** `parents`: of each node, -1 for the root, in an order in which parents precede their children. `start`: pytree
     of the root's c; inward it is added to the sum of the last node (zeros, usually). `rows`: pytree of x (n, ...), floats alone.
-    `step` reads arrays that it is given, and known ones.
 
     **Returns:** outward, c of the last node, and inward, the sum of the root; and y (n, ...).
     """
@@ -33,9 +33,18 @@ def sweep(step: Callable, parents: Sequence[int], start, rows, *, inward: bool =
     flat, structure = jax.tree.flatten((start, rows))
     count = len(jax.tree.leaves(start))
     one = jax.tree.unflatten(structure, [*flat[:count], *(x[0] for x in flat[count:])])
-    call, out = jax.make_jaxpr(step, return_shape=True)(*one)
-    end, results = out
-    found = sweep_p.bind(*flat, call=call, parents=tuple(parents), carries=count, inward=inward)
+    traced, (end, results) = jax.make_jaxpr(step, return_shape=True)(*one)
+    # What the step reads of functions around it becomes an operand.
+    outside = [x for x in traced.consts if not is_concrete(x)]
+
+    def of_operands(*leaves):
+        given = iter(leaves[: len(outside)])
+        consts = [x if is_concrete(x) else next(given) for x in traced.consts]
+        return eval_jaxpr(traced.jaxpr, consts, *leaves[len(outside) :])
+
+    call = jax.make_jaxpr(of_operands)(*outside, *jax.tree.leaves(one)) if outside else traced
+    counts = len(outside), count
+    found = sweep_p.bind(*outside, *flat, call=call, parents=tuple(parents), counts=counts, inward=inward)
     return jax.tree.unflatten(jax.tree.structure(end), found[:count]), jax.tree.unflatten(
         jax.tree.structure(results), found[count:]
     )
@@ -61,61 +70,61 @@ def _sweep_by_jax(step: Callable, parents: Sequence[int], start, rows, inward: b
     return jax.tree.map(lambda x: x[last], memory), results
 
 
-def _types(*types, call, parents, carries, inward):
+def _types(*types, call, parents, counts, inward):
     outs = call.out_avals
-    rows = [ShapedArray((len(parents), *x.shape), x.dtype) for x in outs[carries:]]
-    return [*outs[:carries], *rows]
+    rows = [ShapedArray((len(parents), *x.shape), x.dtype) for x in outs[counts[1] :]]
+    return [*outs[: counts[1]], *rows]
 
 
-def _again(function: Callable, args, carries: int, parents, inward: bool) -> list:
-    """The sweep of another step, of and to flat lists."""
+def _again(function: Callable, start, rows, parents, inward: bool) -> list:
+    """The sweep of another step, function(*carries, *row) -> carries and rows."""
 
     def step(carry, row):
         results = function(*carry, *row)
-        return results[:carries], results[carries:]
+        return results[: len(start)], results[len(start) :]
 
-    end, results = sweep(step, parents, list(args[:carries]), list(args[carries:]), inward=inward)
+    end, results = sweep(step, parents, list(start), list(rows), inward=inward)
     return [*end, *results]
 
 
-def _batch(args, axes, *, call, parents, carries, inward):
+def _split(values, counts: tuple[int, int]) -> tuple:
+    return values[: counts[0]], values[counts[0] : sum(counts)], values[sum(counts) :]
+
+
+def _batch(args, axes, *, call, parents, counts, inward):
     size = next(x.shape[axis] for x, axis in zip(args, axes, strict=True) if axis is not None)
+    (consts, start, rows), (of_consts, of_start, of_rows) = _split(args, counts), _split(axes, counts)
     # Of carries all have the axis, as those that start without it get it. Rows have it behind that of the nodes.
-    full = [
+    start = [
         jnp.broadcast_to(x, (size, *x.shape)) if axis is None else jnp.moveaxis(x, axis, 0)
-        for x, axis in zip(args[:carries], axes, strict=False)
+        for x, axis in zip(start, of_start, strict=True)
     ]
-    places = [0] * carries
-    for x, axis in zip(args[carries:], axes[carries:], strict=True):
-        full.append(x if axis is None else jnp.moveaxis(x, axis, 1))
-        places.append(None if axis is None else 0)
-    results = _again(jax.vmap(function_of(call), places), full, carries, parents, inward)
-    return results, [0] * carries + [1] * (len(results) - carries)
+    rows = [x if axis is None else jnp.moveaxis(x, axis, 1) for x, axis in zip(rows, of_rows, strict=True)]
+    places = [*of_consts, *[0] * len(start), *(None if axis is None else 0 for axis in of_rows)]
+
+    def step(*leaves):
+        return jax.vmap(function_of(call), places)(*consts, *leaves)
+
+    results = _again(step, start, rows, parents, inward)
+    return results, [0] * len(start) + [1] * (len(results) - len(start))
 
 
-def _jvp(primals, tangents, *, call, parents, carries, inward):
+def _jvp(primals, tangents, *, call, parents, counts, inward):
     # Zeros are known ones, which the program drops.
     steps = [np.zeros(x.shape, x.dtype) if is_zero(d) else d for x, d in zip(primals, tangents, strict=True)]
-    count = len(primals)
+    (consts, start, rows), (d_consts, d_start, d_rows) = _split(primals, counts), _split(steps, counts)
+    c, n = counts[1], len(rows)
 
     def both(*leaves):
-        carry, d_carry, row, d_row = _split(leaves, carries, count - carries)
-        values, changes = jax.jvp(function_of(call), [*carry, *row], [*d_carry, *d_row])
-        return _merge(values, changes, carries)
+        carry, d_carry, row, d_row = leaves[:c], leaves[c : 2 * c], leaves[2 * c : 2 * c + n], leaves[2 * c + n :]
+        at, along = [*consts, *carry, *row], [*d_consts, *d_carry, *d_row]
+        values, changes = jax.jvp(function_of(call), at, along)
+        return [*values[:c], *changes[:c], *values[c:], *changes[c:]]
 
-    given = [*primals[:carries], *steps[:carries], *primals[carries:], *steps[carries:]]
-    results = _again(both, given, 2 * carries, parents, inward)
-    ends, d_ends, rows, d_rows = _split(results, carries, (len(results) - 2 * carries) // 2)
-    return [*ends, *rows], [*d_ends, *d_rows]
-
-
-def _split(leaves, carries: int, rows: int) -> tuple:
-    a, b = 2 * carries, 2 * carries + rows
-    return leaves[:carries], leaves[carries:a], leaves[a:b], leaves[b:]
-
-
-def _merge(values: list, changes: list, carries: int) -> list:
-    return [*values[:carries], *changes[:carries], *values[carries:], *changes[carries:]]
+    results = _again(both, [*start, *d_start], [*rows, *d_rows], parents, inward)
+    ends, d_ends, rest = results[:c], results[c : 2 * c], results[2 * c :]
+    half = len(rest) // 2
+    return [*ends, *rest[:half]], [*d_ends, *rest[half:]]
 
 
 # Bound while a program is traced, which has loops; elsewhere a sweep is a loop of JAX.
