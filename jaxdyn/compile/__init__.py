@@ -31,4 +31,5 @@ from jaxdyn.compile.rules import batch_alike as batch_alike
 from jaxdyn.compile.rules import implicit as implicit
 from jaxdyn.compile.rules import invalidate_derivatives as invalidate_derivatives
 from jaxdyn.compile.rules import value_and_jvp as value_and_jvp
+from jaxdyn.compile.sweeps import sweep as sweep
 from jaxdyn.compile.trial import run_trial as _run_trial  # noqa: F401 (it registers itself)

@@ -84,6 +84,11 @@ def repeat_while(goes_on: Callable[[T], Any], step: Callable[[T], T], state: T, 
     return state
 
 
+def each_row(function: Callable, *rows):
+    """function(*row) for the rows (n, ...) of arrays: a loop inside of kernels, whose code is that of one row."""
+    return lax.map(lambda row: function(*row), rows) if is_expanding() else jax.vmap(function)(*rows)
+
+
 def map_rows(function: Callable, rows):
     """function(row) for the rows (n, ...) of a pytree of one sample, n at least 1, such as the states at save points.
 

@@ -10,16 +10,20 @@ sample is such an array: it is passed on without a copy.
 """
 
 from collections.abc import Callable, Sequence
+from itertools import accumulate
 
-from jaxdyn.compile import careful_text
+from jaxdyn.compile import careful_text, memory
 from jaxdyn.compile.careful import Careful
 from jaxdyn.compile.llvm import Emitter
+from jaxdyn.compile.memory import allocation, bytes_of, on_heap
 from jaxdyn.compile.program import COMPARISONS, FLOATS, Array, Constant, Program, kind_of
+from jaxdyn.compile.scan import Scan
 
 # A program of one sample with at least so many operations is compiled once for all kernels that contain it: the copies of a
 # call's arguments are few against them.
 MIN_SHARED_OPERATIONS = 2000
-_ALIGNED = 64  # bytes
+# Arrays of fewer entries are copied entry by entry.
+MIN_ENTRIES_IN_LOOP = 32
 ATTRIBUTES = (
     # LLVM's simplifications of calls of the C library, such as pow(x, 2) = x x, are made at some levels alone.
     'attributes #0 = { nounwind "no-builtins" }',
@@ -42,6 +46,8 @@ class Body:
         self.regions: dict[Program, int] = {}  # where in %in and %out the arrays of a subprogram begin
         self.bytes = self.careful = 0  # of what is passed to subprograms and to careful programs
         self.passed: dict[int, str] = {}  # what stands in %in, which subprograms do not change
+        # Of calls of loops, the first entry, pointer and type of each output: they stay in memory, each call has its own.
+        self.in_memory: dict[int, list[tuple[int, str, Array]]] = {}
         for op, _, args in program.operations:
             if op == "part":
                 self.parts.setdefault(args[0], []).append(args[1].value)
@@ -51,9 +57,15 @@ class Body:
     def name(self, i: int) -> str:
         """Name of operation i; inputs are loaded where they are first read."""
         if self.names[i] is None:
-            _, kind, args = self.program.operations[i]
-            self.names[i] = self.load(*args, kind)
+            op, kind, args = self.program.operations[i]
+            self.names[i] = self._load_part(args[0], args[1], kind) if op == "part" else self.load(*args, kind)
         return self.names[i]
+
+    def _load_part(self, call: int, entry: Constant, kind: str) -> str:
+        for first, pointer, array in self.in_memory[call]:
+            if first <= entry.value < first + array.size:
+                return self.e.load_at(pointer, entry.value - first, kind)
+        raise AssertionError("a part beyond the results of a call")
 
     def text(self, x, kind: str) -> str:
         """An entry: a name or a constant."""
@@ -61,6 +73,12 @@ class Body:
 
     def results(self) -> list[list[str]]:
         """Names of the program's results."""
+        self.compute()
+        rows = zip(self.program.results, self.program.outputs, strict=True)
+        return [[self.text(x, kind_of(array.dtype)) for x in row] for row, array in rows]
+
+    def compute(self) -> None:
+        """Write all operations."""
         operations = self.program.operations
         for i, (op, kind, args) in enumerate(operations):
             if op == "input" or i in self.merged:
@@ -70,7 +88,8 @@ class Body:
             elif op == "call_where":
                 self.names[i] = self._call_where(i, *args)
             elif op == "part":
-                self.names[i] = self.names[args[0]][args[1].value]
+                if args[0] not in self.in_memory:
+                    self.names[i] = self.names[args[0]][args[1].value]
             elif i in self.fused:
                 place = self.fused[i]
                 factors = [self.text(x, kind) for x in operations[args[place]].args]
@@ -80,8 +99,6 @@ class Body:
                 given = kinds[-1] if kinds else kind
                 known = given if op in COMPARISONS else kind
                 self.names[i] = self.e.operation(op, kind, [self.text(x, known) for x in args], given)
-        rows = zip(self.program.results, self.program.outputs, strict=True)
-        return [[self.text(x, kind_of(array.dtype)) for x in row] for row, array in rows]
 
     def _call_where(self, i: int, which, flag, *entries) -> dict[int, str]:
         """Call a subprogram if the flag of any sample is set; names of the entries of its outputs that are needed."""
@@ -110,23 +127,30 @@ class Body:
     def _call(self, i: int, which, *given, flag: str = "") -> dict[int, str]:
         """Call a subprogram; names of the entries of its outputs that are needed."""
         called = self.program.subprograms[which.value]
-        if called not in self.regions:
-            self.regions[called] = self.bytes
-            self.bytes += sum(bytes_of(x, self.e.width) for x in (*called.inputs, *called.outputs))
-        at, first, pointers = self.regions[called], 0, []
+        at, first, pointers = self.regions.get(called, self.bytes), 0, []
+        if not has_loop(called):
+            self.regions[called] = at
         for array in called.inputs:
             entries = given[first : first + array.size]
-            pointers.append(self._input_pointer(entries, array) or self._copy_entries(entries, array, at))
-            at, first = at + bytes_of(array, self.e.width), first + array.size
+            pointer = self._input_pointer(entries, array)
+            pointers.append(pointer or self._copy_entries(entries, array, at))
+            # Of a loop, whose arrays are large and used by one call, what is passed on has no place of its own.
+            at += 0 if has_loop(called) and pointer else bytes_of(array, self.e.width)
+            first += array.size
         outputs = []
         for array in called.outputs:
             outputs.append((self._place(at), kind_of(array.dtype), array.size))
             at += bytes_of(array, self.e.width)
+        self.bytes = max(self.bytes, at)
         pointers += [pointer for pointer, _, _ in outputs]
         if isinstance(called, Careful):
             self.careful = max(self.careful, careful_text.write_call(self.e, called, flag, pointers))
         else:
             _write_call(self.e, called, pointers)
+        if has_loop(called):
+            ends = [0, *accumulate(array.size for array in called.outputs)]
+            self.in_memory[i] = [(x, y[0], z) for x, y, z in zip(ends, outputs, called.outputs, strict=False)]
+            return {}
         needed, results, first = set(self.parts.get(i, ())), {}, 0
         for pointer, kind, size in outputs:
             results |= {first + k: self.e.load_at(pointer, k, kind) for k in range(size) if first + k in needed}
@@ -134,19 +158,29 @@ class Body:
         return results
 
     def _input_pointer(self, entries, array: Array) -> str | None:
-        """The pointer to an input of this program that these entries are."""
+        """The pointer to an input of this program, or to an output of a loop, that these entries are."""
+        place = whole_input(self.program, entries, array)
+        return self.pointer_to(entries, array) if place is None else self.array(place)
+
+    def pointer_to(self, entries, array: Array) -> str | None:
+        """The pointer to the output of a loop that these entries are, all of it in its order."""
         operations = self.program.operations
-        if any(type(x) is Constant or operations[x].op != "input" for x in entries) or not entries:
+        if not entries or type(entries[0]) is Constant or operations[entries[0]].op != "part":
             return None
-        place = operations[entries[0]].args[0]
-        # Only a whole input in its order is passed on as it is; a slice of one would need another layout for W samples.
-        whole = [(place, k) for k in range(self.program.inputs[place].size)]
-        same = whole == [operations[x].args for x in entries] and self.program.inputs[place].dtype == array.dtype
-        return self.array(place) if same else None
+        call, (start,) = operations[entries[0]].args
+        for first, pointer, made in self.in_memory.get(call, ()):
+            if first == start and made.size == len(entries) and made.dtype == array.dtype:
+                whole = [(call, Constant(first + k)) for k in range(made.size)]
+                same = all(type(x) is not Constant and operations[x].op == "part" for x in entries)
+                return pointer if same and whole == [operations[x].args for x in entries] else None
+        return None
 
     def _copy_entries(self, entries, array: Array, at: int) -> str:
         """A pointer to memory with these entries."""
         kind, pointer = kind_of(array.dtype), self._place(at)
+        if len(entries) >= MIN_ENTRIES_IN_LOOP and all(type(x) is Constant and x.value == 0 for x in entries):
+            memory.zero(self.e, pointer, len(entries) * array.dtype.itemsize * self.e.width)
+            return pointer
         for k, x in enumerate(entries):
             value, place = self.text(x, kind), at + k * array.dtype.itemsize * self.e.width
             if self.passed.get(place) != value:
@@ -159,8 +193,38 @@ class Body:
 
     def allocations(self) -> list[str]:
         """Memory for what is passed."""
-        passed = [f"  %passed = alloca [{self.bytes} x i8], align {_ALIGNED}"] if self.bytes else []
+        passed = [allocation("%passed", self.bytes)] if self.bytes else []
         return [*passed, *careful_text.allocation(self.careful)]
+
+
+def has_loop(called) -> bool:
+    """Decide whether a subprogram is a loop, whose arrays stay in memory."""
+    return isinstance(called, Scan)
+
+
+def whole_input(program: Program, entries: Sequence, array: Array) -> int | None:
+    """The place of the input of a program that these entries are, all of it in its order; or None."""
+    operations = program.operations
+    if any(type(x) is Constant or operations[x].op != "input" for x in entries) or not entries:
+        return None
+    place = operations[entries[0]].args[0]
+    # Only a whole input in its order is passed on as it is; a slice of one would need another layout for W samples.
+    whole = [(place, k) for k in range(program.inputs[place].size)]
+    same = whole == [operations[x].args for x in entries] and program.inputs[place].dtype == array.dtype
+    return place if same else None
+
+
+def _inputs_of_loops(program: Program) -> list[int]:
+    """Inputs of a program that are passed on whole to a loop."""
+    found = set()
+    for op, _, args in program.operations:
+        if op == "call" and has_loop(called := program.subprograms[args[0].value]):
+            first = 1
+            for array in called.inputs:
+                entries, first = args[first : first + array.size], first + array.size
+                if len(entries) >= MIN_ENTRIES_IN_LOOP:
+                    found.add(whole_input(program, entries, array))
+    return sorted(found - {None})
 
 
 def _find_products(program: Program) -> dict[int, int]:
@@ -187,11 +251,6 @@ def _find_products(program: Program) -> dict[int, int]:
                     found[i] = place
                     break
     return found
-
-
-def bytes_of(array: Array, width: int) -> int:
-    """Bytes of an array for W samples, rounded up to whole cache lines: vector loads are aligned."""
-    return -(-array.size * array.dtype.itemsize * width // _ALIGNED) * _ALIGNED
 
 
 def _write_call(e: Emitter, called: Program, pointers: Sequence[str]) -> None:
@@ -224,7 +283,9 @@ def subprogram_ir(called: Program, width: int) -> str:
             e.store_at(f"%r{i}", k, kind_of(array.dtype), name)
     names = [f"%a{i}" for i in range(len(called.inputs))] + [f"%r{i}" for i in range(len(called.outputs))]
     head = f"define void @called({', '.join(f'ptr noalias {name}' for name in names)}) #0 {{"
-    return "\n".join([head, *body.allocations(), *e.lines, "  ret void", "}", *e.declared.values(), *ATTRIBUTES])
+    allocations, free, declared = on_heap(body.allocations())
+    lines = [head, *allocations, *e.lines, *free, "  ret void", "}"]
+    return "\n".join([*lines, *declared, *e.declared.values(), *ATTRIBUTES])
 
 
 def calls_itself(program: Program, width: int) -> bool:
@@ -263,11 +324,20 @@ def kernel_ir(program: Program, width: int, uniform: Sequence[bool]) -> str:
             tiles[place, first] = e.load_tile(rows[place], first, kind)
         return tiles[place, first][entry - first]
 
+    packed: dict[int, str] = {}
+
     def array(place):
-        """The row of one sample."""
-        return None if width > 1 else rows[place][0] if place in rows else f"%a{place}"
+        """The row of one sample, or what has been packed."""
+        if width > 1:
+            return packed.get(place)
+        return rows[place][0] if place in rows else f"%a{place}"
 
     body, valid, allocations = Body(e, fast, load, array), None, []
+    for place in _inputs_of_loops(fast) if width > 1 else ():
+        packed[place], given = f"%packed{place}", arrays[place]
+        allocations.append(allocation(packed[place], bytes_of(given, width)))
+        source = [f"%a{place}"] * width if uniform[place] else rows[place]
+        memory.pack(e, source, packed[place], given.size, kind_of(given.dtype))
     # The kernel of one sample of a large program is a call: the same code serves as a subprogram of steps and rollouts.
     if calls_itself(program, width):
         pointers = [str(array(i)) for i in range(len(arrays))]
@@ -277,11 +347,15 @@ def kernel_ir(program: Program, width: int, uniform: Sequence[bool]) -> str:
         _write_call(e, fast, pointers)
         valid = None if program.careful is None else e.load_at("%valid", 0, "b1")
     else:
-        results = body.results()
+        body.compute()
+        for i, (row, output) in enumerate(zip(fast.results, program.outputs, strict=False)):
+            kind, pointer = kind_of(output.dtype), body.pointer_to(row, output)
+            if pointer is not None and len(row) >= MIN_ENTRIES_IN_LOOP:
+                memory.unpack(e, pointer, rows[count + i], len(row), kind)
+            else:
+                e.store_array(rows[count + i], kind, [body.text(x, kind) for x in row])
         if program.careful is not None:
-            *results, (valid,) = results
-        for i, (row, output) in enumerate(zip(results, program.outputs, strict=True)):
-            e.store_array(rows[count + i], kind_of(output.dtype), row)
+            valid = body.text(fast.results[-1][0], "b1")
     if valid is not None and program.careful is not None:
         flag = e.operation("not", "b1", [valid], "b1")
         same = [*uniform, *[False] * len(program.outputs)]
@@ -303,12 +377,13 @@ def wrap_kernel(e: Emitter, title: str, uniform: Sequence[bool], outputs: int, a
     pointers = []
     for at, i in enumerate([*varying_first(uniform), *range(len(uniform), len(uniform) + outputs)]):
         pointers += [f"  %p{i} = getelementptr ptr, ptr %data, i64 {at}", f"  %a{i} = load ptr, ptr %p{i}"]
+    lines, free, declared = on_heap(allocations)
     return "\n".join(
         [
             f"; {title}",
             "define void @kernel(ptr %data, i64 %n, i64 %begin, i64 %end) #0 {",
             "entry:",
-            *allocations,
+            *lines,
             *pointers,
             "  %last = sub i64 %n, 1",
             "  %some = icmp ult i64 %begin, %end",
@@ -322,8 +397,10 @@ def wrap_kernel(e: Emitter, title: str, uniform: Sequence[bool], outputs: int, a
             "  %more = icmp ult i64 %next, %end",
             "  br i1 %more, label %block, label %done",
             "done:",
+            *free,
             "  ret void",
             "}",
+            *declared,
             *e.declared.values(),
             *ATTRIBUTES,
         ]

@@ -42,20 +42,36 @@ def _tangent(program: Program, moving: tuple[bool, ...]) -> Program:
     entries = [graph.inputs(index, array) for index, array in enumerate(arrays)]
     primal, input_changes = entries[: len(moving)], iter(entries[len(moving) :])
     changes_in = [next(input_changes).ravel().tolist() if varies else None for varies in moving]
-    values, _ = replay(graph, program, primal)
+    # After inlining, only subprograms with loops are still called. A scan computes values and changes in one loop.
+    values: list = [] if program.subprograms else replay(graph, program, primal)[0]
     changes: list = []  # of each operation: a Number, or 0.0 where it does not change
-    for operation, value in zip(program.operations, values, strict=True):
+    for i, operation in enumerate(program.operations):
         if operation.op == "input":
             index, entry = operation.args
             row = changes_in[index]
             changes.append(0.0 if row is None else row[entry])
+            if i == len(values):
+                values.append(primal[index].reshape(-1)[entry])
+            continue
+        operands = [x.value if type(x) is Constant else values[x] for x in operation.args]
+        if operation.op == "part":
+            call, (values_of, entry) = changes[operation.args[0]], operands
+            values.append(values_of[entry])
+            changes.append(0.0 if type(call) is float else call[entry])
             continue
         operand_changes = [(0.0 if type(x) is Constant else changes[x]) for x in operation.args]
         any_change = any(is_number(x) or x != 0 for x in operand_changes)
-        # After inlining, only subprograms with loops are still called; their derivative needs a rule.
         if operation.op in ("call", "call_where") and any_change:
-            raise NotNumbers("a branch, or a pseudo-inverse without a rule for its derivative")
-        operands = [x.value if type(x) is Constant else values[x] for x in operation.args]
+            called = program.subprograms[operands[0]]
+            if operation.op == "call_where" or not hasattr(called, "call_with_changes"):
+                raise NotNumbers("a branch, or a pseudo-inverse without a rule for its derivative")
+            value, change = called.call_with_changes(graph, operands[1:], operand_changes[1:])
+            values.append(value)
+            changes.append(change)
+            continue
+        if i == len(values):
+            values.append(repeat(graph, program, operation, operands))
+        value = values[i]
         # Integers and bools have no change. Numbers whose operands do not change have none either: this keeps tangents short.
         varies = operation.kind in FLOATS and any_change
         changes.append(
@@ -197,10 +213,12 @@ def _transpose(program: Program, linear: tuple[bool, ...], given: tuple[bool, ..
     # Fixed inputs come first, then the cotangents, as JAX's transpose rule passes them.
     operands = iter(entries[: len(fixed)])
     # Values that depend on the linear inputs are not needed: a linear operation is transposed from its other operands alone.
-    values = _coefficient_values(graph, program, [None if varies else next(operands) for varies in linear])
+    values, calls = _coefficient_values(graph, program, [None if varies else next(operands) for varies in linear])
     # Each cotangent is a sum over the operations that use the value. Operands precede their users, so that in reverse order the
     # sum is complete when it is needed.
     cotangent_of: list = [0.0] * len(program.operations)
+    for i, call in calls.items():
+        cotangent_of[i] = [0.0] * len(call.values)
     cotangents = iter(entries[len(fixed) :])
     for row, is_given in zip(program.results, given, strict=True):
         if is_given:
@@ -216,11 +234,19 @@ def _transpose(program: Program, linear: tuple[bool, ...], given: tuple[bool, ..
             cotangent_of[operand] = graph.add(cotangent_of[operand], cotangent)
 
     for i in reversed(range(len(program.operations))):
+        op, kind, args = program.operations[i]
+        if i in calls:
+            if any(is_number(x) or x != 0 for x in cotangent_of[i]):
+                for operand, cotangent in zip(args[1:], calls[i].cotangents(cotangent_of[i]), strict=True):
+                    accumulate(operand, cotangent)
+            continue
         # An operation with a value does not depend on the linear inputs, and one with a zero cotangent contributes nothing.
         if values[i] is not None or not (is_number(cotangent_of[i]) or cotangent_of[i] != 0):
             continue
-        op, kind, args = program.operations[i]
-        if op == "input":
+        if op == "part":
+            of_call = cotangent_of[args[0]]
+            of_call[args[1].value] = graph.add(of_call[args[1].value], cotangent_of[i])
+        elif op == "input":
             row = input_cotangents[args[0]]
             assert row is not None
             row[args[1]] = cotangent_of[i]
@@ -235,21 +261,28 @@ def _transpose(program: Program, linear: tuple[bool, ...], given: tuple[bool, ..
     return _finish(graph, program, arrays, [x[1] for x in rows], [x[0] for x in rows], values, name)
 
 
-def _coefficient_values(graph: Graph, program: Program, inputs: list) -> list:
-    """Values of the operations that do not depend on an input given as None; None for the others."""
+def _coefficient_values(graph: Graph, program: Program, inputs: list) -> tuple[list, dict[int, Any]]:
+    """Values of the operations that do not depend on an input given as None, None for the others; calls that depend."""
     flat = [None if x is None else x.ravel().tolist() for x in inputs]
     values: list = []
-    for operation in program.operations:
+    calls: dict[int, Any] = {}
+    for i, operation in enumerate(program.operations):
         op, _, args = operation
         if op == "input":
             row = flat[args[0]]
             values.append(None if row is None else row[args[1]])
+        elif op == "part" and args[0] in calls:
+            values.append(calls[args[0]].values[args[1].value])
+        elif op == "call" and any(type(x) is not Constant and values[x] is None for x in args):
+            given = [x.value if type(x) is Constant else values[x] for x in args[1:]]
+            calls[i] = program.subprograms[args[0].value].transposed_call(graph, given)
+            values.append(calls[i].values)
         elif any(type(x) is not Constant and values[x] is None for x in args):
             values.append(None)
         else:
             operands = [x.value if type(x) is Constant else values[x] for x in args]
             values.append(repeat(graph, program, operation, operands))
-    return values
+    return values, calls
 
 
 def _transpose_operation(g: Graph, op: str, kind: str, args, values, c, accumulate, program: Program) -> None:

@@ -13,18 +13,19 @@ from typing import Any
 import jax
 import numpy as np
 
-from jaxdyn.compile import array_rules, jax_adapter, look_ups, mode
+from jaxdyn.compile import array_rules, jax_adapter, look_ups, mode, rolled
 from jaxdyn.compile import program as numbers
 from jaxdyn.compile.array_rules import bind_known, empty_reduction, evaluate_known
 from jaxdyn.compile.derive import without_unread
 from jaxdyn.compile.graph import Graph
 from jaxdyn.compile.inlining import replay
-from jaxdyn.compile.jax_adapter import ClosedJaxpr, Literal, Tracer, scan_counts  # pyright: ignore[reportPrivateImportUsage]
+from jaxdyn.compile.jax_adapter import ClosedJaxpr, Literal, Tracer  # pyright: ignore[reportPrivateImportUsage]
 from jaxdyn.compile.program import (
     Array,
     NotNumbers,
     Number,
     Program,
+    TooLong,
     as_kind,
     as_objects,
     is_number,
@@ -32,7 +33,10 @@ from jaxdyn.compile.program import (
     objects,
 )
 from jaxdyn.compile.rearrange import AT_PLACES, REARRANGEMENTS
+from jaxdyn.compile.scan import Scan
 
+# Operations of a program that calls loops.
+MAX_BESIDE_LOOPS = 40_000
 # A function of fewer operations is scatter_places where it is called.
 MIN_SUBPROGRAM_OPERATIONS = 300
 
@@ -69,6 +73,15 @@ def expand(
         results.append(objects([graph.invert(expansion.flagged)], ()))
     program = graph.finish(inputs, outputs, [as_objects(x) for x in results], name=name)
     program.reports_validity = reports
+    # Arithmetic on the arrays that loops take and return is written out, entry by entry, and LLVM takes longer for operations
+    # on memory than for others: a step of a chain of 200 links would compile for a minute.
+    written = sum(x.op not in ("input", "part") for x in program.operations)
+    if (
+        written > MAX_BESIDE_LOOPS
+        and most <= mode.MAX_OPERATIONS
+        and any(isinstance(x, Scan) for x in program.subprograms)
+    ):
+        raise TooLong(f"more than {MAX_BESIDE_LOOPS} operations beside loops")
     numbers.prune_calls(program)
     return program, expansion.has_rules
 
@@ -122,6 +135,15 @@ class _Expansion:
                 raise
             values.update(zip(eqn.outvars, results, strict=True))
         return [read(x) for x in jaxpr.outvars]
+
+    def evaluate_in(self, graph: Graph, inner: ClosedJaxpr, args) -> list:
+        """The results of a jaxpr in another graph, that of an iteration of a loop."""
+        inside = _Expansion(graph, self.calls, self.branches)
+        results = inside.evaluate(inner, args)
+        self.has_rules |= inside.has_rules
+        if inside.flagged is not False:
+            raise NotNumbers("samples that an iteration of a loop cannot compute")
+        return results
 
     def one(self, eqn, args) -> list:
         name, params = eqn.primitive.name, eqn.params
@@ -256,35 +278,6 @@ class _Expansion:
         chosen = [self.graph.select(flag, x, math.nan, kind) for flag, x in zip(flags, entries, strict=True)]
         return [objects(chosen, args[1].shape)]
 
-    def _scan(self, params, args, eqn):
-        count, carried = scan_counts(params)
-        consts, carry, rows = args[:count], args[count : count + carried], args[count + carried :]
-        saved: list[list] = []
-        length = params["length"]
-        # Unrolled: the length is known, and zeros of a first step are seen in the following ones.
-        for i in reversed(range(length)) if params["reverse"] else range(length):
-            results = self.evaluate(params["jaxpr"], [*consts, *carry, *(x[i, ...] for x in rows)])
-            carry = results[:carried]
-            saved.append(results[carried:])
-        if params["reverse"]:
-            saved.reverse()
-        outs = [x.aval for x in eqn.outvars[carried:]]
-        if not length:
-            return [*carry, *(np.zeros(x.shape, x.dtype) for x in outs)]
-        return [*carry, *(_stack(column) for column in zip(*saved, strict=True))]
-
-    def _while(self, params, args, eqn):
-        count, more = params["cond_nconsts"], params["body_nconsts"]
-        of_cond, of_body, carry = args[:count], args[count : count + more], args[count + more :]
-        while True:
-            (going,) = self.evaluate(params["cond_jaxpr"], [*of_cond, *carry])
-            going = as_objects(going).item()
-            if type(going) is Number:
-                raise NotNumbers("a while_loop whose end is not known")
-            if not going:
-                return carry
-            carry = self.evaluate(params["body_jaxpr"], [*of_body, *carry])
-
     def _cond(self, params, args, eqn):
         which, branches = as_objects(args[0]).item(), params["branches"]
         if type(which) is Number:
@@ -406,8 +399,9 @@ _OTHER: dict[str, Callable] = {
     "call_hi_primitive": _Expansion._high,
     "polynomial": array_rules.polynomial,
     **dict.fromkeys(("cumsum", "cumprod", "cummax", "cummin"), look_ups.cumulative),
-    "scan": _Expansion._scan,
-    "while": _Expansion._while,
+    "scan": rolled.scan,
+    "jaxdyn_sweep": rolled.sweep,
+    "while": rolled.while_loop,
     "cond": _Expansion._cond,
     "custom_linear_solve": _Expansion._linear_solve,
     "cholesky": array_rules.cholesky,
@@ -432,9 +426,3 @@ def _constant(x) -> np.ndarray:
     if isinstance(x, Tracer):
         raise NotNumbers("a number of an enclosing function")
     return np.asarray(x)
-
-
-def _stack(rows: Sequence) -> np.ndarray:
-    if any(x.dtype.kind == "O" for x in rows):
-        return np.stack([as_objects(x) for x in rows])
-    return np.stack(rows)

@@ -6,6 +6,7 @@ Each has its comment "Listed" here. What no output needs is dropped when a graph
 """
 
 import functools
+import itertools
 import math
 from collections import defaultdict
 from collections.abc import Callable, Sequence
@@ -329,6 +330,31 @@ class Graph:
 
     # --- finishing ---
 
+    def _drop_results(self, live: Sequence[Number]) -> None:
+        """Let loops compute those of their outputs alone that are live."""
+        needed: dict[Number, set] = {}
+        for number in live:
+            if number.op == "part" and number.args[0].op == "call":
+                needed.setdefault(number.args[0], set()).add(number.args[1])
+        for call, parts in needed.items():
+            called: Any = self.subprograms[call.args[0]]
+            if not hasattr(called, "with_outputs"):
+                continue
+            ends = [0, *itertools.accumulate(x.size for x in called.outputs)]
+            flags = [any(k in parts for k in range(a, b)) for a, b in itertools.pairwise(ends)]
+            few = called.with_outputs(flags)
+            if len(few.outputs) < len(called.outputs):
+                kept = [i < called.counts.carries or flag for i, flag in enumerate(flags)]
+                places = [k for i, (a, b) in enumerate(itertools.pairwise(ends)) if kept[i] for k in range(a, b)]
+                at = {k: i for i, k in enumerate(places)}
+                which = self.numbers_of_subprograms.setdefault(few.digest, len(self.subprograms))
+                if which == len(self.subprograms):
+                    self.subprograms.append(few)
+                call.args = (which, *call.args[1:])
+                for number in live:
+                    if number.op == "part" and number.args[0] is call:
+                        number.args = (call, at[number.args[1]])
+
     def finish(
         self, inputs: Sequence[Array], outputs: Sequence[Array], entries: Sequence[np.ndarray], **more
     ) -> Program:
@@ -345,29 +371,34 @@ class Graph:
                 if number.op != "input":
                     # Of what stands for the outputs of a branch, that alone which has a part is needed.
                     waiting.extend(self._inputs_of_branch(number) if number.op == "call_where" else number.args)
-        operations = []
+        live = [number for number in self.numbers if number.place is not None]
+        self._drop_results(live)
+        operations, count = [], 0
+        called: dict[int, int] = {}  # numbers of the subprograms that are still called, by those of the graph
         # In the order of creation, where operands precede their operation. Depth first from the outputs was tried: forward
         # dynamics of a Panda took 1.6 times as long.
-        numbers, self.numbers = self.numbers, []
+        self.numbers = []
         # Numbers know their graph: with these references the collector of cycles would look for them in the whole process,
         # which was a tenth of a first call.
         self.shared.clear()
         new = tuple.__new__  # of named tuples, a third of the time that their own constructors take
-        for number in numbers:
-            if number.place is not None:
-                op, kind, args = number.op, number.kind, number.args
-                number.place = len(operations)
-                if op != "input":
-                    if op == "call_where":
-                        args = tuple(x if type(x) is not Number or x.place is not None else 0 for x in args)
-                    if any([type(x) is Number and x.kind != kind for x in args]):
-                        _check_kinds(number)
-                    args = tuple([x.place if type(x) is Number else new(Constant, (x,)) for x in args])
-                operations.append(new(Operation, (op, kind, args)))
-        if len(operations) > self.most:
+        for number in live:
+            op, kind, args = number.op, number.kind, number.args
+            number.place = len(operations)
+            if op != "input":
+                if op in ("call", "call_where"):
+                    args = (called.setdefault(args[0], len(called)), *args[1:])
+                if op == "call_where":
+                    args = tuple(x if type(x) is not Number or x.place is not None else 0 for x in args)
+                if any([type(x) is Number and x.kind != kind for x in args]):
+                    _check_kinds(number)
+                args = tuple([x.place if type(x) is Number else new(Constant, (x,)) for x in args])
+            operations.append(new(Operation, (op, kind, args)))
+            count += op not in ("input", "part")  # these are memory
+        if count > self.most:
             raise TooLong(f"more than {self.most} operations")
         results = [tuple([x.place if type(x) is Number else Constant(x) for x in row]) for row in flat]
-        return Program(inputs, outputs, operations, results, self.subprograms, **more)
+        return Program(inputs, outputs, operations, results, [self.subprograms[i] for i in called], **more)
 
 
 _BY_NAME: dict[str, Callable] = {

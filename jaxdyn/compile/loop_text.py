@@ -15,8 +15,9 @@ from typing import Any
 import jax
 import numpy as np
 
-from jaxdyn.compile.code import Body, bytes_of, wrap_kernel
+from jaxdyn.compile.code import Body, wrap_kernel
 from jaxdyn.compile.llvm import Emitter
+from jaxdyn.compile.memory import bytes_of
 from jaxdyn.compile.program import Array, kind_of
 
 

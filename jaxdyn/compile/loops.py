@@ -22,7 +22,8 @@ from jaxdyn.compile.jax_adapter import forgive, vary_alike
 from jaxdyn.compile.kernels import kernel
 from jaxdyn.compile.known import Known, partition_tracers
 from jaxdyn.compile.loop_text import loop_ir
-from jaxdyn.compile.primitive import kernel_p, over_batch, target
+from jaxdyn.compile.operations import over_batch
+from jaxdyn.compile.primitive import kernel_p, target
 from jaxdyn.compile.program import Array, Program
 from jaxdyn.compile.trace import program_of
 

@@ -80,7 +80,7 @@ class MatrixProgram:
         """The text of the kernel (see `code.kernel_ir`)."""
         return f"; {self.title}\n{self._write_kernel().module}"
 
-    def subprogram_ir(self) -> str:
+    def subprogram_ir(self, width: int) -> str:
         """The text of the function `called` (see `code.subprogram_ir`)."""
         parts = self.definition("called")
         return "\n".join(parts.values()).replace("define internal void @called(", "define void @called(")

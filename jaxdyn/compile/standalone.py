@@ -118,7 +118,8 @@ def jacobian_program(program: Program | Directions, name: str) -> Program | Dire
     moving = tuple(array.dtype.kind == "f" for array in program.inputs)
     change = inline(derive.tangent(program, moving))
     columns = sum(array.size for array, moves in zip(program.inputs, moving, strict=True) if moves)
-    if change.cost * columns > MAX_WRITTEN_OUT:
+    # Of loops each column is a call.
+    if change.cost * columns > MAX_WRITTEN_OUT and not change.subprograms:
         return Directions(program, change)
     graph = Graph(MAX_OPERATIONS)
     primal = [graph.inputs(place, array) for place, array in enumerate(program.inputs)]

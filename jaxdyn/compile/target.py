@@ -381,7 +381,7 @@ def _publish(symbol: str, width: int, programs: dict[str, Any], recover: Callabl
         return True
     if not isinstance(found, objects.ObjectFile):
         assert called is not None
-        text = subprogram_ir(called, width) if isinstance(called, Program) else called.subprogram_ir()
+        text = subprogram_ir(called, width) if isinstance(called, Program) else called.subprogram_ir(width)
         found = objects.make(symbol, text, tuple(calls), careful, called.name, width)
     _called[symbol] = _Called(ctypes.c_uint64(), found.calls, found.careful)
     _install(found, symbol, "called", functools.partial(setattr, _called[symbol].address, "value"))

@@ -22,6 +22,7 @@ from jax import lax
 from jax.flatten_util import ravel_pytree
 from jaxtyping import Array, Float, Int, PyTree
 
+from jaxdyn.compile import batch
 from jaxdyn.compile.known import is_concrete
 from jaxdyn.constraints.codes import RESULTS, Outcome
 from jaxdyn.constraints.rank import eps_of
@@ -326,8 +327,9 @@ def _backward(problem: _Problem, state: _State):
         return problem.cost(z[:nx], z[nx:], i)
 
     # Derivatives do not depend on V: they are computed for all steps at once, and not within the backward scan.
-    F = jax.vmap(jax.jacrev(step))(Z)
-    lz, lzz = jax.vmap(jax.grad(cost))(Z, count), jax.vmap(jax.hessian(cost))(Z, count)
+    F, lz, lzz = batch.each_row(
+        lambda z, i: (jax.jacrev(step)(z), jax.grad(cost)(z, i), jax.hessian(cost)(z, i)), Z, count
+    )
     none = jnp.zeros((), us.dtype)
 
     def go_back(carry, row):

@@ -20,6 +20,7 @@ from jaxtyping import Array, Float
 from jaxdyn.compile import implicit, kernel, value_and_jvp
 from jaxdyn.dynamics import recursions, scans, world_frame
 from jaxdyn.dynamics.kinematics import TreeFrame, body_twists, tree_frame
+from jaxdyn.dynamics.recursions import sweeps
 from jaxdyn.dynamics.world_frame import momentum, tree_inertias
 from jaxdyn.lie.so3 import matmul
 from jaxdyn.model.arguments import Numbers, check_shapes, check_state
@@ -165,9 +166,10 @@ def forward_dynamics(
     if external is not None:
         tau = tau + generalized_force(model, q, external)
     # The derivative of the solve is M^-1 times that of inverse dynamics, so ABA itself is never differentiated.
-    if model.nb > MAX_BODIES or model.nb == 0:
+    form = _recursions(model)
+    if form is None:
         return _solve_for_acceleration(model, q, v, tau)
-    return kernel(recursions.aba, fallback=_solve_for_acceleration, derivative=_acceleration_tangent)(model, q, v, tau)
+    return kernel(form.aba, fallback=_solve_for_acceleration, derivative=_acceleration_tangent)(model, q, v, tau)
 
 
 def _kernel_with_checks(recursion: Callable) -> Callable:
@@ -195,14 +197,27 @@ rnea, crba, aba, mass_matrix_sqrt = map(
     _kernel_with_checks, (recursions.rnea, recursions.crba, recursions.aba, recursions.mass_matrix_sqrt)
 )
 
-# Scalar programs of more bodies compile for longer than a few seconds; recursions then run as loops over the bodies.
+# From so many bodies on the recursions are sweeps (see `recursions.sweeps`). For general geometry these are as fast from 15 on;
+# where axes are at right angles every body that is written out has zeros of its own.
+MIN_BODIES_IN_SWEEPS = 40
+# Scalar programs of more bodies, for joints without sweeps, compile for longer than a few seconds.
 MAX_BODIES = 128
 # In small batches the mask form of the matrices is as fast as the loops.
 _MAX_BODIES_IN_MATRICES = 16
 
 
+def _recursions(model: Model) -> Any:
+    """The module with the recursions of a model; None where there are too many bodies."""
+    if model.nb >= MIN_BODIES_IN_SWEEPS and sweeps.has_sweeps(model):
+        return sweeps
+    return recursions if 0 < model.nb <= MAX_BODIES else None
+
+
 def by_recursion(recursion, matrices, model: Model, *args):
     """Evaluate recursion(model, *args) as a kernel, or by products of matrices where there is no kernel."""
+    form = _recursions(model)
+    if form is sweeps and hasattr(sweeps, recursion.__name__):
+        return kernel(getattr(sweeps, recursion.__name__), fallback=matrices)(model, *args)
     if model.nb > MAX_BODIES or model.nb == 0:
         return matrices(model, *args)
     return kernel(recursion, fallback=matrices)(model, *args)
@@ -230,7 +245,8 @@ def _solve_for_acceleration(model: Model, q, v, tau):
 
 def _acceleration_tangent(model: Model, q, v, tau, steps):
     """Tangent M^-1 (dtau - dID at fixed a) of the acceleration, for tangents of the leaves of (model, q, v, tau)."""
-    return recursions.aba_tangent(model, q, v, tau, _force_tangent(recursions.rnea, model, q, v, tau, steps))[1]
+    form = _recursions(model)
+    return form.aba_tangent(model, q, v, tau, _force_tangent(form.rnea, model, q, v, tau, steps))[1]
 
 
 def _force_tangent(inverse, model, q, v, tau, steps):

@@ -283,6 +283,13 @@ def warn_unphysical_inertias(inertias: Mapping[str, Any], places: Mapping[str, s
         warn(f"{'; '.join(faults[:5])}{more}. No body has such an inertia: {fix}", UserWarning)
 
 
+def nearest_rotation(rotation: Float[Array, "*n 3 3"]) -> Float[Array, "*n 3 3"]:
+    """R (3 - R^T R)/2, one Newton step towards the orthogonal factor, which is differentiable without an SVD."""
+    gram = jnp.einsum("...ji,...jk->...ik", rotation, rotation)
+    one = jnp.eye(3, dtype=rotation.dtype).reshape((1,) * (rotation.ndim - 2) + (3, 3))
+    return jnp.einsum("...ij,...jk->...ik", rotation, 1.5 * one - 0.5 * gram)
+
+
 def _geometry(model: Model) -> tuple[Array | np.ndarray, Array | np.ndarray]:
     mask = model.topology.screw_mask
     # A revolute joint of a declared kind ignores v, so that its derivative with respect to v is zero too.
@@ -290,11 +297,7 @@ def _geometry(model: Model) -> tuple[Array | np.ndarray, Array | np.ndarray]:
     # A known home pose is not differentiated, so that the projection would only add rounding.
     if is_concrete(model.home):
         return model.home, screws
-    rotation = model.home[:, :3, :3]
-    # The polynomial R (3 - R^T R)/2 is one Newton step towards the orthogonal factor; it is differentiable without an
-    # SVD.
-    gram = jnp.einsum("nji,njk->nik", rotation, rotation)
-    rotation = jnp.einsum("nij,njk->nik", rotation, 1.5 * jnp.eye(3, dtype=rotation.dtype)[None] - 0.5 * gram)
+    rotation = nearest_rotation(model.home[:, :3, :3])
     last = jnp.broadcast_to(jnp.asarray(np.eye(4)[3:], rotation.dtype), (model.nb, 1, 4))
     return jnp.concatenate([jnp.concatenate([rotation, model.home[:, :3, 3:]], 2), last], 1), screws
 

@@ -16,7 +16,8 @@ from jaxdyn.compile import careful as pairs
 from jaxdyn.compile import kernel, mark_invalid, target
 from jaxdyn.compile.batch import any_sample
 from jaxdyn.compile.loops import Carry, Given, Iteration, Task, run_loop
-from jaxdyn.compile.primitive import as_operations, kernel_p
+from jaxdyn.compile.operations import as_operations
+from jaxdyn.compile.primitive import kernel_p
 from jaxdyn.compile.trace import program_of
 
 pytestmark = pytest.mark.native

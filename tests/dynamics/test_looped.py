@@ -78,12 +78,12 @@ def test_five_hundred_links(branching):
 @pytest.mark.parametrize("links", [pytest.param(40, marks=pytest.mark.slow), dynamics.MAX_BODIES + 1])
 @pytest.mark.parametrize("count", [pytest.param(1, marks=pytest.mark.slow), 40])
 def test_long_chains(count, links):
-    """With the most bodies of a kernel and more, against the matrix form; which way was taken."""
+    """Sweeps in native code, against the matrix form."""
     model = planar_chain(links)
     q, v, tau = (jnp.asarray(x) for x in np.random.default_rng(0).normal(size=(3, count, links)))
     run = quick(jax.vmap(lambda *state: dynamics.forward_dynamics(model, *state)))
-    # A loop over the bodies, in which the small matrices of a joint are kernels, or one kernel for all of it.
-    assert ("stablehlo.while" in run.lower(q, v, tau).as_text()) == (links > dynamics.MAX_BODIES)
+    # One kernel for all of it.
+    assert "stablehlo.while" not in run.lower(q, v, tau).as_text()
     by_matrices = quick(
         jax.vmap(lambda *x: (world_frame.forward_dynamics(model, *x), world_frame.mass_matrix(model, x[0])))
     )

@@ -539,12 +539,6 @@ def test_cortex_m_calls_only_what_the_runtime_has(exported, tmp_path):
             {"name": "f"},
             "function cannot be exported: it has pure_callback",
         ),
-        (
-            lambda x: jax.lax.while_loop(lambda x: x.sum() < 9, lambda x: 2 * x, x),
-            (X,),
-            {"name": "f"},
-            "cannot be exported: it has a while_loop whose end is not known",
-        ),
         (lambda x: x[x > 0], (X,), {"name": "f"}, "cannot be exported: it has shapes, branches or conversions"),
         (lambda x: x if x[0] > 0 else -x, (X,), {"name": "f"}, "cannot be exported: it has shapes, branches"),
         (lambda x: jnp.asarray(np.sin(x)), (X,), {"name": "f"}, "cannot be exported: it has shapes, branches"),

@@ -71,7 +71,7 @@ def factorize_at(links: Links, chains: list[Chain]) -> ArticulatedFactors:
         A, gains[i], inverses[i] = total[i], [], []
         for j, k in enumerate(columns_of(links.model.topology.kinds[i])):
             armature = None if armatures is None else entry(armatures[i], j)
-            A, gain, inverse = _eliminate(A, entry(links.subspaces[i], j, 1), k, armature)
+            A, gain, inverse = eliminate(A, entry(links.subspaces[i], j, 1), k, armature)
             gains[i].append(gain)
             inverses[i].append(inverse)
         parent = links.parents[i]
@@ -80,7 +80,7 @@ def factorize_at(links: Links, chains: list[Chain]) -> ArticulatedFactors:
     return ArticulatedFactors(links, chains, gains, inverses)
 
 
-def _eliminate(A, s, k, armature):
+def eliminate(A, s, k, armature):
     """Eliminate one degree of freedom: A - U U^T/D, U/D and 1/D; `k` is the coordinate that s spans alone, or None."""
     U = dot(A, s)
     D = dot(s, U) if armature is None else dot(s, U) + armature

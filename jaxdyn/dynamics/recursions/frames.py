@@ -232,6 +232,9 @@ def _moments() -> np.ndarray:
     return tensor
 
 
+MOMENTS = _moments()
+
+
 def pseudo_inertias(model: Model, frames: Frames) -> list:
     """Pseudo-inertias (4, 4) of the bodies in their canonical frames (kg, kg m, kg m^2), numpy arrays where they are known.
 
@@ -241,7 +244,7 @@ def pseudo_inertias(model: Model, frames: Frames) -> list:
     xp = np if known else jnp
     dtype = model.home.dtype
     inertias = xp.asarray(model.inertias)
-    total = xp.einsum("ijk,nk->nij", xp.asarray(_moments(), dtype), inertias)
+    total = xp.einsum("ijk,nk->nij", xp.asarray(MOMENTS, dtype), inertias)
     placement = frames.placement
     turned = xp.swapaxes(placement[:, :3, :3], 1, 2)
     # Pseudo-inertias transform by congruence with the homogeneous matrix: J' = T J T^T.

@@ -73,40 +73,48 @@ def body_wrenches(links: Links, chains: list[Chain], v=None, a=None, external=No
     motion: list = []  # w, dw, K, acceleration of the origin
     wrenches = []
     for i, parent in enumerate(links.parents):
-        w, dw, K, acc = motion[parent] if parent >= 0 else (zero, zero, np.zeros((3, 3), dtype), weight)
-        chain = chains[i]
-        # The parent's K gives the acceleration of every point fixed in it, the child's origin among them.
-        r = origin_in_parent(chain)
-        acc = rotate_to_child(chain, acc if r is None else acc + dot(K, r))
-        w, dw = rotate_to_child(chain, w), rotate_to_child(chain, dw)
-        S = links.subspaces[i]
-        slides, turns = _is_nonzero(S[:3]), _is_nonzero(S[3:])
-        if speeds is not None:
-            if slides:
-                slide = dot(part(S, 0, 3), speeds[i])
-                # Coriolis acceleration 2 w x slide, with w of the parent.
-                acc = acc + dot(_hat(w + w), slide)
-            if turns:
-                omega = dot(part(S, 3, 6), speeds[i])
-                dw = dw + dot(_hat(w), omega)
-                w = w + omega
-                if slides:
-                    # The joint's own rotation carries its translation with it: omega x slide, for helical, planar and
-                    # free joints.
-                    acc = acc + dot(_hat(omega), slide)
-        if rates is not None:
-            acc = acc + dot(part(S, 0, 3), rates[i]) if slides else acc
-            dw = dw + dot(part(S, 3, 6), rates[i]) if turns else dw
-        # At rest K stays the zero matrix of numpy, so that its products are never compiled.
-        if speeds is not None or rates is not None:
-            square = _hat(w)
-            K = _hat(dw) + dot(square, square)
-        motion.append((w, dw, K, acc))
+        at_rest = zero, zero, np.zeros((3, 3), dtype), weight
+        speed, rate = (None if x is None else x[i] for x in (speeds, rates))
+        motion.append(
+            move_with_joint(motion[parent] if parent >= 0 else at_rest, chains[i], links.subspaces[i], speed, rate)
+        )
+        _, _, K, acc = motion[-1]
         wrench = wrench_of_acceleration(K, acc, links.moments[i])
         if external is not None:
             wrench = wrench - wrench_in_link(links, i, entry(external, i))
         wrenches.append(wrench)
     return wrenches
+
+
+def move_with_joint(motion: tuple, chain: Chain, S, speed, rate) -> tuple:
+    """Motion (w, dw, K, acceleration of the origin) of a body from that of its parent; speed and rate (nj,), or None."""
+    w, dw, K, acc = motion
+    # The parent's K gives the acceleration of every point fixed in it, the child's origin among them.
+    r = origin_in_parent(chain)
+    acc = rotate_to_child(chain, acc if r is None else acc + dot(K, r))
+    w, dw = rotate_to_child(chain, w), rotate_to_child(chain, dw)
+    slides, turns = _is_nonzero(S[:3]), _is_nonzero(S[3:])
+    if speed is not None:
+        if slides:
+            slide = dot(part(S, 0, 3), speed)
+            # Coriolis acceleration 2 w x slide, with w of the parent.
+            acc = acc + dot(_hat(w + w), slide)
+        if turns:
+            omega = dot(part(S, 3, 6), speed)
+            dw = dw + dot(_hat(w), omega)
+            w = w + omega
+            if slides:
+                # The joint's own rotation carries its translation with it: omega x slide, for helical, planar and
+                # free joints.
+                acc = acc + dot(_hat(omega), slide)
+    if rate is not None:
+        acc = acc + dot(part(S, 0, 3), rate) if slides else acc
+        dw = dw + dot(part(S, 3, 6), rate) if turns else dw
+    # At rest K stays the zero matrix of numpy, so that its products are never compiled.
+    if speed is not None or rate is not None:
+        square = _hat(w)
+        K = _hat(dw) + dot(square, square)
+    return w, dw, K, acc
 
 
 def _is_nonzero(S) -> bool:

@@ -1,0 +1,385 @@
+"""Loops of jaxprs as `scan.Scan`s: the program of one iteration, from the arrays that go into all of them.
+
+What is known is folded into it: entries of carries that never change, and columns of rows that are the same in all iterations,
+such as the zeros of joints of one kind. Other known columns are tables. Entries that are always equal, such as those of a
+symmetric matrix, are one entry.
+"""
+
+from collections.abc import Callable, Sequence
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from jaxdyn.compile.graph import Graph
+from jaxdyn.compile.jax_adapter import scan_counts
+from jaxdyn.compile.program import Array, Number, as_objects, dtype_of, is_number, kind_or_refuse, objects
+from jaxdyn.compile.scan import MAX_WRITTEN_OUT, Counts, Scan
+
+# Loops of fewer iterations are always written out.
+MIN_ITERATIONS = 8
+# Of a loop whose end is not known, for estimates of its cost.
+GUESSED_ITERATIONS = 10
+
+
+def scan(expansion, params, args, eqn):
+    """`lax.scan`: as a loop, or written out where it is short."""
+    count, carried = scan_counts(params)
+    length = params["length"]
+    consts, carry, rows = args[:count], args[count : count + carried], args[count + carried :]
+    outs = [x.aval for x in eqn.outvars[carried:]]
+    if not length:
+        return [*carry, *(np.zeros(x.shape, x.dtype) for x in outs)]
+    if length >= MIN_ITERATIONS and any(x.dtype.kind == "O" for x in args):
+        results = _roll(
+            expansion, params["jaxpr"], [consts, carry, rows], eqn, length, params["reverse"], None, MAX_WRITTEN_OUT
+        )
+        if results is not None:
+            return results
+    saved: list[list] = []
+    # Written out: the length is known, and zeros of a first step are seen in the following ones.
+    for i in reversed(range(length)) if params["reverse"] else range(length):
+        results = expansion.evaluate(params["jaxpr"], [*consts, *carry, *(x[i, ...] for x in rows)])
+        carry = results[:carried]
+        saved.append(results[carried:])
+    if params["reverse"]:
+        saved.reverse()
+    return [*carry, *(_stack(column) for column in zip(*saved, strict=True))]
+
+
+def _roll(expansion, inner, arrays, eqn, length: int, inward: bool, parents, most: int) -> list | None:
+    """The results of a loop in native code; None where it is short enough to be written out."""
+    sizes = np.cumsum([len(x) for x in arrays]).tolist()
+    of_inputs, of_results = [x.aval.dtype for x in eqn.invars], [x.aval.dtype for x in eqn.outvars]
+    dtypes = [
+        of_inputs[: sizes[0]],
+        of_inputs[sizes[0] : sizes[1]],
+        of_inputs[sizes[1] :],
+        of_results[len(arrays[1]) :],
+    ]
+
+    def body(graph, consts, carries, rows):
+        return expansion.evaluate_in(graph, inner, [*consts, *carries, *rows])
+
+    return roll(expansion.graph, body, arrays, dtypes, length, inward, parents, most)
+
+
+def sweep(expansion, params, args, eqn):
+    """A sweep over a tree (see `sweeps`)."""
+    (before, count), parents, inward = params["counts"], params["parents"], params["inward"]
+    consts, start, rows, inner = args[:before], args[before : before + count], args[before + count :], params["call"]
+    # Whoever asks for a sweep has decided that a loop is faster. Without unknown numbers there is nothing to run.
+    results = None
+    if any(x.dtype.kind == "O" for x in args):
+        results = _roll(expansion, inner, [consts, start, rows], eqn, len(parents), inward, parents, 0)
+    if results is not None:
+        return results
+    # Written out: of each node the carry, or the sum over its children; the root is the last one.
+    carries: list = [None] * len(parents) + [None if inward else start]
+    if inward:
+        carries[len(parents) - 1] = start
+    saved: list = [None] * len(parents)
+    for i in reversed(range(len(parents))) if inward else range(len(parents)):
+        given = carries[i if inward else parents[i]]
+        given = (
+            [np.zeros(x.aval.shape, x.aval.dtype) for x in eqn.invars[before : before + count]]
+            if given is None
+            else given
+        )
+        results = expansion.evaluate(inner, [*consts, *given, *(x[i, ...] for x in rows)])
+        own, saved[i] = results[:count], results[count:]
+        to, add = (parents[i], carries[parents[i]]) if inward else (i, None)
+        carries[to] = own if add is None else [_add(expansion, x, y) for x, y in zip(add, own, strict=True)]
+    return [*carries[-1 if inward else len(parents) - 1], *(_stack(column) for column in zip(*saved, strict=True))]
+
+
+def while_loop(expansion, params, args, eqn):
+    """`lax.while_loop`: written out where its end is known."""
+    count, more = params["cond_nconsts"], params["body_nconsts"]
+    of_cond, of_body, carry = args[:count], args[count : count + more], args[count + more :]
+    while True:
+        (going,) = expansion.evaluate(params["cond_jaxpr"], [*of_cond, *carry])
+        going = as_objects(going).item()
+        if type(going) is Number:
+            return _roll_while(expansion, params, of_cond, of_body, carry, eqn)
+        if not going:
+            return carry
+        carry = expansion.evaluate(params["body_jaxpr"], [*of_body, *carry])
+
+
+def _roll_while(expansion, params, of_cond, of_body, carry, eqn) -> list:
+    """The carries at the end of a loop whose number of iterations is not known."""
+    types = [x.aval.dtype for x in eqn.invars]
+    count = len(of_cond) + len(of_body)
+
+    def condition(graph, consts, carries):
+        return expansion.evaluate_in(graph, params["cond_jaxpr"], [*consts[: len(of_cond)], *carries])
+
+    def body(graph, consts, carries):
+        return expansion.evaluate_in(graph, params["body_jaxpr"], [*consts[len(of_cond) :], *carries])
+
+    arrays, dtypes = ([*of_cond, *of_body], carry), (types[:count], types[count:])
+    return roll_while(expansion.graph, condition, body, arrays, dtypes)
+
+
+def _add(expansion, x: np.ndarray, y: np.ndarray) -> np.ndarray:
+    return as_objects(expansion.elementwise["add"](as_objects(x), as_objects(y)))
+
+
+# --- loops as subprograms ---
+
+
+def roll(
+    graph: Graph,
+    body: Callable,
+    arrays: Sequence[Sequence],
+    dtypes: Sequence[Sequence],
+    length: int,
+    inward: bool,
+    parents,
+    most: int,
+) -> list | None:
+    """Results of a loop as a call of a subprogram; None where it is short enough to be written out.
+
+    **Arguments:**
+
+    - `body(graph, consts, carries, rows)`: results of one iteration, carries and then rows, in a graph of its own.
+    - `most`: operations of a loop that is written out.
+    - `arrays`, `dtypes`: of constants, carries, and rows (length, ...); `dtypes` also of the rows that are results.
+
+    **Returns:** carries, and rows (length, ...), as those of `lax.scan`.
+    """
+    consts, carries, rows = ([as_objects(x) if x.dtype.kind == "O" else x for x in group] for group in arrays)
+    of_consts, of_carries, of_rows, of_results = dtypes
+    consts = [_group([[y] for y in x.ravel().tolist()], x, d) for x, d in zip(consts, of_consts, strict=True)]
+    rows = [_group(_columns(x), x[0, ...], d) for x, d in zip(rows, of_rows, strict=True)]
+    classes = _Classes([as_objects(x) for x in carries], of_carries)
+    while True:
+        inner, types = Graph(graph.most), []
+
+        def make(arrays, inner=inner, types=types):
+            first = len(types)
+            types.extend(arrays)
+            return [inner.inputs(first + i, x) for i, x in enumerate(arrays)]
+
+        own_consts = make([Array((len(x.passed),), x.dtype) for x in consts if x.passed])
+        own_carries = make(classes.types)
+        own_rows = make([Array((len(x.passed),), x.dtype) for x in rows if x.passed])
+        own_tables = make([Array((len(x.known),), x.dtype) for x in rows if x.known])
+        given = (
+            [x.entries(iter(y), None) for x, y in _pairs(consts, own_consts)],
+            classes.entries(own_carries),
+            _row_entries(rows, own_rows, own_tables),
+        )
+        results = [as_objects(x) for x in body(inner, *given)]
+        ends, outs = results[: len(carries)], results[len(carries) :]
+        if not classes.refine(ends):
+            break
+    distinct = [_distinct(x.ravel().tolist()) for x in outs]
+    carried = classes.outputs(ends)
+    kept = [i for i, (first, _) in enumerate(distinct) if first]
+    made = [objects([outs[i].ravel()[k] for k in distinct[i][0]], (len(distinct[i][0]),)) for i in kept]
+    outputs = [*classes.types, *(Array(x.shape, np.dtype(of_results[i])) for i, x in zip(kept, made, strict=True))]
+    program = inner.finish(types, outputs, [*carried, *made])
+    if program.cost * length <= most:
+        return None
+    tables = [np.stack([np.array(y, x.dtype) for y in x.known], 1) for x in rows if x.known]
+    counts = Counts(len(own_consts), len(carried), len(own_rows), len(tables), 0, len(kept))
+    scan = Scan(program, counts, length, tables, inward, parents)
+    passed = [np.stack([objects(y, (len(y),)) for y in x.passed], 1) for x in rows if x.passed]
+    consts = [objects([y[0] for y in x.passed], (len(x.passed),)) for x in consts if x.passed]
+    found = scan.call(graph, [*consts, *classes.starts(), *passed])
+    by_place = dict(zip(kept, found[len(carried) :], strict=True))
+    stacked = []
+    for i, (out, (_, places)) in enumerate(zip(outs, distinct, strict=True)):
+        full = np.empty((length, out.size), object)
+        for k, (x, place) in enumerate(zip(out.ravel().tolist(), places, strict=True)):
+            full[:, k] = x if place is None else by_place[i][:, place]
+        stacked.append(full.reshape(length, *out.shape))
+    return [*classes.entries(found[: len(carried)]), *stacked]
+
+
+def roll_while(
+    graph: Graph, condition: Callable, body: Callable, arrays: Sequence[Sequence], dtypes: Sequence[Sequence]
+) -> list:
+    """Carries at the end of a `lax.while_loop`, as a call of a subprogram.
+
+    **Arguments:** `condition(graph, consts, carries)` and `body(graph, consts, carries)`: results of one iteration. `arrays`,
+    `dtypes`: of constants and carries.
+    """
+    consts, carries = ([as_objects(x) if x.dtype.kind == "O" else x for x in group] for group in arrays)
+    consts = [_group([[y] for y in x.ravel().tolist()], x, d) for x, d in zip(consts, dtypes[0], strict=True)]
+    classes = _Classes([as_objects(x) for x in carries], dtypes[1])
+
+    def inputs():
+        inner = Graph(graph.most)
+        types = [*(Array((len(x.passed),), x.dtype) for x in consts if x.passed), *classes.types]
+        made = [inner.inputs(i, x) for i, x in enumerate(types)]
+        count = len(types) - len(classes.types)
+        own = [x.entries(iter(y), None) for x, y in _pairs(consts, made[:count])]
+        return inner, types, own, classes.entries(made[count:])
+
+    while True:
+        inner, types, *given = inputs()
+        ends = [as_objects(x) for x in body(inner, *given)]
+        if not classes.refine(ends):
+            break
+    program = inner.finish(types, classes.types, classes.outputs(ends))
+    inner, types, *given = inputs()
+    until = inner.finish(types, [Array((), np.dtype(bool))], [as_objects(condition(inner, *given)[0])])
+    passed = [objects([y[0] for y in x.passed], (len(x.passed),)) for x in consts if x.passed]
+    counts = Counts(len(passed), len(classes.types), 0, 0, 0, 0)
+    scan = Scan(program, counts, GUESSED_ITERATIONS, condition=until)
+    return classes.entries(scan.call(graph, [*passed, *classes.starts()]))
+
+
+def _distinct(entries: list) -> tuple[list[int], list[int | None]]:
+    """Places of the first of equal entries that are not known; for each entry its place among these, None where known."""
+    found: dict[int, int] = {}
+    first, places = [], []
+    for k, x in enumerate(entries):
+        if not is_number(x):
+            places.append(None)
+            continue
+        if id(x) not in found:
+            found[id(x)] = len(first)
+            first.append(k)
+        places.append(found[id(x)])
+    return first, places
+
+
+# --- constants and rows ---
+
+
+class _Group(NamedTuple):
+    """An array of constants or rows by its entries in one iteration.
+
+    - `places`: for each entry ("fixed", its value), ("passed", column) or ("known", column).
+    - `passed`, `known`: columns over the iterations, each once.
+    """
+
+    shape: tuple[int, ...]
+    dtype: np.dtype
+    places: list[tuple[str, Any]]
+    passed: list[list]
+    known: list[list]
+
+    def entries(self, passed, known) -> np.ndarray:
+        """Entries of one iteration; `passed` and `known` are iterators over the inputs of the groups."""
+        own: dict[str, Any] = {"passed": next(passed) if self.passed else None}
+        own["known"] = next(known) if self.known else None
+        return objects([at if where == "fixed" else own[where][at] for where, at in self.places], self.shape)
+
+
+def _columns(x: np.ndarray) -> list[list]:
+    flat = x.reshape(len(x), -1)
+    return [as_objects(flat[:, k]).tolist() for k in range(flat.shape[1])]
+
+
+def _group(columns: list[list], one: np.ndarray, dtype) -> _Group:
+    kind_or_refuse(dtype)
+    places: list = []
+    passed: dict[tuple, int] = {}
+    known: dict[bytes, int] = {}
+    by_key: dict[Any, list] = {}
+    for column in columns:
+        if any(is_number(x) for x in column):
+            key, where = tuple(map(id, column)), "passed"
+            places.append((where, passed.setdefault(key, len(passed))))
+        else:
+            # By bits: zeros of both signs are different, and NaN is equal to itself.
+            key = np.array(column, dtype).tobytes()
+            if key == key[: np.dtype(dtype).itemsize] * len(column):
+                places.append(("fixed", column[0]))
+                continue
+            places.append(("known", known.setdefault(key, len(known))))
+        by_key[key] = column
+    return _Group(one.shape, np.dtype(dtype), places, [by_key[x] for x in passed], [by_key[x] for x in known])
+
+
+def _pairs(groups: Sequence[_Group], inputs: list):
+    """Groups with the array that each takes, if it takes one."""
+    at = iter(inputs)
+    return [(x, [next(at)] if x.passed else []) for x in groups]
+
+
+def _row_entries(groups: Sequence[_Group], passed: list, known: list) -> list[np.ndarray]:
+    of_passed, of_known = iter(passed), iter(known)
+    return [x.entries(of_passed, of_known) for x in groups]
+
+
+# --- carries ---
+
+
+class _Classes:
+    """Entries of carries in classes of equal ones, found by refinement: entries that start equal and are computed alike.
+
+    A class whose start is known and which keeps it is no carry at all.
+    """
+
+    def __init__(self, carries: Sequence[np.ndarray], dtypes: Sequence):
+        self.shapes = [x.shape for x in carries]
+        # Each array of carries is one of the loop: derivatives decide by arrays what they depend on.
+        self.owners = [i for i, x in enumerate(carries) for _ in range(x.size)]
+        self.kinds = [kind_or_refuse(d) for d, x in zip(dtypes, carries, strict=True) for _ in range(x.size)]
+        self.start = [x for array in carries for x in array.ravel().tolist()]
+        self.known = [not is_number(x) for x in self.start]
+        self.keys: list[Any] = [(kind, _key(x)) for kind, x in zip(self.kinds, self.start, strict=True)]
+
+    def _members(self) -> dict[int, list[int]]:
+        """First entries of the classes that are carried, by array."""
+        seen, members = set(), {}
+        for i, (key, known, owner) in enumerate(zip(self.keys, self.known, self.owners, strict=True)):
+            if not known and key not in seen:
+                seen.add(key)
+                members.setdefault(owner, []).append(i)
+        return members
+
+    @property
+    def types(self) -> list[Array]:
+        """Arrays of the carried entries."""
+        return [Array((len(x),), dtype_of(self.kinds[x[0]])) for x in self._members().values()]
+
+    def entries(self, inputs: Sequence[np.ndarray]) -> list[np.ndarray]:
+        """Arrays of the carries from their classes' values."""
+        value = {
+            self.keys[i]: x
+            for members, array in zip(self._members().values(), inputs, strict=True)
+            for i, x in zip(members, array.ravel().tolist(), strict=True)
+        }
+        flat = iter([s if k else value[key] for s, k, key in zip(self.start, self.known, self.keys, strict=True)])
+        return [objects([next(flat) for _ in range(int(np.prod(shape)))], shape) for shape in self.shapes]
+
+    def refine(self, ends: Sequence[np.ndarray]) -> bool:
+        """Divide classes whose entries were computed differently; False where none were."""
+        made = [_key(x) for array in ends for x in array.ravel().tolist()]
+        known = [k and _key(s) == m for k, s, m in zip(self.known, self.start, made, strict=True)]
+        keys = [key if k else (key, m) for key, k, m in zip(self.keys, known, made, strict=True)]
+        before = len(set(zip(self.keys, self.known, strict=True)))
+        changed = known != self.known or len(set(zip(keys, known, strict=True))) != before
+        if changed:
+            names: dict[Any, int] = {}
+            self.known = known
+            self.keys = [names.setdefault((key, k), len(names)) for key, k in zip(keys, known, strict=True)]
+        return changed
+
+    def outputs(self, ends: Sequence[np.ndarray]) -> list[np.ndarray]:
+        """Arrays of the carried entries at the end of an iteration."""
+        return self._of([x for array in ends for x in array.ravel().tolist()])
+
+    def starts(self) -> list[np.ndarray]:
+        """The same before the first iteration."""
+        return self._of(self.start)
+
+    def _of(self, flat: list) -> list[np.ndarray]:
+        return [objects([flat[i] for i in members], (len(members),)) for members in self._members().values()]
+
+
+def _key(x) -> Any:
+    """Equal for entries that are the same number, or known numbers of the same bits."""
+    return id(x) if is_number(x) else ("known", type(x), np.asarray(x).tobytes())
+
+
+def _stack(rows: Sequence) -> np.ndarray:
+    if any(x.dtype.kind == "O" for x in rows):
+        return np.stack([as_objects(x) for x in rows])
+    return np.stack(rows)

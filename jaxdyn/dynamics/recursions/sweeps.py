@@ -1,0 +1,295 @@
+"""The recursions for many bodies: the same steps for each body, as sweeps over the tree whose code does not grow with it.
+
+All joints have one degree of freedom. What they have alike, such as a zero, is dropped when a sweep is compiled.
+
+- Known geometry: canonical frames (see `frames`), with s = (0, 0, a, 0, 0, b): a is 0 for revolute joints, 1 for prismatic ones,
+  the pitch for helical ones; b is 0 or 1.
+- Geometry that is an argument: the model's own frames and screws.
+"""
+
+from collections.abc import Callable
+from typing import Any, NamedTuple
+
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float
+
+from jaxdyn.compile import sweep
+from jaxdyn.compile.known import is_concrete
+from jaxdyn.dynamics.recursions._arrays import as_numpy_if_known, contract, dot, join, part
+from jaxdyn.dynamics.recursions.articulated import eliminate, spatial_inertia
+from jaxdyn.dynamics.recursions.frames import MOMENTS, canonical_frames, pseudo_inertias
+from jaxdyn.dynamics.recursions.newton_euler import move_with_joint, wrench_of_acceleration
+from jaxdyn.dynamics.recursions.transforms import (
+    Chain,
+    GeneralRotation,
+    PlaneRotation,
+    PlaneRotations,
+    Transform,
+    X,
+    Z,
+    inertia_to_parent,
+    twist_to_child,
+    wrench_to_parent,
+)
+from jaxdyn.model.joints import SCREW_KINDS, screw_transform
+from jaxdyn.model.tree import Model, nearest_rotation
+
+_TURNS = ("revolute", "continuous")
+
+
+def has_sweeps(model: Model) -> bool:
+    """Decide whether the joints are such that this module computes them."""
+    kinds = {"revolute" if kind in _TURNS else kind for kind in model.topology.kinds}
+    # With given geometry the formula of a joint's pose is chosen by its kind.
+    return kinds <= set(SCREW_KINDS) and (len(kinds) == 1 or is_concrete(model.home, model.screws))
+
+
+class _Bodies:
+    """Data of the bodies. `rows`: arrays (nb, ...); the methods take one row of them."""
+
+    rows: Any
+    scale: Any = None  # unit velocity = scale * v, (nv,), or None
+
+    def __init__(self, model: Model):
+        self.model, self.parents = model, model.topology.parents
+        self.gravity, self.armature = as_numpy_if_known(model.gravity), as_numpy_if_known(model.armature)
+        kinds = set(model.topology.kinds)
+        self.kind = "revolute" if kinds <= set(_TURNS) else kinds.pop() if len(kinds) == 1 else None
+        self.dtype = model.home.dtype
+
+    # The coordinate of (v, omega) that all joints move along, or None.
+    column: int | None = None
+
+    def place(self, row, q):
+        """What the pose of a body in its parent depends on."""
+        raise NotImplementedError
+
+    def chain(self, row, place) -> Chain:
+        """The pose."""
+        raise NotImplementedError
+
+    def subspace(self, row):
+        """Motion subspace (6,)."""
+        raise NotImplementedError
+
+    def moments(self, row):
+        """Pseudo-inertia (4, 4)."""
+        raise NotImplementedError
+
+
+class _Canonical(_Bodies):
+    """Known geometry. Rows: home poses as screws, s, inertias, armatures."""
+
+    class Row(NamedTuple):
+        phi: Any  # (2,) cosine and sine
+        alpha: Any
+        theta: Any
+        lengths: Any  # (5,): e, shift, d
+        along: Any  # (): a
+        about: Any  # (): b
+        inertia: Any  # (4, 4) in the canonical frame; (10,) of the body, where these are given
+        to_frame: Any  # (4, 4), where they are
+        armature: Any  # (), or None
+
+    def __init__(self, model: Model):
+        super().__init__(model)
+        frames, dtype, n = canonical_frames(model), self.dtype, model.nb
+        screws, kinds = frames.screws, model.topology.kinds
+        assert screws is not None
+        self.column = {"revolute": 5, "prismatic": 2}.get(self.kind or "")
+        if not (frames.rate == 1).all():
+            self.scale = frames.rate
+            # Armature acts on v^2 of the model; on unit velocities it is divided by the square of the scale.
+            self.armature = None if self.armature is None else self.armature / self.scale**2
+
+        def rows(values):
+            return np.array(values, dtype).reshape(n, -1)
+
+        slides = np.array([kind == "prismatic" for kind in kinds], dtype)
+        if is_concrete(model.inertias):
+            inertias, to_frame = np.stack(pseudo_inertias(model, frames)), None
+        else:
+            inertias, to_frame = model.inertias, np.linalg.inv(frames.placement)
+        self.rows = self.Row(
+            rows([x.phi for x in screws]), rows([x.alpha for x in screws]), rows([x.theta for x in screws]),
+            rows([[x.e, *x.shift, x.d] for x in screws]), slides + frames.pitch, 1 - slides, inertias, to_frame,
+            self.armature,
+        )  # fmt: skip
+
+    def place(self, row, q):
+        angle = q * row.about
+        c, s = jnp.cos(angle), jnp.sin(angle)
+        cos, sin = row.theta[0], row.theta[1]
+        return jnp.stack([c * cos - s * sin, s * cos + c * sin, q * row.along])
+
+    def chain(self, row, place) -> Chain:
+        zero, lengths = np.zeros(2, self.dtype), row.lengths
+
+        def plane(axis: int, angle):
+            return PlaneRotation(PlaneRotations(axis, angle[:1], angle[1:]), 0)
+
+        return (
+            Transform(join([zero, lengths[:1]], 0), plane(Z, row.phi)),
+            Transform(lengths[1:4], plane(X, row.alpha)),
+            Transform(join([zero, lengths[4:] + place[2:]], 0), plane(Z, place[:2])),
+        )
+
+    def subspace(self, row):
+        zero = np.zeros(2, self.dtype)
+        return join([zero, row.along.reshape(1), zero, row.about.reshape(1)], 0)
+
+    def moments(self, row):
+        if row.to_frame is None:
+            return row.inertia
+        moments = contract(MOMENTS.astype(self.dtype), row.inertia, (2,), (0,))
+        return contract(dot(row.to_frame, moments), row.to_frame, (1,), (1,))
+
+
+class _Given(_Bodies):
+    """Geometry that is an argument. Rows: home poses, screws, inertias, armatures; a place is a rotation and a position."""
+
+    class Row(NamedTuple):
+        home: Any  # (4, 4)
+        screw: Any  # (6,)
+        inertia: Any  # (10,)
+        armature: Any  # (), or None
+
+    def __init__(self, model: Model):
+        super().__init__(model)
+        self.rows = self.Row(model.home, model.screws, model.inertias, self.armature)
+
+    def place(self, row, q):
+        home, pose = row.home, screw_transform(str(self.kind), self.subspace(row), q)
+        rotation = nearest_rotation(home[:3, :3])
+        turned, place = dot(rotation, pose[:3, :3]), home[:3, 3] + dot(rotation, pose[:3, 3])
+        return join([turned.reshape(9), place], 0)
+
+    def chain(self, row, place) -> Chain:
+        return (Transform(part(place, 9, 12), GeneralRotation(part(place, 0, 9).reshape(3, 3))),)
+
+    def subspace(self, row):
+        return row.screw * self.model.topology.screw_mask[0]
+
+    def moments(self, row):
+        return contract(MOMENTS.astype(self.dtype), row.inertia, (2,), (0,))
+
+
+def _bodies(model: Model) -> _Bodies:
+    return (_Canonical if is_concrete(model.home, model.screws) else _Given)(model)
+
+
+def _scaled(bodies: _Bodies, x) -> Any:
+    """Velocities of unit screws from those of the model's; equally, forces of the model's screws from those of unit ones."""
+    return x if bodies.scale is None or x is None else x * bodies.scale
+
+
+def _unscaled(bodies: _Bodies, x) -> Any:
+    """The inverse of `_scaled`."""
+    return x if bodies.scale is None else x / bodies.scale
+
+
+# --- sweeps ---
+
+
+def _wrenches(bodies: _Bodies, q, v, a) -> tuple[Any, Any]:
+    """Inertial wrenches (nb, 6), gravity included, and places (nb, n): the outward sweep of Newton-Euler."""
+    zero = np.zeros(3, bodies.dtype)
+    start = zero, zero, np.zeros((3, 3), bodies.dtype), zero if bodies.gravity is None else -bodies.gravity
+
+    def step(motion, row):
+        row, q, v, a = row
+        place, S = bodies.place(row, q), bodies.subspace(row).reshape(6, 1)
+        motion = move_with_joint(motion, bodies.chain(row, place), S, v, a)
+        return motion, (wrench_of_acceleration(motion[2], motion[3], bodies.moments(row)), place)
+
+    rows = bodies.rows, q, *(None if x is None else x.reshape(-1, 1) for x in (v, a))
+    return sweep(step, bodies.parents, start, rows)[1]
+
+
+def rnea(model: Model, q, v, a) -> Float[Array, " nv"]:
+    """Inverse dynamics (see `newton_euler.rnea`); `v` and `a` may be None, which is zero."""
+    bodies = _bodies(model)
+    q, v, a = (_scaled(bodies, x) for x in (q, v, a))
+    wrenches, places = _wrenches(bodies, q, v, a)
+
+    def step(total, row):
+        row, place, wrench = row
+        total = total + wrench
+        return wrench_to_parent(bodies.chain(row, place), total), dot(bodies.subspace(row), total)
+
+    tau = sweep(step, bodies.parents, np.zeros(6, bodies.dtype), (bodies.rows, places, wrenches), inward=True)[1]
+    if a is not None and bodies.armature is not None:
+        tau = tau + bodies.armature * a
+    return _scaled(bodies, tau)
+
+
+def bias_force(model: Model, q, v) -> Float[Array, " nv"]:
+    """Bias force C v + N (nv,)."""
+    return rnea(model, q, v, None)
+
+
+def gravity_force(model: Model, q) -> Float[Array, " nv"]:
+    """Gravity force N (nv,)."""
+    return rnea(model, q, None, None)
+
+
+class _Factors(NamedTuple):
+    """Articulated-body factors: per body its place, the gain U/D (6,) and 1/D."""
+
+    bodies: _Bodies
+    places: Any
+    gains: Any
+    inverses: Any
+
+
+def _factorize(bodies: _Bodies, places) -> _Factors:
+    def step(total, row):
+        row, place = row
+        A = total + spatial_inertia(bodies.moments(row))
+        rest, gain, inverse = eliminate(A, bodies.subspace(row), bodies.column, row.armature)
+        return inertia_to_parent(bodies.chain(row, place), rest), (gain, inverse)
+
+    start = np.zeros((6, 6), bodies.dtype)
+    return _Factors(bodies, places, *sweep(step, bodies.parents, start, (bodies.rows, places), inward=True)[1])
+
+
+def _solve(factors: _Factors, force, wrenches=None) -> Float[Array, " nv"]:
+    """Solve M a = force - (generalised forces of the wrenches)."""
+    bodies, places, gains, inverses = factors
+    zero = np.zeros(6, bodies.dtype)
+
+    def inward(total, row):
+        row, place, gain, force, wrench = row
+        F = total if wrench is None else total + wrench
+        left = force - dot(bodies.subspace(row), F)
+        return wrench_to_parent(bodies.chain(row, place), F + gain * left), left
+
+    def outward(V, row):
+        row, place, gain, inverse, left = row
+        V = twist_to_child(bodies.chain(row, place), V)
+        x = left * inverse - dot(gain, V)
+        return V + bodies.subspace(row) * x, x
+
+    rows = bodies.rows, places, gains, _unscaled(bodies, force), wrenches
+    left = sweep(inward, bodies.parents, zero, rows, inward=True)[1]
+    a = sweep(outward, bodies.parents, zero, (bodies.rows, places, gains, inverses, left))[1]
+    return _unscaled(bodies, a)
+
+
+def _free_and_inverse(model: Model, q, v, tau) -> tuple[Array, Callable]:
+    bodies = _bodies(model)
+    wrenches, places = _wrenches(bodies, _scaled(bodies, q), _scaled(bodies, v), None)
+    factors = _factorize(bodies, places)
+    return _solve(factors, tau, wrenches), lambda force: _solve(factors, force)
+
+
+def aba(model: Model, q, v, tau) -> Float[Array, " nv"]:
+    """Forward dynamics (see `articulated.aba`)."""
+    return _free_and_inverse(model, q, v, tau)[0]
+
+
+def aba_tangent(model: Model, q, v, tau, force_change: Callable) -> tuple[Array, Array]:
+    """Forward dynamics a, and M^-1 times `force_change(a)` (see `articulated.aba_tangent`)."""
+    a, times = _free_and_inverse(model, q, v, tau)
+    return a, times(force_change(a))
