@@ -64,12 +64,16 @@ class HeightField(Surface):
         self.f = self.coefficients = self.spacing = self.origin = None
         if callable(heights):
             if spacing is not None or origin is not None or not smooth:
-                raise ValueError("HeightField: spacing, origin and smooth are of a grid of heights; omit them for a function")
+                raise ValueError(
+                    "HeightField: spacing, origin and smooth are of a grid of heights; omit them for a function"
+                )
             self.f = as_pytree(heights, "HeightField: heights")
             return
         grid = as_float(heights, "HeightField: heights", (None, None))
         if min(grid.shape) < 2 or (is_concrete(grid) and not np.isfinite(np.asarray(grid)).all()):
-            raise ValueError(f"HeightField: heights has shape {grid.shape}; give two finite heights or more along x and y")
+            raise ValueError(
+                f"HeightField: heights has shape {grid.shape}; give two finite heights or more along x and y"
+            )
         sizes = as_array(1.0 if spacing is None else spacing, "HeightField: spacing")
         if spacing is None or (is_concrete(sizes) and not (np.isfinite(sizes) & (np.asarray(sizes) > 0)).all()):
             raise ValueError(f"HeightField: spacing is {spacing}; give the distance of the heights (m), above zero")
@@ -170,7 +174,7 @@ def _splines(place, count: int, smooth: bool, order: int) -> list:
     values = [jnp.zeros_like(t)] * (order + 1)
     for weight, shift in ((1, 2.0), (-4, 1.0), (6, 0.0), (-4, -1.0)):
         x = jnp.maximum(t + shift, 0.0)
-        powers = (x * x * x / 6.0, 0.5 * x * x, x, jnp.where(x > 0, 1.0, 0.0).astype(x.dtype))
+        powers = (x * x * x / 6.0, 0.5 * x * x, x, jnp.where((x > 0) & (t < 2.0), 1.0, 0.0).astype(x.dtype))
         values = [value + weight * power for value, power in zip(values, powers, strict=False)]
     return values
 

@@ -186,7 +186,9 @@ def _check_pair(shape, on, name: str) -> tuple[Feature, ...]:
     elif isinstance(on, HeightField):
         is_round = any(f.is_smooth and not (isinstance(f, Ball) and f.radius is None) for f in features)
         if is_round and not on.smooth:
-            raise ValueError(f"{pair} with smooth=False has edges, on which a round shape has two contacts; set smooth=True")
+            raise ValueError(
+                f"{pair} with smooth=False has edges, on which a round shape has two contacts; set smooth=True"
+            )
     elif not isinstance(on, Plane):
         raise ValueError(f"{pair} has no contacts here; on is a Plane, HeightField, Sphere, Capsule or Box")
     return features

@@ -151,7 +151,10 @@ def features_of(shape: Any) -> tuple[Feature, ...]:
         features: list[Feature] = []
         for end in _ends(shape.length):
             points = end + _known(shape.radius) * circle
-            features += [Rim(shape.radius, _leaf(end[2], shape.radius)), *(Ball(_leaf(x, shape.radius)) for x in points)]
+            features += [
+                Rim(shape.radius, _leaf(end[2], shape.radius)),
+                *(Ball(_leaf(x, shape.radius)) for x in points),
+            ]
         return tuple(features)
     if isinstance(shape, Box):
         corners = 0.5 * np.array(list(itertools.product((-1.0, 1.0), repeat=3))) * _known(shape.size)
@@ -181,7 +184,7 @@ def outward(shape: Any, point: Float[Array, "3"]) -> tuple[Float[Array, "3"], Fl
         away = point - jnp.clip(point, -half, half)
         is_outside = deepest > 0
         normal = jnp.where(is_outside, unit_or(away, jnp.asarray([1.0, 0.0, 0.0], point.dtype)), inside)
-        return normal, jnp.where(is_outside, jnp.sum(normal * away), jnp.sum(inside * point) - jnp.sum(chosen * half))
+        return normal, jnp.where(is_outside, jnp.sum(normal * away), deepest)
     away = point
     if isinstance(shape, Capsule):
         half = 0.5 * shape.length.astype(point.dtype)
