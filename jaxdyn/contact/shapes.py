@@ -20,8 +20,8 @@ from jaxdyn.lie.so3 import matmul
 from jaxdyn.model.arguments import Numbers
 from jaxdyn.model.numbers import as_float, as_number
 
-# Below this sine of its tilt, the lowest point of a cylinder moves from the rim to the centre of the end face.
-UPRIGHT = 1e-3
+# Below this sine of its tilt, the lowest point of a cylinder moves from the rim to the axis, into the end face by this share of it.
+UPRIGHT, RECESS = 1e-3, 0.1
 
 
 class Box(eqx.Module):
@@ -113,12 +113,15 @@ class Rim(Feature):
         across = along - jnp.sum(along * axis) * axis
         square = jnp.sum(across * across)
         # Of an upright cylinder all points of the rim are extreme. The length by which `across` is divided stays above
-        # 3/8 of `UPRIGHT`, with two continuous derivatives at `UPRIGHT`: below, the point is inside the end face.
+        # 3/8 of `UPRIGHT`, with two continuous derivatives at `UPRIGHT`: below, the point moves towards the axis. There it
+        # would be a fourth point of an end that stands on three, which makes forces redundant: it moves into the cylinder too.
         is_tilted = square >= UPRIGHT**2
         ratio = jnp.where(is_tilted, jnp.ones_like(square), square / UPRIGHT**2)
         near = UPRIGHT / 8 * (3.0 + 6.0 * ratio - ratio * ratio)
         length = jnp.where(is_tilted, jnp.sqrt(jnp.where(is_tilted, square, jnp.ones_like(square))), near)
-        return self.centre(R, p) + self.radius.astype(p.dtype) * across / length
+        inward = jnp.where(self.height.astype(p.dtype) > 0, -axis, axis)
+        recess = RECESS * UPRIGHT * (1.0 - ratio) ** 3
+        return self.centre(R, p) + self.radius.astype(p.dtype) * (across / length + recess * inward)
 
 
 class Egg(Feature):

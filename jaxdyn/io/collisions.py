@@ -6,6 +6,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from jaxdyn.contact.height_field import HeightField
+from jaxdyn.contact.hulls import hull_vertices
 from jaxdyn.contact.shape_contacts import shape_contacts
 from jaxdyn.contact.shapes import Box, Capsule, ConvexHull
 from jaxdyn.contact.surfaces import Cylinder, Ellipsoid, Plane, Sphere
@@ -19,9 +20,8 @@ from jaxdyn.model.builder import unknown
 from jaxdyn.model.tree import Model
 
 FRICTION = 1.0  # where a format or a file has none: the default of Gazebo and of MuJoCo
-# Contacts of a mesh, by its most distant vertices. The equations of a step grow with the square of the number of contacts.
+# Contacts of a mesh. The equations of a step grow with the square of the number of contacts.
 _MOST_VERTICES = 12
-_DIRECTIONS = 400  # in which the error of such a hull is measured
 
 
 class Collision(NamedTuple):
@@ -124,7 +124,7 @@ def _shape(solid: Solid, owner: str) -> tuple[Any, list[str]]:
     size = np.asarray(solid.size)
     if solid.kind == "mesh":
         assert solid.vertices is not None
-        hull, count, error = hull_of(solid.vertices * size)
+        hull, count, error = hull_vertices(solid.vertices * size, _MOST_VERTICES)
         # A small part of a mesh is exact.
         note = [f"{owner} ({len(hull)} of {count} vertices, within {error:.2g} m)"] if len(hull) < count else []
         return ConvexHull(hull), note
@@ -133,32 +133,3 @@ def _shape(solid: Solid, owner: str) -> tuple[Any, list[str]]:
     return {"box": lambda: Box(size), "capsule": lambda: Capsule(*size), "cylinder": lambda: Cylinder(*size)}[
         solid.kind
     ](), []
-
-
-def hull_of(points: np.ndarray, most: int = _MOST_VERTICES) -> tuple[np.ndarray, int, float]:
-    """At most `most` vertices (n, 3) of the convex hull of points, the number of all, and the largest distance left out, m.
-
-    Vertices are added where the hull so far falls most short, in directions that are spread over the sphere.
-    """
-    # Imported on use, because scipy's geometry takes long to import.
-    from scipy.spatial import ConvexHull as Hull
-    from scipy.spatial import QhullError
-
-    points = np.unique(points, axis=0)
-    try:
-        points = points[np.sort(Hull(points).vertices)]
-    except (QhullError, ValueError):
-        pass  # flat, or less than four points: all of them
-    if len(points) <= most:
-        return points, len(points), 0.0
-    k = np.arange(_DIRECTIONS) + 0.5
-    polar, around = np.arccos(1 - 2 * k / _DIRECTIONS), np.pi * (1 + 5**0.5) * k
-    directions = np.stack([np.cos(around) * np.sin(polar), np.sin(around) * np.sin(polar), np.cos(polar)], 1)
-    reach = points @ directions.T
-    wanted, chosen = reach.max(0), [int(np.argmax(reach[:, 0]))]
-    while len(chosen) < most:
-        short = wanted - reach[chosen].max(0)
-        if short.max() <= 0:
-            break
-        chosen.append(int(np.argmax(reach[:, np.argmax(short)])))
-    return points[np.sort(chosen)], len(points), float((wanted - reach[chosen].max(0)).max())

@@ -39,7 +39,7 @@ def load(
     gravity: Numbers | None = GRAVITY,
     loops: str | os.PathLike | bool | None = None,
     missing_inertia: Numbers | None = None,
-    contacts: str | Iterable[str] | None = None,
+    contacts: Checked[str | Iterable[str] | None] = None,
     arguments: Mapping[str, Any] | None = None,
     packages: Mapping[str, str | os.PathLike] | None = None,
     dtype: DType | None = None,
@@ -136,7 +136,7 @@ def _urdf_scene(
     gravity: Numbers | None,
     missing_inertia: Numbers | None,
     loops: Checked[FilePath | bool | None],
-    contacts: str | Iterable[str] | None,
+    contacts: Checked[str | Iterable[str] | None],
     dtype: DType | None,
 ) -> LoadedScene:
     closures = read_closures(file.source, loops)
@@ -181,8 +181,8 @@ def _contacts(file: XmlFile, model: Model, contacts) -> tuple[list, list[str]]:
             friction[str(link.get("name"))] = float(file.numbers(part, 1, "a link", "value")[0])
     for extension in file.root.findall("gazebo"):
         # Gazebo's own element has priority, as it is made for the file's simulator.
-        if extension.get("reference") and extension.find("mu1") is not None:
-            friction[extension.get("reference")] = file.number(extension, "mu1", FRICTION, "a link")
+        if (link := extension.get("reference")) and extension.find("mu1") is not None:
+            friction[link] = file.number(extension, "mu1", FRICTION, "a link")
     missing: list[str] = []
     collisions = [
         one

@@ -34,14 +34,14 @@ from jaxdyn.io.mjcf_parts import actuators, constraints, tendon_forces
 from jaxdyn.io.mjcf_sensors import sensors
 from jaxdyn.io.xml_lines import LARGEST_ROUNDING, XmlFile, rounding_of_digits
 from jaxdyn.model import host_math
-from jaxdyn.model.arguments import DType, as_path
+from jaxdyn.model.arguments import Checked, DType, as_path
 from jaxdyn.model.builder import ModelBuilder
 from jaxdyn.model.joints import joint_neutral
 from jaxdyn.model.tree import Model
 
 
 def load_mjcf(
-    path: str | os.PathLike, *, contacts: str | Iterable[str] | None = None, dtype: DType | None = None
+    path: str | os.PathLike, *, contacts: Checked[str | Iterable[str] | None] = None, dtype: DType | None = None
 ) -> LoadedScene:
     """Load the scene of an MJCF file (MuJoCo's XML), compiled by the mujoco package.
 
@@ -74,7 +74,7 @@ def load_mjcf(
     `jd.sensors.measure`), `.not_taken`.
 
     **Warns:** `NotTakenWarning` naming unsupported elements: contact geometry without contacts, muscles, DC motors and
-    user-defined actuators, spatial tendons, flexible bodies, fluid forces, gravity compensation, missing mesh files, and the like.
+    user-defined actuators, spatial tendons, flexible bodies, fluid forces, gravity compensation, missing mesh files, and more.
 
     `UnitsWarning` where limits look like degrees, or lengths and inertias like millimetres.
 
@@ -91,7 +91,7 @@ def load_mjcf(
     tendons, also = tendon_forces(file, model)
     drives, idle = actuators(file, model)
     touching, apart, taken = contacts_of(file, model, contacts, bool(missing))
-    readings, unread = sensors(file, model)
+    readings, unread = sensors(file, model, taken)
     not_taken = (*missing, *left, *also, *idle, *_elements_without_effect(file, taken), *apart, *unread)
     warn_not_taken(path, not_taken)
     warn_of_units(path, model)

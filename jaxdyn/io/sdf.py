@@ -19,7 +19,7 @@ from jaxdyn.io.unread import SDF_FRAME, SDF_JOINT, SDF_LINK, SDF_MODEL, SDF_ROOT
 from jaxdyn.io.urdf import ROOT_JOINT
 from jaxdyn.io.xml_lines import rounding_of_digits
 from jaxdyn.model import host_math
-from jaxdyn.model.arguments import DType
+from jaxdyn.model.arguments import Checked, DType
 from jaxdyn.model.builder import GRAVITY, ModelBuilder
 from jaxdyn.model.joints import joint_neutral
 from jaxdyn.model.topology import body_index
@@ -36,7 +36,7 @@ def load_sdf(
     path: str | os.PathLike,
     *,
     floating_base: bool = True,
-    contacts: str | Iterable[str] | None = None,
+    contacts: Checked[str | Iterable[str] | None] = None,
     dtype: DType | None = None,
 ) -> LoadedScene:
     """Load the scene of an SDF file, with its loops. Meshes are not read, and no other package is needed.

@@ -9,7 +9,7 @@ import pytest
 
 import jaxdyn as jd
 from jaxdyn.contact import HeightField, Plane
-from jaxdyn.io.collisions import hull_of
+from jaxdyn.contact.hulls import hull_vertices
 
 INERTIAL = '<inertial><mass value="1"/><inertia ixx="1" iyy="1" izz="1" ixy="0" ixz="0" iyz="0"/></inertial>'
 SIZES = {
@@ -98,7 +98,7 @@ def test_meshes_that_cannot_be_read_are_named(urdf):
     assert any("mesh 'hull.obj' (no such file)" in line for line in scene.not_taken)
     points = np.random.default_rng(0).normal(size=(500, 3))
     points /= np.linalg.norm(points, axis=1)[:, None]
-    hull, count, error = hull_of(0.1 * points)
+    hull, count, error = hull_vertices(0.1 * points, 12)
     assert (len(hull), count) == (12, 500) and 0.01 < error < 0.04
     # The error is the largest lack of the support function.
     directions = np.random.default_rng(1).normal(size=(2000, 3))
@@ -106,10 +106,10 @@ def test_meshes_that_cannot_be_read_are_named(urdf):
     lack = (0.1 * points @ directions.T).max(0) - (hull @ directions.T).max(0)
     assert -1e-15 <= lack.min() and abs(lack.max() - error) < 2e-3
     cube = np.array([(x, y, z) for x in (0, 1) for y in (0, 1) for z in (0, 1)])
-    hull, count, error = hull_of(np.concatenate([cube, cube, [[0.5, 0.5, 0.5]]]))
+    hull, count, error = hull_vertices(np.concatenate([cube, cube, [[0.5, 0.5, 0.5]]]), 12)
     assert (len(hull), count, error) == (8, 8, 0.0)
     flat = np.array([[0, 0, 0], [1, 0, 0], [0, 1, 0.0]])
-    assert len(hull_of(flat)[0]) == 3
+    assert len(hull_vertices(flat, 12)[0]) == 3
 
 
 SDF = """<sdf version="1.9"><world name="w"><gravity>0 0 -9.8</gravity>
