@@ -122,10 +122,10 @@ def shape_contacts(
     | `Cylinder(radius, length)`             | 8: on each rim the lowest point, and three that are fixed at 0 and 120 degrees |
 
     On a plane the least gap is the exact distance. Of a cylinder it is exact where its axis is more than 1e-3 rad from the
-    normal, and upright; between, the lowest point moves from the rim to the axis, by up to 2e-4 of the radius above the rim. On uneven
-    ground (`HeightField`) gaps have the sign and the rates of the distance, and differ from it by their square times the
-    curvature; spheres, capsules and ellipsoids must be smaller than the radius of curvature of valleys, and edges and faces
-    between corners are not looked at. The lowest point of a rim is that of the plane below its centre.
+    normal, and upright; between, the lowest point moves from the rim to the axis, by up to 2e-4 of the radius above the rim.
+    On uneven ground (`HeightField`) gaps have the sign and the rates of the distance, and differ from it by their square times
+    the curvature. Spheres, capsules and ellipsoids must be smaller there than the radius of curvature of valleys, and edges and
+    faces between corners are not looked at. The lowest point of a rim is that of the plane below its centre.
 
     A sphere also touches a `Sphere`, a `Capsule` or a `Box` in its closest point. There the gap has kinks where that
     point is not unique (inside a box between faces; at the centre of a sphere and on the axis of a capsule, where the normal is

@@ -20,7 +20,7 @@ from jaxdyn.lie.so3 import matmul
 from jaxdyn.model.arguments import Numbers
 from jaxdyn.model.numbers import as_float, as_number
 
-# Below this sine of its tilt, the lowest point of a cylinder moves from the rim to the axis, into the end face by this share of it.
+# Below this sine of its tilt, the lowest point of a cylinder moves from the rim to the axis, and inwards by this share of it.
 UPRIGHT, RECESS = 1e-3, 0.1
 
 
