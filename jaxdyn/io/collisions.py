@@ -37,13 +37,14 @@ class Collision(NamedTuple):
     key: Any = None
 
 
-def check_choice(contacts: Any) -> None:
+def check_choice(contacts: Any) -> str | tuple[str, ...] | None:
     """Check the option `contacts` of a reader. **Raises:** ValueError."""
-    if contacts is None or contacts == "ground":
-        return
-    names = isinstance(contacts, Iterable) and not isinstance(contacts, (str, dict))
-    if not names or not all(isinstance(name, str) for name in contacts):
+    if contacts is None or (isinstance(contacts, str) and contacts == "ground"):
+        return contacts
+    names = tuple(contacts) if isinstance(contacts, Iterable) and not isinstance(contacts, (str, dict)) else (None,)
+    if not all(isinstance(name, str) for name in names):
         raise ValueError(f"contacts is {contacts!r}; give 'ground', a list of names of links that touch it, or None")
+    return names  # pyright: ignore[reportReturnType]
 
 
 def contacts_with_ground(
@@ -96,7 +97,14 @@ def contacts_with_ground(
                 one.frame, shape, one.pose, on=on, friction=friction, name=names.new(name), **options
             )
             taken.add(one.frame)
-    return made, [*summarize("collision shapes without contacts", left), *summarize("hulls of meshes", hulls)], taken
+    return (
+        made,
+        [
+            *summarize("collision shapes without contacts", list(dict.fromkeys(left))),
+            *summarize("hulls of meshes", hulls),
+        ],
+        taken,
+    )
 
 
 def collision_of(element: Element, friction: float) -> list[Collision]:

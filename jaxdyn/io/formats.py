@@ -89,7 +89,7 @@ def load(
     if not path.suffix and not path.exists():
         # A file without a suffix takes precedence over a robot of that name.
         path = find_description(str(source))
-    check_choice(contacts)
+    contacts = check_choice(contacts)
     # The suffix or the root element decides, because URDF, MJCF and SDF all occur as .xml.
     kind = format_of(path)
     if kind == "urdf":

@@ -82,7 +82,7 @@ def load_mjcf(
     compiled; for a joint that moves no inertia. ImportError without mujoco.
     """
     mujoco = import_mujoco()
-    check_choice(contacts)
+    contacts = check_choice(contacts)
     given = str(as_path(path))
     m, missing = compile_file(mujoco, given)
     file = assign_names(mujoco, m, given)

@@ -81,7 +81,7 @@ def load_sdf(
     another version, unknown names or types, reserved names, a part that is given twice, cyclic poses, bad numbers, an inertia
     that is to be computed from shapes, or whose pose is relative to another frame; for a joint that moves no inertia.
     """
-    check_choice(contacts)
+    contacts = check_choice(contacts)
     file = SdfFile(path)
     joints = read_joints(file)
     # A gearbox couples two other joints; as an edge of the graph it would close a loop that does not exist.

@@ -8,6 +8,7 @@ import pytest
 from scipy.optimize import minimize
 from scipy.spatial.transform import Rotation
 
+import jaxdyn as jd
 from jaxdyn.contact import Box, Capsule, ConvexHull, Cylinder, Ellipsoid, HeightField, Plane, Sphere, shape_contacts
 from jaxdyn.contact.shapes import UPRIGHT
 from jaxdyn.lie import so3
@@ -284,6 +285,7 @@ PLACES = [
 ]
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("case", PLACES, ids=[case[0] for case in PLACES])
 def test_derivatives_are_finite_in_singular_places(case):
     """Gaps, normals and slip directions, with first and second derivatives; the gap of a box is exact on its faces."""
