@@ -24,10 +24,10 @@ TETRAHEDRON = np.array([[0, 0, 0], [0.1, 0, 0], [0, 0.2, 0], [0, 0, 0.3]])
 OBJ = "".join(f"v {x} {y} {z}\n" for x, y, z in TETRAHEDRON) + "f 1 3 2\nf 1 2 4\nf 2 3 4\nf 3 1 4\n"
 
 
-def load(path, *, quiet=False, **options):
-    """Load a file; with `quiet`, without any warning."""
+def load(path, **options):
+    """Load a file without warnings."""
     with warnings.catch_warnings():
-        warnings.simplefilter("error" if quiet else "ignore")
+        warnings.simplefilter("ignore")
         return jd.load(path, **options)
 
 
@@ -159,6 +159,8 @@ def test_sdf_shapes_touch_a_plane(tmp_path):
         assert words in lines
     assert "<collision> of links" not in lines
     assert "<collision> of links: floor::slab, m::b" in "; ".join(load(path).not_taken)
+    with pytest.warns(jd.io.NotTakenWarning, match="cone"):
+        assert len(touching_of(jd.io.load_sdf(path, contacts=["m::b"]))) == 20
 
 
 MJCF = """<mujoco><asset><mesh name="t" vertex="0 0 0  0.1 0 0  0 0.2 0  0 0 0.3"/>
@@ -209,7 +211,8 @@ def test_mjcf_geoms_touch_a_plane(tmp_path):
         np.testing.assert_allclose(ours[k], theirs[g], atol=1e-7 if g == 5 else 1e-10)  # meshes are in float32
     rules = '<contact><pair geom1="floor" geom2="ball" friction="0.3 0.3 0 0 0"/><exclude body1="world" body2="d"/></contact>'
     path.write_text(MJCF.format(ground=FLOOR, more=rules))
-    touching = touching_of(load(path, contacts=["c", "d"]))
+    with pytest.warns(jd.io.NotTakenWarning, match=r"collision shapes without contacts: world \(fixed\)"):
+        touching = touching_of(jd.io.load_mjcf(path, contacts=["c", "d"]))
     assert set(touching) == {"c"} and float(touching["c"].coefficient) == 0.3
 
 
