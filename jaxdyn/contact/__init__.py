@@ -15,6 +15,7 @@ from jaxdyn.contact.contact_equations import relative_pose as relative_pose
 from jaxdyn.contact.coordinates import contact_coordinates as contact_coordinates
 from jaxdyn.contact.forces import ContactForces as ContactForces
 from jaxdyn.contact.forces import contact_forces as contact_forces
+from jaxdyn.contact.height_field import HeightField as HeightField
 from jaxdyn.contact.kinds import wrench_basis as wrench_basis
 from jaxdyn.contact.optimal import optimal_forces as optimal_forces
 from jaxdyn.contact.qp import QPSolution as QPSolution
@@ -22,6 +23,10 @@ from jaxdyn.contact.qp import solve_qp as solve_qp
 from jaxdyn.contact.rolling import RollingContact as RollingContact
 from jaxdyn.contact.rolling import rolling_contact as rolling_contact
 from jaxdyn.contact.rolling_model import RollingModel as RollingModel
+from jaxdyn.contact.shape_contacts import shape_contacts as shape_contacts
+from jaxdyn.contact.shapes import Box as Box
+from jaxdyn.contact.shapes import Capsule as Capsule
+from jaxdyn.contact.shapes import ConvexHull as ConvexHull
 from jaxdyn.contact.surfaces import Cylinder as Cylinder
 from jaxdyn.contact.surfaces import Ellipsoid as Ellipsoid
 from jaxdyn.contact.surfaces import Parametrised as Parametrised
@@ -38,13 +43,17 @@ from jaxdyn.contact.wrench_cones import wrench_cone as wrench_cone
 from jaxdyn.contact.wrench_cones import wrench_cone_of_polygon as wrench_cone_of_polygon
 
 __all__ = [
+    "Box",
+    "Capsule",
     "ContactForces",
     "ContactKinematics",
+    "ConvexHull",
     "Cylinder",
     "DryFriction",
     "Ellipsoid",
     "ForceClosure",
     "FrictionCone",
+    "HeightField",
     "Parametrised",
     "Plane",
     "QPSolution",
@@ -64,6 +73,7 @@ __all__ = [
     "optimal_forces",
     "relative_pose",
     "rolling_contact",
+    "shape_contacts",
     "solve_qp",
     "surface_cone",
     "surface_geometry",

@@ -186,13 +186,23 @@ class Cylinder(Surface):
 
     $$f(u, v) = (R \cos u, R \sin u, v), \quad K = \operatorname{diag}(1 / R, 0), \quad T = 0$$
 
-    **Arguments:** `radius`: m. **Raises:** ValueError for a radius that is not positive.
+    **Arguments:** `radius`: m. `length`: m, from face to face, with the origin in the middle; None for one without ends.
+
+    **Raises:** ValueError for a radius or a length that is not positive.
     """
 
     radius: Float[Array, ""]
+    length: Float[Array, ""] | None
 
-    def __init__(self, radius: Numbers):
+    def __init__(self, radius: Numbers, length: Numbers | None = None):
         self.radius = as_number(radius, "radius", "m")
+        self.length = None if length is None else as_number(length, "length", "m")
+
+    def chart_margin(self, alpha: Float[Array, "2"]) -> Float[Array, ""]:
+        """Distance of v from the nearer end, m; infinite without ends."""
+        if self.length is None:
+            return super().chart_margin(alpha)
+        return 0.5 * self.length.astype(alpha.dtype) - jnp.abs(alpha[1])
 
     def point(self, alpha: Float[Array, "2"]) -> Float[Array, "3"]:
         """Point (R cos u, R sin u, v), m."""

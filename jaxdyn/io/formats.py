@@ -12,9 +12,11 @@ import numpy as np
 
 from jaxdyn.constraints.loops import model_couplings
 from jaxdyn.forces.elements import CoulombFriction, JointDamping
-from jaxdyn.io.loaded import LoadedScene, Start, warn_not_taken
+from jaxdyn.io.collisions import FRICTION, check_choice, collision_of, contacts_with_ground
+from jaxdyn.io.loaded import LoadedScene, Start, summarize, warn_not_taken
 from jaxdyn.io.mjcf import load_mjcf
 from jaxdyn.io.sdf import load_sdf
+from jaxdyn.io.solids import urdf_elements
 from jaxdyn.io.urdf import urdf_model
 from jaxdyn.io.urdf_loops import loop_constraints, motors_of, plugin_followers, read_closures
 from jaxdyn.io.urdf_parts import elements_without_effect
@@ -22,6 +24,7 @@ from jaxdyn.io.xml_lines import XmlFile
 from jaxdyn.model.arguments import Checked, DType, FilePath, Numbers, as_path
 from jaxdyn.model.builder import GRAVITY
 from jaxdyn.model.configuration import neutral
+from jaxdyn.model.tree import Model
 
 _BY_SUFFIX = {".urdf": "urdf", ".xacro": "urdf", ".sdf": "sdf", ".world": "sdf", ".mjcf": "mjcf"}
 _BY_ROOT = {"robot": "urdf", "sdf": "sdf", "gazebo": "sdf", "mujoco": "mjcf", "mujocoinclude": "mjcf"}
@@ -36,6 +39,7 @@ def load(
     gravity: Numbers | None = GRAVITY,
     loops: str | os.PathLike | bool | None = None,
     missing_inertia: Numbers | None = None,
+    contacts: Checked[str | Iterable[str] | None] = None,
     arguments: Mapping[str, Any] | None = None,
     packages: Mapping[str, str | os.PathLike] | None = None,
     dtype: DType | None = None,
@@ -60,6 +64,12 @@ def load(
       mimic a joint count too. "ignore" loads files whose joints follow missing ones.
     - `loops`: the YAML file of a URDF's loops. None: the one with the URDF's name in its folder, if there is one;
       False: no YAML file.
+    - `contacts`: "ground" for unilateral contacts of the collision shapes of all moving links with the ground, or a list of the
+      links that touch it, as ["LF_FOOT", "RF_FOOT"]; None for none. They are `jd.contact.shape_contacts`, named by their link, in
+      `.forces`. The ground is the file's planes and height fields that are fixed to the world, else the plane z = 0; URDF
+      has none. A mesh counts by at most 12 vertices of its convex hull. Coefficients of friction are those of the file; in a URDF
+      `<mu1>` in the `<gazebo>` element of the link or `<lateral_friction>` in its `<contact>`, and 1 without.
+      Steps take time with the number of contacts squared, and minutes to compile for more than some ten: name the feet.
     - `arguments`: of the `<xacro:arg>` elements of a file whose name ends in .xacro, {"prefix": "left_"}. The package xacro
       expands it to a URDF; lines in errors are those of the expanded text.
     - `dtype`: as for `ModelBuilder`.
@@ -79,6 +89,7 @@ def load(
     if not path.suffix and not path.exists():
         # A file without a suffix takes precedence over a robot of that name.
         path = find_description(str(source))
+    contacts = check_choice(contacts)
     # The suffix or the root element decides, because URDF, MJCF and SDF all occur as .xml.
     kind = format_of(path)
     if kind == "urdf":
@@ -90,6 +101,7 @@ def load(
             gravity=gravity,
             missing_inertia=missing_inertia,
             loops=loops,
+            contacts=contacts,
             dtype=dtype,
         )
     if loops is not None:
@@ -110,9 +122,9 @@ def load(
             raise ValueError(
                 f"floating_base is {floating_base}, but {path} is MJCF, which states it by <freejoint>; leave it out"
             )
-        return load_mjcf(path, dtype=dtype)
+        return load_mjcf(path, contacts=contacts, dtype=dtype)
     # None means the default of the format, which is a free base in SDF and a fixed one in URDF.
-    return load_sdf(path, floating_base=floating_base is not False, dtype=dtype)
+    return load_sdf(path, floating_base=floating_base is not False, contacts=contacts, dtype=dtype)
 
 
 def _urdf_scene(
@@ -124,6 +136,7 @@ def _urdf_scene(
     gravity: Numbers | None,
     missing_inertia: Numbers | None,
     loops: Checked[FilePath | bool | None],
+    contacts: Checked[str | Iterable[str] | None],
     dtype: DType | None,
 ) -> LoadedScene:
     closures = read_closures(file.source, loops)
@@ -143,18 +156,41 @@ def _urdf_scene(
         missing_inertia=missing_inertia,
     )
     rows, not_taken = loop_constraints(closures, file, model)
-    not_taken = [*not_taken, *elements_without_effect(file)]
+    touching, apart = ([], []) if contacts is None else _contacts(file, model, contacts)
+    not_taken = [*not_taken, *elements_without_effect(file), *apart]
     warn_not_taken(file.path, not_taken)
     # Zeros in <dynamics> are common; a force of zeros would be compiled and evaluated in every step.
     forces: list = []
     for leaf, force in ((model.damping, JointDamping), (model.friction, CoulombFriction)):
         if leaf is not None and np.any(np.asarray(leaf) != 0):
             forces.append(force(leaf))
+    forces += touching
     starts = {"reference": Start(neutral(model), jnp.zeros((model.nv,), model.home.dtype))}
     drives = motors_of(closures, model)
     # Mimicked joints precede the loops, so that row indices of the couplings do not depend on the YAML file.
     rows = [*model_couplings(model), *rows]
     return LoadedScene(model, rows, forces, starts=starts, actuators=drives, not_taken=not_taken)
+
+
+def _contacts(file: XmlFile, model: Model, contacts) -> tuple[list, list[str]]:
+    """Contacts of a URDF with the plane z = 0, and descriptions of what is left out."""
+    friction: dict[str, float] = {}
+    for link in file.root.findall("link"):
+        part = link.find("contact/lateral_friction")
+        if part is not None:
+            friction[str(link.get("name"))] = float(file.numbers(part, 1, "a link", "value")[0])
+    for extension in file.root.findall("gazebo"):
+        # Gazebo's own element has priority, as it is made for the file's simulator.
+        if (link := extension.get("reference")) and extension.find("mu1") is not None:
+            friction[link] = file.number(extension, "mu1", FRICTION, "a link")
+    missing: list[str] = []
+    collisions = [
+        one
+        for element in urdf_elements(file, "collision", missing)
+        for one in collision_of(element, friction.get(element.frame, FRICTION))
+    ]
+    made, left, _ = contacts_with_ground(model, collisions, contacts)
+    return made, [*left, *summarize("collisions", missing)]
 
 
 def format_of(path: pathlib.Path) -> str:

@@ -7,6 +7,7 @@ reference `qpos0` there, the coordinate of the file's placement, which the home 
 """
 
 import os
+from collections.abc import Iterable
 from typing import Any
 
 import jax.numpy as jnp
@@ -14,7 +15,9 @@ import numpy as np
 
 from jaxdyn.forces.elements import CoulombFriction, JointDamping, JointSpring
 from jaxdyn.io.chains import Link, Names, add_chain, build_model
+from jaxdyn.io.collisions import check_choice
 from jaxdyn.io.loaded import LoadedScene, Start, summarize, warn_not_taken, warn_of_units
+from jaxdyn.io.mjcf_contacts import contacts_of
 from jaxdyn.io.mjcf_file import (
     BALL,
     FREE,
@@ -31,13 +34,15 @@ from jaxdyn.io.mjcf_parts import actuators, constraints, tendon_forces
 from jaxdyn.io.mjcf_sensors import sensors
 from jaxdyn.io.xml_lines import LARGEST_ROUNDING, XmlFile, rounding_of_digits
 from jaxdyn.model import host_math
-from jaxdyn.model.arguments import DType, as_path
+from jaxdyn.model.arguments import Checked, DType, as_path
 from jaxdyn.model.builder import ModelBuilder
 from jaxdyn.model.joints import joint_neutral
 from jaxdyn.model.tree import Model
 
 
-def load_mjcf(path: str | os.PathLike, *, dtype: DType | None = None) -> LoadedScene:
+def load_mjcf(
+    path: str | os.PathLike, *, contacts: Checked[str | Iterable[str] | None] = None, dtype: DType | None = None
+) -> LoadedScene:
     """Load the scene of an MJCF file (MuJoCo's XML), compiled by the mujoco package.
 
     Supported are bodies with their inertias, joints (hinge, slide, ball, free; several on one body become a chain of
@@ -55,14 +60,21 @@ def load_mjcf(path: str | os.PathLike, *, dtype: DType | None = None) -> LoadedS
     Coordinates: hinge and slide have MuJoCo's numbers; ball and free joints have MuJoCo's configuration (a free body's q
     is its pose in the world), and velocities in body axes. Joints stand depth-first, siblings by name, as everywhere.
 
-    **Arguments:** `path`, the file; `dtype`, as for `ModelBuilder`.
+    **Arguments:**
+
+    - `path`: the file.
+    - `contacts`: "ground" for contacts of the collision geoms of all bodies with the planes and height fields that are fixed to
+      the world (with the plane z = 0 where there are none), or a list of the bodies that touch it, as for `jd.load`. Bits
+      (contype, conaffinity), pairs and exclusions of the file decide which of them touch; the coefficient of friction is the
+      larger one, that of the higher priority, or that of the pair, and zero for condim 1. Softness is not read. None: none.
+    - `dtype`: as for `ModelBuilder`.
 
     **Returns:** `LoadedScene`: `.system`, `.constraints`, `.forces` (springs, damping, and dry friction smoothed at
     0.01 rad/s, `CoulombFriction`), `.starts` ("reference" is MuJoCo's qpos0), `.actuators`, `.sensors` (a tuple for
     `jd.sensors.measure`), `.not_taken`.
 
-    **Warns:** `NotTakenWarning` naming unsupported elements: contact geometry, muscles, DC motors and user-defined
-    actuators, spatial tendons, flexible bodies, fluid forces, gravity compensation, missing mesh files, and the like.
+    **Warns:** `NotTakenWarning` naming unsupported elements: contact geometry without contacts, muscles, DC motors and
+    user-defined actuators, spatial tendons, flexible bodies, fluid forces, gravity compensation, missing mesh files, and more.
 
     `UnitsWarning` where limits look like degrees, or lengths and inertias like millimetres.
 
@@ -70,6 +82,7 @@ def load_mjcf(path: str | os.PathLike, *, dtype: DType | None = None) -> LoadedS
     compiled; for a joint that moves no inertia. ImportError without mujoco.
     """
     mujoco = import_mujoco()
+    contacts = check_choice(contacts)
     given = str(as_path(path))
     m, missing = compile_file(mujoco, given)
     file = assign_names(mujoco, m, given)
@@ -77,11 +90,12 @@ def load_mjcf(path: str | os.PathLike, *, dtype: DType | None = None) -> LoadedS
     rows, left = constraints(file, model)
     tendons, also = tendon_forces(file, model)
     drives, idle = actuators(file, model)
-    readings, unread = sensors(file, model)
-    not_taken = (*missing, *left, *also, *idle, *_elements_without_effect(file), *unread)
+    touching, apart, taken = contacts_of(file, model, contacts, bool(missing))
+    readings, unread = sensors(file, model, taken)
+    not_taken = (*missing, *left, *also, *idle, *_elements_without_effect(file, taken), *apart, *unread)
     warn_not_taken(path, not_taken)
     warn_of_units(path, model)
-    forces = (*_joint_forces(file, model), *tendons)
+    forces = (*_joint_forces(file, model), *tendons, *touching)
     starts = _starts(file, model, drives)
     return LoadedScene(model, rows, forces, starts=starts, actuators=drives, not_taken=not_taken, sensors=readings)
 
@@ -230,8 +244,11 @@ def _state(file: CompiledFile, model: Model, qpos, qvel) -> tuple[np.ndarray, np
     return q, v
 
 
-def _elements_without_effect(file: CompiledFile) -> list[str]:
-    """Elements of the file that the scene does not represent, apart from constraints, tendons and actuators."""
+def _elements_without_effect(file: CompiledFile, taken: set[str]) -> list[str]:
+    """Elements of the file that the scene does not represent, apart from constraints, tendons and actuators.
+
+    `taken`: bodies with contacts.
+    """
     m, mujoco = file.m, file.mujoco
     free = [file.joints[j] for j in range(m.njnt) if m.jnt_type[j] == FREE]
 
@@ -245,7 +262,8 @@ def _elements_without_effect(file: CompiledFile) -> list[str]:
     # Geoms without contype and conaffinity are visual and touch nothing unless a pair names them.
     touching = {m.geom_bodyid[g] for g in range(m.ngeom) if m.geom_contype[g] or m.geom_conaffinity[g]}
     touching |= {m.geom_bodyid[g] for pair in (m.pair_geom1, m.pair_geom2) for g in pair}
-    names = [file.bodies[b] or "world" for b in sorted(touching)] if not file.off("CONTACT") else []
+    names = [file.bodies[b] or "world" for b in sorted(touching) if not taken or file.bodies[b] is not None]
+    names = [name for name in names if name not in taken] if not file.off("CONTACT") else []
     fluid = [key for key in ("density", "viscosity") if getattr(m.opt, key)]
     flexes = [mujoco.mj_id2name(m, mujoco.mjtObj.mjOBJ_FLEX, i) or f"flex{i}" for i in range(m.nflex)]
     return [

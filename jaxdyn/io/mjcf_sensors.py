@@ -1,4 +1,4 @@
-"""Sensors of MJCF files: those on frames and joints, and force and torque at a site."""
+"""Sensors of MJCF files: those on frames and joints, force and torque at a site, and touch."""
 
 from typing import Any
 
@@ -19,6 +19,7 @@ from jaxdyn.sensors import (
     Noise,
     Sensor,
     Tachometer,
+    Touch,
     Velocimeter,
 )
 
@@ -36,17 +37,22 @@ _ON_JOINTS = {"JOINTPOS": Encoder, "BALLQUAT": Encoder, "JOINTVEL": Tachometer, 
 _WRENCHES = {"FORCE": "force", "TORQUE": "torque"}
 
 
-def sensors(file: CompiledFile, model: Model) -> tuple[tuple[Sensor, ...], list[str]]:
-    """The sensors of a file, and descriptions of those that are not taken."""
+def sensors(file: CompiledFile, model: Model, touching: set[str]) -> tuple[tuple[Sensor, ...], list[str]]:
+    """The sensors of a file, and descriptions of those that are not taken; `touching`: bodies with contacts."""
     m, mujoco = file.m, file.mujoco
-    taken, left, clipped, sampled = [], [], [], []
+    taken, left, clipped, sampled, touch = [], [], [], [], []
     for i in range(m.nsensor):
         name = mujoco.mj_id2name(m, mujoco.mjtObj.mjOBJ_SENSOR, i) or f"sensor{i}"
         kind = mujoco.mjtSensor(int(m.sensor_type[i])).name.removeprefix("mjSENS_")
         # Older releases of mujoco have no delay of sensors.
         late = getattr(m, "sensor_delay", np.zeros(m.nsensor))[i]
         noise = Noise(float(m.sensor_noise[i])) if m.sensor_noise[i] > 0 else None
-        sensor = _sensor(file, model, i, kind, {"name": name, "noise": noise, "delay": float(max(late, 0.0))})
+        options: dict = {"name": name, "noise": noise, "delay": float(max(late, 0.0))}
+        sensor = _sensor(file, model, i, kind, options)
+        if kind == "TOUCH" and file.bodies[m.site_bodyid[m.sensor_objid[i]]] in touching:
+            # All contacts of the body count, wherever they are.
+            sensor = Touch(file.sites[m.sensor_objid[i]], **options)
+            touch.append(name)
         if sensor is None:
             left.append(name)
             continue
@@ -57,6 +63,7 @@ def sensors(file: CompiledFile, model: Model) -> tuple[tuple[Sensor, ...], list[
         if getattr(m, "sensor_interval", np.zeros((m.nsensor, 1)))[i].any():
             sampled.append(name)
     more = [*summarize("cutoff of sensors", clipped), *summarize("interval of sensors", sampled)]
+    more += summarize("volume of touch sensors", touch)
     return tuple(taken), [*summarize("sensors", left), *more]
 
 

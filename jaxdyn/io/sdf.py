@@ -10,14 +10,16 @@ from jaxdyn.constraints.base import Constraint
 from jaxdyn.constraints.loops import gear, lock_joint, loop
 from jaxdyn.forces.elements import CoulombFriction, JointDamping, JointSpring
 from jaxdyn.io.chains import Link, Names, add_chain, build_model
+from jaxdyn.io.collisions import FRICTION, check_choice, collision_of, contacts_with_ground
 from jaxdyn.io.loaded import LoadedScene, Start, summarize, warn_not_taken, warn_of_units
 from jaxdyn.io.sdf_frames import SdfFile
 from jaxdyn.io.sdf_joints import LOOPS, Axis, Edge, Joint, read_joints, spanning_tree
+from jaxdyn.io.solids import sdf_elements
 from jaxdyn.io.unread import SDF_FRAME, SDF_JOINT, SDF_LINK, SDF_MODEL, SDF_ROOT, SDF_WORLD, unread_parts
 from jaxdyn.io.urdf import ROOT_JOINT
 from jaxdyn.io.xml_lines import rounding_of_digits
 from jaxdyn.model import host_math
-from jaxdyn.model.arguments import DType
+from jaxdyn.model.arguments import Checked, DType
 from jaxdyn.model.builder import GRAVITY, ModelBuilder
 from jaxdyn.model.joints import joint_neutral
 from jaxdyn.model.topology import body_index
@@ -30,7 +32,13 @@ _PARALLEL = 1e-4  # files give right angles with four or five digits
 _MIMIC = (("multiplier", 1.0), ("offset", 0.0), ("reference", 0.0))
 
 
-def load_sdf(path: str | os.PathLike, *, floating_base: bool = True, dtype: DType | None = None) -> LoadedScene:
+def load_sdf(
+    path: str | os.PathLike,
+    *,
+    floating_base: bool = True,
+    contacts: Checked[str | Iterable[str] | None] = None,
+    dtype: DType | None = None,
+) -> LoadedScene:
     """Load the scene of an SDF file, with its loops. Meshes are not read, and no other package is needed.
 
     Supported are links with their inertias, all joints (of two axes as two joints, JOINT and JOINT_axis2), limits (as the
@@ -52,6 +60,9 @@ def load_sdf(path: str | os.PathLike, *, floating_base: bool = True, dtype: DTyp
     - `path`: the file.
     - `floating_base`: whether parts without a joint to the world move freely, the default of the format; False fixes the root
       links at the file's placement. The root of a part is its model's canonical link.
+    - `contacts`: "ground" for contacts of the collisions of all links with the planes of static models (with the plane z = 0
+      where there are none), or a list of the links that touch it, as for `jd.load`. The coefficient of friction is the smaller
+      `<mu>` in `<surface><friction><ode>` of both, by default 1, as Gazebo takes it. None: no contacts.
     - `dtype`: as for `ModelBuilder`.
 
     **Returns:** `LoadedScene`: `.system`, `.constraints`, `.forces` (springs, damping, and dry friction smoothed at
@@ -59,7 +70,7 @@ def load_sdf(path: str | os.PathLike, *, floating_base: bool = True, dtype: DTyp
     `.actuators` (None), `.not_taken`. Gravity is that of the file's world (its default is 9.8 m/s^2), 9.81 m/s^2
     downwards where the file has no world.
 
-    **Warns:** `NotTakenWarning` naming unsupported elements: collisions, sensors, plugins, includes, screws that
+    **Warns:** `NotTakenWarning` naming unsupported elements: collisions without contacts, sensors, plugins, includes, screws that
     close loops, springs and damping of joints that close loops, and the like.
 
     Elements and attributes that the format does not have are named too.
@@ -70,6 +81,7 @@ def load_sdf(path: str | os.PathLike, *, floating_base: bool = True, dtype: DTyp
     another version, unknown names or types, reserved names, a part that is given twice, cyclic poses, bad numbers, an inertia
     that is to be computed from shapes, or whose pose is relative to another frame; for a joint that moves no inertia.
     """
+    contacts = check_choice(contacts)
     file = SdfFile(path)
     joints = read_joints(file)
     # A gearbox couples two other joints; as an edge of the graph it would close a loop that does not exist.
@@ -83,11 +95,13 @@ def load_sdf(path: str | os.PathLike, *, floating_base: bool = True, dtype: DTyp
     loops, left = _loops(file, model, cut)
     # Joints that were cut have no coordinate, so couplings are looked up among those of the tree.
     couplings, also = _couplings(file, joints, tree)
-    not_taken = (*left, *also, *_elements_without_effect(file))
+    touching, apart, taken = ([], [], set()) if contacts is None else _contacts(file, model, contacts)
+    not_taken = (*left, *also, *_elements_without_effect(file, taken), *apart)
     warn_not_taken(path, not_taken)
     warn_of_units(path, model)
     starts = {"reference": _start(file, model, roots)}
-    return LoadedScene(model, [*loops, *couplings], _forces(model, tree), starts=starts, not_taken=not_taken)
+    forces = [*_forces(model, tree), *touching]
+    return LoadedScene(model, [*loops, *couplings], forces, starts=starts, not_taken=not_taken)
 
 
 def _model(file: SdfFile, edges: list[Edge], static: set[str], floating: bool, dtype) -> tuple[Model, dict[str, str]]:
@@ -325,14 +339,37 @@ def _start(file: SdfFile, model: Model, roots: dict[str, str]) -> Start:
     return Start(jnp.asarray(q, model.home.dtype), jnp.zeros(model.nv, model.home.dtype))
 
 
-def _elements_without_effect(file: SdfFile) -> list[str]:
-    """Elements of the file that the scene does not represent."""
+def _contacts(file: SdfFile, model: Model, contacts) -> tuple[list, list[str], set[str]]:
+    """Contacts with the ground, descriptions of what is left out, and the links that have contacts."""
+    missing: list[str] = []
+    collisions, uneven, bouncing = [], [], []
+    for element in sdf_elements(file, "collision", missing):
+        what = f"<collision> of link {element.frame!r}"
+        friction = element.xml.find("surface/friction/ode")
+        mu = file.number(friction, "mu", FRICTION, what)
+        uneven += [element.frame] * (file.number(friction, "mu2", mu, what) != mu)
+        bounce = file.number(element.xml, "surface/bounce/restitution_coefficient", 0.0, what)
+        bouncing += [element.frame] * (bounce != 0)
+        collisions += collision_of(element, mu)
+    made, left, taken = contacts_with_ground(model, collisions, contacts)
+    left += summarize("friction of collisions in a second direction", [x for x in dict.fromkeys(uneven) if x in taken])
+    left += summarize("restitution of collisions", [x for x in dict.fromkeys(bouncing) if x in taken])
+    return made, [*left, *summarize("collisions", missing)], taken
+
+
+def _elements_without_effect(file: SdfFile, taken: set[str]) -> list[str]:
+    """Elements of the file that the scene does not represent; `taken`: links with contacts."""
     elements = [(element, name, SDF_LINK) for name, (element, _) in file.links.items()]
     elements += [(element, name, SDF_JOINT) for name, (element, _) in file.joints.items()]
     elements += [(element, name, SDF_FRAME) for name, (element, _) in file.frames.items()]
     elements += [(scope.element, scope.element.get("name") or name, SDF_MODEL) for name, scope in file.models.items()]
     elements += [] if file.world is None else [(file.world, file.world.get("name") or "world", SDF_WORLD)]
     elements += [(file.root, os.path.basename(file.path), SDF_ROOT)]
-    lines = [line for reason, names in unread_parts(file, elements).items() for line in summarize(reason, names)]
+    unread = unread_parts(file, elements)
+    grounds = {name for name, (_, scope) in file.links.items() if scope.static} if taken else set()
+    unread["<collision> of links"] = [
+        name for name in unread.get("<collision> of links", ()) if name not in taken and name not in grounds
+    ]
+    lines = [line for reason, names in unread.items() for line in summarize(reason, names)]
     lines += summarize("links with the reserved name of the world, which they stand for", file.of_world)
     return [*lines, *summarize("includes", file.includes)]

@@ -17,6 +17,7 @@ from jaxdyn.sensors.joints import ContactForce as ContactForce
 from jaxdyn.sensors.joints import Encoder as Encoder
 from jaxdyn.sensors.joints import ForceTorque as ForceTorque
 from jaxdyn.sensors.joints import Tachometer as Tachometer
+from jaxdyn.sensors.joints import Touch as Touch
 from jaxdyn.sensors.records import record as record
 
 __all__ = [
@@ -32,6 +33,7 @@ __all__ = [
     "Noise",
     "Sensor",
     "Tachometer",
+    "Touch",
     "Velocimeter",
     "measure",
     "record",

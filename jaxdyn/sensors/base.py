@@ -9,8 +9,10 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from jaxdyn.constraints.base import layout
+from jaxdyn.constraints.base import constraint_jacobian, layout
 from jaxdyn.constraints.dynamics import constrained_dynamics
+from jaxdyn.contact.unilateral import UnilateralContact
+from jaxdyn.lie.so3 import matmul
 from jaxdyn.model.arguments import (
     Checked,
     DType,
@@ -173,6 +175,7 @@ def measure(
     t: Numbers = 0.0,
     *,
     thrusts: Mapping[str, Numbers] | None = None,
+    contacts: Mapping[str, Numbers] | None = None,
 ) -> dict[str, Float[Array, " k"]]:
     """Readings of sensors at one instant, without errors and delay, in steps of their resolution.
 
@@ -181,7 +184,9 @@ def measure(
     **Arguments:** `scene` of a `Model`; `sensors`, a list; `q` (nq,); `v` (nv,); `tau` (nv,), N m or N (None: zero); `t`, s;
     `thrusts`: wrenches (f, tau) (6,) by the names of frames, at their origins and in their axes, whose generalised force is a
     part of `tau`, as of propellers (`scene.actuators.thrusts` of an MJCF file). `ForceTorque` feels them where they act; all of
-    `tau` acts in the joints without them.
+    `tau` acts in the joints without them. `contacts`: of a scene with unilateral contacts, their forces by name, N: the normal
+    force, then friction, as `ContactStep.forces`. Sensors feel them as those of constraints, and `ContactForce` and `Touch` read
+    them.
 
     **Returns:** readings (k,) by the sensors' names, in SI units.
 
@@ -196,9 +201,49 @@ def measure(
     sensors = check_sensors(scene, sensors)
     q, v, tau, t = check_state(scene.system, q=q, v=v, tau=zeros_if_none(tau, scene.nv), t=t)
     thrusts = check_thrusts(scene, thrusts, (6,), q.dtype)
+    return readings_of(sensors, motion_at(scene, q, v, tau, t, thrusts, check_contacts(scene, contacts, (), q.dtype)))
+
+
+def motion_at(scene: Scene, q, v, tau, t, thrusts, forces: Array) -> Motion:
+    """Motion of a scene under torques and the forces of its contacts, stacked.
+
+    Its scene has the rows of the contacts behind its own.
+    """
     # Solved once for all sensors: accelerations and multipliers belong to the same motion.
-    dynamics = constrained_dynamics(scene, q, v, tau, t)
-    return readings_of(sensors, Motion(scene, q, v, dynamics.acceleration, dynamics.multipliers, t, thrusts))
+    touching = [force.contact for force in scene.forces if isinstance(force, UnilateralContact)]
+    if not touching:
+        dynamics = constrained_dynamics(scene, q, v, tau, t)
+        return Motion(scene, q, v, dynamics.acceleration, dynamics.multipliers, t, thrusts)
+    smooth = tuple(force for force in scene.forces if not isinstance(force, UnilateralContact))
+    rows = constraint_jacobian(Scene(scene.system, touching), q, t)
+    dynamics = constrained_dynamics(Scene(scene.system, scene.constraints, smooth), q, v, tau + matmul(forces, rows), t)
+    multipliers = jnp.concatenate([dynamics.multipliers, forces])
+    return Motion(with_contacts(scene, smooth), q, v, dynamics.acceleration, multipliers, t, thrusts)
+
+
+def with_contacts(scene: Scene, forces: Sequence = ()) -> Scene:
+    """Scene with the rows of its unilateral contacts behind its own, and other forces."""
+    touching = [force.contact for force in scene.forces if isinstance(force, UnilateralContact)]
+    return Scene(scene.system, (*scene.constraints, *touching), forces)
+
+
+def check_contacts(scene: Scene, contacts: Any, rows: tuple[int, ...], dtype) -> Array:
+    """Forces of the unilateral contacts of a scene, stacked in its order, (*rows, k); () of a scene without.
+
+    **Raises:** ValueError for contacts whose forces are missing, unknown names and shapes that do not fit.
+    """
+    touching = {force.name: force.contact for force in scene.forces if isinstance(force, UnilateralContact)}
+    given = check_mapping(contacts, "contacts", "report.forces")
+    if given.keys() != touching.keys():
+        raise ValueError(
+            f"contacts has the forces of {sorted(given)}, and the scene has the contacts {sorted(touching)}; pass the forces of "
+            "a step, contacts=report.forces of jd.stepper(scene, dt, report=True)"
+        )
+    parts = [jnp.zeros((*rows, 0), dtype)]
+    for name, contact in touching.items():
+        wanted = (*rows, sum(contact.sizes(scene.system, dtype)))
+        parts.append(as_float(given[name], f"contacts[{name!r}]", wanted, dtype))
+    return jnp.concatenate(parts, -1)
 
 
 def check_thrusts(scene: Scene, thrusts: Any, shape: tuple[int, ...], dtype: DType) -> dict[str, Array]:
@@ -217,8 +262,9 @@ def readings_of(sensors: Sequence[Sensor], motion: Motion) -> dict[str, Array]:
 def constraint_place(scene: Scene, name: str) -> slice:
     """Rows of a constraint by its name. **Raises:** ValueError for a name of none."""
     # The layout depends on structure only, so that the slice is static under tracing.
-    for place in layout(scene):
+    places = layout(with_contacts(scene))
+    for place in places:
         if place.name == name:
             return slice(place.start, place.end)
-    names = ", ".join(repr(place.name) for place in layout(scene)) or "none"
+    names = ", ".join(repr(place.name) for place in places) or "none"
     raise ValueError(f"constraint {name!r} is not in the scene; its constraints are {names}")

@@ -9,7 +9,9 @@ import numpy as np
 from jax import lax
 from jaxtyping import Array, Float
 
+from jaxdyn.constraints.base import layout
 from jaxdyn.constraints.reactions import body_wrenches_where
+from jaxdyn.constraints.rolling import Touching
 from jaxdyn.dynamics.joint_wrenches import joint_wrench
 from jaxdyn.dynamics.kinematics import named_frame
 from jaxdyn.forces.wrenches import sum_wrenches, wrenches_where
@@ -18,7 +20,7 @@ from jaxdyn.model.arguments import Numbers, check_names
 from jaxdyn.model.numbers import as_float, as_number
 from jaxdyn.model.topology import joint_index
 from jaxdyn.model.tree import Model
-from jaxdyn.sensors.base import Motion, Sensor, check_part, constraint_place
+from jaxdyn.sensors.base import Motion, Sensor, check_part, constraint_place, with_contacts
 from jaxdyn.systems.scene import Scene
 
 
@@ -224,7 +226,9 @@ def _beyond(model: Model, body: int, inertia, joints) -> tuple[Model, Array]:
 class ContactForce(Sensor):
     """Multipliers of a constraint, (n,), N along rows in m and N m along rows in rad: of a loop, a wheel, a foot on the ground.
 
-    **Arguments:** `constraint`, its name in the scene; `name`, `noise`, `delay` (s) as of `Sensor`.
+    Of a unilateral contact they are the normal force and the friction that `measure` gets as `contacts`.
+
+    **Arguments:** `constraint`, its name in the scene, or that of a contact; `name`, `noise`, `delay` (s) as of `Sensor`.
 
     ```python
     sensor = jd.sensors.ContactForce("knee")  # of jd.scenes.four_bar()
@@ -244,3 +248,49 @@ class ContactForce(Sensor):
     def read(self, motion: Motion) -> Float[Array, " n"]:
         """Multipliers of the constraint."""
         return motion.multipliers[constraint_place(motion.scene, self.constraint)]
+
+
+class Touch(Sensor):
+    """Sum of the normal forces of unilateral contacts, (1,), N: a switch or a load cell under a foot.
+
+    **Arguments:** `frame`, the name of a body or frame: all contacts on its body count that are between bodies, as those of
+    `jd.contact.ground_contact` and `jd.contact.shape_contacts`; `name`, `noise`, `delay` (s) as of `Sensor`. Forces are those
+    that `measure` gets as `contacts`.
+
+    **Raises:** (when used) ValueError for a frame without contacts.
+
+    ```python
+    sensor = jd.sensors.Touch("FL_foot")
+    ```
+    """
+
+    frame: str = eqx.field(static=True)
+
+    def default_name(self) -> str:
+        """Name "touch of FRAME"."""
+        return f"touch of {self.frame}"
+
+    def check(self, scene: Scene) -> None:
+        """Refuse a frame without contacts. **Raises:** ValueError."""
+        if not self._rows(with_contacts(scene)):
+            raise ValueError(
+                f"{self.name!r}: frame {self.frame!r} has no contacts; list some among the forces of the scene, as "
+                "jd.contact.ground_contact(frame, ...)"
+            )
+
+    def read(self, motion: Motion) -> Float[Array, "1"]:
+        """Sum of the normal forces."""
+        return jnp.sum(motion.multipliers[np.array(self._rows(motion.scene), int)])[None]
+
+    def _rows(self, scene: Scene) -> list[int]:
+        """Rows of the normals of the contacts on the frame's body."""
+        model: Any = scene.system
+        body = named_frame(model, self.frame)[0]
+        pairs = zip(scene.constraints, layout(scene), strict=True)
+        return [
+            place.start
+            for constraint, place in pairs
+            if isinstance(constraint, Touching)
+            and constraint.contact
+            and named_frame(model, constraint.body)[0] == body
+        ]

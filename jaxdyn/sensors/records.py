@@ -9,10 +9,9 @@ import numpy as np
 from jax import lax
 from jaxtyping import Array, Float
 
-from jaxdyn.constraints.dynamics import constrained_dynamics
 from jaxdyn.lie import so3
 from jaxdyn.model.arguments import Checked, Numbers, as_array, is_concrete, state_dtype
-from jaxdyn.sensors.base import Motion, Noise, Sensor, check_sensors, check_thrusts
+from jaxdyn.sensors.base import Noise, Sensor, check_contacts, check_sensors, check_thrusts, motion_at
 from jaxdyn.systems.scene import as_scene
 from jaxdyn.systems.system import SceneLike
 
@@ -26,6 +25,7 @@ def record(
     tau: Numbers | None = None,
     *,
     thrusts: Mapping[str, Numbers] | None = None,
+    contacts: Mapping[str, Numbers] | None = None,
     key: Array | None = None,
 ) -> dict[str, Float[Array, "n k"]]:
     """Readings of sensors along a motion: delayed, with noise, then in steps of their resolution.
@@ -35,8 +35,8 @@ def record(
     disturbed on the group: they stay unit quaternions, whose sign is that of the sample before.
 
     **Arguments:** `scene` of a `Model`; `sensors`, a list; `ts` (n,), s, increasing; `q` (n, nq), `v` (n, nv), `tau` (n, nv), N m
-    or N (None: zero), as of a `Solution`; `thrusts`, as of `measure`, wrenches (n, 6) by the names of frames; `key` of
-    `jax.random` for the noise, None for readings without it.
+    or N (None: zero), as of a `Solution`; `thrusts`, as of `measure`, wrenches (n, 6) by the names of frames; `contacts`, as
+    of `measure`, forces (n, k) by the names of contacts; `key` of `jax.random` for the noise, None for readings without it.
 
     **Returns:** readings (n, k) by the sensors' names.
 
@@ -65,13 +65,14 @@ def record(
 
     thrusts = check_thrusts(scene, thrusts, (count, 6), dtype)
 
-    def read(q, v, tau, t, thrusts):
+    forces = check_contacts(scene, contacts, (count,), dtype)
+
+    def read(q, v, tau, t, thrusts, forces):
         # Accelerations are solved for, and not differences of v, which would amplify its rounding.
-        dynamics = constrained_dynamics(scene, q, v, tau, t)
-        motion = Motion(scene, q, v, dynamics.acceleration, dynamics.multipliers, t, thrusts)
+        motion = motion_at(scene, q, v, tau, t, thrusts, forces)
         return [sensor.read(motion) for sensor in sensors]
 
-    readings = jax.vmap(read)(q, v, tau, ts, thrusts)
+    readings = jax.vmap(read)(q, v, tau, ts, thrusts, forces)
     for sensor, values in zip(sensors, readings, strict=True):
         if sensor.noise is not None:
             at = sensor.quaternion_start(scene)

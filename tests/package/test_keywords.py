@@ -67,6 +67,18 @@ CALLS = {
     "contact.friction_cone": (("soft-finger",), {"mu": 0.5, "gamma": 0.1}),
     "contact.gap_contact": ((lambda q, t: q[0],), {"along": lambda q, t: q[1:], "friction": 0.3, "static": 0.4}),
     "contact.ground_contact": (("a",), {"friction": 0.3, "static": 0.4, "plane_body": "b", "name": "foot"}),
+    "contact.shape_contacts": (
+        ("a", Sphere(0.1)),
+        {
+            "pose": (0, 0, 0.1),
+            "on": Plane(),
+            "surface": (0, 0, 0.1),
+            "surface_body": "b",
+            "friction": 0.3,
+            "static": 0.4,
+            "name": "foot",
+        },
+    ),
     "contact.optimal_forces": (
         (G3, jnp.ones(6), [CONE] * 3),
         {"preload": 0.1, "target": jnp.ones(9), "weights": jnp.ones(9), "tol": 1e-8},

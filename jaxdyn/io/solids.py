@@ -1,0 +1,150 @@
+"""Solids of the elements <visual> and <collision> of URDF and SDF files, and of the geoms of compiled MJCF files."""
+
+import pathlib
+from collections.abc import Callable, Iterator
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from jaxdyn.io.meshes import MeshError, find_mesh, read_mesh
+from jaxdyn.io.sdf_frames import SdfFile
+from jaxdyn.io.xml_lines import XmlFile
+from jaxdyn.model import host_math
+
+
+class Solid(NamedTuple):
+    """Solid of an element in its own axes.
+
+    `kind` and `size` (m) as of `jaxdyn.pictures.Shape`, or "plane", with its normal as size. Of a mesh: `vertices` (n, 3) before
+    they are scaled by `size`, `faces` (m, 3), and its own `color` (3,) or None.
+    """
+
+    kind: str
+    size: tuple[float, ...]
+    vertices: np.ndarray | None = None
+    faces: np.ndarray | None = None
+    color: tuple[float, ...] | None = None
+
+
+class Element(NamedTuple):
+    """A <visual> or <collision>: the frame of its link, its `pose` (4, 4) in it (m), the XML element, and its solids."""
+
+    frame: str
+    pose: np.ndarray
+    xml: Any
+    solids: list[Solid]
+
+
+_MJCF_KINDS = {0: "plane", 2: "sphere", 3: "capsule", 4: "ellipsoid", 5: "cylinder", 6: "box", 7: "mesh"}  # mjtGeom
+
+
+def geom_solid(m, g: int) -> Solid | None:
+    """Solid of a geom of MuJoCo's model; None of height fields and signed distance fields."""
+    kind, size = _MJCF_KINDS.get(int(m.geom_type[g])), tuple(float(x) for x in m.geom_size[g])
+    if kind is None:
+        return None
+    if kind == "plane":
+        return Solid(kind, (0.0, 0.0, 1.0))
+    if kind == "sphere":
+        # MuJoCo stores three sizes for every geom; a sphere uses the first.
+        return Solid("ellipsoid", (size[0],) * 3)
+    if kind in ("capsule", "cylinder"):
+        # MuJoCo has half lengths.
+        return Solid(kind, (size[0], 2 * size[1]))
+    if kind == "box":
+        return Solid(kind, tuple(2 * x for x in size))
+    if kind == "ellipsoid":
+        return Solid(kind, size)
+    # The compiler has scaled the vertices, and moved them to the mesh's own frame.
+    mesh = int(m.geom_dataid[g])
+    start, count = m.mesh_vertadr[mesh], m.mesh_vertnum[mesh]
+    vertices = np.asarray(m.mesh_vert[start : start + count], float)
+    start, count = m.mesh_faceadr[mesh], m.mesh_facenum[mesh]
+    return Solid(kind, (1.0, 1.0, 1.0), vertices, np.asarray(m.mesh_face[start : start + count], int))
+
+
+class _Reader:
+    """Reader of geometries, with descriptions of what is missing. Each mesh is read once."""
+
+    def __init__(self, path: pathlib.Path):
+        self.folder = path.resolve().parent
+        self.missing: list[str] = []
+        self._read: dict[str, list[tuple]] = {}
+
+    def solids(self, frame: str, geometry, numbers: Callable, uri: Callable) -> list[Solid]:
+        """Solids of a <geometry>; `numbers(part, key, count, default)` and `uri(part)` read its elements."""
+        solids = []
+        for part in () if geometry is None else geometry:
+            if part.tag == "box":
+                solids.append(Solid("box", tuple(numbers(part, "size", 3, np.ones(3)))))
+            elif part.tag == "sphere":
+                radius = float(numbers(part, "radius", 1, 1.0))
+                solids.append(Solid("ellipsoid", (radius,) * 3))
+            elif part.tag in ("cylinder", "capsule"):
+                size = float(numbers(part, "radius", 1, 0.5)), float(numbers(part, "length", 1, 1.0))
+                solids.append(Solid(part.tag, size))
+            elif part.tag == "ellipsoid":
+                solids.append(Solid("ellipsoid", tuple(numbers(part, "radii", 3, np.ones(3)))))
+            elif part.tag == "plane":
+                solids.append(Solid("plane", tuple(numbers(part, "normal", 3, np.array([0.0, 0.0, 1.0])))))
+            elif part.tag == "mesh":
+                size = tuple(float(x) for x in numbers(part, "scale", 3, np.ones(3)))
+                solids += [Solid("mesh", size, *mesh) for mesh in self._mesh(uri(part))]
+            elif part.tag != "empty":
+                self.missing.append(f"<{part.tag}> of link {frame!r}")
+        return solids
+
+    def _mesh(self, uri: str) -> list[tuple]:
+        if uri not in self._read:
+            try:
+                self._read[uri] = read_mesh(find_mesh(uri, self.folder))
+            except MeshError as error:
+                self._read[uri] = []
+                self.missing.append(f"mesh {uri!r} ({error})")
+        return self._read[uri]
+
+
+def urdf_elements(file: XmlFile, tag: str, missing: list[str]) -> Iterator[Element]:
+    """Elements <visual> or <collision> of a URDF file; what cannot be read is appended to `missing`.
+
+    **Raises:** ValueError with file and line for numbers that are none.
+    """
+    reader = _Reader(file.source)
+    reader.missing = missing
+    for link in file.root.findall("link"):
+        frame = file.name(link, "the robot")
+        what = f"<{tag}> of link {frame!r}"
+        for element in link.findall(tag):
+            origin, pose = element.find("origin"), np.eye(4)
+            if origin is not None:
+                place = tuple(file.numbers(origin, 3, what, key, np.zeros(3)) for key in ("xyz", "rpy"))
+                pose = np.asarray(host_math.pose_matrix(place, what))
+
+            def numbers(part, key, count, default, what=what):
+                # Of the attributes of a geometry, URDF has a default for the scale alone; it has no planes.
+                values = file.numbers(part, count, what, key, default if key in ("scale", "normal") else None)
+                return values if count > 1 else values[0]
+
+            solids = reader.solids(frame, element.find("geometry"), numbers, lambda part: part.get("filename") or "")
+            yield Element(frame, pose, element, solids)
+
+
+def sdf_elements(file: SdfFile, tag: str, missing: list[str]) -> Iterator[Element]:
+    """Elements <visual> or <collision> of an SDF file; what cannot be read is appended to `missing`.
+
+    **Raises:** ValueError with file and line for numbers that are none.
+    """
+    reader = _Reader(file.source)
+    reader.missing = missing
+    for frame, (link, _) in file.links.items():
+        what = f"<{tag}> of link {frame!r}"
+        for element in link.findall(tag):
+
+            def numbers(part, key, count, default, what=what):
+                if count == 1:
+                    return file.number(part, key, default, what)
+                child = part.find(key)
+                return default if child is None else file.numbers(child, count, what)
+
+            solids = reader.solids(frame, element.find("geometry"), numbers, lambda part: file.word(part, "uri"))
+            yield Element(frame, file.raw_pose(element, what), element, solids)
