@@ -1,18 +1,16 @@
-"""Time of accelerations under loops against Pinocchio's constraintDynamics.
+"""Cost of constraints: accelerations, projections, gradients and steps of mechanisms with loops, alone and in batches.
 
-    python -m benchmarks.constraints ["hand with a ball"] [--batch 1024] [--rounds 20]
+    python -m benchmarks.constraints ["four-bar in space"] [--batch 1024] [--rounds 20] [--windows 40]
 
-Scenes: the redundant planar parallel manipulator (three 2R legs that carry one point), the A02 windows, N = 40, and the
-three-finger hand with a ball (nine rows of three point contacts). Per method
-microseconds per evaluation, best and median of the rounds, interleaved with Pinocchio in the same loop. Pinocchio is called from
-Python once per sample on one core; jaxdyn uses all cores, so its time is multiplied by their number for the ratio per core.
-Pinocchio closes the loops by three-dimensional point contacts, its smallest joint that fits, and solves the then dependent
-rows by its proximal method (mu = 1e-10); its accelerations are compared with ours before anything is timed.
+Microseconds a sample under `jit`, best of the rounds, interleaved with Pinocchio's `constraintDynamics` and `lcaba`, which are
+called from Python once per sample on one core; jaxdyn has both cores in a batch. The scene is known to the program, as in a
+control loop. Pinocchio closes loops by three-dimensional point contacts, its smallest joint that fits, and solves the then
+dependent rows by its proximal method. Its accelerations are compared with ours: "wrong" where they differ by more than 1e-6.
+"held": a scene with its choice of rows (`jd.constraints.choose_rows`); the file of that robot has few digits, so that the rows
+are searched in each call without it.
 """
 
 import argparse
-import os
-import time
 
 import jax
 import jax.numpy as jnp
@@ -21,6 +19,10 @@ import pinocchio as pin
 
 import jaxdyn as jd
 from benchmarks import timing
+from benchmarks.first_calls import robot_file
+from benchmarks.overconstrained import tilted_four_bar
+
+CASSIE = "cassie_description/robots/cassie_v2.sdf"
 
 
 def to_pinocchio(scene):
@@ -59,49 +61,82 @@ def ordered(model, q):
     return q[:, order]
 
 
-def measure(name, scene, start, batch, rounds):
-    """One row per method."""
-    rng = np.random.default_rng(0)
-    q, v = (np.tile(np.asarray(x), (batch, 1)) for x in start)
-    v = v * rng.uniform(0.5, 2.0, (batch, 1))
-    tau = rng.normal(size=v.shape)
+def mechanisms(windows: int) -> dict:
+    """Functions that give a scene with a state on its constraints."""
+
+    def of(named, **parameters):
+        return lambda: (named(**parameters), *named.start(**{k: x for k, x in parameters.items() if k == "count"}))
+
+    def robot(is_held: bool):
+        scene = jd.load(robot_file(CASSIE), floating_base=True)
+        stands = jd.assemble(scene, scene.starts["reference"].q).q
+        return jd.constraints.choose_rows(scene, stands) if is_held else scene, stands, jnp.zeros(scene.nv)
+
+    return {
+        "four-bar in the plane": of(jd.scenes.four_bar),
+        "four-bar in space": lambda: (tilted_four_bar().scene, *jd.scenes.four_bar.start()),
+        "three legs on one point": of(jd.scenes.parallel_manipulator, gravity=(0.0, -9.81, 0.0)),
+        "ring of 30 bars": of(jd.scenes.closed_ring, count=30),
+        f"{windows} windows": of(jd.scenes.windows, count=windows),
+        "hand with a ball": of(jd.scenes.hand_with_ball),
+        "robot with four loops": lambda: robot(False),
+        "robot with four loops, held": lambda: robot(True),
+    }
+
+
+def functions(scene: jd.Scene) -> dict:
+    """What is timed, of one sample."""
+    times = jnp.asarray([0.0, 0.05])
+
+    def accelerate(q, v):
+        return jd.constrained_dynamics(scene, q, v).acceleration
+
+    return {
+        "acceleration": accelerate,
+        "projection": lambda q, v: jd.constraints.projections(scene, q).P_T,
+        "gradient": jax.grad(lambda q, v: jnp.sum(accelerate(q, v)), 1),
+        "50 steps of RK4": lambda q, v: jd.simulate(scene, q, v, times, stepsize=1e-3, throw=False).q[-1],
+    }
+
+
+def peers(scene: jd.Scene, q, v) -> dict:
+    """Pinocchio's two functions for one state, called from Python; empty for joints that it has no converter for here."""
+    if not set(scene.system.topology.kinds) <= {"revolute", "continuous", "free"}:
+        return {}
     source, contacts = to_pinocchio(scene)
-    theirs = ordered(scene.system, q)
-    data, held = source.createData(), pin.StdVec_RigidConstraintData()
+    data, other, held = source.createData(), source.createData(), pin.StdVec_RigidConstraintData()
     held.extend(contact.createData() for contact in contacts)
     pin.initConstraintDynamics(source, data, contacts, held)
-    settings = pin.ProximalSettings(1e-12, 1e-10, 20)
+    pin.computeJointMinimalOrdering(source, other, contacts)
+    q, v = ordered(scene.system, np.asarray(q)[None])[0], np.asarray(v)
+    settings, tau = pin.ProximalSettings(1e-12, 1e-10, 20), np.zeros(source.nv)
+    # Its most accurate setting here: with a smaller mu it loses digits to rounding.
+    other_settings = pin.ProximalSettings(1e-14, 1e-4, 50)
+    return {
+        "constraintDynamics": lambda: pin.constraintDynamics(source, data, q, v, tau, contacts, held, settings).copy(),
+        "lcaba": lambda: pin.lcaba(source, other, q, v, tau, contacts, held, other_settings).copy(),
+    }
 
-    def peer():
-        return [
-            pin.constraintDynamics(source, data, a, b, c, contacts, held, settings).copy()
-            for a, b, c in zip(theirs, v, tau, strict=True)
-        ]
 
-    want, inputs, calls, built = np.array(peer()), [jnp.asarray(x) for x in (q, v, tau)], {"pinocchio": peer}, {}
-    for method in ("rank_aware", "schur"):
-        function = jax.jit(
-            jax.vmap(lambda q, v, tau, m=method: jd.constrained_dynamics(scene, q, v, tau, method=m).acceleration)
-        )
-        began = time.perf_counter()
-        program = function.lower(*inputs).compile()
-        built[method] = time.perf_counter() - began
-        error = float(np.abs(np.asarray(program(*inputs)) - want).max() / np.abs(want).max())
-        print(f"{name}, {method}: accelerations differ from Pinocchio's by {error:.1e} of the largest", flush=True)
-        calls[method] = lambda program=program: jax.block_until_ready(program(*inputs))
-    times = timing.time_interleaved(calls, rounds)
-    cores = len(os.sched_getaffinity(0))
-    rows = []
-    for method in built:
-        best, median = (times[method][key] / batch * 1e6 for key in ("best", "median"))
-        peer_best, peer_median = (times["pinocchio"][key] / batch * 1e6 for key in ("best", "median"))
+def measure(name: str, scene, q, v, batch: int, rounds: int) -> list[dict]:
+    """One row for a single call, and one for a batch."""
+    rows, theirs = [], {} if "held" in name else peers(scene, q, v)
+    want = np.asarray(jd.constrained_dynamics(scene, q, v).acceleration)
+    differences = {peer: float(np.abs(call() - want).max() / np.abs(want).max()) for peer, call in theirs.items()}
+    print(f"{name}: differences from Pinocchio's accelerations {differences}", flush=True)
+    for count in (1, batch):
+        calls: dict = dict(theirs) if count == 1 else {}
+        for title, function in functions(scene).items():
+            run = jax.jit(function if count == 1 else jax.vmap(function))
+            state = (q, v) if count == 1 else (jnp.tile(q, (count, 1)), jnp.tile(v, (count, 1)))
+            jax.block_until_ready(run(*state))
+            calls[title] = lambda run=run, state=state: jax.block_until_ready(run(*state))
+        times = timing.time_interleaved(calls, rounds)
         rows.append(
-            {
-                "scene": name, "method": method, "us": [best, median], "pinocchio us": [peer_best, peer_median],
-                "ratio": [best / peer_best, median / peer_median], "ratio per core": best * cores / peer_best,
-                "compile s": built[method],
-            }
-        )  # fmt: skip
+            {"differences": differences}
+            | {"scene": name, "batch": count}
+            | {x: times[x]["best"] / count * 1e6 for x in calls}
+        )
     return rows
 
 
@@ -114,31 +149,19 @@ def main(argv=None):
     parser.add_argument("--windows", type=int, default=40)
     options = parser.parse_args(argv)
     jax.config.update("jax_enable_x64", True)
-    manipulator = jd.scenes.parallel_manipulator(gravity=(0.0, -9.81, 0.0))
-    count = options.windows
-    scenes = {
-        "parallel manipulator": (manipulator, jd.scenes.parallel_manipulator.start()),
-        f"windows, N = {count}": (jd.scenes.windows(count=count), jd.scenes.windows.start(count=count)),
-        "hand with a ball": (jd.scenes.hand_with_ball(), jd.scenes.hand_with_ball.start()),
-    }
-    chosen = timing.chosen_names(options.scenes, scenes)
-    rows = [
-        row
-        for name, (scene, start) in ((name, scenes[name]) for name in chosen)
-        for row in measure(name, scene, start, options.batch, options.rounds)
-    ]
-    print("| scene | method | jaxdyn us | Pinocchio us, one core | ratio | ratio per core | compile s |")
-    print("|---|---|---|---|---|---|---|")
+    scenes, rows = mechanisms(options.windows), []
+    for name in timing.chosen_names(options.scenes, scenes):
+        batch = min(options.batch, 256) if "robot" in name else options.batch
+        rows += measure(name, *scenes[name](), batch, options.rounds)
+    columns = ["acceleration", "constraintDynamics", "lcaba", "projection", "gradient", "50 steps of RK4"]
+    print(f"| us a sample | batch | {' | '.join(columns)} |\n|---|---|{'---|' * len(columns)}")
     for row in rows:
-        ours, peer = ("{:.3g} ({:.3g})".format(*row[key]) for key in ("us", "pinocchio us"))
-        print(
-            f"| {row['scene']} | {row['method']} | {ours} | {peer} | {row['ratio'][0]:.2f} ({row['ratio'][1]:.2f}) | "
-            f"{row['ratio per core']:.2f} | {row['compile s']:.1f} |"
+        cells = (
+            "" if column not in row else f"{row[column]:.3g}" if row["differences"].get(column, 0) < 1e-6 else "wrong"
+            for column in columns
         )
-    print(
-        "written to",
-        timing.write("benchmark_constraints", {"machine": timing.machine(), "batch": options.batch, "rows": rows}),
-    )
+        print(f"| {row['scene']} | {row['batch']} | {' | '.join(cells)} |")
+    print("written to", timing.write("benchmark_constraints", {"machine": timing.machine(), "rows": rows}))
 
 
 if __name__ == "__main__":

@@ -15,7 +15,7 @@ LOOSE = {"float64": 1e-6, "float32": 1e-3}
 
 @case
 def rates(dtypes, gradient):
-    """Angular rates up to 1e4 rad/s: a free body, 10 rad of its time"""
+    """Angular rates up to 1e4 rad/s: a free body, over 10 rad of rotation"""
     base, (q, start) = jd.scenes.free_body(), jd.scenes.free_body.start()
     factors = np.array([1e-4, 1.0, 1e2, 1e4])
     reference = references.free_top(np.array([0.0, 5.0, 10.0]))

@@ -25,7 +25,7 @@ from jaxdyn.constraints.redundancy import keep_rows, opening_of_redundant, row_m
 from jaxdyn.constraints.selection import hide_unclear, most_rounding, select_rows
 from jaxdyn.constraints.tolerances import coordinate_sizes, largest_ratio, row_limits
 from jaxdyn.lie.so3 import matmul
-from jaxdyn.model.arguments import Numbers, check_state, zeros_if_none
+from jaxdyn.model.arguments import Numbers, check_mapping, check_state, zeros_if_none
 from jaxdyn.model.numbers import as_static, check_count
 from jaxdyn.systems.scene import Scene, as_scene
 from jaxdyn.systems.system import SceneLike, displace, displacement
@@ -150,9 +150,10 @@ def assemble(
     """
     scene, rank_tol = as_scene(scene), check_tolerance(rank_tol)
     check_search(steps, guesses, atol)
+    hold = check_mapping(hold, "hold", '{"1": 0.5}')
     v = zeros_if_none(v, scene.nv)
     q, v, t = check_state(scene.system, q=q, v=v, t=t)
-    locked = Scene(scene.system, (*scene.constraints, *(lock_joint(*joint) for joint in (hold or {}).items())))
+    locked = Scene(scene.system, (*scene.constraints, *(lock_joint(*joint) for joint in hold.items())))
     layout(locked)  # raises for joints that do not exist
     atol = None if atol is None else float(atol)
 

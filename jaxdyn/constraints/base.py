@@ -19,7 +19,18 @@ from jaxtyping import Array, Float
 
 from jaxdyn.compile import kernel
 from jaxdyn.lie.so3 import matmul
-from jaxdyn.model.arguments import DType, Function, Number, Numbers, SystemLike, batch_hint, check_state, state_dtype
+from jaxdyn.model.arguments import (
+    DType,
+    Function,
+    Number,
+    Numbers,
+    SystemLike,
+    batch_hint,
+    check_flag,
+    check_new_name,
+    check_state,
+    state_dtype,
+)
 from jaxdyn.systems.scene import Scene, as_pytree, as_scene
 from jaxdyn.systems.system import velocity_to_rate
 
@@ -117,7 +128,7 @@ class Holonomic(Constraint):
 
     def __init__(self, phi: Function, with_system: bool = False, name: str | None = None):
         self.name = _own_name(name, phi, "holonomic")
-        self.with_system = bool(with_system)
+        self.with_system = check_flag(with_system, f"constraint {self.name!r}: with_system")
         self.phi = as_pytree(phi, f"constraint {self.name!r}: phi", "system, q, t" if with_system else "q, t")
 
     def position(self, system: SystemLike, q: Float[Array, " nq"], t: Number) -> Array | None:
@@ -155,10 +166,10 @@ class Pfaffian(Constraint):
 
     def __init__(self, A: Function, b: Function | None = None, with_system: bool = False, name: str | None = None):
         self.name = _own_name(name, A, "pfaffian")
+        self.with_system = check_flag(with_system, f"constraint {self.name!r}: with_system")
         takes = "system, q, t" if with_system else "q, t"
         self.A = as_pytree(A, f"constraint {self.name!r}: A", takes)
         self.b = None if b is None else as_pytree(b, f"constraint {self.name!r}: b", takes)
-        self.with_system = bool(with_system)
 
     def velocity(self, system: SystemLike, q: Float[Array, " nq"], v: Float[Array, " nv"], t: Number) -> Array | None:
         """Residual of the rows, (n,).
@@ -373,9 +384,5 @@ def _groups(scene: Scene):
 
 
 def _own_name(name, function, default: str) -> str:
-    if name is not None:
-        if not isinstance(name, str) or not name:
-            raise ValueError(f"name is {name!r}; give a non-empty string, or None")
-        return name
     given = getattr(function, "__name__", default)
-    return default if given == "<lambda>" else given
+    return check_new_name(name, default if given == "<lambda>" else given)

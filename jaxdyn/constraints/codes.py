@@ -10,6 +10,7 @@ import numpy as np
 from jaxtyping import Array, ArrayLike, Bool, Int, PyTree
 
 from jaxdyn.compile.known import is_concrete, stop_gradient
+from jaxdyn.model.arguments import check_flag
 
 _messages: list[str] = []
 
@@ -205,6 +206,7 @@ def require_success(outcome: Any, throw: bool | None, message: Callable[[Any], s
 
     **Raises:** ValueError with the message; under tracing the program raises the text of the result's code.
     """
+    throw = throw if throw is None else check_flag(throw, "throw")
     failed = ~outcome.success
     if not is_concrete(outcome.result):
         # Under tracing the result is unknown, so that only an error at run time is possible.

@@ -20,9 +20,9 @@ from jaxtyping import Array, Float
 from jaxdyn.compile.known import is_concrete
 from jaxdyn.constraints.base import Constraint
 from jaxdyn.constraints.frames import Pair
-from jaxdyn.model.arguments import Checked, DType, Number, Numbers, pose_leaf
+from jaxdyn.model.arguments import Checked, DType, Number, Numbers, check_body, check_flag, check_new_name, pose_leaf
 from jaxdyn.model.joints import KINDS, SCREW_KINDS, joint_difference
-from jaxdyn.model.numbers import as_number
+from jaxdyn.model.numbers import as_float, as_number
 from jaxdyn.model.topology import body_index
 from jaxdyn.model.tree import Model
 
@@ -161,9 +161,9 @@ def loop(
     **Raises:** ValueError for an unknown joint, a bad pose or twice the same body; when used, for a system that is no
     `Model` and for names that it does not have.
     """
-    name = f"{body_a or 'world'}-{body_b or 'world'}" if name is None else name
+    name = check_new_name(name, f"{body_a or 'world'}-{body_b or 'world'}")
     what = f"loop {name!r}"
-    kinds = _IN_PLANE if in_plane else _SPATIAL
+    kinds = _IN_PLANE if check_flag(in_plane, f"{what}: in_plane") else _SPATIAL
     if not isinstance(joint, str) or joint not in kinds:
         raise ValueError(f"{what}: joint {joint!r} is unknown; choose from {', '.join(kinds)}")
     if body_a == body_b:
@@ -171,9 +171,9 @@ def loop(
     return Loop(
         name=name,
         joint=joint,
-        body_a=body_a,
-        body_b=body_b,
-        in_plane=bool(in_plane),
+        body_a=check_body(body_a, f"{name!r}: body_a"),
+        body_b=check_body(body_b, f"{name!r}: body_b"),
+        in_plane=in_plane,
         pose_a=pose_leaf(pose_a, f"{what}: pose_a"),
         pose_b=pose_leaf(pose_b, f"{what}: pose_b"),
     )
@@ -225,11 +225,11 @@ def distance(
 
     **Raises:** ValueError for bad points or a length that is not positive.
     """
-    name = f"distance {body_a or 'world'}-{body_b or 'world'}" if name is None else name
+    name = check_new_name(name, f"distance {body_a or 'world'}-{body_b or 'world'}")
     return Distance(
         name=name,
-        body_a=body_a,
-        body_b=body_b,
+        body_a=check_body(body_a, f"{name!r}: body_a"),
+        body_b=check_body(body_b, f"{name!r}: body_b"),
         pose_a=pose_leaf(point_a, f"{name!r}: point_a"),
         pose_b=pose_leaf(point_b, f"{name!r}: point_b"),
         length=as_number(length, f"{name!r}: length", "m"),
@@ -272,8 +272,11 @@ def gear(joint_a: str, joint_b: str, ratio: Numbers, offset: Numbers = 0.0, *, n
     """
     if joint_a == joint_b:
         raise ValueError(f"gear: both joints are {joint_a!r}; name two different ones")
-    name = f"gear {joint_a}-{joint_b}" if name is None else name
-    return Gear(name, joint_a, joint_b, jnp.asarray(ratio, float), jnp.asarray(offset, float))
+    name = check_new_name(name, f"gear {joint_a}-{joint_b}")
+    what = f"{name!r}: "
+    return Gear(
+        name, joint_a, joint_b, as_float(ratio, what + "ratio", (), float), as_float(offset, what + "offset", (), float)
+    )
 
 
 class JointLock(Constraint):
@@ -308,10 +311,10 @@ def lock_joint(joint: str, value: Numbers = 0.0, *, name: str | None = None) -> 
 
     **Raises:** ValueError for a value that is not finite; when used, for an unknown joint or a value of another size.
     """
+    array = jnp.atleast_1d(as_float(value, f"lock_joint {joint!r}: value", None, float))
     if is_concrete(value) and not np.isfinite(np.asarray(value, float)).all():
         raise ValueError(f"lock_joint {joint!r}: value is {value}; give finite numbers")
-    name = f"lock {joint}" if name is None else name
-    return JointLock(name, joint, jnp.atleast_1d(jnp.asarray(value, float)))
+    return JointLock(check_new_name(name, f"lock {joint}"), joint, array)
 
 
 def model_couplings(model: Model) -> tuple[Gear, ...]:

@@ -22,7 +22,16 @@ from jaxdyn.compile.known import is_concrete
 from jaxdyn.constraints.frames import Pair
 from jaxdyn.constraints.loops import check_bodies
 from jaxdyn.lie.so3 import cross, matmul
-from jaxdyn.model.arguments import DType, Numbers, SystemLike, pose_leaf
+from jaxdyn.model.arguments import (
+    DType,
+    Numbers,
+    SystemLike,
+    check_body,
+    check_flag,
+    check_name,
+    check_new_name,
+    pose_leaf,
+)
 from jaxdyn.model.numbers import as_number
 
 
@@ -166,16 +175,16 @@ def rolling_wheel(
 
     **Raises:** ValueError for a radius that is not positive or a bad pose; when used, for unknown bodies.
     """
-    name = f"wheel {body}" if name is None else name
+    name = check_new_name(name, f"wheel {body}")
     return RollingWheel(
         name=name,
-        body=body,
-        surface_body=plane_body,
+        body=check_name(body, f"{name!r}: body"),
+        surface_body=check_body(plane_body, f"{name!r}: plane_body"),
         pose=pose_leaf(pose, f"{name!r}: pose"),
         surface=pose_leaf(plane, f"{name!r}: plane"),
         radius=as_number(radius, f"{name!r}: radius", "m"),
-        contact=bool(contact),
-        count=2 if lateral else 1,
+        contact=check_flag(contact, f"{name!r}: contact"),
+        count=2 if check_flag(lateral, f"{name!r}: lateral") else 1,
     )
 
 
@@ -203,14 +212,14 @@ def knife_edge(
 
     **Raises:** ValueError for a bad pose; when used, for unknown bodies.
     """
-    name = f"knife edge {body}" if name is None else name
+    name = check_new_name(name, f"knife edge {body}")
     return KnifeEdge(
         name=name,
-        body=body,
-        surface_body=plane_body,
+        body=check_name(body, f"{name!r}: body"),
+        surface_body=check_body(plane_body, f"{name!r}: plane_body"),
         pose=pose_leaf(pose, f"{name!r}: pose"),
         surface=pose_leaf(plane, f"{name!r}: plane"),
-        contact=bool(contact),
+        contact=check_flag(contact, f"{name!r}: contact"),
         count=1,
     )
 
@@ -277,13 +286,13 @@ def rolling_sphere(
     **Raises:** ValueError for an unknown surface, radii that are missing, not positive or too small for one
     inside, a bad pose, or no rows at all; when used, for unknown bodies.
     """
-    name = f"sphere {body}" if name is None else name
+    name = check_new_name(name, f"sphere {body}")
     if on not in ("plane", "sphere", "cylinder"):
         raise ValueError(f"{name!r}: on is {on!r}; choose from plane, sphere, cylinder")
     if (on == "plane") != (surface_radius is None):
         fix = "leave it out" if on == "plane" else "give the radius of the surface (m)"
         raise ValueError(f"{name!r}: surface_radius is {surface_radius} on a {on}; {fix}")
-    if on == "plane" and inside:
+    if check_flag(inside, f"{name!r}: inside") and on == "plane":
         raise ValueError(f"{name!r}: a plane has no inside; turn the plane over")
     check_has_rows(name, slip, spin, contact)
     radius = as_number(radius, f"{name!r}: radius", "m")
@@ -293,22 +302,24 @@ def rolling_sphere(
         raise ValueError(f"{name!r}: radius {radius} is not below surface_radius {reach}; it does not fit inside")
     return RollingSphere(
         name=name,
-        body=body,
-        surface_body=surface_body,
+        body=check_name(body, f"{name!r}: body"),
+        surface_body=check_body(surface_body, f"{name!r}: surface_body"),
         pose=pose_leaf(center, f"{name!r}: center"),
         surface=pose_leaf(surface, f"{name!r}: surface"),
         radius=radius,
         surface_radius=reach,
         on=on,
-        inside=bool(inside),
-        contact=bool(contact),
-        spin=bool(spin),
+        inside=inside,
+        contact=contact,
+        spin=spin,
         count=0 if slip else 2,
     )
 
 
 def check_has_rows(name: str, slip: bool, spin: bool, contact: bool) -> None:
-    """Refuse a contact that constrains nothing. **Raises:** ValueError."""
+    """Refuse a contact that constrains nothing. **Raises:** ValueError, for values that are not True or False too."""
+    for what, value in {"slip": slip, "spin": spin, "contact": contact}.items():
+        check_flag(value, f"{name!r}: {what}")
     if slip and not (spin or contact):
         raise ValueError(
             f"{name!r}: slip is True and contact and spin are False, which leaves no rows; set contact=True"

@@ -21,6 +21,7 @@ import numpy as np
 from jax.nn import logsumexp
 from jaxtyping import Array, Float
 
+from jaxdyn.compile.known import is_concrete
 from jaxdyn.contact.kinds import components
 from jaxdyn.lie.series import safe_sqrt
 from jaxdyn.lie.so3 import matmul
@@ -162,7 +163,7 @@ class FrictionCone(eqx.Module):
 
 
 def _is_zero(smoothing) -> bool:
-    return isinstance(smoothing, (int, float)) and smoothing == 0
+    return is_concrete(smoothing) and np.ndim(smoothing) == 0 and float(smoothing) == 0
 
 
 def _length(parts, smoothing):
@@ -202,7 +203,7 @@ def friction_cone(
             raise ValueError(f"{name} is {value} for a {kind} contact, which has none; leave it out")
     mu = None if mu is None else as_number(mu, "mu", "", zero=True)
     gamma = None if gamma is None or mu is None else as_number(gamma, "gamma", "m", zero=True, like=mu.dtype)
-    return FrictionCone(kind, bool(in_plane), mu, gamma, None)
+    return FrictionCone(kind, in_plane, mu, gamma, None)
 
 
 def surface_cone(rows: Numbers) -> FrictionCone:

@@ -10,6 +10,7 @@ from jaxtyping import Array, Float
 from jaxdyn.constraints.base import layout
 from jaxdyn.contact.cones import Cones, FrictionCone
 from jaxdyn.model.arguments import Numbers, as_array, batch_hint, state_dtype
+from jaxdyn.model.numbers import as_number
 from jaxdyn.systems.scene import Scene
 
 
@@ -63,6 +64,7 @@ def contact_forces(
             f"multipliers has shape {multipliers.shape}, expected ({count},), one per row of the scene"
             f"{batch_hint(multipliers, (1,))}"
         )
+    smoothing = as_number(smoothing, "smoothing", "N", zero=True, like=multipliers.dtype)
     forces, margins = {}, {}
     for contact in contacts_with_cones(scene, cones):
         forces[contact.name] = multipliers[contact.rows]

@@ -3,6 +3,8 @@
 import numpy as np
 from jaxtyping import Float
 
+from jaxdyn.model.arguments import check_flag
+
 # Components (fx, fy, fz, tx, ty, tz) of a wrench that each contact transmits.
 _SPATIAL = {
     "frictionless": (2,),
@@ -16,7 +18,7 @@ _IN_PLANE = {"frictionless": (2,), "hard-finger": (0, 2), "rigid": (0, 2, 4)}
 
 def components(kind: str, in_plane: bool, what: str) -> tuple[int, ...]:
     """Indices of the transmitted components. **Raises:** ValueError for an unknown kind, naming `what`."""
-    kinds = _IN_PLANE if in_plane else _SPATIAL
+    kinds = _IN_PLANE if check_flag(in_plane, f"{what}: in_plane") else _SPATIAL
     if not isinstance(kind, str) or kind not in kinds:
         hint = "; in a plane a soft finger is a hard one" if isinstance(kind, str) and kind in _SPATIAL else ""
         raise ValueError(f"{what}: kind {kind!r} is unknown; choose from {', '.join(kinds)}{hint}")

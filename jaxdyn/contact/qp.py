@@ -110,6 +110,8 @@ def solve_qp(
     G, h = _pair(G, h, "G", "h", n, Q.dtype)
     A, b = _pair(A, b, "A", "b", n, Q.dtype)
     # Two arrays are one pair (S, c); two pairs are tuples, without `ndim`.
+    if not isinstance(cones, Sequence):
+        raise ValueError(f"cones is {cones!r}; give a pair (S, c), or a list of pairs")
     pairs: list[Any] = [cones] if len(cones) == 2 and hasattr(cones[0], "ndim") else list(cones)
     checked = []
     for i, pair in enumerate(pairs):

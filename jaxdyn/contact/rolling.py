@@ -13,7 +13,7 @@ from jaxdyn.constraints.rolling import Touching, TouchingPoint, check_has_rows, 
 from jaxdyn.contact.surfaces import Surface, check_surface
 from jaxdyn.contact.touching import Patch, Steps, newton_steps, patch_at
 from jaxdyn.lie.so3 import cross, matmul
-from jaxdyn.model.arguments import Checked, Numbers, pose_leaf
+from jaxdyn.model.arguments import Checked, Numbers, check_body, check_new_name, pose_leaf
 
 
 class RollingContact(Touching):
@@ -184,19 +184,19 @@ def rolling_contact(
 
     Source: Montana (1988); Murray, Li & Sastry (1994), section 5.6; EQUATIONS section 8.
     """
-    name = f"{body_b or 'world'} on {body_a or 'world'}" if name is None else name
+    name = check_new_name(name, f"{body_b or 'world'} on {body_a or 'world'}")
     for surface in (surface_a, surface_b):
         check_surface(surface)
     check_has_rows(name, slip, spin, contact)
     return RollingContact(
         name=name,
-        body=body_b,
-        surface_body=body_a,
+        body=check_body(body_b, f"{name!r}: body_b"),
+        surface_body=check_body(body_a, f"{name!r}: body_a"),
         pose=pose_leaf(pose_b, f"{name!r}: pose_b"),
         surface=pose_leaf(pose_a, f"{name!r}: pose_a"),
         shape_a=surface_a,
         shape_b=surface_b,
-        contact=bool(contact),
-        spin=bool(spin),
+        contact=contact,
+        spin=spin,
         count=0 if slip else 2,
     )

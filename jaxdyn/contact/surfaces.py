@@ -26,7 +26,7 @@ from jaxdyn.compile import entry_point
 from jaxdyn.compile.known import is_concrete
 from jaxdyn.constraints.rolling import tangents, unit_or
 from jaxdyn.lie.so3 import cross, matmul
-from jaxdyn.model.arguments import Checked, Function, Numbers
+from jaxdyn.model.arguments import Checked, Function, Numbers, check_flag
 from jaxdyn.model.numbers import as_float, as_number
 from jaxdyn.systems.scene import as_pytree
 
@@ -239,7 +239,7 @@ class Parametrised(Surface):
 
     def __init__(self, f: Function, flip: bool = False):
         self.f = as_pytree(f, "surface: f")
-        self.flip = bool(flip)
+        self.flip = check_flag(flip, "flip")
 
     def point(self, alpha: Float[Array, "2"]) -> Float[Array, "3"]:
         """Point f(alpha), m, with u and v exchanged for `flip`."""

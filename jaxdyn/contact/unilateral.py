@@ -14,7 +14,18 @@ from jaxtyping import Array, Float
 from jaxdyn.compile.known import is_concrete
 from jaxdyn.constraints.base import Constraint, Pfaffian
 from jaxdyn.constraints.rolling import RollingSphere
-from jaxdyn.model.arguments import Checked, Function, Number, Numbers, SystemLike, as_array, pose_leaf
+from jaxdyn.model.arguments import (
+    Checked,
+    Function,
+    Number,
+    Numbers,
+    SystemLike,
+    as_array,
+    check_body,
+    check_name,
+    check_new_name,
+    pose_leaf,
+)
 from jaxdyn.model.numbers import as_number
 from jaxdyn.systems.scene import Scene, as_pytree
 
@@ -82,7 +93,7 @@ class DryFriction(WithModes):
         smoothing: Numbers | None = None,
         name: str = "friction",
     ):
-        self.name = _check_name(name, "DryFriction")
+        self.name = check_new_name(name, "friction", "DryFriction: name")
         self.coefficient, self.static = _coefficients(coefficient, static, f"DryFriction {name!r}")
         self.constraint = normal if isinstance(normal, str) else None
         if isinstance(normal, str):
@@ -153,7 +164,7 @@ class UnilateralContact(WithModes):
                 "jd.contact.ground_contact(body, point, friction=0.5)"
             )
         self.contact = contact
-        self.name = _check_name(contact.name if name is None else name, "UnilateralContact")
+        self.name = check_new_name(name, contact.name, "UnilateralContact: name")
         owner = f"UnilateralContact {self.name!r}"
         self.coefficient, self.static = _coefficients(friction, static, owner)
         self.restitution = jnp.asarray(as_array(restitution, f"{owner}: restitution"), float)
@@ -190,12 +201,12 @@ def ground_contact(
     solution = jd.simulate(jd.Scene(robot, forces=feet), q0, v0, ts)
     ```
     """
-    name = f"{body} on the ground" if name is None else name
+    name = check_new_name(name, f"{body} on the ground")
     # A point is a sphere of radius zero, and a rolling sphere has the rows of gap and slip.
     contact = RollingSphere(
         name=name,
-        body=body,
-        surface_body=plane_body,
+        body=check_name(body, f"ground_contact {name!r}: body"),
+        surface_body=check_body(plane_body, f"ground_contact {name!r}: plane_body"),
         pose=pose_leaf(point, f"ground_contact {name!r}: point"),
         surface=pose_leaf(plane, f"ground_contact {name!r}: plane"),
         radius=as_number(radius, f"ground_contact {name!r}: radius", "m", zero=True, like=float),
@@ -227,7 +238,7 @@ def gap_contact(
     stop = jd.contact.gap_contact(lambda q, t: 0.5 - q[0], restitution=0.3, name="stop")
     ```
     """
-    name = _check_name(name, "gap_contact")
+    name = check_new_name(name, "contact", "gap_contact: name")
     rows = None if along is None else as_pytree(along, f"gap_contact {name!r}: along")
     contact = _Gap(gap=as_pytree(gap, f"gap_contact {name!r}: gap"), along=rows, name=name)
     return UnilateralContact(contact, friction, static=static, restitution=restitution, name=name)
@@ -271,22 +282,14 @@ class _Gap(Constraint):
         return None if self.along is None else Pfaffian(self.along, name=self.name).velocity(system, q, v, t)
 
 
-def _check_name(name: Any, owner: str) -> str:
-    if not isinstance(name, str) or not name:
-        raise ValueError(f"{owner}: name is {name!r}; give a non-empty string")
-    return name
-
-
 def _coefficients(sliding: Any, static: Any, owner: str):
     """Check sliding and static coefficients and convert them to leaves."""
-    coefficients = [
-        jnp.asarray(as_array(x, f"{owner}: coefficient"), float)
-        for x in (sliding, sliding if static is None else static)
-    ]
+    given = {"friction": sliding, "static": sliding if static is None else static}
+    coefficients = [jnp.asarray(as_array(x, f"{owner}: {name}"), float) for name, x in given.items()]
     if is_concrete(coefficients):
         mu, mu_s = (np.asarray(x) for x in coefficients)
         if not (np.isfinite(mu).all() and (mu >= 0).all() and np.isfinite(mu_s).all() and (mu_s >= mu).all()):
-            raise ValueError(f"{owner}: coefficients are {mu} sliding and {mu_s} at rest; give 0 <= sliding <= static")
+            raise ValueError(f"{owner}: friction is {mu} and static {mu_s}; give 0 <= friction <= static")
     return coefficients
 
 

@@ -148,7 +148,7 @@ class RateError(Constraint):
 
 def frame_error(model: Any, frame: str, target: Any, task: str) -> FrameError:
     """Error of a frame. **Raises:** ValueError for an unknown task or frame, and for anything but a `Model`."""
-    if task not in TASKS:
+    if not isinstance(task, str) or task not in TASKS:
         raise ValueError(f"task is {task!r}; choose from {', '.join(TASKS)}")
     if not isinstance(model, Model):
         raise ValueError(f"model is a {type(model).__name__}, which has no named frames; pass a Model")

@@ -27,7 +27,7 @@ from jaxdyn.constraints.codes import RESULTS, Outcome
 from jaxdyn.constraints.rank import eps_of
 from jaxdyn.control.box_qp import minimize_in_box
 from jaxdyn.lie.so3 import matmul
-from jaxdyn.model.arguments import Checked, Function, Numbers, as_array, batch_hint
+from jaxdyn.model.arguments import Checked, Function, Numbers, as_array, batch_hint, check_flag
 from jaxdyn.model.numbers import as_float, as_number, as_static, check_count
 from jaxdyn.systems.mass_factor import cholesky, solve_cholesky
 from jaxdyn.systems.scene import as_pytree
@@ -165,7 +165,7 @@ def ilqr(
         lambda x: jnp.asarray(final_cost(structure(x)), us.dtype),
         lower,
         upper,
-        bool(second_order),
+        check_flag(second_order, "second_order"),
     )
     n, nu = us.shape
     # With zero gains the reference states do not count: the first rollout applies the controls alone.

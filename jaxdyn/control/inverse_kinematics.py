@@ -27,7 +27,7 @@ from jaxdyn.constraints.selection import most_rounding
 from jaxdyn.constraints.tolerances import own_length
 from jaxdyn.control.least_squares import Aims, clip_to_limits, screw_joints, search
 from jaxdyn.control.targets import as_targets, target_rows
-from jaxdyn.model.arguments import Checked, Number, Numbers, as_array, check_state
+from jaxdyn.model.arguments import Checked, Number, Numbers, as_array, check_flag, check_mapping, check_state
 from jaxdyn.model.tree import Model
 from jaxdyn.systems.scene import Scene, as_scene
 from jaxdyn.systems.system import SceneLike, displace
@@ -132,7 +132,16 @@ def inverse_kinematics(
     factors = row_weights(rows, weights, guess.dtype)
     # Forces and cones do not affect configurations: they are left out, so that others do not cause a second compilation.
     place = _solve_by_program(
-        Scene(model, scene.constraints), rows, guess, factors, posture, t, bool(limits), steps, guesses, atol
+        Scene(model, scene.constraints),
+        rows,
+        guess,
+        factors,
+        posture,
+        t,
+        check_flag(limits, "limits"),
+        steps,
+        guesses,
+        atol,
     )
 
     def message(place: InverseKinematics) -> str:
@@ -147,14 +156,15 @@ def inverse_kinematics(
 
 def row_weights(rows: tuple[Constraint, ...], weights, dtype) -> Array:
     """Weights (m,) of all rows of the targets."""
-    names = {row.name.partition(" ")[0] if row.name not in (weights or {}) else row.name for row in rows}
-    unknown = set(weights or {}) - {row.name for row in rows} - {getattr(row, "frame", row.name) for row in rows}
+    weights = check_mapping(weights, "weights", f"{{{rows[0].name!r}: 2.0}}")
+    names = {row.name.partition(" ")[0] if row.name not in weights else row.name for row in rows}
+    unknown = set(weights) - {row.name for row in rows} - {getattr(row, "frame", row.name) for row in rows}
     if unknown:
         raise ValueError(f"weights names {sorted(unknown)}, which are no targets; targets are {sorted(names)}")
     parts = []
     for row in rows:
         count = sum(target_rows(row))
-        value = (weights or {}).get(row.name, (weights or {}).get(getattr(row, "frame", row.name), 1.0))
+        value = weights.get(row.name, weights.get(getattr(row, "frame", row.name), 1.0))
         value = as_array(value, f"weights[{row.name!r}]", dtype)
         if value.shape not in ((), (count,)):
             raise ValueError(

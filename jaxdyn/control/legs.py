@@ -24,6 +24,8 @@ from jaxdyn.lie.so3 import matmul
 from jaxdyn.model.arguments import Checked, Numbers, check_shapes
 from jaxdyn.model.numbers import as_float, as_number
 from jaxdyn.model.tree import Model
+from jaxdyn.reduction.inverse_dynamics import velocity_choice
+from jaxdyn.systems.scene import Scene
 
 
 class LeggedDynamics(Outcome):
@@ -199,7 +201,4 @@ def passive_velocities(model: Model, passive: Sequence[int] | None) -> np.ndarra
             )
         return indices
     # Sorted: the order of the base's velocities is that of v, whatever the order given.
-    indices = np.unique(np.asarray(passive, int))
-    if not indices.size or indices[0] < 0 or indices[-1] >= model.nv:
-        raise ValueError(f"passive is {passive!r}; give indices of velocities from 0 to {model.nv - 1}")
-    return indices
+    return np.array(sorted(velocity_choice(Scene(model), passive, "passive")))

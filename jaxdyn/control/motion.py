@@ -25,7 +25,7 @@ from jaxdyn.control.gains import gain, times
 from jaxdyn.dynamics.quantities import gravity_force, inverse_dynamics
 from jaxdyn.lie.so3 import matmul
 from jaxdyn.model.arguments import Number, Numbers, SystemLike, state_dtype
-from jaxdyn.model.numbers import as_number
+from jaxdyn.model.numbers import as_float, as_number
 from jaxdyn.model.tree import Model
 from jaxdyn.systems.scene import Scene, as_scene
 from jaxdyn.systems.system import SceneLike, displacement
@@ -132,7 +132,7 @@ class OperationalSpace(eqx.Module):
             as_number(damping, "damping", zero=True),
             as_number(stiffness, "stiffness", zero=True),
         )
-        self.posture = None if posture is None else jnp.asarray(posture, state_dtype(self.scene.system))
+        self.posture = None if posture is None else as_float(posture, "posture", like=state_dtype(self.scene.system))
 
     def __check_init__(self):
         if self.posture is not None and self.posture.shape != (self.scene.nq,):

@@ -21,9 +21,9 @@ from jaxdyn.compile import entry_point
 from jaxdyn.dynamics.kinematics import body_subspace, relative_poses
 from jaxdyn.lie import se3
 from jaxdyn.lie.so3 import matmul
-from jaxdyn.model.arguments import as_array, check_shapes
+from jaxdyn.model.arguments import as_array, check_name, check_shapes
 from jaxdyn.model.inertia import spatial_inertia
-from jaxdyn.model.topology import check_name, frame_index
+from jaxdyn.model.topology import frame_index
 from jaxdyn.model.tree import Model
 
 

@@ -11,6 +11,7 @@ from jaxtyping import Array, Bool, Float
 
 from jaxdyn.forces.piecewise import PiecewiseForce
 from jaxdyn.model.arguments import Checked, Function, Number, Numbers, SystemLike, is_concrete
+from jaxdyn.model.numbers import as_float
 from jaxdyn.systems.scene import as_pytree
 
 
@@ -98,7 +99,7 @@ class SlidingFriction(PiecewiseForce):
             )
         if not callable(along) and (isinstance(along, bool) or not isinstance(along, int) or along < 0):
             raise ValueError(f"SlidingFriction: along is {along!r}; give an index of v or a function A(q, t) -> (nv,)")
-        self.coefficient = jnp.asarray(coefficient)
+        self.coefficient = as_float(coefficient, "SlidingFriction: coefficient")
         takes = "system, q, v, t"
         self.normal = as_pytree(normal, "SlidingFriction: normal", takes) if callable(normal) else jnp.asarray(normal)
         self.direction = direction

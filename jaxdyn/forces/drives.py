@@ -64,8 +64,8 @@ class FirstOrderDrive(_Lag):
     ```
     """
 
-    time_constant: Float[Array, "..."] = eqx.field(converter=as_leaf)
-    initial: Float[Array, "..."] = eqx.field(converter=as_leaf, default=0.0)
+    time_constant: Float[Array, "..."] = eqx.field(converter=as_leaf("time_constant"))
+    initial: Float[Array, "..."] = eqx.field(converter=as_leaf("initial"), default=0.0)
     joints: tuple[str, ...] | None = eqx.field(static=True, converter=as_names, default=None)
 
     def __check_init__(self):
@@ -109,9 +109,9 @@ class SecondOrderDrive(_Lag):
     ```
     """
 
-    frequency: Float[Array, "..."] = eqx.field(converter=as_leaf)
-    damping_ratio: Float[Array, "..."] = eqx.field(converter=as_leaf, default=1.0)
-    initial: Float[Array, "..."] = eqx.field(converter=as_leaf, default=0.0)
+    frequency: Float[Array, "..."] = eqx.field(converter=as_leaf("frequency"))
+    damping_ratio: Float[Array, "..."] = eqx.field(converter=as_leaf("damping_ratio"), default=1.0)
+    initial: Float[Array, "..."] = eqx.field(converter=as_leaf("initial"), default=0.0)
     joints: tuple[str, ...] | None = eqx.field(static=True, converter=as_names, default=None)
 
     def __check_init__(self):

@@ -1,22 +1,19 @@
 """Elastic joints: springs and dampers between motors and joints, and robots with a rotor for each joint."""
 
 from collections.abc import Sequence
+from functools import partial
 
 import equinox as eqx
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from jaxdyn.forces.elements import as_leaf, broadcast_leaf, is_positive, joint_indices
-from jaxdyn.model.arguments import Checked, Number, Numbers, SystemLike
+from jaxdyn.forces.elements import as_leaf, as_names, broadcast_leaf, is_positive, joint_indices
+from jaxdyn.model.arguments import Checked, Number, Numbers, SystemLike, check_name, check_names
 from jaxdyn.model.builder import ModelBuilder
 from jaxdyn.model.joining import join
 from jaxdyn.model.joints import KINDS
 from jaxdyn.model.tree import Model
 from jaxdyn.systems.scene import Scene
-
-
-def _tuple(names: str | Sequence[str]) -> tuple[str, ...]:
-    return (names,) if isinstance(names, str) else tuple(names)
 
 
 class ElasticTransmission(eqx.Module):
@@ -38,11 +35,11 @@ class ElasticTransmission(eqx.Module):
     Source: Spong (1987), ASME J. Dyn. Sys. Meas. Control 109, eq. 13; De Luca & Book, Springer Handbook of Robotics, ch. 11.
     """
 
-    motors: tuple[str, ...] = eqx.field(static=True, converter=_tuple)
-    joints: tuple[str, ...] = eqx.field(static=True, converter=_tuple)
-    stiffness: Float[Array, "..."] = eqx.field(converter=as_leaf)
-    damping: Float[Array, "..."] = eqx.field(converter=as_leaf, default=0.0)
-    gear: Float[Array, "..."] = eqx.field(converter=as_leaf, default=1.0)
+    motors: tuple[str, ...] = eqx.field(static=True, converter=partial(check_names, what="motors"))
+    joints: tuple[str, ...] = eqx.field(static=True, converter=partial(check_names, what="joints"))
+    stiffness: Float[Array, "..."] = eqx.field(converter=as_leaf("stiffness"))
+    damping: Float[Array, "..."] = eqx.field(converter=as_leaf("damping"), default=0.0)
+    gear: Float[Array, "..."] = eqx.field(converter=as_leaf("gear"), default=1.0)
 
     def __check_init__(self):
         if len(self.motors) != len(self.joints):
@@ -109,7 +106,7 @@ def elastic_joints(
     scene = jd.forces.elastic_joints(jd.robots.iiwa(), 1e4, 3e-5, damping=5.0, gear=100.0)
     ```
     """
-    chosen = model.joint_names if joints is None else _tuple(joints)
+    chosen = as_names(joints) or model.joint_names
     # Called for its message on unknown joints.
     joint_indices(model, chosen, "elastic_joints")
     kinds = dict(zip(model.joint_names, model.topology.kinds, strict=True))
@@ -117,6 +114,7 @@ def elastic_joints(
         raise ValueError(f"elastic_joints: {several} have several coordinates; name joints of one")
     if not is_positive(rotor_inertia):
         raise ValueError(f"elastic_joints: rotor_inertia is {rotor_inertia}; give positive inertias (kg m^2)")
+    check_name(suffix, "elastic_joints: suffix")
     motors = tuple(f"{name}{suffix}" for name in chosen)
     inertias = jnp.broadcast_to(jnp.asarray(rotor_inertia, float), (len(chosen),))
     whole = model

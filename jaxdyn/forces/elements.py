@@ -5,6 +5,7 @@ Each is a frozen equinox Module called as `force(system, q, v, t) -> (nv,)`; its
 selected joints (all of them when None); per-coordinate values are then listed in the order of these names.
 """
 
+from collections.abc import Callable
 from typing import Any, NamedTuple, cast
 
 import equinox as eqx
@@ -13,8 +14,9 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from jaxdyn.dynamics.kinematics import body_jacobian, frame_pose, take
-from jaxdyn.model.arguments import Number, SystemLike, batch_hint, is_concrete
+from jaxdyn.model.arguments import Number, SystemLike, batch_hint, check_names, is_concrete
 from jaxdyn.model.configuration import difference, neutral
+from jaxdyn.model.numbers import as_float
 from jaxdyn.model.topology import frame_index
 from jaxdyn.model.tree import Model
 
@@ -62,17 +64,17 @@ def scatter(values: Array, indices: np.ndarray, others: Array) -> Array:
     return values if np.array_equal(indices, np.arange(others.size)) else others.at[indices].set(values)
 
 
-def as_leaf(value) -> Any:
-    """Convert a user's number to a floating array leaf of strong type, so that a new value never recompiles."""
-    if value is None:
-        return None
-    value = jnp.asarray(value)
-    return jnp.asarray(value, value.dtype if jnp.issubdtype(value.dtype, jnp.inexact) else float)
+def as_leaf(what: str, *, optional: bool = False) -> Callable[[Any], Any]:
+    """Converter of a field of numbers to a floating array leaf, None where that is `optional`.
+
+    The leaf is of strong type, so that a new value never recompiles. The converter **raises** ValueError, as `as_float` does.
+    """
+    return lambda value: None if value is None and optional else as_float(value, what)
 
 
 def as_names(joints) -> tuple[str, ...] | None:
-    """Tuple of joint names, of one name or several; None for all joints."""
-    return joints if joints is None else (joints,) if isinstance(joints, str) else tuple(joints)
+    """Tuple of joint names, of one name or several; None for all joints. **Raises:** ValueError for anything else."""
+    return None if joints is None else check_names(joints, "joints")
 
 
 def _value_or_leaf(value, system, indices: _Indices, field: str, force: str):
@@ -110,7 +112,7 @@ class JointDamping(eqx.Module):
     **Raises:** (when called) ValueError for unknown joints, a wrong shape, or no coefficient in force and model.
     """
 
-    coefficient: Float[Array, "..."] | None = eqx.field(converter=as_leaf, default=None)
+    coefficient: Float[Array, "..."] | None = eqx.field(converter=as_leaf("coefficient", optional=True), default=None)
     joints: tuple[str, ...] | None = eqx.field(static=True, converter=as_names, default=None)
 
     def __call__(
@@ -141,8 +143,8 @@ class CoulombFriction(eqx.Module):
     level.
     """
 
-    level: Float[Array, "..."] | None = eqx.field(converter=as_leaf, default=None)
-    v_s: Float[Array, "..."] = eqx.field(converter=as_leaf, default=1e-2)
+    level: Float[Array, "..."] | None = eqx.field(converter=as_leaf("level", optional=True), default=None)
+    v_s: Float[Array, "..."] = eqx.field(converter=as_leaf("v_s"), default=1e-2)
     joints: tuple[str, ...] | None = eqx.field(static=True, converter=as_names, default=None)
 
     def __check_init__(self):
@@ -180,8 +182,8 @@ class JointSpring(eqx.Module):
     **Raises:** (when called) ValueError for unknown joints or a wrong shape.
     """
 
-    stiffness: Float[Array, "..."] = eqx.field(converter=as_leaf)
-    rest: Float[Array, "..."] | None = eqx.field(converter=as_leaf, default=None)
+    stiffness: Float[Array, "..."] = eqx.field(converter=as_leaf("stiffness"))
+    rest: Float[Array, "..."] | None = eqx.field(converter=as_leaf("rest", optional=True), default=None)
     joints: tuple[str, ...] | None = eqx.field(static=True, converter=as_names, default=None)
 
     def __call__(
@@ -217,11 +219,11 @@ class Drive(eqx.Module):
     shape.
     """
 
-    kp: Float[Array, "..."] = eqx.field(converter=as_leaf)
-    kd: Float[Array, "..."] = eqx.field(converter=as_leaf)
-    target: Float[Array, "..."] = eqx.field(converter=as_leaf)
-    target_velocity: Float[Array, "..."] = eqx.field(converter=as_leaf, default=0.0)
-    effort_limit: Float[Array, "..."] | None = eqx.field(converter=as_leaf, default=None)
+    kp: Float[Array, "..."] = eqx.field(converter=as_leaf("kp"))
+    kd: Float[Array, "..."] = eqx.field(converter=as_leaf("kd"))
+    target: Float[Array, "..."] = eqx.field(converter=as_leaf("target"))
+    target_velocity: Float[Array, "..."] = eqx.field(converter=as_leaf("target_velocity"), default=0.0)
+    effort_limit: Float[Array, "..."] | None = eqx.field(converter=as_leaf("effort_limit", optional=True), default=None)
     joints: tuple[str, ...] | None = eqx.field(static=True, converter=as_names, default=None)
 
     def __check_init__(self):
@@ -264,7 +266,7 @@ class ExternalWrench(eqx.Module):
     """
 
     frame: str = eqx.field(static=True)
-    wrench: Float[Array, "..."] = eqx.field(converter=as_leaf)
+    wrench: Float[Array, "..."] = eqx.field(converter=as_leaf("wrench"))
     axes: str = eqx.field(static=True, default="world")
 
     def __check_init__(self):

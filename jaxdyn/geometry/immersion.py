@@ -23,8 +23,8 @@ from jaxtyping import Array, Float
 from jaxdyn.compile.known import is_known
 from jaxdyn.dynamics import quantities as dynamics
 from jaxdyn.lie.so3 import matmul
-from jaxdyn.model.arguments import Checked, Function, Numbers, check_state
-from jaxdyn.model.numbers import check_count
+from jaxdyn.model.arguments import Checked, Function, Numbers, check_flag, check_state
+from jaxdyn.model.numbers import as_float, check_count
 from jaxdyn.systems.scene import Scene, as_pytree, as_scene, check_force
 from jaxdyn.systems.system import SceneLike, System, describe_state, rate_to_velocity
 
@@ -262,7 +262,11 @@ def constrain_by_immersion(
             )
     units = tuple(scene.system for scene in scenes)
     immersed = ImmersedSystem(
-        units=units, immersion=as_pytree(xi, "xi"), nq=check_count(nq, "nq"), moving=bool(moving), joined=joined
+        units=units,
+        immersion=as_pytree(xi, "xi"),
+        nq=check_count(nq, "nq"),
+        moving=check_flag(moving, "moving"),
+        joined=joined,
     )
     if force is None and not any(isinstance(unit, Scene) for unit in given):
         return immersed
@@ -309,7 +313,8 @@ def reaction_force(
     # The generalised force comes from the same per-unit forces that are subtracted below, so that J^T R = 0 to rounding.
     applied = [jnp.zeros_like(w) for w in speeds]
     if force is not None:
-        applied = _add_forces(applied, force if immersed.joined else (force,), "force")
+        given = force if immersed.joined and isinstance(force, Sequence) else (force,)
+        applied = _add_forces(applied, [as_float(part, "force", (None,), q.dtype) for part in given], "force")
     for pulled in scene.forces:
         applied = [a + f for a, f in zip(applied, pulled.on_units(immersed, places, speeds, t), strict=True)]
     tau = _sum(matmul(m.J.T, f) for m, f in zip(motions, applied, strict=True))

@@ -20,7 +20,7 @@ from jaxdyn.constraints.loops import attitude, check_bodies
 from jaxdyn.constraints.rolling import RollingSphere, RollingWheel
 from jaxdyn.contact.kinds import components
 from jaxdyn.model import host_math
-from jaxdyn.model.arguments import DType, Numbers, SystemLike, pose_leaf
+from jaxdyn.model.arguments import DType, Numbers, SystemLike, check_body, check_new_name, pose_leaf
 
 
 class Contact(Pair):
@@ -108,14 +108,14 @@ def contact(
 
     Source: Murray, Li & Sastry (1994), eq. 5.14; EQUATIONS section 10.
     """
-    name = (finger or "world") if name is None else name
+    name = check_new_name(name, finger or "world")
     components(kind, in_plane, f"contact {name!r}")
     return Contact(
         name=name,
         kind=kind,
-        finger=finger,
-        object=object,
-        in_plane=bool(in_plane),
+        finger=check_body(finger, f"contact {name!r}: finger"),
+        object=check_body(object, f"contact {name!r}: object"),
+        in_plane=in_plane,
         pose=pose_leaf(pose, f"contact {name!r}: pose"),
         finger_pose=pose_leaf(finger_pose, f"contact {name!r}: finger_pose"),
     )

@@ -26,7 +26,7 @@ from jaxdyn.constraints.redundancy import distribute_multipliers
 from jaxdyn.constraints.selection import independent_rows
 from jaxdyn.dynamics.quantities import coriolis_matrix, gravity_force, mass_matrix
 from jaxdyn.grasp.hand import Grasp, check_grasp
-from jaxdyn.grasp.motions import HandMotions, hand_motions, velocity_rows
+from jaxdyn.grasp.motions import HandMotions, check_motions, hand_motions, velocity_rows
 from jaxdyn.lie.so3 import matmul
 from jaxdyn.model.arguments import Numbers, as_array, batch_hint, check_state, zeros_if_none
 from jaxdyn.reduction.bases import least_quality
@@ -156,7 +156,7 @@ def hand_dynamics(
     check_grasp(grasp)
     tau = zeros_if_none(tau, grasp.nv)
     q, tau, t = check_state(grasp.system, q=q, tau=tau, t=t)
-    motions = hand_motions(grasp, q, t) if motions is None else motions
+    motions = hand_motions(grasp, q, t) if motions is None else check_motions(motions)
     nh, no = len(grasp.hand_velocities), len(grasp.object_velocities)
     if motions.object.shape[0] != no or motions.internal.shape[0] != nh:
         raise ValueError(

@@ -28,7 +28,7 @@ from jaxdyn.dynamics.quantities import gravity_force
 from jaxdyn.grasp.contacts import Contact
 from jaxdyn.grasp.hand import Grasp, check_grasp, grasp_map, hand_jacobian
 from jaxdyn.lie.so3 import matmul
-from jaxdyn.model.arguments import Numbers, as_array, batch_hint, check_state
+from jaxdyn.model.arguments import Numbers, as_array, batch_hint, check_flag, check_state
 from jaxdyn.reduction.bases import orthonormal, split_directions
 
 
@@ -238,7 +238,7 @@ def force_closure(
     order = np.concatenate([contact.rows for contact in contacts])
     # The cones expect components in the order of the wrench basis, which may differ from that of the rows.
     closure = force_closure_of_map(grasp_map(grasp, q, t)[:, order], [contact.cone for contact in contacts])
-    if required and not closure.closed:
+    if check_flag(required, "required") and not closure.closed:
         raise ValueError(
             f"the contacts {[contact.name for contact in contacts]} on {grasp.object!r} have no force closure: the wrench "
             f"{np.round(closure.direction, 6).tolist()} on the object cannot be resisted; add contacts or friction, or place "

@@ -13,7 +13,7 @@ from jaxtyping import Array, Bool, Float
 from jaxdyn.compile import entry_point, gram_eigenvectors
 from jaxdyn.constraints.base import constraint_jacobian
 from jaxdyn.grasp.hand import Grasp, check_grasp
-from jaxdyn.grasp.motions import HandMotions, hand_motions, velocity_rows
+from jaxdyn.grasp.motions import HandMotions, check_motions, hand_motions, velocity_rows
 from jaxdyn.lie.series import safe_sqrt
 from jaxdyn.lie.so3 import matmul
 from jaxdyn.model.arguments import Numbers, check_state
@@ -73,7 +73,7 @@ def manipulability(
     check_grasp(grasp)
     q, t = check_state(grasp.system, q=q, t=t)
     length = as_number(length, "length", "m", like=q.dtype)
-    motions = hand_motions(grasp, q, t) if motions is None else motions
+    motions = hand_motions(grasp, q, t) if motions is None else check_motions(motions)
     if not motions.object.shape[1]:
         raise ValueError(
             f"the fingers cannot follow any velocity of {grasp.object!r} here, so there is nothing to measure"

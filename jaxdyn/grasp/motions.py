@@ -96,6 +96,13 @@ class HandMotions(Basis):
         return "use jd.grasp.hand_motions(grasp, q)"
 
 
+def check_motions(motions: HandMotions) -> HandMotions:
+    """Check the references that a user gives. **Raises:** ValueError for anything but `HandMotions`."""
+    if not isinstance(motions, HandMotions):
+        raise ValueError(f"motions is {motions!r}; give jd.grasp.hand_motions(grasp, q), or None")
+    return motions
+
+
 def hand_motions(
     grasp: Grasp, q: Float[Array, " nq"], t: Numbers = 0.0, *, sizes: tuple[int, int] | None = None
 ) -> HandMotions:
@@ -134,6 +141,8 @@ def hand_motions(
         else:
             rank = min(count, nh)
             sizes = max(no - (count - rank), 0), nh - rank
+    if not (isinstance(sizes, tuple) and len(sizes) == 2 and all(isinstance(n, (int, np.integer)) for n in sizes)):
+        raise ValueError(f"sizes is {sizes!r}; give (nw, nk), the numbers of motions of the object and of the hand")
     nw, nk = sizes
     if not (0 <= nw <= no and 0 <= nk <= nh):
         raise ValueError(f"sizes is {sizes}; give (nw, nk) with nw from 0 to {no} and nk from 0 to {nh}")

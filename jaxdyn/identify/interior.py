@@ -30,7 +30,12 @@ class TorqueProblem(NamedTuple):
 
     @classmethod
     def of(cls, chart: "LinearChart", condensed: Condensed, sigma: float, prior: float) -> "TorqueProblem":
-        """Problem of condensed logs with the torque noise sigma (N m). **Raises:** ValueError for a noise of zero."""
+        """Problem of condensed logs with the torque noise sigma (N m). **Raises:** ValueError for zero or infinite noise."""
+        # An infinite deviation would weigh all errors by zero, and any point would be a minimum.
+        if not sigma < np.inf:
+            raise ValueError(
+                f"the torques of the logs have the deviation {sigma}: their squares overflow; give them in N m"
+            )
         if not sigma > 0:
             raise ValueError(
                 "the torques of the logs are all zero; a fit by torques needs logs of a robot that is driven"

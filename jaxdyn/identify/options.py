@@ -21,6 +21,7 @@ from typing import Any
 import equinox as eqx
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array, Float
 
 from jaxdyn.dynamics import quantities as dynamics
@@ -39,7 +40,8 @@ from jaxdyn.identify.replay import (
 )
 from jaxdyn.identify.result import inverse_torque
 from jaxdyn.identify.sensors import Measured
-from jaxdyn.model.arguments import Checked, FilePath, SystemLike, warn
+from jaxdyn.model.arguments import Checked, FilePath, SystemLike, check_mapping, warn
+from jaxdyn.model.numbers import as_static, check_count, check_seed
 from jaxdyn.simulation.controls import Control
 from jaxdyn.systems.system import displace
 from jaxdyn.tasks import DaskClient
@@ -49,7 +51,14 @@ BALANCES = ("momentum", "energy")
 ERRORS = ("trajectory", "torque", "momentum", "energy", "closed-loop")
 
 
+_SIMULATE = ("solver", "stepsize", "rtol", "atol", "adjoint", "max_steps", "method")
+
+
 def _as_tuple(names):
+    if names is not None and not isinstance(names, (tuple, list)):
+        raise ValueError(
+            f"observed is {names!r}; give the names (or indices) of the measured coordinates, or None for all"
+        )
     return None if names is None else tuple(names)
 
 
@@ -103,8 +112,14 @@ class Objective(eqx.Module):
         check_replay(self.initial, self.hold)
         if self.error not in ERRORS:
             raise ValueError(f"error is {self.error!r}; give one of {ERRORS}")
-        if not self.noise > 0:
-            raise ValueError(f"noise is {self.noise}; give a positive share, such as 0.01")
+        as_static(self.noise, "noise", np.finfo(float).tiny, np.inf, "a positive share, such as 0.01")
+        unknown = set(check_mapping(self.simulation, "simulation", '{"rtol": 1e-6}')) - set(_SIMULATE)
+        if unknown or self.simulation is None:
+            raise ValueError(
+                f"simulation is {self.simulation!r}; give options by name, of {', '.join(_SIMULATE)}, or none: {{}}"
+            )
+        if self.horizon is not None:
+            check_count(self.horizon, "horizon")
         if (self.control is None) == (self.error == "closed-loop"):
             raise ValueError(
                 f"control is {self.control!r} with error={self.error!r}; error='closed-loop' takes the logged controller, "
@@ -271,16 +286,17 @@ class Solver(eqx.Module):
         methods = (GAUSS_NEWTON, *SOLVERS, *METHODS)
         if isinstance(self.method, str) and self.method not in methods:
             raise ValueError(f"method is {self.method!r}; give one of {methods} or an optax.GradientTransformation")
-        if not (self.steps > 0 and self.learning_rate > 0 and self.tolerance >= 0):
-            raise ValueError(
-                f"steps={self.steps}, learning_rate={self.learning_rate}, tolerance={self.tolerance}; all must be positive"
-            )
-        if isinstance(self.starts, bool) or not isinstance(self.starts, int) or self.starts < 1:
-            raise ValueError(f"starts is {self.starts!r}; give the number of starting points, at least 1")
-        if not self.spread > 0:
-            raise ValueError(
-                f"spread is {self.spread}; give a positive number, the deviation of the starts' coordinates"
-            )
+        if not (isinstance(self.method, str) or (hasattr(self.method, "init") and hasattr(self.method, "update"))):
+            raise ValueError(f"method is {self.method!r}; give one of {methods} or an optax.GradientTransformation")
+        check_count(self.steps, "steps")
+        check_count(self.starts, "starts")
+        check_seed(self.seed)
+        positive = np.finfo(float).tiny
+        as_static(self.learning_rate, "learning_rate", positive, np.inf, "a positive number")
+        as_static(self.tolerance, "tolerance", 0, np.inf, "zero or a positive number")
+        as_static(
+            self.spread, "spread", positive, np.inf, "a positive number, the deviation of the starts' coordinates"
+        )
 
     @property
     def name(self) -> str:

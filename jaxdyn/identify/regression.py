@@ -15,6 +15,7 @@ from jaxdyn.identify.torque_terms import TERMS, Terms, check_terms, friction_reg
 from jaxdyn.model.arguments import Number, Numbers, as_array, check_shapes, is_concrete
 from jaxdyn.model.configuration import integrate, neutral
 from jaxdyn.model.joints import KINDS
+from jaxdyn.model.numbers import check_seed
 from jaxdyn.model.tree import Model
 
 _NUMBERS = ("m", "mcx", "mcy", "mcz", "Ixx", "Ixy", "Iyy", "Ixz", "Iyz", "Izz")
@@ -38,7 +39,7 @@ def parameter_names(model: Model, terms: Terms = TERMS) -> tuple[str, ...]:
     """Names of x: the ten numbers of each body (`body.m`, `body.mcx`, ...), then the terms (`joint.viscous`)."""
     joints = coordinate_names(model)
     bodies = [f"{body}.{number}" for body in model.body_names for number in _NUMBERS]
-    return tuple(bodies + [f"{joint}.{term}" for term in terms for joint in joints])
+    return tuple(bodies + [f"{joint}.{term}" for term in check_terms(terms, v_s=1.0) for joint in joints])
 
 
 def nominal_parameters(model: Model) -> np.ndarray:
@@ -214,7 +215,8 @@ def base_parameters(model: Model, terms: Terms = (), *, v_s: float = 0.01, seed:
 
     **Returns:** `BaseParameters`. The iiwa's 70 numbers give 43.
 
-    **Raises:** ValueError when the rank is not clear in the model's precision (use a float64 model).
+    **Raises:** ValueError for unknown terms, a `v_s` or a seed that does not fit, and when the rank is not clear in the
+    model's precision (use a float64 model).
 
     Source: Gautier (1991), "Numerical calculation of the base inertial parameters"; Khalil & Dombre (2002), chapter 9.
     """
@@ -223,7 +225,7 @@ def base_parameters(model: Model, terms: Terms = (), *, v_s: float = 0.01, seed:
     p = len(names)
     # Twice as many rows as columns: a rank must not be low for lack of states.
     count = max(2 * p // max(model.nv, 1) + 1, 30)
-    generator = np.random.default_rng(seed)
+    generator = np.random.default_rng(check_seed(seed))
     # Away from the neutral configuration by up to about half a turn; identifiability does not depend on limits.
     displacement, v, a = generator.normal(size=(3, count, model.nv))
     q = _displace_neutral(model, jnp.asarray(2 * displacement, model.home.dtype))

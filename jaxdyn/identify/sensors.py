@@ -9,6 +9,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float, PyTree
 
 from jaxdyn.model.arguments import Function, Numbers, as_array, state_dtype
+from jaxdyn.model.numbers import as_float
 from jaxdyn.systems.scene import Scene, as_pytree, as_scene
 from jaxdyn.systems.system import SceneLike
 
@@ -125,9 +126,7 @@ class Measured(eqx.Module):
             if array.shape != (nv,):
                 raise ValueError(f"{name} has shape {array.shape}, expected {(nv,)} = (nv,)")
             setattr(self, name, array)
-        self.delay = jnp.asarray(as_array(delay, "delay", dtype))
-        if self.delay.shape != ():
-            raise ValueError(f"delay has shape {self.delay.shape}; give one number (s)")
+        self.delay = as_float(delay, "delay", (), dtype)
 
 
 def with_sensors(system: Any) -> Measured:

@@ -12,7 +12,7 @@ Source: Dahl (1968), "A solid friction model"; Hamon, Gautier & Garrec (2010), l
 """
 
 import itertools
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Iterable, Sequence, Set
 from typing import TYPE_CHECKING, Any
 
 import equinox as eqx
@@ -22,6 +22,7 @@ from jaxtyping import Array, Float
 
 from jaxdyn.identify.logs import Log, filter_like_log, refine_samples, samples_for_jumps
 from jaxdyn.model.arguments import Number, SystemLike, warn
+from jaxdyn.model.numbers import as_number
 
 TERMS = ("viscous", "coulomb", "offset", "armature")
 # Terms that are physical only when they are not negative.
@@ -71,12 +72,13 @@ def friction_regressor(v: Float[Array, " nv"], a: Float[Array, " nv"], terms, v_
 
 def check_terms(terms: Terms, v_s: Number) -> tuple[str, ...]:
     """Check terms, and return a tuple. **Raises:** ValueError for an unknown or repeated term, or a v_s that is not positive."""
+    if not isinstance(terms, (str, Sequence, Set)):
+        raise ValueError(f"terms is {terms!r}; give some of {TERMS}, each once")
     terms = (terms,) if isinstance(terms, str) else tuple(terms)
     unknown = [term for term in terms if term not in TERMS]
     if unknown or len(set(terms)) < len(terms):
         raise ValueError(f"terms is {terms}; give some of {TERMS}, each once")
-    if not v_s > 0:
-        raise ValueError(f"v_s is {v_s}; give a positive smoothing velocity, e.g. 0.01 rad/s")
+    as_number(v_s, "v_s", "rad/s or m/s, such as 0.01")
     return terms
 
 

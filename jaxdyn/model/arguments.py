@@ -4,7 +4,7 @@ import os
 import pathlib
 import sys
 import warnings
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from typing import TYPE_CHECKING, Annotated, Any, Protocol, TypeVar
 
 import equinox as eqx
@@ -96,6 +96,53 @@ def as_path(path: Any, name: str = "path") -> pathlib.Path:
     if not isinstance(path, (str, os.PathLike)) or isinstance(path, bytes):
         raise ValueError(f"{name} is {path!r}; pass the path of a file, a string or a pathlib.Path")
     return pathlib.Path(path).expanduser()
+
+
+def check_name(name: Any, what: str) -> str:
+    """Check that something is named by a string. **Raises:** ValueError."""
+    if not isinstance(name, str):
+        raise ValueError(f"{what} is {name!r}; give its name, a string")
+    return name
+
+
+def check_names(names: Any, what: str) -> tuple[str, ...]:
+    """Tuple of names, of one name or several. **Raises:** ValueError for anything else."""
+    if isinstance(names, str):
+        return (names,)
+    if not isinstance(names, (tuple, list)):
+        raise ValueError(f"{what} is {names!r}; give a name, or several in a list")
+    return tuple(check_name(name, what) for name in names)
+
+
+def check_body(name: Any, what: str) -> str | None:
+    """Check that a body or frame is named by a string, or is the world, None. **Raises:** ValueError."""
+    return None if name is None else check_name(name, what)
+
+
+def check_new_name(name: Any, default: str, what: str = "name") -> str:
+    """Check the name that a user gives to something, or take the default for None. **Raises:** ValueError."""
+    if name is None:
+        return default
+    if not isinstance(name, str) or not name:
+        raise ValueError(f"{what} is {name!r}; give a non-empty string, or None for {default!r}")
+    return name
+
+
+def check_flag(value: Any, what: str) -> bool:
+    """Check a choice of yes or no on which a program depends.
+
+    **Raises:** ValueError for anything but True and False: to Python any object is true, "no" and NaN included.
+    """
+    if not isinstance(value, (bool, np.bool_)):
+        raise ValueError(f"{what} is {value!r}; give True or False, not traced")
+    return bool(value)
+
+
+def check_mapping(value: Any, what: str, example: str) -> dict[str, Any]:
+    """Check a mapping from names, None for an empty one. **Raises:** ValueError that shows the example."""
+    if value is not None and not isinstance(value, Mapping):
+        raise ValueError(f"{what} is {value!r}; give a mapping from names, such as {example}")
+    return {check_name(name, f"a key of {what}"): item for name, item in (value or {}).items()}
 
 
 def parse_number(text: str) -> float:

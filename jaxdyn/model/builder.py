@@ -15,7 +15,7 @@ import numpy as np
 
 from jaxdyn.compile.known import array_namespace, is_concrete
 from jaxdyn.model import host_math
-from jaxdyn.model.arguments import DType, Number, Numbers, store_leaf
+from jaxdyn.model.arguments import DType, Number, Numbers, check_name, store_leaf
 from jaxdyn.model.joints import KINDS, SCREW_KINDS
 from jaxdyn.model.tree import Model, Topology, check_rounding, warn_unphysical_inertias
 
@@ -78,7 +78,7 @@ class ModelBuilder:
         dtype: DType | None = None,
         rounding: float = 0.0,
     ):
-        self._name = name
+        self._name = check_name(name, "name")
         self._rounding = check_rounding(rounding)
         three = {(3,): "three numbers (3,) or None"}
         self._gravity = None if gravity is None else host_math.numbers(gravity, three, "gravity")
@@ -319,7 +319,11 @@ def _float_dtype(dtype):
     default = jnp.dtype(jax.dtypes.canonicalize_dtype(float))
     if dtype is None:
         return default
-    if not jnp.issubdtype(dtype, jnp.floating):
+    try:
+        is_floating = jnp.issubdtype(dtype, jnp.floating)
+    except TypeError:
+        is_floating = False
+    if not is_floating:
         raise ValueError(f"dtype is {dtype!r}; give a floating-point type such as jax.numpy.float32")
     # jax would truncate to float32 without an error, and every later comparison would fail by 1e-7.
     if jax.dtypes.canonicalize_dtype(dtype) != jnp.dtype(dtype):

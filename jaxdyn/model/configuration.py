@@ -6,7 +6,7 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from jaxdyn.compile.known import array_namespace
-from jaxdyn.model.arguments import Numbers, as_array, check_shapes
+from jaxdyn.model.arguments import Numbers, check_shapes
 from jaxdyn.model.joints import (
     KINDS,
     joint_difference,
@@ -15,6 +15,7 @@ from jaxdyn.model.joints import (
     joint_random,
     joint_rate,
 )
+from jaxdyn.model.numbers import as_float
 from jaxdyn.model.tree import Model, Topology
 
 
@@ -49,9 +50,11 @@ def integrate(model: Model, q: Float[Array, " nq"], v: Float[Array, " nv"], dt: 
     **Arguments:** `q` (nq,); `v` (nv,), body-fixed; `dt` in s.
 
     **Returns:** (nq,), with unit quaternions.
+
+    **Raises:** ValueError for shapes that do not fit.
     """
     q, v = check_shapes(model, q=q, v=v)
-    dt = as_array(dt, "dt", q.dtype)
+    dt = as_float(dt, "dt", (), q.dtype)
     return model.complete_configuration(q, map_joints(model.topology, joint_integrate, q, (v * dt, False)))
 
 

@@ -16,6 +16,7 @@ from jaxdyn.compile.known import array_namespace
 from jaxdyn.lie import so3
 from jaxdyn.model import host_math
 from jaxdyn.model.arguments import Checked, Number, Numbers, Row
+from jaxdyn.model.numbers import as_static
 
 # Positions of (xx, xy, yy, xz, yz, zz) in a symmetric 3x3 matrix, row by row.
 _SYMMETRIC = np.array([[0, 1, 3], [1, 2, 4], [3, 4, 5]])
@@ -183,7 +184,10 @@ def is_feasible(parameters: Numbers, *, tolerance: float = 0.0) -> bool:
     """Decide whether concrete parameters (10,) belong to a physical body: pseudo-inertia positive semidefinite.
 
     `tolerance` is relative to its largest eigenvalue.
+
+    **Raises:** ValueError for a tolerance that is negative or no number.
     """
+    tolerance = as_static(tolerance, "tolerance", 0, np.inf, "zero or a positive number")
     parameters = np.asarray(parameters, np.float64)
     if not np.isfinite(parameters).all():
         return False
@@ -195,7 +199,8 @@ def is_feasible(parameters: Numbers, *, tolerance: float = 0.0) -> bool:
 def nearest_feasible(parameters: Numbers, *, floor: float = 1e-6) -> np.ndarray:
     """Feasible parameters close to infeasible ones: pseudo-inertia eigenvalues raised to `floor` times the largest.
 
-    **Raises:** ValueError when the mass is not positive, because then there is no body to repair, and for NaN or infinity.
+    **Raises:** ValueError when the mass is not positive, because then there is no body to repair, for NaN or infinity, and
+    for a floor outside [0, 1).
     """
     parameters = np.asarray(parameters, np.float64)
     if not np.isfinite(parameters).all():
@@ -204,7 +209,7 @@ def nearest_feasible(parameters: Numbers, *, floor: float = 1e-6) -> np.ndarray:
         raise ValueError(f"mass is {parameters[0]}, cannot be repaired; give the body a positive mass")
     values, vectors = np.linalg.eigh(host_math.pseudo_inertia(parameters))
     # Raising eigenvalues changes the trace, and with it the mass; the scaling below restores the given mass.
-    values = np.maximum(values, floor * values[-1])
+    values = np.maximum(values, as_static(floor, "floor", 0, 1, "a number from 0 to 1") * values[-1])
     repaired = (vectors * values) @ vectors.T
     repaired *= parameters[0] / repaired[3, 3]
     return host_math.parameters_from_pseudo(repaired).astype(_dtypes.canonicalize_dtype(float))

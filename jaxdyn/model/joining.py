@@ -10,7 +10,7 @@ import numpy as np
 
 from jaxdyn.compile.known import array_namespace, is_concrete
 from jaxdyn.lie.so3 import matmul
-from jaxdyn.model.arguments import Checked, Numbers, pose_leaf, store_leaf
+from jaxdyn.model.arguments import Checked, Numbers, check_new_name, pose_leaf, store_leaf
 from jaxdyn.model.joints import KINDS
 from jaxdyn.model.tree import Model, Topology
 
@@ -52,7 +52,7 @@ def join(
     if not isinstance(prefixes, (tuple, list)) or len(prefixes) != 2 or not all(isinstance(x, str) for x in prefixes):
         raise ValueError(f"prefix is {prefix!r}; give a string for the right model, or one for each")
     first, second = (add_prefix(model, before) for model, before in zip((left, right), prefixes, strict=True))
-    whole = f"{left.name} and {right.name}" if name is None else name
+    whole = check_new_name(name, f"{left.name} and {right.name}")
     return _side_by_side(
         [first, second if pose is None else _move_world(second, pose)], whole, "pass prefix=", by_name=False
     )

@@ -51,9 +51,17 @@ def as_static(value: Any, what: str, low: Number, high: Number, fix: str) -> flo
 
     **Raises:** ValueError for anything else, with what to give: `fix`.
     """
-    if isinstance(value, str) or not is_concrete(value) or np.shape(value) != () or not low <= float(value) < high:
+    is_number = isinstance(value, (int, float, np.ndarray, np.generic, jax.Array)) and is_concrete(value)
+    if not is_number or np.shape(value) != () or not low <= float(value) < high:
         raise ValueError(f"{what} is {value!r}; give {fix}, not traced")
     return float(value)
+
+
+def check_seed(value: Any, what: str = "seed") -> int:
+    """Check the seed of random numbers. **Raises:** ValueError for anything but an integer of 32 bits that is not negative."""
+    if isinstance(value, bool) or not isinstance(value, (int, np.integer)) or not 0 <= value < 2**32:
+        raise ValueError(f"{what} is {value!r}; give a whole number from 0 to 2^32 - 1")
+    return int(value)
 
 
 def check_count(value: Any, what: str) -> int:

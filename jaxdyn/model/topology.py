@@ -9,6 +9,7 @@ from typing import Any
 
 import numpy as np
 
+from jaxdyn.model.arguments import check_name
 from jaxdyn.model.joints import KINDS, screw_mask
 
 
@@ -124,12 +125,6 @@ class Topology:
             # Each table composed with itself doubles the distance of the jump.
             jump = jump[jump]
         return tuple(tables)
-
-
-def check_name(name: Any, what: str) -> None:
-    """Check that a part of a model is named by a string. **Raises:** ValueError."""
-    if not isinstance(name, str):
-        raise ValueError(f"{what} is {name!r}; give its name, a string")
 
 
 def body_index(model: Any, name: str | None) -> int:

@@ -201,7 +201,7 @@ def spurious_terms(
         raise ValueError("the scene has no constraints, so there is nothing to substitute; add some")
     if scene.nq != scene.nv:
         raise ValueError(f"the system has nq = {scene.nq}, nv = {scene.nv}; substitution needs v = dq/dt")
-    choice = as_basis(tuple(independent), scene)
+    choice = as_basis(tuple(independent) if isinstance(independent, Sequence) else independent, scene)
     if not isinstance(choice, Independent) or nu.shape != (choice.size(scene),):
         raise ValueError(f"nu has shape {nu.shape}, expected {(choice.size(scene),)} = (nr,){batch_hint(nu, (1,))}")
     terms, depends = _substitute(independent_rows(scene, q, t), choice, q, nu, tau, t)

@@ -13,7 +13,7 @@ Sources: Nakamura & Ghodoussi (1989), Dynamics computation of closed-link robot 
 actuators, eqs. 12 to 20; EQUATIONS sections 6 to 8.
 """
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from typing import TYPE_CHECKING, Any
 
 import jax.numpy as jnp
@@ -165,7 +165,9 @@ def _motors(scene: Scene, motors, dtype) -> tuple[Any, tuple[int, ...] | None]:
 
 def velocity_choice(scene: Scene, velocities: Any, argument: str) -> tuple[int, ...]:
     """Different indices of velocities, named by joints or given. **Raises:** ValueError for others."""
-    given = [velocities] if isinstance(velocities, str) else list(velocities)
+    given = (
+        [velocities] if isinstance(velocities, str) else list(velocities) if isinstance(velocities, Iterable) else []
+    )
     if given and all(isinstance(name, str) for name in given):
         if not isinstance(scene.system, Model):
             raise ValueError(f"{argument} names joints, and a {type(scene.system).__name__} has none; give indices")

@@ -29,7 +29,8 @@ from jaxdyn.constraints.redundancy import distribute_multipliers
 from jaxdyn.constraints.selection import independent_rows, rank_code
 from jaxdyn.dynamics.quantities import bias_force, coriolis_matrix, mass_matrix
 from jaxdyn.lie.so3 import matmul
-from jaxdyn.model.arguments import Numbers, batch_hint, check_state, zeros_if_none
+from jaxdyn.model.arguments import Numbers, check_state, zeros_if_none
+from jaxdyn.model.numbers import as_float
 from jaxdyn.reduction.bases import count_dof, orthonormal, split_directions
 from jaxdyn.systems.mass_factor import cholesky, solve_lower
 from jaxdyn.systems.scene import Scene, as_scene
@@ -107,11 +108,10 @@ def gauge_invariant(
         raise ValueError("the scene has no constraints, so there is nothing to decouple; use jd.forward_dynamics")
     scene = independent_rows(scene, q, t, rank_tol)
     dof = count_dof(scene, q, t, dof, rank_tol)
-    for name, value, size in (("rotation", rotation, scene.nv), ("motion_rotation", motion_rotation, dof)):
-        if value is not None and value.shape != (size, size):
-            raise ValueError(
-                f"{name} has shape {value.shape}, expected {(size, size)}; give an orthogonal matrix{batch_hint(value, (1, 1))}"
-            )
+    rotation, motion_rotation = (
+        None if value is None else as_float(value, name, (size, size), q.dtype)
+        for name, value, size in (("rotation", rotation, scene.nv), ("motion_rotation", motion_rotation, dof))
+    )
     return _decouple(scene, q, v, tau, t, rotation, motion_rotation, dof, rank_tol)
 
 

@@ -11,7 +11,7 @@ import numpy as np
 from jaxtyping import PyTree
 
 from jaxdyn.model.arguments import as_array
-from jaxdyn.model.numbers import check_count
+from jaxdyn.model.numbers import check_count, check_seed
 
 MAX_MEMBERS = 2**32  # `fold_in` takes 32 bits
 
@@ -73,16 +73,17 @@ def members(named: dict[str, Any], draw: Callable | None, samples: int | float |
             raise ValueError(f"{first} is of {size} rollouts and {name} of {other}; give as many of each")
     if not 0 < size < MAX_MEMBERS:
         raise ValueError(f"{first} is of {size} rollouts; give from 1 to 2^32 - 1")
-    if isinstance(seed, bool) or not isinstance(seed, (int, np.integer)) or not 0 <= seed < MAX_MEMBERS:
-        raise ValueError(f"seed is {seed!r}; give a whole number from 0 to 2^32 - 1")
-    return Members(size, rows, draw, int(seed))
+    return Members(size, rows, draw, check_seed(seed))
 
 
 def member(parameters: PyTree, number: int, seed: int = 0) -> PyTree:
     """Parameters of rollout `number` of `jd.scale.run` and `jd.scale.evaluate`, to compute it again.
 
     **Arguments:** `parameters` and `seed` as they were passed there.
+
+    **Raises:** ValueError for a number of a rollout or a seed that is negative or no integer.
     """
+    seed = check_seed(seed)
     # As in `Members.one`, which the program of a batch traces.
     if callable(parameters):
         return parameters(jax.random.fold_in(jax.random.key(seed), jnp.uint32(number)))

@@ -3,6 +3,7 @@
 from typing import Any
 
 import jax
+import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array
 
@@ -99,8 +100,11 @@ def _cube_start(
         target = position + size / 2 * rotation @ np.asarray(point)
         reached = _reach(model, joints, offset, np.array([angles[i] for i in joints]), target)
         place, jacobian = _tip(model, joints, offset, reached)
-        # A traced target cannot be refused; the residuals of the contacts then show the gap.
-        if is_concrete(target) and not np.linalg.norm(target - place) < 1e-12:
+        # A traced target cannot be refused: a start that does not reach it is not a number.
+        gap = xp.linalg.norm(target - place)
+        if not is_concrete(target):
+            reached = jnp.where(gap < 4e4 * jnp.finfo(place.dtype).eps * size, reached, jnp.nan)
+        elif not gap < 1e-12:
             raise ValueError(
                 f"size is {size}, position {np.asarray(position).tolist()}, turned {list(turned)}: {name} cannot reach its "
                 "contact point on the cube; give a pose closer to the default one"

@@ -13,8 +13,19 @@ from jaxdyn.constraints.base import constraint_jacobian, layout
 from jaxdyn.constraints.dynamics import constrained_dynamics
 from jaxdyn.contact.unilateral import UnilateralContact
 from jaxdyn.lie.so3 import matmul
-from jaxdyn.model.arguments import Checked, Numbers, as_array, check_state, is_concrete, zeros_if_none
-from jaxdyn.model.numbers import as_number
+from jaxdyn.model.arguments import (
+    Checked,
+    DType,
+    Numbers,
+    as_array,
+    check_mapping,
+    check_name,
+    check_state,
+    is_concrete,
+    zeros_if_none,
+)
+from jaxdyn.model.numbers import as_float, as_number
+from jaxdyn.model.topology import frame_index
 from jaxdyn.model.tree import Model
 from jaxdyn.systems.scene import Scene, as_scene
 from jaxdyn.systems.system import SceneLike
@@ -108,7 +119,9 @@ class Sensor(eqx.Module):
     delay: Array = eqx.field(converter=_as_delay, default=0.0, kw_only=True)
 
     def __post_init__(self):
-        self.name = self.name or self.default_name()
+        self.name = check_name(self.name, "name") or self.default_name()
+        if not (self.noise is None or isinstance(self.noise, Noise)):
+            raise ValueError(f"sensor {self.name!r}: noise is {self.noise!r}; give a jd.sensors.Noise, or None")
 
     def default_name(self) -> str:
         """Name of the readings where none is given."""
@@ -132,7 +145,7 @@ class Sensor(eqx.Module):
 
 def check_part(part: Any, parts: dict) -> None:
     """Check that a sensor has such a part. **Raises:** ValueError."""
-    if part not in parts:
+    if not (part is None or isinstance(part, str)) or part not in parts:
         raise ValueError(f"part is {part!r}; choose from {', '.join(map(repr, parts))}")
 
 
@@ -187,6 +200,7 @@ def measure(
     scene = as_scene(scene)
     sensors = check_sensors(scene, sensors)
     q, v, tau, t = check_state(scene.system, q=q, v=v, tau=zeros_if_none(tau, scene.nv), t=t)
+    thrusts = check_thrusts(scene, thrusts, (6,), q.dtype)
     return readings_of(sensors, motion_at(scene, q, v, tau, t, thrusts, check_contacts(scene, contacts, (), q.dtype)))
 
 
@@ -232,6 +246,14 @@ def check_contacts(scene: Scene, contacts: Any, rows: tuple[int, ...], dtype) ->
         if parts[-1].shape != wanted:
             raise ValueError(f"contacts[{name!r}] has shape {parts[-1].shape}, expected {wanted}")
     return jnp.concatenate(parts, -1)
+
+
+def check_thrusts(scene: Scene, thrusts: Any, shape: tuple[int, ...], dtype: DType) -> dict[str, Array]:
+    """Check wrenches by the names of frames. **Raises:** ValueError for unknown frames, and for another shape."""
+    given = check_mapping(thrusts, "thrusts", '{"propeller": wrench}')
+    for frame in given:
+        frame_index(scene.system, frame)
+    return {frame: as_float(wrench, f"thrusts[{frame!r}]", shape, dtype) for frame, wrench in given.items()}
 
 
 def readings_of(sensors: Sequence[Sensor], motion: Motion) -> dict[str, Array]:

@@ -1,5 +1,6 @@
 """Sensors of joints and of forces: encoder, tachometer, force and torque in a joint or a mount, contact force."""
 
+from functools import partial
 from typing import Any, cast
 
 import equinox as eqx
@@ -15,7 +16,7 @@ from jaxdyn.dynamics.joint_wrenches import joint_wrench
 from jaxdyn.dynamics.kinematics import named_frame
 from jaxdyn.forces.wrenches import sum_wrenches, wrenches_where
 from jaxdyn.lie import se3
-from jaxdyn.model.arguments import Numbers
+from jaxdyn.model.arguments import Numbers, check_names
 from jaxdyn.model.numbers import as_float, as_number
 from jaxdyn.model.topology import joint_index
 from jaxdyn.model.tree import Model
@@ -32,7 +33,7 @@ def _as_inertia(inertia: Numbers | None) -> Array | None:
 
 
 def _as_frames(frames: Any) -> tuple[str, ...] | None:
-    return None if frames is None else tuple(frames)
+    return None if frames is None else check_names(frames, "frames")
 
 
 class Encoder(Sensor):
@@ -136,7 +137,9 @@ class ForceTorque(Sensor):
 
     frame: str = eqx.field(static=True)
     inertia: Array | None = eqx.field(converter=_as_inertia, default=None, kw_only=True)
-    joints: tuple[str, ...] = eqx.field(static=True, converter=tuple, default=(), kw_only=True)
+    joints: tuple[str, ...] = eqx.field(
+        static=True, converter=partial(check_names, what="joints"), default=(), kw_only=True
+    )
     frames: tuple[str, ...] | None = eqx.field(static=True, converter=_as_frames, default=None, kw_only=True)
     part: str | None = eqx.field(static=True, default=None, kw_only=True)
 

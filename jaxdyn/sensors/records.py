@@ -11,7 +11,7 @@ from jaxtyping import Array, Float
 
 from jaxdyn.lie import so3
 from jaxdyn.model.arguments import Checked, Numbers, as_array, is_concrete, state_dtype
-from jaxdyn.sensors.base import Noise, Sensor, check_contacts, check_sensors, motion_at
+from jaxdyn.sensors.base import Noise, Sensor, check_contacts, check_sensors, check_thrusts, motion_at
 from jaxdyn.systems.scene import as_scene
 from jaxdyn.systems.system import SceneLike
 
@@ -63,12 +63,7 @@ def record(
     if is_concrete(ts) and not (np.diff(np.asarray(ts)) > 0).all():
         raise ValueError("ts does not increase; give the times of the samples in order")
 
-    thrusts = {frame: as_array(x, f"thrusts[{frame!r}]", dtype) for frame, x in (thrusts or {}).items()}
-    for frame, wrench in thrusts.items():
-        if wrench.shape != (count, 6):
-            raise ValueError(
-                f"thrusts[{frame!r}] has shape {wrench.shape}, expected {(count, 6)}, one row per time in ts"
-            )
+    thrusts = check_thrusts(scene, thrusts, (count, 6), dtype)
 
     forces = check_contacts(scene, contacts, (count,), dtype)
 
@@ -84,7 +79,10 @@ def record(
             # An orientation has four numbers and three angles of error.
             sensor.noise.check(sensor.name, values.shape[1] if at is None else at + 3)
     # One key for each sensor: the noise of one does not depend on the number of readings of another.
-    keys = [None] * len(sensors) if key is None else list(jax.random.split(key, len(sensors)))
+    try:
+        keys = [None] * len(sensors) if key is None else list(jax.random.split(key, len(sensors)))
+    except (TypeError, ValueError):
+        raise ValueError(f"key is {key!r}; give a random key, such as jax.random.key(0), or None") from None
     results = {}
     for sensor, values, one in zip(sensors, readings, keys, strict=True):
         at, late = sensor.quaternion_start(scene), ts - sensor.delay.astype(dtype)

@@ -32,6 +32,7 @@ from jaxdyn.dynamics.quantities import forward_dynamics
 from jaxdyn.lie.so3 import matmul
 from jaxdyn.model.arguments import Number, Numbers, state_dtype
 from jaxdyn.model.configuration import neutral
+from jaxdyn.model.numbers import as_float, check_count
 from jaxdyn.model.tree import Model
 from jaxdyn.reduction.bases import (
     Basis,
@@ -203,7 +204,9 @@ class Baumgarte(Multipliers):
     name: ClassVar[str] = "baumgarte"
 
     def __init__(self, alpha: Numbers = 10.0, beta: Numbers = 10.0):
-        self.alpha, self.beta = jnp.asarray(alpha, float), jnp.asarray(beta, float)
+        self.alpha, self.beta = (
+            as_float(value, f"Baumgarte: {name}", (), float) for name, value in (("alpha", alpha), ("beta", beta))
+        )
 
     def acceleration(self, scene: Scene, q: Q, v: V, t: Number, force: Force) -> Array:
         r"""Acceleration under the rows with feedback of their violation.
@@ -243,8 +246,12 @@ class Reduced(Method):
     def __init__(self, basis: BasisLike | None = None, *, dof: int | None = None):
         # A function becomes a pytree, so that arrays which it holds are inputs of the compiled run and not constants.
         is_function = callable(basis) and not isinstance(basis, Basis)
+        if basis is not None and not (is_function or isinstance(basis, (Basis, tuple, list, np.ndarray, jax.Array))):
+            raise ValueError(
+                f"basis is {basis!r}; give indices of independent velocities, a function N(q, t), a reference matrix, or None"
+            )
         self.basis = UserBasis(as_pytree(basis, "basis")) if is_function else basis
-        self.dof = dof
+        self.dof = dof if dof is None else check_count(dof, "dof")
 
     def for_scene(self, scene: Scene, dof: int | None) -> "Reduced":
         """Method with the basis of a scene; `dof` where it is known."""

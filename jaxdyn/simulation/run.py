@@ -15,7 +15,7 @@ import numpy as np
 
 from jaxdyn.compile.known import is_concrete, is_known
 from jaxdyn.contact.unilateral import has_modes
-from jaxdyn.model.arguments import Numbers, as_array, state_dtype
+from jaxdyn.model.arguments import Numbers, as_array, check_flag, state_dtype
 from jaxdyn.simulation import checks, controls
 from jaxdyn.simulation.checks import check_constraints, choose_method, may_have_singular_mass
 from jaxdyn.simulation.controls import Control
@@ -173,7 +173,7 @@ def simulate(
         solution = smooth_motion(scene, control, method, numbers, options)
     if limits == "report":
         solution = report_limits(scene, solution, concrete)
-    throw = concrete if throw is None else throw
+    throw = concrete if throw is None else check_flag(throw, "throw")
     if throw and concrete:
         raise_failure(solution, scene, control, options)
     return solution.result.error_if(solution, ~solution.success) if throw and not concrete else solution

@@ -14,7 +14,7 @@ from jaxdyn.constraints.redundancy import keep_rows
 from jaxdyn.constraints.selection import hide_unclear, select_rows
 from jaxdyn.contact.unilateral import has_modes
 from jaxdyn.forces.piecewise import fix_pieces, guards, pieces_of, values_and_levels
-from jaxdyn.model.arguments import Numbers, as_array, check_shape, state_dtype
+from jaxdyn.model.arguments import Numbers, as_array, check_flag, check_shape, state_dtype
 from jaxdyn.simulation.checks import choose_method
 from jaxdyn.simulation.contact_steps import contact_step, contacts_of, mean_of_steps
 from jaxdyn.simulation.equations import DRIVES
@@ -95,7 +95,7 @@ def stepper(
         start, advance = None, _advance_contacts(scene, length, substeps, limits, smoothing, report)
     else:
         start, advance = _advance(scene, length, substeps, adjoint != "reverse")
-    by_numbers = jax.checkpoint(advance) if remat else advance
+    by_numbers = jax.checkpoint(advance) if check_flag(remat, "stepper: remat") else advance
 
     def step(state, tau, t: Any = 0.0):
         if len(state) != (2 if start is None else 3):
@@ -202,7 +202,7 @@ def _check_contact_options(by_contacts: bool, smoothing, report) -> None:
     energy = as_array(smoothing, "stepper: smoothing")
     if energy.shape != () or (is_concrete(energy) and not 0 <= float(energy) < np.inf):
         raise ValueError(f"stepper: smoothing is {smoothing!r}; give one energy (J), zero or more")
-    if not by_contacts and (report or (is_concrete(energy) and float(energy) > 0)):
+    if not by_contacts and (check_flag(report, "stepper: report") or (is_concrete(energy) and float(energy) > 0)):
         name = "report" if report else "smoothing"
         raise ValueError(f"stepper: {name} is for scenes with contacts, and this one has none; leave it out")
 

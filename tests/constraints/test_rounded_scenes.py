@@ -380,8 +380,10 @@ def test_results_are_those_of_the_exact_mechanism_or_carry_a_code(name, digits, 
             run = (lambda s, q, v, c=call: eqx.filter_jit(lambda q, v: c(s, q, v))(q, v)) if traced else call
             try:
                 success, values = as_arrays(run(*rounded))
-            except ValueError as error:  # refused, with a reason
-                wrong += [f"{function}: {error}"] if traced else []
+            except ValueError as error:
+                # Refused for the rank alone; a trace has a code instead.
+                if traced or "rank" not in str(error):
+                    wrong.append(f"{function}{' traced' * traced}: {error}")
                 continue
             if not success:
                 continue

@@ -1,5 +1,6 @@
 """The Allegro hand from its URDF with a cube: contacts by the names of its fingertips, closure, forces, a short motion."""
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
@@ -45,6 +46,16 @@ def test_the_fingers_move_with_the_cube(hand):
     assert float(jnp.abs(jd.constraint_jacobian(grasp, q) @ v).max()) < 1e-15
     with pytest.raises(ValueError, match=r"link_3.0_tip cannot reach"):
         jd.scenes.allegro_with_cube.start(position=(0.3, 0.0, 0.0))
+
+
+@pytest.mark.long
+def test_a_traced_start_out_of_reach_is_not_a_number(hand):
+    """A traced position cannot be refused; within reach it is the start of known numbers."""
+    start = jax.jit(lambda position: jd.scenes.allegro_with_cube.start(position=position))
+    near, far = jnp.array([0.108, 0.013, 0.004]), jnp.array([0.3, 0.0, 0.0])
+    for got, want in zip(start(near), jd.scenes.allegro_with_cube.start(position=tuple(near.tolist())), strict=True):
+        np.testing.assert_allclose(got, want, atol=1e-12)
+    assert np.isnan(start(far)[0]).any()
 
 
 @pytest.mark.slow

@@ -15,7 +15,7 @@ from jaxdyn import identify, inertia, robots
 from jaxdyn.constraints.codes import RESULTS
 from jaxdyn.identify.chart import entropic_residual, make_chart
 from jaxdyn.identify.condensed_fit import Setting
-from jaxdyn.identify.interior import LOG_CHOLESKY_BASIS, LinearChart, TorqueProblem
+from jaxdyn.identify.interior import LOG_CHOLESKY_BASIS, InteriorPoint, LinearChart, TorqueProblem
 from jaxdyn.identify.regression import condense
 from jaxdyn.identify.robot_problem import RobotProblem, model_with_parameters
 from jaxdyn.io.urdf import load_urdf
@@ -321,6 +321,21 @@ def test_the_linear_map_on_the_host_is_the_chart(wrong_iiwa):
 
 def lowest_eigenvalue(model):
     return float(np.linalg.eigvalsh(pseudo_inertias(model.inertias)).min())
+
+
+def test_interior_points_end_with_a_code_where_numbers_are_not_finite(iiwa, iiwa_log):
+    """Torques whose squares overflow, and multipliers that rounding has made indefinite."""
+    huge = identify.Log(iiwa_log.t, iiwa_log.q, iiwa_log.v, iiwa_log.a, 1e154 * iiwa_log.tau)
+    with np.errstate(all="ignore"), pytest.raises(ValueError, match="squares overflow"):
+        identify.fit_torques(iiwa, huge)
+    chart = LinearChart(iiwa, identify.TERMS, "full", UNITS)
+    method = InteriorPoint(TorqueProblem.of(chart, condense(iiwa, iiwa_log), 0.5, 0.7), 1e-9)
+    iterate = method.init(chart.start, None)
+    assert method.step(iterate, [iterate.loss], iterate)[1] is None
+    state, targets = iterate.state
+    broken = iterate._replace(state=(state._replace(dual=-1e6 * state.dual), targets))
+    following, result = method.step(broken, [broken.loss], broken)
+    assert result is RESULTS.nonfinite and following is broken
 
 
 def test_feasible_fit_recovers_base_parameters_without_noise(iiwa, wrong_iiwa, iiwa_log):

@@ -450,7 +450,7 @@ def test_bad_choices_are_refused(swung, oscillation):
             metric, swung, free=lambda s: s.parameters
         ),
         "method is 'bfgs'": lambda: identify.Solver("bfgs"),
-        "steps=0": lambda: identify.Solver(steps=0),
+        "steps is 0": lambda: identify.Solver(steps=0),
         "starts is 0": lambda: identify.Solver(starts=0),
         "initial is 'guessed'": objective("trajectory", initial="guessed"),
         "hold is 'spline'": objective("trajectory", hold="spline"),

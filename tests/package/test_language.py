@@ -22,7 +22,7 @@ TERMS = """generalized_force applied_force reduced_dynamics constrained_dynamics
     underactuated_inverse_dynamics closed_form
     articulated_bodies
     coordinated_lifting closed_ring quadruped left_jacobian left_jacobian_inverse unconstrained constrained named_frame
-    signed_distance displaced converged_reference published_state time_interleaved embed""".split()
+    signed_distance displaced converged_reference published_state time_interleaved embed check_seed""".split()
 DEPRECATED = """called followed followed_rate limited moved placed wanted_force wanted_forces completed bounded tied aligned
     named scaled
     told""".split()

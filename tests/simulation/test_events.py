@@ -411,7 +411,7 @@ def test_float32_finds_the_same_events():
 @pytest.mark.parametrize(
     ("make", "words"),
     [
-        (lambda: jd.contact.DryFriction(-0.1, 1.0), "0 <= sliding"),
+        (lambda: jd.contact.DryFriction(-0.1, 1.0), "0 <= friction"),
         (lambda: jd.contact.DryFriction(0.5, 1.0, static=0.4), "static"),
         (lambda: jd.contact.DryFriction(0.5, 1.0, -1), "along"),
         (lambda: jd.contact.DryFriction(0.5, 1.0, smoothing=0.0), "smoothing"),

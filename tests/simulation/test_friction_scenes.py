@@ -279,7 +279,7 @@ def test_what_does_not_fit_is_refused():
                              *scenes.bowling_ball.start(), [0.0, 1.0]), "'cube'"),
         (lambda: jd.contact.ground_contact("ball", restitution=1.2), "restitution is 1.2"),
         (lambda: jd.contact.gap_contact(0.5), "gap is 0.5"),
-        (lambda: jd.contact.gap_contact(lambda q, t: q[0], friction=-1.0), "0 <= sliding"),
+        (lambda: jd.contact.gap_contact(lambda q, t: q[0], friction=-1.0), "0 <= friction"),
         (lambda: jd.simulate(jd.Scene(scenes.pendulum().system, forces=[jd.contact.gap_contact(lambda q, t: q)]),
                              [0.1], [0.0], [0.0, 1.0]), "gap returned shape"),
     ):  # fmt: skip
