@@ -70,18 +70,18 @@ class _FirstCall:
                     self._start()
             self.inner.seconds = None if within is None else within + now - start
 
-    def add_compilation(self, event: str, seconds: float, **_) -> None:
+    def add_compilation(self, event: str, duration_secs: float, **_) -> None:
         """Count the time that XLA has compiled, as JAX reports it."""
         if event != "/jax/core/compile/backend_compile_duration":
             return
         now = time.perf_counter()
         with self.changed:
-            if not self.active and now - seconds - self.end > _QUIET_SECONDS:
+            if not self.active and now - duration_secs - self.end > _QUIET_SECONDS:
                 return  # a program without kernels
             self.end = now
-            self.seconds["XLA"] += seconds
+            self.seconds["XLA"] += duration_secs
         if getattr(self.inner, "seconds", None) is not None:
-            self.inner.seconds += seconds
+            self.inner.seconds += duration_secs
 
     def report(self) -> None:
         """Log how long the phases of a long first call took, once."""
