@@ -135,7 +135,6 @@ def react(elements: Elements, mode: Mode, gram, friction, loads, along, target) 
     `friction` (n,): coefficients of sliding; `loads` (n,): normal forces that are given.
     """
     dtype = target.dtype
-    gram, target = turn_gram(elements, mode, along, gram), turn_rows(elements, mode, along, target)
     # Rows that do not act are masked and not removed: every mode has the same shapes and the same program.
     active, zero = elements.active(mode).astype(dtype), jnp.zeros((), dtype)
     level = jnp.where(slides(elements, mode), friction, 0.0)
@@ -144,8 +143,7 @@ def react(elements: Elements, mode: Mode, gram, friction, loads, along, target) 
     for i, one in enumerate(elements.each):
         push = [zero] * elements.count
         for k, row in enumerate(one.tangent):
-            # Along its own line a direction is the first unit vector.
-            push[row] = -level[i] * jnp.where(mode.creep[i] > 0, 1.0 - k, along[i, k])
+            push[row] = -level[i] * along[i, k]
         pushes.append(jnp.stack(push))
     given = sum((loads[i] * pushes[i] for i, one in enumerate(elements.each) if one.normal < 0), jnp.zeros_like(target))
     Z = jnp.stack([jnp.zeros_like(target), *(pushes[i] for i in elements.frictional)])[1:].T
@@ -167,30 +165,7 @@ def react(elements: Elements, mode: Mode, gram, friction, loads, along, target) 
             pivots[i] = jnp.where(is_sliding[i], pivot, jnp.ones_like(pivot))
     lam = (base + matmul(by_normal, normal)) * active
     normals = [sign[i] * lam[one.normal] if one.normal >= 0 else loads[i] for i, one in enumerate(elements.each)]
-    forces = turn_rows(elements, mode, along, lam + given + matmul(Z, normal), back=True)
-    lam = turn_rows(elements, mode, along, lam, back=True)
-    return Reaction(forces, lam, jnp.stack(normals), by_element(elements, lam), jnp.stack(pivots))
-
-
-def turn_rows(elements: Elements, mode: Mode, along, rowwise, *, back: bool = False):
-    """Entries (count, ...) of the rows with those of elements that slide along a line turned into components along and across it.
-
-    Where an element begins to slide in a plane, its direction follows the forces: as |w| -> 0 ever faster, for which explicit
-    steps would have to be short without bound. Up to a small speed it slides along a line instead, with a force across.
-    """
-    parts = [rowwise[k] for k in range(elements.count)]
-    for i, one in enumerate(elements.each):
-        if len(one.tangent) == 2 and not one.smooth:
-            is_line, (first, second) = mode.creep[i] > 0, one.tangent
-            c, s = jnp.where(is_line, along[i, 0], 1.0), jnp.where(is_line, along[i, 1], 0.0)
-            s, (a, b) = -s if back else s, (parts[first], parts[second])
-            parts[first], parts[second] = c * a + s * b, c * b - s * a
-    return jnp.stack(parts)
-
-
-def turn_gram(elements: Elements, mode: Mode, along, gram):
-    """Gram matrix of turned rows."""
-    return turn_rows(elements, mode, along, turn_rows(elements, mode, along, gram).T)
+    return Reaction(lam + given + matmul(Z, normal), lam, jnp.stack(normals), by_element(elements, lam), jnp.stack(pivots))
 
 
 def solve_rows(gram, active, right):
@@ -370,9 +345,11 @@ def guards_and_levels(
             margin = friction.static[i] * reaction.normal[i] + mode.excess[i] * total - size
             # Sliding is guarded by a signed speed, which crosses zero; the length of the velocity only touches it.
             speed = jnp.sum(reference[i] * terms.slip[i])
-            # Along a line it slides from rest to the speed of `creep`: one guard for both ends, in units of a speed.
-            share = jnp.where(mode.creep[i] > 0, 1 - speed / jnp.where(mode.creep[i] > 0, mode.creep[i], one_), one_)
-            sliding = jnp.where(mode.stick[i], margin, speed * share)
+            # In a fixed direction it slides from rest to the speed of `creep`: one guard for both ends, in units of a speed.
+            is_fixed = mode.creep[i] > 0
+            square = jnp.sum(terms.slip[i] * terms.slip[i]) / jnp.where(is_fixed, mode.creep[i], one_) ** 2
+            speed = jnp.where(is_fixed, speed * (1 - square), speed + mode.creep[i])
+            sliding = jnp.where(mode.stick[i], margin, speed)
             sliding = jnp.where(mode.closed[i], sliding, one_)
         if one.tangent:
             pivot = reaction.pivots[i]

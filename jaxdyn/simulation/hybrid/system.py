@@ -37,8 +37,6 @@ from jaxdyn.simulation.hybrid.dynamics import (
     solve_rows,
     terms_at,
     tolerance,
-    turn_gram,
-    turn_rows,
 )
 from jaxdyn.simulation.hybrid.modes import Elements, Mode, extend
 from jaxdyn.simulation.hybrid.transitions import (
@@ -50,11 +48,9 @@ from jaxdyn.simulation.hybrid.transitions import (
     find_jams,
     first_guess,
     guess_again,
-    independent_lines,
     length,
     rates_of,
     with_excess,
-    with_lines,
 )
 from jaxdyn.simulation.solvers.explicit import Plan
 from jaxdyn.systems.scene import Scene
@@ -148,7 +144,7 @@ class ModalSystem(HybridSystem):
         mode = mode._replace(positive=mode.positive ^ switched)
         holding, speed, size = kernel(self._friction)(unknown, mode, slip, t, q, v)
         # Sliding that is slower than the error of its velocity has ended: its direction is not known.
-        least = 2 * tolerance(q.dtype) if atol is None else jnp.maximum(2 * tolerance(q.dtype), _STOPPED * atol)
+        least = _slowest(q.dtype, atol)
         is_impact = (jnp.asarray(self.elements.opening) & hit[:, 0] & ~mode.closed).any()
         stopped = (
             jnp.asarray(self.elements.rough) & mode.closed & ~mode.stick & (speed <= least * (1 + size)) & ~is_impact
@@ -183,7 +179,7 @@ class ModalSystem(HybridSystem):
             problem, along = kernel(self._forces)(unknown, resting, at, t, q, after)
             final = choose_mode(elements, problem, guess_again(elements, problem, resting, guess), along)
             follows, soft, short, paradox = kernel(self._flights)(
-                unknown, collision, problem, final.mode, final.slip, t, q, v, after, (height, fast)
+                unknown, collision, problem, final.mode, final.slip, t, q, v, after, (height, fast, ends)
             )
             cornered = kernel(self._paradox)(problem, resting, along)
             # Both choices are valid if no element disagreed in the end.
@@ -204,6 +200,7 @@ class ModalSystem(HybridSystem):
         mode = mode._replace(excess=jnp.zeros((n,), q.dtype), creep=jnp.zeros((n,), q.dtype))
         # As far as the square of the speed is below the tolerance, the direction of sliding may lag behind.
         fast = jnp.asarray(1e-4, q.dtype) if atol is None else 0.3 * jnp.sqrt(jnp.maximum(atol, least))
+        ends = jnp.minimum(_slowest(q.dtype, atol), 0.1 * fast)
         start = Collision(mode, slip, jnp.ones((n,), q.dtype), none, stopped)
         blank = Transition(start, mode, slip, v, no, no)
         return while_loop(lambda carry: carry[4], attempt, (zero, zero, start[2:], blank, ~no))[3]
@@ -274,7 +271,7 @@ class ModalSystem(HybridSystem):
         """Mode, contacts (n,) whose rebound is too low to be followed, others whose flight is, and whether a pivot is lost."""
         scene, elements = self._bind(unknown)[0], self.elements
         terms, of = terms_at(scene, elements, q, v, t), coefficients(scene, elements, v.dtype)
-        height, fast = limits
+        height, fast, ends = limits
         still, reaction, rates = find_jams(elements, problem, mode, along)
         rate = rates_of(elements, rates)[0]
         velocity = rates_of(elements, matmul(terms.row.A, after - v) + terms.row.velocity)[0]
@@ -290,9 +287,9 @@ class ModalSystem(HybridSystem):
         follows = with_excess(elements, problem, mode, still)
         slides = mode.closed & ~follows.stick & jnp.asarray(elements.planar)
         speed, _ = length(rates_of(elements, matmul(terms.row.A, after - v) + terms.row.velocity)[1])
-        line = slides & (problem.may_stick | (speed < 0.9 * fast))
-        line = independent_lines(elements, problem.gram, follows, along, line)
-        follows = with_lines(elements, problem, follows, along, jnp.where(line, fast, 0.0))
+        # Explicit steps could not follow a direction that turns ever faster as the speed falls to zero.
+        begins = problem.may_stick | (speed < 0.9 * fast)
+        follows = follows._replace(creep=jnp.where(slides, jnp.where(begins, fast, -ends), 0.0))
         return follows, low & bounces, low & ~bounces & ~collision.held, lost
 
     def _paradox(self, problem: Problem, mode: Mode, along):
@@ -321,6 +318,12 @@ class ModalSystem(HybridSystem):
         return ravel_pytree(y | {"v": y["v"] if v is None else v, "slip": slip})[0]
 
 
+def _slowest(dtype, atol):
+    """Speed () below which sliding has ended."""
+    least = jnp.asarray(2 * tolerance(dtype), dtype)
+    return least if atol is None else jnp.maximum(least, _STOPPED * atol)
+
+
 def project(scene: Scene, elements: Elements, mode: Mode, t, y, error):
     """Project q and v by the least change onto the rows that act, and the error (or None) onto their tangent space.
 
@@ -330,15 +333,14 @@ def project(scene: Scene, elements: Elements, mode: Mode, t, y, error):
     whole, dtype = extend(scene), y["v"].dtype
     q, v = retract(scene.system, y["q"]), y["v"]
     terms = terms_at(scene, elements, q, v, t)
-    holonomic, gram = holonomic_rows(layout(whole)), turn_gram(elements, mode, y["slip"], terms.gram)
+    holonomic = holonomic_rows(layout(whole))
     # Masks keep the shapes of all modes: rows that do not act are multiplied by zero.
     active = elements.active(mode).astype(dtype)
     holds = jnp.zeros((elements.count,), dtype).at[holonomic].set(1.0) * active
 
     def change(residual, mask):
         """Least velocity that changes the rows of a mask by `residual`."""
-        residual = turn_rows(elements, mode, y["slip"], residual)
-        lam = turn_rows(elements, mode, y["slip"], solve_rows(gram, mask, (residual * mask)[:, None])[:, 0], back=True)
+        lam = solve_rows(terms.gram, mask, (residual * mask)[:, None])[:, 0]
         return terms.metric.unwhiten(matmul(terms.Y, lam))
 
     start, last, blank = q, jnp.zeros_like(v), jnp.zeros((elements.count,), dtype)

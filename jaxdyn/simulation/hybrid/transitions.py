@@ -31,12 +31,10 @@ from jaxdyn.simulation.hybrid.dynamics import (
     depends_on_others,
     force_tolerance,
     react,
-    solve_rows,
     tolerance,
 )
 from jaxdyn.simulation.hybrid.modes import Elements, Mode
 
-_INDEPENDENT = 1e-2  # of the square of a row, that is left of it when others hold
 GUESSES = 3  # other modes from which changes begin where the first one leads to no mode
 _ANGLE = 1e-14  # 1 - cos of the angle up to which a direction is known
 _STILL = 1e-4  # rate of slipping, of the terms that cancel in it, of what may stand still
@@ -240,49 +238,6 @@ def with_excess(elements: Elements, problem: Problem, mode: Mode, still) -> Mode
     room = jnp.maximum(beyond, 0.0) / jnp.where(total > 0, total, 1.0) + _ROOM * problem.static
     excess = jnp.where(mode.stick & mode.closed & still.any() & (beyond > -_ROOM * problem.static * total), room, 0.0)
     return mode._replace(excess=excess)
-
-
-def with_lines(elements: Elements, problem: Problem, mode: Mode, along, creep) -> Mode:
-    """Mode in which elements slide along lines up to the speeds `creep` (n,), if that is consistent.
-
-    It is if all contacts push and speed up then, and forces across are small.
-    """
-    lines = mode._replace(creep=creep)
-    reaction = react(elements, lines, problem.gram, problem.sliding, problem.loads, along, -problem.free)
-    tiny = force_tolerance(creep.dtype) / 4 * jnp.sum(jnp.abs(reaction.normal))
-    across, level = length(reaction.holding)[0], problem.sliding * jnp.abs(reaction.normal)
-    pushes = ~(jnp.asarray(elements.opening) & mode.closed) | (reaction.normal >= -tiny)
-    sticks = mode.stick & mode.closed & jnp.asarray(elements.rough)
-    cone = problem.static * jnp.abs(reaction.normal) + mode.excess * jnp.sum(jnp.abs(reaction.normal)) + tiny
-    rates = rates_of(elements, matmul(problem.gram, reaction.along) + problem.free)[1]
-    speeds_up = jnp.sum(rates * along, 1) >= 0
-    fits = jnp.where(sticks, across <= cone, (creep <= 0) | ((across <= 0.5 * level) & speeds_up))
-    return mode._replace(creep=jnp.where((pushes & fits).all(), creep, 0.0))
-
-
-def independent_lines(elements: Elements, gram, mode: Mode, along, wanted):
-    """Those of the `wanted` elements (n,) that may slide along lines: rows across them do not depend on others that act."""
-    none = jnp.zeros((elements.count,), gram.dtype)
-    across = []
-    for i, one in enumerate(elements.each):
-        is_plane = len(one.tangent) == 2
-        across.append(
-            none.at[jnp.asarray(one.tangent)].set(jnp.stack([-along[i, 1], along[i, 0]])) if is_plane else none
-        )
-    across = jnp.stack(across, 1)
-    active = elements.active(mode._replace(creep=jnp.zeros_like(mode.creep))).astype(gram.dtype)
-    rates = matmul(gram, across)
-    # What is left of the rows across when the others hold: their Schur complement, eliminated in order.
-    held = solve_rows(gram, active, rates * active[:, None])
-    whole = matmul(across.T, rates)
-    left = whole - matmul(rates.T, held)
-    chosen = []
-    for i in range(len(elements.each)):
-        is_free = wanted[i] & (left[i, i] > _INDEPENDENT * whole[i, i])
-        chosen.append(is_free)
-        pivot = jnp.where(is_free, left[i, i], jnp.ones_like(left[i, i]))
-        left = left - jnp.where(is_free, left[:, i, None] * left[None, i] / pivot, 0.0)
-    return jnp.stack(chosen)
 
 
 def rates_of(elements: Elements, rates) -> tuple[Array, Array]:
