@@ -348,7 +348,8 @@ def guards_and_levels(
             # In a fixed direction it slides from rest to the speed of `creep`: one guard for both ends, in units of a speed.
             is_fixed = mode.creep[i] > 0
             square = jnp.sum(terms.slip[i] * terms.slip[i]) / jnp.where(is_fixed, mode.creep[i], one_) ** 2
-            speed = jnp.where(is_fixed, speed * (1 - square), speed + mode.creep[i])
+            share = jnp.where(speed > 0, 1 - square, one_)  # both factors are negative behind a fast reversal
+            speed = jnp.where(is_fixed, speed * share, speed + mode.creep[i])
             sliding = jnp.where(mode.stick[i], margin, speed)
             sliding = jnp.where(mode.closed[i], sliding, one_)
         if one.tangent:

@@ -37,7 +37,7 @@ class Mode(NamedTuple):
     negative: Array  # true where the normal multiplier is negative
     positive: Array  # of the switching functions of piecewise smooth forces
     excess: Array  # friction (n,) beyond the cone, of all normal forces, by which an element that depends on others may stick
-    # Speeds (n,). Positive: sliding from rest has a fixed direction up to this speed. Negative: sliding ends below its size.
+    # Speeds (n,). Positive: sliding has a fixed direction up to this speed. Negative: its direction is fixed below its size.
     creep: Array
 
     def signs(self, dtype) -> Array:

@@ -60,6 +60,7 @@ from jaxdyn.systems.system import displace, rate_to_velocity, retract, velocity_
 # open in proportion to the first correction, which only coarse tolerances make large.
 _ROUNDS, _SAVED_ROUNDS = 2, 6
 _STOPPED = 30  # tolerances of the velocity below which sliding has ended
+_SLOWER = 0.1  # part of the speed up to which sliding begins in a fixed direction, below which it ends in one
 
 
 class HybridSystem:
@@ -144,11 +145,12 @@ class ModalSystem(HybridSystem):
         mode = mode._replace(positive=mode.positive ^ switched)
         holding, speed, size = kernel(self._friction)(unknown, mode, slip, t, q, v)
         # Sliding that is slower than the error of its velocity has ended: its direction is not known.
-        least = _slowest(q.dtype, atol)
+        least = jnp.asarray(2 * tolerance(q.dtype), q.dtype)
+        least = least if atol is None else jnp.maximum(least, _STOPPED * atol)
         is_impact = (jnp.asarray(self.elements.opening) & hit[:, 0] & ~mode.closed).any()
-        stopped = (
-            jnp.asarray(self.elements.rough) & mode.closed & ~mode.stick & (speed <= least * (1 + size)) & ~is_impact
-        )
+        # In a fixed direction it ends where it turns round, with what is left across.
+        ends = (speed <= least * (1 + size)) | (hit[:, 1] & (mode.creep > 0) & (speed < mode.creep / 2))
+        stopped = jnp.asarray(self.elements.rough) & mode.closed & ~mode.stick & ends & ~is_impact
         mode, slip, begins = first_guess(self.elements, mode, slip, holding, speed, hit)
         mode = mode._replace(stick=mode.stick | (stopped & mode.closed))
         after = self._pass(unknown, mode, slip, begins, stopped & mode.closed, t, q, v, atol)
@@ -179,7 +181,7 @@ class ModalSystem(HybridSystem):
             problem, along = kernel(self._forces)(unknown, resting, at, t, q, after)
             final = choose_mode(elements, problem, guess_again(elements, problem, resting, guess), along)
             follows, soft, short, paradox = kernel(self._flights)(
-                unknown, collision, problem, final.mode, final.slip, t, q, v, after, (height, fast, ends)
+                unknown, collision, problem, final.mode, final.slip, t, q, v, after, (height, fast)
             )
             cornered = kernel(self._paradox)(problem, resting, along)
             # Both choices are valid if no element disagreed in the end.
@@ -200,7 +202,6 @@ class ModalSystem(HybridSystem):
         mode = mode._replace(excess=jnp.zeros((n,), q.dtype), creep=jnp.zeros((n,), q.dtype))
         # As far as the square of the speed is below the tolerance, the direction of sliding may lag behind.
         fast = jnp.asarray(1e-4, q.dtype) if atol is None else 0.3 * jnp.sqrt(jnp.maximum(atol, least))
-        ends = jnp.minimum(_slowest(q.dtype, atol), 0.1 * fast)
         start = Collision(mode, slip, jnp.ones((n,), q.dtype), none, stopped)
         blank = Transition(start, mode, slip, v, no, no)
         return while_loop(lambda carry: carry[4], attempt, (zero, zero, start[2:], blank, ~no))[3]
@@ -271,7 +272,7 @@ class ModalSystem(HybridSystem):
         """Mode, contacts (n,) whose rebound is too low to be followed, others whose flight is, and whether a pivot is lost."""
         scene, elements = self._bind(unknown)[0], self.elements
         terms, of = terms_at(scene, elements, q, v, t), coefficients(scene, elements, v.dtype)
-        height, fast, ends = limits
+        height, fast = limits
         still, reaction, rates = find_jams(elements, problem, mode, along)
         rate = rates_of(elements, rates)[0]
         velocity = rates_of(elements, matmul(terms.row.A, after - v) + terms.row.velocity)[0]
@@ -289,7 +290,7 @@ class ModalSystem(HybridSystem):
         speed, _ = length(rates_of(elements, matmul(terms.row.A, after - v) + terms.row.velocity)[1])
         # Explicit steps could not follow a direction that turns ever faster as the speed falls to zero.
         begins = problem.may_stick | (speed < 0.9 * fast)
-        follows = follows._replace(creep=jnp.where(slides, jnp.where(begins, fast, -ends), 0.0))
+        follows = follows._replace(creep=jnp.where(slides, jnp.where(begins, fast, -_SLOWER * fast), 0.0))
         return follows, low & bounces, low & ~bounces & ~collision.held, lost
 
     def _paradox(self, problem: Problem, mode: Mode, along):
@@ -316,12 +317,6 @@ class ModalSystem(HybridSystem):
     def with_slip(self, y, v, slip):
         y = self.plan.structure(y)
         return ravel_pytree(y | {"v": y["v"] if v is None else v, "slip": slip})[0]
-
-
-def _slowest(dtype, atol):
-    """Speed () below which sliding has ended."""
-    least = jnp.asarray(2 * tolerance(dtype), dtype)
-    return least if atol is None else jnp.maximum(least, _STOPPED * atol)
 
 
 def project(scene: Scene, elements: Elements, mode: Mode, t, y, error):

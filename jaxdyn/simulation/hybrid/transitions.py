@@ -111,7 +111,8 @@ def first_guess(elements: Elements, mode: Mode, slip, holding, speed, hit) -> tu
     first, second = hit[:, 0], hit[:, 1]
     closes, releases = opens & first & ~mode.closed, opens & first & mode.closed
     begins, ends = second & mode.stick & mode.closed, second & ~mode.stick & mode.closed
-    leaves = ends & (mode.creep > 0) & (speed > mode.creep / 2)
+    # What is slow enough for a fixed direction, or too fast for it, slides on.
+    leaves = ends & jnp.where(mode.creep > 0, speed > mode.creep / 2, mode.creep < 0)
     ends = ends & ~leaves
     _, against = length(-holding)
     # An element that breaks loose slides against the friction that held it: its velocity is still zero.
@@ -126,10 +127,15 @@ def first_guess(elements: Elements, mode: Mode, slip, holding, speed, hit) -> tu
 
 
 def guess_again(elements: Elements, problem: Problem, mode: Mode, guess) -> Mode:
-    """Mode from which changes begin, where `guess` () others before have led to no mode: all contacts open, stick, or slide."""
+    """Mode from which changes begin, where `guess` () others before have led to no mode: all contacts open, stick, or slide.
+
+    The first one has all contacts closed that may be. Of redundant contacts several modes agree, with other forces: the choice
+    must not depend on the modes before, between which a motion would change without end.
+    """
     opens, others = jnp.asarray(elements.opening), guess > 0
-    closed = jnp.where(opens & others, problem.may_close & (guess > 1), mode.closed)
-    stick = jnp.where(others, closed & problem.may_stick & jnp.asarray(elements.rough) & (guess == 2), mode.stick)
+    closed = jnp.where(opens, jnp.where(others, problem.may_close & (guess > 1), mode.closed | problem.may_close), mode.closed)
+    sticks = closed & problem.may_stick & jnp.asarray(elements.rough)
+    stick = jnp.where(others, sticks & (guess == 2), mode.stick | (sticks & ~mode.closed))
     return mode._replace(closed=closed, stick=stick)
 
 
