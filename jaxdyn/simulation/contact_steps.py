@@ -372,12 +372,19 @@ def _scale_problem(
     contacts: Contacts, scene: Scene, metric: MassFactor, Y, place, velocity, terms: _Terms, velocities, bound
 ) -> _Problem:
     """Coordinates in which the friction coefficient is one, and the mean inertia of a contact."""
-    one, zero = jnp.ones((), Y.dtype), jnp.zeros((), Y.dtype)
-    squares = jax.lax.stop_gradient(jnp.sum(Y * Y, 0))
+    one, zero, gram = jnp.ones((), Y.dtype), jnp.zeros((), Y.dtype), matmul(Y.T, Y)
+    squares = jax.lax.stop_gradient(jnp.diagonal(gram))
     relative, scales, parts, sizes, start = velocities.at[contacts.normals].add(-bound), [], [], [], 0
-    for size, mu in _sizes(contacts, scene):
+    units = []
+    for size, _ in _sizes(contacts, scene):
         mean = jnp.mean(squares[start : start + size])
-        unit = jnp.where(mean > 0, 1 / jnp.sqrt(jnp.where(mean > 0, mean, one)), one)
+        units += [jnp.where(mean > 0, 1 / jnp.sqrt(jnp.where(mean > 0, mean, one)), one)] * size
+        start += size
+    if _may_contradict(contacts, scene):
+        relative = _make_consistent(contacts, gram, jnp.stack(units), relative)
+    start = 0
+    for size, mu in _sizes(contacts, scene):
+        unit = units[start]
         scales.append(jnp.stack([unit, *[unit * mu.astype(Y.dtype)] * (size - 1)]))
         parts.append(scales[-1] * relative[start : start + size])
         # Contacts that are far away do not count: their large bounds would hide the velocities of the others.
@@ -386,8 +393,36 @@ def _scale_problem(
         start += size
     scale, q, size = jnp.concatenate(scales), jnp.concatenate(parts), jnp.max(jnp.stack(sizes))
     size = jnp.where(size > 0, size, one)
-    W = matmul(Y.T, Y) * scale[:, None] * scale[None]
+    W = gram * scale[:, None] * scale[None]
     return _Problem(place, velocity, metric, Y, W, q / size, scale, size, terms.side)
+
+
+def _may_contradict(contacts: Contacts, scene: Scene) -> bool:
+    """Decide whether rows may depend on each other: by their number, or because contacts share a body."""
+    bodies = [getattr(force_at(scene, one).contact, "body", None) for one in contacts.elements]
+    rows = sum(size for size, _ in _sizes(contacts, scene))
+    return rows + contacts.own > scene.nv or len(set(bodies)) < len(bodies)
+
+
+def _make_consistent(contacts: Contacts, gram, unit, relative):
+    """Velocities (m,) of the contacts that close, projected on those that impulses can stop; `unit` (m,) scales the rows.
+
+    Where an edge falls on its two ends, these close their gaps with different velocities, and cannot both stick: their distance
+    is constant, and the edge is oblique. The slip of the second order that is left would have all of their friction.
+    """
+    mask, start = [], 0
+    for size in [1 + len(contacts.elements[i].tangent) for i in contacts.order] + [1] * len(contacts.limited):
+        mask += [relative[start] < 0] * size
+        start += size
+    closes = jnp.stack(mask)
+    scale = unit * closes.astype(gram.dtype)
+    gram, wanted = gram * scale[:, None] * scale[None], relative * scale
+    # Between the squares of independent rows and rounding. The second step leaves a share of its square.
+    shift = float(jnp.finfo(gram.dtype).eps) ** 0.55
+    factor = cholesky(gram + shift * jnp.eye(len(unit), dtype=gram.dtype))
+    x = solve_cholesky(factor, wanted)
+    x = x + solve_cholesky(factor, wanted - matmul(gram, x))
+    return jnp.where(closes, matmul(gram, x) / unit, relative)
 
 
 def _sizes(contacts: Contacts, scene: Scene):
