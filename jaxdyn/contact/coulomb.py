@@ -213,14 +213,15 @@ def _step(groups: Groups, W, q, floor, shift, state: _State) -> _State:
 
 
 def _schedule(step):
-    """Quotient of widths in the attempt of a step, the first width of the next one, and whether the attempt ends."""
+    """Quotient of widths in the attempt of a step, the first width of the next one, and whether another one follows."""
     factor, start, is_over, end = jnp.zeros_like(step), jnp.zeros_like(step), step < 0, 0
     for i, (_, quotient, count) in enumerate(_ATTEMPTS):
         here = (step >= end) & (step < end + count)
         end += count
         factor = jnp.where(here, quotient, factor)
-        start = jnp.where(here, _ATTEMPTS[min(i + 1, len(_ATTEMPTS) - 1)][0], start)
-        is_over = is_over | (step == end - 1)
+        if i + 1 < len(_ATTEMPTS):
+            start = jnp.where(here, _ATTEMPTS[i + 1][0], start)
+            is_over = is_over | (step == end - 1)
     return factor, start, is_over
 
 
@@ -230,7 +231,7 @@ def solve(groups: Groups, is_redundant: bool, W, q, scale, width) -> Solution:
     Of several solutions it is that with impulses `scale` x of least norm, `scale` (m,). `is_redundant`: whether W is known to be
     singular. A function of kernels without a derivative (see `attach_derivative`).
     """
-    dtype, tol, shift = q.dtype, tolerance(q.dtype), _shift(scale)
+    dtype, shift = q.dtype, _shift(scale)
     start, *_ = _residual(groups, jnp.zeros_like(q), q, width)
     # Where nothing touches, zero is the solution, and no step is made.
     error = jnp.sqrt(jnp.sum(start * start))
@@ -245,7 +246,8 @@ def solve(groups: Groups, is_redundant: bool, W, q, scale, width) -> Solution:
         sum(count for *_, count in _ATTEMPTS),
     )
     residual = residual_at(groups, state.x, matmul(W, state.x) + q, width)
-    solved = (residual <= tol) | ((state.alive == 0) & (residual <= float(jnp.finfo(dtype).eps) ** _SHIFT))
+    # Half of the digits are those of forces that are not unique; see `_step`.
+    solved = residual <= float(jnp.finfo(dtype).eps) ** _SHIFT
     return Solution(state.x, residual, solved, state.step)
 
 
