@@ -165,7 +165,9 @@ def react(elements: Elements, mode: Mode, gram, friction, loads, along, target) 
             pivots[i] = jnp.where(is_sliding[i], pivot, jnp.ones_like(pivot))
     lam = (base + matmul(by_normal, normal)) * active
     normals = [sign[i] * lam[one.normal] if one.normal >= 0 else loads[i] for i, one in enumerate(elements.each)]
-    return Reaction(lam + given + matmul(Z, normal), lam, jnp.stack(normals), by_element(elements, lam), jnp.stack(pivots))
+    return Reaction(
+        lam + given + matmul(Z, normal), lam, jnp.stack(normals), by_element(elements, lam), jnp.stack(pivots)
+    )
 
 
 def solve_rows(gram, active, right):

@@ -6,6 +6,7 @@ States have the entries q, v and `slip`, the directions (n, 2) in which elements
 
 from abc import abstractmethod
 from collections.abc import Callable
+from functools import partial
 from typing import Any
 
 import diffrax
@@ -14,7 +15,7 @@ import jax.numpy as jnp
 from jax.flatten_util import ravel_pytree
 
 from jaxdyn.compile import kernel
-from jaxdyn.compile.batch import while_loop
+from jaxdyn.compile.batch import cond, while_loop
 from jaxdyn.constraints.base import holonomic_rows, layout, position_residual, velocity_residual
 from jaxdyn.forces.piecewise import values_and_levels
 from jaxdyn.lie.so3 import matmul
@@ -38,6 +39,7 @@ from jaxdyn.simulation.hybrid.dynamics import (
     terms_at,
     tolerance,
 )
+from jaxdyn.simulation.hybrid.impulses import impulsive_mode
 from jaxdyn.simulation.hybrid.modes import Elements, Mode, extend
 from jaxdyn.simulation.hybrid.transitions import (
     GUESSES,
@@ -173,7 +175,14 @@ class ModalSystem(HybridSystem):
         def attempt(carry):
             tries, guess, (rebound, held, stopped), _, busy = carry
             problem, along = kernel(self._velocities)(unknown, mode, rebound, held, stopped, slip, t, q, v)
-            begin = guess_again(elements, problem, mode, guess)
+            begin = guess_again(elements, problem, mode, jnp.zeros_like(guess))
+            begin, along = cond(
+                (guess > 0) & busy,
+                partial(impulsive_mode, elements, problem),
+                lambda mode, along: (mode, along),
+                begin,
+                along,
+            )
             choice = choose_mode(elements, problem, begin._replace(stick=begin.stick | (stopped & begin.closed)), along)
             collision = Collision(choice.mode, choice.slip, rebound, held, stopped)
             still = kernel(self._find_jams)(problem, choice.mode, choice.slip)

@@ -133,7 +133,9 @@ def guess_again(elements: Elements, problem: Problem, mode: Mode, guess) -> Mode
     must not depend on the modes before, between which a motion would change without end.
     """
     opens, others = jnp.asarray(elements.opening), guess > 0
-    closed = jnp.where(opens, jnp.where(others, problem.may_close & (guess > 1), mode.closed | problem.may_close), mode.closed)
+    closed = jnp.where(
+        opens, jnp.where(others, problem.may_close & (guess > 1), mode.closed | problem.may_close), mode.closed
+    )
     sticks = closed & problem.may_stick & jnp.asarray(elements.rough)
     stick = jnp.where(others, sticks & (guess == 2), mode.stick | (sticks & ~mode.closed))
     return mode._replace(closed=closed, stick=stick)
