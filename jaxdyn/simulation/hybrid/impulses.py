@@ -11,7 +11,6 @@ from jaxtyping import Array
 from jaxdyn.compile import kernel
 from jaxdyn.contact import coulomb
 from jaxdyn.lie.so3 import matmul
-from jaxdyn.simulation.hybrid.dynamics import solve_rows
 from jaxdyn.simulation.hybrid.modes import Elements, Mode
 from jaxdyn.simulation.hybrid.transitions import Problem, length
 
@@ -29,14 +28,15 @@ def _impulsive_mode(elements: Elements, problem: Problem, mode: Mode, slip):
     sizes = [1 + len(elements.each[i].tangent) for i in contacts]
     groups = tuple((sizes.count(size), size) for size in (3, 2, 1) if size in sizes)
     rows = np.array([k for i in contacts for k in (elements.each[i].normal, *elements.each[i].tangent)])
-    G, free, dtype = problem.gram, problem.free, problem.free.dtype
-    W, q = G[rows][:, rows], free[rows]
+    gram, free, dtype = problem.gram, problem.free, problem.free.dtype
+    Y = gram.Y[:, rows]
+    W, q = matmul(Y.T, Y), free[rows]
     if len(rows) < elements.count:
         # Other rows that act are eliminated: what is left are the velocities of the contacts when these rows hold.
         others = np.setdiff1d(np.arange(elements.count), rows)
         act = elements.active(mode).astype(dtype) * jnp.zeros((elements.count,), dtype).at[others].set(1.0)
-        held = solve_rows(G, act, jnp.concatenate([G[:, rows], free[:, None]], 1) * act[:, None])
-        change = matmul(G[rows], held)
+        right = jnp.concatenate([matmul(gram.Y.T, Y), free[:, None]], 1)
+        change = matmul(Y.T, matmul(gram.Y, gram.factor(act).solve(right * act[:, None])))
         W, q = W - change[:, :-1], q - change[:, -1]
     # Coordinates in which the friction coefficient is one; contacts that do not touch are far away.
     one, scales, parts, start = jnp.ones((), dtype), [], [], 0

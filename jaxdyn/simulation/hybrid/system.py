@@ -19,28 +19,12 @@ from jaxdyn.compile.batch import cond, while_loop
 from jaxdyn.constraints.base import holonomic_rows, layout, position_residual, velocity_residual
 from jaxdyn.forces.piecewise import values_and_levels
 from jaxdyn.lie.so3 import matmul
-from jaxdyn.simulation.hybrid.dynamics import (
-    ROUNDING,
-    Collision,
-    StateTerms,
-    by_element,
-    by_normal_row,
-    coefficients,
-    directions,
-    free_motion,
-    gaps,
-    guards_and_levels,
-    impact,
-    motion_at,
-    normal_loads,
-    react,
-    rebounds,
-    solve_rows,
-    terms_at,
-    tolerance,
-)
+from jaxdyn.simulation.hybrid.impacts import Collision, impact, rebounds
 from jaxdyn.simulation.hybrid.impulses import impulsive_mode
+from jaxdyn.simulation.hybrid.mode_guards import ROUNDING, guards_and_levels
 from jaxdyn.simulation.hybrid.modes import Elements, Mode, extend
+from jaxdyn.simulation.hybrid.reactions import coefficients, directions, free_motion, motion_at, normal_loads, react
+from jaxdyn.simulation.hybrid.rows import StateTerms, by_element, by_normal_row, gaps, terms_at, tolerance
 from jaxdyn.simulation.hybrid.transitions import (
     GUESSES,
     Problem,
@@ -222,7 +206,7 @@ class ModalSystem(HybridSystem):
         rates = terms.row.velocity
         wanted = by_normal_row(elements, rebounds(elements, terms, of.restitution * rebound))
         each = jnp.ones(rebound.shape, bool)
-        size = (1 + jnp.max(jnp.abs(rates))) / jnp.max(jnp.diagonal(terms.gram))
+        size = (1 + jnp.max(jnp.abs(rates))) / jnp.max(terms.gram.squares)
         sliding, static = jnp.where(held, 0.0, of.sliding), jnp.where(held, 0.0, of.static)
         loads, touches, rate = jnp.zeros_like(rebound), self._touches(scene, q, t), 1 + self._speeds(terms, v)
         problem = Problem(
@@ -244,7 +228,7 @@ class ModalSystem(HybridSystem):
         scene, elements = self._bind(unknown)[0], self.elements
         terms, of = terms_at(scene, elements, q, v, t), coefficients(scene, elements, v.dtype)
         after, reaction = impact(scene, elements, collision, terms, v)
-        rates = matmul(terms.gram, reaction.along) + terms.row.velocity
+        rates = terms.gram.times(reaction.along) + terms.row.velocity
         speed, unit = length(rates_of(elements, rates)[1])
         is_sliding = speed > 2 * tolerance(v.dtype) * (1 + self._speeds(terms, v))
         # Elements that rebound open; those that came to rest together stick if their cones allow it.
@@ -269,7 +253,7 @@ class ModalSystem(HybridSystem):
         least = 2 * tolerance(v.dtype) * (1 + self._speeds(terms, v))
         rests = self._touches(scene, q, t) & (jnp.abs(rates_of(elements, terms.row.velocity)[0]) <= least)
         speed, _ = length(terms.slip)
-        size = jnp.max(jnp.abs(rates)) / jnp.max(jnp.diagonal(terms.gram))
+        size = jnp.max(jnp.abs(rates)) / jnp.max(terms.gram.squares)
         loads = normal_loads(scene, elements, q, v, t)
         # A contact in flight has no force, and an element that slides does not stick.
         problem = Problem(
@@ -344,8 +328,8 @@ def project(scene: Scene, elements: Elements, mode: Mode, t, y, error):
 
     def change(residual, mask):
         """Least velocity that changes the rows of a mask by `residual`."""
-        lam = solve_rows(terms.gram, mask, (residual * mask)[:, None])[:, 0]
-        return terms.metric.unwhiten(matmul(terms.Y, lam))
+        lam = terms.gram.factor(mask).solve((residual * mask)[:, None])[:, 0]
+        return terms.metric.unwhiten(matmul(terms.gram.Y, lam))
 
     start, last, blank = q, jnp.zeros_like(v), jnp.zeros((elements.count,), dtype)
     rounds = _SAVED_ROUNDS if error is None else _ROUNDS

@@ -24,16 +24,10 @@ from jax import lax
 from jaxtyping import Array
 
 from jaxdyn.compile.loops import Carry, Given, Iteration, Task, run_loop
-from jaxdyn.lie.so3 import matmul
-from jaxdyn.simulation.hybrid.dynamics import (
-    Collision,
-    Reaction,
-    depends_on_others,
-    force_tolerance,
-    react,
-    tolerance,
-)
+from jaxdyn.simulation.hybrid.impacts import Collision
 from jaxdyn.simulation.hybrid.modes import Elements, Mode
+from jaxdyn.simulation.hybrid.reactions import Reaction, depends_on_others, react
+from jaxdyn.simulation.hybrid.rows import Gram, force_tolerance, tolerance
 
 GUESSES = 3  # other modes from which changes begin where the first one leads to no mode
 _ANGLE = 1e-14  # 1 - cos of the angle up to which a direction is known
@@ -45,7 +39,7 @@ _WEIGHT = 32  # changes of direction for which there is the same room as for one
 class Problem(NamedTuple):
     """Complementarity problem of the elements: rates u = G p + free of the rows by forces p along them."""
 
-    gram: Array  # G (count, count)
+    gram: Gram
     free: Array  # (count,), less the rates that the rows which act are given
     sliding: Array  # coefficients of friction (n,)
     static: Array  # at rest
@@ -188,18 +182,18 @@ def _disagreements(elements: Elements, problem: Problem, mode: Mode, slip, react
     opens, rough = jnp.asarray(elements.opening), jnp.asarray(elements.rough)
     has_multiplier = jnp.asarray(np.array([one.normal >= 0 for one in elements.each]))
     dtype, held = reaction.normal.dtype, problem.held
-    rates = matmul(problem.gram, reaction.along) + problem.free
+    rates = problem.gram.times(reaction.along) + problem.free
     normal, slipping = rates_of(elements, rates)
     hold, _ = length(reaction.holding)
     forces = jnp.sum(jnp.abs(reaction.normal)) + jnp.sum(jnp.abs(reaction.holding))
     tiny = force_tolerance(dtype) / 4 * forces + tolerance(dtype) * problem.force
-    sizes = matmul(jnp.abs(problem.gram), jnp.abs(reaction.along)) + jnp.abs(problem.free)
+    sizes = problem.gram.sizes(reaction.along) + jnp.abs(problem.free)
     across, beside = rates_of(elements, sizes)
     rise, small = (tolerance(dtype) * (problem.rate + x) for x in (across, jnp.max(beside, 1)))
     # Friction mu N against a slip d is the projection of mu N d + r u, u the rate of slipping, onto its disk, for any r > 0:
     # inside of the disk it sticks, and outside it has the direction of this vector.
     level = jnp.maximum(problem.sliding * reaction.normal, 0.0)
-    square = rates_of(elements, jnp.diagonal(problem.gram))[1]
+    square = rates_of(elements, problem.gram.squares)[1]
     share = jnp.sum(square, 1)
     share = jnp.where(share > 0, 1 / jnp.where(share > 0, share, jnp.ones_like(share)), 0.0)
     trial, turned = length(level[:, None] * slip + share[:, None] * slipping)
@@ -226,11 +220,11 @@ def find_jams(elements: Elements, problem: Problem, mode: Mode, along) -> tuple[
     Their friction of least norm has left the cone, and another share of it has not.
     """
     reaction = react(elements, mode, problem.gram, problem.sliding, problem.loads, along, -problem.free)
-    rates = matmul(problem.gram, reaction.along) + problem.free
+    rates = problem.gram.times(reaction.along) + problem.free
     rests = mode.closed & jnp.asarray(elements.rough) & problem.may_stick
     depends = depends_on_others(elements, problem.gram, mode._replace(stick=mode.stick | rests))
     speed, _ = length(rates_of(elements, rates)[1])
-    sizes = matmul(jnp.abs(problem.gram), jnp.abs(reaction.along)) + jnp.abs(problem.free)
+    sizes = problem.gram.sizes(reaction.along) + jnp.abs(problem.free)
     least = _STILL * jnp.max(rates_of(elements, sizes)[1], 1) + tolerance(speed.dtype) * problem.rate
     return rests & ~mode.stick & depends & (speed <= least), reaction, rates
 
