@@ -225,11 +225,11 @@ def _schedule(step):
     return factor, start, is_over
 
 
-def solve(groups: Groups, is_redundant: bool, W, q, scale, width) -> Solution:
+def solve(groups: Groups, is_redundant: bool, W, q, scale, width, wanted=True) -> Solution:
     """Solve for x with W (m, m) and q (m,) of size one, and projections of a smooth `width` (), zero for Coulomb's law.
 
     Of several solutions it is that with impulses `scale` x of least norm, `scale` (m,). `is_redundant`: whether W is known to be
-    singular. A function of kernels without a derivative (see `attach_derivative`).
+    singular. Without `wanted` () it is zero. A function of kernels without a derivative (see `attach_derivative`).
     """
     dtype, shift = q.dtype, _shift(scale)
     start, *_ = _residual(groups, jnp.zeros_like(q), q, width)
@@ -238,7 +238,7 @@ def solve(groups: Groups, is_redundant: bool, W, q, scale, width) -> Solution:
     # A zero that the compiler does not know: the program of the first step is that of the others.
     zero = jnp.where(error >= 0, 0.0, error).astype(dtype)
     first = zero + (_SHIFTED if is_redundant else _PLAIN)
-    state = _State(jnp.full_like(q, zero), width + zero, first, zero, (error > 0).astype(dtype))
+    state = _State(jnp.full_like(q, zero), width + zero, first, zero, ((error > 0) & wanted).astype(dtype))
     state = batch.repeat_while(
         lambda state: state.alive > 0,
         lambda state: _step(groups, W, q, width, shift, state),

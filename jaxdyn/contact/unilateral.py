@@ -66,6 +66,7 @@ class DryFriction(WithModes):
 
     coefficient: Float[Array, "..."]
     static: Float[Array, "..."]
+    has_static: bool = eqx.field(static=True)
     normal: Any
     constraint: str | None = eqx.field(static=True)
     along: Constraint
@@ -84,6 +85,7 @@ class DryFriction(WithModes):
     ):
         self.name = _check_name(name, "DryFriction")
         self.coefficient, self.static = _coefficients(coefficient, static, f"DryFriction {name!r}")
+        self.has_static = static is not None
         self.constraint = normal if isinstance(normal, str) else None
         if isinstance(normal, str):
             self.normal = None
@@ -134,6 +136,7 @@ class UnilateralContact(WithModes):
     contact: Constraint
     coefficient: Float[Array, "..."]
     static: Float[Array, "..."]
+    has_static: bool = eqx.field(static=True)
     restitution: Float[Array, "..."]
     name: str = eqx.field(static=True)
 
@@ -156,6 +159,7 @@ class UnilateralContact(WithModes):
         self.name = _check_name(contact.name if name is None else name, "UnilateralContact")
         owner = f"UnilateralContact {self.name!r}"
         self.coefficient, self.static = _coefficients(friction, static, owner)
+        self.has_static = static is not None
         self.restitution = jnp.asarray(as_array(restitution, f"{owner}: restitution"), float)
         known = np.asarray(self.restitution) if is_concrete(self.restitution) else None
         if known is not None and not ((known >= 0) & (known <= 1)).all():

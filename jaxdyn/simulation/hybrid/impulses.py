@@ -4,6 +4,7 @@ Changes of one element at a time may cycle, since directions of sliding change w
 has a solution for all impacts on the ground, and its impulses tell which contacts close, stick, and slide.
 """
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array
@@ -15,14 +16,14 @@ from jaxdyn.simulation.hybrid.modes import Elements, Mode
 from jaxdyn.simulation.hybrid.transitions import Problem, length
 
 
-def impulsive_mode(elements: Elements, problem: Problem, mode: Mode, slip) -> tuple[Mode, Array]:
-    """Mode of an impact and directions of sliding (n, 2); those of other elements than contacts are kept."""
+def impulsive_mode(elements: Elements, problem: Problem, wanted, mode: Mode, slip) -> tuple[Mode, Array]:
+    """Mode of an impact and directions of sliding (n, 2), if `wanted` (); those of other elements than contacts are kept."""
     if not elements.opening.any():
         return mode, slip
-    return kernel(_impulsive_mode, static=1, derivative=False)(elements, problem, mode, slip)
+    return kernel(_impulsive_mode, static=1, derivative=False)(elements, problem, wanted, mode, slip)
 
 
-def _impulsive_mode(elements: Elements, problem: Problem, mode: Mode, slip):
+def _impulsive_mode(elements: Elements, problem: Problem, wanted, mode: Mode, slip):
     contacts = [i for i, one in enumerate(elements.each) if one.opens]
     contacts.sort(key=lambda i: -len(elements.each[i].tangent))
     sizes = [1 + len(elements.each[i].tangent) for i in contacts]
@@ -53,7 +54,7 @@ def _impulsive_mode(elements: Elements, problem: Problem, mode: Mode, slip):
     largest = jnp.where(largest > 0, largest, one)
     q = jnp.where(scale > 0, q / largest, q)
     W = W * scale[:, None] * scale[None]
-    x = coulomb.solve(groups, True, W, q, scale, jnp.zeros((), dtype)).x
+    x = coulomb.solve(groups, True, W, q, scale, jnp.zeros((), dtype), wanted).x
     y = matmul(W, x) + q
     tiny = float(jnp.finfo(dtype).eps) ** 0.5
     closed, stick, along = list(mode.closed), list(mode.stick), list(slip)
@@ -63,4 +64,5 @@ def _impulsive_mode(elements: Elements, problem: Problem, mode: Mode, slip):
             speed, unit = length(jnp.concatenate([y[k + 1 : k + size], jnp.zeros((3 - size,), dtype)])[None])
             stick[i] = closed[i] & (speed[0] <= tiny)
             along[i] = jnp.where(stick[i], slip[i], unit[0])
-    return mode._replace(closed=jnp.stack(closed), stick=jnp.stack(stick)), jnp.stack(along)
+    found = mode._replace(closed=jnp.stack(closed), stick=jnp.stack(stick)), jnp.stack(along)
+    return jax.tree.map(lambda a, b: jnp.where(wanted, a, b), found, (mode, slip))

@@ -42,7 +42,7 @@ class PiecewiseSystem(HybridSystem):
         values, levels = self._switching(t, y, (*args[0], args[1].positive))
         return jnp.where(args[1].positive, values, -values), levels
 
-    def reset(self, unknown, t, y, mode, slip, hit, atol):
+    def reset(self, unknown, t, y, mode, slip, hit, happens, atol):
         # Forces are finite on both sides of a zero: the piece changes, and the velocity does not jump.
         mode, yes = mode._replace(positive=mode.positive ^ hit), jnp.ones((), bool)
         none = jnp.zeros((0,), y.dtype)

@@ -18,7 +18,7 @@ from jaxdyn.systems.scene import Scene
 
 
 class Gram(NamedTuple):
-    """Gram matrix G = Y^T Y (count, count) of rows Y (nv, count); `matrix` is None where there are more rows than velocities."""
+    """Gram matrix G = Y^T Y (count, count) of rows Y (nv, count); `matrix` is None where there are many more rows than velocities."""
 
     Y: Array
     matrix: Array | None
@@ -26,7 +26,8 @@ class Gram(NamedTuple):
     @classmethod
     def of(cls, Y) -> "Gram":
         """Gram matrix of whitened rows Y (nv, count)."""
-        return cls(Y, None if Y.shape[0] < Y.shape[1] else matmul(Y.T, Y))
+        # Operations of kernels grow as the cube of the rows: those of eight contacts of a body would be too many.
+        return cls(Y, None if 2 * Y.shape[0] < Y.shape[1] else matmul(Y.T, Y))
 
     def times(self, x):
         """Product G x, x (count,) or (count, k)."""

@@ -63,8 +63,11 @@ class HybridSystem:
         """Guards and their rounding levels: those of the elements by CHANNELS, then those of the switching functions."""
 
     @abstractmethod
-    def reset(self, unknown, t, y, mode: Mode, slip, hit, atol) -> Transition:
-        """Transition after the guards `hit`; `atol` (), m: the height of flights that are not followed, None for rounding."""
+    def reset(self, unknown, t, y, mode: Mode, slip, hit, happens, atol) -> Transition:
+        """Transition after the guards `hit`, of any value unless it `happens` ().
+
+        `atol` (), m: the height of flights that are not followed, None for rounding.
+        """
 
     @abstractmethod
     def impact(self, unknown, collision: Collision, t, y) -> Any:
@@ -124,7 +127,7 @@ class ModalSystem(HybridSystem):
         more = values, levels / ROUNDING
         return tuple(jnp.concatenate([a.reshape(-1), b]) for a, b in zip(own, more, strict=True))
 
-    def reset(self, unknown, t, y, mode, slip, hit, atol):
+    def reset(self, unknown, t, y, mode, slip, hit, happens, atol):
         y = self.plan.structure(y)
         q, v = y["q"], y["v"]
         hit, switched = self.elements.split(hit)
@@ -139,7 +142,7 @@ class ModalSystem(HybridSystem):
         stopped = jnp.asarray(self.elements.rough) & mode.closed & ~mode.stick & ends & ~is_impact
         mode, slip, begins = first_guess(self.elements, mode, slip, holding, speed, hit)
         mode = mode._replace(stick=mode.stick | (stopped & mode.closed))
-        after = self._pass(unknown, mode, slip, begins, stopped & mode.closed, t, q, v, atol)
+        after = self._pass(unknown, mode, slip, begins, stopped & mode.closed, happens, t, q, v, atol)
         # Switching functions that the impact has carried across their zeros.
         values, levels = self._switches(unknown, after.mode.positive, q, after.v, t)
         crossed = (values < -levels) & ~switched
@@ -150,7 +153,7 @@ class ModalSystem(HybridSystem):
         *_, terms, motion = self._motion((unknown, mode), t, {"q": q, "v": v, "slip": slip})
         return motion.reaction.holding, length(terms.slip)[0], self._speeds(terms, v)
 
-    def _pass(self, unknown, mode, slip, begins, stopped, t, q, v, atol) -> Transition:
+    def _pass(self, unknown, mode, slip, begins, stopped, happens, t, q, v, atol) -> Transition:
         """Transition from a first guess of the mode; `begins` (n,) marks elements that slide from rest."""
         elements, n = self.elements, len(self.elements.each)
         least = tolerance(q.dtype) * (1 + jnp.max(jnp.abs(q)))
@@ -162,7 +165,7 @@ class ModalSystem(HybridSystem):
             begin = guess_again(elements, problem, mode, jnp.zeros_like(guess))
             begin, along = cond(
                 (guess > 0) & busy,
-                partial(impulsive_mode, elements, problem),
+                partial(impulsive_mode, elements, problem, (guess > 0) & busy),
                 lambda mode, along: (mode, along),
                 begin,
                 along,
@@ -197,7 +200,7 @@ class ModalSystem(HybridSystem):
         fast = jnp.asarray(1e-4, q.dtype) if atol is None else 0.3 * jnp.sqrt(jnp.maximum(atol, least))
         start = Collision(mode, slip, jnp.ones((n,), q.dtype), none, stopped)
         blank = Transition(start, mode, slip, v, no, no)
-        return while_loop(lambda carry: carry[4], attempt, (zero, zero, start[2:], blank, ~no))[3]
+        return while_loop(lambda carry: carry[4], attempt, (zero, zero, start[2:], blank, ~no & happens))[3]
 
     def _velocities(self, unknown, mode: Mode, rebound, held, stopped, slip, t, q, v):
         """Problem of an impact, and directions of sliding (n, 2)."""
