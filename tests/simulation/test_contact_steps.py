@@ -380,8 +380,8 @@ def test_batches_are_single_samples_and_float32():
     step = jd.stepper(scene, 0.01, report=True)
     batch = jax.jit(jax.vmap(lambda q, v: step((q, v), STILL)))
     (_, velocities), report = batch(q, v)
-    # Impacts of a box with four corners, whose forces are not unique, are the hardest: others are NaN and have a code.
-    assert np.mean(report.success) > 0.99
+    # Impacts of a box with four corners, whose forces are not unique, are the hardest.
+    assert np.asarray(report.success).all()
     for count in (0, 1, 3):
         np.testing.assert_allclose(batch(q[:count], v[:count])[0][1], velocities[:count], rtol=0, atol=1e-12)
     single = jax.jit(lambda q, v: step((q, v), STILL))
@@ -491,7 +491,7 @@ def test_friction_at_rest_has_its_own_coefficient():
 
 
 def test_dry_friction_and_drives_in_steps_with_contacts():
-    """A block on a rail: it slides to rest under a load that is given, and rests under a drive whose torque rises to 0.9 of it."""
+    """A block on a rail: it slides to rest under a load that is given, and rests under a drive that is weaker at rest."""
     builder = jd.ModelBuilder("block", gravity=None)
     builder.add_body("block", None, "prismatic", (2.0, (0, 0, 0), (0.1, 0.1, 0.1)), axis=(1, 0, 0), joint_name="rail")
     friction = jd.contact.DryFriction(0.3, 10.0, 0, static=0.4)

@@ -162,10 +162,13 @@ class ModalSystem(HybridSystem):
         def attempt(carry):
             tries, guess, (rebound, held, stopped), _, busy = carry
             problem, along = kernel(self._velocities)(unknown, mode, rebound, held, stopped, slip, t, q, v)
-            begin = guess_again(elements, problem, mode, jnp.zeros_like(guess))
+            # First the impulses of Coulomb's law. They are zero where sliding leaves no forces: an impulse without collision begins
+            # from elements that stick.
+            by_law = (guess == 1) & busy
+            begin = guess_again(elements, problem, mode, jnp.where(by_law, 0, guess))
             begin, along = cond(
-                (guess > 0) & busy,
-                partial(impulsive_mode, elements, problem, (guess > 0) & busy),
+                by_law,
+                partial(impulsive_mode, elements, problem, by_law),
                 lambda mode, along: (mode, along),
                 begin,
                 along,
