@@ -18,7 +18,7 @@ from jaxdyn.systems.scene import Scene
 
 
 class Gram(NamedTuple):
-    """Gram matrix G = Y^T Y (count, count) of rows Y (nv, count); `matrix` is None where there are many more rows than velocities."""
+    """Gram matrix G = Y^T Y (count, count) of rows Y (nv, count); `matrix` is None where there are far more rows."""
 
     Y: Array
     matrix: Array | None

@@ -140,9 +140,12 @@ class ModalSystem(HybridSystem):
         # In a fixed direction it ends where it turns round, with what is left across.
         ends = (speed <= least * (1 + size)) | (hit[:, 1] & (mode.creep > 0) & (speed < mode.creep / 2))
         stopped = jnp.asarray(self.elements.rough) & mode.closed & ~mode.stick & ends & ~is_impact
+        before = mode.closed
         mode, slip, begins = first_guess(self.elements, mode, slip, holding, speed, hit)
         mode = mode._replace(stick=mode.stick | (stopped & mode.closed))
-        after = self._pass(unknown, mode, slip, begins, stopped & mode.closed, happens, t, q, v, atol)
+        after = self._pass(
+            unknown, mode, slip, begins, stopped & mode.closed, before & ~mode.closed, happens, t, q, v, atol
+        )
         # Switching functions that the impact has carried across their zeros.
         values, levels = self._switches(unknown, after.mode.positive, q, after.v, t)
         crossed = (values < -levels) & ~switched
@@ -153,7 +156,7 @@ class ModalSystem(HybridSystem):
         *_, terms, motion = self._motion((unknown, mode), t, {"q": q, "v": v, "slip": slip})
         return motion.reaction.holding, length(terms.slip)[0], self._speeds(terms, v)
 
-    def _pass(self, unknown, mode, slip, begins, stopped, happens, t, q, v, atol) -> Transition:
+    def _pass(self, unknown, mode, slip, begins, stopped, released, happens, t, q, v, atol) -> Transition:
         """Transition from a first guess of the mode; `begins` (n,) marks elements that slide from rest."""
         elements, n = self.elements, len(self.elements.each)
         least = tolerance(q.dtype) * (1 + jnp.max(jnp.abs(q)))
@@ -162,10 +165,10 @@ class ModalSystem(HybridSystem):
         def attempt(carry):
             tries, guess, (rebound, held, stopped), _, busy = carry
             problem, along = kernel(self._velocities)(unknown, mode, rebound, held, stopped, slip, t, q, v)
-            # First the impulses of Coulomb's law. They are zero where sliding leaves no forces: an impulse without collision begins
-            # from elements that stick.
+            # First the impulses of Coulomb's law. They are zero where sliding leaves no forces: an impulse without collision
+            # begins from elements that stick.
             by_law = (guess == 1) & busy
-            begin = guess_again(elements, problem, mode, jnp.where(by_law, 0, guess))
+            begin = guess_again(elements, problem, mode, jnp.where(by_law, 0, guess), released)
             begin, along = cond(
                 by_law,
                 partial(impulsive_mode, elements, problem, by_law),
@@ -178,7 +181,7 @@ class ModalSystem(HybridSystem):
             still = kernel(self._find_jams)(problem, choice.mode, choice.slip)
             resting, at, after, gains = kernel(self._after)(unknown, collision, begins, t, q, v)
             problem, along = kernel(self._forces)(unknown, resting, at, t, q, after)
-            final = choose_mode(elements, problem, guess_again(elements, problem, resting, guess), along)
+            final = choose_mode(elements, problem, guess_again(elements, problem, resting, guess, released), along)
             follows, soft, short, paradox = kernel(self._flights)(
                 unknown, collision, problem, final.mode, final.slip, t, q, v, after, (height, fast)
             )

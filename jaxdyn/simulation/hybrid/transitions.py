@@ -120,15 +120,18 @@ def first_guess(elements: Elements, mode: Mode, slip, holding, speed, hit) -> tu
     return changed, slip, begins
 
 
-def guess_again(elements: Elements, problem: Problem, mode: Mode, guess) -> Mode:
+def guess_again(elements: Elements, problem: Problem, mode: Mode, guess, released) -> Mode:
     """Mode from which changes begin, where `guess` () others before have led to no mode: all contacts open, stick, or slide.
 
     The first one has all contacts closed that may be. Of redundant contacts several modes agree, with other forces: the choice
-    must not depend on the modes before, between which a motion would change without end.
+    must not depend on the modes before, between which a motion would change without end. Contacts (n,) that the event has
+    `released` have no force in either mode, and are open.
     """
     opens, others = jnp.asarray(elements.opening), guess > 0
     closed = jnp.where(
-        opens, jnp.where(others, problem.may_close & (guess > 1), mode.closed | problem.may_close), mode.closed
+        opens,
+        jnp.where(others, problem.may_close & (guess > 1), mode.closed | (problem.may_close & ~released)),
+        mode.closed,
     )
     sticks = closed & problem.may_stick & jnp.asarray(elements.rough)
     stick = jnp.where(others, sticks & (guess == 2), mode.stick | (sticks & ~mode.closed))
