@@ -8,6 +8,9 @@ It is solved by changing the first element that disagrees, one at a time, which 
 Each time the forces of all elements are computed from their modes, those of dependent rows by least norm: a contact whose force
 of least norm would pull is opened, and rests beside the others without force.
 
+Directions of sliding change with the modes, so that changes may cycle: then an impact begins from the modes of its impulses by
+Newton's method (`impulses`).
+
 The impact is plastic, or has rebounds by Newton's hypothesis (Moreau's law: friction is against the velocity after it). A plastic
 impact loses energy, p.u <= 0. With rebounds and friction Newton's law can gain some (Kane 1984): the coefficients of
 restitution of all contacts are then halved, until the work p.(u + u_free)/2 of the impulses is not positive.
