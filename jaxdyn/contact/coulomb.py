@@ -17,7 +17,7 @@ simulation of nonsmooth rigid multibody dynamics (2006); Hayashi, Yamashita & Fu
 """
 
 from functools import partial
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -225,7 +225,7 @@ def _schedule(step):
     return factor, start, is_over
 
 
-def solve(groups: Groups, is_redundant: bool, W, q, scale, width, wanted=True) -> Solution:
+def solve(groups: Groups, is_redundant: bool, W, q, scale, width, wanted: Any = True) -> Solution:
     """Solve for x with W (m, m) and q (m,) of size one, and projections of a smooth `width` (), zero for Coulomb's law.
 
     Of several solutions it is that with impulses `scale` x of least norm, `scale` (m,). `is_redundant`: whether W is known to be

@@ -146,7 +146,20 @@ def _change_without_flags(found: _Step, change: _Step) -> _Step:
     )
 
 
-def _step(contacts: Contacts, scene: Scene, q, v, z, tau, t, h, smoothing, x=None, at_rest=None, relaxed=None) -> _Step:
+def _step(
+    contacts: Contacts,
+    scene: Scene,
+    q,
+    v,
+    z,
+    tau,
+    t,
+    h,
+    smoothing,
+    x: Any = None,
+    at_rest: Any = None,
+    relaxed: Any = None,
+) -> _Step:
     """A step; with `x`, the solution of its contacts, the cones `at_rest`, whether it is `relaxed`, for its derivatives."""
     # One subprogram, in which the zeros of the rows are known, as far as they are.
     problem, groups = jax.jit(partial(pose, contacts, scene))(q, v, z, tau, t, h), contacts.groups
@@ -192,7 +205,7 @@ def _step(contacts: Contacts, scene: Scene, q, v, z, tau, t, h, smoothing, x=Non
     )
 
 
-def _solve_relaxed(contacts: Contacts, scene: Scene, of: Scaled, solution: coulomb.Solution, width, wanted=True):
+def _solve_relaxed(contacts: Contacts, scene: Scene, of: Scaled, solution: coulomb.Solution, width, wanted: Any = True):
     """The solution, or that with consistent velocities where there is none, and whether it is that."""
     if not may_contradict(contacts, scene):
         return solution, jnp.zeros((), bool)

@@ -227,10 +227,11 @@ def _advance_contacts(scene: Scene, length, substeps: int, limits, smoothing, re
         # Known numbers stay numpy's: an array of JAX would be an argument more of the program around the step.
         energy = np.asarray(smoothing, q.dtype) if is_concrete(smoothing) else jnp.asarray(smoothing, q.dtype)
 
-        start = (q, v, *z) if z else (q, v, jnp.zeros((0,), q.dtype))
+        start: Any = (q, v, *z) if z else (q, v, jnp.zeros((0,), q.dtype))
 
-        def once(state, i):
-            return contact_step(contacts, whole, *state, tau, t + i * size, size, energy)
+        def once(state: Any, i):
+            q, v, z = state
+            return contact_step(contacts, whole, q, v, z, tau, t + i * size, size, energy)
 
         if substeps == 1:
             state, of_step = once(start, 0)
