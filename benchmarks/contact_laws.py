@@ -16,7 +16,7 @@ import numpy as np
 import jaxdyn as jd
 from jaxdyn.compile import kernel
 from jaxdyn.contact import coulomb, jordan
-from jaxdyn.simulation import contact_steps
+from jaxdyn.simulation import contact_problem
 
 GROUPS = ((4, 3),)
 
@@ -28,13 +28,13 @@ def problems(count: int):
     corners = [(a, b, -0.1) for a in (-0.3, 0.3) for b in (-0.2, 0.2)]
     contacts = [jd.contact.ground_contact("box", p, 0.5, name=f"{i}") for i, p in enumerate(corners)]
     scene = jd.Scene(builder.build(), forces=contacts)
-    places, none = contact_steps.contacts_of(scene, None), jnp.zeros(())
+    places, none = contact_problem.contacts_of(scene, None), jnp.zeros(())
     q = np.tile([0, 0, 0.1, 1, 0, 0, 0.0], (count, 1))
     q[:, 2] += np.where(np.arange(count) % 2 == 0, 0.0, rng.uniform(0, 0.02, count))
 
     def one(q, v):
-        problem = contact_steps._problem(places, scene, q, v, jnp.zeros(6), none, jnp.asarray(0.01))
-        return problem.W, problem.q, problem.scale
+        problem = contact_problem.pose(places, scene, q, v, jnp.zeros(0), jnp.zeros(6), none, jnp.asarray(0.01))
+        return contact_problem.scaled(places, problem, contact_problem.friction_of(places, scene, q.dtype))[:3]
 
     return jax.jit(jax.vmap(one))(q, rng.normal(size=(count, 6)))
 

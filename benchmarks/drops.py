@@ -192,7 +192,7 @@ def run(name: str, seconds: float = 1.0, most: int = 1000, **options) -> tuple[C
         )
         energy: Any = motion.energy
         if drop.rest is not None:
-            bent = motion.q[:, -drop.rest.size :] - drop.rest
+            bent = motion.q[:, -drop.rest.size :] - drop.rest[None]
             energy = energy + SPRING * softness / 2 * jnp.sum(bent**2, 1)
         gaps = jax.vmap(
             lambda q: jnp.stack([force.contact.position(scene.system, q, 0.0)[0] for force in scene.forces])

@@ -17,7 +17,7 @@ simulation of nonsmooth rigid multibody dynamics (2006); Hayashi, Yamashita & Fu
 """
 
 from functools import partial
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -213,31 +213,32 @@ def _step(groups: Groups, W, q, floor, shift, state: _State) -> _State:
 
 
 def _schedule(step):
-    """Quotient of widths in the attempt of a step, the first width of the next one, and whether the attempt ends."""
+    """Quotient of widths in the attempt of a step, the first width of the next one, and whether another one follows."""
     factor, start, is_over, end = jnp.zeros_like(step), jnp.zeros_like(step), step < 0, 0
     for i, (_, quotient, count) in enumerate(_ATTEMPTS):
         here = (step >= end) & (step < end + count)
         end += count
         factor = jnp.where(here, quotient, factor)
-        start = jnp.where(here, _ATTEMPTS[min(i + 1, len(_ATTEMPTS) - 1)][0], start)
-        is_over = is_over | (step == end - 1)
+        if i + 1 < len(_ATTEMPTS):
+            start = jnp.where(here, _ATTEMPTS[i + 1][0], start)
+            is_over = is_over | (step == end - 1)
     return factor, start, is_over
 
 
-def solve(groups: Groups, is_redundant: bool, W, q, scale, width) -> Solution:
+def solve(groups: Groups, is_redundant: bool, W, q, scale, width, wanted: Any = True) -> Solution:
     """Solve for x with W (m, m) and q (m,) of size one, and projections of a smooth `width` (), zero for Coulomb's law.
 
     Of several solutions it is that with impulses `scale` x of least norm, `scale` (m,). `is_redundant`: whether W is known to be
-    singular. A function of kernels without a derivative (see `attach_derivative`).
+    singular. Without `wanted` () it is zero. A function of kernels without a derivative (see `attach_derivative`).
     """
-    dtype, tol, shift = q.dtype, tolerance(q.dtype), _shift(scale)
+    dtype, shift = q.dtype, _shift(scale)
     start, *_ = _residual(groups, jnp.zeros_like(q), q, width)
     # Where nothing touches, zero is the solution, and no step is made.
     error = jnp.sqrt(jnp.sum(start * start))
     # A zero that the compiler does not know: the program of the first step is that of the others.
     zero = jnp.where(error >= 0, 0.0, error).astype(dtype)
     first = zero + (_SHIFTED if is_redundant else _PLAIN)
-    state = _State(jnp.full_like(q, zero), width + zero, first, zero, (error > 0).astype(dtype))
+    state = _State(jnp.full_like(q, zero), width + zero, first, zero, ((error > 0) & wanted).astype(dtype))
     state = batch.repeat_while(
         lambda state: state.alive > 0,
         lambda state: _step(groups, W, q, width, shift, state),
@@ -245,7 +246,8 @@ def solve(groups: Groups, is_redundant: bool, W, q, scale, width) -> Solution:
         sum(count for *_, count in _ATTEMPTS),
     )
     residual = residual_at(groups, state.x, matmul(W, state.x) + q, width)
-    solved = (residual <= tol) | ((state.alive == 0) & (residual <= float(jnp.finfo(dtype).eps) ** _SHIFT))
+    # Half of the digits are those of forces that are not unique; see `_step`.
+    solved = residual <= float(jnp.finfo(dtype).eps) ** _SHIFT
     return Solution(state.x, residual, solved, state.step)
 
 

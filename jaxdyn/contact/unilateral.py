@@ -77,6 +77,7 @@ class DryFriction(WithModes):
 
     coefficient: Float[Array, "..."]
     static: Float[Array, "..."]
+    has_static: bool = eqx.field(static=True)
     normal: Any
     constraint: str | None = eqx.field(static=True)
     along: Constraint
@@ -95,6 +96,7 @@ class DryFriction(WithModes):
     ):
         self.name = check_new_name(name, "friction", "DryFriction: name")
         self.coefficient, self.static = _coefficients(coefficient, static, f"DryFriction {name!r}")
+        self.has_static = static is not None
         self.constraint = normal if isinstance(normal, str) else None
         if isinstance(normal, str):
             self.normal = None
@@ -145,6 +147,7 @@ class UnilateralContact(WithModes):
     contact: Constraint
     coefficient: Float[Array, "..."]
     static: Float[Array, "..."]
+    has_static: bool = eqx.field(static=True)
     restitution: Float[Array, "..."]
     name: str = eqx.field(static=True)
 
@@ -167,6 +170,7 @@ class UnilateralContact(WithModes):
         self.name = check_new_name(name, contact.name, "UnilateralContact: name")
         owner = f"UnilateralContact {self.name!r}"
         self.coefficient, self.static = _coefficients(friction, static, owner)
+        self.has_static = static is not None
         self.restitution = jnp.asarray(as_array(restitution, f"{owner}: restitution"), float)
         known = np.asarray(self.restitution) if is_concrete(self.restitution) else None
         if known is not None and not ((known >= 0) & (known <= 1)).all():

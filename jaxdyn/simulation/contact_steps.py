@@ -12,14 +12,18 @@ where the normal velocity counts from a bound n . v' >= c:
     c = min(-gap / h, -u)    for a gap below zero; u = n . v_f: no more velocity comes out than has come in,
     c = e |u|                for an impact: the contact closes in the next step, with restitution e.
 
-If no contact closes, q' is that of the midpoint rule, q + h v/2 + h v'/2, and the step is of order two. A contact at rest has
-v = 0, and so q' = q to rounding: nothing creeps. q' is projected onto the holonomic constraints before the solve.
+If no contact closes, and no friction has a load, q' is that of the midpoint rule, q + h v/2 + h v'/2, and the step is of order
+two. A contact at rest has v = 0, and so q' = q to rounding: nothing creeps. q' is projected onto the holonomic constraints
+before the solve.
+
+A contact or friction with a coefficient at rest of its own has that one as long as it slips neither before the step nor after
+it. Where contacts that close contradict each other, and no solution is found, their velocities are made consistent
+(`contact_problem`). States of drives follow the midpoint rule, with the mean of v and v'.
 
 Sources: Moreau, Unilateral contact and dry friction in finite freedom dynamics (1988); Stewart & Trinkle (1996); Acary &
 Brogliato, Numerical methods for nonsmooth dynamical systems (2008), chapters 10 and 13.
 """
 
-from collections.abc import Callable
 from functools import partial
 from typing import Any, NamedTuple
 
@@ -29,27 +33,21 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from jaxdyn.compile import implicit, invalidate_derivatives, kernel, value_and_jvp
-from jaxdyn.compile.known import is_concrete
-from jaxdyn.constraints.base import constraint_jacobian, position_residual, velocity_residual
 from jaxdyn.constraints.codes import RESULTS, Outcome, Result
-from jaxdyn.constraints.dynamics import constrained_dynamics
-from jaxdyn.constraints.projection import project_state
-from jaxdyn.constraints.rank import regular_gram
 from jaxdyn.contact import coulomb
-from jaxdyn.contact.unilateral import UnilateralContact, WithModes
-from jaxdyn.dynamics.quantities import bias_force, mass_matrix
-from jaxdyn.forces.piecewise import Pieces
 from jaxdyn.lie.so3 import matmul
-from jaxdyn.model.joints import KINDS
-from jaxdyn.model.tree import Model
-from jaxdyn.simulation.hybrid.modes import elements_of, extend, force_at
-from jaxdyn.systems.mass_factor import MassFactor, cholesky, mass_factor, solve_cholesky
-from jaxdyn.systems.scene import Scene, has_drives
-from jaxdyn.systems.system import displace
-
-# An approach counts as an impact, with restitution, above this many times what forces change in a step: a rebound from a slower
-# one would end within a few steps.
-_IMPACT = 2.0
+from jaxdyn.simulation.contact_problem import (
+    Contacts,
+    Scaled,
+    friction_of,
+    make_consistent,
+    may_contradict,
+    pose,
+    rests_at,
+    scaled,
+    slip_speeds,
+)
+from jaxdyn.systems.scene import Scene
 
 
 class ContactStep(Outcome):
@@ -68,114 +66,35 @@ class ContactStep(Outcome):
     residual: Float[Array, ""]
 
 
-class Contacts(NamedTuple):
-    """Contacts of a scene in the order of the cones: those with two directions of slip, with one, and without; joint limits.
-
-    - `elements`: of `simulation.hybrid.modes`; `order`: their indices in the order of the cones.
-    - `limited`: indices in q and v of the joints whose limits hold. `own`: number of rows of the scene's constraints.
-    """
-
-    elements: tuple
-    order: tuple[int, ...]
-    limited: tuple[tuple[int, int], ...]
-    own: int
-
-    @property
-    def groups(self) -> coulomb.Groups:
-        """Numbers and dimensions of the cones."""
-        sizes = [1 + len(self.elements[i].tangent) for i in self.order]
-        groups = [(sizes.count(size), size) for size in (3, 2)]
-        return tuple(x for x in (*groups, (sizes.count(1) + len(self.limited), 1)) if x[0])
-
-    @property
-    def rows(self) -> np.ndarray:
-        """Rows of the contacts among those of the extended scene, in the order of the cones."""
-        chosen = [k for i in self.order for k in (self.elements[i].normal, *self.elements[i].tangent)]
-        return np.array(chosen, int)
-
-    @property
-    def normals(self) -> np.ndarray:
-        """Entries of the normals in the order of the cones."""
-        sizes = [1 + len(self.elements[i].tangent) for i in self.order] + [1] * len(self.limited)
-        return np.cumsum([0, *sizes])[:-1]
-
-
-def contacts_of(scene: Scene, limits: str | None) -> Contacts:
-    """Contacts of a scene. **Raises:** ValueError for other forces with modes, and drives with states."""
-    for force in scene.forces:
-        if isinstance(force, WithModes) and not isinstance(force, UnilateralContact):
-            raise ValueError(
-                f"stepper: {type(force).__name__} {force.name!r} sticks and slips by events, which steps of one length do not "
-                "have; take jd.simulate, or jd.forces.CoulombFriction in its place"
-            )
-        if isinstance(force, UnilateralContact):
-            _check_static(force)
-    if has_drives(scene):
-        raise ValueError(
-            "stepper: drives with states (jd.forces.DriveDynamics) have no steps with contacts or limits='hold'"
-        )
-    elements = elements_of(scene, Pieces((), ())) if any(isinstance(f, WithModes) for f in scene.forces) else None
-    each = () if elements is None else elements.each
-    order = sorted(range(len(each)), key=lambda i: -len(each[i].tangent))
-    return Contacts(each, tuple(order), _joints_with_limits(scene, limits), 0 if elements is None else elements.own)
-
-
-def _check_static(force: UnilateralContact) -> None:
-    pair = (force.coefficient, force.static)
-    if is_concrete(pair) and (np.asarray(pair[0]) != np.asarray(pair[1])).any():
-        raise ValueError(
-            f"stepper: contact {force.name!r} has friction {pair[0]} and static {pair[1]}; time stepping has one coefficient: "
-            "leave static out, or take jd.simulate"
-        )
-
-
-def _joints_with_limits(scene: Scene, limits: str | None) -> tuple[tuple[int, int], ...]:
-    """Indices in q and v of the joints of one coordinate that have a limit."""
-    if limits is None:
-        return ()
-    if limits != "hold":
-        raise ValueError(f"stepper: limits is {limits!r}; choose 'hold' or None")
-    model = scene.system
-    if not isinstance(model, Model):
-        raise ValueError(
-            f"stepper: limits is 'hold', and a {type(model).__name__} has no joint limits; pass limits=None"
-        )
-    top, places = model.topology, []
-    for kind, at_q, at_v in zip(top.kinds, top.q_slices, top.v_slices, strict=True):
-        if KINDS[kind].nq == KINDS[kind].nv == 1:
-            places.append((at_q.start, at_v.start))
-    return tuple(places)
-
-
 class _Step(NamedTuple):
     q: Array
     v: Array
+    z: Array  # states of drives
     impulses: Array  # (m,), N s
     x: Array  # of `coulomb.solve`
+    at_rest: Array  # cones (k,) with the coefficient of friction at rest
+    relaxed: Array  # whether velocities of contacts that close were made consistent
     residual: Array
     solved: Array
     steps: Array
     regular: Array  # whether the mass matrix is positive definite
 
 
-class _Terms(NamedTuple):
-    """Contacts at a configuration: gaps (k,), rows J (m, nv), and velocities J v - b at a velocity."""
-
-    gap: Array
-    J: Array
-    velocity: Any
-    side: Array  # of joint limits: 1 where the lower one is nearer, else -1
-
-
-def contact_step(contacts: Contacts, scene: Scene, q, v, tau, t, h, smoothing) -> tuple[Array, Array, ContactStep]:
-    """State after a step of length h (), and its contact forces; `smoothing` () in J."""
-    found = _advance(contacts, scene, q, v, tau, t, h, smoothing)
-    fine = found.solved & found.regular & jnp.isfinite(found.q).all() & jnp.isfinite(found.v).all()
+def contact_step(contacts: Contacts, scene: Scene, q, v, z, tau, t, h, smoothing) -> tuple[tuple, ContactStep]:
+    """State (q, v, z) after a step of length h (), and its contact forces; z: of drives; `smoothing` () in J."""
+    found = _advance(contacts, scene, q, v, z, tau, t, h, smoothing)
+    fine = (
+        found.solved
+        & found.regular
+        & jnp.isfinite(found.q).all()
+        & jnp.isfinite(found.v).all()
+        & jnp.isfinite(found.z).all()
+    )
     result = RESULTS.where(found.solved, RESULTS.successful, RESULTS.no_contact_impulses)  # pyright: ignore[reportArgumentType]
     result = RESULTS.where(fine | ~found.solved, result, RESULTS.nonfinite)  # pyright: ignore[reportArgumentType]
     result = RESULTS.where(found.regular, result, RESULTS.singular_mass_matrix)  # pyright: ignore[reportArgumentType]
-    q1, v1, forces = (jnp.where(fine, x, jnp.nan) for x in (found.q, found.v, found.impulses / h))
-    q1, v1, forces = invalidate_derivatives((q1, v1, forces), ~fine, (scene, q, v, tau, t, h))
+    *state, forces = (jnp.where(fine, x, jnp.nan) for x in (found.q, found.v, found.z, found.impulses / h))
+    *state, forces = invalidate_derivatives((*state, forces), ~fine, (scene, q, v, z, tau, t, h))
     by_name, start = {}, 0
     for i in contacts.order:
         size = 1 + len(contacts.elements[i].tangent)
@@ -185,7 +104,7 @@ def contact_step(contacts: Contacts, scene: Scene, q, v, tau, t, h, smoothing) -
     if contacts.limited:
         limit_forces = limit_forces.at[np.array([k for _, k in contacts.limited])].add(forces[start:])
     by_name = {one.name: by_name[one.name] for one in contacts.elements}
-    return q1, v1, ContactStep(by_name, limit_forces, result, found.residual)
+    return tuple(state), ContactStep(by_name, limit_forces, result, found.residual)
 
 
 def mean_of_steps(steps: ContactStep) -> ContactStep:
@@ -203,12 +122,12 @@ def _advance(contacts: Contacts, scene: Scene, *state) -> _Step:
     def tangent(scene, *rest):
         *state, steps = rest
         found = _advance(contacts, scene, *state)
-        x = jax.lax.stop_gradient(found.x)
+        known = jax.lax.stop_gradient((found.x, found.at_rest, found.relaxed))
 
         def again(scene, *args):
             return kernel(_step, static=1)(contacts, scene, *args)
 
-        _, change = value_and_jvp(again, (scene, *state, x), [*steps, None])
+        _, change = value_and_jvp(again, (scene, *state, *known), [*steps, None, None, None])
         return found, jax.tree.map(jnp.zeros_like, found) if change is None else _change_without_flags(found, change)
 
     return implicit(scene, state, solve, tangent)
@@ -221,179 +140,78 @@ def _change_without_flags(found: _Step, change: _Step) -> _Step:
         residual=jnp.zeros_like(found.residual),
         steps=jnp.zeros_like(found.steps),
         solved=float0(found.solved),
+        at_rest=float0(found.at_rest),
+        relaxed=float0(found.relaxed),
         regular=float0(found.regular),
     )
 
 
-def _terms(contacts: Contacts, scene: Scene, q, v, t) -> _Terms:
-    """Contacts and joint limits at q; `scene` is the extended one."""
-    parts_gap, parts_J, parts_velocity, side = [], [], [], jnp.zeros((0,), q.dtype)
-    if contacts.elements:
-        # The rows of the contacts alone, which come behind those of the scene's constraints.
-        own = Scene(scene.system, scene.constraints[len(scene.constraints) - len(contacts.elements) :])
-        rows = contacts.rows - contacts.own
-        gaps = position_residual(own, q, t)
-        parts_gap.append(gaps[np.array(contacts.order, int)])
-        parts_J.append(constraint_jacobian(own, q, t)[rows])
-        parts_velocity.append(velocity_residual(own, q, v, t)[rows])
-    if contacts.limited:
-        at_q, at_v = (np.array(x, int) for x in zip(*contacts.limited, strict=True))
-        lower, upper = (jnp.asarray(x, q.dtype)[at_q] for x in (scene.system.lower, scene.system.upper))
-        # A joint has one row: it touches one of its limits at a time.
-        side = jnp.where(q[at_q] - lower <= upper - q[at_q], 1.0, -1.0).astype(q.dtype)
-        limit = jnp.where(side > 0, lower, upper)
-        # A joint without a limit is far from it.
-        bounded = jnp.isfinite(limit)
-        gap = jnp.where(bounded, side * (q[at_q] - jnp.where(bounded, limit, 0.0)), 1e6)
-        J = jnp.zeros((len(at_q), scene.nv), q.dtype).at[np.arange(len(at_q)), at_v].set(side)
-        parts_gap.append(gap)
-        parts_J.append(J)
-        parts_velocity.append(side * v[at_v])
-    gap, rows, velocity = map(jnp.concatenate, (parts_gap, parts_J, parts_velocity))
-    return _Terms(gap, rows, velocity, side)
-
-
-class _Flow(NamedTuple):
-    """Motion without contacts at the middle of a step: `place`, the factor of M, and accelerations.
-
-    `acceleration(v, w)`: at the velocity v, with forces of the scene at the velocity w.
-    """
-
-    place: Array
-    metric: MassFactor
-    acceleration: Callable
-
-
-def _flow(scene: Scene, q, v, tau, t, h) -> _Flow:
-    """Motion of a scene without contacts."""
-    system, middle, unforced = scene.system, t + 0.5 * h, Scene(scene.system, scene.constraints)
-    place = displace(system, q, 0.5 * h * v)
-    metric = mass_factor(mass_matrix(system, place, middle))
-
-    def acceleration(v, v_of_forces):
-        force = scene.drive_torque(place, v_of_forces, middle, tau)[0]
-        applied = scene.applied_force(place, v_of_forces, middle)
-        force = force if applied is None else force + applied
-        if scene.constraints:
-            return constrained_dynamics(unforced, place, v, force, middle).acceleration
-        return metric.solve(force - bias_force(system, place, v, middle))
-
-    return _Flow(place, metric, acceleration)
-
-
-def _bounds(contacts: Contacts, scene: Scene, terms: _Terms, v, free, h):
-    """Bounds (k,) of the normal velocities; v (nv,) is the velocity at the start, `free` that without contact forces."""
-    at = contacts.normals
-    change, free = matmul(terms.J[at], free - v), terms.velocity[at]
-    now = free - change
-    restitution = [force_at(scene, contacts.elements[i]).restitution for i in contacts.order]
-    e = jnp.stack([*restitution, *[jnp.zeros(())] * len(contacts.limited)]).astype(free.dtype)
-    reach = -terms.gap / h
-    bound = jnp.where(terms.gap < 0, jnp.minimum(reach, -free), reach)
-    # Closing in the next step, and faster than forces close it.
-    is_impact = (free < bound) & (-now > _IMPACT * jnp.abs(change)) & (e > 0)
-    # Under a constant force, which changes the velocity by d in the step, the velocity u after the way h u is the root of
-    # (u + d)^2 - d^2: so restitution of one keeps the energy.
-    speed = jnp.sqrt(jnp.where(is_impact, free * free - change * change, jnp.ones_like(free)))
-    return jnp.where(is_impact, jnp.maximum(bound, e * speed), bound)
-
-
-class _Problem(NamedTuple):
-    """Complementarity problem of a step in scaled numbers, and what its solution x changes: velocity + push x.
-
-    `W` (m, m), `q` (m,) and `scale` (m,) as of `coulomb.solve`; impulses are `scale` x `size`.
-    """
-
-    place: Array
-    velocity: Array
-    metric: MassFactor
-    Y: Array
-    W: Array
-    q: Array
-    scale: Array
-    size: Array
-    side: Array
-
-
-def _step(contacts: Contacts, scene: Scene, q, v, tau, t, h, smoothing, x=None) -> _Step:
-    """A step; with `x`, the solution of its contacts, an equation for its derivatives."""
+def _step(
+    contacts: Contacts,
+    scene: Scene,
+    q,
+    v,
+    z,
+    tau,
+    t,
+    h,
+    smoothing,
+    x: Any = None,
+    at_rest: Any = None,
+    relaxed: Any = None,
+) -> _Step:
+    """A step; with `x`, the solution of its contacts, the cones `at_rest`, whether it is `relaxed`, for its derivatives."""
     # One subprogram, in which the zeros of the rows are known, as far as they are.
-    problem = jax.jit(partial(_problem, contacts, scene))(q, v, tau, t, h)
-    scaled, width = problem.Y * problem.scale[None], jnp.sqrt(smoothing) / problem.size
+    problem, groups = jax.jit(partial(pose, contacts, scene))(q, v, z, tau, t, h), contacts.groups
+    is_redundant = sum(contacts.sizes) + contacts.own > scene.nv
     if x is None:
-        is_redundant = len(problem.q) + contacts.own > scene.nv
-        solution = coulomb.solve(contacts.groups, is_redundant, problem.W, problem.q, problem.scale, width)
+        at_rest = jnp.zeros((len(contacts.sizes),), bool)
+        if contacts.has_static:
+            at_rest = rests_at(contacts, scene, q, v, t)
+        of = scaled(contacts, problem, friction_of(contacts, scene, q.dtype, at_rest))
+        solution = coulomb.solve(groups, is_redundant, *of[:3], jnp.sqrt(smoothing) / of.size)
+        solution, relaxed = _solve_relaxed(contacts, scene, of, solution, jnp.sqrt(smoothing) / of.size)
+        if contacts.has_static:
+            x = solution.x
+            # What slips from rest has the coefficient of sliding.
+            slips = at_rest & (slip_speeds(contacts, matmul(of.W, x) + of.q) > coulomb.tolerance(q.dtype) ** 0.5)
+            at_rest = at_rest & ~slips
+            of = scaled(contacts, problem, friction_of(contacts, scene, q.dtype, at_rest))
+            width, anew = jnp.sqrt(smoothing) / of.size, slips.any()
+            again = coulomb.solve(groups, is_redundant, *of[:3], width, anew)
+            again, relaxed_too = _solve_relaxed(contacts, scene, of, again, width, anew)
+            solution = jax.tree.map(lambda a, b: jnp.where(anew, a, b), again, solution)
+            relaxed = jnp.where(anew, relaxed_too, relaxed)
         x, residual, solved, steps = solution
     else:
-        y = matmul(scaled.T, matmul(scaled, x)) + problem.q
+        of = scaled(contacts, problem, friction_of(contacts, scene, q.dtype, at_rest))
+        width = jnp.sqrt(smoothing) / of.size
+        if may_contradict(contacts, scene):
+            of = of._replace(q=jnp.where(relaxed, make_consistent(contacts, of).q, of.q))
+        y = matmul(of.W, x) + of.q
         # The residual is no more than a reader of all arguments: programs leave out those that no value depends on.
-        residual = coulomb.residual_at(contacts.groups, x, y, width)
+        residual = coulomb.residual_at(groups, x, y, width)
         solved, steps = residual >= 0, residual
-        x = coulomb.attach_derivative(contacts.groups, problem.W, y, problem.scale, jax.lax.stop_gradient(width), x)
-    velocity = problem.velocity + problem.metric.unwhiten(matmul(scaled, x) * problem.size)
+        x = coulomb.attach_derivative(groups, of.W, y, of.scale, jax.lax.stop_gradient(width), x)
+    # Impulses of frictions' loads move nothing: their rows are zero.
+    velocity = problem.velocity + problem.metric.unwhiten(matmul(problem.Y * of.scale[None], x) * of.size)
     signs = jnp.concatenate([jnp.ones((len(x) - len(contacts.limited),), q.dtype), problem.side])
-    impulses = problem.scale * x * problem.size * signs
-    return _Step(problem.place, velocity, impulses, x, residual, solved, steps, problem.metric.is_definite())
-
-
-def _problem(contacts: Contacts, scene: Scene, q, v, tau, t, h) -> _Problem:
-    whole = extend(scene)
-    bare = Scene(scene.system, scene.constraints, whole.forces)
-    flow, end = _flow(bare, q, v, tau, t, h), t + h
-    place, metric, start = displace(scene.system, flow.place, 0.5 * h * v), flow.metric, flow.acceleration(v, v)
-    free = v + h * start
-    terms = _terms(contacts, whole, place, free, end)
-    closes = jnp.any(terms.velocity[contacts.normals] < _bounds(contacts, scene, terms, v, free, h))
-    # Halfway to a velocity without contact forces, damping would be that of a motion that contacts prevent.
-    half = v + 0.5 * h * start
-    change = h * (flow.acceleration(half, jnp.where(closes, v, half)) - start)
-    free, terms = free + change, terms._replace(velocity=terms.velocity + matmul(terms.J, change))
-    bound = _bounds(contacts, scene, terms, v, free, h)
-    place = jnp.where(closes, place, displace(scene.system, flow.place, 0.5 * h * free))
-    if not scene.constraints:
-        return _scale_problem(
-            contacts, scene, metric, metric.whiten(terms.J.T), place, free, terms, terms.velocity, bound
-        )
-    place = project_state(bare, place, free, end)[0]
-    terms = _terms(contacts, whole, place, free, end)
-    bound = _bounds(contacts, scene, terms, v, free, h)
-    # The rows of the scene's constraints are eliminated: what is left of Y is orthogonal to them.
-    of_loops, Y = metric.whiten(constraint_jacobian(bare, place, end).T), metric.whiten(terms.J.T)
-    factor = cholesky(regular_gram(of_loops))
-    closed = -matmul(of_loops, solve_cholesky(factor, velocity_residual(bare, place, free, end)))
-    rest = Y - matmul(of_loops, solve_cholesky(factor, matmul(of_loops.T, Y)))
-    velocities = terms.velocity + matmul(Y.T, closed)
-    return _scale_problem(
-        contacts, scene, metric, rest, place, free + metric.unwhiten(closed), terms, velocities, bound
+    impulses = of.scale * x * of.size * signs
+    if z.size:
+        rates: Any = scene.drive_torque(problem.middle, (v + velocity) / 2, t + 0.5 * h, tau, problem.drives)[1]
+        z = z + h * rates
+    return _Step(
+        problem.place, velocity, z, impulses, x, at_rest, relaxed, residual, solved, steps, problem.metric.is_definite()
     )
 
 
-def _scale_problem(
-    contacts: Contacts, scene: Scene, metric: MassFactor, Y, place, velocity, terms: _Terms, velocities, bound
-) -> _Problem:
-    """Coordinates in which the friction coefficient is one, and the mean inertia of a contact."""
-    one, zero = jnp.ones((), Y.dtype), jnp.zeros((), Y.dtype)
-    squares = jax.lax.stop_gradient(jnp.sum(Y * Y, 0))
-    relative, scales, parts, sizes, start = velocities.at[contacts.normals].add(-bound), [], [], [], 0
-    for size, mu in _sizes(contacts, scene):
-        mean = jnp.mean(squares[start : start + size])
-        unit = jnp.where(mean > 0, 1 / jnp.sqrt(jnp.where(mean > 0, mean, one)), one)
-        scales.append(jnp.stack([unit, *[unit * mu.astype(Y.dtype)] * (size - 1)]))
-        parts.append(scales[-1] * relative[start : start + size])
-        # Contacts that are far away do not count: their large bounds would hide the velocities of the others.
-        largest = jnp.max(jnp.abs(jax.lax.stop_gradient(parts[-1])))
-        sizes.append(jnp.where(parts[-1][0] < 0, largest, zero))
-        start += size
-    scale, q, size = jnp.concatenate(scales), jnp.concatenate(parts), jnp.max(jnp.stack(sizes))
-    size = jnp.where(size > 0, size, one)
-    W = matmul(Y.T, Y) * scale[:, None] * scale[None]
-    return _Problem(place, velocity, metric, Y, W, q / size, scale, size, terms.side)
-
-
-def _sizes(contacts: Contacts, scene: Scene):
-    """Dimension and friction coefficient of each cone."""
-    for i in contacts.order:
-        one = contacts.elements[i]
-        yield 1 + len(one.tangent), force_at(scene, one).coefficient
-    for _ in contacts.limited:
-        yield 1, jnp.ones(())
+def _solve_relaxed(contacts: Contacts, scene: Scene, of: Scaled, solution: coulomb.Solution, width, wanted: Any = True):
+    """The solution, or that with consistent velocities where there is none, and whether it is that."""
+    if not may_contradict(contacts, scene):
+        return solution, jnp.zeros((), bool)
+    fails = ~solution.solved & wanted
+    again = coulomb.solve(contacts.groups, True, of.W, make_consistent(contacts, of).q, of.scale, width, fails)
+    # The residual is that of the law itself.
+    residual = coulomb.residual_at(contacts.groups, again.x, matmul(of.W, again.x) + of.q, width)
+    again = again._replace(residual=residual, steps=solution.steps + again.steps)
+    return jax.tree.map(lambda a, b: jnp.where(fails, a, b), again, solution), fails

@@ -16,7 +16,8 @@ from jaxdyn.contact.unilateral import has_modes
 from jaxdyn.forces.piecewise import fix_pieces, guards, pieces_of, values_and_levels
 from jaxdyn.model.arguments import Numbers, as_array, check_flag, check_shape, state_dtype
 from jaxdyn.simulation.checks import choose_method
-from jaxdyn.simulation.contact_steps import contact_step, contacts_of, mean_of_steps
+from jaxdyn.simulation.contact_problem import contacts_of
+from jaxdyn.simulation.contact_steps import contact_step, mean_of_steps
 from jaxdyn.simulation.equations import DRIVES
 from jaxdyn.simulation.hybrid.piecewise import PiecewiseSystem, piecewise_motion
 from jaxdyn.simulation.methods import may_have_redundant_rows
@@ -59,8 +60,7 @@ def stepper(
 
     **Arguments:**
 
-    - `scene`: a `Scene` or `Model`. `jd.contact.DryFriction` sticks by events, which steps of one length do not have: take
-      `jd.forces.CoulombFriction`. Contacts have one coefficient of friction here, and no drives with states beside them.
+    - `scene`: a `Scene` or `Model`. `jd.contact.DryFriction` has steps of the same kind; its load is a number or a function.
     - `dt`: s; `substeps`: steps in it.
     - `remat`: if True, reverse mode keeps no more of a step than its state and tau, and computes the rest again. With several
       substeps that costs a step. A run of n steps then keeps 8 (nq + 2 nv) n bytes a sample in float64; with a law as tau,
@@ -75,8 +75,8 @@ def stepper(
       result code. A step whose contacts were not solved has the code `no_contact_impulses`; with and without a report its state
       and derivatives are NaN.
 
-    **Raises:** ValueError for a dt that is not positive, substeps that are no count, another adjoint, dry friction with modes,
-    contacts with a static coefficient of their own, unknown limits, negative smoothing; (when called) for shapes that do not fit.
+    **Raises:** ValueError for a dt that is not positive, substeps that are no count, another adjoint, dry friction whose load
+    is the force of a constraint, or with smoothing, unknown limits, negative smoothing; (when called) for shapes that do not fit.
 
     ```python
     step = jd.stepper(robot, dt=0.01, substeps=2)
@@ -92,7 +92,8 @@ def stepper(
     # In numpy a known length stays known inside a jit, where jax would trace it.
     length = np.asarray(seconds, dtype) if is_concrete(seconds) else jnp.asarray(seconds, dtype)
     if by_contacts:
-        start, advance = None, _advance_contacts(scene, length, substeps, limits, smoothing, report)
+        q, v = (jnp.zeros((n,), dtype) for n in (scene.nq, scene.nv))
+        start, advance = scene.drive_state(q, v), _advance_contacts(scene, length, substeps, limits, smoothing, report)
     else:
         start, advance = _advance(scene, length, substeps, adjoint != "reverse")
     by_numbers = jax.checkpoint(advance) if check_flag(remat, "stepper: remat") else advance
@@ -208,12 +209,12 @@ def _check_contact_options(by_contacts: bool, smoothing, report) -> None:
 
 
 def _advance_contacts(scene: Scene, length, substeps: int, limits, smoothing, report: bool) -> Callable:
-    """Function (q, v, tau, t) -> (q, v), or ((q, v), ContactStep) with `report`, of a step with contacts."""
+    """Function (q, v, tau, t, *z) -> (q, v, *z), or ((q, v, *z), ContactStep) with `report`, of a step with contacts."""
     contacts = contacts_of(scene, limits)
     selects_rows = bool(scene.constraints) and may_have_redundant_rows(scene)
     bare = Scene(scene.system, scene.constraints)
 
-    def advance(q, v, tau, t):
+    def advance(q, v, tau, t, *z):
         if is_standalone():
             raise ValueError(
                 "stepper: exported code has no loops, by which steps through contacts are solved; leave contacts and "
@@ -226,16 +227,19 @@ def _advance_contacts(scene: Scene, length, substeps: int, limits, smoothing, re
         # Known numbers stay numpy's: an array of JAX would be an argument more of the program around the step.
         energy = np.asarray(smoothing, q.dtype) if is_concrete(smoothing) else jnp.asarray(smoothing, q.dtype)
 
-        def once(state, i):
-            q, v = state
-            q, v, of_step = contact_step(contacts, whole, q, v, tau, t + i * size, size, energy)
-            return (q, v), of_step
+        start: Any = (q, v, *z) if z else (q, v, jnp.zeros((0,), q.dtype))
+
+        def once(state: Any, i):
+            q, v, z = state
+            return contact_step(contacts, whole, q, v, z, tau, t + i * size, size, energy)
 
         if substeps == 1:
-            state, of_step = once((q, v), 0)
-            return (state, of_step) if report else state
-        state, of_steps = jax.lax.scan(once, (q, v), jnp.arange(substeps, dtype=q.dtype))
-        return (state, mean_of_steps(of_steps)) if report else state
+            state, of_step = once(start, 0)
+        else:
+            state, of_steps = jax.lax.scan(once, start, jnp.arange(substeps, dtype=q.dtype))
+            of_step = mean_of_steps(of_steps)
+        state = state if z else state[:2]
+        return (state, of_step) if report else state
 
     return advance
 

@@ -380,8 +380,8 @@ def test_batches_are_single_samples_and_float32():
     step = jd.stepper(scene, 0.01, report=True)
     batch = jax.jit(jax.vmap(lambda q, v: step((q, v), STILL)))
     (_, velocities), report = batch(q, v)
-    # Impacts of a box with four corners, whose forces are not unique, are the hardest: others are NaN and have a code.
-    assert np.mean(report.success) > 0.99
+    # Impacts of a box with four corners, whose forces are not unique, are the hardest.
+    assert np.asarray(report.success).all()
     for count in (0, 1, 3):
         np.testing.assert_allclose(batch(q[:count], v[:count])[0][1], velocities[:count], rtol=0, atol=1e-12)
     single = jax.jit(lambda q, v: step((q, v), STILL))
@@ -465,10 +465,50 @@ def test_substeps_are_steps():
         (lambda: jd.stepper(ball(0.3), 0.01, smoothing=-1.0), "smoothing"),
         (lambda: jd.stepper(ball(0.3).system, 0.01, report=True), "report"),
         (lambda: jd.stepper(ball(0.3), 0.01, limits="stop"), "hold"),
-        (lambda: jd.stepper(free_body([jd.contact.ground_contact("body", None, 0.3, static=0.4)]), 0.01), "static"),
-        (lambda: jd.stepper(free_body([jd.contact.DryFriction(0.1, 1.0)]), 0.01), "CoulombFriction"),
+        (lambda: jd.stepper(free_body([jd.contact.DryFriction(0.1, "rail")]), 0.01), "rail"),
+        (lambda: jd.stepper(free_body([jd.contact.DryFriction(0.1, 1.0, smoothing=0.1)]), 0.01), "CoulombFriction"),
     ],
 )
 def test_refusals(make, words):
     with pytest.raises(ValueError, match=words):
         make()
+
+
+def test_friction_at_rest_has_its_own_coefficient():
+    """A ball that cannot turn on a slope of tan 0.45: at rest it stays by 0.5, and from a push it slides with 0.3."""
+    slope, dt = np.arctan(0.45), 0.01
+    plane = ((0.0, 0.0, 0.0), (0.0, slope, 0.0))
+    contacts = [
+        jd.contact.ground_contact("body", p, 0.3, static=0.5, plane=plane, name=f"{i}") for i, p in enumerate(CORNERS)
+    ]
+    scene, (q, _) = free_body(contacts), (on_slope(slope), STILL)
+    down = jnp.asarray([1.0, 0, 0, 0, 0, 0])
+    (_, rests), report = jax.jit(lambda s: run(scene, dt, s, 20))((q, STILL))
+    assert np.asarray(report.success).all() and np.abs(rests).max() < 1e-12
+    (_, slides), _ = jax.jit(lambda s: run(scene, dt, s, 20))((q, 0.5 * down))
+    rate = G * (np.sin(slope) - 0.3 * np.cos(slope))
+    np.testing.assert_allclose(np.diff(slides[:, 0]), rate * dt, rtol=1e-6)
+
+
+def test_dry_friction_and_drives_in_steps_with_contacts():
+    """A block on a rail: it slides to rest under a load that is given, and rests under a drive that is weaker at rest."""
+    builder = jd.ModelBuilder("block", gravity=None)
+    builder.add_body("block", None, "prismatic", (2.0, (0, 0, 0), (0.1, 0.1, 0.1)), axis=(1, 0, 0), joint_name="rail")
+    friction = jd.contact.DryFriction(0.3, 10.0, 0, static=0.4)
+    model, dt = builder.build(), 0.01
+    (_, v), report = jax.jit(lambda s: run(jd.Scene(model, forces=[friction]), dt, s, 50, jnp.zeros(1)))(
+        (jnp.zeros(1), jnp.ones(1) * 0.5)
+    )
+    np.testing.assert_allclose(v[:, 0], np.maximum(0.5 - 1.5 * dt * np.arange(1, 51), 0), atol=1e-12)
+    assert report.forces["friction"][0] == pytest.approx([10.0, -3.0])
+    drive = jd.forces.FirstOrderDrive(0.05)
+    scene = jd.Scene(model, forces=[drive, friction])
+    step = jd.stepper(scene, dt)
+    for load, moves in ((3.9, False), (4.1, True)):
+        start = (jnp.zeros(1), jnp.zeros(1), scene.drive_state(jnp.zeros(1), jnp.zeros(1)))
+        q, v, z = jax.lax.fori_loop(0, 100, lambda _, s, load=load: step(s, jnp.full(1, load)), start)
+        assert z[0] == pytest.approx(load, rel=1e-6)
+        assert bool(abs(v[0]) > 1e-15) == moves
+        assert moves or abs(q[0]) < 1e-15
+    gradient = jax.jit(jax.grad(lambda u: step(start, u)[2][0]))(jnp.full(1, 4.0))
+    assert gradient[0] == pytest.approx(dt / 0.05 - (dt / 0.05) ** 2 / 2, rel=1e-12)

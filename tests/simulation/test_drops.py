@@ -93,11 +93,8 @@ def test_impacts_of_four_corners_do_not_depend_on_their_order_and_gain_no_energy
 @pytest.mark.slow
 @pytest.mark.parametrize("name", ["box", "rod", "hand"])
 def test_random_drops_come_to_their_end(name):
-    """Without penetration, gain of energy, or accumulating events. More of each by `python -m benchmarks.drops`.
-
-    Up to three of 64 use up their steps, as slow friction in a plane is stiff for explicit steps, or find no mode.
-    """
+    """Without penetration, gain of energy, or accumulating events. More of each by `python -m benchmarks.drops`."""
     once, starts = drops.run(name, max_steps=8192)
     outcome = jax.device_get(jax.jit(jax.vmap(once))(*drops.samples(starts, 64)))
     failures = drops.failures(outcome)
-    assert set(failures) <= {"max_steps_reached", "no_contact_mode"} and sum(failures.values()) <= 3, failures
+    assert not failures, failures

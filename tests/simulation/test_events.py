@@ -14,6 +14,7 @@ from jaxdyn.forces.piecewise import Pieces
 from jaxdyn.simulation.hybrid import transitions
 from jaxdyn.simulation.hybrid.event_loop import _cases
 from jaxdyn.simulation.hybrid.modes import Mode, elements_of
+from jaxdyn.simulation.hybrid.rows import Gram
 
 G, MU, MU_S, LOAD, RATE = 9.81, 0.3, 0.5, 6.0, 2.0
 PLANE = ((0, 0, 0), (-np.pi / 2, 0, 0))  # z of the ground along y of the world
@@ -474,7 +475,7 @@ def test_modes_that_flip_without_end_are_not_found(monkeypatch):
 
         monkeypatch.setattr(transitions, "_disagreements", disagreements)
         problem = transitions.Problem(
-            jnp.eye(count), jnp.zeros(count), *jnp.zeros((3, 2)), flags, none, none, none, *jnp.ones(2)
+            Gram.of(jnp.eye(count)), jnp.zeros(count), *jnp.zeros((3, 2)), flags, none, none, none, *jnp.ones(2)
         )
         mode = Mode(flags, none, none, jnp.zeros(0, bool), *jnp.zeros((2, 2)))
         return transitions.choose_mode(elements, problem, mode, jnp.zeros((2, 2)))

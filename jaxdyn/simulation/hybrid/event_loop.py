@@ -66,7 +66,7 @@ def run_events(system: HybridSystem, unknown, ts, y0, mode, rtol, atol, stepsize
     elements, plan = system.elements, system.plan
     hit = jnp.zeros((CHANNELS * len(elements.each) + elements.switches,), bool)
     # The start may be an impact, or its mode may not hold: it passes a transition before the first step.
-    begun = system.reset(unknown, ts[0], y0, mode, system.slip(y0), hit, atol)
+    begun = system.reset(unknown, ts[0], y0, mode, system.slip(y0), hit, True, atol)
     y = system.with_slip(y0, begun.v, begun.slip)
     if stepsize is not None:
         # One grid for the whole run: steps that an event has cut return to it.
@@ -108,7 +108,7 @@ def _pass_event(system: HybridSystem, unknown, most: int, is_fixed_length: bool,
     elements, before, state, records = system.elements, run.mode, run.steps.state, run.records
     hit, search = state.search.hit, state.search
     happens = hit.any() & ~state.stopped
-    change = system.reset(unknown, state.t, state.y, before, system.slip(state.y), hit, atol)
+    change = system.reset(unknown, state.t, state.y, before, system.slip(state.y), hit, happens, atol)
     mode, y = change.mode, system.with_slip(state.y, change.v, change.slip)
     y, rate, guards = _begin_mode(system, (unknown, mode), state.t, y)
     by_element, switched = elements.split(hit)

@@ -37,7 +37,8 @@ class Mode(NamedTuple):
     negative: Array  # true where the normal multiplier is negative
     positive: Array  # of the switching functions of piecewise smooth forces
     excess: Array  # friction (n,) beyond the cone, of all normal forces, by which an element that depends on others may stick
-    creep: Array  # speed (n,) up to which an element slides along a fixed line, zero for others
+    # Speeds (n,). Positive: sliding has a fixed direction up to this speed. Negative: its direction is fixed below its size.
+    creep: Array
 
     def signs(self, dtype) -> Array:
         """Signs of the normal multipliers, (n,)."""
@@ -99,10 +100,8 @@ class Elements(NamedTuple):
         for i, one in enumerate(self.each):
             if one.opens:
                 rows[one.normal] = mode.closed[i]
-            for k, row in enumerate(one.tangent):
-                # Along a line, the slip across it does not change; see `turn_rows`.
-                holds = mode.stick[i] | (mode.creep[i] > 0) if k else mode.stick[i]
-                rows[row] = jnp.zeros((), bool) if one.smooth else mode.closed[i] & holds
+            for row in one.tangent:
+                rows[row] = jnp.zeros((), bool) if one.smooth else mode.closed[i] & mode.stick[i]
         return jnp.stack(rows)
 
 

@@ -8,7 +8,7 @@ from jax import lax
 from jax.flatten_util import ravel_pytree
 
 from jaxdyn.forces.piecewise import Pieces
-from jaxdyn.simulation.hybrid.dynamics import Collision
+from jaxdyn.simulation.hybrid.impacts import Collision
 from jaxdyn.simulation.hybrid.modes import Elements, Mode
 from jaxdyn.simulation.hybrid.replay import HybridRun
 from jaxdyn.simulation.hybrid.system import HybridSystem
@@ -42,7 +42,7 @@ class PiecewiseSystem(HybridSystem):
         values, levels = self._switching(t, y, (*args[0], args[1].positive))
         return jnp.where(args[1].positive, values, -values), levels
 
-    def reset(self, unknown, t, y, mode, slip, hit, atol):
+    def reset(self, unknown, t, y, mode, slip, hit, happens, atol):
         # Forces are finite on both sides of a zero: the piece changes, and the velocity does not jump.
         mode, yes = mode._replace(positive=mode.positive ^ hit), jnp.ones((), bool)
         none = jnp.zeros((0,), y.dtype)

@@ -6,7 +6,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array
 
-from jaxdyn.simulation.hybrid.dynamics import Collision
+from jaxdyn.simulation.hybrid.impacts import Collision
 from jaxdyn.simulation.hybrid.modes import CHANNELS, KINDS, Elements, Mode
 from jaxdyn.simulation.hybrid.transitions import Transition
 

@@ -6,6 +6,7 @@ States have the entries q, v and `slip`, the directions (n, 2) in which elements
 
 from abc import abstractmethod
 from collections.abc import Callable
+from functools import partial
 from typing import Any
 
 import diffrax
@@ -14,33 +15,16 @@ import jax.numpy as jnp
 from jax.flatten_util import ravel_pytree
 
 from jaxdyn.compile import kernel
-from jaxdyn.compile.batch import while_loop
+from jaxdyn.compile.batch import cond, while_loop
 from jaxdyn.constraints.base import holonomic_rows, layout, position_residual, velocity_residual
 from jaxdyn.forces.piecewise import values_and_levels
 from jaxdyn.lie.so3 import matmul
-from jaxdyn.simulation.hybrid.dynamics import (
-    ROUNDING,
-    Collision,
-    StateTerms,
-    by_element,
-    by_normal_row,
-    coefficients,
-    directions,
-    free_motion,
-    gaps,
-    guards_and_levels,
-    impact,
-    motion_at,
-    normal_loads,
-    react,
-    rebounds,
-    solve_rows,
-    terms_at,
-    tolerance,
-    turn_gram,
-    turn_rows,
-)
+from jaxdyn.simulation.hybrid.impacts import Collision, impact, rebounds
+from jaxdyn.simulation.hybrid.impulses import impulsive_mode
+from jaxdyn.simulation.hybrid.mode_guards import ROUNDING, guards_and_levels
 from jaxdyn.simulation.hybrid.modes import Elements, Mode, extend
+from jaxdyn.simulation.hybrid.reactions import coefficients, directions, free_motion, motion_at, normal_loads, react
+from jaxdyn.simulation.hybrid.rows import StateTerms, by_element, by_normal_row, gaps, terms_at, tolerance
 from jaxdyn.simulation.hybrid.transitions import (
     GUESSES,
     Problem,
@@ -50,11 +34,9 @@ from jaxdyn.simulation.hybrid.transitions import (
     find_jams,
     first_guess,
     guess_again,
-    independent_lines,
     length,
     rates_of,
     with_excess,
-    with_lines,
 )
 from jaxdyn.simulation.solvers.explicit import Plan
 from jaxdyn.systems.scene import Scene
@@ -64,6 +46,7 @@ from jaxdyn.systems.system import displace, rate_to_velocity, retract, velocity_
 # open in proportion to the first correction, which only coarse tolerances make large.
 _ROUNDS, _SAVED_ROUNDS = 2, 6
 _STOPPED = 30  # tolerances of the velocity below which sliding has ended
+_SLOWER = 0.1  # part of the speed up to which sliding begins in a fixed direction, below which it ends in one
 
 
 class HybridSystem:
@@ -80,8 +63,11 @@ class HybridSystem:
         """Guards and their rounding levels: those of the elements by CHANNELS, then those of the switching functions."""
 
     @abstractmethod
-    def reset(self, unknown, t, y, mode: Mode, slip, hit, atol) -> Transition:
-        """Transition after the guards `hit`; `atol` (), m: the height of flights that are not followed, None for rounding."""
+    def reset(self, unknown, t, y, mode: Mode, slip, hit, happens, atol) -> Transition:
+        """Transition after the guards `hit`, of any value unless it `happens` ().
+
+        `atol` (), m: the height of flights that are not followed, None for rounding.
+        """
 
     @abstractmethod
     def impact(self, unknown, collision: Collision, t, y) -> Any:
@@ -141,21 +127,25 @@ class ModalSystem(HybridSystem):
         more = values, levels / ROUNDING
         return tuple(jnp.concatenate([a.reshape(-1), b]) for a, b in zip(own, more, strict=True))
 
-    def reset(self, unknown, t, y, mode, slip, hit, atol):
+    def reset(self, unknown, t, y, mode, slip, hit, happens, atol):
         y = self.plan.structure(y)
         q, v = y["q"], y["v"]
         hit, switched = self.elements.split(hit)
         mode = mode._replace(positive=mode.positive ^ switched)
         holding, speed, size = kernel(self._friction)(unknown, mode, slip, t, q, v)
         # Sliding that is slower than the error of its velocity has ended: its direction is not known.
-        least = 2 * tolerance(q.dtype) if atol is None else jnp.maximum(2 * tolerance(q.dtype), _STOPPED * atol)
+        least = jnp.asarray(2 * tolerance(q.dtype), q.dtype)
+        least = least if atol is None else jnp.maximum(least, _STOPPED * atol)
         is_impact = (jnp.asarray(self.elements.opening) & hit[:, 0] & ~mode.closed).any()
-        stopped = (
-            jnp.asarray(self.elements.rough) & mode.closed & ~mode.stick & (speed <= least * (1 + size)) & ~is_impact
-        )
+        # In a fixed direction it ends where it turns round, with what is left across.
+        ends = (speed <= least * (1 + size)) | (hit[:, 1] & (mode.creep > 0) & (speed < mode.creep / 2))
+        stopped = jnp.asarray(self.elements.rough) & mode.closed & ~mode.stick & ends & ~is_impact
+        before = mode.closed
         mode, slip, begins = first_guess(self.elements, mode, slip, holding, speed, hit)
         mode = mode._replace(stick=mode.stick | (stopped & mode.closed))
-        after = self._pass(unknown, mode, slip, begins, stopped & mode.closed, t, q, v, atol)
+        after = self._pass(
+            unknown, mode, slip, begins, stopped & mode.closed, before & ~mode.closed, happens, t, q, v, atol
+        )
         # Switching functions that the impact has carried across their zeros.
         values, levels = self._switches(unknown, after.mode.positive, q, after.v, t)
         crossed = (values < -levels) & ~switched
@@ -166,7 +156,7 @@ class ModalSystem(HybridSystem):
         *_, terms, motion = self._motion((unknown, mode), t, {"q": q, "v": v, "slip": slip})
         return motion.reaction.holding, length(terms.slip)[0], self._speeds(terms, v)
 
-    def _pass(self, unknown, mode, slip, begins, stopped, t, q, v, atol) -> Transition:
+    def _pass(self, unknown, mode, slip, begins, stopped, released, happens, t, q, v, atol) -> Transition:
         """Transition from a first guess of the mode; `begins` (n,) marks elements that slide from rest."""
         elements, n = self.elements, len(self.elements.each)
         least = tolerance(q.dtype) * (1 + jnp.max(jnp.abs(q)))
@@ -175,13 +165,23 @@ class ModalSystem(HybridSystem):
         def attempt(carry):
             tries, guess, (rebound, held, stopped), _, busy = carry
             problem, along = kernel(self._velocities)(unknown, mode, rebound, held, stopped, slip, t, q, v)
-            begin = guess_again(elements, problem, mode, guess)
+            # First the impulses of Coulomb's law. They are zero where sliding leaves no forces: an impulse without collision
+            # begins from elements that stick.
+            by_law = (guess == 1) & busy
+            begin = guess_again(elements, problem, mode, jnp.where(by_law, 0, guess), released)
+            begin, along = cond(
+                by_law,
+                partial(impulsive_mode, elements, problem, by_law),
+                lambda mode, along: (mode, along),
+                begin,
+                along,
+            )
             choice = choose_mode(elements, problem, begin._replace(stick=begin.stick | (stopped & begin.closed)), along)
             collision = Collision(choice.mode, choice.slip, rebound, held, stopped)
             still = kernel(self._find_jams)(problem, choice.mode, choice.slip)
             resting, at, after, gains = kernel(self._after)(unknown, collision, begins, t, q, v)
             problem, along = kernel(self._forces)(unknown, resting, at, t, q, after)
-            final = choose_mode(elements, problem, guess_again(elements, problem, resting, guess), along)
+            final = choose_mode(elements, problem, guess_again(elements, problem, resting, guess, released), along)
             follows, soft, short, paradox = kernel(self._flights)(
                 unknown, collision, problem, final.mode, final.slip, t, q, v, after, (height, fast)
             )
@@ -206,7 +206,7 @@ class ModalSystem(HybridSystem):
         fast = jnp.asarray(1e-4, q.dtype) if atol is None else 0.3 * jnp.sqrt(jnp.maximum(atol, least))
         start = Collision(mode, slip, jnp.ones((n,), q.dtype), none, stopped)
         blank = Transition(start, mode, slip, v, no, no)
-        return while_loop(lambda carry: carry[4], attempt, (zero, zero, start[2:], blank, ~no))[3]
+        return while_loop(lambda carry: carry[4], attempt, (zero, zero, start[2:], blank, ~no & happens))[3]
 
     def _velocities(self, unknown, mode: Mode, rebound, held, stopped, slip, t, q, v):
         """Problem of an impact, and directions of sliding (n, 2)."""
@@ -215,7 +215,7 @@ class ModalSystem(HybridSystem):
         rates = terms.row.velocity
         wanted = by_normal_row(elements, rebounds(elements, terms, of.restitution * rebound))
         each = jnp.ones(rebound.shape, bool)
-        size = (1 + jnp.max(jnp.abs(rates))) / jnp.max(jnp.diagonal(terms.gram))
+        size = (1 + jnp.max(jnp.abs(rates))) / jnp.max(terms.gram.squares)
         sliding, static = jnp.where(held, 0.0, of.sliding), jnp.where(held, 0.0, of.static)
         loads, touches, rate = jnp.zeros_like(rebound), self._touches(scene, q, t), 1 + self._speeds(terms, v)
         problem = Problem(
@@ -237,7 +237,7 @@ class ModalSystem(HybridSystem):
         scene, elements = self._bind(unknown)[0], self.elements
         terms, of = terms_at(scene, elements, q, v, t), coefficients(scene, elements, v.dtype)
         after, reaction = impact(scene, elements, collision, terms, v)
-        rates = matmul(terms.gram, reaction.along) + terms.row.velocity
+        rates = terms.gram.times(reaction.along) + terms.row.velocity
         speed, unit = length(rates_of(elements, rates)[1])
         is_sliding = speed > 2 * tolerance(v.dtype) * (1 + self._speeds(terms, v))
         # Elements that rebound open; those that came to rest together stick if their cones allow it.
@@ -262,7 +262,7 @@ class ModalSystem(HybridSystem):
         least = 2 * tolerance(v.dtype) * (1 + self._speeds(terms, v))
         rests = self._touches(scene, q, t) & (jnp.abs(rates_of(elements, terms.row.velocity)[0]) <= least)
         speed, _ = length(terms.slip)
-        size = jnp.max(jnp.abs(rates)) / jnp.max(jnp.diagonal(terms.gram))
+        size = jnp.max(jnp.abs(rates)) / jnp.max(terms.gram.squares)
         loads = normal_loads(scene, elements, q, v, t)
         # A contact in flight has no force, and an element that slides does not stick.
         problem = Problem(
@@ -290,9 +290,9 @@ class ModalSystem(HybridSystem):
         follows = with_excess(elements, problem, mode, still)
         slides = mode.closed & ~follows.stick & jnp.asarray(elements.planar)
         speed, _ = length(rates_of(elements, matmul(terms.row.A, after - v) + terms.row.velocity)[1])
-        line = slides & (problem.may_stick | (speed < 0.9 * fast))
-        line = independent_lines(elements, problem.gram, follows, along, line)
-        follows = with_lines(elements, problem, follows, along, jnp.where(line, fast, 0.0))
+        # Explicit steps could not follow a direction that turns ever faster as the speed falls to zero.
+        begins = problem.may_stick | (speed < 0.9 * fast)
+        follows = follows._replace(creep=jnp.where(slides, jnp.where(begins, fast, -_SLOWER * fast), 0.0))
         return follows, low & bounces, low & ~bounces & ~collision.held, lost
 
     def _paradox(self, problem: Problem, mode: Mode, along):
@@ -330,16 +330,15 @@ def project(scene: Scene, elements: Elements, mode: Mode, t, y, error):
     whole, dtype = extend(scene), y["v"].dtype
     q, v = retract(scene.system, y["q"]), y["v"]
     terms = terms_at(scene, elements, q, v, t)
-    holonomic, gram = holonomic_rows(layout(whole)), turn_gram(elements, mode, y["slip"], terms.gram)
+    holonomic = holonomic_rows(layout(whole))
     # Masks keep the shapes of all modes: rows that do not act are multiplied by zero.
     active = elements.active(mode).astype(dtype)
     holds = jnp.zeros((elements.count,), dtype).at[holonomic].set(1.0) * active
 
     def change(residual, mask):
         """Least velocity that changes the rows of a mask by `residual`."""
-        residual = turn_rows(elements, mode, y["slip"], residual)
-        lam = turn_rows(elements, mode, y["slip"], solve_rows(gram, mask, (residual * mask)[:, None])[:, 0], back=True)
-        return terms.metric.unwhiten(matmul(terms.Y, lam))
+        lam = terms.gram.factor(mask).solve((residual * mask)[:, None])[:, 0]
+        return terms.metric.unwhiten(matmul(terms.gram.Y, lam))
 
     start, last, blank = q, jnp.zeros_like(v), jnp.zeros((elements.count,), dtype)
     rounds = _SAVED_ROUNDS if error is None else _ROUNDS

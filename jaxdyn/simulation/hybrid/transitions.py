@@ -8,6 +8,9 @@ It is solved by changing the first element that disagrees, one at a time, which 
 Each time the forces of all elements are computed from their modes, those of dependent rows by least norm: a contact whose force
 of least norm would pull is opened, and rests beside the others without force.
 
+Directions of sliding change with the modes, so that changes may cycle: then an impact begins from the modes of its impulses by
+Newton's method (`impulses`).
+
 The impact is plastic, or has rebounds by Newton's hypothesis (Moreau's law: friction is against the velocity after it). A plastic
 impact loses energy, p.u <= 0. With rebounds and friction Newton's law can gain some (Kane 1984): the coefficients of
 restitution of all contacts are then halved, until the work p.(u + u_free)/2 of the impulses is not positive.
@@ -24,19 +27,11 @@ from jax import lax
 from jaxtyping import Array
 
 from jaxdyn.compile.loops import Carry, Given, Iteration, Task, run_loop
-from jaxdyn.lie.so3 import matmul
-from jaxdyn.simulation.hybrid.dynamics import (
-    Collision,
-    Reaction,
-    depends_on_others,
-    force_tolerance,
-    react,
-    solve_rows,
-    tolerance,
-)
+from jaxdyn.simulation.hybrid.impacts import Collision
 from jaxdyn.simulation.hybrid.modes import Elements, Mode
+from jaxdyn.simulation.hybrid.reactions import Reaction, depends_on_others, react
+from jaxdyn.simulation.hybrid.rows import Gram, force_tolerance, tolerance
 
-_INDEPENDENT = 1e-2  # of the square of a row, that is left of it when others hold
 GUESSES = 3  # other modes from which changes begin where the first one leads to no mode
 _ANGLE = 1e-14  # 1 - cos of the angle up to which a direction is known
 _STILL = 1e-4  # rate of slipping, of the terms that cancel in it, of what may stand still
@@ -47,7 +42,7 @@ _WEIGHT = 32  # changes of direction for which there is the same room as for one
 class Problem(NamedTuple):
     """Complementarity problem of the elements: rates u = G p + free of the rows by forces p along them."""
 
-    gram: Array  # G (count, count)
+    gram: Gram
     free: Array  # (count,), less the rates that the rows which act are given
     sliding: Array  # coefficients of friction (n,)
     static: Array  # at rest
@@ -113,7 +108,8 @@ def first_guess(elements: Elements, mode: Mode, slip, holding, speed, hit) -> tu
     first, second = hit[:, 0], hit[:, 1]
     closes, releases = opens & first & ~mode.closed, opens & first & mode.closed
     begins, ends = second & mode.stick & mode.closed, second & ~mode.stick & mode.closed
-    leaves = ends & (mode.creep > 0) & (speed > mode.creep / 2)
+    # What is slow enough for a fixed direction, or too fast for it, slides on.
+    leaves = ends & jnp.where(mode.creep > 0, speed > mode.creep / 2, mode.creep < 0)
     ends = ends & ~leaves
     _, against = length(-holding)
     # An element that breaks loose slides against the friction that held it: its velocity is still zero.
@@ -127,11 +123,21 @@ def first_guess(elements: Elements, mode: Mode, slip, holding, speed, hit) -> tu
     return changed, slip, begins
 
 
-def guess_again(elements: Elements, problem: Problem, mode: Mode, guess) -> Mode:
-    """Mode from which changes begin, where `guess` () others before have led to no mode: all contacts open, stick, or slide."""
+def guess_again(elements: Elements, problem: Problem, mode: Mode, guess, released) -> Mode:
+    """Mode from which changes begin, where `guess` () others before have led to no mode: all contacts open, stick, or slide.
+
+    The first one has all contacts closed that may be. Of redundant contacts several modes agree, with other forces: the choice
+    must not depend on the modes before, between which a motion would change without end. Contacts (n,) that the event has
+    `released` have no force in either mode, and are open.
+    """
     opens, others = jnp.asarray(elements.opening), guess > 0
-    closed = jnp.where(opens & others, problem.may_close & (guess > 1), mode.closed)
-    stick = jnp.where(others, closed & problem.may_stick & jnp.asarray(elements.rough) & (guess == 2), mode.stick)
+    closed = jnp.where(
+        opens,
+        jnp.where(others, problem.may_close & (guess > 1), mode.closed | (problem.may_close & ~released)),
+        mode.closed,
+    )
+    sticks = closed & problem.may_stick & jnp.asarray(elements.rough)
+    stick = jnp.where(others, sticks & (guess == 2), mode.stick | (sticks & ~mode.closed))
     return mode._replace(closed=closed, stick=stick)
 
 
@@ -182,18 +188,18 @@ def _disagreements(elements: Elements, problem: Problem, mode: Mode, slip, react
     opens, rough = jnp.asarray(elements.opening), jnp.asarray(elements.rough)
     has_multiplier = jnp.asarray(np.array([one.normal >= 0 for one in elements.each]))
     dtype, held = reaction.normal.dtype, problem.held
-    rates = matmul(problem.gram, reaction.along) + problem.free
+    rates = problem.gram.times(reaction.along) + problem.free
     normal, slipping = rates_of(elements, rates)
     hold, _ = length(reaction.holding)
     forces = jnp.sum(jnp.abs(reaction.normal)) + jnp.sum(jnp.abs(reaction.holding))
     tiny = force_tolerance(dtype) / 4 * forces + tolerance(dtype) * problem.force
-    sizes = matmul(jnp.abs(problem.gram), jnp.abs(reaction.along)) + jnp.abs(problem.free)
+    sizes = problem.gram.sizes(reaction.along) + jnp.abs(problem.free)
     across, beside = rates_of(elements, sizes)
     rise, small = (tolerance(dtype) * (problem.rate + x) for x in (across, jnp.max(beside, 1)))
     # Friction mu N against a slip d is the projection of mu N d + r u, u the rate of slipping, onto its disk, for any r > 0:
     # inside of the disk it sticks, and outside it has the direction of this vector.
     level = jnp.maximum(problem.sliding * reaction.normal, 0.0)
-    square = rates_of(elements, jnp.diagonal(problem.gram))[1]
+    square = rates_of(elements, problem.gram.squares)[1]
     share = jnp.sum(square, 1)
     share = jnp.where(share > 0, 1 / jnp.where(share > 0, share, jnp.ones_like(share)), 0.0)
     trial, turned = length(level[:, None] * slip + share[:, None] * slipping)
@@ -220,11 +226,11 @@ def find_jams(elements: Elements, problem: Problem, mode: Mode, along) -> tuple[
     Their friction of least norm has left the cone, and another share of it has not.
     """
     reaction = react(elements, mode, problem.gram, problem.sliding, problem.loads, along, -problem.free)
-    rates = matmul(problem.gram, reaction.along) + problem.free
+    rates = problem.gram.times(reaction.along) + problem.free
     rests = mode.closed & jnp.asarray(elements.rough) & problem.may_stick
     depends = depends_on_others(elements, problem.gram, mode._replace(stick=mode.stick | rests))
     speed, _ = length(rates_of(elements, rates)[1])
-    sizes = matmul(jnp.abs(problem.gram), jnp.abs(reaction.along)) + jnp.abs(problem.free)
+    sizes = problem.gram.sizes(reaction.along) + jnp.abs(problem.free)
     least = _STILL * jnp.max(rates_of(elements, sizes)[1], 1) + tolerance(speed.dtype) * problem.rate
     return rests & ~mode.stick & depends & (speed <= least), reaction, rates
 
@@ -240,49 +246,6 @@ def with_excess(elements: Elements, problem: Problem, mode: Mode, still) -> Mode
     room = jnp.maximum(beyond, 0.0) / jnp.where(total > 0, total, 1.0) + _ROOM * problem.static
     excess = jnp.where(mode.stick & mode.closed & still.any() & (beyond > -_ROOM * problem.static * total), room, 0.0)
     return mode._replace(excess=excess)
-
-
-def with_lines(elements: Elements, problem: Problem, mode: Mode, along, creep) -> Mode:
-    """Mode in which elements slide along lines up to the speeds `creep` (n,), if that is consistent.
-
-    It is if all contacts push and speed up then, and forces across are small.
-    """
-    lines = mode._replace(creep=creep)
-    reaction = react(elements, lines, problem.gram, problem.sliding, problem.loads, along, -problem.free)
-    tiny = force_tolerance(creep.dtype) / 4 * jnp.sum(jnp.abs(reaction.normal))
-    across, level = length(reaction.holding)[0], problem.sliding * jnp.abs(reaction.normal)
-    pushes = ~(jnp.asarray(elements.opening) & mode.closed) | (reaction.normal >= -tiny)
-    sticks = mode.stick & mode.closed & jnp.asarray(elements.rough)
-    cone = problem.static * jnp.abs(reaction.normal) + mode.excess * jnp.sum(jnp.abs(reaction.normal)) + tiny
-    rates = rates_of(elements, matmul(problem.gram, reaction.along) + problem.free)[1]
-    speeds_up = jnp.sum(rates * along, 1) >= 0
-    fits = jnp.where(sticks, across <= cone, (creep <= 0) | ((across <= 0.5 * level) & speeds_up))
-    return mode._replace(creep=jnp.where((pushes & fits).all(), creep, 0.0))
-
-
-def independent_lines(elements: Elements, gram, mode: Mode, along, wanted):
-    """Those of the `wanted` elements (n,) that may slide along lines: rows across them do not depend on others that act."""
-    none = jnp.zeros((elements.count,), gram.dtype)
-    across = []
-    for i, one in enumerate(elements.each):
-        is_plane = len(one.tangent) == 2
-        across.append(
-            none.at[jnp.asarray(one.tangent)].set(jnp.stack([-along[i, 1], along[i, 0]])) if is_plane else none
-        )
-    across = jnp.stack(across, 1)
-    active = elements.active(mode._replace(creep=jnp.zeros_like(mode.creep))).astype(gram.dtype)
-    rates = matmul(gram, across)
-    # What is left of the rows across when the others hold: their Schur complement, eliminated in order.
-    held = solve_rows(gram, active, rates * active[:, None])
-    whole = matmul(across.T, rates)
-    left = whole - matmul(rates.T, held)
-    chosen = []
-    for i in range(len(elements.each)):
-        is_free = wanted[i] & (left[i, i] > _INDEPENDENT * whole[i, i])
-        chosen.append(is_free)
-        pivot = jnp.where(is_free, left[i, i], jnp.ones_like(left[i, i]))
-        left = left - jnp.where(is_free, left[:, i, None] * left[None, i] / pivot, 0.0)
-    return jnp.stack(chosen)
 
 
 def rates_of(elements: Elements, rates) -> tuple[Array, Array]:

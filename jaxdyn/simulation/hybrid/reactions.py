@@ -1,0 +1,193 @@
+"""Forces within a mode: constraints, closed contacts, friction that sticks, and friction that slides.
+
+For the active rows A a = gamma, and sliding friction -Z N whose normal forces N = S lam are multipliers themselves,
+
+    M a + h = tau + A^T lam - Z N,    (A M^-1 A^T) lam - (A M^-1 Z) S lam = gamma - A M^-1 (tau - h).
+
+The first matrix is symmetric; the second term makes the equations for N lose their positive pivots where friction is strong:
+Painleve's paradox, where forces of rigid bodies do not exist or are not unique.
+"""
+
+from typing import Any, NamedTuple
+
+import jax.numpy as jnp
+from jaxtyping import Array
+
+from jaxdyn.dynamics.quantities import bias_force
+from jaxdyn.lie.so3 import matmul
+from jaxdyn.simulation.hybrid.modes import Elements, Mode, force_at
+from jaxdyn.simulation.hybrid.rows import Gram, StateTerms, by_element, tolerance
+from jaxdyn.systems.scene import Scene
+
+
+class Coefficients(NamedTuple):
+    """Coefficients (n,) of the elements: friction while they slide and at rest, and restitution."""
+
+    sliding: Array
+    static: Array
+    restitution: Array
+
+
+class Reaction(NamedTuple):
+    """Reaction of constraints and friction to a motion, as forces or as impulses."""
+
+    along: Array  # forces along the rows (count,), sliding friction included
+    multipliers: Array  # of the rows that act (count,)
+    normal: Array  # normal forces (n,), those that are given included
+    holding: Array  # friction of elements that stick (n, 2)
+    pivots: Array  # of the equations for the normal forces (n,): one without friction
+
+
+def coefficients(scene: Scene, elements: Elements, dtype) -> Coefficients:
+    """Coefficients of the elements."""
+    forces, zero = [force_at(scene, one) for one in elements.each], jnp.zeros((), dtype)
+    bounces = [f.restitution if one.opens else zero for f, one in zip(forces, elements.each, strict=True)]
+    lists = [f.coefficient for f in forces], [f.static for f in forces], bounces
+    return Coefficients(*(jnp.stack([x.astype(dtype) for x in values]) for values in lists))
+
+
+def normal_loads(scene: Scene, elements: Elements, q, v, t) -> Array:
+    """Given normal forces of frictions, (n,), zero where they are negative: such friction would drive the motion."""
+    loads = []
+    for one in elements.each:
+        normal: Any = force_at(scene, one).normal if one.normal < 0 else 0.0
+        value: Any = normal(scene.system, q, v, t) if callable(normal) else normal
+        if jnp.shape(value) != ():
+            raise ValueError(f"friction {one.name!r}: normal gives shape {jnp.shape(value)}; expected one number, ()")
+        loads.append(jnp.maximum(jnp.asarray(value, q.dtype), 0.0))
+    return jnp.stack(loads)
+
+
+def directions(scene: Scene, elements: Elements, mode: Mode, slip, reference) -> Array:
+    """Unit vectors (n, 2) of sliding; shorter ones for friction that is smooth.
+
+    They continue smoothly through w = 0 to w < 0, because the event that ends a mode there is bracketed from both sides: w/|w|
+    with the sign of `reference` (n, 2), which for one row is constant.
+    """
+    unit_vectors = []
+    for i, one in enumerate(elements.each):
+        w, s = slip[i], reference[i]
+        # A velocity that may be the rounding of others has no direction of its own: the reference is kept.
+        least = 0.0 if one.smooth else tolerance(w.dtype)
+        square = jnp.sum(w * w)
+        is_sliding = (square > least**2) & (mode.creep[i] <= 0)
+        # The square root has an infinite derivative at zero, which a mask behind it would turn into NaN.
+        length = jnp.sqrt(jnp.where(is_sliding, square, jnp.ones_like(square)))
+        if one.smooth:
+            speed = force_at(scene, one).smoothing.astype(w.dtype)
+            # 1/speed is the limit of tanh(|w|/speed)/|w| at rest.
+            unit_vectors.append(w * jnp.where(is_sliding, jnp.tanh(length / speed) / length, 1 / speed))
+        elif len(one.tangent) < 2:
+            unit_vectors.append(s)
+        else:
+            # Behind w = 0 the direction is reversed: friction stays smooth in the interval that brackets the event.
+            forward = jnp.where(jnp.sum(s * w) < 0, -1.0, 1.0).astype(w.dtype)
+            unit_vectors.append(jnp.where(is_sliding, forward * w / length, s))
+    return jnp.stack(unit_vectors)
+
+
+def slides(elements: Elements, mode: Mode) -> Array:
+    """Mask of the elements that slide, (n,)."""
+    return mode.closed & (jnp.asarray(elements.smooth) | ~mode.stick)
+
+
+def react(elements: Elements, mode: Mode, gram: Gram, friction, loads, along, target) -> Reaction:
+    """Forces that change the rates of the active rows by `target` (count,), or impulses that so change their velocities.
+
+    `friction` (n,): coefficients of sliding; `loads` (n,): normal forces that are given.
+    """
+    dtype = target.dtype
+    # Rows that do not act are masked and not removed: every mode has the same shapes and the same program.
+    active, zero = elements.active(mode).astype(dtype), jnp.zeros((), dtype)
+    level = jnp.where(slides(elements, mode), friction, 0.0)
+    # Forces of sliding friction along the rows, for a normal force of one.
+    pushes = []
+    for i, one in enumerate(elements.each):
+        push = [zero] * elements.count
+        for k, row in enumerate(one.tangent):
+            push[row] = -level[i] * along[i, k]
+        pushes.append(jnp.stack(push))
+    given = sum((loads[i] * pushes[i] for i, one in enumerate(elements.each) if one.normal < 0), jnp.zeros_like(target))
+    Z = jnp.stack([jnp.zeros_like(target), *(pushes[i] for i in elements.frictional)])[1:].T
+    right = jnp.concatenate([(target - gram.times(given))[:, None], -gram.times(Z)], 1) * active[:, None]
+    # Multipliers without sliding friction, and their change by each normal force of an element that slides.
+    lam = gram.factor(active).solve(right)
+    base, by_normal = lam[:, 0], lam[:, 1:]
+    sign = mode.signs(dtype)
+    at = [elements.each[i].normal for i in elements.frictional]
+    normal, count = jnp.zeros((0,), dtype), len(at)
+    pivots = [jnp.ones((), dtype)] * len(elements.each)
+    if count:
+        pick = jnp.stack([sign[i] for i in elements.frictional])
+        # Sliding friction changes its own normal forces: N = S (base + by_normal N), S the rows and signs of `pick`.
+        K = jnp.eye(count, dtype=dtype) - pick[:, None] * by_normal[jnp.asarray(at)]
+        normal, own = _eliminate(K, pick * base[jnp.asarray(at)])
+        is_sliding = slides(elements, mode)
+        for i, pivot in zip(elements.frictional, own, strict=True):
+            pivots[i] = jnp.where(is_sliding[i], pivot, jnp.ones_like(pivot))
+    lam = (base + matmul(by_normal, normal)) * active
+    normals = [sign[i] * lam[one.normal] if one.normal >= 0 else loads[i] for i, one in enumerate(elements.each)]
+    return Reaction(
+        lam + given + matmul(Z, normal), lam, jnp.stack(normals), by_element(elements, lam), jnp.stack(pivots)
+    )
+
+
+def depends_on_others(elements: Elements, gram: Gram, mode: Mode):
+    """Mask of the elements (n,) whose friction depends on that of others: only their sum is determined."""
+    free = gram.factor(elements.active(mode).astype(gram.Y.dtype)).nullity() > 1e-3
+    return jnp.stack([jnp.stack([free[k] for k in one.tangent] or [free[0] & False]).any() for one in elements.each])
+
+
+def _eliminate(K, right):
+    """Solution x of K x = right, and the pivots of the elimination in order.
+
+    Without exchange of rows, because the sign of each pivot tells where friction leaves no forces.
+    """
+    n, pivots = K.shape[0], []
+    matrix = [K[i] for i in range(n)]
+    values = [right[i] for i in range(n)]
+    for i in range(n):
+        pivot = matrix[i][i]
+        pivots.append(pivot)
+        # The recorded pivot stays zero, which ends the mode; the division needs another number.
+        pivot = jnp.where(pivot == 0, jnp.full_like(pivot, float(jnp.finfo(pivot.dtype).eps)), pivot)
+        for j in range(i + 1, n):
+            share = matrix[j][i] / pivot
+            matrix[j] = matrix[j] - share * matrix[i]
+            values[j] = values[j] - share * values[i]
+    unknowns: list[Any] = [None] * n
+    for i in reversed(range(n)):
+        rest = values[i]
+        for j in range(i + 1, n):
+            rest = rest - matrix[i][j] * unknowns[j]
+        pivot = matrix[i][i]
+        unknowns[i] = rest / jnp.where(pivot == 0, jnp.full_like(pivot, float(jnp.finfo(pivot.dtype).eps)), pivot)
+    return jnp.stack(unknowns), pivots
+
+
+class Motion(NamedTuple):
+    """Motion in a mode."""
+
+    acceleration: Array  # (nv,)
+    reaction: Reaction
+
+
+def free_motion(scene: Scene, terms: StateTerms, generalized_force, q, v, t) -> tuple[Array, Array]:
+    """Whitened acceleration without the elements and constraints, (nv,), and A a - gamma of the rows there, (count,).
+
+    `generalized_force` (nv,) is tau and the forces without modes, or None.
+    """
+    force = jnp.zeros_like(v) if generalized_force is None else generalized_force
+    free = terms.metric.whiten(force - bias_force(scene.system, q, v, t))
+    return free, matmul(terms.gram.Y.T, free) - terms.row.gamma
+
+
+def motion_at(
+    scene: Scene, elements: Elements, mode: Mode, terms: StateTerms, reference, generalized_force, q, v, t
+) -> Motion:
+    """Motion in a mode; `generalized_force` as of `free_motion`."""
+    along = directions(scene, elements, mode, terms.slip, reference)
+    loads, friction = normal_loads(scene, elements, q, v, t), coefficients(scene, elements, v.dtype).sliding
+    free, rates = free_motion(scene, terms, generalized_force, q, v, t)
+    reaction = react(elements, mode, terms.gram, friction, loads, along, -rates)
+    return Motion(terms.metric.unwhiten(free + matmul(terms.gram.Y, reaction.along)), reaction)
