@@ -17,7 +17,6 @@ from jaxdyn.compile.careful import Careful
 from jaxdyn.compile.llvm import Emitter
 from jaxdyn.compile.memory import allocation, bytes_of, on_heap
 from jaxdyn.compile.program import COMPARISONS, FLOATS, Array, Constant, Program, kind_of
-from jaxdyn.compile.scan import Scan
 
 # A program of one sample with at least so many operations is compiled once for all kernels that contain it: the copies of a
 # call's arguments are few against them.
@@ -199,7 +198,7 @@ class Body:
 
 def has_loop(called) -> bool:
     """Decide whether a subprogram is a loop, whose arrays stay in memory."""
-    return isinstance(called, Scan)
+    return getattr(called, "keeps_arrays", False)
 
 
 def whole_input(program: Program, entries: Sequence, array: Array) -> int | None:

@@ -8,7 +8,6 @@ _REMEDIES = {
     "svd": "decompose a constant matrix once, outside of the function",
     "eigh": "decompose a constant matrix once, outside of the function",
     "qr": "decompose a constant matrix once, outside of the function",
-    "a while_loop": "give it a fixed number of steps by jax.lax.fori_loop",
     "a cond": "choose among two results by jnp.where",
     "an array of key": "draw random numbers outside of the function, and pass them in",
     "division of integers": "divide floating-point numbers and round them down",

@@ -15,6 +15,8 @@ from jaxdyn.compile.jax_adapter import scan_counts
 from jaxdyn.compile.program import Array, Number, as_objects, dtype_of, is_number, kind_or_refuse, objects
 from jaxdyn.compile.scan import MAX_WRITTEN_OUT, Counts, Scan
 
+# Operations of an iteration beyond which there is no loop, but of a sweep.
+MAX_LOOP_BODY = 20_000
 # Loops of fewer iterations are always written out.
 MIN_ITERATIONS = 8
 # Of a loop whose end is not known, for estimates of its cost.
@@ -180,7 +182,8 @@ def roll(
     made = [objects([outs[i].ravel()[k] for k in distinct[i][0]], (len(distinct[i][0]),)) for i in kept]
     outputs = [*classes.types, *(Array(x.shape, np.dtype(of_results[i])) for i, x in zip(kept, made, strict=True))]
     program = inner.finish(types, outputs, [*carried, *made])
-    if program.cost * length <= most:
+    # A loop of long iterations would compile for as long as what is written out, which then is refused as too long.
+    if program.cost * length <= most or (most and len(program.operations) > MAX_LOOP_BODY):
         return None
     tables = [np.stack([np.array(y, x.dtype) for y in x.known], 1) for x in rows if x.known]
     counts = Counts(len(own_consts), len(carried), len(own_rows), len(tables), 0, len(kept))

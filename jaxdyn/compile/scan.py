@@ -56,6 +56,7 @@ class Scan:
     derivative = fallback = None
     turns = 1
     is_called = is_kept = True
+    keeps_arrays = True  # in memory, where the next loop reads them
     name = "scan"
 
     def __init__(self, body: Program, counts: Counts, length: int, tables=(), inward=False, parents=None,

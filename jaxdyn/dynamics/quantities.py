@@ -17,7 +17,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from jaxdyn.compile import implicit, kernel, value_and_jvp
+from jaxdyn.compile import implicit, kernel, value_and_jvp, variant
 from jaxdyn.dynamics import recursions, scans, world_frame
 from jaxdyn.dynamics.kinematics import TreeFrame, body_twists, tree_frame
 from jaxdyn.dynamics.recursions import sweeps
@@ -169,7 +169,8 @@ def forward_dynamics(
     form = _recursions(model)
     if form is None:
         return _solve_for_acceleration(model, q, v, tau)
-    return kernel(form.aba, fallback=_solve_for_acceleration, derivative=_acceleration_tangent)(model, q, v, tau)
+    tangent = _tangent_by_sweeps if form is sweeps else _tangent_by_recursions
+    return kernel(form.aba, fallback=_solve_for_acceleration, derivative=tangent)(model, q, v, tau)
 
 
 def _kernel_with_checks(recursion: Callable) -> Callable:
@@ -206,9 +207,19 @@ MAX_BODIES = 128
 _MAX_BODIES_IN_MATRICES = 16
 
 
+def _least_bodies_in_kernels() -> int:
+    # What is written out shares its numbers with the rest of a kernel, such as the rows of loops.
+    return MAX_BODIES + 1
+
+
+@variant(_least_bodies_in_kernels)
+def _least_bodies_in_sweeps() -> int:
+    return MIN_BODIES_IN_SWEEPS
+
+
 def _recursions(model: Model) -> Any:
     """The module with the recursions of a model; None where there are too many bodies."""
-    if model.nb >= MIN_BODIES_IN_SWEEPS and sweeps.has_sweeps(model):
+    if model.nb >= _least_bodies_in_sweeps() and sweeps.has_sweeps(model):
         return sweeps
     return recursions if 0 < model.nb <= MAX_BODIES else None
 
@@ -218,7 +229,7 @@ def by_recursion(recursion, matrices, model: Model, *args):
     form = _recursions(model)
     if form is sweeps and hasattr(sweeps, recursion.__name__):
         return kernel(getattr(sweeps, recursion.__name__), fallback=matrices)(model, *args)
-    if model.nb > MAX_BODIES or model.nb == 0:
+    if form is None:
         return matrices(model, *args)
     return kernel(recursion, fallback=matrices)(model, *args)
 
@@ -243,10 +254,13 @@ def _solve_for_acceleration(model: Model, q, v, tau):
     return implicit(model, (q, v, tau), form.forward_dynamics, tangent)
 
 
-def _acceleration_tangent(model: Model, q, v, tau, steps):
+def _acceleration_tangent(form: Any, model: Model, q, v, tau, steps):
     """Tangent M^-1 (dtau - dID at fixed a) of the acceleration, for tangents of the leaves of (model, q, v, tau)."""
-    form = _recursions(model)
     return form.aba_tangent(model, q, v, tau, _force_tangent(form.rnea, model, q, v, tau, steps))[1]
+
+
+_tangent_by_recursions = functools.partial(_acceleration_tangent, recursions)
+_tangent_by_sweeps = functools.partial(_acceleration_tangent, sweeps)
 
 
 def _force_tangent(inverse, model, q, v, tau, steps):

@@ -6,6 +6,7 @@
 | `transforms`       | changes of frame of twists, wrenches and inertias                                            |
 | `links`            | joint transforms and motion subspaces of every joint kind                                    |
 | `newton_euler`     | recursive Newton-Euler: inverse dynamics, bias and gravity force; composite bodies: the mass matrix |
+| `sweeps`           | the same for many bodies, as loops whose code does not grow with their number                 |
 | `articulated`      | articulated-body inertias: M = W W^T, and M^-1 times a vector; forward dynamics and its tangent |
 
 EQUATIONS sections 4 and 5; Featherstone (2008), chapters 5 to 7. Twists are (v, omega) and wrenches (f, n), linear part first.

@@ -169,7 +169,7 @@ class _Given(_Bodies):
         return (Transform(part(place, 9, 12), GeneralRotation(part(place, 0, 9).reshape(3, 3))),)
 
     def subspace(self, row):
-        return row.screw * self.model.topology.screw_mask[0]
+        return row.screw * self.model.topology.screw_mask[0].astype(self.dtype)
 
     def moments(self, row):
         return contract(MOMENTS.astype(self.dtype), row.inertia, (2,), (0,))

@@ -1,0 +1,111 @@
+"""Recursions as sweeps: against those that are written out, their derivatives, and chains of hundreds of links."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from pinocchio_bridge import assert_close, quick
+
+import jaxdyn as jd
+from jaxdyn.compile import kernel
+from jaxdyn.dynamics import quantities, recursions
+from jaxdyn.dynamics.recursions import sweeps
+from jaxdyn.model.robots import random_tree
+
+pytestmark = pytest.mark.native
+
+KINDS = [("revolute",), ("prismatic",), ("helical",), ("revolute", "prismatic", "helical", "continuous")]
+
+
+def tree(kinds, nb=12, branching=1.6, **changes):
+    model = random_tree(3, nb, branching=branching, skew=1.0, taper=0.9, kinds=kinds)
+    # Screws that are not of unit length, and rotors.
+    return model.replace(screws=model.screws * 1.3, armature=jnp.linspace(0.1, 0.2, nb), **changes)
+
+
+def state(model, seed=0):
+    return tuple(jnp.asarray(x) for x in np.random.default_rng(seed).normal(size=(3, model.nv)))
+
+
+@pytest.mark.parametrize("kinds", KINDS)
+@pytest.mark.parametrize("given", [False, True])
+def test_as_the_recursions_that_are_written_out(kinds, given):
+    if given and len(kinds) > 1:
+        assert not jax.eval_shape(lambda m: jnp.zeros(int(sweeps.has_sweeps(m))), tree(kinds)).size
+        return
+    model = tree(kinds)
+    q, v, x = state(model)
+
+    def of(form):
+        def both(model, q, v, x):
+            return form.aba(model, q, v, x), form.rnea(model, q, v, x), form.gravity_force(model, q)
+
+        compiled = kernel(both)
+        return quick(compiled)(model, q, v, x) if given else quick(lambda *s: compiled(model, *s))(q, v, x)
+
+    for a, b in zip(of(sweeps), of(recursions), strict=True):
+        assert_close(a, b, 1e-12)
+
+
+def test_batches_gravity_and_given_inertias():
+    model = tree(("revolute",), gravity=None)
+    many = [jnp.stack([x, 2 * x, -x]) for x in state(model)]
+
+    def of(form):
+        compiled = kernel(lambda model, *s: form.aba(model, *s))
+        return quick(lambda inertias, *s: jax.vmap(lambda *x: compiled(model.replace(inertias=inertias), *x))(*s))(
+            model.inertias, *many
+        )
+
+    assert_close(of(sweeps), of(recursions), 1e-12)
+
+
+@pytest.mark.parametrize("kinds", [("revolute",), pytest.param(("helical",), marks=pytest.mark.slow)])
+def test_derivatives(kinds):
+    """Reverse mode of public functions over all leaves: against the recursions that are written out, and differences."""
+    nb = quantities.MIN_BODIES_IN_SWEEPS
+    model = tree(kinds, nb=nb, branching=1.3)
+    at = (model, *state(model))
+    weights = jnp.cos(jnp.arange(model.nv))
+
+    def value(model, q, v, x):
+        return jnp.sum(weights * jd.forward_dynamics(model, q, v, x)) + jnp.sum(
+            weights * jd.inverse_dynamics(model, q, v, x)
+        )
+
+    def direct(model, q, v, x):
+        a, tau = kernel(lambda m, *s: (recursions.aba(m, *s), recursions.rnea(m, *s)))(model, q, v, x)
+        return jnp.sum(weights * a) + jnp.sum(weights * tau)
+
+    computed = quick(jax.grad(value, (0, 1, 2, 3)))(*at)
+    for a, b in zip(
+        jax.tree.leaves(computed), jax.tree.leaves(quick(jax.grad(direct, (0, 1, 2, 3)))(*at)), strict=True
+    ):
+        assert_close(a, b, 1e-9)
+    q, step = at[1], 1e-6
+    run = quick(value)
+    difference = (run(model, q + step * weights, *at[2:]) - run(model, q - step * weights, *at[2:])) / (2 * step)
+    assert_close(computed[1] @ weights, difference, 1e-6)  # of central differences
+
+
+def test_code_does_not_grow_with_the_bodies():
+    from jaxdyn.compile.trace import program_of
+
+    def program(nb):
+        model = random_tree(1, nb, branching=1, skew=0.3, taper=1.0, kinds=("revolute",))
+        return program_of(sweeps.aba, (), model, state(model))[1][0]
+
+    few, many = program(50), program(150)
+    assert sum(len(x.body.operations) for x in few.subprograms) == sum(len(x.body.operations) for x in many.subprograms)
+    assert sum(x.op not in ("input", "part") for x in many.operations) == len(many.subprograms) == 4
+
+
+@pytest.mark.parametrize("links", [200, pytest.param(1000, marks=pytest.mark.slow)])
+@pytest.mark.parametrize("branching", [1, 2])
+def test_hundreds_of_links(links, branching):
+    model = random_tree(1, links, branching=branching, skew=0.3, taper=1.0, kinds=("revolute",))
+    q, v, tau = (0.3 * x for x in state(model))
+    a = quick(lambda *s: jd.forward_dynamics(model, *s))(q, v, tau)
+    inverse = quick(lambda *s: jd.inverse_dynamics(model, *s))
+    size = jnp.max(jnp.abs(inverse(q, v, 0 * a)))
+    assert jnp.max(jnp.abs(inverse(q, v, a) - tau)) < 1e-12 * size
