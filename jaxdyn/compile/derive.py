@@ -275,7 +275,7 @@ def _coefficient_values(graph: Graph, program: Program, inputs: list) -> tuple[l
             values.append(calls[args[0]].values[args[1].value])
         elif op == "call" and any(type(x) is not Constant and values[x] is None for x in args):
             given = [x.value if type(x) is Constant else values[x] for x in args[1:]]
-            calls[i] = program.subprograms[args[0].value].transposed_call(graph, given)
+            calls[i] = program.subprograms[args[0].value].transpose_at(graph, given)
             values.append(calls[i].values)
         elif any(type(x) is not Constant and values[x] is None for x in args):
             values.append(None)

@@ -225,7 +225,7 @@ class Scan:
                 return made, (*carries, *flags[len(carries) :])
             carries = found
 
-    def transposed_call(self, graph: Graph, values: list) -> "TransposedCall":
+    def transpose_at(self, graph: Graph, values: list) -> "TransposedCall":
         """A call of the scan within a program that is transposed; `values` are None for what depends on linear inputs.
 
         **Raises:** ValueError for a `lax.while_loop`, as JAX does.
@@ -274,7 +274,7 @@ class Scan:
         return Linear(fixed, rest, tuple(is_linear[i] for i in places), l_carries, outputs)
 
     def depending_entries(self, flags: list[bool]) -> list[bool]:
-        """Which entries of the outputs depend on these entries of the inputs, decided by arrays."""
+        """Flags of the entries of the outputs that depend on these entries of the inputs, decided by arrays."""
         outputs = self.split_linear(tuple(bool(x.any()) for x in _arrays(self.inputs, flags))).outputs
         return [flag for flag, array in zip(outputs, self.outputs, strict=True) for _ in range(array.size)]
 

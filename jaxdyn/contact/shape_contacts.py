@@ -26,7 +26,7 @@ from jaxdyn.contact.shapes import Ball, Box, Capsule, Feature, features_of, outw
 from jaxdyn.contact.surfaces import Plane, Sphere
 from jaxdyn.contact.unilateral import UnilateralContact
 from jaxdyn.lie.so3 import matmul
-from jaxdyn.model.arguments import Checked, Numbers, pose_leaf
+from jaxdyn.model.arguments import Checked, Numbers, check_body, pose_leaf
 
 _EXPANSIONS = 3  # Taylor polynomials of uneven ground, each about the point of the one before
 
@@ -161,7 +161,7 @@ def shape_contacts(
         touching = ShapeContact(
             name=own,
             body=body,
-            surface_body=surface_body,
+            surface_body=check_body(surface_body, "shape_contacts: surface_body"),
             pose=place,
             surface=ground,
             feature=feature,

@@ -34,8 +34,8 @@ def intersect_circles(center, radius, other, reach):
     if is_concrete(square) and square < 0:
         raise ValueError(f"lengths {radius} and {reach} do not close over {distance:.6g}; no such configuration exists")
     direction = direction / distance
-    # Traced lengths cannot be refused: those that do not close give a start that is not a number.
-    height = xp.sqrt(square) if xp is np else jnp.sqrt(jnp.where(square >= 0, square, jnp.nan))
+    # Traced lengths that cannot close give the closest configuration, with a constraint residual.
+    height = xp.sqrt(square) if xp is np else jnp.where(square > 0, jnp.sqrt(jnp.where(square > 0, square, 1.0)), 0.0)
     return center + along * direction + height * xp.stack([-direction[1], direction[0]])
 
 

@@ -53,7 +53,7 @@ class Contacts(NamedTuple):
 
     @property
     def closing(self) -> list[bool]:
-        """Whether each cone has a gap: all but those of frictions."""
+        """Flags of the cones with a gap: all but those of frictions."""
         return [self.elements[i].opens for i in self.order] + [True] * len(self.limited)
 
     @property

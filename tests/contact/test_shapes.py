@@ -313,7 +313,7 @@ def test_derivatives_are_finite_in_singular_places(case):
         ({"shape": Plane()}, "shape is a Plane; give a Sphere, Capsule"),
         ({"shape": Sphere(1.0), "on": Ellipsoid((1, 1, 2))}, "on is a Plane, HeightField, Sphere, Capsule or Box"),
         ({"shape": Capsule(1.0, 1.0), "on": HeightField(HEIGHTS, 0.3, smooth=False)}, "set smooth=True"),
-        ({"shape": Sphere(1.0), "friction": -1.0}, "coefficients are -1.0"),
+        ({"shape": Sphere(1.0), "friction": -1.0}, "friction is -1.0"),
     ],
 )
 def test_pairs_that_are_not_there_are_refused(options, message):

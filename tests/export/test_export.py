@@ -610,3 +610,54 @@ def test_solutions_of_equations_and_what_to_write_in_place_of_other_factors():
     )
     with pytest.raises(ValueError, match=words):
         jd.export(decomposed, x, name="decomposed")
+
+
+@pytest.mark.long
+def test_loops_stay_loops_in_exported_code(arm):
+    """A `while_loop` of unknown length, and a scan of 300 steps with its Jacobian, against JAX."""
+    exported = jd.export(
+        lambda x: jax.lax.while_loop(
+            lambda c: c[0] * c[0] - c[1] > 1e-13, lambda c: ((c[0] + c[1] / c[0]) / 2, c[1]), (x, x)
+        ),
+        2.0,
+        name="root",
+    )
+    for x in (2.0, 9.0, 1e6):
+        np.testing.assert_allclose(exported(x)[0], np.sqrt(x), rtol=1e-14)
+    step = jd.stepper(arm, 0.001)
+
+    def end(q, v, tau):
+        return jax.lax.scan(lambda state, _: (step(state, tau), None), (q, v), None, length=300)[0][0]
+
+    long = jd.export(end, X, V, TAU, name="rollout", derivatives=("jacobian",))
+    np.testing.assert_allclose(long(X, V, TAU), jax.jit(end)(*STATE), rtol=1e-12)
+    wanted = jax.jit(jax.jacfwd(end, argnums=(0, 1, 2)))(*STATE)
+    for got, want in zip(long.jacobian(X, V, TAU), wanted, strict=True):
+        np.testing.assert_allclose(got, want, rtol=1e-10, atol=1e-10)
+
+
+@pytest.mark.long
+def test_a_predictive_controller_is_exported(tmp_path):
+    """Five iterations of iterated LQR over 20 steps of a cart-pole with limits: the numbers of JAX."""
+    builder = jd.ModelBuilder("cart-pole")
+    builder.add_body("cart", None, "prismatic", jd.inertia.box(1.0, (0.2, 0.2, 0.1)), axis=(1, 0, 0))
+    builder.add_body("pole", "cart", "continuous", (0.2, (0, 0, -0.5), (0.01, 0.01, 0.0)), axis=(0, 1, 0))
+    robot = builder.build()
+    motors, advance = robot.selection_matrix(["cart_joint"]), jd.stepper(robot, dt=0.04)
+
+    def upright(x):
+        q, v = x
+        return 200 * (1 + jnp.cos(q[1])) + 10 * q[0] ** 2 + 10 * v @ v
+
+    def controller(q, v, us):
+        plan = jd.control.ilqr(
+            lambda x, u: advance(x, motors @ u),
+            lambda x, u, k: 0.01 * u @ u + 0.01 * upright(x),
+            upright, (q, v), us, limits=(-15.0, 15.0), iterations=5,
+        )  # fmt: skip
+        return plan.us, plan.cost
+
+    given = np.array([0.1, 2.5]), np.array([0.1, -0.3]), 0.1 * np.ones((20, 1))
+    exported = jd.export(controller, *given, name="controller")
+    for got, want in zip(exported(*given), jax.jit(controller)(*map(jnp.asarray, given)), strict=True):
+        np.testing.assert_allclose(got, want, rtol=1e-12, atol=1e-12)

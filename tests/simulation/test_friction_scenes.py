@@ -70,8 +70,10 @@ def test_link_thrown_onto_a_disk(mu, names):
     q, v = scenes.rough_disk_and_link.start(speed=3.0)
     motion = jd.simulate(scenes.rough_disk_and_link(friction=mu), q, v, TS, control=level, **TIGHT)
     times, states = phases(mu, 3.0)
-    assert motion.success and list(motion.events.name[: len(names) + 1]) == [*names, ""]
-    np.testing.assert_allclose(motion.events.time[: len(names)], times[1:], rtol=0, atol=1e-10)
+    # An "inner" event changes how a mode is computed, and not the motion.
+    seen = [i for i, name in enumerate(motion.events.name) if name and not name.endswith("inner")]
+    assert motion.success and [motion.events.name[i] for i in seen] == names
+    np.testing.assert_allclose(motion.events.time[np.array(seen)], times[1:], rtol=0, atol=1e-10)
     x, y, turn = np.asarray(motion.v)[:, :3].T  # in the axes of the disk
     angle = np.asarray(motion.q[:, 2])
     computed = np.stack([np.cos(angle) * x - np.sin(angle) * y, turn, motion.v[:, 3]], 1)

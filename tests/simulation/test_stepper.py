@@ -139,7 +139,10 @@ def test_limits_cut_the_control_and_nothing_else():
     [
         (lambda: jd.stepper(arm(), 0.0), "dt"),
         (lambda: jd.stepper(arm(), 0.1, substeps=0), "substeps"),
-        (lambda: jd.stepper(jd.Scene(arm(), forces=(jd.contact.DryFriction(0.1, 1.0),)), 0.1), "CoulombFriction"),
+        (
+            lambda: jd.stepper(jd.Scene(arm(), forces=(jd.contact.DryFriction(0.1, 1.0, smoothing=0.1),)), 0.1),
+            "smoothing",
+        ),
         (lambda: jd.stepper(arm(), 0.1)((jnp.zeros(3), jnp.zeros(2)), TAU), "q has shape"),
         (lambda: jd.stepper(arm(), 0.1)((jnp.zeros(2), jnp.zeros(2)), jnp.zeros(3)), "tau"),
         (lambda: jd.stepper(arm(), 0.1)((jnp.zeros(2), jnp.zeros(2)), lambda q, v, t: jnp.zeros(3)), "tau"),
