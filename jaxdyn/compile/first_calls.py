@@ -1,14 +1,12 @@
 """First calls, for which somebody waits: how long each phase takes, and what is put off until they are over.
 
-Phases that follow each other within a second belong to one first call. Python's collector of cycles does not run in a phase:
-it would search tens of thousands of new numbers again and again, and find none to free. Native code that was compiled
-quickly is optimised by one thread of the process, after the first call.
+Phases that follow each other within a second belong to one first call. Native code that was compiled quickly is optimised by one
+thread of the process, after the first call. Python's collector of cycles stays on: it belongs to the user.
 """
 
 import atexit
 import collections
 import contextlib
-import gc
 import logging
 import os
 import threading
@@ -30,8 +28,7 @@ class _FirstCall:
         self.changed = threading.Condition(threading.RLock())
         self.seconds: dict[str, float] = dict.fromkeys(PHASES, 0.0)
         self.begin = self.end = self.added = 0.0  # of the phases, and when the last task came
-        self.active = self.collecting = 0  # phases in all threads, and those in which the collector rests
-        self.is_collecting = True  # whether the collector runs outside of phases
+        self.active = 0  # phases in all threads
         self.inner = threading.local()  # seconds of phases within the phase at hand, in this thread
         self.tasks: collections.deque[Callable] = collections.deque()
         self.thread: threading.Thread | None = None
@@ -48,11 +45,6 @@ class _FirstCall:
                 self.report()
                 self.begin = start
             self.active += 1
-            if not is_beside:
-                if not self.collecting:
-                    self.is_collecting = gc.isenabled()
-                    gc.disable()
-                self.collecting += 1
         self.inner.seconds = 0.0
         try:
             yield
@@ -63,9 +55,6 @@ class _FirstCall:
                 self.end = now
                 if not is_beside:
                     self.seconds[name] += now - start - self.inner.seconds
-                    self.collecting -= 1
-                    if not self.collecting and self.is_collecting:
-                        gc.enable()
                 if now - self.begin > REPORTED_SECONDS:
                     self._start()
             self.inner.seconds = None if within is None else within + now - start

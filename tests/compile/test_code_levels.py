@@ -1,6 +1,5 @@
 """First calls: quick code and what takes its place, the collector of cycles, and the message on a long call."""
 
-import gc
 import logging
 import re
 import subprocess
@@ -12,7 +11,6 @@ import numpy as np
 import pytest
 
 from jaxdyn.compile import first_calls, kernel, objects, target
-from jaxdyn.compile.first_calls import phase
 
 pytestmark = pytest.mark.native
 
@@ -83,22 +81,6 @@ def test_quick_code_on_disk_is_optimised_by_another_process(monkeypatch, tmp_pat
         lines.append(done.stdout.splitlines())
     assert lines[0][0] == lines[1][0]
     assert [x[1] for x in lines] == ["[True]", "[False]"]
-
-
-def test_the_collector_rests_in_a_phase():
-    with pytest.raises(ZeroDivisionError), phase("tracing"):
-        with phase("expansion"):
-            assert not gc.isenabled()
-        assert not gc.isenabled()
-        raise ZeroDivisionError
-    assert gc.isenabled()
-    gc.disable()
-    try:
-        with phase("tracing"):
-            pass
-        assert not gc.isenabled()
-    finally:
-        gc.enable()
 
 
 def test_a_long_first_call_is_reported_once(monkeypatch, caplog, two_levels):

@@ -43,7 +43,7 @@ def is_made(before: set, count: int = 1) -> list[bool]:
     """Whether each kernel that is new has code."""
     new = [target._kernels[number] for number in target._kernels if number not in before]
     assert len(new) == count
-    return [made.code is not None for made in new]
+    return [made.is_made for made in new]
 
 
 def awaited(condition) -> bool:
@@ -113,10 +113,10 @@ def test_an_error_of_the_other_thread_is_told_to_who_calls(monkeypatch):
     """It is made again when it is called: first it fails there too, then not any more."""
     fails, made = [True], objects.compile_text
 
-    def failing(text):
+    def failing(text, *options):
         if fails[0]:
             raise MemoryError("no room")
-        return made(text)
+        return made(text, *options)
 
     monkeypatch.setattr(objects, "compile_text", failing)
     monkeypatch.setattr(objects, "find", lambda identity: None)
