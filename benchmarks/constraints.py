@@ -84,12 +84,17 @@ def mechanisms(windows: int) -> dict:
     }
 
 
+def torques(scene: jd.Scene) -> np.ndarray:
+    """Any torques: without them some of the scenes hardly accelerate."""
+    return np.cos(np.arange(scene.nv))
+
+
 def functions(scene: jd.Scene) -> dict:
     """What is timed, of one sample."""
     times = jnp.asarray([0.0, 0.05])
 
     def accelerate(q, v):
-        return jd.constrained_dynamics(scene, q, v).acceleration
+        return jd.constrained_dynamics(scene, q, v, torques(scene)).acceleration
 
     return {
         "acceleration": accelerate,
@@ -108,8 +113,8 @@ def peers(scene: jd.Scene, q, v) -> dict:
     held.extend(contact.createData() for contact in contacts)
     pin.initConstraintDynamics(source, data, contacts, held)
     pin.computeJointMinimalOrdering(source, other, contacts)
-    q, v = ordered(scene.system, np.asarray(q)[None])[0], np.asarray(v)
-    settings, tau = pin.ProximalSettings(1e-12, 1e-10, 20), np.zeros(source.nv)
+    q, v, tau = ordered(scene.system, np.asarray(q)[None])[0], np.asarray(v), torques(scene)
+    settings = pin.ProximalSettings(1e-12, 1e-10, 20)
     # Its most accurate setting here: with a smaller mu it loses digits to rounding.
     other_settings = pin.ProximalSettings(1e-14, 1e-4, 50)
     return {
@@ -121,7 +126,7 @@ def peers(scene: jd.Scene, q, v) -> dict:
 def measure(name: str, scene, q, v, batch: int, rounds: int) -> list[dict]:
     """One row for a single call, and one for a batch."""
     rows, theirs = [], {} if "held" in name else peers(scene, q, v)
-    want = np.asarray(jd.constrained_dynamics(scene, q, v).acceleration)
+    want = np.asarray(jd.constrained_dynamics(scene, q, v, torques(scene)).acceleration)
     differences = {peer: float(np.abs(call() - want).max() / np.abs(want).max()) for peer, call in theirs.items()}
     print(f"{name}: differences from Pinocchio's accelerations {differences}", flush=True)
     for count in (1, batch):

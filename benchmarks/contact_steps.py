@@ -126,6 +126,7 @@ def mujoco_rollout(path, dt: float, steps: int, batch):
 def measure(call, rounds: int) -> tuple[float, float]:
     """Least wall time and processor time of a call, s."""
     call()
+    wait_for_code()
     wall, cpu = [], []
     for _ in range(rounds):
         start, used = time.perf_counter(), time.process_time()

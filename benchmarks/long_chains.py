@@ -18,7 +18,7 @@ from benchmarks import timing
 from jaxdyn.model.description import table
 from jaxdyn.model.robots import random_tree
 
-COUNTS = (50, 100, 200, 500)
+COUNTS = (50, 100, 200, 500, 1000)
 
 
 def program(count: int, branching: int, batch: int):
