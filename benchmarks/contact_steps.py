@@ -21,6 +21,7 @@ import numpy as np
 
 import jaxdyn as jd
 from benchmarks import timing
+from jaxdyn.compile import wait_for_code
 
 RADIUS, FRICTION, LEG = 0.02, 0.8, 0.2
 STANCE = (0.0, 0.8, -1.6)

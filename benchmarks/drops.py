@@ -23,6 +23,7 @@ import numpy as np
 
 import jaxdyn as jd
 from benchmarks import timing
+from jaxdyn.compile import wait_for_code
 from jaxdyn.constraints.codes import CODES, code_of
 
 G = 9.81
@@ -269,6 +270,7 @@ def main():
         first = time.process_time()
         jax.block_until_ready(call(*(x[: options.batch] for x in given)))
         first = time.process_time() - first
+        wait_for_code()
         parts, spent = [], time.process_time()
         for at in range(0, options.drops, options.batch):
             parts.append(jax.device_get(call(*(x[at : at + options.batch] for x in given))))

@@ -22,6 +22,7 @@ import numpy as np
 import jaxdyn as jd
 from benchmarks import jax_peers, timing
 from benchmarks.dynamics import FILES, ROBOTS
+from jaxdyn.compile import wait_for_code
 
 DT = 1e-3
 
@@ -127,6 +128,8 @@ def _compiled(function, *args):
     before = time.perf_counter()
     program = jax.jit(jax.vmap(function)).lower(*args).compile()
     print(f"  traced and compiled in {time.perf_counter() - before:.1f} s", flush=True)
+    np.asarray(program(*args))
+    wait_for_code()
     return lambda: np.asarray(program(*args))
 
 
