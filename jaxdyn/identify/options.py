@@ -51,7 +51,7 @@ BALANCES = ("momentum", "energy")
 ERRORS = ("trajectory", "torque", "momentum", "energy", "closed-loop")
 
 
-_SIMULATE = ("solver", "stepsize", "rtol", "atol", "adjoint", "max_steps", "method")
+_SIMULATE = ("solver", "stepsize", "substeps", "rtol", "atol", "adjoint", "max_steps", "method")
 
 
 def _as_tuple(names):
