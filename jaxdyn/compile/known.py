@@ -16,6 +16,12 @@ def is_concrete(*trees) -> bool:
     return not any(isinstance(leaf, Tracer) for leaf in jax.tree.leaves(trees))
 
 
+def as_numpy_if_known(array: Any) -> Any:
+    """Convert a leaf with known values to numpy; a traced leaf is returned unchanged."""
+    # Numpy operations on known numbers run at trace time, so their zeros are dropped before anything is compiled.
+    return np.asarray(array) if array is not None and is_concrete(array) else array
+
+
 def array_namespace(*trees) -> Any:
     """NumPy where no leaf is traced, else `jax.numpy`: results of known numbers then stay known inside of a trace."""
     return np if is_concrete(*trees) else jnp

@@ -83,7 +83,7 @@ class Scan:
 
     def call(self, graph: Graph, arrays: Sequence[np.ndarray]) -> list[np.ndarray]:
         """The outputs of a call with these inputs, of which those are passed that the body reads."""
-        few, places = self._made("read", self._with_read_inputs)
+        few, places = self._derive_once("read", self._with_read_inputs)
         return graph.call(few, [arrays[i] for i in places])
 
     def _with_read_inputs(self) -> tuple["Scan", list[int]]:
@@ -108,7 +108,7 @@ class Scan:
 
     def with_outputs(self, needed: Sequence[bool]) -> "Scan":
         """The scan of its carries and of those of its other outputs that are needed."""
-        return self._made(("outputs", tuple(needed)), lambda: self._with_outputs(needed))
+        return self._derive_once(("outputs", tuple(needed)), lambda: self._with_outputs(needed))
 
     def _with_outputs(self, needed: Sequence[bool]) -> "Scan":
         kept = [i for i, flag in enumerate(needed) if flag or i < self.counts.carries]
@@ -167,7 +167,7 @@ class Scan:
         inward = self.inward if inward is None else inward
         return Scan(body, counts, self.length, self.tables, inward, self.parents, self.condition)
 
-    def _made(self, key, make) -> Any:
+    def _derive_once(self, key, make) -> Any:
         if key not in self.derived:
             self.derived[key] = make()
         return self.derived[key]
@@ -176,7 +176,7 @@ class Scan:
         """Entries of the outputs and their changes, for entries of the inputs and their changes (0.0: none)."""
         arrays, steps = _arrays(self.inputs, values), _arrays(self.inputs, changes)
         moving = tuple(any(is_number(x) or x != 0 for x in step.flat) for step in steps)
-        tangent, moves = self._made(("tangent", moving), lambda: self._tangent(moving))
+        tangent, moves = self._derive_once(("tangent", moving), lambda: self._tangent(moving))
         groups = zip(*(_split(x, self.counts[:3]) for x in (arrays, steps, moves[: len(arrays)])), strict=True)
         made = iter(tangent.call(graph, [x for group in groups for x in _with_changes(*group)]))
         outs, out_steps = [], []
@@ -239,7 +239,7 @@ class Scan:
 
     def split_linear(self, linear: tuple[bool, ...]) -> "Linear":
         """The scan of what does not depend on the inputs that are `linear`, and the linear scan of the rest."""
-        return self._made(("split", linear), lambda: self._split_linear(linear))
+        return self._derive_once(("split", linear), lambda: self._split_linear(linear))
 
     def _split_linear(self, linear: tuple[bool, ...]) -> "Linear":
         body, tables = self.body, self.counts.tables
@@ -280,7 +280,7 @@ class Scan:
 
     def transpose(self, linear: tuple[bool, ...]) -> "Scan":
         """The transpose of a scan whose body is linear in these inputs, all carries among them."""
-        return self._made(("transpose", linear), lambda: self._transpose(linear))
+        return self._derive_once(("transpose", linear), lambda: self._transpose(linear))
 
     def _transpose(self, linear: tuple[bool, ...]) -> "Scan":
         backwards = derive.transpose(self.body, linear, [True] * len(self.body.outputs))
@@ -397,7 +397,7 @@ def _tangent_of(body: Program, moving: tuple[bool, ...]) -> tuple[Program, list[
 
 
 def _parts(program: Program | None) -> tuple | None:
-    """What is kept of a program."""
+    """Data of a program that a file keeps."""
     if program is None:
         return None
     operations = [tuple(x) for x in program.operations]
@@ -422,7 +422,7 @@ def _with_more_inputs(program: Program, types: Sequence[Array], moves: Sequence[
 
 
 def _depends(body: Program, linear: Sequence[bool]) -> list[bool]:
-    """Which outputs of a program depend on the `linear` inputs."""
+    """Flags of the outputs of a program that depend on the `linear` inputs."""
     varies: list[Any] = []
     for op, _, args in body.operations:
         if op == "input":

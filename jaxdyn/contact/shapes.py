@@ -13,7 +13,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from jaxdyn.compile.known import is_concrete
+from jaxdyn.compile.known import as_numpy_if_known, is_concrete
 from jaxdyn.constraints.rolling import unit_or
 from jaxdyn.contact.surfaces import Cylinder, Ellipsoid, Sphere
 from jaxdyn.lie.so3 import matmul
@@ -153,17 +153,17 @@ def features_of(shape: Any) -> tuple[Feature, ...]:
         circle = np.stack([np.cos(angles), np.sin(angles), np.zeros(3)], 1)
         features: list[Feature] = []
         for end in _ends(shape.length):
-            points = end + _known(shape.radius) * circle
+            points = end + as_numpy_if_known(shape.radius) * circle
             features += [
                 Rim(shape.radius, _leaf(end[2], shape.radius)),
                 *(Ball(_leaf(x, shape.radius)) for x in points),
             ]
         return tuple(features)
     if isinstance(shape, Box):
-        corners = 0.5 * np.array(list(itertools.product((-1.0, 1.0), repeat=3))) * _known(shape.size)
+        corners = 0.5 * np.array(list(itertools.product((-1.0, 1.0), repeat=3))) * as_numpy_if_known(shape.size)
         return tuple(Ball(_leaf(corner, shape.size)) for corner in corners)
     if isinstance(shape, ConvexHull):
-        return tuple(Ball(_leaf(vertex, shape.vertices)) for vertex in _known(shape.vertices))
+        return tuple(Ball(_leaf(vertex, shape.vertices)) for vertex in as_numpy_if_known(shape.vertices))
     hint = "; a Cylinder needs its length" if isinstance(shape, Cylinder) else ""
     raise ValueError(
         f"shape is a {type(shape).__name__}; give a Sphere, Capsule, Box, Cylinder, Ellipsoid or ConvexHull{hint}"
@@ -198,12 +198,7 @@ def outward(shape: Any, point: Float[Array, "3"]) -> tuple[Float[Array, "3"], Fl
 
 def _ends(length) -> list:
     """Points on the z axis at half of a length below and above the origin."""
-    return [0.5 * _known(length) * np.array([0.0, 0.0, sign]) for sign in (-1.0, 1.0)]
-
-
-def _known(leaf: Array) -> Any:
-    """A leaf in NumPy where its numbers are known: results of them then stay known inside of a trace."""
-    return np.asarray(leaf) if is_concrete(leaf) else leaf
+    return [0.5 * as_numpy_if_known(length) * np.array([0.0, 0.0, sign]) for sign in (-1.0, 1.0)]
 
 
 def _leaf(value, like: Array) -> Array:

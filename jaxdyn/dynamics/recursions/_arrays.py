@@ -5,14 +5,6 @@ from typing import NamedTuple
 import numpy as np
 from jax import lax
 
-from jaxdyn.compile.known import is_concrete
-
-
-def as_numpy_if_known(array):
-    """Convert a leaf with known values to numpy; a traced leaf is returned unchanged."""
-    # Numpy operations on known numbers run at trace time, so their zeros are dropped before anything is compiled.
-    return np.asarray(array) if array is not None and is_concrete(array) else array
-
 
 def contract(a, b, axes_a: tuple[int, ...], axes_b: tuple[int, ...]):
     """Contract some axes of two tensors; the remaining axes of `a` come first."""

@@ -10,8 +10,8 @@ import jax.numpy as jnp
 import numpy as np
 from jax import lax
 
+from jaxdyn.compile.known import as_numpy_if_known
 from jaxdyn.dynamics.recursions._arrays import (
-    as_numpy_if_known,
     constants,
     contract,
     dot,

@@ -15,8 +15,8 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from jaxdyn.compile import sweep
-from jaxdyn.compile.known import is_concrete
-from jaxdyn.dynamics.recursions._arrays import as_numpy_if_known, contract, dot, join, part
+from jaxdyn.compile.known import as_numpy_if_known, is_concrete
+from jaxdyn.dynamics.recursions._arrays import contract, dot, join, part
 from jaxdyn.dynamics.recursions.articulated import eliminate, spatial_inertia
 from jaxdyn.dynamics.recursions.frames import MOMENTS, canonical_frames, pseudo_inertias
 from jaxdyn.dynamics.recursions.newton_euler import move_with_joint, wrench_of_acceleration
@@ -62,7 +62,7 @@ class _Bodies:
     column: int | None = None
 
     def place(self, row, q):
-        """What the pose of a body in its parent depends on."""
+        """Numbers that the pose of a body in its parent depends on."""
         raise NotImplementedError
 
     def chain(self, row, place) -> Chain:
@@ -179,13 +179,13 @@ def _bodies(model: Model) -> _Bodies:
     return (_Canonical if is_concrete(model.home, model.screws) else _Given)(model)
 
 
-def _scaled(bodies: _Bodies, x) -> Any:
+def _to_unit_screws(bodies: _Bodies, x) -> Any:
     """Velocities of unit screws from those of the model's; equally, forces of the model's screws from those of unit ones."""
     return x if bodies.scale is None or x is None else x * bodies.scale
 
 
-def _unscaled(bodies: _Bodies, x) -> Any:
-    """The inverse of `_scaled`."""
+def _to_model_units(bodies: _Bodies, x) -> Any:
+    """The inverse of `_to_unit_screws`."""
     return x if bodies.scale is None else x / bodies.scale
 
 
@@ -210,7 +210,7 @@ def _wrenches(bodies: _Bodies, q, v, a) -> tuple[Any, Any]:
 def rnea(model: Model, q, v, a) -> Float[Array, " nv"]:
     """Inverse dynamics (see `newton_euler.rnea`); `v` and `a` may be None, which is zero."""
     bodies = _bodies(model)
-    q, v, a = (_scaled(bodies, x) for x in (q, v, a))
+    q, v, a = (_to_unit_screws(bodies, x) for x in (q, v, a))
     wrenches, places = _wrenches(bodies, q, v, a)
 
     def step(total, row):
@@ -221,7 +221,7 @@ def rnea(model: Model, q, v, a) -> Float[Array, " nv"]:
     tau = sweep(step, bodies.parents, np.zeros(6, bodies.dtype), (bodies.rows, places, wrenches), inward=True)[1]
     if a is not None and bodies.armature is not None:
         tau = tau + bodies.armature * a
-    return _scaled(bodies, tau)
+    return _to_unit_screws(bodies, tau)
 
 
 def bias_force(model: Model, q, v) -> Float[Array, " nv"]:
@@ -271,15 +271,15 @@ def _solve(factors: _Factors, force, wrenches=None) -> Float[Array, " nv"]:
         x = left * inverse - dot(gain, V)
         return V + bodies.subspace(row) * x, x
 
-    rows = bodies.rows, places, gains, _unscaled(bodies, force), wrenches
+    rows = bodies.rows, places, gains, _to_model_units(bodies, force), wrenches
     left = sweep(inward, bodies.parents, zero, rows, inward=True)[1]
     a = sweep(outward, bodies.parents, zero, (bodies.rows, places, gains, inverses, left))[1]
-    return _unscaled(bodies, a)
+    return _to_model_units(bodies, a)
 
 
 def _free_and_inverse(model: Model, q, v, tau) -> tuple[Array, Callable]:
     bodies = _bodies(model)
-    wrenches, places = _wrenches(bodies, _scaled(bodies, q), _scaled(bodies, v), None)
+    wrenches, places = _wrenches(bodies, _to_unit_screws(bodies, q), _to_unit_screws(bodies, v), None)
     factors = _factorize(bodies, places)
     return _solve(factors, tau, wrenches), lambda force: _solve(factors, force)
 
