@@ -247,7 +247,7 @@ def test_recipe_geometry():
 @pytest.mark.slow
 def test_recipe_workspace():
     """The places within two lengths of all bases; the margin is zero where the first two arms are in one line."""
-    names = recipe("Workspace and singular positions of a parallel robot")
+    names = recipe("Workspace and singular configurations of a parallel robot")
     bases = np.array([(0.0, 1.2), (-1.04, -0.6), (1.04, -0.6)])
     distance = np.linalg.norm(np.asarray(names["grid"])[:, None] - bases, axis=2)
     assert np.mean(np.asarray(names["inside"]) == (distance < 2).all(1)) > 0.9
