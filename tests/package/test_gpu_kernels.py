@@ -43,7 +43,7 @@ def gradient(dtype=jnp.float64):
 
 def starts(named):
     q, v = named.start()
-    return [jnp.repeat(jnp.asarray(q)[None], SAMPLES, 0), jnp.linspace(0.9, 1.1, SAMPLES)[:, None] * jnp.asarray(v)]
+    return [jnp.repeat(jnp.asarray(q)[None], SAMPLES, 0), jnp.linspace(0.9, 1.1, SAMPLES)[:, None] * jnp.asarray(v)[None]]
 
 
 def motion(named, **options):
