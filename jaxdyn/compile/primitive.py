@@ -27,9 +27,8 @@ from jaxdyn.compile.trace import tangent_program
 
 try:
     from jaxdyn.compile import target
-    from jaxdyn.compile.gpu import device
 except ImportError:  # no llvmlite for this platform
-    target = device = None
+    target = None
 
 
 # --- evaluation, types, batches ---
@@ -321,19 +320,17 @@ def _lower_to_call(ctx, *operands, program, rows, on_gpu=False):
 
 def _lower_to_launch(ctx, *operands, program, rows, uniform):
     """The call of a kernel on a GPU."""
+    assert target is not None, "kernels need llvmlite"
+    from jaxdyn.compile.gpu import device  # here, as hardly anybody needs it
+
     try:
-        if device is None:
-            raise jax_adapter.Unsupported("llvmlite is not installed (pip install llvmlite)")
         number = device.kernel(program, uniform)
-    except jax_adapter.Unsupported as reason:
-        mode.say_once(f"functions run on JAX's own operations on GPUs: {reason}")
-        return lowering_of(as_operations)(ctx, *operands, program=program, rows=rows)
-    except device.TooLarge as reason:  # pyright: ignore[reportOptionalMemberAccess]
-        mode.say_once(f"{program.name} runs on JAX's own operations on GPUs: {reason}")
+    except (jax_adapter.Unsupported, device.TooLarge) as reason:
+        what = "functions run" if isinstance(reason, jax_adapter.Unsupported) else f"{program.name} runs"
+        mode.say_once(f"{what} on JAX's own operations on GPUs: {reason}")
         return lowering_of(as_operations)(ctx, *operands, program=program, rows=rows)
     if _is_divisible(ctx.avals_in, ctx.avals_out[0].shape[:-1]):
         return lowering_of(_with_last_axis)(ctx, *operands, program=program, rows=rows and rows + 1)
-    assert target is not None
     order = target.varying_first(uniform)
     attributes = _partition_attributes([ctx.avals_in[i] for i in order], ctx.avals_out)
     layouts = device.layouts(program, uniform, [x.shape for x in (*ctx.avals_in, *ctx.avals_out)])

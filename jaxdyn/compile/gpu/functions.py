@@ -312,7 +312,7 @@ def _far_angle(x: Number) -> tuple[Number, Number, Number, Number]:
     """
     e = x.e
     bits = x.abs().bits()
-    n = Number(e, e.emit(f"or i64 {e.emit(f'and i64 {bits.name}, {2**52 - 1}')}, {2**52}"), "i8")
+    n = (bits & (2**52 - 1)) | 2**52
     # 2^e times bit j of 2/pi, of weight 2^-j, is no whole turn where j >= e - 1; a word of zeros stands before the point.
     place = bits.shift("lshr", 52) - 1075 + 64 - 2
     word, shift = place.shift("lshr", 6), place & 63
@@ -325,14 +325,18 @@ def _far_angle(x: Number) -> tuple[Number, Number, Number, Number]:
         e.emit(f"call i64 @llvm.fshl.i64(i64 {a}, i64 {b}, i64 {shift.name})")
         for a, b in zip(words, words[1:], strict=False)
     )
-    wide = [e.emit(f"zext i64 {w} to i128") for w in (n.name, high, middle, low)]
-    carry = e.emit(f"lshr i128 {e.emit(f'mul i128 {wide[0]}, {wide[3]}')}, 64")
-    total = e.emit(f"add i128 {e.emit(f'mul i128 {wide[0]}, {wide[2]}')}, {carry}")
-    total = e.emit(f"add i128 {e.emit(f'shl i128 {e.emit(f"mul i128 {wide[0]}, {wide[1]}")}, 64')}, {total}")
-    quarters = Number(e, e.emit(f"trunc i128 {e.emit(f'lshr i128 {total}, 126')} to i64"), "i8")
-    fraction = e.emit(f"shl i128 {total}, 2")
-    top = Number(e, e.emit(f"trunc i128 {e.emit(f'lshr i128 {fraction}, 64')} to i64"), "i8")
-    bottom = Number(e, e.emit(f"trunc i128 {fraction} to i64"), "i8")
+    def wide(op, a, b):
+        return e.emit(f"{op} i128 {a}, {b}")
+
+    def cut(a):
+        return e.emit(f"trunc i128 {a} to i64")
+
+    n, high, middle, low = (e.emit(f"zext i64 {w} to i128") for w in (n.name, high, middle, low))
+    total = wide("add", wide("mul", n, middle), wide("lshr", wide("mul", n, low), 64))
+    total = wide("add", wide("shl", wide("mul", n, high), 64), total)
+    fraction = wide("shl", total, 2)  # beyond the two bits of whole quarters
+    quarters = Number(e, cut(wide("lshr", total, 126)), "i8")
+    top, bottom = (Number(e, cut(x), "i8") for x in (wide("lshr", fraction, 64), fraction))
     quarters = quarters + (top < 0).pick(Number(e, "1", "i8"), 0)
     rest = Number(e, e.emit(f"uitofp i64 {bottom.name} to double"))
     part = top.convert("f8") * 2.0**-64 + rest * 2.0**-128
