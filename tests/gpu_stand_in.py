@@ -195,7 +195,7 @@ def _stream_get(args):
 _api_of_cpu = {}
 
 
-def on_cpu(address: int) -> int:
+def on_cpu(address: int) -> int | None:
     """A handler for XLA's CPUs that calls one for GPUs, with a stream, which XLA has not on a CPU."""
 
     @_HANDLER

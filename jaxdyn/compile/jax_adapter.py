@@ -349,7 +349,9 @@ def ffi_version(header: str | None = None, for_gpus: bool = False) -> tuple[int,
     for name, expected in (_OF_GPUS if for_gpus else _READ | _PASSED).items():
         fields = structures.get(name, {})
         have = {field: fields.get(field) for field in expected}
-        if have != expected or (name.endswith("_Args") and name not in _READ and list(fields)[-1] != list(expected)[-1]):
+        if have != expected or (
+            name.endswith("_Args") and name not in _READ and list(fields)[-1] != list(expected)[-1]
+        ):
             raise Unsupported(
                 f"version {major}.{minor} of XLA's FFI has another {name}: {fields or 'none'}, and kernels need {expected}"
             )

@@ -43,7 +43,8 @@ def arguments_of(name):
     elif name in ("asin", "acos"):
         x = np.concatenate([RNG.uniform(-1, 1, 3000), 1 - 10.0 ** RNG.uniform(-16, 0, 500), [1.5]])
     elif name in ("sin", "cos"):  # far angles alone: near ones have polynomials of their own
-        x = np.concatenate([10.0 ** RNG.uniform(4.1, 308, 3000), -(10.0 ** RNG.uniform(4.1, 20, 1000)), np.arange(3e7, 3e7 + 500) * np.pi / 2])  # fmt: skip
+        x = np.concatenate([10.0 ** RNG.uniform(4.1, 308, 3000), -(10.0 ** RNG.uniform(4.1, 20, 1000))])
+        x = np.concatenate([x, np.arange(3e7, 3e7 + 500) * np.pi / 2])  # near whole quarters of a turn
     elif name == "tan":
         x = np.concatenate([wide, 10.0 ** RNG.uniform(6, 300, 1000)])
     else:

@@ -165,7 +165,9 @@ def test_errors_of_the_driver_are_errors_of_xla(gpu, name):
     call = jax.jit(jax.vmap(lambda x: backend.kernel(lambda _, x: factor * x)((), x)))
     x = jnp.ones((3, 2))
     gpu.fails = name
-    with pytest.raises(jax.errors.JaxRuntimeError, match=f"{name} of CUDA's driver failed with CUDA_ERROR_OUT_OF_MEMORY"):
+    with pytest.raises(
+        jax.errors.JaxRuntimeError, match=f"{name} of CUDA's driver failed with CUDA_ERROR_OUT_OF_MEMORY"
+    ):
         call(x)
     gpu.fails = None
     gpu.contexts.clear()

@@ -10,8 +10,9 @@ from importlib import resources
 from jaxdyn.compile.careful_text import number_of
 from jaxdyn.compile.gpu.driver import DriverError, driver
 from jaxdyn.compile.gpu.ptx import ptx_of
-from jaxdyn.compile.gpu.text import KERNEL, MAX_THREADS, TooLarge, is_aside, module_ir
-from jaxdyn.compile.jax_adapter import Unsupported, ffi_version, register_handler
+from jaxdyn.compile.gpu.text import KERNEL, MAX_THREADS, is_aside, module_ir
+from jaxdyn.compile.gpu.text import TooLarge as TooLarge
+from jaxdyn.compile.jax_adapter import ffi_version, register_handler
 from jaxdyn.compile.objects import Code, compile_text
 from jaxdyn.compile.target import SLOTS, Entry, Row, fill_handler, free_entry
 
@@ -118,12 +119,3 @@ def _explain(code: int) -> int:
 
 _LOAD = ctypes.CFUNCTYPE(ctypes.c_void_p, ctypes.c_uint64, ctypes.c_int64, ctypes.c_void_p)(_load)
 _EXPLAIN = ctypes.CFUNCTYPE(ctypes.c_void_p, ctypes.c_int)(_explain)
-
-
-def reason_against() -> str | None:
-    """Why no kernel can be called on a GPU here, or None."""
-    try:
-        register()
-    except Unsupported as reason:
-        return str(reason)
-    return None

@@ -7,9 +7,11 @@ Source: Muller, Elementary Functions (2016), for the reductions; polynomials are
 """
 
 import functools
+import itertools
 import math
 from collections.abc import Callable
 
+from jaxdyn.compile.gpu.numbers import Number, constant
 from jaxdyn.compile.llvm import Emitter
 from jaxdyn.compile.trigonometry import COSINE, SINE, pi_with_bits
 
@@ -28,96 +30,8 @@ LOG = tuple(2 / (2 * k + 3) for k in range(11))  # (2 atanh(s) - 2 s)/s^3 as a p
 INF, NAN = math.inf, math.nan
 
 
-class Number:
-    """A float64 number of a function that is being written, or with `kind` b1 or i8 a flag or an integer."""
-
-    def __init__(self, e: Emitter, name: str, kind: str = "f8"):
-        self.e, self.name, self.kind = e, name, kind
-
-    def _of(self, x) -> str:
-        return x.name if isinstance(x, Number) else self.e.constant(x, self.kind)
-
-    def _apply(self, op: str, *args, kind: str = "") -> "Number":
-        names = [self._of(x) for x in args]
-        return Number(self.e, self.e.operation(op, kind or self.kind, names, self.kind), kind or self.kind)
-
-    def __add__(self, x):
-        return self._apply("add", self, x)
-
-    def __sub__(self, x):
-        return self._apply("sub", self, x)
-
-    def __rsub__(self, x):
-        return self._apply("sub", x, self)
-
-    def __mul__(self, x):
-        return self._apply("mul", self, x)
-
-    def __truediv__(self, x):
-        return self._apply("div", self, x)
-
-    def __rtruediv__(self, x):
-        return self._apply("div", x, self)
-
-    def __neg__(self):
-        return self._apply("neg", self)
-
-    def __lt__(self, x):
-        return self._apply("lt", self, x, kind="b1")
-
-    def __gt__(self, x):
-        return self._apply("gt", self, x, kind="b1")
-
-    def __and__(self, x):
-        return self._apply("and", self, x)
-
-    def __or__(self, x):
-        return self._apply("or", self, x)
-
-    def is_equal(self, x):
-        """Whether both are equal."""
-        return self._apply("eq", self, x, kind="b1")
-
-    def pick(self, yes, no):
-        """`yes` where this flag is set, else `no`."""
-        one = yes if isinstance(yes, Number) else no if isinstance(no, Number) else Number(self.e, "")
-        names = [one._of(x) for x in (no, yes)]
-        return Number(self.e, self.e.operation("select", one.kind, [self.name, *names], one.kind), one.kind)
-
-    def call(self, name: str, *others):
-        """An intrinsic of LLVM."""
-        return Number(self.e, self.e.call(name, "f8", self.name, *map(self._of, others)))
-
-    def abs(self):
-        return self.call("fabs")
-
-    def times_plus(self, b, c):
-        """Self times b plus c, rounded once."""
-        return self.call("fma", b, c)
-
-    def bits(self):
-        """The number's bits as an integer."""
-        return Number(self.e, self.e.emit(f"bitcast double {self.name} to i64"), "i8")
-
-    def shift(self, word: str, by: int):
-        """An integer whose bits are shifted."""
-        return Number(self.e, self.e.emit(f"{word} i64 {self.name}, {by}"), "i8")
-
-    def of_bits(self):
-        """The number with the bits of this integer."""
-        return Number(self.e, self.e.emit(f"bitcast i64 {self.name} to double"))
-
-    def convert(self, kind: str):
-        """The number as an integer, or the reverse."""
-        return Number(self.e, self.e.convert(self.name, self.kind, kind), kind)
-
-
-def _constant(x: Number, value: float) -> Number:
-    return Number(x.e, x.e.constant(value, "f8"))
-
-
 def _polynomial(x: Number, coefficients) -> Number:
-    value = _constant(x, coefficients[-1])
+    value = constant(x, coefficients[-1])
     for coefficient in coefficients[-2::-1]:
         value = value.times_plus(x, coefficient)
     return value
@@ -263,7 +177,7 @@ def _pow(x: Number, y: Number) -> Number:
     value = (value < INF).pick(value + value * lost, value)
     # Powers of numbers below zero.
     is_whole = y.call("floor").is_equal(y)
-    is_odd = is_whole & (y * 0.5).call("floor")._apply("ne", (y * 0.5).call("floor"), y * 0.5, kind="b1")
+    is_odd = is_whole & (y * 0.5).call("floor").is_other(y * 0.5)
     is_negative = x.bits() < 0
     value = (is_negative & is_odd).pick(-value, value)
     is_real = (x > 0.0) | x.is_equal(0.0) | is_whole | a.is_equal(INF)
@@ -322,9 +236,9 @@ def _far_angle(x: Number) -> tuple[Number, Number, Number, Number]:
         words.append(e.emit(f"load i64, ptr {at}"))
     e.declared["fshl"] = "declare i64 @llvm.fshl.i64(i64, i64, i64)"
     high, middle, low = (
-        e.emit(f"call i64 @llvm.fshl.i64(i64 {a}, i64 {b}, i64 {shift.name})")
-        for a, b in zip(words, words[1:], strict=False)
+        e.emit(f"call i64 @llvm.fshl.i64(i64 {a}, i64 {b}, i64 {shift.name})") for a, b in itertools.pairwise(words)
     )
+
     def wide(op, a, b):
         return e.emit(f"{op} i128 {a}, {b}")
 
@@ -338,7 +252,7 @@ def _far_angle(x: Number) -> tuple[Number, Number, Number, Number]:
     quarters = Number(e, cut(wide("lshr", total, 126)), "i8")
     top, bottom = (Number(e, cut(x), "i8") for x in (wide("lshr", fraction, 64), fraction))
     quarters = quarters + (top < 0).pick(Number(e, "1", "i8"), 0)
-    rest = Number(e, e.emit(f"uitofp i64 {bottom.name} to double"))
+    rest = bottom.write("uitofp i64 {} to double", "f8")
     part = top.convert("f8") * 2.0**-64 + rest * 2.0**-128
     r = part * HALF_PI_HIGH
     r = r + (part.times_plus(HALF_PI_HIGH, -r) + part * HALF_PI_LOW)
@@ -351,7 +265,7 @@ def _far_angle(x: Number) -> tuple[Number, Number, Number, Number]:
 def _sin(x: Number) -> Number:
     sine, cosine, odd, high = _far_angle(x)
     value = odd.pick(cosine, sine)
-    value = (high.pick(-value, value)) * _constant(x, 1.0).call("copysign", x)
+    value = (high.pick(-value, value)) * constant(x, 1.0).call("copysign", x)
     return (x.abs() < INF).pick(value, NAN)
 
 
@@ -364,7 +278,7 @@ def _cos(x: Number) -> Number:
 FUNCTIONS: dict[str, Callable] = {
     "exp": _exp, "exp2": _exp2, "expm1": _expm1, "sinh": _sinh, "cosh": _cosh, "tanh": _tanh, "log": _log, "log1p": _log1p,
     "cbrt": _cbrt, "pow": _pow, "atan2": _atan2, "tan": _tan, "sin": _sin, "cos": _cos,
-    "atan": lambda x: _atan2(x, _constant(x, 1.0)), "asin": lambda x: _atan2(x, _cosine_of_arc(x)),
+    "atan": lambda x: _atan2(x, constant(x, 1.0)), "asin": lambda x: _atan2(x, _cosine_of_arc(x)),
     "acos": lambda x: _atan2(_cosine_of_arc(x), x),
 }  # fmt: skip
 
@@ -422,7 +336,9 @@ def library_text(name: str) -> str | None:
 @functools.cache
 def _text(name: str) -> str:
     if name == "fmod":
-        declared = [f"declare double @llvm.{x}.f64({y})" for x, y in (("fabs", "double"), ("copysign", "double, double"))]
+        declared = [
+            f"declare double @llvm.{x}.f64({y})" for x, y in (("fabs", "double"), ("copysign", "double, double"))
+        ]
         return "\n".join([_FMOD, *declared])
     e, names = Emitter(1), ["%x", "%y"][: 2 if name in ("pow", "atan2") else 1]
     result = FUNCTIONS[name](*(Number(e, x) for x in names)).name
