@@ -1,11 +1,17 @@
-"""The functions of the C library that kernels for GPUs bring with them, against NumPy's, on the CPU."""
+"""The functions of the C library that kernels for GPUs bring with them, against NumPy's, and all operations, on the CPU."""
 
 import ctypes
 
+import jax
+import jax.numpy as jnp
 import numpy as np
 import pytest
+from gpu_stand_in import run_threads
+from jax import lax
 
-from jaxdyn.compile import objects
+from jaxdyn.compile import objects, target
+from jaxdyn.compile.expansion import expand
+from jaxdyn.compile.gpu import ptx, text
 from jaxdyn.compile.gpu.functions import FUNCTIONS, library_text
 
 pytestmark = pytest.mark.native
@@ -19,9 +25,8 @@ ATTRIBUTES = 'attributes #0 = { nounwind "no-builtins" }'
 
 def compiled(name):
     kind = ctypes.c_float if name not in FUNCTIONS and name != "fmod" else ctypes.c_double
-    text = library_text(name)
-    # Functions are internal: the one that is called has another name.
-    code = objects.Code(objects.compile_text(f"{text.replace('define internal', 'define')}\n{ATTRIBUTES}"))
+    written = library_text(name).replace("define internal", "define")  # so that this test can call it
+    code = objects.Code(objects.compile_text(f"{written}\n{ATTRIBUTES}"))
     arguments = 2 if name.removesuffix("f") in OF_TWO or name in OF_TWO else 1
     call = ctypes.CFUNCTYPE(kind, *[kind] * arguments)(code.address(name))
     call.code = code
@@ -87,3 +92,45 @@ def test_functions_of_float32_are_rounded_ones_of_float64(name):
     assert same.mean() > 0.999
     with np.errstate(all="ignore"):
         assert (np.abs(computed - wanted)[~same] <= np.spacing(np.abs(wanted[~same]))).all()
+
+
+def operations(x, n):
+    """Every operation that programs have, of floats x (k,), integers n (k,) and flags."""
+    y, flag = x[::-1], x > 0.3
+    floats = [
+        x + y, x - y, x * y, x / y, -x, jnp.maximum(x, y), jnp.minimum(x, y), jnp.abs(x), jnp.sign(x), jnp.floor(x), jnp.ceil(x),
+        jnp.round(x), jnp.sqrt(jnp.abs(x)), lax.clamp(x.dtype.type(-0.5), x, x.dtype.type(0.5)), jnp.where(flag, x, y),
+        lax.rem(x, y), jnp.max(x)[None], jnp.min(x)[None], jnp.sin(x), jnp.cos(x), jnp.tan(x), jnp.cbrt(x), n.astype(x.dtype),
+        flag.astype(x.dtype), lax.pow(jnp.abs(x), y), jnp.exp2(x), jnp.expm1(x), jnp.sinh(x), jnp.cosh(x), jnp.arcsin(x / 10),
+        jnp.arccos(x / 10), jnp.arctan(x), x @ y[:, None],
+    ]  # fmt: skip
+    whole = [n + 3, -n, n * n, jnp.maximum(n, 2), n & 5, n | 8, (100 * x).astype(n.dtype), (1e30 * x).astype(n.dtype)]
+    flags = [
+        x < y,
+        x <= y,
+        x == y,
+        x != y,
+        x >= y,
+        flag & (n > 0),
+        flag | (n == 1),
+        ~flag,
+        jnp.isfinite(x / (n - 1).astype(x.dtype)),
+    ]
+    return floats, [*whole, flag.astype(n.dtype)], flags
+
+
+@pytest.mark.parametrize("dtype", [np.float64, np.float32])
+@pytest.mark.parametrize("integer", [np.int32, np.int64])
+def test_every_operation(dtype, integer):
+    samples = 4
+    x = np.concatenate([RNG.normal(size=(samples - 1, 3)), [[np.inf, np.nan, 0.0]]]).astype(dtype)
+    n = RNG.integers(-3, 4, size=(samples, 3)).astype(integer)
+    program = expand(jax.make_jaxpr(operations)(x[0], n[0]), 10**6)[0]
+    computed = run_threads(program, [x, n])
+    wanted = [target.call(program, [x[s], n[s]]) for s in range(samples)]
+    bound = 2e-15 if dtype == np.float64 else 1e-6
+    for k, result in enumerate(computed):
+        want = np.stack([row[k] for row in wanted]).reshape(samples, -1)
+        assert result.dtype == want.dtype
+        np.testing.assert_allclose(result, want, rtol=bound, atol=0)
+    assert ".entry" in ptx.ptx_of(text.module_ir(program, [False, False]), 70)

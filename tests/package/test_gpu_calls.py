@@ -85,6 +85,12 @@ def test_a_batch_is_one_launch(gpu, batch):
     assert [launch[1:] for launch in gpu.launches] == ([(-(-count // 32), 32, 1001)] if count else [])
 
 
+def test_calls_outside_of_jit(gpu):
+    args = states()
+    assert_same(jd.forward_dynamics(ARM, *args), by_jax(dynamics, *args))
+    assert len(gpu.launches) == 1
+
+
 def test_large_batches_have_large_blocks(gpu):
     x = jnp.asarray(RNG.normal(size=(4096, 2)))
     gpu.registers = 200
