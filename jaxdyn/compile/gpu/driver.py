@@ -85,7 +85,7 @@ class Driver:
             raise DriverError(self.explain(name, code))
 
     def explain(self, name: str, code: int) -> str:
-        """What is said of the error of a function."""
+        """Text of the error of a function."""
         text = ctypes.c_char_p()
         known = self._library.cuGetErrorName(code, ctypes.byref(text)) == 0 and text.value
         return f"jaxdyn: {name} of CUDA's driver failed with {text.value.decode() if known and text.value else code}"
