@@ -135,6 +135,41 @@ def test_a_whole_motion_is_one_launch(gpu):
     assert names == ["_begin", "loop of _iterate"]  # however many steps there are
 
 
+def test_a_model_that_is_an_argument(gpu):
+    """Shared by all samples, and one for each of them."""
+    q, v, tau = states(4)
+    models = jax.tree.map(lambda x: jnp.stack([x] * 4) * 1.0, ARM)
+
+    def of_model(model, *state):
+        return jd.forward_dynamics(model, *state)
+
+    for model, axis in ((ARM, None), (models, 0)):
+        mapped = jax.vmap(of_model, (axis, 0, 0, 0))
+        assert_same(jax.jit(mapped)(model, q, v, tau), by_jax(mapped, model, q, v, tau))
+    assert gpu.launches
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("options", [{}, {"stepsize": 5e-3}])
+def test_motions_of_a_mechanism_with_a_loop(gpu, options):
+    """Projections, pseudo-inverses and rows of one sample among those of the batch; reverse mode of fixed steps."""
+    scene, ts = jd.scenes.four_bar(), np.linspace(0.0, 0.02, 3)
+    q, v = (np.repeat(np.asarray(x)[None], 3, 0) for x in jd.scenes.four_bar.start())
+    v = np.array([[0.5], [1.0], [2.0]]) * v
+
+    def end(q, v):
+        return jd.simulate(scene, q, v, ts, throw=False, **options).q
+
+    functions = [end] if not options else [end, jax.grad(lambda q, v: jnp.sum(end(q, v)[-1] ** 2), 1)]
+    for function in functions:
+        computed = jax.jit(jax.vmap(function))(q, v)
+        with jd.compilation("plain"):
+            wanted = jax.jit(jax.vmap(function))(q, v)
+        # Two implementations choose steps of their own at the tolerance of the default.
+        assert_same(computed, wanted, 1e-9 if options else 1e-6)
+    assert gpu.launches
+
+
 def test_two_devices_load_a_module_each(gpu):
     mesh = Mesh(np.array(jax.devices()[:2]), ("batch",))
     split = PartitionSpec("batch")
