@@ -1,26 +1,31 @@
-"""Dynamics and rollouts on a GPU, with their roofline.
+"""Dynamics and rollouts on a GPU, by XLA's own code and by native kernels, with their roofline.
 
-    python -m benchmarks.gpu [--batches 4096 65536] [--robots panda g1] [--steps 100]
-    python -m benchmarks.gpu --count [--robots panda]
+    python -m benchmarks.gpu [--batches 4096 65536] [--robots panda g1] [--steps 100] [--modes auto native]
+    python -m benchmarks.gpu --count [--robots panda] [--modes native]
 
-Times are those of the first device of `jax.devices()`: best of some calls, in float32. The roofline is the larger of two
-times: operations over the operations a second that a long chain of multiply-adds reaches on this device, and bytes over the
-bytes a second that adding two long arrays reaches, both measured here; counts are by XLA's account of the compiled program.
-On a CPU, whose kernels XLA cannot see into, the tables have no roofline.
+Times are those of the first device of `jax.devices()`: best of some calls, in float32, with the error against the CPU relative to
+the largest number. The last lines decide: native kernels are to be the default on GPUs where they are right and faster in every
+row. The roofline is the larger of two times: operations over the operations a second that a long chain of multiply-adds reaches
+on this device, and bytes over the bytes a second that adding two long arrays reaches, both measured here. Operations are those
+of the scalar programs, times the steps of a rollout; bytes are those of the arguments and the results. Adaptive motions have no
+roofline, as their steps are not known beforehand, nor has a CPU.
 
 `--count` compiles for an H100 without one, where the CUDA plugin is installed (`pip install jax-cuda12-plugin
 jax-cuda12-pjrt nvidia-cuda-nvcc-cu12`, of jax's version), and counts what a call launches: kernels, calls of libraries
-(cuSOLVER, cuBLAS), callbacks of the host.
+(cuSOLVER, cuBLAS), callbacks of the host. Native kernels need a driver even then: without one they are left to XLA.
 """
 
 import argparse
+import functools
 import importlib.util
+import math
 import os
 import re
 import sys
 import time
 from collections import Counter
 from collections.abc import Callable
+from typing import NamedTuple
 
 if "--count" in sys.argv:  # with the platform of the host alone the plugin looks for no driver
     os.environ["JAX_PLATFORMS"] = "cpu"
@@ -46,6 +51,8 @@ runtime_version { major: 12 minor: 9 patch: 0 }
 """
 # Instructions of a compiled program that launch nothing.
 FREE = {"parameter", "constant", "bitcast", "tuple", "get-tuple-element", "after-all", "partition-id", "replica-id"}
+MAX_ERROR = 1e-5  # of the largest number, in float32
+MAX_COMPILATION = 5.0  # s
 LIBRARIES = ("cublas", "cusolver", "cudnn", "cufft")
 
 
@@ -66,9 +73,18 @@ def functions(name: str, steps: int) -> dict[str, tuple[Callable, tuple[int, ...
     if name == "four-bar":
         scene = jd.scenes.four_bar()
         sizes = (scene.nq, scene.nv)
-        return {"constrained dynamics": (lambda q, v: jd.constrained_dynamics(scene, q, v).acceleration, sizes)}
+        ts = np.linspace(0.0, 1.0, 2, dtype=np.float32)
+
+        def motion(q, v, **options):
+            return jd.simulate(scene, q, v, ts, throw=False, **options).q[-1]
+
+        return {
+            "constrained dynamics": (lambda q, v: jd.constrained_dynamics(scene, q, v).acceleration, sizes),
+            f"{steps} steps over one second": (functools.partial(motion, stepsize=1.0 / steps), sizes),
+            "adaptive steps over one second": (motion, sizes),
+        }
     model = robot(name)
-    ts = np.linspace(0.0, 1e-3 * steps, 2)
+    ts = np.linspace(0.0, 1e-3 * steps, 2, dtype=np.float32)
 
     def rollout(q, v):
         return jd.simulate(model, q, v, ts, stepsize=1e-3, throw=False).q[-1]
@@ -195,36 +211,115 @@ def _chained(y, x):
     return y
 
 
-def measure(names, batches, steps: int, size: int) -> None:
-    """Print times with their roofline."""
+def arguments(name: str, sizes, batch: int) -> list[jax.Array]:
+    """States of a batch; those of a four-bar are assembled, at several speeds."""
+    if name == "four-bar":
+        q, v = (np.asarray(x, np.float32) for x in jd.scenes.four_bar.start())
+        return [
+            jnp.asarray(np.tile(q, (batch, 1))),
+            jnp.asarray(np.linspace(0.5, 2.0, batch, dtype=np.float32)[:, None] * v),
+        ]
+    keys = jax.random.split(jax.random.key(0), len(sizes))
+    return [0.3 * jax.random.normal(key, (batch, n), jnp.float32) for key, n in zip(keys, sizes, strict=True)]
+
+
+def operations_of(function: Callable, args, steps: int) -> float | None:
+    """Operations of the kernels of a call, for all samples; None where the number of steps is not known."""
+    total = 0.0
+    jaxprs = [jax.make_jaxpr(function)(*args).jaxpr]
+    while jaxprs:
+        for eqn in jaxprs.pop().eqns:
+            program = eqn.params.get("program")
+            if program is not None:
+                samples = max((math.prod(getattr(x.aval, "shape", ())[:-1]) for x in eqn.invars), default=1)
+                total += samples * program.cost * (steps if program.turns > 1 else 1)
+            jaxprs += [x.jaxpr for x in jax.tree.leaves(list(eqn.params.values())) if hasattr(x, "jaxpr")]
+    return total or None
+
+
+class Row(NamedTuple):
+    """What was measured of a function in a mode."""
+
+    seconds: float
+    error: float
+    compilation: float
+
+
+def measure_one(function: Callable, args, reference) -> Row:
+    """The time and the error of a call."""
+    before = time.perf_counter()
+    program = jax.jit(function).lower(*args).compile()
+    compilation = time.perf_counter() - before
+    error = 0.0
+    for computed, want in zip(jax.tree.leaves(program(*args)), reference, strict=True):
+        # A motion of a few samples may end early in one precision: those that have no number in both do not count.
+        difference = np.abs(np.asarray(computed) - want) / max(1.0, np.nanmax(np.abs(want)))
+        both = np.isnan(np.asarray(computed)) & np.isnan(want)
+        error = max(error, float(np.max(np.where(both, 0.0, np.where(np.isnan(difference), np.inf, difference)))))
+    return Row(seconds(program, *args), error, compilation)
+
+
+def measure(names, batches, steps: int, size: int, modes=("auto",)) -> None:
+    """Print times with their roofline, and what they decide."""
     device = jax.devices()[0]
     is_gpu = device.platform == "gpu"
     print(f"device: {device.device_kind} ({device.platform}), float32, jax {jax.__version__}")
     if not is_gpu:
         print("no GPU here: the figures below are those of this CPU, without roofline")
+        modes = ("auto",)
     else:
         operations, bandwidth = peaks(size)
         print(f"reached by a chain of multiply-adds: {operations:.3g} 1/s; by adding arrays: {bandwidth:.3g} B/s")
-    print("| robot | function | batch | us a call | samples/s | operations | bytes | roofline us | share | compile s |")
-    print("|---|---|---|---|---|---|---|---|---|---|")
+    head = "robot|function|batch|mode|us a call|samples/s|error|operations|bytes|roofline us|share|compile s".split("|")
+    print("| " + " | ".join(head) + " |")
+    print("|" + "---|" * len(head))
+    against = []
     for name in names:
-        for label, (function, sizes) in functions(name, steps).items():
+        for label, (one, sizes) in functions(name, steps).items():
             for batch in batches:
-                keys = jax.random.split(jax.random.key(0), len(sizes))
-                args = [
-                    0.3 * jax.random.normal(key, (batch, n), jnp.float32) for key, n in zip(keys, sizes, strict=True)
-                ]
-                before = time.perf_counter()
-                program = jax.jit(jax.vmap(function)).lower(*args).compile()
-                compilation = time.perf_counter() - before
-                took, rest = seconds(program, *args), ["-"] * 4
-                if is_gpu:
-                    cost = program.cost_analysis() or {}
-                    flops, moved = cost.get("flops", 0.0), cost.get("bytes accessed", 0.0)
-                    least = max(flops / operations, moved / bandwidth)
-                    rest = [f"{flops:.3g}", f"{moved:.3g}", f"{1e6 * least:.3g}", f"{least / took:.2f}"]
-                row = [name, label, batch, f"{1e6 * took:.3g}", f"{batch / took:.3g}", *rest, f"{compilation:.0f}"]
-                print("| " + " | ".join(map(str, row)) + " |", flush=True)
+                args, function = arguments(name, sizes, batch), jax.vmap(one)
+                on_cpu = jax.device_put(args, jax.devices("cpu")[0])
+                reference = [np.asarray(x) for x in jax.tree.leaves(jax.jit(function)(*on_cpu))]
+                rows = {}
+                for mode in modes:
+                    with jd.compilation(mode):
+                        rows[mode] = measure_one(function, args, reference)
+                    took, rest = rows[mode].seconds, ["-"] * 4
+                    if is_gpu and not label.startswith("adaptive"):
+                        flops = operations_of(function, args, steps) or 0.0
+                        moved = sum(x.nbytes for x in (*args, *reference))
+                        least = max(flops / operations, moved / bandwidth)
+                        rest = [f"{flops:.3g}", f"{moved:.3g}", f"{1e6 * least:.3g}", f"{least / took:.2f}"]
+                    row = [
+                        name,
+                        label,
+                        batch,
+                        mode,
+                        f"{1e6 * took:.3g}",
+                        f"{batch / took:.3g}",
+                        f"{rows[mode].error:.1e}",
+                    ]
+                    row += [*rest, f"{rows[mode].compilation:.1f}"]
+                    print("| " + " | ".join(map(str, row)) + " |", flush=True)
+                against += reasons_against(f"{name}, {label}, batch {batch}", rows)
+    if is_gpu and {"auto", "native"} <= set(modes):
+        print("\n".join(["native kernels are not to be the default on this GPU:", *against] if against else [
+            "native kernels are right and faster in every row: make them the default on GPUs"]))  # fmt: skip
+
+
+def reasons_against(what: str, rows: dict[str, Row]) -> list[str]:
+    """Reasons not to take native kernels: errors that XLA's own code has not, times, compilation."""
+    if not {"auto", "native"} <= rows.keys():
+        return []
+    usual, native = rows["auto"], rows["native"]
+    found = []
+    if not native.error <= max(MAX_ERROR, 2 * usual.error):
+        found.append(f"{what}: error {native.error:.1e} against {usual.error:.1e}")
+    if native.seconds > usual.seconds:
+        found.append(f"{what}: {1e6 * native.seconds:.3g} us against {1e6 * usual.seconds:.3g}")
+    if native.compilation > max(MAX_COMPILATION, usual.compilation):
+        found.append(f"{what}: {native.compilation:.1f} s of compilation against {usual.compilation:.1f}")
+    return found
 
 
 def main() -> None:
@@ -239,12 +334,16 @@ def main() -> None:
         "--size", type=int, default=2**26, help="numbers in an array that measures what a device reaches"
     )
     parser.add_argument("--count", action="store_true", help="count launches by compiling for an H100, without one")
+    parser.add_argument("--modes", nargs="+", default=["auto", "native"], choices=["auto", "native", "plain"])
     parser.add_argument("--only", default="", help="with --count: part of the names of functions")
     args = parser.parse_args()
     if args.count:
-        count(args.robots, args.batches, args.steps, args.only)
+        for mode in args.modes:
+            with jd.compilation(mode):
+                print(f"mode {mode}")
+                count(args.robots, args.batches, args.steps, args.only)
     else:
-        measure(args.robots, args.batches, args.steps, args.size)
+        measure(args.robots, args.batches, args.steps, args.size, args.modes)
 
 
 if __name__ == "__main__":

@@ -170,7 +170,7 @@ def _may_be_kept(text: str, is_traced: bool) -> bool:
     from jaxdyn.compile import target
 
     unsafe = {a or b for a, b in _CALLS.findall(text) if not _SAFE.fullmatch(a or b)}
-    if not is_traced:
+    if not is_traced and not unsafe:
         rows = (target.row_of(int(x)) for x in set(_NUMBERS.findall(text)))
         unsafe |= {row.name for row in rows if not row.is_kept}
     if unsafe:

@@ -127,6 +127,7 @@ def define_primitive(
     implement: Callable | None = None,
     lower: Callable | None = None,
     lower_on_cpu: Callable | None = None,
+    lower_on_gpu: Callable | None = None,
     batch: Callable | None = None,
     jvp: Callable | None = None,
     transpose: Callable | None = None,
@@ -136,7 +137,8 @@ def define_primitive(
     **Arguments:**
 
     - `types(*types, **params)`: types of the results. `implement(*arrays, **params)`: the call outside of a trace.
-    - `lower(*arrays, **params)`: the same by operations of JAX. `lower_on_cpu(context, *operands, **params)`: a rule of its own.
+    - `lower(*arrays, **params)`: the same by operations of JAX. `lower_on_cpu(context, *operands, **params)`: a rule of its own,
+      as `lower_on_gpu`, for those of NVIDIA.
     - `batch(arrays, axes, **params)` -> results and their axes, None for what has no axis; `jvp(primals, tangents, **params)`;
       `transpose(cotangents, *operands, **params)`. Tangents and cotangents may be zero (`is_zero`).
     """
@@ -150,6 +152,8 @@ def define_primitive(
             mlir.register_lowering(primitive, mlir.lower_fun(lower, multiple_results=multiple_results))
         if lower_on_cpu is not None:
             mlir.register_lowering(primitive, lower_on_cpu, platform="cpu")
+        if lower_on_gpu is not None:
+            mlir.register_lowering(primitive, lower_on_gpu, platform="cuda")
         if batch is not None:
             batching.primitive_batchers[primitive] = batch
         if jvp is not None:
@@ -313,6 +317,12 @@ _PASSED = {
     "XLA_FFI_ThreadPool_Schedule_Args": {"ctx": 16, "task": 24, "data": 32},
     "XLA_FFI_ThreadPool_NumThreads_Args": {"ctx": 16, "num_threads": 24},
 }
+# What the handler for GPUs reads and passes beside these.
+_OF_GPUS = {
+    "XLA_FFI_Api": {"XLA_FFI_Stream_Get": 80, "XLA_FFI_DeviceOrdinal_Get": 184},
+    "XLA_FFI_Stream_Get_Args": {"ctx": 16, "stream": 24},
+    "XLA_FFI_DeviceOrdinal_Get_Args": {"ctx": 16, "device_ordinal": 24},
+}
 _MAJOR = 0
 
 
@@ -320,7 +330,7 @@ class Unsupported(Exception):
     """Why kernels cannot be called here."""
 
 
-def ffi_version(header: str | None = None) -> tuple[int, int]:
+def ffi_version(header: str | None = None, for_gpus: bool = False) -> tuple[int, int]:
     """Version of the FFI of the jaxlib that is installed, or of that header. **Raises:** `Unsupported`.
 
     Minor versions add fields at the ends of structures and functions at the end of the table, and may rename. So no version is
@@ -336,10 +346,12 @@ def ffi_version(header: str | None = None) -> tuple[int, int]:
     if major != _MAJOR:
         raise Unsupported(f"jaxlib has version {major}.{minor} of XLA's FFI, and kernels are written for {_MAJOR}.x")
     structures = _structures(header)
-    for name, expected in (_READ | _PASSED).items():
+    for name, expected in (_OF_GPUS if for_gpus else _READ | _PASSED).items():
         fields = structures.get(name, {})
         have = {field: fields.get(field) for field in expected}
-        if have != expected or (name in _PASSED and list(fields)[-1] != list(expected)[-1]):
+        if have != expected or (
+            name.endswith("_Args") and name not in _READ and list(fields)[-1] != list(expected)[-1]
+        ):
             raise Unsupported(
                 f"version {major}.{minor} of XLA's FFI has another {name}: {fields or 'none'}, and kernels need {expected}"
             )
@@ -378,9 +390,9 @@ def _structures(header: str) -> dict[str, dict[str, int]]:
     return structures
 
 
-def register_handler(name: str, address: int) -> None:
-    """Tell XLA of a function that serves typed calls of this name on CPUs, and that their batches can be divided."""
-    jax.ffi.register_ffi_target(name, jax.ffi.pycapsule(ctypes.c_void_p(address)), platform="cpu", api_version=1)
+def register_handler(name: str, address: int, platform: str = "cpu") -> None:
+    """Tell XLA of a function that serves typed calls of this name on a platform, and that their batches can be divided."""
+    jax.ffi.register_ffi_target(name, jax.ffi.pycapsule(ctypes.c_void_p(address)), platform=platform, api_version=1)
     jax.ffi.register_ffi_target_as_batch_partitionable(name)
 
 
@@ -390,13 +402,28 @@ _EXPORT_HINT = (
 )
 
 
-def lower_call(name: str, context, operands: Sequence, order: Sequence[int], attributes: dict | None, **static) -> Any:
-    """Lower a call of a registered function with its operands in that order, within a lowering rule."""
+def lower_call(
+    name: str,
+    context,
+    operands: Sequence,
+    order: Sequence[int],
+    attributes: dict | None,
+    layouts: Sequence[tuple[int, ...]] | None = None,
+    **static,
+) -> Any:
+    """Lower a call of a registered function with its operands in that order, within a lowering rule.
+
+    `layouts`: for each operand in its own order and each result the axes from the fastest to the slowest; by rows by default.
+    """
     context = context.replace(avals_in=[context.avals_in[i] for i in order])
     if getattr(context.module_context.lowering_parameters, "for_export", False):
         # JAX refuses such calls with an error that shows them: the user reads there what to do.
         attributes = {**(attributes or {}), "jaxdyn": mlir.ir_attribute(_EXPORT_HINT)}
-    lower = jax.ffi.ffi_lowering(name, extra_attributes=attributes)
+    of_operands = None if layouts is None else [layouts[i] for i in order]
+    of_results = None if layouts is None else layouts[len(operands) :]
+    lower = jax.ffi.ffi_lowering(
+        name, operand_layouts=of_operands, result_layouts=of_results, extra_attributes=attributes
+    )
     return lower(context, *(operands[i] for i in order), **{key: np.int64(value) for key, value in static.items()})
 
 

@@ -15,7 +15,7 @@ import numpy as np
 from jaxdyn.compile import jax_adapter
 
 logger = logging.getLogger("jaxdyn")
-MODES = ("auto", "plain")
+MODES = ("auto", "native", "plain")
 OPTIONS = ("", "usual", "least")
 # LLVM takes some 50 microseconds an operation: three seconds.
 MAX_OPERATIONS = 60_000
@@ -54,6 +54,7 @@ def compilation(mode: str) -> Iterator[None]:
     **Arguments:** `mode`:
 
     - "auto": native kernels on a CPU where a function is a program of single numbers, operations of JAX elsewhere.
+    - "native": native kernels on NVIDIA's GPUs too, which have been tested without a GPU only.
     - "plain": operations of JAX everywhere, which compile and run slower: a reference for tests.
 
     The mode counts when a function is traced, and `jax.jit` traces a function once in each mode. Without this context the

@@ -269,7 +269,24 @@ def _lower_on_cpu(ctx, *operands, program, rows):
         return lowering_of(by_jax)(ctx, *operands, program=program, rows=rows)
 
 
-def _lower_to_call(ctx, *operands, program, rows):
+def _lower_on_gpu(ctx, *operands, program, rows):
+    if mode.current() != "native":  # until it has run on a device
+        return lowering_of(as_operations)(ctx, *operands, program=program, rows=rows)
+    try:
+        return _lower_to_call(ctx, *operands, program=program, rows=rows, on_gpu=True)
+    except Exception as error:
+        if not jax_adapter.forgive(error):
+            raise
+        return lowering_of(by_jax)(ctx, *operands, program=program, rows=rows)
+
+
+def _lower_elsewhere(*args, program, rows):
+    if mode.current() == "native":
+        mode.say_once("functions run on JAX's own operations: native kernels are for CPUs and for NVIDIA's GPUs")
+    return as_operations(*args, program=program, rows=rows)
+
+
+def _lower_to_call(ctx, *operands, program, rows, on_gpu=False):
     # Each rewriting below lowers a function that binds the primitive again, nearer to a call that the handler knows.
     lead = ctx.avals_out[0].shape[:-1] if ctx.avals_out else ()
     uniform = [bool(lead) and len(x.shape) == 1 for x in ctx.avals_in]
@@ -280,6 +297,8 @@ def _lower_to_call(ctx, *operands, program, rows):
     samples = math.prod(batch) if all(isinstance(n, int) for n in batch) else None  # `jax.export` has symbolic sizes
     if samples != 1 and target is not None and target.is_available() and split_program(program, uniform) is not None:
         return lowering_of(_call_in_two)(ctx, *operands, program=program, rows=rows)
+    if on_gpu:
+        return _lower_to_launch(ctx, *operands, program=program, rows=rows, uniform=uniform)
     try:
         assert target is not None
         width = target.width_of(program, samples)
@@ -297,6 +316,25 @@ def _lower_to_call(ctx, *operands, program, rows):
     order = target.varying_first(uniform)
     attributes = _partition_attributes([ctx.avals_in[i] for i in order], ctx.avals_out)
     return jax_adapter.lower_call(target.TARGET, ctx, operands, order, attributes, program=number)
+
+
+def _lower_to_launch(ctx, *operands, program, rows, uniform):
+    """The call of a kernel on a GPU."""
+    assert target is not None, "kernels need llvmlite"
+    from jaxdyn.compile.gpu import device  # here, as hardly anybody needs it
+
+    try:
+        number = device.kernel(program, uniform)
+    except (jax_adapter.Unsupported, device.TooLarge) as reason:
+        what = "functions run" if isinstance(reason, jax_adapter.Unsupported) else f"{program.name} runs"
+        mode.say_once(f"{what} on JAX's own operations on GPUs: {reason}")
+        return lowering_of(as_operations)(ctx, *operands, program=program, rows=rows)
+    if _is_divisible(ctx.avals_in, ctx.avals_out[0].shape[:-1]):
+        return lowering_of(_with_last_axis)(ctx, *operands, program=program, rows=rows and rows + 1)
+    order = target.varying_first(uniform)
+    attributes = _partition_attributes([ctx.avals_in[i] for i in order], ctx.avals_out)
+    layouts = device.layouts(program, uniform, [x.shape for x in (*ctx.avals_in, *ctx.avals_out)])
+    return jax_adapter.lower_call(device.TARGET, ctx, operands, order, attributes, layouts, program=number)
 
 
 def _with_last_axis(*args, program, rows):
@@ -326,8 +364,9 @@ kernel_p = define_primitive(
     _result_types,
     multiple_results=True,
     implement=_implement,
-    lower=as_operations,
+    lower=_lower_elsewhere,
     lower_on_cpu=_lower_on_cpu,
+    lower_on_gpu=_lower_on_gpu,
     batch=_batch,
     jvp=_jvp,
     transpose=_transpose,

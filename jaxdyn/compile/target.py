@@ -35,7 +35,9 @@ _RELAX = {"x86_64": "void @llvm.x86.sse2.pause()", "aarch64": "void @llvm.aarch6
 logger = logging.getLogger("jaxdyn")
 
 
-class _Entry(ctypes.Structure):
+class Entry(ctypes.Structure):
+    """An entry of the table (see `handler.ll`)."""
+
     _fields_ = (
         ("hash", ctypes.c_uint64),
         ("kernel", ctypes.c_uint64),
@@ -47,7 +49,7 @@ class _Entry(ctypes.Structure):
 
 
 # The handler finds a kernel by open addressing in this table, without a lock: an entry's hash is written last.
-_table = (_Entry * SLOTS)()
+_table = (Entry * SLOTS)()
 _threads = ctypes.c_int64(1 << 30)
 _failures = ctypes.c_int64(0)  # kernels that could not be compiled when they were called
 _lock = threading.RLock()
@@ -71,6 +73,15 @@ def register() -> None:
 
 @functools.cache  # which does not keep two threads from a first call at once
 def _register() -> None:
+    # Its addresses are those of this process: it is not kept on disk.
+    code = Code(compile_text(fill_handler(_table, ctypes.cast(_PREPARE, ctypes.c_void_p).value)))
+    register_handler(TARGET, code.address("handler"))
+    code.publish("careful", CAREFUL)
+    _codes.append(code)
+
+
+def fill_handler(table: ctypes.Array, prepare: int | None) -> str:
+    """The text of the handler for a table and the function that makes the code of an entry. **Raises:** `Unsupported`."""
     version = ffi_version()
     architecture = _architecture()
     if architecture not in _RELAX:
@@ -78,19 +89,15 @@ def _register() -> None:
     text = resources.files("jaxdyn.compile").joinpath("handler.ll").read_text()
     messages = {"MISSING": _MISSING, "FAILED": _FAILED, "MISFIT": _MISFIT}
     fields = {
-        "TABLE": ctypes.addressof(_table), "SLOT_MASK": SLOTS - 1, "LIMIT": ctypes.addressof(_threads),
-        "FAILURES": ctypes.addressof(_failures), "PREPARE": ctypes.cast(_PREPARE, ctypes.c_void_p).value,
+        "TABLE": ctypes.addressof(table), "SLOT_MASK": SLOTS - 1, "LIMIT": ctypes.addressof(_threads),
+        "FAILURES": ctypes.addressof(_failures), "PREPARE": prepare,
         "MAJOR": version[0], "MINOR": version[1],
         "RELAX": _RELAX[architecture], "RELAX_TYPE": _RELAX[architecture].replace("i32 1", "i32"),
         **messages, **{f"{name}_BYTES": len(message) + 1 for name, message in messages.items()},
     }  # fmt: skip
     for name, value in fields.items():
         text = text.replace("{" + name + "}", str(value))
-    # Its addresses are those of this process: it is not kept on disk.
-    code = Code(compile_text(text))
-    register_handler(TARGET, code.address("handler"))
-    code.publish("careful", CAREFUL)
-    _codes.append(code)
+    return text
 
 
 @functools.cache
@@ -181,6 +188,14 @@ class Row(NamedTuple):
         return cls(identity, width, chunk, tuple(sizes), program.name, careful, program.is_kept)
 
 
+def free_entry(table: ctypes.Array, number: int) -> Entry:
+    """The entry of a table for the kernel with a number, which has none."""
+    slot = number % SLOTS
+    while table[slot].hash:
+        slot = (slot + 1) % SLOTS
+    return table[slot]
+
+
 class _Called(NamedTuple):
     """The place in memory of a subprogram's address, and what it calls (see `objects.ObjectFile`)."""
 
@@ -204,10 +219,7 @@ class _Kernel:
         self.is_made = False
         self.is_awaited = False  # whether a worker is to compile it (see `ahead`)
         self.sizes = (ctypes.c_int64 * len(row.sizes))(*row.sizes)
-        slot = number % SLOTS
-        while _table[slot].hash:
-            slot = (slot + 1) % SLOTS
-        self.entry = _table[slot]
+        self.entry = free_entry(_table, number)
         self.entry.kernel, self.entry.chunk, self.entry.least = 0, row.chunk, 2 * row.chunk
         self.entry.buffers, self.entry.sizes = len(row.sizes), ctypes.addressof(self.sizes)
         self.entry.hash = number  # last: from here on it is found

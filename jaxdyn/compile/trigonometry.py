@@ -104,7 +104,7 @@ def _quarters_table(kind: str):
     bits, last = (53, 1024) if kind == "f8" else (24, 128)
     half, first = bits // 2, math.frexp(MAX_ANGLE[kind])[1] - bits - 1
     size = last + 3 * bits  # of 2/pi, in bits behind the point
-    inverse = (2 << 2 * size) // _pi(size)
+    inverse = (2 << 2 * size) // pi_with_bits(size)
     rows = []
     for e in range(first, last - bits + half + 1):
         value = (inverse << max(e, 0)) >> max(-e, 0)
@@ -119,7 +119,7 @@ def _quarters_table(kind: str):
     return bits, half, first, np.asarray(rows, np.float64 if kind == "f8" else np.float32)
 
 
-def _pi(bits: int) -> int:
+def pi_with_bits(bits: int) -> int:
     """Pi with so many bits behind the point, as an integer (Machin 1706)."""
 
     def arctangent_of_inverse(n):

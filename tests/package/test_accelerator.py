@@ -89,15 +89,17 @@ CASES = {
 
 
 @pytest.mark.skipif(jax.devices()[0].platform == "cpu", reason="JAX has no accelerator here")
+@pytest.mark.parametrize("mode", ["auto", "native"])
 @pytest.mark.parametrize("batch", [1, 64])
 @pytest.mark.parametrize("name", CASES)
-def test_an_accelerator_has_the_numbers_of_the_cpu(name, batch):
+def test_an_accelerator_has_the_numbers_of_the_cpu(name, batch, mode):
     function, arguments, bound = CASES[name]
     arguments = arguments(batch)
     results = []
     for device in (jax.devices()[0], jax.devices("cpu")[0]):
         placed = jax.device_put(arguments, device)
-        results.append(jax.tree.map(np.asarray, jax.jit(jax.vmap(function))(*placed)))
+        with jd.compilation(mode):
+            results.append(jax.tree.map(np.asarray, jax.jit(jax.vmap(function))(*placed)))
     for computed, want in zip(*map(jax.tree.leaves, results), strict=True):
         assert np.isfinite(want).all()
         np.testing.assert_allclose(computed, want, rtol=0, atol=bound * max(1.0, np.abs(want).max()))

@@ -19,7 +19,19 @@ def test_forward_dynamics_calls_no_library_and_no_host():
     reason = gpu.why_not()
     if reason:
         pytest.skip(f"nothing can be compiled for a GPU: {reason}")
-    command = [sys.executable, "-m", "benchmarks.gpu", "--count", "--robots", "iiwa", "--batches", "1", "4096"]
+    command = [
+        sys.executable,
+        "-m",
+        "benchmarks.gpu",
+        "--count",
+        "--robots",
+        "iiwa",
+        "--batches",
+        "1",
+        "4096",
+        "--modes",
+        "auto",
+    ]
     root = Path(jd.__file__).parents[1]
     done = subprocess.run(
         [*command, "--only", "forward dynamics"], cwd=root, capture_output=True, text=True, timeout=900
@@ -56,6 +68,27 @@ ENTRY %main (q: f32[4]) -> f32[4] {
 }
 """
     assert gpu.launches(text) == {"once": 1, "each turn": 3, "libraries": 1, "callbacks": 1}
+
+
+@pytest.mark.long
+def test_operations_of_a_rollout_are_those_of_all_its_evaluations():
+    computed = gpu.functions("iiwa", steps=10)
+    dynamics, rollout = computed["forward dynamics"], computed["RK4 rollout, 10 steps"]
+    one, all_steps = (
+        gpu.operations_of(jax.vmap(function), gpu.arguments("iiwa", sizes, 3), 10)
+        for function, sizes in (dynamics, rollout)
+    )
+    # Four evaluations a step, and the sums of the method.
+    assert 40 * one < all_steps < 60 * one
+
+
+@pytest.mark.parametrize(
+    ("native", "reasons"),
+    [((1e-3, 1e-7, 2.0), 0), ((3e-3, 1e-7, 2.0), 1), ((1e-3, 1e-3, 2.0), 1), ((1e-3, float("inf"), 50.0), 2)],
+)
+def test_the_benchmark_decides_by_error_time_and_compilation(native, reasons):
+    rows = {"auto": gpu.Row(2e-3, 1e-6, 40.0), "native": gpu.Row(*native)}
+    assert len(gpu.reasons_against("case", rows)) == reasons
 
 
 @pytest.mark.long

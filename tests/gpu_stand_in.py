@@ -1,0 +1,214 @@
+"""Kernels for GPUs on the CPU: their text for the host, run thread by thread; a driver that does so; calls of kernels."""
+
+import ctypes
+import functools
+import math
+
+import jax
+import numpy as np
+
+from jaxdyn.compile import objects, primitive
+from jaxdyn.compile.code import varying_first
+from jaxdyn.compile.gpu import driver, text
+
+HOST_SAMPLE = """@jaxdyn_sample = thread_local global i64 0
+define internal i64 @sample() {
+  %sample = load i64, ptr @jaxdyn_sample
+  ret i64 %sample
+}"""
+
+
+def host_text(module: str) -> str:
+    """The module for this processor: the number of a thread is in memory, not in a register."""
+    return f"{module.replace('define ptx_kernel void', 'define void')}\n{HOST_SAMPLE.replace('thread_local ', '')}"
+
+
+class HostKernel:
+    """A kernel for GPUs as machine code of this processor."""
+
+    def __init__(self, module: str):
+        self.code = objects.Code(objects.compile_text(host_text(module)))
+        self.address = self.code.address(text.KERNEL)
+        self.arrays = module.partition(f"@{text.KERNEL}(")[2].partition(")")[0].count("ptr ")
+        self.sample = ctypes.c_int64.from_address(self.code.engine.get_global_value_address("jaxdyn_sample"))
+
+    def run(self, pointers, samples: int, threads: int) -> None:
+        """Run so many threads, one after the other."""
+        call = ctypes.CFUNCTYPE(None, *[ctypes.c_void_p] * len(pointers), ctypes.c_int64)(self.address)
+        for thread in range(threads):
+            self.sample.value = thread
+            call(*pointers, samples)
+
+
+def uniform_of(args) -> list[bool]:
+    """Which operands of a call all samples share."""
+    return [x.ndim == 1 and any(y.ndim > 1 for y in args) for x in args]
+
+
+def run_threads(program, args) -> list[np.ndarray]:
+    """The results (..., size) of a program for operands (..., size), by its kernel for GPUs."""
+    args = [np.asarray(x) for x in args]
+    uniform = uniform_of(args)
+    lead = max((x.shape[:-1] for x in args), key=len)
+    samples = math.prod(lead)
+
+    def placed(x, array, same):
+        flat = x.reshape(array.size) if same else x.reshape(samples, array.size)
+        return np.ascontiguousarray(flat.T if text.is_aside(array, same) else flat)
+
+    given = [placed(x, array, same) for x, array, same in zip(args, program.inputs, uniform, strict=True)]
+    results = [placed(np.zeros((samples, x.size), x.dtype), x, False) for x in program.outputs]
+    kernel = HostKernel(text.module_ir(program, uniform))
+    pointers = [given[i].ctypes.data for i in varying_first(uniform)] + [x.ctypes.data for x in results]
+    kernel.run(pointers, samples, samples + 3)  # threads beyond the last sample do nothing
+    return [
+        (x.T if text.is_aside(array, False) else x).reshape(*lead, array.size)
+        for x, array in zip(results, program.outputs, strict=True)
+    ]
+
+
+def recorded_calls(function, *args) -> list[tuple]:
+    """The calls of kernels, (program, operands, results), that a function makes."""
+    calls, usual = [], primitive._jit_kernel
+
+    def recorder(program, rows):
+        def call(*operands):
+            results = usual(program, rows)(*operands)
+            calls.append((program, operands, results))
+            return results
+
+        return call
+
+    primitive._jit_kernel = recorder
+    try:
+        with jax.disable_jit():
+            function(*args)
+    finally:
+        primitive._jit_kernel = usual
+    return calls
+
+
+# --- a driver that is none ---
+
+DEVICES, SUCCESS, OUT_OF_MEMORY = 2, 0, 2
+_P, _I = ctypes.c_void_p, ctypes.c_int
+
+
+class StandInDriver:
+    """The driver's functions as far as kernels call them: modules are loaded for the host, launches recorded and carried out.
+
+    `launches`: (function's handle, blocks, threads, stream). `fails`: the name of the function that returns an error.
+    Streams are numbers above 1000, contexts above 2000, by device.
+    """
+
+    def __init__(self, capability=(9, 0), version=12040, devices=DEVICES):
+        self.capability, self.version, self.devices = capability, version, devices
+        self.launches, self.loaded, self.contexts, self.kernels = [], [], [], {}
+        self.fails, self.registers = None, 80
+        for name, arguments in driver._FUNCTIONS.items():
+            function = functools.partial(self._run, name, getattr(self, f"_{name}"))
+            setattr(self, name, ctypes.CFUNCTYPE(_I, *[_kind(x) for x in arguments])(function))
+
+    def _run(self, name, function, *args):
+        if self.fails == name:
+            return OUT_OF_MEMORY
+        result = function(*args)
+        return SUCCESS if result is None else result
+
+    def _cuInit(self, flags): ...
+
+    def _cuDriverGetVersion(self, at):
+        _I.from_address(at).value = self.version
+
+    def _cuDeviceGetCount(self, at):
+        _I.from_address(at).value = self.devices
+
+    def _cuDeviceGet(self, at, device):
+        _I.from_address(at).value = device
+
+    def _cuDeviceGetAttribute(self, at, which, device):
+        assert 0 <= device < self.devices
+        _I.from_address(at).value = {75: self.capability[0], 76: self.capability[1], 16: 10}[which]
+
+    def _cuStreamGetCtx(self, stream, at):
+        _P.from_address(at).value = stream + 1000
+
+    def _cuCtxPushCurrent_v2(self, context):
+        self.contexts.append(context)
+
+    def _cuCtxPopCurrent_v2(self, at):
+        _P.from_address(at).value = self.contexts.pop()
+
+    def _cuCtxGetDevice(self, at):
+        _I.from_address(at).value = self.contexts[-1] - 2001
+
+    def _cuModuleLoadDataEx(self, at, image, count, options, values):
+        assert count == 2 and list((_I * 2).from_address(options)) == [5, 6]
+        self.loaded.append(self.contexts[-1])
+        handle = 10 + len(self.kernels)
+        self.kernels[handle] = HostKernel(image.decode())
+        _P.from_address(at).value = handle
+
+    def _cuModuleGetFunction(self, at, module, name):
+        assert name == text.KERNEL.encode()
+        _P.from_address(at).value = module
+
+    def _cuFuncGetAttribute(self, at, which, function):
+        assert which == 4
+        _I.from_address(at).value = self.registers
+
+    def _cuLaunchKernel(self, function, x, y, z, threads, ty, tz, shared, stream, parameters, extra):
+        assert (y, z, ty, tz, shared, extra) == (1, 1, 1, 1, 0, None)
+        self.launches.append((function, x, threads, stream))
+        kernel = self.kernels[function]
+        addresses = list((_P * (kernel.arrays + 1)).from_address(parameters))
+        samples = ctypes.c_int64.from_address(addresses.pop()).value
+        kernel.run([_P.from_address(x).value for x in addresses], samples, x * threads)
+
+    def _cuGetErrorName(self, code, at):
+        _P.from_address(at).value = ctypes.cast(_NAME, _P).value
+
+
+_NAME = ctypes.c_char_p(b"CUDA_ERROR_OUT_OF_MEMORY")
+
+
+def _kind(argument):
+    """Pointers to results are addresses here."""
+    return argument if argument is ctypes.c_char_p or not hasattr(argument, "contents") else _P
+
+
+_HANDLER = ctypes.CFUNCTYPE(_P, _P)
+_ASK = ctypes.CFUNCTYPE(_P, _P)
+_kept = []
+
+
+@_ASK
+def _stream_get(args):
+    """The stream of the device that XLA calls for."""
+    context = _P.from_address(args + 16).value
+    asked = (ctypes.c_int64 * 4)(28, 0, context, 0)
+    _ASK(_api_of_cpu["device"])(ctypes.addressof(asked))
+    _P.from_address(args + 24).value = 1001 + (asked[3] & 0xFFFFFFFF)
+    return None
+
+
+_api_of_cpu = {}
+
+
+def on_cpu(address: int) -> int | None:
+    """A handler for XLA's CPUs that calls one for GPUs, with a stream, which XLA has not on a CPU."""
+
+    @_HANDLER
+    def handler(frame):
+        if _P.from_address(frame + 8).value:  # XLA asks for the version
+            return _HANDLER(address)(frame)
+        api = _P.from_address(frame + 16).value
+        own_api = ctypes.create_string_buffer(ctypes.string_at(api, ctypes.c_int64.from_address(api).value))
+        _api_of_cpu["device"] = _P.from_address(api + 184).value
+        _P.from_address(ctypes.addressof(own_api) + 80).value = ctypes.cast(_stream_get, _P).value
+        own = ctypes.create_string_buffer(ctypes.string_at(frame, ctypes.c_int64.from_address(frame).value))
+        _P.from_address(ctypes.addressof(own) + 16).value = ctypes.addressof(own_api)
+        return _HANDLER(address)(ctypes.addressof(own))
+
+    _kept.append(handler)
+    return ctypes.cast(handler, _P).value
