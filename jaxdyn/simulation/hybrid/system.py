@@ -93,8 +93,10 @@ class ModalSystem(HybridSystem):
         leaves, tree = jax.tree.flatten(y0)
         shapes = tuple(x.shape for x in leaves)
         self._bind, self.elements = bind, elements
-        plan = Plan(type(solver), jax.jit(self._field), self._project, ("slip",), False, tree, shapes)
-        self.plan = plan._replace(guards=self.guards, rounding=ROUNDING)
+        # Under `jax.jit`, each is compiled once and called: a step reads the guards four times, and written out it would have
+        # more operations than a kernel holds.
+        plan = Plan(type(solver), jax.jit(self._field), jax.jit(self._project), ("slip",), False, tree, shapes)
+        self.plan = plan._replace(guards=jax.jit(self.guards), rounding=ROUNDING)
 
     def _motion(self, args, t, y):
         unknown, mode = args
@@ -132,7 +134,7 @@ class ModalSystem(HybridSystem):
         q, v = y["q"], y["v"]
         hit, switched = self.elements.split(hit)
         mode = mode._replace(positive=mode.positive ^ switched)
-        holding, speed, size = kernel(self._friction)(unknown, mode, slip, t, q, v)
+        holding, speed, size = kernel(self._friction, derivative=False)(unknown, mode, slip, t, q, v)
         # Sliding that is slower than the error of its velocity has ended: its direction is not known.
         least = jnp.asarray(2 * tolerance(q.dtype), q.dtype)
         least = least if atol is None else jnp.maximum(least, _STOPPED * atol)
@@ -164,7 +166,7 @@ class ModalSystem(HybridSystem):
 
         def attempt(carry):
             tries, guess, (rebound, held, stopped), _, busy = carry
-            problem, along = kernel(self._velocities)(unknown, mode, rebound, held, stopped, slip, t, q, v)
+            problem, along = kernel(self._velocities, derivative=False)(unknown, mode, rebound, held, stopped, slip, t, q, v)
             # First the impulses of Coulomb's law. They are zero where sliding leaves no forces: an impulse without collision
             # begins from elements that stick.
             by_law = (guess == 1) & busy
@@ -178,14 +180,14 @@ class ModalSystem(HybridSystem):
             )
             choice = choose_mode(elements, problem, begin._replace(stick=begin.stick | (stopped & begin.closed)), along)
             collision = Collision(choice.mode, choice.slip, rebound, held, stopped)
-            still = kernel(self._find_jams)(problem, choice.mode, choice.slip)
-            resting, at, after, gains = kernel(self._after)(unknown, collision, begins, t, q, v)
-            problem, along = kernel(self._forces)(unknown, resting, at, t, q, after)
+            still = kernel(self._find_jams, derivative=False)(problem, choice.mode, choice.slip)
+            resting, at, after, gains = kernel(self._after, derivative=False)(unknown, collision, begins, t, q, v)
+            problem, along = kernel(self._forces, derivative=False)(unknown, resting, at, t, q, after)
             final = choose_mode(elements, problem, guess_again(elements, problem, resting, guess, released), along)
-            follows, soft, short, paradox = kernel(self._flights)(
+            follows, soft, short, paradox = kernel(self._flights, derivative=False)(
                 unknown, collision, problem, final.mode, final.slip, t, q, v, after, (height, fast)
             )
-            cornered = kernel(self._paradox)(problem, resting, along)
+            cornered = kernel(self._paradox, derivative=False)(problem, resting, along)
             # Both choices are valid if no element disagreed in the end.
             settled = ~(choice.wrong | final.wrong)
             new = Transition(collision, follows, final.slip, after, settled, paradox | (cornered & ~settled))
