@@ -166,7 +166,9 @@ class ModalSystem(HybridSystem):
 
         def attempt(carry):
             tries, guess, (rebound, held, stopped), _, busy = carry
-            problem, along = kernel(self._velocities, derivative=False)(unknown, mode, rebound, held, stopped, slip, t, q, v)
+            problem, along = kernel(self._velocities, derivative=False)(
+                unknown, mode, rebound, held, stopped, slip, t, q, v
+            )
             # First the impulses of Coulomb's law. They are zero where sliding leaves no forces: an impulse without collision
             # begins from elements that stick.
             by_law = (guess == 1) & busy
