@@ -279,6 +279,12 @@ def test_examples(page, tmp_path, monkeypatch):
     assert checks[page](names)
 
 
+@pytest.mark.long
+def test_recipe_gradient_through_contact():
+    names = recipe("Checking a gradient through contact")
+    assert names["mismatch"] < 1e-9 and np.abs(names["gradient"](names["v"])).max() > 0.1
+
+
 @pytest.mark.slow
 def test_recipe_operational_space():
     names = recipe("Operational space")
