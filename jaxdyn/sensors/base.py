@@ -34,7 +34,8 @@ from jaxdyn.systems.system import SceneLike
 class Motion(NamedTuple):
     """An instant `t` (s) of a motion: `q` (nq,), `v` (nv,), `a` (nv,), its rate, and `multipliers` (nc,) of the constraints.
 
-    `thrusts`: wrenches (6,) by the names of frames, which are a part of tau.
+    `thrusts`: wrenches (6,) by the names of frames, which are a part of tau. `contacts`: forces (n,) of unilateral contacts by
+    their names, friction before the normal force.
     """
 
     scene: Scene
@@ -44,6 +45,7 @@ class Motion(NamedTuple):
     multipliers: Array
     t: Numbers = 0.0
     thrusts: Mapping[str, Any] | None = None
+    contacts: Mapping[str, Array] | None = None
 
 
 class Noise(eqx.Module):
@@ -205,20 +207,24 @@ def measure(
 
 
 def motion_at(scene: Scene, q, v, tau, t, thrusts, forces: Array) -> Motion:
-    """Motion of a scene under torques and the forces of its contacts, stacked.
+    """Motion of a scene under torques and the forces of its contacts, stacked by rows, the normal one first.
 
     Its scene has the rows of the contacts behind its own.
     """
     # Solved once for all sensors: accelerations and multipliers belong to the same motion.
-    touching = [force.contact for force in scene.forces if isinstance(force, UnilateralContact)]
+    touching = {force.name: force.contact for force in scene.forces if isinstance(force, UnilateralContact)}
     if not touching:
         dynamics = constrained_dynamics(scene, q, v, tau, t)
         return Motion(scene, q, v, dynamics.acceleration, dynamics.multipliers, t, thrusts)
     smooth = tuple(force for force in scene.forces if not isinstance(force, UnilateralContact))
-    rows = constraint_jacobian(Scene(scene.system, touching), q, t)
+    rows = constraint_jacobian(Scene(scene.system, tuple(touching.values())), q, t)
     dynamics = constrained_dynamics(Scene(scene.system, scene.constraints, smooth), q, v, tau + matmul(forces, rows), t)
     multipliers = jnp.concatenate([dynamics.multipliers, forces])
-    return Motion(with_contacts(scene, smooth), q, v, dynamics.acceleration, multipliers, t, thrusts)
+    places = layout(Scene(scene.system, tuple(touching.values())))
+    contacts = {
+        name: jnp.roll(forces[place.start : place.end], -1) for name, place in zip(touching, places, strict=True)
+    }
+    return Motion(with_contacts(scene, smooth), q, v, dynamics.acceleration, multipliers, t, thrusts, contacts)
 
 
 def with_contacts(scene: Scene, forces: Sequence = ()) -> Scene:
@@ -228,7 +234,7 @@ def with_contacts(scene: Scene, forces: Sequence = ()) -> Scene:
 
 
 def check_contacts(scene: Scene, contacts: Any, rows: tuple[int, ...], dtype) -> Array:
-    """Forces of the unilateral contacts of a scene, stacked in its order, (*rows, k); () of a scene without.
+    """Forces of the unilateral contacts of a scene, stacked by their rows, (*rows, k); () of a scene without.
 
     **Raises:** ValueError for contacts whose forces are missing, unknown names and shapes that do not fit.
     """
@@ -242,7 +248,8 @@ def check_contacts(scene: Scene, contacts: Any, rows: tuple[int, ...], dtype) ->
     parts = [jnp.zeros((*rows, 0), dtype)]
     for name, contact in touching.items():
         wanted = (*rows, sum(contact.sizes(scene.system, dtype)))
-        parts.append(as_float(given[name], f"contacts[{name!r}]", wanted, dtype))
+        # The row of the gap comes before those of slip.
+        parts.append(jnp.roll(as_float(given[name], f"contacts[{name!r}]", wanted, dtype), 1, -1))
     return jnp.concatenate(parts, -1)
 
 

@@ -226,7 +226,7 @@ def _beyond(model: Model, body: int, inertia, joints) -> tuple[Model, Array]:
 class ContactForce(Sensor):
     """Multipliers of a constraint, (n,), N along rows in m and N m along rows in rad: of a loop, a wheel, a foot on the ground.
 
-    Of a unilateral contact they are the normal force and the friction that `measure` gets as `contacts`.
+    Of a unilateral contact it is the force that `measure` gets as `contacts`: the friction, and the normal force as the last one.
 
     **Arguments:** `constraint`, its name in the scene, or that of a contact; `name`, `noise`, `delay` (s) as of `Sensor`.
 
@@ -246,7 +246,9 @@ class ContactForce(Sensor):
         constraint_place(scene, self.constraint)
 
     def read(self, motion: Motion) -> Float[Array, " n"]:
-        """Multipliers of the constraint."""
+        """Multipliers of the constraint, or the force of the contact."""
+        if self.constraint in (motion.contacts or {}):
+            return motion.contacts[self.constraint]
         return motion.multipliers[constraint_place(motion.scene, self.constraint)]
 
 

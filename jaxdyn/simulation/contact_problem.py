@@ -365,17 +365,23 @@ def may_contradict(contacts: Contacts, scene: Scene) -> bool:
     return sum(contacts.sizes) + contacts.own > scene.nv or len(set(bodies)) < len(bodies)
 
 
-def make_consistent(contacts: Contacts, problem: Scaled) -> Scaled:
-    """Problem with velocities of the contacts that close projected on those that impulses can stop.
+def closing_cones(contacts: Contacts, problem: Scaled, x) -> Array:
+    """Mask (k,) of the contacts that close by their velocities, or in impulses x (m,) that push others onto them."""
+    least = 1e-6 * jnp.max(jnp.abs(x))
+    normals, closing = contacts.normals, np.array(contacts.closing)
+    return closing & ((problem.q[normals] < 0) | (x[normals] > least))
+
+
+def make_consistent(contacts: Contacts, problem: Scaled, closes) -> Scaled:
+    """Problem with velocities of the contacts that close, (k,), projected on those that impulses can stop.
 
     Where an edge falls on its two ends, these close their gaps with different velocities, and cannot both stick: their distance
     is constant, and the edge is oblique. A slip of the second order is left, which would have all of their friction: often such
     problems have no solution that Newton's method finds. The slip is taken as a stop.
     """
     act, q, W = [], problem.q, problem.W
-    for at, size, closing in zip(contacts.normals, contacts.sizes, contacts.closing, strict=True):
-        closes = (q[at] < 0).astype(q.dtype) if closing else jnp.zeros((), q.dtype)
-        act += [closes, *[_OF_SLIP * closes] * (size - 1)]
+    for is_closing, size in zip(closes.astype(q.dtype), contacts.sizes, strict=True):
+        act += [is_closing, *[_OF_SLIP * is_closing] * (size - 1)]
     act = jnp.stack(act)
     gram, wanted = W * act[:, None] * act[None], q * act
     # Between the squares of independent rows and rounding. The second step leaves a share of its square.

@@ -39,6 +39,7 @@ from jaxdyn.lie.so3 import matmul
 from jaxdyn.simulation.contact_problem import (
     Contacts,
     Scaled,
+    closing_cones,
     friction_of,
     make_consistent,
     may_contradict,
@@ -53,8 +54,8 @@ from jaxdyn.systems.scene import Scene
 class ContactStep(Outcome):
     """Contact forces of a step.
 
-    - `forces`: by the contact's name, (n,), N: the normal force, and the friction along the rows of slip; means over the step, so
-      that those of an impact are its impulse over the step's length.
+    - `forces`: by the contact's name, (n,), N: the friction along the rows of slip, and the normal force as the last one; means
+      over the step, so that those of an impact are its impulse over the step's length.
     - `limit_forces` (nv,): of joint limits, N or N m.
     - `result`: one of `jd.RESULTS`. Where it is not `successful` the state is NaN, with derivatives of NaN.
     - `residual` (): of Coulomb's law, in numbers scaled to one.
@@ -73,7 +74,7 @@ class _Step(NamedTuple):
     impulses: Array  # (m,), N s
     x: Array  # of `coulomb.solve`
     at_rest: Array  # cones (k,) with the coefficient of friction at rest
-    relaxed: Array  # whether velocities of contacts that close were made consistent
+    relaxed: Array  # cones (k,) whose velocities were made consistent with each other
     residual: Array
     solved: Array
     steps: Array
@@ -98,7 +99,8 @@ def contact_step(contacts: Contacts, scene: Scene, q, v, z, tau, t, h, smoothing
     by_name, start = {}, 0
     for i in contacts.order:
         size = 1 + len(contacts.elements[i].tangent)
-        by_name[contacts.elements[i].name] = forces[start : start + size]
+        # The normal is the third axis of a contact's frame, in outputs of `simulate` and of grasps too.
+        by_name[contacts.elements[i].name] = jnp.roll(forces[start : start + size], -1)
         start += size
     limit_forces = jnp.zeros_like(v)
     if contacts.limited:
@@ -160,7 +162,7 @@ def _step(
     at_rest: Any = None,
     relaxed: Any = None,
 ) -> _Step:
-    """A step; with `x`, the solution of its contacts, the cones `at_rest`, whether it is `relaxed`, for its derivatives."""
+    """A step; with `x`, the solution of its contacts, and the cones that are `at_rest` and `relaxed`, for its derivatives."""
     # One subprogram, in which the zeros of the rows are known, as far as they are.
     problem, groups = jax.jit(partial(pose, contacts, scene))(q, v, z, tau, t, h), contacts.groups
     is_redundant = sum(contacts.sizes) + contacts.own > scene.nv
@@ -187,7 +189,7 @@ def _step(
         of = scaled(contacts, problem, friction_of(contacts, scene, q.dtype, at_rest))
         width = jnp.sqrt(smoothing) / of.size
         if may_contradict(contacts, scene):
-            of = of._replace(q=jnp.where(relaxed, make_consistent(contacts, of).q, of.q))
+            of = of._replace(q=jnp.where(relaxed.any(), make_consistent(contacts, of, relaxed).q, of.q))
         y = matmul(of.W, x) + of.q
         # The residual is no more than a reader of all arguments: programs leave out those that no value depends on.
         residual = coulomb.residual_at(groups, x, y, width)
@@ -206,12 +208,14 @@ def _step(
 
 
 def _solve_relaxed(contacts: Contacts, scene: Scene, of: Scaled, solution: coulomb.Solution, width, wanted: Any = True):
-    """The solution, or that with consistent velocities where there is none, and whether it is that."""
+    """The solution, or that with consistent velocities where there is none, and the cones (k,) with such velocities."""
     if not may_contradict(contacts, scene):
-        return solution, jnp.zeros((), bool)
+        return solution, jnp.zeros((len(contacts.sizes),), bool)
     fails = ~solution.solved & wanted
-    again = coulomb.solve(contacts.groups, True, of.W, make_consistent(contacts, of).q, of.scale, width, fails)
+    # Contacts that only impulses of others close may contradict them too.
+    closes = closing_cones(contacts, of, solution.x) & fails
+    again = coulomb.solve(contacts.groups, True, of.W, make_consistent(contacts, of, closes).q, of.scale, width, fails)
     # The residual is that of the law itself.
     residual = coulomb.residual_at(contacts.groups, again.x, matmul(of.W, again.x) + of.q, width)
     again = again._replace(residual=residual, steps=solution.steps + again.steps)
-    return jax.tree.map(lambda a, b: jnp.where(fails, a, b), again, solution), fails
+    return jax.tree.map(lambda a, b: jnp.where(fails, a, b), again, solution), closes

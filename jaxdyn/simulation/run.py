@@ -97,9 +97,9 @@ def simulate(
       makes the steps.
     - `outputs`: any of "energy", "power", "work" (one more state, under the same error control), "acceleration" (the rate
       of v: of a free joint that of its body twist; `jd.dynamics.frame_acceleration` gives those of frames in world axes),
-      "multipliers", "constraint_residual", "contact_forces", "contact_margins", "torque" (of the control, behind drives
-      and limits), "control_state" (of a controller), "drive_state" (of drives) and "pose:<frame>". They are computed only if
-      asked for.
+      "multipliers", "constraint_residual", "contact_forces" (N, by the names of contacts: two components of friction, then
+      the normal force), "contact_margins", "torque" (of the control, behind drives and limits), "control_state" (of a
+      controller), "drive_state" (of drives) and "pose:<frame>". They are computed only if asked for.
     - `contacts`: of a scene with `cones`. "stop", the default: where a contact pulls or leaves its cone (a margin below zero by
       more than rounding, $\epsilon^{1/2}$ of its force) the run ends, with the code `contact_lost` and the time, which is found
       within the step. "report": it continues, with contacts that hold on both sides.

@@ -381,7 +381,7 @@ def test_shapes_dropped_on_the_ground_come_to_rest(name):
     assert np.asarray(report.success).all()
     np.testing.assert_allclose(qs[-1, 2], height, atol=1e-9)
     assert float(jnp.abs(vs[-1]).max()) < 1e-9
-    np.testing.assert_allclose(sum(f[-1, 0] for f in report.forces.values()), 9.81, rtol=1e-9)
+    np.testing.assert_allclose(sum(f[-1, -1] for f in report.forces.values()), 9.81, rtol=1e-9)
     energy = jax.vmap(lambda q, v: jd.kinetic_energy(scene.system, q, v) + jd.potential_energy(scene.system, q))(qs, vs)
     # Steps are of order one where contacts close: a corner that is about to touch pushes a step too early.
     assert float(jnp.max(jnp.diff(energy))) < 1e-3 * float(energy[0])
@@ -418,12 +418,18 @@ def test_ball_thrown_at_a_moving_box_conserves_momentum():
             about = about + np.cross(own[:3], mass * turn @ twist[:3]) + 0.01 * mass * turn @ twist[3:]
         return np.concatenate([total, about])
 
-    (qs, vs), report = steps(scene, (jnp.asarray(q), jnp.asarray(v)), 60)
-    assert np.asarray(report.success).all() and float(max(f[:, 0].max() for f in report.forces.values())) > 10
-    for q1, v1 in zip(np.asarray(qs), np.asarray(vs), strict=True):
-        # The box turns by several degrees: angular momentum holds to the order of the step.
-        np.testing.assert_allclose(momentum(q1, v1)[:3], momentum(q, v)[:3], atol=1e-3)
-        np.testing.assert_allclose(momentum(q1, v1)[3:], momentum(q, v)[3:], atol=1e-3)
+    errors = []
+    for count in (60, 120, 240):
+        (qs, vs), report = steps(scene, (jnp.asarray(q), jnp.asarray(v)), count, 0.3 / count)
+        assert np.asarray(report.success).all() and float(max(f[:, -1].max() for f in report.forces.values())) > 10
+        before, after = (
+            momentum(q, v),
+            np.array([momentum(*x) for x in zip(np.asarray(qs), np.asarray(vs), strict=True)]),
+        )
+        errors.append([np.abs((after - before)[:, part]).max() for part in (slice(3), slice(3, 6))])
+    # Velocities are those of axes that turn in a step: both momenta hold to its square.
+    errors = np.array(errors)
+    assert (errors[0] < 1e-4).all() and (np.abs(errors[:-1] / errors[1:] - 4) < 0.2).all(), errors
 
 
 @pytest.mark.long

@@ -281,24 +281,32 @@ def agrees_with_simulate(names):
     "page", sorted(path.stem for path in (ROOT / "docs/examples").glob("*.md") if path.stem != "index")
 )
 def test_examples(page, tmp_path, monkeypatch):
-    """A script of less than 60 lines, with its figure."""
+    """A script of less than 60 lines of code, with its figure."""
     monkeypatch.chdir(tmp_path)
     text = (ROOT / f"docs/examples/{page}.md").read_text()
     (block,) = re.findall(r"```python\n(.*?)```", text, flags=re.DOTALL)
-    assert len(block.splitlines()) < 60 and (ROOT / f"docs/figures/example_{page}.png").exists()
+    assert sum(bool(line) for line in block.splitlines()) < 60 and (ROOT / f"docs/figures/example_{page}.png").exists()
     names = run(f"docs/examples/{page}.md", least=1)
     assert (tmp_path / f"{page}.png").stat().st_size > 10_000
     checks = {
         "bicycle": has_published_eigenvalues,
         "delta": lambda n: bool(n["path"].success.all()) and np.abs(n["tau"]).max() < 20,
         "diffeqsolve": lambda n: np.abs(n["torques"] - np.array([0.3, 0.8])).max() < 1e-3 and agrees_with_simulate(n),
+        "hopper": lambda n: n["losses"][-1] < 0.05 * n["losses"][0] and n["mismatch"] < 1e-7,
         "payload": lambda n: np.abs(n["found"] - n["payload"]).max() < 0.02,
         "policy_gradient": lambda n: n["losses"][-1] < 0.7 * n["losses"][0],
         "predictive_control": lambda n: abs(np.cos(n["states"][-1][1]) + 1) < 0.02,
+        "quadruped": lambda n: n["losses"][-1] < 0.05 * n["losses"][0],
         "synthesis": lambda n: n["openings"][0] > 0.1 and n["openings"][1] < 1e-9 and n["losses"][-1] < 0.05,
         "vehicles": lambda n: bool(n["success"].all()) and n["missed"].max() < 1.0,
     }
     assert checks[page](names)
+
+
+@pytest.mark.long
+def test_recipe_gradient_through_contact():
+    names = recipe("Checking a gradient through contact")
+    assert names["mismatch"] < 1e-9 and np.abs(names["gradient"](names["v"])).max() > 0.1
 
 
 @pytest.mark.slow

@@ -95,5 +95,5 @@ def test_touch_sensors_of_a_file(tmp_path):
     assert not bare.sensors and "sensors: t" in bare.not_taken and "volume of touch sensors: t" in scene.not_taken
     (sensor,) = scene.sensors
     q = scene.starts["reference"].q
-    reading = jd.sensors.measure(scene, scene.sensors, q, jnp.zeros(6), contacts={"foot": jnp.array([3.0, 0.1, 0.2])})
+    reading = jd.sensors.measure(scene, scene.sensors, q, jnp.zeros(6), contacts={"foot": jnp.array([0.1, 0.2, 3.0])})
     assert isinstance(sensor, jd.sensors.Touch) and reading["t"].tolist() == [3.0]

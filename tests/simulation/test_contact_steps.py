@@ -86,18 +86,18 @@ def test_velocities_and_forces_satisfy_coulombs_law(restitution):
         for point, f in zip(CORNERS, force, strict=True):
             velocity, gap = R @ (v[:3] + np.cross(v[3:], point)), (q[:3] + R @ point)[2]
             slip, scale = velocity[:2], 10.0 / dt  # impulses of 0.1 N s over a step
-            assert f[0] >= -1e-10 * scale
-            residuals.append((np.linalg.norm(f[1:]) - mu * f[0]) / scale)
+            assert f[2] >= -1e-10 * scale
+            residuals.append((np.linalg.norm(f[:2]) - mu * f[2]) / scale)
             # Friction opposes sliding with all of its force: the residual of the cone.
-            residuals.append(np.linalg.norm(mu * f[0] * slip + np.linalg.norm(slip) * f[1:]) / scale)
-            if f[0] <= 1e-9 * scale:
+            residuals.append(np.linalg.norm(mu * f[2] * slip + np.linalg.norm(slip) * f[:2]) / scale)
+            if f[2] <= 1e-9 * scale:
                 open_ += 1
                 # It stays open in the next step, but for what forces move it in one.
                 assert gap + dt * velocity[2] >= -G * dt**2 or gap < 0
             elif restitution == 0 and gap >= 0:
                 assert abs(gap + dt * velocity[2]) <= 1e-6 * dt
-            stuck += f[0] > 1e-6 and np.linalg.norm(slip) < 1e-10
-            slid += f[0] > 1e-6 and np.linalg.norm(slip) > 1e-3
+            stuck += f[2] > 1e-6 and np.linalg.norm(slip) < 1e-10
+            slid += f[2] > 1e-6 and np.linalg.norm(slip) > 1e-3
     assert min(stuck, slid, open_) > 100, (stuck, slid, open_)
     # The two corners of an edge that lands obliquely cannot both stick while they close different gaps in one step.
     assert np.quantile(residuals, 0.99) < 1e-10
@@ -158,13 +158,13 @@ def test_frictionless_impulses_are_the_least_in_the_metric_of_the_mass():
     v = jnp.asarray([0.3, -0.2, -1.0, 0.7, -1.5, 0.4])
     end, report = jax.jit(jd.stepper(scene, dt, report=True))((q, v), STILL)
     force = np.array([report.forces[f"{i}"] for i in range(4)])
-    assert np.abs(force[:, 1:]).max() < 1e-9
+    assert np.abs(force[:, :2]).max() < 1e-9
     # Inertia is that of the body's axes, and gravity that of the middle of the step.
     q, M = np.asarray(end[0]), np.diag([1, 1, 1, 0.1, 0.2, 0.15])
     R = turn(q[3:])
     J = np.stack([np.concatenate([R[2], np.cross(p, R[2])]) for p in CORNERS])
     after = np.asarray(end[1])
-    free = after - np.linalg.solve(M, J.T @ force[:, 0] * dt)
+    free = after - np.linalg.solve(M, J.T @ force[:, 2] * dt)
     gap = q[2] + CORNERS @ R[2]
     bound = np.where(gap < 0, np.minimum(-gap / dt, -(J @ free)), -gap / dt)
     # min |L^-1 (J^T p)|^2 / 2 + p . (J free - bound): by its dual, nnls of the stacked equations.
@@ -188,8 +188,8 @@ def test_redundant_contacts_have_the_forces_of_least_norm():
     scene, slope = box(0.5, slope=0.4), 0.4
     (q, _), report = jax.jit(lambda s: run(scene, 0.01, s, 1))((on_slope(slope), STILL))
     R = turn(np.asarray(q[0, 3:]))
-    # Rows of a corner in the frame of the plane: normal, then the tangents, in the body's axes.
-    rows = np.array([[0.0, 0, 1], [1, 0, 0], [0, 1, 0]])
+    # Rows of a corner in the frame of the plane: the tangents, then the normal, in the body's axes.
+    rows = np.eye(3)
     J = np.concatenate([np.concatenate([rows, np.cross(p[None], rows)], 1) for p in CORNERS])
     weight = np.concatenate([R.T @ [0, 0, G], np.zeros(3)])
     least = np.linalg.lstsq(J.T, weight, rcond=None)[0].reshape(4, 3)
@@ -287,7 +287,7 @@ def test_a_closed_leg_hops_and_its_gradient():
     bare = jd.Scene(scene.system, scene.constraints)
     assert np.abs(jax.vmap(lambda q: position_residual(bare, q))(q)).max() < 1e-10
     assert np.abs(jax.vmap(lambda q, v: velocity_residual(bare, q, v))(q, v)).max() < 1e-10
-    touches = np.asarray(report.forces["toe"][:, 0]) > 0
+    touches = np.asarray(report.forces["toe"][:, -1]) > 0
     assert 3 < touches.sum() < 30, touches
 
     def loss(weights):
@@ -358,7 +358,7 @@ def test_grazing_has_finite_derivatives_and_smoothing_a_hover():
     energy = 1e-4
     (q, _), report = jax.jit(lambda s: run(ball(0.3), 0.01, s, 400, smoothing=energy))((q.at[2].add(1e-4), STILL))
     assert np.asarray(report.success).all()
-    assert report.forces["0"][-1, 0] == pytest.approx(G, rel=1e-6)
+    assert report.forces["0"][-1, -1] == pytest.approx(G, rel=1e-6)
     assert q[-1, 2] - 0.1 == pytest.approx(energy / G, rel=1e-6)
 
     def after(z):
@@ -500,7 +500,7 @@ def test_dry_friction_and_drives_in_steps_with_contacts():
         (jnp.zeros(1), jnp.ones(1) * 0.5)
     )
     np.testing.assert_allclose(v[:, 0], np.maximum(0.5 - 1.5 * dt * np.arange(1, 51), 0), atol=1e-12)
-    assert report.forces["friction"][0] == pytest.approx([10.0, -3.0])
+    assert report.forces["friction"][0] == pytest.approx([-3.0, 10.0])
     drive = jd.forces.FirstOrderDrive(0.05)
     scene = jd.Scene(model, forces=[drive, friction])
     step = jd.stepper(scene, dt)

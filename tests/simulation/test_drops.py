@@ -6,6 +6,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+import scipy.optimize
 from test_events import TIGHT, G, box
 from test_friction_scenes import bounce
 
@@ -14,18 +15,19 @@ from benchmarks import drops
 
 
 @pytest.mark.long
-def test_ball_bounces_to_rest_at_the_sum_of_the_geometric_series():
-    """Touches are those of the series to 1e-9, up to flights that are lower than the tolerance; behind them the ball rests."""
-    e, fall = 0.6, np.sqrt(2 / G)
-    motion = bounce(e, end=4.0)
+@pytest.mark.parametrize("e", [0.3, 0.6, 0.8])
+def test_ball_bounces_to_rest_at_the_sum_of_the_geometric_series(e):
+    """Touches are those of the series to 1e-9, and the last one is its limit; behind it the ball rests."""
+    fall = np.sqrt(2 / G)
+    motion = bounce(e, end=5.0)
     assert motion.success
     times = np.asarray(motion.events.time)[: int(motion.events.count)]
-    powers = e ** np.arange(times.size)
-    np.testing.assert_allclose(times, fall * (1 + 2 * (np.cumsum(powers) - 1)), rtol=0, atol=1e-9)
+    powers = e ** np.arange(times.size - 1)
+    np.testing.assert_allclose(times[:-1], fall * (1 + 2 * (np.cumsum(powers) - 1)), rtol=0, atol=1e-9)
     rest = fall * (1 + e) / (1 - e)
-    # The flight that is not followed any more: v^2/2g is 1e-9 of a metre at most.
-    assert 0 < rest - times[-1] < 2 * np.sqrt(2 * 2e-9 / G) / (1 - e)
+    np.testing.assert_allclose(times[-1], rest, rtol=0, atol=1e-9)
     behind = np.asarray(motion.ts) > rest
+    assert behind.any()
     np.testing.assert_array_equal(motion.v[behind], 0.0)
     np.testing.assert_allclose(motion.q[behind], 0.0, atol=1e-12)
 
@@ -52,13 +54,69 @@ def test_block_rocks_to_rest_and_loses_what_housner_says():
     np.testing.assert_allclose(
         energy[second] - level, factor**2 * (energy[0] - level), rtol=1e-8
     )  # of the dense output
-    # To the first impact: the quarter of the period, by the energy of the block about its corner.
+    # Every impact, and the limit of their series: quarters of periods, by the energy of the block about its corner.
     moment, radius, tip = 4 / 3 * 2.0 * (half**2 + high**2), np.hypot(half, high), np.arctan(half / high)
-    nodes, weights = np.polynomial.legendre.leggauss(80)
-    s = np.sqrt(angle) * (nodes + 1) / 2  # theta = angle - s^2 takes the root of the energy out of the integral
-    theta = angle - s**2
-    speed = np.sqrt(2 * 2.0 * G * radius / moment * (np.cos(tip - angle) - np.cos(tip - theta)))
-    np.testing.assert_allclose(times[0], np.sum(weights * np.sqrt(angle) / 2 * 2 * s / speed), atol=1e-9)
+
+    def lift(theta):
+        """Height of the centre above that at rest over the radius, cos(tip - theta) - cos(tip) without cancellation."""
+        return 2 * np.sin(theta / 2) * np.sin(tip - theta / 2)
+
+    def quarter(peak):
+        """Time from the greatest angle to the impact."""
+        nodes, weights = np.polynomial.legendre.leggauss(80)
+        s = np.sqrt(peak) * (nodes + 1) / 2  # theta = peak - s^2 takes the root of the energy out of the integral
+        fall = 2 * np.sin(s**2 / 2) * np.sin(tip - peak + s**2 / 2)  # of lift, from the peak
+        return np.sum(weights * np.sqrt(peak) / 2 * 2 * s / np.sqrt(2 * 2.0 * G * radius / moment * fall))
+
+    peaks = [angle]
+    while peaks[-1] > 1e-22:
+        wanted = factor**2 * lift(peaks[-1])
+        peaks.append(scipy.optimize.brentq(lambda x, wanted=wanted: lift(x) - wanted, 0, peaks[-1], xtol=1e-30))
+    expected = np.cumsum([quarter(peaks[0]), *(2 * quarter(peak) for peak in peaks[1:])])
+    impacts = times[np.diff(times, prepend=-1.0) > 0]  # contacts that change together have one time
+    assert impacts.size > 10
+    np.testing.assert_allclose(impacts[:-1], expected[: impacts.size - 1], atol=1e-9)
+    np.testing.assert_allclose(impacts[-1], expected[-1], atol=1e-8)
+
+
+@pytest.mark.slow
+def test_box_topples_in_the_time_of_its_energy():
+    """On one corner: the time to the fall on the other one, and the angle on the way, by a quadrature of the energy."""
+    a, h, m, start = 0.4, 0.2, 2.0, 0.3  # on its left corner, which does not slip
+    radius, tip, moment = np.hypot(a, h) / 2, np.arctan2(h, a), 4 / 3 * m * (a * a + h * h) / 4
+    assert start + tip < np.pi / 2
+    corner = np.array([-a / 2, -h / 2])
+    turned = np.array([[np.cos(start), -np.sin(start)], [np.sin(start), np.cos(start)]])
+
+    def time_to(angle):
+        """From rest at `start`; angle = start - s^2 takes the root of the energy out of the integral."""
+        nodes, weights = np.polynomial.legendre.leggauss(120)
+        end = np.sqrt(start - angle)
+        s = end * (nodes + 1) / 2
+        fall = np.sin(tip + start) - np.sin(tip + start - s**2)
+        return np.sum(weights * end / 2 * 2 * s / np.sqrt(2 * m * G * radius / moment * fall))
+
+    landing, halfway = time_to(0.0), time_to(0.15)
+    ts = jnp.asarray([0.0, halfway, landing + 0.5])
+    motion = jd.simulate(box(mu=3.0), [*(-turned @ corner), start], jnp.zeros(3), ts, **TIGHT)
+    assert motion.success
+    np.testing.assert_allclose(motion.q[1, 2], 0.15, atol=1e-9)
+    np.testing.assert_allclose(motion.events.times("right: touch")[0], landing, atol=1e-9)
+
+
+@pytest.mark.slow
+def test_block_slides_and_stops_where_coulomb_says():
+    """v/(mu g) later and v^2/(2 mu g) further, to 1e-9; then it rests, to rounding."""
+    mu, speed = 0.3, 1.7
+    stop, way = speed / (mu * G), speed**2 / (2 * mu * G)
+    ts = jnp.asarray([0.0, stop / 2, stop + 0.1, stop + 10.0])
+    motion = jd.simulate(box(mu), [0.0, 0.1, 0.0], [speed, 0.0, 0.0], ts, **TIGHT)
+    assert motion.success
+    np.testing.assert_allclose(motion.q[1, 0], 0.75 * way, atol=1e-9)
+    np.testing.assert_allclose(motion.events.times("left: stick")[0], stop, atol=1e-9)
+    np.testing.assert_allclose(motion.q[2], [way, 0.1, 0.0], atol=1e-9)
+    np.testing.assert_allclose(motion.q[3], motion.q[2], atol=1e-13)
+    np.testing.assert_allclose(motion.v[2:], 0.0, atol=1e-12)
 
 
 @pytest.mark.slow

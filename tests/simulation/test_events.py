@@ -138,8 +138,10 @@ def test_bowling_ball_rolls_when_the_closed_form_says():
     slip = v + np.cross(w, -r * up)
     rolling = r / (inertia + m * r * r) * np.cross(inertia * w + m * r * np.cross(up, v), up)
     begins = (v - rolling) @ slip / (np.linalg.norm(slip) * mu * g)
-    assert list(motion.events.name[:2]) == ["lane: stick", ""]
-    assert abs(motion.events.time[0] - begins) < 1e-8
+    # Slow sliding has a fixed direction, whose beginning is an inner event.
+    changes = [name for name in motion.events.name if name and not name.endswith(": inner")]
+    assert changes == ["lane: stick"]
+    assert abs(motion.events.times("lane: stick")[0] - begins) < 1e-8
     turned = jax.vmap(jd.so3.quat_to_matrix)(motion.q[-1:, 3:])[0]
     np.testing.assert_allclose(turned @ motion.v[-1, :3], rolling, atol=1e-8)
     along = (v * begins - mu * g * slip / np.linalg.norm(slip) * begins**2 / 2) + rolling * (4 - begins)

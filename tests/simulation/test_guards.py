@@ -13,6 +13,7 @@ from pinocchio_bridge import quick
 import jaxdyn as jd
 from jaxdyn.contact import friction_cone
 from jaxdyn.grasp import contact
+from jaxdyn.simulation.solvers.guards import Point, Search, search_root
 
 TS = np.linspace(0.0, 3.0, 7)
 ROUNDING = np.finfo(float).eps ** 0.5  # that conditions let pass, of the size of a limit or a force
@@ -351,3 +352,20 @@ def test_other_times_have_second_derivatives(name):
     x = case.numbers[0]
     second = jax.jit(jax.jacfwd(jax.grad(lambda x: case.move(x, **TIGHT).stats["time_reached"])))(jnp.asarray(x))
     np.testing.assert_allclose(second, case.time(x) / x**2 * (2 if name == "cone" else 0.75), rtol=1e-9)
+
+
+@pytest.mark.parametrize("fraction", [0.31, 0.53, 0.7, 0.83])
+def test_a_zero_of_the_dense_output_between_two_numbers_of_the_time_is_passed(fraction):
+    """A guard that is negative at a fraction of a step by its dense output alone: the search ends, and the step is kept."""
+    one, none, t0 = np.ones(1), np.zeros(1), np.array(0.4)
+    length = np.array(5e-6)
+    search = jax.tree.map(np.asarray, Search.begin(jnp.ones(1), jnp.zeros(1, bool), jnp.asarray(length)))
+    attempt = jax.jit(search_root)
+    for _ in range(100):
+        within = [Point(np.array(fraction), -one, none)]
+        search, kept, located, length = attempt(search, t0, t0 + length, (one, none), within, True, np.array(1.0))
+        if kept:
+            break
+    # Not at an event, and at the fraction up to the rounding of the time.
+    assert located and not search.hit.any() and not search.locating
+    assert abs(float(search.bracket.low) - fraction * 5e-6) < 2e-16

@@ -48,7 +48,7 @@ def guards_at(plan: Plan, args, t, y):
     return plan.guards_of(args, t, y)
 
 
-@kernel(static=1)
+@kernel(static=1, derivative=False)
 def _begin_mode(system: HybridSystem, args, t, y):
     """State behind an event on the rows that act, its rate of change if steps reuse it, and its guards."""
     plan = system.plan

@@ -176,6 +176,8 @@ class Events(eqx.Module):
     - `names`: "<element>: <kind>". The kinds of a contact are "touch" and "release"; those of friction "stick" and "slip". A
       "turn" reverses the direction of sliding, or the sign of the normal force of a friction that holds on both sides. An
       "inner" event changes how a mode is computed, and not the motion.
+      A touch at which infinitely many bounces accumulate has the time of rest, the limit of their series; its derivative is that
+      of the last flight that was followed.
     - `count` (): number of events. Elements that change at the same time have one entry each, that of the guard which was
       crossed first in front.
     """

@@ -126,6 +126,7 @@ def hybrid_motion(scene: Scene, control, numbers, options) -> Solution:
     result = rank_code(scene, first_of(cases, end.result))
     # The end of a run is an input, which has derivatives; the time in the loop has none.
     time_reached = jnp.where(end.t >= ts[-1], ts[-1], end.t)
+    times = _times_of_rest(times, lax.stop_gradient(records.tail[:most]), ts[-1])
     touched = _impacts_at_start(scene, elements, q0, v0, ts[0], mode)
     events = _events(elements, touched, ts[0], times, records.name[:most], good & start_ok)
     rows, times = {"q": y["q"], "v": y["v"], **values}, (jnp.where(good, time_reached, ts[0]), events)
@@ -174,6 +175,14 @@ def _guess(scene: Scene, elements, q, v, t):
     start_ok = (~opens | (gap >= -limit * reach)).all()
     # Smooth friction is a function of the state, which has no mode that sticks.
     return mode._replace(stick=mode.stick & ~jnp.asarray(elements.smooth)), lax.stop_gradient(unit), start_ok
+
+
+def _times_of_rest(times, tails, end):
+    """Times of events (ne,) with those of impacts that accumulate moved to the limit, up to the next event and the end."""
+    known = jnp.where(jnp.isfinite(times), lax.stop_gradient(times), jnp.inf)
+    following = jnp.append(known, jnp.inf)[jnp.searchsorted(known, known, side="right")]
+    room = jnp.maximum(jnp.minimum(following, lax.stop_gradient(end)) - known, 0.0)
+    return times + jnp.where((tails > 0) & jnp.isfinite(known), jnp.minimum(tails, room), 0.0)
 
 
 def _impacts_at_start(scene: Scene, elements, q, v, t, mode: Mode):

@@ -46,7 +46,8 @@ class PiecewiseSystem(HybridSystem):
         # Forces are finite on both sides of a zero: the piece changes, and the velocity does not jump.
         mode, yes = mode._replace(positive=mode.positive ^ hit), jnp.ones((), bool)
         none = jnp.zeros((0,), y.dtype)
-        return Transition(Collision(mode, slip, none, none > 0, none > 0), mode, slip, none, yes, ~yes)
+        collision = Collision(mode, slip, none, none > 0, none > 0)
+        return Transition(collision, mode, slip, none, yes, ~yes, jnp.zeros((), y.dtype))
 
     def impact(self, unknown, collision, t, y):
         return y

@@ -8,8 +8,10 @@ The first matrix is symmetric; the second term makes the equations for N lose th
 Painleve's paradox, where forces of rigid bodies do not exist or are not unique.
 """
 
+from functools import partial
 from typing import Any, NamedTuple
 
+import jax
 import jax.numpy as jnp
 from jaxtyping import Array
 
@@ -91,6 +93,8 @@ def slides(elements: Elements, mode: Mode) -> Array:
     return mode.closed & (jnp.asarray(elements.smooth) | ~mode.stick)
 
 
+# Under `jax.jit` kernels without derivative call it: written out at each place, those of eight contacts are too long.
+@partial(jax.jit, static_argnums=0)
 def react(elements: Elements, mode: Mode, gram: Gram, friction, loads, along, target) -> Reaction:
     """Forces that change the rates of the active rows by `target` (count,), or impulses that so change their velocities.
 

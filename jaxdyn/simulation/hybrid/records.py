@@ -15,6 +15,7 @@ class Records(NamedTuple):
     """Records of events, a row each; the last row is for what is not kept."""
 
     time: Array
+    tail: Array  # time from it to rest, of impacts that accumulate there, s
     name: Array  # index among `Elements.names`
     trigger: Array  # the guard that fell to zero, -1 for an event that came with another one
     impact: Collision
@@ -28,7 +29,8 @@ def no_records(elements: Elements, dtype, most: int) -> Records:
     flags, slip = jnp.zeros((most + 1, n), bool), jnp.zeros((most + 1, n, 2), dtype)
     mode = Mode(flags, flags, flags, jnp.zeros((most + 1, elements.switches), bool), slip[..., 0], slip[..., 0])
     impact = Collision(mode, slip, slip[..., 0], flags, flags)
-    return Records(jnp.full((most + 1,), jnp.nan, dtype), none - 1, none - 1, impact, mode, slip)
+    times = jnp.full((most + 1,), jnp.nan, dtype)
+    return Records(times, jnp.zeros_like(times), none - 1, none - 1, impact, mode, slip)
 
 
 def record_elements(
@@ -61,6 +63,7 @@ def record_elements(
     still = Collision(mode, change.slip, none, none > 0, none > 0)
     new = Records(
         jnp.broadcast_to(t, number.shape),
+        jnp.where(kind == 0, change.tail, 0.0),
         number * len(KINDS) + kind.astype(jnp.int32),
         jnp.where(leads, leading, -1),
         by_row(change.impact, still),
@@ -83,6 +86,7 @@ def record_switches(elements: Elements, t, count, mode: Mode, records: Records, 
     modes = modes._replace(positive=modes.positive ^ earlier)
     rows = Records(
         jnp.broadcast_to(t, (k,)),
+        jnp.zeros((k,), t.dtype),
         first * len(KINDS) + number,
         first * CHANNELS + number,
         Collision(modes, slip, slip[..., 0], slip[..., 0] > 0, slip[..., 0] > 0),

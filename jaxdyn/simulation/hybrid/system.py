@@ -93,8 +93,10 @@ class ModalSystem(HybridSystem):
         leaves, tree = jax.tree.flatten(y0)
         shapes = tuple(x.shape for x in leaves)
         self._bind, self.elements = bind, elements
-        plan = Plan(type(solver), jax.jit(self._field), self._project, ("slip",), False, tree, shapes)
-        self.plan = plan._replace(guards=self.guards, rounding=ROUNDING)
+        # Under `jax.jit`, each is compiled once and called: a step reads the guards four times, and written out it would have
+        # more operations than a kernel holds.
+        plan = Plan(type(solver), jax.jit(self._field), jax.jit(self._project), ("slip",), False, tree, shapes)
+        self.plan = plan._replace(guards=jax.jit(self.guards), rounding=ROUNDING)
 
     def _motion(self, args, t, y):
         unknown, mode = args
@@ -132,7 +134,7 @@ class ModalSystem(HybridSystem):
         q, v = y["q"], y["v"]
         hit, switched = self.elements.split(hit)
         mode = mode._replace(positive=mode.positive ^ switched)
-        holding, speed, size = kernel(self._friction)(unknown, mode, slip, t, q, v)
+        holding, speed, size = kernel(self._friction, derivative=False)(unknown, mode, slip, t, q, v)
         # Sliding that is slower than the error of its velocity has ended: its direction is not known.
         least = jnp.asarray(2 * tolerance(q.dtype), q.dtype)
         least = least if atol is None else jnp.maximum(least, _STOPPED * atol)
@@ -163,8 +165,10 @@ class ModalSystem(HybridSystem):
         height = 4 * least if atol is None else jnp.maximum(4 * least, atol)
 
         def attempt(carry):
-            tries, guess, (rebound, held, stopped), _, busy = carry
-            problem, along = kernel(self._velocities)(unknown, mode, rebound, held, stopped, slip, t, q, v)
+            tries, guess, (rebound, held, stopped), last, busy = carry
+            problem, along = kernel(self._velocities, derivative=False)(
+                unknown, mode, rebound, held, stopped, slip, t, q, v
+            )
             # First the impulses of Coulomb's law. They are zero where sliding leaves no forces: an impulse without collision
             # begins from elements that stick.
             by_law = (guess == 1) & busy
@@ -178,17 +182,19 @@ class ModalSystem(HybridSystem):
             )
             choice = choose_mode(elements, problem, begin._replace(stick=begin.stick | (stopped & begin.closed)), along)
             collision = Collision(choice.mode, choice.slip, rebound, held, stopped)
-            still = kernel(self._find_jams)(problem, choice.mode, choice.slip)
-            resting, at, after, gains = kernel(self._after)(unknown, collision, begins, t, q, v)
-            problem, along = kernel(self._forces)(unknown, resting, at, t, q, after)
+            still = kernel(self._find_jams, derivative=False)(problem, choice.mode, choice.slip)
+            resting, at, after, gains = kernel(self._after, derivative=False)(unknown, collision, begins, t, q, v)
+            problem, along = kernel(self._forces, derivative=False)(unknown, resting, at, t, q, after)
             final = choose_mode(elements, problem, guess_again(elements, problem, resting, guess, released), along)
-            follows, soft, short, paradox = kernel(self._flights)(
+            follows, soft, short, paradox, tail = kernel(self._flights, derivative=False)(
                 unknown, collision, problem, final.mode, final.slip, t, q, v, after, (height, fast)
             )
-            cornered = kernel(self._paradox)(problem, resting, along)
+            cornered = kernel(self._paradox, derivative=False)(problem, resting, along)
             # Both choices are valid if no element disagreed in the end.
             settled = ~(choice.wrong | final.wrong)
-            new = Transition(collision, follows, final.slip, after, settled, paradox | (cornered & ~settled))
+            ends = settled & ~gains & (soft.any() | short.any())
+            tail = jnp.where(ends & (last.tail == 0), tail, last.tail)
+            new = Transition(collision, follows, final.slip, after, settled, paradox | (cornered & ~settled), tail)
             fate = (
                 jnp.where(gains, jnp.where(rebound > 0.1, rebound / 2, 0.0), jnp.where(soft, 0.0, rebound)),
                 held | (short & ~gains & ~still.any()),
@@ -205,7 +211,7 @@ class ModalSystem(HybridSystem):
         # As far as the square of the speed is below the tolerance, the direction of sliding may lag behind.
         fast = jnp.asarray(1e-4, q.dtype) if atol is None else 0.3 * jnp.sqrt(jnp.maximum(atol, least))
         start = Collision(mode, slip, jnp.ones((n,), q.dtype), none, stopped)
-        blank = Transition(start, mode, slip, v, no, no)
+        blank = Transition(start, mode, slip, v, no, no, jnp.zeros((), q.dtype))
         return while_loop(lambda carry: carry[4], attempt, (zero, zero, start[2:], blank, ~no & happens))[3]
 
     def _velocities(self, unknown, mode: Mode, rebound, held, stopped, slip, t, q, v):
@@ -271,7 +277,8 @@ class ModalSystem(HybridSystem):
         return problem, directions(scene, elements, mode, terms.slip, slip)
 
     def _flights(self, unknown, collision: Collision, problem: Problem, mode: Mode, along, t, q, v, after, limits):
-        """Mode, contacts (n,) whose rebound is too low to be followed, others whose flight is, and whether a pivot is lost."""
+        """Mode, contacts (n,) whose rebound is too low to be followed, others whose flight is, whether a pivot is lost, and the
+        time in which such flights come to rest."""
         scene, elements = self._bind(unknown)[0], self.elements
         terms, of = terms_at(scene, elements, q, v, t), coefficients(scene, elements, v.dtype)
         height, fast = limits
@@ -293,7 +300,16 @@ class ModalSystem(HybridSystem):
         # Explicit steps could not follow a direction that turns ever faster as the speed falls to zero.
         begins = problem.may_stick | (speed < 0.9 * fast)
         follows = follows._replace(creep=jnp.where(slides, jnp.where(begins, fast, -_SLOWER * fast), 0.0))
-        return follows, low & bounces, low & ~bounces & ~collision.held, lost
+        soft, short = low & bounces, low & ~bounces & ~collision.held
+        # Every flight takes 2 v / a, and the next one is shorter by the ratio of this impact's velocities: a geometric series.
+        before = jnp.max(jnp.where(self._touches(scene, q, t), -rates_of(elements, terms.row.velocity)[0], 0.0))
+        ends, one = soft | short, jnp.ones_like(before)
+        ratio = jnp.max(jnp.where(ends, velocity, 0.0)) / jnp.where(before > 0, before, one)
+        flight = jnp.max(jnp.where(ends, 2 * velocity / jnp.where(ends, -rate, 1.0), 0.0))
+        # Slower ones are rounding of velocities that are zero.
+        bounces_on = (ratio > tolerance(v.dtype) ** 0.5) & (ratio < 1)
+        tail = jnp.where(bounces_on, flight / jnp.where(bounces_on, 1 - ratio, one), 0.0)
+        return follows, soft, short, lost, tail
 
     def _paradox(self, problem: Problem, mode: Mode, along):
         """True if sliding in a mode has lost a positive pivot of its forces: then they do not exist, or are not unique."""

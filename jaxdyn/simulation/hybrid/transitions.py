@@ -77,6 +77,7 @@ class Transition(NamedTuple):
     v: Array
     settled: Array  # true if a mode was found
     paradox: Array  # true where friction leaves no forces
+    tail: Array  # time (), s, in which flights that are not followed would come to rest
 
 
 def length(x):

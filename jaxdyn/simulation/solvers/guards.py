@@ -177,8 +177,10 @@ def search_root(
     locating, width = (search.locating & good) | begins, bracket.high - bracket.low
     is_narrow = width <= 4 * eps * jnp.maximum(jnp.abs(t1), search.usual)
     # The root is known when a guard is zero, or when its time is, up to rounding. A zero within the step may have been an error
-    # of the dense output: then the bracket closes on its end, before which no guard is negative.
-    is_known = (jnp.abs(value) <= 64 * eps) | (is_narrow & (violated | (width <= 0)))
+    # of the dense output: then the bracket closes on its end, before which no guard is negative. Attempts end at numbers of the
+    # time, between which an end that was a fraction of a step may lie.
+    is_closed = (width <= 0) | (t0 + bracket.high <= t1)
+    is_known = (jnp.abs(value) <= 64 * eps) | (is_narrow & (violated | is_closed))
     # A zero within the step is not at the end of it, which is where a step can be cut.
     located = locating & is_known & ~inside
     kept = good & ((~violated & ~search.locating) | located)

@@ -1,0 +1,109 @@
+"""Quality of steps through contacts beside C MuJoCo: penetration, creep, the law of friction, and energy, at one step length.
+
+    python -m benchmarks.contact_quality [--dt 0.002]
+
+A box on its four lower corners: it rests on a slope below the friction angle for ten seconds, slides down one above it, where the
+acceleration is known, and tumbles in flight for half a second. MuJoCo has elliptic cones and its defaults.
+"""
+
+import argparse
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+import jaxdyn as jd
+from benchmarks import timing
+
+G, MU, SIZE = 9.81, 0.5, np.array([0.2, 0.15, 0.1])
+SPIN = np.array([0.3, 0.1, 2.0, 4.0, 7.0, -3.0])  # of the flight
+
+
+def gravity(slope: float) -> np.ndarray:
+    """Gravity in axes of a slope that falls along x."""
+    return G * np.array([np.sin(slope), 0.0, -np.cos(slope)])
+
+
+def ours(slope: float, height: float, v, dt: float, count: int):
+    """Heights of the lowest corner, positions, energies, and forces (count, 4, 3) of each corner: friction, normal."""
+    builder = jd.ModelBuilder("box", gravity=tuple(gravity(slope)))
+    builder.add_body("box", None, "free", (1.0, (0, 0, 0), (np.sum(SIZE**2) - SIZE**2) / 12))
+    corners = [SIZE / 2 * (x, y, -1) for x in (-1, 1) for y in (-1, 1)]
+    feet = [jd.contact.ground_contact("box", at, MU, name=str(i)) for i, at in enumerate(corners)]
+    scene = jd.Scene(builder.build(), forces=feet)
+    step = jd.stepper(scene, dt, report=True)
+
+    def advance(state, _):
+        state, report = step(state, jnp.zeros(6))
+        turn = jd.so3.quat_to_matrix(state[0][3:])
+        low = jnp.min(state[0][2] + jnp.asarray(corners) @ turn[2])
+        energy = jd.kinetic_energy(scene.system, *state) - jnp.asarray(gravity(slope)) @ state[0][:3]
+        return state, (low, state[0], energy, jnp.stack([report.forces[str(i)] for i in range(4)]))
+
+    start = jnp.asarray([0, 0, height, 1, 0, 0, 0.0]), jnp.asarray(v, float)
+    return map(np.asarray, jax.jit(lambda s: jax.lax.scan(advance, s, None, length=count)[1])(start))
+
+
+def with_mujoco(slope: float, height: float, v, dt: float, count: int):
+    """The same by MuJoCo."""
+    import mujoco as _mujoco
+
+    mujoco: Any = _mujoco  # without types
+    x, y, z = SIZE / 2
+    gx, gy, gz = gravity(slope)
+    model = mujoco.MjModel.from_xml_string(
+        f"""<mujoco><option gravity="{gx} {gy} {gz}" timestep="{dt}" cone="elliptic"><flag energy="enable"/></option>
+        <default><geom friction="{MU} 0.005 0.0001"/></default><worldbody><geom type="plane" size="99 99 1"/>
+        <body><freejoint/><geom type="box" size="{x} {y} {z}" mass="1"/></body></worldbody></mujoco>"""
+    )
+    data = mujoco.MjData(model)
+    data.qpos[:3], data.qvel[:] = (0, 0, height), v
+    rows = []
+    for _ in range(count):
+        mujoco.mj_step(model, data)
+        forces, low = np.zeros((4, 3)), np.inf
+        for i in range(min(4, data.ncon)):
+            wrench = np.zeros(6)
+            mujoco.mj_contactForce(model, data, i, wrench)
+            forces[i], low = wrench[[1, 2, 0]], min(low, data.contact[i].dist)
+        mujoco.mj_forward(model, data)  # the energy is that of the start of a step
+        rows.append((low, data.qpos.copy(), data.energy.sum(), forces))
+    return map(np.array, zip(*rows, strict=True))
+
+
+def quality(run, dt: float) -> dict[str, float]:
+    """Measures of one program."""
+    count = round(1 / dt)
+    low, q, _, _ = run(0.4, SIZE[2] / 2, np.zeros(6), dt, 11 * count)
+    measures = {
+        "penetration at rest, m": max(0.0, -low[-1]),
+        "creep in ten seconds, m": np.linalg.norm(q[-1, :3] - q[count, :3]),
+    }
+    low, q, _, forces = run(0.6, SIZE[2] / 2, np.zeros(6), dt, count)
+    # From the second half on, where a soft contact has settled: positions of a constant acceleration.
+    times = dt * np.arange(1, count + 1)
+    found = 2 * np.polyfit(times[count // 2 :], q[count // 2 :, 0], 2)[0]
+    normal = forces[count // 2 :, :, 2]
+    excess = np.linalg.norm(forces[count // 2 :, :, :2], axis=2) - MU * normal
+    measures["error of the acceleration of sliding"] = abs(found / (G * (np.sin(0.6) - MU * np.cos(0.6))) - 1)
+    measures["friction beyond or below mu N while sliding, of N"] = np.abs(excess).max() / normal.sum(1).max()
+    _, _, energy, _ = run(0.0, 1.0, SPIN, dt, count // 2)
+    measures["change of energy in flight"] = np.ptp(energy) / energy[0]
+    return measures
+
+
+def main():
+    """Print a table."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--dt", type=float, default=0.002)
+    given = parser.parse_args()
+    jax.config.update("jax_enable_x64", True)
+    print(timing.machine())
+    a, b = (quality(run, given.dt) for run in (ours, with_mujoco))
+    for name in a:
+        print(f"{name}: jaxdyn {a[name]:.1e}, MuJoCo {b[name]:.1e}")
+
+
+if __name__ == "__main__":
+    main()
