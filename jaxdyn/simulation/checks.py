@@ -3,6 +3,7 @@
 All checks raise ValueError with the argument, its value and the fix.
 """
 
+from collections.abc import Callable
 from typing import Any, NamedTuple
 
 import diffrax
@@ -12,12 +13,12 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool
 
-from jaxdyn.compile.known import is_concrete
+from jaxdyn.compile.known import is_concrete, once
 from jaxdyn.constraints.assembly import largest_residuals, open_constraints, start_openness
 from jaxdyn.constraints.base import layout
 from jaxdyn.constraints.rank import LEAST_GAP
-from jaxdyn.constraints.redundancy import keep_rows
-from jaxdyn.constraints.selection import count_free, most_rounding, select_rows
+from jaxdyn.constraints.redundancy import holds_rows, keep_rows
+from jaxdyn.constraints.selection import count_free, known_rows, most_rounding, select_rows
 from jaxdyn.contact.forces import contacts_with_cones
 from jaxdyn.dynamics.quantities import mass_matrix
 from jaxdyn.forces.piecewise import has_pieces
@@ -105,8 +106,11 @@ def angle_coordinates(system) -> np.ndarray:
 
 def check_angles(scene: Scene, q0, dtype) -> None:
     """Refuse angles of so many turns that their dtype holds too little of the rest."""
+    sizes = np.abs(np.asarray(q0, float))
+    if not (sizes > largest_angle(dtype)).any():
+        return
     angles = angle_coordinates(scene.system)
-    sizes = np.abs(np.asarray(q0, float)[angles])
+    sizes = sizes[angles]
     if sizes.size and sizes.max() > largest_angle(dtype):
         index = int(angles[np.argmax(sizes)])
         value, eps = float(q0[index]), float(jnp.finfo(dtype).eps)
@@ -132,17 +136,18 @@ def check_times(ts) -> None:
         return
     _check_finite("ts", ts)
     times = np.asarray(ts, float)
-    back = np.flatnonzero(np.diff(times) <= 0)
-    if back.size:
-        i = back[0]
+    is_later = times[1:] > times[:-1]
+    if not is_later.all():
+        i = np.flatnonzero(~is_later)[0]
         raise ValueError(
             f"ts does not increase at index {i + 1}: {times[i]} then {times[i + 1]}; sort it, drop doubles"
         )
 
 
 def _check_finite(name: str, value) -> None:
-    bad = np.flatnonzero(~np.isfinite(np.asarray(value, float)))
-    if bad.size:
+    is_finite = np.isfinite(np.asarray(value, float))
+    if not is_finite.all():
+        bad = np.flatnonzero(~is_finite)
         raise ValueError(f"{name} is {np.asarray(value)[bad[0]]} at index {bad[0]}; give finite numbers")
 
 
@@ -281,6 +286,7 @@ def check_limits(scene: Scene, limits: Any, modal: bool) -> None:
 METHODS: dict[str, type[Method]] = {
     kind.name: kind for kind in (Multipliers, Projected, Reduced, Baumgarte, Variational)
 }
+_FREE, _PROJECTED = Free(), Projected()
 
 
 def choose_method(scene: Scene, method: str | Method) -> Method:
@@ -293,12 +299,12 @@ def choose_method(scene: Scene, method: str | Method) -> Method:
     """
     if not scene.constraints:
         if method in ("auto", "free") or isinstance(method, Free):
-            return Free()
+            return _FREE
         if method == "variational" or isinstance(method, Variational):
             return Variational() if isinstance(method, str) else method
         raise ValueError(f"method is {method!r}; a scene without constraints takes 'auto' or 'free', or 'variational'")
     if method == "auto":
-        return Projected()
+        return _PROJECTED
     if isinstance(method, Method) and not isinstance(method, Free):
         chosen = method
     elif isinstance(method, str) and method in METHODS:
@@ -317,12 +323,15 @@ def check_constraints(scene: Scene, method: Method, q, v, t) -> tuple[Scene, Met
     **Raises:** ValueError that names the constraints, the size of their violation and the fix; for a basis that is not regular
     at the start.
     """
+    # Most starts are on independent constraints, which is found without the details that messages need.
+    if not isinstance(method, Reduced) and _find_soundness(scene, rank_tol=method.rank_tol, dtype=q.dtype)(q, v, t):
+        return scene, method
     limit, t = start_limit(q.dtype), np.asarray(t, q.dtype)
     selection = select_rows(scene, q, t, method.rank_tol)
     rank = int(np.sum(selection.kept))
     with jax.ensure_compile_time_eval():  # known numbers stay known while a function around is traced
         selected = scene if rank == len(selection.kept) else keep_rows(scene, selection)
-    ratio = start_openness(selected, q, v, t, limit)
+    ratio = start_openness(selected, relative=limit)(q, v, t)
     if ratio <= 1 and selection.rounding > most_rounding(q.dtype):
         raise ValueError(
             f"rows of the constraints contradict each other: they depend on others, but are open by "
@@ -357,6 +366,15 @@ def check_constraints(scene: Scene, method: Method, q, v, t) -> tuple[Scene, Met
         if method.basis is not None and not bool(_is_regular_at(selected, method.basis, q, t)):
             raise ValueError(f"the basis is not regular at q0: {method.basis.advice(selected, q, t)}")
     return selected, method
+
+
+@once
+def _find_soundness(scene: Scene, *, rank_tol, dtype) -> Callable[..., bool]:
+    """Function (q, v, t) of a known scene: whether all rows are independent beyond doubt, and closed, and leave freedom."""
+    rows, has_doubtful_rows = known_rows(scene, rank_tol=rank_tol, dtype=dtype)
+    is_free = rows.kept.size < scene.nv and not holds_rows(scene)
+    openness = start_openness(scene, relative=start_limit(dtype))
+    return lambda q, v, t: is_free and not has_doubtful_rows(q, t) and bool(openness(q, v, t) <= 1)
 
 
 def may_have_singular_mass(system) -> bool:
