@@ -19,7 +19,7 @@ import jax
 logger = logging.getLogger("jaxdyn")
 PHASES = "tracing", "expansion", "XLA", "LLVM"
 REPORTED_SECONDS = 2.0  # of a first call
-_QUIET_SECONDS = 1.0
+_QUIET_SECONDS, _SHORT_SECONDS = 1.0, 0.2
 
 
 class _FirstCall:
@@ -89,8 +89,8 @@ class _FirstCall:
     def optimise_later(self, improve: Callable, size: int, is_new: bool) -> None:
         """Call improve() in the thread that optimises code, the short ones first.
 
-        Not `is_new`: code that an earlier process has left quick, as it ended soon. It is optimised at once, so that scripts
-        which end soon do not run it for ever.
+        Not `is_new`: code that an earlier process has left quick, as it ended soon. It is optimised before all other, so that
+        scripts which end soon do not run it for ever.
         """
         with self.changed:
             heapq.heappush(self.tasks, (is_new, size, next(self.order), improve))
@@ -105,9 +105,11 @@ class _FirstCall:
 
     def _wait(self) -> float:
         """Seconds until the first call is over, as far as that is known."""
-        if self.is_hurried or self.is_ending or (self.tasks and not self.tasks[0][0]):
+        if self.is_hurried or self.is_ending:
             return 0.0
-        return _QUIET_SECONDS if self.active else max(self.end, self.added) + _QUIET_SECONDS - time.perf_counter()
+        # What an earlier process left quick has waited long enough.
+        quiet = _SHORT_SECONDS if self.tasks and not self.tasks[0][0] else _QUIET_SECONDS
+        return quiet if self.active else max(self.end, self.added) + quiet - time.perf_counter()
 
     def _run(self) -> None:
         while True:

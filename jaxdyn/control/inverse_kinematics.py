@@ -27,7 +27,7 @@ from jaxdyn.constraints.selection import most_rounding
 from jaxdyn.constraints.tolerances import own_length
 from jaxdyn.control.least_squares import Aims, clip_to_limits, screw_joints, search
 from jaxdyn.control.targets import as_targets, target_rows
-from jaxdyn.model.arguments import Checked, Number, Numbers, as_operand, check_flag, check_mapping, check_state
+from jaxdyn.model.arguments import Checked, Given, Number, Numbers, as_operand, check_flag, check_mapping, check_state
 from jaxdyn.model.tree import Model
 from jaxdyn.systems.scene import Scene, as_scene
 from jaxdyn.systems.system import SceneLike, displace
@@ -154,7 +154,7 @@ def inverse_kinematics(
     return require_success(place, throw, message)
 
 
-def row_weights(rows: tuple[Constraint, ...], weights, dtype) -> Array:
+def row_weights(rows: tuple[Constraint, ...], weights, dtype) -> Given:
     """Weights (m,) of all rows of the targets."""
     weights = check_mapping(weights, "weights", f"{{{rows[0].name!r}: 2.0}}")
     names = {row.name.partition(" ")[0] if row.name not in weights else row.name for row in rows}
@@ -173,7 +173,7 @@ def row_weights(rows: tuple[Constraint, ...], weights, dtype) -> Array:
         if is_concrete(value) and not (np.isfinite(value).all() and (np.asarray(value) >= 0).all()):
             raise ValueError(f"weights[{row.name!r}] is {np.asarray(value)}; give numbers that are not negative")
         parts.append((value, count))
-    join = np if is_known([value for value, _ in parts]) else jnp
+    join: Any = np if is_known([value for value, _ in parts]) else jnp
     return join.concatenate([join.broadcast_to(value, (count,)) for value, count in parts])
 
 

@@ -35,8 +35,8 @@ class FrameTarget(Pair):
     name: str = eqx.field(static=True)
     frame: str = eqx.field(static=True)
     task: str = eqx.field(static=True)
-    target: Float[Array, "4 4"]
-    pose: Float[Array, "4 4"]
+    target: Float[Array | np.ndarray, "4 4"]
+    pose: Float[Array | np.ndarray, "4 4"]
 
     def sizes(self, system, dtype):
         """Rows of the position and of the orientation, all holonomic."""
@@ -83,7 +83,7 @@ def as_targets(model: Any, targets: Any) -> tuple[Constraint, ...]:
     for name, value in targets.items():
         # A frame of the model by this name has precedence.
         if name == CENTER and CENTER not in model.frame_names:
-            target = Fixed(_numbers(value, CENTER, (3,), model.home.dtype))
+            target = Fixed(jnp.asarray(_numbers(value, CENTER, (3,), model.home.dtype)))
             rows.append(CenterError(target=target, name=CENTER))
             continue
         frame_index(model, name)  # refuses unknown names
@@ -146,7 +146,7 @@ def _frame_target(label: str, frame: str, task: str, number, axis) -> FrameTarge
         pose = _pose(_frame_along(jnp.asarray(axis, number.dtype), f"targets[{frame!r}]: axis"), none)
     if not is_known(number, axis):
         target, pose = jnp.asarray(target), jnp.asarray(pose)
-    return FrameTarget(label, frame, task, target, pose)  # pyright: ignore[reportArgumentType]
+    return FrameTarget(label, frame, task, target, pose)
 
 
 def _pose(R, p):

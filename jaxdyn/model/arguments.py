@@ -79,7 +79,7 @@ def as_array(value: Any, name: str, dtype=None) -> Given:
 def as_operand(value: Any, name: str, dtype) -> Given:
     """`as_array`; of numpy outside of a trace, where each operation of JAX is a program of its own."""
     value = as_array(value, name)
-    return _cast(value, dtype) if is_known(value) else as_array(value, name, dtype)
+    return _cast(value, dtype) if is_known(value) else as_array(value, name, dtype)  # pyright: ignore[reportReturnType]
 
 
 def _cast(value: Any, dtype) -> np.ndarray:
