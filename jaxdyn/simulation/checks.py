@@ -6,7 +6,6 @@ All checks raise ValueError with the argument, its value and the fix.
 from collections.abc import Callable
 from typing import Any, NamedTuple
 
-import diffrax
 import equinox as eqx
 import jax
 import jax.numpy as jnp
@@ -29,9 +28,8 @@ from jaxdyn.model.topology import frame_index
 from jaxdyn.model.tree import Model
 from jaxdyn.simulation.controls import Controller, Sampled
 from jaxdyn.simulation.methods import Baumgarte, Free, Method, Multipliers, Projected, Reduced, is_regular, start_limit
+from jaxdyn.simulation.options import is_backsolve, is_step_length, is_variational
 from jaxdyn.simulation.solution import RESULTS
-from jaxdyn.simulation.solvers import Stepper
-from jaxdyn.simulation.solvers.choice import has_name, is_explicit, is_step_length, label, uses_tolerances
 from jaxdyn.simulation.variational import Variational
 from jaxdyn.systems.mass_factor import mass_factor
 from jaxdyn.systems.scene import Scene, has_drives
@@ -166,16 +164,16 @@ def sort_outputs(scene: Scene, outputs) -> tuple[str, ...]:
 
 def check_combination(control, method: Method, solver, adjoint) -> None:
     """Refuse controls and adjoints that a method does not support."""
-    if isinstance(solver, Stepper) and isinstance(control, (Controller, Sampled)):
+    if is_variational(solver) and isinstance(control, (Controller, Sampled)):
         raise ValueError(
             f"control is a {type(control).__name__}, whose state the steps of method 'variational' do not integrate; take "
             "another method"
         )
-    if isinstance(solver, Stepper) and isinstance(adjoint, diffrax.BacksolveAdjoint):
+    if is_variational(solver) and is_backsolve(adjoint):
         raise ValueError(
             "adjoint is 'backsolve', which needs a differential equation; take 'reverse' or another method"
         )
-    if isinstance(method, Reduced) and isinstance(adjoint, diffrax.BacksolveAdjoint):
+    if isinstance(method, Reduced) and is_backsolve(adjoint):
         raise ValueError(
             "adjoint is 'backsolve', which cannot follow the basis of method='reduced' backwards, nor see it become singular; "
             "take 'reverse'"
@@ -184,7 +182,7 @@ def check_combination(control, method: Method, solver, adjoint) -> None:
 
 def check_conditions(conditions, adjoint) -> None:
     """Refuse an adjoint that does not go back through the event that may end a run."""
-    if any(conditions) and isinstance(adjoint, diffrax.BacksolveAdjoint):
+    if any(conditions) and is_backsolve(adjoint):
         raise ValueError(
             "adjoint is 'backsolve', which does not go back through events, and contacts, limits or the control may end the run; "
             "take 'reverse', or contacts='report', limits=None and a control without `allowance`"
@@ -200,7 +198,7 @@ def check_drives(scene: Scene, control, solver, modal: bool) -> None:
         raise ValueError(
             f"{what} and forces with modes (jd.contact.DryFriction, jd.contact.UnilateralContact); leave one of them out"
         )
-    if isinstance(solver, Stepper):
+    if is_variational(solver):
         raise ValueError(f"{what}, which the steps of method 'variational' do not integrate; take another method")
     if isinstance(control, Controller) and control.takes_multipliers:
         raise ValueError(f"{what}, behind which multipliers do not depend on the command; use a control without them")
@@ -215,12 +213,14 @@ def check_modal_options(control, stepsize, solver, adjoint, outputs) -> None:
         raise ValueError(
             f"stepsize is {stepsize!r}, and {what}; leave it out for steps that keep rtol and atol, or give a length (s)"
         )
+    from jaxdyn.simulation.solvers.choice import has_name, is_explicit, label
+
     if not is_explicit(solver):
         raise ValueError(
             f"solver is {label(solver)}, and {what}, whose events are located within explicit steps; take diffrax.Dopri8() or "
             "Tsit5(), or, where forces are stiff, friction without modes (jd.forces.CoulombFriction)"
         )
-    if isinstance(adjoint, diffrax.BacksolveAdjoint):
+    if is_backsolve(adjoint):
         raise ValueError(f"adjoint is 'backsolve', which does not go back through events, and {what}; take 'reverse'")
     if not has_name(adjoint):
         raise ValueError(f"adjoint is {adjoint}, which does not go back through events, and {what}; take 'reverse'")
@@ -233,13 +233,16 @@ def check_modal_options(control, stepsize, solver, adjoint, outputs) -> None:
 
 def check_effects(scene: Scene, solver, stepsize, modal: bool, given: dict[str, Any]) -> None:
     """Refuse options that were given (not None) and have no effect on this run, and a bad number of events."""
-    if stepsize is not None and not uses_tolerances(solver):
-        steps = "fixed" if is_step_length(stepsize) else "their own"
-        for name in ("rtol", "atol"):
-            if given[name] is not None:
-                raise ValueError(
-                    f"{name} is given, and {label(solver)} has no use for it with {steps} steps (stepsize); omit one of them"
-                )
+    without_use = [name for name in ("rtol", "atol") if stepsize is not None and given[name] is not None]
+    if without_use:
+        from jaxdyn.simulation.solvers.choice import choose_solver, label, uses_tolerances
+
+        solver, steps = choose_solver(solver, stepsize), "fixed" if is_step_length(stepsize) else "their own"
+        if not uses_tolerances(solver):
+            raise ValueError(
+                f"{without_use[0]} is given, and {label(solver)} has no use for it with {steps} steps (stepsize); omit one of "
+                "them"
+            )
     most = given["max_events"]
     if most is not None:
         if isinstance(most, bool) or not isinstance(most, (int, np.integer)) or most < 1:

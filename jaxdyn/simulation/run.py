@@ -8,31 +8,29 @@ no such projection.
 from collections.abc import Sequence
 from typing import Any
 
-import diffrax
 import jax
 import jax.numpy as jnp
 import numpy as np
 
+from jaxdyn.compile import entry_point
 from jaxdyn.compile.known import as_numpy_if_known, is_concrete, is_known, once
 from jaxdyn.contact.unilateral import has_modes
 from jaxdyn.model.arguments import Numbers, as_array, check_flag, state_dtype
 from jaxdyn.simulation import checks, controls
 from jaxdyn.simulation.checks import check_constraints, choose_method, may_have_singular_mass
 from jaxdyn.simulation.controls import Control
-from jaxdyn.simulation.hybrid.motion import hybrid_motion
 from jaxdyn.simulation.methods import Method, may_have_redundant_rows
-from jaxdyn.simulation.motion import smooth_motion
-from jaxdyn.simulation.solution import Solution, raise_failure
-from jaxdyn.simulation.solvers.choice import (
+from jaxdyn.simulation.options import (
+    ADJOINTS,
+    Adjoint,
     Solver,
     Stepsize,
-    choose_adjoint,
-    choose_solver,
+    check_step_length,
+    is_backsolve,
     is_step_length,
-    solver_for_start,
     step_limit,
 )
-from jaxdyn.simulation.terminal_events import report_limits
+from jaxdyn.simulation.solution import Solution, raise_failure
 from jaxdyn.systems.scene import Scene, as_scene
 from jaxdyn.systems.system import SceneLike, System, has_dependent_coordinates
 
@@ -49,7 +47,7 @@ def simulate(
     stepsize: Stepsize = None,
     rtol: Numbers | None = None,
     atol: Numbers | None = None,
-    adjoint: str | diffrax.AbstractAdjoint | None = None,
+    adjoint: Adjoint = None,
     outputs: Sequence[str] = (),
     contacts: str | None = None,
     limits: str | None = None,
@@ -161,11 +159,29 @@ def simulate(
     else:
         solution = smooth_motion(scene, control, method, numbers, options)
     if limits == "report":
+        from jaxdyn.simulation.terminal_events import report_limits
+
         solution = report_limits(scene, solution, concrete)
     throw = concrete if throw is None else check_flag(throw, "throw")
     if throw and concrete:
         raise_failure(solution, scene, control, options)
     return solution.result.error_if(solution, ~solution.success) if throw and not concrete else solution
+
+
+@entry_point
+def smooth_motion(*args) -> Solution:
+    """A run without modes; what makes its program is imported where it is not on disk."""
+    from jaxdyn.simulation.motion import smooth_motion
+
+    return smooth_motion(*args)
+
+
+@entry_point
+def hybrid_motion(*args) -> Solution:
+    """A run with modes."""
+    from jaxdyn.simulation.hybrid.motion import hybrid_motion
+
+    return hybrid_motion(*args)
 
 
 def _is_array(x, dtype) -> bool:
@@ -219,10 +235,11 @@ def _prepare_start(scene: Scene, method: Method, start, stepsize, modal: bool, c
 
 def _solver_at_start(scene: Scene, control, solver, stepsize, adjoint, arrays, modal: bool):
     """The solver that was given, or the one that a stiff start asks for."""
-    backwards = adjoint == "backsolve" or isinstance(adjoint, diffrax.BacksolveAdjoint)
     # Only for adaptive steps without modes: events are located within explicit steps. Backwards the equations are others.
-    if solver is not None or not scene.forces or modal or is_step_length(stepsize) or backwards:
+    if solver is not None or not scene.forces or modal or is_step_length(stepsize) or is_backsolve(adjoint):
         return solver
+    from jaxdyn.simulation.solvers.choice import solver_for_start
+
     q0, v0, ts, *_ = arrays
     return solver_for_start(scene, controls.at_start(control, q0, v0, ts[0]), q0, v0, ts)
 
@@ -232,9 +249,17 @@ def _choose(
     scene: Scene, control, method: Method, solver, stepsize, adjoint,
     *, outputs, contacts, limits, max_events, tolerances: tuple[bool, bool], modal: bool,
 ) -> dict[str, Any]:  # fmt: skip
-    """Options of a run that the numbers do not decide."""
-    solver = choose_solver(method.stepper(solver, stepsize), stepsize)
-    adjoint = choose_adjoint(adjoint, solver)
+    """Options of a run that the numbers do not decide; defaults and names stay what they are (see `as_objects`)."""
+    solver = method.stepper(solver, stepsize)
+    is_default = solver is None and (stepsize is None or is_step_length(stepsize)) and not modal
+    if is_default and (adjoint is None or (isinstance(adjoint, str) and adjoint in ADJOINTS)):
+        adjoint = "reverse" if adjoint is None else adjoint
+        if stepsize is not None:
+            check_step_length(stepsize)
+    else:
+        from jaxdyn.simulation.solvers.choice import as_objects
+
+        solver, adjoint = as_objects({"solver": solver, "adjoint": adjoint}, stepsize).values()
     checks.check_drives(scene, control, solver, modal)
     checks.check_combination(control, method, solver, adjoint)
     if modal:
