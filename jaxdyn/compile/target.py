@@ -17,7 +17,7 @@ from jaxdyn.compile.code import calls_itself, kernel_ir, subprogram_ir, symbol_o
 from jaxdyn.compile.first_calls import optimise_later, phase
 from jaxdyn.compile.jax_adapter import Unsupported as Unsupported
 from jaxdyn.compile.jax_adapter import ffi_version, register_handler
-from jaxdyn.compile.objects import Code, compile_text, features
+from jaxdyn.compile.objects import Code, features
 from jaxdyn.compile.program import FLOATS, Program, kind_of
 from jaxdyn.compile.stored import changed
 
@@ -79,16 +79,17 @@ def _register() -> None:
     text = resources.files("jaxdyn.compile").joinpath("handler.ll").read_text()
     messages = {"MISSING": _MISSING, "FAILED": _FAILED, "MISFIT": _MISFIT}
     fields = {
-        "TABLE": ctypes.addressof(_table), "SLOT_MASK": SLOTS - 1, "LIMIT": ctypes.addressof(_threads),
-        "FAILURES": ctypes.addressof(_failures), "PREPARE": ctypes.cast(_PREPARE, ctypes.c_void_p).value,
-        "MAJOR": version[0], "MINOR": version[1],
+        "SLOT_MASK": SLOTS - 1, "MAJOR": version[0], "MINOR": version[1],
         "RELAX": _RELAX[architecture], "RELAX_TYPE": _RELAX[architecture].replace("i32 1", "i32"),
         **messages, **{f"{name}_BYTES": len(message) + 1 for name, message in messages.items()},
     }  # fmt: skip
     for name, value in fields.items():
         text = text.replace("{" + name + "}", str(value))
-    # Its addresses are those of this process: it is not kept on disk.
-    code = Code(compile_text(text))
+    # Places of this process have names in the text, so that its code is found on disk.
+    for name, place in (("table", _table), ("limit", _threads), ("failures", _failures)):
+        objects.add_symbol(f"jaxdyn_{name}", ctypes.addressof(place))
+    objects.add_symbol("jaxdyn_prepare", ctypes.cast(_PREPARE, ctypes.c_void_p).value or 0)
+    code = objects.code_of(text)
     register_handler(TARGET, code.address("handler"))
     code.publish("careful", CAREFUL)
     _codes.append(code)

@@ -142,7 +142,7 @@ def _frame_target(label: str, frame: str, task: str, number, axis) -> FrameTarge
     elif task == "position":
         target = _pose(still, number)
     else:
-        target = _pose(_frame_along(number, f"targets[{frame!r}]: direction"), none)
+        target = _pose(_frame_along(jnp.asarray(number), f"targets[{frame!r}]: direction"), none)
         pose = _pose(_frame_along(jnp.asarray(axis, number.dtype), f"targets[{frame!r}]: axis"), none)
     if not is_known(number, axis):
         target, pose = jnp.asarray(target), jnp.asarray(pose)
