@@ -18,6 +18,7 @@ from jaxdyn.compile.flags import mark_invalid as mark_invalid
 from jaxdyn.compile.jacobi import gram_eigenvectors as gram_eigenvectors
 from jaxdyn.compile.jacobi import inverse as inverse
 from jaxdyn.compile.jacobi import pseudo_inverse_by_rotations as pseudo_inverse_by_rotations
+from jaxdyn.compile.kernels import Evaluation as Evaluation
 from jaxdyn.compile.kernels import evaluate as evaluate
 from jaxdyn.compile.kernels import kernel as kernel
 from jaxdyn.compile.kernels import variant as variant

@@ -46,13 +46,14 @@ def _compile(function: Callable, options: Callable) -> Callable:
     def call(*args, **kwargs):
         if is_tracing():
             return function(*args, **kwargs)
-        # JAX refuses compiler options under a transformation such as `grad`, whose arguments are traced.
-        if not (_is_glue(jax.default_backend()) and is_concrete((args, kwargs))):
-            return usual(*args, **kwargs)
-        if _is_plain_call():
+        is_glue = _is_glue(jax.default_backend())
+        if is_glue and _is_plain_call():
             found = executables.call(function, args, kwargs, options)
             if found is not None:
                 return found
+        # JAX refuses compiler options under a transformation such as `grad`, whose arguments are traced.
+        if not (is_glue and is_concrete((args, kwargs))):
+            return usual(*args, **kwargs)
         with ahead.worker(not mode.wants_usual_options()):
             return compiled()(*args, **kwargs)
 

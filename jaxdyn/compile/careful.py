@@ -18,7 +18,7 @@ import jax.numpy as jnp
 
 from jaxdyn.compile import derive, mode
 from jaxdyn.compile.program import Array, Constant, Operation, Program, kind_of
-from jaxdyn.compile.stored import key_within
+from jaxdyn.compile.stored import changed, key_within
 
 T = TypeVar("T")
 
@@ -127,10 +127,16 @@ class Description(NamedTuple):
         """The careful program; `remake()` makes it from the function again, which hardly any process needs."""
         inputs, outputs, digest, name, which = self
 
-        def by_jax(*flat):
-            return remake().by_jax(*flat)
+        def again() -> Careful:
+            made = remake()
+            if not isinstance(made, Careful) or (made.inputs, made.outputs) != (inputs, outputs):
+                raise changed(name)
+            return made
 
-        return Careful(inputs, outputs, digest, name, lambda: remake()._program(), by_jax, which, True)
+        def by_jax(*flat):
+            return again().by_jax(*flat)
+
+        return Careful(inputs, outputs, digest, name, lambda: again()._program(), by_jax, which, True)
 
 
 def _digest(*parts) -> str:

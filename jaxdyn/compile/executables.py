@@ -59,7 +59,8 @@ def call(function: Callable, args: tuple, kwargs: dict, options: Callable) -> An
     device, kinds, arrays = _default_sharding(), [], []
     for x in leaves:
         if isinstance(x, jax.Array):
-            if x.sharding != device or not isinstance(x.dtype, np.dtype):  # random keys have a dtype of their own
+            # Random keys have a dtype of their own.
+            if isinstance(x, jax_adapter.Tracer) or x.sharding != device or not isinstance(x.dtype, np.dtype):
                 return None
             kinds.append((x.shape, x.dtype, x.weak_type))
             arrays.append(x)

@@ -5,8 +5,9 @@ thread of the process, after the first call. Python's collector of cycles stays 
 """
 
 import atexit
-import collections
 import contextlib
+import heapq
+import itertools
 import logging
 import os
 import threading
@@ -18,7 +19,7 @@ import jax
 logger = logging.getLogger("jaxdyn")
 PHASES = "tracing", "expansion", "XLA", "LLVM"
 REPORTED_SECONDS = 2.0  # of a first call
-_QUIET_SECONDS = 1.0
+_QUIET_SECONDS, _SHORT_SECONDS = 1.0, 0.2
 
 
 class _FirstCall:
@@ -30,8 +31,9 @@ class _FirstCall:
         self.begin = self.end = self.added = 0.0  # of the phases, and when the last task came
         self.active = 0  # phases in all threads
         self.inner = threading.local()  # seconds of phases within the phase at hand, in this thread
-        self.tasks: collections.deque[Callable] = collections.deque()
+        self.tasks: list[tuple[bool, int, int, Callable]] = []  # a heap
         self.thread: threading.Thread | None = None
+        self.order = itertools.count()
         self.is_hurried = self.is_ending = False
 
     @contextlib.contextmanager
@@ -84,12 +86,17 @@ class _FirstCall:
 
     # --- after the first call ---
 
-    def optimise_later(self, improve: Callable) -> None:
-        """Call improve() in the thread that optimises code."""
+    def optimise_later(self, improve: Callable, size: int, is_new: bool) -> None:
+        """Call improve() in the thread that optimises code, the short ones first.
+
+        Not `is_new`: code that an earlier process has left quick, as it ended soon. It is optimised before all other, so that
+        scripts which end soon do not run it for ever.
+        """
         with self.changed:
-            self.tasks.append(improve)
+            heapq.heappush(self.tasks, (is_new, size, next(self.order), improve))
             self.added = time.perf_counter()
             self._start()
+            self.changed.notify_all()
 
     def _start(self) -> None:
         if self.thread is None:
@@ -100,7 +107,9 @@ class _FirstCall:
         """Seconds until the first call is over, as far as that is known."""
         if self.is_hurried or self.is_ending:
             return 0.0
-        return _QUIET_SECONDS if self.active else max(self.end, self.added) + _QUIET_SECONDS - time.perf_counter()
+        # What an earlier process left quick has waited long enough.
+        quiet = _SHORT_SECONDS if self.tasks and not self.tasks[0][0] else _QUIET_SECONDS
+        return quiet if self.active else max(self.end, self.added) + quiet - time.perf_counter()
 
     def _run(self) -> None:
         while True:
@@ -112,7 +121,7 @@ class _FirstCall:
                     self.thread = None
                     self.changed.notify_all()
                     return
-                improve = self.tasks.popleft()
+                improve = heapq.heappop(self.tasks)[-1]
             # What cannot be optimised keeps its quick code.
             with contextlib.suppress(Exception):
                 improve()

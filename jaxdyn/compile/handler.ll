@@ -15,6 +15,11 @@ declare ptr @malloc(i64)
 declare void @free(ptr)
 declare void @llvm.memcpy.p0.p0.i64(ptr, ptr, i64, i1)
 declare {RELAX_TYPE}
+; Of the process: `target.register` says where they are.
+@{TABLE} = external global i8
+@jaxdyn_limit = external global i64
+@jaxdyn_failures = external global i64
+declare ptr @jaxdyn_prepare(i64)
 
 @missing = private constant [{MISSING_BYTES} x i8] c"{MISSING}\00"
 @failed = private constant [{FAILED_BYTES} x i8] c"{FAILED}\00"
@@ -123,12 +128,11 @@ define internal ptr @failure(ptr %api, ptr %message, i32 %code) #0 {
 ; The table's entry for a hash, or null: linear probing.
 define internal ptr @look_up(i64 %hash) #0 {
 entry:
-  %table = inttoptr i64 {TABLE} to ptr
   br label %look
 look:
   %probe = phi i64 [ %hash, %entry ], [ %probe.next, %other ]
   %slot = and i64 %probe, {SLOT_MASK}
-  %here = getelementptr %Entry, ptr %table, i64 %slot
+  %here = getelementptr %Entry, ptr @{TABLE}, i64 %slot
   %found = load atomic i64, ptr %here acquire, align 8
   %is.same = icmp eq i64 %found, %hash
   br i1 %is.same, label %hit, label %other
@@ -223,8 +227,7 @@ none:
   ret i64 1
 some:
   %count = load i64, ptr %count.at
-  %limit.at = inttoptr i64 {LIMIT} to ptr
-  %limit = load i64, ptr %limit.at
+  %limit = load i64, ptr @jaxdyn_limit
   %is.less = icmp slt i64 %count, %limit
   %allowed = select i1 %is.less, i64 %count, i64 %limit
   ret i64 %allowed
@@ -316,8 +319,7 @@ look:
 old:
   ret ptr %ready
 new:
-  %prepare = inttoptr i64 {PREPARE} to ptr
-  %made = call ptr %prepare(i64 %hash)
+  %made = call ptr @jaxdyn_prepare(i64 %hash)
   ret ptr %made
 }
 
@@ -436,8 +438,7 @@ not.made:
   %error.failed = call ptr @failure(ptr %api, ptr @failed, i32 13)
   ret ptr %error.failed
 go:
-  %failures.at = inttoptr i64 {FAILURES} to ptr
-  %failures = load atomic i64, ptr %failures.at acquire, align 8
+  %failures = load atomic i64, ptr @jaxdyn_failures acquire, align 8
   %chunk.at = getelementptr %Entry, ptr %entry.at, i32 0, i32 2
   %chunk = load i64, ptr %chunk.at
   %least.at = getelementptr %Entry, ptr %entry.at, i32 0, i32 3
@@ -493,7 +494,7 @@ parallel:
   br label %check
 check:
   ; A careful program that could not be made, of this call or of one at the same time.
-  %failures.after = load atomic i64, ptr %failures.at acquire, align 8
+  %failures.after = load atomic i64, ptr @jaxdyn_failures acquire, align 8
   %is.failed = icmp ne i64 %failures, %failures.after
   br i1 %is.failed, label %not.made, label %finished
 finished:

@@ -11,6 +11,7 @@ import copy
 import ctypes
 import functools
 import logging
+import operator
 import re
 import warnings
 from collections.abc import Callable, Iterator, Sequence
@@ -95,12 +96,12 @@ def reason_against_kernels() -> str | None:
 
 def configuration() -> tuple:
     """JAX's options that are in force in this thread: all of them, as any may change what a trace becomes."""
-    return tuple([getattr(jax.config, name, None) for name in _options()])
+    return _options()(jax.config)
 
 
 @functools.cache
-def _options() -> tuple[str, ...]:
-    return tuple(sorted(jax.config.values))
+def _options() -> Callable:
+    return operator.attrgetter(*sorted(name for name in jax.config.values if hasattr(jax.config, name)))
 
 
 # --- extension points ---

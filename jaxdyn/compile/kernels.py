@@ -139,29 +139,56 @@ def _jit_call(program):
 
 
 def evaluate(function: Callable, tree, *args, static: tuple = (), is_input: bool = False):
-    """function(*static, tree, *args) for known numbers, as numpy arrays, also while another program is traced.
+    """function(*static, tree, *args) for known numbers, also while another program is traced; see `Evaluation`."""
+    return Evaluation(function, tree, static, is_input)(*args)
+
+
+class Evaluation:
+    """function(*static, tree, *args) of a known tree, for many calls with known numbers; results are numpy arrays.
 
     **Arguments:** as of `kernel`; `is_input`: whether the tree's arrays are operands of the kernel too, as they are in a program
     that takes the tree as an argument: it is the same kernel then.
     """
-    leaves, structure = jax.tree.flatten(args)
-    inputs, known = partition(tree, jax.Array if is_input else ())
-    leaves = [np.asarray(x) for x in (*inputs, *leaves)]
-    leaves = [x.astype(jax.dtypes.canonicalize_dtype(x.dtype)) for x in leaves]
-    if mode.current() != "plain" and target is not None:
-        shapes = tuple((x.shape, x.dtype) for x in leaves)
+
+    def __init__(self, function: Callable, tree, static: tuple = (), is_input: bool = False):
+        self.function, self.tree, self.static = function, tree, static
+        inputs, self.known = partition(tree, jax.Array if is_input else ())
+        self.inputs = [_as_canonical(x) for x in inputs]
+        self.found: dict[Any, tuple | None] = {}
+
+    def __call__(self, *args):
+        """The results, by native code without XLA: a call through XLA would be staged into a trace around it."""
+        leaves, structure = jax.tree.flatten(args)
+        leaves = [_as_canonical(x) for x in leaves]
+        if mode.current() != "plain" and target is not None:
+            key = structure, tuple([(x.shape, x.dtype) for x in leaves]), mode.state_of_programs()
+            if key not in self.found:
+                self.found[key] = self._find(structure, leaves)
+            if (found := self.found[key]) is not None:
+                call, places, results = found
+                try:
+                    return jax.tree.unflatten(results, call([leaves[i] for i in places]))
+                except Exception as error:
+                    if not isinstance(error, target.Unsupported) and not jax_adapter.forgive(error):
+                        raise
+        with jax.ensure_compile_time_eval():
+            return jax.tree.map(np.asarray, self.function(*self.static, self.tree, *map(jnp.asarray, args)))
+
+    def _find(self, structure, leaves) -> tuple | None:
+        """The native call, the places of its operands among the leaves, and the structure of its results."""
+        count, shapes = len(self.inputs), tuple((x.shape, x.dtype) for x in (*self.inputs, *leaves))
         # With the arguments of `_bind`, so that both share one trace.
-        traced = trace_program(function, static, known, len(inputs), structure, shapes, flags="repair")
-        if not isinstance(traced, str):
-            program, places = without_unread(traced[0])
-            try:
-                # The native code is called without XLA, as a call through XLA would be staged into the trace around it.
-                return jax.tree.unflatten(traced[1], target.call(program, [leaves[i] for i in places]))
-            except Exception as error:
-                if not isinstance(error, target.Unsupported) and not jax_adapter.forgive(error):
-                    raise
-    with jax.ensure_compile_time_eval():
-        return jax.tree.map(np.asarray, function(*static, tree, *map(jnp.asarray, args)))
+        traced = trace_program(self.function, self.static, self.known, count, structure, shapes, flags="repair")
+        if isinstance(traced, str):
+            return None
+        program, places = without_unread(traced[0])
+        fixed = {k: self.inputs[i] for k, i in enumerate(places) if i < count}
+        return target.Call(program, fixed), [i - count for i in places if i >= count], traced[1]
+
+
+def _as_canonical(x) -> np.ndarray:
+    x = np.asarray(x)
+    return x.astype(jax.dtypes.canonicalize_dtype(x.dtype), copy=False)
 
 
 def variant(inside: Callable, *, marks: bool = False) -> Any:

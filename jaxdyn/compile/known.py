@@ -1,19 +1,23 @@
 """Known and traced leaves of pytrees, and functions that keep known values known."""
 
+import functools
 import hashlib
+from collections.abc import Callable
 from typing import Any, NamedTuple
 
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import lax
 
+from jaxdyn.compile import mode
 from jaxdyn.compile.jax_adapter import ShapedArray, Tracer, define_primitive
 
 
 def is_concrete(*trees) -> bool:
     """Decide whether no leaf is traced, so that its value can be read."""
-    return not any(isinstance(leaf, Tracer) for leaf in jax.tree.leaves(trees))
+    return not any([isinstance(leaf, Tracer) for leaf in jax.tree.leaves(trees)])
 
 
 def as_numpy_if_known(array: Any) -> Any:
@@ -52,10 +56,13 @@ def stop_gradient(tree):
     return jax.tree.map(lambda leaf: lax.stop_gradient(leaf) if isinstance(leaf, Tracer) else leaf, tree)
 
 
+_PLAIN = (bool, int, float, str)
+
+
 class _Leaves:
     """Leaves compared by identity, for keys of caches; held, so that no other object gets the identity of one of them.
 
-    NumPy arrays, whose entries may be set, are copied and compared by value.
+    NumPy arrays, whose entries may be set, are copied and compared by value, as numbers and texts of Python are.
     """
 
     def __init__(self, leaves):
@@ -65,12 +72,21 @@ class _Leaves:
         return len(self.leaves) == len(other.leaves) and all(map(_is_same, self.leaves, other.leaves))
 
     def __hash__(self):
-        return hash(tuple(leaf.shape if isinstance(leaf, np.ndarray) else id(leaf) for leaf in self.leaves))
+        return hash(tuple(map(_hash_of, self.leaves)))
+
+
+def _hash_of(leaf) -> int:
+    if isinstance(leaf, np.ndarray):
+        return hash(leaf.shape)
+    return hash(leaf) if type(leaf) in _PLAIN else id(leaf)
 
 
 def _is_same(mine, theirs) -> bool:
+    if mine is theirs:
+        return True
     if not (isinstance(mine, np.ndarray) and isinstance(theirs, np.ndarray)):
-        return mine is theirs
+        # By their texts: 0.0 and -0.0 are equal, and are other constants.
+        return type(mine) is type(theirs) and type(mine) in _PLAIN and repr(mine) == repr(theirs)
     kinds = (mine.shape, mine.dtype) == (theirs.shape, theirs.dtype)
     return kinds and mine.tobytes() == theirs.tobytes()
 
@@ -110,3 +126,60 @@ def partition(tree, types: type | tuple[type, ...]) -> tuple[list, Known]:
     places = tuple(i for i, leaf in enumerate(leaves) if isinstance(leaf, types))
     known = _Leaves([None if i in places else leaf for i, leaf in enumerate(leaves)])
     return [leaves[i] for i in places], Known(structure, places, known)
+
+
+def once(function: Callable) -> Callable:
+    """Compute what a function makes of known trees once for the same leaves and modes; a decorator.
+
+    `function(*trees, **static)` has no effects, and its results are never changed; `static` is hashable. Within a trace, or of
+    traced leaves, nothing is kept.
+    """
+    by_identity: dict[tuple, tuple] = {}  # with the trees, so that no other object gets the identity of one of them
+
+    @functools.lru_cache(maxsize=256)
+    def by_leaves(known: Known, static: tuple, context):
+        del context  # part of the key alone
+        return function(*known(()), **dict(static))
+
+    @functools.wraps(function)
+    def call(*trees, **static):
+        context, items = (jax.config.read("jax_enable_x64"), mode.state()), tuple(static.items())
+        key = (*[repr(x) if type(x) in _PLAIN else id(x) for x in trees], items, context)
+        try:
+            kept = by_identity.get(key)
+        except TypeError:  # what is static has no hash, and may be refused by the function
+            return function(*trees, **static)
+        if is_tracing():
+            return function(*trees, **static)
+        if kept is not None:
+            return kept[1]
+        traced, known = partition_tracers(trees)
+        if traced or not _is_hashable(known):
+            return function(*trees, **static)
+        result = by_leaves(known, items, context)
+        if _is_fixed(known):
+            if len(by_identity) >= 256:
+                by_identity.clear()
+            by_identity[key] = trees, result
+        return result
+
+    return call
+
+
+def _is_hashable(known: Known) -> bool:
+    try:
+        hash(known)
+    except TypeError:  # users' objects in the structure
+        return False
+    return True
+
+
+def _is_fixed(known: Known) -> bool:
+    """Decide whether nothing in a tree can be replaced, so that the same object is the same tree."""
+
+    def has_fixed_nodes(structure) -> bool:
+        data = structure.node_data()
+        is_fixed = data is None or data[0] in (tuple, type(None)) or issubclass(data[0], eqx.Module)
+        return is_fixed and all(map(has_fixed_nodes, structure.children()))
+
+    return has_fixed_nodes(known.structure) and not any(isinstance(x, np.ndarray) for x in known.leaves.leaves)

@@ -26,6 +26,7 @@ from jaxdyn.compile.mode import wants_least_optimisation, wants_usual_options
 logger = logging.getLogger("jaxdyn")
 ANNOUNCED_LINES = 100_000  # of LLVM's text, which compile in some five seconds
 LONG_LINES = 6000  # of LLVM's text, beyond which a kernel is straight code of one program but for few lines
+BLOCK_LINES = 500  # of a block at the lowest level: a kernel of 29 000 lines takes a fifth of the time
 QUICK_LINES = 300  # of LLVM's text, which take 0.02 s
 QUICK_BYTES = 1 << 22  # of memory on the stack, where at the lowest level almost every number has a place of its own
 
@@ -180,11 +181,38 @@ def _module(text: str, machine):
 _BROADCAST = re.compile(r"(  %\w+ = insertelement <\d+ x (\w+)> poison, \w+ )(%\w+)(, i32 0)")
 
 
+_LABEL, _ORIGIN = re.compile(r"([\w.]+):"), re.compile(r", %([\w.]+) \]")
+
+
+def _in_short_blocks(text: str) -> str:
+    """The text with long blocks in parts: the time that LLVM's lowest level takes grows faster than their length."""
+    whole, function, last = [], [], {}  # of each label, that of the last part of its block
+    label, count = "", 0
+    for line in text.split("\n"):
+        function.append(line)
+        count += 1
+        if line.startswith("define"):
+            label, count = "", 0
+        elif found := _LABEL.match(line):
+            label, count = found.group(1), 0
+        elif count >= BLOCK_LINES and line.startswith("  %") and " phi " not in line and " alloca " not in line:
+            last[label], count = f"short{len(function)}", 0
+            function += [f"  br label %{last[label]}", f"{last[label]}:"]
+        elif line == "}":
+            whole += [_ORIGIN.sub(functools.partial(_renamed, last), x) if " phi " in x else x for x in function]
+            function, last = [], {}
+    return "\n".join([*whole, *function])
+
+
+def _renamed(names: dict[str, str], origin: re.Match) -> str:
+    return f", %{names.get(origin.group(1), origin.group(1))} ]"
+
+
 def compile_text(text: str, is_quick: bool = False) -> bytes:
     """The object file of a text of LLVM."""
     if is_quick or wants_least_optimisation():
         # LLVM 22 at level 0 aborts where it merges loads with their broadcasts ("Node is not in map!").
-        text = _BROADCAST.sub(r"  \3.frozen = freeze \2 \3\n\1\3.frozen\4", text)
+        text = _in_short_blocks(_BROADCAST.sub(r"  \3.frozen = freeze \2 \3\n\1\3.frozen\4", text))
         machine = target_machine(0)
         return machine.emit_object(_module(text, machine))
     machine = target_machine()

@@ -83,7 +83,7 @@ class StoredProgram(Program):
 
     def __init__(self, description: Description, remake: Callable[[], Program]):
         inner = [x.restore(functools.partial(_subprogram_of, self, i)) for i, x in enumerate(description.subprograms)]
-        self._remake = remake
+        self._remake, self.stored = remake, tuple(inner)
         self.start(description.inputs, description.outputs, inner, description.name)
         self.reports_validity = description.reports_validity
         # Properties that are computed from the operations elsewhere.
@@ -112,15 +112,23 @@ class StoredProgram(Program):
         made = self._remake()
         if made.digest != self.digest:
             if (made.inputs, made.outputs, made.read_places) != (self.inputs, self.outputs, self.read_places):
-                raise RuntimeError(
-                    f"{self.name} has another program when it is traced again; remove {disk.cache_folder()}"
-                )
+                raise changed(self.name)
             self.subprograms = made.subprograms
         return made
 
 
 def _subprogram_of(program: StoredProgram, i: int) -> Any:
-    return program.remade.subprograms[i]
+    """Subprogram of a program that is made again, which may have its own in another order."""
+    made = program.remade.subprograms
+    found = [x for x in made if x.digest == program.stored[i].digest] or made[i : i + 1]
+    if not found:
+        raise changed(program.name)
+    return found[0]
+
+
+def changed(name: str) -> RuntimeError:
+    """The error where a function gives another program than the one that is on disk under its key."""
+    return RuntimeError(f"{name} has another program when it is traced again; remove {disk.cache_folder()}")
 
 
 def load_or_make(key: str | None, make: Callable[[], tuple[Sequence[Program], Any]]) -> tuple[Sequence[Program], Any]:

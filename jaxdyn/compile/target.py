@@ -17,8 +17,9 @@ from jaxdyn.compile.code import calls_itself, kernel_ir, subprogram_ir, symbol_o
 from jaxdyn.compile.first_calls import optimise_later, phase
 from jaxdyn.compile.jax_adapter import Unsupported as Unsupported
 from jaxdyn.compile.jax_adapter import ffi_version, register_handler
-from jaxdyn.compile.objects import Code, compile_text, features
+from jaxdyn.compile.objects import Code, features
 from jaxdyn.compile.program import FLOATS, Program, kind_of
+from jaxdyn.compile.stored import changed
 
 TARGET = "jaxdyn_kernel"
 SLOTS = 1 << 16
@@ -73,15 +74,14 @@ def register() -> None:
 
 @functools.cache  # which does not keep two threads from a first call at once
 def _register() -> None:
-    # Its addresses are those of this process: it is not kept on disk.
-    code = Code(compile_text(fill_handler(_table, ctypes.cast(_PREPARE, ctypes.c_void_p).value)))
+    code = objects.code_of(fill_handler("jaxdyn_table", _table))
     register_handler(TARGET, code.address("handler"))
     code.publish("careful", CAREFUL)
     _codes.append(code)
 
 
-def fill_handler(table: ctypes.Array, prepare: int | None) -> str:
-    """The text of the handler for a table and the function that makes the code of an entry. **Raises:** `Unsupported`."""
+def fill_handler(name: str, table: ctypes.Array) -> str:
+    """The text of the handler for a table of this process, which the text knows by a name. **Raises:** `Unsupported`."""
     version = ffi_version()
     architecture = _architecture()
     if architecture not in _RELAX:
@@ -89,14 +89,16 @@ def fill_handler(table: ctypes.Array, prepare: int | None) -> str:
     text = resources.files("jaxdyn.compile").joinpath("handler.ll").read_text()
     messages = {"MISSING": _MISSING, "FAILED": _FAILED, "MISFIT": _MISFIT}
     fields = {
-        "TABLE": ctypes.addressof(table), "SLOT_MASK": SLOTS - 1, "LIMIT": ctypes.addressof(_threads),
-        "FAILURES": ctypes.addressof(_failures), "PREPARE": prepare,
-        "MAJOR": version[0], "MINOR": version[1],
+        "TABLE": name, "SLOT_MASK": SLOTS - 1, "MAJOR": version[0], "MINOR": version[1],
         "RELAX": _RELAX[architecture], "RELAX_TYPE": _RELAX[architecture].replace("i32 1", "i32"),
         **messages, **{f"{name}_BYTES": len(message) + 1 for name, message in messages.items()},
     }  # fmt: skip
-    for name, value in fields.items():
-        text = text.replace("{" + name + "}", str(value))
+    for field, value in fields.items():
+        text = text.replace("{" + field + "}", str(value))
+    # Places of this process have names in the text, so that its code is found on disk.
+    for symbol, place in ((name, table), ("jaxdyn_limit", _threads), ("jaxdyn_failures", _failures)):
+        objects.add_symbol(symbol, ctypes.addressof(place))
+    objects.add_symbol("jaxdyn_prepare", ctypes.cast(_PREPARE, ctypes.c_void_p).value or 0)
     return text
 
 
@@ -234,10 +236,11 @@ class _Kernel:
     def address(self) -> int:
         """Address of the code, which is compiled where there is none."""
         if not self.is_made and not self.make():
-            assert self.recover is not None, "a kernel has neither code nor a program"
-            run_apart(self.recover)
-            made = self.make()
-            assert made, "a program that was traced again has other kernels than before"
+            # Of a kernel from disk the function is traced again.
+            if self.recover is not None:
+                run_apart(self.recover)
+            if not self.make():
+                raise changed(self.row.name)
         return self.entry.kernel
 
     def make(self) -> bool:
@@ -266,7 +269,7 @@ class _Kernel:
             return self.is_made or self._make(program, identity)
 
     def _make(self, program, identity: str) -> bool:
-        width, found = self.row.width, objects.find(identity)
+        width, found, is_new = self.row.width, objects.find(identity), False
         if found is None and program is None:
             return False
         calls, careful = _calls(_subprograms_of_kernel(program, width), width)
@@ -279,8 +282,8 @@ class _Kernel:
             text = kernel_ir(program, width, uniform) if is_program else program.ir(width, uniform)
             # A loop may run for long, and quick code of vectors takes four times as long, that of single numbers a quarter more.
             quick_width = 0 if program.turns > 1 and width > 1 else width
-            found = objects.make(identity, text, tuple(calls), careful, program.name, quick_width)
-        _install(found, identity, "kernel", self._enter)
+            found, is_new = objects.make(identity, text, tuple(calls), careful, program.name, quick_width), True
+        _install(found, identity, "kernel", self._enter, is_new)
         self.is_made, self.program = True, None  # a program of a large robot takes megabytes
         return True
 
@@ -380,7 +383,7 @@ def _publish(symbol: str, width: int, programs: dict[str, Any], recover: Callabl
 
     `recover()`: makes careful programs that it calls, should it be found and they be needed.
     """
-    called, known = programs.get(symbol), _called.get(symbol)
+    called, known, is_new = programs.get(symbol), _called.get(symbol), False
     found = objects.find(symbol) if known is None else known
     if called is None and found is None:
         return False
@@ -394,20 +397,22 @@ def _publish(symbol: str, width: int, programs: dict[str, Any], recover: Callabl
     if not isinstance(found, objects.ObjectFile):
         assert called is not None
         text = subprogram_ir(called, width) if isinstance(called, Program) else called.subprogram_ir(width)
-        found = objects.make(symbol, text, tuple(calls), careful, called.name, width)
+        found, is_new = objects.make(symbol, text, tuple(calls), careful, called.name, width), True
     _called[symbol] = _Called(ctypes.c_uint64(), found.calls, found.careful)
-    _install(found, symbol, "called", functools.partial(setattr, _called[symbol].address, "value"))
+    _install(found, symbol, "called", functools.partial(setattr, _called[symbol].address, "value"), is_new)
     objects.add_symbol(f"{symbol}_at", ctypes.addressof(_called[symbol].address))
     return True
 
 
-def _install(found: objects.ObjectFile, identity: str, name: str, enter: Callable[[int], None]) -> None:
+def _install(
+    found: objects.ObjectFile, identity: str, name: str, enter: Callable[[int], None], is_new: bool = False
+) -> None:
     """Load code and enter the address of its function; quick code is replaced later, and stays for those who run it."""
     code = Code(found.binary)
     _codes.append(code)
     enter(code.address(name))
     if found.text and objects.has_two_levels():
-        optimise_later(lambda: _install(found.improve(identity), identity, name, enter))
+        optimise_later(lambda: _install(found.improve(identity), identity, name, enter), len(found.text), is_new)
 
 
 def _restore_careful(rows: Sequence, recover: Callable | None) -> None:
@@ -431,18 +436,40 @@ def _prepare(number: int) -> int:
 _PREPARE = ctypes.CFUNCTYPE(ctypes.c_void_p, ctypes.c_uint64)(_prepare)
 
 
-def call(program, arrays: Sequence[np.ndarray]) -> list[np.ndarray]:
-    """The results of a program for one sample, by its kernel and without XLA; `arrays` as its inputs."""
+class Call:
+    """A program for one sample, by its kernel and without XLA; `fixed`: those of its inputs that are the same in all calls."""
+
     # One thread and one sample: the handler, which shares a batch among XLA's threads, is not needed.
-    number = kernel(program, 1, [False] * len(program.inputs))
-    given = [np.ascontiguousarray(x, array.dtype) for x, array in zip(arrays, program.inputs, strict=True)]
-    results = [np.empty(array.shape, array.dtype) for array in program.outputs]
-    data = (ctypes.c_void_p * (len(given) + len(results)))(*(x.ctypes.data for x in (*given, *results)))
-    address, failures = _kernels[number].address(), _failures.value
-    _KERNEL(address)(data, 1, 0, 1)
-    if _failures.value != failures:
-        raise RuntimeError(_FAILED)
-    return results
+    def __init__(self, program, fixed: dict[int, np.ndarray]):
+        self.program = program
+        self.fixed = {i: np.ascontiguousarray(x, program.inputs[i].dtype) for i, x in fixed.items()}
+        self.given = [(i, x.dtype) for i, x in enumerate(program.inputs) if i not in fixed]
+        self.results = [(len(program.inputs) + i, x.shape, x.dtype) for i, x in enumerate(program.outputs)]
+        self.data = (ctypes.c_void_p * (len(program.inputs) + len(program.outputs)))()
+        for i, x in self.fixed.items():
+            self.data[i] = x.ctypes.data
+
+    @functools.cached_property
+    def _kernel(self) -> _Kernel:
+        return _kernels[kernel(self.program, 1, [False] * len(self.program.inputs))]
+
+    def __call__(self, arrays: Sequence[np.ndarray]) -> list[np.ndarray]:
+        """The results for the inputs that are not fixed, in their order."""
+        data = type(self.data).from_buffer_copy(self.data)  # another thread may call too
+        given = [np.ascontiguousarray(x, dtype) for x, (_, dtype) in zip(arrays, self.given, strict=True)]
+        results = [np.empty(shape, dtype) for _, shape, dtype in self.results]
+        for (i, *_), x in zip((*self.given, *self.results), (*given, *results), strict=True):
+            data[i] = x.ctypes.data
+        address, failures = self._kernel.address(), _failures.value
+        _KERNEL(address)(data, 1, 0, 1)
+        if _failures.value != failures:
+            raise RuntimeError(_FAILED)
+        return results
+
+
+def call(program, arrays: Sequence[np.ndarray]) -> list[np.ndarray]:
+    """The results of a program for one sample; `arrays` as its inputs."""
+    return Call(program, {})(arrays)
 
 
 _KERNEL = ctypes.CFUNCTYPE(None, ctypes.c_void_p, ctypes.c_int64, ctypes.c_int64, ctypes.c_int64)

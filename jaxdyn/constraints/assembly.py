@@ -12,8 +12,8 @@ import numpy as np
 from jax import lax
 from jaxtyping import Array, Bool, Float
 
-from jaxdyn.compile import entry_point, evaluate, invalidate_derivatives, kernel
-from jaxdyn.compile.known import is_concrete, is_tracing, stop_gradient
+from jaxdyn.compile import Evaluation, entry_point, evaluate, invalidate_derivatives, kernel
+from jaxdyn.compile.known import is_concrete, is_tracing, once, stop_gradient
 from jaxdyn.constraints.base import Layout, holonomic_rows, layout, position_residual, velocity_residual
 from jaxdyn.constraints.branches import changes_branch, unit_rows
 from jaxdyn.constraints.closing import follow_path, nearest_configuration, polish
@@ -382,11 +382,12 @@ def _residuals_and_limits(scene, q, v, t, relative):
     return position_residual(scene, q, t), velocity_residual(scene, q, v, t), *limits
 
 
-def start_openness(scene: Scene, q, v, t, relative: float) -> float:
-    """`openness` at a concrete state."""
+@once
+def start_openness(scene: Scene, *, relative: float) -> Evaluation:
+    """`largest_ratio` of a known scene, at (q, v, t)."""
     bare = Scene(scene.system, scene.constraints)
     # By the kernel that the program of a run uses too, so that it is compiled once.
-    return float(evaluate(largest_ratio, bare, q, v, t, static=(relative,), is_input=not is_tracing()))
+    return Evaluation(largest_ratio, bare, (relative,), is_input=not is_tracing())
 
 
 def largest_residuals(scene: Scene, q, v, t) -> np.ndarray:

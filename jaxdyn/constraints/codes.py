@@ -181,13 +181,13 @@ def code_of(result: Any) -> Array:
 
 
 def is_successful(result: Any) -> bool:
-    """Decide whether one concrete result is `successful`, without a program of XLA."""
-    return np.array_equal(jax.tree.leaves(result), jax.tree.leaves(RESULTS.successful))
+    """Decide whether a concrete result, or all of a batch, are `successful`, without a program of XLA."""
+    return bool(np.all(np.asarray(result.index) == np.asarray(RESULTS.successful.index)))
 
 
 def name_of(result: Any) -> str:
     """Name of one concrete result."""
-    return CODES[int(code_of(result))]
+    return CODES[int(np.asarray(result.index))]
 
 
 class Outcome(eqx.Module):
@@ -207,11 +207,10 @@ def require_success(outcome: Any, throw: bool | None, message: Callable[[Any], s
     **Raises:** ValueError with the message; under tracing the program raises the text of the result's code.
     """
     throw = throw if throw is None else check_flag(throw, "throw")
-    failed = ~outcome.success
     if not is_concrete(outcome.result):
         # Under tracing the result is unknown, so that only an error at run time is possible.
-        return outcome.result.error_if(outcome, failed) if throw else outcome
-    if (throw is None or throw) and bool(jnp.any(failed)):
+        return outcome.result.error_if(outcome, ~outcome.success) if throw else outcome
+    if (throw is None or throw) and not is_successful(outcome.result):
         raise ValueError(message(stop_gradient(outcome)))
     return outcome
 

@@ -25,16 +25,16 @@ from jax import lax
 from jaxtyping import Array, Float, Int
 
 from jaxdyn.compile import (
+    Evaluation,
     eliminate_rows,
     entry_point,
-    evaluate,
     is_standalone,
     kernel,
     mark_invalid,
     variant,
 )
 from jaxdyn.compile.batch import cond
-from jaxdyn.compile.known import is_concrete, is_tracing, stop_gradient
+from jaxdyn.compile.known import is_concrete, is_tracing, once, stop_gradient
 from jaxdyn.constraints.base import constraint_jacobian, holonomic_rows, layout, position_residual
 from jaxdyn.constraints.codes import RESULTS
 from jaxdyn.constraints.rank import (
@@ -201,23 +201,33 @@ def select_rows(scene: Scene, q, t: Any, rank_tol: float | None = None) -> Selec
 @variant(_select_in_kernel, marks=True)
 def _search_rows(scene: Scene, q, t: Any, rank_tol: float | None) -> Selection:
     # A choice has no derivative: forces do not select rows, and the scene, q and t enter without tangents.
-    bare = stop_gradient(Scene(scene.system, scene.constraints))
-    q, t = stop_gradient((q, t))
-    every, least = _every_row(bare, q.dtype), _least_doubtless(q, rank_tol)
-    if not every.kept.size:
-        return every
-    # Most scenes have independent rows: one Cholesky factorisation says so, and the search is skipped.
-    if is_concrete(bare, q, t):
+    if is_concrete(scene, q, t):
         place = np.asarray(q), np.asarray(t, q.dtype)
-        if not evaluate(_has_doubtful_rows, bare, *place, static=(least,), is_input=not is_tracing()):
+        every, has_doubtful_rows = known_rows(scene, rank_tol=rank_tol, dtype=q.dtype)
+        # Most scenes have independent rows: one Cholesky factorisation says so, and the search is skipped.
+        if not every.kept.size or not has_doubtful_rows(*place):
             return every
         with jax.ensure_compile_time_eval():
-            chosen = _select(bare, *map(jnp.asarray, place), rank_tol)
+            chosen = _select(Scene(scene.system, scene.constraints), *map(jnp.asarray, place), rank_tol)
         return Selection(*map(np.asarray, chosen))  # pyright: ignore[reportArgumentType]
+    bare = stop_gradient(Scene(scene.system, scene.constraints))
+    q, t = stop_gradient((q, t))
+    every = _every_row(bare, q.dtype)
+    if not every.kept.size:
+        return every
     t = jnp.asarray(t, q.dtype)
     if is_standalone():  # a program without JAX has no branches
         return _select(bare, q, t, rank_tol)
     return _select_doubtful(rank_tol, bare, q, t)
+
+
+@once
+def known_rows(scene: Scene, *, rank_tol: float | None, dtype) -> tuple[Selection, Evaluation]:
+    """All rows of a known scene, and whether some are doubtful at (q, t)."""
+    bare, every = Scene(scene.system, scene.constraints), _every_row(scene, dtype)
+    return every, Evaluation(
+        _has_doubtful_rows, bare, (_least_doubtless(every.kept, rank_tol),), is_input=not is_tracing()
+    )
 
 
 @kernel(static=1, fallback=lambda rank_tol, scene, q, t: _select(scene, q, t, rank_tol))

@@ -17,7 +17,7 @@ from jax import lax
 from jaxtyping import Array, Float, Int
 
 from jaxdyn.compile import entry_point, invalidate_derivatives
-from jaxdyn.compile.known import is_concrete, stop_gradient
+from jaxdyn.compile.known import is_concrete, is_known, stop_gradient
 from jaxdyn.constraints.assembly import check_search, closing_tolerance, independent_rows_near
 from jaxdyn.constraints.base import Constraint, holonomic_rows, layout, position_residual
 from jaxdyn.constraints.closing import nearest_configuration, polish, slide_to_nearest
@@ -27,7 +27,7 @@ from jaxdyn.constraints.selection import most_rounding
 from jaxdyn.constraints.tolerances import own_length
 from jaxdyn.control.least_squares import Aims, clip_to_limits, screw_joints, search
 from jaxdyn.control.targets import as_targets, target_rows
-from jaxdyn.model.arguments import Checked, Number, Numbers, as_array, check_flag, check_mapping, check_state
+from jaxdyn.model.arguments import Checked, Given, Number, Numbers, as_operand, check_flag, check_mapping, check_state
 from jaxdyn.model.tree import Model
 from jaxdyn.systems.scene import Scene, as_scene
 from jaxdyn.systems.system import SceneLike, displace
@@ -154,7 +154,7 @@ def inverse_kinematics(
     return require_success(place, throw, message)
 
 
-def row_weights(rows: tuple[Constraint, ...], weights, dtype) -> Array:
+def row_weights(rows: tuple[Constraint, ...], weights, dtype) -> Given:
     """Weights (m,) of all rows of the targets."""
     weights = check_mapping(weights, "weights", f"{{{rows[0].name!r}: 2.0}}")
     names = {row.name.partition(" ")[0] if row.name not in weights else row.name for row in rows}
@@ -165,15 +165,16 @@ def row_weights(rows: tuple[Constraint, ...], weights, dtype) -> Array:
     for row in rows:
         count = sum(target_rows(row))
         value = weights.get(row.name, weights.get(getattr(row, "frame", row.name), 1.0))
-        value = as_array(value, f"weights[{row.name!r}]", dtype)
+        value = as_operand(value, f"weights[{row.name!r}]", dtype)
         if value.shape not in ((), (count,)):
             raise ValueError(
                 f"weights[{row.name!r}] has shape {value.shape}; give one number, or {(count,)}, one per row of the target"
             )
         if is_concrete(value) and not (np.isfinite(value).all() and (np.asarray(value) >= 0).all()):
             raise ValueError(f"weights[{row.name!r}] is {np.asarray(value)}; give numbers that are not negative")
-        parts.append(jnp.broadcast_to(value, (count,)))
-    return jnp.concatenate(parts)
+        parts.append((value, count))
+    join: Any = np if is_known([value for value, _ in parts]) else jnp
+    return join.concatenate([join.broadcast_to(value, (count,)) for value, count in parts])
 
 
 @entry_point

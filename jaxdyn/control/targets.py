@@ -12,14 +12,14 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from jaxdyn.compile.known import is_concrete
+from jaxdyn.compile.known import is_concrete, is_known
 from jaxdyn.constraints.base import Constraint
 from jaxdyn.constraints.frames import Pair
 from jaxdyn.constraints.rolling import tangents
 from jaxdyn.control.errors import CenterError, Fixed
 from jaxdyn.lie import so3
 from jaxdyn.lie.so3 import matmul
-from jaxdyn.model.arguments import as_array, batch_hint
+from jaxdyn.model.arguments import as_operand, batch_hint
 from jaxdyn.model.topology import frame_index
 from jaxdyn.model.tree import Model
 
@@ -35,8 +35,8 @@ class FrameTarget(Pair):
     name: str = eqx.field(static=True)
     frame: str = eqx.field(static=True)
     task: str = eqx.field(static=True)
-    target: Float[Array, "4 4"]
-    pose: Float[Array, "4 4"]
+    target: Float[Array | np.ndarray, "4 4"]
+    pose: Float[Array | np.ndarray, "4 4"]
 
     def sizes(self, system, dtype):
         """Rows of the position and of the orientation, all holonomic."""
@@ -83,7 +83,7 @@ def as_targets(model: Any, targets: Any) -> tuple[Constraint, ...]:
     for name, value in targets.items():
         # A frame of the model by this name has precedence.
         if name == CENTER and CENTER not in model.frame_names:
-            target = Fixed(_numbers(value, CENTER, (3,), model.home.dtype))
+            target = Fixed(jnp.asarray(_numbers(value, CENTER, (3,), model.home.dtype)))
             rows.append(CenterError(target=target, name=CENTER))
             continue
         frame_index(model, name)  # refuses unknown names
@@ -119,7 +119,7 @@ def _task_of(name: str, value) -> str:
 
 
 def _numbers(value, name: str, shape: tuple, dtype):
-    value = as_array(value, name, dtype)
+    value = as_operand(value, name, dtype)
     if value.shape != shape:
         raise ValueError(f"{name} has shape {value.shape}, expected {shape}{batch_hint(value, shape)}")
     if is_concrete(value):
@@ -129,21 +129,30 @@ def _numbers(value, name: str, shape: tuple, dtype):
         R = known[:3, :3] if len(shape) == 2 else np.eye(3)
         if np.abs(R.T @ R - np.eye(3)).max() > 1e-4 or np.linalg.det(R) < 0:
             raise ValueError(f"{name}: its rotation is no rotation matrix, R^T R differs from 1; normalise it")
-    return jnp.asarray(value)
+    return value
 
 
 def _frame_target(label: str, frame: str, task: str, number, axis) -> FrameTarget:
-    target, pose = jnp.eye(4, dtype=number.dtype), jnp.eye(4, dtype=number.dtype)
+    still, none = np.eye(3, dtype=number.dtype), np.zeros(3, number.dtype)
+    target = pose = np.eye(4, dtype=number.dtype)
     if task == "pose":
         target = number
     elif task == "orientation":
-        target = target.at[:3, :3].set(number)
+        target = _pose(number, none)
     elif task == "position":
-        target = target.at[:3, 3].set(number)
+        target = _pose(still, number)
     else:
-        target = target.at[:3, :3].set(_frame_along(number, f"targets[{frame!r}]: direction"))
-        pose = pose.at[:3, :3].set(_frame_along(jnp.asarray(axis, number.dtype), f"targets[{frame!r}]: axis"))
+        target = _pose(_frame_along(jnp.asarray(number), f"targets[{frame!r}]: direction"), none)
+        pose = _pose(_frame_along(jnp.asarray(axis, number.dtype), f"targets[{frame!r}]: axis"), none)
+    if not is_known(number, axis):
+        target, pose = jnp.asarray(target), jnp.asarray(pose)
     return FrameTarget(label, frame, task, target, pose)
+
+
+def _pose(R, p):
+    join = np if is_known(R, p) else jnp
+    bottom = np.eye(4, dtype=R.dtype)[3:]
+    return join.concatenate([join.concatenate([R, p[:, None]], 1), bottom])
 
 
 def _frame_along(direction, name: str) -> Float[Array, "3 3"]:

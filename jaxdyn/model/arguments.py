@@ -15,6 +15,7 @@ from jax.typing import ArrayLike, DTypeLike
 from jaxtyping import Array, Float
 
 from jaxdyn.compile.known import is_concrete as is_concrete
+from jaxdyn.compile.known import is_known
 from jaxdyn.model import host_math
 
 _T = TypeVar("_T")
@@ -65,13 +66,20 @@ def as_array(value: Any, name: str, dtype=None) -> Given:
         except (TypeError, ValueError):
             raise ValueError(f"{name} is {value!r}; pass an array of numbers, or a list of equal rows") from None
     # A silent cast to real numbers would drop the imaginary part.
-    if jnp.issubdtype(value.dtype, jnp.complexfloating):
+    if value.dtype.kind == "c":
         raise ValueError(f"{name} is complex ({value.dtype}); pass real numbers, such as {name}.real")
-    if not (jnp.issubdtype(value.dtype, jnp.number) or value.dtype == bool):
+    # Short floats are of no kind that numpy knows.
+    if value.dtype.kind not in "fiub" and not jnp.issubdtype(value.dtype, jnp.number):
         raise ValueError(f"{name} is {value!r}; pass an array of numbers")
     if dtype is None or (isinstance(value, jax.Array) and value.dtype == dtype):
         return value  # pyright: ignore[reportReturnType]
     return jnp.asarray(_cast(value, dtype) if isinstance(value, np.ndarray) else value, dtype)
+
+
+def as_operand(value: Any, name: str, dtype) -> Given:
+    """`as_array`; of numpy outside of a trace, where each operation of JAX is a program of its own."""
+    value = as_array(value, name)
+    return _cast(value, dtype) if is_known(value) else as_array(value, name, dtype)  # pyright: ignore[reportReturnType]
 
 
 def _cast(value: Any, dtype) -> np.ndarray:

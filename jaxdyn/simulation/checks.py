@@ -3,21 +3,21 @@
 All checks raise ValueError with the argument, its value and the fix.
 """
 
+from collections.abc import Callable
 from typing import Any, NamedTuple
 
-import diffrax
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool
 
-from jaxdyn.compile.known import is_concrete
+from jaxdyn.compile.known import is_concrete, once
 from jaxdyn.constraints.assembly import largest_residuals, open_constraints, start_openness
 from jaxdyn.constraints.base import layout
 from jaxdyn.constraints.rank import LEAST_GAP
-from jaxdyn.constraints.redundancy import keep_rows
-from jaxdyn.constraints.selection import count_free, most_rounding, select_rows
+from jaxdyn.constraints.redundancy import holds_rows, keep_rows
+from jaxdyn.constraints.selection import count_free, known_rows, most_rounding, select_rows
 from jaxdyn.contact.forces import contacts_with_cones
 from jaxdyn.dynamics.quantities import mass_matrix
 from jaxdyn.forces.piecewise import has_pieces
@@ -28,9 +28,8 @@ from jaxdyn.model.topology import frame_index
 from jaxdyn.model.tree import Model
 from jaxdyn.simulation.controls import Controller, Sampled
 from jaxdyn.simulation.methods import Baumgarte, Free, Method, Multipliers, Projected, Reduced, is_regular, start_limit
+from jaxdyn.simulation.options import is_backsolve, is_step_length, is_variational
 from jaxdyn.simulation.solution import RESULTS
-from jaxdyn.simulation.solvers import Stepper
-from jaxdyn.simulation.solvers.choice import has_name, is_explicit, is_step_length, label, uses_tolerances
 from jaxdyn.simulation.variational import Variational
 from jaxdyn.systems.mass_factor import mass_factor
 from jaxdyn.systems.scene import Scene, has_drives
@@ -105,8 +104,11 @@ def angle_coordinates(system) -> np.ndarray:
 
 def check_angles(scene: Scene, q0, dtype) -> None:
     """Refuse angles of so many turns that their dtype holds too little of the rest."""
+    sizes = np.abs(np.asarray(q0, float))
+    if not (sizes > largest_angle(dtype)).any():
+        return
     angles = angle_coordinates(scene.system)
-    sizes = np.abs(np.asarray(q0, float)[angles])
+    sizes = sizes[angles]
     if sizes.size and sizes.max() > largest_angle(dtype):
         index = int(angles[np.argmax(sizes)])
         value, eps = float(q0[index]), float(jnp.finfo(dtype).eps)
@@ -132,17 +134,18 @@ def check_times(ts) -> None:
         return
     _check_finite("ts", ts)
     times = np.asarray(ts, float)
-    back = np.flatnonzero(np.diff(times) <= 0)
-    if back.size:
-        i = back[0]
+    is_later = times[1:] > times[:-1]
+    if not is_later.all():
+        i = np.flatnonzero(~is_later)[0]
         raise ValueError(
             f"ts does not increase at index {i + 1}: {times[i]} then {times[i + 1]}; sort it, drop doubles"
         )
 
 
 def _check_finite(name: str, value) -> None:
-    bad = np.flatnonzero(~np.isfinite(np.asarray(value, float)))
-    if bad.size:
+    is_finite = np.isfinite(np.asarray(value, float))
+    if not is_finite.all():
+        bad = np.flatnonzero(~is_finite)
         raise ValueError(f"{name} is {np.asarray(value)[bad[0]]} at index {bad[0]}; give finite numbers")
 
 
@@ -161,16 +164,16 @@ def sort_outputs(scene: Scene, outputs) -> tuple[str, ...]:
 
 def check_combination(control, method: Method, solver, adjoint) -> None:
     """Refuse controls and adjoints that a method does not support."""
-    if isinstance(solver, Stepper) and isinstance(control, (Controller, Sampled)):
+    if is_variational(solver) and isinstance(control, (Controller, Sampled)):
         raise ValueError(
             f"control is a {type(control).__name__}, whose state the steps of method 'variational' do not integrate; take "
             "another method"
         )
-    if isinstance(solver, Stepper) and isinstance(adjoint, diffrax.BacksolveAdjoint):
+    if is_variational(solver) and is_backsolve(adjoint):
         raise ValueError(
             "adjoint is 'backsolve', which needs a differential equation; take 'reverse' or another method"
         )
-    if isinstance(method, Reduced) and isinstance(adjoint, diffrax.BacksolveAdjoint):
+    if isinstance(method, Reduced) and is_backsolve(adjoint):
         raise ValueError(
             "adjoint is 'backsolve', which cannot follow the basis of method='reduced' backwards, nor see it become singular; "
             "take 'reverse'"
@@ -179,7 +182,7 @@ def check_combination(control, method: Method, solver, adjoint) -> None:
 
 def check_conditions(conditions, adjoint) -> None:
     """Refuse an adjoint that does not go back through the event that may end a run."""
-    if any(conditions) and isinstance(adjoint, diffrax.BacksolveAdjoint):
+    if any(conditions) and is_backsolve(adjoint):
         raise ValueError(
             "adjoint is 'backsolve', which does not go back through events, and contacts, limits or the control may end the run; "
             "take 'reverse', or contacts='report', limits=None and a control without `allowance`"
@@ -195,7 +198,7 @@ def check_drives(scene: Scene, control, solver, modal: bool) -> None:
         raise ValueError(
             f"{what} and forces with modes (jd.contact.DryFriction, jd.contact.UnilateralContact); leave one of them out"
         )
-    if isinstance(solver, Stepper):
+    if is_variational(solver):
         raise ValueError(f"{what}, which the steps of method 'variational' do not integrate; take another method")
     if isinstance(control, Controller) and control.takes_multipliers:
         raise ValueError(f"{what}, behind which multipliers do not depend on the command; use a control without them")
@@ -210,12 +213,14 @@ def check_modal_options(control, stepsize, solver, adjoint, outputs) -> None:
         raise ValueError(
             f"stepsize is {stepsize!r}, and {what}; leave it out for steps that keep rtol and atol, or give a length (s)"
         )
+    from jaxdyn.simulation.solvers.choice import has_name, is_explicit, label
+
     if not is_explicit(solver):
         raise ValueError(
             f"solver is {label(solver)}, and {what}, whose events are located within explicit steps; take diffrax.Dopri8() or "
             "Tsit5(), or, where forces are stiff, friction without modes (jd.forces.CoulombFriction)"
         )
-    if isinstance(adjoint, diffrax.BacksolveAdjoint):
+    if is_backsolve(adjoint):
         raise ValueError(f"adjoint is 'backsolve', which does not go back through events, and {what}; take 'reverse'")
     if not has_name(adjoint):
         raise ValueError(f"adjoint is {adjoint}, which does not go back through events, and {what}; take 'reverse'")
@@ -228,13 +233,16 @@ def check_modal_options(control, stepsize, solver, adjoint, outputs) -> None:
 
 def check_effects(scene: Scene, solver, stepsize, modal: bool, given: dict[str, Any]) -> None:
     """Refuse options that were given (not None) and have no effect on this run, and a bad number of events."""
-    if stepsize is not None and not uses_tolerances(solver):
-        steps = "fixed" if is_step_length(stepsize) else "their own"
-        for name in ("rtol", "atol"):
-            if given[name] is not None:
-                raise ValueError(
-                    f"{name} is given, and {label(solver)} has no use for it with {steps} steps (stepsize); omit one of them"
-                )
+    without_use = [name for name in ("rtol", "atol") if stepsize is not None and given[name] is not None]
+    if without_use:
+        from jaxdyn.simulation.solvers.choice import choose_solver, label, uses_tolerances
+
+        solver, steps = choose_solver(solver, stepsize), "fixed" if is_step_length(stepsize) else "their own"
+        if not uses_tolerances(solver):
+            raise ValueError(
+                f"{without_use[0]} is given, and {label(solver)} has no use for it with {steps} steps (stepsize); omit one of "
+                "them"
+            )
     most = given["max_events"]
     if most is not None:
         if isinstance(most, bool) or not isinstance(most, (int, np.integer)) or most < 1:
@@ -281,6 +289,7 @@ def check_limits(scene: Scene, limits: Any, modal: bool) -> None:
 METHODS: dict[str, type[Method]] = {
     kind.name: kind for kind in (Multipliers, Projected, Reduced, Baumgarte, Variational)
 }
+_FREE, _PROJECTED = Free(), Projected()
 
 
 def choose_method(scene: Scene, method: str | Method) -> Method:
@@ -293,12 +302,12 @@ def choose_method(scene: Scene, method: str | Method) -> Method:
     """
     if not scene.constraints:
         if method in ("auto", "free") or isinstance(method, Free):
-            return Free()
+            return _FREE
         if method == "variational" or isinstance(method, Variational):
             return Variational() if isinstance(method, str) else method
         raise ValueError(f"method is {method!r}; a scene without constraints takes 'auto' or 'free', or 'variational'")
     if method == "auto":
-        return Projected()
+        return _PROJECTED
     if isinstance(method, Method) and not isinstance(method, Free):
         chosen = method
     elif isinstance(method, str) and method in METHODS:
@@ -317,12 +326,15 @@ def check_constraints(scene: Scene, method: Method, q, v, t) -> tuple[Scene, Met
     **Raises:** ValueError that names the constraints, the size of their violation and the fix; for a basis that is not regular
     at the start.
     """
+    # Most starts are on independent constraints, which is found without the details that messages need.
+    if not isinstance(method, Reduced) and _find_soundness(scene, rank_tol=method.rank_tol, dtype=q.dtype)(q, v, t):
+        return scene, method
     limit, t = start_limit(q.dtype), np.asarray(t, q.dtype)
     selection = select_rows(scene, q, t, method.rank_tol)
     rank = int(np.sum(selection.kept))
     with jax.ensure_compile_time_eval():  # known numbers stay known while a function around is traced
         selected = scene if rank == len(selection.kept) else keep_rows(scene, selection)
-    ratio = start_openness(selected, q, v, t, limit)
+    ratio = start_openness(selected, relative=limit)(q, v, t)
     if ratio <= 1 and selection.rounding > most_rounding(q.dtype):
         raise ValueError(
             f"rows of the constraints contradict each other: they depend on others, but are open by "
@@ -357,6 +369,15 @@ def check_constraints(scene: Scene, method: Method, q, v, t) -> tuple[Scene, Met
         if method.basis is not None and not bool(_is_regular_at(selected, method.basis, q, t)):
             raise ValueError(f"the basis is not regular at q0: {method.basis.advice(selected, q, t)}")
     return selected, method
+
+
+@once
+def _find_soundness(scene: Scene, *, rank_tol, dtype) -> Callable[..., bool]:
+    """Function (q, v, t) of a known scene: whether all rows are independent beyond doubt, and closed, and leave freedom."""
+    rows, has_doubtful_rows = known_rows(scene, rank_tol=rank_tol, dtype=dtype)
+    is_free = rows.kept.size < scene.nv and not holds_rows(scene)
+    openness = start_openness(scene, relative=start_limit(dtype))
+    return lambda q, v, t: is_free and not has_doubtful_rows(q, t) and bool(openness(q, v, t) <= 1)
 
 
 def may_have_singular_mass(system) -> bool:

@@ -12,12 +12,12 @@ from jaxdyn.simulation import controls, terminal_events
 from jaxdyn.simulation.equations import KEPT, Equations
 from jaxdyn.simulation.hybrid.piecewise import MIN_EVENTS, PiecewiseSystem, piecewise_motion
 from jaxdyn.simulation.methods import Reduced, is_regular
+from jaxdyn.simulation.options import is_step_length
 from jaxdyn.simulation.solution import RESULTS, from_diffrax
 from jaxdyn.simulation.solvers import ExplicitSteps, ProjectedSolver
 from jaxdyn.simulation.solvers.choice import (
     has_name,
     is_explicit,
-    is_step_length,
     label,
     progress_meter,
     solver_and_control,

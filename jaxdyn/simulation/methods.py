@@ -47,7 +47,7 @@ from jaxdyn.reduction.bases import (
     velocity_and_drift,
 )
 from jaxdyn.reduction.minimal import solve_in_basis
-from jaxdyn.simulation.solvers.choice import Solver, Stepsize
+from jaxdyn.simulation.options import Solver, Stepsize
 from jaxdyn.systems.scene import Scene, as_pytree
 from jaxdyn.systems.system import displace, needs_retraction, rate_to_velocity, retract, velocity_to_rate
 

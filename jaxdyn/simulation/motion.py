@@ -9,7 +9,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array
 
-from jaxdyn.compile import entry_point, kernel
+from jaxdyn.compile import kernel
 from jaxdyn.compile.batch import map_rows
 from jaxdyn.constraints.codes import first_of
 from jaxdyn.constraints.rank import LEAST_GAP
@@ -27,9 +27,10 @@ from jaxdyn.simulation.checks import (
 from jaxdyn.simulation.equations import DRIVES, KEPT, Equations, at_save_point, equations
 from jaxdyn.simulation.integration import integrate
 from jaxdyn.simulation.methods import Method, consistent, is_regular, satisfies_redundant_rows, start_limit
+from jaxdyn.simulation.options import is_step_length
 from jaxdyn.simulation.solution import RESULTS, Solution, invalidate_failures, rows_where
 from jaxdyn.simulation.solvers import LieGroup, Stepper
-from jaxdyn.simulation.solvers.choice import is_split, is_step_length, label
+from jaxdyn.simulation.solvers.choice import as_objects, is_split, label
 from jaxdyn.simulation.solvers.differentiable import COUNTS
 from jaxdyn.simulation.terminal_events import Conditions, Violation, first_violation
 from jaxdyn.systems.scene import Scene, check_callback
@@ -55,9 +56,9 @@ class _Run(NamedTuple):
         return self.method.to_qv(scene, self.method.correct(scene, y, t), t)
 
 
-@entry_point
 def smooth_motion(scene: Scene, control, method: Method, numbers, options) -> Solution:
     """Run of `simulate`; `numbers`: q0, v0, ts, rtol, atol and the length of steps or a controller of them."""
+    options = as_objects(options, numbers[-1])
     given, inputs = (scene, control, numbers), safe_inputs(scene.system, numbers)
     scene, inputs, faults = _project_start(scene, method, inputs, options["selects_rows"])
     run, y0 = _set_up(scene, control, method, inputs, options)

@@ -8,31 +8,29 @@ no such projection.
 from collections.abc import Sequence
 from typing import Any
 
-import diffrax
 import jax
 import jax.numpy as jnp
 import numpy as np
 
-from jaxdyn.compile.known import is_concrete, is_known
+from jaxdyn.compile import entry_point
+from jaxdyn.compile.known import as_numpy_if_known, is_concrete, is_known, once
 from jaxdyn.contact.unilateral import has_modes
 from jaxdyn.model.arguments import Numbers, as_array, check_flag, state_dtype
 from jaxdyn.simulation import checks, controls
 from jaxdyn.simulation.checks import check_constraints, choose_method, may_have_singular_mass
 from jaxdyn.simulation.controls import Control
-from jaxdyn.simulation.hybrid.motion import hybrid_motion
 from jaxdyn.simulation.methods import Method, may_have_redundant_rows
-from jaxdyn.simulation.motion import smooth_motion
-from jaxdyn.simulation.solution import Solution, raise_failure
-from jaxdyn.simulation.solvers.choice import (
+from jaxdyn.simulation.options import (
+    ADJOINTS,
+    Adjoint,
     Solver,
     Stepsize,
-    choose_adjoint,
-    choose_solver,
+    check_step_length,
+    is_backsolve,
     is_step_length,
-    solver_for_start,
     step_limit,
 )
-from jaxdyn.simulation.terminal_events import report_limits
+from jaxdyn.simulation.solution import Solution, raise_failure
 from jaxdyn.systems.scene import Scene, as_scene
 from jaxdyn.systems.system import SceneLike, System, has_dependent_coordinates
 
@@ -49,7 +47,7 @@ def simulate(
     stepsize: Stepsize = None,
     rtol: Numbers | None = None,
     atol: Numbers | None = None,
-    adjoint: str | diffrax.AbstractAdjoint | None = None,
+    adjoint: Adjoint = None,
     outputs: Sequence[str] = (),
     contacts: str | None = None,
     limits: str | None = None,
@@ -133,36 +131,25 @@ def simulate(
     ```
     """
     scene, control = as_scene(scene), controls.as_control(control)
-    given = {"rtol": rtol, "atol": atol, "max_events": max_events, "contacts": contacts}
-    rtol, atol = (1e-8 if x is None else x for x in (rtol, atol))
-    contacts, max_events = "stop" if contacts is None else contacts, 256 if max_events is None else max_events
     arrays, stepsize = _check_numbers(scene, q0, v0, ts, rtol, atol, stepsize)
-    q0, v0, ts, *_ = arrays
-    modal, start = has_modes(scene), (q0, v0, ts)
-    scene, method = _prepare_start(scene, choose_method(scene, method), start, stepsize, modal)
+    method, modal = choose_method(scene, method), has_modes(scene)
+    concrete = is_known(scene, control, method, arrays, stepsize)
+    start = tuple([np.asarray(x) if concrete else as_numpy_if_known(x) for x in arrays[:3]])
+    scene, method = _prepare_start(scene, method, start, stepsize, modal, concrete)
     controls.check_steps(control, stepsize)
-    solver, adjoint = _choose(scene, control, method, solver, stepsize, adjoint, start, modal)
-    outputs = checks.sort_outputs(scene, outputs)
-    if modal:
-        checks.check_modal_options(control, stepsize, solver, adjoint, outputs)
-    checks.check_effects(scene, solver, stepsize, modal, given)
-    checks.check_contacts(scene, contacts, () if modal else outputs)
-    checks.check_limits(scene, limits, modal)
-    options = {
-        "solver": solver,
-        "adjoint": adjoint,
-        "outputs": outputs,
-        "contacts": contacts,
-        "limits": limits,
+    solver = _solver_at_start(scene, control, solver, stepsize, adjoint, arrays, modal)
+    options = _choose(
+        scene, control, method, solver, stepsize, adjoint,
+        outputs=checks.sort_outputs(scene, outputs), contacts=contacts, limits=limits, max_events=max_events,
+        tolerances=(rtol is not None, atol is not None), modal=modal,
+    )  # fmt: skip
+    options = options | {
         "progress": bool(progress),
-        "max_steps": step_limit(max_steps, ts, stepsize, adjoint),
+        "max_steps": step_limit(max_steps, start[-1], stepsize, options["adjoint"]),
         "limit_is_given": max_steps is not None,
-        "max_events": max_events,
-        "checks_mass": may_have_singular_mass(scene.system),
-        "selects_rows": _selects_rows(scene, method, *start),
+        "selects_rows": not concrete and _selects_rows(scene, method, *start),
     }
     dtype, has_length = state_dtype(scene.system), is_step_length(stepsize)
-    concrete = is_known(scene, control, method, arrays, stepsize)
     # Known numbers go to the compiled program as they are: each array of JAX made before would be a transfer of its own.
     to_array = np.asarray if concrete and not modal else jnp.asarray
     numbers: list[Any] = [x if _is_array(x, dtype) else to_array(x, dtype) for x in arrays]
@@ -172,11 +159,29 @@ def simulate(
     else:
         solution = smooth_motion(scene, control, method, numbers, options)
     if limits == "report":
+        from jaxdyn.simulation.terminal_events import report_limits
+
         solution = report_limits(scene, solution, concrete)
     throw = concrete if throw is None else check_flag(throw, "throw")
     if throw and concrete:
         raise_failure(solution, scene, control, options)
     return solution.result.error_if(solution, ~solution.success) if throw and not concrete else solution
+
+
+@entry_point
+def smooth_motion(*args) -> Solution:
+    """A run without modes; what makes its program is imported where it is not on disk."""
+    from jaxdyn.simulation.motion import smooth_motion
+
+    return smooth_motion(*args)
+
+
+@entry_point
+def hybrid_motion(*args) -> Solution:
+    """A run with modes."""
+    from jaxdyn.simulation.hybrid.motion import hybrid_motion
+
+    return hybrid_motion(*args)
 
 
 def _is_array(x, dtype) -> bool:
@@ -186,15 +191,24 @@ def _is_array(x, dtype) -> bool:
 def _check_numbers(scene: Scene, q0, v0, ts, rtol, atol, stepsize) -> tuple:
     """Start, times and tolerances as arrays, and the length of steps or its controller, refused if they do not fit."""
     q0, v0, ts = as_array(q0, "q0"), as_array(v0, "v0"), as_array(ts, "ts")
-    checks.check_start(scene, q0, v0)
-    checks.check_times(ts)
-    rtol, atol = as_array(rtol, "rtol"), as_array(atol, "atol")
-    checks.check_tolerance("rtol", rtol)
-    checks.check_tolerance("atol", atol)
+    checks.check_start(scene, as_numpy_if_known(q0), as_numpy_if_known(v0))
+    checks.check_times(as_numpy_if_known(ts))
+    rtol, atol = (_tolerance(name, value) for name, value in (("rtol", rtol), ("atol", atol)))
     return (q0, v0, ts, rtol, atol), as_array(stepsize, "stepsize") if is_step_length(stepsize) else stepsize
 
 
-def _prepare_start(scene: Scene, method: Method, start, stepsize, modal: bool) -> tuple[Scene, Method]:
+_DEFAULT_TOLERANCE = np.asarray(1e-8)
+
+
+def _tolerance(name: str, value):
+    if value is None:
+        return _DEFAULT_TOLERANCE
+    value = as_array(value, name)
+    checks.check_tolerance(name, value)
+    return value
+
+
+def _prepare_start(scene: Scene, method: Method, start, stepsize, modal: bool, concrete: bool) -> tuple[Scene, Method]:
     """Check a concrete start by the rules of the system and of the constraints, and drop redundant rows."""
     q0, v0, ts = start
 
@@ -202,34 +216,68 @@ def _prepare_start(scene: Scene, method: Method, start, stepsize, modal: bool) -
         with jax.ensure_compile_time_eval():
             scene.system.check_start(*(jnp.asarray(x, state_dtype(scene.system)) for x in (q0, v0, ts[0])))
 
+    is_readable = concrete or is_concrete((scene, start))
     # Places of contacts come first, because the constraints depend on them.
-    if has_dependent_coordinates(scene.system) and is_concrete((scene, q0, v0, ts)):
+    if is_readable and has_dependent_coordinates(scene.system):
         check_system()
-    if scene.constraints and is_concrete((scene, method, q0, v0, ts)):
-        state = [np.asarray(x, state_dtype(scene.system)) for x in (q0, v0, np.asarray(ts)[0])]
+    if is_readable and scene.constraints and (concrete or is_concrete(method)):
+        state = [np.asarray(x, state_dtype(scene.system)) for x in (q0, v0, ts[0])]
         selected, method = check_constraints(scene, method, *state)
         # In a motion with modes the rows that are independent change with the contacts. Rows that repeat others but for the
         # rounding of a file are dropped there too.
         scene = scene if modal and not scene.rounding else selected
-    if isinstance(scene.system, System) and is_concrete((scene, q0, v0, ts)):
+    if is_readable and isinstance(scene.system, System):
         check_system()
     if not is_step_length(stepsize) and is_concrete(q0):
         checks.check_angles(scene, q0, state_dtype(scene.system))
     return scene, method
 
 
-def _choose(scene: Scene, control, method: Method, solver, stepsize, adjoint, start, modal: bool):
-    """Solver and adjoint of a run."""
-    backwards = adjoint == "backsolve" or isinstance(adjoint, diffrax.BacksolveAdjoint)
+def _solver_at_start(scene: Scene, control, solver, stepsize, adjoint, arrays, modal: bool):
+    """The solver that was given, or the one that a stiff start asks for."""
     # Only for adaptive steps without modes: events are located within explicit steps. Backwards the equations are others.
-    if solver is None and scene.forces and not (modal or is_step_length(stepsize) or backwards):
-        q0, v0, ts = start
-        solver = solver_for_start(scene, controls.at_start(control, q0, v0, ts[0]), q0, v0, ts)
-    solver = choose_solver(method.stepper(solver, stepsize), stepsize)
-    adjoint = choose_adjoint(adjoint, solver)
+    if solver is not None or not scene.forces or modal or is_step_length(stepsize) or is_backsolve(adjoint):
+        return solver
+    from jaxdyn.simulation.solvers.choice import solver_for_start
+
+    q0, v0, ts, *_ = arrays
+    return solver_for_start(scene, controls.at_start(control, q0, v0, ts[0]), q0, v0, ts)
+
+
+@once
+def _choose(
+    scene: Scene, control, method: Method, solver, stepsize, adjoint,
+    *, outputs, contacts, limits, max_events, tolerances: tuple[bool, bool], modal: bool,
+) -> dict[str, Any]:  # fmt: skip
+    """Options of a run that the numbers do not decide; defaults and names stay what they are (see `as_objects`)."""
+    solver = method.stepper(solver, stepsize)
+    is_default = solver is None and (stepsize is None or is_step_length(stepsize)) and not modal
+    if is_default and (adjoint is None or (isinstance(adjoint, str) and adjoint in ADJOINTS)):
+        adjoint = "reverse" if adjoint is None else adjoint
+        if stepsize is not None:
+            check_step_length(stepsize)
+    else:
+        from jaxdyn.simulation.solvers.choice import as_objects
+
+        solver, adjoint = as_objects({"solver": solver, "adjoint": adjoint}, stepsize).values()
     checks.check_drives(scene, control, solver, modal)
     checks.check_combination(control, method, solver, adjoint)
-    return solver, adjoint
+    if modal:
+        checks.check_modal_options(control, stepsize, solver, adjoint, outputs)
+    given = {name: is_given or None for name, is_given in zip(("rtol", "atol"), tolerances, strict=True)}
+    checks.check_effects(scene, solver, stepsize, modal, given | {"max_events": max_events, "contacts": contacts})
+    contacts, max_events = "stop" if contacts is None else contacts, 256 if max_events is None else max_events
+    checks.check_contacts(scene, contacts, () if modal else outputs)
+    checks.check_limits(scene, limits, modal)
+    return {
+        "solver": solver,
+        "adjoint": adjoint,
+        "outputs": outputs,
+        "contacts": contacts,
+        "limits": limits,
+        "max_events": max_events,
+        "checks_mass": may_have_singular_mass(scene.system),
+    }
 
 
 def _selects_rows(scene: Scene, method: Method, q0, v0, ts) -> bool:

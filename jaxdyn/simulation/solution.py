@@ -2,7 +2,6 @@
 
 from typing import TYPE_CHECKING, Any
 
-import diffrax
 import equinox as eqx
 import jax
 import jax.numpy as jnp
@@ -19,7 +18,6 @@ from jaxdyn.model.description import solution_lines
 from jaxdyn.model.tree import Model
 from jaxdyn.simulation.controls import at_start
 from jaxdyn.simulation.export import as_xarray, write_csv, write_npz
-from jaxdyn.simulation.solvers.choice import find_stiffness, innermost, is_stiff
 from jaxdyn.systems.scene import Scene
 from jaxdyn.systems.system import SceneLike
 
@@ -41,6 +39,8 @@ def rows_where(mask, rows, otherwise):
 
 def from_diffrax(result) -> Any:
     """Code of diffrax as one of `RESULTS`, by its name."""
+    import diffrax
+
     # By name, because the numbers of codes differ between the two enumerations and between versions of diffrax.
     cases = [(result == getattr(diffrax.RESULTS, name), getattr(RESULTS, name)) for name in OF_DIFFRAX]
     return first_of(cases, RESULTS.internal_error)
@@ -197,10 +197,20 @@ def raise_failure(solution: Solution, scene: Scene, control, options) -> None:
     )
 
 
+def _is_explicit(solver) -> bool:
+    import diffrax
+
+    from jaxdyn.simulation.solvers.choice import innermost
+
+    return solver is None or isinstance(innermost(solver), diffrax.AbstractERK)  # those by default are explicit
+
+
 def _advice(name: str, solution: Solution, scene: Scene, control, options) -> str:
     advice = ADVICE.get(name, "try smaller steps, other tolerances, or another solver").format(**options)
     # The scene may have become stiff on the way, so that the choice of the solver at the start has not seen it.
-    if name == "max_steps_reached" and isinstance(innermost(options["solver"]), diffrax.AbstractERK):
+    if name == "max_steps_reached" and _is_explicit(options["solver"]):
+        from jaxdyn.simulation.solvers.choice import find_stiffness, is_stiff
+
         last = int(np.flatnonzero(np.isfinite(solution.q).all(1))[-1])
         state = solution.q[last], solution.v[last], solution.ts[last]
         rates = find_stiffness(scene, *state, at_start(control, *state))

@@ -48,8 +48,7 @@ from jaxdyn.model.arguments import Number
 from jaxdyn.model.joints import SCREW_KINDS
 from jaxdyn.model.tree import Model
 from jaxdyn.simulation.methods import Force, Free, Multipliers, Q, State, V
-from jaxdyn.simulation.solvers import Stepper
-from jaxdyn.simulation.solvers.choice import Solver, Stepsize, is_step_length
+from jaxdyn.simulation.options import Solver, Stepsize, is_step_length
 from jaxdyn.systems.lagrangian import LagrangianSystem
 from jaxdyn.systems.mass_factor import solve_positive
 from jaxdyn.systems.scene import Scene
@@ -309,6 +308,8 @@ class Variational(Multipliers):
                 f"stepsize is {stepsize!r}; method 'variational' takes fixed steps, because adaptive ones lose its "
                 "conservation: pass a number (s), e.g. stepsize=0.01"
             )
+        from jaxdyn.simulation.solvers.fixed_steps import Stepper
+
         return Stepper()
 
     def begin(self, scene: Scene, y: State, t: Number) -> Carried:

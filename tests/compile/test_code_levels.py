@@ -83,6 +83,22 @@ def test_quick_code_on_disk_is_optimised_by_another_process(monkeypatch, tmp_pat
     assert [x[1] for x in lines] == ["[True]", "[False]"]
 
 
+@pytest.mark.long
+def test_quick_code_of_processes_that_end_soon_is_optimised_at_once(monkeypatch, tmp_path):
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
+    monkeypatch.delenv("JAXDYN_COMPILATION_OPTIONS", raising=False)
+    # No first call is ever over: what waits for that is not optimised.
+    busy = "from jaxdyn.compile import first_calls; first_calls._QUIET_SECONDS = 1e6\n"
+    look = "any(objects.find(x.row.identity).text for x in target._kernels.values())"
+    wait = f"import time; end = time.monotonic() + 60\nwhile {look} and time.monotonic() < end: time.sleep(0.01)\n"
+    lines = []
+    for script in (_SCRIPT, _SCRIPT.replace("print([", wait + "print([")):
+        done = subprocess.run([sys.executable, "-c", busy + script], capture_output=True, text=True, check=True)
+        lines.append(done.stdout.splitlines())
+    assert lines[0][0] == lines[1][0]
+    assert [x[1] for x in lines] == ["[True]", "[False]"]
+
+
 def test_a_long_first_call_is_reported_once(monkeypatch, caplog, two_levels):
     first_calls.wait_for_code()
     monkeypatch.setattr(first_calls, "REPORTED_SECONDS", 0.0)

@@ -15,6 +15,7 @@ import pytest
 
 import jaxdyn as jd
 from jaxdyn.compile import disk, entry_point, executables, jax_adapter, stored, target, trace
+from jaxdyn.compile.careful import Careful
 from jaxdyn.compile.expansion import expand
 from jaxdyn.compile.fingerprint import NoFingerprint, fingerprint
 
@@ -191,6 +192,49 @@ def test_a_program_that_is_traced_in_another_order_takes_the_place_of_the_stored
     another = expand(jax.make_jaxpr(lambda x, y: [x * y, y])(x, x), 10**4)[0]
     with pytest.raises(RuntimeError, match="traced again"):
         _ = stored.Description.of(one).restore(lambda: another).operations
+
+
+def test_subprograms_that_are_called_in_another_order(folder):
+    x = np.linspace(0.1, 0.9, 3)
+    one, other, third = (expand(jax.make_jaxpr(f)(x), 10**4)[0] for f in (jnp.sin, jnp.cos, jnp.tan))
+    caller, again, fewer = (expand(jax.make_jaxpr(f)(x), 10**4)[0] for f in (jnp.exp, lambda x: 2 * x, jnp.log))
+    caller.subprograms, again.subprograms, fewer.subprograms = (one, other), (other, third), ()
+    found = stored.Description.of(caller).restore(lambda: again)
+    # The one that is there still, and for the other the one in its place.
+    assert stored._subprogram_of(found, 1) is other
+    assert stored._subprogram_of(found, 0) is other
+    with pytest.raises(RuntimeError, match="traced again"):
+        stored._subprogram_of(stored.Description.of(caller).restore(lambda: fewer), 0)
+
+
+def make_careful(name: str, digest: str) -> Careful:
+    """A careful program for sines of three numbers."""
+    program = expand(jax.make_jaxpr(lambda x: [jnp.sin(x)])(np.zeros(3)), 10**4, name)[0]
+    return Careful(
+        program.inputs, program.outputs, digest, name, lambda: program, lambda x: [jnp.sin(x)], "within", True
+    )
+
+
+@pytest.mark.native
+def test_a_careful_program_is_traced_again(folder):
+    x, kept = np.linspace(0.1, 0.9, 3), make_careful("sines", "careful sines")
+
+    def row(digest):
+        made = kept if digest == kept.digest else make_careful("sines", digest)
+        return target.number_of(made, 1, (False,)), target.Row.of(made, 1, (False,))
+
+    # Its code is missing: the function is traced again, which enters the program.
+    number, entry = row(kept.digest)
+    target.restore(number, entry, lambda: target.kernel(kept, 1, [False]))
+    np.testing.assert_allclose(target.Call(kept, {})([x])[0], np.sin(x), rtol=1e-15)
+    # A function that has another program now.
+    number, entry = row("careful sines of another process")
+    target.restore(number, entry, lambda: None)
+    with pytest.raises(RuntimeError, match=f"sines has another program.*{folder}"):
+        target._kernels[number].address()
+    again = kept.describe().restore(lambda: expand(jax.make_jaxpr(jnp.cos)(x), 10**4)[0])
+    with pytest.raises(RuntimeError, match="traced again"):
+        again.program()
 
 
 GAIN = 2.0

@@ -83,7 +83,7 @@ def register() -> ctypes.Array:
     }  # fmt: skip
     for name, value in fields.items():
         text = text.replace("{" + name + "}", str(value))
-    code = Code(compile_text(fill_handler(table, 0) + text))
+    code = Code(compile_text(fill_handler("jaxdyn_cuda_table", table) + text))
     register_handler(TARGET, code.address("cuda_handler"), "CUDA")
     _codes.append(code)
     return table

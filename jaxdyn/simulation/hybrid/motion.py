@@ -8,7 +8,7 @@ import jax
 import jax.numpy as jnp
 from jax import lax
 
-from jaxdyn.compile import entry_point, kernel
+from jaxdyn.compile import kernel
 from jaxdyn.compile.known import partition_tracers
 from jaxdyn.constraints.base import velocity_residual
 from jaxdyn.constraints.codes import RESULTS, first_of
@@ -65,7 +65,6 @@ class _Binder:
         return in_piece, generalized_force, lambda q, v, t: guards(scene, q, v, t, self.effort(unknown, q, v, t))
 
 
-@entry_point
 def hybrid_motion(scene: Scene, control, numbers, options) -> Solution:
     """Solution of a run with modes; `numbers` are q0, v0, ts, rtol, atol, and the length of fixed steps or None."""
     for i, force in enumerate(extend(scene).forces):

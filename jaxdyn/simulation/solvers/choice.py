@@ -1,42 +1,29 @@
 """Choice of solver, step-size control and adjoint: the user's options as diffrax's objects."""
 
 import importlib.util
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import diffrax
 import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
 import optimistix
-from jax.typing import ArrayLike
 
-from jaxdyn.compile.known import is_concrete, is_known
-from jaxdyn.model.arguments import batch_hint
-from jaxdyn.simulation.solvers.fixed_steps import RK4, Stepper
+from jaxdyn.compile.known import is_known
+from jaxdyn.simulation.options import ADJOINTS, check_step_length, is_backsolve, is_step_length
+from jaxdyn.simulation.solvers.fixed_steps import RK4
 from jaxdyn.simulation.solvers.lie import LieGroup
 from jaxdyn.simulation.solvers.rosenbrock import Rodas5P
 from jaxdyn.simulation.solvers.step_control import Adaptive, ErrorMonitoredSteps
 from jaxdyn.simulation.stiffness import Stiffness, stiffness
 from jaxdyn.systems.scene import Scene
 
-if TYPE_CHECKING:
-    Solver = diffrax.AbstractSolver | Stepper | None
-    Stepsize = ArrayLike | diffrax.AbstractStepSizeController | None
-else:
-    Solver = Stepsize = Any  # `choose_solver` checks them
-
-ADJOINTS = ("reverse", "direct", "forward", "backsolve")
 # Degree of the dense output, by the classes that diffrax's methods use.
 _INTERPOLATION_DEGREE = {
     diffrax.LocalLinearInterpolation: 1,
     diffrax.ThirdOrderHermitePolynomialInterpolation: 3,
     diffrax.FourthOrderPolynomialInterpolation: 4,
 }
-
-
-def is_step_length(stepsize) -> bool:
-    """True if `stepsize` is a number: fixed steps."""
-    return not (stepsize is None or isinstance(stepsize, diffrax.AbstractStepSizeController))
 
 
 def choose_solver(solver, stepsize):
@@ -47,10 +34,7 @@ def choose_solver(solver, stepsize):
     if solver is not None and not isinstance(solver, diffrax.AbstractSolver):
         raise ValueError(f"solver is {solver!r}; pass an instance of a diffrax solver, e.g. diffrax.Tsit5()")
     if is_step_length(stepsize):
-        if np.shape(stepsize) != ():
-            raise ValueError(f"stepsize has shape {np.shape(stepsize)}; pass one number (s){batch_hint(stepsize, ())}")
-        if is_concrete(stepsize) and not (np.isfinite(stepsize) and stepsize > 0):
-            raise ValueError(f"stepsize is {stepsize}; pass a positive number (s), or None for adaptive steps")
+        check_step_length(stepsize)
         solver = RK4() if solver is None else solver
     else:
         if isinstance(stepsize, diffrax.ConstantStepSize):
@@ -125,8 +109,7 @@ def choose_adjoint(adjoint, solver) -> diffrax.AbstractAdjoint:
 
     **Raises:** ValueError for an unknown name, and for the continuous adjoint of a method that has none.
     """
-    backsolve = adjoint == "backsolve" or isinstance(adjoint, diffrax.BacksolveAdjoint)
-    if backsolve and (is_split(solver) or isinstance(solver, LieGroup)):
+    if is_backsolve(adjoint) and (is_split(solver) or isinstance(solver, LieGroup)):
         raise ValueError(f"adjoint is 'backsolve', which {type(solver).__name__} does not support; take 'reverse'")
     if isinstance(adjoint, diffrax.AbstractAdjoint):
         return adjoint
@@ -142,6 +125,12 @@ def choose_adjoint(adjoint, solver) -> diffrax.AbstractAdjoint:
     raise ValueError(f"adjoint is {adjoint!r}; choose one of {', '.join(ADJOINTS)}, or pass a diffrax adjoint")
 
 
+def as_objects(options: dict[str, Any], stepsize) -> dict[str, Any]:
+    """Options of a run with diffrax's objects in the place of defaults and names."""
+    solver = choose_solver(options["solver"], stepsize)
+    return options | {"solver": solver, "adjoint": choose_adjoint(options["adjoint"], solver)}
+
+
 def has_name(adjoint: diffrax.AbstractAdjoint) -> bool:
     """True for the adjoints that have a name, whose derivatives the library's own loops give too.
 
@@ -150,24 +139,6 @@ def has_name(adjoint: diffrax.AbstractAdjoint) -> bool:
     if type(adjoint) is diffrax.RecursiveCheckpointAdjoint:
         return adjoint.checkpoints is None
     return type(adjoint) in (diffrax.ForwardMode, diffrax.DirectAdjoint, diffrax.BacksolveAdjoint)
-
-
-def step_limit(max_steps, ts, stepsize, adjoint: diffrax.AbstractAdjoint) -> int:
-    """Limit on the number of steps: as given, else what fixed steps need, else 65536 (4096 where each allowed step costs).
-
-    **Raises:** ValueError for anything but a positive integer or None.
-    """
-    if max_steps is not None:
-        if isinstance(max_steps, bool) or not isinstance(max_steps, (int, np.integer)) or max_steps < 1:
-            raise ValueError(f"max_steps is {max_steps!r}; pass a positive integer, or None for the default")
-        return int(max_steps)
-    if is_step_length(stepsize) and is_concrete((ts, stepsize)):
-        # Rounded up to a power of two, so that other times seldom mean another program. In numpy: inside a jit, jax would trace
-        # the difference of known times too.
-        first, last = np.asarray(ts)[[0, -1]]
-        needed = 1.001 * float(last - first) / float(stepsize) + 2
-        return 2 ** int(np.ceil(np.log2(max(needed, 16))))
-    return 4096 if isinstance(adjoint, diffrax.DirectAdjoint) else 65536
 
 
 def uses_tolerances(solver) -> bool:

@@ -1,0 +1,84 @@
+"""Options of a run as users give them, without diffrax, whose import takes longer than a run from stored programs."""
+
+from typing import TYPE_CHECKING, Any
+
+import jax
+import numpy as np
+from jax.typing import ArrayLike
+
+from jaxdyn.compile.known import is_concrete
+from jaxdyn.model.arguments import batch_hint
+
+if TYPE_CHECKING:
+    import diffrax
+
+    from jaxdyn.simulation.solvers.fixed_steps import Stepper
+
+    Solver = diffrax.AbstractSolver | Stepper | None
+    Stepsize = ArrayLike | diffrax.AbstractStepSizeController | None
+    Adjoint = str | diffrax.AbstractAdjoint | None
+else:
+    Solver = Stepsize = Adjoint = Any  # `choose_solver` and `choose_adjoint` check them
+
+ADJOINTS = ("reverse", "direct", "forward", "backsolve")
+
+
+def is_step_length(stepsize) -> bool:
+    """True if `stepsize` is a number: fixed steps."""
+    if stepsize is None or isinstance(stepsize, (int, float, np.ndarray, np.generic, jax.Array)):
+        return stepsize is not None
+    import diffrax
+
+    return not isinstance(stepsize, diffrax.AbstractStepSizeController)
+
+
+def is_backsolve(adjoint) -> bool:
+    """True for the continuous adjoint, by its name or of diffrax."""
+    if adjoint is None or isinstance(adjoint, str):
+        return adjoint == "backsolve"
+    import diffrax
+
+    return isinstance(adjoint, diffrax.BacksolveAdjoint)
+
+
+def is_variational(solver) -> bool:
+    """True for the steps of method "variational"."""
+    if solver is None:
+        return False
+    from jaxdyn.simulation.solvers.fixed_steps import Stepper
+
+    return isinstance(solver, Stepper)
+
+
+def check_step_length(stepsize) -> None:
+    """Refuse a length of steps that is not one positive number. **Raises:** ValueError."""
+    if np.shape(stepsize) != ():
+        raise ValueError(f"stepsize has shape {np.shape(stepsize)}; pass one number (s){batch_hint(stepsize, ())}")
+    if is_concrete(stepsize) and not (np.isfinite(stepsize) and stepsize > 0):
+        raise ValueError(f"stepsize is {stepsize}; pass a positive number (s), or None for adaptive steps")
+
+
+def step_limit(max_steps, ts, stepsize, adjoint) -> int:
+    """Limit on the number of steps: as given, else what fixed steps need, else 65536 (4096 where each allowed step costs).
+
+    **Raises:** ValueError for anything but a positive integer or None.
+    """
+    if max_steps is not None:
+        if isinstance(max_steps, bool) or not isinstance(max_steps, (int, np.integer)) or max_steps < 1:
+            raise ValueError(f"max_steps is {max_steps!r}; pass a positive integer, or None for the default")
+        return int(max_steps)
+    if is_step_length(stepsize) and is_concrete((ts, stepsize)):
+        # Rounded up to a power of two, so that other times seldom mean another program. In numpy: inside a jit, jax would trace
+        # the difference of known times too.
+        first, last = np.asarray(ts)[[0, -1]]
+        needed = 1.001 * float(last - first) / float(stepsize) + 2
+        return 2 ** int(np.ceil(np.log2(max(needed, 16))))
+    return 4096 if _is_direct(adjoint) else 65536
+
+
+def _is_direct(adjoint) -> bool:
+    if isinstance(adjoint, str):
+        return adjoint == "direct"
+    import diffrax
+
+    return isinstance(adjoint, diffrax.DirectAdjoint)
