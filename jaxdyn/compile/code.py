@@ -145,7 +145,7 @@ class Body:
         if isinstance(called, Careful):
             self.careful = max(self.careful, careful_text.write_call(self.e, called, flag, pointers))
         else:
-            _write_call(self.e, called, pointers)
+            write_call(self.e, called, pointers)
         if has_loop(called):
             ends = [0, *accumulate(array.size for array in called.outputs)]
             self.in_memory[i] = [(x, y[0], z) for x, y, z in zip(ends, outputs, called.outputs, strict=False)]
@@ -187,6 +187,10 @@ class Body:
                 self.passed[place] = value
         return pointer
 
+    def arrays_in_memory(self) -> list[int]:
+        """Inputs of the program that are read as arrays."""
+        return _inputs_of_loops(self.program)
+
     def _place(self, at: int) -> str:
         return self.e.emit(f"getelementptr i8, ptr %passed, i64 {at}")
 
@@ -226,6 +230,13 @@ def _inputs_of_loops(program: Program) -> list[int]:
     return sorted(found - {None})
 
 
+def body_of(e: Emitter, program: Program, load: Callable, array: Callable) -> Body:
+    """The operations of a program as code, or as data of a loop where they are too many."""
+    from jaxdyn.compile.listing import Listing, is_listed
+
+    return (Listing if is_listed(program) else Body)(e, program, load, array)
+
+
 def _find_products(program: Program) -> dict[int, int]:
     """Sums and differences one of whose operands is a product that nothing else needs, and the place of that operand.
 
@@ -252,7 +263,7 @@ def _find_products(program: Program) -> dict[int, int]:
     return found
 
 
-def _write_call(e: Emitter, called: Program, pointers: Sequence[str]) -> None:
+def write_call(e: Emitter, called: Program, pointers: Sequence[str]) -> None:
     name, places = symbol_of(called, e.width), [f"ptr %{k}" for k in range(len(pointers))]
     # By its address in memory: code that is better takes its place while this code runs.
     e.declared[name] = "\n".join(
@@ -276,10 +287,15 @@ def symbol_of(called: Program, width: int) -> str:
 def subprogram_ir(called: Program, width: int) -> str:
     """The text of a subprogram, the function `called`."""
     e = Emitter(width)
-    body = Body(e, called, lambda place, entry, kind: e.load_at(f"%a{place}", entry, kind), lambda place: f"%a{place}")
-    for i, (row, array) in enumerate(zip(body.results(), called.outputs, strict=True)):
-        for k, name in enumerate(row):
-            e.store_at(f"%r{i}", k, kind_of(array.dtype), name)
+    body = body_of(e, called, lambda place, entry, kind: e.load_at(f"%a{place}", entry, kind), lambda place: f"%a{place}")
+    body.compute()
+    for i, (row, array) in enumerate(zip(called.results, called.outputs, strict=True)):
+        pointer = body.pointer_to(row, array)
+        if pointer is not None and len(row) >= MIN_ENTRIES_IN_LOOP:
+            memory.copy(e, pointer, f"%r{i}", array.size * array.dtype.itemsize * width)
+            continue
+        for k, x in enumerate(row):
+            e.store_at(f"%r{i}", k, kind_of(array.dtype), body.text(x, kind_of(array.dtype)))
     names = [f"%a{i}" for i in range(len(called.inputs))] + [f"%r{i}" for i in range(len(called.outputs))]
     head = f"define void @called({', '.join(f'ptr noalias {name}' for name in names)}) #0 {{"
     allocations, free, declared = on_heap(body.allocations())
@@ -331,8 +347,8 @@ def kernel_ir(program: Program, width: int, uniform: Sequence[bool]) -> str:
             return packed.get(place)
         return rows[place][0] if place in rows else f"%a{place}"
 
-    body, valid, allocations = Body(e, fast, load, array), None, []
-    for place in _inputs_of_loops(fast) if width > 1 else ():
+    body, valid, allocations = body_of(e, fast, load, array), None, []
+    for place in body.arrays_in_memory() if width > 1 else ():
         packed[place], given = f"%packed{place}", arrays[place]
         allocations.append(allocation(packed[place], bytes_of(given, width)))
         source = [f"%a{place}"] * width if uniform[place] else rows[place]
@@ -343,7 +359,7 @@ def kernel_ir(program: Program, width: int, uniform: Sequence[bool]) -> str:
         if program.careful is not None:
             allocations.append("  %valid = alloca i8")
             pointers.append("%valid")
-        _write_call(e, fast, pointers)
+        write_call(e, fast, pointers)
         valid = None if program.careful is None else e.load_at("%valid", 0, "b1")
     else:
         body.compute()

@@ -165,8 +165,9 @@ def _group_rows(members: tuple[Pair, ...], system, q, v) -> list:
         columns = jnp.zeros((*D.shape[:2], len(frames.coordinates)), q.dtype)
         for sign, mask, adjoint in sides:
             if mask[index].any():
-                part = matmul(matmul(D, take(adjoint, index)), frames.subspace.T)
-                columns = columns + part * jnp.asarray(sign * mask[index][:, None, :], q.dtype)
+                # Masked before the product: a kernel then computes no entry that the mask removes.
+                moving = frames.subspace.T * jnp.asarray(sign * mask[index][:, None, :], q.dtype)
+                columns = columns + matmul(matmul(D, take(adjoint, index)), moving)
         if len(frames.coordinates) < system.nv:
             # The pass went through the bodies between the frames alone; other coordinates have columns of zeros.
             wide = jnp.zeros((*D.shape[:2], system.nv), q.dtype)
