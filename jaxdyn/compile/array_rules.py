@@ -45,6 +45,8 @@ def _as_dtype(expansion, x: np.ndarray, dtype) -> np.ndarray:
     if x.dtype.kind != "O":
         return convert_known(x, dtype)
     kind = kind_or_refuse(dtype)
+    if all([type(y) is Number and y.kind == kind for y in x.ravel().tolist()]):
+        return x
     return objects([expansion.graph.convert(y, kind) for y in x.ravel().tolist()], x.shape)
 
 
@@ -90,7 +92,7 @@ def dot_general(expansion, params, args, eqn):
         count, columns, length
     )
     # The result may have a wider type than the operands (`preferred_element_type`); then the sums are in that type.
-    a, b = (_as_dtype(expansion, x, out.dtype) for x in (a, b))
+    a, b = (x if y.aval.dtype == out.dtype else _as_dtype(expansion, x, out.dtype) for x, y in zip((a, b), eqn.invars, strict=True))
     if out.dtype == bool:
         raise NotNumbers("a product of bools")
     if a.dtype.kind != "O" and b.dtype.kind != "O":

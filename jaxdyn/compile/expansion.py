@@ -25,7 +25,6 @@ from jaxdyn.compile.program import (
     NotNumbers,
     Number,
     Program,
-    TooLong,
     as_kind,
     as_objects,
     is_number,
@@ -33,10 +32,7 @@ from jaxdyn.compile.program import (
     objects,
 )
 from jaxdyn.compile.rearrange import AT_PLACES, REARRANGEMENTS
-from jaxdyn.compile.scan import Scan
 
-# Operations of a program that calls loops.
-MAX_BESIDE_LOOPS = 40_000
 # A function of fewer operations is scatter_places where it is called.
 MIN_SUBPROGRAM_OPERATIONS = 300
 
@@ -73,15 +69,6 @@ def expand(
         results.append(objects([graph.invert(expansion.flagged)], ()))
     program = graph.finish(inputs, outputs, [as_objects(x) for x in results], name=name)
     program.reports_validity = reports
-    # Arithmetic on the arrays that loops take and return is written out, entry by entry, and LLVM takes longer for operations
-    # on memory than for others: a step of a chain of 200 links would compile for a minute.
-    written = sum(x.op not in ("input", "part") for x in program.operations)
-    if (
-        written > MAX_BESIDE_LOOPS
-        and most <= mode.MAX_OPERATIONS
-        and any(isinstance(x, Scan) for x in program.subprograms)
-    ):
-        raise TooLong(f"more than {MAX_BESIDE_LOOPS} operations beside loops")
     numbers.prune_calls(program)
     return program, expansion.has_rules
 

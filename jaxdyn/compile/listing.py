@@ -14,20 +14,22 @@ import numpy as np
 
 from jaxdyn.compile import careful_text, memory
 from jaxdyn.compile.careful import Careful
-from jaxdyn.compile.code import Body, write_call
+from jaxdyn.compile.code import Body, has_loop, write_call
 from jaxdyn.compile.llvm import Emitter
 from jaxdyn.compile.memory import allocation, bytes_of
 from jaxdyn.compile.program import COMPARISONS, Array, Constant, Program, dtype_of, kind_of
 
-# Operations from which on a program is a listing.
-MIN_LISTED_OPERATIONS = 60_000
+# Operations from which on a program is a listing, and those of one that calls loops: arithmetic on the arrays that loops take and
+# return is written out entry by entry, and LLVM takes longer for operations on memory than for others.
+MIN_LISTED_OPERATIONS, MIN_LISTED_BESIDE_LOOPS = 60_000, 40_000
 _COLUMNS = 5  # of the table: code, result, three operands
 _ESCAPED = [f"\\{x:02X}" for x in range(256)]
 
 
 def is_listed(program: Program) -> bool:
     """Decide whether the operations of a program are data of its code."""
-    return len(program.operations) >= MIN_LISTED_OPERATIONS
+    count = sum(x.op not in ("input", "part") for x in program.operations)
+    return count > (MIN_LISTED_BESIDE_LOOPS if any(map(has_loop, program.subprograms)) else MIN_LISTED_OPERATIONS)
 
 
 class Listing(Body):
