@@ -12,6 +12,8 @@ sample is such an array: it is passed on without a copy.
 from collections.abc import Callable, Sequence
 from itertools import accumulate
 
+import numpy as np
+
 from jaxdyn.compile import careful_text, memory
 from jaxdyn.compile.careful import Careful
 from jaxdyn.compile.llvm import Emitter
@@ -177,7 +179,7 @@ class Body:
     def _copy_entries(self, entries, array: Array, at: int) -> str:
         """A pointer to memory with these entries."""
         kind, pointer = kind_of(array.dtype), self._place(at)
-        if len(entries) >= MIN_ENTRIES_IN_LOOP and all(type(x) is Constant and x.value == 0 for x in entries):
+        if len(entries) >= MIN_ENTRIES_IN_LOOP and all(map(is_zero, entries)):
             memory.zero(self.e, pointer, len(entries) * array.dtype.itemsize * self.e.width)
             return pointer
         for k, x in enumerate(entries):
@@ -198,6 +200,16 @@ class Body:
         """Memory for what is passed."""
         passed = [allocation("%passed", self.bytes)] if self.bytes else []
         return [*passed, *careful_text.allocation(self.careful)]
+
+
+def is_zero(x) -> bool:
+    """Decide whether an entry is a known zero, all of whose bits are zero."""
+    return type(x) is Constant and x.value == 0 and not np.signbit(x.value)
+
+
+def has_zeros(entries: Sequence) -> bool:
+    """Decide whether entries are mostly known zeros: all are set to zero at once, and then the others."""
+    return len(entries) >= MIN_ENTRIES_IN_LOOP and 8 * sum(map(is_zero, entries)) > 7 * len(entries)
 
 
 def has_loop(called) -> bool:
@@ -294,8 +306,12 @@ def subprogram_ir(called: Program, width: int) -> str:
         if pointer is not None and len(row) >= MIN_ENTRIES_IN_LOOP:
             memory.copy(e, pointer, f"%r{i}", array.size * array.dtype.itemsize * width)
             continue
+        is_empty = has_zeros(row)
+        if is_empty:
+            memory.zero(e, f"%r{i}", array.size * array.dtype.itemsize * width)
         for k, x in enumerate(row):
-            e.store_at(f"%r{i}", k, kind_of(array.dtype), body.text(x, kind_of(array.dtype)))
+            if not (is_empty and is_zero(x)):
+                e.store_at(f"%r{i}", k, kind_of(array.dtype), body.text(x, kind_of(array.dtype)))
     names = [f"%a{i}" for i in range(len(called.inputs))] + [f"%r{i}" for i in range(len(called.outputs))]
     head = f"define void @called({', '.join(f'ptr noalias {name}' for name in names)}) #0 {{"
     allocations, free, declared = on_heap(body.allocations())
@@ -367,6 +383,12 @@ def kernel_ir(program: Program, width: int, uniform: Sequence[bool]) -> str:
             kind, pointer = kind_of(output.dtype), body.pointer_to(row, output)
             if pointer is not None and len(row) >= MIN_ENTRIES_IN_LOOP:
                 memory.unpack(e, pointer, rows[count + i], len(row), kind)
+            elif has_zeros(row):
+                for at in rows[count + i]:
+                    memory.zero(e, at, output.size * output.dtype.itemsize)
+                for k, x in enumerate(row):
+                    if not is_zero(x):
+                        e.store(rows[count + i], k, kind, body.text(x, kind))
             else:
                 e.store_array(rows[count + i], kind, [body.text(x, kind) for x in row])
         if program.careful is not None:

@@ -14,7 +14,7 @@ import numpy as np
 
 from jaxdyn.compile import careful_text, memory
 from jaxdyn.compile.careful import Careful
-from jaxdyn.compile.code import Body, has_loop, write_call
+from jaxdyn.compile.code import Body, has_loop, has_zeros, is_zero, write_call
 from jaxdyn.compile.llvm import Emitter
 from jaxdyn.compile.memory import allocation, bytes_of
 from jaxdyn.compile.program import COMPARISONS, Array, Constant, Program, dtype_of, kind_of
@@ -202,10 +202,12 @@ class Listing(Body):
         self.at[i] = self.memory.take(size)
         self.size_of[i] = size
         if op in ("reduce_max", "reduce_min"):  # a chain of two operands each
-            code, total = (op.removeprefix("reduce_"), kind, (kind, kind), False), self._operand(operands[0], kind)
-            for x in operands[1:]:
-                self._row(code, self.at[i], [total, self._operand(x, kind)])
-                total = self.at[i]
+            code = op.removeprefix("reduce_"), kind, (kind, kind), False
+            # The first two are one where all are equal.
+            first, *others = dict.fromkeys(self._operand(x, kind) for x in operands)
+            for x in others or [first]:
+                self._row(code, self.at[i], [first, x])
+                first = self.at[i]
             return
         self._row(code, self.at[i], [self._operand(x, of) for x, of in zip(operands, kinds, strict=True)])
 
@@ -291,13 +293,12 @@ class Listing(Body):
     def _fill(self, place: int, entries, array: Array) -> None:
         """Copy entries to an array; zeros at once, where they are most of it."""
         kind, step, e = kind_of(array.dtype), array.dtype.itemsize * self.e.width, self.e
-        zeros = [type(x) is Constant and x.value == 0 and not np.signbit(x.value) for x in entries]
-        is_empty = 2 * sum(zeros) > len(entries)
+        is_empty = has_zeros(entries)
         if is_empty:
             self._run()
             memory.zero(e, self._pointer(place), array.size * step)
         for k, x in enumerate(entries):
-            if not (is_empty and zeros[k]):
+            if not (is_empty and is_zero(x)):
                 self._copy(kind, self._operand(x, kind), place + k * step)
 
     def _make_outputs(self) -> None:
