@@ -242,11 +242,14 @@ def _inputs_of_loops(program: Program) -> list[int]:
     return sorted(found - {None})
 
 
-def body_of(e: Emitter, program: Program, load: Callable, array: Callable) -> Body:
-    """The operations of a program as code, or as data of a loop where they are too many."""
+def body_of(e: Emitter, program: Program, load: Callable, array: Callable, is_quick: bool = False) -> Body:
+    """The operations of a program as code, or as data of a loop where they are too many.
+
+    `is_quick`: whether code is wanted that compiles quickly.
+    """
     from jaxdyn.compile.listing import Listing, is_listed
 
-    return (Listing if is_listed(program) else Body)(e, program, load, array)
+    return (Listing if is_listed(program, is_quick) else Body)(e, program, load, array)
 
 
 def _find_products(program: Program) -> dict[int, int]:
@@ -296,10 +299,10 @@ def symbol_of(called: Program, width: int) -> str:
     return f"jaxdyn_{called.digest[:32]}_{width}"
 
 
-def subprogram_ir(called: Program, width: int) -> str:
+def subprogram_ir(called: Program, width: int, is_quick: bool = False) -> str:
     """The text of a subprogram, the function `called`."""
     e = Emitter(width)
-    body = body_of(e, called, lambda place, entry, kind: e.load_at(f"%a{place}", entry, kind), lambda place: f"%a{place}")
+    body = body_of(e, called, lambda place, entry, kind: e.load_at(f"%a{place}", entry, kind), lambda place: f"%a{place}", is_quick)
     body.compute()
     for i, (row, array) in enumerate(zip(called.results, called.outputs, strict=True)):
         pointer = body.pointer_to(row, array)
@@ -331,8 +334,8 @@ def varying_first(uniform: Sequence[bool]) -> list[int]:
     return sorted(range(len(uniform)), key=lambda i: uniform[i])
 
 
-def kernel_ir(program: Program, width: int, uniform: Sequence[bool]) -> str:
-    """The text of a kernel; `uniform` says which arguments are the same for all samples."""
+def kernel_ir(program: Program, width: int, uniform: Sequence[bool], is_quick: bool = False) -> str:
+    """The text of a kernel; `uniform` says which arguments are the same for all samples. `is_quick` as of `body_of`."""
     e = Emitter(width)
     count, fast = len(program.inputs), program.fast or program
     arrays = [*program.inputs, *program.outputs]
@@ -363,7 +366,7 @@ def kernel_ir(program: Program, width: int, uniform: Sequence[bool]) -> str:
             return packed.get(place)
         return rows[place][0] if place in rows else f"%a{place}"
 
-    body, valid, allocations = body_of(e, fast, load, array), None, []
+    body, valid, allocations = body_of(e, fast, load, array, is_quick), None, []
     for place in body.arrays_in_memory() if width > 1 else ():
         packed[place], given = f"%packed{place}", arrays[place]
         allocations.append(allocation(packed[place], bytes_of(given, width)))

@@ -22,9 +22,9 @@ from jaxdyn.compile.memory import bytes_of
 from jaxdyn.compile.program import Array, kind_of
 
 
-def loop_ir(loop: Any, width: int, uniform: Sequence[bool]) -> str:
+def loop_ir(loop: Any, width: int, uniform: Sequence[bool], is_quick: bool = False) -> str:
     """The text of the kernel of a `loops.Loop`; `uniform` says which arguments are the same for all samples."""
-    return _LoopText(loop, width, uniform).text()
+    return _LoopText(loop, width, uniform).text(is_quick)
 
 
 class _LoopText:
@@ -47,13 +47,13 @@ class _LoopText:
         ends = np.cumsum([0, *(array.size for array in loop.turn.outputs)]).tolist()
         self.entries = [range(*ends) for ends in pairwise(ends)]  # of a turn's outputs, among all of its results
 
-    def text(self) -> str:
+    def text(self, is_quick: bool) -> str:
         """All of it."""
         e, loop = self.e, self.loop
         self._set_up()
         self._begin("turn")
         self._set_table_rows()
-        turn = body_of(e, loop.turn, self._load, self._array)
+        turn = body_of(e, loop.turn, self._load, self._array, is_quick)
         results = [name for row in turn.results() for name in row]
         # The state is stored before rows are written: their program reads the stages of this iteration, not the state.
         more = self._store_state(results)
