@@ -110,3 +110,8 @@ def partition(tree, types: type | tuple[type, ...]) -> tuple[list, Known]:
     places = tuple(i for i, leaf in enumerate(leaves) if isinstance(leaf, types))
     known = _Leaves([None if i in places else leaf for i, leaf in enumerate(leaves)])
     return [leaves[i] for i in places], Known(structure, places, known)
+
+
+def as_constant(tree) -> Known:
+    """A tree of concrete leaves as one static argument of an entry point, which compiles its numbers in; called with (), the tree."""
+    return partition(jax.tree.map(as_numpy_if_known, tree), ())[1]

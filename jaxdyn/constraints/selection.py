@@ -34,7 +34,7 @@ from jaxdyn.compile import (
     variant,
 )
 from jaxdyn.compile.batch import cond
-from jaxdyn.compile.known import is_concrete, is_tracing, stop_gradient
+from jaxdyn.compile.known import is_concrete, stop_gradient
 from jaxdyn.constraints.base import constraint_jacobian, holonomic_rows, layout, position_residual
 from jaxdyn.constraints.codes import RESULTS
 from jaxdyn.constraints.rank import (
@@ -64,7 +64,7 @@ from jaxdyn.dynamics.quantities import mass_matrix
 from jaxdyn.lie.so3 import matmul
 from jaxdyn.model.arguments import Numbers, check_state
 from jaxdyn.systems.mass_factor import cholesky, mass_factor
-from jaxdyn.systems.scene import Scene, as_scene
+from jaxdyn.systems.scene import Scene, as_scene, is_given
 from jaxdyn.systems.system import SceneLike, displace, retract
 
 # Distance at which doubtful rows are tested, rad or lengths of the mechanism, and Newton's steps that go there. Far enough for
@@ -89,8 +89,8 @@ def unit_rows(scene: Scene, q, t) -> Float[Array, "nc nv"]:
     squares = jnp.sum(A * A, 1)
     largest = largest_of_each(scene, squares)
     squares = jnp.where(squares > _TINY_ROW**2 * largest, squares, largest)
-    # A constraint may have rows of zeros alone.
-    return A / jnp.sqrt(jnp.maximum(squares, float(jnp.finfo(A.dtype).tiny)))[:, None]
+    # A constraint may have rows of zeros alone. By the reciprocal: in a kernel a product with a known zero is one, a quotient not.
+    return A * (1.0 / jnp.sqrt(jnp.maximum(squares, float(jnp.finfo(A.dtype).tiny))))[:, None]
 
 
 def eliminate(B: Float[Array, "nc nv"], least: float, first: Float[Array, " nc"], most=None) -> tuple[Array, ...]:
@@ -209,7 +209,7 @@ def _search_rows(scene: Scene, q, t: Any, rank_tol: float | None) -> Selection:
     # Most scenes have independent rows: one Cholesky factorisation says so, and the search is skipped.
     if is_concrete(bare, q, t):
         place = np.asarray(q), np.asarray(t, q.dtype)
-        if not evaluate(_has_doubtful_rows, bare, *place, static=(least,), is_input=not is_tracing()):
+        if not evaluate(_has_doubtful_rows, bare, *place, static=(least,), is_input=is_given(bare)):
             return every
         with jax.ensure_compile_time_eval():
             chosen = _select(bare, *map(jnp.asarray, place), rank_tol)
