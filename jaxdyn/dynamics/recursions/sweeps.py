@@ -41,7 +41,7 @@ from jaxdyn.model.tree import Model, nearest_rotation
 _TURNS = ("revolute", "continuous")
 
 
-def _has_base(model: Model) -> bool:
+def has_base(model: Model) -> bool:
     """Decide whether a floating base carries all other bodies."""
     kinds, parents = model.topology.kinds, model.topology.parents
     return len(kinds) > 1 and kinds[0] == "free" and -1 not in parents[1:]
@@ -49,7 +49,7 @@ def _has_base(model: Model) -> bool:
 
 def has_sweeps(model: Model) -> bool:
     """Decide whether the joints are such that this module computes them."""
-    kinds = {"revolute" if kind in _TURNS else kind for kind in model.topology.kinds[_has_base(model) :]}
+    kinds = {"revolute" if kind in _TURNS else kind for kind in model.topology.kinds[has_base(model) :]}
     # With given geometry the formula of a joint's pose is chosen by its kind.
     return kinds <= set(SCREW_KINDS) and (len(kinds) == 1 or is_concrete(model.home, model.screws))
 
@@ -65,7 +65,7 @@ class _Bodies:
     scale: Any = None  # unit velocity = scale * v, (nv,), or None
 
     def __init__(self, model: Model):
-        self.model, self.first = model, int(_has_base(model))
+        self.model, self.first = model, int(has_base(model))
         self.parents = tuple(x - self.first for x in model.topology.parents[self.first :])
         self.gravity, self.armature = as_numpy_if_known(model.gravity), as_numpy_if_known(model.armature)
         kinds = set(model.topology.kinds[self.first :])
