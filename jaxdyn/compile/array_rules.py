@@ -45,6 +45,8 @@ def _as_dtype(expansion, x: np.ndarray, dtype) -> np.ndarray:
     if x.dtype.kind != "O":
         return convert_known(x, dtype)
     kind = kind_or_refuse(dtype)
+    if all([type(y) is Number and y.kind == kind for y in x.ravel().tolist()]):
+        return x
     return objects([expansion.graph.convert(y, kind) for y in x.ravel().tolist()], x.shape)
 
 
@@ -90,7 +92,7 @@ def dot_general(expansion, params, args, eqn):
         count, columns, length
     )
     # The result may have a wider type than the operands (`preferred_element_type`); then the sums are in that type.
-    a, b = (_as_dtype(expansion, x, out.dtype) for x in (a, b))
+    a, b = (x if y.aval.dtype == out.dtype else _as_dtype(expansion, x, out.dtype) for x, y in zip((a, b), eqn.invars, strict=True))
     if out.dtype == bool:
         raise NotNumbers("a product of bools")
     if a.dtype.kind != "O" and b.dtype.kind != "O":
@@ -137,23 +139,26 @@ def triangular_solve(expansion, params, args, eqn):
 # --- matrices whose entries are single numbers ---
 
 
+def _is_nonzero(x) -> bool:
+    return type(x) is Number or x != 0
+
+
 def _products(graph: Graph, a: np.ndarray, b: np.ndarray, zero) -> list:
     """Entries of a_k b_k^T, one matrix after the other, for a (count, rows, n) and b (count, columns, n).
 
     `zero` is an empty sum.
     """
-    entries, add, mul = [], graph.add, graph.mul
-    for rows, columns in zip(a.tolist(), b.tolist(), strict=True):
-        # Known zeros are most of it: they are looked for once.
-        nonzero = [[(k, y) for k, y in enumerate(column) if type(y) is Number or y != 0] for column in columns]
+    # Known zeros are most of it: they are looked for once.
+    entries, add, mul, size = [], graph.add, graph.mul, b.shape[1]
+    for rows, columns in zip(a.tolist(), b.swapaxes(1, 2).tolist(), strict=True):
+        nonzero = [[(j, y) for j, y in enumerate(column) if type(y) is Number or y != 0] for column in columns]
         for row in rows:
-            for column in nonzero:
-                total = zero
-                for k, y in column:
-                    x = row[k]
-                    if type(x) is Number or x != 0:
-                        total = add(total, mul(x, y))
-                entries.append(total)
+            totals = [zero] * size
+            for x, column in zip(row, nonzero, strict=True):
+                if column and (type(x) is Number or x != 0):
+                    for j, y in column:
+                        totals[j] = add(totals[j], mul(x, y))
+            entries += totals
     return entries
 
 
@@ -161,34 +166,45 @@ def _cholesky_factor(graph: Graph, matrix: np.ndarray) -> np.ndarray:
     """The lower factor L of a symmetric matrix L L^T; reads the lower triangle."""
     n = matrix.shape[0]
     lower = np.full((n, n), 0.0, object)
+    # By rows and by columns what is not a known zero: of a large mechanism that is a small part.
+    below = [{i for i, x in enumerate(column) if i > j and _is_nonzero(x)} for j, column in enumerate(matrix.T.tolist())]
+    rows: list[dict] = [{} for _ in range(n)]
     # Reciprocals of the diagonal are kept: n divisions, not n^2/2, and `_solve_triangle` finds the same numbers again.
-    inverse = []
-    for j in range(n):
-        for i in range(j, n):
+    for j, row in enumerate(rows):
+        for k in row:
+            below[j].update(i for i in below[k] if i > j)
+        pivot = matrix[j, j]
+        for x in row.values():
+            pivot = graph.sub(pivot, graph.mul(x, x))
+        lower[j, j] = graph.function("sqrt", pivot)
+        inverse = graph.div(1.0, lower[j, j])
+        for i in sorted(below[j]):
             entry = matrix[i, j]
-            for k in range(j):
-                entry = graph.sub(entry, graph.mul(lower[i, k], lower[j, k]))
-            if i == j:
-                lower[j, j] = graph.function("sqrt", entry)
-                inverse.append(graph.div(1.0, lower[j, j]))
+            for k, x in row.items():
+                if k in rows[i]:
+                    entry = graph.sub(entry, graph.mul(rows[i][k], x))
+            if _is_nonzero(entry := graph.mul(entry, inverse)):
+                lower[i, j] = rows[i][j] = entry
             else:
-                lower[i, j] = graph.mul(entry, inverse[j])
+                below[j].discard(i)
     return lower
 
 
 def _solve_triangle(graph: Graph, a: np.ndarray, b: np.ndarray, lower: bool, unit: bool) -> np.ndarray:
     """x with a x = b, for a triangular matrix (n, n), whose diagonal is taken as ones if `unit`, and b (n, columns)."""
-    n = a.shape[0]
-    rows: list = [None] * n
+    n, matrix, solution = a.shape[0], a.tolist(), b.copy()
+    rows: list[dict] = [{} for _ in range(n)]  # of the solution, without known zeros: most of it for the branches of a tree
     for i in range(n) if lower else reversed(range(n)):
-        row = b[i].tolist()
+        row = {j: x for j, x in enumerate(b[i].tolist()) if _is_nonzero(x)}
         for k in range(i) if lower else range(i + 1, n):
-            # Known zeros of a factor are the branches of a tree.
-            if type(a[i, k]) is Number or a[i, k] != 0:
-                row = [graph.sub(x, graph.mul(a[i, k], y)) for x, y in zip(row, rows[k], strict=True)]
-        inverse = 1.0 if unit else graph.div(1.0, a[i, i])
-        rows[i] = [graph.mul(x, inverse) for x in row]
-    return objects([x for row in rows for x in row], b.shape)
+            x = matrix[i][k]
+            if type(x) is Number or x != 0:
+                for j, y in rows[k].items():
+                    row[j] = graph.sub(row.get(j, 0.0), graph.mul(x, y))
+        inverse = 1.0 if unit else graph.div(1.0, matrix[i][i])
+        for j, x in row.items():
+            solution[i, j] = rows[i][j] = graph.mul(x, inverse)
+    return solution
 
 
 # --- arrays whose numbers are all known ---

@@ -12,6 +12,8 @@ sample is such an array: it is passed on without a copy.
 from collections.abc import Callable, Sequence
 from itertools import accumulate
 
+import numpy as np
+
 from jaxdyn.compile import careful_text, memory
 from jaxdyn.compile.careful import Careful
 from jaxdyn.compile.llvm import Emitter
@@ -145,7 +147,7 @@ class Body:
         if isinstance(called, Careful):
             self.careful = max(self.careful, careful_text.write_call(self.e, called, flag, pointers))
         else:
-            _write_call(self.e, called, pointers)
+            write_call(self.e, called, pointers)
         if has_loop(called):
             ends = [0, *accumulate(array.size for array in called.outputs)]
             self.in_memory[i] = [(x, y[0], z) for x, y, z in zip(ends, outputs, called.outputs, strict=False)]
@@ -177,7 +179,7 @@ class Body:
     def _copy_entries(self, entries, array: Array, at: int) -> str:
         """A pointer to memory with these entries."""
         kind, pointer = kind_of(array.dtype), self._place(at)
-        if len(entries) >= MIN_ENTRIES_IN_LOOP and all(type(x) is Constant and x.value == 0 for x in entries):
+        if len(entries) >= MIN_ENTRIES_IN_LOOP and all(map(is_zero, entries)):
             memory.zero(self.e, pointer, len(entries) * array.dtype.itemsize * self.e.width)
             return pointer
         for k, x in enumerate(entries):
@@ -187,6 +189,10 @@ class Body:
                 self.passed[place] = value
         return pointer
 
+    def arrays_in_memory(self) -> list[int]:
+        """Inputs of the program that are read as arrays."""
+        return _inputs_of_loops(self.program)
+
     def _place(self, at: int) -> str:
         return self.e.emit(f"getelementptr i8, ptr %passed, i64 {at}")
 
@@ -194,6 +200,16 @@ class Body:
         """Memory for what is passed."""
         passed = [allocation("%passed", self.bytes)] if self.bytes else []
         return [*passed, *careful_text.allocation(self.careful)]
+
+
+def is_zero(x) -> bool:
+    """Decide whether an entry is a known zero, all of whose bits are zero."""
+    return type(x) is Constant and x.value == 0 and not np.signbit(x.value)
+
+
+def has_zeros(entries: Sequence) -> bool:
+    """Decide whether entries are mostly known zeros: all are set to zero at once, and then the others."""
+    return len(entries) >= MIN_ENTRIES_IN_LOOP and 8 * sum(map(is_zero, entries)) > 7 * len(entries)
 
 
 def has_loop(called) -> bool:
@@ -226,6 +242,16 @@ def _inputs_of_loops(program: Program) -> list[int]:
     return sorted(found - {None})
 
 
+def body_of(e: Emitter, program: Program, load: Callable, array: Callable, is_quick: bool = False) -> Body:
+    """The operations of a program as code, or as data of a loop where they are too many.
+
+    `is_quick`: whether code is wanted that compiles quickly.
+    """
+    from jaxdyn.compile.listing import Listing, is_listed
+
+    return (Listing if is_listed(program, is_quick) else Body)(e, program, load, array)
+
+
 def _find_products(program: Program) -> dict[int, int]:
     """Sums and differences one of whose operands is a product that nothing else needs, and the place of that operand.
 
@@ -252,7 +278,7 @@ def _find_products(program: Program) -> dict[int, int]:
     return found
 
 
-def _write_call(e: Emitter, called: Program, pointers: Sequence[str]) -> None:
+def write_call(e: Emitter, called: Program, pointers: Sequence[str]) -> None:
     name, places = symbol_of(called, e.width), [f"ptr %{k}" for k in range(len(pointers))]
     # By its address in memory: code that is better takes its place while this code runs.
     e.declared[name] = "\n".join(
@@ -273,13 +299,22 @@ def symbol_of(called: Program, width: int) -> str:
     return f"jaxdyn_{called.digest[:32]}_{width}"
 
 
-def subprogram_ir(called: Program, width: int) -> str:
+def subprogram_ir(called: Program, width: int, is_quick: bool = False) -> str:
     """The text of a subprogram, the function `called`."""
     e = Emitter(width)
-    body = Body(e, called, lambda place, entry, kind: e.load_at(f"%a{place}", entry, kind), lambda place: f"%a{place}")
-    for i, (row, array) in enumerate(zip(body.results(), called.outputs, strict=True)):
-        for k, name in enumerate(row):
-            e.store_at(f"%r{i}", k, kind_of(array.dtype), name)
+    body = body_of(e, called, lambda place, entry, kind: e.load_at(f"%a{place}", entry, kind), lambda place: f"%a{place}", is_quick)
+    body.compute()
+    for i, (row, array) in enumerate(zip(called.results, called.outputs, strict=True)):
+        pointer = body.pointer_to(row, array)
+        if pointer is not None and len(row) >= MIN_ENTRIES_IN_LOOP:
+            memory.copy(e, pointer, f"%r{i}", array.size * array.dtype.itemsize * width)
+            continue
+        is_empty = has_zeros(row)
+        if is_empty:
+            memory.zero(e, f"%r{i}", array.size * array.dtype.itemsize * width)
+        for k, x in enumerate(row):
+            if not (is_empty and is_zero(x)):
+                e.store_at(f"%r{i}", k, kind_of(array.dtype), body.text(x, kind_of(array.dtype)))
     names = [f"%a{i}" for i in range(len(called.inputs))] + [f"%r{i}" for i in range(len(called.outputs))]
     head = f"define void @called({', '.join(f'ptr noalias {name}' for name in names)}) #0 {{"
     allocations, free, declared = on_heap(body.allocations())
@@ -299,8 +334,8 @@ def varying_first(uniform: Sequence[bool]) -> list[int]:
     return sorted(range(len(uniform)), key=lambda i: uniform[i])
 
 
-def kernel_ir(program: Program, width: int, uniform: Sequence[bool]) -> str:
-    """The text of a kernel; `uniform` says which arguments are the same for all samples."""
+def kernel_ir(program: Program, width: int, uniform: Sequence[bool], is_quick: bool = False) -> str:
+    """The text of a kernel; `uniform` says which arguments are the same for all samples. `is_quick` as of `body_of`."""
     e = Emitter(width)
     count, fast = len(program.inputs), program.fast or program
     arrays = [*program.inputs, *program.outputs]
@@ -331,8 +366,8 @@ def kernel_ir(program: Program, width: int, uniform: Sequence[bool]) -> str:
             return packed.get(place)
         return rows[place][0] if place in rows else f"%a{place}"
 
-    body, valid, allocations = Body(e, fast, load, array), None, []
-    for place in _inputs_of_loops(fast) if width > 1 else ():
+    body, valid, allocations = body_of(e, fast, load, array, is_quick), None, []
+    for place in body.arrays_in_memory() if width > 1 else ():
         packed[place], given = f"%packed{place}", arrays[place]
         allocations.append(allocation(packed[place], bytes_of(given, width)))
         source = [f"%a{place}"] * width if uniform[place] else rows[place]
@@ -343,7 +378,7 @@ def kernel_ir(program: Program, width: int, uniform: Sequence[bool]) -> str:
         if program.careful is not None:
             allocations.append("  %valid = alloca i8")
             pointers.append("%valid")
-        _write_call(e, fast, pointers)
+        write_call(e, fast, pointers)
         valid = None if program.careful is None else e.load_at("%valid", 0, "b1")
     else:
         body.compute()
@@ -351,6 +386,12 @@ def kernel_ir(program: Program, width: int, uniform: Sequence[bool]) -> str:
             kind, pointer = kind_of(output.dtype), body.pointer_to(row, output)
             if pointer is not None and len(row) >= MIN_ENTRIES_IN_LOOP:
                 memory.unpack(e, pointer, rows[count + i], len(row), kind)
+            elif has_zeros(row):
+                for at in rows[count + i]:
+                    memory.zero(e, at, output.size * output.dtype.itemsize)
+                for k, x in enumerate(row):
+                    if not is_zero(x):
+                        e.store(rows[count + i], k, kind, body.text(x, kind))
             else:
                 e.store_array(rows[count + i], kind, [body.text(x, kind) for x in row])
         if program.careful is not None:

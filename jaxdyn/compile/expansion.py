@@ -25,7 +25,6 @@ from jaxdyn.compile.program import (
     NotNumbers,
     Number,
     Program,
-    TooLong,
     as_kind,
     as_objects,
     is_number,
@@ -33,10 +32,7 @@ from jaxdyn.compile.program import (
     objects,
 )
 from jaxdyn.compile.rearrange import AT_PLACES, REARRANGEMENTS
-from jaxdyn.compile.scan import Scan
 
-# Operations of a program that calls loops.
-MAX_BESIDE_LOOPS = 40_000
 # A function of fewer operations is written out where it is called.
 MIN_SUBPROGRAM_OPERATIONS = 300
 
@@ -73,15 +69,6 @@ def expand(
         results.append(objects([graph.invert(expansion.flagged)], ()))
     program = graph.finish(inputs, outputs, [as_objects(x) for x in results], name=name)
     program.reports_validity = reports
-    # Arithmetic on the arrays that loops take and return is written out, entry by entry, and LLVM takes longer for operations
-    # on memory than for others: a step of a chain of 200 links would compile for a minute.
-    written = sum(x.op not in ("input", "part") for x in program.operations)
-    if (
-        written > MAX_BESIDE_LOOPS
-        and most <= mode.MAX_OPERATIONS
-        and any(isinstance(x, Scan) for x in program.subprograms)
-    ):
-        raise TooLong(f"more than {MAX_BESIDE_LOOPS} operations beside loops")
     numbers.prune_calls(program)
     return program, expansion.has_rules
 
@@ -196,12 +183,12 @@ class _Expansion:
         return self._repair(results, program, again, args)
 
     def _subprogram(self, inner: ClosedJaxpr, args) -> tuple[Program, list]:
-        """A function as a subprogram, and its arguments without those that are known, which are compiled in."""
-        known = tuple(None if x.dtype.kind == "O" else (x.shape, x.dtype.str, x.tobytes()) for x in args)
+        """A function as a subprogram, and its arguments without what is known of them, which is compiled in."""
+        known = tuple(_known_entries(x) for x in args)
         program, has_rules = _subprogram(inner, known, self.graph.most)
         self.has_rules |= has_rules
         program, places = without_unread(program)
-        given = [x for x, y in zip(args, known, strict=True) if y is None]
+        given = [_split_entries(x, y) for x, y in zip(args, known, strict=True) if not isinstance(y, bytes)]
         return program, [given[i] for i in places]
 
     def _repair(self, results: list, program: Program, again, args) -> list:
@@ -353,21 +340,52 @@ def _innermost(inner: ClosedJaxpr, args: Sequence, again, given: Sequence) -> tu
     return _innermost(params["call"], args, params["again"], args)
 
 
+def _known_entries(x: np.ndarray) -> bytes | tuple | None:
+    """The bytes of a known array; of another one its zeros and ones, with None in all other places, or None without any."""
+    if x.dtype.kind != "O":
+        return x.tobytes()
+    # Other known numbers are passed: a function that is called with several of them is compiled once.
+    entries = tuple([None if type(y) is Number or y not in (0, 1, -1) else _signed(y) for y in x.ravel().tolist()])
+    return entries if any(y is not None for y in entries) else None
+
+
+def _signed(x) -> str:
+    return "-0" if x == 0 and math.copysign(1.0, x) < 0 else str(int(x))
+
+
+def _split_entries(x: np.ndarray, known: tuple | None) -> np.ndarray:
+    """The entries that `_known_entries` does not know."""
+    if known is None:
+        return x
+    return objects(given := [y for y, z in zip(x.ravel().tolist(), known, strict=True) if z is None], (len(given),))
+
+
+def _join_entries(x: np.ndarray, known: tuple | None, array: Array) -> np.ndarray:
+    """The inverse of `_split_entries`."""
+    if known is None:
+        return x
+    kind, unknown = kind_or_refuse(array.dtype), iter(x.tolist())
+    return objects([next(unknown) if y is None else as_kind(float(y), kind) for y in known], array.shape)
+
+
 @functools.lru_cache(maxsize=256)
 def _subprogram(inner: ClosedJaxpr, known: tuple, most: int) -> tuple[Program, bool]:
     """The program of a function that others call, and whether it has rules.
 
-    `known`: shape, dtype and bytes of the arguments that are compiled in; None for the others. Where numbers may be
-    flagged, there is one more output, which says whether one is.
+    `known`: what `_known_entries` says of the arguments. Where numbers may be flagged, there is one more output, which says
+    whether one is.
     """
     # By the identity of the jaxpr, which JAX keeps for a function under `jit`: of all calls of a function one program is made.
     graph = Graph(most)
     arrays = [Array(x.aval.shape, np.dtype(x.aval.dtype)) for x in inner.jaxpr.invars]  # pyright: ignore[reportAttributeAccessIssue]
-    inputs = [array for array, x in zip(arrays, known, strict=True) if x is None]
-    entries = iter([graph.inputs(place, array) for place, array in enumerate(inputs)])
     # A subprogram makes no calls of its own but branches: only programs that have both call it.
-    expansion = _Expansion(graph, False, True)
-    args = [next(entries) if x is None else np.frombuffer(x[2], x[1]).reshape(x[0]) for x in known]
+    expansion, inputs, args = _Expansion(graph, False, True), [], []
+    for array, x in zip(arrays, known, strict=True):
+        if isinstance(x, bytes):
+            args.append(np.frombuffer(x, array.dtype).reshape(array.shape))
+            continue
+        inputs.append(array if x is None else Array((x.count(None),), array.dtype))
+        args.append(_join_entries(graph.inputs(len(inputs) - 1, inputs[-1]), x, array))
     results = [as_objects(x) for x in expansion.evaluate(inner, args)]
     outputs = [Array(x.aval.shape, np.dtype(x.aval.dtype)) for x in inner.jaxpr.outvars]  # pyright: ignore[reportAttributeAccessIssue]
     if expansion.flagged is not False:

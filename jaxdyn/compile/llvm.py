@@ -118,7 +118,8 @@ class Emitter:
             return self.sign(args[0], kind)
         if op in ("reduce_max", "reduce_min"):
             pick = op.removeprefix("reduce_")
-            return functools.reduce(lambda a, b: self.operation(pick, kind, (a, b), kind), args)
+            # Each once: of the entries of a large matrix most are zero.
+            return functools.reduce(lambda a, b: self.operation(pick, kind, (a, b), kind), dict.fromkeys(args))
         if op == "clamp":
             low, x, high = args
             return self.operation("min", kind, (self.operation("max", kind, (x, low), kind), high), kind)

@@ -15,15 +15,16 @@ from typing import Any
 import jax
 import numpy as np
 
-from jaxdyn.compile.code import Body, wrap_kernel
+from jaxdyn.compile.code import Body, body_of, wrap_kernel
+from jaxdyn.compile import memory
 from jaxdyn.compile.llvm import Emitter
 from jaxdyn.compile.memory import bytes_of
 from jaxdyn.compile.program import Array, kind_of
 
 
-def loop_ir(loop: Any, width: int, uniform: Sequence[bool]) -> str:
+def loop_ir(loop: Any, width: int, uniform: Sequence[bool], is_quick: bool = False) -> str:
     """The text of the kernel of a `loops.Loop`; `uniform` says which arguments are the same for all samples."""
-    return _LoopText(loop, width, uniform).text()
+    return _LoopText(loop, width, uniform).text(is_quick)
 
 
 class _LoopText:
@@ -46,13 +47,13 @@ class _LoopText:
         ends = np.cumsum([0, *(array.size for array in loop.turn.outputs)]).tolist()
         self.entries = [range(*ends) for ends in pairwise(ends)]  # of a turn's outputs, among all of its results
 
-    def text(self) -> str:
+    def text(self, is_quick: bool) -> str:
         """All of it."""
         e, loop = self.e, self.loop
         self._set_up()
         self._begin("turn")
         self._set_table_rows()
-        turn = Body(e, loop.turn, self._load, self._array)
+        turn = body_of(e, loop.turn, self._load, self._array, is_quick)
         results = [name for row in turn.results() for name in row]
         # The state is stored before rows are written: their program reads the stages of this iteration, not the state.
         more = self._store_state(results)
@@ -101,12 +102,11 @@ class _LoopText:
         if has_rows:
             self.allocations.append("  %saved = alloca [64 x i8], align 64")
             e.store_at("%saved", 0, "i4", self._from_row(self.saved, 0, "i4"))
-        e.declared["memcpy"] = "declare void @llvm.memcpy.p0.p0.i64(ptr, ptr, i64, i1)"
         for place in range(self.saved + has_rows, self.results):
             after = self.sample_rows[self.saved_after + place - self.saved]
             size = self.arrays[place].size * self.arrays[place].dtype.itemsize
             for source, target in zip(self.sample_rows[place], after, strict=True):
-                e.lines.append(f"  call void @llvm.memcpy.p0.p0.i64(ptr {target}, ptr {source}, i64 {size}, i1 false)")
+                memory.copy(e, source, target, size)
 
     def _from_row(self, place: int, entry: int, kind: str) -> str:
         if self.uniform[place]:

@@ -55,6 +55,12 @@ def zero(e: Emitter, pointer: str, size: int) -> None:
     e.lines.append(f"  call void @llvm.memset.p0.i64(ptr {pointer}, i8 0, i64 {size}, i1 false)")
 
 
+def copy(e: Emitter, source: str, target: str, size: int) -> None:
+    """Copy memory."""
+    e.declared["memcpy"] = "declare void @llvm.memcpy.p0.p0.i64(ptr, ptr, i64, i1)"
+    e.lines.append(f"  call void @llvm.memcpy.p0.p0.i64(ptr {target}, ptr {source}, i64 {size}, i1 false)")
+
+
 def pack(e: Emitter, rows: Sequence[str], array: str, size: int, kind: str) -> None:
     """Copy the rows of all samples to an array in memory whose entries follow each other, each with its W samples."""
     first = size // e.width * e.width if kind in FLOATS else 0

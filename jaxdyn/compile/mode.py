@@ -6,6 +6,7 @@ under `jax.jit` is traced once in each of them: results do not depend on how the
 
 import contextlib
 import logging
+import math
 import os
 from collections.abc import Callable, Iterator
 
@@ -17,8 +18,9 @@ from jaxdyn.compile import jax_adapter
 logger = logging.getLogger("jaxdyn")
 MODES = ("auto", "native", "plain")
 OPTIONS = ("", "usual", "least")
-# LLVM takes some 50 microseconds an operation: three seconds.
-MAX_OPERATIONS = 60_000
+# Operations of a program: so many, or so many for each entry of its arguments. Where the cost of a mechanism grows with its size it
+# is a program, however large it is (see `listing`). Matrices of hundreds of rows are none.
+MAX_OPERATIONS, MAX_OPERATIONS_PER_ENTRY = 60_000, 500
 
 # None: the environment decides, which is read at each use, so that a test can set it.
 _mode = jax.make_user_context(None)
@@ -69,6 +71,11 @@ def compilation(mode: str) -> Iterator[None]:
     """
     with _mode(_check_mode(mode, "compilation: mode")):
         yield
+
+
+def most_operations(arrays) -> int:
+    """Operations beyond which a function of these arrays is no program."""
+    return max(MAX_OPERATIONS, MAX_OPERATIONS_PER_ENTRY * sum(math.prod(x.shape) for x in arrays))
 
 
 def is_expanding() -> bool:

@@ -103,17 +103,26 @@ def find(identity: str) -> ObjectFile | None:
 
 
 def make(
-    identity: str, text: str, calls: Sequence[str], careful: Sequence = (), name: str = "", width: int = 0
+    identity: str,
+    text: str,
+    calls: Sequence[str],
+    careful: Sequence = (),
+    name: str = "",
+    width: int = 0,
+    quick_text: str = "",
 ) -> ObjectFile:
     """Compile a text, and keep the code in the folder.
 
-    `width`: samples in a vector of code that may be quick; zero for code that is optimised at once.
+    `width`: samples in a vector of code that may be quick; zero for code that is optimised at once. `quick_text`: of the same
+    function, which compiles quickly (see `listing`); without it quick code is that of LLVM's lowest level.
     """
     if (lines := text.count("\n")) > ANNOUNCED_LINES:
         message = "jaxdyn: compiling %s, %d lines; the next start of this script reads it from the cache"
         logger.warning(message, name or "a function", lines)
-    is_quick = width > 0 and lines > QUICK_LINES and 8 * width * lines < QUICK_BYTES and has_two_levels()
-    made = ObjectFile(compile_text(text, is_quick), tuple(calls), tuple(careful), text if is_quick else "")
+    is_quick = width > 0 and lines > QUICK_LINES and has_two_levels()
+    is_quick = is_quick and (bool(quick_text) or 8 * width * lines < QUICK_BYTES)
+    binary = compile_text(quick_text or text, is_quick and not quick_text)
+    made = ObjectFile(binary, tuple(calls), tuple(careful), text if is_quick else "")
     _keep(identity, made)
     return made
 

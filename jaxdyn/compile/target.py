@@ -5,6 +5,7 @@ import functools
 import logging
 import threading
 from collections.abc import Callable, Sequence
+from functools import partial
 from importlib import resources
 from typing import Any, NamedTuple
 
@@ -17,6 +18,7 @@ from jaxdyn.compile.code import calls_itself, kernel_ir, subprogram_ir, symbol_o
 from jaxdyn.compile.first_calls import optimise_later, phase
 from jaxdyn.compile.jax_adapter import Unsupported as Unsupported
 from jaxdyn.compile.jax_adapter import ffi_version, register_handler
+from jaxdyn.compile.listing import is_listed
 from jaxdyn.compile.objects import Code, features
 from jaxdyn.compile.program import FLOATS, Program, kind_of
 from jaxdyn.compile.stored import changed
@@ -282,7 +284,10 @@ class _Kernel:
             text = kernel_ir(program, width, uniform) if is_program else program.ir(width, uniform)
             # A loop may run for long, and quick code of vectors takes four times as long, that of single numbers a quarter more.
             quick_width = 0 if program.turns > 1 and width > 1 else width
-            found, is_new = objects.make(identity, text, tuple(calls), careful, program.name, quick_width), True
+            quick = partial(kernel_ir, program, width, uniform) if is_program else partial(program.ir, width, uniform)
+            quick_text = _quick_text(program, quick_width, quick)
+            found = objects.make(identity, text, tuple(calls), careful, program.name, quick_width, quick_text)
+            is_new = True
         _install(found, identity, "kernel", self._enter, is_new)
         self.is_made, self.program = True, None  # a program of a large robot takes megabytes
         return True
@@ -397,11 +402,22 @@ def _publish(symbol: str, width: int, programs: dict[str, Any], recover: Callabl
     if not isinstance(found, objects.ObjectFile):
         assert called is not None
         text = subprogram_ir(called, width) if isinstance(called, Program) else called.subprogram_ir(width)
-        found, is_new = objects.make(symbol, text, tuple(calls), careful, called.name, width), True
+        quick_text = _quick_text(called, width, partial(subprogram_ir, called, width))
+        found = objects.make(symbol, text, tuple(calls), careful, called.name, width, quick_text)
+        is_new = True
     _called[symbol] = _Called(ctypes.c_uint64(), found.calls, found.careful)
-    _install(found, symbol, "called", functools.partial(setattr, _called[symbol].address, "value"), is_new)
+    _install(found, symbol, "called", partial(setattr, _called[symbol].address, "value"), is_new)
     objects.add_symbol(f"{symbol}_at", ctypes.addressof(_called[symbol].address))
     return True
+
+
+def _quick_text(program, width: int, write: Callable) -> str:
+    """The text of a large program as a listing, by write(is_quick=True), or an empty one."""
+    program = getattr(program, "turn", program)
+    if not (width and objects.has_two_levels() and isinstance(program, Program)):
+        return ""
+    program = program.fast or program
+    return write(is_quick=True) if is_listed(program, True) and not is_listed(program) else ""
 
 
 def _install(

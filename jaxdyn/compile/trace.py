@@ -28,7 +28,7 @@ def program_of(
     args: tuple,
     *,
     tangent: Callable | None = None,
-    most: int = mode.MAX_OPERATIONS,
+    most: int | None = None,
     calls: bool = False,
     flags: str = "refuse",
     fallback: Callable | None = None,
@@ -40,7 +40,7 @@ def program_of(
     - `function(*static, tree, *args)`: pure, of one sample. `static` is hashable.
     - `tree`: pytree whose known leaves are compiled in; its traced leaves, and all of `args`, are operands.
     - `tangent(*static, tree, *args, steps)`: the function's derivative along `steps`, as of `kernel`.
-    - `most`: operations beyond which there is no program. `calls`: whether long functions under `jax.jit` become subprograms.
+    - `most`: operations beyond which there is no program; by default those of `mode`. `calls`: whether long functions under `jax.jit` become subprograms.
     - `flags`: as of `expand`; with "repair" samples that are flagged are computed by the program of `fallback`, or of the
       function itself, which is traced when the first of them appears (see `careful`).
     """
@@ -53,7 +53,7 @@ def program_of(
     return leaves, trace_program(function, static, known, len(traced), structure, shapes, *how)
 
 
-def trace_program(function, static, known: Known, count, structure, shapes, tangent=None, most=mode.MAX_OPERATIONS,
+def trace_program(function, static, known: Known, count, structure, shapes, tangent=None, most=None,
                   calls=False, flags="refuse", fallback=None):  # fmt: skip
     """The program and the structure of its results, or the reason why there is none; `count`: traced leaves of the tree."""
     # A trace depends on these settings too: they are a part of the key under which the program is kept.
@@ -68,6 +68,7 @@ def _trace_program(function, static, known: Known, count, structure, shapes, tan
     del context  # part of the key alone
     is_pair, flags = flags == "repair", "report" if flags == "repair" else flags
     avals = [jax.ShapeDtypeStruct(*shape) for shape in shapes]
+    most = mode.most_operations(avals) if most is None else most
     flat = function_of_leaves(function, static, known, count, structure)
 
     def make():
@@ -173,7 +174,7 @@ def _make_careful(again: Again, outputs, key: str | None) -> Program:
         with phase("tracing"), mode.expanding(again.calls):
             closed = jax.make_jaxpr(compute)(*avals)
         # The marks of what is left as it is are NaN, which the results then are too.
-        most, name = 10 * mode.MAX_OPERATIONS, name_of(again.function)
+        most, name = 10 * mode.most_operations(avals), name_of(again.function)
         program, has_rules = expand(closed, most, name, again.calls, "ignore")
         return [program], has_rules
 
@@ -307,7 +308,7 @@ def tangent_program(change: Callable, avals, moving, flags: str, key: str | None
             closed = jax.make_jaxpr(change)(*avals)
         # A tangent has two to four times the operations of the values. The bound is there for those that explode.
         of_tangent = flags if flags in ("refuse", "report") else "ignore"
-        program, has_rules = expand(closed, 10 * mode.MAX_OPERATIONS, "change", flags=of_tangent)
+        program, has_rules = expand(closed, 10 * mode.most_operations(avals), "change", flags=of_tangent)
         return [program], has_rules
 
     (program,), has_rules = stored.load_or_make(key, make)

@@ -13,7 +13,7 @@ from jax import lax
 from jaxtyping import Array, Bool, Float
 
 from jaxdyn.compile import Evaluation, entry_point, evaluate, invalidate_derivatives, kernel
-from jaxdyn.compile.known import is_concrete, is_tracing, once, stop_gradient
+from jaxdyn.compile.known import is_concrete, once, stop_gradient
 from jaxdyn.constraints.base import Layout, holonomic_rows, layout, position_residual, velocity_residual
 from jaxdyn.constraints.branches import changes_branch, unit_rows
 from jaxdyn.constraints.closing import follow_path, nearest_configuration, polish
@@ -27,7 +27,7 @@ from jaxdyn.constraints.tolerances import coordinate_sizes, largest_ratio, row_l
 from jaxdyn.lie.so3 import matmul
 from jaxdyn.model.arguments import Numbers, check_mapping, check_state, zeros_if_none
 from jaxdyn.model.numbers import as_static, check_count
-from jaxdyn.systems.scene import Scene, as_scene
+from jaxdyn.systems.scene import Scene, as_scene, is_given
 from jaxdyn.systems.system import SceneLike, displace, displacement
 
 
@@ -387,7 +387,7 @@ def start_openness(scene: Scene, *, relative: float) -> Evaluation:
     """`largest_ratio` of a known scene, at (q, v, t)."""
     bare = Scene(scene.system, scene.constraints)
     # By the kernel that the program of a run uses too, so that it is compiled once.
-    return Evaluation(largest_ratio, bare, (relative,), is_input=not is_tracing())
+    return Evaluation(largest_ratio, bare, (relative,), is_input=is_given(bare))
 
 
 def largest_residuals(scene: Scene, q, v, t) -> np.ndarray:

@@ -165,8 +165,8 @@ def _group_rows(members: tuple[Pair, ...], system, q, v) -> list:
         columns = jnp.zeros((*D.shape[:2], len(frames.coordinates)), q.dtype)
         for sign, mask, adjoint in sides:
             if mask[index].any():
-                part = matmul(matmul(D, take(adjoint, index)), frames.subspace.T)
-                columns = columns + part * jnp.asarray(sign * mask[index][:, None, :], q.dtype)
+                left = matmul(D, take(adjoint, index))
+                columns = columns + sign * _masked_columns(left, frames.subspace, mask[index])
         if len(frames.coordinates) < system.nv:
             # The pass went through the bodies between the frames alone; other coordinates have columns of zeros.
             wide = jnp.zeros((*D.shape[:2], system.nv), q.dtype)
@@ -174,6 +174,22 @@ def _group_rows(members: tuple[Pair, ...], system, q, v) -> list:
         for k, i in enumerate(index):
             motions[i] = columns[k], gamma[k], velocity[k]
     return motions
+
+
+def _few_columns(left, subspace, mask: np.ndarray):
+    """`_masked_columns` by those columns alone that the mask leaves: of a large mechanism they are few."""
+    count = mask.sum(1).max()
+    index = np.argsort(~mask, axis=1, kind="stable")[:, :count]
+    product = matmul(left, jnp.swapaxes(take(subspace, index), 1, 2))
+    product = product * jnp.asarray(np.take_along_axis(mask, index, 1)[:, None, :], left.dtype)
+    rows, zero = np.ogrid[: left.shape[0], : left.shape[1], :1], jnp.zeros((*left.shape[:2], len(subspace)), left.dtype)
+    return zero.at[rows[0], rows[1], index[:, None, :]].set(product)
+
+
+@variant(_few_columns)
+def _masked_columns(left, subspace, mask: np.ndarray):
+    """Products (n, r, nv) of left (n, r, 6) with the screws (nv, 6) of the coordinates, zero where not mask (n, nv)."""
+    return matmul(left, subspace.T) * jnp.asarray(mask[:, None, :], left.dtype)
 
 
 # Traced once for all calls of a program: a step with projections has many of them. Not in kernels, where a nested `jit` would

@@ -34,7 +34,7 @@ from jaxdyn.compile import (
     variant,
 )
 from jaxdyn.compile.batch import cond
-from jaxdyn.compile.known import is_concrete, is_tracing, once, stop_gradient
+from jaxdyn.compile.known import is_concrete, once, stop_gradient
 from jaxdyn.constraints.base import constraint_jacobian, holonomic_rows, layout, position_residual
 from jaxdyn.constraints.codes import RESULTS
 from jaxdyn.constraints.rank import (
@@ -64,7 +64,7 @@ from jaxdyn.dynamics.quantities import mass_matrix
 from jaxdyn.lie.so3 import matmul
 from jaxdyn.model.arguments import Numbers, check_state
 from jaxdyn.systems.mass_factor import cholesky, mass_factor
-from jaxdyn.systems.scene import Scene, as_scene
+from jaxdyn.systems.scene import Scene, as_scene, is_given
 from jaxdyn.systems.system import SceneLike, displace, retract
 
 # Distance at which doubtful rows are tested, rad or lengths of the mechanism, and Newton's steps that go there. Far enough for
@@ -89,8 +89,8 @@ def unit_rows(scene: Scene, q, t) -> Float[Array, "nc nv"]:
     squares = jnp.sum(A * A, 1)
     largest = largest_of_each(scene, squares)
     squares = jnp.where(squares > _TINY_ROW**2 * largest, squares, largest)
-    # A constraint may have rows of zeros alone.
-    return A / jnp.sqrt(jnp.maximum(squares, float(jnp.finfo(A.dtype).tiny)))[:, None]
+    # A constraint may have rows of zeros alone. By the reciprocal: in a kernel a product with a known zero is one, a quotient not.
+    return A * (1.0 / jnp.sqrt(jnp.maximum(squares, float(jnp.finfo(A.dtype).tiny))))[:, None]
 
 
 def eliminate(B: Float[Array, "nc nv"], least: float, first: Float[Array, " nc"], most=None) -> tuple[Array, ...]:
@@ -226,7 +226,7 @@ def known_rows(scene: Scene, *, rank_tol: float | None, dtype) -> tuple[Selectio
     """All rows of a known scene, and whether some are doubtful at (q, t)."""
     bare, every = Scene(scene.system, scene.constraints), _every_row(scene, dtype)
     return every, Evaluation(
-        _has_doubtful_rows, bare, (_least_doubtless(every.kept, rank_tol),), is_input=not is_tracing()
+        _has_doubtful_rows, bare, (_least_doubtless(every.kept, rank_tol),), is_input=is_given(bare)
     )
 
 

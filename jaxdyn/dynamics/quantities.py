@@ -219,7 +219,9 @@ def _least_bodies_in_sweeps() -> int:
 
 def _recursions(model: Model) -> Any:
     """The module with the recursions of a model; None where there are too many bodies."""
-    if model.nb >= _least_bodies_in_sweeps() and sweeps.has_sweeps(model):
+    # Robots with floating bases have most axes at right angles.
+    least = MAX_BODIES + 1 if sweeps.has_base(model) else _least_bodies_in_sweeps()
+    if model.nb >= least and sweeps.has_sweeps(model):
         return sweeps
     return recursions if 0 < model.nb <= MAX_BODIES else None
 

@@ -19,7 +19,7 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from jaxdyn.compile import evaluate
-from jaxdyn.compile.known import is_concrete, is_tracing
+from jaxdyn.compile.known import is_concrete
 from jaxdyn.constraints.base import Rows, constraint_jacobian, holonomic_rows, layout, position_residual, rows
 from jaxdyn.constraints.codes import RESULTS
 from jaxdyn.constraints.dynamics import constrained_dynamics, solve_rows
@@ -48,7 +48,7 @@ from jaxdyn.reduction.bases import (
 )
 from jaxdyn.reduction.minimal import solve_in_basis
 from jaxdyn.simulation.options import Solver, Stepsize
-from jaxdyn.systems.scene import Scene, as_pytree
+from jaxdyn.systems.scene import Scene, as_pytree, is_given
 from jaxdyn.systems.system import displace, needs_retraction, rate_to_velocity, retract, velocity_to_rate
 
 State: TypeAlias = dict[str, Any]  # arrays, and pytrees of them, by name
@@ -371,7 +371,7 @@ def may_have_redundant_rows(scene: Scene) -> bool:
     # Away from the neutral configuration, at which entries of A may vanish that do not vanish elsewhere.
     step = np.random.default_rng(0).uniform(0.1, 0.9, scene.nv).astype(state_dtype(scene.system))
     try:
-        is_coupled = np.abs(evaluate(_generic_rows, bare, step, is_input=not is_tracing())) > 0
+        is_coupled = np.abs(evaluate(_generic_rows, bare, step, is_input=is_given(bare))) > 0
     except jax.errors.JAXTypeError:  # a constraint is a function that holds a traced number
         return True
     # Connected components of the graph whose edges are the rows: a scene of two four-bars is two sets of coordinates.

@@ -11,6 +11,7 @@ from jaxtyping import Array
 
 from jaxdyn.compile import kernel
 from jaxdyn.compile.batch import map_rows
+from jaxdyn.compile.known import Known
 from jaxdyn.constraints.codes import first_of
 from jaxdyn.constraints.rank import LEAST_GAP
 from jaxdyn.constraints.redundancy import exchange_rows, gap_of_redundant, has_selection, keep_rows, row_mask, rows_of
@@ -56,8 +57,9 @@ class _Run(NamedTuple):
         return self.method.to_qv(scene, self.method.correct(scene, y, t), t)
 
 
-def smooth_motion(scene: Scene, control, method: Method, numbers, options) -> Solution:
+def smooth_motion(scene: Scene | Known, control, method: Method, numbers, options) -> Solution:
     """Run of `simulate`; `numbers`: q0, v0, ts, rtol, atol and the length of steps or a controller of them."""
+    scene = scene(()) if isinstance(scene, Known) else scene
     options = as_objects(options, numbers[-1])
     given, inputs = (scene, control, numbers), safe_inputs(scene.system, numbers)
     scene, inputs, faults = _project_start(scene, method, inputs, options["selects_rows"])

@@ -13,7 +13,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from jaxdyn.compile import entry_point
-from jaxdyn.compile.known import as_numpy_if_known, is_concrete, is_known, once
+from jaxdyn.compile.known import as_constant, as_numpy_if_known, is_concrete, is_known, once
 from jaxdyn.contact.unilateral import has_modes
 from jaxdyn.model.arguments import Numbers, as_array, check_flag, state_dtype
 from jaxdyn.simulation import checks, controls
@@ -31,7 +31,7 @@ from jaxdyn.simulation.options import (
     step_limit,
 )
 from jaxdyn.simulation.solution import Solution, raise_failure
-from jaxdyn.systems.scene import Scene, as_scene
+from jaxdyn.systems.scene import Scene, as_scene, is_given
 from jaxdyn.systems.system import SceneLike, System, has_dependent_coordinates
 
 
@@ -157,7 +157,9 @@ def simulate(
     if modal:
         solution = hybrid_motion(scene, control, numbers, options)
     else:
-        solution = smooth_motion(scene, control, method, numbers, options)
+        # A large scene is a constant of the program: its zeros are known, and most of it is zeros.
+        whole = as_constant(scene) if is_concrete(scene) and not is_given(scene) else scene
+        solution = smooth_motion(whole, control, method, numbers, options)
     if limits == "report":
         from jaxdyn.simulation.terminal_events import report_limits
 

@@ -13,7 +13,7 @@ import numpy as np
 from jaxtyping import Array, Float, PyTree
 
 from jaxdyn._renamed import RenamedMethod
-from jaxdyn.compile.known import is_concrete
+from jaxdyn.compile.known import is_concrete, is_tracing
 from jaxdyn.model.arguments import Checked, Number, SystemLike, as_array, batch_hint, check_system
 from jaxdyn.model.description import scene_lines
 from jaxdyn.systems.drives import DriveDynamics, pass_command
@@ -228,6 +228,17 @@ class Scene(eqx.Module):
             command, rate, state = pass_command(force, self.system, q, v, t, command, state)
             rates += [] if rate is None else [rate]
         return command, jnp.concatenate(rates) if rates else None
+
+
+# Velocity coordinates from which on a scene with constraints is compiled with its numbers. Between 16 and 40 windows, with 33 and 81
+# of them, the program of given numbers, of six times the operations, exceeds what LLVM compiles in a few seconds.
+MIN_KNOWN_COORDINATES = 64
+
+
+def is_given(scene: Scene) -> bool:
+    """Decide whether a call outside of a trace takes the scene's numbers as arguments of its program, which serves others too."""
+    is_large = bool(scene.constraints) and scene.nv >= MIN_KNOWN_COORDINATES
+    return not is_tracing() and not (is_large and is_concrete(scene))
 
 
 def has_drives(scene: Scene) -> bool:

@@ -23,8 +23,26 @@ def tree(kinds, nb=12, branching=1.6, **changes):
     return model.replace(screws=model.screws * 1.3, armature=jnp.linspace(0.1, 0.2, nb), **changes)
 
 
+def floating(kinds, nb=12, branching=1.6, armature=True, gravity=(0.3, -0.2, -9.81)):
+    """A floating base with bodies on it."""
+    rng, builder = np.random.default_rng(5), jd.ModelBuilder("floating", gravity=gravity)
+    builder.add_body("b000", None, "free", (2.0, (0.1, -0.2, 0.05), (0.3, 0.4, 0.5)), pose=((0.3, 0.1, -0.2), (0.4, -0.3, 0.2)))
+    for i in range(1, nb):
+        parent, kind = f"b{max(0, int((i - 1) / branching)):03d}", kinds[i % len(kinds)]
+        inertia = (1.0, tuple(0.1 * rng.normal(size=3)), tuple(0.1 + 0.05 * rng.uniform(size=3)))
+        options = {"pitch": 0.2} if kind == "helical" else {}
+        pose = tuple(0.3 * rng.normal(size=3)), tuple(rng.normal(size=3))
+        builder.add_body(f"b{i:03d}", parent, kind, inertia, pose=pose, axis=tuple(rng.normal(size=3)), **options)
+    model = builder.build()
+    # Screws that are not of unit length, and rotors.
+    model = model.replace(screws=model.screws * jnp.where(jnp.arange(nb) > 0, 1.3, 1.0)[:, None])
+    return model.replace(armature=jnp.linspace(0.1, 0.2, model.nv)) if armature else model
+
+
 def state(model, seed=0):
-    return tuple(jnp.asarray(x) for x in np.random.default_rng(seed).normal(size=(3, model.nv)))
+    rng = np.random.default_rng(seed)
+    q, v, x = rng.normal(size=model.nq), *rng.normal(size=(2, model.nv))
+    return tuple(map(jnp.asarray, (q, v, x)))
 
 
 @pytest.mark.parametrize("kinds", KINDS)
@@ -47,6 +65,37 @@ def test_as_the_recursions_that_are_written_out(kinds, given):
         assert_close(a, b, 1e-12)
 
 
+@pytest.mark.parametrize("kinds", KINDS)
+@pytest.mark.parametrize("given", [False, True])
+@pytest.mark.parametrize("armature", [False, True])
+def test_floating_base(kinds, given, armature):
+    if given and len(kinds) > 1:
+        return
+    model = floating(kinds, armature=armature)
+    assert sweeps.has_sweeps(model)
+    q, v, x = state(model)
+
+    def of(form):
+        def all_of(model, q, v, x):
+            a, times = form.aba_tangent(model, q, v, x, lambda a: x * a)
+            return a, times, form.rnea(model, q, v, x), form.bias_force(model, q, v), form.gravity_force(model, q)
+
+        compiled = kernel(all_of)
+        return quick(compiled)(model, q, v, x) if given else quick(lambda *s: compiled(model, *s))(q, v, x)
+
+    for a, b in zip(of(sweeps), of(recursions), strict=True):
+        assert_close(a, b, 1e-12)
+
+
+def test_no_sweeps_of_other_trees():
+    """Two floating bodies, and other joints of several degrees of freedom."""
+    builder = jd.ModelBuilder("two")
+    for name in "ab":
+        builder.add_body(name, None, "free", (1.0, (0.0, 0.0, 0.0), (0.1, 0.1, 0.1)))
+    assert not sweeps.has_sweeps(builder.build())
+    assert not sweeps.has_sweeps(random_tree(0, 3, kinds=("spherical",)))
+
+
 def test_batches_gravity_and_given_inertias():
     model = tree(("revolute",), gravity=None)
     many = [jnp.stack([x, 2 * x, -x]) for x in state(model)]
@@ -60,11 +109,13 @@ def test_batches_gravity_and_given_inertias():
     assert_close(of(sweeps), of(recursions), 1e-12)
 
 
-@pytest.mark.parametrize("kinds", [("revolute",), pytest.param(("helical",), marks=pytest.mark.slow)])
-def test_derivatives(kinds):
+@pytest.mark.parametrize("kinds", [("revolute",), ("free",), pytest.param(("helical",), marks=pytest.mark.slow)])
+def test_derivatives(kinds, monkeypatch):
     """Reverse mode of public functions over all leaves: against the recursions that are written out, and differences."""
     nb = quantities.MIN_BODIES_IN_SWEEPS
-    model = tree(kinds, nb=nb, branching=1.3)
+    is_floating = kinds == ("free",)
+    monkeypatch.setattr(quantities, "MAX_BODIES", nb - 1 if is_floating else quantities.MAX_BODIES)
+    model = floating(("revolute",), nb, 1.3) if is_floating else tree(kinds, nb=nb, branching=1.3)
     at = (model, *state(model))
     weights = jnp.cos(jnp.arange(model.nv))
 
@@ -83,9 +134,12 @@ def test_derivatives(kinds):
     ):
         assert_close(a, b, 1e-9)
     q, step = at[1], 1e-6
+    along = jnp.cos(jnp.arange(model.nq))
     run = quick(value)
-    difference = (run(model, q + step * weights, *at[2:]) - run(model, q - step * weights, *at[2:])) / (2 * step)
-    assert_close(computed[1] @ weights, difference, 1e-6)  # of central differences
+    difference = (run(model, q + step * along, *at[2:]) - run(model, q - step * along, *at[2:])) / (2 * step)
+    assert_close(computed[1] @ along, difference, 1e-6)  # of central differences
+    forward = quick(lambda q: jax.jvp(lambda q: value(model, q, *at[2:]), (q,), (along,))[1])(q)
+    assert_close(forward, computed[1] @ along, 1e-9)
 
 
 def test_code_does_not_grow_with_the_bodies():
@@ -101,9 +155,11 @@ def test_code_does_not_grow_with_the_bodies():
 
 
 @pytest.mark.parametrize("links", [200, pytest.param(1000, marks=pytest.mark.slow)])
-@pytest.mark.parametrize("branching", [1, 2])
+@pytest.mark.parametrize("branching", [1, 2, "floating"])
 def test_hundreds_of_links(links, branching):
-    model = random_tree(1, links, branching=branching, skew=0.3, taper=1.0, kinds=("revolute",))
+    is_floating = branching == "floating"
+    model = floating(("revolute",), links, 1.0, armature=False) if is_floating else None
+    model = model or random_tree(1, links, branching=branching, skew=0.3, taper=1.0, kinds=("revolute",))
     q, v, tau = (0.3 * x for x in state(model))
     a = quick(lambda *s: jd.forward_dynamics(model, *s))(q, v, tau)
     inverse = quick(lambda *s: jd.inverse_dynamics(model, *s))

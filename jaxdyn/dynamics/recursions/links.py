@@ -124,7 +124,7 @@ def joint_transforms(links: Links, q) -> list[Chain]:
         joint = _joint_transform(kind, qi, entry(links.frames.rate, i), entry(links.frames.pitch, i), turn)
         screws = links.frames.screws
         if screws is None or kind in ("spherical", "free"):
-            chains.append(_compose(entry(links.frames.home, i), joint))
+            chains.append(compose(entry(links.frames.home, i), joint))
             continue
         home = screws[i]
         theta = None if kind in TURN_ABOUT_Z and kind != "planar" else home.theta  # those have it in their angle
@@ -207,7 +207,7 @@ def _plane_rotation(axis: int, turn: PlaneAngle, dtype) -> PlaneRotation | None:
     return PlaneRotation(PlaneRotations(axis, np.array([turn.cos], dtype), np.array([turn.sin], dtype)), 0)
 
 
-def _compose(home, joint: Transform) -> Chain:
+def compose(home, joint: Transform) -> Chain:
     """Compose a general home pose (4, 4) and a joint's transform."""
     rotation, place = part(part(home, 0, 3), 0, 3, 1), entry(part(home, 0, 3), 3, 1)
     shift = place if joint.shift is None else place + dot(rotation, joint.shift)

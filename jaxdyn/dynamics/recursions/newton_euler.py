@@ -201,11 +201,13 @@ def ancestor_rows(links: Links, chains: list[Chain], i: int, columns) -> list:
 
 def place_rows(links: Links, pieces: dict, width: int, dtype):
     """Assemble rows (nv, width) from blocks at their joints, zero for all other joints."""
-    rows = []
-    for i, place in enumerate(links.model.topology.v_slices):
-        # Numpy zeros are known, so the sparsity of branches survives in the scalar program.
-        rows.append(pieces[i] if i in pieces else np.zeros((place.stop - place.start, width), dtype))
-    return join(rows, 0)
+    # Numpy zeros are known, so the sparsity of branches survives in the scalar program. Those that follow each other are one block:
+    # of a wide tree most are.
+    rows, at, places = [], 0, links.model.topology.v_slices
+    for i in sorted(pieces):
+        rows += [np.zeros((places[i].start - at, width), dtype), pieces[i]]
+        at = places[i].stop
+    return join([x for x in (*rows, np.zeros((links.model.nv - at, width), dtype)) if x.shape[0]], 0)
 
 
 def crba(model: Model, q: Float[Array, " nq"]) -> Float[Array, "nv nv"]:

@@ -1,6 +1,8 @@
 """The recursions for many bodies: the same steps for each body, as sweeps over the tree whose code does not grow with it.
 
-All joints have one degree of freedom. What they have alike, such as a zero, is dropped when a sweep is compiled.
+All joints have one degree of freedom, but that of a floating base, the root of all bodies, which is computed before or after the
+sweeps: its carry is where an outward sweep starts and an inward one ends. What joints have alike, such as a zero, is dropped when a
+sweep is compiled.
 
 - Known geometry: canonical frames (see `frames`), with s = (0, 0, a, 0, 0, b): a is 0 for revolute joints, 1 for prismatic ones,
   the pitch for helical ones; b is 0 or 1.
@@ -19,6 +21,7 @@ from jaxdyn.compile.known import as_numpy_if_known, is_concrete
 from jaxdyn.dynamics.recursions._arrays import contract, dot, join, part
 from jaxdyn.dynamics.recursions.articulated import eliminate, spatial_inertia
 from jaxdyn.dynamics.recursions.frames import MOMENTS, canonical_frames, pseudo_inertias
+from jaxdyn.dynamics.recursions.links import compose, quaternion_rotation
 from jaxdyn.dynamics.recursions.newton_euler import move_with_joint, wrench_of_acceleration
 from jaxdyn.dynamics.recursions.transforms import (
     Chain,
@@ -38,25 +41,48 @@ from jaxdyn.model.tree import Model, nearest_rotation
 _TURNS = ("revolute", "continuous")
 
 
+def has_base(model: Model) -> bool:
+    """Decide whether a floating base carries all other bodies."""
+    kinds, parents = model.topology.kinds, model.topology.parents
+    return len(kinds) > 1 and kinds[0] == "free" and -1 not in parents[1:]
+
+
 def has_sweeps(model: Model) -> bool:
     """Decide whether the joints are such that this module computes them."""
-    kinds = {"revolute" if kind in _TURNS else kind for kind in model.topology.kinds}
+    kinds = {"revolute" if kind in _TURNS else kind for kind in model.topology.kinds[has_base(model) :]}
     # With given geometry the formula of a joint's pose is chosen by its kind.
     return kinds <= set(SCREW_KINDS) and (len(kinds) == 1 or is_concrete(model.home, model.screws))
 
 
 class _Bodies:
-    """Data of the bodies. `rows`: arrays (nb, ...); the methods take one row of them."""
+    """Data of the bodies. `rows`: arrays (nb, ...) of all but a floating base; the methods take one row of them.
+
+    `base`: rows of the floating base, if there is one.
+    """
 
     rows: Any
+    base: Any = None
     scale: Any = None  # unit velocity = scale * v, (nv,), or None
 
     def __init__(self, model: Model):
-        self.model, self.parents = model, model.topology.parents
+        self.model, self.first = model, int(has_base(model))
+        self.parents = tuple(x - self.first for x in model.topology.parents[self.first :])
         self.gravity, self.armature = as_numpy_if_known(model.gravity), as_numpy_if_known(model.armature)
-        kinds = set(model.topology.kinds)
+        kinds = set(model.topology.kinds[self.first :])
         self.kind = "revolute" if kinds <= set(_TURNS) else kinds.pop() if len(kinds) == 1 else None
         self.dtype = model.home.dtype
+
+    def split(self, rows: tuple) -> None:
+        """Set rows of all bodies, armatures (nv,) the last of them."""
+        *rows, armature = rows
+        own = None if armature is None else armature[6 * self.first :]
+        self.rows = self.Row(*(None if x is None else x[self.first :] for x in rows), own)
+        if self.first:
+            self.base = self.Row(*(None if x is None else x[0] for x in rows), None if own is None else armature[:6])
+
+    def home(self, row):
+        """Home pose (4, 4) of the base."""
+        raise NotImplementedError
 
     # The coordinate of (v, omega) that all joints move along, or None.
     column: int | None = None
@@ -97,9 +123,10 @@ class _Canonical(_Bodies):
         frames, dtype, n = canonical_frames(model), self.dtype, model.nb
         screws, kinds = frames.screws, model.topology.kinds
         assert screws is not None
+        self.homes = frames.home
         self.column = {"revolute": 5, "prismatic": 2}.get(self.kind or "")
         if not (frames.rate == 1).all():
-            self.scale = frames.rate
+            self.scale = np.concatenate([np.ones(5 * self.first, dtype), frames.rate])
             # Armature acts on v^2 of the model; on unit velocities it is divided by the square of the scale.
             self.armature = None if self.armature is None else self.armature / self.scale**2
 
@@ -111,11 +138,15 @@ class _Canonical(_Bodies):
             inertias, to_frame = np.stack(pseudo_inertias(model, frames)), None
         else:
             inertias, to_frame = model.inertias, np.linalg.inv(frames.placement)
-        self.rows = self.Row(
+        of_bodies = (
             rows([x.phi for x in screws]), rows([x.alpha for x in screws]), rows([x.theta for x in screws]),
             rows([[x.e, *x.shift, x.d] for x in screws]), slides + frames.pitch, 1 - slides, inertias, to_frame,
             self.armature,
         )  # fmt: skip
+        self.split(of_bodies)
+
+    def home(self, row):
+        return self.homes[0]
 
     def place(self, row, q):
         angle = q * row.about
@@ -157,7 +188,11 @@ class _Given(_Bodies):
 
     def __init__(self, model: Model):
         super().__init__(model)
-        self.rows = self.Row(model.home, model.screws, model.inertias, self.armature)
+        self.split((model.home, model.screws, model.inertias, self.armature))
+
+    def home(self, row):
+        place = join([nearest_rotation(row.home[:3, :3]), row.home[:3, 3:]], 1)
+        return join([place, np.eye(4, dtype=self.dtype)[3:]], 0)
 
     def place(self, row, q):
         home, pose = row.home, screw_transform(str(self.kind), self.subspace(row), q)
@@ -169,7 +204,7 @@ class _Given(_Bodies):
         return (Transform(part(place, 9, 12), GeneralRotation(part(place, 0, 9).reshape(3, 3))),)
 
     def subspace(self, row):
-        return row.screw * self.model.topology.screw_mask[0].astype(self.dtype)
+        return row.screw * self.model.topology.screw_mask[self.first].astype(self.dtype)
 
     def moments(self, row):
         return contract(MOMENTS.astype(self.dtype), row.inertia, (2,), (0,))
@@ -184,18 +219,69 @@ def _to_unit_screws(bodies: _Bodies, x) -> Any:
     return x if bodies.scale is None or x is None else x * bodies.scale
 
 
+def _to_unit_coordinates(bodies: _Bodies, q) -> Any:
+    """Coordinates of unit screws; those of a floating base, a position and a quaternion, as they are."""
+    if bodies.scale is None:
+        return q
+    return q * np.concatenate([np.ones(bodies.first, bodies.dtype), bodies.scale])
+
+
 def _to_model_units(bodies: _Bodies, x) -> Any:
     """The inverse of `_to_unit_screws`."""
     return x if bodies.scale is None else x / bodies.scale
 
 
+# --- a floating base ---
+
+
+def _split(bodies: _Bodies, *values) -> list[tuple]:
+    """Parts of vectors (nv,), or None: that of a floating base (6,), or None, and that of all other joints."""
+    if not bodies.first:
+        return [(None, x) for x in values]
+    return [(None, None) if x is None else (part(x, 0, 6), part(x, 6, x.shape[0])) for x in values]
+
+
+def _base_chain(bodies: _Bodies, q) -> Chain:
+    """Pose of the floating base."""
+    return compose(bodies.home(bodies.base), Transform(part(q, 0, 3), GeneralRotation(quaternion_rotation(part(q, 3, 7)))))
+
+
+def _eliminate_base(bodies: _Bodies, A) -> tuple[list, list]:
+    """Gains and inverse pivots of the six degrees of freedom of the base, of the articulated inertia A."""
+    gains, inverses, armature = [], [], bodies.base.armature
+    for k, s in enumerate(np.eye(6, dtype=bodies.dtype)):
+        A, gain, inverse = eliminate(A, s, k, None if armature is None else armature[k])
+        gains.append(gain)
+        inverses.append(inverse)
+    return gains, inverses
+
+
+def _accelerate_base(gains: list, inverses: list, force, F) -> Any:
+    """Acceleration of the base (6,), from the wrench F (6,) of the bodies that it carries."""
+    left = []
+    for k, gain in enumerate(gains):
+        left.append(force[k] - F[k])
+        F = F + gain * left[-1]
+    x: Any = None
+    for k in reversed(range(6)):
+        along, free = np.eye(6, dtype=F.dtype)[k], left[k] * inverses[k]
+        x = along * free if x is None else x + along * (free - dot(gains[k], x))
+    return x
+
+
 # --- sweeps ---
 
 
-def _wrenches(bodies: _Bodies, q, v, a) -> tuple[Any, Any]:
-    """Inertial wrenches (nb, 6), gravity included, and places (nb, n): the outward sweep of Newton-Euler."""
+def _wrenches(bodies: _Bodies, q, v, a) -> tuple[Any, Any, Any]:
+    """Inertial wrenches (nb, 6), gravity included, places (nb, n), and the wrench of a floating base: the outward sweep."""
     zero = np.zeros(3, bodies.dtype)
     start = zero, zero, np.zeros((3, 3), bodies.dtype), zero if bodies.gravity is None else -bodies.gravity
+    (of_base, v), (rate, a), own = *_split(bodies, v, a), None
+    if bodies.first:
+        S = np.eye(6, dtype=bodies.dtype)
+        start = move_with_joint(start, _base_chain(bodies, q), S, of_base, rate)
+        own = wrench_of_acceleration(start[2], start[3], bodies.moments(bodies.base))
+        q = part(q, 7, q.shape[0])
 
     def step(motion, row):
         row, q, v, a = row
@@ -204,21 +290,23 @@ def _wrenches(bodies: _Bodies, q, v, a) -> tuple[Any, Any]:
         return motion, (wrench_of_acceleration(motion[2], motion[3], bodies.moments(row)), place)
 
     rows = bodies.rows, q, *(None if x is None else x.reshape(-1, 1) for x in (v, a))
-    return sweep(step, bodies.parents, start, rows)[1]
+    return *sweep(step, bodies.parents, start, rows)[1], own
 
 
 def rnea(model: Model, q, v, a) -> Float[Array, " nv"]:
     """Inverse dynamics (see `newton_euler.rnea`); `v` and `a` may be None, which is zero."""
     bodies = _bodies(model)
-    q, v, a = (_to_unit_screws(bodies, x) for x in (q, v, a))
-    wrenches, places = _wrenches(bodies, q, v, a)
+    q, v, a = _to_unit_coordinates(bodies, q), *(_to_unit_screws(bodies, x) for x in (v, a))
+    wrenches, places, own = _wrenches(bodies, q, v, a)
 
     def step(total, row):
         row, place, wrench = row
         total = total + wrench
         return wrench_to_parent(bodies.chain(row, place), total), dot(bodies.subspace(row), total)
 
-    tau = sweep(step, bodies.parents, np.zeros(6, bodies.dtype), (bodies.rows, places, wrenches), inward=True)[1]
+    end, tau = sweep(step, bodies.parents, np.zeros(6, bodies.dtype), (bodies.rows, places, wrenches), inward=True)
+    if bodies.first:
+        tau = join([end + own, tau], 0)
     if a is not None and bodies.armature is not None:
         tau = tau + bodies.armature * a
     return _to_unit_screws(bodies, tau)
@@ -235,12 +323,13 @@ def gravity_force(model: Model, q) -> Float[Array, " nv"]:
 
 
 class _Factors(NamedTuple):
-    """Articulated-body factors: per body its place, the gain U/D (6,) and 1/D."""
+    """Articulated-body factors: per body its place, the gain U/D (6,) and 1/D; those of a floating base, in lists."""
 
     bodies: _Bodies
     places: Any
     gains: Any
     inverses: Any
+    of_base: Any = None
 
 
 def _factorize(bodies: _Bodies, places) -> _Factors:
@@ -251,13 +340,17 @@ def _factorize(bodies: _Bodies, places) -> _Factors:
         return inertia_to_parent(bodies.chain(row, place), rest), (gain, inverse)
 
     start = np.zeros((6, 6), bodies.dtype)
-    return _Factors(bodies, places, *sweep(step, bodies.parents, start, (bodies.rows, places), inward=True)[1])
+    end, factors = sweep(step, bodies.parents, start, (bodies.rows, places), inward=True)
+    if not bodies.first:
+        return _Factors(bodies, places, *factors)
+    return _Factors(bodies, places, *factors, _eliminate_base(bodies, end + spatial_inertia(bodies.moments(bodies.base))))
 
 
-def _solve(factors: _Factors, force, wrenches=None) -> Float[Array, " nv"]:
-    """Solve M a = force - (generalised forces of the wrenches)."""
-    bodies, places, gains, inverses = factors
+def _solve(factors: _Factors, force, wrenches=None, own=None) -> Float[Array, " nv"]:
+    """Solve M a = force - (generalised forces of the wrenches, `own` that of a floating base)."""
+    bodies, places, gains, inverses, of_base = factors
     zero = np.zeros(6, bodies.dtype)
+    ((base_force, force),) = _split(bodies, _to_model_units(bodies, force))
 
     def inward(total, row):
         row, place, gain, force, wrench = row
@@ -271,17 +364,20 @@ def _solve(factors: _Factors, force, wrenches=None) -> Float[Array, " nv"]:
         x = left * inverse - dot(gain, V)
         return V + bodies.subspace(row) * x, x
 
-    rows = bodies.rows, places, gains, _to_model_units(bodies, force), wrenches
-    left = sweep(inward, bodies.parents, zero, rows, inward=True)[1]
-    a = sweep(outward, bodies.parents, zero, (bodies.rows, places, gains, inverses, left))[1]
-    return _to_model_units(bodies, a)
+    rows = bodies.rows, places, gains, force, wrenches
+    end, left = sweep(inward, bodies.parents, zero, rows, inward=True)
+    start = zero
+    if of_base is not None:
+        start = _accelerate_base(*of_base, base_force, end if own is None else end + own)
+    a = sweep(outward, bodies.parents, start, (bodies.rows, places, gains, inverses, left))[1]
+    return _to_model_units(bodies, a if of_base is None else join([start, a], 0))
 
 
 def _free_and_inverse(model: Model, q, v, tau) -> tuple[Array, Callable]:
     bodies = _bodies(model)
-    wrenches, places = _wrenches(bodies, _to_unit_screws(bodies, q), _to_unit_screws(bodies, v), None)
+    wrenches, places, own = _wrenches(bodies, _to_unit_coordinates(bodies, q), _to_unit_screws(bodies, v), None)
     factors = _factorize(bodies, places)
-    return _solve(factors, tau, wrenches), lambda force: _solve(factors, force)
+    return _solve(factors, tau, wrenches, own), lambda force: _solve(factors, force)
 
 
 def aba(model: Model, q, v, tau) -> Float[Array, " nv"]:
