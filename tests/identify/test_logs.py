@@ -7,6 +7,7 @@ import pytest
 
 from jaxdyn import identify
 from jaxdyn.identify.logs import check_log
+from jaxdyn.identify.workflows.raw_logs import spline_lines
 from jaxdyn.io.logs import read_log, write_log
 from jaxdyn.model.builder import ModelBuilder
 
@@ -265,3 +266,30 @@ def test_logs_in_other_encodings_are_refused_with_their_line(tmp_path):
 def test_logs_of_texts_and_complex_numbers_are_refused(t):
     with pytest.raises(ValueError, match=r"t holds .*; give real numbers"):
         identify.Log(t, np.zeros((2, 1)), tau=np.zeros((2, 1)))
+
+
+def test_lines_between_rare_samples_become_splines():
+    """A 5 Hz torque recorded at 50 Hz and written at 500 Hz as lines loses 3 % of its size: the splines give it back."""
+    t = np.arange(0, 4, 0.002)
+    exact = np.stack([np.sin(2 * np.pi * 5 * t), np.cos(2 * np.pi * 3 * t)], axis=1)
+    lines = np.stack([np.interp(t, t[::10], column) for column in exact[::10].T], axis=1)
+    inner = slice(50, -50)  # away from the ends of the spline
+    with pytest.warns(identify.LogWarning, match="2 columns of torques are lines between rarer samples"):
+        splines = spline_lines(t, lines, "torques")
+    # The lines' own loss is 1 - sinc(0.1)^2 in the mean; a spline's error is of fourth order.
+    assert np.abs(lines - exact)[inner].max() > 0.03 and np.abs(splines - exact)[inner].max() < 2e-3
+    with pytest.warns(identify.LogWarning, match="torques are lines"):
+        log = identify.from_raw(t, exact, lines, cutoff=20.0, trim=100, every=1)
+    wanted = identify.from_raw(t, exact, exact, cutoff=20.0, trim=100, every=1)
+    np.testing.assert_allclose(log.tau, wanted.tau, atol=2e-3)
+
+
+def test_other_columns_are_no_lines():
+    """Smooth and noisy columns, held samples, one that rests at times, and one of a few lines stay the same arrays."""
+    t, rng = np.arange(0, 4, 0.002), np.random.default_rng(0)
+    held = np.repeat(rng.normal(size=200), 10)
+    rests = np.where(np.sin(3 * t) > 0, np.sin(20 * t), 0.0)
+    few = np.interp(t, [0, 1, 2.5, 4], [0, 1, -1, 0])
+    for column in (np.sin(t), rng.normal(size=2000), held, rests, few, np.zeros(2000), np.round(np.sin(t), 2)):
+        x = column[:, None]
+        assert spline_lines(t, x, "torques") is x

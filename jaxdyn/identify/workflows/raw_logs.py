@@ -10,10 +10,13 @@ from typing import NamedTuple
 
 import numpy as np
 
-from jaxdyn.identify.logs import Log, pad_length
-from jaxdyn.identify.workflows.log_repair import repair_log
-from jaxdyn.model.arguments import Checked, Numbers
+from jaxdyn.identify.logs import Log, pad_length, root_mean_square
+from jaxdyn.identify.workflows.log_repair import LogWarning, repair_log
+from jaxdyn.model.arguments import Checked, Numbers, warn
 from jaxdyn.model.tree import Model
+
+# Bend of a line, as a share of the root mean square, below which it counts as straight, and least number of corners of lines.
+_BEND, _CORNERS = 0.01, 8
 
 
 def from_raw(
@@ -32,7 +35,8 @@ def from_raw(
 ) -> Log:
     """Make a log for torque fits from raw positions and torques: uniform time, low-pass without delay, numerical rates.
 
-    The samples are interpolated linearly to a uniform grid of as many samples. q is low-passed forward and backward
+    Columns that a recorder has interpolated linearly between rarer samples become splines through these (`spline_lines`). The
+    samples are interpolated linearly to a uniform grid of as many samples. q is low-passed forward and backward
     (Butterworth, zero phase); v is its numerical gradient, low-passed again; a the gradient of v, low-passed again; tau
     is low-passed the same way, so that both sides of the equation of motion have the same filter. The filter's
     transients at both ends are dropped, and as the signals have no power above the cut-off, only every few samples are
@@ -103,6 +107,7 @@ def from_raw(
     def low(x):
         return filtfilt(numerator, denominator, x, axis=0, padlen=pad_length(rate, cutoff, n))
 
+    q, tau = spline_lines(t, q, "positions"), spline_lines(t, tau, "torques")
     positions, torques = low(uniform(q)), low(uniform(tau))
     # A difference amplifies noise in proportion to its frequency: each result goes through the low-pass again.
     v = low(np.gradient(positions, grid, axis=0))
@@ -125,6 +130,35 @@ _RISE, _SHARE = 10.0, 1e-4
 _LINES = 6
 # Highest cut-off as a share of the sampling rate.
 _SAMPLING = 0.4
+
+
+def spline_lines(t: np.ndarray, x: np.ndarray, what: str) -> np.ndarray:
+    """Columns (n, k), those that are lines between every second or rarer sample replaced by cubic splines through their corners.
+
+    Lines between samples of the rate f lower a sine of the frequency s by the factor sinc(s / f)^2, 3 % at a tenth of f. The
+    columns of a fit are not lowered so, and friction and rotors were off by several of their standard deviations. A spline
+    through the corners lowers the sine by 2e-4.
+
+    **Warns:** `LogWarning` with the number of columns.
+    """
+    from scipy.interpolate import CubicSpline
+
+    result, count = x, 0
+    bends = np.abs(np.diff(np.diff(x, axis=0) / np.diff(t)[:, None], axis=0))
+    is_corner = bends > _BEND * root_mean_square(bends)
+    for column in np.flatnonzero(np.mean(is_corner, axis=0) <= 0.5):
+        corners = np.concatenate([[0], 1 + np.flatnonzero(is_corner[:, column]), [len(t) - 1]])
+        gaps = np.diff(corners)[1:-1]
+        typical = np.median(gaps) if len(gaps) >= _CORNERS else 0.0
+        # Corners at irregular places are those of a signal that rests at times, or is held, where a spline would overshoot.
+        if typical < 2 or gaps.min() < 0.5 * typical or gaps.max() > 4 * typical:
+            continue
+        result = x.copy() if result is x else result
+        result[:, column] = CubicSpline(t[corners], x[corners, column])(t)
+        count += 1
+    if count:
+        warn(f"{count} columns of {what} are lines between rarer samples; they were replaced by splines", LogWarning)
+    return result
 
 
 class Cutoff(NamedTuple):
