@@ -57,7 +57,7 @@ class _Run(NamedTuple):
         return self.method.to_qv(scene, self.method.correct(scene, y, t), t)
 
 
-def smooth_motion(scene: Scene | Known, control, method: Method, numbers, options) -> Solution:
+def smooth_motion(scene: Any, control, method: Method, numbers, options) -> Solution:
     """Run of `simulate`; `numbers`: q0, v0, ts, rtol, atol and the length of steps or a controller of them."""
     scene = scene(()) if isinstance(scene, Known) else scene
     options = as_objects(options, numbers[-1])
