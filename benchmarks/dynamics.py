@@ -207,8 +207,8 @@ def line(row):
 
 
 HEAD = (
-    "| robot | function | batch | dtype | known model, us | ratio | model as argument, us | ratio | Pinocchio us | by | frax us | MJX us | "
-    "trace + compile s |\n|---|---|---|---|---|---|---|---|---|---|---|---|---|"
+    "| robot | function | batch | dtype | known model, us | ratio | model as argument, us | ratio | Pinocchio us | by | "
+    "frax us | MJX us | trace + compile s |\n|---|---|---|---|---|---|---|---|---|---|---|---|---|"
 )
 KINEMATICS = ("frame pose", "body Jacobian", "centre of mass", "potential energy")
 
