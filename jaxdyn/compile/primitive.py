@@ -325,10 +325,13 @@ def _lower_to_launch(ctx, *operands, program, rows, uniform):
 
     try:
         number = device.kernel(program, uniform)
-    except (jax_adapter.Unsupported, device.TooLarge) as reason:
-        what = "functions run" if isinstance(reason, jax_adapter.Unsupported) else f"{program.name} runs"
-        mode.say_once(f"{what} on JAX's own operations on GPUs: {reason}")
+    except jax_adapter.Unsupported as reason:
+        mode.say_once(f"functions run on JAX's own operations on GPUs: {reason}")
         return lowering_of(as_operations)(ctx, *operands, program=program, rows=rows)
+    except device.TooLarge as reason:
+        # Its entries are too many operations for XLA: the function itself has fewer.
+        mode.say_once(f"{program.name} runs on JAX's own operations on GPUs: {reason}")
+        return lowering_of(by_jax)(ctx, *operands, program=program, rows=rows)
     if _is_divisible(ctx.avals_in, ctx.avals_out[0].shape[:-1]):
         return lowering_of(_with_last_axis)(ctx, *operands, program=program, rows=rows and rows + 1)
     order = target.varying_first(uniform)

@@ -818,11 +818,13 @@ def test_modes(monkeypatch):
     with backend.compilation("auto"):
         assert has_kernel()
     monkeypatch.setenv("JAXDYN_COMPILATION", "fast")
-    with pytest.raises(ValueError, match="environment's JAXDYN_COMPILATION is 'fast'; choose from 'auto', 'plain'"):
+    with pytest.raises(
+        ValueError, match="environment's JAXDYN_COMPILATION is 'fast'; choose from 'auto', 'native', 'plain'"
+    ):
         has_kernel()
-    for wrong in ("native", ""):
+    for wrong in ("machine", ""):
         with (
-            pytest.raises(ValueError, match=r"compilation: mode is .*'auto', 'plain'"),
+            pytest.raises(ValueError, match=r"compilation: mode is .*'auto', 'native', 'plain'"),
             backend.compilation(wrong),
         ):
             pass

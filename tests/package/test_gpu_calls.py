@@ -14,7 +14,7 @@ from jax.sharding import Mesh, NamedSharding, PartitionSpec
 import jaxdyn as jd
 from jaxdyn import compile as backend
 from jaxdyn.compile import jax_adapter, mode, primitive
-from jaxdyn.compile.gpu import device, driver
+from jaxdyn.compile.gpu import device, driver, ptx
 
 pytestmark = pytest.mark.native
 
@@ -213,6 +213,44 @@ def test_errors_of_the_driver_are_errors_of_xla(gpu, name):
     gpu.fails = None
     gpu.contexts.clear()
     np.testing.assert_array_equal(call(x), factor * x)
+
+
+def test_a_kernel_of_another_process_is_an_error(gpu):
+    call = jax.jit(jax.vmap(lambda x: backend.kernel(lambda _, x: 7.5 * x)((), x)))
+    call(x := jnp.ones((3, 2)))
+    entries = {number: kernel.entry for number, kernel in device._kernels.items()}
+    for entry in entries.values():
+        entry.hash = 0
+    with pytest.raises(ValueError, match="compiled by another process"):
+        call(x)
+    for number, entry in entries.items():
+        entry.hash = number
+    np.testing.assert_array_equal(call(x), 7.5 * x)
+
+
+def test_what_takes_too_much_memory_runs_on_jax_after_a_warning(gpu, caplog):
+    def large(_, x):
+        def step(y, _):
+            y = 0.5 * y + jnp.flip(y)
+            return y, y
+
+        rows = lax.scan(step, x, length=500)[1]  # half a megabyte, which the next loop reads
+        return lax.scan(lambda total, row: (jnp.maximum(total, row), None), x, rows)[0]
+
+    x = jnp.asarray(RNG.normal(size=(2, 120)))
+    with caplog.at_level(logging.WARNING, "jaxdyn"):
+        computed = jax.jit(jax.vmap(lambda x: backend.kernel(large)((), x)))(x)
+    assert_same(computed, jax.vmap(lambda x: large((), x))(x))
+    assert not gpu.launches
+    (message,) = [r.message for r in caplog.records]
+    assert "bytes of memory for each sample, and a GPU's threads have 65536" in message
+
+
+def test_a_build_of_llvm_without_the_target_is_unsupported(monkeypatch):
+    monkeypatch.setattr(ptx, "_TRIPLE", "nvptx128-nobody-here")
+    monkeypatch.setattr(ptx, "_target", ptx._target.__wrapped__)
+    with pytest.raises(jax_adapter.Unsupported, match="LLVM has no target for NVIDIA's GPUs"):
+        ptx.ptx_of("", 90)
 
 
 @pytest.mark.parametrize("name", ["cuInit", "cuDriverGetVersion", "cuDeviceGetCount", "cuDeviceGet"])

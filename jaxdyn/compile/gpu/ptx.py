@@ -6,6 +6,7 @@ import re
 import llvmlite.binding as llvm
 
 from jaxdyn.compile.gpu.text import KERNEL, MAX_THREADS
+from jaxdyn.compile.jax_adapter import Unsupported
 
 # Architectures that LLVM writes for; the driver takes PTX of an older one for a newer one. ISA 8.0 came with CUDA 12.0.
 ARCHITECTURES = (70, 75, 80, 86, 89, 90)
@@ -34,15 +35,18 @@ def architecture_for(capability: int) -> int | None:
 
 
 @functools.cache
-def _initialize() -> None:
+def _target():
     llvm.initialize_all_targets()
     llvm.initialize_all_asmprinters()
+    try:
+        return llvm.Target.from_triple(_TRIPLE)
+    except RuntimeError as error:  # a build of llvmlite on an LLVM of somebody else
+        raise Unsupported(f"LLVM has no target for NVIDIA's GPUs ({error})") from None
 
 
 def ptx_of(module: str, architecture: int) -> str:
-    """The PTX of a module's text (see `text.module_ir`)."""
-    _initialize()
-    machine = llvm.Target.from_triple(_TRIPLE).create_target_machine(cpu=f"sm_{architecture}", features=_ISA, opt=1)
+    """The PTX of a module's text (see `text.module_ir`). **Raises:** `Unsupported`."""
+    machine = _target().create_target_machine(cpu=f"sm_{architecture}", features=_ISA, opt=1)
     parsed = llvm.parse_assembly(f"{module}\n{_SAMPLE}")
     parsed.triple, parsed.data_layout = _TRIPLE, str(machine.target_data)
     passes = llvm.create_new_module_pass_manager()
