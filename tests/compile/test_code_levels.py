@@ -1,5 +1,6 @@
 """First calls: quick code and what takes its place, the collector of cycles, and the message on a long call."""
 
+import ctypes
 import logging
 import re
 import subprocess
@@ -56,6 +57,35 @@ def test_optimised_code_takes_the_place_of_quick_code(two_levels, batch):
         better = objects.find(name)
         assert better is not None and not better.text
     np.testing.assert_array_equal(np.asarray(run(A, x)), quick)
+
+
+def test_long_blocks_come_in_parts():
+    """Of a branch: what is joined behind it comes from the last part of each side, whose sums differ."""
+
+    def side(name: str, summand: str) -> list[str]:
+        lines = [f"{name}:", f"  %{name}0 = fadd double %x, {summand}"]
+        lines += [f"  %{name}{i} = fadd double %{name}{i - 1}, {summand}" for i in range(1, 3 * objects.BLOCK_LINES)]
+        return [*lines, "  br label %joined"]
+
+    last = 3 * objects.BLOCK_LINES - 1
+    text = "\n".join(
+        [
+            "define double @function(double %x) {",
+            "begin:",
+            "  %is_large = fcmp ogt double %x, 1.0",
+            "  br i1 %is_large, label %large, label %small",
+            *side("large", "1.0"),
+            *side("small", "2.0"),
+            "joined:",
+            f"  %sum = phi double [ %large{last}, %large ], [ %small{last}, %small ]",
+            "  ret double %sum",
+            "}",
+        ]
+    )
+    assert objects._in_short_blocks(text).count("br label") == 2 + 2 * 3
+    code = objects.Code(objects.compile_text(text, is_quick=True))
+    function = ctypes.CFUNCTYPE(ctypes.c_double, ctypes.c_double)(code.address("function"))
+    assert [function(2.0), function(0.5)] == [2.0 + last + 1, 0.5 + 2 * (last + 1)]
 
 
 _SCRIPT = """

@@ -174,6 +174,27 @@ print([float(x).hex() for x in accelerate(scene, q, v).acceleration])
     np.testing.assert_allclose(numbers, first, rtol=1e-12)
 
 
+@pytest.mark.native
+@pytest.mark.long
+def test_a_run_from_disk_does_not_import_what_makes_it(tmp_path):
+    script = """
+import sys, jax, jax.numpy as jnp
+jax.config.update("jax_enable_x64", True)
+import jaxdyn as jd
+motion = jd.simulate(jd.scenes.four_bar(), *jd.scenes.four_bar.start(), jnp.linspace(0.0, 0.1, 3), stepsize=0.05)
+print([float(x).hex() for x in motion.q.ravel()])
+print(sorted({"diffrax", "optimistix", "lineax"} & sys.modules.keys()))
+"""
+    env = os.environ | {"XDG_CACHE_HOME": str(tmp_path)}
+    lines = []
+    for _ in range(2):
+        done = subprocess.run([sys.executable, "-c", script], env=env, capture_output=True, text=True, timeout=300)
+        assert done.returncode == 0, done.stderr[-2000:]
+        lines.append(done.stdout.splitlines())
+    assert lines[0][0] == lines[1][0]
+    assert [x[1] for x in lines] == ["['diffrax', 'lineax', 'optimistix']", "[]"]
+
+
 def test_a_program_that_is_traced_in_another_order_takes_the_place_of_the_stored_one(folder):
     x = np.linspace(0.1, 0.9, 3)
 
