@@ -22,6 +22,8 @@ from jaxdyn.compile.mode import has_branches, in_rows, is_careful, is_expanding,
 T = TypeVar("T")
 # Rows that are computed together. It bounds the memory for operands and results of kernels.
 AT_ONCE = 16
+# Repetitions up to which code without JAX has them written out.
+MOST_WRITTEN_OUT = 16
 
 
 @custom_vmap
@@ -59,10 +61,10 @@ def repeat_while(goes_on: Callable[[T], Any], step: Callable[[T], T], state: T, 
 
     The first repetition is certain where `goes_on(state)` is True itself. For others a native loop, and a kernel without a
     derivative, branches where a block of samples needs it. Other kernels have no branches: samples that need a repetition are
-    marked as not valid, and computed again outside of the kernel. In code without JAX all repetitions are written out, or with
-    `marks` such samples are left to its second program.
+    marked as not valid, and computed again outside of the kernel. In code without JAX many repetitions are a loop; a few are
+    written out, or with `marks` such samples are left to its second program.
     """
-    if not is_expanding():
+    if not is_expanding() or (is_standalone() and most > MOST_WRITTEN_OUT):
 
         def again(carry):
             count, state = carry

@@ -215,11 +215,6 @@ def _advance_contacts(scene: Scene, length, substeps: int, limits, smoothing, re
     bare = Scene(scene.system, scene.constraints)
 
     def advance(q, v, tau, t, *z):
-        if is_standalone():
-            raise ValueError(
-                "stepper: exported code has no loops, by which steps through contacts are solved; leave contacts and "
-                "limits='hold' out of the exported scene"
-            )
         whole, size = scene, length / np.asarray(substeps, length.dtype)
         if selects_rows:
             kept = keep_rows(bare, hide_unclear(select_rows(bare, q, t, None)))

@@ -316,6 +316,35 @@ def test_a_step_of_an_integrator(constrained, tmp_path):
 
 
 @pytest.mark.long
+def test_a_step_with_contacts(tmp_path):
+    """A box on four corners that is thrown on the ground, and its impulses, which a loop in the exported code solves."""
+    builder = jd.ModelBuilder("box")
+    builder.add_body("box", None, "free", (1.0, (0, 0, 0), (0.1, 0.2, 0.15)))
+    corners = [(x, y, -0.1) for x in (-0.2, 0.2) for y in (-0.15, 0.15)]
+    feet = [jd.contact.ground_contact("box", at, 0.5, restitution=0.3, name=str(i)) for i, at in enumerate(corners)]
+    step = jd.stepper(jd.Scene(builder.build(), forces=feet), 0.01, report=True)
+
+    def advance(q, v, tau):
+        state, report = step((q, v), tau)
+        return *state, jnp.stack([report.forces[str(i)] for i in range(4)])
+
+    q, v = np.array([0, 0, 0.25, 1, 0.1, 0.2, 0.0]), np.array([1.0, 0.2, 0, 0.3, -0.5, 1.0])
+    q[3:] /= np.linalg.norm(q[3:])
+    exported, compiled = jd.export(advance, q, v, np.zeros(6), name="thrown"), jax.jit(advance)
+    touched = 0
+    for _ in range(100):
+        wanted = [np.asarray(x) for x in compiled(q, v, np.zeros(6))]
+        for got, expected in zip(exported(q, v, np.zeros(6)), wanted, strict=True):
+            # Half of the digits of forces are those of dependent rows.
+            np.testing.assert_allclose(got, expected, rtol=1e-6, atol=1e-6 if expected.ndim > 1 else 1e-9)
+        q, v, forces = wanted
+        touched += forces[:, 2].max() > 1.0
+    assert touched > 20
+    exported.save(tmp_path)
+    run_c(tmp_path, "thrown")
+
+
+@pytest.mark.long
 def test_a_step_of_an_arm_behind_drives(tmp_path):
     """Drives of first and second order, their states as an argument and a result; steps that end at kinks are refused."""
     forces = jd.forces.FirstOrderDrive(0.01), jd.forces.SecondOrderDrive(80.0, 0.6)
