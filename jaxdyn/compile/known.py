@@ -113,5 +113,8 @@ def partition(tree, types: type | tuple[type, ...]) -> tuple[list, Known]:
 
 
 def as_constant(tree) -> Known:
-    """A tree of concrete leaves as one static argument of an entry point, which compiles its numbers in; called with (), the tree."""
+    """A tree of concrete leaves as one static argument of an entry point, which compiles its numbers in.
+
+    Called with () it is the tree.
+    """
     return partition(jax.tree.map(as_numpy_if_known, tree), ())[1]

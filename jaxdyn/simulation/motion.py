@@ -57,9 +57,9 @@ class _Run(NamedTuple):
 
 
 @entry_point
-def smooth_motion(scene: Scene | Known, control, method: Method, numbers, options) -> Solution:
+def smooth_motion(given_scene: Scene | Known, control, method: Method, numbers, options) -> Solution:
     """Run of `simulate`; `numbers`: q0, v0, ts, rtol, atol and the length of steps or a controller of them."""
-    scene = scene(()) if isinstance(scene, Known) else scene
+    scene: Scene = given_scene(()) if isinstance(given_scene, Known) else given_scene
     given, inputs = (scene, control, numbers), safe_inputs(scene.system, numbers)
     scene, inputs, faults = _project_start(scene, method, inputs, options["selects_rows"])
     run, y0 = _set_up(scene, control, method, inputs, options)
