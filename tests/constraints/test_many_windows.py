@@ -1,7 +1,7 @@
 """Rows of tens of windows, large programs, against the closed form of their one degree of freedom.
 
-While all uprights have the same angle q to the vertical, couplers translate. N windows of bars of mass m and length L then have the
-kinetic energy ((N + 1) / 3 + N) m L^2 q'^2 / 2 and the potential energy ((N + 1) / 2 + N) m g L cos q.
+While all uprights have the same angle q to the vertical, couplers translate. N windows of bars of mass m and length L then have
+the kinetic energy ((N + 1) / 3 + N) m L^2 q'^2 / 2 and the potential energy ((N + 1) / 2 + N) m g L cos q.
 """
 
 import jax
@@ -36,14 +36,14 @@ def test_acceleration(count):
 
 def test_gradient():
     """The derivative of accelerations by velocities and angles, against differences."""
-    scene, signs, q, v = windows(40, 0.7, 1.3)
+    scene, _, q, v = windows(40, 0.7, 1.3)
     weights = jnp.cos(jnp.arange(scene.nv))
 
     def value(q, v):
         return weights @ jd.constrained_dynamics(scene, q, v, weights).acceleration
 
     # Any direction: accelerations are defined off the constraints too.
-    run, step, along = jax.jit(value), 1e-6, jnp.sin(3.0 * jnp.arange(scene.nv))
+    run, step, along = jax.jit(value), 1e-6, jnp.asarray(np.sin(3.0 * np.arange(scene.nv)))
     for i, gradient in enumerate(jax.jit(jax.grad(value, (0, 1)))(q, v)):
         ends = [run(*(x + side * step * along * (i == k) for k, x in enumerate((q, v)))) for side in (1, -1)]
         # Central differences have errors of 1e-9 of the largest terms.
