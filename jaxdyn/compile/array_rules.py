@@ -92,7 +92,10 @@ def dot_general(expansion, params, args, eqn):
         count, columns, length
     )
     # The result may have a wider type than the operands (`preferred_element_type`); then the sums are in that type.
-    a, b = (x if y.aval.dtype == out.dtype else _as_dtype(expansion, x, out.dtype) for x, y in zip((a, b), eqn.invars, strict=True))
+    a, b = (
+        x if y.aval.dtype == out.dtype else _as_dtype(expansion, x, out.dtype)
+        for x, y in zip((a, b), eqn.invars, strict=True)
+    )
     if out.dtype == bool:
         raise NotNumbers("a product of bools")
     if a.dtype.kind != "O" and b.dtype.kind != "O":
@@ -167,7 +170,9 @@ def _cholesky_factor(graph: Graph, matrix: np.ndarray) -> np.ndarray:
     n = matrix.shape[0]
     lower = np.full((n, n), 0.0, object)
     # By rows and by columns what is not a known zero: of a large mechanism that is a small part.
-    below = [{i for i, x in enumerate(column) if i > j and _is_nonzero(x)} for j, column in enumerate(matrix.T.tolist())]
+    below = [
+        {i for i, x in enumerate(column) if i > j and _is_nonzero(x)} for j, column in enumerate(matrix.T.tolist())
+    ]
     rows: list[dict] = [{} for _ in range(n)]
     # Reciprocals of the diagonal are kept: n divisions, not n^2/2, and `_solve_triangle` finds the same numbers again.
     for j, row in enumerate(rows):
@@ -193,7 +198,9 @@ def _cholesky_factor(graph: Graph, matrix: np.ndarray) -> np.ndarray:
 def _solve_triangle(graph: Graph, a: np.ndarray, b: np.ndarray, lower: bool, unit: bool) -> np.ndarray:
     """x with a x = b, for a triangular matrix (n, n), whose diagonal is taken as ones if `unit`, and b (n, columns)."""
     n, matrix, solution = a.shape[0], a.tolist(), b.copy()
-    rows: list[dict] = [{} for _ in range(n)]  # of the solution, without known zeros: most of it for the branches of a tree
+    rows: list[dict] = [
+        {} for _ in range(n)
+    ]  # of the solution, without known zeros: most of it for the branches of a tree
     for i in range(n) if lower else reversed(range(n)):
         row = {j: x for j, x in enumerate(b[i].tolist()) if _is_nonzero(x)}
         for k in range(i) if lower else range(i + 1, n):

@@ -302,7 +302,9 @@ def symbol_of(called: Program, width: int) -> str:
 def subprogram_ir(called: Program, width: int, is_quick: bool = False) -> str:
     """The text of a subprogram, the function `called`."""
     e = Emitter(width)
-    body = body_of(e, called, lambda place, entry, kind: e.load_at(f"%a{place}", entry, kind), lambda place: f"%a{place}", is_quick)
+    body = body_of(
+        e, called, lambda place, entry, kind: e.load_at(f"%a{place}", entry, kind), lambda place: f"%a{place}", is_quick
+    )
     body.compute()
     for i, (row, array) in enumerate(zip(called.results, called.outputs, strict=True)):
         pointer = body.pointer_to(row, array)

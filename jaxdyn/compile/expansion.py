@@ -341,9 +341,9 @@ def _innermost(inner: ClosedJaxpr, args: Sequence, again, given: Sequence) -> tu
 
 
 def _known_entries(x: np.ndarray) -> bytes | tuple | None:
-    """The bytes of a known array; of another one its zeros and ones, with None in all other places, or None without any."""
+    """The type and bytes of a known array; of another one its zeros and ones, None in all other places, or None without any."""
     if x.dtype.kind != "O":
-        return x.tobytes()
+        return f"{x.dtype.str} ".encode() + x.tobytes()
     # Other known numbers are passed: a function that is called with several of them is compiled once.
     entries = tuple([None if type(y) is Number or y not in (0, 1, -1) else _signed(y) for y in x.ravel().tolist()])
     return entries if any(y is not None for y in entries) else None
@@ -382,7 +382,8 @@ def _subprogram(inner: ClosedJaxpr, known: tuple, most: int) -> tuple[Program, b
     expansion, inputs, args = _Expansion(graph, False, True), [], []
     for array, x in zip(arrays, known, strict=True):
         if isinstance(x, bytes):
-            args.append(np.frombuffer(x, array.dtype).reshape(array.shape))
+            kind, _, data = x.partition(b" ")
+            args.append(np.frombuffer(data, kind.decode()).reshape(array.shape))
             continue
         inputs.append(array if x is None else Array((x.count(None),), array.dtype))
         args.append(_join_entries(graph.inputs(len(inputs) - 1, inputs[-1]), x, array))

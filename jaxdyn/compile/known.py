@@ -184,5 +184,8 @@ def _is_fixed(known: Known) -> bool:
 
     return has_fixed_nodes(known.structure) and not any(isinstance(x, np.ndarray) for x in known.leaves.leaves)
 def as_constant(tree) -> Known:
-    """A tree of concrete leaves as one static argument of an entry point, which compiles its numbers in; called with (), the tree."""
+    """A tree of concrete leaves as one static argument of an entry point, which compiles its numbers in.
+
+    Called with () it is the tree.
+    """
     return partition(jax.tree.map(as_numpy_if_known, tree), ())[1]

@@ -8,7 +8,6 @@ of a piece of code, the place of the result, and those of the operands. Between 
 
 import itertools
 from collections.abc import Callable, Sequence
-from typing import Any
 
 import numpy as np
 
@@ -47,7 +46,8 @@ class Listing(Body):
         self.codes: dict[tuple, int] = {}  # numbers of pieces of code
         self.at: dict[int, int] = {}  # places of operations
         self.constants: dict[tuple, int] = {}
-        self.given = self.made = ()
+        self.parts_at: dict[tuple[int, int], int] = {}  # of calls, places of the entries of their outputs
+        self.made: list[int] = []  # places of the outputs
 
     # --- what a `Body` has ---
 
@@ -224,13 +224,9 @@ class Listing(Body):
 
     # --- calls ---
 
-    parts_at: dict[tuple[int, int], int] = {}
-
     def _call(self, i: int, is_branch: bool, which: Constant, *entries) -> None:
         e, called = self.e, self.program.subprograms[which.value]
         flag, *entries = entries if is_branch else (None, *entries)
-        if not self.parts_at:
-            self.parts_at = {}
         pointers, at, regions = [], 0, []
         for array in called.inputs:
             place = self._whole(entries[at : at + array.size], array)
@@ -267,7 +263,9 @@ class Listing(Body):
             e.lines += [f"  br i1 {e.any(text)}, label %{rare}, label %{after}", f"{rare}:"]
             self._write_call(called, text, pointers)
             for k, (place, kind) in chosen.items():
-                self._row(("select", kind, ("b1", kind, kind), False), place, [self._operand(flag, "b1"), place, places[k][0]])
+                self._row(
+                    ("select", kind, ("b1", kind, kind), False), place, [self._operand(flag, "b1"), place, places[k][0]]
+                )
             self._run()
             e.lines += [f"  br label %{after}", f"{after}:"]
             self.parts_at |= {(i, k): place for k, (place, _) in chosen.items()}

@@ -15,8 +15,8 @@ from typing import Any
 import jax
 import numpy as np
 
-from jaxdyn.compile.code import Body, body_of, wrap_kernel
 from jaxdyn.compile import memory
+from jaxdyn.compile.code import Body, body_of, wrap_kernel
 from jaxdyn.compile.llvm import Emitter
 from jaxdyn.compile.memory import bytes_of
 from jaxdyn.compile.program import Array, kind_of

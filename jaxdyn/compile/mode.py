@@ -18,8 +18,8 @@ from jaxdyn.compile import jax_adapter
 logger = logging.getLogger("jaxdyn")
 MODES = ("auto", "native", "plain")
 OPTIONS = ("", "usual", "least")
-# Operations of a program: so many, or so many for each entry of its arguments. Where the cost of a mechanism grows with its size it
-# is a program, however large it is (see `listing`). Matrices of hundreds of rows are none.
+# Operations of a program: so many, or so many for each entry of its arguments. A mechanism whose cost grows with its size is a
+# program, however large it is (see `listing`). Products of matrices of hundreds of rows are none.
 MAX_OPERATIONS, MAX_OPERATIONS_PER_ENTRY = 60_000, 500
 
 # None: the environment decides, which is read at each use, so that a test can set it.

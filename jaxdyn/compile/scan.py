@@ -22,7 +22,23 @@ import numpy as np
 from jaxdyn.compile import derive
 from jaxdyn.compile.graph import Graph
 from jaxdyn.compile.inlining import replay
-from jaxdyn.compile.program import Array, Constant, Operation, Program, as_objects, is_number, objects
+from jaxdyn.compile.program import Program, is_number
+from jaxdyn.compile.scan_parts import (
+    arrays_of,
+    depending_outputs,
+    entries_of,
+    index_of_flag,
+    is_chain,
+    parts_of_program,
+    program_of_parts,
+    rewrite,
+    rows_of_array,
+    split_by_counts,
+    tangent_of,
+    where_flag,
+    with_changes,
+    with_more_inputs,
+)
 
 # Operations beyond which a loop is not written out. LLVM takes some 50 microseconds for each: one second.
 MAX_WRITTEN_OUT = 20_000
@@ -67,19 +83,19 @@ class Scan:
         self.condition = condition
         self.derived: dict = {}
         given, made = self.split_inputs(body.inputs), self.split_outputs(body.outputs)
-        self.inputs = (*given[0], *given[1], *(_rows(x, length) for x in given[2]))
-        self.outputs = (*made[0], *made[1], *(_rows(x, length) for x in made[2]))
+        self.inputs = (*given[0], *given[1], *(rows_of_array(x, length) for x in given[2]))
+        self.outputs = (*made[0], *made[1], *(rows_of_array(x, length) for x in made[2]))
         ends = np.cumsum([0, *(x.size for x in self.outputs)]).tolist()
         self.results = tuple(tuple(range(a, b)) for a, b in itertools.pairwise(ends))
         self.cost = max(1, length * body.cost)
 
     def split_inputs(self, values: Sequence) -> tuple:
         """Constants, carries, rows and tables among the inputs of the body."""
-        return _split(values, self.counts[:4])
+        return split_by_counts(values, self.counts[:4])
 
     def split_outputs(self, values: Sequence) -> tuple:
         """Carries, terms of sums and rows among the outputs of the body."""
-        return _split(values, (self.counts.carries, self.counts.sums, self.counts.results))
+        return split_by_counts(values, (self.counts.carries, self.counts.sums, self.counts.results))
 
     def call(self, graph: Graph, arrays: Sequence[np.ndarray]) -> list[np.ndarray]:
         """The outputs of a call with these inputs, of which those are passed that the body reads."""
@@ -99,7 +115,7 @@ class Scan:
         ]
         if sum(map(len, kept)) == len(self.body.inputs):
             return self, list(range(len(self.inputs)))
-        body = _rewrite(self.body, [i for group in kept for i in group], range(len(self.body.outputs)))
+        body = rewrite(self.body, [i for group in kept for i in group], range(len(self.body.outputs)))
         counts = self.counts._replace(consts=len(kept[0]), rows=len(kept[2]), tables=len(kept[3]))
         tables = [self.tables[i - tables[0]] for i in kept[3]]
         return Scan(body, counts, self.length, tables, self.inward, self.parents), [
@@ -113,7 +129,7 @@ class Scan:
     def _with_outputs(self, needed: Sequence[bool]) -> "Scan":
         kept = [i for i, flag in enumerate(needed) if flag or i < self.counts.carries]
         _, sums, results = self.split_outputs(needed)
-        body = _rewrite(self.body, range(len(self.body.inputs)), kept)
+        body = rewrite(self.body, range(len(self.body.inputs)), kept)
         return self._like(body, self.counts._replace(sums=sum(sums), results=sum(results)))
 
     @property
@@ -134,10 +150,14 @@ class Scan:
     # --- on disk ---
 
     def __getstate__(self):
-        return vars(self) | {"derived": {}, "body": _parts(self.body), "condition": _parts(self.condition)}
+        return vars(self) | {
+            "derived": {},
+            "body": parts_of_program(self.body),
+            "condition": parts_of_program(self.condition),
+        }
 
     def __setstate__(self, state):
-        self.__dict__ |= state | {name: _program_of_parts(state[name]) for name in ("body", "condition")}
+        self.__dict__ |= state | {name: program_of_parts(state[name]) for name in ("body", "condition")}
 
     def describe(self) -> "Scan":
         """Itself, as what is kept of it on disk (see `stored`)."""
@@ -174,30 +194,32 @@ class Scan:
 
     def call_with_changes(self, graph: Graph, values: list, changes: list) -> tuple[list, list]:
         """Entries of the outputs and their changes, for entries of the inputs and their changes (0.0: none)."""
-        arrays, steps = _arrays(self.inputs, values), _arrays(self.inputs, changes)
+        arrays, steps = arrays_of(self.inputs, values), arrays_of(self.inputs, changes)
         moving = tuple(any(is_number(x) or x != 0 for x in step.flat) for step in steps)
         tangent, moves = self._derive_once(("tangent", moving), lambda: self._tangent(moving))
-        groups = zip(*(_split(x, self.counts[:3]) for x in (arrays, steps, moves[: len(arrays)])), strict=True)
-        made = iter(tangent.call(graph, [x for group in groups for x in _with_changes(*group)]))
+        groups = zip(*(split_by_counts(x, self.counts[:3]) for x in (arrays, steps, moves[: len(arrays)])), strict=True)
+        made = iter(tangent.call(graph, [x for group in groups for x in with_changes(*group)]))
         outs, out_steps = [], []
-        for flags in _split(moves[len(arrays) :], (self.counts.carries, self.counts.sums, self.counts.results)):
+        for flags in split_by_counts(
+            moves[len(arrays) :], (self.counts.carries, self.counts.sums, self.counts.results)
+        ):
             own = [next(made) for _ in flags]
             outs += own
             out_steps += [
                 next(made) if flag else np.zeros(x.shape, object) + 0.0 for x, flag in zip(own, flags, strict=True)
             ]
-        return _entries(outs), _entries(out_steps)
+        return entries_of(outs), entries_of(out_steps)
 
     def _tangent(self, moving: tuple[bool, ...]) -> tuple["Scan", tuple[bool, ...]]:
         """The scan of values and changes, and which of the inputs and then of the outputs change."""
         body, tables = self.body, self.split_inputs(self.body.inputs)[3]
-        m_consts, m_carries, m_rows = _split(moving, self.counts[:3])
-        change, moves = self._fixpoint(m_carries, lambda carries: _tangent_of(body, (*m_consts, *carries, *m_rows)))
+        m_consts, m_carries, m_rows = split_by_counts(moving, self.counts[:3])
+        change, moves = self._fixpoint(m_carries, lambda carries: tangent_of(body, (*m_consts, *carries, *m_rows)))
         m_carries, m_sums, m_results = self.split_outputs(moves)
         graph = Graph()
         types, values, steps = [], [], []
         for arrays, flags in zip(self.split_inputs(body.inputs), (m_consts, m_carries, m_rows), strict=False):
-            both = _with_changes(arrays, arrays, flags)
+            both = with_changes(arrays, arrays, flags)
             entries = [graph.inputs(len(types) + i, x) for i, x in enumerate(both)]
             types, values, steps = types + both, values + entries[: len(arrays)], steps + entries[len(arrays) :]
         values += [graph.inputs(len(types) + i, x) for i, x in enumerate(tables)]
@@ -205,15 +227,15 @@ class Scan:
         own = replay(graph, body, values)[1]
         changes = [next(moved) if x.dtype.kind == "f" else None for x in body.outputs]
         groups = [self.split_outputs(x) for x in (own, changes, body.outputs, moves)]
-        outs = [x for y, d, _, m in zip(*groups, strict=True) for x in _with_changes(y, d, m)]
-        outputs = [x for _, _, y, m in zip(*groups, strict=True) for x in _with_changes(y, y, m)]
+        outs = [x for y, d, _, m in zip(*groups, strict=True) for x in with_changes(y, d, m)]
+        outputs = [x for _, _, y, m in zip(*groups, strict=True) for x in with_changes(y, y, m)]
         program = graph.finish([*types, *tables], outputs, outs)
         sizes = [len(x) + sum(x) for x in (m_consts, m_carries, m_rows)]
         of_outputs = [len(x) + sum(x) for x in (m_sums, m_results)]
         counts = Counts(sizes[0], sizes[1], sizes[2], len(tables), of_outputs[0], of_outputs[1])
         scan = self._like(program, counts)
         if self.condition is not None:
-            scan.condition = _with_more_inputs(self.condition, types, (m_consts, m_carries))
+            scan.condition = with_more_inputs(self.condition, types, (m_consts, m_carries))
         return scan, (*m_consts, *m_carries, *m_rows, *m_carries, *m_sums, *m_results)
 
     def _fixpoint(self, carries: tuple[bool, ...], find) -> tuple[Any, tuple[bool, ...]]:
@@ -243,17 +265,17 @@ class Scan:
 
     def _split_linear(self, linear: tuple[bool, ...]) -> "Linear":
         body, tables = self.body, self.counts.tables
-        l_consts, l_carries, l_rows = _split(linear, self.counts[:3])
+        l_consts, l_carries, l_rows = split_by_counts(linear, self.counts[:3])
 
         def find(carries):
-            return None, _depends(body, (*l_consts, *carries, *l_rows, *[False] * tables))
+            return None, depending_outputs(body, (*l_consts, *carries, *l_rows, *[False] * tables))
 
         _, outputs = self._fixpoint(l_carries, find)
         l_carries, l_sums, l_results = self.split_outputs(outputs)
         consts, carries, rows, at_tables = self.split_inputs(range(len(body.inputs)))
-        own_carries = _only(carries, l_carries, False)
-        places = [*_only(consts, l_consts, False), *own_carries, *_only(rows, l_rows, False), *at_tables]
-        first = _rewrite(body, places, _index(outputs, False), own_carries)
+        own_carries = where_flag(carries, l_carries, False)
+        places = [*where_flag(consts, l_consts, False), *own_carries, *where_flag(rows, l_rows, False), *at_tables]
+        first = rewrite(body, places, index_of_flag(outputs, False), own_carries)
         counts = Counts(
             l_consts.count(False), len(own_carries), l_rows.count(False), tables, l_sums.count(False),
             l_results.count(False) + len(own_carries),
@@ -261,21 +283,21 @@ class Scan:
         fixed = self._like(first, counts)
         # The carries that the first scan has saved are rows of the second one.
         groups = (
-            [*_only(consts, l_consts, False), *_only(consts, l_consts)],
-            _only(carries, l_carries),
-            [*_only(rows, l_rows, False), *own_carries, *_only(rows, l_rows)],
+            [*where_flag(consts, l_consts, False), *where_flag(consts, l_consts)],
+            where_flag(carries, l_carries),
+            [*where_flag(rows, l_rows, False), *own_carries, *where_flag(rows, l_rows)],
             at_tables,
         )
         is_linear = [*l_consts, *l_carries, *l_rows, *[False] * tables]
         places = [i for group in groups for i in group]
         sizes = [len(x) for x in groups]
         counts = Counts(sizes[0], sizes[1], sizes[2], sizes[3], sum(l_sums), sum(l_results))
-        rest = self._like(_rewrite(body, places, _index(outputs, True)), counts)
+        rest = self._like(rewrite(body, places, index_of_flag(outputs, True)), counts)
         return Linear(fixed, rest, tuple(is_linear[i] for i in places), l_carries, outputs)
 
     def depending_entries(self, flags: list[bool]) -> list[bool]:
         """Flags of the entries of the outputs that depend on these entries of the inputs, decided by arrays."""
-        outputs = self.split_linear(tuple(bool(x.any()) for x in _arrays(self.inputs, flags))).outputs
+        outputs = self.split_linear(tuple(bool(x.any()) for x in arrays_of(self.inputs, flags))).outputs
         return [flag for flag, array in zip(outputs, self.outputs, strict=True) for _ in range(array.size)]
 
     def transpose(self, linear: tuple[bool, ...]) -> "Scan":
@@ -288,10 +310,12 @@ class Scan:
         c, s, y, t = self.counts.carries, self.counts.sums, self.counts.results, self.counts.tables
         fixed = l_consts.count(False), l_rows.count(False)
         # The inputs are fixed constants, fixed rows, tables, then cotangents of carries, sums, rows.
-        consts, rows, tables, of_carries, of_sums, of_rows = _split(range(len(backwards.inputs)), (*fixed, t, c, s, y))
-        to_consts, to_carries, to_rows = _split(range(len(backwards.outputs)), (sum(l_consts), c, sum(l_rows)))
+        consts, rows, tables, of_carries, of_sums, of_rows = split_by_counts(
+            range(len(backwards.inputs)), (*fixed, t, c, s, y)
+        )
+        to_consts, to_carries, to_rows = split_by_counts(range(len(backwards.outputs)), (sum(l_consts), c, sum(l_rows)))
         places = [*consts, *of_sums, *of_carries, *rows, *of_rows, *tables]
-        body = _rewrite(backwards, places, [*to_carries, *to_consts, *to_rows])
+        body = rewrite(backwards, places, [*to_carries, *to_consts, *to_rows])
         counts = Counts(fixed[0] + s, c, fixed[1] + y, t, len(to_consts), len(to_rows))
         return self._like(body, counts, not self.inward)
 
@@ -316,136 +340,36 @@ class TransposedCall:
     """
 
     def __init__(self, graph: Graph, scan: Scan, values: list):
-        arrays = _arrays(scan.inputs, values)
+        arrays = arrays_of(scan.inputs, values)
         self.graph, self.scan = graph, scan
         self.linear = tuple(any(x is None for x in array.flat) for array in arrays)
         self.parts = scan.split_linear(self.linear)
-        (l_consts, _, l_rows), (consts, carries, rows) = (_split(x, scan.counts[:3]) for x in (self.linear, arrays))
-        self.consts, rows = _only(consts, l_consts, False), _only(rows, l_rows, False)
-        made = self.parts.fixed.call(graph, [*self.consts, *_only(carries, self.parts.carries, False), *rows])
+        (l_consts, _, l_rows), (consts, carries, rows) = (
+            split_by_counts(x, scan.counts[:3]) for x in (self.linear, arrays)
+        )
+        self.consts, rows = where_flag(consts, l_consts, False), where_flag(rows, l_rows, False)
+        made = self.parts.fixed.call(graph, [*self.consts, *where_flag(carries, self.parts.carries, False), *rows])
         count = self.parts.carries.count(False)
         own, saved = iter(made[: len(made) - count]), made[len(made) - count :]
         self.rows = [*rows, *saved]
         self.values: list = []
         for flag, array in zip(self.parts.outputs, scan.outputs, strict=True):
-            self.values += [None] * array.size if flag else _entries([next(own)])
+            self.values += [None] * array.size if flag else entries_of([next(own)])
 
     def cotangents(self, given: list) -> list:
         """Cotangents of the entries of the inputs, 0.0 for those that are fixed, from those of the outputs."""
         scan, parts = self.scan, self.parts
         c, s, y = parts.rest.counts.carries, parts.rest.counts.sums, parts.rest.counts.results
-        carries, sums, rows = _split(_only(_arrays(scan.outputs, given), parts.outputs), (c, s, y))
+        carries, sums, rows = split_by_counts(where_flag(arrays_of(scan.outputs, given), parts.outputs), (c, s, y))
         backwards = parts.rest.transpose(parts.linear)
         made = backwards.call(self.graph, [*self.consts, *sums, *carries, *self.rows, *rows])
-        of_carries, of_consts, of_rows = map(iter, _split(made, (c, backwards.counts.sums, backwards.counts.results)))
-        l_consts, l_start, l_rows = _split(self.linear, scan.counts[:3])
+        of_carries, of_consts, of_rows = map(
+            iter, split_by_counts(made, (c, backwards.counts.sums, backwards.counts.results))
+        )
+        l_consts, l_start, l_rows = split_by_counts(self.linear, scan.counts[:3])
         by_carry = [next(of_carries) if flag else None for flag in parts.carries]
         found = [next(of_consts) if flag else None for flag in l_consts]
         found += [x if flag else None for x, flag in zip(by_carry, l_start, strict=True)]
         found += [next(of_rows) if flag else None for flag in l_rows]
         zeros = [np.zeros(x.shape, object) + 0.0 if y is None else y for x, y in zip(scan.inputs, found, strict=True)]
-        return _entries(zeros)
-
-
-# --- parts of programs ---
-
-
-def is_chain(parents) -> bool:
-    """Decide whether the parent of each node is the one before it."""
-    return all(parent == i - 1 for i, parent in enumerate(parents))
-
-
-def _rows(array: Array, length: int) -> Array:
-    return Array((length, *array.shape), array.dtype)
-
-
-def _split(values: Sequence, counts: Sequence[int]) -> tuple:
-    at, parts = 0, []
-    for count in counts:
-        parts.append(tuple(values[at : at + count]))
-        at += count
-    return tuple(parts)
-
-
-def _only(values: Sequence, flags: Sequence[bool], which: bool = True) -> list:
-    return [x for x, flag in zip(values, flags, strict=True) if flag == which]
-
-
-def _index(flags: Sequence[bool], which: bool) -> list[int]:
-    return [i for i, flag in enumerate(flags) if flag == which]
-
-
-def _with_changes(values: Sequence, changes: Sequence, flags: Sequence[bool]) -> list:
-    return [*values, *_only(changes, flags)]
-
-
-def _entries(arrays: Sequence[np.ndarray]) -> list:
-    return [x for array in arrays for x in array.ravel().tolist()]
-
-
-def _arrays(types: Sequence[Array], entries: list) -> list[np.ndarray]:
-    ends = np.cumsum([array.size for array in types]).tolist()
-    return [objects(entries[end - array.size : end], array.shape) for end, array in zip(ends, types, strict=True)]
-
-
-def _tangent_of(body: Program, moving: tuple[bool, ...]) -> tuple[Program, list[bool]]:
-    """The tangent of a program, and which of its outputs change."""
-    change = derive.tangent(body, (*moving, *[False] * (len(body.inputs) - len(moving))))
-    rows = iter(change.results)
-    found = [next(rows) if x.dtype.kind == "f" else () for x in body.outputs]
-    return change, [any(type(x) is not Constant or x.value != 0 for x in row) for row in found]
-
-
-def _parts(program: Program | None) -> tuple | None:
-    """Data of a program that a file keeps."""
-    if program is None:
-        return None
-    operations = [tuple(x) for x in program.operations]
-    return program.inputs, program.outputs, operations, program.results, program.subprograms
-
-
-def _program_of_parts(parts: tuple | None) -> Program | None:
-    if parts is None:
-        return None
-    inputs, outputs, operations, results, inner = parts
-    return Program(inputs, outputs, [Operation(*x) for x in operations], results, inner)
-
-
-def _with_more_inputs(program: Program, types: Sequence[Array], moves: Sequence[Sequence[bool]]) -> Program:
-    """A program of two groups of inputs as one of inputs of these `types`, where changes follow each group."""
-    graph, given, at = Graph(), [], 0
-    entries = [graph.inputs(i, x) for i, x in enumerate(types)]
-    for flags in moves:
-        given += entries[at : at + len(flags)]
-        at += len(flags) + sum(flags)
-    return graph.finish(types, program.outputs, replay(graph, program, given)[1])
-
-
-def _depends(body: Program, linear: Sequence[bool]) -> list[bool]:
-    """Flags of the outputs of a program that depend on the `linear` inputs."""
-    varies: list[Any] = []
-    for op, _, args in body.operations:
-        if op == "input":
-            varies.append(linear[args[0]])
-        elif op == "part" and type(varies[args[0]]) is list:
-            varies.append(varies[args[0]][args[1].value])
-        else:
-            found: Any = [type(x) is not Constant and varies[x] for x in args]
-            if op == "call" and any(found) and isinstance(called := body.subprograms[args[0].value], Scan):
-                varies.append(called.depending_entries(found[1:]))
-            else:
-                varies.append(any(found))
-    return [any(varies[x] for x in row if type(x) is not Constant) for row in body.results]
-
-
-def _rewrite(body: Program, places: Sequence[int], outputs: Sequence[int], more: Sequence[int] = ()) -> Program:
-    """The program of the inputs at `places`; its outputs are those at `outputs`, and `more` of its inputs."""
-    graph, entries = Graph(), [as_objects(np.zeros(x.shape, x.dtype)) for x in body.inputs]
-    # Inputs that are left out are read by no output that is kept.
-    for new, old in enumerate(places):
-        entries[old] = graph.inputs(new, body.inputs[old])
-    _, results = replay(graph, body, entries)
-    types = [*(body.outputs[i] for i in outputs), *(body.inputs[i] for i in more)]
-    return graph.finish(
-        [body.inputs[i] for i in places], types, [*(results[i] for i in outputs), *(entries[i] for i in more)]
-    )
+        return entries_of(zeros)

@@ -11,7 +11,7 @@ from jax import lax
 from jaxdyn.compile import mode
 from jaxdyn.compile.jax_adapter import ShapedArray, define_primitive, eval_jaxpr, function_of, is_zero
 from jaxdyn.compile.known import is_concrete
-from jaxdyn.compile.scan import is_chain
+from jaxdyn.compile.scan_parts import is_chain
 from jaxdyn.compile.scan_text import find_slots
 
 

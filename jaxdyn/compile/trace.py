@@ -40,7 +40,8 @@ def program_of(
     - `function(*static, tree, *args)`: pure, of one sample. `static` is hashable.
     - `tree`: pytree whose known leaves are compiled in; its traced leaves, and all of `args`, are operands.
     - `tangent(*static, tree, *args, steps)`: the function's derivative along `steps`, as of `kernel`.
-    - `most`: operations beyond which there is no program; by default those of `mode`. `calls`: whether long functions under `jax.jit` become subprograms.
+    - `most`: operations beyond which there is no program; by default as `mode` says.
+    - `calls`: whether long functions under `jax.jit` become subprograms.
     - `flags`: as of `expand`; with "repair" samples that are flagged are computed by the program of `fallback`, or of the
       function itself, which is traced when the first of them appears (see `careful`).
     """

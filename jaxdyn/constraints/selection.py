@@ -89,7 +89,7 @@ def unit_rows(scene: Scene, q, t) -> Float[Array, "nc nv"]:
     squares = jnp.sum(A * A, 1)
     largest = largest_of_each(scene, squares)
     squares = jnp.where(squares > _TINY_ROW**2 * largest, squares, largest)
-    # A constraint may have rows of zeros alone. By the reciprocal: in a kernel a product with a known zero is one, a quotient not.
+    # A constraint may have rows of zeros alone. By the reciprocal: products of known zeros are known, quotients are not.
     return A * (1.0 / jnp.sqrt(jnp.maximum(squares, float(jnp.finfo(A.dtype).tiny))))[:, None]
 
 

@@ -57,9 +57,9 @@ class _Run(NamedTuple):
         return self.method.to_qv(scene, self.method.correct(scene, y, t), t)
 
 
-def smooth_motion(scene: Any, control, method: Method, numbers, options) -> Solution:
+def smooth_motion(given_scene: Scene | Known, control, method: Method, numbers, options) -> Solution:
     """Run of `simulate`; `numbers`: q0, v0, ts, rtol, atol and the length of steps or a controller of them."""
-    scene = scene(()) if isinstance(scene, Known) else scene
+    scene: Scene = given_scene(()) if isinstance(given_scene, Known) else given_scene
     options = as_objects(options, numbers[-1])
     given, inputs = (scene, control, numbers), safe_inputs(scene.system, numbers)
     scene, inputs, faults = _project_start(scene, method, inputs, options["selects_rows"])

@@ -230,8 +230,8 @@ class Scene(eqx.Module):
         return command, jnp.concatenate(rates) if rates else None
 
 
-# Velocity coordinates from which on a scene with constraints is compiled with its numbers. Between 16 and 40 windows, with 33 and 81
-# of them, the program of given numbers, of six times the operations, exceeds what LLVM compiles in a few seconds.
+# Velocity coordinates from which on a scene with constraints is compiled with its numbers. The program of given numbers has six
+# times the operations: between 16 and 40 windows, with 33 and 81 coordinates, it takes longer to compile than a user waits.
 MIN_KNOWN_COORDINATES = 64
 
 

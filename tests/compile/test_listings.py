@@ -9,7 +9,7 @@ import pytest
 from jax import lax
 
 import jaxdyn as jd
-from jaxdyn.compile import kernel, listing, objects, rolled, target
+from jaxdyn.compile import listing, objects, rolled, target
 from jaxdyn.compile.code import calls_itself, kernel_ir, subprogram_ir, varying_first
 from jaxdyn.compile.derive import tangent, transpose
 from jaxdyn.compile.program import Program
@@ -46,7 +46,9 @@ def compute(of: Program, width: int, uniform, arrays, is_listed: bool) -> list[n
         return results
     rows = [*(arrays[i] for i in order), *results]
     data = (ctypes.c_void_p * len(rows))(*(x.ctypes.data for x in rows))
-    function = ctypes.CFUNCTYPE(None, ctypes.c_void_p, ctypes.c_int64, ctypes.c_int64, ctypes.c_int64)(code.address("kernel"))
+    function = ctypes.CFUNCTYPE(None, ctypes.c_void_p, ctypes.c_int64, ctypes.c_int64, ctypes.c_int64)(
+        code.address("kernel")
+    )
     function(ctypes.addressof(data), SAMPLES, 0, SAMPLES)
     return results
 
@@ -106,7 +108,9 @@ def test_calls_and_loops(monkeypatch):
     def function(A, x):
         y = long(A, x)
         z = long(A, jnp.flip(y) + 0.5)
-        (w, _), rows = lax.scan(lambda c, r: ((0.5 * c[0] + jnp.sin(r) * x, c[1] + r), c[0]), (z, 0.0), jnp.cumsum(jnp.tile(y, 3)))
+        (w, _), rows = lax.scan(
+            lambda c, r: ((0.5 * c[0] + jnp.sin(r) * x, c[1] + r), c[0]), (z, 0.0), jnp.cumsum(jnp.tile(y, 3))
+        )
         return w, rows, y
 
     made = program(function, jnp.zeros((5, 5)), jnp.zeros(5), calls=True)

@@ -26,7 +26,9 @@ def tree(kinds, nb=12, branching=1.6, **changes):
 def floating(kinds, nb=12, branching=1.6, armature=True, gravity=(0.3, -0.2, -9.81)):
     """A floating base with bodies on it."""
     rng, builder = np.random.default_rng(5), jd.ModelBuilder("floating", gravity=gravity)
-    builder.add_body("b000", None, "free", (2.0, (0.1, -0.2, 0.05), (0.3, 0.4, 0.5)), pose=((0.3, 0.1, -0.2), (0.4, -0.3, 0.2)))
+    builder.add_body(
+        "b000", None, "free", (2.0, (0.1, -0.2, 0.05), (0.3, 0.4, 0.5)), pose=((0.3, 0.1, -0.2), (0.4, -0.3, 0.2))
+    )
     for i in range(1, nb):
         parent, kind = f"b{max(0, int((i - 1) / branching)):03d}", kinds[i % len(kinds)]
         inertia = (1.0, tuple(0.1 * rng.normal(size=3)), tuple(0.1 + 0.05 * rng.uniform(size=3)))

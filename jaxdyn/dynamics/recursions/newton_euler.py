@@ -201,8 +201,8 @@ def ancestor_rows(links: Links, chains: list[Chain], i: int, columns) -> list:
 
 def place_rows(links: Links, pieces: dict, width: int, dtype):
     """Assemble rows (nv, width) from blocks at their joints, zero for all other joints."""
-    # Numpy zeros are known, so the sparsity of branches survives in the scalar program. Those that follow each other are one block:
-    # of a wide tree most are.
+    # Numpy zeros are known, so the sparsity of branches survives in the scalar program. Those of neighbours are one block: of a
+    # wide tree most are.
     rows, at, places = [], 0, links.model.topology.v_slices
     for i in sorted(pieces):
         rows += [np.zeros((places[i].start - at, width), dtype), pieces[i]]

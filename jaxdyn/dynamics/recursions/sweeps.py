@@ -1,8 +1,7 @@
 """The recursions for many bodies: the same steps for each body, as sweeps over the tree whose code does not grow with it.
 
-All joints have one degree of freedom, but that of a floating base, the root of all bodies, which is computed before or after the
-sweeps: its carry is where an outward sweep starts and an inward one ends. What joints have alike, such as a zero, is dropped when a
-sweep is compiled.
+All joints have one degree of freedom, except that of a floating base, the root of all bodies. It is computed apart: outward
+sweeps start with its carry, and inward ones end with it. What joints have alike, such as a zero, is dropped from the code.
 
 - Known geometry: canonical frames (see `frames`), with s = (0, 0, a, 0, 0, b): a is 0 for revolute joints, 1 for prismatic ones,
   the pitch for helical ones; b is 0 or 1.
@@ -62,6 +61,7 @@ class _Bodies:
 
     rows: Any
     base: Any = None
+    Row: Any
     scale: Any = None  # unit velocity = scale * v, (nv,), or None
 
     def __init__(self, model: Model):
@@ -74,11 +74,11 @@ class _Bodies:
 
     def split(self, rows: tuple) -> None:
         """Set rows of all bodies, armatures (nv,) the last of them."""
-        *rows, armature = rows
-        own = None if armature is None else armature[6 * self.first :]
-        self.rows = self.Row(*(None if x is None else x[self.first :] for x in rows), own)
+        *others, armature = rows
+        own, of_base = (None, None) if armature is None else (armature[6 * self.first :], armature[:6])
+        self.rows = self.Row(*(None if x is None else x[self.first :] for x in others), own)
         if self.first:
-            self.base = self.Row(*(None if x is None else x[0] for x in rows), None if own is None else armature[:6])
+            self.base = self.Row(*(None if x is None else x[0] for x in others), of_base)
 
     def home(self, row):
         """Home pose (4, 4) of the base."""
@@ -243,7 +243,9 @@ def _split(bodies: _Bodies, *values) -> list[tuple]:
 
 def _base_chain(bodies: _Bodies, q) -> Chain:
     """Pose of the floating base."""
-    return compose(bodies.home(bodies.base), Transform(part(q, 0, 3), GeneralRotation(quaternion_rotation(part(q, 3, 7)))))
+    return compose(
+        bodies.home(bodies.base), Transform(part(q, 0, 3), GeneralRotation(quaternion_rotation(part(q, 3, 7))))
+    )
 
 
 def _eliminate_base(bodies: _Bodies, A) -> tuple[list, list]:
@@ -290,7 +292,8 @@ def _wrenches(bodies: _Bodies, q, v, a) -> tuple[Any, Any, Any]:
         return motion, (wrench_of_acceleration(motion[2], motion[3], bodies.moments(row)), place)
 
     rows = bodies.rows, q, *(None if x is None else x.reshape(-1, 1) for x in (v, a))
-    return *sweep(step, bodies.parents, start, rows)[1], own
+    wrenches, places = sweep(step, bodies.parents, start, rows)[1]
+    return wrenches, places, own
 
 
 def rnea(model: Model, q, v, a) -> Float[Array, " nv"]:
@@ -340,10 +343,11 @@ def _factorize(bodies: _Bodies, places) -> _Factors:
         return inertia_to_parent(bodies.chain(row, place), rest), (gain, inverse)
 
     start = np.zeros((6, 6), bodies.dtype)
-    end, factors = sweep(step, bodies.parents, start, (bodies.rows, places), inward=True)
+    end, (gains, inverses) = sweep(step, bodies.parents, start, (bodies.rows, places), inward=True)
     if not bodies.first:
-        return _Factors(bodies, places, *factors)
-    return _Factors(bodies, places, *factors, _eliminate_base(bodies, end + spatial_inertia(bodies.moments(bodies.base))))
+        return _Factors(bodies, places, gains, inverses)
+    of_base = _eliminate_base(bodies, end + spatial_inertia(bodies.moments(bodies.base)))
+    return _Factors(bodies, places, gains, inverses, of_base)
 
 
 def _solve(factors: _Factors, force, wrenches=None, own=None) -> Float[Array, " nv"]:
@@ -368,7 +372,8 @@ def _solve(factors: _Factors, force, wrenches=None, own=None) -> Float[Array, " 
     end, left = sweep(inward, bodies.parents, zero, rows, inward=True)
     start = zero
     if of_base is not None:
-        start = _accelerate_base(*of_base, base_force, end if own is None else end + own)
+        gains_of_base, inverses_of_base = of_base
+        start = _accelerate_base(gains_of_base, inverses_of_base, base_force, end if own is None else end + own)
     a = sweep(outward, bodies.parents, start, (bodies.rows, places, gains, inverses, left))[1]
     return _to_model_units(bodies, a if of_base is None else join([start, a], 0))
 
