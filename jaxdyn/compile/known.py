@@ -183,6 +183,8 @@ def _is_fixed(known: Known) -> bool:
         return is_fixed and all(map(has_fixed_nodes, structure.children()))
 
     return has_fixed_nodes(known.structure) and not any(isinstance(x, np.ndarray) for x in known.leaves.leaves)
+
+
 def as_constant(tree) -> Known:
     """A tree of concrete leaves as one static argument of an entry point, which compiles its numbers in.
 
