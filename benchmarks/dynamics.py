@@ -183,6 +183,12 @@ def reference(row):
     return max((key for key in row["times"] if key.startswith("pin")), key=lambda key: (key[-1].isdigit(), key))
 
 
+def called_by(peer):
+    """How Pinocchio is called: in threads of its own, or sample by sample from Python."""
+    number = peer.removeprefix("pin ")
+    return "Python's loop" if number == "loop" else f"{number} thread{'s' * (number != '1')}"
+
+
 def line(row):
     """One row of the table."""
     base = row["times"][reference(row)]
@@ -192,7 +198,7 @@ def line(row):
         ratios = entry and [entry[key] / base[key] for key in ("best_us", "median_us")]
         cells.append("" if entry is None else f"{entry['best_us']:.3g} ({entry['median_us']:.3g})")
         cells.append("" if entry is None else f"{ratios[0]:.2f} ({ratios[1]:.2f})")
-    cells += [f"{base['best_us']:.3g} ({base['median_us']:.3g})", reference(row)]
+    cells += [f"{base['best_us']:.3g} ({base['median_us']:.3g})", called_by(reference(row))]
     for peer in ("frax", "MJX"):
         entry = row["times"].get(peer)
         cells.append("" if entry is None else f"{entry['best_us']:.3g} ({entry['median_us']:.3g})")
@@ -201,8 +207,8 @@ def line(row):
 
 
 HEAD = (
-    "| robot | function | batch | dtype | jaxdyn us | ratio | model given us | ratio | Pinocchio us | as | frax us | MJX us | "
-    "trace + compile s |\n|---|---|---|---|---|---|---|---|---|---|---|---|---|"
+    "| robot | function | batch | dtype | known model, us | ratio | model as argument, us | ratio | Pinocchio us | by | "
+    "frax us | MJX us | trace + compile s |\n|---|---|---|---|---|---|---|---|---|---|---|---|---|"
 )
 KINEMATICS = ("frame pose", "body Jacobian", "centre of mass", "potential energy")
 

@@ -39,9 +39,10 @@ def links(text: str) -> list[str]:
 
 
 def anchors(text: str) -> set[str]:
-    """What a link may name behind # on a page: its headings, as GitHub and the site make anchors of them."""
+    """What a link may name behind # on a page: its headings, as GitHub and the site make anchors of them, and its names."""
+    names = set(re.findall(r"^::: (\S+)$", text, flags=re.MULTILINE))
     text = re.sub(r"```.*?```", "", text, flags=re.DOTALL)
-    matches: set[str] = set(re.findall(r"<a (?:id|name)=\"([^\"]+)\"", text))
+    matches: set[str] = names | set(re.findall(r"<a (?:id|name)=\"([^\"]+)\"", text))
     for heading in re.findall(r"^#+ (.*)$", text, flags=re.MULTILINE):
         plain = re.sub(r"\[([^]]*)\]\([^)]*\)|[`*]", r"\1", heading).strip().lower()
         matches.add(re.sub(r" ", "-", re.sub(r"[^\w\- ]", "", plain)))

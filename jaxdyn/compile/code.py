@@ -295,7 +295,7 @@ def calls_itself(program: Program, width: int) -> bool:
 
 def varying_first(uniform: Sequence[bool]) -> list[int]:
     """The order in which a kernel takes the arguments of its program."""
-    # XLA partitions a call as its first argument is partitioned, which so is one of the batch.
+    # XLA partitions a call as its first argument is partitioned: it is one of the batch.
     return sorted(range(len(uniform)), key=lambda i: uniform[i])
 
 

@@ -37,7 +37,7 @@ from jaxdyn.compile.scan import Scan
 
 # Operations of a program that calls loops.
 MAX_BESIDE_LOOPS = 40_000
-# A function of fewer operations is scatter_places where it is called.
+# A function of fewer operations is written out where it is called.
 MIN_SUBPROGRAM_OPERATIONS = 300
 
 

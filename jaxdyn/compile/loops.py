@@ -170,7 +170,7 @@ def _run_natively(task: Task, tree, constants, given: Given, carry: Carry) -> Ca
     leaves = leaves[: len(leaves) - len(read)]
     after = jax.tree.leaves(carry)[len(jax.tree.leaves(carry.state)) :]
     flat = vary_alike([x.reshape(-1) for x in (*leaves, *jax.tree.leaves(given), *after)])
-    # The loop takes the place of a program in the primitive, which so batches it. It has no derivative.
+    # The loop takes the place of a program in the primitive, by whose rule it is batched. It has no derivative.
     results = kernel_p.bind(*flat, program=loop, rows=0)
     return _Form.of(carry)(results)
 
@@ -194,7 +194,7 @@ class _Form(NamedTuple):
 class Loop:
     """A loop as a kernel; stands in the place of a `Program`.
 
-    Its inputs are those of a turn but for what is read, then the times and the tables, and what of the carry comes after the
+    Its inputs are those of a turn without the rows that it reads, the times, the tables, and the parts of the carry after the
     state; its results are the carry.
     """
 

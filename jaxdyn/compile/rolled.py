@@ -182,8 +182,9 @@ def roll(
     made = [objects([outs[i].ravel()[k] for k in distinct[i][0]], (len(distinct[i][0]),)) for i in kept]
     outputs = [*classes.types, *(Array(x.shape, np.dtype(of_results[i])) for i, x in zip(kept, made, strict=True))]
     program = inner.finish(types, outputs, [*carried, *made])
-    # A loop of long iterations would compile for as long as what is written out, which then is refused as too long.
-    if program.cost * length <= most or (most and len(program.operations) > MAX_LOOP_BODY):
+    # A call counts as one operation: its code exists once. A loop of long iterations would compile for as long as what is written
+    # out, which then is refused as too long.
+    if len(program.operations) * length <= most or (most and len(program.operations) > MAX_LOOP_BODY):
         return None
     tables = [np.stack([np.array(y, x.dtype) for y in x.known], 1) for x in rows if x.known]
     counts = Counts(len(own_consts), len(carried), len(own_rows), len(tables), 0, len(kept))

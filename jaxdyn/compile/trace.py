@@ -56,7 +56,7 @@ def program_of(
 def trace_program(function, static, known: Known, count, structure, shapes, tangent=None, most=mode.MAX_OPERATIONS,
                   calls=False, flags="refuse", fallback=None):  # fmt: skip
     """The program and the structure of its results, or the reason why there is none; `count`: traced leaves of the tree."""
-    # A trace depends on these settings too, which so are a part of the key under which the program is kept.
+    # A trace depends on these settings too: they are a part of the key under which the program is kept.
     context = jax.config.read("jax_enable_x64"), mode.state_of_programs()
     how = tangent, most, calls, flags, fallback
     return _trace_program(function, static, known, count, structure, shapes, *how, context)

@@ -123,7 +123,7 @@ def ilqr(
       full one does.
     - `regularization`: mu of the first iteration.
     - `second_order`: whether to keep the second derivatives of the step (DDP): fewer iterations near the solution, each of
-      them dearer.
+      which takes longer.
 
     **Returns:** `OptimalControl`.
 

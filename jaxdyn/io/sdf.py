@@ -87,7 +87,7 @@ def load_sdf(
     # A gearbox couples two other joints; as an edge of the graph it would close a loop that does not exist.
     moving = [joint for joint in joints if joint.kind != "gearbox"]
     static = [name for name, (_, scope) in file.links.items() if scope.static]
-    # The format floats a model by its canonical link, which so becomes the root of its part.
+    # A model that is not fixed moves by its canonical link, which becomes the root of its part.
     first = [link for model in file.models.values() if (link := file.canonical_link(model)) is not None]
     edges, cut = spanning_tree(file.links, static, moving, first)
     model, roots = _model(file, edges, set(static), floating_base, dtype)

@@ -274,8 +274,8 @@ def about_com(parameters: np.ndarray) -> tuple[float, np.ndarray, np.ndarray]:
 
 
 def spatial_inertia(parameters: np.ndarray) -> np.ndarray:
-    # Asymmetric first moments make the two off-diagonal blocks negatives of each other.
     """Spatial inertia (6, 6), linear part first."""
+    # The matrix of the first moments is skew, so that the two other blocks are negatives of each other.
     first = hat(parameters[1:4])
     return np.block([[parameters[0] * np.eye(3), -first], [first, rotational_inertia(parameters)]])
 

@@ -89,9 +89,9 @@ class Findings(NamedTuple):
         return self.fit.parameters if isinstance(self.fit, LeastSquares) else self.fit.vector
 
     @property
-    # Order of the parameter vector: ten per body, then nv of each term.
     def friction(self) -> dict[str, np.ndarray]:
         """Terms of friction and rotors, (nv,) each."""
+        # Order of the parameter vector: ten for each body, then nv of each term.
         blocks = self.parameters[10 * self.model.nb :].reshape(len(TERMS), self.model.nv)
         return dict(zip(TERMS, blocks, strict=True))
 

@@ -40,9 +40,9 @@ class TargetPlugin(WorkerPlugin):
         self._start = asyncio.create_task(self._enable(worker))
 
     async def _enable(self, worker: Worker) -> None:
-        # Tasks come when the object is open, which takes seconds of compilation. A worker that replaces a dead one would else be
-        # given the last tasks, and hold up a run that the others could have finished. So each object has a resource of its own:
-        # that of all tasks is there from the first object on, or from the start.
+        # Tasks come when the object is open, which takes seconds of compilation. Without this, a worker that replaces a dead one
+        # would be given the last tasks, and hold up a run that the others could have finished. So each object has a resource of
+        # its own: that of all tasks is there from the first object on, or from the start.
         with contextlib.suppress(Exception):  # the first task raises it again, for the client
             await asyncio.get_running_loop().run_in_executor(worker.executors["default"], self._open)
         await worker.set_resources(**{RESOURCE: 1} | worker.state.total_resources | {self.name: 1})

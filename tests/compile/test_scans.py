@@ -182,6 +182,23 @@ def test_code_does_not_grow_with_the_iterations():
     assert few.cost * 2 == many.cost
 
 
+def test_a_loop_over_calls_is_written_out():
+    """Stages of a Runge-Kutta method: a loop would not see the zeros of their sums, and a call is code of its own."""
+
+    @jax.jit
+    def long(x):
+        for _ in range(800):
+            x = jnp.exp(x) * x
+        return x
+
+    def function(_, x):
+        return lax.scan(lambda c, weight: (long(c) * weight, None), x, jnp.linspace(1.0, 2.0, 14))[0]
+
+    _, (program, _) = program_of(function, (), (), (jnp.ones(()),), calls=True)
+    assert program.cost > rolled.MAX_WRITTEN_OUT > len(program.operations)
+    assert not any(isinstance(x, Scan) for x in program.subprograms)
+
+
 def test_other_devices_compute_the_same(monkeypatch):
     monkeypatch.setattr(rolled, "MAX_WRITTEN_OUT", 0)
     args = inputs()

@@ -244,14 +244,36 @@ def test_recipe_geometry():
     np.testing.assert_allclose(recipe("Optimising a geometry")["lengths"], [0.32, 0.95, 0.75], rtol=1e-9)
 
 
+def test_recipe_sweep():
+    """A crank that turns once returns to its place; so do the other joints, but for whole turns."""
+    names = recipe("Sweeping a linkage")
+    sweep, turns = names["sweep"], (names["sweep"].q[-1] - names["sweep"].q[0]) / (2 * np.pi)
+    assert sweep.success.all() and not names["jumps"].any()
+    np.testing.assert_allclose(turns, np.round(turns), atol=1e-12)
+    assert np.abs(np.diff(names["path"], axis=0)).max() < 0.2 * np.ptp(names["path"])
+
+
 @pytest.mark.slow
 def test_recipe_workspace():
     """The places within two lengths of all bases; the margin is zero where the first two arms are in one line."""
-    names = recipe("Workspace and singular positions of a parallel robot")
+    names = recipe("Workspace and singular configurations of a parallel robot")
     bases = np.array([(0.0, 1.2), (-1.04, -0.6), (1.04, -0.6)])
     distance = np.linalg.norm(np.asarray(names["grid"])[:, None] - bases, axis=2)
     assert np.mean(np.asarray(names["inside"]) == (distance < 2).all(1)) > 0.9
     assert np.isfinite(names["margin"]).all()
+
+
+def has_published_eigenvalues(names):
+    """At 5 m/s, by Meijaard, Papadopoulos, Ruina & Schwab (2007), table 2; the other six are zero."""
+    wanted = [-14.07838969279822, -0.77534188219585, -0.77534188219585, -0.32286642900409]
+    parts = np.sort(np.asarray(names["eigenvalues"][50].real))
+    return np.allclose(parts[:4], wanted, rtol=1e-11) and np.abs(parts[4:]).max() < 1e-7
+
+
+def agrees_with_simulate(names):
+    q, v, ts = (names[x] for x in ("q", "v", "ts"))
+    ours = jd.simulate(names["hand"], q, v, ts, control=names["law"], rtol=1e-9, atol=1e-9)
+    return np.abs(ours.q - names["configurations"]).max() < 1e-6
 
 
 @pytest.mark.slow
@@ -267,7 +289,9 @@ def test_examples(page, tmp_path, monkeypatch):
     names = run(f"docs/examples/{page}.md", least=1)
     assert (tmp_path / f"{page}.png").stat().st_size > 10_000
     checks = {
+        "bicycle": has_published_eigenvalues,
         "delta": lambda n: bool(n["path"].success.all()) and np.abs(n["tau"]).max() < 20,
+        "diffeqsolve": lambda n: np.abs(n["torques"] - np.array([0.3, 0.8])).max() < 1e-3 and agrees_with_simulate(n),
         "payload": lambda n: np.abs(n["found"] - n["payload"]).max() < 0.02,
         "policy_gradient": lambda n: n["losses"][-1] < 0.7 * n["losses"][0],
         "predictive_control": lambda n: abs(np.cos(n["states"][-1][1]) + 1) < 0.02,
