@@ -45,7 +45,6 @@ ELSEWHERE = {
     "identify.Delays": "test_delays",
     "identify.RobotFit": "test_identify_robot",
     "identify.choose_poses": "test_geometry",
-    "identify.fit_geometry": "test_geometry",
     "identify.fit_payload": "test_identify_robot",
     "identify.fit_robot": "test_identify_robot",
     "plot.work_precision": "test_plots_and_tables",
