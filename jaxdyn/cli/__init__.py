@@ -1,4 +1,4 @@
-"""Command line: `jaxdyn info`, `simulate`, `sweep`, `excite`, `identify`, `report` and `export`."""
+"""Command line: `jaxdyn info`, `simulate`, `sweep`, `excite`, `identify`, `calibrate`, `report` and `export`."""
 
 import argparse
 import shlex
@@ -9,16 +9,17 @@ from typing import NoReturn
 import jax
 
 from jaxdyn import __version__
-from jaxdyn.cli import excite, export, identify, info, report, simulate, sweep
+from jaxdyn.cli import calibrate, excite, export, identify, info, report, simulate, sweep
 from jaxdyn.cli.common import help_format
 
-COMMANDS = (info, simulate, sweep, excite, identify, report, export)
+COMMANDS = (info, simulate, sweep, excite, identify, calibrate, report, export)
 _EPILOG = """\
 examples:
   jaxdyn info panda.urdf
   jaxdyn simulate panda.urdf --duration 2 --torque gravity --out motion.csv
   jaxdyn sweep study.toml
   jaxdyn identify --urdf panda.urdf --log log.csv --out fitted.urdf
+  jaxdyn calibrate arm.urdf --frame flange --poses poses.csv --out calibrated.urdf
   jaxdyn report four_bar --out report
   jaxdyn export panda.urdf --function forward_dynamics --jacobian --out panda_fd
 
@@ -51,7 +52,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     parser = _Parser(
         prog="jaxdyn",
         description="Rigid-body dynamics of robots: inspect a file, simulate it, run studies of many rollouts, identify "
-        "inertias from logs, report error against run time, and export functions to C.",
+        "inertias from logs, calibrate their geometry, report error against run time, and export functions to C.",
         epilog=_EPILOG,
         formatter_class=help_format,
         fromfile_prefix_chars="@",

@@ -11,7 +11,8 @@ from jaxdyn.model.columns import columns_of
 from jaxdyn.model.tree import Model
 from jaxdyn.reports.identification import Findings, model_joint, total_percent
 
-_BASE_ROWS = 200
+# Rows of base parameters on the screen, so that the output of an arm stays below sixty lines.
+_BASE_ROWS = 16
 
 
 def error_table(findings: Findings) -> str:
@@ -46,6 +47,7 @@ def tables(findings: Findings) -> str:
     if isinstance(result, RobotFit):
         parts += [_choice_text(findings.choice or result.choice, model)]
         parts += [] if result.delays is None else [delays_text(result.delays, columns_of(model).v)]
+        parts += _widening_text(result, columns_of(model).v)
         parts += [_robot_base_table(result, model)]
     parts.append(_mass_table(findings))
     return "\n".join(parts)
@@ -111,6 +113,13 @@ def _choice_text(choice: Choice, model: Model) -> str:
     )
 
 
+def _widening_text(result: RobotFit, labels) -> list[str]:
+    """Line on joints whose errors show that the model lacks something; none where there is no such joint."""
+    cells = [f"{label} {x:.2g}" for label, x in zip(labels, result.intervals.widening, strict=True) if x > 1]
+    line = f"The model lacks something that recurs in the errors; intervals are wider by the factors {', '.join(cells)}"
+    return [line] if cells else []
+
+
 def delays_text(delays: Delays, labels) -> str:
     """Delays of the torques, in ms, with half-widths of the 95 % intervals of fitted ones."""
     half = 1e3 * delays.factor * delays.std
@@ -132,8 +141,12 @@ def _robot_base_table(result: RobotFit, model: Model) -> str:
         for name, x0, x, s, source in zip(base.names, start, base.values, base.std, base.sources, strict=True)
     ]
     text = "Base parameters: URDF, fitted, half-width of the 95 % interval, and source"
-    # Large robots have hundreds of combinations; the report holds all of them.
-    return text + "\n" + table(["combination", "URDF", "fitted", "+-", "from"], rows[:_BASE_ROWS])
+    if len(rows) > _BASE_ROWS:
+        # The least certain ones, in their order; those at a bound have no interval.
+        share = np.nan_to_num(base.std / np.maximum(np.abs(base.values), 1e-300), nan=0.0, posinf=1e300)
+        rows = [rows[i] for i in sorted(np.argsort(-share, kind="stable")[:_BASE_ROWS])]
+        text += f"; the {_BASE_ROWS} of {len(base.names)} with the widest interval for their size, all in the report"
+    return text + "\n" + table(["combination", "URDF", "fitted", "+-", "from"], rows)
 
 
 def _mass_table(findings: Findings) -> str:

@@ -5,6 +5,9 @@ from typing import Any
 from jaxdyn.identify.condensed_fit import Intervals as Intervals
 from jaxdyn.identify.delays import Delays as Delays
 from jaxdyn.identify.delays import shift_torques as shift_torques
+from jaxdyn.identify.geometry import GeometryFit as GeometryFit
+from jaxdyn.identify.geometry import choose_poses as choose_poses
+from jaxdyn.identify.geometry import fit_geometry as fit_geometry
 from jaxdyn.identify.linear_fit import Identifiability as Identifiability
 from jaxdyn.identify.linear_fit import LeastSquares as LeastSquares
 from jaxdyn.identify.linear_fit import identifiability as identifiability
@@ -63,6 +66,7 @@ __all__ = [
     "Execution",
     "Fit",
     "Friction",
+    "GeometryFit",
     "Identifiability",
     "Intervals",
     "LeastSquares",
@@ -80,9 +84,11 @@ __all__ = [
     "Whiteness",
     "base_parameters",
     "choose_cutoff",
+    "choose_poses",
     "complete_log",
     "exciting_motion",
     "fit_gains",
+    "fit_geometry",
     "fit_parameters",
     "fit_payload",
     "fit_robot",

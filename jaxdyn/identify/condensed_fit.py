@@ -256,6 +256,7 @@ class Intervals(NamedTuple):
       zero have no standard deviation (NaN).
     - `base`: the identifiable combinations of inertias and terms, and `combinations`, their definition.
     - `factor`: a 95 % interval is the value plus and minus this many standard deviations (Student's t, blocks - 1).
+    - `widening` (nv,): factor of the scatter of each torque's errors, above 1 where these show that the model is wrong.
     """
 
     parameters: Spread
@@ -263,6 +264,7 @@ class Intervals(NamedTuple):
     combinations: BaseParameters
     base_covariance: np.ndarray
     factor: float
+    widening: np.ndarray
 
 
 def intervals(
@@ -273,6 +275,7 @@ def intervals(
     weights: np.ndarray,
     terms,
     size: float,
+    widening: np.ndarray,
     curved: Data | None = None,
     still: Sequence[int] = (),
 ) -> Intervals:
@@ -282,7 +285,8 @@ def intervals(
     D_b + P: leaving b out moves the fit by (H - D_b)^-1 g_b. Their covariance times (B - 1) is the data's share, and
     max(prior, 1) H^-1 P H^-1 the prior's. All in the coordinates of the chart, then carried over to x.
 
-    `size`: effective sample size of the errors, which determines the length of the groups left out. `curved`: logs
+    `size`: effective sample size of the errors, which determines the length of the groups left out. `widening` (nv,): as of
+    `Intervals`. `curved`: logs
     whose curvature counts, where the loss is not made of squares: Huber's has none beyond its threshold, though it has a gradient
     there. `still`: indices of the torques whose joints hardly moved.
 
@@ -293,7 +297,8 @@ def intervals(
     jacobian, curvature, free = _local(data, setting, estimate)
     blocks, sigma = data.blocks, estimate.sigma
     # In the chart's coordinates, in which the prior's curvature is known and bounds are inactive or eliminated.
-    gradients = blocks.scores(estimate.x, weights) @ jacobian / sigma**2
+    # A score is quadratic in the weights: their roots make the scatter of a torque's errors larger by the factor itself.
+    gradients = blocks.scores(estimate.x, weights * np.sqrt(widening)) @ jacobian / sigma**2
     grams_of_curvature = (data if curved is None else curved).blocks.grams(weights)
     grams = np.einsum("pi,bpq,qj->bij", jacobian, grams_of_curvature, jacobian, optimize=True) / sigma**2
     # The prior is in every replicate: it is no observation that could be left out.
@@ -336,7 +341,7 @@ def intervals(
     is_confounded = share_of_extra(combine, covariance, extra) > _FROM_EXTRA
     marks = np.where(is_still[columns[base.independent]], STILL, np.where(is_confounded, CONFOUNDED, ""))
     spread = _make_spread(base.names, base.values(estimate.x[columns]), a, b, known, marks)
-    return Intervals(parameters, spread, base, a @ a.T + b @ b.T, factor)
+    return Intervals(parameters, spread, base, a @ a.T + b @ b.T, factor, widening)
 
 
 def share_of_extra(rows: np.ndarray, covariance: np.ndarray, extra: np.ndarray) -> np.ndarray:

@@ -14,7 +14,7 @@ from jaxdyn.identify.condensed_fit import Estimate, Intervals, Setting
 from jaxdyn.identify.logs import Log
 from jaxdyn.identify.result import Fit
 from jaxdyn.identify.robot_problem import RobotProblem
-from jaxdyn.identify.selection import folds, improving_torques
+from jaxdyn.identify.selection import improving_torques, splits
 from jaxdyn.identify.torque_terms import TorqueTerm
 from jaxdyn.model.arguments import Numbers
 from jaxdyn.model.tree import Model
@@ -115,7 +115,7 @@ def find_delays(
         problem = RobotProblem(model, _shift_logs(logs, shift), basic, used, inertia, blocks)
         # A new problem has weights of ones and no loads: folds of shifted logs are compared with weights of their own.
         problem.refine(setting, fixed, rounds=2)
-        parts, _ = folds(problem.data(setting).blocks)
+        parts, _ = splits(problem.data(setting).blocks)
         squares.append(np.array([problem.validation_squares(setting, part).sum(axis=0) for part in parts]))
     kept = np.isin(every, improving_torques(squares[0], squares[1], least=0.0))
     return Delays(np.where(kept, delay, 0.0), std, spread.factor, (squares[0], squares[1]))

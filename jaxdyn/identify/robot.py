@@ -13,7 +13,7 @@ from jaxdyn.identify.logs import Log, as_logs
 from jaxdyn.identify.regression import check_weights
 from jaxdyn.identify.result import Fit
 from jaxdyn.identify.robot_problem import RobotProblem, cross_validation
-from jaxdyn.identify.selection import PRIORS, ROBUST, VELOCITIES, Choice, Search, folds, search
+from jaxdyn.identify.selection import PRIORS, ROBUST, VELOCITIES, Choice, Search, search, splits
 from jaxdyn.identify.threads import on_one_thread
 from jaxdyn.identify.torque_terms import EXTRA, TERMS, RobotTerms, Terms, check_terms, split_terms
 from jaxdyn.model.arguments import Checked, Numbers, warn
@@ -137,7 +137,7 @@ def fit_robot(
     problem.refine(setting, fixed, rounds=2)
     trials, by = (), "given"
     if any(isinstance(value, str) and value == "auto" for value in (terms, v_s, prior, robust)):
-        parts, by = folds(problem.data(setting).blocks)
+        parts, by = splits(problem.data(setting).blocks)
         with open_engine(client) as engine:
             trying = Search(cross_validation(problem, engine), parts, problem.torque, callback)
             setting = search(
@@ -145,7 +145,7 @@ def fit_robot(
                 setting,
                 [term.name for term in extra] if isinstance(terms, str) and terms == "auto" else [],
                 problem.torques_not_white,
-                problem.has_outliers,
+                problem.loss_squares,
                 velocities=VELOCITIES if isinstance(v_s, str) else (setting.v_s,),
                 priors=PRIORS if isinstance(prior, str) else (setting.prior,),
                 losses=ROBUST if isinstance(robust, str) else (setting.robust,),

@@ -24,13 +24,15 @@ from jaxdyn.identify.regression import log_regressor
 from jaxdyn.identify.result import Fit
 from jaxdyn.identify.threads import on_one_thread
 from jaxdyn.identify.torque_terms import TERMS, ExtraTorque, Friction, TorqueTerm
-from jaxdyn.identify.uncertainty import effective_sample_size, is_white
+from jaxdyn.identify.uncertainty import effective_sample_size, is_white, model_error_factors
 from jaxdyn.model.tree import Model
 from jaxdyn.tasks import Engine, results
 
 # Share of errors beyond three standard deviations from which on their tails are heavy: 0.3 % of normal ones are, and of those of
 # two recorded robots 5 to 15 % at some joint. Between, unresolved reversals of simulated friction make up to 4 %.
 _TAIL = 0.04
+# Fits of a half of the logs by a robust loss, each with weights of samples from the one before.
+_WEIGHINGS = 3
 
 
 class RobotProblem:
@@ -77,6 +79,37 @@ class RobotProblem:
         # All losses are scored by plain squares; weighted ones would favour the loss that ignores most samples.
         return self.data(setting._replace(robust=None)).blocks.squares(estimate.x, part)
 
+    def loss_squares(self, setting: Setting, settings: Sequence[Setting]) -> list[np.ndarray] | None:
+        """Squared errors (blocks, nv) of either half of the logs, of fits of the other half, for losses of their own.
+
+        None where the errors of a setting have no heavy tails, and a robust loss is of no use. Weights of samples follow from the
+        fitted half alone: from a fit to all samples they would pull it towards the half that is left out.
+        """
+        if not self.has_outliers(setting):
+            return None
+        halves = np.array_split(np.arange(len(self.data(setting).blocks)), 2)
+        return [np.concatenate([self._half_squares(one, *pair) for pair in (halves, halves[::-1])]) for one in settings]
+
+    def _half_squares(self, setting: Setting, part: np.ndarray, rest: np.ndarray) -> np.ndarray:
+        plain = setting._replace(robust=None)
+        data = fitted = self.data(plain)
+        for remaining in reversed(range(1 if setting.robust is None else _WEIGHINGS)):
+            rows = np.asarray(np.linalg.qr(fitted.blocks.rows(self.weights, rest), mode="r"))
+            estimate = fit_blocks(
+                self.chart,
+                fitted,
+                plain,
+                self.sizes,
+                self.weights,
+                rows=rows,
+                count=data.blocks.count(rest),
+                is_rough=True,
+            )
+            if remaining and setting.robust is not None:
+                weights = huber_weights(self._errors(plain, estimate), setting.robust)
+                fitted = gather(self.model, self.logs, setting.v_s, self.extra, self.loads, self.blocks, weights)
+        return data.blocks.squares(estimate.x, part)
+
     def weigh_samples(self, setting: Setting) -> None:
         """Find the weights of samples for the loss of a setting, unless they are known."""
         # Two fits are enough to compare settings, which share these weights; the fit that counts refines its own.
@@ -118,9 +151,7 @@ class RobotProblem:
     def has_outliers(self, setting: Setting) -> bool:
         """Decide whether the errors of a least-squares fit have heavier tails than normal ones at any torque.
 
-        A robust loss is of use only then. Cross-validation cannot tell: weights of samples come from a fit to all of them, which
-        pulls the fits to parts of the logs towards it, and with few independent samples this alone lowers their errors by some
-        per cent.
+        A robust loss is of use only then.
         """
         plain = setting._replace(robust=None)
         errors = self._errors(plain, self.fit(plain))
@@ -146,8 +177,11 @@ class RobotProblem:
     def intervals(self, setting: Setting, estimate: Estimate, fit: Fit) -> Intervals:
         """Standard deviations of an estimate, which is this fit."""
         data, curved = self.data(setting), self.curvature_data(setting)
-        size = effective_sample_size([fit.torques(log) - np.asarray(log.tau, np.float64) for log in self.logs])
-        return intervals(self.model, data, setting, estimate, self.weights, self.basic, size, curved, self.still)
+        errors = [fit.torques(log) - np.asarray(log.tau, np.float64) for log in self.logs]
+        size, widening = effective_sample_size(errors), model_error_factors(self.logs, errors)
+        return intervals(
+            self.model, data, setting, estimate, self.weights, self.basic, size, widening, curved, self.still
+        )
 
     def with_term(self, term: TorqueTerm) -> "RobotProblem":
         """Copy with the columns of one more term, after all others."""
@@ -172,7 +206,7 @@ class RobotProblem:
         blocks = self.data(setting).blocks
         rms = np.sqrt(blocks.squares(estimate.x).sum(axis=0) / blocks.samples.sum())
         # A torque that is fitted exactly, or constant, would get an infinite weight; it gets a large finite one.
-        weights = 1 / np.maximum(rms, 1e-3 * rms.max(initial=0) or 1.0)
+        weights = 1 / np.sqrt(np.maximum(rms, 1e-3 * rms.max(initial=0) or 1.0))
         # Only ratios matter to the fit; sigma has the level.
         return weights / weights.mean()
 

@@ -1,15 +1,18 @@
 """Smoothing velocity, loss, extra torque terms and prior weight by cross-validation over logs, or over blocks of them.
 
-Every setting is fitted with one part of the blocks left out in turn, and scored by its error there: the mean over the torques of
-the logarithm of their squared errors, which asks for the same relative improvement of a wrist as of a shoulder.
+Every setting is fitted with parts of the blocks left out in turn, and scored by its errors there (`log_errors`). Half of one or
+two logs is left out, in every combination of quarters: a term that follows the temperature or the path of one log must predict
+samples that are far away in time.
 
 The lowest score alone would overfit: among dozens of settings one is best by chance, and logs of some seconds hold few
 independent samples. A setting that adds something to the plain fit is therefore taken only where it is clearly better:
 
 - a term, at joints with errors that are not white, as white errors hold nothing that a term could explain, and where it lowers
-  the squared errors by one per cent and in most of the folds;
-- a robust loss, where errors have heavier tails than normal ones, and it lowers the squared errors of blocks by one per cent in
-  the mean and by more than its standard error; another v_s than the default in the same way.
+  the squared errors by one per cent and in most of the splits;
+- another v_s than the default, where it lowers the squared errors of blocks by one per cent in the mean (a larger one by 20), by
+  more than its standard error, and in most of the splits;
+- a robust loss, where errors have heavier tails than normal ones, and it lowers the squared errors of one half of the logs in the
+  same way, fitted to the other half with weights of samples from there alone.
 
 The weight of the prior is the best one: it adds nothing, and on recorded robots the strongest prior within one standard error
 predicts other logs by some per cent worse.
@@ -19,6 +22,7 @@ rule; Hastie, Tibshirani & Friedman (2009), "The elements of statistical learnin
 periodogram.
 """
 
+import itertools
 from collections.abc import Callable, Sequence
 from typing import NamedTuple
 
@@ -31,29 +35,44 @@ VELOCITIES = (0.0003, 0.001, 0.003, 0.01, 0.03, 0.1)
 # Factors by which v_s is refined between two of these, in turn.
 # Neighbours on the grid differ by about 3; each factor halves the remaining step in logarithms.
 _REFINEMENTS = (3**0.5, 3**0.25, 3**0.125)
-PRIORS = (0.1, 1.0, 10.0, 100.0, 1000.0)
+PRIORS = (0.01, 0.1, 1.0, 10.0, 100.0, 1000.0)
 # Thresholds of Huber's loss, in standard deviations: 1.345 is the usual one, 3 leaves all but outliers alone.
 ROBUST = (None, 3.0, 1.345)
-# Hastie et al. (section 7.10) recommend five or ten: a compromise between bias and variance of the estimated error.
-_FOLDS = 5
+# Quarters of the logs: half of them predict the other half, in every combination.
+_QUARTERS = 4
 # Least decrease of the squared error of left-out blocks for which a term, a loss or another v_s is worth its while.
 _LEAST = 0.01
-# Share of the folds in which a term must lower the squared error of a joint.
-_MOST = 0.6
+# The same for a v_s above the default.
+_CURVE = 0.2
+# Share of the splits in which a term must lower the squared error of a joint: five of six.
+_MOST = 0.8
 
 
 class Trial(NamedTuple):
-    """One setting with the squared errors (blocks, nv) of blocks that the fit did not see, and their sum in per cent."""
+    """One setting with the squared errors (blocks, nv) of blocks that the fit did not see, and their sum in per cent.
+
+    `by_split` (splits, nv): the sums over the blocks left out in each split.
+    """
 
     setting: Setting
     squares: np.ndarray
+    by_split: np.ndarray
     percent: float
 
     @property
     def score(self) -> float:
-        """Mean logarithm of the squared errors of the torques; lower is better."""
-        # The floor keeps the score of a noise-free log finite.
-        return float(np.mean(np.log(np.maximum(self.squares.sum(axis=0), 1e-300))))
+        """`log_errors` of all blocks together; lower is better."""
+        return float(log_errors(self.squares.sum(axis=0)))
+
+
+def log_errors(squares: np.ndarray) -> np.ndarray:
+    """Logarithm (...) of squared errors (..., nv): half that of their sum, half the mean over the torques.
+
+    The sum counts newton metres, so that shoulders decide; the mean asks for the same relative improvement of a wrist.
+    """
+    # The floor keeps the score of a noise-free log finite.
+    squares = np.maximum(squares, 1e-300)
+    return np.asarray((np.log(squares.sum(axis=-1)) + np.log(squares).mean(axis=-1)) / 2)
 
 
 class Choice(NamedTuple):
@@ -64,8 +83,8 @@ class Choice(NamedTuple):
     by: str
 
 
-def folds(blocks: Blocks) -> tuple[list[np.ndarray], str]:
-    """Cross-validation folds, as arrays of block indices, and their description: the logs if there are three, else parts of them.
+def splits(blocks: Blocks) -> tuple[list[np.ndarray], str]:
+    """Blocks left out in turn, as arrays of indices, and their description: the logs if there are three, else halves.
 
     **Raises:** ValueError for fewer blocks than two.
     """
@@ -75,9 +94,12 @@ def folds(blocks: Blocks) -> tuple[list[np.ndarray], str]:
     # Blocks of one log share its motion and its drift; a log that was left out is an independent test.
     if len(set(blocks.logs.tolist())) >= 3:
         return [np.flatnonzero(blocks.logs == which) for which in np.unique(blocks.logs)], "logs"
-    # Consecutive, not random: errors of neighbouring blocks are correlated, and neighbours would give left-out blocks away.
-    parts = np.array_split(np.arange(count), min(_FOLDS, count))
-    return parts, f"{len(parts)} parts of consecutive samples"
+    # With one part of five left out, its neighbours on both sides have nearly its temperature and its path: terms that follow
+    # these predict it, and fail on another log. Half of the log must predict the half that is far away.
+    quarters = np.array_split(np.arange(count), min(_QUARTERS, count))
+    chosen = itertools.combinations(range(len(quarters)), len(quarters) // 2)
+    parts = [np.concatenate([quarters[k] for k in pair]) for pair in chosen]
+    return parts, f"{len(parts)} halves of the samples"
 
 
 class Search:
@@ -88,6 +110,7 @@ class Search:
 
     def __init__(self, fit: Callable, parts: Sequence[np.ndarray], torque: float, callback: Callable | None = None):
         self._fit, self._parts, self._torque, self._callback = fit, parts, torque, callback
+        self._count = 1 + max(int(part.max()) for part in parts)
         self.trials: dict[Setting, Trial] = {}
 
     def __call__(self, setting: Setting) -> Trial:
@@ -101,8 +124,15 @@ class Search:
         missing = [setting for setting in dict.fromkeys(settings) if setting not in self.trials]
         errors = iter(self._fit([(setting, part) for setting in missing for part in self._parts]))
         for setting in missing:
-            squares = np.concatenate([next(errors) for _ in self._parts])
-            trial = Trial(setting, squares, 100 * float(np.sqrt(squares.sum() / self._torque)))
+            squares = [next(errors) for _ in self._parts]
+            # A block is left out in several splits: the mean over these.
+            total, count = np.zeros((self._count, squares[0].shape[1])), np.zeros(self._count)
+            for part, own in zip(self._parts, squares, strict=True):
+                total[part] += own
+                count[part] += 1
+            total /= count[:, None]
+            percent = 100 * float(np.sqrt(total.sum() / self._torque))
+            trial = Trial(setting, total, np.stack([own.sum(axis=0) for own in squares]), percent)
             self.trials[setting] = trial
             if self._callback is not None:
                 self._callback(trial)
@@ -118,21 +148,15 @@ class Search:
         return best if self.is_better(plain, best) else plain
 
     def is_better(self, plain: Setting, other: Setting) -> bool:
-        """Decide whether a setting clearly predicts blocks better than another one.
-
-        By the logarithms of each block's squared errors: of the sums, a collision in one block is nearly all, with any loss.
-        """
-        before, after = (np.maximum(self(one).squares, 1e-300) for one in (plain, other))
-        gains = np.mean(np.log(before / after), axis=1)
-        # One-standard-error rule: the best of many settings is better by chance, by about the standard error.
-        return bool(gains.mean() > max(_LEAST, standard_error(gains)))
+        """Decide whether a setting clearly predicts blocks better than another one, and most of the splits too."""
+        gains = log_errors(self(plain).by_split) - log_errors(self(other).by_split)
+        # A wide v_s is a curve of friction over the speeds of these logs, and is wrong at others, so that it must gain much.
+        least = _CURVE if other.v_s > plain.v_s else _LEAST
+        return bool(np.mean(gains > 0) >= _MOST) and is_clear(self(plain).squares, self(other).squares, least)
 
     def improving_torques(self, before: Setting, after: Setting) -> tuple[int, ...]:
         """Indices of the torques that a setting predicts better than another one, as `improving_torques`."""
-        # A trial holds its blocks fold after fold, so that reduceat sums each fold.
-        edges = np.cumsum([0, *map(len, self._parts)])[:-1]
-        sums = [np.add.reduceat(self(one).squares, edges, axis=0) for one in (before, after)]
-        return improving_torques(sums[0], sums[1])
+        return improving_torques(self(before).by_split, self(after).by_split)
 
 
 def search(
@@ -140,7 +164,7 @@ def search(
     start: Setting,
     extra: Sequence[str],
     candidates: Callable[[Setting], Sequence[int]],
-    has_outliers: Callable[[Setting], bool],
+    loss_squares: Callable[[Setting, Sequence[Setting]], list[np.ndarray] | None],
     *,
     velocities=VELOCITIES,
     priors=PRIORS,
@@ -148,17 +172,19 @@ def search(
 ) -> Setting:
     """Coordinate descent over v_s, the loss, terms joint by joint in order of their gains, the prior, v_s and the loss again.
 
-    `candidates`: from a setting to the indices of the torques that may get another term; `has_outliers`: whether its errors
-    have tails for which a robust loss may help.
+    `candidates`: from a setting to the indices of the torques that may get another term; `loss_squares`: squared errors (blocks,
+    nv) for each of some losses, or None where the errors have no tails for which a robust loss may help.
     """
     setting = _choose_velocity(search, start, velocities)
-    setting = _choose_loss(search, setting, losses, has_outliers)
+    setting = _choose_loss(search, setting, losses, loss_squares)
     remaining = list(extra)
     while remaining and (joints := tuple(candidates(setting))):
         trials = []
         search.run([setting, *(setting._replace(extra=(*setting.extra, (name, joints))) for name in remaining)])
         for name in remaining:
             improved = search.improving_torques(setting, setting._replace(extra=(*setting.extra, (name, joints))))
+            # Errors of other joints decrease too, as they share the bodies: they do not get the term.
+            improved = tuple(joint for joint in improved if joint in joints)
             if improved:
                 trials.append(setting._replace(extra=(*setting.extra, (name, improved))))
         if not trials:
@@ -171,7 +197,7 @@ def search(
         remaining.remove(setting.extra[-1][0])
     setting = search.best([setting._replace(prior=prior) for prior in priors])
     setting = _choose_velocity(search, setting, velocities)
-    return _choose_loss(search, setting, losses, has_outliers)
+    return _choose_loss(search, setting, losses, loss_squares)
 
 
 def _choose_velocity(search: Search, setting: Setting, velocities) -> Setting:
@@ -185,13 +211,29 @@ def _choose_velocity(search: Search, setting: Setting, velocities) -> Setting:
     return best
 
 
-def _choose_loss(search: Search, setting: Setting, losses, has_outliers: Callable[[Setting], bool]) -> Setting:
+def _choose_loss(search: Search, setting: Setting, losses, loss_squares: Callable) -> Setting:
     """Squares, unless errors have heavy tails and a robust loss is clearly better; the best of losses without squares."""
     settings = [setting._replace(robust=threshold) for threshold in losses]
-    plain = [one for one in settings if one.robust is None]
-    if not plain:
+    if len(settings) == 1:
+        return settings[0]
+    if all(one.robust is not None for one in settings):
         return search.best(settings)
-    return search.simplest(plain[0], settings) if len(settings) > 1 and has_outliers(setting) else plain[0]
+    squares = loss_squares(setting, settings)
+    if squares is None:
+        return setting._replace(robust=None)
+    plain = next(k for k, one in enumerate(settings) if one.robust is None)
+    best = min(range(len(settings)), key=lambda k: np.sum(log_errors(squares[k])))
+    return settings[best if is_clear(squares[plain], squares[best]) else plain]
+
+
+def is_clear(before: np.ndarray, after: np.ndarray, least: float = _LEAST) -> bool:
+    """Decide whether squared errors (blocks, nv) decrease by the share `least` and beyond the standard error of the decrease.
+
+    By the logarithms of each block: of the sums, a collision in one block is nearly all, with any loss.
+    """
+    gains = log_errors(before) - log_errors(after)
+    # One-standard-error rule: the best of many settings is better by chance, by about the standard error.
+    return bool(gains.mean() > max(least, standard_error(gains)))
 
 
 def improving_torques(before: np.ndarray, after: np.ndarray, least: float = _LEAST) -> tuple[int, ...]:

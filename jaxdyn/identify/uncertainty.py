@@ -27,6 +27,8 @@ from jaxdyn.identify.regression import least_squares_by_svd
 _TOGETHER, _INDEPENDENT, _FEWEST = 2, 2, 6
 # Level of the test for white residuals: a search asks it for every joint of a robot.
 _LEVEL = 1e-3
+# Most independent samples that a log counts for where its errors are those of the model.
+_STATES = 10
 # About so many blocks are cut from all logs of a fit of parameters; each log has at least one.
 _BLOCKS = 20
 
@@ -154,6 +156,22 @@ def effective_sample_size(residuals: Sequence[np.ndarray]) -> float:
     """Effective sample size of the residuals (n, k) of all logs, by the column with the longest autocorrelation."""
     # Logs are independent and add up. Within a log all torques share the parameters, so that the slowest errors decide.
     return sum(float((len(residual) / _autocorrelation_times(residual)).min()) for residual in residuals)
+
+
+def model_error_factors(logs: Sequence[Log], residuals: Sequence[np.ndarray]) -> np.ndarray:
+    """Factors (k,) of at least 1 of the scatter of the residuals (n, k) of logs, for errors that are those of the model.
+
+    Noise averages out with time. The errors of a wrong model are a function of the state: they recur whenever the motion does,
+    and a fit takes part of them for its parameters, alike in every group of samples. Where residuals are not white, a log
+    therefore counts as at most ten independent samples, and the scatter of a log that seems worth more is multiplied by the root
+    of the ratio.
+
+    Ripple and other terms left out on simulated arms moved parameters by three to five standard deviations of the scatter.
+    """
+    # Logs are independent and add up.
+    sizes = np.sum([len(residual) / _autocorrelation_times(residual) for residual in residuals], axis=0)
+    factors = np.sqrt(np.maximum(sizes / (_STATES * len(residuals)), 1.0))
+    return np.where(is_white(logs, residuals), 1.0, factors)
 
 
 def is_white(logs: Sequence[Log], residuals: Sequence[np.ndarray]) -> np.ndarray:

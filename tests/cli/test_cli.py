@@ -831,3 +831,60 @@ def test_info_and_simulate_expand_xacro(tmp_path, capsys):
     for extra, mass in (([], "1 kg"), (["--arguments", "mass=2.5"], "2.5 kg")):
         assert main(["info", str(path), *extra]) == 0
         assert f"moving mass {mass}" in capsys.readouterr().out
+
+
+@pytest.mark.long
+def test_calibrate(tmp_path, capsys):
+    """Poses are chosen, measured on an arm with other lengths, and give these back; held-out poses show the noise."""
+    arm = """<robot name="arm"><link name="base"/>{links}</robot>"""
+    link = """<link name="l{i}"><inertial><mass value="1"/>
+      <inertia ixx=".1" iyy=".1" izz=".1" ixy="0" ixz="0" iyz="0"/></inertial></link>
+      <joint name="j{i}" type="revolute"><parent link="{parent}"/><child link="l{i}"/>
+      <origin xyz="{x} 0.1 0.3" rpy="0.3 0 0"/>
+      <axis xyz="{axis}"/><limit lower="-2" upper="2" effort="9" velocity="9"/></joint>"""
+
+    def write(name, stretch):
+        links = [
+            link.format(
+                i=i, parent=f"l{i - 1}" if i else "base", x=0.1 + stretch * i, axis=("0 0 1", "0 1 0", "1 0 0")[i]
+            )
+            for i in range(3)
+        ]
+        (tmp_path / name).write_text(arm.format(links="".join(links)))
+        return str(tmp_path / name)
+
+    nominal, true = write("nominal.urdf", 0.0), jd.load_urdf(write("true.urdf", 0.004))
+    poses = tmp_path / "poses.csv"
+    assert main(["calibrate", nominal, "--frame", "l2", "--choose", "30", "--marker", "--out", str(poses)]) == 0
+    header, *rows = poses.read_text().splitlines()
+    assert header == "j0,j1,j2" and len(rows) == 30
+    q = np.array([[float(x) for x in row.split(",")] for row in rows])
+    places = np.stack([np.asarray(jd.frame_pose(true, jnp.asarray(x), "l2"))[:3, 3] for x in q])
+    places = places + 1e-5 * np.random.default_rng(0).normal(size=places.shape)
+    lines = [
+        "j0,j1,j2,x,y,z",
+        *(",".join(map(repr, [*a, *b])) for a, b in zip(q.tolist(), places.tolist(), strict=True)),
+    ]
+    poses.write_text("\n".join(lines))
+    out = str(tmp_path / "calibrated.urdf")
+    capsys.readouterr()
+    assert main(["calibrate", nominal, "--frame", "l2", "--poses", str(poses), "--test", "0.2", "--out", out]) == 0
+    text = capsys.readouterr().out
+    # A marker on the frame of the last joint: its own turn moves it nowhere, so that fewer directions are found than any poses
+    # of a marker beside it would determine.
+    assert "error on the 6 poses held out" in text and "24 poses determine" in text
+    assert float(text.split("held out: ")[1].split(" mm")[0]) < 0.1
+    fitted = jd.load_urdf(out)
+    assert fitted.joint_names == ("j0", "j1", "j2")
+    for bad, words in (
+        (["--choose", "5", "--poses", str(poses)], "one of them"),
+        (["--poses", str(poses), "--test", "2"], "--test is 2.0"),
+    ):
+        assert main(["calibrate", nominal, "--frame", "l2", *bad]) == 2 and words in capsys.readouterr().err
+    for content, words in (
+        ("j0,j1,j2,x,y\n1,2,3,4,5\n", "has no columns z"),
+        ("j0,j1,j2,x,y,z\n1,2,3,4,5,six\n", "line 2"),
+    ):
+        poses.write_text(content)
+        assert main(["calibrate", nominal, "--frame", "l2", "--poses", str(poses)]) == 2
+        assert words in capsys.readouterr().err

@@ -1,0 +1,144 @@
+"""`jaxdyn calibrate`: joint offsets, axes and link lengths of a robot from poses or markers measured at its tip."""
+
+import argparse
+import csv
+from typing import Any
+
+import numpy as np
+
+from jaxdyn import identify
+from jaxdyn.cli.common import add_model_options, load_model, output_path, real, table, whole
+from jaxdyn.constraints.codes import name_of
+from jaxdyn.identify.geometry_errors import PARTS
+from jaxdyn.io import save_urdf
+from jaxdyn.model import host_math
+from jaxdyn.model.arguments import as_path
+
+HELP = "calibrate joint offsets, axes and link lengths from poses or markers measured at the tip"
+DESCRIPTION = """\
+Fit joint offsets, axes, link lengths, base and tool of a robot to poses or to positions of a marker that an external device has
+measured at its tip, and write the calibrated robot; or choose the poses to measure (--choose).
+"""
+EPILOG = """\
+examples:
+  jaxdyn calibrate arm.urdf --frame flange --choose 40 --out poses.csv
+  jaxdyn calibrate arm.urdf --frame flange --poses poses.csv --out calibrated.urdf
+
+The CSV file has a header: a column for each joint by its name (rad, m, as the encoders read it), the measured position x, y, z
+(m), and for poses the unit quaternion qw, qx, qy, qz of the frame's rotation, all in axes of the measuring device. The device may
+stand anywhere. Without a quaternion the position is that of one marker at the frame's origin, or near it.
+"""
+_POSITION, _QUATERNION = ("x", "y", "z"), ("qw", "qx", "qy", "qz")
+# Largest deviation of a quaternion from length one: files have some four digits.
+_UNIT = 1e-2
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """Add the arguments of the command."""
+    parser.add_argument("urdf", help="the robot, where the fit starts")
+    add_model_options(parser)
+    parser.add_argument("--frame", required=True, help="the link or frame that is measured")
+    parser.add_argument("--poses", metavar="FILE", help="measured poses, .csv")
+    parser.add_argument("--choose", type=whole, metavar="N", help="choose N configurations to measure instead")
+    parser.add_argument("--marker", action="store_true", help="with --choose: positions alone will be measured")
+    parser.add_argument(
+        "--free",
+        nargs="+",
+        choices=PARTS,
+        default=PARTS,
+        metavar="PART",
+        help=f"some of {', '.join(PARTS)} (default: all)",
+    )
+    parser.add_argument("--test", type=real, default=0.0, metavar="SHARE", help="share of the poses to hold out")
+    parser.add_argument("--seed", type=whole, default=0, help="seed of the configurations to choose from (default: 0)")
+    parser.add_argument(
+        "--out", metavar="FILE", help="write the calibrated robot, .urdf; with --choose the poses, .csv"
+    )
+
+
+def run(args: argparse.Namespace) -> int:
+    """Calibrate and write the robot, or choose poses and write these."""
+    if (args.poses is None) == (args.choose is None):
+        raise ValueError("give --poses FILE to calibrate, or --choose N to choose poses: one of them")
+    out = output_path(args.out, (".csv",) if args.choose is not None else (".urdf",), "--out")
+    model = load_model(args.urdf, args)
+    if args.choose is not None:
+        markers = np.zeros((1, 3)) if args.marker else None
+        q = identify.choose_poses(model, args.choose, frame=args.frame, markers=markers, free=args.free, seed=args.seed)
+        print(table(list(model.joint_names), [[f"{x:.4f}" for x in row] for row in q]))
+        if out is not None:
+            with open(out, "w", newline="", encoding="utf-8") as file:
+                csv.writer(file).writerows([model.joint_names, *(map(repr, row) for row in q.tolist())])
+            print(f"Wrote {out}.")
+        return 0
+    q, seen = read_poses(args.poses, model.joint_names)
+    if not 0 <= args.test < 1:
+        raise ValueError(f"--test is {args.test}; give a share of the poses from 0 to below 1")
+    fitted = len(q) - round(args.test * len(q))
+    measured: dict[str, Any] = {"poses" if seen.ndim == 3 else "positions": seen[:fitted]}
+    fit = identify.fit_geometry(model, q[:fitted], frame=args.frame, free=tuple(args.free), **measured)
+    if fitted < len(q):
+        places = seen[:, :3, 3] if seen.ndim == 3 else seen
+        error = np.sqrt(np.mean(np.sum((fit.predict(q[fitted:])[:, :3, 3] - places[fitted:]) ** 2, axis=1)))
+        print(f"error on the {len(q) - fitted} poses held out: {1e3 * error:.4g} mm (root mean square)")
+    print(fit.summary())
+    if not bool(fit.success):
+        print(f"NOT CONVERGED: {name_of(fit.result)}")
+    if fit.expected is not None and fit.rank < fit.expected:
+        print(f"{fit.expected - fit.rank} directions stay as in the file; measure poses that differ more (--choose)")
+    if out is not None:
+        save_urdf(fit.model, out)
+        print(f"Wrote {out}.")
+    return 0
+
+
+def read_poses(path: str, joints) -> tuple[np.ndarray, np.ndarray]:
+    """Joint positions (n, nq), and poses (n, 4, 4) or marker positions (n, 3), of a CSV file.
+
+    **Raises:** ValueError for missing columns, entries that are no numbers (their row), and quaternions that are not of length 1.
+    """
+    file = as_path(path, "--poses")
+    with open(file, newline="", encoding="utf-8") as lines:
+        rows = [row for row in csv.reader(lines) if row]
+    header = [name.strip() for name in rows[0]] if rows else []
+    turned = all(name in header for name in _QUATERNION)
+    wanted = (*joints, *_POSITION, *(_QUATERNION if turned else ()))
+    missing = [name for name in wanted if name not in header]
+    if missing or len(rows) < 2:
+        what = f"has no columns {', '.join(missing)}" if missing else "has no rows"
+        raise ValueError(
+            f"{file} {what}; give a header with {', '.join((*joints, *_POSITION))}, and a row for each pose"
+        )
+    places = [header.index(name) for name in wanted]
+    try:
+        numbers = np.array([[float(row[k]) for k in places] for row in rows[1:]])
+    except (ValueError, IndexError):
+        bad = next(i for i, row in enumerate(rows[1:], 2) if len(row) < len(header) or not all(map(_is_number, row)))
+        raise ValueError(f"{file}, line {bad}: {', '.join(rows[bad - 1])!r} are not {len(header)} numbers") from None
+    q, position = numbers[:, : len(joints)], numbers[:, len(joints) : len(joints) + 3]
+    if not turned:
+        return q, position
+    quaternions = numbers[:, -4:]
+    length = np.linalg.norm(quaternions, axis=1)
+    off = np.abs(length - 1)
+    if not off.max() < _UNIT:
+        row = int(np.argmax(np.where(np.isfinite(off), off, np.inf)))
+        raise ValueError(
+            f"{file}, line {row + 2}: the quaternion has length {length[row]:.4g}; give unit ones, qw first"
+        )
+    rotations = [_rotation(x) for x in quaternions / length[:, None]]
+    return q, np.stack([np.asarray(host_math.pose_of(R, p)) for R, p in zip(rotations, position, strict=True)])
+
+
+def _rotation(quaternion: np.ndarray) -> np.ndarray:
+    """Rotation 1 + 2 w hat(u) + 2 hat(u)^2 of a unit quaternion (w, u)."""
+    cross = host_math.hat(quaternion[1:])
+    return np.eye(3) + 2 * quaternion[0] * cross + 2 * cross @ cross
+
+
+def _is_number(text: str) -> bool:
+    try:
+        float(text)
+    except ValueError:
+        return False
+    return True

@@ -1,0 +1,434 @@
+"""Calibration of a mechanism's geometry by poses or marker positions measured at its tip, and the choice of such poses."""
+
+from collections.abc import Sequence
+from typing import Any, NamedTuple
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from jaxdyn.constraints.codes import RESULTS, Outcome, name_of
+from jaxdyn.dynamics.kinematics import frame_pose
+from jaxdyn.identify.geometry_errors import (
+    FAR,
+    PARTS,
+    Measurements,
+    Mechanism,
+    change_scene,
+    close_loops,
+    free_directions,
+    linearise,
+    make_mechanism,
+    null_coordinates,
+    null_space,
+    redundant_directions,
+)
+from jaxdyn.lie import se3
+from jaxdyn.model import host_math
+from jaxdyn.model.arguments import Checked, Numbers, as_array
+from jaxdyn.model.numbers import check_count, check_seed
+from jaxdyn.model.tree import Model
+from jaxdyn.systems.scene import Scene
+from jaxdyn.systems.system import SceneLike
+
+# Singular values below this share of the largest one are not determined: derivatives are exact to about 1e-13.
+_RANK = 1e-8
+# Most Gauss-Newton steps, halvings of a step, and rounds of weights of positions against rotations.
+_STEPS, _HALVINGS, _ROUNDS = 60, 30, 5
+# A step that changes no number by more than this (rad, shares of the arm's size) ends a fit; least deviation of errors.
+_SETTLED, _FLOOR = 1e-11, 1e-14
+# Share of the information of all candidates with which a choice of poses starts.
+_FAINT = 1e-6
+# Random configurations for each pose that is to be chosen, and their span about zero where a joint has no limits (rad, m).
+_CANDIDATES, _SPAN = 12, np.pi
+
+
+class GeometryFit(Outcome):
+    """Result of `fit_geometry`.
+
+    - `model`: calibrated, with new home poses; `scene`: the same with its loops. `base` (4, 4): pose of the model's world in the
+      frame of the measuring device; `tool` (4, 4): pose of the measured frame in `frame`. `predict(q)` combines them.
+    - `names`, `values`, `std` (w,): changes of the free numbers (rad, m), the smallest that explain the measurements, and their
+      standard deviations; `covariance` (w, w). Those of the base count from the rigid motion nearest to the measured points, and
+      what may be attributed to the base or to a joint is the base's. The prediction at the tip has no such choice: `tip_std`.
+    - `rank`: number of directions that these poses determine; `expected`: that any poses can, by theory, None with loops.
+      `redundant` (w, d): combinations of the numbers that these poses do not determine, orthonormal in units of the arm's size.
+    - `condition`: of the errors in the directions that are determined.
+    - `noise`: standard deviations of a measured position (m) and rotation (rad; NaN for markers). `tip_std` (m): root mean
+      square deviation of the calibrated tip, over the measured poses.
+    - `q` (n, nq): configurations, with the joints that the loops determine. `errors` (n, k): m and rad.
+    - `history`: losses. `result`: one of `jd.RESULTS`: `successful`, `max_steps_reached`, or `nonfinite`.
+    """
+
+    model: Model
+    scene: Scene
+    frame: str = eqx.field(static=True)
+    base: np.ndarray
+    tool: np.ndarray
+    names: tuple[str, ...] = eqx.field(static=True)
+    values: np.ndarray
+    std: np.ndarray
+    covariance: np.ndarray
+    rank: int
+    expected: int | None
+    redundant: np.ndarray
+    condition: float
+    noise: tuple[float, float]
+    tip_std: float
+    q: np.ndarray
+    errors: np.ndarray
+    history: np.ndarray
+    result: Any
+
+    def predict(self, q: Numbers) -> np.ndarray:
+        """Poses (n, 4, 4) of the measured frame in the device's frame at configurations (n, nq)."""
+        return self.base @ _frame_poses(self.model, np.asarray(q, np.float64), self.frame) @ self.tool
+
+    def summary(self) -> str:
+        """Text of the result."""
+        known = "" if self.expected is None else f" of {self.expected} identifiable"
+        rotation = "" if np.isnan(self.noise[1]) else f" and {1e3 * self.noise[1]:.4g} mrad"
+        lines = [
+            f"geometry of {self.model.name!r}: {name_of(self.result)} after {len(self.history) - 1} steps",
+            f"{len(self.q)} poses determine {self.rank}{known} directions of {len(self.names)} numbers, condition "
+            f"{self.condition:.4g}",
+            f"noise {1e3 * self.noise[0]:.4g} mm{rotation}; standard deviation of the calibrated tip "
+            f"{1e3 * self.tip_std:.4g} mm",
+        ]
+        width = max(map(len, self.names))
+        lines.append(f"{'change':{width}}  {'value':>12}  {'std':>12}")
+        rows = zip(self.names, self.values, self.std, strict=True)
+        return "\n".join([*lines, *(f"{name:{width}}  {value:12.5g}  {std:12.3g}" for name, value, std in rows)])
+
+
+def fit_geometry(
+    system: SceneLike,
+    q: Numbers,
+    poses: Checked[Numbers | None] = None,
+    *,
+    frame: str,
+    positions: Checked[Numbers | None] = None,
+    markers: Checked[Numbers | None] = None,
+    free: Sequence[str] = PARTS,
+    measured: Checked[Sequence[str] | None] = None,
+) -> GeometryFit:
+    """Fit joint offsets, axes, link lengths, base and tool to poses or marker positions measured at the tip.
+
+    Least squares by Gauss-Newton steps, which leave out the directions that no pose determines. Positions are weighted against
+    rotations by their residuals, iterated.
+
+    **Arguments:**
+
+    - `system`: model, or scene with loops (`jd.loop`), where the fit starts. Its joints have one degree of freedom each.
+    - `q` (n, nq): positions of the joints (rad, m) in each pose, as the encoders read them.
+    - `poses` (n, 4, 4): of the frame, in the frame of the measuring device; or `positions` (n, 3) or (n, k, 3): of markers (m),
+      which are at `markers` (k, 3) in the frame, one at its origin by default.
+    - `frame`: name of the frame that is measured.
+    - `free`: some of "base", pose of the model's world in the device's frame; "offsets", the zeros of the encoders; "axes", the
+      directions of axes; "lengths", the places of axes, and of the frames of loops; "tool", pose of the measured frame.
+    - `measured`: names of the joints whose columns of q were measured; the loops determine the others, next to their columns.
+
+    **Returns:** `GeometryFit`.
+
+    **Raises:** ValueError for unknown names, wrong shapes, matrices that are no poses, joints with several degrees of freedom,
+    fewer measurements than directions to find, and loops that cannot be closed.
+
+    Source: Mooring, Roth & Driels (1991), "Fundamentals of manipulator calibration"; Park & Okamura (1994).
+
+    ```python
+    fit = jd.identify.fit_geometry(arm, q, poses, frame="flange")
+    ```
+    """
+    mechanism = make_mechanism(system, frame, measured)
+    q = _check_configurations(mechanism, q)
+    data = _check_measurements(len(q), poses, positions, markers)
+    names, directions, units = free_directions(mechanism, free)
+    expected = None
+    if not mechanism.loops:
+        unseen = null_coordinates(directions, redundant_directions(mechanism, data.markers if poses is None else None))
+        expected = directions.shape[1] - unseen.shape[1]
+    rows = data.positions.size if data.poses is None else 6 * len(q)
+    if rows <= (wanted := directions.shape[1] if expected is None else expected):
+        raise ValueError(
+            f"{len(q)} poses give {rows} numbers for {wanted} directions to find; measure more poses, or free fewer parts"
+        )
+    q = close_loops(mechanism, np.zeros((len(mechanism.places), 6)), q)
+    if "base" in free:
+        tips = _frame_poses(mechanism.model, q, frame)
+        points = np.einsum("nij,kj->nki", tips[:, :3, :3], data.markers) + tips[:, None, :3, 3]
+        # The device may stand anywhere: the steps start from the rigid motion that brings the points nearest to each other.
+        data = data._replace(base=_nearest_motion(points.reshape(-1, 3), data.positions.reshape(-1, 3)))
+    minimum = _minimise(mechanism, data, directions, q, expected)
+    here, weights = minimum.here, minimum.weights
+    _, s, Vt = here.decompose(weights)
+    covariance = Vt.T / s**2 @ Vt
+    # In the same units for all: those of the base prefer it in the fit alone.
+    even = np.array([FAR if name.startswith("base ") else 1.0 for name in names])
+    singular = here._replace(jacobian=here.jacobian / even, expected=len(s)).decompose(weights)[1]
+    twists = (directions @ minimum.y).reshape(-1, 6)
+    scene: Any = change_scene(mechanism, jnp.asarray(twists, mechanism.model.home.dtype))
+    base, tool = (np.asarray(se3.exp(jnp.asarray(twists[place]))) for place in (0, mechanism.tool))
+    tip = here.jacobian[:, ~here.turns].reshape(-1, len(units))
+    return GeometryFit(
+        model=scene.system,
+        scene=scene,
+        frame=frame,
+        base=data.base @ base,
+        tool=tool,
+        names=names,
+        values=minimum.y * units,
+        std=np.sqrt(np.diag(covariance)) * units,
+        covariance=covariance * units[:, None] * units,
+        rank=len(s),
+        expected=expected,
+        redundant=null_space(Vt),
+        condition=float(singular[0] / singular[-1]),
+        noise=(float(1 / weights[0]), float(1 / weights[1]) if here.turns.any() else np.nan),
+        # Three coordinates of a point: the sum of their variances, in the mean over all points.
+        tip_std=float(np.sqrt(3 * np.mean(np.einsum("ij,jk,ik->i", tip, covariance, tip)))),
+        q=here.q,
+        errors=here.errors,
+        history=np.array(minimum.history),
+        result=minimum.result,
+    )
+
+
+class _Linear(NamedTuple):
+    """Errors (n, k) at configurations `q`, their Jacobian (n, k, w), which of the k are rotations, and the rank by theory."""
+
+    q: np.ndarray
+    errors: np.ndarray
+    jacobian: np.ndarray
+    turns: np.ndarray
+    expected: int | None
+
+    def _weigh(self, weights: np.ndarray) -> np.ndarray:
+        """Weights (n k,): those of positions and of rotations."""
+        return np.tile(np.where(self.turns, weights[1], weights[0]), len(self.errors))
+
+    def loss(self, weights: np.ndarray) -> float:
+        """Sum of the squares of the weighted errors."""
+        return float(np.sum((self._weigh(weights) * self.errors.reshape(-1)) ** 2))
+
+    def decompose(self, weights: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """Singular values and vectors of the weighted Jacobian, without the directions that are not determined."""
+        U, s, Vt = np.linalg.svd(
+            self._weigh(weights)[:, None] * self.jacobian.reshape(self.errors.size, -1), full_matrices=False
+        )
+        rank = int(np.sum(s > _RANK * s.max(initial=0.0)))
+        # Away from the nominal geometry theory's rank is the same: what is beyond it is rounding.
+        rank = rank if self.expected is None else min(rank, self.expected)
+        return U[:, :rank], s[:rank], Vt[:rank]
+
+    def step(self, weights: np.ndarray) -> np.ndarray:
+        """Gauss-Newton step (w,), the shortest one."""
+        U, s, Vt = self.decompose(weights)
+        return -Vt.T @ ((U.T @ (self._weigh(weights) * self.errors.reshape(-1))) / s)
+
+    def new_weights(self, weights: np.ndarray, floor: np.ndarray) -> np.ndarray:
+        """Weights (2,) of positions and rotations: one over the deviations of their errors."""
+        U = self.decompose(weights)[0]
+        squares, spare = self.errors**2, 1 - np.sum(U**2, axis=1).reshape(self.errors.shape)
+        # Each error has used up its leverage of the degrees of freedom.
+        kinds = [squares[:, kind].sum() / max(spare[:, kind].sum(), 1e-9) for kind in (~self.turns, self.turns)]
+        return 1 / np.maximum(np.sqrt(kinds), floor)
+
+
+class _Minimum(NamedTuple):
+    """End of `_minimise`: the free numbers, the errors there, the weights, all losses, and the result."""
+
+    y: np.ndarray
+    here: _Linear
+    weights: np.ndarray
+    history: list[float]
+    result: Any
+
+
+def _minimise(mechanism: Mechanism, data: Measurements, directions: np.ndarray, q: np.ndarray, expected) -> _Minimum:
+    """Minimise the squared errors by Gauss-Newton steps, and weigh positions against rotations by what remains of them."""
+    turns = np.arange(6) >= 3 if data.poses is not None else np.zeros(data.positions[0].size, bool)
+
+    def evaluate(y, q):
+        return _Linear(*linearise(mechanism, data, directions, y, q), turns, expected)
+
+    # A lever of the arm's size makes both kinds comparable before their errors are known; noise-free ones keep finite weights.
+    y, weights = np.zeros(directions.shape[1]), np.array([1.0, mechanism.size])
+    floor, here, history = _FLOOR * np.array([mechanism.size, 1.0]), evaluate(y, q), []
+    for _ in range(_ROUNDS):
+        history.append(here.loss(weights))
+        result = RESULTS.max_steps_reached
+        for _ in range(_STEPS):
+            if not np.isfinite(history[-1]):
+                return _Minimum(y, here, weights, history, RESULTS.nonfinite)
+            step = here.step(weights)
+            trials = (evaluate(y + 0.5**k * step, here.q) for k in range(_HALVINGS))
+            k, following = next(((k, x) for k, x in enumerate(trials) if x.loss(weights) < history[-1]), (0, None))
+            if following is None:
+                # Near a minimum rounding hides the decrease.
+                result = RESULTS.successful if np.abs(step).max() < _SETTLED**0.5 else RESULTS.no_descent
+                break
+            y, here = y + 0.5**k * step, following
+            history.append(here.loss(weights))
+            if np.abs(step).max() < _SETTLED:
+                result = RESULTS.successful
+                break
+        weights = here.new_weights(weights, floor)
+        if not turns.any():
+            break
+    return _Minimum(y, here, weights, history, result)
+
+
+def choose_poses(
+    system: SceneLike,
+    count: int,
+    *,
+    frame: str,
+    markers: Checked[Numbers | None] = None,
+    free: Sequence[str] = PARTS,
+    measured: Checked[Sequence[str] | None] = None,
+    guess: Checked[Numbers | None] = None,
+    seed: int = 0,
+) -> np.ndarray:
+    """Choose configurations (count, nq) whose measured poses determine the geometry well: the determinant of the information.
+
+    Of random configurations within the limits of the joints, each in turn is the one that adds most to the logarithm of the
+    determinant (D-optimality); chosen ones are then exchanged for better ones.
+
+    **Arguments:** as of `fit_geometry`; `markers` (k, 3) if those are measured, None for poses. `guess` (nq,): a configuration
+    with closed loops. `seed` of the random configurations.
+
+    **Raises:** ValueError as `fit_geometry`, and for fewer poses than determine the directions.
+
+    Source: Borm & Menq (1991), observability; Mitchell (1974), exchange of designs.
+    """
+    mechanism = make_mechanism(system, frame, measured)
+    count, rng = check_count(count, "count"), np.random.default_rng(check_seed(seed))
+    _, directions, _ = free_directions(mechanism, free)
+    points = np.zeros((1, 3)) if markers is None else _check_markers(markers)
+    q = _random_configurations(mechanism, _CANDIDATES * count, guess, rng)
+    data = Measurements(
+        np.broadcast_to(np.eye(4), (len(q), 4, 4)), np.zeros((len(q), 1, 3)), points, np.eye(4), np.eye(4)
+    )
+    if markers is not None:
+        data = data._replace(poses=None, positions=np.zeros((len(q), len(points), 3)))
+    q, errors, jacobian = linearise(mechanism, data, directions, np.zeros(directions.shape[1]), q)
+    if markers is None:
+        jacobian = jacobian * np.where(np.arange(6) < 3, 1.0, mechanism.size)[:, None]
+    # What no candidate determines has no information in any choice.
+    _, singular, Vt = np.linalg.svd(jacobian.reshape(-1, jacobian.shape[2]), full_matrices=False)
+    rows = jacobian @ Vt[: int(np.sum(singular > _RANK * singular[0]))].T
+    if count * errors.shape[1] < rows.shape[2]:
+        raise ValueError(
+            f"count is {count}; {rows.shape[2]} directions need at least {-(-rows.shape[2] // errors.shape[1])}"
+        )
+    # A little information of all candidates makes the determinant positive before there are enough poses.
+    whole = np.einsum("nki,nkj->ij", rows, rows) / len(rows)
+    chosen = list(range(count))
+    for place in range(2 * count):
+        # Two rounds: in each every pose in turn is taken out, and the best one for its place put in.
+        place %= count
+        rest = [k for i, k in enumerate(chosen) if i != place]
+        information = _FAINT * whole + np.einsum("nki,nkj->ij", rows[rest], rows[rest])
+        # det(A + J^T J) = det(A) det(1 + J A^-1 J^T).
+        half = rows @ np.linalg.inv(np.linalg.cholesky(information)).T
+        gains = np.linalg.slogdet(np.eye(rows.shape[1]) + half @ np.swapaxes(half, 1, 2))[1]
+        gains[rest] = -np.inf
+        chosen[place] = int(np.argmax(gains))
+    return q[chosen]
+
+
+def _random_configurations(mechanism: Mechanism, count: int, guess, rng) -> np.ndarray:
+    """Random configurations within limits (count, nq), on the loops where there are any."""
+    model = mechanism.model
+    start = np.zeros(model.nq) if guess is None else np.asarray(as_array(guess, "guess"), np.float64)
+    if start.shape != (model.nq,):
+        raise ValueError(f"guess has shape {start.shape}, expected ({model.nq},)")
+    lower, upper = (np.asarray(x, np.float64) for x in (model.lower, model.upper))
+    lower, upper = (
+        np.where(np.isfinite(lower), lower, start - _SPAN),
+        np.where(np.isfinite(upper), upper, start + _SPAN),
+    )
+    if not mechanism.loops:
+        return rng.uniform(lower, upper, (count, model.nq))
+    found: list[np.ndarray] = []
+    # Measured joints walk away from the guess in small steps, so that the loops stay on their branch.
+    q = start
+    for _ in range(20 * count):
+        change = 0.2 * rng.normal(size=model.nq)
+        change[list(mechanism.passive)] = 0
+        try:
+            trial = close_loops(
+                mechanism, np.zeros((len(mechanism.places), 6)), np.clip(q + change, lower, upper)[None]
+            )[0]
+        except ValueError:
+            continue
+        if np.abs(trial - q).max() < 1.0:
+            q = trial
+            found.append(q)
+        if len(found) == count:
+            return np.stack(found)
+    raise ValueError(f"only {len(found)} configurations with closed loops were found near guess; give another one")
+
+
+@eqx.filter_jit
+def _poses_of(model: Model, q, frame: str):
+    return jax.vmap(lambda q: frame_pose(model, q, frame))(q)
+
+
+def _frame_poses(model: Model, q: np.ndarray, frame: str) -> np.ndarray:
+    return np.asarray(_poses_of(model, jnp.asarray(q, model.home.dtype), frame), np.float64)
+
+
+def _nearest_motion(points: np.ndarray, seen: np.ndarray) -> np.ndarray:
+    """Rigid motion (4, 4) that brings points (n, 3) nearest to others (Kabsch 1976)."""
+    centre, other = points.mean(axis=0), seen.mean(axis=0)
+    U, _, Vt = np.linalg.svd((seen - other).T @ (points - centre))
+    # The last column's sign makes it a rotation, and no reflection.
+    rotation = U @ np.diag([1.0, 1.0, np.sign(np.linalg.det(U @ Vt))]) @ Vt
+    return np.asarray(host_math.pose_of(rotation, other - rotation @ centre))
+
+
+def _check_configurations(mechanism: Mechanism, q) -> np.ndarray:
+    q, nq = np.array(as_array(q, "q"), np.float64), mechanism.model.nq
+    if q.ndim != 2 or q.shape[1] != nq or not len(q) or not np.isfinite(q).all():
+        raise ValueError(f"q has shape {q.shape}; give finite numbers of shape (n, {nq}), a row for each pose")
+    return q
+
+
+def _check_measurements(count: int, poses, positions, markers) -> Measurements:
+    """Measurements as arrays, with base and tool at the identity. **Raises:** ValueError as `fit_geometry`."""
+    if (poses is None) == (positions is None):
+        raise ValueError("give poses (n, 4, 4), or positions (n, 3) of markers: one of them")
+    if poses is not None:
+        if markers is not None:
+            raise ValueError("markers are given with poses; they belong to positions")
+        T = np.array(as_array(poses, "poses"), np.float64)
+        if T.shape != (count, 4, 4) or not np.isfinite(T).all():
+            raise ValueError(
+                f"poses has shape {T.shape}; give finite numbers of shape ({count}, 4, 4), as q has {count} rows"
+            )
+        off = np.abs(np.swapaxes(T[:, :3, :3], 1, 2) @ T[:, :3, :3] - np.eye(3)).max(axis=(1, 2))
+        off = np.maximum(off, np.abs(T[:, 3] - [0, 0, 0, 1]).max(axis=1)) + 9 * (np.linalg.det(T[:, :3, :3]) < 0)
+        if off.max() > 1e-4:
+            row = int(np.argmax(off))
+            raise ValueError(
+                f"poses[{row}] is no pose: its rotation is off by {off[row]:.3g}; give rigid motions (4, 4), m"
+            )
+        return Measurements(T, T[:, None, :3, 3], np.zeros((1, 3)), np.eye(4), np.eye(4))
+    points = np.zeros((1, 3)) if markers is None else _check_markers(markers)
+    seen = np.array(as_array(positions, "positions"), np.float64)
+    seen = seen[:, None] if seen.ndim == 2 else seen
+    if seen.shape != (count, len(points), 3) or not np.isfinite(seen).all():
+        raise ValueError(
+            f"positions has shape {np.shape(positions)}; give finite numbers of shape ({count}, {len(points)}, 3), as q has "
+            f"{count} rows, and markers {len(points)}"
+        )
+    return Measurements(None, seen, points, np.eye(4), np.eye(4))
+
+
+def _check_markers(markers) -> np.ndarray:
+    points = np.atleast_2d(np.array(as_array(markers, "markers"), np.float64))
+    if points.ndim != 2 or points.shape[1] != 3 or not np.isfinite(points).all():
+        raise ValueError(f"markers has shape {points.shape}; give finite numbers of shape (k, 3), m in the frame")
+    return points
