@@ -247,9 +247,9 @@ class ContactForce(Sensor):
 
     def read(self, motion: Motion) -> Float[Array, " n"]:
         """Multipliers of the constraint, or the force of the contact."""
-        forces = motion.contacts or {}
-        if self.constraint in forces:
-            return forces[self.constraint]
+        contacts = motion.contacts or {}
+        if self.constraint in contacts:
+            return contacts[self.constraint]
         return motion.multipliers[constraint_place(motion.scene, self.constraint)]
 
 
