@@ -6,7 +6,7 @@ Microseconds a sample under `jit`, best of the rounds, interleaved with Pinocchi
 called from Python once per sample on one core; jaxdyn has both cores in a batch. The scene is known to the program, as in a
 control loop. Pinocchio closes loops by three-dimensional point contacts, its smallest joint that fits, and solves the then
 dependent rows by its proximal method. Its accelerations are compared with ours: "wrong" where they differ by more than 1e-6.
-Exudyn, where the Python of EXUDYN_PYTHON (by default this one) can import it, makes 50 implicit steps of the mechanisms in a plane.
+Exudyn, where the Python of EXUDYN_PYTHON (by default this one) can import it, makes 50 implicit steps of mechanisms in a plane.
 "held": a scene with its choice of rows (`jd.constraints.choose_rows`); the file of that robot has few digits, so that the rows
 are searched in each call without it.
 """
@@ -144,9 +144,8 @@ def exudyn_steps(scene: jd.Scene, q, v, rounds: int) -> tuple[float, float] | No
         c = first / m
         about = np.array([[xx, xy, xz], [xy, yy, yz], [xz, yz, zz]]) - m * (c @ c * np.eye(3) - np.outer(c, c))
         twist = np.asarray(jd.frame_velocity(model, q, v, name), float)
-        linear, omega = pose[:3, :3] @ twist[:3], pose[:3, :3] @ twist[3:]
         body = {"mass": float(m[0]), "com": c, "inertia": about, "position": pose[:3, 3], "rotation": pose[:3, :3]}
-        bodies.append(body | {"velocity": linear, "omega": omega})
+        bodies.append(body | {"velocity": twist[:3], "omega": twist[3:]})
         place = {"position": pose[:3, 3], "rotation": pose[:3, :3], "axes": [1, 1, 1, 1, 1, 0]}
         joints.append({"body": i, "parent": model.topology.parents[i]} | place)
     for loop in scene.constraints:

@@ -47,8 +47,8 @@ def build(exu, mechanism: dict):
 
 def main() -> None:
     """Run as often as asked, and print the best time and where the bodies end."""
-    import exudyn as exu
-    import exudyn.utilities
+    import exudyn as exu  # pyright: ignore[reportMissingImports]
+    import exudyn.utilities  # pyright: ignore[reportMissingImports]
 
     mechanism = json.load(sys.stdin)
     best, positions = float("inf"), []
