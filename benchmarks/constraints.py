@@ -6,11 +6,17 @@ Microseconds a sample under `jit`, best of the rounds, interleaved with Pinocchi
 called from Python once per sample on one core; jaxdyn has both cores in a batch. The scene is known to the program, as in a
 control loop. Pinocchio closes loops by three-dimensional point contacts, its smallest joint that fits, and solves the then
 dependent rows by its proximal method. Its accelerations are compared with ours: "wrong" where they differ by more than 1e-6.
+Exudyn, where the Python of EXUDYN_PYTHON (by default this one) can import it, makes 50 implicit steps of mechanisms in a plane.
 "held": a scene with its choice of rows (`jd.constraints.choose_rows`); the file of that robot has few digits, so that the rows
 are searched in each call without it.
 """
 
 import argparse
+import json
+import os
+import subprocess
+import sys
+from pathlib import Path
 
 import jax
 import jax.numpy as jnp
@@ -123,6 +129,40 @@ def peers(scene: jd.Scene, q, v) -> dict:
     }
 
 
+def exudyn_steps(scene: jd.Scene, q, v, rounds: int) -> tuple[float, float] | None:
+    """Seconds of 50 steps of Exudyn, and the distance of its bodies from ours; None where it is missing, or has no converter."""
+    model = scene.system
+    python = os.environ.get("EXUDYN_PYTHON", sys.executable)
+    planar = all(getattr(x, "in_plane", False) and x.joint == "revolute" for x in scene.constraints)
+    has_exudyn = subprocess.run([python, "-c", "import exudyn"], capture_output=True).returncode == 0
+    if not (planar and has_exudyn and set(model.topology.kinds) <= {"revolute", "continuous"}):
+        return None
+    names, bodies, joints = model.body_names, [], []
+    poses = [np.asarray(jd.frame_pose(model, q, name), float) for name in names]
+    for i, (name, pose) in enumerate(zip(names, poses, strict=True)):
+        m, first, (xx, xy, yy, xz, yz, zz) = (*np.split(np.asarray(model.inertias[i], float), [1, 4]),)
+        c = first / m
+        about = np.array([[xx, xy, xz], [xy, yy, yz], [xz, yz, zz]]) - m * (c @ c * np.eye(3) - np.outer(c, c))
+        twist = np.asarray(jd.frame_velocity(model, q, v, name), float)
+        body = {"mass": float(m[0]), "com": c, "inertia": about, "position": pose[:3, 3], "rotation": pose[:3, :3]}
+        bodies.append(body | {"velocity": twist[:3], "omega": twist[3:]})
+        place = {"position": pose[:3, 3], "rotation": pose[:3, :3], "axes": [1, 1, 1, 1, 1, 0]}
+        joints.append({"body": i, "parent": model.topology.parents[i]} | place)
+    for loop in scene.constraints:
+        (a, _), (b, at) = loop.ends()
+        place = poses[names.index(b)] @ np.asarray(at, float)
+        joint = {"body": names.index(b), "parent": names.index(a) if a else -1, "axes": [1, 1, 0, 0, 0, 0]}
+        joints.append(joint | {"position": place[:3, 3], "rotation": place[:3, :3]})
+    gravity = np.zeros(3) if model.gravity is None else np.asarray(model.gravity, float)
+    mechanism = {"bodies": bodies, "joints": joints, "gravity": gravity, "steps": 50, "time": 0.05, "rounds": rounds}
+    given = json.dumps(mechanism, default=lambda x: x.tolist())
+    command = [python, str(Path(__file__).parent / "peers" / "with_exudyn.py")]
+    found = json.loads(subprocess.run(command, input=given, stdout=subprocess.PIPE, text=True, check=True).stdout)
+    end = jd.simulate(scene, q, v, jnp.asarray([0.0, 0.05]), stepsize=1e-3).q[-1]
+    ours = np.array([jd.frame_pose(model, end, name)[:3, 3] for name in names])
+    return found["seconds"], float(np.abs(ours - np.array(found["positions"])).max())
+
+
 def measure(name: str, scene, q, v, batch: int, rounds: int) -> list[dict]:
     """One row for a single call, and one for a batch."""
     rows, theirs = [], {} if "held" in name else peers(scene, q, v)
@@ -137,6 +177,9 @@ def measure(name: str, scene, q, v, batch: int, rounds: int) -> list[dict]:
             jax.block_until_ready(run(*state))
             calls[title] = lambda run=run, state=state: jax.block_until_ready(run(*state))
         times = timing.time_interleaved(calls, rounds)
+        if count == 1 and "held" not in name and (found := exudyn_steps(scene, q, v, rounds)):
+            print(f"{name}: positions after 50 steps of Exudyn differ by {found[1]:.1e} m", flush=True)
+            calls["Exudyn, 50 steps"], times["Exudyn, 50 steps"] = None, {"best": found[0]}
         rows.append(
             {"differences": differences}
             | {"scene": name, "batch": count}
@@ -158,7 +201,15 @@ def main(argv=None):
     for name in timing.chosen_names(options.scenes, scenes):
         batch = min(options.batch, 256) if "robot" in name else options.batch
         rows += measure(name, *scenes[name](), batch, options.rounds)
-    columns = ["acceleration", "constraintDynamics", "lcaba", "projection", "gradient", "50 steps of RK4"]
+    columns = [
+        "acceleration",
+        "constraintDynamics",
+        "lcaba",
+        "projection",
+        "gradient",
+        "50 steps of RK4",
+        "Exudyn, 50 steps",
+    ]
     print(f"| us a sample | batch | {' | '.join(columns)} |\n|---|---|{'---|' * len(columns)}")
     for row in rows:
         cells = (

@@ -247,9 +247,9 @@ def body_of(e: Emitter, program: Program, load: Callable, array: Callable, is_qu
 
     `is_quick`: whether code is wanted that compiles quickly.
     """
-    from jaxdyn.compile.listing import Listing, is_listed
+    from jaxdyn.compile.listing import Listing, has_table
 
-    return (Listing if is_listed(program, is_quick) else Body)(e, program, load, array)
+    return (Listing if has_table(program, is_quick) else Body)(e, program, load, array)
 
 
 def _find_products(program: Program) -> dict[int, int]:

@@ -27,7 +27,7 @@ _COLUMNS = 5  # of the table: code, result, three operands
 _ESCAPED = [f"\\{x:02X}" for x in range(256)]
 
 
-def is_listed(program: Program, is_quick: bool = False) -> bool:
+def has_table(program: Program, is_quick: bool = False) -> bool:
     """Decide whether the operations of a program are data of its code, or of that which runs until the other is there."""
     count = sum(x.op not in ("input", "part") for x in program.operations)
     if is_quick:

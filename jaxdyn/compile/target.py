@@ -18,7 +18,7 @@ from jaxdyn.compile.code import calls_itself, kernel_ir, subprogram_ir, symbol_o
 from jaxdyn.compile.first_calls import optimise_later, phase
 from jaxdyn.compile.jax_adapter import Unsupported as Unsupported
 from jaxdyn.compile.jax_adapter import ffi_version, register_handler
-from jaxdyn.compile.listing import is_listed
+from jaxdyn.compile.listing import has_table
 from jaxdyn.compile.objects import Code, features
 from jaxdyn.compile.program import FLOATS, Program, kind_of
 from jaxdyn.compile.stored import changed
@@ -417,7 +417,7 @@ def _quick_text(program, width: int, write: Callable) -> str:
     if not (width and objects.has_two_levels() and isinstance(program, Program)):
         return ""
     program = program.fast or program
-    return write(is_quick=True) if is_listed(program, True) and not is_listed(program) else ""
+    return write(is_quick=True) if has_table(program, True) and not has_table(program) else ""
 
 
 def _install(

@@ -37,7 +37,7 @@ def test_acceleration(count):
 def test_gradient():
     """The derivative of accelerations by velocities and angles, against differences."""
     scene, _, q, v = windows(40, 0.7, 1.3)
-    weights = jnp.cos(jnp.arange(scene.nv))
+    weights = jnp.asarray(np.cos(np.arange(scene.nv)))
 
     def value(q, v):
         return weights @ jd.constrained_dynamics(scene, q, v, weights).acceleration
@@ -45,7 +45,7 @@ def test_gradient():
     # Any direction: accelerations are defined off the constraints too.
     run, step, along = jax.jit(value), 1e-6, jnp.asarray(np.sin(3.0 * np.arange(scene.nv)))
     for i, gradient in enumerate(jax.jit(jax.grad(value, (0, 1)))(q, v)):
-        ends = [run(*(x + side * step * along * (i == k) for k, x in enumerate((q, v)))) for side in (1, -1)]
+        ends = [run(*(x + side * step * along * float(i == k) for k, x in enumerate((q, v)))) for side in (1, -1)]
         # Central differences have errors of 1e-9 of the largest terms.
         np.testing.assert_allclose(gradient @ along, (ends[0] - ends[1]) / (2 * step), rtol=1e-6, atol=1e-7)
 
