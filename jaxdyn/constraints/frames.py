@@ -180,7 +180,7 @@ def _few_columns(left, subspace, mask: np.ndarray):
     """`_masked_columns` by those columns alone that the mask leaves: of a large mechanism they are few."""
     count = mask.sum(1).max()
     index = np.argsort(~mask, axis=1, kind="stable")[:, :count]
-    product = matmul(left, jnp.swapaxes(take(subspace, index), 1, 2))
+    product = matmul(left, jnp.swapaxes(subspace[index], 1, 2))
     product = product * jnp.asarray(np.take_along_axis(mask, index, 1)[:, None, :], left.dtype)
     rows, zero = np.ogrid[: left.shape[0], : left.shape[1], :1], jnp.zeros((*left.shape[:2], len(subspace)), left.dtype)
     return zero.at[rows[0], rows[1], index[:, None, :]].set(product)

@@ -57,9 +57,15 @@ class _Run(NamedTuple):
         return self.method.to_qv(scene, self.method.correct(scene, y, t), t)
 
 
+def _as_arrays(known: Known) -> Any:
+    """A known tree whose leaves are arrays of JAX, also within a trace."""
+    with jax.ensure_compile_time_eval():
+        return jax.tree.map(jnp.asarray, known(()))
+
+
 def smooth_motion(given_scene: Scene | Known, control, method: Method, numbers, options) -> Solution:
     """Run of `simulate`; `numbers`: q0, v0, ts, rtol, atol and the length of steps or a controller of them."""
-    scene: Scene = given_scene(()) if isinstance(given_scene, Known) else given_scene
+    scene: Scene = _as_arrays(given_scene) if isinstance(given_scene, Known) else given_scene
     options = as_objects(options, numbers[-1])
     given, inputs = (scene, control, numbers), safe_inputs(scene.system, numbers)
     scene, inputs, faults = _project_start(scene, method, inputs, options["selects_rows"])

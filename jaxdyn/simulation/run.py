@@ -13,7 +13,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from jaxdyn.compile import entry_point
-from jaxdyn.compile.known import as_constant, as_numpy_if_known, is_concrete, is_known, once
+from jaxdyn.compile.known import as_constant, as_numpy_if_known, is_concrete, is_known, is_tracing, once
 from jaxdyn.contact.unilateral import has_modes
 from jaxdyn.model.arguments import Numbers, as_array, check_flag, state_dtype
 from jaxdyn.simulation import checks, controls
@@ -158,7 +158,7 @@ def simulate(
         solution = hybrid_motion(scene, control, numbers, options)
     else:
         # A large scene is a constant of the program: its zeros are known, and most of it is zeros.
-        whole = as_constant(scene) if is_concrete(scene) and not is_given(scene) else scene
+        whole = as_constant(scene) if not is_tracing() and is_concrete(scene) and not is_given(scene) else scene
         solution = smooth_motion(whole, control, method, numbers, options)
     if limits == "report":
         from jaxdyn.simulation.terminal_events import report_limits
