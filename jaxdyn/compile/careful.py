@@ -18,7 +18,7 @@ import jax.numpy as jnp
 
 from jaxdyn.compile import derive, mode
 from jaxdyn.compile.program import Array, Constant, Operation, Program, kind_of
-from jaxdyn.compile.stored import changed, key_within
+from jaxdyn.compile.stored import error_of_retrace, key_within
 
 T = TypeVar("T")
 
@@ -130,7 +130,7 @@ class Description(NamedTuple):
         def again() -> Careful:
             made = remake()
             if not isinstance(made, Careful) or (made.inputs, made.outputs) != (inputs, outputs):
-                raise changed(name)
+                raise error_of_retrace(name)
             return made
 
         def by_jax(*flat):

@@ -9,7 +9,7 @@ register, and a loop takes the columns of that argument, as many as there are la
 from collections.abc import Callable, Sequence
 from typing import Any
 
-from jaxdyn.compile.code import Body
+from jaxdyn.compile.body import Body
 from jaxdyn.compile.graph import Graph
 from jaxdyn.compile.inlining import replay
 from jaxdyn.compile.llvm import Emitter

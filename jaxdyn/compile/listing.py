@@ -1,7 +1,7 @@
 """Large programs as data: a loop carries out their operations one after the other, from a table.
 
 LLVM takes some 50 microseconds for an operation, and code that is run through once waits for memory as long as a table does. The
-code of a listing is that of one operation of each kind, with the arithmetic of `code.Body`, so that results are the same bits.
+code of a listing is that of one operation of each kind, with the arithmetic of `body.Body`, so that results are the same bits.
 Every number has a place in memory, which is used again when nothing needs the number any more. A row of the table has the number
 of a piece of code, the place of the result, and those of the operands. Between calls of subprograms the table is run in one go.
 """
@@ -12,8 +12,8 @@ from collections.abc import Callable, Sequence
 import numpy as np
 
 from jaxdyn.compile import careful_text, memory
+from jaxdyn.compile.body import Body, has_loop, has_zeros, is_zero, write_call
 from jaxdyn.compile.careful import Careful
-from jaxdyn.compile.code import Body, has_loop, has_zeros, is_zero, write_call
 from jaxdyn.compile.llvm import Emitter
 from jaxdyn.compile.memory import allocation, bytes_of
 from jaxdyn.compile.program import COMPARISONS, Array, Constant, Program, dtype_of, kind_of

@@ -16,7 +16,8 @@ import jax
 import numpy as np
 
 from jaxdyn.compile import memory
-from jaxdyn.compile.code import Body, body_of, wrap_kernel
+from jaxdyn.compile.body import Body
+from jaxdyn.compile.code import body_of, wrap_kernel
 from jaxdyn.compile.llvm import Emitter
 from jaxdyn.compile.memory import bytes_of
 from jaxdyn.compile.program import Array, kind_of

@@ -10,7 +10,8 @@ from typing import Any
 
 import numpy as np
 
-from jaxdyn.compile.code import ATTRIBUTES, Body, symbol_of
+from jaxdyn.compile.body import Body, symbol_of
+from jaxdyn.compile.code import ATTRIBUTES
 from jaxdyn.compile.llvm import Emitter
 from jaxdyn.compile.memory import allocation, bytes_of, zero
 from jaxdyn.compile.program import Array, kind_of

@@ -12,7 +12,8 @@ import jax
 import numpy as np
 
 from jaxdyn.compile import derive
-from jaxdyn.compile.code import ATTRIBUTES, Body, symbol_of
+from jaxdyn.compile.body import Body, symbol_of
+from jaxdyn.compile.code import ATTRIBUTES
 from jaxdyn.compile.directions import Directions
 from jaxdyn.compile.graph import Graph
 from jaxdyn.compile.inlining import inline, replay

@@ -112,7 +112,7 @@ class StoredProgram(Program):
         made = self._remake()
         if made.digest != self.digest:
             if (made.inputs, made.outputs, made.read_places) != (self.inputs, self.outputs, self.read_places):
-                raise changed(self.name)
+                raise error_of_retrace(self.name)
             self.subprograms = made.subprograms
         return made
 
@@ -122,11 +122,11 @@ def _subprogram_of(program: StoredProgram, i: int) -> Any:
     made = program.remade.subprograms
     found = [x for x in made if x.digest == program.stored[i].digest] or made[i : i + 1]
     if not found:
-        raise changed(program.name)
+        raise error_of_retrace(program.name)
     return found[0]
 
 
-def changed(name: str) -> RuntimeError:
+def error_of_retrace(name: str) -> RuntimeError:
     """The error where a function gives another program than the one that is on disk under its key."""
     return RuntimeError(f"{name} has another program when it is traced again; remove {disk.cache_folder()}")
 

@@ -12,16 +12,17 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from jaxdyn.compile import ahead, objects
+from jaxdyn.compile.body import symbol_of
 from jaxdyn.compile.careful import Careful, run_apart
 from jaxdyn.compile.careful_text import CAREFUL, identity_of, number_of
-from jaxdyn.compile.code import calls_itself, kernel_ir, subprogram_ir, symbol_of, varying_first
+from jaxdyn.compile.code import calls_itself, kernel_ir, subprogram_ir, varying_first
 from jaxdyn.compile.first_calls import optimise_later, phase
 from jaxdyn.compile.jax_adapter import Unsupported as Unsupported
 from jaxdyn.compile.jax_adapter import ffi_version, register_handler
 from jaxdyn.compile.listing import has_table
 from jaxdyn.compile.objects import Code, features
 from jaxdyn.compile.program import FLOATS, Program, kind_of
-from jaxdyn.compile.stored import changed
+from jaxdyn.compile.stored import error_of_retrace
 
 TARGET = "jaxdyn_kernel"
 SLOTS = 1 << 16
@@ -242,7 +243,7 @@ class _Kernel:
             if self.recover is not None:
                 run_apart(self.recover)
             if not self.make():
-                raise changed(self.row.name)
+                raise error_of_retrace(self.row.name)
         return self.entry.kernel
 
     def make(self) -> bool:

@@ -203,7 +203,7 @@ def _search_rows(scene: Scene, q, t: Any, rank_tol: float | None) -> Selection:
     # A choice has no derivative: forces do not select rows, and the scene, q and t enter without tangents.
     if is_concrete(scene, q, t):
         place = np.asarray(q), np.asarray(t, q.dtype)
-        every, has_doubtful_rows = known_rows(scene, rank_tol=rank_tol, dtype=q.dtype)
+        every, has_doubtful_rows = rows_and_doubts(scene, rank_tol=rank_tol, dtype=q.dtype)
         # Most scenes have independent rows: one Cholesky factorisation says so, and the search is skipped.
         if not every.kept.size or not has_doubtful_rows(*place):
             return every
@@ -222,7 +222,7 @@ def _search_rows(scene: Scene, q, t: Any, rank_tol: float | None) -> Selection:
 
 
 @once
-def known_rows(scene: Scene, *, rank_tol: float | None, dtype) -> tuple[Selection, Evaluation]:
+def rows_and_doubts(scene: Scene, *, rank_tol: float | None, dtype) -> tuple[Selection, Evaluation]:
     """All rows of a known scene, and whether some are doubtful at (q, t)."""
     bare, every = Scene(scene.system, scene.constraints), _every_row(scene, dtype)
     return every, Evaluation(

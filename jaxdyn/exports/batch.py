@@ -2,7 +2,7 @@
 
 from typing import Any
 
-from jaxdyn.compile.code import Body
+from jaxdyn.compile.body import Body
 from jaxdyn.compile.llvm import Emitter
 from jaxdyn.compile.program import kind_of
 from jaxdyn.compile.standalone import DEGENERATE, NOT_FINITE, Text, all_finite

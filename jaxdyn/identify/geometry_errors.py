@@ -2,7 +2,7 @@ r"""Errors of measured tip poses as functions of a mechanism's geometry, and the
 
 Every joint i has a home pose $H_i$ and a screw $S_i$; the tip is at
 
-$$T = B\,e^{\beta} \prod_i H_i\,e^{\xi_i}\,e^{S_i q_i}\; F\,e^{\tau}$$
+$$T = B\,e^{\beta} \prod_i H_i\,e^{\xi_i}\,e^{S_i q_i}\, F\,e^{\tau}$$
 
 with the base B in the frame of the measuring device and the tool F in the last body. Unknown are the twists $\beta$, $\xi_i$ and
 $\tau$. The errors of the zero of an encoder, of the direction of an axis and of lengths between joints are components of $\xi_i$.

@@ -17,7 +17,7 @@ from jaxdyn.constraints.assembly import largest_residuals, open_constraints, sta
 from jaxdyn.constraints.base import layout
 from jaxdyn.constraints.rank import LEAST_GAP
 from jaxdyn.constraints.redundancy import holds_rows, keep_rows
-from jaxdyn.constraints.selection import count_free, known_rows, most_rounding, select_rows
+from jaxdyn.constraints.selection import count_free, most_rounding, rows_and_doubts, select_rows
 from jaxdyn.contact.forces import contacts_with_cones
 from jaxdyn.dynamics.quantities import mass_matrix
 from jaxdyn.forces.piecewise import has_pieces
@@ -374,7 +374,7 @@ def check_constraints(scene: Scene, method: Method, q, v, t) -> tuple[Scene, Met
 @once
 def _find_soundness(scene: Scene, *, rank_tol, dtype) -> Callable[..., bool]:
     """Function (q, v, t) of a known scene: whether all rows are independent beyond doubt, and closed, and leave freedom."""
-    rows, has_doubtful_rows = known_rows(scene, rank_tol=rank_tol, dtype=dtype)
+    rows, has_doubtful_rows = rows_and_doubts(scene, rank_tol=rank_tol, dtype=dtype)
     is_free = rows.kept.size < scene.nv and not holds_rows(scene)
     openness = start_openness(scene, relative=start_limit(dtype))
     return lambda q, v, t: is_free and not has_doubtful_rows(q, t) and bool(openness(q, v, t) <= 1)

@@ -977,12 +977,14 @@ def second_process(tmp_path_factory):
         own = jax.jit(function)(*[jnp.full(2, 0.1 * k) for k in range(3)]).tolist()
     finally:
         disk._folder, disk._is_off = before
+    # That of the handler is there too, if this test is the first of the process that calls a kernel.
     files = sorted(path.name for path in cache.rglob("*.o"))
     stored = bytes(_exported().serialize()) if importlib.util.find_spec("flatbuffers") else b""
     env, command = os.environ | {"XDG_CACHE_HOME": str(cache)}, [sys.executable, "-c", SECOND]
     done = subprocess.run(command, input=stored, env=env, capture_output=True, timeout=300)
     assert done.returncode == 0, done.stderr.decode()[-2000:]
-    assert sorted(path.name for path in cache.rglob("*.o")) == files
+    after = sorted(path.name for path in cache.rglob("*.o"))
+    assert set(files) <= set(after) and len(after) <= len(files) + 1
     return own, files, json.loads(done.stdout)
 
 

@@ -7,7 +7,7 @@ import pytest
 
 from jaxdyn.compile import compilation, kernel, target
 from jaxdyn.compile.batch import repeat_while
-from jaxdyn.compile.code import symbol_of
+from jaxdyn.compile.body import symbol_of
 from jaxdyn.compile.expansion import expand
 from jaxdyn.compile.loops import Carry, Given, Iteration, Task, run_loop
 

@@ -254,6 +254,7 @@ OTHERS = {
     "laws without constraints": ("control.ComputedTorque", "control.OperationalSpace"),
     "of hands, whose rows are contacts": ("grasp.", "control.GraspForce"),
     "calibration of logs": ("identify.Measured",),
+    "result of a calibration": ("identify.GeometryFit",),
     "runs `simulate`, `sensors.measure`": ("scale.run", "sensors.record"),
     "forces of a scene, not of its rows": ("forces.external_wrenches",),
     "data": ("scenes.NamedScene", "sensors.Motion"),

@@ -484,7 +484,7 @@ def test_modes_that_flip_without_end_are_not_found(monkeypatch):
 
     choice = jax.jit(jax.vmap(search))(jnp.array([True, False]))
     assert choice.done.all() and choice.wrong.tolist() == [True, False]
-    change = transitions.Transition(None, None, None, None, ~choice.wrong[0], jnp.asarray(False))
+    change = transitions.Transition(None, None, None, None, ~choice.wrong[0], jnp.asarray(False), None)
     ((paradox, _), (unsettled, code)) = _cases(change)
     assert bool(unsettled) and not bool(paradox) and code is jd.RESULTS.no_contact_mode
 

@@ -12,8 +12,9 @@ import copy
 import re
 from collections.abc import Sequence
 
+from jaxdyn.compile.body import symbol_of
 from jaxdyn.compile.careful import Careful
-from jaxdyn.compile.code import kernel_ir, subprogram_ir, symbol_of, varying_first
+from jaxdyn.compile.code import kernel_ir, subprogram_ir, varying_first
 from jaxdyn.compile.gpu.functions import library_text
 from jaxdyn.compile.llvm import Emitter
 from jaxdyn.compile.program import Array, Constant, Operation, Program, kind_of

@@ -230,6 +230,30 @@ def test_lengths_of_a_loop_follow_from_its_motor_and_tip():
     np.testing.assert_allclose(fit.predict(at)[:, :3, 3], wanted, atol=1e-9)
 
 
+def test_chosen_places_of_a_loop_close_it_and_repeat_with_their_seed():
+    scene = four_bar()
+    guess = four_bar_states(scene, [0.0])[0]
+
+    def choose(seed):
+        return identify.choose_poses(
+            scene,
+            8,
+            frame="tip",
+            markers=np.zeros((1, 3)),
+            free=("lengths",),
+            measured=["motor"],
+            guess=guess,
+            seed=seed,
+        )
+
+    q = choose(3)
+    coupler, rocker = (
+        np.stack([jd.frame_pose(scene.system, jnp.asarray(x), name) for x in q]) for name in ("coupler", "rocker")
+    )
+    np.testing.assert_allclose(coupler @ [0.9, 0, 0, 1], rocker @ [0.6, 0, 0, 1], atol=1e-10)
+    np.testing.assert_array_equal(q, choose(3))
+
+
 def test_refusals_of_loops():
     scene = four_bar()
     q = np.zeros((9, 3))
