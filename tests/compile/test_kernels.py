@@ -954,7 +954,8 @@ count, compiled = [], objects.compile_text
 objects.compile_text = lambda *args: count.append(args) or compiled(*args)
 function = kernel(lambda _, x, y, z: jnp.sin(x) * 1.2345 + y * z)
 a = jax.jit(lambda *x: function((), *x))(*[jnp.full(2, 0.1 * k) for k in range(3)])
-told = {"compiled": len(count), "acceleration": a.tolist(), "refused": ""}
+# The handler, which every process needs, may have been compiled before the folder was chosen.
+told = {"compiled": sum("@handler(" not in text for text, *_ in count), "acceleration": a.tolist(), "refused": ""}
 stored = sys.stdin.buffer.read()
 if stored:
     try:
