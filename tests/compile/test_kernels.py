@@ -973,12 +973,12 @@ def second_process(tmp_path_factory):
     """
     cache, before = tmp_path_factory.mktemp("cache"), (disk._folder, disk._is_off)
     function = native(lambda x, y, z: jnp.sin(x) * 1.2345 + y * z)  # of no other test
+    target.register()  # the handler's code is a file too, which the second process adds
     disk.set_cache_folder(cache / "jaxdyn" / "kernels")
     try:
         own = jax.jit(function)(*[jnp.full(2, 0.1 * k) for k in range(3)]).tolist()
     finally:
         disk._folder, disk._is_off = before
-    # That of the handler is there too, if this test is the first of the process that calls a kernel.
     files = sorted(path.name for path in cache.rglob("*.o"))
     stored = bytes(_exported().serialize()) if importlib.util.find_spec("flatbuffers") else b""
     env, command = os.environ | {"XDG_CACHE_HOME": str(cache)}, [sys.executable, "-c", SECOND]
