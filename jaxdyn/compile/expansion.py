@@ -184,7 +184,7 @@ class _Expansion:
 
     def _subprogram(self, inner: ClosedJaxpr, args) -> tuple[Program, list]:
         """A function as a subprogram, and its arguments without what is known of them, which is compiled in."""
-        known = tuple(_known_entries(x) for x in args)
+        known = tuple(_find_known_entries(x) for x in args)
         program, has_rules = _subprogram(inner, known, self.graph.most)
         self.has_rules |= has_rules
         program, places = without_unread(program)
@@ -340,21 +340,23 @@ def _innermost(inner: ClosedJaxpr, args: Sequence, again, given: Sequence) -> tu
     return _innermost(params["call"], args, params["again"], args)
 
 
-def _known_entries(x: np.ndarray) -> bytes | tuple | None:
+def _find_known_entries(x: np.ndarray) -> bytes | tuple | None:
     """The type and bytes of a known array; of another one its zeros and ones, None in all other places, or None without any."""
     if x.dtype.kind != "O":
         return f"{x.dtype.str} ".encode() + x.tobytes()
     # Other known numbers are passed: a function that is called with several of them is compiled once.
-    entries = tuple([None if type(y) is Number or y not in (0, 1, -1) else _signed(y) for y in x.ravel().tolist()])
+    entries = tuple(
+        [None if type(y) is Number or y not in (0, 1, -1) else _write_number(y) for y in x.ravel().tolist()]
+    )
     return entries if any(y is not None for y in entries) else None
 
 
-def _signed(x) -> str:
+def _write_number(x) -> str:
     return "-0" if x == 0 and math.copysign(1.0, x) < 0 else str(int(x))
 
 
 def _split_entries(x: np.ndarray, known: tuple | None) -> np.ndarray:
-    """The entries that `_known_entries` does not know."""
+    """The entries that `_find_known_entries` does not know."""
     if known is None:
         return x
     return objects(given := [y for y, z in zip(x.ravel().tolist(), known, strict=True) if z is None], (len(given),))
@@ -372,7 +374,7 @@ def _join_entries(x: np.ndarray, known: tuple | None, array: Array) -> np.ndarra
 def _subprogram(inner: ClosedJaxpr, known: tuple, most: int) -> tuple[Program, bool]:
     """The program of a function that others call, and whether it has rules.
 
-    `known`: what `_known_entries` says of the arguments. Where numbers may be flagged, there is one more output, which says
+    `known`: what `_find_known_entries` says of the arguments. Where numbers may be flagged, there is one more output, which says
     whether one is.
     """
     # By the identity of the jaxpr, which JAX keeps for a function under `jit`: of all calls of a function one program is made.

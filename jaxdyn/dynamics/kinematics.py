@@ -354,7 +354,7 @@ def take(rows: Array, index: np.ndarray) -> Array:
     """`rows[index]` for a constant index; no operation when the index lists all rows in order."""
     index = np.asarray(index)
     # A gather stays an operation of the program even where it moves nothing.
-    if len(index) == rows.shape[0] and (index == np.arange(len(index))).all():
+    if index.shape == rows.shape[:1] and (index == np.arange(len(index))).all():
         return rows
     return rows[index]
 

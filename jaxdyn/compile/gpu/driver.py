@@ -64,7 +64,7 @@ class Driver:
         version = self._ask("cuDriverGetVersion")
         if version < LEAST_DRIVER:
             raise Unsupported(
-                f"CUDA's driver is of version {_shown(version)}, and kernels need {_shown(LEAST_DRIVER)} or newer"
+                f"CUDA's driver is of version {_write_version(version)}, and kernels need {_write_version(LEAST_DRIVER)} or newer"
             )
         capabilities = [self._capability(self._ask("cuDeviceGet", i)) for i in range(self._ask("cuDeviceGetCount"))]
         if not capabilities:
@@ -128,7 +128,7 @@ class Driver:
         return function.value, registers, multiprocessors
 
 
-def _shown(version: int) -> str:
+def _write_version(version: int) -> str:
     return f"{version // 1000}.{version % 1000 // 10}"
 
 

@@ -45,46 +45,46 @@ def _power_of_two(k: Number) -> Number:
     return (k + 1023).shift("shl", 52).of_bits()
 
 
-def _reduced_exp(x: Number) -> tuple[Number, Number]:
+def _reduce_exp(x: Number) -> tuple[Number, Number]:
     """e^r - 1 and the integer k with x = k ln 2 + r, for |x| up to 1100."""
     k = (x * (1 / math.log(2))).call("roundeven")
     r = k.times_plus(-LN2_LOW, k.times_plus(-LN2_HIGH, x))
     return (r * r).times_plus(_polynomial(r, EXP), r), k
 
 
-def _scaled(x: Number, k: Number) -> Number:
+def _scale(x: Number, k: Number) -> Number:
     """Number x times 2^k in two steps, each of which is a normal number."""
     k = k.convert("i8")
     half = k.shift("ashr", 1)
     return x * _power_of_two(half) * _power_of_two(k - half)
 
 
-def _clamped(x: Number) -> Number:
+def _clamp(x: Number) -> Number:
     return x.call("minnum", 1100.0).call("maxnum", -1100.0)
 
 
 def _exp(x: Number) -> Number:
-    p, k = _reduced_exp(_clamped(x))
-    return x.is_equal(x).pick(_scaled(p + 1.0, k), x)
+    p, k = _reduce_exp(_clamp(x))
+    return x.is_equal(x).pick(_scale(p + 1.0, k), x)
 
 
 def _exp2(x: Number) -> Number:
-    near = _clamped(x)
+    near = _clamp(x)
     k = near.call("roundeven")
     r = near - k
     r = (r * math.log(2)) + r * 2.3190468138462996e-17  # what the nearest number to ln 2 lacks
-    return x.is_equal(x).pick(_scaled((r * r).times_plus(_polynomial(r, EXP), r) + 1.0, k), x)
+    return x.is_equal(x).pick(_scale((r * r).times_plus(_polynomial(r, EXP), r) + 1.0, k), x)
 
 
 def _expm1(x: Number) -> Number:
-    p, k = _reduced_exp(x.call("minnum", 40.0).call("maxnum", -80.0))
+    p, k = _reduce_exp(x.call("minnum", 40.0).call("maxnum", -80.0))
     scale = _power_of_two(k.convert("i8"))
     near = p.times_plus(scale, scale - 1.0)
     near = (x.abs() < 1e-300).pick(x, near)  # with the sign of zero
     return (x.is_equal(x) & (x < 40.0)).pick(near, _exp(x))
 
 
-def _half_exp_squared(x: Number) -> Number:
+def _half_of_exp(x: Number) -> Number:
     """e^x / 2, which is a number where e^x is none."""
     half = _exp(x * 0.5)
     return half * 0.5 * half
@@ -93,13 +93,13 @@ def _half_exp_squared(x: Number) -> Number:
 def _sinh(x: Number) -> Number:
     a = x.abs()
     t = _expm1(a)
-    return (a < 22.0).pick((t + t / (t + 1.0)) * 0.5, _half_exp_squared(a)).call("copysign", x)
+    return (a < 22.0).pick((t + t / (t + 1.0)) * 0.5, _half_of_exp(a)).call("copysign", x)
 
 
 def _cosh(x: Number) -> Number:
     a = x.abs()
     e = _exp(a)
-    return (a < 22.0).pick((e + 1.0 / e) * 0.5, _half_exp_squared(a))
+    return (a < 22.0).pick((e + 1.0 / e) * 0.5, _half_of_exp(a))
 
 
 def _tanh(x: Number) -> Number:
@@ -242,15 +242,15 @@ def _far_angle(x: Number) -> tuple[Number, Number, Number, Number]:
     def wide(op, a, b):
         return e.emit(f"{op} i128 {a}, {b}")
 
-    def cut(a):
+    def take_low_bits(a):
         return e.emit(f"trunc i128 {a} to i64")
 
     n, high, middle, low = (e.emit(f"zext i64 {w} to i128") for w in (n.name, high, middle, low))
     total = wide("add", wide("mul", n, middle), wide("lshr", wide("mul", n, low), 64))
     total = wide("add", wide("shl", wide("mul", n, high), 64), total)
     fraction = wide("shl", total, 2)  # beyond the two bits of whole quarters
-    quarters = Number(e, cut(wide("lshr", total, 126)), "i8")
-    top, bottom = (Number(e, cut(x), "i8") for x in (wide("lshr", fraction, 64), fraction))
+    quarters = Number(e, take_low_bits(wide("lshr", total, 126)), "i8")
+    top, bottom = (Number(e, take_low_bits(x), "i8") for x in (wide("lshr", fraction, 64), fraction))
     quarters = quarters + (top < 0).pick(Number(e, "1", "i8"), 0)
     rest = bottom.write("uitofp i64 {} to double", "f8")
     part = top.convert("f8") * 2.0**-64 + rest * 2.0**-128
