@@ -339,10 +339,10 @@ def main() -> None:
     parser.add_argument("--only", default="", help="with --count: part of the names of functions")
     args = parser.parse_args()
     if args.count:
-        from jaxdyn.compile.gpu import device
+        from jaxdyn.compile.gpu import device as gpu_device
 
         # What native kernels ask the driver for before anything is launched: the architecture, that of an H100.
-        device.driver = lambda: SimpleNamespace(architecture=90, launch=0)
+        gpu_device.driver = lambda: SimpleNamespace(architecture=90, launch=0)
         for mode in args.modes:
             with jd.compilation(mode):
                 print(f"mode {mode}")
