@@ -54,7 +54,7 @@ def run_threads(program, args) -> list[np.ndarray]:
 
     def placed(x, array, same):
         flat = x.reshape(array.size) if same else x.reshape(samples, array.size)
-        return np.ascontiguousarray(flat.T if text.is_aside(array, same) else flat)
+        return np.ascontiguousarray(flat.T if text.is_interleaved(array, same) else flat)
 
     given = [placed(x, array, same) for x, array, same in zip(args, program.inputs, uniform, strict=True)]
     results = [placed(np.zeros((samples, x.size), x.dtype), x, False) for x in program.outputs]
@@ -62,7 +62,7 @@ def run_threads(program, args) -> list[np.ndarray]:
     pointers = [given[i].ctypes.data for i in varying_first(uniform)] + [x.ctypes.data for x in results]
     kernel.run(pointers, samples, samples + 3)  # threads beyond the last sample do nothing
     return [
-        (x.T if text.is_aside(array, False) else x).reshape(*lead, array.size)
+        (x.T if text.is_interleaved(array, False) else x).reshape(*lead, array.size)
         for x, array in zip(results, program.outputs, strict=True)
     ]
 

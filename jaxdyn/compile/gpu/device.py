@@ -10,7 +10,7 @@ from importlib import resources
 from jaxdyn.compile.careful_text import number_of
 from jaxdyn.compile.gpu.driver import DriverError, driver
 from jaxdyn.compile.gpu.ptx import ptx_of
-from jaxdyn.compile.gpu.text import KERNEL, MAX_THREADS, is_aside, module_ir
+from jaxdyn.compile.gpu.text import KERNEL, MAX_THREADS, is_interleaved, module_ir
 from jaxdyn.compile.gpu.text import TooLarge as TooLarge
 from jaxdyn.compile.jax_adapter import ffi_version, register_handler
 from jaxdyn.compile.objects import Code, compile_text
@@ -20,7 +20,7 @@ TARGET = "jaxdyn_cuda_kernel"
 MAX_DEVICES = 64
 # A block of more threads would leave registers of a multiprocessor unused, which has 65536.
 MANY_REGISTERS = 128
-WARPS_AT_LEAST = 4  # on each multiprocessor, which has as many schedulers
+MIN_WARPS = 4  # on each multiprocessor, which has as many schedulers
 _DEVICE = f"jaxdyn: kernels know {MAX_DEVICES} devices of a process"
 
 logger = logging.getLogger("jaxdyn")
@@ -44,7 +44,7 @@ class _Kernel:
         function, registers, multiprocessors = driver().load(self.ptx, KERNEL, stream)
         self.entry.chunk = MAX_THREADS if registers <= MANY_REGISTERS else MAX_THREADS // 2
         # Small batches are spread over all multiprocessors.
-        self.entry.least = 32 * WARPS_AT_LEAST * multiprocessors
+        self.entry.least = 32 * MIN_WARPS * multiprocessors
         self.functions[device] = function
 
 
@@ -66,7 +66,7 @@ def layouts(program, uniform: Sequence[bool], shapes: Sequence[tuple[int, ...]])
     found = []
     for shape, array, is_same in zip(shapes, (*program.inputs, *program.outputs), same, strict=True):
         axes = range(len(shape))
-        last = (*reversed(axes[:-1]), axes[-1]) if is_aside(array, is_same) else tuple(reversed(axes))
+        last = (*reversed(axes[:-1]), axes[-1]) if is_interleaved(array, is_same) else tuple(reversed(axes))
         found.append(last)
     return found
 

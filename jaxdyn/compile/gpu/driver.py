@@ -7,7 +7,7 @@ import sys
 from collections.abc import Iterator
 from contextlib import contextmanager
 
-from jaxdyn.compile.gpu.ptx import ARCHITECTURES, LEAST_DRIVER, architecture_for
+from jaxdyn.compile.gpu.ptx import ARCHITECTURES, MIN_DRIVER, architecture_for
 from jaxdyn.compile.jax_adapter import Unsupported
 
 _HANDLE, _INT = ctypes.c_void_p, ctypes.c_int
@@ -62,9 +62,9 @@ class Driver:
             function.argtypes, function.restype = arguments, _INT
         self.call("cuInit", 0)
         version = self._ask("cuDriverGetVersion")
-        if version < LEAST_DRIVER:
+        if version < MIN_DRIVER:
             raise Unsupported(
-                f"CUDA's driver is of version {_write_version(version)}, and kernels need {_write_version(LEAST_DRIVER)} or newer"
+                f"CUDA's driver is of version {_write_version(version)}, and kernels need {_write_version(MIN_DRIVER)} or newer"
             )
         capabilities = [self._capability(self._ask("cuDeviceGet", i)) for i in range(self._ask("cuDeviceGetCount"))]
         if not capabilities:

@@ -33,7 +33,7 @@ INF, NAN = math.inf, math.nan
 def _polynomial(x: Number, coefficients) -> Number:
     value = constant(x, coefficients[-1])
     for coefficient in coefficients[-2::-1]:
-        value = value.times_plus(x, coefficient)
+        value = value.fma(x, coefficient)
     return value
 
 
@@ -42,14 +42,14 @@ def _polynomial(x: Number, coefficients) -> Number:
 
 def _power_of_two(k: Number) -> Number:
     """2^k for an integer k of a normal number."""
-    return (k + 1023).shift("shl", 52).of_bits()
+    return (k + 1023).shift("shl", 52).from_bits()
 
 
 def _reduce_exp(x: Number) -> tuple[Number, Number]:
     """e^r - 1 and the integer k with x = k ln 2 + r, for |x| up to 1100."""
     k = (x * (1 / math.log(2))).call("roundeven")
-    r = k.times_plus(-LN2_LOW, k.times_plus(-LN2_HIGH, x))
-    return (r * r).times_plus(_polynomial(r, EXP), r), k
+    r = k.fma(-LN2_LOW, k.fma(-LN2_HIGH, x))
+    return (r * r).fma(_polynomial(r, EXP), r), k
 
 
 def _scale(x: Number, k: Number) -> Number:
@@ -65,27 +65,27 @@ def _clamp(x: Number) -> Number:
 
 def _exp(x: Number) -> Number:
     p, k = _reduce_exp(_clamp(x))
-    return x.is_equal(x).pick(_scale(p + 1.0, k), x)
+    return x.is_equal(x).select(_scale(p + 1.0, k), x)
 
 
 def _exp2(x: Number) -> Number:
     near = _clamp(x)
     k = near.call("roundeven")
     r = near - k
-    r = (r * math.log(2)) + r * 2.3190468138462996e-17  # what the nearest number to ln 2 lacks
-    return x.is_equal(x).pick(_scale((r * r).times_plus(_polynomial(r, EXP), r) + 1.0, k), x)
+    r = (r * math.log(2)) + r * 2.3190468138462996e-17  # the rounding error of ln 2
+    return x.is_equal(x).select(_scale((r * r).fma(_polynomial(r, EXP), r) + 1.0, k), x)
 
 
 def _expm1(x: Number) -> Number:
     p, k = _reduce_exp(x.call("minnum", 40.0).call("maxnum", -80.0))
     scale = _power_of_two(k.convert("i8"))
-    near = p.times_plus(scale, scale - 1.0)
-    near = (x.abs() < 1e-300).pick(x, near)  # with the sign of zero
-    return (x.is_equal(x) & (x < 40.0)).pick(near, _exp(x))
+    near = p.fma(scale, scale - 1.0)
+    near = (x.abs() < 1e-300).select(x, near)  # with the sign of zero
+    return (x.is_equal(x) & (x < 40.0)).select(near, _exp(x))
 
 
 def _half_of_exp(x: Number) -> Number:
-    """e^x / 2, which is a number where e^x is none."""
+    """e^x / 2, which is finite up to larger x than e^x."""
     half = _exp(x * 0.5)
     return half * 0.5 * half
 
@@ -93,13 +93,13 @@ def _half_of_exp(x: Number) -> Number:
 def _sinh(x: Number) -> Number:
     a = x.abs()
     t = _expm1(a)
-    return (a < 22.0).pick((t + t / (t + 1.0)) * 0.5, _half_of_exp(a)).call("copysign", x)
+    return (a < 22.0).select((t + t / (t + 1.0)) * 0.5, _half_of_exp(a)).call("copysign", x)
 
 
 def _cosh(x: Number) -> Number:
     a = x.abs()
     e = _exp(a)
-    return (a < 22.0).pick((e + 1.0 / e) * 0.5, _half_of_exp(a))
+    return (a < 22.0).select((e + 1.0 / e) * 0.5, _half_of_exp(a))
 
 
 def _tanh(x: Number) -> Number:
@@ -113,18 +113,18 @@ def _tanh(x: Number) -> Number:
 def _mantissa(x: Number) -> tuple[Number, Number]:
     """Number m between the root of a half and that of two, and k, with x = m 2^k for finite x above zero."""
     is_small = x < 2.0**-1022
-    bits = is_small.pick(x * 2.0**54, x).bits()
+    bits = is_small.select(x * 2.0**54, x).bits()
     least = 0x3FE6A09E667F3BCD  # the bits of the root of a half
     k = (bits - least).shift("ashr", 52)
-    m = (bits - k.shift("shl", 52)).of_bits()
-    return m, k.convert("f8") - is_small.pick(54.0, 0.0)
+    m = (bits - k.shift("shl", 52)).from_bits()
+    return m, k.convert("f8") - is_small.select(54.0, 0.0)
 
 
-def _at_ends(x: Number, value: Number) -> Number:
-    """A logarithm, or what it is at zero, at infinity and where it is none."""
-    value = x.is_equal(INF).pick(INF, value)
-    value = x.is_equal(0.0).pick(-INF, value)
-    return ((x > 0.0) | x.is_equal(0.0)).pick(value, NAN)
+def _with_special_values(x: Number, value: Number) -> Number:
+    """A logarithm with its values at zero, at infinity and below zero."""
+    value = x.is_equal(INF).select(INF, value)
+    value = x.is_equal(0.0).select(-INF, value)
+    return ((x > 0.0) | x.is_equal(0.0)).select(value, NAN)
 
 
 def _log(x: Number) -> Number:
@@ -135,31 +135,31 @@ def _log(x: Number) -> Number:
     half = f * f * 0.5
     # The sum begins with the smallest term: log(1 + f) = f - (f^2/2 - s (f^2/2 + s^2 P(s^2))).
     rest = half - (s * (half + z * _polynomial(z, LOG)) + k * LN2_LOW)
-    return _at_ends(x, k * LN2_HIGH - (rest - f))
+    return _with_special_values(x, k * LN2_HIGH - (rest - f))
 
 
 def _log1p(x: Number) -> Number:
     # The error of 1 + x is taken back by a quotient (Kahan, in Goldberg 1991, theorem 4).
     u = x + 1.0
     value = _log(u) * (x / (u - 1.0))
-    value = x.is_equal(INF).pick(INF, value)
-    return u.is_equal(1.0).pick(x, x.is_equal(-1.0).pick(-INF, value))
+    value = x.is_equal(INF).select(INF, value)
+    return u.is_equal(1.0).select(x, x.is_equal(-1.0).select(-INF, value))
 
 
 def _cbrt(x: Number) -> Number:
     a = x.abs()
     y = _exp(_log(a) * (1 / 3))
     y = y - (y - a / (y * y)) * (1 / 3)  # a step of Newton's method
-    return ((a > 0.0) & (a < INF)).pick(y.call("copysign", x), x)
+    return ((a > 0.0) & (a < INF)).select(y.call("copysign", x), x)
 
 
 def _pow(x: Number, y: Number) -> Number:
     a = x.abs()
     m, k = _mantissa(a)
-    # log m in two numbers: s = f/d with d = m + 1, all of which have a rest.
+    # log m as the sum of two numbers: s = f/d with d = m + 1, and the rounding errors of f, d and s.
     f, d = m - 1.0, m + 1.0
     s = f / d
-    rest = (-s).times_plus(m - (d - 1.0), (-s).times_plus(d, f)) / d
+    rest = (-s).fma(m - (d - 1.0), (-s).fma(d, f)) / d
     z = s * s
     high = s * 2.0
     low = rest * 2.0 + s * z * _polynomial(z, LOG)
@@ -169,21 +169,21 @@ def _pow(x: Number, y: Number) -> Number:
     low = low + (high - (total - whole)) + k * LN2_LOW
     both = total + low
     low = low - (both - total)
-    log = _at_ends(a, both)
+    log = _with_special_values(a, both)
     product = y * log
-    lost = y.times_plus(log, -product) + y * low
-    lost = (product.abs() < 1000.0).pick(lost, 0.0)
+    lost = y.fma(log, -product) + y * low
+    lost = (product.abs() < 1000.0).select(lost, 0.0)
     value = _exp(product)
-    value = (value < INF).pick(value + value * lost, value)
+    value = (value < INF).select(value + value * lost, value)
     # Powers of numbers below zero.
     is_whole = y.call("floor").is_equal(y)
-    is_odd = is_whole & (y * 0.5).call("floor").is_other(y * 0.5)
+    is_odd = is_whole & (y * 0.5).call("floor").is_not_equal(y * 0.5)
     is_negative = x.bits() < 0
-    value = (is_negative & is_odd).pick(-value, value)
+    value = (is_negative & is_odd).select(-value, value)
     is_real = (x > 0.0) | x.is_equal(0.0) | is_whole | a.is_equal(INF)
-    value = (is_real & x.is_equal(x) & y.is_equal(y)).pick(value, NAN)
+    value = (is_real & x.is_equal(x) & y.is_equal(y)).select(value, NAN)
     is_one = x.is_equal(1.0) | y.is_equal(0.0) | (x.is_equal(-1.0) & y.abs().is_equal(INF))
-    return is_one.pick(1.0, value)
+    return is_one.select(1.0, value)
 
 
 # --- angles ---
@@ -192,21 +192,21 @@ def _pow(x: Number, y: Number) -> Number:
 def _atan2(y: Number, x: Number) -> Number:
     a, b = y.abs(), x.abs()
     is_steep = a > b
-    less, more = is_steep.pick(b, a), is_steep.pick(a, b)
+    smaller, larger = is_steep.select(b, a), is_steep.select(a, b)
     # Sums of huge numbers would overflow.
-    scale = (more > 1e300).pick(0.25, 1.0)
-    both = more.is_equal(INF) & less.is_equal(INF)
-    less, more = both.pick(1.0, less * scale), both.pick(1.0, more * scale)
-    is_far = less > more * math.tan(math.pi / 8)
-    t = is_far.pick(less - more, less) / is_far.pick(less + more, more)
-    t = more.is_equal(0.0).pick(0.0, t)
+    scale = (larger > 1e300).select(0.25, 1.0)
+    both = larger.is_equal(INF) & smaller.is_equal(INF)
+    smaller, larger = both.select(1.0, smaller * scale), both.select(1.0, larger * scale)
+    is_far = smaller > larger * math.tan(math.pi / 8)
+    t = is_far.select(smaller - larger, smaller) / is_far.select(smaller + larger, larger)
+    t = larger.is_equal(0.0).select(0.0, t)
     z = t * t
-    angle = (t * z).times_plus(_polynomial(z, ATAN), t)
-    angle = angle + is_far.pick(HALF_PI_HIGH / 2, 0.0)
-    angle = is_steep.pick((-angle + HALF_PI_LOW) + HALF_PI_HIGH, angle)
+    angle = (t * z).fma(_polynomial(z, ATAN), t)
+    angle = angle + is_far.select(HALF_PI_HIGH / 2, 0.0)
+    angle = is_steep.select((-angle + HALF_PI_LOW) + HALF_PI_HIGH, angle)
     is_back = x.bits() < 0
-    angle = is_back.pick((-angle + 2 * HALF_PI_LOW) + 2 * HALF_PI_HIGH, angle)
-    return (x.is_equal(x) & y.is_equal(y)).pick(angle.call("copysign", y), x + y)
+    angle = is_back.select((-angle + 2 * HALF_PI_LOW) + 2 * HALF_PI_HIGH, angle)
+    return (x.is_equal(x) & y.is_equal(y)).select(angle.call("copysign", y), x + y)
 
 
 def _cosine_of_arc(x: Number) -> Number:
@@ -215,13 +215,13 @@ def _cosine_of_arc(x: Number) -> Number:
 
 def _tan(x: Number) -> Number:
     sine, cosine = x.e.sine_and_cosine(x.name, "f8")
-    return (x.abs() < 1e-9).pick(x, Number(x.e, sine) / Number(x.e, cosine))  # with the sign of zero
+    return (x.abs() < 1e-9).select(x, Number(x.e, sine) / Number(x.e, cosine))  # with the sign of zero
 
 
 def _far_angle(x: Number) -> tuple[Number, Number, Number, Number]:
     """Sine and cosine of r and bits 0 and 1 of n as flags, with x = n pi/2 + r and |r| <= pi/4, for |x| above 2^13.
 
-    Words of 2/pi are multiplied by the 53 bits of x in integers of 64 bits, without those that are whole turns
+    Words of 2/pi are multiplied by the 53 bits of x in integers of 64 bits, without the words that give whole turns
     (Payne & Hanek 1983).
     """
     e = x.e
@@ -251,28 +251,28 @@ def _far_angle(x: Number) -> tuple[Number, Number, Number, Number]:
     fraction = wide("shl", total, 2)  # beyond the two bits of whole quarters
     quarters = Number(e, take_low_bits(wide("lshr", total, 126)), "i8")
     top, bottom = (Number(e, take_low_bits(x), "i8") for x in (wide("lshr", fraction, 64), fraction))
-    quarters = quarters + (top < 0).pick(Number(e, "1", "i8"), 0)
+    quarters = quarters + (top < 0).select(Number(e, "1", "i8"), 0)
     rest = bottom.write("uitofp i64 {} to double", "f8")
     part = top.convert("f8") * 2.0**-64 + rest * 2.0**-128
     r = part * HALF_PI_HIGH
-    r = r + (part.times_plus(HALF_PI_HIGH, -r) + part * HALF_PI_LOW)
+    r = r + (part.fma(HALF_PI_HIGH, -r) + part * HALF_PI_LOW)
     z = r * r
-    sine = (r * z).times_plus(_polynomial(z, SINE["f8"]), r)
-    cosine = (z * z).times_plus(_polynomial(z, COSINE["f8"]), z.times_plus(-0.5, 1.0))
+    sine = (r * z).fma(_polynomial(z, SINE["f8"]), r)
+    cosine = (z * z).fma(_polynomial(z, COSINE["f8"]), z.fma(-0.5, 1.0))
     return sine, cosine, (quarters & 1).is_equal(1), (quarters & 2).is_equal(2)
 
 
 def _sin(x: Number) -> Number:
     sine, cosine, odd, high = _far_angle(x)
-    value = odd.pick(cosine, sine)
-    value = (high.pick(-value, value)) * constant(x, 1.0).call("copysign", x)
-    return (x.abs() < INF).pick(value, NAN)
+    value = odd.select(cosine, sine)
+    value = (high.select(-value, value)) * constant(x, 1.0).call("copysign", x)
+    return (x.abs() < INF).select(value, NAN)
 
 
 def _cos(x: Number) -> Number:
     sine, cosine, odd, high = _far_angle(x)
-    value = odd.pick(-sine, cosine)
-    return (x.abs() < INF).pick(high.pick(-value, value), NAN)
+    value = odd.select(-sine, cosine)
+    return (x.abs() < INF).select(high.select(-value, value), NAN)
 
 
 FUNCTIONS: dict[str, Callable] = {

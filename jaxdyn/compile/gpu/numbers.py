@@ -30,7 +30,7 @@ class Number:
     __lt__ = partialmethod(apply, "lt", kind="b1")
     __gt__ = partialmethod(apply, "gt", kind="b1")
     is_equal = partialmethod(apply, "eq", kind="b1")
-    is_other = partialmethod(apply, "ne", kind="b1")
+    is_not_equal = partialmethod(apply, "ne", kind="b1")
 
     def __rsub__(self, x):
         return constant(self, x) - self
@@ -38,7 +38,7 @@ class Number:
     def __rtruediv__(self, x):
         return constant(self, x) / self
 
-    def pick(self, yes, no):
+    def select(self, yes, no):
         """`yes` where this flag is set, else `no`; one of them may be known."""
         one = yes if isinstance(yes, Number) else no if isinstance(no, Number) else Number(self.e, "")
         names = [one.text_of(x) for x in (no, yes)]
@@ -52,7 +52,7 @@ class Number:
         """The number without its sign."""
         return self.call("fabs")
 
-    def times_plus(self, b, c):
+    def fma(self, b, c):
         """This number times b plus c, rounded once."""
         return self.call("fma", b, c)
 
@@ -68,7 +68,7 @@ class Number:
         """An integer whose bits are shifted."""
         return self.write(f"{word} i64 {{}}, {by}", "i8")
 
-    def of_bits(self):
+    def from_bits(self):
         """The number with the bits of this integer."""
         return self.write("bitcast i64 {} to double", "f8")
 

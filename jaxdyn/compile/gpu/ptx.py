@@ -10,7 +10,7 @@ from jaxdyn.compile.jax_adapter import Unsupported
 
 # Architectures that LLVM writes for; the driver takes PTX of an older one for a newer one. ISA 8.0 came with CUDA 12.0.
 ARCHITECTURES = (70, 75, 80, 86, 89, 90)
-LEAST_DRIVER = 12000
+MIN_DRIVER = 12000
 _TRIPLE, _ISA = "nvptx64-nvidia-cuda", "+ptx80"
 
 _SAMPLE = """define internal i64 @sample() alwaysinline {

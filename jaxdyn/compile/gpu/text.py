@@ -3,9 +3,9 @@
 The module is complete in itself: the subprograms that the kernel calls, careful programs among them, and the functions of the C
 library are in it. So a whole motion is one kernel, and no thread waits for Python.
 
-Arrays that are short stand with the entries of neighbouring samples side by side: entry k of sample s of n is number k n + s, so
-that the threads of a warp read neighbouring words. A thread copies them to registers. Longer arrays, such as saved rows, which
-are read at places that depend on numbers, stand by samples.
+Short arrays are interleaved: entry k of sample s of n is number k n + s, so that the threads of a warp read neighbouring words. A
+thread copies them to registers. Longer arrays, such as saved rows, are read at indices that depend on numbers, and are stored
+sample by sample.
 """
 
 import copy
@@ -20,20 +20,20 @@ from jaxdyn.compile.llvm import Emitter
 from jaxdyn.compile.program import Array, Constant, Operation, Program, kind_of
 
 KERNEL = "jaxdyn_thread"  # the function of a thread
-# Entries of an array that a thread keeps in registers, or in memory of its own.
-MAX_ENTRIES_ASIDE = 128
+# A thread copies arrays of at most so many entries to registers, or to its local memory.
+MAX_INTERLEAVED_ENTRIES = 128
 MAX_THREADS = 128  # in a block: each of them may take as many registers as there are
 # Memory of a thread for its arrays. A GPU reserves it for all threads that it can run at a time: 18 GB of an H100's 80.
 MAX_BYTES = 1 << 16
 
 
 class TooLarge(Exception):
-    """Why a program is no kernel for a GPU."""
+    """A program that cannot be a kernel for a GPU, with the reason."""
 
 
-def is_aside(array: Array, uniform: bool) -> bool:
-    """Decide whether the entries of an array stand with those of neighbouring samples side by side."""
-    return not uniform and array.size <= MAX_ENTRIES_ASIDE
+def is_interleaved(array: Array, uniform: bool) -> bool:
+    """Whether an array is stored with the entries of neighbouring samples side by side."""
+    return not uniform and array.size <= MAX_INTERLEAVED_ENTRIES
 
 
 def module_ir(program, uniform: Sequence[bool]) -> str:
@@ -66,11 +66,11 @@ def module_ir(program, uniform: Sequence[bool]) -> str:
     return text
 
 
-# --- programs without what is made later ---
+# --- programs without parts that are made later ---
 
 
 def with_careful_programs(program):
-    """The program with careful programs in the place of what makes them; one of a matrix as a call of it."""
+    """The program with its careful programs made; one of a matrix as a call of it."""
     if isinstance(program, Careful):
         return with_careful_programs(program.program())
     if isinstance(program, Program):
@@ -165,8 +165,8 @@ def _thread_ir(program, uniform: Sequence[bool]) -> str:
     e, after, allocations = _ThreadEmitter(), [], [f"  %data = alloca [{len(arrays)} x ptr]"]
     for at, i in enumerate(order):
         array, pointer = arrays[i], f"%g{i}"
-        if is_aside(array, same[i]):
-            pointer = f"%aside{i}"
+        if is_interleaved(array, same[i]):
+            pointer = f"%local{i}"
             allocations.append(f"  {pointer} = alloca [{max(8, array.size * array.dtype.itemsize)} x i8], align 8")
             if i < len(uniform):
                 e.copy(pointer, f"%g{i}", array, is_back=False)
