@@ -7,7 +7,6 @@ import equinox as eqx
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, PyTree
 
-from jaxdyn._renamed import RenamedMethod
 from jaxdyn.constraints.base import Constraint, layout, rows
 from jaxdyn.constraints.selection import independent_rows
 from jaxdyn.control.errors import hierarchical_acceleration, row_rank, target_rows
@@ -76,8 +75,6 @@ class ForceLoop(ForceIntegral):
                 f"{batch_hint(force, (count,))}"
             )
         return jnp.asarray(force, q.dtype)
-
-    wanted_force = RenamedMethod("reference_force")
 
     def force_command(self, q: Float[Array, " nq"], t: Number, state: PyTree) -> Float[Array, " nc"]:
         # The sign follows M a + h = tau + A^T lam: a reference multiplier is cancelled by the opposite torque.

@@ -17,7 +17,6 @@ import equinox as eqx
 import jax.numpy as jnp
 from jaxtyping import Array, Float, PyTree
 
-from jaxdyn._renamed import RenamedMethod
 from jaxdyn.constraints.base import Constraint, constraint_jacobian
 from jaxdyn.control.errors import Target, as_target
 from jaxdyn.control.force_loop import ForceIntegral
@@ -140,9 +139,6 @@ class GraspForce(ForceIntegral):
         t = jnp.asarray(t, q.dtype)
         # None in place of the integral: this is the reference itself, and not the command that corrects it.
         return self._forces(q, t, torque_for(self.scene, q, v, self.acceleration(q, v, t), t), None)
-
-    wanted_forces = RenamedMethod("reference_forces")
-    grasp = RenamedMethod("scene")
 
     def __call__(
         self,

@@ -1,6 +1,5 @@
 """Reading and writing mechanisms. File libraries are imported here alone, and only when a file is read."""
 
-from jaxdyn._renamed import old_names as _old_names
 from jaxdyn.io.formats import load as load
 from jaxdyn.io.loaded import Actuators as Actuators
 from jaxdyn.io.loaded import LoadedScene as LoadedScene
@@ -32,8 +31,6 @@ __all__ = [
     "urdf_inertia_report",
     "write_log",
 ]
-
-__getattr__ = _old_names(__name__)
 
 
 def __dir__() -> list[str]:

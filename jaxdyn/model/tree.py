@@ -176,21 +176,6 @@ class Model(eqx.Module):
         """Decide whether the dependent coordinates of q solve their equations; True for a `Model`."""
         return jnp.asarray(True)
 
-    def followed(self, q: Float[Array, " nq"], joints: Array) -> Float[Array, " nq"]:
-        """Deprecated name of `complete_configuration`."""
-        warn("Model.followed is deprecated; call complete_configuration", DeprecationWarning)
-        return self.complete_configuration(q, joints)
-
-    def followed_rate(self, q: Float[Array, " nq"], v: Float[Array, " nv"], rate: Array) -> Float[Array, " nq"]:
-        """Deprecated name of `complete_rate`."""
-        warn("Model.followed_rate is deprecated; call complete_rate", DeprecationWarning)
-        return self.complete_rate(q, v, rate)
-
-    def follows(self, q: Float[Array, " nq"]) -> Bool[Array, ""]:
-        """Deprecated name of `is_consistent`."""
-        warn("Model.follows is deprecated; call is_consistent", DeprecationWarning)
-        return self.is_consistent(q)
-
 
 def _payload(inertia: Any, dtype) -> Array:
     """Ten inertial parameters of an inertia argument, traced or not."""
