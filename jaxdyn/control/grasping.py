@@ -18,9 +18,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float, PyTree
 
 from jaxdyn.constraints.base import Constraint, constraint_jacobian
-from jaxdyn.control.errors import Target, as_target
-from jaxdyn.control.force_loop import ForceIntegral
-from jaxdyn.control.gains import gain, times
+from jaxdyn.control.errors import ForceIntegral, Target, as_target, gain, times
 from jaxdyn.control.motion import torque_for
 from jaxdyn.grasp.forces import as_preload, split_forces
 from jaxdyn.grasp.hand import Grasp, check_grasp

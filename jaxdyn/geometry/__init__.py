@@ -3,10 +3,10 @@
 Imports `dynamics` and what is below it.
 """
 
-from jaxdyn.geometry.euler import arnold_form as arnold_form
 from jaxdyn.geometry.immersion import constrain_by_immersion as constrain_by_immersion
 from jaxdyn.geometry.immersion import pull_back as pull_back
 from jaxdyn.geometry.immersion import reaction_force as reaction_force
+from jaxdyn.geometry.metric import arnold_form as arnold_form
 from jaxdyn.geometry.metric import christoffel_symbols as christoffel_symbols
 from jaxdyn.geometry.metric import connection as connection
 from jaxdyn.geometry.metric import covariant_derivative as covariant_derivative

@@ -7,6 +7,7 @@ from jaxdyn.sensors.base import Motion as Motion
 from jaxdyn.sensors.base import Noise as Noise
 from jaxdyn.sensors.base import Sensor as Sensor
 from jaxdyn.sensors.base import measure as measure
+from jaxdyn.sensors.base import record as record
 from jaxdyn.sensors.frames import Accelerometer as Accelerometer
 from jaxdyn.sensors.frames import FramePose as FramePose
 from jaxdyn.sensors.frames import FrameVelocity as FrameVelocity
@@ -18,7 +19,6 @@ from jaxdyn.sensors.joints import Encoder as Encoder
 from jaxdyn.sensors.joints import ForceTorque as ForceTorque
 from jaxdyn.sensors.joints import Tachometer as Tachometer
 from jaxdyn.sensors.joints import Touch as Touch
-from jaxdyn.sensors.records import record as record
 
 __all__ = [
     "Accelerometer",
