@@ -3,6 +3,8 @@
 Imports `dynamics` and what is below it.
 """
 
+from types import ModuleType as _ModuleType
+
 from jaxdyn.forces.dissipation import RayleighDissipation as RayleighDissipation
 from jaxdyn.forces.dissipation import SlidingFriction as SlidingFriction
 from jaxdyn.forces.drives import ElasticTransmission as ElasticTransmission
@@ -21,27 +23,7 @@ from jaxdyn.forces.limits import TorqueSpeedLimits as TorqueSpeedLimits
 from jaxdyn.forces.piecewise import PiecewiseForce as PiecewiseForce
 from jaxdyn.systems.drives import DriveDynamics as DriveDynamics
 
-__all__ = [
-    "CoulombFriction",
-    "Drive",
-    "DriveDynamics",
-    "EffortLimits",
-    "ElasticTransmission",
-    "ExternalWrench",
-    "FirstOrderDrive",
-    "JointDamping",
-    "JointSpring",
-    "JointStops",
-    "PiecewiseForce",
-    "RayleighDissipation",
-    "SecondOrderDrive",
-    "SlidingFriction",
-    "TorqueSpeedLimits",
-    "elastic_joints",
-    "external_wrenches",
-]
-
 
 def __dir__() -> list[str]:
     """Names of the namespace; its modules are internal."""
-    return __all__
+    return [x for x, value in globals().items() if x[0] != "_" and not isinstance(value, _ModuleType)]

@@ -3,6 +3,8 @@
 `jd.scenes.<name>(**parameters)` is a `Scene`, `.start()` the initial state of its reference.
 """
 
+from types import ModuleType as _ModuleType
+
 from jaxdyn.scenes._named import REGISTRY as _REGISTRY
 from jaxdyn.scenes._named import NamedScene as NamedScene
 from jaxdyn.scenes.arms import coordinated_lifting as coordinated_lifting
@@ -58,58 +60,6 @@ def names() -> tuple[str, ...]:
     return tuple(sorted(_REGISTRY))
 
 
-__all__ = [
-    "NamedScene",
-    "allegro_with_cube",
-    "ball_on_incline",
-    "ball_on_turntable",
-    "bennett",
-    "bicycle",
-    "bowling_ball",
-    "box_on_table",
-    "bricard",
-    "car",
-    "chaplygin_sleigh",
-    "closed_ring",
-    "coordinated_lifting",
-    "differential_drive",
-    "disk_and_link",
-    "double_pendulum",
-    "four_bar",
-    "free_body",
-    "free_box",
-    "goldberg",
-    "hand_rolling_ball",
-    "hand_rolling_egg",
-    "hand_with_ball",
-    "hand_with_bar",
-    "hand_with_disk",
-    "hinge_platform",
-    "knife_edge_on_incline",
-    "names",
-    "parallel_manipulator",
-    "particle_in_plane",
-    "pendulum",
-    "pendulum_in_plane",
-    "planar_arm",
-    "rigid_body_in_euler_angles",
-    "rolling_coin",
-    "rolling_disk",
-    "rough_disk_and_link",
-    "sarrus",
-    "slider_crank",
-    "sliding_block",
-    "snakeboard",
-    "spatial_arm",
-    "sphere_arm",
-    "spherical_pendulum",
-    "spherical_pendulum_in_angles",
-    "suslov",
-    "windows",
-    "woodpecker",
-]
-
-
 def __dir__() -> list[str]:
     """Names of the namespace; its modules are internal."""
-    return __all__
+    return [x for x, value in globals().items() if x[0] != "_" and not isinstance(value, _ModuleType)]

@@ -3,6 +3,8 @@
 A sensor is a Module with a name; `measure` gives the readings of several at one instant, `record` those along a motion.
 """
 
+from types import ModuleType as _ModuleType
+
 from jaxdyn.sensors.base import Motion as Motion
 from jaxdyn.sensors.base import Noise as Noise
 from jaxdyn.sensors.base import Sensor as Sensor
@@ -20,26 +22,7 @@ from jaxdyn.sensors.joints import ForceTorque as ForceTorque
 from jaxdyn.sensors.joints import Tachometer as Tachometer
 from jaxdyn.sensors.joints import Touch as Touch
 
-__all__ = [
-    "Accelerometer",
-    "ContactForce",
-    "Encoder",
-    "ForceTorque",
-    "FramePose",
-    "FrameVelocity",
-    "Gyroscope",
-    "Imu",
-    "Motion",
-    "Noise",
-    "Sensor",
-    "Tachometer",
-    "Touch",
-    "Velocimeter",
-    "measure",
-    "record",
-]
-
 
 def __dir__() -> list[str]:
     """Names of the namespace; its modules are internal."""
-    return __all__
+    return [x for x, value in globals().items() if x[0] != "_" and not isinstance(value, _ModuleType)]

@@ -403,13 +403,12 @@ def test_jitted_batch_of_40000_rows_equals_eager(dtype, rtol):
 
 
 def test_public_namespaces_list_their_names():
-    """`__all__` is what `dir` shows."""
+    """`dir` shows public names alone."""
     assert dir(jaxdyn) == sorted(jaxdyn.__all__) and len(jaxdyn.__all__) <= 90
     for name in jaxdyn.__all__:
         namespace = getattr(jaxdyn, name)
         if isinstance(namespace, ModuleType):
-            assert all(hasattr(namespace, each) for each in namespace.__all__), name
-            assert sorted(namespace.__all__) == dir(namespace), name
+            assert not [each for each in dir(namespace) if each.startswith("_") or not hasattr(namespace, each)], name
     with pytest.raises(AttributeError, match="nonsense"):
         _ = jaxdyn.nonsense
 
@@ -418,7 +417,7 @@ def test_one_name_for_one_thing_and_one_thing_by_one_name():
     """A name in several namespaces is one object in all of them, but for what the Lie groups have in common."""
     rooms = [jaxdyn, *(room for name in jaxdyn.__all__ if isinstance(room := getattr(jaxdyn, name), ModuleType))]
     groups = (jaxdyn.so3, jaxdyn.se2, jaxdyn.se3)
-    named = [(name, getattr(room, name)) for room in rooms if room not in groups for name in room.__all__]
+    named = [(name, getattr(room, name)) for room in rooms if room not in groups for name in dir(room)]
     objects, names = {}, {}
     for name, value in named:
         if isinstance(value, ModuleType):
