@@ -27,13 +27,12 @@ _HOMES, __all__ = _read_stub()
 
 
 def __getattr__(name: str) -> Any:
-    """Import a name at its first use (PEP 562), or find one that has moved, with a warning; AttributeError for others."""
+    """Import a name at its first use (PEP 562); AttributeError for others."""
     if name not in _HOMES or name not in __all__:
-        from jaxdyn._renamed import find
-
         # Subpackages that are not public are attributes too, as after `import jaxdyn.compile`.
-        is_module = not name.startswith("_") and importlib.util.find_spec(f"{__name__}.{name}") is not None
-        return importlib.import_module(f"{__name__}.{name}") if is_module else find(name)
+        if not name.startswith("_") and importlib.util.find_spec(f"{__name__}.{name}") is not None:
+            return importlib.import_module(f"{__name__}.{name}")
+        raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
     module, present = _HOMES[name]
     home = None if module == __name__ else importlib.import_module(module)
     value = getattr(home, present) if hasattr(home, present) else importlib.import_module(f"{module}.{present}")

@@ -22,7 +22,7 @@ from jaxdyn.constraints.codes import RESULTS
 from jaxdyn.identify import TERMS
 from jaxdyn.identify.workflows.excitation_search import OBJECTIVES
 from jaxdyn.io import write_log
-from jaxdyn.model.columns import columns_of
+from jaxdyn.model.configuration import columns_of
 from jaxdyn.simulation.solution import Solution
 
 HELP = "optimise an exciting motion within limits for the identification of inertias and friction"

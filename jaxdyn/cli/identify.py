@@ -30,10 +30,9 @@ from jaxdyn.identify.threads import on_one_thread
 from jaxdyn.identify.workflows.log_checks import check_log_content, check_rest
 from jaxdyn.identify.workflows.raw_logs import vibration
 from jaxdyn.io import save_urdf
-from jaxdyn.io.files import write_text
-from jaxdyn.model.columns import columns_of
-from jaxdyn.model.inertia_checks import inertia_report, repair_inertias
-from jaxdyn.model.tree import Model
+from jaxdyn.io.urdf_write import write_text
+from jaxdyn.model.configuration import columns_of
+from jaxdyn.model.tree import Model, inertia_report, repair_inertias
 from jaxdyn.reports.identification import Evaluation, Findings, content, gains_content, payload_content
 
 # Fraction of the residual's power far above the motion's band that triggers a warning.

@@ -7,7 +7,7 @@ from jaxdyn.constraints.codes import is_successful, name_of
 from jaxdyn.identify import TERMS, Delays, DriveGains, LeastSquares, Payload, RobotFit, nominal_parameters
 from jaxdyn.identify.regression import free_columns
 from jaxdyn.identify.selection import Choice
-from jaxdyn.model.columns import columns_of
+from jaxdyn.model.configuration import columns_of
 from jaxdyn.model.tree import Model
 from jaxdyn.reports.identification import Findings, model_joint, total_percent
 

@@ -16,11 +16,9 @@ from jaxdyn.io import LoadedScene, NotTakenWarning, save_urdf, urdf_inertia_repo
 from jaxdyn.io.formats import format_of
 from jaxdyn.io.xml_lines import XmlFile
 from jaxdyn.model import host_math
-from jaxdyn.model.columns import columns_of
-from jaxdyn.model.configuration import integrate
-from jaxdyn.model.inertia_checks import inertia_report, repair_inertias
+from jaxdyn.model.configuration import columns_of, integrate
 from jaxdyn.model.joints import KINDS
-from jaxdyn.model.tree import Model
+from jaxdyn.model.tree import Model, inertia_report, repair_inertias
 
 HELP = "bodies, joints, limits, loops, frames and faulty inertias of a URDF, MJCF or SDF file"
 DESCRIPTION = """\

@@ -3,7 +3,6 @@
 Source: Murray, Li & Sastry (1994), chapter 5; EQUATIONS sections 8, 10 and 11.
 """
 
-from jaxdyn._renamed import old_names as _old_names
 from jaxdyn.contact.closure import ForceClosure as ForceClosure
 from jaxdyn.contact.closure import force_closure_of_map as force_closure_of_map
 from jaxdyn.contact.cones import FrictionCone as FrictionCone
@@ -81,8 +80,6 @@ __all__ = [
     "wrench_cone",
     "wrench_cone_of_polygon",
 ]
-
-__getattr__ = _old_names(__name__)
 
 
 def __dir__() -> list[str]:

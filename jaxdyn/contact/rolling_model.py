@@ -20,7 +20,6 @@ import numpy as np
 from jax import lax
 from jaxtyping import Array, Bool, Float, PyTree
 
-from jaxdyn._renamed import RenamedMethod
 from jaxdyn.compile import kernel
 from jaxdyn.compile.known import is_known
 from jaxdyn.constraints.frames import each, relative_motions, relative_poses
@@ -103,8 +102,6 @@ class RollingModel(Model):
     def contacts_at(self, q: Float[Array, " nq"]) -> tuple[RollingContact, ...]:
         """Contacts at their places in q."""
         return tuple(one.with_place(q[at]) for one, at in zip(self.contacts, self.place_slices, strict=True))
-
-    placed = RenamedMethod("contacts_at")
 
     def place(self, joints: Numbers, near: Numbers | None = None) -> Float[Array, " nq"]:
         """Configuration q (nq,) for the joints' coordinates, with the closest points of the surfaces as places.

@@ -21,7 +21,6 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from jaxdyn._renamed import RenamedMethod
 from jaxdyn.compile import entry_point
 from jaxdyn.compile.known import is_concrete
 from jaxdyn.constraints.rolling import tangents, unit_or
@@ -61,8 +60,6 @@ class Surface(eqx.Module):
     def displace(self, place: Float[Array, " n"], step: Float[Array, "2"]) -> Float[Array, " n"]:
         """Place at `step` in a chart about `place`, with the orientation of f."""
         return place + step
-
-    moved = RenamedMethod("displace")
 
     def point_at(self, place: Float[Array, " n"]) -> Float[Array, "3"]:
         """Point of the surface, m, in the body's axes."""

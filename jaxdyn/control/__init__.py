@@ -7,6 +7,8 @@
 Sources: EQUATIONS sections 8 to 10.
 """
 
+from types import ModuleType as _ModuleType
+
 from jaxdyn.control.contacts import ContactCoordinates as ContactCoordinates
 from jaxdyn.control.feet import Foot as Foot
 from jaxdyn.control.feet import foot as foot
@@ -24,26 +26,7 @@ from jaxdyn.control.motion import OperationalSpace as OperationalSpace
 from jaxdyn.control.whole_body import WholeBody as WholeBody
 from jaxdyn.control.whole_body import standing as standing
 
-__all__ = [
-    "CartesianStiffness",
-    "ComputedTorque",
-    "ContactCoordinates",
-    "Foot",
-    "GaugeInvariant",
-    "GraspForce",
-    "HybridForce",
-    "LeggedDynamics",
-    "OperationalSpace",
-    "OptimalControl",
-    "WholeBody",
-    "foot",
-    "ilqr",
-    "missing_wrench",
-    "standing",
-    "underactuated_inverse_dynamics",
-]
-
 
 def __dir__() -> list[str]:
     """Names of the namespace; its modules are internal."""
-    return __all__
+    return [x for x, value in globals().items() if x[0] != "_" and not isinstance(value, _ModuleType)]

@@ -1,4 +1,4 @@
-"""Control errors e(q, t), and errors of rates w(q, v, t), as constraint rows.
+"""Control errors e(q, t), and errors of rates w(q, v, t), as constraint rows, with gains and the loop of constraint forces.
 
 An error is a constraint that the motion need not satisfy. Its rows are those of any constraint
 (`jaxdyn.constraints.base`): de/dt = A v - b and d2e/dt2 = A a - gamma, on manifold-valued q and moving targets too. A law
@@ -15,24 +15,72 @@ from typing import TYPE_CHECKING, Any
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Float
+import numpy as np
+from jaxtyping import Array, Bool, Float, PyTree
 
-from jaxdyn.constraints.base import Constraint, position_residual, rows
+from jaxdyn.constraints.base import Constraint, layout, position_residual, rows
 from jaxdyn.constraints.rank import pseudo_inverse, rank_of, tolerance
-from jaxdyn.control.gains import times
+from jaxdyn.constraints.selection import independent_rows
 from jaxdyn.dynamics.centroidal import center_of_mass
 from jaxdyn.dynamics.kinematics import frame_pose
 from jaxdyn.dynamics.quantities import mass_matrix
 from jaxdyn.lie import so3
 from jaxdyn.lie.series import safe_sqrt
 from jaxdyn.lie.so3 import matmul
-from jaxdyn.model.arguments import Number, Numbers, batch_hint
+from jaxdyn.model.arguments import Number, Numbers, as_array, batch_hint, is_concrete
 from jaxdyn.model.numbers import as_float
 from jaxdyn.model.topology import frame_index
 from jaxdyn.model.tree import Model
+from jaxdyn.simulation.controls import Controller
 from jaxdyn.systems.mass_factor import mass_factor
 from jaxdyn.systems.scene import Scene, as_pytree
 from jaxdyn.systems.system import displacement
+
+
+def gain(value: Any, name: str) -> Array:
+    """Convert a gain to an array leaf: (), (n,) for a diagonal matrix, or (n, n).
+
+    **Raises:** ValueError, for concrete numbers, for a gain that is not positive definite: its symmetric part has
+    an eigenvalue that is zero, negative or not finite.
+    """
+    array = as_array(value, name)
+    if array.ndim > 2 or (array.ndim == 2 and array.shape[0] != array.shape[1]):
+        raise ValueError(
+            f"{name} has shape {array.shape}; give a number, (n,) for a diagonal matrix, or a matrix (n, n)"
+        )
+    if is_concrete(array):
+        # Only the symmetric part enters e . K e, so it alone decides definiteness.
+        known = np.asarray(array, float)
+        # `initial` admits a gain for no rows, which has no least entry.
+        least = np.linalg.eigvalsh((known + known.T) / 2).min() if _is_matrix(known) else known.min(initial=np.inf)
+        if not (np.isfinite(known).all() and least > 0):
+            raise ValueError(f"{name} is {known.tolist()}, which is not positive definite; give positive gains")
+    # Integer gains become floating-point leaves: `jax.grad` refuses integers.
+    return as_float(array, name)
+
+
+def times(gain: Array, error: Float[Array, " n"], name: str) -> Float[Array, " n"]:
+    """Product K e for a gain of any shape. **Raises:** ValueError for one of another size."""
+    if gain.ndim and gain.shape[0] != error.shape[0]:
+        raise ValueError(
+            f"{name} has shape {gain.shape} for an error of {error.shape[0]} rows; give a number, {error.shape} or "
+            f"{error.shape * 2}"
+        )
+    # A float64 gain would promote the law of a float32 state.
+    gain = gain.astype(error.dtype)
+    return matmul(gain, error) if gain.ndim == 2 else gain * error
+
+
+def as_matrix(gain: Array, like: Float[Array, " n"], name: str) -> Float[Array, "n n"]:
+    """Matrix (n, n) of a gain."""
+    # Column by column through `times`, so that numbers, diagonals and matrices follow one rule.
+    unit = jnp.eye(like.shape[0], dtype=like.dtype)
+    return jnp.stack([times(gain, column, name) for column in unit], 1)
+
+
+def _is_matrix(known: np.ndarray) -> bool:
+    return known.ndim == 2
+
 
 if TYPE_CHECKING:
     Target = Numbers | Callable[[Array], Any]
@@ -227,3 +275,88 @@ def regularity(system, q, t, A, T) -> Float[Array, ""]:
 def row_rank(matrix: Float[Array, "m n"]) -> Array:
     """Number of independent rows, ()."""
     return rank_of(matrix, pseudo_inverse(matrix, tolerance(None, matrix), True))
+
+
+class ForceIntegral(Controller):
+    """Base class of laws whose state is the integral of a force error, (nc,), with integral action."""
+
+    scene: eqx.AbstractVar[Scene]
+    error: eqx.AbstractVar[Constraint]
+    kp: eqx.AbstractVar[Array]
+    kd: eqx.AbstractVar[Array | None]
+    ki: eqx.AbstractVar[Array | None]
+
+    def start(self, q: Float[Array, " nq"], v: Float[Array, " nv"], t: Number) -> Float[Array, " nc"] | None:
+        """Zero integral at the start; None without integral action."""
+        return None if self.ki is None else jnp.zeros((row_count(self.scene),), q.dtype)
+
+    def is_regular(self, q: Float[Array, " nq"], v: Float[Array, " nv"], t: Number = 0.0) -> Bool[Array, ""]:
+        """Decide whether task and constraints are independent, as the error equations require."""
+        t = jnp.asarray(t, q.dtype)
+        (A, _), (T, _) = self._orders(q, v, t)
+        # Ranks add exactly where no direction of the task is fixed by the constraints.
+        return row_rank(jnp.concatenate([A, T])) == row_rank(A) + T.shape[0]
+
+    def _orders(self, q, v, t):
+        """Rows A and right-hand sides of A a = ..., those of the constraints before those of the task."""
+        row = rows(independent_rows(self.scene, q, t), q, v, t)
+        return (row.A, row.gamma), target_rows(self.scene.system, self.error, self.kp, self.kd, q, v, t)
+
+    def _acceleration(self, q, v, t, start) -> Array:
+        """Acceleration closest to `start` (nv,) that satisfies the constraints, and the task in what these leave free."""
+        # A task that depends on the constraints is met in the least-squares sense; the constraints hold in any case.
+        return hierarchical_acceleration(self.scene.system, q, t, self._orders(q, v, t), start)
+
+
+class ForceLoop(ForceIntegral):
+    """Base class of laws whose state is the integral of lam - lam_d, (nc,), with integral action."""
+
+    force: eqx.AbstractVar[Callable | None]
+
+    def rate(
+        self,
+        q: Float[Array, " nq"],
+        v: Float[Array, " nv"],
+        t: Number,
+        state: PyTree,
+        multipliers: Float[Array, " nc"],
+    ) -> Float[Array, " nc"]:
+        """Rate lam - lam_d of the integral."""
+        return multipliers - self.reference_force(q, t)
+
+    def reference_force(self, q: Float[Array, " nq"], t: Number) -> Float[Array, " nc"]:
+        """Reference lam_d (nc,) of the multipliers."""
+        count = row_count(self.scene)
+        if self.force is None:
+            return jnp.zeros((count,), q.dtype)
+        force = self.force(t)
+        if jnp.shape(force) != (count,):
+            raise ValueError(
+                f"force has shape {jnp.shape(force)}, expected {(count,)}, one per row of the constraints"
+                f"{batch_hint(force, (count,))}"
+            )
+        return jnp.asarray(force, q.dtype)
+
+    def force_command(self, q: Float[Array, " nq"], t: Number, state: PyTree) -> Float[Array, " nc"]:
+        # The sign follows M a + h = tau + A^T lam: a reference multiplier is cancelled by the opposite torque.
+        """Force command -lam_d + KI z."""
+        wanted = -self.reference_force(q, t)
+        # A law that is called outside of a simulation has no state; its integral then counts as zero.
+        return wanted if state is None or self.ki is None else wanted + times(self.ki, state, "ki")
+
+
+def constrained(scene: Any) -> Scene:
+    """Require a scene with constraints. **Raises:** ValueError for anything else."""
+    if not isinstance(scene, Scene) or not scene.constraints:
+        raise ValueError(
+            "scene has no constraints, so there is no force to control; use jd.control.ComputedTorque or "
+            "jd.control.OperationalSpace"
+        )
+    # Refuses constraints on unknown bodies here, and not at the first call of the law.
+    layout(scene)
+    return scene
+
+
+def row_count(scene: Scene) -> int:
+    """Number of rows of the constraints of a scene."""
+    return layout(scene)[-1].end

@@ -9,9 +9,17 @@ from jaxtyping import Array, Float, PyTree
 from jaxdyn.constraints.base import Constraint, constraint_jacobian, rows
 from jaxdyn.constraints.rank import pseudo_inverse, solve_square, tolerance
 from jaxdyn.constraints.selection import independent_rows
-from jaxdyn.control.errors import Target, TaskError, as_target
-from jaxdyn.control.force_loop import ForceLoop, constrained, row_count
-from jaxdyn.control.gains import as_matrix, gain, times
+from jaxdyn.control.errors import (
+    ForceLoop,
+    Target,
+    TaskError,
+    as_matrix,
+    as_target,
+    constrained,
+    gain,
+    row_count,
+    times,
+)
 from jaxdyn.dynamics.quantities import bias_force, coriolis_matrix, mass_matrix
 from jaxdyn.lie.so3 import matmul
 from jaxdyn.model.arguments import Function, Number, Numbers, check_state

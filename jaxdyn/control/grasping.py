@@ -17,11 +17,8 @@ import equinox as eqx
 import jax.numpy as jnp
 from jaxtyping import Array, Float, PyTree
 
-from jaxdyn._renamed import RenamedMethod
 from jaxdyn.constraints.base import Constraint, constraint_jacobian
-from jaxdyn.control.errors import Target, as_target
-from jaxdyn.control.force_loop import ForceIntegral
-from jaxdyn.control.gains import gain, times
+from jaxdyn.control.errors import ForceIntegral, Target, as_target, gain, times
 from jaxdyn.control.motion import torque_for
 from jaxdyn.grasp.forces import as_preload, split_forces
 from jaxdyn.grasp.hand import Grasp, check_grasp
@@ -140,9 +137,6 @@ class GraspForce(ForceIntegral):
         t = jnp.asarray(t, q.dtype)
         # None in place of the integral: this is the reference itself, and not the command that corrects it.
         return self._forces(q, t, torque_for(self.scene, q, v, self.acceleration(q, v, t), t), None)
-
-    wanted_forces = RenamedMethod("reference_forces")
-    grasp = RenamedMethod("scene")
 
     def __call__(
         self,

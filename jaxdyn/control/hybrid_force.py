@@ -21,14 +21,15 @@ from jaxdyn.constraints.base import Constraint, constraint_jacobian
 from jaxdyn.constraints.dynamics import projections
 from jaxdyn.constraints.rank import pseudo_inverse, tolerance
 from jaxdyn.control.errors import (
+    ForceLoop,
     RateError,
     Target,
     TaskError,
     as_target,
+    constrained,
+    gain,
     regularity,
 )
-from jaxdyn.control.force_loop import ForceLoop, constrained
-from jaxdyn.control.gains import gain
 from jaxdyn.control.motion import torque_for
 from jaxdyn.lie.so3 import matmul
 from jaxdyn.model.arguments import Checked, Function, Number, Numbers, as_array

@@ -25,8 +25,7 @@ from jaxdyn.constraints.codes import RESULTS, Outcome, name_of, require_success
 from jaxdyn.constraints.redundancy import KeptRows, has_selection, opening_of_redundant
 from jaxdyn.constraints.selection import most_rounding
 from jaxdyn.constraints.tolerances import own_length
-from jaxdyn.control.least_squares import Aims, clip_to_limits, screw_joints, search
-from jaxdyn.control.targets import as_targets, target_rows
+from jaxdyn.control.targets import Aims, as_targets, clip_to_limits, screw_joints, search, target_rows
 from jaxdyn.model.arguments import Checked, Given, Number, Numbers, as_operand, check_flag, check_mapping, check_state
 from jaxdyn.model.tree import Model
 from jaxdyn.systems.scene import Scene, as_scene

@@ -18,10 +18,11 @@ from jaxdyn.control.errors import (
     Target,
     as_target,
     frame_error,
+    gain,
     least_acceleration,
     target_rows,
+    times,
 )
-from jaxdyn.control.gains import gain, times
 from jaxdyn.dynamics.quantities import gravity_force, inverse_dynamics
 from jaxdyn.lie.so3 import matmul
 from jaxdyn.model.arguments import Number, Numbers, SystemLike, state_dtype

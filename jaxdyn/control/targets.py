@@ -1,11 +1,26 @@
-"""Targets of named frames and of the centre of mass, as constraint rows: what inverse kinematics drives to zero.
+"""Targets of frames and of the centre of mass as constraint rows, and the search for a configuration that meets them.
 
 Rows of positions are in m, in the axes of the target; those of orientations are the rotation vector from the target to the frame,
 rad, and those of directions the two components of the rotation that takes the target's direction to the frame's.
+
+The search is by damped least squares: rows of constraints exactly, rows of targets as well as limits allow.
+A step d, in coordinates scaled by the sizes of joints, is the shortest one in the sense of
+
+    min |d|^2 + |R d + r|^2 / Lam:   d = -R^T (R R^T + Lam)^-1 r,
+
+with the rows R of the constraints, for which Lam is rounding, and those of the targets, for which it is the damping. The
+damping is in proportion to what is left of the errors, so that steps are Newton's in the end and short where a target is out
+of reach (Sugihara 2011). Joints at a limit that the step would pass are left out of the rows. Where a search comes no further
+it begins again somewhere else, as often as allowed, and ends with the best place that it has met.
+
+All of it is one loop in machine code, in which every sample of a batch goes on by itself.
+
+Sources: Sugihara (2011), Solvability-unconcerned inverse kinematics by the Levenberg-Marquardt method, eqs. 8 to 13; Baerlocher
+& Boulic (2004) for limits.
 """
 
 from collections.abc import Mapping
-from typing import Any
+from typing import Any, NamedTuple
 
 import equinox as eqx
 import jax.numpy as jnp
@@ -13,15 +28,22 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from jaxdyn.compile.known import is_concrete, is_known
-from jaxdyn.constraints.base import Constraint
+from jaxdyn.compile.loops import Carry, Given, Iteration, Task, run_loop
+from jaxdyn.constraints.base import Constraint, constraint_jacobian, holonomic_rows, layout, position_residual
 from jaxdyn.constraints.frames import Pair
+from jaxdyn.constraints.rank import eps_of
 from jaxdyn.constraints.rolling import tangents
+from jaxdyn.constraints.tolerances import coordinate_sizes
 from jaxdyn.control.errors import CenterError, Fixed
 from jaxdyn.lie import so3
 from jaxdyn.lie.so3 import matmul
 from jaxdyn.model.arguments import as_operand, batch_hint
+from jaxdyn.model.joints import SCREW_KINDS
 from jaxdyn.model.topology import frame_index
 from jaxdyn.model.tree import Model
+from jaxdyn.systems.mass_factor import cholesky, solve_cholesky
+from jaxdyn.systems.scene import Scene
+from jaxdyn.systems.system import displace, retract
 
 CENTER = "center_of_mass"
 _SHAPES = {"pose": (4, 4), "orientation": (3, 3), "position": (3,), "direction": (3,)}
@@ -162,3 +184,184 @@ def _frame_along(direction, name: str) -> Float[Array, "3 3"]:
     # Only z enters the residual. x and y are arbitrary: they choose the axes of its two components.
     unit = direction / jnp.sqrt(matmul(direction, direction))
     return jnp.concatenate([tangents(unit), unit[None]]).T
+
+
+# Steps of one search from one place, and of the last one, which starts at the best place.
+_STEPS, _LAST_STEPS = 40, 100
+# The damping of the first step, and its factors where a step has reduced the errors, and where it has not.
+_DAMPING, _LESS, _MORE = 1e-2, 0.2, 6.0
+_LARGEST_STEP = 1.0  # rad or lengths of the mechanism
+# A search ends where a step reduces the squared errors by a smaller part than this; the last one continues longer.
+_LEAST_GAIN, _LEAST_LAST_GAIN = 1e-2, 1e-9
+
+
+class Aims(NamedTuple):
+    """Aims of a search.
+
+    - `weights`, `shift`, `tolerances` (nh,): factors of the rows; the residuals to be reached, zero in the end; how near.
+    - `is_exact` (nh,): 1 for rows of constraints, 0 for rows of targets.
+    - `lower`, `upper` (nq,): limits, infinite where there are none.
+    """
+
+    weights: Array
+    shift: Array
+    tolerances: Array
+    is_exact: Array
+    lower: Array
+    upper: Array
+
+
+class Search(NamedTuple):
+    """State of a search.
+
+    The configuration, the damping, the steps from this place and the places tried, and the best configuration with its squared
+    errors.
+
+    `guess` is the place from which others are found.
+    """
+
+    q: Array
+    damping: Array
+    steps: Array
+    tried: Array
+    best: Array
+    least: Array
+    guess: Array
+    done: Array
+
+
+def search(scene: Scene, q, t, aims: Aims, guesses: int) -> tuple[Array, Array]:
+    """The best configuration that is met, and how many places were tried; constants.
+
+    `scene` has the targets after the constraints; `guesses` counts the places from which a search may begin.
+    """
+    q = clip_to_limits(scene.system, q, aims)
+    none = jnp.zeros((), jnp.int32)
+    large = jnp.full((), jnp.inf, q.dtype)
+    state = Search(q, jnp.full((), _DAMPING, q.dtype), none, none + 1, q, large, q, jnp.asarray(False))
+    state = run_loop(Task(_turn, (guesses,)), scene, (t, aims), Given(), Carry(state)).state
+    return state.best, state.tried
+
+
+def _turn(guesses: int, scene: Scene, constants, state: Search, _) -> Iteration:
+    after = _improve(guesses, scene, constants, state)
+    return Iteration(after, ~state.done, ~after.done)
+
+
+def _improve(guesses: int, scene: Scene, constants, state: Search) -> Search:
+    t, aims = constants
+    q, damping = state.q, state.damping
+    r = residual(scene, q, t, aims)
+    errors = jnp.sum(r * r)
+    # In proportion to the squared errors (Sugihara 2011), the damping vanishes at a solution.
+    step = _levenberg_marquardt_step(scene, q, t, aims, r, damping * errors)
+    tried = clip_to_limits(scene.system, retract(scene.system, displace(scene.system, q, step)), aims)
+    left = residual(scene, tried, t, aims)
+    new = jnp.sum(left * left)
+    # A residual of NaN compares false: the step is refused, and `stops` ends the search from this place.
+    falls = new < errors
+    q, after = jnp.where(falls, tried, q), jnp.where(falls, new, errors)
+    damping = jnp.clip(jnp.where(falls, _LESS * damping, _MORE * damping), 1e-8, 1e8)
+    is_better = after < state.least
+    best, least = jnp.where(is_better, q, state.best), jnp.where(is_better, after, state.least)
+
+    # Rows that are there already count as such, whatever their weights.
+    reached = jnp.all(jnp.where(falls, jnp.abs(left) <= aims.tolerances, jnp.abs(r) <= aims.tolerances))
+    is_last = state.tried >= guesses
+    gain = jnp.where(is_last, _LEAST_LAST_GAIN, _LEAST_GAIN).astype(q.dtype)
+    stops = (falls & (new > (1 - gain) * errors)) | (damping >= 1e6)
+    stops = stops | (state.steps >= jnp.where(is_last, _LAST_STEPS, _STEPS)) | ~jnp.isfinite(new)
+    elsewhere = stops & ~is_last & ~reached
+    tried_next = state.tried + elsewhere.astype(jnp.int32)
+    other = _place(scene.system, state.guess, tried_next, aims)
+    other = jnp.where(tried_next >= guesses, best, other)
+    return Search(
+        jnp.where(elsewhere, other, q),
+        jnp.where(elsewhere, jnp.full_like(damping, _DAMPING), damping),
+        jnp.where(elsewhere, jnp.zeros_like(state.steps), state.steps + 1),
+        tried_next,
+        best,
+        least,
+        state.guess,
+        reached | (stops & is_last),
+    )
+
+
+def residual(scene: Scene, q, t, aims: Aims):
+    """Residuals of constraints and targets, less what is to be left of them, times their weights."""
+    return aims.weights * (position_residual(scene, q, t) - aims.shift)
+
+
+def _levenberg_marquardt_step(scene: Scene, q, t, aims: Aims, r, damping):
+    """The step (nv,) of damped least squares for the residuals r, within the limits."""
+    sizes, _ = coordinate_sizes(scene.system, q.dtype)
+    R = constraint_jacobian(scene, q, t)[holonomic_rows(layout(scene))] * aims.weights[:, None] * sizes[None]
+
+    def shortest(R):
+        # In the space of rows, each row has its own damping: exact rows have none.
+        gram = matmul(R, R.T)
+        diagonal = jnp.diagonal(gram)
+        # Rows that depend on others are met with them; rows that are zero are left out.
+        rounding = 64 * eps_of(q) * (diagonal + jnp.max(diagonal)) + float(jnp.finfo(q.dtype).tiny) ** 0.5
+        gram = gram + jnp.diag(rounding + damping * (1 - aims.is_exact))
+        return -matmul(R.T, solve_cholesky(cholesky(gram), r))
+
+    step = shortest(R)
+    # Once only: where the new step would pass other limits, the caller clips it, and the next step leaves those joints out.
+    inside = _is_inside(scene.system, q, step, aims)
+    if inside is not None:
+        step = shortest(R * inside[None]) * inside
+    # Shortened as a whole, so that its direction remains.
+    length = jnp.max(jnp.abs(step))
+    return step * sizes * jnp.minimum(1.0, _LARGEST_STEP / jnp.where(length > 0, length, jnp.ones_like(length)))
+
+
+def screw_joints(model: Model) -> tuple[np.ndarray, np.ndarray]:
+    """Places in q and in v of the joints of one degree of freedom."""
+    top = model.topology
+    pairs = [
+        (a.start, b.start)
+        for kind, a, b in zip(top.kinds, top.q_slices, top.v_slices, strict=True)
+        if kind in SCREW_KINDS
+    ]
+    places = np.asarray(pairs, int).reshape(-1, 2)
+    return places[:, 0], places[:, 1]
+
+
+def _is_inside(model: Model, q, step, aims: Aims):
+    """1 for coordinates that may move along a step (nv,), 0 for those that it would take out of their limits; None: all may."""
+    at_q, at_v = screw_joints(model)
+    if not at_q.size:
+        return None
+    low = (q[at_q] <= aims.lower[at_q]) & (step[at_v] < 0)
+    high = (q[at_q] >= aims.upper[at_q]) & (step[at_v] > 0)
+    return jnp.ones_like(step).at[at_v].set(1 - (low | high).astype(q.dtype))
+
+
+def clip_to_limits(model: Model, q, aims: Aims):
+    """q with its joints of one degree of freedom within the limits."""
+    at_q, _ = screw_joints(model)
+    return q.at[at_q].set(jnp.clip(q[at_q], aims.lower[at_q], aims.upper[at_q])) if at_q.size else q
+
+
+def _place(model: Model, guess, count, aims: Aims):
+    """The place number `count` from which to search: points of a Kronecker sequence within the limits, or around the guess.
+
+    Joints of several degrees of freedom stay at the guess.
+    """
+    at_q, at_v = screw_joints(model)
+    if not at_q.size:
+        return guess
+    sizes, _ = coordinate_sizes(model, guess.dtype)
+    # A joint without limits is searched half a turn, or pi lengths of the mechanism, to both sides of the guess.
+    reach = np.pi * sizes[at_v]
+    ends = aims.lower[at_q], guess[at_q] - reach, aims.upper[at_q], guess[at_q] + reach
+    low, high = (jnp.where(jnp.isfinite(x), x, y) for x, y in (ends[:2], ends[2:]))
+    # Multiples of powers of the root of x^(n+1) = x + 1 fill a cube evenly (Roberts 2018).
+    root = 2.0
+    # A contraction by less than 1/2: 60 iterations of it leave no more than rounding in float64.
+    for _ in range(60):
+        root = (1 + root) ** (1 / (at_q.size + 1))
+    factors = jnp.asarray(root ** -(1.0 + np.arange(at_q.size)), guess.dtype)
+    parts = count.astype(guess.dtype) * factors + 0.5
+    return guess.at[at_q].set(low + (high - low) * (parts - jnp.floor(parts)))

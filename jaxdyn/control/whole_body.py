@@ -23,11 +23,11 @@ from jaxdyn.control.errors import (
     FrameError,
     as_target,
     frame_error,
+    gain,
     hierarchical_acceleration,
     target_rows,
 )
 from jaxdyn.control.feet import Foot, check_feet
-from jaxdyn.control.gains import gain
 from jaxdyn.control.legs import LeggedDynamics, missing_wrench, passive_velocities, underactuated_inverse_dynamics
 from jaxdyn.lie.so3 import matmul
 from jaxdyn.model.arguments import Checked, Number, Numbers

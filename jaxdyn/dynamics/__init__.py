@@ -6,7 +6,6 @@ the matrix form in world axes and in link frames, and scans for many bodies (EQU
 Imports `systems` and what is below it. The four algorithms do not import each other.
 """
 
-from jaxdyn._renamed import old_names as _old_names
 from jaxdyn.dynamics.articulated_motion import ArticulatedBodies as ArticulatedBodies
 from jaxdyn.dynamics.articulated_motion import articulated_bodies as articulated_bodies
 from jaxdyn.dynamics.base_frame import base_twists as base_twists
@@ -54,8 +53,6 @@ __all__ = [
     "torque_regressor",
     "workspace_dynamics",
 ]
-
-__getattr__ = _old_names(__name__)
 
 
 def __dir__() -> list[str]:

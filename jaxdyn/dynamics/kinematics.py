@@ -19,7 +19,6 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from jaxdyn._renamed import rename_argument
 from jaxdyn.compile import kernel, variant
 from jaxdyn.compile.known import array_namespace
 from jaxdyn.lie import se3
@@ -262,7 +261,6 @@ def _translate(pose: Float[Array, "*n 4 4"], shift: Float[Array, "*n 3"]) -> Flo
     return jnp.concatenate([pose[..., :3], pose[..., 3:] + step], -1)
 
 
-@rename_argument("name", "frame")
 def frame_pose(model: Model, q: Float[Array, " nq"], frame: str | None) -> Float[Array, "4 4"]:
     """Pose of a named frame in the world.
 

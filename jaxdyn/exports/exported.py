@@ -20,12 +20,12 @@ from jaxdyn.compile.standalone import DEGENERATE, Routine
 from jaxdyn.exports.arguments import (
     Argument,
     arguments_of,
+    batch_ir,
     check_identifier,
     comment_on,
     fields_of,
     system_of,
 )
-from jaxdyn.exports.batch import batch_ir
 from jaxdyn.exports.casadi import casadi_ir
 from jaxdyn.exports.files import write_files
 from jaxdyn.model.tree import Model

@@ -3,45 +3,27 @@
 Imports `dynamics` and what is below it.
 """
 
+from types import ModuleType as _ModuleType
+
 from jaxdyn.forces.dissipation import RayleighDissipation as RayleighDissipation
 from jaxdyn.forces.dissipation import SlidingFriction as SlidingFriction
+from jaxdyn.forces.drives import ElasticTransmission as ElasticTransmission
 from jaxdyn.forces.drives import FirstOrderDrive as FirstOrderDrive
 from jaxdyn.forces.drives import SecondOrderDrive as SecondOrderDrive
-from jaxdyn.forces.elastic import ElasticTransmission as ElasticTransmission
-from jaxdyn.forces.elastic import elastic_joints as elastic_joints
+from jaxdyn.forces.drives import elastic_joints as elastic_joints
 from jaxdyn.forces.elements import CoulombFriction as CoulombFriction
 from jaxdyn.forces.elements import Drive as Drive
 from jaxdyn.forces.elements import ExternalWrench as ExternalWrench
 from jaxdyn.forces.elements import JointDamping as JointDamping
 from jaxdyn.forces.elements import JointSpring as JointSpring
+from jaxdyn.forces.elements import external_wrenches as external_wrenches
 from jaxdyn.forces.limits import EffortLimits as EffortLimits
 from jaxdyn.forces.limits import JointStops as JointStops
 from jaxdyn.forces.limits import TorqueSpeedLimits as TorqueSpeedLimits
 from jaxdyn.forces.piecewise import PiecewiseForce as PiecewiseForce
-from jaxdyn.forces.wrenches import external_wrenches as external_wrenches
 from jaxdyn.systems.drives import DriveDynamics as DriveDynamics
-
-__all__ = [
-    "CoulombFriction",
-    "Drive",
-    "DriveDynamics",
-    "EffortLimits",
-    "ElasticTransmission",
-    "ExternalWrench",
-    "FirstOrderDrive",
-    "JointDamping",
-    "JointSpring",
-    "JointStops",
-    "PiecewiseForce",
-    "RayleighDissipation",
-    "SecondOrderDrive",
-    "SlidingFriction",
-    "TorqueSpeedLimits",
-    "elastic_joints",
-    "external_wrenches",
-]
 
 
 def __dir__() -> list[str]:
     """Names of the namespace; its modules are internal."""
-    return __all__
+    return [x for x, value in globals().items() if x[0] != "_" and not isinstance(value, _ModuleType)]

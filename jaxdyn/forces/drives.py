@@ -1,4 +1,7 @@
-"""Drives whose torque follows the command with first- or second-order dynamics."""
+"""Drives whose torque follows the command with dynamics, and elastic joints between a motor and a link."""
+
+from collections.abc import Sequence
+from functools import partial
 
 import equinox as eqx
 import jax.numpy as jnp
@@ -6,8 +9,13 @@ from jaxtyping import Array, Float
 
 from jaxdyn.dynamics.kinematics import take
 from jaxdyn.forces.elements import as_leaf, as_names, broadcast_leaf, is_positive, joint_indices, scatter
-from jaxdyn.model.arguments import Number, SystemLike
+from jaxdyn.model.arguments import Checked, Number, Numbers, SystemLike, check_name, check_names
+from jaxdyn.model.builder import ModelBuilder
+from jaxdyn.model.joining import join
+from jaxdyn.model.joints import KINDS
+from jaxdyn.model.tree import Model
 from jaxdyn.systems.drives import DriveDynamics
+from jaxdyn.systems.scene import Scene
 
 
 class _Lag(DriveDynamics):
@@ -143,3 +151,113 @@ class SecondOrderDrive(_Lag):
         error, leaf = self._error(system, state, command)
         frequency, speed = leaf("frequency"), state[error.shape[0] :]
         return jnp.concatenate([speed, frequency * (frequency * error - 2 * leaf("damping_ratio") * speed)])
+
+
+class ElasticTransmission(eqx.Module):
+    r"""Spring and damper between motors and joints.
+
+    $$s = \theta/n - q, \quad \tau = K s + D \dot s$$
+
+    $\tau$ acts on the joint and $-\tau/n$ on the motor; $\theta$ is the motor's own angle and n the gear ratio, whose
+    sign is that of the direction of rotation. It conserves the energy $K s^2/2$ and dissipates $D \dot s^2$. Steps must
+    resolve the frequency $\sqrt{K (1/I + 1/(n^2 B))}$, with B and I the inertias of motor and link; `jd.solvers.Rodas5P`
+    has longer ones where the elastic motion has died out.
+
+    **Arguments:** `motors`, `joints`, names of joints of one coordinate, in pairs; `stiffness` K (N m/rad or N/m), `damping` D
+    (N m s/rad or N s/m), `gear` n (1, or rad/m for a spindle): numbers or one per pair.
+
+    **Raises:** ValueError for names that are no pairs, a gear ratio of zero; (when called) for unknown joints, joints of several
+    coordinates, a wrong shape.
+
+    Source: Spong (1987), ASME J. Dyn. Sys. Meas. Control 109, eq. 13; De Luca & Book, Springer Handbook of Robotics, ch. 11.
+    """
+
+    motors: tuple[str, ...] = eqx.field(static=True, converter=partial(check_names, what="motors"))
+    joints: tuple[str, ...] = eqx.field(static=True, converter=partial(check_names, what="joints"))
+    stiffness: Float[Array, "..."] = eqx.field(converter=as_leaf("stiffness"))
+    damping: Float[Array, "..."] = eqx.field(converter=as_leaf("damping"), default=0.0)
+    gear: Float[Array, "..."] = eqx.field(converter=as_leaf("gear"), default=1.0)
+
+    def __check_init__(self):
+        if len(self.motors) != len(self.joints):
+            raise ValueError(
+                f"ElasticTransmission: {len(self.motors)} motors for {len(self.joints)} joints; give pairs"
+            )
+        # The sign of n is a direction of rotation; only zero is refused.
+        if not is_positive(self.gear**2):
+            raise ValueError(f"ElasticTransmission: gear is {self.gear}; give ratios that are not zero")
+
+    def __call__(
+        self, system: SystemLike, q: Float[Array, " nq"], v: Float[Array, " nv"], t: Number
+    ) -> Float[Array, " nv"]:
+        n = len(self.joints)
+        motor, joint = (joint_indices(system, names, "ElasticTransmission") for names in (self.motors, self.joints))
+        if any(len(index) != n for index in (*motor, *joint)):
+            raise ValueError("ElasticTransmission: motors and joints have one coordinate each")
+        stiffness, damping, gear = (
+            broadcast_leaf(value, q, n, f"ElasticTransmission: {name}")
+            for name, value in (("stiffness", self.stiffness), ("damping", self.damping), ("gear", self.gear))
+        )
+        # Both are at the joint: the motor's angle is divided by the gear ratio.
+        stretch, rate = (x[a] / gear - x[b] for x, a, b in ((q, motor.q, joint.q), (v, motor.v, joint.v)))
+        tau = stiffness * stretch + damping * rate
+        # tau/n on the motor, so that the transmission conserves power. `add` sums over pairs that share a motor or a joint.
+        return jnp.zeros_like(v).at[joint.v].add(tau).at[motor.v].add(-tau / gear)
+
+
+def elastic_joints(
+    model: Checked[Model],
+    stiffness: Numbers,
+    rotor_inertia: Numbers,
+    *,
+    damping: Numbers = 0.0,
+    gear: Numbers = 1.0,
+    joints: Checked[str | Sequence[str] | None] = None,
+    suffix: str = "_motor",
+) -> Scene:
+    r"""Robot with elastic joints: a scene with a rotor for each of them behind the model's coordinates, and the springs.
+
+    $$M(q) \ddot q + h(q, \dot q) = K (\theta/n - q) + D (\dot\theta/n - \dot q) = \tau_s, \quad
+        B \ddot\theta + \tau_s/n = \tau$$
+
+        The scene's q is (model's q, theta) and v is (model's v, rate of theta); torques of the motors are the last
+        entries of tau. The kinetic energy of a rotor is that of its own rotation, $B \dot\theta^2/2$; its mass belongs to
+        the link that carries it. Spong's model neglects the coupling with that link's rotation, which is of the order of
+        1/n: where it matters, add rotors as bodies on their links by a `ModelBuilder`, and `ElasticTransmission` to the
+        scene.
+
+    **Arguments:**
+
+    - `model`: the robot with rigid joints. Its `armature` is that of the link side: leave the rotors' out.
+    - `stiffness` K, `damping` D, `gear` n: as of `ElasticTransmission`.
+    - `rotor_inertia` B, kg m^2, about the rotor's own axis, before the gear: a number or one per joint.
+    - `joints`: names of joints of one coordinate; None for all.
+    - `suffix`: of the rotors' names behind those of the joints.
+
+    **Returns:** `Scene` of the joined model, without effort limits and joint limits of the rotors. Add forces by
+    `jd.Scene(scene.system, forces=(*scene.forces, ...))`. K, D, n are leaves of `scene.forces[0]`, B of `system.armature`.
+
+    **Raises:** ValueError for unknown joints and those of several coordinates, and for rotors without inertia.
+
+    ```python
+    scene = jd.forces.elastic_joints(jd.robots.iiwa(), 1e4, 3e-5, damping=5.0, gear=100.0)
+    ```
+    """
+    chosen = as_names(joints) or model.joint_names
+    # Called for its message on unknown joints.
+    joint_indices(model, chosen, "elastic_joints")
+    kinds = dict(zip(model.joint_names, model.topology.kinds, strict=True))
+    if several := [name for name in chosen if KINDS[kinds[name]].nv != 1]:
+        raise ValueError(f"elastic_joints: {several} have several coordinates; name joints of one")
+    if not is_positive(rotor_inertia):
+        raise ValueError(f"elastic_joints: rotor_inertia is {rotor_inertia}; give positive inertias (kg m^2)")
+    check_name(suffix, "elastic_joints: suffix")
+    motors = tuple(f"{name}{suffix}" for name in chosen)
+    inertias = jnp.broadcast_to(jnp.asarray(rotor_inertia, float), (len(chosen),))
+    whole = model
+    for motor, inertia in zip(motors, inertias, strict=True):
+        rotor = ModelBuilder(motor, gravity=model.gravity, dtype=model.home.dtype)
+        # No mass and an armature alone: the rotor's mass belongs to the link that carries it.
+        rotor.add_body(motor, None, "continuous", joint_name=motor, armature=inertia)
+        whole = join(whole, rotor.build(), name=model.name)
+    return Scene(whole, forces=(ElasticTransmission(motors, chosen, stiffness, damping, gear),))

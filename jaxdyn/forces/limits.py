@@ -8,7 +8,6 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float
 
-from jaxdyn._renamed import RenamedMethod
 from jaxdyn.forces.elements import as_names, broadcast_leaf, joint_indices
 from jaxdyn.forces.piecewise import PiecewiseForce
 from jaxdyn.model.arguments import Checked, Number, Numbers, SystemLike, as_array, is_concrete
@@ -148,8 +147,6 @@ class EffortLimits(eqx.Module):
             # Inserted in front, so that upper limits come first, as `clip_effort` reads them.
             guards.insert(0, jnp.where(bounded, side * (tau - jnp.where(bounded, limit, 0.0)), -1.0))
         return jnp.concatenate(guards)
-
-    limited = RenamedMethod("clip_effort")
 
     def clip_effort(
         self,

@@ -1,6 +1,7 @@
 """Reading and writing mechanisms. File libraries are imported here alone, and only when a file is read."""
 
-from jaxdyn._renamed import old_names as _old_names
+from types import ModuleType as _ModuleType
+
 from jaxdyn.io.formats import load as load
 from jaxdyn.io.loaded import Actuators as Actuators
 from jaxdyn.io.loaded import LoadedScene as LoadedScene
@@ -16,26 +17,7 @@ from jaxdyn.io.urdf import urdf_inertia_report as urdf_inertia_report
 from jaxdyn.io.urdf_write import read_torque_terms as read_torque_terms
 from jaxdyn.io.urdf_write import save_urdf as save_urdf
 
-__all__ = [
-    "Actuators",
-    "LoadedScene",
-    "NotTakenWarning",
-    "Start",
-    "UnitsWarning",
-    "load",
-    "load_mjcf",
-    "load_sdf",
-    "load_urdf",
-    "read_log",
-    "read_torque_terms",
-    "save_urdf",
-    "urdf_inertia_report",
-    "write_log",
-]
-
-__getattr__ = _old_names(__name__)
-
 
 def __dir__() -> list[str]:
     """Names of the namespace; its modules are internal."""
-    return __all__
+    return [x for x, value in globals().items() if x[0] != "_" and not isinstance(value, _ModuleType)]

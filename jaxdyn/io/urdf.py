@@ -12,15 +12,13 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from jaxdyn.io.loaded import warn_not_taken, warn_of_units
-from jaxdyn.io.urdf_check import JOINTS
-from jaxdyn.io.urdf_parts import Inertial, Joint, Mimic, elements_without_effect, read_parts
+from jaxdyn.io.urdf_parts import JOINTS, Inertial, Joint, Mimic, elements_without_effect, read_parts
 from jaxdyn.io.xml_lines import XmlFile, rounding_of_digits
 from jaxdyn.model import host_math
 from jaxdyn.model.arguments import DType, Numbers
 from jaxdyn.model.builder import GRAVITY, ModelBuilder, unknown
-from jaxdyn.model.inertia_checks import inertia_problems
 from jaxdyn.model.joints import KINDS, SCREW_KINDS, joint_neutral
-from jaxdyn.model.tree import Model
+from jaxdyn.model.tree import Model, inertia_problems
 
 # URDF has no number for "no limit", and other readers refuse "inf"; `save_urdf` writes the largest double.
 NO_LIMIT = float(np.finfo(np.float64).max)

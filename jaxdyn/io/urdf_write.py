@@ -1,18 +1,44 @@
-"""URDF writer; its files load as the same model."""
+"""URDF writer, whose files load as the same model, and atomic writes of files."""
 
+import contextlib
 import os
+import pathlib
 import xml.etree.ElementTree as ET
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from typing import NamedTuple
 
 import numpy as np
 
-from jaxdyn.io.files import replacing
 from jaxdyn.io.urdf import NO_LIMIT, ROOT_JOINT
 from jaxdyn.io.xml_lines import XmlFile
 from jaxdyn.model import host_math
 from jaxdyn.model.arguments import as_path, check_shapes, parse_number
 from jaxdyn.model.tree import Model
+
+
+@contextlib.contextmanager
+def replacing(path: str | os.PathLike) -> Iterator[pathlib.Path]:
+    """Temporary path with the folder and suffix of `path`; at the end of the block it replaces `path`.
+
+    When the block raises, the temporary file is removed and an existing file stays.
+    """
+    path = pathlib.Path(path)
+    # The process id keeps two processes that write the same file apart.
+    # The same folder, since a rename is atomic within one file system only; the same suffix, since writers infer the format.
+    part = path.with_name(f".{path.stem}.{os.getpid()}{path.suffix}")
+    try:
+        yield part
+        # os.rename fails on Windows where the target exists.
+        os.replace(part, path)
+    finally:
+        part.unlink(missing_ok=True)
+
+
+def write_text(path: str | os.PathLike, text: str) -> None:
+    """Write a UTF-8 text atomically."""
+    with replacing(path) as part:
+        part.write_text(text, encoding="utf-8")
+
 
 _TYPES = {"free": "floating", **{kind: kind for kind in ("revolute", "continuous", "prismatic", "planar")}}
 

@@ -3,9 +3,9 @@
 Imports `lie` and `compile`. Conventions: docs/conventions.md.
 """
 
-from jaxdyn.model.inertia_checks import inertia_report as inertia_report
-from jaxdyn.model.inertia_checks import repair_inertias as repair_inertias
 from jaxdyn.model.topology import Topology as Topology
+from jaxdyn.model.tree import inertia_report as inertia_report
+from jaxdyn.model.tree import repair_inertias as repair_inertias
 
 __all__ = [
     "Topology",

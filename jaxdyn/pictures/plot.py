@@ -12,7 +12,7 @@ import numpy as np
 
 from jaxdyn.constraints.base import layout
 from jaxdyn.model.arguments import Checked
-from jaxdyn.model.columns import columns_of
+from jaxdyn.model.configuration import columns_of
 from jaxdyn.reports.page import panel
 from jaxdyn.reports.plotting import BLUE, RED, SERIES, Axes, bands, new_figure, style
 from jaxdyn.reports.records import Record

@@ -3,6 +3,8 @@
 `jd.scenes.<name>(**parameters)` is a `Scene`, `.start()` the initial state of its reference.
 """
 
+from types import ModuleType as _ModuleType
+
 from jaxdyn.scenes._named import REGISTRY as _REGISTRY
 from jaxdyn.scenes._named import NamedScene as NamedScene
 from jaxdyn.scenes.arms import coordinated_lifting as coordinated_lifting
@@ -10,9 +12,11 @@ from jaxdyn.scenes.arms import sphere_arm as sphere_arm
 from jaxdyn.scenes.balls import ball_on_incline as ball_on_incline
 from jaxdyn.scenes.balls import ball_on_turntable as ball_on_turntable
 from jaxdyn.scenes.balls import bowling_ball as bowling_ball
-from jaxdyn.scenes.bodies import free_body as free_body
-from jaxdyn.scenes.boxes import allegro_with_cube as allegro_with_cube
-from jaxdyn.scenes.boxes import box_on_table as box_on_table
+from jaxdyn.scenes.balls import free_body as free_body
+from jaxdyn.scenes.balls import pendulum_in_plane as pendulum_in_plane
+from jaxdyn.scenes.balls import spherical_pendulum as spherical_pendulum
+from jaxdyn.scenes.friction import allegro_with_cube as allegro_with_cube
+from jaxdyn.scenes.friction import box_on_table as box_on_table
 from jaxdyn.scenes.friction import rough_disk_and_link as rough_disk_and_link
 from jaxdyn.scenes.friction import woodpecker as woodpecker
 from jaxdyn.scenes.hands import hand_rolling_ball as hand_rolling_ball
@@ -34,19 +38,17 @@ from jaxdyn.scenes.linkages import four_bar as four_bar
 from jaxdyn.scenes.linkages import parallel_manipulator as parallel_manipulator
 from jaxdyn.scenes.linkages import slider_crank as slider_crank
 from jaxdyn.scenes.linkages import windows as windows
-from jaxdyn.scenes.particles import pendulum_in_plane as pendulum_in_plane
-from jaxdyn.scenes.particles import spherical_pendulum as spherical_pendulum
-from jaxdyn.scenes.platforms import hinge_platform as hinge_platform
-from jaxdyn.scenes.platforms import sarrus as sarrus
 from jaxdyn.scenes.rolling import chaplygin_sleigh as chaplygin_sleigh
+from jaxdyn.scenes.rolling import hand_rolling_egg as hand_rolling_egg
 from jaxdyn.scenes.rolling import knife_edge_on_incline as knife_edge_on_incline
 from jaxdyn.scenes.rolling import rolling_coin as rolling_coin
 from jaxdyn.scenes.rolling import rolling_disk as rolling_disk
 from jaxdyn.scenes.rolling import suslov as suslov
-from jaxdyn.scenes.rolling_hands import hand_rolling_egg as hand_rolling_egg
 from jaxdyn.scenes.spatial_linkages import bennett as bennett
 from jaxdyn.scenes.spatial_linkages import bricard as bricard
 from jaxdyn.scenes.spatial_linkages import goldberg as goldberg
+from jaxdyn.scenes.spatial_linkages import hinge_platform as hinge_platform
+from jaxdyn.scenes.spatial_linkages import sarrus as sarrus
 from jaxdyn.scenes.vehicles import bicycle as bicycle
 from jaxdyn.scenes.vehicles import car as car
 from jaxdyn.scenes.vehicles import differential_drive as differential_drive
@@ -58,58 +60,6 @@ def names() -> tuple[str, ...]:
     return tuple(sorted(_REGISTRY))
 
 
-__all__ = [
-    "NamedScene",
-    "allegro_with_cube",
-    "ball_on_incline",
-    "ball_on_turntable",
-    "bennett",
-    "bicycle",
-    "bowling_ball",
-    "box_on_table",
-    "bricard",
-    "car",
-    "chaplygin_sleigh",
-    "closed_ring",
-    "coordinated_lifting",
-    "differential_drive",
-    "disk_and_link",
-    "double_pendulum",
-    "four_bar",
-    "free_body",
-    "free_box",
-    "goldberg",
-    "hand_rolling_ball",
-    "hand_rolling_egg",
-    "hand_with_ball",
-    "hand_with_bar",
-    "hand_with_disk",
-    "hinge_platform",
-    "knife_edge_on_incline",
-    "names",
-    "parallel_manipulator",
-    "particle_in_plane",
-    "pendulum",
-    "pendulum_in_plane",
-    "planar_arm",
-    "rigid_body_in_euler_angles",
-    "rolling_coin",
-    "rolling_disk",
-    "rough_disk_and_link",
-    "sarrus",
-    "slider_crank",
-    "sliding_block",
-    "snakeboard",
-    "spatial_arm",
-    "sphere_arm",
-    "spherical_pendulum",
-    "spherical_pendulum_in_angles",
-    "suslov",
-    "windows",
-    "woodpecker",
-]
-
-
 def __dir__() -> list[str]:
     """Names of the namespace; its modules are internal."""
-    return __all__
+    return [x for x, value in globals().items() if x[0] != "_" and not isinstance(value, _ModuleType)]

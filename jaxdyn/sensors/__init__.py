@@ -3,10 +3,13 @@
 A sensor is a Module with a name; `measure` gives the readings of several at one instant, `record` those along a motion.
 """
 
+from types import ModuleType as _ModuleType
+
 from jaxdyn.sensors.base import Motion as Motion
 from jaxdyn.sensors.base import Noise as Noise
 from jaxdyn.sensors.base import Sensor as Sensor
 from jaxdyn.sensors.base import measure as measure
+from jaxdyn.sensors.base import record as record
 from jaxdyn.sensors.frames import Accelerometer as Accelerometer
 from jaxdyn.sensors.frames import FramePose as FramePose
 from jaxdyn.sensors.frames import FrameVelocity as FrameVelocity
@@ -18,28 +21,8 @@ from jaxdyn.sensors.joints import Encoder as Encoder
 from jaxdyn.sensors.joints import ForceTorque as ForceTorque
 from jaxdyn.sensors.joints import Tachometer as Tachometer
 from jaxdyn.sensors.joints import Touch as Touch
-from jaxdyn.sensors.records import record as record
-
-__all__ = [
-    "Accelerometer",
-    "ContactForce",
-    "Encoder",
-    "ForceTorque",
-    "FramePose",
-    "FrameVelocity",
-    "Gyroscope",
-    "Imu",
-    "Motion",
-    "Noise",
-    "Sensor",
-    "Tachometer",
-    "Touch",
-    "Velocimeter",
-    "measure",
-    "record",
-]
 
 
 def __dir__() -> list[str]:
     """Names of the namespace; its modules are internal."""
-    return __all__
+    return [x for x, value in globals().items() if x[0] != "_" and not isinstance(value, _ModuleType)]

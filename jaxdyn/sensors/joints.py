@@ -14,7 +14,7 @@ from jaxdyn.constraints.reactions import body_wrenches_where
 from jaxdyn.constraints.rolling import Touching
 from jaxdyn.dynamics.joint_wrenches import joint_wrench
 from jaxdyn.dynamics.kinematics import named_frame
-from jaxdyn.forces.wrenches import sum_wrenches, wrenches_where
+from jaxdyn.forces.elements import sum_wrenches, wrenches_where
 from jaxdyn.lie import se3
 from jaxdyn.model.arguments import Numbers, check_names
 from jaxdyn.model.numbers import as_float, as_number

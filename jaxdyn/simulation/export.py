@@ -9,7 +9,7 @@ import numpy as np
 
 from jaxdyn.constraints.base import layout
 from jaxdyn.model.arguments import as_path
-from jaxdyn.model.columns import columns_of
+from jaxdyn.model.configuration import columns_of
 from jaxdyn.systems.scene import Scene, as_scene
 
 

@@ -12,7 +12,6 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, PyTree
 
-from jaxdyn._renamed import RenamedMethod
 from jaxdyn.compile.known import is_concrete, is_tracing
 from jaxdyn.model.arguments import Checked, Number, SystemLike, as_array, batch_hint, check_system
 from jaxdyn.model.description import scene_lines
@@ -194,8 +193,6 @@ class Scene(eqx.Module):
             value = check_force(force(self.system, q, v, t), q, self.nv, f"forces[{i}]")
             total = value if total is None else total + value
         return total
-
-    limited = RenamedMethod("clip_effort")
 
     def clip_effort(self, tau: Float[Array, " nv"]) -> Float[Array, " nv"]:
         """Torques tau (nv,) clipped by the scene's `EffortLimits`."""

@@ -268,10 +268,10 @@ def public_functions():
     found, seen = [], [jd]
 
     def walk(module, prefix):
-        for name in module.__all__:
+        for name in dir(module):
             item = getattr(module, name, None)
             if isinstance(item, types.ModuleType):
-                if item.__name__.startswith("jaxdyn") and item not in seen and hasattr(item, "__all__"):
+                if item.__name__.startswith("jaxdyn") and item not in seen and "__dir__" in vars(item):
                     seen.append(item)
                     walk(item, f"{prefix}{name}.")
             elif callable(item) and getattr(item, "__module__", "").startswith("jaxdyn"):

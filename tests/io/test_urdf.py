@@ -17,8 +17,8 @@ from jaxdyn import robots
 from jaxdyn.dynamics import kinematics
 from jaxdyn.io import UnitsWarning, load, load_urdf, save_urdf, urdf_inertia_report
 from jaxdyn.model.builder import ModelBuilder
-from jaxdyn.model.inertia_checks import inertia_report
 from jaxdyn.model.joints import KINDS
+from jaxdyn.model.tree import inertia_report
 from jaxdyn.pictures import shapes
 from tests.pinocchio_bridge import ROBOTS, quick, to_jaxdyn
 

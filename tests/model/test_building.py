@@ -20,7 +20,7 @@ from jaxdyn.io import load_urdf
 from jaxdyn.model import configuration as mdl
 from jaxdyn.model import host_math, joints
 from jaxdyn.model.builder import ModelBuilder
-from jaxdyn.model.inertia_checks import inertia_report, repair_inertias
+from jaxdyn.model.tree import inertia_report, repair_inertias
 from tests.pinocchio_bridge import quick, to_pinocchio
 
 BALL = (2.0, (0.1, 0.2, 0.3), (0.03, 0.04, 0.05))

@@ -200,12 +200,6 @@ def test_a_batch_without_vmap_is_told_so():
         jd.simulate(ARM, [0, 0], [0, 0], [0, 1], stepsize=[0.1, 0.2])
 
 
-def test_frames_have_one_name():
-    with pytest.warns(DeprecationWarning, match=r"frame_pose\(name=\) is now frame_pose\(frame=\)"):
-        old = jd.frame_pose(ARM, jnp.zeros(2), name=BODY)
-    np.testing.assert_array_equal(old, jd.frame_pose(ARM, jnp.zeros(2), frame=BODY))
-
-
 def test_a_scene_in_place_of_its_system_is_told_where_to_go():
     with pytest.raises(
         ValueError, match=r"model is a Scene; pass scene.system.*jd\.constrained_dynamics.*jd\.reduced_dynamics"

@@ -196,10 +196,10 @@ def public_functions() -> dict[str, object]:
     found, seen = {}, set()
 
     def walk(namespace, prefix):
-        for name in namespace.__all__:
+        for name in dir(namespace):
             value = getattr(namespace, name)
             if isinstance(value, types.ModuleType):
-                if not prefix and hasattr(value, "__all__"):
+                if not prefix and "__dir__" in vars(value):
                     walk(value, f"{name}.")
             elif callable(value) and not inspect.isclass(value) and id(value) not in seen:
                 seen.add(id(value))

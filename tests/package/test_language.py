@@ -23,7 +23,7 @@ TERMS = """generalized_force applied_force reduced_dynamics constrained_dynamics
     articulated_bodies
     coordinated_lifting closed_ring quadruped left_jacobian left_jacobian_inverse unconstrained constrained named_frame
     signed_distance displaced converged_reference published_state time_interleaved embed check_seed""".split()
-DEPRECATED = """called followed followed_rate limited moved placed wanted_force wanted_forces completed bounded tied aligned
+DEPRECATED = """called completed bounded tied aligned
     named scaled
     told""".split()
 # Left column of the glossary, as far as a help text could have it.

@@ -16,7 +16,6 @@ import numpy as np
 import pytest
 
 import jaxdyn
-from jaxdyn import _renamed
 
 PACKAGE = Path(jaxdyn.__file__).parent
 
@@ -34,7 +33,6 @@ FLOORS = (
     "pictures",
     "cli demo",
     "__main__",
-    "_renamed",
 )
 RANK = {name: rank for rank, floor in enumerate(FLOORS) for name in floor.split()}
 PROGRAMS = {"cli", "demo", "__main__"}
@@ -153,12 +151,11 @@ def test_package_is_typed():
 def test_rooms_use_those_below():
     """Every module is in a room, a room uses rooms on floors below its own alone, and not too many of them."""
     assert {top(module) for module in SOURCES} == {"", *RANK}
-    # `_renamed` is no room: namespaces ask it for names of the release before.
     arrows = {
         (top(module), top(used))
         for module, names in USES.items()
         for used in names
-        if top(used) not in ("", "_renamed", top(module))
+        if top(used) not in ("", top(module))
     }
     wrong = [f"{room} uses {used}" for room, used in arrows if room and RANK[used] >= RANK[room]]
     assert not wrong, "\n".join(sorted(wrong))
@@ -406,36 +403,21 @@ def test_jitted_batch_of_40000_rows_equals_eager(dtype, rtol):
 
 
 def test_public_namespaces_list_their_names():
-    """`__all__` is what `dir` shows; the names that moved are found with a warning."""
+    """`dir` shows public names alone."""
     assert dir(jaxdyn) == sorted(jaxdyn.__all__) and len(jaxdyn.__all__) <= 90
     for name in jaxdyn.__all__:
         namespace = getattr(jaxdyn, name)
         if isinstance(namespace, ModuleType):
-            assert all(hasattr(namespace, each) for each in namespace.__all__), name
-            assert sorted(namespace.__all__) == dir(namespace), name
-    for namespace, names in _renamed._MOVED.items():
-        for name in names.split():
-            with pytest.warns(DeprecationWarning, match=rf"jd\.{namespace}\.{name}"):
-                assert getattr(jaxdyn, name) is getattr(getattr(jaxdyn, namespace), name)
-    for old in _renamed._RENAMED:
-        namespace, _, name = old.rpartition(".")
-        with pytest.warns(DeprecationWarning, match=rf"jd\.{old} is now jd\."):
-            assert callable(getattr(getattr(jaxdyn, namespace, jaxdyn), name))
+            assert not [each for each in dir(namespace) if each.startswith("_") or not hasattr(namespace, each)], name
     with pytest.raises(AttributeError, match="nonsense"):
         _ = jaxdyn.nonsense
-
-
-def test_old_names_of_methods_warn():
-    scene, tau = jaxdyn.Scene(jaxdyn.robots.chain(2)), jnp.ones(2)
-    with pytest.warns(DeprecationWarning, match="Scene.limited is deprecated; its name is clip_effort"):
-        np.testing.assert_array_equal(scene.limited(tau), scene.clip_effort(tau))
 
 
 def test_one_name_for_one_thing_and_one_thing_by_one_name():
     """A name in several namespaces is one object in all of them, but for what the Lie groups have in common."""
     rooms = [jaxdyn, *(room for name in jaxdyn.__all__ if isinstance(room := getattr(jaxdyn, name), ModuleType))]
     groups = (jaxdyn.so3, jaxdyn.se2, jaxdyn.se3)
-    named = [(name, getattr(room, name)) for room in rooms if room not in groups for name in room.__all__]
+    named = [(name, getattr(room, name)) for room in rooms if room not in groups for name in dir(room)]
     objects, names = {}, {}
     for name, value in named:
         if isinstance(value, ModuleType):

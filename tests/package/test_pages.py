@@ -107,7 +107,7 @@ def exports() -> dict[str, object]:
     for group in GROUPS:
         room = getattr(jd, group)
         # The names used most stand in `jd` and in their room.
-        computed |= {f"jd.{group}.{n}": getattr(room, n) for n in room.__all__ if id(getattr(room, n)) not in shown}
+        computed |= {f"jd.{group}.{n}": getattr(room, n) for n in dir(room) if id(getattr(room, n)) not in shown}
     return {name: x for name, x in computed.items() if callable(x) and not inspect.ismodule(x)}
 
 

@@ -10,7 +10,7 @@ import pytest
 
 import jaxdyn as jd
 from jaxdyn.io.logs import read_log
-from jaxdyn.model.columns import columns_of
+from jaxdyn.model.configuration import columns_of
 
 TS = np.linspace(0.0, 1.0, 6)
 
