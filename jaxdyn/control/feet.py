@@ -15,6 +15,7 @@ from jaxdyn.dynamics.kinematics import body_jacobian, frame_pose
 from jaxdyn.lie import se3
 from jaxdyn.lie.so3 import matmul
 from jaxdyn.model.arguments import Checked, Numbers, as_array, is_concrete
+from jaxdyn.model.host_math import ORTHONORMAL_GROUND, rotation_fault
 from jaxdyn.model.topology import frame_index
 from jaxdyn.model.tree import Model
 
@@ -108,9 +109,10 @@ def foot(
         raise ValueError(f"foot {frame!r}: ground has shape {rotation.shape}; give a rotation (3, 3)")
     if is_concrete(rotation):
         known = np.asarray(rotation, float)
-        # The tolerance admits rotations typed with about six digits.
-        if np.abs(known @ known.T - np.eye(3)).max() > 1e-5 or np.linalg.det(known) < 0:
-            raise ValueError(f"foot {frame!r}: ground is {known.tolist()}, which is no rotation; give orthogonal axes")
+        if fault := rotation_fault(known, ORTHONORMAL_GROUND):
+            raise ValueError(
+                f"foot {frame!r}: ground is {known.tolist()}, which is no rotation: it {fault}; give orthogonal axes"
+            )
     return Foot(frame, cone, pose_leaf(pose, f"foot {frame!r}: pose"), jnp.asarray(rotation, float))
 
 

@@ -236,16 +236,16 @@ def _solve(problem: _Problem, x0, xs, us, gains, damping, iterations: int, tol: 
     code = jnp.where(jnp.isfinite(cost), _RUNNING, _NOT_FINITE).astype(jnp.int32)
     state = _State(xs, us, gains, cost, costs, damping, one, none, jnp.full_like(cost, jnp.inf), code)
 
-    def goes_on(state: _State):
+    def is_running(state: _State):
         return (state.code == _RUNNING) & (state.iterations < iterations)
 
-    return lax.while_loop(goes_on, lambda state: _iterate(problem, state, tol), state)
+    return lax.while_loop(is_running, lambda state: _iterate(problem, state, tol), state)
 
 
 def _iterate(problem: _Problem, state: _State, tol: float) -> _State:
-    k, K, slope, curvature, is_definite = _backward(problem, state)
+    k, K, gradient, curvature, is_definite = _backward(problem, state)
     # The change of the cost for alpha = 1 with its sign reversed: positive where a full step is expected to reduce it.
-    predicted = -(slope + curvature)
+    predicted = -(gradient + curvature)
     # What is left of a cost that goes to zero is rounding of the first one.
     size = jnp.maximum(jnp.abs(state.cost), eps_of(state.cost) * jnp.abs(state.costs[0]))
     # With large damping a small step is no sign of a minimum; 1e-5 is the bound of iLQG.
@@ -256,16 +256,16 @@ def _iterate(problem: _Problem, state: _State, tol: float) -> _State:
         _, count = carry
         alpha = jnp.asarray(_LENGTHS, k.dtype)[count]
         xs, us, cost = _rollout(problem, state.xs[0], state.xs[:-1], state.us, alpha * k, K)
-        enough = state.cost - cost >= -_LEAST_PART * alpha * (slope + alpha * curvature)
+        enough = state.cost - cost >= -_LEAST_PART * alpha * (gradient + alpha * curvature)
         # A cost of NaN compares false, so that the next length is tried.
         return (xs, us, cost, enough & (cost < state.cost)), count + 1
 
-    def goes_on(carry):
+    def is_running(carry):
         # Without a definite Quu the gains are NaN: there is no rollout, and the damping grows.
         return ~carry[0][3] & (carry[1] < len(_LENGTHS)) & is_definite & ~is_small
 
     before = state.xs, state.us, state.cost, jnp.asarray(False)
-    (xs, us, cost, falls), count = lax.while_loop(goes_on, try_length, (before, jnp.zeros((), jnp.int32)))
+    (xs, us, cost, falls), count = lax.while_loop(is_running, try_length, (before, jnp.zeros((), jnp.int32)))
     xs, us, cost = (jnp.where(falls, x, y) for x, y in zip((xs, us, cost), before[:3], strict=True))
 
     # Repeated successes or failures change mu ever faster (Tassa, Erez & Todorov 2012, section II).
@@ -299,7 +299,7 @@ def _rollout(problem: _Problem, x0, xs, us, k, K):
     """States (n + 1, nx), controls (n, nu) and cost of u + k + K (x - xs) within the limits."""
     count = jnp.arange(us.shape[0], dtype=jnp.int32)
 
-    def go_on(carry, row):
+    def step_forward(carry, row):
         x, total = carry
         x_before, u, k, K, i = row
         # Clipped after the feedback: k keeps to the limits, and K (x - xs) need not.
@@ -307,12 +307,12 @@ def _rollout(problem: _Problem, x0, xs, us, k, K):
         return (problem.step(x, u), total + problem.cost(x, u, i)), (x, u)
 
     start = x0, jnp.zeros((), us.dtype)
-    (last, total), (states, controls) = lax.scan(go_on, start, (xs, us, k, K, count))
+    (last, total), (states, controls) = lax.scan(step_forward, start, (xs, us, k, K, count))
     return jnp.concatenate([states, last[None]]), controls, total + problem.final(last)
 
 
 def _backward(problem: _Problem, state: _State):
-    """k (n, nu), K (n, nu, nx), the predicted change of the cost a slope + a^2 curvature, and whether every Quu
+    """k (n, nu), K (n, nu, nx), the predicted change of the cost a gradient + a^2 curvature, and whether every Quu
     is positive definite.
     """
     xs, us = state.xs, state.us
@@ -332,8 +332,8 @@ def _backward(problem: _Problem, state: _State):
     )
     none = jnp.zeros((), us.dtype)
 
-    def go_back(carry, row):
-        Vx, Vxx, slope, curvature, is_definite = carry
+    def step_backward(carry, row):
+        Vx, Vxx, gradient, curvature, is_definite = carry
         z, F, lz, lzz, i = row
         Qz = lz + matmul(F.T, Vx)
         Qzz = lzz + matmul(F.T, matmul(Vxx, F))
@@ -360,11 +360,13 @@ def _backward(problem: _Problem, state: _State):
         Vx = Qz[:nx] + matmul(K.T, Quuk + Qu) + matmul(Qux.T, k)
         crossed = matmul(K.T, Qux)
         Vxx = Qzz[:nx, :nx] + matmul(K.T, matmul(Quu, K)) + crossed + crossed.T
-        slope, curvature = slope + jnp.sum(k * Qu), curvature + 0.5 * jnp.sum(k * Quuk)
+        gradient, curvature = gradient + jnp.sum(k * Qu), curvature + 0.5 * jnp.sum(k * Quuk)
         # Symmetrised at each step, so that the unsymmetric part of rounding does not grow.
-        return (Vx, 0.5 * (Vxx + Vxx.T), slope, curvature, definite), (k, K)
+        return (Vx, 0.5 * (Vxx + Vxx.T), gradient, curvature, definite), (k, K)
 
     final = jax.grad(problem.final)(xs[-1]), jax.hessian(problem.final)(xs[-1])
-    carry, (k, K) = lax.scan(go_back, (*final, none, none, jnp.asarray(True)), (Z, F, lz, lzz, count), reverse=True)
-    _, _, slope, curvature, is_definite = carry
-    return k, K, slope, curvature, is_definite
+    carry, (k, K) = lax.scan(
+        step_backward, (*final, none, none, jnp.asarray(True)), (Z, F, lz, lzz, count), reverse=True
+    )
+    _, _, gradient, curvature, is_definite = carry
+    return k, K, gradient, curvature, is_definite

@@ -10,10 +10,10 @@ A step d, in coordinates scaled by the sizes of joints, is the shortest one in t
 
 with the rows R of the constraints, for which Lam is rounding, and those of the targets, for which it is the damping. The
 damping is in proportion to what is left of the errors, so that steps are Newton's in the end and short where a target is out
-of reach (Sugihara 2011). Joints at a limit that the step would pass are left out of the rows. Where a search comes no further
-it begins again somewhere else, as often as allowed, and ends with the best place that it has met.
+of reach (Sugihara 2011). Joints at a limit that the step would pass are left out of the rows. Where a search stalls it
+begins again somewhere else, as often as allowed, and ends with the best place that it has met.
 
-All of it is one loop in machine code, in which every sample of a batch goes on by itself.
+All of it is one loop in machine code, in which every sample of a batch advances independently.
 
 Sources: Sugihara (2011), Solvability-unconcerned inverse kinematics by the Levenberg-Marquardt method, eqs. 8 to 13; Baerlocher
 & Boulic (2004) for limits.
@@ -38,6 +38,7 @@ from jaxdyn.control.errors import CenterError, Fixed
 from jaxdyn.lie import so3
 from jaxdyn.lie.so3 import matmul
 from jaxdyn.model.arguments import as_operand, batch_hint
+from jaxdyn.model.host_math import ORTHONORMAL_TARGET, rotation_fault
 from jaxdyn.model.joints import SCREW_KINDS
 from jaxdyn.model.topology import frame_index
 from jaxdyn.model.tree import Model
@@ -149,8 +150,8 @@ def _numbers(value, name: str, shape: tuple, dtype):
         if not np.isfinite(known).all():
             raise ValueError(f"{name} is {known}; give finite numbers")
         R = known[:3, :3] if len(shape) == 2 else np.eye(3)
-        if np.abs(R.T @ R - np.eye(3)).max() > 1e-4 or np.linalg.det(R) < 0:
-            raise ValueError(f"{name}: its rotation is no rotation matrix, R^T R differs from 1; normalise it")
+        if fault := rotation_fault(R, ORTHONORMAL_TARGET):
+            raise ValueError(f"{name}: its rotation is no rotation matrix: it {fault}; normalise it")
     return value
 
 
@@ -211,7 +212,7 @@ class Aims(NamedTuple):
     upper: Array
 
 
-class Search(NamedTuple):
+class SearchState(NamedTuple):
     """State of a search.
 
     The configuration, the damping, the steps from this place and the places tried, and the best configuration with its squared
@@ -238,17 +239,17 @@ def search(scene: Scene, q, t, aims: Aims, guesses: int) -> tuple[Array, Array]:
     q = clip_to_limits(scene.system, q, aims)
     none = jnp.zeros((), jnp.int32)
     large = jnp.full((), jnp.inf, q.dtype)
-    state = Search(q, jnp.full((), _DAMPING, q.dtype), none, none + 1, q, large, q, jnp.asarray(False))
-    state = run_loop(Task(_turn, (guesses,)), scene, (t, aims), Given(), Carry(state)).state
+    state = SearchState(q, jnp.full((), _DAMPING, q.dtype), none, none + 1, q, large, q, jnp.asarray(False))
+    state = run_loop(Task(_step, (guesses,)), scene, (t, aims), Given(), Carry(state)).state
     return state.best, state.tried
 
 
-def _turn(guesses: int, scene: Scene, constants, state: Search, _) -> Iteration:
+def _step(guesses: int, scene: Scene, constants, state: SearchState, _) -> Iteration:
     after = _improve(guesses, scene, constants, state)
     return Iteration(after, ~state.done, ~after.done)
 
 
-def _improve(guesses: int, scene: Scene, constants, state: Search) -> Search:
+def _improve(guesses: int, scene: Scene, constants, state: SearchState) -> SearchState:
     t, aims = constants
     q, damping = state.q, state.damping
     r = residual(scene, q, t, aims)
@@ -275,7 +276,7 @@ def _improve(guesses: int, scene: Scene, constants, state: Search) -> Search:
     tried_next = state.tried + elsewhere.astype(jnp.int32)
     other = _place(scene.system, state.guess, tried_next, aims)
     other = jnp.where(tried_next >= guesses, best, other)
-    return Search(
+    return SearchState(
         jnp.where(elsewhere, other, q),
         jnp.where(elsewhere, jnp.full_like(damping, _DAMPING), damping),
         jnp.where(elsewhere, jnp.zeros_like(state.steps), state.steps + 1),

@@ -159,7 +159,7 @@ def batch_ir(exported: Any, width: int) -> Text:
     # Results follow the arguments in the numbering of pointers.
     sizes = {i: x.bytes for i, x in enumerate(arguments) if not x.is_structure}
     sizes |= {len(arguments) + i: x.size * x.dtype.itemsize for i, x in enumerate(outputs)}
-    # Where fewer samples are left than lanes, the last sample stands in the others too: no code for a remainder, and no reading
+    # Where fewer samples remain than lanes, the others repeat the last sample: no code for a remainder, and no reading
     # beyond the arrays. It is computed several times and stored as often.
     rows = e.rows(list(sizes), list(sizes.values()))
     if program.subprograms:

@@ -263,13 +263,19 @@ class LoadedScene(Scene):
         self.sensors = tuple(sensors)
 
 
-def summarize(what: str, names: Sequence[str], most: int = 8) -> list[str]:
+_NAMES = 8
+
+
+def summarize(what: str, names: Sequence[str]) -> list[str]:
     """One entry of `not_taken`: a description and the first names; empty when there are none."""
-    if not names:
-        return []
+    return summarize_all({what: names})
+
+
+def summarize_all(left: Mapping[str, Sequence[str]]) -> list[str]:
+    """Entries of `not_taken`, of names by their descriptions."""
     # A warning that lists hundreds of geoms hides the other entries.
-    more = f" and {len(names) - most} more" if len(names) > most else ""
-    return [f"{what}: {', '.join(names[:most])}{more}"]
+    more = {what: f" and {len(names) - _NAMES} more" * (len(names) > _NAMES) for what, names in left.items()}
+    return [f"{what}: {', '.join(names[:_NAMES])}{more[what]}" for what, names in left.items() if names]
 
 
 def warn_not_taken(path, not_taken: Iterable[str]) -> None:
@@ -280,7 +286,8 @@ def warn_not_taken(path, not_taken: Iterable[str]) -> None:
 
 # Robot joints turn by two or three turns at most, and links are shorter than 100 m; ships and cranes may trigger the warning.
 _MOST_TURNS, _LONGEST = 4.0, 100.0
-_NO_LIMIT = 1e15  # files write 1e16 for no limit
+# Limits from here on are none: files write 1e16, the default of SDF up to version 1.6.
+UNLIMITED = 1e15
 
 
 def warn_of_units(path, model: Model) -> None:
@@ -290,7 +297,7 @@ def warn_of_units(path, model: Model) -> None:
     for name, kind, place in zip(top.joint_names, top.kinds, top.q_slices, strict=True):
         ends = np.abs(np.concatenate([lower[place], upper[place]]))
         # Infinite limits and the huge numbers of files are no limits; they must not count as degrees.
-        if kind == "revolute" and (ends[ends < _NO_LIMIT] > 2 * np.pi * _MOST_TURNS).any():
+        if kind == "revolute" and (ends[ends < UNLIMITED] > 2 * np.pi * _MOST_TURNS).any():
             doubts.append(f"limits {lower[place][0]:g} to {upper[place][0]:g} rad of joint {name!r} (degrees?)")
     for name, home, parameters in zip(top.body_names, np.asarray(model.home), np.asarray(model.inertias), strict=True):
         if (far := np.linalg.norm(home[:3, 3])) > _LONGEST:

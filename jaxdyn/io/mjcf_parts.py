@@ -13,7 +13,7 @@ from jaxtyping import Array, Float
 
 from jaxdyn.constraints.base import Constraint, Holonomic
 from jaxdyn.constraints.loops import gear, lock_joint, loop
-from jaxdyn.io.loaded import Actuators, summarize
+from jaxdyn.io.loaded import Actuators, summarize, summarize_all
 from jaxdyn.io.mjcf_file import HINGE, SLIDE, CompiledFile, pose_of
 from jaxdyn.model.topology import body_index
 from jaxdyn.model.tree import Model
@@ -96,7 +96,7 @@ def constraints(file: CompiledFile, model: Model) -> tuple[list[Constraint], lis
             made, reason = None, "equalities of flexible bodies"
         taken += [] if made is None else [made]
         left.setdefault(reason, []).extend([name] if made is None else [])
-    return taken, [line for reason, names in left.items() for line in summarize(reason, names)]
+    return taken, summarize_all(left)
 
 
 def _loop(file: CompiledFile, model: Model, i: int, name: str) -> tuple[Constraint | None, str]:
@@ -213,7 +213,7 @@ def actuators(file: CompiledFile, model: Model) -> tuple[Actuators | None, list[
             left.setdefault(reason, []).append(name)
         else:
             taken.append(i)
-    lines = [line for reason, names in left.items() for line in summarize(f"actuators {reason}", names)]
+    lines = summarize_all({f"actuators {reason}": names for reason, names in left.items()})
     lines += summarize(
         "armature or damping of actuators on tendons and sites",
         [

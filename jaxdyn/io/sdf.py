@@ -11,7 +11,7 @@ from jaxdyn.constraints.loops import gear, lock_joint, loop
 from jaxdyn.forces.elements import CoulombFriction, JointDamping, JointSpring
 from jaxdyn.io.chains import Link, Names, add_chain, build_model
 from jaxdyn.io.collisions import FRICTION, check_choice, collision_of, contacts_with_ground
-from jaxdyn.io.loaded import LoadedScene, Start, summarize, warn_not_taken, warn_of_units
+from jaxdyn.io.loaded import LoadedScene, Start, summarize, summarize_all, warn_not_taken, warn_of_units
 from jaxdyn.io.sdf_frames import SdfFile
 from jaxdyn.io.sdf_joints import LOOPS, Axis, Edge, Joint, read_joints, spanning_tree
 from jaxdyn.io.solids import sdf_elements
@@ -244,24 +244,22 @@ def _loops(file: SdfFile, model: Model, cut: list[Joint]) -> tuple[list[Constrai
             place[:3, 3] = joint.pose[:3, 3]
             poses.append(place if end is None else host_math.inverse(file.pose(end)) @ place)
         taken.append(loop(ends[0], poses[0], ends[1], poses[1], LOOPS[joint.kind], name=joint.name))
-    return taken, [line for reason, names in left.items() for line in summarize(reason, names)]
+    return taken, summarize_all(left)
 
 
 def _couplings(file: SdfFile, joints: list[Joint], tree: dict[str, Joint]) -> tuple[list[Constraint], list[str]]:
     """Couplings by gearboxes and mimicked axes, and descriptions of those whose joints have no coordinate."""
-    taken: list[Constraint] = []
-    left: list[str] = []
+    couplings: list[tuple[str, Constraint | None]] = []
     for joint in joints:
         if joint.kind == "gearbox":
-            made = _gearbox(file, joint, tree.values())
-            (left if made is None else taken).append(joint.name if made is None else made)  # pyright: ignore[reportArgumentType]
+            couplings.append((joint.name, _gearbox(file, joint, tree.values())))
             continue
-        for name, axis in zip(_axis_names(joint), joint.axes, strict=False):
-            # <mimic> is an element of an axis and not of the joint.
-            if axis.mimic is not None:
-                made = _mimic(file, joint, name, axis, tree)
-                (left if made is None else taken).append(name if made is None else made)  # pyright: ignore[reportArgumentType]
-    return taken, summarize("couplings of joints that have no coordinate or axes that are not parallel", left)
+        # <mimic> is an element of an axis and not of the joint.
+        axes = [x for x in zip(_axis_names(joint), joint.axes, strict=False) if x[1].mimic is not None]
+        couplings += [(name, _mimic(file, joint, name, axis, tree)) for name, axis in axes]
+    left = [name for name, coupling in couplings if coupling is None]
+    text = "couplings of joints that have no coordinate or axes that are not parallel"
+    return [coupling for _, coupling in couplings if coupling is not None], summarize(text, left)
 
 
 def _gearbox(file: SdfFile, joint: Joint, tree: Iterable[Joint]) -> Constraint | None:
@@ -370,6 +368,6 @@ def _elements_without_effect(file: SdfFile, taken: set[str]) -> list[str]:
     unread["<collision> of links"] = [
         name for name in unread.get("<collision> of links", ()) if name not in taken and name not in grounds
     ]
-    lines = [line for reason, names in unread.items() for line in summarize(reason, names)]
+    lines = summarize_all(unread)
     lines += summarize("links with the reserved name of the world, which they stand for", file.of_world)
     return [*lines, *summarize("includes", file.includes)]

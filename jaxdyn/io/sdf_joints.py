@@ -6,6 +6,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from jaxdyn.io.loaded import UNLIMITED
 from jaxdyn.io.sdf_frames import SdfFile
 from jaxdyn.model import host_math
 from jaxdyn.model.builder import unknown
@@ -15,7 +16,6 @@ AXES = dict(revolute=1, continuous=1, prismatic=1, screw=1, revolute2=2, univers
 # Kind of `jd.loop` for each kind of joint; screws and gearboxes cannot close loops.
 LOOPS = dict(revolute="revolute", continuous="revolute", prismatic="prismatic", universal="universal")
 LOOPS |= dict(revolute2="universal", ball="spherical", fixed="weld")
-_FAR = 1e15  # limits beyond this are none; +-1e16 was the default up to version 1.6
 
 
 class Axis(NamedTuple):
@@ -101,14 +101,14 @@ def _axis(file: SdfFile, name: str, joint, scope, tag: str, kind: str, pose: np.
         turn = file.pose(file.find(inside, scope, xyz))[:3, :3]
     get = lambda tag, default, **how: file.number(element, tag, default, what, **how)  # noqa: E731
     lower, upper = get("limit/lower", -np.inf, finite=False), get("limit/upper", np.inf, finite=False)
-    limited = kind != "continuous" and (lower > -_FAR or upper < _FAR)
+    limited = kind != "continuous" and (lower > -UNLIMITED or upper < UNLIMITED)
     leaves: dict[str, Any] = {}
     # Files write huge finite numbers for no limit; only finite limits become leaves.
     if limited:
-        leaves = {"lower": lower if lower > -_FAR else -np.inf, "upper": upper if upper < _FAR else np.inf}
+        leaves = {"lower": lower if lower > -UNLIMITED else -np.inf, "upper": upper if upper < UNLIMITED else np.inf}
     for key, path in (("effort_limit", "limit/effort"), ("velocity_limit", "limit/velocity")):
         value = get(path, -1.0, finite=False)  # negative: no limit
-        if 0 <= value < _FAR:
+        if 0 <= value < UNLIMITED:
             leaves[key] = value
     for key in ("damping", "friction"):
         # Zero is the format's default; a leaf of zeros would be a force that does nothing.

@@ -21,7 +21,7 @@ import numpy as np
 
 from jaxdyn.constraints.base import Constraint
 from jaxdyn.constraints.loops import loop
-from jaxdyn.io.loaded import Actuators, summarize
+from jaxdyn.io.loaded import Actuators, summarize, summarize_all
 from jaxdyn.io.sdf_joints import LOOPS
 from jaxdyn.io.urdf_parts import Mimic
 from jaxdyn.io.xml_lines import XmlFile
@@ -204,7 +204,7 @@ def _gazebo(file: XmlFile, model: Model) -> tuple[list[Constraint], list[str]]:
             taken.append(_gazebo_loop(file, joint, name, LOOPS[kind], model))
             if any(joint.find(f"axis/{tag}") is not None for tag in ("dynamics", "limit")):
                 left.setdefault("limits and damping of <gazebo> joints", []).append(name)
-    return taken, [line for reason, names in left.items() for line in summarize(reason, names)]
+    return taken, summarize_all(left)
 
 
 def _gazebo_loop(file: XmlFile, joint, name: str, kind: str, model: Model) -> Constraint:

@@ -5,7 +5,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from jaxdyn.io.loaded import summarize
+from jaxdyn.io.loaded import summarize_all
 from jaxdyn.io.unread import URDF_GAZEBO, URDF_JOINT, URDF_LINK, URDF_ROBOT, unread_parts
 from jaxdyn.io.xml_lines import XmlFile
 from jaxdyn.model import host_math
@@ -172,7 +172,7 @@ def elements_without_effect(file: XmlFile) -> list[str]:
     for element in file.root:
         if element.tag in tables:
             elements.append((element, element.get("name") or element.get("reference") or robot, tables[element.tag]))
-    return [line for reason, names in unread_parts(file, elements).items() for line in summarize(reason, names)]
+    return summarize_all(unread_parts(file, elements))
 
 
 def _inertial(element) -> Inertial | None:

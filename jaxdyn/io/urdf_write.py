@@ -236,7 +236,9 @@ def _write_joint(robot: ET.Element, model: Model, edge: _Edge) -> None:
     _write_limits(joint, model, edge.body, what)
     given = {key: getattr(model, key) for key in ("damping", "friction", "armature")}
     # Readers of URDF refuse <dynamics> without damping and friction.
-    dynamics = dict.fromkeys(("damping", "friction"), "0") if any(x is not None for x in given.values()) else {}
+    dynamics: dict[str, str] = {}
+    if any(x is not None for x in given.values()):
+        dynamics = {"damping": "0", "friction": "0"}
     for key, values in given.items():
         if values is not None:
             own = np.asarray(values, np.float64)[model.topology.v_slices[edge.body]]
@@ -244,9 +246,9 @@ def _write_joint(robot: ET.Element, model: Model, edge: _Edge) -> None:
                 raise ValueError(
                     f"{what}: {key} {own.tolist()} differs between directions; URDF holds one number per joint"
                 )
-            dynamics[key] = _text(own[:1])  # pyright: ignore[reportArgumentType]
+            dynamics[key] = _text(own[:1])
     if dynamics:
-        ET.SubElement(joint, "dynamics", dynamics)  # pyright: ignore[reportArgumentType]
+        ET.SubElement(joint, "dynamics", dynamics)
     for n, (i, source) in enumerate(model.topology.couplings):
         if i == edge.body and model.coupling_values is not None:
             multiplier, offset = np.asarray(model.coupling_values, np.float64)[n]

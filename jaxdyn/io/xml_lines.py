@@ -132,8 +132,8 @@ _PLACES = {"xyz", "rpy", "pos", "quat", "euler", "axisangle", "xyaxes", "zaxis",
 # Elements whose places do not matter for the closing of loops.
 _NO_PLACES = {"inertial", "visual", "collision", "geom", "camera", "light", "asset"}
 _NUMBER = re.compile(r"[-+]?(\d*)\.?(\d*)(?:[eE]([-+]?\d+))?$")
-# Numbers of one or two digits (1, 0.5, -1.2) are meant as they stand. Coarser rounding than the largest one is never told from
-# a mechanism that does not close, and finer rounding than the least one is lost in that of the computation.
+# Numbers of one or two digits (1, 0.5, -1.2) are meant as they stand. Coarser rounding than the largest one cannot be
+# distinguished from a mechanism that does not close; finer rounding than the least one is lost in that of the computation.
 _PLAIN_DIGITS, _LEAST_ROUNDING, LARGEST_ROUNDING = 2, 1e-12, 1e-3
 
 

@@ -14,10 +14,12 @@ import numpy as np
 from jaxdyn.compile.known import array_namespace, is_concrete
 from jaxdyn.model.joints import KINDS, SCREW_KINDS, joint_neutral
 
-_SYMMETRIC = np.array([[0, 1, 3], [1, 2, 4], [3, 4, 5]])
-_TRIANGLE = (np.array([0, 0, 1, 0, 1, 2]), np.array([0, 1, 1, 2, 2, 2]))
-# Rotations further than this from orthonormal are mistakes and not rounding (float32 files reach 1e-7).
-_ORTHONORMAL = 1e-6
+# Positions of (xx, xy, yy, xz, yz, zz) in a symmetric 3x3 matrix, row by row.
+SYMMETRIC = np.array([[0, 1, 3], [1, 2, 4], [3, 4, 5]])
+TRIANGLE = (np.array([0, 0, 1, 0, 1, 2]), np.array([0, 1, 1, 2, 2, 2]))
+# Rotations further than this from orthonormal are mistakes and not rounding: float32 files reach 1e-7; axes of the ground are
+# typed with about six digits, and targets with four or five.
+ORTHONORMAL, ORTHONORMAL_GROUND, ORTHONORMAL_TARGET = 1e-6, 1e-5, 1e-4
 _V, _W = slice(0, 3), slice(3, 6)
 
 Values = np.ndarray | jax.Array
@@ -114,14 +116,20 @@ def pose_matrix(pose, what: str) -> Values:
     if not is_concrete(given):
         return given
     rotation = given[:3, :3]
-    # Measured before the determinant: a matrix that is far from orthonormal may have any determinant.
-    error = np.abs(rotation.T @ rotation - np.eye(3)).max()
-    if error > _ORTHONORMAL or np.linalg.det(rotation) < 0:
-        fault = "is a reflection" if error <= _ORTHONORMAL else f"is not orthonormal: |R^T R - 1| = {error:.2g}"
+    if fault := rotation_fault(rotation, ORTHONORMAL):
         raise ValueError(f"{what}: the rotation {rotation.tolist()} {fault}; give a proper rotation or (xyz, rpy)")
     if np.any(given[3] != [0, 0, 0, 1]):
         raise ValueError(f"{what}: the last row is {given[3].tolist()}, expected [0, 0, 0, 1]")
     return given
+
+
+def rotation_fault(rotation: Values, tolerance: float) -> str:
+    """Description of the fault of a known matrix (3, 3) that is no rotation; empty for a rotation."""
+    # Measured before the determinant: a matrix that is far from orthonormal may have any determinant.
+    error = np.abs(rotation.T @ rotation - np.eye(3)).max()
+    if error > tolerance:
+        return f"is not orthonormal: |R^T R - 1| = {error:.2g}"
+    return "is a reflection" if np.linalg.det(rotation) < 0 else ""
 
 
 def inverse(pose: Values) -> Values:
@@ -217,14 +225,14 @@ def inertia_numbers(inertia, what: str) -> Values:
         shapes = {(3, 3): "(3, 3)", (3,): "principal moments (3,)"}
         at_com = numbers(inertia[2], shapes, f"{what}: rotational inertia")
         at_com = array_namespace(at_com).diag(at_com) if at_com.ndim == 1 else at_com
-        if is_concrete(at_com) and np.abs(at_com - at_com.T).max() > _ORTHONORMAL * np.abs(at_com).max():
+        if is_concrete(at_com) and np.abs(at_com - at_com.T).max() > ORTHONORMAL * np.abs(at_com).max():
             raise ValueError(f"{what}: the rotational inertia {at_com.tolist()} is not symmetric")
         xp = array_namespace(mass, com, at_com)
         mass, com, at_com = (xp.asarray(x, float) for x in (mass, com, at_com))
         # Steiner's theorem, with the symmetric part taken row by row: an asymmetry below the tolerance is dropped.
         with np.errstate(over="ignore", invalid="ignore"):
             about_origin = at_com + mass * (com @ com * xp.eye(3) - xp.outer(com, com))
-            parameters = xp.concatenate([mass[None], mass * com, about_origin[_TRIANGLE]])
+            parameters = xp.concatenate([mass[None], mass * com, about_origin[TRIANGLE]])
         # Finite factors can have an infinite product.
         if is_concrete(parameters) and not np.isfinite(parameters).all():
             raise ValueError(f"{what}: mass {mass} kg at {com.tolist()} m overflows; give numbers in kg and m")
@@ -262,7 +270,7 @@ def inertia_fault(parameters: np.ndarray) -> str:
 
 def rotational_inertia(parameters: Values) -> Values:
     """Rotational inertia (3, 3) about the frame's origin."""
-    return parameters[4:][_SYMMETRIC]
+    return parameters[4:][SYMMETRIC]
 
 
 def about_com(parameters: np.ndarray) -> tuple[float, np.ndarray, np.ndarray]:
@@ -292,7 +300,7 @@ def pseudo_inertia(parameters: np.ndarray) -> np.ndarray:
 def parameters_from_pseudo(matrix: np.ndarray) -> np.ndarray:
     """Ten inertial parameters of a pseudo-inertia (4, 4)."""
     sigma = matrix[:3, :3]
-    return np.concatenate([matrix[3:, 3], matrix[:3, 3], (np.trace(sigma) * np.eye(3) - sigma)[_TRIANGLE]])
+    return np.concatenate([matrix[3:, 3], matrix[:3, 3], (np.trace(sigma) * np.eye(3) - sigma)[TRIANGLE]])
 
 
 def move_inertia(pose: Values, parameters: Values) -> Values:
@@ -306,7 +314,7 @@ def move_inertia(pose: Values, parameters: Values) -> Values:
     ph = xp.outer(shift, first)
     scale = 2 * shift @ first + mass * shift @ shift
     inertia = inertia + scale * xp.eye(3) - ph - ph.T - mass * xp.outer(shift, shift)
-    return xp.concatenate([mass[None], first + mass * shift, inertia[_TRIANGLE]])
+    return xp.concatenate([mass[None], first + mass * shift, inertia[TRIANGLE]])
 
 
 def idle_joints(topology, home, screws, inertias, armature, q) -> dict[int, bool]:

@@ -16,11 +16,8 @@ from jaxdyn.compile.known import array_namespace
 from jaxdyn.lie import so3
 from jaxdyn.model import host_math
 from jaxdyn.model.arguments import Checked, Number, Numbers, Row
+from jaxdyn.model.host_math import SYMMETRIC, TRIANGLE
 from jaxdyn.model.numbers import as_static
-
-# Positions of (xx, xy, yy, xz, yz, zz) in a symmetric 3x3 matrix, row by row.
-_SYMMETRIC = np.array([[0, 1, 3], [1, 2, 4], [3, 4, 5]])
-_TRIANGLE = (np.array([0, 0, 1, 0, 1, 2]), np.array([0, 1, 1, 2, 2, 2]))
 
 
 def _check_shapes(**given) -> None:
@@ -36,7 +33,7 @@ def _check_shapes(**given) -> None:
 def rotational_inertia(parameters: Checked[Float[Array, "10"]]) -> Float[Array, "3 3"]:
     """Rotational inertia (3, 3) about the frame's origin (kg m^2) from the ten inertial parameters."""
     _check_shapes(parameters=(parameters, (10,)))
-    return parameters[4:][_SYMMETRIC]
+    return parameters[4:][SYMMETRIC]
 
 
 def spatial_inertia(parameters: Checked[Float[Array, "10"]]) -> Float[Array, "6 6"]:
@@ -53,7 +50,7 @@ def spatial_inertia(parameters: Checked[Float[Array, "10"]]) -> Float[Array, "6 
 def parameters_from_spatial(matrix: Checked[Float[Array, "6 6"]]) -> Float[Array, "10"]:
     """Ten inertial parameters of a spatial inertia (6, 6); inverse of `spatial_inertia`."""
     _check_shapes(matrix=(matrix, (6, 6)))
-    return jnp.concatenate([matrix[:1, 0], so3.vee(matrix[3:, :3]), matrix[3:, 3:][_TRIANGLE]])
+    return jnp.concatenate([matrix[:1, 0], so3.vee(matrix[3:, :3]), matrix[3:, 3:][TRIANGLE]])
 
 
 def inertial_parameters(mass: Number, com: Numbers, inertia_com: Numbers) -> Float[Array, "10"]:
@@ -67,7 +64,7 @@ def inertial_parameters(mass: Number, com: Numbers, inertia_com: Numbers) -> Flo
     mass = jnp.asarray(mass, com.dtype)
     outer = com[:, None] * com[None, :]
     about_origin = inertia_com + mass * (jnp.sum(com**2) * jnp.eye(3, dtype=com.dtype) - outer)
-    return jnp.concatenate([mass[None], mass * com, about_origin[_TRIANGLE]])
+    return jnp.concatenate([mass[None], mass * com, about_origin[TRIANGLE]])
 
 
 def mass_com_inertia(
@@ -102,7 +99,7 @@ def transform_inertia(
     ph = shift[:, None] * first[None, :]
     scale = 2 * jnp.sum(shift * first) + mass * jnp.sum(shift * shift)
     inertia = inertia + scale * jnp.eye(3, dtype=pose.dtype) - ph - ph.T - mass * shift[:, None] * shift[None, :]
-    return jnp.concatenate([mass[None], first + mass * shift, inertia[_TRIANGLE]])
+    return jnp.concatenate([mass[None], first + mass * shift, inertia[TRIANGLE]])
 
 
 def pseudo_inertia(parameters: Checked[Float[Array, "10"]]) -> Float[Array, "4 4"]:
@@ -128,7 +125,7 @@ def parameters_from_pseudo(matrix: Checked[Float[Array, "4 4"]]) -> Float[Array,
     _check_shapes(matrix=(matrix, (4, 4)))
     sigma = matrix[:3, :3]
     inertia = jnp.trace(sigma) * jnp.eye(3, dtype=matrix.dtype) - sigma
-    return jnp.concatenate([matrix[3:, 3], matrix[:3, 3], inertia[_TRIANGLE]])
+    return jnp.concatenate([matrix[3:, 3], matrix[:3, 3], inertia[TRIANGLE]])
 
 
 def log_cholesky_factor(theta: Checked[Float[Array, "10"]]) -> Float[Array, "4 4"]:

@@ -224,7 +224,7 @@ def _replace(model: Model, leaves: dict) -> Model:
 
 def check_rounding(rounding: Any) -> float:
     """Check the rounding of poses. **Raises:** ValueError for anything but a number from 0 to 0.01."""
-    # Above that redundant rows could not be told from independent ones, whatever the mechanism.
+    # Above that redundant rows are not distinguishable from independent ones, whatever the mechanism.
     if not isinstance(rounding, (int, float, np.number)) or not 0 <= rounding <= 1e-2:
         raise ValueError(f"rounding is {rounding!r}; give the size of the poses' rounding errors, 0 to 0.01 (m or rad)")
     return float(rounding)

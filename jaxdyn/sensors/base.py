@@ -50,6 +50,11 @@ class Motion(NamedTuple):
     thrusts: Mapping[str, Any] | None = None
     contacts: Mapping[str, Array] | None = None
 
+    @property
+    def model(self) -> Model:
+        """The tree of bodies of the scene; `Sensor.check` has refused other systems."""
+        return cast(Model, self.scene.system)
+
 
 class Noise(eqx.Module):
     r"""Errors of a sensor: reading + bias + walk(t) + white noise.

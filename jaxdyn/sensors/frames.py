@@ -1,7 +1,5 @@
 """Sensors on frames: accelerometer, gyroscope, both as an IMU, velocity and pose."""
 
-from typing import Any
-
 import equinox as eqx
 import jax.numpy as jnp
 from jaxtyping import Array, Float
@@ -26,11 +24,11 @@ class _OnFrame(Sensor):
 
     def check(self, scene: Scene) -> None:
         """Refuse a frame that the model does not have. **Raises:** ValueError."""
-        frame_index(scene.system, self.frame)  # pyright: ignore[reportArgumentType]
+        frame_index(scene.system, self.frame)
 
     def _rotation(self, motion: Motion) -> Float[Array, "3 3"]:
         # The columns are the frame's axes in the world: its transpose takes a vector of the world to the frame.
-        return frame_pose(motion.scene.system, motion.q, self.frame)[:3, :3]  # pyright: ignore[reportArgumentType]
+        return frame_pose(motion.model, motion.q, self.frame)[:3, :3]
 
     def _in_frame_axes(self, motion: Motion, vector) -> Float[Array, "3"]:
         """A vector of the world in the frame's axes."""
@@ -38,10 +36,10 @@ class _OnFrame(Sensor):
 
     def _velocity(self, motion: Motion) -> Float[Array, "6"]:
         # Linear part first, of the frame's origin, both parts in world axes.
-        return frame_velocity(motion.scene.system, motion.q, motion.v, self.frame)  # pyright: ignore[reportArgumentType]
+        return frame_velocity(motion.model, motion.q, motion.v, self.frame)
 
     def _specific_force(self, motion: Motion) -> Float[Array, "3"]:
-        model: Any = motion.scene.system
+        model = motion.model
         # The acceleration of the origin, which has the term w x v that the linear part of a twist's rate lacks.
         a = frame_acceleration(model, motion.q, motion.v, motion.a, self.frame)[:3]
         # A gravity of None is that of a model without weight. At rest the reading is -g, upwards.
@@ -141,7 +139,7 @@ class FramePose(_OnFrame):
     def read(self, motion: Motion) -> Float[Array, " k"]:
         """Position and quaternion."""
         # The pose of the frame in the world. Its quaternion has the real part first, as those of q.
-        pose = frame_pose(motion.scene.system, motion.q, self.frame)  # pyright: ignore[reportArgumentType]
+        pose = frame_pose(motion.model, motion.q, self.frame)
         return jnp.concatenate([pose[:3, 3], so3.matrix_to_quat(pose[:3, :3])])[_POSES[self.part]]
 
 

@@ -60,7 +60,7 @@ class Encoder(Sensor):
 
     def check(self, scene: Scene) -> None:
         """Refuse a joint that the model does not have. **Raises:** ValueError."""
-        model: Any = scene.system
+        model = cast(Model, scene.system)
         place = model.topology.q_slices[joint_index(model, self.joint)]
         # A quaternion rounded entry by entry is no unit quaternion.
         if self.resolution is not None and place.stop - place.start > 1:
@@ -68,7 +68,7 @@ class Encoder(Sensor):
 
     def read(self, motion: Motion) -> Float[Array, " n"]:
         """Coordinates of the joint."""
-        model: Any = motion.scene.system
+        model = motion.model
         return motion.q[model.topology.q_slices[joint_index(model, self.joint)]]
 
     def quaternion_start(self, scene: Scene) -> int | None:
@@ -103,7 +103,7 @@ class Tachometer(Sensor):
 
     def read(self, motion: Motion) -> Float[Array, " n"]:
         """Velocities of the joint."""
-        model: Any = motion.scene.system
+        model = motion.model
         return motion.v[model.topology.v_slices[joint_index(model, self.joint)]]
 
 
@@ -158,7 +158,7 @@ class ForceTorque(Sensor):
 
     def check(self, scene: Scene) -> None:
         """Refuse a frame on the ground, and joints that the frame's body does not carry. **Raises:** ValueError."""
-        model: Any = scene.system
+        model = cast(Model, scene.system)
         body, _ = named_frame(model, self.frame)
         # -1 is the world, which has no joint.
         if body < 0:
@@ -177,8 +177,7 @@ class ForceTorque(Sensor):
 
     def read(self, motion: Motion) -> Float[Array, " k"]:
         """Wrench at the frame's origin, in its axes."""
-        scene, q = motion.scene, motion.q
-        model: Any = scene.system
+        q, model = motion.q, motion.model
         body, offset = named_frame(model, self.frame)
         pulls = self._outer_wrenches(motion, body)
         if self.inertia is not None:
@@ -192,8 +191,7 @@ class ForceTorque(Sensor):
 
     def _outer_wrenches(self, motion: Motion, body: int) -> Float[Array, "nb 6"] | None:
         """Wrenches on each body past the joints, of loops, feet and outer forces; None without any."""
-        scene, q = motion.scene, motion.q
-        model: Any = scene.system
+        scene, q, model = motion.scene, motion.q, motion.model
 
         def counts(frame: str) -> bool:
             return self.frames is None or frame in self.frames or named_frame(model, frame)[0] != body
@@ -287,7 +285,7 @@ class Touch(Sensor):
 
     def _rows(self, scene: Scene) -> list[int]:
         """Rows of the normals of the contacts on the frame's body."""
-        model: Any = scene.system
+        model = cast(Model, scene.system)
         body = named_frame(model, self.frame)[0]
         pairs = zip(scene.constraints, layout(scene), strict=True)
         return [
