@@ -28,7 +28,7 @@ _MOVED = {
     "geometry": ("constrain_by_immersion reaction_force"),
     "reduction": ("tangent_basis gauge_invariant involutive spurious_terms"),
     "solvers": ("LieGroup Rodas5P"),
-    "simulation": ("JointLimitWarning Stiffness"),
+    "simulation": ("Baumgarte JointLimitWarning Stiffness"),
     "model": ("Topology inertia_report repair_inertias"),
     "control": ("LeggedDynamics underactuated_inverse_dynamics"),
 }
