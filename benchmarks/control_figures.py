@@ -276,14 +276,14 @@ def grasp_force():
     ts, goal = jnp.linspace(0, 2.5, 51), q[4:] + jnp.asarray([0.02, 0.03, 0.1])
     figure, left, right = pair()
     law = jd.control.GraspForce(plant, goal, KP, KD, preload=10.0)
-    motion = jd.simulate(plant, q, v, ts, control=law, stepsize=0.02, contacts="report")
+    motion = jd.simulate(plant, q, v, ts, control=law, stepsize=0.02, events=[jd.events.ContactLost(stop=False)])
     errors = np.asarray(jax.vmap(lambda q: law.error.position(plant.system, q, 0.0))(motion.q))
     promised = decayed(np.asarray(ts), errors[0], np.zeros(3))
     against(left, ts, errors, promised, ("x", "y", "angle"), "|error of the bar| (m, rad)")
     squeeze = 10.0 * jd.grasp.normal_forces(plant)
     for ki in (None, 4.0):
         law = jd.control.GraspForce(scenes.hand_with_bar(masses=(0.5, 0.4)), q[4:], 400.0, 40.0, preload=10.0, ki=ki)
-        options = {"stepsize": 0.01, "contacts": "report", "outputs": ("multipliers",)}
+        options = {"stepsize": 0.01, "events": [jd.events.ContactLost(stop=False)], "outputs": ("multipliers",)}
         motion = jd.simulate(plant, q, v, ts, control=law, **options)
         inside = jax.vmap(lambda q, lam: jd.grasp.internal_forces(plant, q, lam))(motion.q, motion.multipliers)
         error = np.abs(np.asarray(inside) - squeeze).max(1)
@@ -320,7 +320,11 @@ def whole_body():
         model, feet, goal, KP, KD, orientation=attitude, posture=q, passive=(0, 1, 2), preload=1.0
     )
     scene = jd.control.standing(model, q, feet)
-    options = {"stepsize": 0.02, "contacts": "report", "outputs": ("contact_margins", "contact_forces")}
+    options = {
+        "stepsize": 0.02,
+        "events": [jd.events.ContactLost(stop=False)],
+        "outputs": ("contact_margins", "contact_forces"),
+    }
     motion = jd.simulate(scene, q, jnp.zeros(model.nv), ts, control=law, **options)
     errors = np.asarray(jax.vmap(lambda q: jd.center_of_mass(model, q))(motion.q) - goal)[:, [0, 2]]
     figure, left, right = pair()

@@ -196,7 +196,13 @@ def run(name: str, seconds: float = 1.0, most: int = 1000, **options) -> tuple[C
     def once(q0, v0, mu, e):
         scene = drop.scene(mu, e)
         law = None if control is None else jax.tree_util.Partial(control)
-        how = {"rtol": TOLERANCE, "atol": TOLERANCE, "max_events": most, "throw": False, **options}
+        how = {
+            "rtol": TOLERANCE,
+            "atol": TOLERANCE,
+            "events": [jd.events.ModeSwitches(most)],
+            "throw": False,
+            **options,
+        }
         motion = jd.simulate(scene, q0, v0, ts, control=law, outputs=("energy",), **how)
         energy: Any = motion.energy
         if drop.rest is not None:

@@ -58,8 +58,8 @@ def write(name: str, folder: Path) -> float:
         ts = jnp.linspace(0.0, duration, _FRAMES)
         # Fingers under no torques would soon pull: the picture shows the motion that the rows allow.
         outputs = ("multipliers",) if name in _FORCES else ()
-        contacts = None if scene.cones is None else "report"
-        motion = jd.simulate(scene, start[0], start[1], ts, contacts=contacts, outputs=outputs)
+        events = [] if scene.cones is None else [jd.events.ContactLost(stop=False)]
+        motion = jd.simulate(scene, start[0], start[1], ts, events=events, outputs=outputs)
     partial = folder / f"{name}.part.gif"
     jd.animate(scene, motion, partial, fps=15, speed=duration * 15 / _FRAMES)
     partial.replace(folder / f"{name}.gif")

@@ -35,7 +35,9 @@ def turned_ball():
     q, v = jd.scenes.hand_with_ball.start(position=(-SWAY, 0.0, 0.3), turned=(0.0, 0.0, 0.0), twist=(0.0,) * 6)
     law = jd.control.GraspForce(grasp, target, kp=100.0, kd=20.0, preload=PRELOAD)
     outputs = ("multipliers", "contact_forces", "contact_margins")
-    return grasp, jd.simulate(grasp, q, v, TS, control=law, stepsize=0.01, contacts="report", outputs=outputs)
+    return grasp, jd.simulate(
+        grasp, q, v, TS, control=law, stepsize=0.01, events=[jd.events.ContactLost(stop=False)], outputs=outputs
+    )
 
 
 def figure(grasp, motion) -> matplotlib.figure.Figure:

@@ -113,7 +113,7 @@ def scene(name: str, batch: int, steps: int) -> dict:
         named = {"disk": jd.scenes.rolling_disk, "hand": jd.scenes.hand_with_ball}[name]
         built, (q, v) = named(), named.start()
     # Nothing grips the ball: its contacts hold on both sides.
-    free = {"contacts": "report"} if name == "hand" else {}
+    free = {"events": [jd.events.ContactLost(stop=False)]} if name == "hand" else {}
     ts = DT * np.array([0.0, steps])
     speeds = np.linspace(0.5, 1.5, batch)[:, None]
 

@@ -58,7 +58,7 @@ def scene_calls(name: str, batch: int, steps: int):
     named = getattr(jd.scenes, name)
     scene, (q, v) = named(), named.start()
     ts = jnp.asarray([0.0, STEP * steps])
-    contacts = {} if scene.cones is None else {"contacts": "report"}
+    contacts = {} if scene.cones is None else {"events": [jd.events.ContactLost(stop=False)]}
 
     def motion(v, tau):
         control = jax.tree_util.Partial(_constant, tau)

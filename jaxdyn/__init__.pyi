@@ -62,9 +62,9 @@ from jaxdyn.pictures import animate, draw, plot, view
 from jaxdyn.reduction.inverse_dynamics import constrained_inverse_dynamics
 from jaxdyn.reduction.minimal import reduced_dynamics
 from jaxdyn.reports import report
-from jaxdyn.simulation import solvers
+from jaxdyn.simulation import events, solvers
 from jaxdyn.simulation.controls import Controller, Sampled
-from jaxdyn.simulation.methods import Baumgarte, Multipliers, Projected, Reduced
+from jaxdyn.simulation.methods import Multipliers, Projected, Reduced
 from jaxdyn.simulation.run import simulate
 from jaxdyn.simulation.solution import Solution
 from jaxdyn.simulation.stepping import stepper
@@ -77,7 +77,6 @@ from jaxdyn.systems.system import ExplicitSystem, MetricSystem
 __version__: str
 __all__ = [
     "RESULTS",
-    "Baumgarte",
     "Controller",
     "ExplicitSystem",
     "Exported",
@@ -114,6 +113,7 @@ __all__ = [
     "difference",
     "draw",
     "dynamics",
+    "events",
     "export",
     "follow",
     "forces",

@@ -33,6 +33,7 @@ from jaxdyn.io.logs import read_log
 from jaxdyn.model.configuration import integrate
 from jaxdyn.model.tree import Model
 from jaxdyn.pictures import save_html, shapes, view
+from jaxdyn.simulation.events import events_of
 from jaxdyn.simulation.methods import Projected
 from jaxdyn.simulation.run import Solution, simulate
 from jaxdyn.systems.scene import Scene
@@ -179,7 +180,7 @@ def run(args: argparse.Namespace) -> int:
 
     watch = Stopwatch()
     carry = model if args.torque.startswith("gravity") else None
-    steps["progress"] = args.progress
+    steps["events"] = events_of(progress=args.progress)
     solution, tau = _simulate(scene, control, carry, starts, speeds, ts, steps)
     done = np.asarray(solution.success)
     print(f"{args.file}: {args.batch} motion{'s' * (args.batch > 1)} of {duration:g} s, {len(ts)} rows each, in {watch} "

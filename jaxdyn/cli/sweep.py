@@ -18,6 +18,7 @@ from jaxdyn.cli.common import Stopwatch, check_least, check_memory, whole
 from jaxdyn.io import load_urdf
 from jaxdyn.model.arguments import as_path
 from jaxdyn.model.configuration import integrate, neutral
+from jaxdyn.simulation.events import events_of
 from jaxdyn.simulation.run import simulate
 
 HELP = "simulate a study of many rollouts into a Zarr store; resumable"
@@ -85,7 +86,17 @@ _KEYS: dict[str, tuple[type, ...]] = {
 # Options of `jd.simulate` that a file can set, and of `jd.scale.run`.
 _OPTIONS = {"batch_size", *inspect.signature(simulate).parameters}
 # The study sets these itself, or a file cannot express them.
-_OPTIONS -= {"scene", "q0", "v0", "ts", "control", "outputs", "adjoint", "progress", "throw"}
+_OPTIONS -= {"scene", "q0", "v0", "ts", "control", "outputs", "adjoint", "events", "throw"}
+# Events by words (`events_of`).
+_EVENTS = {"contacts", "limits", "max_events"}
+_OPTIONS |= _EVENTS
+
+
+def _options(study: dict[str, Any]) -> dict[str, Any]:
+    given = study.get("options", {})
+    options = {name: value for name, value in given.items() if name not in _EVENTS}
+    events = events_of(**{name: value for name, value in given.items() if name in _EVENTS})
+    return options | ({"events": events} if events else {})
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -141,7 +152,7 @@ def run(args: argparse.Namespace) -> int:
             client=client,
             chunk=args.chunk,
             progress=not args.quiet,
-            **study.get("options", {}),
+            **_options(study),
         )
     print(f"{result}\nin {watch}, compilation included.")
     return int(not result.success)

@@ -16,6 +16,7 @@ from jaxdyn.lie.so3 import quat_to_matrix
 from jaxdyn.model.tree import Model
 from jaxdyn.reports.case import Case, Reference
 from jaxdyn.simulation.checks import choose_method
+from jaxdyn.simulation.events import ContactLost
 from jaxdyn.simulation.run import simulate
 from jaxdyn.simulation.solvers import RK4, Rodas5P
 from jaxdyn.systems.scene import Scene
@@ -67,7 +68,7 @@ class Programs:
             steps = {"stepsize": setting} if solver in FIXED else {"rtol": setting, "atol": setting}
             # Only the integration is measured: contacts that pull are reported and do not end it.
             options = {"method": method, "solver": SOLVERS[solver](), "max_steps": MOST_STEPS, "throw": False}
-            options["contacts"] = None if scene.cones is None else "report"
+            options["events"] = () if scene.cones is None else (ContactLost(stop=False),)
             solution = simulate(scene, q, v, ts, **steps, **options)
             return solution.q, solution.v, solution.result, solution.stats
 

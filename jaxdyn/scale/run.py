@@ -124,8 +124,7 @@ def run(
     ts = np.asarray(as_array(ts, "ts"))
     check_times(ts)
     # `Rollout` passes `throw` itself, which given twice would be a TypeError.
-    for name in ("throw", "progress"):
-        options.pop(name, None)
+    options.pop("throw", None)
     model: Any = scene
     # A function is a leaf; a scene or a model is a pytree, even if it can be called.
     builds = callable(scene) and jax.tree_util.all_leaves([scene])

@@ -10,10 +10,12 @@ from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
     from jaxdyn.simulation.contact_steps import ContactStep as ContactStep
+    from jaxdyn.simulation.methods import Baumgarte as Baumgarte
     from jaxdyn.simulation.stiffness import Stiffness as Stiffness
     from jaxdyn.simulation.terminal_events import JointLimitWarning as JointLimitWarning
 
 __all__ = [
+    "Baumgarte",
     "ContactStep",
     "JointLimitWarning",
     "Stiffness",
@@ -27,7 +29,12 @@ def __dir__() -> list[str]:
 
 def __getattr__(name: str) -> Any:
     # At their first use: diffrax, which two of them import, is not needed by runs whose programs are on disk.
-    homes = {"ContactStep": "contact_steps", "JointLimitWarning": "terminal_events", "Stiffness": "stiffness"}
+    homes = {
+        "Baumgarte": "methods",
+        "ContactStep": "contact_steps",
+        "JointLimitWarning": "terminal_events",
+        "Stiffness": "stiffness",
+    }
     if name not in homes:
         raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
     return getattr(importlib.import_module(f"{__name__}.{homes[name]}"), name)

@@ -27,6 +27,7 @@ from jaxdyn.model.configuration import neutral
 from jaxdyn.model.topology import frame_index
 from jaxdyn.model.tree import Model
 from jaxdyn.simulation.controls import Controller, Sampled
+from jaxdyn.simulation.events import Terminal, Watch
 from jaxdyn.simulation.methods import Baumgarte, Free, Method, Multipliers, Projected, Reduced, is_regular, start_limit
 from jaxdyn.simulation.options import is_backsolve, is_step_length, is_variational
 from jaxdyn.simulation.solution import RESULTS
@@ -184,8 +185,9 @@ def check_conditions(conditions, adjoint) -> None:
     """Refuse an adjoint that does not go back through the event that may end a run."""
     if any(conditions) and is_backsolve(adjoint):
         raise ValueError(
-            "adjoint is 'backsolve', which does not go back through events, and contacts, limits or the control may end the run; "
-            "take 'reverse', or contacts='report', limits=None and a control without `allowance`"
+            "adjoint is 'backsolve', which does not go back through events, and contacts, limits, a terminal event or the "
+            "control may end the run; take 'reverse', or jd.events.ContactLost(stop=False), no other events and a control "
+            "without `allowance`"
         )
 
 
@@ -231,58 +233,58 @@ def check_modal_options(control, stepsize, solver, adjoint, outputs) -> None:
             )
 
 
-def check_effects(scene: Scene, solver, stepsize, modal: bool, given: dict[str, Any]) -> None:
-    """Refuse options that were given (not None) and have no effect on this run, and a bad number of events."""
-    without_use = [name for name in ("rtol", "atol") if stepsize is not None and given[name] is not None]
-    if without_use:
-        from jaxdyn.simulation.solvers.choice import choose_solver, label, uses_tolerances
+def check_tolerances(solver, stepsize, given: list[str]) -> None:
+    """Refuse tolerances that were given and have no effect on this run."""
+    if not given or stepsize is None:
+        return
+    from jaxdyn.simulation.solvers.choice import choose_solver, label, uses_tolerances
 
-        solver, steps = choose_solver(solver, stepsize), "fixed" if is_step_length(stepsize) else "their own"
-        if not uses_tolerances(solver):
-            raise ValueError(
-                f"{without_use[0]} is given, and {label(solver)} has no use for it with {steps} steps (stepsize); omit one of "
-                "them"
-            )
-    most = given["max_events"]
-    if most is not None:
-        if isinstance(most, bool) or not isinstance(most, (int, np.integer)) or most < 1:
-            raise ValueError(f"max_events is {most!r}; pass a positive integer, such as 64")
-        if not modal and not any(has_pieces(force) for force in scene.forces):
-            raise ValueError(
-                f"max_events is {most}, and no force of the scene has events (jd.contact.DryFriction, "
-                "jd.contact.UnilateralContact, jd.forces.PiecewiseForce); omit it"
-            )
-    if given["contacts"] in ("stop", "report") and scene.cones is None:
+    solver, steps = choose_solver(solver, stepsize), "fixed" if is_step_length(stepsize) else "their own"
+    if not uses_tolerances(solver):
         raise ValueError(
-            f"contacts is {given['contacts']!r}, and the scene has no cones; omit it, or give jd.Scene(cones=...)"
+            f"{given[0]} is given, and {label(solver)} has no use for it with {steps} steps (stepsize); omit one of them"
         )
 
 
-def check_contacts(scene: Scene, contacts: str, outputs) -> None:
-    """Refuse an unknown choice, cones that do not fit, and contact forces of a scene without cones."""
-    if contacts not in ("stop", "report"):
-        raise ValueError(f"contacts is {contacts!r}; choose from 'stop', 'report'")
+def check_events(scene: Scene, watch: Watch, modal: bool) -> None:
+    """Refuse events that cannot happen in a scene, and ends at limits in a motion with modes."""
+    if watch.switches is not None and not modal and not any(has_pieces(force) for force in scene.forces):
+        raise ValueError(
+            f"events has {watch.switches}, and no force of the scene has events (jd.contact.DryFriction, "
+            "jd.contact.UnilateralContact, jd.forces.PiecewiseForce); omit it"
+        )
+    if watch.contacts is not None and scene.cones is None:
+        raise ValueError(
+            f"events has {watch.contacts}, and the scene has no cones; omit it, or give jd.Scene(cones=...)"
+        )
+    if watch.limits is None:
+        return
+    if not isinstance(scene.system, Model):
+        raise ValueError(f"events has {watch.limits}, and a {type(scene.system).__name__} has no joint limits; omit it")
+    if watch.limits.stop and modal:
+        raise ValueError(
+            f"events has {watch.limits}, which a scene whose forces have modes (jd.contact.DryFriction, "
+            "jd.contact.UnilateralContact) does not support; pass jd.events.JointLimit(stop=False)"
+        )
+
+
+def check_terminals(terminals: tuple[Terminal, ...], modal: bool) -> None:
+    """Refuse terminal events of motions with modes."""
+    if terminals and modal:
+        raise ValueError(
+            "events has a jd.events.Terminal, which a scene whose forces have modes (jd.contact.DryFriction, "
+            "jd.contact.UnilateralContact) does not support; end ts earlier"
+        )
+
+
+def check_cones(scene: Scene, outputs) -> None:
+    """Refuse cones that do not fit, and contact forces of a scene without cones."""
     if scene.cones is not None:
         contacts_with_cones(scene)
     elif asked := [name for name in outputs if name in CONTACT_OUTPUTS]:
         raise ValueError(
             f"outputs has {asked[0]!r} and the scene has no cones; give its contacts cones, as in jd.Scene(..., "
             "cones=jd.contact.friction_cone('hard-finger', mu=0.8))"
-        )
-
-
-def check_limits(scene: Scene, limits: Any, modal: bool) -> None:
-    """Refuse an unknown choice, limits of a system that has none, and ends at limits in a motion with modes."""
-    if limits not in ("report", "stop", None):
-        raise ValueError(f"limits is {limits!r}; choose from 'report', 'stop', None")
-    if limits is not None and not isinstance(scene.system, Model):
-        raise ValueError(
-            f"limits is {limits!r}, and a {type(scene.system).__name__} has no joint limits; pass limits=None"
-        )
-    if limits == "stop" and modal:
-        raise ValueError(
-            "limits is 'stop', which a scene whose forces have modes (jd.contact.DryFriction, jd.contact.UnilateralContact) "
-            "does not take; pass limits='report'"
         )
 
 

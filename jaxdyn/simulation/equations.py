@@ -34,12 +34,12 @@ def power(force, v):
 
 
 def equations(
-    scene: Scene, control: Any, method: Method, start: dict, q0, v0, t0, conditions: Conditions
+    scene: Scene, control: Any, method: Method, start: dict, q0, v0, t0, conditions: Conditions, terminals: tuple = ()
 ) -> tuple["Equations", tuple | None]:
     """Equations of a run and their arguments; `start`: entries of the control and the drives at the start (q0, v0, t0)."""
     # diffrax compiles its arguments, which hides their values. Known leaves are compiled in, the rest is `args`: flat, because
     # its continuous adjoint supports no empty tuples.
-    unknown, known = partition_tracers((scene, control, method))
+    unknown, known = partition_tracers((scene, control, method, terminals))
     args = tuple(unknown) or None
     eqs = Equations(known, len(unknown), tuple(start), conditions)
     eqs.pieces = pieces_of(scene, start, q0, v0, t0, lambda y, q, v, t: (eqs.effort(args, y, q, v, t), y.get(DRIVES)))
@@ -66,7 +66,7 @@ class Equations:
     def unpack(self, args, y=None):
         """Scene with the rows that the step from y keeps, control and method."""
         args = args or ()
-        scene, control, method = self._known(args[: self._count])
+        scene, control, method, _ = self._known(args[: self._count])
         if y is not None and KEPT in y:
             scene = exchange_rows(scene, y[KEPT])
         if len(args) > self._count:
@@ -190,6 +190,9 @@ class Equations:
             margins.append(limit_allowances(scene.system, q))
         if self.conditions.control:
             margins.append(control.allowance(q, v, t)[None])
+        if self.conditions.terminals:
+            terminals = self._known((args or ())[: self._count])[3]
+            margins.append(jnp.stack([one.margin(q, v, t) for one in terminals]))
         return jnp.concatenate(margins)
 
     def _guards(self, t, y, args):

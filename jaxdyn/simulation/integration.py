@@ -100,7 +100,10 @@ def _reason_for_diffrax(solver, controller, adjoint, options) -> str | None:
 def _reason_for_crossing(quality, guards) -> str | None:
     """Reason why explicit steps go across the kinks of forces instead of ending there, or None."""
     if guards is not None:
-        return "contacts, limits or the control may end the run; pass contacts='report' and limits=None"
+        return (
+            "contacts, limits, a terminal event or the control may end the run; pass jd.events.ContactLost(stop=False) "
+            "and no other events"
+        )
     return None if quality is None else "method is 'reduced'; take 'projected'"
 
 

@@ -169,13 +169,12 @@ def _set_up(scene: Scene, control, method: Method, inputs: Inputs, options) -> t
     entries = controls.initial_entries(control, *start)
     if (of_drives := scene.drive_state(*start)) is not None:
         entries = entries | {DRIVES: of_drives}
-    conditions = Conditions(
-        options["contacts"] == "stop" and scene.cones is not None,
-        options["limits"] == "stop",
-        controls.can_end(control, *start),
-    )
+    at_contacts, at_limits = options["stops"]
+    conditions = Conditions(at_contacts, at_limits, controls.can_end(control, *start), len(options["terminals"]))
+    for one in options["terminals"]:
+        check_callback(one.function, "Terminal: function", "function(q, v, t)", *start)
     check_conditions(conditions, options["adjoint"])
-    eqs, args = equations(scene, control, method, entries, *start, conditions)
+    eqs, args = equations(scene, control, method, entries, *start, conditions, options["terminals"])
     # Shapes that do not fit are reported here, with the user's function at the end of the traceback.
     eqx.filter_eval_shape(eqs.generalized_force, args, entries, *start)
     y0 = method.start(scene, *start) | entries

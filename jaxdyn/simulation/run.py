@@ -19,6 +19,7 @@ from jaxdyn.model.arguments import Numbers, as_array, check_flag, state_dtype
 from jaxdyn.simulation import checks, controls
 from jaxdyn.simulation.checks import check_constraints, choose_method, may_have_singular_mass
 from jaxdyn.simulation.controls import Control
+from jaxdyn.simulation.events import Event, Watch, accept_former_events, sort_events
 from jaxdyn.simulation.methods import Method, may_have_redundant_rows
 from jaxdyn.simulation.options import (
     ADJOINTS,
@@ -35,6 +36,7 @@ from jaxdyn.systems.scene import Scene, as_scene, is_given
 from jaxdyn.systems.system import SceneLike, System, has_dependent_coordinates
 
 
+@accept_former_events
 def simulate(
     scene: SceneLike,
     q0: Numbers,
@@ -49,10 +51,7 @@ def simulate(
     atol: Numbers | None = None,
     adjoint: Adjoint = None,
     outputs: Sequence[str] = (),
-    contacts: str | None = None,
-    limits: str | None = None,
-    max_events: int | None = None,
-    progress: bool = False,
+    events: Sequence[Event] = (),
     max_steps: int | None = None,
     throw: bool | None = None,
 ) -> Solution:
@@ -79,7 +78,7 @@ def simulate(
       "multipliers": the same without the projection, so that the constraints open as the local errors add up;
       "reduced": minimal velocities are integrated, and q by v = N nu + v0; `jd.Reduced(basis)` chooses them;
       "variational": steps of fixed length that keep the energy over long times, with a solver of their own;
-      "baumgarte": feedback of violated rows, for comparison, with the rates `jd.Baumgarte(alpha, beta)`.
+      "baumgarte": feedback of violated rows, for comparison, with the rates `jd.simulation.Baumgarte(alpha, beta)`.
       "auto" is "free", or "projected", which handles redundant rows and rank loss on the way and needs no choice.
     - `solver`: any diffrax method of an `ODETerm`, `jd.solvers.Rodas5P()`, `jd.solvers.LieGroup(...)` of one of them, or a
       method that takes an implicit and an explicit part (`diffrax.KenCarp4`): implicit are dq/dt = H v and the share of
@@ -98,21 +97,12 @@ def simulate(
       "multipliers", "constraint_residual", "contact_forces" (N, by the names of contacts: two components of friction, then
       the normal force), "contact_margins", "torque" (of the control, behind drives and limits), "control_state" (of a
       controller), "drive_state" (of drives) and "pose:<frame>". They are computed only if asked for.
-    - `contacts`: of a scene with `cones`. "stop", the default: where a contact pulls or leaves its cone (a margin below zero by
-      more than rounding, $\epsilon^{1/2}$ of its force) the run ends, with the code `contact_lost` and the time, which is found
-      within the step. "report": it continues, with contacts that hold on both sides.
-    - `limits`: of the model's joints (`model.lower`, `model.upper`), which nothing enforces. None: they are ignored.
-      "stop": where a joint passes one the run ends, with the code `joint_limit_passed` and the time, found within the step.
-      So are passages that end within the same step, except short ones: of less than about 1e-3 of what the joint moves in the
-      step with explicit methods, which predict where it comes nearest to the limit, and of less than an eighth of the step's
-      time with others. If only a save point shows a passage, its time is that of the save point. The same holds for contacts.
-      "report": the run continues; `stats["passed_limit"]` is the entry of q of the first limit that is passed at a save point, or
-      -1, and a concrete run warns (`JointLimitWarning`).
-    - `max_events`: of a scene with forces that have modes (`jd.contact.DryFriction`, `jd.contact.UnilateralContact`), after
-      which the run ends with the code `too_many_events`; by default 256. Such scenes take explicit methods with adaptive or fixed
-      steps, which end at events; what begins and ends within one step is found as that of `limits` is. Of piecewise forces, the
-      events that derivatives follow (`jd.forces.PiecewiseForce`).
-    - `progress`: show a meter (tqdm if installed, else lines of text).
+    - `events`: objects of `jd.events`, each kind at most once: `ContactLost` (of a scene with `cones`, whose contacts end the run
+      where they are lost unless `ContactLost(stop=False)` is listed), `JointLimit` (without it limits are ignored),
+      `ModeSwitches(max_events)` (of forces with modes or pieces), and any number of `Terminal(function)`, which end the run where
+      a function of the state falls below zero; `Progress()` shows a meter. Scenes with forces that have modes
+      (`jd.contact.DryFriction`, `jd.contact.UnilateralContact`) take explicit methods with adaptive or fixed steps, which end at
+      events.
     - `max_steps`: most steps to take, rejected ones included. Default: what fixed steps need; 65536 for adaptive ones,
       4096 with "direct", and where derivatives go through adaptive steps: the end of each one is recorded, 8 bytes a step
       and trajectory.
@@ -131,20 +121,21 @@ def simulate(
     ```
     """
     scene, control = as_scene(scene), controls.as_control(control)
+    watch, terminals = sort_events(events)
     arrays, stepsize = _check_numbers(scene, q0, v0, ts, rtol, atol, stepsize)
     method, modal = choose_method(scene, method), has_modes(scene)
-    concrete = is_known(scene, control, method, arrays, stepsize)
+    concrete = is_known(scene, control, method, arrays, stepsize, terminals)
     start = tuple([np.asarray(x) if concrete else as_numpy_if_known(x) for x in arrays[:3]])
     scene, method = _prepare_start(scene, method, start, stepsize, modal, concrete)
     controls.check_steps(control, stepsize)
+    checks.check_terminals(terminals, modal)
     solver = _solver_at_start(scene, control, solver, stepsize, adjoint, arrays, modal)
     options = _choose(
         scene, control, method, solver, stepsize, adjoint,
-        outputs=checks.sort_outputs(scene, outputs), contacts=contacts, limits=limits, max_events=max_events,
-        tolerances=(rtol is not None, atol is not None), modal=modal,
+        outputs=checks.sort_outputs(scene, outputs), watch=watch, tolerances=(rtol is not None, atol is not None), modal=modal,
     )  # fmt: skip
     options = options | {
-        "progress": bool(progress),
+        "terminals": terminals,
         "max_steps": step_limit(max_steps, start[-1], stepsize, options["adjoint"]),
         "limit_is_given": max_steps is not None,
         "selects_rows": not concrete and _selects_rows(scene, method, *start),
@@ -160,7 +151,7 @@ def simulate(
         # A large scene is a constant of the program: its zeros are known, and most of it is zeros.
         whole = as_constant(scene) if not is_tracing() and is_concrete(scene) and not is_given(scene) else scene
         solution = smooth_motion(whole, control, method, numbers, options)
-    if limits == "report":
+    if watch.limits is not None and not watch.limits.stop:
         from jaxdyn.simulation.terminal_events import report_limits
 
         solution = report_limits(scene, solution, concrete)
@@ -249,7 +240,7 @@ def _solver_at_start(scene: Scene, control, solver, stepsize, adjoint, arrays, m
 @once
 def _choose(
     scene: Scene, control, method: Method, solver, stepsize, adjoint,
-    *, outputs, contacts, limits, max_events, tolerances: tuple[bool, bool], modal: bool,
+    *, outputs, watch: Watch, tolerances: tuple[bool, bool], modal: bool,
 ) -> dict[str, Any]:  # fmt: skip
     """Options of a run that the numbers do not decide; defaults and names stay what they are (see `as_objects`)."""
     solver = method.stepper(solver, stepsize)
@@ -266,18 +257,20 @@ def _choose(
     checks.check_combination(control, method, solver, adjoint)
     if modal:
         checks.check_modal_options(control, stepsize, solver, adjoint, outputs)
-    given = {name: is_given or None for name, is_given in zip(("rtol", "atol"), tolerances, strict=True)}
-    checks.check_effects(scene, solver, stepsize, modal, given | {"max_events": max_events, "contacts": contacts})
-    contacts, max_events = "stop" if contacts is None else contacts, 256 if max_events is None else max_events
-    checks.check_contacts(scene, contacts, () if modal else outputs)
-    checks.check_limits(scene, limits, modal)
+    given = [name for name, is_given in zip(("rtol", "atol"), tolerances, strict=True) if is_given]
+    checks.check_tolerances(solver, stepsize, given)
+    checks.check_events(scene, watch, modal)
+    checks.check_cones(scene, () if modal else outputs)
     return {
         "solver": solver,
         "adjoint": adjoint,
         "outputs": outputs,
-        "contacts": contacts,
-        "limits": limits,
-        "max_events": max_events,
+        "stops": (
+            scene.cones is not None and (watch.contacts is None or watch.contacts.stop),
+            watch.limits is not None and watch.limits.stop,
+        ),
+        "max_events": watch.max_events,
+        "progress": watch.progress is not None,
         "checks_mass": may_have_singular_mass(scene.system),
     }
 

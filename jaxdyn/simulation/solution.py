@@ -6,11 +6,11 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float
+from jaxtyping import Array, Bool, Float
 
 from jaxdyn.compile import invalidate_derivatives
 from jaxdyn.constraints.codes import RESULTS as RESULTS
-from jaxdyn.constraints.codes import Outcome, first_of, is_successful, name_of
+from jaxdyn.constraints.codes import Outcome, first_of, name_of
 from jaxdyn.contact.forces import contacts_with_cones
 from jaxdyn.forces.dissipation import SlidingFriction
 from jaxdyn.model.arguments import FilePath
@@ -49,6 +49,7 @@ def from_diffrax(result) -> Any:
 # Codes of runs whose rows, as far as they come, are a motion, with its derivatives.
 _OF_MOTIONS = (
     "successful", "coarse_steps", "contact_lost", "joint_limit_passed", "control_singular", "no_single_contact", "singular_basis",
+    "event_occurred",
 )  # fmt: skip
 
 
@@ -88,12 +89,12 @@ ADVICE = {
     "on the way",
     "no_single_contact": "take surfaces that are more convex where they come to touch, or other starts",
     "contact_lost": "grip harder (jd.contact.optimal_forces finds forces within the cones, jd.grasp.internal_forces what "
-    "squeezes), or pass contacts='report' to continue with two-sided contacts",
+    "squeezes), or pass events=[jd.events.ContactLost(stop=False)] to continue with two-sided contacts",
     "control_singular": "choose another task or target, or leave out the control's least_regularity to continue, with the task "
     "followed as closely as possible",
-    "joint_limit_passed": "change the start or the control, or pass limits='report' to continue, or None",
-    "too_many_events": "raise max_events (now {max_events}); where events accumulate (a body that rocks to rest, friction that "
-    "chatters) rigid bodies have no motion after that time: give friction a smoothing, or end before",
+    "joint_limit_passed": "change the start or the control, or pass jd.events.JointLimit(stop=False) to continue",
+    "too_many_events": "raise max_events of jd.events.ModeSwitches (now {max_events}); where events accumulate (a body that "
+    "rocks to rest, friction that chatters) rigid bodies have no motion after that time: smooth the friction, or end before",
     "painleve_paradox": "rigid bodies have no answer here: lower the friction, or give the contact some compliance",
     "no_contact_mode": "lower the friction, or look for contacts that press against each other",
 }
@@ -103,8 +104,8 @@ class Solution(Outcome):
     """A simulated motion; every row belongs to one save point. Rows not reached are NaN.
 
     - `ts` (nt,) in s, as given; `q` (nt, nq); `v` (nt, nv), body-fixed.
-    - `result`, a `RESULTS` code; `success`, true if the motion was computed to its end, by steps short enough; `solver`, the name
-      of the method that was used.
+    - `result`, a `RESULTS` code; `success`, true if the motion was computed to its end or to a terminal event, by steps short
+      enough; `solver`, the name of the method that was used.
     - `stats`: arrays `num_steps`, `num_accepted_steps`, `num_rejected_steps`, and `time_reached` (s).
     - The requested `outputs`, others None: `energy` (nt,), kinetic plus gravitational, J; `power` (nt,), of tau and the
       scene's forces, W; `work` (nt,), its integral from the start, J; `acceleration` (nt, nv); `multipliers`
@@ -116,8 +117,9 @@ class Solution(Outcome):
       None. Its `contact_forces` (nt, 3) are the two components of friction and the normal force, N.
     - If the rows of the constraints were not all found independent before the run, `stats["redundant_rows"]` is the number of
       rows that were dropped as redundant, and `stats["redundant_gap"]` the largest of their residuals, m or rad.
-    - With `limits`, `stats["passed_limit"]` is the entry of q that was the first to pass one of its limits, or -1.
+    - With `jd.events.JointLimit`, `stats["passed_limit"]` is the entry of q that was the first to pass one of its limits, or -1.
     - With cones, `stats["lost_contact"]` is the contact that ended the run, an index among those with a cone, or -1.
+    - With `jd.events.Terminal`, `stats["terminal_event"]` is the index of the one that ended the run, or -1.
     """
 
     ts: Float[Array, " nt"]
@@ -139,6 +141,11 @@ class Solution(Outcome):
     contact_margins: dict[str, Float[Array, " nt"]] = eqx.field(default_factory=dict)
     events: Any = None
     solver: str = eqx.field(static=True, default="")
+
+    @property
+    def success(self) -> Bool[Array, "..."]:
+        """True where the motion was computed to its end, or to a `jd.events.Terminal`."""
+        return (self.result == RESULTS.successful) | (self.result == RESULTS.event_occurred)
 
     def __str__(self) -> str:
         return solution_lines(self)
@@ -187,9 +194,9 @@ def joint_of(model: Model, entry: int) -> str:
 
 def raise_failure(solution: Solution, scene: Scene, control, options) -> None:
     """Raise RuntimeError with the time reached, the cause and the fix, if a concrete run failed."""
-    if is_successful(solution.result):
-        return
     name = name_of(solution.result)
+    if name in ("successful", "event_occurred"):
+        return
     reached, end = float(solution.stats["time_reached"]), float(solution.ts[-1])
     raise RuntimeError(
         f"simulate stopped at t = {reached:.6g} s of {end:.6g} s. {RESULTS[solution.result]} Fix: "

@@ -31,15 +31,17 @@ class JointLimitWarning(UserWarning):
 
 
 class Conditions(NamedTuple):
-    """Conditions that can end a run: those of its contacts, of its joint limits, and of its control."""
+    """Conditions that can end a run: its contacts, its joint limits, its control, and the number of terminal events."""
 
     contacts: bool
     limits: bool
     control: bool
+    terminals: int
 
-    def counts(self, scene: Scene) -> tuple[int, int]:
-        """Numbers of allowances of contacts and of limits, in this order among all."""
-        return len(contacts_with_cones(scene)) if self.contacts else 0, 2 * scene.nq if self.limits else 0
+    def counts(self, scene: Scene) -> tuple[int, int, int, int]:
+        """Numbers of allowances of contacts, limits, the control and terminal events, in this order among all."""
+        contacts = len(contacts_with_cones(scene)) if self.contacts else 0
+        return contacts, 2 * scene.nq if self.limits else 0, int(self.control), self.terminals
 
 
 def contact_allowances(scene: Scene, multipliers: Float[Array, " nc"]) -> Float[Array, " k"]:
@@ -75,26 +77,25 @@ class Violation(NamedTuple):
     time: Float[Array, ""]
     entry: Int[Array, ""]
 
-    def codes(self, counts: tuple[int, int]) -> list[tuple[Any, Any]]:
+    def codes(self, counts: tuple[int, int, int, int]) -> list[tuple[Any, Any]]:
         """Cases of the result, for `first_of`; `counts` as of `Conditions`."""
-        contacts, limits = counts
-        entry, codes = self.entry, RESULTS
-        return [
-            (self.happened & (entry >= contacts + limits), codes.control_singular),
-            (self.happened & (entry >= contacts) & (entry < contacts + limits), codes.joint_limit_passed),
-            (self.happened & (entry < contacts), codes.contact_lost),
-        ]
+        codes: Any = RESULTS
+        names = codes.contact_lost, codes.joint_limit_passed, codes.control_singular, codes.event_occurred
+        return [(self._within(counts, i), code) for i, code in enumerate(names)]
 
-    def stats(self, conditions: Conditions, counts: tuple[int, int]) -> dict[str, Array]:
-        """Index of the contact that was lost, and entry of q whose limit was passed, each -1 for none."""
-        contacts, limits = counts
-        lost = {"lost_contact": jnp.where(self.entry < contacts, self.entry, -1)} if conditions.contacts else {}
-        if conditions.limits:
-            is_limit = self.happened & (self.entry >= contacts) & (self.entry < contacts + limits)
-            # The lower limits of all entries come before the upper ones: both belong to the entry modulo their number.
-            place = jnp.where(is_limit, (self.entry - contacts) % (limits // 2), -1)
-            lost["passed_limit"] = place.astype(jnp.int32)
-        return lost
+    def _within(self, counts, kind: int) -> Bool[Array, ""]:
+        first = sum(counts[:kind])
+        return self.happened & (self.entry >= first) & (self.entry < first + counts[kind])
+
+    def stats(self, conditions: Conditions, counts: tuple[int, int, int, int]) -> dict[str, Array]:
+        """Index of the contact that was lost, entry of q whose limit was passed, terminal event, each -1 for none."""
+        # The lower limits of all entries come before the upper ones: both belong to the entry modulo their number.
+        names = {"lost_contact": (0, counts[0]), "passed_limit": (1, counts[1] // 2), "terminal_event": (3, counts[3])}
+        return {
+            name: jnp.where(self._within(counts, kind), (self.entry - sum(counts[:kind])) % size, -1).astype(jnp.int32)
+            for name, (kind, size) in names.items()
+            if conditions[kind]
+        }
 
 
 def first_violation(rows: Float[Array, "nt k"], reached, ts, within) -> Violation:
@@ -219,5 +220,7 @@ def report_limits(scene: Scene, solution: Solution, is_concrete: bool) -> Soluti
         words = (
             f"joint {joint!r} is at {q:.6g}, its {side} limit is {limit:.6g}, at t = {float(solution.ts[first]):.6g} s"
         )
-        warnings.warn(f"{words}; the motion continues (limits='stop' ends it there)", JointLimitWarning, stacklevel=3)
+        warnings.warn(
+            f"{words}; the motion continues (jd.events.JointLimit() ends it there)", JointLimitWarning, stacklevel=3
+        )
     return eqx.tree_at(lambda s: s.stats, solution, solution.stats | {"passed_limit": entry})

@@ -86,7 +86,7 @@ def test_forces_and_margins_are_those_of_newton(motions):
 def test_a_run_that_may_go_on_reports_negative_margins():
     rates = RATES[SLIPS]
     options = {"control": push(rates), "stepsize": 0.11, "outputs": WORDS}
-    solution = jd.simulate(block(), *STILL, TIMES, contacts="report", **options)
+    solution = jd.simulate(block(), *STILL, TIMES, events=[jd.events.ContactLost(stop=False)], **options)
     assert solution.success and "lost_contact" not in solution.stats
     wanted = MU * MASS * GRAVITY - rates[0] * TIMES
     np.testing.assert_allclose(solution.contact_margins["table"], wanted, atol=1e-12)
@@ -131,7 +131,7 @@ def test_margins_are_differentiable():
 
 @pytest.mark.slow
 def test_an_error_names_the_contact_and_the_time():
-    with pytest.raises(RuntimeError, match=r"stopped at t = 0\.654 s.*contact is 'table'.*contacts='report'"):
+    with pytest.raises(RuntimeError, match=r"stopped at t = 0\.654 s.*contact is 'table'.*ContactLost"):
         jd.simulate(block(), *STILL, TIMES, control=push(RATES[SLIPS]), stepsize=0.11)
     hand = jd.scenes.hand_with_bar
     with pytest.raises(RuntimeError, match=r"stopped at t = 0 s.*contact is 'tip1'"):
@@ -141,7 +141,7 @@ def test_an_error_names_the_contact_and_the_time():
 def test_bad_input_is_refused():
     scene = block()
     for call, match in (
-        (lambda: jd.simulate(scene, *STILL, TIMES, contacts="ignore"), "contacts is 'ignore'"),
+        (lambda: jd.simulate(scene, *STILL, TIMES, events=["report"]), "events has 'report'"),
         (lambda: jd.simulate(jd.Scene(scene.system, scene.constraints), *STILL, TIMES, outputs=WORDS), "has no cones"),
         (lambda: jd.simulate(jd.Scene(scene.system, scene.constraints, cones={"floor": 1}), *STILL, TIMES), "floor"),
         (lambda: jd.simulate(jd.Scene(scene.system, scene.constraints, cones=friction_cone("hard-finger", 0.2)),

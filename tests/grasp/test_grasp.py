@@ -11,7 +11,7 @@ from pinocchio_bridge import assert_close, quick
 from scipy.integrate import solve_ivp
 from scipy.spatial.transform import Rotation
 
-from jaxdyn import inertia, scenes
+from jaxdyn import events, inertia, scenes
 from jaxdyn.constraints import Pfaffian, rolling_sphere
 from jaxdyn.constraints.base import constraint_jacobian
 from jaxdyn.constraints.dynamics import RESULTS, constrained_dynamics
@@ -366,7 +366,13 @@ def steady(q, v, t):
 def simulated(grasp, q, v, methods):
     """Motions by `simulate`, on the contacts, with an energy that changes by the work done."""
     outputs = ("energy", "work", "constraint_residual")
-    options = {"control": steady, "rtol": 1e-12, "atol": 1e-12, "outputs": outputs, "contacts": "report"}
+    options = {
+        "control": steady,
+        "rtol": 1e-12,
+        "atol": 1e-12,
+        "outputs": outputs,
+        "events": [events.ContactLost(stop=False)],
+    }
     runs = [simulate(grasp, q, v, jnp.linspace(0.0, 0.1, 3), method=method, **options) for method in methods]
     for one in runs:
         assert float(one.constraint_residual.max()) < 1e-12
@@ -424,7 +430,7 @@ def test_gradients_through_the_reduced_motion():
         inertias = grasp.system.inertias.at[jnp.array([bar, outer])].multiply(scales[:, None], unique_indices=True)
         changed = eqx.tree_at(lambda g: g.system.inertias, grasp, inertias)
         ts, method = jnp.linspace(0.0, 0.05, 2), Reduced(grasp.object_velocities)
-        end = simulate(changed, q, v, ts, method=method, stepsize=2.5e-3, contacts="report").q[-1]
+        end = simulate(changed, q, v, ts, method=method, stepsize=2.5e-3, events=[events.ContactLost(stop=False)]).q[-1]
         return jnp.stack([end[5], end[6]])
 
     place = jnp.asarray([1.0, 1.0])

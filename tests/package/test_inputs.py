@@ -222,8 +222,11 @@ OPTIONS = [
     ({"stepsize": 0.1, "rtol": 1e-6}, "rtol is given, and RK4 has no use for it with fixed steps"),
     ({"stepsize": 0.1, "atol": 1e-6, "solver": diffrax.Tsit5()}, "atol is given, and Tsit5 has no use"),
     ({"stepsize": diffrax.StepTo(jnp.linspace(0, 1, 5)), "rtol": 1e-6}, "rtol is given, and Dopri8 .* their own steps"),
-    ({"max_events": 8}, "max_events is 8, and no force of the scene has events"),
-    ({"contacts": "stop"}, "contacts is 'stop', and the scene has no cones"),
+    (
+        {"events": [jd.events.ModeSwitches(8)]},
+        r"events has ModeSwitches\(max_events=8\), and no force of the scene has events",
+    ),
+    ({"events": [jd.events.ContactLost()]}, "ContactLost.*, and the scene has no cones"),
     ({"control": lambda q, v, t: np.sin(q)}, "control needs the values .* jax.numpy"),
     ({"control": stiffer}, r"control needs the values .* jax\.lax\.cond instead of if"),
     ({"control": lambda q, v: q}, r"control takes \(q, v\), but is called as control\(q, v, t\)"),

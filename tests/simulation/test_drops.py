@@ -40,7 +40,13 @@ def test_block_rocks_to_rest_and_loses_what_housner_says():
     start = -lean @ np.array([-half, -high])
     ts = jnp.linspace(0.0, 6.0, 61)
     motion = jd.simulate(
-        box(mu=2.0, size=(0.2, 0.6)), [*start, angle], jnp.zeros(3), ts, max_events=200, outputs=("energy",), **TIGHT
+        box(mu=2.0, size=(0.2, 0.6)),
+        [*start, angle],
+        jnp.zeros(3),
+        ts,
+        events=[jd.events.ModeSwitches(200)],
+        outputs=("energy",),
+        **TIGHT,
     )
     times = np.asarray(motion.events.time)[: int(motion.events.count)]
     assert motion.success

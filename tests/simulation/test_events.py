@@ -268,12 +268,14 @@ def test_rocking_to_rest_ends_with_a_code():
     angle = 0.15
     lean = np.array([[np.cos(angle), -np.sin(angle)], [np.sin(angle), np.cos(angle)]])
     at = -lean @ np.array([-0.1, -0.3])
-    motion = jd.simulate(scene, [*at, angle], jnp.zeros(3), jnp.linspace(0, 5.0, 6), max_events=40, throw=False)
+    motion = jd.simulate(
+        scene, [*at, angle], jnp.zeros(3), jnp.linspace(0, 5.0, 6), events=[jd.events.ModeSwitches(40)], throw=False
+    )
     assert motion.result == jd.RESULTS.too_many_events
     times = np.asarray(motion.events.time)
     assert (np.diff(times) >= 0).all()
     with pytest.raises(RuntimeError, match="max_events"):
-        jd.simulate(scene, [*at, angle], jnp.zeros(3), jnp.linspace(0, 5.0, 6), max_events=40)
+        jd.simulate(scene, [*at, angle], jnp.zeros(3), jnp.linspace(0, 5.0, 6), events=[jd.events.ModeSwitches(40)])
 
 
 def differences(f, at, steps):
@@ -288,7 +290,9 @@ def test_gradients_go_through_events():
 
     def computed(p):
         scene = block(p[0], p[1], p[2])
-        motion = jd.simulate(scene, jnp.zeros(1), p[3:], ts, control=load, rtol=1e-13, atol=1e-13, max_events=4)
+        motion = jd.simulate(
+            scene, jnp.zeros(1), p[3:], ts, control=load, rtol=1e-13, atol=1e-13, events=[jd.events.ModeSwitches(4)]
+        )
         return jnp.concatenate([motion.q[:, 0], motion.v[:, 0], motion.events.time[:3]])
 
     at = jnp.asarray([MU, MU_S, G, 2.0])
@@ -312,7 +316,14 @@ def test_second_derivatives_go_through_events():
 
     def slides(p):
         motion = jd.simulate(
-            block(p[0], p[1]), jnp.zeros(1), p[2:], ts, control=load, rtol=1e-12, atol=1e-12, max_events=3
+            block(p[0], p[1]),
+            jnp.zeros(1),
+            p[2:],
+            ts,
+            control=load,
+            rtol=1e-12,
+            atol=1e-12,
+            events=[jd.events.ModeSwitches(3)],
         )
         return (
             jnp.sum(jnp.sin(motion.q[:, 0]))
@@ -334,7 +345,7 @@ def test_gradients_go_through_an_impact():
 
     def computed(p):
         q0, v0 = jnp.stack([0 * p[1], p[1], p[2]]), jnp.stack([p[3], 0 * p[3], 0 * p[3]])
-        motion = jd.simulate(box(p[0]), q0, v0, ts, rtol=1e-12, atol=1e-12, max_events=6)
+        motion = jd.simulate(box(p[0]), q0, v0, ts, rtol=1e-12, atol=1e-12, events=[jd.events.ModeSwitches(6)])
         return jnp.concatenate([motion.q.ravel(), motion.v.ravel(), motion.events.time[:2]])
 
     at = jnp.asarray([0.4, 0.5, 0.3, 0.7])
@@ -425,7 +436,7 @@ def test_float32_finds_the_same_events():
         (lambda: jd.simulate(block(), [0.0], [1.0], TS, solver=jd.solvers.Rodas5P()), "solver"),
         (lambda: jd.simulate(block(), [0.0], [1.0], TS, adjoint="backsolve"), "adjoint"),
         (lambda: jd.simulate(block(), [0.0], [1.0], TS, outputs=("work",)), "outputs"),
-        (lambda: jd.simulate(block(), [0.0], [1.0], TS, max_events=0), "max_events"),
+        (lambda: jd.simulate(block(), [0.0], [1.0], TS, events=[jd.events.ModeSwitches(0)]), "max_events"),
         (lambda: jd.simulate(block(normal="rail"), [0.0], [1.0], TS), "rail"),
         (lambda: jd.constrained_dynamics(block(), jnp.zeros(1), jnp.zeros(1)), "CoulombFriction"),
     ],

@@ -202,7 +202,15 @@ def bounce(e, height=1.0, most=64, end=1.6):
     builder.add_body("ball", None, "prismatic", (1.0, (0, 0, 0), (0.1, 0.1, 0.1)), axis=(0, 0, 1))
     scene = jd.Scene(builder.build(), forces=[jd.contact.ground_contact("ball", restitution=e, name="floor")])
     start = jnp.stack([jnp.asarray(height, float)])
-    return jd.simulate(scene, start, jnp.zeros(1), jnp.linspace(0.0, end, 9), max_events=most, throw=False, **TIGHT)
+    return jd.simulate(
+        scene,
+        start,
+        jnp.zeros(1),
+        jnp.linspace(0.0, end, 9),
+        events=[jd.events.ModeSwitches(most)],
+        throw=False,
+        **TIGHT,
+    )
 
 
 @pytest.mark.long

@@ -61,7 +61,9 @@ RAIL, FREE, BLOCK = cart(lower=-1.0, upper=1.0), cart(), block()
 
 def limit(v, **options):
     """q(t) = v t + t^2/4 from the middle of the rail to its end."""
-    return jd.simulate(RAIL, jnp.zeros(1), v[None], TS, control=push_cart, limits="stop", throw=False, **options)
+    return jd.simulate(
+        RAIL, jnp.zeros(1), v[None], TS, control=push_cart, events=[jd.events.JointLimit()], throw=False, **options
+    )
 
 
 def cone(rate, **options):
@@ -184,7 +186,9 @@ def test_a_basis_and_limits_in_one_run_have_derivatives():
     )
 
     def time(rate, **options):
-        run = jd.simulate(limits, q, rate * v, jnp.linspace(0.0, 1.0, 5), limits="stop", throw=False, **options)
+        run = jd.simulate(
+            limits, q, rate * v, jnp.linspace(0.0, 1.0, 5), events=[jd.events.JointLimit()], throw=False, **options
+        )
         return run.stats["time_reached"]
 
     implicit: dict[str, Any] = {"method": "reduced", "solver": diffrax.Kvaerno5(), "rtol": 1e-9, "atol": 1e-9}
@@ -211,7 +215,7 @@ def test_the_continuous_adjoint_is_refused(name):
 
 
 def test_a_start_behind_the_guard_is_the_end():
-    beyond = jd.simulate(RAIL, [1.5], [0.0], TS, control=push_cart, limits="stop", throw=False)
+    beyond = jd.simulate(RAIL, [1.5], [0.0], TS, control=push_cart, events=[jd.events.JointLimit()], throw=False)
     assert beyond.result == jd.RESULTS.joint_limit_passed and float(beyond.stats["time_reached"]) == 0.0
     assert np.isfinite(beyond.q[0]).all() and np.isnan(beyond.q[1:]).all()
 
@@ -245,7 +249,9 @@ def there_and_back(depth, **options):
     v = np.sqrt(top)
     ts = np.linspace(0.0, 4 * v, options.pop("saves", 2))
     back = lambda q, v, t: -jnp.ones_like(v)  # noqa: E731
-    run = jd.simulate(RAIL, jnp.zeros(1), jnp.asarray([v]), ts, control=back, limits="stop", throw=False, **options)
+    run = jd.simulate(
+        RAIL, jnp.zeros(1), jnp.asarray([v]), ts, control=back, events=[jd.events.JointLimit()], throw=False, **options
+    )
     return run, 2 * (v - np.sqrt(v * v - 1 - ROUNDING))
 
 
@@ -284,7 +290,9 @@ def test_short_passages_of_an_oscillation_are_found():
 
     def time(w):
         law = jax.tree_util.Partial(lambda w, q, v, t: -2.0 * w * w * q, w)
-        run = jd.simulate(RAIL, jnp.zeros(1), 1.001 * w[None], TS, control=law, limits="stop", throw=False)
+        run = jd.simulate(
+            RAIL, jnp.zeros(1), 1.001 * w[None], TS, control=law, events=[jd.events.JointLimit()], throw=False
+        )
         return run.stats["time_reached"], run.result == jd.RESULTS.joint_limit_passed
 
     wanted = np.arcsin((1 + ROUNDING) / 1.001) / np.asarray(frequencies)
@@ -321,7 +329,9 @@ def limit_of(p, **options):
     """q(t) = v t + F t^2/4 of both numbers, and the end of the save points."""
     law = jax.tree_util.Partial(lambda force, q, v, t: force[None], p[1])
     ts = jnp.linspace(0.0, p[2], 4)
-    run = jd.simulate(RAIL, jnp.zeros(1), p[:1], ts, control=law, limits="stop", throw=False, **options)
+    run = jd.simulate(
+        RAIL, jnp.zeros(1), p[:1], ts, control=law, events=[jd.events.JointLimit()], throw=False, **options
+    )
     return run.stats["time_reached"]
 
 

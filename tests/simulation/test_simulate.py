@@ -11,7 +11,7 @@ from pinocchio_bridge import ROBOTS, assert_close, quick, to_jaxdyn
 from scipy.integrate import solve_ivp
 from scipy.spatial.transform import Rotation
 
-from jaxdyn import scenes
+from jaxdyn import events, scenes
 from jaxdyn.constraints.base import Holonomic
 from jaxdyn.dynamics.kinematics import frame_pose
 from jaxdyn.dynamics.quantities import forward_dynamics, kinetic_energy, potential_energy
@@ -489,7 +489,7 @@ def test_throw_inside_jit(pendulum):
 
 
 def test_progress_meter(pendulum, capfd):
-    simulate(pendulum, [1.0], [0.0], [0.0, 0.5], stepsize=0.01, progress=True)
+    simulate(pendulum, [1.0], [0.0], [0.0, 0.5], stepsize=0.01, events=[events.Progress()])
     jax.effects_barrier()
     shown = capfd.readouterr()
     assert "100.00%" in shown.out + shown.err

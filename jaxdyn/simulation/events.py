@@ -1,0 +1,184 @@
+"""Events of `jd.simulate`: conditions that end a motion or are reported, and the number of mode switches of a motion."""
+
+import functools
+from collections.abc import Callable, Iterable
+from dataclasses import dataclass
+from typing import Any, NamedTuple, TypeAlias, TypeVar, cast
+
+import equinox as eqx
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float
+
+from jaxdyn.model.arguments import Function, Number, as_array, check_flag, warn
+from jaxdyn.systems.scene import as_pytree
+
+__all__ = ["ContactLost", "JointLimit", "ModeSwitches", "Progress", "Terminal"]
+
+
+def __dir__() -> list[str]:
+    """Names of the namespace."""
+    return __all__
+
+
+@dataclass(frozen=True)
+class ContactLost:
+    r"""A contact of a scene with `cones` that pulls or leaves its friction cone.
+
+    The event is where a margin falls below zero by more than rounding, $\epsilon^{1/2}$ of the contact's force.
+
+    **Arguments:** `stop`: if True (the default, also of a run without this event) the run ends there, with the code
+    `contact_lost` and the time, which is found within the step. If False it continues, with contacts that hold on both sides.
+    """
+
+    stop: bool = True
+
+    def __post_init__(self):
+        check_flag(self.stop, "ContactLost: stop")
+
+
+@dataclass(frozen=True)
+class JointLimit:
+    """A joint that passes a limit of its model (`model.lower`, `model.upper`), which nothing enforces.
+
+    **Arguments:** `stop`: if True (default) the run ends there, with the code `joint_limit_passed` and the time, found within the
+    step. If False it continues; `stats["passed_limit"]` is the entry of q of the first limit that is passed at a save point,
+    or -1, and a concrete run warns (`jd.simulation.JointLimitWarning`).
+
+    Without this event limits are ignored. Passages that end within a step are found too, except short ones: of less than about
+    1e-3 of what the joint moves in the step with explicit methods, which predict where it comes nearest to the limit, and of
+    less than an eighth of the step's time with others. If only a save point shows a passage, its time is that of the save point.
+    The same holds for the other events.
+    """
+
+    stop: bool = True
+
+    def __post_init__(self):
+        check_flag(self.stop, "JointLimit: stop")
+
+
+@dataclass(frozen=True)
+class ModeSwitches:
+    """Impacts, and changes between sticking, sliding and separation, of forces with modes; kinks of piecewise forces.
+
+    **Arguments:** `max_events`: number of them after which the run ends with the code `too_many_events`; 256 by default, also of
+    a run without this event. Of piecewise forces (`jd.forces.PiecewiseForce`), the number that derivatives follow.
+    """
+
+    max_events: int = 256
+
+    def __post_init__(self):
+        most = self.max_events
+        if isinstance(most, bool) or not isinstance(most, (int, np.integer)) or most < 1:
+            raise ValueError(f"max_events is {most!r}; pass a positive integer, such as 64")
+
+
+@dataclass(frozen=True)
+class Progress:
+    """A meter of the time reached, shown during the run by tqdm where it is installed, else as lines of text.
+
+    diffrax makes the steps of such a run.
+    """
+
+
+class Terminal(eqx.Module):
+    """A terminal event: the run ends where function(q, v, t) falls below zero.
+
+    The code is `event_occurred`, which counts as a success. `stats["terminal_event"]` is the index of the event among the
+    terminal ones, or -1, and `stats["time_reached"]` its time, found within the step, with derivatives. Later rows are NaN.
+
+    **Arguments:** `function`: function(q (nq,), v (nv,), t ()) -> (), smooth and not negative at the start. An equinox Module or
+    a `jax.tree_util.Partial` carries leaves that can be differentiated and batched; a plain function is static: define it once.
+
+    **Raises:** ValueError for what cannot be called so.
+
+    ```python
+    def height(q, v, t):
+        return q[2]
+
+
+    jd.simulate(model, q0, v0, ts, events=[jd.events.Terminal(height)])
+    ```
+    """
+
+    function: Callable
+
+    def __init__(self, function: Function):
+        self.function = as_pytree(function, "Terminal: function", "q, v, t")
+
+    def margin(self, q: Float[Array, " nq"], v: Float[Array, " nv"], t: Number) -> Float[Array, ""]:
+        """Value of the function, (), in the dtype of q. **Raises:** ValueError where it is not one number."""
+        value = self.function(q, v, t)
+        if jnp.shape(value) != ():
+            raise ValueError(f"Terminal: function returned shape {jnp.shape(value)}; return one number, ()")
+        return as_array(value, "Terminal: function", q.dtype)
+
+
+F = TypeVar("F", bound=Callable)
+Event: TypeAlias = ContactLost | JointLimit | ModeSwitches | Progress | Terminal
+
+
+class Watch(NamedTuple):
+    """Events of a run without arrays; None for a kind that was not given."""
+
+    contacts: ContactLost | None = None
+    limits: JointLimit | None = None
+    switches: ModeSwitches | None = None
+    progress: Progress | None = None
+
+    @property
+    def max_events(self) -> int:
+        """Largest number of mode switches."""
+        return (self.switches or ModeSwitches()).max_events
+
+
+_KINDS = (ContactLost, JointLimit, ModeSwitches, Progress)
+_NONE = Watch()
+# Arguments of `simulate` that `events` has replaced.
+_FORMER = {"contacts", "limits", "max_events", "progress"}
+
+
+def sort_events(events: Iterable[Event]) -> tuple[Watch, tuple[Terminal, ...]]:
+    """Events of a run by their kinds, and the terminal ones. **Raises:** ValueError for other objects, and for a kind twice."""
+    if isinstance(events, (tuple, list)) and not events:
+        return _NONE, ()
+    if not isinstance(events, (tuple, list)):
+        raise ValueError(f"events is {events!r}; pass a list, such as [jd.events.JointLimit()]")
+    for one in events:
+        if not isinstance(one, (*_KINDS, Terminal)):
+            raise ValueError(f"events has {one!r}; give objects of jd.events, as jd.events.Terminal(function)")
+    by_kind: list[list[Any]] = [[one for one in events if isinstance(one, kind)] for kind in _KINDS]
+    for kind, given in zip(_KINDS, by_kind, strict=True):
+        if len(given) > 1:
+            raise ValueError(f"events has {len(given)} of jd.events.{kind.__name__}; give one")
+    watch = Watch(*(given[0] if given else None for given in by_kind))
+    return watch, tuple(one for one in events if isinstance(one, Terminal))
+
+
+def events_of(
+    contacts: str | None = None, limits: str | None = None, max_events: int | None = None, progress: bool = False
+) -> list[Any]:
+    """Events by words: `contacts` and `limits` are "stop" or "report". **Raises:** ValueError for other words."""
+    events: list[Any] = []
+    for name, word, kind in (("contacts", contacts, ContactLost), ("limits", limits, JointLimit)):
+        if word not in ("stop", "report", None):
+            raise ValueError(f"{name} is {word!r}; choose from 'stop', 'report'")
+        events += [] if word is None else [kind()] if word == "stop" else [kind(stop=False)]
+    return events + ([] if max_events is None else [ModeSwitches(max_events)]) + ([Progress()] if progress else [])
+
+
+def accept_former_events(function: F) -> F:
+    """Decorator of `simulate`: the arguments that `events` has replaced warn, with the new form."""
+
+    @functools.wraps(function)
+    def call(*args: Any, **options: Any) -> Any:
+        if not _FORMER.isdisjoint(options):
+            given = {name: options.pop(name) for name in sorted(_FORMER & set(options))}
+            former = events_of(**given)
+            options["events"] = [*options.get("events", ()), *former]
+            old = ", ".join(f"{name}={value!r}" for name, value in given.items())
+            new = ", ".join(f"jd.events.{one!r}" for one in former)
+            warn(f"simulate({old}) is now simulate(events=[{new}])", DeprecationWarning)
+        return function(*args, **options)
+
+    return cast(F, call)
