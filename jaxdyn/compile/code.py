@@ -75,7 +75,7 @@ def kernel_ir(program: Program, width: int, uniform: Sequence[bool], is_quick: b
     count, fast = len(program.inputs), program.fast or program
     arrays = [*program.inputs, *program.outputs]
     # The careful program of a pair reads rows of the caller's memory: nothing is loaded for it.
-    entries = {x.args for x in fast.operations if x.op == "input"}
+    entries = {args for op, _, args in fast.operations if op == "input"}
     read = {place for place, _ in entries}
     places = [i for i in range(len(arrays)) if i >= count or (i in read and not uniform[i])]
     rows = e.rows(places, [arrays[i].size * arrays[i].dtype.itemsize for i in places])
