@@ -41,7 +41,7 @@ class Body:
             if op == "part":
                 self.parts.setdefault(args[0], []).append(args[1].value)
         self.fused = _find_products(program)  # of sums, the place of the operand that is a product
-        self.merged = {program.operations[i].args[place] for i, place in self.fused.items()}
+        self.merged = {program.operations[i][2][place] for i, place in self.fused.items()}
 
     def name(self, i: int) -> str:
         """Name of operation i; inputs are loaded where they are first read."""
@@ -81,10 +81,10 @@ class Body:
                     self.names[i] = self.names[args[0]][args[1].value]
             elif i in self.fused:
                 place = self.fused[i]
-                factors = [self.text(x, kind) for x in operations[args[place]].args]
+                factors = [self.text(x, kind) for x in operations[args[place]][2]]
                 self.names[i] = self.e.add_product(op, kind, factors, self.text(args[1 - place], kind), place == 0)
             else:
-                kinds = [operations[x].kind for x in args if type(x) is not Constant]
+                kinds = [operations[x][1] for x in args if type(x) is not Constant]
                 given = kinds[-1] if kinds else kind
                 known = given if op in COMPARISONS else kind
                 self.names[i] = self.e.operation(op, kind, [self.text(x, known) for x in args], given)
@@ -154,14 +154,14 @@ class Body:
     def pointer_to(self, entries, array: Array) -> str | None:
         """The pointer to the output of a loop that these entries are, all of it in its order."""
         operations = self.program.operations
-        if not entries or type(entries[0]) is Constant or operations[entries[0]].op != "part":
+        if not entries or type(entries[0]) is Constant or operations[entries[0]][0] != "part":
             return None
-        call, (start,) = operations[entries[0]].args
+        _, _, (call, (start,)) = operations[entries[0]]
         for first, pointer, made in self.in_memory.get(call, ()):
             if first == start and made.size == len(entries) and made.dtype == array.dtype:
                 whole = [(call, Constant(first + k)) for k in range(made.size)]
-                same = all(type(x) is not Constant and operations[x].op == "part" for x in entries)
-                return pointer if same and whole == [operations[x].args for x in entries] else None
+                same = all(type(x) is not Constant and operations[x][0] == "part" for x in entries)
+                return pointer if same and whole == [operations[x][2] for x in entries] else None
         return None
 
     def _copy_entries(self, entries, array: Array, at: int) -> str:
@@ -208,12 +208,12 @@ def has_loop(called) -> bool:
 def whole_input(program: Program, entries: Sequence, array: Array) -> int | None:
     """The place of the input of a program that these entries are, all of it in its order; or None."""
     operations = program.operations
-    if any(type(x) is Constant or operations[x].op != "input" for x in entries) or not entries:
+    if any(type(x) is Constant or operations[x][0] != "input" for x in entries) or not entries:
         return None
-    place = operations[entries[0]].args[0]
+    _, _, (place, _) = operations[entries[0]]
     # Only a whole input in its order is passed on as it is; a slice of one would need another layout for W samples.
     whole = [(place, k) for k in range(program.inputs[place].size)]
-    same = whole == [operations[x].args for x in entries] and program.inputs[place].dtype == array.dtype
+    same = whole == [operations[x][2] for x in entries] and program.inputs[place].dtype == array.dtype
     return place if same else None
 
 
@@ -250,7 +250,7 @@ def _find_products(program: Program) -> dict[int, int]:
         if op in ("add", "sub") and kind in FLOATS:
             for place in (1, 0):
                 x = args[place]
-                if type(x) is not Constant and operations[x].op == "mul" and uses[x] == 1:
+                if type(x) is not Constant and operations[x][0] == "mul" and uses[x] == 1:
                     found[i] = place
                     break
     return found

@@ -206,10 +206,10 @@ class Pair(Program):
     @functools.cached_property
     def _body(self) -> tuple[list[Operation], tuple[tuple, ...]]:
         fast, operations = self.fast, list(self.fast.operations)
-        place = {x.args: i for i, x in enumerate(operations) if x.op == "input"}
+        place = {args: i for i, (op, _, args) in enumerate(operations) if op == "input"}
 
         def add(*operation) -> int:
-            operations.append(Operation(*operation))
+            operations.append(operation)
             return len(operations) - 1
 
         def entry(array: int, k: int) -> int:

@@ -75,7 +75,7 @@ def kernel_ir(program: Program, width: int, uniform: Sequence[bool], is_quick: b
     count, fast = len(program.inputs), program.fast or program
     arrays = [*program.inputs, *program.outputs]
     # The careful program of a pair reads rows of the caller's memory: nothing is loaded for it.
-    entries = {x.args for x in fast.operations if x.op == "input"}
+    entries = {args for op, _, args in fast.operations if op == "input"}
     read = {place for place, _ in entries}
     places = [i for i in range(len(arrays)) if i >= count or (i in read and not uniform[i])]
     rows = e.rows(places, [arrays[i].size * arrays[i].dtype.itemsize for i in places])
@@ -101,12 +101,7 @@ def kernel_ir(program: Program, width: int, uniform: Sequence[bool], is_quick: b
             return packed.get(place)
         return rows[place][0] if place in rows else f"%a{place}"
 
-    body, valid, allocations = body_of(e, fast, load, array, is_quick), None, []
-    for place in body.arrays_in_memory() if width > 1 else ():
-        packed[place], given = f"%packed{place}", arrays[place]
-        allocations.append(allocation(packed[place], bytes_of(given, width)))
-        source = [f"%a{place}"] * width if uniform[place] else rows[place]
-        memory.pack(e, source, packed[place], given.size, kind_of(given.dtype))
+    valid, allocations, taken = None, [], 0
     # The kernel of one sample of a large program is a call: the same code serves as a subprogram of steps and rollouts.
     if calls_itself(program, width):
         pointers = [str(array(i)) for i in range(len(arrays))]
@@ -116,6 +111,12 @@ def kernel_ir(program: Program, width: int, uniform: Sequence[bool], is_quick: b
         write_call(e, fast, pointers)
         valid = None if program.careful is None else e.load_at("%valid", 0, "b1")
     else:
+        body = body_of(e, fast, load, array, is_quick)
+        for place in body.arrays_in_memory() if width > 1 else ():
+            packed[place], given = f"%packed{place}", arrays[place]
+            allocations.append(allocation(packed[place], bytes_of(given, width)))
+            source = [f"%a{place}"] * width if uniform[place] else rows[place]
+            memory.pack(e, source, packed[place], given.size, kind_of(given.dtype))
         body.compute()
         for i, (row, output) in enumerate(zip(fast.results, program.outputs, strict=False)):
             kind, pointer = kind_of(output.dtype), body.pointer_to(row, output)
@@ -131,16 +132,20 @@ def kernel_ir(program: Program, width: int, uniform: Sequence[bool], is_quick: b
                 e.store_array(rows[count + i], kind, [body.text(x, kind) for x in row])
         if program.careful is not None:
             valid = body.text(fast.results[-1][0], "b1")
+        taken, body.careful = body.careful, 0
+        allocations += body.allocations()
     if valid is not None and program.careful is not None:
         flag = e.operation("not", "b1", [valid], "b1")
         same = [*uniform, *[False] * len(program.outputs)]
         places = [(f"%a{i}", 0 if same[i] else x.size * x.dtype.itemsize) for i, x in enumerate(arrays)]
-        body.careful = max(body.careful, careful_text.write_call_of_rows(e, program.careful, flag, places))
+        taken = max(taken, careful_text.write_call_of_rows(e, program.careful, flag, places))
     # Arguments that are not read are not in the code, but the handler checks their sizes, so that the hash covers them.
     sizes = " ".join(
         f"{'same' if i < count and uniform[i] else 'each'}:{x.size}x{x.dtype}" for i, x in enumerate(arrays)
     )
-    return wrap_kernel(e, f"{count} {sizes}", uniform, len(program.outputs), [*body.allocations(), *allocations])
+    return wrap_kernel(
+        e, f"{count} {sizes}", uniform, len(program.outputs), [*allocations, *careful_text.allocation(taken)]
+    )
 
 
 def wrap_kernel(e: Emitter, title: str, uniform: Sequence[bool], outputs: int, allocations: Sequence[str]) -> str:

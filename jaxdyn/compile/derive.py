@@ -45,38 +45,36 @@ def _tangent(program: Program, moving: tuple[bool, ...]) -> Program:
     # After inlining, only subprograms with loops are still called. A scan computes values and changes in one loop.
     values: list = [] if program.subprograms else replay(graph, program, primal)[0]
     changes: list = []  # of each operation: a Number, or 0.0 where it does not change
-    for i, operation in enumerate(program.operations):
-        if operation.op == "input":
-            index, entry = operation.args
+    for i, (op, kind, args) in enumerate(program.operations):
+        if op == "input":
+            index, entry = args
             row = changes_in[index]
             changes.append(0.0 if row is None else row[entry])
             if i == len(values):
                 values.append(primal[index].reshape(-1)[entry])
             continue
-        operands = [x.value if type(x) is Constant else values[x] for x in operation.args]
-        if operation.op == "part":
-            call, (values_of, entry) = changes[operation.args[0]], operands
+        operands = [x.value if type(x) is Constant else values[x] for x in args]
+        if op == "part":
+            call, (values_of, entry) = changes[args[0]], operands
             values.append(values_of[entry])
             changes.append(0.0 if type(call) is float else call[entry])
             continue
-        operand_changes = [(0.0 if type(x) is Constant else changes[x]) for x in operation.args]
+        operand_changes = [(0.0 if type(x) is Constant else changes[x]) for x in args]
         any_change = any(is_number(x) or x != 0 for x in operand_changes)
-        if operation.op in ("call", "call_where") and any_change:
+        if op in ("call", "call_where") and any_change:
             called = program.subprograms[operands[0]]
-            if operation.op == "call_where" or not hasattr(called, "call_with_changes"):
+            if op == "call_where" or not hasattr(called, "call_with_changes"):
                 raise NotNumbers("a branch, or a pseudo-inverse without a rule for its derivative")
             value, change = called.call_with_changes(graph, operands[1:], operand_changes[1:])
             values.append(value)
             changes.append(change)
             continue
         if i == len(values):
-            values.append(repeat(graph, program, operation, operands))
+            values.append(repeat(graph, program, op, kind, operands))
         value = values[i]
         # Integers and bools have no change. Numbers whose operands do not change have none either: this keeps tangents short.
-        varies = operation.kind in FLOATS and any_change
-        changes.append(
-            _change(graph, operation.op, operation.kind, value, operands, operand_changes) if varies else 0.0
-        )
+        varies = kind in FLOATS and any_change
+        changes.append(_change(graph, op, kind, value, operands, operand_changes) if varies else 0.0)
     rows, outputs = [], [array for array in program.outputs if array.dtype.kind == "f"]
     for row, array in zip(program.results, program.outputs, strict=True):
         if array.dtype.kind == "f":
@@ -266,8 +264,7 @@ def _coefficient_values(graph: Graph, program: Program, inputs: list) -> tuple[l
     flat = [None if x is None else x.ravel().tolist() for x in inputs]
     values: list = []
     calls: dict[int, Any] = {}
-    for i, operation in enumerate(program.operations):
-        op, _, args = operation
+    for i, (op, kind, args) in enumerate(program.operations):
         if op == "input":
             row = flat[args[0]]
             values.append(None if row is None else row[args[1]])
@@ -281,7 +278,7 @@ def _coefficient_values(graph: Graph, program: Program, inputs: list) -> tuple[l
             values.append(None)
         else:
             operands = [x.value if type(x) is Constant else values[x] for x in args]
-            values.append(repeat(graph, program, operation, operands))
+            values.append(repeat(graph, program, op, kind, operands))
     return values, calls
 
 
@@ -312,7 +309,7 @@ def _transpose_operation(g: Graph, op: str, kind: str, args, values, c, accumula
         accumulate(args[1], g.select(value(args[0]), c, 0.0, kind))
         accumulate(args[2], g.select(value(args[0]), 0.0, c, kind))
     elif op == "convert":
-        accumulate(args[0], g.convert(c, program.operations[args[0]].kind))
+        accumulate(args[0], g.convert(c, program.operations[args[0]][1]))
     else:
         raise AssertionError(f"{op} is not linear")
 
@@ -349,11 +346,12 @@ def _with_inputs(program: Program, places: tuple[int, ...]) -> Program:
 def _renumber_inputs(program: Program, index: dict[int, int]) -> Program:
     operations = []
     for operation in program.operations:
-        if operation.op == "input":
-            place, entry = operation.args
+        op, kind, args = operation
+        if op == "input":
+            place, entry = args
             if place not in index:
                 raise NotNumbers("a derivative of what the values do not depend on")
-            operation = operation._replace(args=(index[place], entry))
+            operation = op, kind, (index[place], entry)
         operations.append(operation)
     inputs = [program.inputs[i] for i in index]
     return Program(inputs, program.outputs, operations, program.results, program.subprograms, name=program.name)

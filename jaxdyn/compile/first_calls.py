@@ -31,7 +31,7 @@ class _FirstCall:
         self.begin = self.end = self.added = 0.0  # of the phases, and when the last task came
         self.active = 0  # phases in all threads
         self.inner = threading.local()  # seconds of phases within the phase at hand, in this thread
-        self.tasks: list[tuple[bool, int, int, Callable]] = []  # a heap
+        self.tasks: list[tuple[bool, int, int, Callable, Callable]] = []  # a heap
         self.thread: threading.Thread | None = None
         self.order = itertools.count()
         self.is_hurried = self.is_ending = False
@@ -86,14 +86,14 @@ class _FirstCall:
 
     # --- after the first call ---
 
-    def optimise_later(self, improve: Callable, size: int, is_new: bool) -> None:
-        """Call improve() in the thread that optimises code, the short ones first.
+    def optimise_later(self, improve: Callable, keep: Callable, size: int, is_new: bool) -> None:
+        """Call improve() in the thread that optimises code, the short ones first, or keep() where the process ends before.
 
         Not `is_new`: code that an earlier process has left quick, as it ended soon. It is optimised before all other, so that
         scripts which end soon do not run it for ever.
         """
         with self.changed:
-            heapq.heappush(self.tasks, (is_new, size, next(self.order), improve))
+            heapq.heappush(self.tasks, (is_new, size, next(self.order), improve, keep))
             self.added = time.perf_counter()
             self._start()
             self.changed.notify_all()
@@ -121,7 +121,7 @@ class _FirstCall:
                     self.thread = None
                     self.changed.notify_all()
                     return
-                improve = heapq.heappop(self.tasks)[-1]
+                *_, improve, _ = heapq.heappop(self.tasks)
             # What cannot be optimised keeps its quick code.
             with contextlib.suppress(Exception):
                 improve()
@@ -135,9 +135,11 @@ class _FirstCall:
             self.is_hurried = False
 
     def stop(self) -> None:
-        """Stop after the code at hand: LLVM must not be at work while the process takes itself apart."""
+        """Stop after the code at hand, and keep the rest: LLVM must not be at work while the process takes itself apart."""
         self.is_ending = True
         self.finish()
+        for *_, keep in self.tasks:
+            keep()
 
 
 _first_call = _FirstCall()

@@ -373,7 +373,8 @@ class Graph:
                     waiting.extend(self._inputs_of_branch(number) if number.op == "call_where" else number.args)
         live = [number for number in self.numbers if number.place is not None]
         self._drop_results(live)
-        operations, count = [], 0
+        operations: list[Operation] = []
+        count = 0
         called: dict[int, int] = {}  # numbers of the subprograms that are still called, by those of the graph
         # In the order of creation, where operands precede their operation. Depth first from the outputs was tried: forward
         # dynamics of a Panda took 1.6 times as long.
@@ -393,7 +394,7 @@ class Graph:
                 if any([type(x) is Number and x.kind != kind for x in args]):
                     _check_kinds(number)
                 args = tuple([x.place if type(x) is Number else new(Constant, (x,)) for x in args])
-            operations.append(new(Operation, (op, kind, args)))
+            operations.append((op, kind, args))
             count += op not in ("input", "part")  # these are memory
         if count > self.most:
             raise TooLong(f"more than {self.most} operations")

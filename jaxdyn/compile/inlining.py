@@ -6,7 +6,7 @@ from typing import Any
 import numpy as np
 
 from jaxdyn.compile.graph import Graph
-from jaxdyn.compile.program import Array, Constant, Operation, Program, kind_of, objects
+from jaxdyn.compile.program import Array, Constant, Program, kind_of, objects
 
 
 def replay(
@@ -18,13 +18,13 @@ def replay(
     """
     numbers: list = []
     flat = [x.ravel().tolist() for x in inputs]
-    for operation in program.operations:
-        if operation.op == "input":
-            place, entry = operation.args
+    for op, kind, args in program.operations:
+        if op == "input":
+            place, entry = args
             numbers.append(flat[place][entry])
         else:
-            args = [x.value if type(x) is Constant else numbers[x] for x in operation.args]
-            numbers.append(repeat(graph, program, operation, args, branches))
+            operands = [x.value if type(x) is Constant else numbers[x] for x in args]
+            numbers.append(repeat(graph, program, op, kind, operands, branches))
     outputs = [
         objects([x.value if type(x) is Constant else numbers[x] for x in row], array.shape)
         for row, array in zip(program.results, program.outputs, strict=True)
@@ -32,9 +32,8 @@ def replay(
     return numbers, outputs
 
 
-def repeat(graph: Graph, program: Program, operation: Operation, args: list, branches: bool = True) -> Any:
+def repeat(graph: Graph, program: Program, op: str, kind: str, args: list, branches: bool = True) -> Any:
     """The number of an operation of a program for these operands; of a call the list of all entries of its outputs."""
-    op, kind, _ = operation
     if op in ("call", "call_where"):  # operands: the number of the subprogram, then entries one after the other
         which, *given = args
         write = _call if op == "call" else _call_where

@@ -29,7 +29,7 @@ _ESCAPED = [f"\\{x:02X}" for x in range(256)]
 
 def has_table(program: Program, is_quick: bool = False) -> bool:
     """Decide whether the operations of a program are data of its code, or of that which runs until the other is there."""
-    count = sum(x.op not in ("input", "part") for x in program.operations)
+    count = sum(op not in ("input", "part") for op, _, _ in program.operations)
     if is_quick:
         return count > MIN_QUICK_OPERATIONS
     return count > (MIN_LISTED_BESIDE_LOOPS if any(map(has_loop, program.subprograms)) else MIN_LISTED_OPERATIONS)
@@ -53,7 +53,7 @@ class Listing(Body):
 
     def name(self, i: int) -> str:
         """Load the number of an operation."""
-        return self.e.load_at(self._pointer(self.at[i]), 0, self.program.operations[i].kind)
+        return self.e.load_at(self._pointer(self.at[i]), 0, self.program.operations[i][1])
 
     def pointer_to(self, entries, array: Array) -> str | None:
         """The pointer to an output of the program."""
@@ -64,7 +64,7 @@ class Listing(Body):
 
     def arrays_in_memory(self) -> list[int]:
         """All inputs that are read."""
-        return sorted({x.args[0] for x in self.program.operations if x.op == "input"})
+        return sorted({args[0] for op, _, args in self.program.operations if op == "input"})
 
     def allocations(self) -> list[str]:
         """Memory for all numbers."""
@@ -106,7 +106,7 @@ class Listing(Body):
         for i, (op, _, args) in enumerate(operations):
             if op != "input" and i not in self.merged:
                 # A product that is merged into a sum is carried out there.
-                args = [*args, *operations[args[self.fused[i]]].args] if i in self.fused else args
+                args = [*args, *operations[args[self.fused[i]]][2]] if i in self.fused else args
                 for x in args:
                     if type(x) is not Constant:
                         last[x] = i
@@ -188,16 +188,16 @@ class Listing(Body):
         """Kinds of the operands, "" for those that are no numbers."""
         if op == "call_where":
             return ["", *(["b1"] if type(args[1]) is Constant else [""]), *[""] * (len(args) - 2)]
-        known = [self.program.operations[x].kind for x in args if type(x) is not Constant]
+        known = [self.program.operations[x][1] for x in args if type(x) is not Constant]
         given = known[-1] if known else kind
         of_constants = given if op in COMPARISONS else kind
-        return [of_constants if type(x) is Constant else self.program.operations[x].kind for x in args]
+        return [of_constants if type(x) is Constant else self.program.operations[x][1] for x in args]
 
     def _add(self, i: int, op: str, kind: str, args) -> None:
         operands, size = list(args), 8 * self.e.width
         if i in self.fused:
             place = self.fused[i]
-            product = self.program.operations[args[place]].args
+            product = self.program.operations[args[place]][2]
             code, operands = (f"fused {op}", kind, (kind,) * 3, place == 0), [*product, args[1 - place]]
             kinds = [kind] * 3
         else:
@@ -289,7 +289,7 @@ class Listing(Body):
             return None
         step, first = array.dtype.itemsize * self.e.width, self.at[entries[0]]
         kind, operations = kind_of(array.dtype), self.program.operations
-        same = all(self.at[x] == first + k * step and operations[x].kind == kind for k, x in enumerate(entries))
+        same = all(self.at[x] == first + k * step and operations[x][1] == kind for k, x in enumerate(entries))
         return first if same else None
 
     def _fill(self, place: int, entries, array: Array) -> None:

@@ -88,7 +88,7 @@ class _LoopText:
         places = [i for i, same in enumerate(self.uniform) if not same]
         self.sample_rows = e.rows(places, [self.arrays[i].size * self.arrays[i].dtype.itemsize for i in places])
         self.sample_rows |= {i: [f"%a{i}"] * self.width for i, same in enumerate(self.uniform) if same}
-        read = {x.args[0] for x in self.loop.turn.operations if x.op == "input"}
+        read = {args[0] for op, _, args in self.loop.turn.operations if op == "input"}
         for place in range(self.end):
             if self._is_direct(place) or (place not in read and place < self.first_state):
                 continue

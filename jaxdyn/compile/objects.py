@@ -13,7 +13,7 @@ import json
 import logging
 import re
 import zlib
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import NamedTuple
 
@@ -76,19 +76,27 @@ def _environment() -> str:
 class ObjectFile(NamedTuple):
     """Machine code as bytes, the symbols of the subprograms that it calls, and the rows of careful programs, by their numbers.
 
-    `text`: of quick code, which is to be compiled once more.
+    `text()`: of quick code, which is to be compiled once more. `is_kept`: whether the folder has the file; where the text is not
+    that of the quick code, it is written after the first call.
     """
 
     binary: bytes
     calls: tuple[str, ...]
     careful: tuple[tuple[int, tuple], ...]
-    text: str = ""
+    text: Callable[[], str] | None = None
+    is_kept: bool = True
 
     def improve(self, identity: str) -> "ObjectFile":
         """The optimised code, which takes the place of this one in the folder too."""
-        made = self._replace(binary=compile_text(self.text), text="")
+        assert self.text is not None
+        made = self._replace(binary=compile_text(self.text()), text=None)
         _keep(identity, made)
         return made
+
+    def keep(self, identity: str) -> None:
+        """Put the file into the folder, if it is not there."""
+        if not self.is_kept:
+            _keep(identity, self)
 
 
 def find(identity: str) -> ObjectFile | None:
@@ -98,31 +106,32 @@ def find(identity: str) -> ObjectFile | None:
         return None
     head, _, rest = contents.partition(b"\n")
     calls, careful, size = json.loads(head)
-    text = zlib.decompress(rest[size:]).decode() if len(rest) > size else ""
+    text = (lambda: zlib.decompress(rest[size:]).decode()) if len(rest) > size else None
     return ObjectFile(rest[:size], tuple(calls), tuple((number, tuple(row)) for number, row in careful), text)
 
 
 def make(
     identity: str,
-    text: str,
+    write: Callable[[], str],
     calls: Sequence[str],
     careful: Sequence = (),
     name: str = "",
     width: int = 0,
-    quick_text: str = "",
+    write_quick: Callable[[], str] | None = None,
 ) -> ObjectFile:
-    """Compile a text, and keep the code in the folder.
+    """Compile the text that `write()` gives, and keep the code in the folder.
 
-    `width`: samples in a vector of code that may be quick; zero for code that is optimised at once. `quick_text`: of the same
-    function, which compiles quickly (see `listing`); without it quick code is that of LLVM's lowest level.
+    `width`: samples in a vector of code that may be quick; zero for code that is optimised at once. `write_quick()`: the text of
+    the same function that compiles quickly (see `listing`); without it quick code is that of LLVM's lowest level.
     """
+    if write_quick is not None:
+        return ObjectFile(compile_text(write_quick()), tuple(calls), tuple(careful), write, is_kept=False)
+    text = write()
     if (lines := text.count("\n")) > ANNOUNCED_LINES:
         message = "jaxdyn: compiling %s, %d lines; the next start of this script reads it from the cache"
         logger.warning(message, name or "a function", lines)
-    is_quick = width > 0 and lines > QUICK_LINES and has_two_levels()
-    is_quick = is_quick and (bool(quick_text) or 8 * width * lines < QUICK_BYTES)
-    binary = compile_text(quick_text or text, is_quick and not quick_text)
-    made = ObjectFile(binary, tuple(calls), tuple(careful), text if is_quick else "")
+    is_quick = width > 0 and lines > QUICK_LINES and has_two_levels() and 8 * width * lines < QUICK_BYTES
+    made = ObjectFile(compile_text(text, is_quick), tuple(calls), tuple(careful), (lambda: text) if is_quick else None)
     _keep(identity, made)
     return made
 
@@ -134,7 +143,7 @@ def has_two_levels() -> bool:
 
 def _keep(identity: str, made: ObjectFile) -> None:
     head = json.dumps([list(made.calls), list(made.careful), len(made.binary)]).encode()
-    text = zlib.compress(made.text.encode(), 1) if made.text else b""
+    text = zlib.compress(made.text().encode(), 1) if made.text else b""
     disk.write(name_of_file(identity), head + b"\n" + made.binary + text)
 
 
@@ -152,7 +161,7 @@ def keep_careful(digest: str, identity: str) -> None:
 def code_of(text: str) -> "Code":
     """The machine code of a text, from the folder or compiled now."""
     identity = hashlib.sha256(text.encode()).hexdigest()
-    return Code((find(identity) or make(identity, text, ())).binary)
+    return Code((find(identity) or make(identity, lambda: text, ())).binary)
 
 
 class Code:

@@ -56,7 +56,7 @@ def as_operations(*args, program: Program, rows: int = 0):
             values.append(lax.convert_element_type(values[operands[0]], dtype_of(kind)))
         else:
             # The kind of a comparison's result is bool: its constants have the kind of the other operand.
-            kinds = [program.operations[x].kind for x in operands if type(x) is not Constant]
+            kinds = [program.operations[x][1] for x in operands if type(x) is not Constant]
             constant_kind = kinds[-1] if op in COMPARISONS else kind
             operand_values = (constant(x.value, constant_kind) if type(x) is Constant else values[x] for x in operands)
             values.append(_OPERATIONS[op](*operand_values))

@@ -24,12 +24,9 @@ class NotNumbers(Exception):
         return super().__str__() + (f", in {self.place}" if self.place else "")
 
 
-class Operation(NamedTuple):
-    """An operation of a finished program; `args` are indices of operations, and `Constant`s."""
-
-    op: str
-    kind: str
-    args: tuple
+# An operation of a finished program: its name, its kind, and its operands, indices of operations and `Constant`s. Plain tuples,
+# which Python's collector of cycles forgets: with a class of their own it visited half a million of them again and again.
+Operation = tuple[str, str, tuple]
 
 
 class Constant(NamedTuple):
@@ -100,13 +97,13 @@ class Program:
     def cost(self) -> int:
         """Number of operations that are carried out, without inputs and changes of sign."""
         # Signs merge with sums and products of LLVM, and inputs are operands in memory.
-        own = sum(_weight(x) for x in self.operations if x.op not in ("input", "neg", "call", "call_where", "part"))
-        return own + sum(self.subprograms[x.args[0].value].cost for x in self.operations if x.op == "call")
+        own = sum(_weight(x) for x in self.operations if x[0] not in ("input", "neg", "call", "call_where", "part"))
+        return own + sum(self.subprograms[args[0].value].cost for op, _, args in self.operations if op == "call")
 
     @functools.cached_property
     def read_places(self) -> tuple[int, ...]:
         """Inputs that are read; all of them where none is, as a call without operands would have no batch."""
-        read = {x.args[0] for x in self.operations if x.op == "input"}
+        read = {args[0] for op, _, args in self.operations if op == "input"}
         return tuple(sorted(read)) or tuple(range(len(self.inputs)))
 
     @property
@@ -125,13 +122,14 @@ class Program:
         """Number of operations of each kind."""
         counts_by_kind: dict[str, int] = {}
         for x in self.operations:
-            counts_by_kind[x.op] = counts_by_kind.get(x.op, 0) + _weight(x)
+            counts_by_kind[x[0]] = counts_by_kind.get(x[0], 0) + _weight(x)
         return counts_by_kind
 
 
 def _weight(operation: Operation) -> int:
     """Number of instructions of an operation: those of several operands are written as a chain."""
-    return len(operation.args) - 1 if operation.op in ("reduce_max", "reduce_min", "clamp") else 1
+    op, _, args = operation
+    return len(args) - 1 if op in ("reduce_max", "reduce_min", "clamp") else 1
 
 
 class Renumbering:
@@ -156,7 +154,8 @@ def prune_calls(program: Program) -> None:
     needed: list[set[int]] = [set() for _ in program.subprograms]
     for op, _, args in program.operations:
         if op == "part":
-            needed[program.operations[args[0]].args[0].value].add(args[1].value)
+            _, _, (which, *_) = program.operations[args[0]]
+            needed[which.value].add(args[1].value)
     program.subprograms = tuple(map(_with_results, program.subprograms, needed))
 
 
@@ -178,7 +177,7 @@ def _with_results(program: Program, needed: set[int]) -> Program:
     few = Renumbering()
     for i in sorted(live):
         op, kind, args = program.operations[i]
-        few.add(i, Operation(op, kind, args if op == "input" else few.args(args)))
+        few.add(i, (op, kind, args if op == "input" else few.args(args)))
     rows = [few.args(row) for row in results]
     return Program(program.inputs, program.outputs, few.operations, rows, program.subprograms, name=program.name)
 

@@ -105,7 +105,7 @@ class Scan:
     def _with_read_inputs(self) -> tuple["Scan", list[int]]:
         if self.condition is not None:
             return self, list(range(len(self.inputs)))
-        read = {x.args[0] for x in self.body.operations if x.op == "input"}
+        read = {args[0] for op, _, args in self.body.operations if op == "input"}
         consts, carries, rows, tables = self.split_inputs(range(len(self.body.inputs)))
         kept = [
             [i for i in consts if i in read],

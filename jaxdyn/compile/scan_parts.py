@@ -8,7 +8,7 @@ import numpy as np
 from jaxdyn.compile import derive
 from jaxdyn.compile.graph import Graph
 from jaxdyn.compile.inlining import replay
-from jaxdyn.compile.program import Array, Constant, Operation, Program, as_objects, objects
+from jaxdyn.compile.program import Array, Constant, Program, as_objects, objects
 
 
 def is_chain(parents) -> bool:
@@ -68,8 +68,7 @@ def parts_of_program(program: Program | None) -> tuple | None:
     """Data of a program that a file keeps."""
     if program is None:
         return None
-    operations = [tuple(x) for x in program.operations]
-    return program.inputs, program.outputs, operations, program.results, program.subprograms
+    return program.inputs, program.outputs, program.operations, program.results, program.subprograms
 
 
 def program_of_parts(parts: tuple | None) -> Program | None:
@@ -77,7 +76,7 @@ def program_of_parts(parts: tuple | None) -> Program | None:
     if parts is None:
         return None
     inputs, outputs, operations, results, inner = parts
-    return Program(inputs, outputs, [Operation(*x) for x in operations], results, inner)
+    return Program(inputs, outputs, operations, results, inner)
 
 
 def with_more_inputs(program: Program, types: Sequence[Array], moves: Sequence[Sequence[bool]]) -> Program:

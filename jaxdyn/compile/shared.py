@@ -8,7 +8,7 @@ import functools
 from collections.abc import Sequence
 
 from jaxdyn.compile.code import MIN_SHARED_OPERATIONS
-from jaxdyn.compile.program import Array, Constant, Operation, Program, Renumbering, dtype_of
+from jaxdyn.compile.program import Array, Constant, Program, Renumbering, dtype_of
 from jaxdyn.compile.stored import key_within, load_or_make
 
 
@@ -40,15 +40,15 @@ def _split(program: Program, uniform: Sequence[bool]) -> tuple[Program, Program]
                 op not in ("call", "call_where", "part") and all(is_shared[x] for x in args if type(x) is not Constant)
             )
     saved = sum(
-        shared and x.op not in ("input", "neg") for shared, x in zip(is_shared, program.operations, strict=True)
+        shared and op not in ("input", "neg") for shared, (op, _, _) in zip(is_shared, program.operations, strict=True)
     )
     # Below this a second call costs more than the batch saves; for one sample nothing is saved at all.
     if saved < MIN_SHARED_OPERATIONS:
         return None
     # One array for each kind of number, not one per number: the runtime handler checks every argument of a kernel.
     passed = _interface(program, is_shared)
-    kinds = sorted({program.operations[i].kind for i in passed})
-    by_kind = [[i for i in passed if program.operations[i].kind == kind] for kind in kinds]
+    kinds = sorted({program.operations[i][1] for i in passed})
+    by_kind = [[i for i in passed if program.operations[i][1] == kind] for kind in kinds]
     arrays = [Array((len(entries),), dtype_of(kind)) for kind, entries in zip(kinds, by_kind, strict=True)]
 
     places = [i for i, same in enumerate(uniform) if same]
@@ -57,7 +57,7 @@ def _split(program: Program, uniform: Sequence[bool]) -> tuple[Program, Program]
     for i, (op, kind, args) in enumerate(program.operations):
         if is_shared[i]:
             args = (places.index(args[0]), args[1]) if op == "input" else first.args(args)
-            first.add(i, Operation(op, kind, args))
+            first.add(i, (op, kind, args))
     once = Program(
         [program.inputs[i] for i in places],
         arrays,
@@ -70,11 +70,11 @@ def _split(program: Program, uniform: Sequence[bool]) -> tuple[Program, Program]
     count, rest = len(program.inputs), Renumbering()
     for place, (kind, entries) in enumerate(zip(kinds, by_kind, strict=True), count):
         for k, i in enumerate(entries):
-            rest.add(i, Operation("input", kind, (place, k)))
+            rest.add(i, ("input", kind, (place, k)))
     for i, (op, kind, args) in enumerate(program.operations):
         if is_shared[i]:
             continue
-        rest.add(i, Operation(op, kind, args if op == "input" else rest.args(args)))
+        rest.add(i, (op, kind, args if op == "input" else rest.args(args)))
     each = Program(
         [*program.inputs, *arrays],
         program.outputs,
@@ -88,7 +88,7 @@ def _split(program: Program, uniform: Sequence[bool]) -> tuple[Program, Program]
 
 def _interface(program: Program, is_shared: Sequence[bool]) -> list[int]:
     """Shared operations that the second program reads or returns, in the order in which it reads them."""
-    read = [x.args for i, x in enumerate(program.operations) if not is_shared[i] and x.op != "input"]
+    read = [args for i, (op, _, args) in enumerate(program.operations) if not is_shared[i] and op != "input"]
     numbers: dict[int, None] = {}
     for args in (*read, *program.results):
         numbers |= {x: None for x in args if type(x) is not Constant and is_shared[x]}

@@ -103,7 +103,7 @@ class StoredProgram(Program):
     def _body(self) -> tuple[list[Operation], tuple[tuple, ...]]:
         found = _load(f"{self.digest}.operations")
         if found is not None:
-            return [Operation(*x) for x in found[0]], found[1]
+            return found
         return self.remade.operations, self.remade.results
 
     @functools.cached_property
@@ -161,7 +161,7 @@ def _load_or_make(key: str, make: Callable) -> tuple[Sequence[Program], Any]:
 def _save_operations(program: Any) -> None:
     """Keep the operations of a program and of all that it calls, but those of careful programs, which may not be made yet."""
     if isinstance(program, Program):
-        _save(f"{program.digest}.operations", ([tuple(x) for x in program.operations], program.results))
+        _save(f"{program.digest}.operations", (program.operations, program.results))
         for inner in program.subprograms:
             _save_operations(inner)
 

@@ -282,12 +282,12 @@ class _Kernel:
                 return False
         if found is None:
             is_program, uniform = isinstance(program, Program), self.uniform or [False] * len(program.inputs)
-            text = kernel_ir(program, width, uniform) if is_program else program.ir(width, uniform)
+            write = partial(kernel_ir, program, width, uniform) if is_program else partial(program.ir, width, uniform)
             # A loop may run for long, and quick code of vectors takes four times as long, that of single numbers a quarter more.
             quick_width = 0 if program.turns > 1 and width > 1 else width
-            quick = partial(kernel_ir, program, width, uniform) if is_program else partial(program.ir, width, uniform)
-            quick_text = _quick_text(program, quick_width, quick)
-            found = objects.make(identity, text, tuple(calls), careful, program.name, quick_width, quick_text)
+            is_call = is_program and calls_itself(program, width)
+            quick = None if is_call else _write_quick(program, quick_width, write)
+            found = objects.make(identity, write, tuple(calls), careful, program.name, quick_width, quick)
             is_new = True
         _install(found, identity, "kernel", self._enter, is_new)
         self.is_made, self.program = True, None  # a program of a large robot takes megabytes
@@ -402,9 +402,10 @@ def _publish(symbol: str, width: int, programs: dict[str, Any], recover: Callabl
         return True
     if not isinstance(found, objects.ObjectFile):
         assert called is not None
-        text = subprogram_ir(called, width) if isinstance(called, Program) else called.subprogram_ir(width)
-        quick_text = _quick_text(called, width, partial(subprogram_ir, called, width))
-        found = objects.make(symbol, text, tuple(calls), careful, called.name, width, quick_text)
+        is_program = isinstance(called, Program)
+        write = partial(subprogram_ir, called, width) if is_program else partial(called.subprogram_ir, width)
+        quick = _write_quick(called, width, write)
+        found = objects.make(symbol, write, tuple(calls), careful, called.name, width, quick)
         is_new = True
     _called[symbol] = _Called(ctypes.c_uint64(), found.calls, found.careful)
     _install(found, symbol, "called", partial(setattr, _called[symbol].address, "value"), is_new)
@@ -412,13 +413,13 @@ def _publish(symbol: str, width: int, programs: dict[str, Any], recover: Callabl
     return True
 
 
-def _quick_text(program, width: int, write: Callable) -> str:
-    """The text of a large program as a listing, by write(is_quick=True), or an empty one."""
+def _write_quick(program, width: int, write: Callable) -> Callable[[], str] | None:
+    """What writes the text of a large program as a listing, write(is_quick=True); None for others."""
     program = getattr(program, "turn", program)
     if not (width and objects.has_two_levels() and isinstance(program, Program)):
-        return ""
+        return None
     program = program.fast or program
-    return write(is_quick=True) if has_table(program, True) and not has_table(program) else ""
+    return partial(write, is_quick=True) if has_table(program, True) and not has_table(program) else None
 
 
 def _install(
@@ -429,7 +430,8 @@ def _install(
     _codes.append(code)
     enter(code.address(name))
     if found.text and objects.has_two_levels():
-        optimise_later(lambda: _install(found.improve(identity), identity, name, enter), len(found.text), is_new)
+        improve, keep = lambda: _install(found.improve(identity), identity, name, enter), partial(found.keep, identity)
+        optimise_later(improve, keep, len(found.binary), is_new)
 
 
 def _restore_careful(rows: Sequence, recover: Callable | None) -> None:

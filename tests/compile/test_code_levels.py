@@ -95,22 +95,28 @@ from jaxdyn.compile import kernel, objects, target
 objects.QUICK_LINES = 0
 x = jnp.linspace(0.1, 0.9, 5)
 print(repr(float(jax.jit(kernel(lambda x, y: jnp.sum(jnp.sin(x) / jnp.cos(y))))(x, x))))
-print([bool(objects.find(x.row.identity).text) for x in target._kernels.values()])
 """
+_LOOK = "print([bool(objects.find(x.row.identity).text) for x in target._kernels.values()])\n"
+_LISTED = (
+    "from jaxdyn.compile import listing; listing.MIN_QUICK_OPERATIONS = 0\n"  # whose text is written after the call
+)
 
 
 @pytest.mark.long
-def test_quick_code_on_disk_is_optimised_by_another_process(monkeypatch, tmp_path):
+@pytest.mark.parametrize("tier", ["", _LISTED])
+def test_quick_code_on_disk_is_optimised_by_another_process(monkeypatch, tmp_path, tier):
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
     monkeypatch.delenv("JAXDYN_COMPILATION_OPTIONS", raising=False)
-    # The first process ends before it optimises anything; the second one waits.
+    # The first process ends before it optimises anything; the second one finds its code, and waits.
     wait = "from jaxdyn.compile import first_calls; first_calls.wait_for_code()\n"
+    alone = "from jaxdyn.compile import first_calls; first_calls._SHORT_SECONDS = 1e6\nobjects.make = None\n"
+    found = _SCRIPT.replace("x = jnp", alone + "x = jnp")
     lines = []
-    for script in (_SCRIPT, _SCRIPT.replace("print([", wait + "print([")):
+    for script in (tier + _SCRIPT, found + _LOOK + wait + _LOOK):
         done = subprocess.run([sys.executable, "-c", script], capture_output=True, text=True, check=True)
         lines.append(done.stdout.splitlines())
     assert lines[0][0] == lines[1][0]
-    assert [x[1] for x in lines] == ["[True]", "[False]"]
+    assert lines[1][1:] == ["[True]", "[False]"]
 
 
 @pytest.mark.long
@@ -122,7 +128,7 @@ def test_quick_code_of_processes_that_end_soon_is_optimised_at_once(monkeypatch,
     look = "any(objects.find(x.row.identity).text for x in target._kernels.values())"
     wait = f"import time; end = time.monotonic() + 60\nwhile {look} and time.monotonic() < end: time.sleep(0.01)\n"
     lines = []
-    for script in (_SCRIPT, _SCRIPT.replace("print([", wait + "print([")):
+    for script in (_SCRIPT + _LOOK, _SCRIPT + wait + _LOOK):
         done = subprocess.run([sys.executable, "-c", busy + script], capture_output=True, text=True, check=True)
         lines.append(done.stdout.splitlines())
     assert lines[0][0] == lines[1][0]

@@ -137,7 +137,7 @@ def test_a_branch_that_repeats_a_call_shares_its_code():
         return jax.lax.cond(state[0] > 1.0, lambda state: long(*state), lambda state: state, state)
 
     program = expand(jax.make_jaxpr(twice)(1.0, 2.0), 10**5, calls=True)[0]
-    assert [x.op for x in program.operations if x.op.startswith("call")] == ["call", "call_where"]
+    assert [op for op, _, _ in program.operations if op.startswith("call")] == ["call", "call_where"]
     assert len(program.subprograms) == 1
 
 

@@ -17,7 +17,7 @@ from jaxdyn.compile.careful import Careful
 from jaxdyn.compile.code import kernel_ir, subprogram_ir, varying_first
 from jaxdyn.compile.gpu.functions import library_text
 from jaxdyn.compile.llvm import Emitter
-from jaxdyn.compile.program import Array, Constant, Operation, Program, kind_of
+from jaxdyn.compile.program import Array, Constant, Program, kind_of
 
 KERNEL = "jaxdyn_thread"  # the function of a thread
 # A thread copies arrays of at most so many entries to registers, or to its local memory.
@@ -91,13 +91,13 @@ def as_call(called) -> Program:
     operations, entries = [], []
     for place, array in enumerate(called.inputs):
         entries += range(len(operations), len(operations) + array.size)
-        operations += [Operation("input", kind_of(array.dtype), (place, k)) for k in range(array.size)]
+        operations += [("input", kind_of(array.dtype), (place, k)) for k in range(array.size)]
     call = len(operations)
-    operations.append(Operation("call", "call", (Constant(0), *entries)))
+    operations.append(("call", "call", (Constant(0), *entries)))
     results, first = [], 0
     for array in called.outputs:
         kind, at = kind_of(array.dtype), len(operations)
-        operations += [Operation("part", kind, (call, Constant(first + k))) for k in range(array.size)]
+        operations += [("part", kind, (call, Constant(first + k))) for k in range(array.size)]
         results.append(tuple(range(at, at + array.size)))
         first += array.size
     return Program(called.inputs, called.outputs, operations, results, [called], name=called.name)
