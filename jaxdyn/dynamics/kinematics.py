@@ -11,7 +11,7 @@ world's origin is computed exactly as one at home.
 """
 
 import functools
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from typing import Any, NamedTuple
 
 import jax
@@ -20,7 +20,7 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from jaxdyn._renamed import rename_argument
-from jaxdyn.compile import kernel, variant
+from jaxdyn.compile import kernel, sweep, variant
 from jaxdyn.compile.known import array_namespace
 from jaxdyn.lie import se3
 from jaxdyn.lie.so3 import matmul
@@ -28,6 +28,10 @@ from jaxdyn.model.arguments import Given, check_shapes
 from jaxdyn.model.joints import KINDS, SCREW_KINDS, joint_transform, screw_transform
 from jaxdyn.model.topology import frame_index
 from jaxdyn.model.tree import Model, Topology, geometry
+
+# From so many bodies on, kernels of kinematics are loops over the bodies. Fewer are written out: zeros of a body's own are
+# dropped then, and so is what a result does not need.
+MIN_BODIES_IN_LOOPS = 64
 
 
 class TreeFrame(NamedTuple):
@@ -54,17 +58,17 @@ def relative_poses(model: Model, q: Float[Array, " nq"]) -> Float[Array, "nb 4 4
     for kind, bodies in _bodies_by_kind(topology):
         if kind in SCREW_KINDS:
             coordinates = np.array([topology.q_slices[i].start for i in bodies])
-            place = jax.vmap(functools.partial(screw_transform, kind))
-            transforms.append(place(take(screws, bodies), take(q, coordinates)))
+            place = functools.partial(screw_transform, kind)
+            transforms.append(map_rows(place, take(screws, bodies), take(q, coordinates)))
         else:
             coordinates = np.array([np.arange(topology.nq)[topology.q_slices[i]] for i in bodies])
             # The screw is not read by these kinds.
-            transforms.append(jax.vmap(lambda qj, kind=kind: joint_transform(kind, screws[0], qj))(q[coordinates]))
+            transforms.append(map_rows(lambda qj, kind=kind: joint_transform(kind, screws[0], qj), q[coordinates]))
         order.extend(bodies)
     if not transforms:
         return home
     transforms_by_kind = transforms[0] if len(transforms) == 1 else jnp.concatenate(transforms)
-    return matmul(home, take(transforms_by_kind, np.argsort(order)))
+    return map_rows(matmul, home, take(transforms_by_kind, np.argsort(order)))
 
 
 def body_subspace(model: Model) -> Float[Array, "nv 6"]:
@@ -98,12 +102,33 @@ def tree_frame(model: Model, q: Float[Array, " nq"]) -> TreeFrame:
     pose = jnp.where(mask, local, jnp.zeros_like(local))
     pose = _tree_products(topology, pose)
     # S is constant in the body's frame; Ad carries it to the tree frame.
-    subspace = jax.vmap(se3.Ad_apply)(take(pose, topology.dof_body), body_subspace(model))
+    subspace = map_rows(se3.Ad_apply, take(pose, topology.dof_body), body_subspace(model))
     return TreeFrame(pose, origin, subspace)
+
+
+def _map_in_loop(function: Callable, *rows):
+    """`map_rows` inside of a kernel: of many rows as a loop, whose code does not grow with their number."""
+    if len(rows[0]) < MIN_BODIES_IN_LOOPS:
+        return jax.vmap(function)(*rows)
+    # A chain without a carry.
+    return sweep(lambda carry, row: (carry, function(*row)), range(-1, len(rows[0]) - 1), (), rows)[1]
+
+
+@variant(_map_in_loop)
+def map_rows(function: Callable, *rows):
+    """Evaluate function(row of each array) for all rows of arrays (n, ...), one for each body or coordinate."""
+    return jax.vmap(function)(*rows)
 
 
 def _products_in_order(topology: Topology, pose: Float[Array, "nb 4 4"]) -> Float[Array, "nb 4 4"]:
     """`_tree_products` with one product per body: in a kernel pointer jumping would multiply the operations by log2(depth)."""
+    if topology.nb >= MIN_BODIES_IN_LOOPS:
+
+        def step(outer, own):
+            inner = matmul(outer, own)
+            return inner, inner
+
+        return sweep(step, topology.parents, jnp.eye(4, dtype=pose.dtype), pose)[1]
     products: list = []
     for i, parent in enumerate(topology.parents):
         products.append(pose[i] if parent < 0 else matmul(products[parent], pose[i]))
@@ -131,7 +156,7 @@ class BodyFrames(NamedTuple):
       `TreeFrame.subspace`.
     - `velocity_mask` (n, k) of bool: which frame each of these coordinates moves.
     - `twist`, `bias` (n, 6): twist of each frame, as a twist of the fixed frame that now coincides with the tree frame, and
-      its rate at a = 0; None when no velocity was given.
+      its rate at a = 0; `subspace_rate` (k, 6) the rates of `subspace`; None when no velocity was given.
     """
 
     pose: Float[Array, "n 4 4"]
@@ -141,6 +166,7 @@ class BodyFrames(NamedTuple):
     velocity_mask: np.ndarray
     twist: Float[Array, "n 6"] | None = None
     bias: Float[Array, "n 6"] | None = None
+    subspace_rate: Float[Array, "k 6"] | None = None
 
 
 def body_frames(
@@ -154,7 +180,9 @@ def body_frames(
         pose = jnp.broadcast_to(jnp.eye(4, dtype=q.dtype), (n, 4, 4))
         none, at_rest = np.zeros(0, int), None if v is None else jnp.zeros((n, 6), q.dtype)
         nowhere = jnp.zeros((0, 6), q.dtype)
-        return BodyFrames(pose, jnp.zeros((n, 3), q.dtype), nowhere, none, np.zeros((n, 0), bool), at_rest, at_rest)
+        return BodyFrames(
+            pose, jnp.zeros((n, 3), q.dtype), nowhere, none, np.zeros((n, 0), bool), at_rest, at_rest, nowhere
+        )
     coordinates = _coordinate_indices(topology.v_slices, kept)
     # Constraints touch few bodies of a large tree; the remaining bodies need not be placed at all.
     if len(kept) < model.nb:
@@ -172,7 +200,7 @@ def body_frames(
     rates = subspace_rate(model, frame, body_twists(model, frame, v))
     # One product gives the twists and their rates.
     sums = matmul(jnp.asarray(moved_by, q.dtype), jnp.concatenate([frame.subspace, rates], axis=1) * v[:, None])
-    return frames._replace(twist=sums[:, :6], bias=sums[:, 6:])
+    return frames._replace(twist=sums[:, :6], bias=sums[:, 6:], subspace_rate=rates)
 
 
 def _prune(model: Model, kept: list[int]) -> Model:
@@ -218,17 +246,53 @@ def body_twists(model: Model, frame: TreeFrame, v: Float[Array, " nv"]) -> Float
 
 def subspace_rate(model: Model, frame: TreeFrame, twists: Float[Array, "nb 6"]) -> Float[Array, "nv 6"]:
     """Rate of the motion subspace: dS_k/dt = ad_V S_k, V the twist of the body that carries S_k with it."""
-    return jax.vmap(se3.ad_apply)(take(twists, model.topology.dof_body), frame.subspace)
+    return map_rows(se3.ad_apply, take(twists, model.topology.dof_body), frame.subspace)
 
 
-def sum_to_bodies(model: Model, rows: Float[Array, "nv n"]) -> Float[Array, "nb n"]:
-    """G rows: for each body the sum of the rows of the coordinates that move it."""
+def _sweep_to_bodies(model: Model, rows: Float[Array, "nv n"]) -> Float[Array, "nb n"]:
+    """`sum_to_bodies` inside of a kernel, where a product with a mask has an operation for each pair on one path."""
+    topology = model.topology
+    if topology.nb < MIN_BODIES_IN_LOOPS:
+        return _sum_to_bodies(model, rows)
+    # Of joints with several coordinates the sum over these.
+    own = rows if topology.nv == topology.nb else matmul(jnp.asarray(_own_coordinates(topology), rows.dtype), rows)
+    return sweep(lambda outer, x: (outer + x, outer + x), topology.parents, jnp.zeros_like(rows[0]), own)[1]
+
+
+def _sum_to_bodies(model: Model, rows: Float[Array, "nv n"]) -> Float[Array, "nb n"]:
     return matmul(jnp.asarray(model.topology.dof_ancestors, rows.dtype), rows)
 
 
+@variant(_sweep_to_bodies)
+def sum_to_bodies(model: Model, rows: Float[Array, "nv n"]) -> Float[Array, "nb n"]:
+    """G rows: for each body the sum of the rows of the coordinates that move it."""
+    return _sum_to_bodies(model, rows)
+
+
+def _sweep_to_coordinates(model: Model, rows: Float[Array, "nb n"]) -> Float[Array, "nv n"]:
+    topology = model.topology
+    if topology.nb < MIN_BODIES_IN_LOOPS:
+        return _sum_to_coordinates(model, rows)
+
+    def step(total, x):
+        return total + x, total + x
+
+    return take(sweep(step, topology.parents, jnp.zeros_like(rows[0]), rows, inward=True)[1], topology.dof_body)
+
+
+def _sum_to_coordinates(model: Model, rows: Float[Array, "nb n"]) -> Float[Array, "nv n"]:
+    return matmul(jnp.asarray(model.topology.dof_ancestors.T, rows.dtype), rows)
+
+
+@variant(_sweep_to_coordinates)
 def sum_to_coordinates(model: Model, rows: Float[Array, "nb n"]) -> Float[Array, "nv n"]:
     """G^T rows: for each velocity coordinate the sum of the rows of the bodies that it moves."""
-    return matmul(jnp.asarray(model.topology.dof_ancestors.T, rows.dtype), rows)
+    return _sum_to_coordinates(model, rows)
+
+
+def _own_coordinates(topology: Topology) -> np.ndarray:
+    """Mask (nb, nv) of the coordinates of each body's own joint."""
+    return np.arange(topology.nb)[:, None] == topology.dof_body
 
 
 def forward_kinematics(model: Model, q: Float[Array, " nq"]) -> Float[Array, "nb 4 4"]:
@@ -310,8 +374,8 @@ def body_jacobian(model: Model, q: Float[Array, " nq"], frame: str | None) -> Fl
 @kernel(static=1)
 def _body_jacobian(body: int, tree, q):
     model, offset = tree
-    frame = tree_frame(model, q)
-    return twist_columns(model, frame, body, offset, frame.subspace).T
+    frames = body_frames(model, q, [body])
+    return all_coordinates(model, frames, twists_in_frame(frames, offset, frames.subspace)).T
 
 
 def spatial_jacobian(model: Model, q: Float[Array, " nq"], frame: str | None) -> Float[Array, "6 nv"]:
@@ -337,9 +401,10 @@ def spatial_jacobian(model: Model, q: Float[Array, " nq"], frame: str | None) ->
 
 @kernel(static=1)
 def _spatial_jacobian(body: int, model: Model, q):
-    frame = tree_frame(model, q)
-    shift = se3.from_parts(jnp.eye(3, dtype=model.home.dtype), frame.origin[body])
-    return jax.vmap(se3.Ad_apply, (None, 0), 1)(shift, _mask_path(model, body, frame.subspace))
+    frames = body_frames(model, q, [body])
+    shift = se3.from_parts(jnp.eye(3, dtype=model.home.dtype), frames.origin[0])
+    columns = map_rows(functools.partial(se3.Ad_apply, shift), frames.subspace)
+    return all_coordinates(model, frames, columns).T
 
 
 def kinematic_part(model: Model) -> Model:
@@ -376,15 +441,14 @@ def named_frame(model: Model, name: str | None) -> tuple[int, Any]:
     return model.topology.frame_bodies[index], array_namespace(poses).asarray(poses)[index]
 
 
-def _mask_path(model: Model, body: int, rows: Float[Array, "nv 6"]) -> Float[Array, "nv 6"]:
-    """Rows of the coordinates that move a body; other rows are zero."""
-    on_path = model.topology.dof_ancestors[body] if body >= 0 else np.zeros(model.nv, bool)
-    return jnp.where(on_path[:, None], rows, jnp.zeros_like(rows))
+def twists_in_frame(frames: BodyFrames, offset: Given, rows: Float[Array, "k 6"]) -> Float[Array, "k 6"]:
+    """Twists of the tree frame in the axes and at the origin of a frame at `offset` in the first of the bodies."""
+    pose = matmul(frames.pose[0], jnp.asarray(offset))
+    return map_rows(functools.partial(se3.Ad_inv_apply, pose), rows)
 
 
-def twist_columns(model: Model, tree: TreeFrame, body: int, offset: Given, rows: Array) -> Float[Array, "nv 6"]:
-    """Twists of the tree frame (one per coordinate) in the axes and at the origin of a frame at `offset` in a body."""
-    if body < 0:
-        return jnp.zeros_like(rows)
-    pose = matmul(tree.pose[body], jnp.asarray(offset))
-    return jax.vmap(se3.Ad_inv_apply, (None, 0))(pose, _mask_path(model, body, rows))
+def all_coordinates(model: Model, frames: BodyFrames, rows: Float[Array, "k 6"]) -> Float[Array, "nv 6"]:
+    """Rows of all velocity coordinates, zero for those that move none of the bodies."""
+    places = np.full(model.nv, len(frames.coordinates))
+    places[frames.coordinates] = np.arange(len(frames.coordinates))
+    return take(jnp.concatenate([rows, jnp.zeros((1, 6), rows.dtype)]), places)

@@ -43,6 +43,8 @@ def mass_matrix(model: Model | System, q: Float[Array, " nq"], t: Numbers = 0.0)
     if isinstance(model, System):
         return _system_quantity(model, "mass_matrix", *check_state(model, q=q, t=t))
     (q,) = check_shapes(model, q=q)
+    if model.nb > MAX_BODIES or model.topology.ancestors.sum() > MAX_PAIRS:
+        return world_frame.mass_matrix_by_loops(model, q)
     return by_recursion(recursions.crba, world_frame.mass_matrix, model, q)
 
 
@@ -66,7 +68,7 @@ def coriolis_matrix(
     if isinstance(model, System):
         return _system_quantity(model, "coriolis_matrix", *check_state(model, q=q, v=v, t=t))
     q, v = check_shapes(model, q=q, v=v)
-    return by_recursion(world_frame.coriolis_matrix, world_frame.coriolis_matrix, model, q, v)
+    return _by_matrices(world_frame.coriolis_matrix, model, q, v)
 
 
 def gravity_force(model: Model | System, q: Float[Array, " nq"], t: Numbers = 0.0) -> Float[Array, " nv"]:
@@ -166,11 +168,12 @@ def forward_dynamics(
     if external is not None:
         tau = tau + generalized_force(model, q, external)
     # The derivative of the solve is M^-1 times that of inverse dynamics, so ABA itself is never differentiated.
-    form = _recursions(model)
-    if form is None:
-        return _solve_for_acceleration(model, q, v, tau)
-    tangent = _tangent_by_sweeps if form is sweeps else _tangent_by_recursions
-    return kernel(form.aba, fallback=_solve_for_acceleration, derivative=tangent)(model, q, v, tau)
+    form, tangent = {
+        recursions: (recursions.aba, _tangent_by_recursions),
+        sweeps: (sweeps.aba, _tangent_by_sweeps),
+        scans: (scans.forward_dynamics, _tangent_by_scans),
+    }[_recursions(model)]
+    return kernel(form, fallback=_solve_for_acceleration, derivative=tangent)(model, q, v, tau)
 
 
 def _kernel_with_checks(recursion: Callable) -> Callable:
@@ -203,6 +206,8 @@ rnea, crba, aba, mass_matrix_sqrt = map(
 MIN_BODIES_IN_SWEEPS = 40
 # Scalar programs of more bodies, for joints without sweeps, compile for longer than a few seconds.
 MAX_BODIES = 128
+# Pairs of a body and one above it, or itself, beyond which a mass matrix is computed by loops: each is some 60 operations.
+MAX_PAIRS = 1000
 # In small batches the mask form of the matrices is as fast as the loops.
 _MAX_BODIES_IN_MATRICES = 16
 
@@ -218,22 +223,27 @@ def _least_bodies_in_sweeps() -> int:
 
 
 def _recursions(model: Model) -> Any:
-    """The module with the recursions of a model; None where there are too many bodies."""
+    """The module with the recursions of a model."""
     # Robots with floating bases have most axes at right angles.
     least = MAX_BODIES + 1 if sweeps.has_base(model) else _least_bodies_in_sweeps()
     if model.nb >= least and sweeps.has_sweeps(model):
         return sweeps
-    return recursions if 0 < model.nb <= MAX_BODIES else None
+    return recursions if model.nb <= MAX_BODIES else scans
 
 
 def by_recursion(recursion, matrices, model: Model, *args):
-    """Evaluate recursion(model, *args) as a kernel, or by products of matrices where there is no kernel."""
+    """Evaluate recursion(model, *args) as a kernel, or the equal `matrices`, as loops over the bodies where these are many."""
     form = _recursions(model)
-    if form is sweeps and hasattr(sweeps, recursion.__name__):
-        return kernel(getattr(sweeps, recursion.__name__), fallback=matrices)(model, *args)
-    if form is None:
-        return matrices(model, *args)
+    if form is sweeps:
+        recursion = getattr(sweeps, recursion.__name__, recursion)
+    elif form is scans:
+        recursion = matrices
     return kernel(recursion, fallback=matrices)(model, *args)
+
+
+def _by_matrices(matrices, model: Model, *args):
+    """Evaluate products of matrices, whose operations grow with the square of the bodies: as a kernel of few of them."""
+    return matrices(model, *args) if model.nb > MAX_BODIES else kernel(matrices)(model, *args)
 
 
 def _inverse_dynamics(model: Model, q, v, a):
@@ -256,13 +266,14 @@ def _solve_for_acceleration(model: Model, q, v, tau):
     return implicit(model, (q, v, tau), form.forward_dynamics, tangent)
 
 
-def _acceleration_tangent(form: Any, model: Model, q, v, tau, steps):
+def _acceleration_tangent(inverse, solve, model: Model, q, v, tau, steps):
     """Tangent M^-1 (dtau - dID at fixed a) of the acceleration, for tangents of the leaves of (model, q, v, tau)."""
-    return form.aba_tangent(model, q, v, tau, _force_tangent(form.rnea, model, q, v, tau, steps))[1]
+    return solve(model, q, v, tau, _force_tangent(inverse, model, q, v, tau, steps))[1]
 
 
-_tangent_by_recursions = functools.partial(_acceleration_tangent, recursions)
-_tangent_by_sweeps = functools.partial(_acceleration_tangent, sweeps)
+_tangent_by_recursions = functools.partial(_acceleration_tangent, recursions.rnea, recursions.aba_tangent)
+_tangent_by_sweeps = functools.partial(_acceleration_tangent, sweeps.rnea, sweeps.aba_tangent)
+_tangent_by_scans = functools.partial(_acceleration_tangent, scans.inverse_dynamics, scans.forward_dynamics_tangent)
 
 
 def _force_tangent(inverse, model, q, v, tau, steps):
@@ -361,7 +372,7 @@ def torque_regressor(
     Source: Atkeson, An & Hollerbach (1986).
     """
     q, v, a = check_shapes(model, q=q, v=v, a=a)
-    return by_recursion(world_frame.torque_regressor, world_frame.torque_regressor, model, q, v, a)
+    return _by_matrices(world_frame.torque_regressor, model, q, v, a)
 
 
 def mass_matrix_derivative(model: Model, q: Float[Array, " nq"]) -> Float[Array, "nv nv nv"]:
@@ -379,7 +390,7 @@ def mass_matrix_derivative(model: Model, q: Float[Array, " nq"]) -> Float[Array,
     """
     (q,) = check_shapes(model, q=q)
     _check_coordinates(model, "mass_matrix_derivative")
-    return by_recursion(world_frame.mass_matrix_derivative, world_frame.mass_matrix_derivative, model, q)
+    return _by_matrices(world_frame.mass_matrix_derivative, model, q)
 
 
 def first_kind_symbols(model: Model | System, q: Float[Array, " nq"], t: Numbers = 0.0) -> Float[Array, "nv nv nv"]:
