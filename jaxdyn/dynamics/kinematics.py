@@ -164,9 +164,9 @@ class BodyFrames(NamedTuple):
     subspace: Float[Array, "k 6"]
     coordinates: np.ndarray
     velocity_mask: np.ndarray
-    twist: Float[Array, "n 6"] | None = None
-    bias: Float[Array, "n 6"] | None = None
-    subspace_rate: Float[Array, "k 6"] | None = None
+    twist: Any = None
+    bias: Any = None
+    subspace_rate: Any = None
 
 
 def body_frames(
