@@ -10,9 +10,9 @@ from jaxdyn.dynamics.kinematics import (
     body_jacobian,
     kinematic_part,
     named_frame,
-    take,
     twists_in_frame,
 )
+from jaxdyn.dynamics.tree_frames import take
 from jaxdyn.lie.so3 import cross, matmul
 from jaxdyn.model.arguments import check_shapes
 from jaxdyn.model.tree import Model

@@ -13,16 +13,12 @@ import inspect
 from collections.abc import Callable
 from typing import Any
 
-import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from jaxdyn.compile import implicit, kernel, value_and_jvp, variant
 from jaxdyn.dynamics import recursions, scans, world_frame
-from jaxdyn.dynamics.kinematics import TreeFrame, body_twists, tree_frame
 from jaxdyn.dynamics.recursions import sweeps
-from jaxdyn.dynamics.world_frame import momentum, tree_inertias
-from jaxdyn.lie.so3 import matmul
 from jaxdyn.model.arguments import Numbers, check_shapes, check_state
 from jaxdyn.model.tree import Model
 from jaxdyn.systems.system import System, symbols
@@ -41,7 +37,7 @@ def mass_matrix(model: Model | System, q: Float[Array, " nq"], t: Numbers = 0.0)
     Source: Murray, Li & Sastry (1994), eq. 4.19; EQUATIONS sections 2 and 4.
     """
     if isinstance(model, System):
-        return _system_quantity(model, "mass_matrix", *check_state(model, q=q, t=t))
+        return system_quantity(model, "mass_matrix", *check_state(model, q=q, t=t))
     (q,) = check_shapes(model, q=q)
     if model.nb > MAX_BODIES or model.topology.ancestors.sum() > MAX_PAIRS:
         return world_frame.mass_matrix_by_loops(model, q)
@@ -66,7 +62,7 @@ def coriolis_matrix(
     Source: EQUATIONS section 4, Cs and erratum E11.
     """
     if isinstance(model, System):
-        return _system_quantity(model, "coriolis_matrix", *check_state(model, q=q, v=v, t=t))
+        return system_quantity(model, "coriolis_matrix", *check_state(model, q=q, v=v, t=t))
     q, v = check_shapes(model, q=q, v=v)
     return _by_matrices(world_frame.coriolis_matrix, model, q, v)
 
@@ -83,7 +79,7 @@ def gravity_force(model: Model | System, q: Float[Array, " nq"], t: Numbers = 0.
     **Returns:** (nv,), N m or N: the torques that keep the mechanism at rest. Zero when `model.gravity` is None.
     """
     if isinstance(model, System):
-        return _system_quantity(model, "gravity_force", *check_state(model, q=q, t=t))
+        return system_quantity(model, "gravity_force", *check_state(model, q=q, t=t))
     (q,) = check_shapes(model, q=q)
     if model.gravity is None:
         # Zero is known without a compiled program.
@@ -103,7 +99,7 @@ def bias_force(
     **Returns:** (nv,), N m or N.
     """
     if isinstance(model, System):
-        return _system_quantity(model, "bias_force", *check_state(model, q=q, v=v, t=t))
+        return system_quantity(model, "bias_force", *check_state(model, q=q, v=v, t=t))
     q, v = check_shapes(model, q=q, v=v)
     return by_recursion(recursions.bias_force, _bias_force, model, q, v)
 
@@ -130,7 +126,7 @@ def inverse_dynamics(
     """
     if isinstance(model, System):
         q, v, a, t, _ = check_state(model, q=q, v=v, a=a, t=t, external=external)
-        return _system_quantity(model, "inverse_dynamics", q, v, a, t)
+        return system_quantity(model, "inverse_dynamics", q, v, a, t)
     q, v, a, external = check_shapes(model, q=q, v=v, a=a, external=external)
     # The recursion does not take wrenches: a kernel without them is smaller, and their forces are one linear term.
     tau = by_recursion(recursions.rnea, _inverse_dynamics, model, q, v, a)
@@ -163,7 +159,7 @@ def forward_dynamics(
     if isinstance(model, System):
         q, v, tau, time, _ = check_state(model, q=q, v=v, tau=tau, t=t, external=external)
         model.check_start(q, v, time)
-        return _system_quantity(model, "forward_dynamics", q, v, tau, time)
+        return system_quantity(model, "forward_dynamics", q, v, tau, time)
     q, v, tau, external = check_shapes(model, q=q, v=v, tau=tau, external=external)
     if external is not None:
         tau = tau + generalized_force(model, q, external)
@@ -304,57 +300,6 @@ def generalized_force(model: Model, q: Float[Array, " nq"], external: Float[Arra
     return by_recursion(world_frame.generalized_force, world_frame.generalized_force, model, q, external)
 
 
-def kinetic_energy(
-    model: Model | System, q: Float[Array, " nq"], v: Float[Array, " nv"], t: Numbers = 0.0
-) -> Float[Array, ""]:
-    r"""Kinetic energy of the bodies and the rotors.
-
-    $$T = \tfrac12 \sum_i V_i^T M_i V_i + \tfrac12 \sum_j \mathrm{armature}_j v_j^2 = \tfrac12 v^T M(q) v$$
-
-    **Arguments:** `q` (nq,); `v` (nv,).
-
-    **Returns:** (), J.
-    """
-    if isinstance(model, System):
-        return _system_quantity(model, "kinetic_energy", *check_state(model, q=q, v=v, t=t))
-    q, v = check_shapes(model, q=q, v=v)
-    return by_recursion(_kinetic_energy, _kinetic_energy, model, q, v)
-
-
-def _kinetic_energy(model: Model, q, v):
-    frame = tree_frame(model, q)
-    twists = body_twists(model, frame, v)
-    energy = 0.5 * jnp.sum(twists * jax.vmap(momentum)(tree_inertias(model, frame), twists))
-    return energy if model.armature is None else energy + 0.5 * jnp.sum(model.armature * v * v)
-
-
-def potential_energy(model: Model | System, q: Float[Array, " nq"], t: Numbers = 0.0) -> Float[Array, ""]:
-    r"""Potential energy of gravity.
-
-    $$V = -\sum_i m_i g^T c_i$$
-
-    with the world position $c_i$ of each centre of mass. Zero height is the plane through the world's origin. Far from it
-    the value is large, and small differences of it are lost to rounding.
-
-    **Arguments:** `q` (nq,).
-
-    **Returns:** (), J. Zero when `model.gravity` is None.
-    """
-    if isinstance(model, System):
-        return _system_quantity(model, "potential_energy", *check_state(model, q=q, t=t))
-    (q,) = check_shapes(model, q=q)
-    if model.gravity is None:
-        return jnp.zeros((), model.home.dtype)
-    return by_recursion(_potential_energy, _potential_energy, model, q)
-
-
-def _potential_energy(model: Model, q):
-    # Centres relative to the tree's root first; only their sum meets the large world position.
-    mass, first, origin, shift = first_moments(model, tree_frame(model, q))
-    gravity: Any = model.gravity
-    return -jnp.sum(gravity * (jnp.sum(mass) * origin + jnp.sum(first + mass[:, None] * shift, axis=0)))
-
-
 def torque_regressor(
     model: Model, q: Float[Array, " nq"], v: Float[Array, " nv"], a: Float[Array, " nv"]
 ) -> Float[Array, "nv nb10"]:
@@ -396,13 +341,13 @@ def mass_matrix_derivative(model: Model, q: Float[Array, " nq"]) -> Float[Array,
 def first_kind_symbols(model: Model | System, q: Float[Array, " nq"], t: Numbers = 0.0) -> Float[Array, "nv nv nv"]:
     """Christoffel symbols of the first kind of the mass matrix, (nv, nv, nv); see `jd.geometry.christoffel_symbols`."""
     if isinstance(model, System):
-        return _system_quantity(model, "christoffel_symbols", *check_state(model, q=q, t=t))
+        return system_quantity(model, "christoffel_symbols", *check_state(model, q=q, t=t))
     (q,) = check_shapes(model, q=q)
     _check_coordinates(model, "christoffel_symbols")
     return symbols(mass_matrix_derivative(model, q))
 
 
-def _system_quantity(system: System, name: str, *args):
+def system_quantity(system: System, name: str, *args):
     """Evaluate a quantity of a system that is no tree of bodies."""
     return _method(name, system, *args)
 
@@ -421,16 +366,3 @@ def _check_coordinates(model: Model, name: str) -> None:
             f"{name}: symbols need coordinates with v = dq/dt (nq = nv), but model {model.name!r} has joints"
             f" {', '.join(other)} (nq = {model.nq}, nv = {model.nv}); use coriolis_matrix, which needs none"
         )
-
-
-def first_moments(model: Model, frame: TreeFrame):
-    """Masses (nb,), first moments (nb, 3) in the tree frames, world position (3,) of the first tree's origin, and shifts.
-
-    A shift (3,) is the position of a body's tree frame relative to the first one: exactly zero, not a difference of distant
-    positions, for one tree.
-    """
-    mass = model.inertias[:, 0]
-    # First moments m c rather than centres c: massless bodies need no division.
-    rotated = matmul(frame.pose[:, :3, :3], model.inertias[:, 1:4, None])[..., 0]
-    origin = frame.origin[0] if model.nb else jnp.zeros((3,), mass.dtype)
-    return mass, rotated + mass[:, None] * frame.pose[:, :3, 3], origin, frame.origin - origin[None]

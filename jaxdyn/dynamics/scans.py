@@ -14,7 +14,7 @@ from jax import lax
 from jaxtyping import Array, Float
 
 from jaxdyn.compile import sweep
-from jaxdyn.dynamics.kinematics import body_subspace, map_rows, relative_poses
+from jaxdyn.dynamics.tree_frames import body_subspace, map_rows, relative_poses
 from jaxdyn.lie import se3
 from jaxdyn.lie.so3 import matmul
 from jaxdyn.model.inertia import spatial_inertia

@@ -16,7 +16,7 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from jaxdyn.compile import kernel, sweep
-from jaxdyn.dynamics.kinematics import (
+from jaxdyn.dynamics.tree_frames import (
     TreeFrame,
     body_subspace,
     body_twists,

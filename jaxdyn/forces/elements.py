@@ -13,7 +13,8 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from jaxdyn.dynamics.kinematics import body_jacobian, frame_pose, take
+from jaxdyn.dynamics.kinematics import body_jacobian, frame_pose
+from jaxdyn.dynamics.tree_frames import take
 from jaxdyn.model.arguments import Number, SystemLike, batch_hint, check_names, is_concrete
 from jaxdyn.model.configuration import difference, neutral
 from jaxdyn.model.numbers import as_float

@@ -9,7 +9,7 @@ from pinocchio_bridge import assert_close, quick
 import jaxdyn as jd
 from jaxdyn.compile import kernel
 from jaxdyn.compile.trace import program_of
-from jaxdyn.dynamics import kinematics, quantities, recursions, scans, world_frame
+from jaxdyn.dynamics import centroidal, kinematics, quantities, recursions, scans, tree_frames, world_frame
 from jaxdyn.dynamics.recursions import sweeps
 from jaxdyn.model.robots import random_tree
 
@@ -175,7 +175,7 @@ MIXED = ("revolute", "spherical", "prismatic", "planar", "free", "helical")
 @pytest.mark.parametrize("given", [False, True])
 def test_loops_of_joints_of_any_kinds(kinds, given, monkeypatch):
     """Dynamics in link frames and kinematics as native loops, against products of matrices by JAX."""
-    monkeypatch.setattr(kinematics, "MIN_BODIES_IN_LOOPS", 4)
+    monkeypatch.setattr(tree_frames, "MIN_BODIES_IN_LOOPS", 4)
     model = random_tree(3, 12, branching=1.6, skew=1.0, taper=0.9, kinds=kinds)
     model = model.replace(armature=jnp.linspace(0.1, 0.2, model.nv))
     _, v, x = state(model)
@@ -183,8 +183,8 @@ def test_loops_of_joints_of_any_kinds(kinds, given, monkeypatch):
 
     def of(form):
         def values(model, q, v, x):
-            frame = kinematics.tree_frame(model, q)
-            kinetic = quantities._kinetic_energy(model, q, v), world_frame.generalized_force(model, q, wrenches)
+            frame = tree_frames.tree_frame(model, q)
+            kinetic = centroidal._kinetic_energy(model, q, v), world_frame.generalized_force(model, q, wrenches)
             pair = form.forward_dynamics_tangent(model, q, v, x, lambda a: x * a)
             return frame, *kinetic, *pair, form.inverse_dynamics(model, q, v, x)
 
@@ -234,5 +234,5 @@ def test_code_of_kinematics_does_not_grow_with_the_bodies():
         of_all = program_of(kinematics._world_poses.__wrapped__, (), model, (q,))[1][0]
         return [len(x.body.operations) for x in of_all.subprograms]
 
-    few = kinematics.MIN_BODIES_IN_LOOPS
+    few = tree_frames.MIN_BODIES_IN_LOOPS
     assert sum(count(few)) == sum(count(2 * few))
