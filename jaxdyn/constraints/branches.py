@@ -1,17 +1,21 @@
-"""Branches of configurations: whether two neighbours on the same constraints are joined by a path without a singular position."""
+"""Degrees of freedom, and branches: whether a path without a singular position joins two neighbours on the same constraints."""
 
 import jax.numpy as jnp
 from jax import lax
-from jaxtyping import Array, Bool, Float
+from jaxtyping import Array, Bool, Float, Int
 
-from jaxdyn.compile import kernel, pseudo_inverse_by_rotations
-from jaxdyn.compile.known import stop_gradient
+from jaxdyn.compile import entry_point, kernel, pseudo_inverse_by_rotations
+from jaxdyn.compile.known import is_concrete, stop_gradient
+from jaxdyn.constraints import selection
 from jaxdyn.constraints.base import constraint_jacobian, holonomic_rows, layout
-from jaxdyn.constraints.rank import tolerance
+from jaxdyn.constraints.rank import LEAST_GAP, check_tolerance, has_clear_rank, pseudo_inverse, rank_of, tolerance
+from jaxdyn.constraints.redundancy import has_selection
+from jaxdyn.constraints.selection import UNCLEAR_RANK, independent_rows
 from jaxdyn.constraints.tolerances import coordinate_sizes
 from jaxdyn.lie.so3 import matmul
-from jaxdyn.systems.scene import Scene
-from jaxdyn.systems.system import displacement
+from jaxdyn.model.arguments import Numbers, check_state
+from jaxdyn.systems.scene import Scene, as_scene
+from jaxdyn.systems.system import SceneLike, displacement
 
 JUMP = 1.0  # rad or lengths of the mechanism: a longer way between two configurations is no small step
 
@@ -77,3 +81,53 @@ def _sign(_, A):
 
 def _sign_by_lapack(_, A):
     return jnp.where(jnp.linalg.slogdet(A)[0] < 0, -1.0, 1.0).astype(A.dtype)
+
+
+def degrees_of_freedom(
+    scene: SceneLike, q: Float[Array, " nq"], t: Numbers = 0.0, *, rank_tol: float | None = None
+) -> int | Int[Array, ""]:
+    r"""Degrees of freedom at a configuration: nv minus the rank of the constraints' rows A(q, t).
+
+    Dependent rows count once, so that the count is right for overconstrained linkages. It counts independent velocities at
+    this q: it is larger in singular positions, and rolling reduces it though all configurations remain reachable. Loops whose
+    rows are dependent only where the loops are closed need a q of `jd.assemble`. Distances are compared in
+    units of the mechanism's length, each row scaled to length 1; rows at rounding level count as zero.
+
+    **Arguments:** `scene`, a `Scene` or a system; `q` (nq,); `t`, s; `rank_tol`: singular values below `rank_tol` times the
+    largest count as zero, by default $\epsilon^{4/7}$, 1e-9 in float64.
+
+    **Returns:** an int for concrete arguments, an integer array () for traced ones, which is -1 where rounding of the numbers
+    hides the rank.
+
+    **Raises:** ValueError for shapes that do not fit, a `rank_tol` outside (0, 1), and for a rank that is not clear.
+
+    Source: EQUATIONS section 7; the rank is the trace of $A A^+$.
+
+    ```python
+    count = jd.degrees_of_freedom(jd.scenes.four_bar(), jd.scenes.four_bar.start()[0])  # 1
+    ```
+    """
+    scene = as_scene(scene)
+    q, t = check_state(scene.system, q=q, t=t)
+    rank_tol = check_tolerance(rank_tol)
+    if not layout(scene):
+        return scene.nv
+    free = count_free(independent_rows(scene, q, t, rank_tol), q, t, rank_tol)
+    if not is_concrete(free):
+        return free
+    if free < 0:
+        raise ValueError(f"{UNCLEAR_RANK}; give numbers with more digits, or a rank_tol between them")
+    return int(free)
+
+
+@entry_point
+def count_free(scene: Scene, q, t, rank_tol: float | None) -> Int[Array, ""]:
+    """`degrees_of_freedom` by rows that are taken as they are; -1 where the rank is not clear."""
+    # Scaled rows: the singular values of metres next to radians depend on the unit. The rank is by the
+    # pseudo-inverse that all other rank decisions use, so that they agree.
+    A = selection.unit_rows(scene, q, t)
+    inverse = pseudo_inverse(A, tolerance(rank_tol, A), True)
+    is_clear = has_clear_rank(A, inverse, rank_tol)
+    if has_selection(scene):
+        is_clear = is_clear & (scene.constraints[0].gap >= LEAST_GAP)
+    return jnp.where(is_clear, scene.nv - rank_of(A, inverse), -1).astype(jnp.int32)

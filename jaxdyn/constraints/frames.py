@@ -23,7 +23,8 @@ from jaxtyping import Array, Float
 
 from jaxdyn.compile import variant
 from jaxdyn.constraints.base import Constraint
-from jaxdyn.dynamics.kinematics import BodyFrames, body_frames, take
+from jaxdyn.dynamics.kinematics import BodyFrames, body_frames
+from jaxdyn.dynamics.tree_frames import take
 from jaxdyn.lie import se3, so3
 from jaxdyn.lie.so3 import matmul
 from jaxdyn.model.arguments import Number, SystemLike

@@ -22,7 +22,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import lax
-from jaxtyping import Array, Float, Int
+from jaxtyping import Array, Float
 
 from jaxdyn.compile import (
     Evaluation,
@@ -39,13 +39,9 @@ from jaxdyn.constraints.base import constraint_jacobian, holonomic_rows, layout,
 from jaxdyn.constraints.codes import RESULTS
 from jaxdyn.constraints.rank import (
     LEAST_GAP,
-    check_tolerance,
     clear_pivot,
     eps_of,
-    has_clear_rank,
     least_pivot_of,
-    pseudo_inverse,
-    rank_of,
     solve_with_damping,
     tolerance,
 )
@@ -73,7 +69,7 @@ _FAR, _NEWTON_STEPS = 0.2, 12
 # The rows are chosen anew when their least pivot has fallen to this part of its value at their choice. A pivot is the square of a
 # sine, so that the sine of the angle between rows has halved.
 _EXCHANGED_AT = 0.25
-_UNCLEAR = (
+UNCLEAR_RANK = (
     "the rank of the constraints is not clear at this q: singular values that count differ by less than a factor of "
     f"{LEAST_GAP:g} from those that do not"
 )
@@ -150,7 +146,7 @@ def choose_rows(scene: SceneLike, q: Float[Array, " nq"], t: Numbers = 0.0) -> S
             return scene
         if not min(selection.gap, selection.gap_here) >= LEAST_GAP:
             raise ValueError(
-                f"q: {_UNCLEAR}; give numbers with more digits, or an assembled q away from singular positions"
+                f"q: {UNCLEAR_RANK}; give numbers with more digits, or an assembled q away from singular positions"
             )
     selection = hide_unclear(selection)._replace(gap=jnp.minimum(selection.gap, selection.gap_here))
     return keep_rows(scene, selection, is_held=True)
@@ -400,53 +396,3 @@ def _select_far_away(scene: Scene, q, t, sure, apart: float):
 def most_rounding(dtype) -> float:
     """Opening of dropped rows above which they are not redundant but contradict the others."""
     return 10 * clear_pivot(np.zeros((), dtype))
-
-
-def degrees_of_freedom(
-    scene: SceneLike, q: Float[Array, " nq"], t: Numbers = 0.0, *, rank_tol: float | None = None
-) -> int | Int[Array, ""]:
-    r"""Degrees of freedom at a configuration: nv minus the rank of the constraints' rows A(q, t).
-
-    Dependent rows count once, so that the count is right for overconstrained linkages. It counts independent velocities at
-    this q: it is larger in singular positions, and rolling reduces it though all configurations remain reachable. Loops whose
-    rows are dependent only where the loops are closed need a q of `jd.assemble`. Distances are compared in
-    units of the mechanism's length, each row scaled to length 1; rows at rounding level count as zero.
-
-    **Arguments:** `scene`, a `Scene` or a system; `q` (nq,); `t`, s; `rank_tol`: singular values below `rank_tol` times the
-    largest count as zero, by default $\epsilon^{4/7}$, 1e-9 in float64.
-
-    **Returns:** an int for concrete arguments, an integer array () for traced ones, which is -1 where rounding of the numbers
-    hides the rank.
-
-    **Raises:** ValueError for shapes that do not fit, a `rank_tol` outside (0, 1), and for a rank that is not clear.
-
-    Source: EQUATIONS section 7; the rank is the trace of $A A^+$.
-
-    ```python
-    count = jd.degrees_of_freedom(jd.scenes.four_bar(), jd.scenes.four_bar.start()[0])  # 1
-    ```
-    """
-    scene = as_scene(scene)
-    q, t = check_state(scene.system, q=q, t=t)
-    rank_tol = check_tolerance(rank_tol)
-    if not layout(scene):
-        return scene.nv
-    free = count_free(independent_rows(scene, q, t, rank_tol), q, t, rank_tol)
-    if not is_concrete(free):
-        return free
-    if free < 0:
-        raise ValueError(f"{_UNCLEAR}; give numbers with more digits, or a rank_tol between them")
-    return int(free)
-
-
-@entry_point
-def count_free(scene: Scene, q, t, rank_tol: float | None) -> Int[Array, ""]:
-    """`degrees_of_freedom` by rows that are taken as they are; -1 where the rank is not clear."""
-    # Scaled rows: the singular values of metres next to radians depend on the unit. The rank is by the
-    # pseudo-inverse that all other rank decisions use, so that they agree.
-    A = unit_rows(scene, q, t)
-    inverse = pseudo_inverse(A, tolerance(rank_tol, A), True)
-    is_clear = has_clear_rank(A, inverse, rank_tol)
-    if has_selection(scene):
-        is_clear = is_clear & (scene.constraints[0].gap >= LEAST_GAP)
-    return jnp.where(is_clear, scene.nv - rank_of(A, inverse), -1).astype(jnp.int32)

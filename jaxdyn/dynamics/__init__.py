@@ -6,8 +6,6 @@ the matrix form in world axes and in link frames, and scans for many bodies (EQU
 Imports `systems` and what is below it. The four algorithms do not import each other.
 """
 
-from jaxdyn.dynamics.articulated_motion import ArticulatedBodies as ArticulatedBodies
-from jaxdyn.dynamics.articulated_motion import articulated_bodies as articulated_bodies
 from jaxdyn.dynamics.base_frame import base_twists as base_twists
 from jaxdyn.dynamics.base_frame import link_adjoints as link_adjoints
 from jaxdyn.dynamics.center_of_mass import ComDynamics as ComDynamics
@@ -16,6 +14,8 @@ from jaxdyn.dynamics.centroidal import centroidal_momentum as centroidal_momentu
 from jaxdyn.dynamics.centroidal import centroidal_momentum_matrix as centroidal_momentum_matrix
 from jaxdyn.dynamics.frame_motion import frame_acceleration as frame_acceleration
 from jaxdyn.dynamics.frame_motion import jacobian_dot_v as jacobian_dot_v
+from jaxdyn.dynamics.joint_wrenches import ArticulatedBodies as ArticulatedBodies
+from jaxdyn.dynamics.joint_wrenches import articulated_bodies as articulated_bodies
 from jaxdyn.dynamics.joint_wrenches import joint_wrench as joint_wrench
 from jaxdyn.dynamics.kinematics import spatial_jacobian as spatial_jacobian
 from jaxdyn.dynamics.link_frame import NewtonEulerMatrices as NewtonEulerMatrices

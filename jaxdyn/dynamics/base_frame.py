@@ -15,7 +15,8 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from jaxdyn.compile import kernel
-from jaxdyn.dynamics.kinematics import body_subspace, forward_kinematics, take
+from jaxdyn.dynamics.kinematics import forward_kinematics
+from jaxdyn.dynamics.tree_frames import body_subspace, take
 from jaxdyn.lie import se3
 from jaxdyn.lie.so3 import matmul
 from jaxdyn.model.arguments import check_shapes

@@ -1,15 +1,82 @@
-"""Centre of mass, and momentum about it (EQUATIONS section 11)."""
+"""Sums over bodies: energies, centre of mass, and momentum about it (EQUATIONS section 11)."""
+
+from typing import Any
 
 import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from jaxdyn.dynamics.kinematics import TreeFrame, body_twists, sum_to_coordinates, take, tree_frame
-from jaxdyn.dynamics.quantities import by_recursion, first_moments
+from jaxdyn.dynamics.quantities import by_recursion, system_quantity
+from jaxdyn.dynamics.tree_frames import TreeFrame, body_twists, sum_to_coordinates, take, tree_frame
 from jaxdyn.dynamics.world_frame import momentum, tree_inertias
-from jaxdyn.lie.so3 import cross
-from jaxdyn.model.arguments import check_shapes
+from jaxdyn.lie.so3 import cross, matmul
+from jaxdyn.model.arguments import Numbers, check_shapes, check_state
 from jaxdyn.model.tree import Model
+from jaxdyn.systems.system import System
+
+
+def kinetic_energy(
+    model: Model | System, q: Float[Array, " nq"], v: Float[Array, " nv"], t: Numbers = 0.0
+) -> Float[Array, ""]:
+    r"""Kinetic energy of the bodies and the rotors.
+
+    $$T = \tfrac12 \sum_i V_i^T M_i V_i + \tfrac12 \sum_j \mathrm{armature}_j v_j^2 = \tfrac12 v^T M(q) v$$
+
+    **Arguments:** `q` (nq,); `v` (nv,).
+
+    **Returns:** (), J.
+    """
+    if isinstance(model, System):
+        return system_quantity(model, "kinetic_energy", *check_state(model, q=q, v=v, t=t))
+    q, v = check_shapes(model, q=q, v=v)
+    return by_recursion(_kinetic_energy, _kinetic_energy, model, q, v)
+
+
+def _kinetic_energy(model: Model, q, v):
+    frame = tree_frame(model, q)
+    twists = body_twists(model, frame, v)
+    energy = 0.5 * jnp.sum(twists * jax.vmap(momentum)(tree_inertias(model, frame), twists))
+    return energy if model.armature is None else energy + 0.5 * jnp.sum(model.armature * v * v)
+
+
+def potential_energy(model: Model | System, q: Float[Array, " nq"], t: Numbers = 0.0) -> Float[Array, ""]:
+    r"""Potential energy of gravity.
+
+    $$V = -\sum_i m_i g^T c_i$$
+
+    with the world position $c_i$ of each centre of mass. Zero height is the plane through the world's origin. Far from it
+    the value is large, and small differences of it are lost to rounding.
+
+    **Arguments:** `q` (nq,).
+
+    **Returns:** (), J. Zero when `model.gravity` is None.
+    """
+    if isinstance(model, System):
+        return system_quantity(model, "potential_energy", *check_state(model, q=q, t=t))
+    (q,) = check_shapes(model, q=q)
+    if model.gravity is None:
+        return jnp.zeros((), model.home.dtype)
+    return by_recursion(_potential_energy, _potential_energy, model, q)
+
+
+def _potential_energy(model: Model, q):
+    # Centres relative to the tree's root first; only their sum meets the large world position.
+    mass, first, origin, shift = first_moments(model, tree_frame(model, q))
+    gravity: Any = model.gravity
+    return -jnp.sum(gravity * (jnp.sum(mass) * origin + jnp.sum(first + mass[:, None] * shift, axis=0)))
+
+
+def first_moments(model: Model, frame: TreeFrame):
+    """Masses (nb,), first moments (nb, 3) in the tree frames, world position (3,) of the first tree's origin, and shifts.
+
+    A shift (3,) is the position of a body's tree frame relative to the first one: exactly zero, not a difference of distant
+    positions, for one tree.
+    """
+    mass = model.inertias[:, 0]
+    # First moments m c rather than centres c: massless bodies need no division.
+    rotated = matmul(frame.pose[:, :3, :3], model.inertias[:, 1:4, None])[..., 0]
+    origin = frame.origin[0] if model.nb else jnp.zeros((3,), mass.dtype)
+    return mass, rotated + mass[:, None] * frame.pose[:, :3, 3], origin, frame.origin - origin[None]
 
 
 def center_of_mass(model: Model, q: Float[Array, " nq"]) -> Float[Array, "3"]:

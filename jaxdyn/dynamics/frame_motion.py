@@ -5,14 +5,14 @@ from jaxtyping import Array, Float
 
 from jaxdyn.compile import kernel
 from jaxdyn.dynamics.kinematics import (
+    all_coordinates,
+    body_frames,
     body_jacobian,
-    body_twists,
     kinematic_part,
     named_frame,
-    subspace_rate,
-    tree_frame,
-    twist_columns,
+    twists_in_frame,
 )
+from jaxdyn.dynamics.tree_frames import take
 from jaxdyn.lie.so3 import cross, matmul
 from jaxdyn.model.arguments import check_shapes
 from jaxdyn.model.tree import Model
@@ -48,10 +48,10 @@ def frame_jacobian(
 @kernel(static=1)
 def _jacobian(body: int, tree, q):
     model, offset = tree
-    frame = tree_frame(model, q)
-    columns = twist_columns(model, frame, body, offset, frame.subspace)
+    frames = body_frames(model, q, [body])
+    columns = all_coordinates(model, frames, twists_in_frame(frames, offset, frames.subspace))
     # The body Jacobian holds both parts in the frame's axes at its origin; rotating them changes axes, not the point.
-    turn = matmul(frame.pose[body], jnp.asarray(offset))[:3, :3]
+    turn = matmul(frames.pose[0], jnp.asarray(offset))[:3, :3]
     return jnp.concatenate([matmul(turn, columns[:, :3].T), matmul(turn, columns[:, 3:].T)])
 
 
@@ -78,9 +78,9 @@ def frame_velocity(
 @kernel(static=1)
 def _velocity(body: int, tree, q, v):
     model, offset = tree
-    frame = tree_frame(model, q)
+    frames = body_frames(model, q, [body], v)
     # The tree frame has the world's axes, so only the point of reference moves: v_p = v + omega x r.
-    twist, lever = body_twists(model, frame, v)[body], matmul(frame.pose[body], jnp.asarray(offset))[:3, 3]
+    twist, lever = frames.twist[0], matmul(frames.pose[0], jnp.asarray(offset))[:3, 3]
     return jnp.concatenate([twist[:3] + cross(twist[3:], lever), twist[3:]])
 
 
@@ -117,14 +117,14 @@ def frame_acceleration(
 @kernel(static=1)
 def _acceleration(body: int, tree, q, v, a):
     model, offset = tree
-    frame = tree_frame(model, q)
-    twists = body_twists(model, frame, v)
+    frames = body_frames(model, q, [body], v)
+    v, a = (take(x, frames.coordinates)[:, None] for x in (v, a))
     # A = sum of S_k a_k + dS_k/dt v_k, row by row, before the sum over the frame's own coordinates.
-    rows = frame.subspace * a[:, None] + subspace_rate(model, frame, twists) * v[:, None]
+    rows = frames.subspace * a + frames.subspace_rate * v
     # The tree frame is inertial, with the world's axes: rates of twists are componentwise.
-    rate = jnp.sum(twist_columns(model, frame, body, offset, rows), axis=0)
-    twist = jnp.sum(twist_columns(model, frame, body, offset, frame.subspace * v[:, None]), axis=0)
-    turn = matmul(frame.pose[body], jnp.asarray(offset))[:3, :3]
+    rate = jnp.sum(twists_in_frame(frames, offset, rows), axis=0)
+    twist = jnp.sum(twists_in_frame(frames, offset, frames.subspace * v), axis=0)
+    turn = matmul(frames.pose[0], jnp.asarray(offset))[:3, :3]
     # From the rate of the body twist to the acceleration of the origin: dv/dt + omega x v.
     linear = rate[:3] + cross(twist[3:], twist[:3])
     return jnp.concatenate([matmul(turn, linear[:, None])[:, 0], matmul(turn, rate[3:, None])[:, 0]])
@@ -157,6 +157,6 @@ def jacobian_dot_v(
 @kernel(static=1)
 def _jacobian_dot_v(body: int, tree, q, v):
     model, offset = tree
-    frame = tree_frame(model, q)
-    rate = subspace_rate(model, frame, body_twists(model, frame, v)) * v[:, None]
-    return jnp.sum(twist_columns(model, frame, body, offset, rate), axis=0)
+    frames = body_frames(model, q, [body], v)
+    rate = frames.subspace_rate * take(v, frames.coordinates)[:, None]
+    return jnp.sum(twists_in_frame(frames, offset, rate), axis=0)

@@ -1,12 +1,14 @@
-"""Joint wrenches: the wrench transmitted through each joint of a tree in motion."""
+"""Wrenches through the joints of a tree in motion, and its articulated bodies, which give them as functions of accelerations."""
 
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from jaxdyn.compile import kernel
-from jaxdyn.dynamics.kinematics import tree_frame
+from jaxdyn.compile import entry_point, kernel
+from jaxdyn.dynamics import scans
 from jaxdyn.dynamics.quantities import MAX_BODIES
+from jaxdyn.dynamics.tree_frames import tree_frame
 from jaxdyn.dynamics.world_frame import joint_wrenches
 from jaxdyn.lie import se3
 from jaxdyn.lie.so3 import matmul
@@ -75,3 +77,56 @@ def _in_world(model: Model, q, v, a, external=None):
     # Tree frames have the world's axes, so the rotation of the pose is that in the world.
     turn = frame.pose[:, :3, :3]
     return jnp.concatenate([matmul(turn, wrenches[:, :3, None]), matmul(turn, wrenches[:, 3:, None])], 1)[..., 0]
+
+
+class ArticulatedBodies(eqx.Module):
+    r"""Articulated inertia and bias of each body (see `articulated_bodies`), in the body's frame.
+
+    - `inertias` (nb, 6, 6): $\hat M_i$, symmetric; kg, kg m, kg m^2.
+    - `biases` (nb, 6): $b_i$; N, N m.
+    """
+
+    inertias: Float[Array, "nb 6 6"]
+    biases: Float[Array, "nb 6"]
+
+
+def articulated_bodies(
+    model: Model,
+    q: Float[Array, " nq"],
+    v: Float[Array, " nv"],
+    tau: Float[Array, " nv"],
+    *,
+    external: Float[Array, "nb 6"] | None = None,
+) -> ArticulatedBodies:
+    r"""Articulated inertias and biases of all bodies.
+
+    $$F_i = \hat M_i \dot V_i + b_i$$
+
+    $F_i$ is the wrench that joint i transmits to its body (`joint_wrench`), with the joints beyond it free to move under
+    tau. $\dot V_i$ is the body's twist rate less gravity: it starts from $\dot V_0 = (-g, 0)$, as in `newton_euler_matrices`.
+
+    **Arguments:** `q` (nq,); `v` (nv,); `tau` (nv,), N m or N; `external` (nb, 6), wrench (f, tau) ON each body, at its
+    frame's origin and in its axes (N, N m), or None.
+
+    **Returns:** `ArticulatedBodies`. The inertias depend on q alone, and
+    $\det M = \prod_i \det(S_i^T \hat M_i S_i + \mathrm{armature}_i)$. NaN where M is not positive definite.
+
+    **Raises:** ValueError for shapes that do not fit.
+
+    Source: EQUATIONS section 5 with erratum E12; Featherstone (2008), section 7.2.
+
+    ```python
+    bodies = jd.dynamics.articulated_bodies(model, q, v, tau)
+    pivot = bodies.inertias[-1][5, 5]  # of a last joint that turns about z, without armature
+    ```
+    """
+    q, v, tau, external = check_shapes(model, q=q, v=v, tau=tau, external=external)
+    # The scans need at least one body: the largest size of a joint is a maximum over them.
+    if model.nb == 0:
+        return ArticulatedBodies(jnp.zeros((0, 6, 6), q.dtype), jnp.zeros((0, 6), q.dtype))
+    return _articulated_bodies(model, q, v, tau, external)
+
+
+@entry_point
+def _articulated_bodies(model: Model, q, v, tau, external) -> ArticulatedBodies:
+    return ArticulatedBodies(*scans.articulated_bodies(model, q, v, tau, external))

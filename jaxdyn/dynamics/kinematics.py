@@ -1,125 +1,24 @@
 """Kinematics of trees: products of exponentials, Jacobians of named frames and their rates.
 
-The pose of body i is T_i = (product over its ancestors j, root first, of home_j exp(hat(S_j) q_j)), the product of
-exponentials of Murray, Li & Sastry (1994), eq. 3.3, with body frames instead of base-frame screws. The product along
-the tree is taken by pointer jumping: after step k every body holds the product of its last 2^k joints, so log2(depth)
-batched 4x4 products give all poses and the program stays short however many bodies there are.
-
-Quantities summed over bodies are expressed in one *tree frame*: axes parallel to the world's, origin at the origin of
-the tree's root body. Positions in it are built without ever adding the root's own position, so a robot far from the
-world's origin is computed exactly as one at home.
+Poses are those of `tree_frames`.
 """
 
 import functools
 from collections.abc import Sequence
 from typing import Any, NamedTuple
 
-import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from jaxdyn.compile import kernel, variant
+from jaxdyn.compile import kernel
 from jaxdyn.compile.known import array_namespace
+from jaxdyn.dynamics.tree_frames import body_twists, map_rows, subspace_rate, take, tree_frame
 from jaxdyn.lie import se3
 from jaxdyn.lie.so3 import matmul
 from jaxdyn.model.arguments import Given, check_shapes
-from jaxdyn.model.joints import KINDS, SCREW_KINDS, joint_transform, screw_transform
 from jaxdyn.model.topology import frame_index
-from jaxdyn.model.tree import Model, Topology, geometry
-
-
-class TreeFrame(NamedTuple):
-    """A configuration seen from the tree frames (one per root body).
-
-    - `pose` (nb, 4, 4): body frame in its tree frame (m).
-    - `origin` (nb, 3): world position of the tree frame's origin, for each body (m).
-    - `subspace` (nv, 6): row k is the twist, in the tree frame, of the motion with v_k = 1 alone. As a twist of the
-      fixed frame that coincides with the tree frame at this instant it does not depend on where the root body is.
-    """
-
-    pose: Float[Array, "nb 4 4"]
-    origin: Float[Array, "nb 3"]
-    subspace: Float[Array, "nv 6"]
-
-
-def relative_poses(model: Model, q: Float[Array, " nq"]) -> Float[Array, "nb 4 4"]:
-    """Pose of each body frame in its parent body frame (the world's for roots), home @ exp(hat(S) q)."""
-    topology = model.topology
-    home, screws = map(jnp.asarray, geometry(model))
-    order, transforms = [], []
-    # One batched evaluation per joint kind, instead of one per joint: the program does not grow with the number of
-    # bodies.
-    for kind, bodies in _bodies_by_kind(topology):
-        if kind in SCREW_KINDS:
-            coordinates = np.array([topology.q_slices[i].start for i in bodies])
-            place = jax.vmap(functools.partial(screw_transform, kind))
-            transforms.append(place(take(screws, bodies), take(q, coordinates)))
-        else:
-            coordinates = np.array([np.arange(topology.nq)[topology.q_slices[i]] for i in bodies])
-            # The screw is not read by these kinds.
-            transforms.append(jax.vmap(lambda qj, kind=kind: joint_transform(kind, screws[0], qj))(q[coordinates]))
-        order.extend(bodies)
-    if not transforms:
-        return home
-    transforms_by_kind = transforms[0] if len(transforms) == 1 else jnp.concatenate(transforms)
-    return matmul(home, take(transforms_by_kind, np.argsort(order)))
-
-
-def body_subspace(model: Model) -> Float[Array, "nv 6"]:
-    """Motion subspace of every joint in its own body frame, one row per velocity coordinate."""
-    topology = model.topology
-    fixed = np.zeros((topology.nv, 6))
-    is_screw = np.zeros(topology.nv, bool)
-    for kind, place in zip(topology.kinds, topology.v_slices, strict=True):
-        if kind in SCREW_KINDS:
-            is_screw[place] = True
-        else:
-            fixed[place] = np.eye(6)[list(KINDS[kind].columns)]
-    # The screws of other kinds are zero leaves, whose values are not read.
-    constant = jnp.asarray(fixed, model.screws.dtype)
-    if not is_screw.any():
-        return constant
-    screws = take(jnp.asarray(geometry(model)[1]), topology.dof_body)
-    return screws if is_screw.all() else jnp.where(is_screw[:, None], screws, constant)
-
-
-def tree_frame(model: Model, q: Float[Array, " nq"]) -> TreeFrame:
-    """Poses and motion subspace in the tree frames (see `TreeFrame`)."""
-    topology = model.topology
-    local = relative_poses(model, q)
-    is_root = np.array([parent < 0 for parent in topology.parents], bool)
-    # Shared by all bodies of one tree; different trees have different frames.
-    origin = take(local[:, :3, 3], topology.roots)
-    # A root's own translation is replaced by zero before the product, not subtracted after it.
-    mask = np.ones((topology.nb, 4, 4), bool)
-    mask[is_root, :3, 3] = False
-    pose = jnp.where(mask, local, jnp.zeros_like(local))
-    pose = _tree_products(topology, pose)
-    # S is constant in the body's frame; Ad carries it to the tree frame.
-    subspace = jax.vmap(se3.Ad_apply)(take(pose, topology.dof_body), body_subspace(model))
-    return TreeFrame(pose, origin, subspace)
-
-
-def _products_in_order(topology: Topology, pose: Float[Array, "nb 4 4"]) -> Float[Array, "nb 4 4"]:
-    """`_tree_products` with one product per body: in a kernel pointer jumping would multiply the operations by log2(depth)."""
-    products: list = []
-    for i, parent in enumerate(topology.parents):
-        products.append(pose[i] if parent < 0 else matmul(products[parent], pose[i]))
-    return jnp.stack(products) if products else pose
-
-
-@variant(_products_in_order)
-def _tree_products(topology: Topology, pose: Float[Array, "nb 4 4"]) -> Float[Array, "nb 4 4"]:
-    """Products of the poses of all bodies above each body, root first.
-
-    By pointer jumping, with log2(depth) products of all bodies.
-    """
-    # The extra row is the world: a jump beyond the root multiplies by the identity.
-    world = jnp.eye(4, dtype=pose.dtype)[None]
-    for table in topology.jumps:
-        pose = matmul(jnp.concatenate([pose, world])[table], pose)
-    return pose
+from jaxdyn.model.tree import Model, Topology
 
 
 class BodyFrames(NamedTuple):
@@ -130,7 +29,7 @@ class BodyFrames(NamedTuple):
       `TreeFrame.subspace`.
     - `velocity_mask` (n, k) of bool: which frame each of these coordinates moves.
     - `twist`, `bias` (n, 6): twist of each frame, as a twist of the fixed frame that now coincides with the tree frame, and
-      its rate at a = 0; None when no velocity was given.
+      its rate at a = 0; `subspace_rate` (k, 6) the rates of `subspace`; None when no velocity was given.
     """
 
     pose: Float[Array, "n 4 4"]
@@ -138,8 +37,9 @@ class BodyFrames(NamedTuple):
     subspace: Float[Array, "k 6"]
     coordinates: np.ndarray
     velocity_mask: np.ndarray
-    twist: Float[Array, "n 6"] | None = None
-    bias: Float[Array, "n 6"] | None = None
+    twist: Any = None
+    bias: Any = None
+    subspace_rate: Any = None
 
 
 def body_frames(
@@ -153,7 +53,9 @@ def body_frames(
         pose = jnp.broadcast_to(jnp.eye(4, dtype=q.dtype), (n, 4, 4))
         none, at_rest = np.zeros(0, int), None if v is None else jnp.zeros((n, 6), q.dtype)
         nowhere = jnp.zeros((0, 6), q.dtype)
-        return BodyFrames(pose, jnp.zeros((n, 3), q.dtype), nowhere, none, np.zeros((n, 0), bool), at_rest, at_rest)
+        return BodyFrames(
+            pose, jnp.zeros((n, 3), q.dtype), nowhere, none, np.zeros((n, 0), bool), at_rest, at_rest, nowhere
+        )
     coordinates = _coordinate_indices(topology.v_slices, kept)
     # Constraints touch few bodies of a large tree; the remaining bodies need not be placed at all.
     if len(kept) < model.nb:
@@ -171,7 +73,7 @@ def body_frames(
     rates = subspace_rate(model, frame, body_twists(model, frame, v))
     # One product gives the twists and their rates.
     sums = matmul(jnp.asarray(moved_by, q.dtype), jnp.concatenate([frame.subspace, rates], axis=1) * v[:, None])
-    return frames._replace(twist=sums[:, :6], bias=sums[:, 6:])
+    return frames._replace(twist=sums[:, :6], bias=sums[:, 6:], subspace_rate=rates)
 
 
 def _prune(model: Model, kept: list[int]) -> Model:
@@ -208,26 +110,6 @@ def _prune(model: Model, kept: list[int]) -> Model:
 
 def _coordinate_indices(slices, kept: list[int]) -> np.ndarray:
     return np.concatenate([np.arange(slices[i].start, slices[i].stop) for i in kept])
-
-
-def body_twists(model: Model, frame: TreeFrame, v: Float[Array, " nv"]) -> Float[Array, "nb 6"]:
-    """Twist of every body in its tree frame: V_i = sum of S_k v_k over the coordinates k that move body i."""
-    return sum_to_bodies(model, frame.subspace * v[:, None])
-
-
-def subspace_rate(model: Model, frame: TreeFrame, twists: Float[Array, "nb 6"]) -> Float[Array, "nv 6"]:
-    """Rate of the motion subspace: dS_k/dt = ad_V S_k, V the twist of the body that carries S_k with it."""
-    return jax.vmap(se3.ad_apply)(take(twists, model.topology.dof_body), frame.subspace)
-
-
-def sum_to_bodies(model: Model, rows: Float[Array, "nv n"]) -> Float[Array, "nb n"]:
-    """G rows: for each body the sum of the rows of the coordinates that move it."""
-    return matmul(jnp.asarray(model.topology.dof_ancestors, rows.dtype), rows)
-
-
-def sum_to_coordinates(model: Model, rows: Float[Array, "nb n"]) -> Float[Array, "nv n"]:
-    """G^T rows: for each velocity coordinate the sum of the rows of the bodies that it moves."""
-    return matmul(jnp.asarray(model.topology.dof_ancestors.T, rows.dtype), rows)
 
 
 def forward_kinematics(model: Model, q: Float[Array, " nq"]) -> Float[Array, "nb 4 4"]:
@@ -308,8 +190,8 @@ def body_jacobian(model: Model, q: Float[Array, " nq"], frame: str | None) -> Fl
 @kernel(static=1)
 def _body_jacobian(body: int, tree, q):
     model, offset = tree
-    frame = tree_frame(model, q)
-    return twist_columns(model, frame, body, offset, frame.subspace).T
+    frames = body_frames(model, q, [body])
+    return all_coordinates(model, frames, twists_in_frame(frames, offset, frames.subspace)).T
 
 
 def spatial_jacobian(model: Model, q: Float[Array, " nq"], frame: str | None) -> Float[Array, "6 nv"]:
@@ -335,9 +217,10 @@ def spatial_jacobian(model: Model, q: Float[Array, " nq"], frame: str | None) ->
 
 @kernel(static=1)
 def _spatial_jacobian(body: int, model: Model, q):
-    frame = tree_frame(model, q)
-    shift = se3.from_parts(jnp.eye(3, dtype=model.home.dtype), frame.origin[body])
-    return jax.vmap(se3.Ad_apply, (None, 0), 1)(shift, _mask_path(model, body, frame.subspace))
+    frames = body_frames(model, q, [body])
+    shift = se3.from_parts(jnp.eye(3, dtype=model.home.dtype), frames.origin[0])
+    columns = map_rows(functools.partial(se3.Ad_apply, shift), frames.subspace)
+    return all_coordinates(model, frames, columns).T
 
 
 def kinematic_part(model: Model) -> Model:
@@ -346,21 +229,6 @@ def kinematic_part(model: Model) -> Model:
     if all(x is None for x in (model.gravity, model.armature)):
         return model
     return model.replace(gravity=None, armature=None)
-
-
-def take(rows: Array, index: np.ndarray) -> Array:
-    """`rows[index]` for a constant index; no operation when the index lists all rows in order."""
-    index = np.asarray(index)
-    # A gather stays an operation of the program even where it moves nothing.
-    if index.shape == rows.shape[:1] and (index == np.arange(len(index))).all():
-        return rows
-    return rows[index]
-
-
-def _bodies_by_kind(topology: Topology) -> list[tuple[str, np.ndarray]]:
-    # The two kinds differ in limits only and share one batch.
-    labels = np.array(["revolute" if kind == "continuous" else kind for kind in topology.kinds], str)
-    return [(str(kind), np.flatnonzero(labels == kind)) for kind in dict.fromkeys(labels.tolist())]
 
 
 def named_frame(model: Model, name: str | None) -> tuple[int, Any]:
@@ -374,15 +242,14 @@ def named_frame(model: Model, name: str | None) -> tuple[int, Any]:
     return model.topology.frame_bodies[index], array_namespace(poses).asarray(poses)[index]
 
 
-def _mask_path(model: Model, body: int, rows: Float[Array, "nv 6"]) -> Float[Array, "nv 6"]:
-    """Rows of the coordinates that move a body; other rows are zero."""
-    on_path = model.topology.dof_ancestors[body] if body >= 0 else np.zeros(model.nv, bool)
-    return jnp.where(on_path[:, None], rows, jnp.zeros_like(rows))
+def twists_in_frame(frames: BodyFrames, offset: Given, rows: Float[Array, "k 6"]) -> Float[Array, "k 6"]:
+    """Twists of the tree frame in the axes and at the origin of a frame at `offset` in the first of the bodies."""
+    pose = matmul(frames.pose[0], jnp.asarray(offset))
+    return map_rows(functools.partial(se3.Ad_inv_apply, pose), rows)
 
 
-def twist_columns(model: Model, tree: TreeFrame, body: int, offset: Given, rows: Array) -> Float[Array, "nv 6"]:
-    """Twists of the tree frame (one per coordinate) in the axes and at the origin of a frame at `offset` in a body."""
-    if body < 0:
-        return jnp.zeros_like(rows)
-    pose = matmul(tree.pose[body], jnp.asarray(offset))
-    return jax.vmap(se3.Ad_inv_apply, (None, 0))(pose, _mask_path(model, body, rows))
+def all_coordinates(model: Model, frames: BodyFrames, rows: Float[Array, "k 6"]) -> Float[Array, "nv 6"]:
+    """Rows of all velocity coordinates, zero for those that move none of the bodies."""
+    places = np.full(model.nv, len(frames.coordinates))
+    places[frames.coordinates] = np.arange(len(frames.coordinates))
+    return take(jnp.concatenate([rows, jnp.zeros((1, 6), rows.dtype)]), places)

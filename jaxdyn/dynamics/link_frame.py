@@ -18,7 +18,7 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from jaxdyn.compile import entry_point
-from jaxdyn.dynamics.kinematics import body_subspace, relative_poses
+from jaxdyn.dynamics.tree_frames import body_subspace, relative_poses
 from jaxdyn.lie import se3
 from jaxdyn.lie.so3 import matmul
 from jaxdyn.model.arguments import as_array, check_name, check_shapes

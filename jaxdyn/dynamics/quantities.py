@@ -13,16 +13,12 @@ import inspect
 from collections.abc import Callable
 from typing import Any
 
-import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from jaxdyn.compile import implicit, kernel, value_and_jvp, variant
 from jaxdyn.dynamics import recursions, scans, world_frame
-from jaxdyn.dynamics.kinematics import TreeFrame, body_twists, tree_frame
 from jaxdyn.dynamics.recursions import sweeps
-from jaxdyn.dynamics.world_frame import momentum, tree_inertias
-from jaxdyn.lie.so3 import matmul
 from jaxdyn.model.arguments import Numbers, check_shapes, check_state
 from jaxdyn.model.tree import Model
 from jaxdyn.systems.system import System, symbols
@@ -41,8 +37,10 @@ def mass_matrix(model: Model | System, q: Float[Array, " nq"], t: Numbers = 0.0)
     Source: Murray, Li & Sastry (1994), eq. 4.19; EQUATIONS sections 2 and 4.
     """
     if isinstance(model, System):
-        return _system_quantity(model, "mass_matrix", *check_state(model, q=q, t=t))
+        return system_quantity(model, "mass_matrix", *check_state(model, q=q, t=t))
     (q,) = check_shapes(model, q=q)
+    if model.nb > MAX_BODIES or model.topology.ancestors.sum() > MAX_PAIRS:
+        return world_frame.mass_matrix_by_loops(model, q)
     return by_recursion(recursions.crba, world_frame.mass_matrix, model, q)
 
 
@@ -64,9 +62,9 @@ def coriolis_matrix(
     Source: EQUATIONS section 4, Cs and erratum E11.
     """
     if isinstance(model, System):
-        return _system_quantity(model, "coriolis_matrix", *check_state(model, q=q, v=v, t=t))
+        return system_quantity(model, "coriolis_matrix", *check_state(model, q=q, v=v, t=t))
     q, v = check_shapes(model, q=q, v=v)
-    return by_recursion(world_frame.coriolis_matrix, world_frame.coriolis_matrix, model, q, v)
+    return _by_matrices(world_frame.coriolis_matrix, model, q, v)
 
 
 def gravity_force(model: Model | System, q: Float[Array, " nq"], t: Numbers = 0.0) -> Float[Array, " nv"]:
@@ -81,7 +79,7 @@ def gravity_force(model: Model | System, q: Float[Array, " nq"], t: Numbers = 0.
     **Returns:** (nv,), N m or N: the torques that keep the mechanism at rest. Zero when `model.gravity` is None.
     """
     if isinstance(model, System):
-        return _system_quantity(model, "gravity_force", *check_state(model, q=q, t=t))
+        return system_quantity(model, "gravity_force", *check_state(model, q=q, t=t))
     (q,) = check_shapes(model, q=q)
     if model.gravity is None:
         # Zero is known without a compiled program.
@@ -101,7 +99,7 @@ def bias_force(
     **Returns:** (nv,), N m or N.
     """
     if isinstance(model, System):
-        return _system_quantity(model, "bias_force", *check_state(model, q=q, v=v, t=t))
+        return system_quantity(model, "bias_force", *check_state(model, q=q, v=v, t=t))
     q, v = check_shapes(model, q=q, v=v)
     return by_recursion(recursions.bias_force, _bias_force, model, q, v)
 
@@ -128,7 +126,7 @@ def inverse_dynamics(
     """
     if isinstance(model, System):
         q, v, a, t, _ = check_state(model, q=q, v=v, a=a, t=t, external=external)
-        return _system_quantity(model, "inverse_dynamics", q, v, a, t)
+        return system_quantity(model, "inverse_dynamics", q, v, a, t)
     q, v, a, external = check_shapes(model, q=q, v=v, a=a, external=external)
     # The recursion does not take wrenches: a kernel without them is smaller, and their forces are one linear term.
     tau = by_recursion(recursions.rnea, _inverse_dynamics, model, q, v, a)
@@ -161,16 +159,17 @@ def forward_dynamics(
     if isinstance(model, System):
         q, v, tau, time, _ = check_state(model, q=q, v=v, tau=tau, t=t, external=external)
         model.check_start(q, v, time)
-        return _system_quantity(model, "forward_dynamics", q, v, tau, time)
+        return system_quantity(model, "forward_dynamics", q, v, tau, time)
     q, v, tau, external = check_shapes(model, q=q, v=v, tau=tau, external=external)
     if external is not None:
         tau = tau + generalized_force(model, q, external)
     # The derivative of the solve is M^-1 times that of inverse dynamics, so ABA itself is never differentiated.
-    form = _recursions(model)
-    if form is None:
-        return _solve_for_acceleration(model, q, v, tau)
-    tangent = _tangent_by_sweeps if form is sweeps else _tangent_by_recursions
-    return kernel(form.aba, fallback=_solve_for_acceleration, derivative=tangent)(model, q, v, tau)
+    form, tangent = {
+        recursions: (recursions.aba, _tangent_by_recursions),
+        sweeps: (sweeps.aba, _tangent_by_sweeps),
+        scans: (scans.forward_dynamics, _tangent_by_scans),
+    }[_recursions(model)]
+    return kernel(form, fallback=_solve_for_acceleration, derivative=tangent)(model, q, v, tau)
 
 
 def _kernel_with_checks(recursion: Callable) -> Callable:
@@ -203,6 +202,8 @@ rnea, crba, aba, mass_matrix_sqrt = map(
 MIN_BODIES_IN_SWEEPS = 40
 # Scalar programs of more bodies, for joints without sweeps, compile for longer than a few seconds.
 MAX_BODIES = 128
+# Pairs of a body and one above it, or itself, beyond which a mass matrix is computed by loops: each is some 60 operations.
+MAX_PAIRS = 1000
 # In small batches the mask form of the matrices is as fast as the loops.
 _MAX_BODIES_IN_MATRICES = 16
 
@@ -218,22 +219,27 @@ def _least_bodies_in_sweeps() -> int:
 
 
 def _recursions(model: Model) -> Any:
-    """The module with the recursions of a model; None where there are too many bodies."""
+    """The module with the recursions of a model."""
     # Robots with floating bases have most axes at right angles.
     least = MAX_BODIES + 1 if sweeps.has_base(model) else _least_bodies_in_sweeps()
     if model.nb >= least and sweeps.has_sweeps(model):
         return sweeps
-    return recursions if 0 < model.nb <= MAX_BODIES else None
+    return recursions if model.nb <= MAX_BODIES else scans
 
 
 def by_recursion(recursion, matrices, model: Model, *args):
-    """Evaluate recursion(model, *args) as a kernel, or by products of matrices where there is no kernel."""
+    """Evaluate recursion(model, *args) as a kernel, or the equal `matrices`, as loops over the bodies where these are many."""
     form = _recursions(model)
-    if form is sweeps and hasattr(sweeps, recursion.__name__):
-        return kernel(getattr(sweeps, recursion.__name__), fallback=matrices)(model, *args)
-    if form is None:
-        return matrices(model, *args)
+    if form is sweeps:
+        recursion = getattr(sweeps, recursion.__name__, recursion)
+    elif form is scans:
+        recursion = matrices
     return kernel(recursion, fallback=matrices)(model, *args)
+
+
+def _by_matrices(matrices, model: Model, *args):
+    """Evaluate products of matrices, whose operations grow with the square of the bodies: as a kernel of few of them."""
+    return matrices(model, *args) if model.nb > MAX_BODIES else kernel(matrices)(model, *args)
 
 
 def _inverse_dynamics(model: Model, q, v, a):
@@ -256,13 +262,14 @@ def _solve_for_acceleration(model: Model, q, v, tau):
     return implicit(model, (q, v, tau), form.forward_dynamics, tangent)
 
 
-def _acceleration_tangent(form: Any, model: Model, q, v, tau, steps):
+def _acceleration_tangent(inverse, solve, model: Model, q, v, tau, steps):
     """Tangent M^-1 (dtau - dID at fixed a) of the acceleration, for tangents of the leaves of (model, q, v, tau)."""
-    return form.aba_tangent(model, q, v, tau, _force_tangent(form.rnea, model, q, v, tau, steps))[1]
+    return solve(model, q, v, tau, _force_tangent(inverse, model, q, v, tau, steps))[1]
 
 
-_tangent_by_recursions = functools.partial(_acceleration_tangent, recursions)
-_tangent_by_sweeps = functools.partial(_acceleration_tangent, sweeps)
+_tangent_by_recursions = functools.partial(_acceleration_tangent, recursions.rnea, recursions.aba_tangent)
+_tangent_by_sweeps = functools.partial(_acceleration_tangent, sweeps.rnea, sweeps.aba_tangent)
+_tangent_by_scans = functools.partial(_acceleration_tangent, scans.inverse_dynamics, scans.forward_dynamics_tangent)
 
 
 def _force_tangent(inverse, model, q, v, tau, steps):
@@ -293,57 +300,6 @@ def generalized_force(model: Model, q: Float[Array, " nq"], external: Float[Arra
     return by_recursion(world_frame.generalized_force, world_frame.generalized_force, model, q, external)
 
 
-def kinetic_energy(
-    model: Model | System, q: Float[Array, " nq"], v: Float[Array, " nv"], t: Numbers = 0.0
-) -> Float[Array, ""]:
-    r"""Kinetic energy of the bodies and the rotors.
-
-    $$T = \tfrac12 \sum_i V_i^T M_i V_i + \tfrac12 \sum_j \mathrm{armature}_j v_j^2 = \tfrac12 v^T M(q) v$$
-
-    **Arguments:** `q` (nq,); `v` (nv,).
-
-    **Returns:** (), J.
-    """
-    if isinstance(model, System):
-        return _system_quantity(model, "kinetic_energy", *check_state(model, q=q, v=v, t=t))
-    q, v = check_shapes(model, q=q, v=v)
-    return by_recursion(_kinetic_energy, _kinetic_energy, model, q, v)
-
-
-def _kinetic_energy(model: Model, q, v):
-    frame = tree_frame(model, q)
-    twists = body_twists(model, frame, v)
-    energy = 0.5 * jnp.sum(twists * jax.vmap(momentum)(tree_inertias(model, frame), twists))
-    return energy if model.armature is None else energy + 0.5 * jnp.sum(model.armature * v * v)
-
-
-def potential_energy(model: Model | System, q: Float[Array, " nq"], t: Numbers = 0.0) -> Float[Array, ""]:
-    r"""Potential energy of gravity.
-
-    $$V = -\sum_i m_i g^T c_i$$
-
-    with the world position $c_i$ of each centre of mass. Zero height is the plane through the world's origin. Far from it
-    the value is large, and small differences of it are lost to rounding.
-
-    **Arguments:** `q` (nq,).
-
-    **Returns:** (), J. Zero when `model.gravity` is None.
-    """
-    if isinstance(model, System):
-        return _system_quantity(model, "potential_energy", *check_state(model, q=q, t=t))
-    (q,) = check_shapes(model, q=q)
-    if model.gravity is None:
-        return jnp.zeros((), model.home.dtype)
-    return by_recursion(_potential_energy, _potential_energy, model, q)
-
-
-def _potential_energy(model: Model, q):
-    # Centres relative to the tree's root first; only their sum meets the large world position.
-    mass, first, origin, shift = first_moments(model, tree_frame(model, q))
-    gravity: Any = model.gravity
-    return -jnp.sum(gravity * (jnp.sum(mass) * origin + jnp.sum(first + mass[:, None] * shift, axis=0)))
-
-
 def torque_regressor(
     model: Model, q: Float[Array, " nq"], v: Float[Array, " nv"], a: Float[Array, " nv"]
 ) -> Float[Array, "nv nb10"]:
@@ -361,7 +317,7 @@ def torque_regressor(
     Source: Atkeson, An & Hollerbach (1986).
     """
     q, v, a = check_shapes(model, q=q, v=v, a=a)
-    return by_recursion(world_frame.torque_regressor, world_frame.torque_regressor, model, q, v, a)
+    return _by_matrices(world_frame.torque_regressor, model, q, v, a)
 
 
 def mass_matrix_derivative(model: Model, q: Float[Array, " nq"]) -> Float[Array, "nv nv nv"]:
@@ -379,19 +335,19 @@ def mass_matrix_derivative(model: Model, q: Float[Array, " nq"]) -> Float[Array,
     """
     (q,) = check_shapes(model, q=q)
     _check_coordinates(model, "mass_matrix_derivative")
-    return by_recursion(world_frame.mass_matrix_derivative, world_frame.mass_matrix_derivative, model, q)
+    return _by_matrices(world_frame.mass_matrix_derivative, model, q)
 
 
 def first_kind_symbols(model: Model | System, q: Float[Array, " nq"], t: Numbers = 0.0) -> Float[Array, "nv nv nv"]:
     """Christoffel symbols of the first kind of the mass matrix, (nv, nv, nv); see `jd.geometry.christoffel_symbols`."""
     if isinstance(model, System):
-        return _system_quantity(model, "christoffel_symbols", *check_state(model, q=q, t=t))
+        return system_quantity(model, "christoffel_symbols", *check_state(model, q=q, t=t))
     (q,) = check_shapes(model, q=q)
     _check_coordinates(model, "christoffel_symbols")
     return symbols(mass_matrix_derivative(model, q))
 
 
-def _system_quantity(system: System, name: str, *args):
+def system_quantity(system: System, name: str, *args):
     """Evaluate a quantity of a system that is no tree of bodies."""
     return _method(name, system, *args)
 
@@ -410,16 +366,3 @@ def _check_coordinates(model: Model, name: str) -> None:
             f"{name}: symbols need coordinates with v = dq/dt (nq = nv), but model {model.name!r} has joints"
             f" {', '.join(other)} (nq = {model.nq}, nv = {model.nv}); use coriolis_matrix, which needs none"
         )
-
-
-def first_moments(model: Model, frame: TreeFrame):
-    """Masses (nb,), first moments (nb, 3) in the tree frames, world position (3,) of the first tree's origin, and shifts.
-
-    A shift (3,) is the position of a body's tree frame relative to the first one: exactly zero, not a difference of distant
-    positions, for one tree.
-    """
-    mass = model.inertias[:, 0]
-    # First moments m c rather than centres c: massless bodies need no division.
-    rotated = matmul(frame.pose[:, :3, :3], model.inertias[:, 1:4, None])[..., 0]
-    origin = frame.origin[0] if model.nb else jnp.zeros((3,), mass.dtype)
-    return mass, rotated + mass[:, None] * frame.pose[:, :3, 3], origin, frame.origin - origin[None]

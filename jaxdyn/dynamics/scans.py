@@ -1,19 +1,20 @@
 """Recursions as loops over the bodies: run time proportional to their number, program size independent of it.
 
-For mechanisms of hundreds of bodies: matrices cost O(nb^3), and unrolled recursions
-take minutes to compile. Link frames as in EQUATIONS sections 4 and 5, so that long chains lose no digits by distance.
+For mechanisms of hundreds of bodies: matrices cost O(nb^3), and unrolled recursions take minutes to compile. In kernels these are
+native loops (`jaxdyn.compile.sweep`), for joints of any kinds; those of one degree of freedom have faster ones, with canonical
+frames, in `recursions.sweeps`. Link frames as in EQUATIONS sections 4 and 5, so that long chains lose no digits by distance.
 Joints of several degrees of freedom are eliminated at once; all joints are padded to the largest of them.
 """
 
 from typing import NamedTuple
 
-import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import lax
-from jaxtyping import Array, Float, Int
+from jaxtyping import Array, Float
 
-from jaxdyn.dynamics.kinematics import body_subspace, relative_poses
+from jaxdyn.compile import sweep
+from jaxdyn.dynamics.tree_frames import body_subspace, map_rows, relative_poses
 from jaxdyn.lie import se3
 from jaxdyn.lie.so3 import matmul
 from jaxdyn.model.inertia import spatial_inertia
@@ -22,9 +23,8 @@ from jaxdyn.systems.mass_factor import solve_positive
 
 
 class _Links(NamedTuple):
-    """Data of each body: its parent (the world is nb), Ad from the parent's frame, subspace (d, 6), spatial inertia."""
+    """Data of each body: Ad from the parent's frame, subspace (d, 6), spatial inertia."""
 
-    parent: Int[Array, " nb"]
     down: Float[Array, "nb 6 6"]
     subspace: Float[Array, "nb d 6"]
     inertia: Float[Array, "nb 6 6"]
@@ -56,31 +56,28 @@ def _per_body(model: Model, rows: Array) -> Array:
 
 
 def _links(model: Model, q) -> _Links:
-    topology = model.topology
-    parent = jnp.asarray([p if p >= 0 else topology.nb for p in topology.parents])
-    down = jax.vmap(lambda pose: se3.Ad(se3.inverse(pose)))(relative_poses(model, q))
-    return _Links(parent, down, _per_body(model, body_subspace(model)), jax.vmap(spatial_inertia)(model.inertias))
+    down = map_rows(lambda pose: se3.Ad(se3.inverse(pose)), relative_poses(model, q))
+    inertias = map_rows(spatial_inertia, jnp.asarray(model.inertias))
+    return _Links(down, _per_body(model, body_subspace(model)), inertias)
 
 
 def _wrenches(model: Model, links: _Links, v, a) -> tuple[Float[Array, "nb 6"], Float[Array, "nb 6"]]:
     """Inertial wrench and twist rate of each body in its own frame, gravity included: the outward pass of Newton-Euler."""
-    zero = jnp.zeros((model.nb + 1, 6), v.dtype)
-    # Row nb is the world, accelerated against gravity, so that roots need no case of their own.
-    rest = zero if model.gravity is None else zero.at[-1, :3].set(-model.gravity)
+    zero = jnp.zeros((6,), v.dtype)
+    # The world is accelerated against gravity.
+    rest = zero if model.gravity is None else zero.at[:3].set(-model.gravity)
     own_v = jnp.einsum("bd,bdk->bk", _per_body(model, v), links.subspace)
     own_a = jnp.zeros_like(own_v) if a is None else jnp.einsum("bd,bdk->bk", _per_body(model, a), links.subspace)
 
-    def outward(carry, link):
-        twists, rates = carry
-        i, parent, down, turn, push, inertia = link
-        twist = matmul(down, twists[parent]) + turn
+    def outward(outer, link):
+        down, turn, push, inertia = link
+        twist = matmul(down, outer[0]) + turn
         # ad_V of the joint's own twist is the Coriolis part of the rate in the body's frame.
-        rate = matmul(down, rates[parent]) + push + se3.ad_apply(twist, turn)
+        rate = matmul(down, outer[1]) + push + se3.ad_apply(twist, turn)
         wrench = matmul(inertia, rate) - se3.adT_apply(twist, matmul(inertia, twist))
-        return (twists.at[i].set(twist), rates.at[i].set(rate)), (wrench, rate)
+        return (twist, rate), (wrench, rate)
 
-    each = jnp.arange(model.nb), links.parent, links.down, own_v, own_a, links.inertia
-    return lax.scan(outward, (zero, rest), each)[1]
+    return sweep(outward, model.topology.parents, (zero, rest), (links.down, own_v, own_a, links.inertia))[1]
 
 
 def inverse_dynamics(model: Model, q, v, a) -> Float[Array, " nv"]:
@@ -88,15 +85,13 @@ def inverse_dynamics(model: Model, q, v, a) -> Float[Array, " nv"]:
     links = _links(model, q)
     wrenches, _ = _wrenches(model, links, v, a)
 
-    def inward(total, link):
-        i, parent, down, subspace = link
-        wrench = total[i]
-        return total.at[parent].add(matmul(down.T, wrench)), matmul(subspace, wrench)
+    def inward(carried, link):
+        down, subspace, wrench = link
+        total = carried + wrench
+        return matmul(down.T, total), matmul(subspace, total)
 
-    # One row more for the world, which collects the roots' wrenches and is dropped.
-    start = jnp.concatenate([wrenches, jnp.zeros((1, 6), v.dtype)])
-    each = jnp.arange(model.nb), links.parent, links.down, links.subspace
-    tau = _flat(model, lax.scan(inward, start, each, reverse=True)[1])
+    rows = links.down, links.subspace, wrenches
+    tau = _flat(model, sweep(inward, model.topology.parents, jnp.zeros((6,), v.dtype), rows, inward=True)[1])
     return tau if a is None or model.armature is None else tau + model.armature * a
 
 
@@ -112,50 +107,48 @@ def _factorize(model: Model, links: _Links) -> Factor:
     # Padding coordinates get a pivot of one and no coupling: their accelerations are zero and change nothing.
     extra = jnp.where(own, _per_body(model, armature), jnp.ones((), dtype))
 
-    def inward(total, link):
-        i, parent, down, S, extra = link
-        inertia = total[i]
+    def inward(carried, link):
+        down, S, own, extra = link
+        inertia = carried + own
         # Rows of S are the directions of the joint, so U is the transpose of that in the literature.
         U = matmul(S, inertia)
         inverse = solve_positive(matmul(U, S.T) + jnp.diag(extra), jnp.eye(S.shape[0], dtype=dtype))
         gain = matmul(inverse, U)
         left = inertia - matmul(U.T, gain)
-        return total.at[parent].add(matmul(down.T, matmul(left, down))), (inertia, inverse, gain)
+        return matmul(down.T, matmul(left, down)), (inertia, inverse, gain)
 
-    start = jnp.concatenate([links.inertia, jnp.zeros((1, 6, 6), dtype)])
-    each = jnp.arange(model.nb), links.parent, links.down, links.subspace, extra
-    return Factor(links, *lax.scan(inward, start, each, reverse=True)[1])
+    rows = links.down, links.subspace, links.inertia, extra
+    return Factor(links, *sweep(inward, model.topology.parents, jnp.zeros((6, 6), dtype), rows, inward=True)[1])
 
 
 def _residuals(model: Model, factor: Factor, tau, wrenches) -> tuple[Float[Array, "nb d"], Float[Array, "nb 6"]]:
     """Residual joint forces tau - S^T p, and the wrench p on each body of the bodies that it carries: the inward sweep."""
-    links, dtype = factor.links, tau.dtype
+    links = factor.links
 
-    def inward(total, link):
-        i, parent, down, S, gain, force = link
-        left = force - matmul(S, total[i])
+    def inward(carried, link):
+        down, S, gain, force, own = link
+        total = carried if own is None else carried + own
+        left = force - matmul(S, total)
         # The wrench on the parent includes the reaction to the residual joint force, left gain.
-        return total.at[parent].add(matmul(down.T, total[i] + matmul(left, gain))), (left, total[i])
+        return matmul(down.T, total + matmul(left, gain)), (left, total)
 
-    start = jnp.zeros((model.nb + 1, 6), dtype)
-    start = start if wrenches is None else start.at[:-1].set(wrenches)
-    each = jnp.arange(model.nb), links.parent, links.down, links.subspace, factor.gain, _per_body(model, tau)
-    return lax.scan(inward, start, each, reverse=True)[1]
+    rows = links.down, links.subspace, factor.gain, _per_body(model, tau), wrenches
+    return sweep(inward, model.topology.parents, jnp.zeros((6,), tau.dtype), rows, inward=True)[1]
 
 
 def _solve(model: Model, factor: Factor, tau, wrenches) -> Float[Array, " nv"]:
     """Solve M a = tau - (generalised forces of the wrenches) by two sweeps."""
-    links, dtype = factor.links, tau.dtype
+    links = factor.links
     residual, _ = _residuals(model, factor, tau, wrenches)
 
-    def outward(twists, link):
-        i, parent, down, S, gain, inverse, left = link
-        twist = matmul(down, twists[parent])
+    def outward(outer, link):
+        down, S, gain, inverse, left = link
+        twist = matmul(down, outer)
         a = matmul(inverse, left) - matmul(gain, twist)
-        return twists.at[i].set(twist + matmul(a, S)), a
+        return twist + matmul(a, S), a
 
-    each = jnp.arange(model.nb), links.parent, links.down, links.subspace, factor.gain, factor.inverse, residual
-    return _flat(model, lax.scan(outward, jnp.zeros((model.nb + 1, 6), dtype), each)[1])
+    rows = links.down, links.subspace, factor.gain, factor.inverse, residual
+    return _flat(model, sweep(outward, model.topology.parents, jnp.zeros((6,), tau.dtype), rows)[1])
 
 
 def forward_dynamics(model: Model, q, v, tau) -> Float[Array, " nv"]:

@@ -15,12 +15,16 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from jaxdyn.dynamics.kinematics import (
+from jaxdyn.compile import kernel, sweep
+from jaxdyn.dynamics.tree_frames import (
     TreeFrame,
+    body_subspace,
     body_twists,
+    map_rows,
     subspace_rate,
     sum_to_bodies,
     sum_to_coordinates,
+    take,
     tree_frame,
 )
 from jaxdyn.lie import se3, so3
@@ -34,6 +38,40 @@ def mass_matrix(model: Model, q: Float[Array, " nq"]) -> Float[Array, "nv nv"]:
     """Mass matrix M_kl = S_k . I_c S_l with I_c the composite inertia of all bodies that both coordinates move, plus armature."""
     frame = tree_frame(model, q)
     return _mass_matrix(model, frame, tree_inertias(model, frame))
+
+
+def mass_matrix_by_loops(model: Model, q: Float[Array, " nq"]) -> Float[Array, "nv nv"]:
+    """Mass matrix of many bodies: composite bodies by native loops, and products of all pairs by JAX.
+
+    M_kl = F_k . (v_l + w_l x (p_k - p_l), w_l) for a coordinate l that moves the body of k, with the momentum F_k of the
+    composite body at v_k = 1. Each is taken at the origin of its own body, so that long chains lose no digits by distance.
+    """
+    momenta, subspace, place = kernel(_composite_momenta)(model, q)
+    products = matmul(momenta, subspace.T)
+    for i, j, k in ((0, 1, 2), (1, 2, 0), (2, 0, 1)):
+        lever_j, lever_k = (place[:, None, x] - place[None, :, x] for x in (j, k))
+        moment = lever_j * momenta[:, None, k] - lever_k * momenta[:, None, j]
+        products = products + moment * subspace[None, :, 3 + i]
+    return _fill_symmetric(model, products)
+
+
+def _composite_momenta(model: Model, q):
+    """Momenta F (nv, 6) of the composite bodies, motions S (nv, 6), and origins p (nv, 3), in world axes (see above)."""
+    frame, topology = tree_frame(model, q), model.topology
+    turn, place = frame.pose[:, :3, :3], frame.pose[:, :3, 3]
+    parents = np.array([parent if parent >= 0 else model.nb for parent in topology.parents])
+    lever = place - take(jnp.concatenate([place, jnp.zeros((1, 3), q.dtype)]), parents)
+
+    def step(carried, row):
+        turn, lever, own = row
+        total = carried + transform_inertia(se3.from_parts(turn, jnp.zeros_like(lever)), own)
+        return transform_inertia(se3.from_parts(jnp.eye(3, dtype=lever.dtype), lever), total), total
+
+    rows = turn, lever, jnp.asarray(model.inertias)
+    composite = sweep(step, topology.parents, jnp.zeros((10,), q.dtype), rows, inward=True)[1]
+    turn, place, composite = (take(x, topology.dof_body) for x in (turn, place, composite))
+    rotate = map_rows(lambda R, S: jnp.concatenate([matmul(R, S[:3]), matmul(R, S[3:])]), turn, body_subspace(model))
+    return map_rows(momentum, composite, rotate), rotate, place
 
 
 def gravity_force(model: Model, q: Float[Array, " nq"]) -> Float[Array, " nv"]:
@@ -93,7 +131,7 @@ def generalized_force(model: Model, q: Float[Array, " nq"], external: Float[Arra
     """Generalised force: sum of J_i^T f_i over the bodies, J_i the body Jacobian of body i."""
     frame = tree_frame(model, q)
     # Wrenches move to the tree frame, where those of all bodies add.
-    wrenches = jax.vmap(se3.Ad_inv_T_apply)(frame.pose, external)
+    wrenches = map_rows(se3.Ad_inv_T_apply, frame.pose, external)
     return jnp.sum(frame.subspace * sum_to_coordinates(model, wrenches), axis=1)
 
 
@@ -168,7 +206,7 @@ def mass_matrix_derivative(model: Model, q: Float[Array, " nq"]) -> Float[Array,
 
 def tree_inertias(model: Model, frame: TreeFrame) -> Float[Array, "nb 10"]:
     """Inertial parameters of every body in its tree frame."""
-    return jax.vmap(transform_inertia)(frame.pose, model.inertias)
+    return map_rows(transform_inertia, frame.pose, model.inertias)
 
 
 def momentum(parameters: Float[Array, "10"], twist: Float[Array, "6"]) -> Float[Array, "6"]:
@@ -187,8 +225,12 @@ def _descendant_mask(model: Model) -> np.ndarray:
 def _mass_matrix(model: Model, frame: TreeFrame, inertias: Float[Array, "nb 10"]) -> Float[Array, "nv nv"]:
     composite = sum_to_coordinates(model, inertias)
     # Only entries of ancestors are valid: elsewhere the composite inertia is that of an unrelated subtree.
-    forces = jax.vmap(momentum)(composite, frame.subspace)
-    products = matmul(forces, frame.subspace.T)
+    forces = map_rows(momentum, composite, frame.subspace)
+    return _fill_symmetric(model, matmul(forces, frame.subspace.T))
+
+
+def _fill_symmetric(model: Model, products: Float[Array, "nv nv"]) -> Float[Array, "nv nv"]:
+    """Mass matrix from products of which those of a coordinate (row) and one above it (column) are valid, and armature."""
     deeper = _descendant_mask(model)
     zero = jnp.zeros_like(products)
     matrix = jnp.where(deeper, products, zero) + jnp.where(np.tril(deeper, -1).T, products.T, zero)
@@ -217,8 +259,8 @@ def joint_wrenches(model: Model, frame: TreeFrame, v, a, external) -> Float[Arra
 def _body_wrenches(model, frame, inertias, v, a, external) -> Float[Array, "nb 6"]:
     """Resultant of the joint wrenches on each body: its rate of momentum less its weight and the external wrench."""
     twists = body_twists(model, frame, v)
-    wrenches = jax.vmap(_inertial_wrench)(inertias, twists, _accelerations(model, frame, twists, v, a))
-    return wrenches if external is None else wrenches - jax.vmap(se3.Ad_inv_T_apply)(frame.pose, external)
+    wrenches = map_rows(_inertial_wrench, inertias, twists, _accelerations(model, frame, twists, v, a))
+    return wrenches if external is None else wrenches - map_rows(se3.Ad_inv_T_apply, frame.pose, external)
 
 
 def _inverse_dynamics(model, frame, inertias, v, a, external) -> Float[Array, " nv"]:

@@ -7,7 +7,7 @@ import equinox as eqx
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from jaxdyn.dynamics.kinematics import take
+from jaxdyn.dynamics.tree_frames import take
 from jaxdyn.forces.elements import as_leaf, as_names, broadcast_leaf, is_positive, joint_indices, scatter
 from jaxdyn.model.arguments import Checked, Number, Numbers, SystemLike, check_name, check_names
 from jaxdyn.model.builder import ModelBuilder

@@ -13,7 +13,8 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from jaxdyn.dynamics.kinematics import body_jacobian, frame_pose, named_frame, take
+from jaxdyn.dynamics.kinematics import body_jacobian, frame_pose, named_frame
+from jaxdyn.dynamics.tree_frames import take
 from jaxdyn.lie import se3
 from jaxdyn.model.arguments import Number, Numbers, SystemLike, batch_hint, check_names, check_state, is_concrete
 from jaxdyn.model.configuration import difference, neutral

@@ -14,7 +14,7 @@ from jaxdyn.compile.known import is_concrete, is_known
 from jaxdyn.constraints.base import constraint_jacobian, holonomic_rows, layout, velocity_residual
 from jaxdyn.constraints.dynamics import tolerance
 from jaxdyn.constraints.selection import independent_rows
-from jaxdyn.dynamics.quantities import kinetic_energy, potential_energy
+from jaxdyn.dynamics.centroidal import kinetic_energy, potential_energy
 from jaxdyn.lie.so3 import matmul
 from jaxdyn.model.arguments import Numbers, as_array, batch_hint, check_state, zeros_if_none
 from jaxdyn.reduction.bases import Independent, Orthonormal, as_basis, constraint_jacobian_compiled, tangent_basis

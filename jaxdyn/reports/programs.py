@@ -11,7 +11,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from jaxdyn.constraints.assembly import residuals
-from jaxdyn.dynamics.quantities import kinetic_energy, potential_energy
+from jaxdyn.dynamics.centroidal import kinetic_energy, potential_energy
 from jaxdyn.lie.so3 import quat_to_matrix
 from jaxdyn.model.tree import Model
 from jaxdyn.reports.case import Case, Reference

@@ -11,8 +11,8 @@ from jaxdyn.constraints.assembly import residuals
 from jaxdyn.constraints.redundancy import exchange_rows
 from jaxdyn.constraints.selection import project_after_exchange, renew_rows
 from jaxdyn.contact.forces import contact_forces
+from jaxdyn.dynamics.centroidal import kinetic_energy, potential_energy
 from jaxdyn.dynamics.kinematics import frame_pose
-from jaxdyn.dynamics.quantities import kinetic_energy, potential_energy
 from jaxdyn.forces.piecewise import Pieces, fix_pieces, guards, pieces_of, values_and_levels
 from jaxdyn.simulation import controls
 from jaxdyn.simulation.checks import CONTACT_OUTPUTS, POSE

@@ -39,8 +39,8 @@ from jaxdyn.constraints.base import (
 from jaxdyn.constraints.dynamics import correction
 from jaxdyn.constraints.projection import project_state
 from jaxdyn.constraints.rank import solve_square
-from jaxdyn.dynamics.kinematics import body_twists, sum_to_coordinates, take, tree_frame
 from jaxdyn.dynamics.quantities import bias_force, mass_matrix
+from jaxdyn.dynamics.tree_frames import body_twists, sum_to_coordinates, take, tree_frame
 from jaxdyn.dynamics.world_frame import momentum, tree_inertias
 from jaxdyn.lie import se2, se3, so3
 from jaxdyn.lie.so3 import cross, matmul

@@ -8,7 +8,8 @@ from pinocchio_bridge import assert_close, quick
 
 import jaxdyn as jd
 from jaxdyn.compile import kernel
-from jaxdyn.dynamics import quantities, recursions
+from jaxdyn.compile.trace import program_of
+from jaxdyn.dynamics import centroidal, kinematics, quantities, recursions, scans, tree_frames, world_frame
 from jaxdyn.dynamics.recursions import sweeps
 from jaxdyn.model.robots import random_tree
 
@@ -145,8 +146,6 @@ def test_derivatives(kinds, monkeypatch):
 
 
 def test_code_does_not_grow_with_the_bodies():
-    from jaxdyn.compile.trace import program_of
-
     def program(nb):
         model = random_tree(1, nb, branching=1, skew=0.3, taper=1.0, kinds=("revolute",))
         return program_of(sweeps.aba, (), model, state(model))[1][0]
@@ -167,3 +166,73 @@ def test_hundreds_of_links(links, branching):
     inverse = quick(lambda *s: jd.inverse_dynamics(model, *s))
     size = jnp.max(jnp.abs(inverse(q, v, 0 * a)))
     assert jnp.max(jnp.abs(inverse(q, v, a) - tau)) < 1e-12 * size
+
+
+MIXED = ("revolute", "spherical", "prismatic", "planar", "free", "helical")
+
+
+@pytest.mark.parametrize("kinds", [("spherical",), MIXED])
+@pytest.mark.parametrize("given", [False, True])
+def test_loops_of_joints_of_any_kinds(kinds, given, monkeypatch):
+    """Dynamics in link frames and kinematics as native loops, against products of matrices by JAX."""
+    monkeypatch.setattr(tree_frames, "MIN_BODIES_IN_LOOPS", 4)
+    model = random_tree(3, 12, branching=1.6, skew=1.0, taper=0.9, kinds=kinds)
+    model = model.replace(armature=jnp.linspace(0.1, 0.2, model.nv))
+    _, v, x = state(model)
+    q, wrenches = jd.random_configuration(model, jax.random.key(0)), jnp.ones((model.nb, 6))
+
+    def of(form):
+        def values(model, q, v, x):
+            frame = tree_frames.tree_frame(model, q)
+            kinetic = centroidal._kinetic_energy(model, q, v), world_frame.generalized_force(model, q, wrenches)
+            pair = form.forward_dynamics_tangent(model, q, v, x, lambda a: x * a)
+            return frame, *kinetic, *pair, form.inverse_dynamics(model, q, v, x)
+
+        return values
+
+    compiled = kernel(of(scans))
+    computed = quick(compiled)(model, q, v, x) if given else quick(lambda *s: compiled(model, *s))(q, v, x)
+    with jd.compilation("plain"):
+        expected = jax.jit(of(world_frame))(model, q, v, x)
+    for a, b in zip(jax.tree.leaves(computed), jax.tree.leaves(expected), strict=True):
+        assert_close(a, b, 1e-12)
+
+
+@pytest.mark.parametrize("kinds", [("revolute",), ("revolute", "spherical", "prismatic")])
+def test_many_joints_of_several_kinds(kinds):
+    """Public functions of a tree with more bodies than are written out, and their derivatives against differences."""
+    model = random_tree(3, quantities.MAX_BODIES + 4, branching=1.3, skew=1.0, taper=0.95, kinds=kinds)
+    _, v, x = state(model)
+    q = jd.random_configuration(model, jax.random.key(0))
+    M, a = quick(lambda q: (jd.mass_matrix(model, q), jd.forward_dynamics(model, q, v, x)))(q)
+    # The columns of M are forces of unit accelerations, and inverse dynamics inverts the motion.
+    still = model.replace(gravity=None)
+    columns = quick(jax.vmap(lambda e: jd.inverse_dynamics(still, q, jnp.zeros_like(v), e)))(jnp.eye(model.nv))
+    assert_close(M, columns.T, 1e-12)
+    assert_close(jd.inverse_dynamics(model, q, v, a), x, 1e-10)  # the condition number of M is 1e5
+
+    def value(q):
+        tip = jd.forward_kinematics(model, q)[-1, :3, 3]
+        return (
+            v @ jd.mass_matrix(model, q) @ x
+            + tip @ (jd.body_jacobian(model, q, model.frame_names[-1])[:3] @ v)
+            + v @ jd.forward_dynamics(model, q, v, x)
+        )
+
+    step, along, run = 1e-6, jnp.cos(jnp.arange(model.nv)), quick(value)
+    difference = (run(jd.integrate(model, q, along, step)) - run(jd.integrate(model, q, along, -step))) / (2 * step)
+    rate = jax.jvp(lambda s: jd.integrate(model, q, along, s), (0.0,), (1.0,))[1]
+    assert_close(quick(jax.grad(value))(q) @ rate, difference, 1e-6)  # of central differences
+
+
+def test_code_of_kinematics_does_not_grow_with_the_bodies():
+    """Loops of 64 and of 128 bodies have the same operations, and a frame takes the bodies above it alone."""
+
+    def count(nb, branching=1):
+        model = random_tree(1, nb, branching=branching, skew=0.3, taper=1.0, kinds=("revolute",))
+        q = state(model)[0]
+        of_all = program_of(kinematics._world_poses.__wrapped__, (), model, (q,))[1][0]
+        return [len(x.body.operations) for x in of_all.subprograms]
+
+    few = tree_frames.MIN_BODIES_IN_LOOPS
+    assert sum(count(few)) == sum(count(2 * few))

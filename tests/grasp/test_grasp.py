@@ -15,8 +15,9 @@ from jaxdyn import events, inertia, scenes
 from jaxdyn.constraints import Pfaffian, rolling_sphere
 from jaxdyn.constraints.base import constraint_jacobian
 from jaxdyn.constraints.dynamics import RESULTS, constrained_dynamics
+from jaxdyn.dynamics.centroidal import kinetic_energy, potential_energy
 from jaxdyn.dynamics.kinematics import body_jacobian, frame_pose
-from jaxdyn.dynamics.quantities import kinetic_energy, mass_matrix, potential_energy
+from jaxdyn.dynamics.quantities import mass_matrix
 from jaxdyn.grasp import Grasp, contact, grasp_map, hand_jacobian, internal_forces, object_dynamics, wrench_basis
 from jaxdyn.model.builder import ModelBuilder
 from jaxdyn.model.configuration import configuration_rate, integrate

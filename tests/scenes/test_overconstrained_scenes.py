@@ -16,7 +16,7 @@ from jaxdyn.constraints.assembly import residuals
 from jaxdyn.constraints.base import constraint_jacobian
 from jaxdyn.constraints.dynamics import RESULTS, constrained_dynamics
 from jaxdyn.constraints.selection import select_rows
-from jaxdyn.dynamics.quantities import kinetic_energy, potential_energy
+from jaxdyn.dynamics.centroidal import kinetic_energy, potential_energy
 
 # Name, rows, rank, freedom.
 COUNTS = [

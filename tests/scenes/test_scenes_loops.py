@@ -13,7 +13,7 @@ from jaxdyn import scenes
 from jaxdyn.constraints.assembly import assemble, residuals
 from jaxdyn.constraints.base import constraint_jacobian
 from jaxdyn.constraints.dynamics import RESULTS, constrained_dynamics, projections
-from jaxdyn.dynamics.quantities import kinetic_energy, potential_energy
+from jaxdyn.dynamics.centroidal import kinetic_energy, potential_energy
 from jaxdyn.simulation.methods import Projected
 from jaxdyn.simulation.run import simulate
 from jaxdyn.systems.lagrangian import LagrangianSystem

@@ -13,8 +13,9 @@ from scipy.spatial.transform import Rotation
 
 from jaxdyn import events, scenes
 from jaxdyn.constraints.base import Holonomic
+from jaxdyn.dynamics.centroidal import kinetic_energy, potential_energy
 from jaxdyn.dynamics.kinematics import frame_pose
-from jaxdyn.dynamics.quantities import forward_dynamics, kinetic_energy, potential_energy
+from jaxdyn.dynamics.quantities import forward_dynamics
 from jaxdyn.forces.elements import CoulombFriction, JointDamping, JointSpring
 from jaxdyn.model.builder import ModelBuilder
 from jaxdyn.model.configuration import integrate, neutral

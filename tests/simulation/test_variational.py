@@ -11,8 +11,7 @@ from benchmarks.report_cases import references
 from jaxdyn import scenes
 from jaxdyn.constraints import Holonomic, Pfaffian
 from jaxdyn.constraints.codes import CODES
-from jaxdyn.dynamics.centroidal import center_of_mass, centroidal_momentum
-from jaxdyn.dynamics.quantities import kinetic_energy, potential_energy
+from jaxdyn.dynamics.centroidal import center_of_mass, centroidal_momentum, kinetic_energy, potential_energy
 from jaxdyn.model.builder import ModelBuilder
 from jaxdyn.model.configuration import integrate, random_configuration
 from jaxdyn.simulation import variational

@@ -1,0 +1,215 @@
+"""Frames of trees: products of exponentials, and sums over the bodies of a tree.
+
+The pose of body i is T_i = (product over its ancestors j, root first, of home_j exp(hat(S_j) q_j)), the product of
+exponentials of Murray, Li & Sastry (1994), eq. 3.3, with body frames instead of base-frame screws. The product along
+the tree is taken by pointer jumping: after step k every body holds the product of its last 2^k joints, so log2(depth)
+batched 4x4 products give all poses and the program stays short however many bodies there are.
+
+Quantities summed over bodies are expressed in one *tree frame*: axes parallel to the world's, origin at the origin of
+the tree's root body. Positions in it are built without ever adding the root's own position, so a robot far from the
+world's origin is computed exactly as one at home.
+"""
+
+import functools
+from collections.abc import Callable
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float
+
+from jaxdyn.compile import sweep, variant
+from jaxdyn.lie import se3
+from jaxdyn.lie.so3 import matmul
+from jaxdyn.model.joints import KINDS, SCREW_KINDS, joint_transform, screw_transform
+from jaxdyn.model.tree import Model, Topology, geometry
+
+# From so many bodies on, kernels of kinematics are loops over the bodies. Fewer are written out: zeros of a body's own are
+# dropped then, and so is what a result does not need.
+MIN_BODIES_IN_LOOPS = 64
+
+
+class TreeFrame(NamedTuple):
+    """A configuration seen from the tree frames (one per root body).
+
+    - `pose` (nb, 4, 4): body frame in its tree frame (m).
+    - `origin` (nb, 3): world position of the tree frame's origin, for each body (m).
+    - `subspace` (nv, 6): row k is the twist, in the tree frame, of the motion with v_k = 1 alone. As a twist of the
+      fixed frame that coincides with the tree frame at this instant it does not depend on where the root body is.
+    """
+
+    pose: Float[Array, "nb 4 4"]
+    origin: Float[Array, "nb 3"]
+    subspace: Float[Array, "nv 6"]
+
+
+def relative_poses(model: Model, q: Float[Array, " nq"]) -> Float[Array, "nb 4 4"]:
+    """Pose of each body frame in its parent body frame (the world's for roots), home @ exp(hat(S) q)."""
+    topology = model.topology
+    home, screws = map(jnp.asarray, geometry(model))
+    order, transforms = [], []
+    # One batched evaluation per joint kind, instead of one per joint: the program does not grow with the number of
+    # bodies.
+    for kind, bodies in _bodies_by_kind(topology):
+        if kind in SCREW_KINDS:
+            coordinates = np.array([topology.q_slices[i].start for i in bodies])
+            place = functools.partial(screw_transform, kind)
+            transforms.append(map_rows(place, take(screws, bodies), take(q, coordinates)))
+        else:
+            coordinates = np.array([np.arange(topology.nq)[topology.q_slices[i]] for i in bodies])
+            # The screw is not read by these kinds.
+            transforms.append(map_rows(lambda qj, kind=kind: joint_transform(kind, screws[0], qj), q[coordinates]))
+        order.extend(bodies)
+    if not transforms:
+        return home
+    transforms_by_kind = transforms[0] if len(transforms) == 1 else jnp.concatenate(transforms)
+    return map_rows(matmul, home, take(transforms_by_kind, np.argsort(order)))
+
+
+def body_subspace(model: Model) -> Float[Array, "nv 6"]:
+    """Motion subspace of every joint in its own body frame, one row per velocity coordinate."""
+    topology = model.topology
+    fixed = np.zeros((topology.nv, 6))
+    is_screw = np.zeros(topology.nv, bool)
+    for kind, place in zip(topology.kinds, topology.v_slices, strict=True):
+        if kind in SCREW_KINDS:
+            is_screw[place] = True
+        else:
+            fixed[place] = np.eye(6)[list(KINDS[kind].columns)]
+    # The screws of other kinds are zero leaves, whose values are not read.
+    constant = jnp.asarray(fixed, model.screws.dtype)
+    if not is_screw.any():
+        return constant
+    screws = take(jnp.asarray(geometry(model)[1]), topology.dof_body)
+    return screws if is_screw.all() else jnp.where(is_screw[:, None], screws, constant)
+
+
+def tree_frame(model: Model, q: Float[Array, " nq"]) -> TreeFrame:
+    """Poses and motion subspace in the tree frames (see `TreeFrame`)."""
+    topology = model.topology
+    local = relative_poses(model, q)
+    is_root = np.array([parent < 0 for parent in topology.parents], bool)
+    # Shared by all bodies of one tree; different trees have different frames.
+    origin = take(local[:, :3, 3], topology.roots)
+    # A root's own translation is replaced by zero before the product, not subtracted after it.
+    mask = np.ones((topology.nb, 4, 4), bool)
+    mask[is_root, :3, 3] = False
+    pose = jnp.where(mask, local, jnp.zeros_like(local))
+    pose = _tree_products(topology, pose)
+    # S is constant in the body's frame; Ad carries it to the tree frame.
+    subspace = map_rows(se3.Ad_apply, take(pose, topology.dof_body), body_subspace(model))
+    return TreeFrame(pose, origin, subspace)
+
+
+def _map_in_loop(function: Callable, *rows):
+    """`map_rows` inside of a kernel: of many rows as a loop, whose code does not grow with their number."""
+    if len(rows[0]) < MIN_BODIES_IN_LOOPS:
+        return jax.vmap(function)(*rows)
+    # A chain without a carry.
+    return sweep(lambda carry, row: (carry, function(*row)), range(-1, len(rows[0]) - 1), (), rows)[1]
+
+
+@variant(_map_in_loop)
+def map_rows(function: Callable, *rows):
+    """Evaluate function(row of each array) for all rows of arrays (n, ...), one for each body or coordinate."""
+    return jax.vmap(function)(*rows)
+
+
+def _products_in_order(topology: Topology, pose: Float[Array, "nb 4 4"]) -> Float[Array, "nb 4 4"]:
+    """`_tree_products` with one product per body: in a kernel pointer jumping would multiply the operations by log2(depth)."""
+    if topology.nb >= MIN_BODIES_IN_LOOPS:
+
+        def step(outer, own):
+            inner = matmul(outer, own)
+            return inner, inner
+
+        return sweep(step, topology.parents, jnp.eye(4, dtype=pose.dtype), pose)[1]
+    products: list = []
+    for i, parent in enumerate(topology.parents):
+        products.append(pose[i] if parent < 0 else matmul(products[parent], pose[i]))
+    return jnp.stack(products) if products else pose
+
+
+@variant(_products_in_order)
+def _tree_products(topology: Topology, pose: Float[Array, "nb 4 4"]) -> Float[Array, "nb 4 4"]:
+    """Products of the poses of all bodies above each body, root first.
+
+    By pointer jumping, with log2(depth) products of all bodies.
+    """
+    # The extra row is the world: a jump beyond the root multiplies by the identity.
+    world = jnp.eye(4, dtype=pose.dtype)[None]
+    for table in topology.jumps:
+        pose = matmul(jnp.concatenate([pose, world])[table], pose)
+    return pose
+
+
+def body_twists(model: Model, frame: TreeFrame, v: Float[Array, " nv"]) -> Float[Array, "nb 6"]:
+    """Twist of every body in its tree frame: V_i = sum of S_k v_k over the coordinates k that move body i."""
+    return sum_to_bodies(model, frame.subspace * v[:, None])
+
+
+def subspace_rate(model: Model, frame: TreeFrame, twists: Float[Array, "nb 6"]) -> Float[Array, "nv 6"]:
+    """Rate of the motion subspace: dS_k/dt = ad_V S_k, V the twist of the body that carries S_k with it."""
+    return map_rows(se3.ad_apply, take(twists, model.topology.dof_body), frame.subspace)
+
+
+def _sweep_to_bodies(model: Model, rows: Float[Array, "nv n"]) -> Float[Array, "nb n"]:
+    """`sum_to_bodies` inside of a kernel, where a product with a mask has an operation for each pair on one path."""
+    topology = model.topology
+    if topology.nb < MIN_BODIES_IN_LOOPS:
+        return _sum_to_bodies(model, rows)
+    # Of joints with several coordinates the sum over these.
+    own = rows if topology.nv == topology.nb else matmul(jnp.asarray(_own_coordinates(topology), rows.dtype), rows)
+    return sweep(lambda outer, x: (outer + x, outer + x), topology.parents, jnp.zeros_like(rows[0]), own)[1]
+
+
+def _sum_to_bodies(model: Model, rows: Float[Array, "nv n"]) -> Float[Array, "nb n"]:
+    return matmul(jnp.asarray(model.topology.dof_ancestors, rows.dtype), rows)
+
+
+@variant(_sweep_to_bodies)
+def sum_to_bodies(model: Model, rows: Float[Array, "nv n"]) -> Float[Array, "nb n"]:
+    """G rows: for each body the sum of the rows of the coordinates that move it."""
+    return _sum_to_bodies(model, rows)
+
+
+def _sweep_to_coordinates(model: Model, rows: Float[Array, "nb n"]) -> Float[Array, "nv n"]:
+    topology = model.topology
+    if topology.nb < MIN_BODIES_IN_LOOPS:
+        return _sum_to_coordinates(model, rows)
+
+    def step(total, x):
+        return total + x, total + x
+
+    return take(sweep(step, topology.parents, jnp.zeros_like(rows[0]), rows, inward=True)[1], topology.dof_body)
+
+
+def _sum_to_coordinates(model: Model, rows: Float[Array, "nb n"]) -> Float[Array, "nv n"]:
+    return matmul(jnp.asarray(model.topology.dof_ancestors.T, rows.dtype), rows)
+
+
+@variant(_sweep_to_coordinates)
+def sum_to_coordinates(model: Model, rows: Float[Array, "nb n"]) -> Float[Array, "nv n"]:
+    """G^T rows: for each velocity coordinate the sum of the rows of the bodies that it moves."""
+    return _sum_to_coordinates(model, rows)
+
+
+def _own_coordinates(topology: Topology) -> np.ndarray:
+    """Mask (nb, nv) of the coordinates of each body's own joint."""
+    return np.arange(topology.nb)[:, None] == topology.dof_body
+
+
+def take(rows: Array, index: np.ndarray) -> Array:
+    """`rows[index]` for a constant index; no operation when the index lists all rows in order."""
+    index = np.asarray(index)
+    # A gather stays an operation of the program even where it moves nothing.
+    if index.shape == rows.shape[:1] and (index == np.arange(len(index))).all():
+        return rows
+    return rows[index]
+
+
+def _bodies_by_kind(topology: Topology) -> list[tuple[str, np.ndarray]]:
+    # The two kinds differ in limits only and share one batch.
+    labels = np.array(["revolute" if kind == "continuous" else kind for kind in topology.kinds], str)
+    return [(str(kind), np.flatnonzero(labels == kind)) for kind in dict.fromkeys(labels.tolist())]
