@@ -175,7 +175,7 @@ class ModalSystem(HybridSystem):
             # First the impulses of Coulomb's law. They are zero where sliding leaves no forces: an impulse without collision
             # begins from elements that stick.
             by_law = (guess == 1) & busy
-            begin = guess_again(elements, problem, mode, jnp.asarray(_IMPACTS)[guess], released)
+            begin = guess_again(elements, problem, mode, jnp.asarray(_IMPACTS, jnp.int32)[guess], released)
             begin, along = cond(
                 by_law,
                 partial(impulsive_mode, elements, problem, by_law),
