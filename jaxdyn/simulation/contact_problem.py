@@ -33,7 +33,8 @@ _OF_SLIP = 0.1  # weight of slips beside gaps, where velocities are made consist
 class Contacts(NamedTuple):
     """Contacts and frictions of a scene in the order of the cones: two directions of slip, one, and none; joint limits.
 
-    A friction of given load is a contact whose normal impulse moves nothing, with a bound that makes it the load's.
+    A friction is a contact whose normal impulse moves nothing, with a bound that makes it the load's. Where the load is the
+    multiplier of a constraint, the bound moves with the impulses of the others, on which the multiplier depends.
 
     - `elements`: of `simulation.hybrid.modes`; `order`: their indices in the order of the cones.
     - `has_static`: whether an element has a coefficient at rest of its own.
@@ -64,8 +65,14 @@ class Contacts(NamedTuple):
     @property
     def rows(self) -> np.ndarray:
         """Rows of the elements among those of the extended scene, in the order of the cones; -1 for a friction's normal."""
-        chosen = [k for i in self.order for k in (self.elements[i].normal, *self.elements[i].tangent)]
-        return np.array(chosen, int)
+        each = [self.elements[i] for i in self.order]
+        return np.array([k for one in each for k in (one.normal if one.opens else -1, *one.tangent)], int)
+
+    @property
+    def loaded(self) -> list[tuple[int, int]]:
+        """Cones whose load is the multiplier of a constraint, and its row among the scene's own."""
+        each = [self.elements[i] for i in self.order]
+        return [(k, one.normal) for k, one in enumerate(each) if not one.opens and one.normal >= 0]
 
     @property
     def normals(self) -> np.ndarray:
@@ -74,13 +81,8 @@ class Contacts(NamedTuple):
 
 
 def contacts_of(scene: Scene, limits: str | None) -> Contacts:
-    """Contacts of a scene. **Raises:** ValueError for frictions whose load is a multiplier, or that are smoothed."""
+    """Contacts of a scene. **Raises:** ValueError for frictions that are smoothed."""
     for force in scene.forces:
-        if isinstance(force, DryFriction) and force.constraint is not None:
-            raise ValueError(
-                f"stepper: DryFriction {force.name!r} has the force of constraint {force.constraint!r} as its load, which is "
-                "known after a step alone; give a load in N, a function normal(system, q, v, t), or take jd.simulate"
-            )
         if isinstance(force, DryFriction) and force.smoothing is not None:
             raise ValueError(
                 f"stepper: DryFriction {force.name!r} has smoothing, and sticks in steps without it; leave it out, or take "
@@ -167,7 +169,8 @@ def contact_terms(contacts: Contacts, scene: Scene, q, v, t) -> _Terms:
 class _Flow(NamedTuple):
     """Motion without contacts at the middle of a step: `place`, the factor of M, and accelerations.
 
-    `acceleration(v, w)`: at the velocity v, with forces of the scene at the velocity w. `drives`: their states.
+    `acceleration(v, w)`: at the velocity v, with forces of the scene at the velocity w, and the multipliers (nc,) of the
+    constraints. `drives`: their states.
     """
 
     place: Array
@@ -189,8 +192,9 @@ def _flow(scene: Scene, q, v, z, tau, t, h) -> _Flow:
         applied = scene.applied_force(place, v_of_forces, middle)
         force = force if applied is None else force + applied
         if scene.constraints:
-            return constrained_dynamics(unforced, place, v, force, middle).acceleration
-        return metric.solve(force - bias_force(system, place, v, middle))
+            motion = constrained_dynamics(unforced, place, v, force, middle)
+            return motion.acceleration, motion.multipliers
+        return metric.solve(force - bias_force(system, place, v, middle)), jnp.zeros((0,), v.dtype)
 
     return _Flow(place, metric, acceleration, z if drives is None else drives)
 
@@ -263,6 +267,24 @@ def scaled(contacts: Contacts, problem: _Problem, friction) -> Scaled:
     return Scaled(problem.gram * factor[:, None] * factor[None], q / size, problem.unit * factor, size)
 
 
+def load_signs(contacts: Contacts, problem: Scaled, x) -> Array:
+    """Signs (m,) of the loads that are multipliers, for impulses x (m,), at the normals of their frictions; 1 elsewhere."""
+    signs = jnp.ones_like(x)
+    for k, _ in contacts.loaded:
+        at = int(contacts.normals[k])
+        load = x[at] - problem.q[at] - jnp.sum(problem.W[at] * x)
+        signs = signs.at[at].set(jnp.where(load < 0, -1.0, 1.0))
+    return jax.lax.stop_gradient(signs)
+
+
+def with_signs(contacts: Contacts, problem: Scaled, signs) -> Scaled:
+    """Problem in which loads are their sizes, if they have these signs (m,)."""
+    if not contacts.loaded:
+        return problem
+    unit = jnp.eye(len(signs), dtype=signs.dtype)
+    return problem._replace(W=jnp.where(unit > 0, problem.W, problem.W * signs[:, None]), q=problem.q * signs)
+
+
 def friction_of(contacts: Contacts, scene: Scene, dtype, at_rest=None) -> list:
     """Coefficients of the cones; of those `at_rest` (k,) that at rest."""
     coefficients = []
@@ -296,35 +318,45 @@ def pose(contacts: Contacts, scene: Scene, q, v, z, tau, t, h) -> _Problem:
     whole = extend(scene)
     bare = Scene(scene.system, scene.constraints, whole.forces)
     flow, end = _flow(bare, q, v, z, tau, t, h), t + h
-    place, metric, start = displace(scene.system, flow.place, 0.5 * h * v), flow.metric, flow.acceleration(v, v)
+    place, metric, start = displace(scene.system, flow.place, 0.5 * h * v), flow.metric, flow.acceleration(v, v)[0]
     free = v + h * start
     terms = contact_terms(contacts, whole, place, free, end)
     loads = _loads(contacts, scene, flow.place, v, t + 0.5 * h)
-    closes = jnp.any(loads > 0) | jnp.any(
-        terms.velocity[contacts.normals] < _bounds(contacts, scene, terms, v, free, h)
-    )
+    closes = jnp.any(terms.velocity[contacts.normals] < _bounds(contacts, scene, terms, v, free, h))
+    closes = closes | jnp.any(loads > 0) | bool(contacts.loaded)
     # Halfway to a velocity without contact forces, damping would be that of a motion that contacts prevent.
     half = v + 0.5 * h * start
-    change = h * (flow.acceleration(half, jnp.where(closes, v, half)) - start)
+    rate, multipliers = flow.acceleration(half, jnp.where(closes, v, half))
+    change = h * (rate - start)
     free, terms = free + change, terms._replace(velocity=terms.velocity + matmul(terms.J, change))
     bound = _bounds(contacts, scene, terms, v, free, h)
     place = jnp.where(closes, place, displace(scene.system, flow.place, 0.5 * h * free))
     if not scene.constraints:
-        return _in_units(
-            contacts, scene, flow, metric.whiten(terms.J.T), place, free, terms, terms.velocity, bound, h * loads
-        )
+        Y, reaction = metric.whiten(terms.J.T), _Reaction(h * loads, None)
+        return _in_units(contacts, flow, Y, place, free, terms, terms.velocity, bound, reaction)
     place = project_state(bare, place, free, end)[0]
     terms = contact_terms(contacts, whole, place, free, end)
     bound = _bounds(contacts, scene, terms, v, free, h)
     # The rows of the scene's constraints are eliminated: what is left of Y is orthogonal to them.
     of_loops, Y = metric.whiten(constraint_jacobian(bare, place, end).T), metric.whiten(terms.J.T)
     factor = cholesky(regular_gram(of_loops))
-    closed = -matmul(of_loops, solve_cholesky(factor, velocity_residual(bare, place, free, end)))
-    rest = Y - matmul(of_loops, solve_cholesky(factor, matmul(of_loops.T, Y)))
+    # Impulses of the constraints: those that close them at the end, and those against the impulses of the contacts.
+    closing = -solve_cholesky(factor, velocity_residual(bare, place, free, end))
+    against = -solve_cholesky(factor, matmul(of_loops.T, Y))
+    closed, rest = matmul(of_loops, closing), Y + matmul(of_loops, against)
     velocities = terms.velocity + matmul(Y.T, closed)
-    return _in_units(
-        contacts, scene, flow, rest, place, free + metric.unwhiten(closed), terms, velocities, bound, h * loads
-    )
+    loads, total = h * loads, h * multipliers + closing
+    for k, row in contacts.loaded:
+        loads = loads.at[k].set(total[row])
+    reaction = _Reaction(loads, {k: against[row] for k, row in contacts.loaded})
+    return _in_units(contacts, flow, rest, place, free + metric.unwhiten(closed), terms, velocities, bound, reaction)
+
+
+class _Reaction(NamedTuple):
+    """Impulses of loads (k,), N s, of either sign where they are multipliers, and their rates (m,) by those of the cones."""
+
+    loads: Array
+    rates: dict[int, Array] | None
 
 
 def _loads(contacts: Contacts, scene: Scene, q, v, t) -> Array:
@@ -332,7 +364,7 @@ def _loads(contacts: Contacts, scene: Scene, q, v, t) -> Array:
     loads = []
     for i in contacts.order:
         one: Any = contacts.elements[i]
-        normal: Any = 0.0 if one.opens else force_at(scene, one).normal
+        normal: Any = 0.0 if one.opens or one.normal >= 0 else force_at(scene, one).normal
         value: Any = normal(scene.system, q, v, t) if callable(normal) else normal
         if jnp.shape(value) != ():
             raise ValueError(f"friction {one.name!r}: normal gives shape {jnp.shape(value)}; expected one number, ()")
@@ -340,8 +372,8 @@ def _loads(contacts: Contacts, scene: Scene, q, v, t) -> Array:
     return jnp.stack([*loads, *[jnp.zeros((), q.dtype)] * len(contacts.limited)])
 
 
-def _in_units(contacts: Contacts, scene: Scene, flow: _Flow, Y, place, velocity, terms, velocities, bound, loads):
-    """Problem with rows of a mean length of one; `loads` (k,): impulses of the loads of frictions, N s."""
+def _in_units(contacts: Contacts, flow: _Flow, Y, place, velocity, terms, velocities, bound, reaction: _Reaction):
+    """Problem with rows of a mean length of one."""
     one, gram = jnp.ones((), Y.dtype), matmul(Y.T, Y)
     squares = jax.lax.stop_gradient(jnp.diagonal(gram))
     units, start = [], 0
@@ -355,7 +387,9 @@ def _in_units(contacts: Contacts, scene: Scene, flow: _Flow, Y, place, velocity,
     # The normal impulse of a friction moves nothing but a mass of its own.
     for k, (at, closes) in enumerate(zip(contacts.normals, contacts.closing, strict=True)):
         if not closes:
-            gram, relative = gram.at[at, at].set(one), relative.at[at].set(-loads[k] / unit[at])
+            if k in (reaction.rates or ()):
+                gram = gram.at[at].set(-reaction.rates[k] * unit / unit[at])
+            gram, relative = gram.at[at, at].set(one), relative.at[at].set(-reaction.loads[k] / unit[at])
     return _Problem(flow.place, flow.drives, place, velocity, flow.metric, Y, gram, relative, unit, terms.side)
 
 

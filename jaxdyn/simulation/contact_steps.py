@@ -16,6 +16,9 @@ If no contact closes, and no friction has a load, q' is that of the midpoint rul
 two. A contact at rest has v = 0, and so q' = q to rounding: nothing creeps. q' is projected onto the holonomic constraints
 before the solve.
 
+A friction whose load is the multiplier of a constraint has its impulse over the step, from the same equations, with the sign that
+it has in the end.
+
 A contact or friction with a coefficient at rest of its own has that one as long as it slips neither before the step nor after
 it. Where contacts that close contradict each other, and no solution is found, their velocities are made consistent
 (`contact_problem`). States of drives follow the midpoint rule, with the mean of v and v'.
@@ -41,12 +44,14 @@ from jaxdyn.simulation.contact_problem import (
     Scaled,
     closing_cones,
     friction_of,
+    load_signs,
     make_consistent,
     may_contradict,
     pose,
     rests_at,
     scaled,
     slip_speeds,
+    with_signs,
 )
 from jaxdyn.systems.scene import Scene
 
@@ -165,28 +170,25 @@ def _step(
     """A step; with `x`, the solution of its contacts, and the cones that are `at_rest` and `relaxed`, for its derivatives."""
     # One subprogram, in which the zeros of the rows are known, as far as they are.
     problem, groups = jax.jit(partial(pose, contacts, scene))(q, v, z, tau, t, h), contacts.groups
-    is_redundant = sum(contacts.sizes) + contacts.own > scene.nv
     if x is None:
         at_rest = jnp.zeros((len(contacts.sizes),), bool)
         if contacts.has_static:
             at_rest = rests_at(contacts, scene, q, v, t)
         of = scaled(contacts, problem, friction_of(contacts, scene, q.dtype, at_rest))
-        solution = coulomb.solve(groups, is_redundant, *of[:3], jnp.sqrt(smoothing) / of.size)
-        solution, relaxed = _solve_relaxed(contacts, scene, of, solution, jnp.sqrt(smoothing) / of.size)
+        solution, relaxed = _solve(contacts, scene, of, jnp.sqrt(smoothing) / of.size)
         if contacts.has_static:
             x = solution.x
             # What slips from rest has the coefficient of sliding.
             slips = at_rest & (slip_speeds(contacts, matmul(of.W, x) + of.q) > coulomb.tolerance(q.dtype) ** 0.5)
             at_rest = at_rest & ~slips
             of = scaled(contacts, problem, friction_of(contacts, scene, q.dtype, at_rest))
-            width, anew = jnp.sqrt(smoothing) / of.size, slips.any()
-            again = coulomb.solve(groups, is_redundant, *of[:3], width, anew)
-            again, relaxed_too = _solve_relaxed(contacts, scene, of, again, width, anew)
-            solution = jax.tree.map(lambda a, b: jnp.where(anew, a, b), again, solution)
-            relaxed = jnp.where(anew, relaxed_too, relaxed)
+            anew = slips.any()
+            again = _solve(contacts, scene, of, jnp.sqrt(smoothing) / of.size, anew)
+            solution, relaxed = jax.tree.map(lambda a, b: jnp.where(anew, a, b), again, (solution, relaxed))
         x, residual, solved, steps = solution
     else:
         of = scaled(contacts, problem, friction_of(contacts, scene, q.dtype, at_rest))
+        of = with_signs(contacts, of, load_signs(contacts, of, x))
         width = jnp.sqrt(smoothing) / of.size
         if may_contradict(contacts, scene):
             of = of._replace(q=jnp.where(relaxed.any(), make_consistent(contacts, of, relaxed).q, of.q))
@@ -207,8 +209,25 @@ def _step(
     )
 
 
-def _solve_relaxed(contacts: Contacts, scene: Scene, of: Scaled, solution: coulomb.Solution, width, wanted: Any = True):
+def _solve(contacts: Contacts, scene: Scene, of: Scaled, width, wanted: Any = True):
+    """Solution of a step's problem, and the cones (k,) whose velocities were made consistent with each other."""
+    signs = load_signs(contacts, of, jnp.zeros_like(of.q))
+    found = _solve_relaxed(contacts, scene, with_signs(contacts, of, signs), width, wanted)
+    if not contacts.loaded:
+        return found
+    # The impulses may turn the sign of a load: then it has the other one, or none.
+    turned = load_signs(contacts, of, found[0].x)
+    flips = (turned != signs).any() & wanted
+    again = _solve_relaxed(contacts, scene, with_signs(contacts, of, turned), width, flips)
+    agrees = (load_signs(contacts, of, again[0].x) == turned).all()
+    again = again[0]._replace(solved=again[0].solved & agrees), again[1]
+    return jax.tree.map(lambda a, b: jnp.where(flips, a, b), again, found)
+
+
+def _solve_relaxed(contacts: Contacts, scene: Scene, of: Scaled, width, wanted: Any):
     """The solution, or that with consistent velocities where there is none, and the cones (k,) with such velocities."""
+    is_redundant = sum(contacts.sizes) + contacts.own > scene.nv
+    solution = coulomb.solve(contacts.groups, is_redundant, *of[:3], width, wanted)
     if not may_contradict(contacts, scene):
         return solution, jnp.zeros((len(contacts.sizes),), bool)
     fails = ~solution.solved & wanted

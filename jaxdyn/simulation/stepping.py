@@ -60,7 +60,7 @@ def stepper(
 
     **Arguments:**
 
-    - `scene`: a `Scene` or `Model`. `jd.contact.DryFriction` has steps of the same kind; its load is a number or a function.
+    - `scene`: a `Scene` or `Model`. `jd.contact.DryFriction` has steps of the same kind.
     - `dt`: s; `substeps`: steps in it.
     - `remat`: if True, reverse mode keeps no more of a step than its state and tau, and computes the rest again. With several
       substeps that costs a step. A run of n steps then keeps 8 (nq + 2 nv) n bytes a sample in float64; with a law as tau,
@@ -75,8 +75,8 @@ def stepper(
       result code. A step whose contacts were not solved has the code `no_contact_impulses`; with and without a report its state
       and derivatives are NaN.
 
-    **Raises:** ValueError for a dt that is not positive, substeps that are no count, another adjoint, dry friction whose load
-    is the force of a constraint, or with smoothing, unknown limits, negative smoothing; (when called) for shapes that do not fit.
+    **Raises:** ValueError for a dt that is not positive, substeps that are no count, another adjoint, dry friction
+    with smoothing, unknown limits, negative smoothing; (when called) for shapes that do not fit.
 
     ```python
     step = jd.stepper(robot, dt=0.01, substeps=2)

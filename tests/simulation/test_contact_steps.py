@@ -465,7 +465,6 @@ def test_substeps_are_steps():
         (lambda: jd.stepper(ball(0.3), 0.01, smoothing=-1.0), "smoothing"),
         (lambda: jd.stepper(ball(0.3).system, 0.01, report=True), "report"),
         (lambda: jd.stepper(ball(0.3), 0.01, limits="stop"), "hold"),
-        (lambda: jd.stepper(free_body([jd.contact.DryFriction(0.1, "rail")]), 0.01), "rail"),
         (lambda: jd.stepper(free_body([jd.contact.DryFriction(0.1, 1.0, smoothing=0.1)]), 0.01), "CoulombFriction"),
     ],
 )
@@ -512,3 +511,41 @@ def test_dry_friction_and_drives_in_steps_with_contacts():
         assert moves or abs(q[0]) < 1e-15
     gradient = jax.jit(jax.grad(lambda u: step(start, u)[2][0]))(jnp.full(1, 4.0))
     assert gradient[0] == pytest.approx(dt / 0.05 - (dt / 0.05) ** 2 / 2, rel=1e-12)
+
+
+@pytest.mark.parametrize("push", [-30.0, 30.0, 100.0])
+def test_friction_of_a_wall_has_the_force_that_holds_the_body_against_it(push):
+    """A body that is pressed against a vertical wall slides down it, or stops and rests, whatever side it is pressed to."""
+    mu, dt, start = 0.2, 0.01, -0.5
+    system = jd.scenes.pendulum_in_plane().system
+    wall, friction = jd.Holonomic(lambda q, t: q[:1], name="wall"), jd.contact.DryFriction(mu, "wall", 1)
+    scene = jd.Scene(system, (wall,), (friction,))
+    tau = jnp.asarray([push, 0.0])
+    mass = float(jd.mass_matrix(system, jnp.zeros(2))[0, 0])
+    (_, v), report = jax.jit(lambda s: run(scene, dt, s, 30, tau))((jnp.zeros(2), jnp.asarray([0.0, start])))
+    expected = start + dt * np.arange(1, 31) * (mu * abs(push) / mass - G)
+    np.testing.assert_allclose(v[:, 1], np.minimum(expected, 0.0), atol=1e-12)
+    level = mu * abs(push) if expected[-1] < 0 else mass * G
+    np.testing.assert_allclose(report.forces["friction"][-1], [level, abs(push)], rtol=1e-10)
+
+
+@pytest.mark.slow
+def test_friction_of_a_rod_changes_the_force_that_loads_it():
+    """A bead on a circle: steps of order one to the motion with events, and their derivative."""
+    rod = jd.scenes.pendulum_in_plane()
+    along = jd.Pfaffian(lambda q, t: jnp.stack([-q[1], q[0]]), name="along")
+    scene = jd.Scene(rod.system, rod.constraints, (jd.contact.DryFriction(0.3, rod.constraints[0].name, along),))
+    ts, none = jnp.linspace(0.0, 2.0, 5), jnp.zeros(2)
+    motion = jd.simulate(scene, [1.0, 0.0], none, ts, rtol=1e-11, atol=1e-11)
+    errors = []
+    for count in (400, 800):
+        (q, _), report = jax.jit(lambda s, count=count: run(scene, 2.0 / count, s, count, none))((motion.q[0], none))
+        assert np.asarray(report.success).all()
+        errors.append(np.abs(q[count // 4 - 1 :: count // 4] - motion.q[1:]).max())
+    assert errors[1] < 0.004 and errors[0] / errors[1] == pytest.approx(2, rel=0.1)
+    step = jd.stepper(scene, 0.01)
+    speed = lambda v: step((jnp.asarray([0.6, -0.8]), v * jnp.asarray([0.8, 0.6])), none)[1][0]  # noqa: E731
+    gradient, second = jax.grad(speed)(1.0), jax.grad(jax.grad(speed))(1.0)
+    differences = (speed(1 + 1e-5) - speed(1 - 1e-5)) / 2e-5
+    assert float(gradient) == pytest.approx(float(differences), rel=1e-9)
+    assert float(second) == pytest.approx(float(jax.grad(speed)(1 + 1e-5) - jax.grad(speed)(1 - 1e-5)) / 2e-5, rel=1e-6)

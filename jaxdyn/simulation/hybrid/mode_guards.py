@@ -52,15 +52,16 @@ def guards_and_levels(
             pivot = reaction.pivots[i]
         guards.append(jnp.stack([normal, sliding, pivot]))
         speed = small * (1 + jnp.max(jnp.stack([speeds[k] for k in one.tangent] or [jnp.zeros((), dtype)])))
-        # Of a contact in flight the gap is known to rounding; of one that rests beside others it is as zero as its velocity.
-        moves = jnp.zeros((), bool)
+        # Of a contact that falls the gap is known to rounding; of one that rests beside others it is as zero as its velocity.
+        # One that rises leaves a gap below zero by itself: it has that of the projection on others at the event before.
+        falls = jnp.zeros((), bool)
         if one.opens:
-            moves = jnp.abs(terms.row.velocity[one.normal]) > 4 * small * (1 + speeds[one.normal])
+            falls = terms.row.velocity[one.normal] < -4 * small * (1 + speeds[one.normal])
         # The pivots are of the size of one.
         levels.append(
             jnp.stack(
                 [
-                    jnp.where(mode.closed[i], force, jnp.where(moves, ROUNDING * reach, reach)),
+                    jnp.where(mode.closed[i], force, jnp.where(falls, ROUNDING * reach, reach)),
                     jnp.where(mode.stick[i], force, speed),
                     jnp.full((), float(jnp.finfo(dtype).eps), dtype),
                 ]

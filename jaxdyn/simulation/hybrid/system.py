@@ -26,7 +26,8 @@ from jaxdyn.simulation.hybrid.modes import Elements, Mode, extend
 from jaxdyn.simulation.hybrid.reactions import coefficients, directions, free_motion, motion_at, normal_loads, react
 from jaxdyn.simulation.hybrid.rows import StateTerms, by_element, by_normal_row, gaps, terms_at, tolerance
 from jaxdyn.simulation.hybrid.transitions import (
-    GUESSES,
+    SLIDES,
+    STICKS,
     Problem,
     Transition,
     align,
@@ -36,6 +37,7 @@ from jaxdyn.simulation.hybrid.transitions import (
     guess_again,
     length,
     rates_of,
+    search_mode,
     with_excess,
 )
 from jaxdyn.simulation.solvers.explicit import Plan
@@ -46,6 +48,7 @@ from jaxdyn.systems.system import displace, rate_to_velocity, retract, velocity_
 # open in proportion to the first correction, which only coarse tolerances make large.
 _ROUNDS, _SAVED_ROUNDS = 2, 6
 _STOPPED = 30  # tolerances of the velocity below which sliding has ended
+_IMPACTS = (0, 0, STICKS, SLIDES)  # guesses of the mode of an impact; the second one is replaced by that of Coulomb's law
 _SLOWER = 0.1  # part of the speed up to which sliding begins in a fixed direction, below which it ends in one
 
 
@@ -172,7 +175,7 @@ class ModalSystem(HybridSystem):
             # First the impulses of Coulomb's law. They are zero where sliding leaves no forces: an impulse without collision
             # begins from elements that stick.
             by_law = (guess == 1) & busy
-            begin = guess_again(elements, problem, mode, jnp.where(by_law, 0, guess), released)
+            begin = guess_again(elements, problem, mode, jnp.asarray(_IMPACTS, jnp.int32)[guess], released)
             begin, along = cond(
                 by_law,
                 partial(impulsive_mode, elements, problem, by_law),
@@ -185,7 +188,7 @@ class ModalSystem(HybridSystem):
             still = kernel(self._find_jams, derivative=False)(problem, choice.mode, choice.slip)
             resting, at, after, gains = kernel(self._after, derivative=False)(unknown, collision, begins, t, q, v)
             problem, along = kernel(self._forces, derivative=False)(unknown, resting, at, t, q, after)
-            final = choose_mode(elements, problem, guess_again(elements, problem, resting, guess, released), along)
+            final = search_mode(elements, problem, resting, along, released, busy & ~choice.wrong)
             follows, soft, short, paradox, tail = kernel(self._flights, derivative=False)(
                 unknown, collision, problem, final.mode, final.slip, t, q, v, after, (height, fast)
             )
@@ -201,7 +204,7 @@ class ModalSystem(HybridSystem):
                 stopped | still,
             )
             fate = jax.tree.map(lambda a, b: jnp.where(settled, a, b), fate, (rebound, held, stopped))
-            more = jnp.where(settled, gains | soft.any() | short.any() | still.any(), guess < GUESSES)
+            more = jnp.where(settled, gains | soft.any() | short.any() | still.any(), guess < len(_IMPACTS) - 1)
             guess = jnp.where(settled, 0, guess + 1).astype(jnp.int32)
             after = tries + 1, guess, fate, new, more & (tries < 4 * n + 12)
             return jax.tree.map(lambda a, b: jnp.where(busy, a, b), after, carry)

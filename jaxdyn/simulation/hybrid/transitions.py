@@ -21,18 +21,20 @@ collision that stops them (Genot & Brogliato 1999).
 
 from typing import NamedTuple
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import lax
 from jaxtyping import Array
 
+from jaxdyn.compile.batch import while_loop
 from jaxdyn.compile.loops import Carry, Given, Iteration, Task, run_loop
 from jaxdyn.simulation.hybrid.impacts import Collision
 from jaxdyn.simulation.hybrid.modes import Elements, Mode
 from jaxdyn.simulation.hybrid.reactions import Reaction, depends_on_others, react
 from jaxdyn.simulation.hybrid.rows import Gram, force_tolerance, tolerance
 
-GUESSES = 3  # other modes from which changes begin where the first one leads to no mode
+STICKS, SLIDES = 41, 81  # guesses in which all elements stick, or slide; the last one
 _ANGLE = 1e-14  # 1 - cos of the angle up to which a direction is known
 _STILL = 1e-4  # rate of slipping, of the terms that cancel in it, of what may stand still
 _ROOM = 2e-3  # of the friction of all elements, by which the friction of some that stick may grow beyond the cone
@@ -125,21 +127,40 @@ def first_guess(elements: Elements, mode: Mode, slip, holding, speed, hit) -> tu
 
 
 def guess_again(elements: Elements, problem: Problem, mode: Mode, guess, released) -> Mode:
-    """Mode from which changes begin, where `guess` () others before have led to no mode: all contacts open, stick, or slide.
+    """Mode from which changes begin, where `guess` () others before have led to no mode.
 
     The first one has all contacts closed that may be. Of redundant contacts several modes agree, with other forces: the choice
     must not depend on the modes before, between which a motion would change without end. Contacts (n,) that the event has
-    `released` have no force in either mode, and are open.
+    `released` have no force in either mode, and are open. The others are those of `STICKS` and `SLIDES`, and all modes of four
+    elements in order: the ternary digits of their number are 0 for open, 1 for sticking, 2 for sliding. Of more elements those
+    four apart begin alike.
     """
-    opens, others = jnp.asarray(elements.opening), guess > 0
+    opens, is_first = jnp.asarray(elements.opening), guess == 0
+    powers = jnp.asarray(3 ** (np.arange(len(elements.each)) % 4), jnp.int32)
+    digit = (guess - 1) // powers % 3
     closed = jnp.where(
         opens,
-        jnp.where(others, problem.may_close & (guess > 1), mode.closed | (problem.may_close & ~released)),
+        jnp.where(is_first, mode.closed | (problem.may_close & ~released), problem.may_close & (digit > 0)),
         mode.closed,
     )
     sticks = closed & problem.may_stick & jnp.asarray(elements.rough)
-    stick = jnp.where(others, sticks & (guess == 2), mode.stick | (sticks & ~mode.closed))
+    stick = jnp.where(is_first, mode.stick | (sticks & ~mode.closed), sticks & (digit == 1))
     return mode._replace(closed=closed, stick=stick)
+
+
+def search_mode(elements: Elements, problem: Problem, mode: Mode, slip, released, wanted) -> Choice:
+    """Mode of the forces if `wanted` (), from one of the modes of `guess_again`: changes may cycle, from others they end."""
+
+    def attempt(carry):
+        guess, choice, busy = carry
+        begin = guess_again(elements, problem, mode, guess, released)
+        found = choose_mode(elements, problem, begin, slip)
+        choice = jax.tree.map(lambda a, b: jnp.where(busy, a, b), found, choice)
+        return guess + 1, choice, busy & found.wrong & (guess < SLIDES)
+
+    none, no = jnp.zeros((), jnp.int32), jnp.zeros((), bool)
+    begin = none, Choice(mode, slip, none, ~no, no), jnp.asarray(wanted) & ~no
+    return while_loop(lambda carry: carry[2], attempt, begin)[1]
 
 
 def choose_mode(elements: Elements, problem: Problem, mode: Mode, slip) -> Choice:
@@ -208,7 +229,10 @@ def _disagreements(elements: Elements, problem: Problem, mode: Mode, slip, react
     is_plane = jnp.asarray(np.array([len(one.tangent) == 2 for one in elements.each]))
     turned = jnp.where((slides & is_plane)[:, None], turned, slip)
     backwards = (jnp.sum(slip * slipping, 1) < -small) & (~is_plane | (trial <= level) | (level <= tiny))
-    pulls = opens & mode.closed & (reaction.normal < -tiny) & ~held
+    # Without a positive pivot a larger force of a sliding contact opens its gap less: what balances there is unstable, and the
+    # contact opens. It closes again where it would penetrate: then no mode is found that begins from it.
+    is_lost = ~mode.stick & rough & (reaction.pivots <= 0)
+    pulls = opens & mode.closed & ((reaction.normal < -tiny) | is_lost) & ~held
     cone = problem.static * jnp.abs(reaction.normal)
     wrong = [
         pulls & ~mode.stick,
