@@ -19,6 +19,7 @@ from jaxdyn.cli.common import (
     whole,
 )
 from jaxdyn.cli.identify_logs import filter_log, log_cutoff, log_names, log_paths, raw_log
+from jaxdyn.cli.identify_mechanism import load_mechanism, run_mechanism
 from jaxdyn.cli.identify_options import find_gains, make_fit, parse_options, resolve_options
 from jaxdyn.cli.identify_tables import error_table, gains_text, payload_text, tables
 from jaxdyn.cli.repair import load_for_repair
@@ -137,6 +138,10 @@ def run(args: argparse.Namespace) -> None:
         # Negated, so that NaN is refused.
         if (value := getattr(args, name)) is not None and not value > 0:
             raise ValueError(f"--{name.replace('_', '-')} is {value}; give a positive number")
+    mechanism = load_mechanism(args.urdf, args)
+    if mechanism is not None:
+        run_mechanism(mechanism, args)
+        return
     # Paths are checked before the fit, which takes minutes.
     out = output_path(args.out, (".urdf",), "--out")
     json_path = output_path(args.report, (".json",), "--report")

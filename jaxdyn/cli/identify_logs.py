@@ -36,13 +36,27 @@ def log_names(paths: list[str]) -> list[str]:
     return [path if names.count(name) > 1 else name for path, name in zip(paths, names, strict=True)]
 
 
-def raw_log(model: Model, path: str, args) -> Log:
+def raw_log(model: Model, path: str, args, motors: bool = False) -> Log:
     """Read the log of a file as recorded, but for wraps and outliers, which are printed.
+
+    `motors`: the columns are those of some joints, in the model's order.
 
     **Raises:** ValueError for logs that do not fit the model, and for outliers.
     """
     # Repairs follow below with the model, whose continuous joints may turn without limit.
-    raw = read_log(path, joint_names=model.joint_names, rename=_renaming(args.rename), unwrap=False, outliers="keep")
+    options = {"rename": _renaming(args.rename), "unwrap": False, "outliers": "keep"}
+    names = model.joint_names
+    if motors:
+        own = read_log(path, **options).joint_names or ()
+        names = tuple(name for name in model.joint_names if name in own)
+        if not names:
+            raise ValueError(
+                f"{path}: name the columns by the motors' joints, q_JOINT and tau_JOINT, of {', '.join(model.joint_names)}"
+            )
+    raw = read_log(path, joint_names=names, **options)
+    if motors:
+        # The repair looks at limits and kinds of the joints, and has the model of a tree.
+        return repair_log(raw, None, unwrap=_UNWRAP[args.unwrap], outliers=args.outliers)
     if raw.q.shape[1] != model.nq or raw.nv != model.nv:
         raise ValueError(
             f"{path}: the log has {raw.q.shape[1]} columns of q and {raw.nv} of tau, the model has {model.nq} and "

@@ -4,11 +4,13 @@ A fit takes some tens of steps with matrices of a few hundred rows, and a search
 takes about a millisecond, and nothing is compiled.
 """
 
+from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
 
 from jaxdyn.constraints.codes import RESULTS
+from jaxdyn.identify.blocks import Block, Inertias, Numbers, Tied
 from jaxdyn.identify.chart import make_chart
 from jaxdyn.identify.condensed import Condensed
 from jaxdyn.identify.descent import Iterate, Method
@@ -63,13 +65,16 @@ class _State(NamedTuple):
     slack: np.ndarray
 
 
+# Entries of the factor that the coordinates after the first one change.
+_LOG_CHOLESKY_PLACES = [(0, 0), (1, 1), (2, 2), (0, 1), (1, 2), (0, 2), (0, 3), (1, 3), (2, 3)]
+
+
 def _log_cholesky_basis() -> np.ndarray:
     """U + U^T (10, 4, 4) for the derivatives U of `inertia.log_cholesky_factor` at zero."""
-    places = [(0, 0), (1, 1), (2, 2), (0, 1), (1, 2), (0, 2), (0, 3), (1, 3), (2, 3)]
     basis = np.zeros((10, 4, 4))
     # The first coordinate scales the whole factor: the density of the body.
     basis[0] = np.eye(4)
-    for k, place in enumerate(places, 1):
+    for k, place in enumerate(_LOG_CHOLESKY_PLACES, 1):
         basis[(k, *place)] = 1
     # d(U U^T) = dU + dU^T at U = 1.
     return basis + np.swapaxes(basis, 1, 2)
@@ -93,56 +98,39 @@ def _from_pseudo() -> np.ndarray:
 LOG_CHOLESKY_BASIS, _FROM_PSEUDO = _log_cholesky_basis(), _from_pseudo()
 
 
-class LinearChart:
-    """Map from relative pseudo-inertias A A^T of the bodies with mass, and terms, to all parameters x, linear in both.
+class LinearChart(NamedTuple):
+    """Map from relative pseudo-inertias A A^T of some bodies, and terms, to parameters x (p,), linear in both.
 
-    Terms are in units of a tenth of a joint's torque, that torque over the velocity or over the acceleration. `start` (n,): the
-    model's own terms, a tenth of a unit where it has none.
+    x is `given`, plus `read` of each body's F A A^T F^T at its `places`, plus `scale` times the terms at `term_places`.
 
-    **Arguments:** `terms`, some of `TERMS`; `inertia`, "full", "mass" or "fixed"; `sizes`, as of `signal_sizes`.
-
-    **Raises:** ValueError for unknown `inertia`, and for nominal bodies and terms that are not feasible.
+    `factors` F (bodies, 4, 4); `read` (k, 4, 4); `places` (bodies, k); `count`: coordinates of a body, its density alone or all
+    ten; `positive` (n,): which of the terms must not be negative; `start` (n,): terms where a fit starts.
     """
 
-    def __init__(self, model: Model, terms: tuple[str, ...], inertia: str, sizes):
-        chart = make_chart(model, inertia)
-        self.factors = np.asarray(chart.factors, np.float64)
-        # "mass" uses the first of the ten log-Cholesky coordinates alone, which scales the density.
-        self.bodies, self.count = np.array(chart.bodies, int), chart.count
-        self.given = nominal_parameters(model)
-        self.places = (10 * self.bodies[:, None] + np.arange(10)).astype(int)
-        self.term_places = free_columns(model.nb, model.nv, terms)[10 * model.nb :]
-        self.positive = np.repeat([term in POSITIVE for term in terms], model.nv).astype(bool)
-        torque, velocity, acceleration = (np.asarray(x, np.float64) for x in sizes)
-        unit = 0.1 * torque
-        # A torque that is always zero borrows the largest unit: a term in units of zero could not be changed.
-        unit = np.where(unit > 0, unit, unit.max(initial=0.0) or 1.0)
-        per = {"viscous": velocity, "coulomb": np.ones(model.nv), "offset": np.ones(model.nv), "armature": acceleration}
-        scales = [unit / np.where(per[term] > 0, per[term], 1.0) for term in terms]
-        self.scale = np.concatenate([np.zeros(0), *scales])
-        own = self.given[self.term_places]
-        if np.any(own < 0):
-            row, column = divmod(int(np.flatnonzero(own < 0)[0]), model.nv)
-            raise ValueError(
-                f"{terms[row]} of coordinate {column} is {own[row * model.nv + column]} in the model; it must not be negative"
-            )
-        # At a bound a barrier is infinite: start inside.
-        self.start = np.where(self.positive, np.where(own > 0, own / self.scale, 0.1), 0.0)
+    given: np.ndarray
+    factors: np.ndarray
+    read: np.ndarray
+    places: np.ndarray
+    count: int
+    term_places: np.ndarray
+    scale: np.ndarray
+    positive: np.ndarray
+    start: np.ndarray
 
     def x(self, origin: np.ndarray, terms: np.ndarray) -> np.ndarray:
         """All parameters (p,)."""
         result = self.given.copy()
         # A body is a product of its factors, so that rounding cannot make it infeasible; a sum P + dP could be.
         upper = self.factors @ origin
-        result[self.places] = np.einsum("kij,bij->bk", _FROM_PSEUDO, upper @ np.swapaxes(upper, 1, 2))
-        result[self.term_places] = self.scale * terms
+        result[self.places] += np.einsum("kij,bij->bk", self.read, upper @ np.swapaxes(upper, 1, 2))
+        result[self.term_places] += self.scale * terms
         return result
 
     def body_jacobians(self, origin: np.ndarray) -> np.ndarray:
-        """Jacobians (bodies, 10, coordinates) of the ten numbers of each body by its own coordinates."""
+        """Jacobians (bodies, k, coordinates) of the numbers of each body by its own coordinates."""
         upper = (self.factors @ origin)[:, None]
         moved = upper @ LOG_CHOLESKY_BASIS[None, : self.count] @ np.swapaxes(upper, 2, 3)
-        return np.einsum("cij,bkij->bck", _FROM_PSEUDO, moved)
+        return np.einsum("cij,bkij->bck", self.read, moved)
 
     def clip_terms(self, terms: np.ndarray) -> np.ndarray:
         """Terms, with those below a millionth of their unit set to zero, which fits approach but never reach."""
@@ -150,19 +138,91 @@ class LinearChart:
 
     def jacobian(self, origin: np.ndarray) -> np.ndarray:
         """Jacobian (p, n) of all parameters by the coordinates of the bodies, then by the terms."""
-        parts = self.body_jacobians(origin)
-        count = len(parts) * self.count
-        result = np.zeros((len(self.given), count + len(self.scale)))
-        for i, (places, part) in enumerate(zip(self.places, parts, strict=True)):
-            result[places, i * self.count : (i + 1) * self.count] = part
-        result[self.term_places, count:] = np.diag(self.scale)
-        return result
+        return self.rows(np.eye(len(self.given)), self.body_jacobians(origin))
 
     def rows(self, R: np.ndarray, jacobians: np.ndarray) -> np.ndarray:
         """Jacobian (m, n) of R x by the coordinates of the bodies, then by the terms."""
         inertial = np.matmul(np.swapaxes(R[:, self.places], 0, 1), jacobians)
         inertial = np.swapaxes(inertial, 0, 1).reshape(len(R), -1)
         return np.concatenate([inertial, R[:, self.term_places] * self.scale], axis=1)
+
+
+def robot_chart(model: Model, terms: tuple[str, ...], inertia: str, sizes) -> LinearChart:
+    """Chart of all parameters x (10 nb + 4 nv,) of a robot, by its bodies with mass and some of `TERMS`.
+
+    Terms are in units of a tenth of a joint's torque, that torque over the velocity or over the acceleration, and start at the
+    model's own, a tenth of a unit where it has none.
+
+    **Arguments:** `inertia`, "full", "mass" or "fixed"; `sizes`, as of `signal_sizes`.
+
+    **Raises:** ValueError for unknown `inertia`, and for nominal bodies and terms that are not feasible.
+    """
+    chart, given = make_chart(model, inertia), nominal_parameters(model)
+    places = 10 * np.array(chart.bodies, int)[:, None] + np.arange(10)
+    term_places = free_columns(model.nb, model.nv, terms)[10 * model.nb :]
+    own, positive = given[term_places], np.repeat([term in POSITIVE for term in terms], model.nv).astype(bool)
+    if np.any(own < 0):
+        row, column = divmod(int(np.flatnonzero(own < 0)[0]), model.nv)
+        raise ValueError(
+            f"{terms[row]} of coordinate {column} is {own[row * model.nv + column]} in the model; it must not be negative"
+        )
+    torque, velocity, acceleration = (np.asarray(x, np.float64) for x in sizes)
+    unit = 0.1 * torque
+    # A torque that is always zero borrows the largest unit: a term in units of zero could not be changed.
+    unit = np.where(unit > 0, unit, unit.max(initial=0.0) or 1.0)
+    per = {"viscous": velocity, "coulomb": np.ones(model.nv), "offset": np.ones(model.nv), "armature": acceleration}
+    scale = np.concatenate([np.zeros(0), *(unit / np.where(per[term] > 0, per[term], 1.0) for term in terms)])
+    given[places] = given[term_places] = 0.0
+    # At a bound a barrier is infinite: start inside.
+    start = np.where(positive, np.where(own > 0, own / scale, 0.1), 0.0)
+    factors = np.asarray(chart.factors, np.float64)
+    return LinearChart(given, factors, _FROM_PSEUDO, places, chart.count, term_places, scale, positive, start)
+
+
+def block_chart(blocks: Sequence[Block]) -> LinearChart | None:
+    """Chart of the ways z (p,) from the start to the numbers of blocks, along which their derivatives by y are constant.
+
+    Positive numbers are terms in units of their start, and z is their change. None unless inertias with the entropic distance
+    from the nominal ones are among the blocks, or where others are neither free nor positive numbers, nor tied to them.
+    """
+    bodies, places, scale, positive = None, np.zeros((0, 0), int), np.zeros(0), np.zeros(0, bool)
+    begin, term_places = 0, []
+    for block in blocks:
+        own = begin + np.arange(block.size)
+        begin += block.size
+        if (
+            isinstance(block, Inertias)
+            and block.metric == "entropic"
+            and block.ellipsoids is None
+            and block.total is None
+        ):
+            bodies, places = block.chart, own.reshape(len(block.chart.bodies), -1)
+        elif isinstance(block, Numbers) and block.kind != "bound":
+            term_places += own.tolist()
+            positive = np.append(positive, np.full(block.size, block.kind == "positive"))
+        elif not isinstance(block, Tied):
+            return None
+    if bodies is None:
+        return None
+    basis, scale = LOG_CHOLESKY_BASIS[: bodies.count], np.ones(len(term_places))
+    # The dual basis: coordinates of A A^T - 1 in the directions of the log-Cholesky coordinates at the start.
+    read = np.einsum("kl,lij->kij", np.linalg.inv(np.einsum("kij,lij->kl", basis, basis)), basis)
+    given = np.zeros(begin)
+    given[places] = -np.trace(read, axis1=1, axis2=2)
+    given[np.array(term_places, int)[positive]] = -1.0
+    factors = np.broadcast_to(np.eye(4), (len(places), 4, 4))
+    return LinearChart(
+        given, factors, read, places, bodies.count, np.array(term_places, int), scale, positive, positive.astype(float)
+    )
+
+
+def log_cholesky_coordinates(origin: np.ndarray, count: int) -> np.ndarray:
+    """Coordinates (bodies, count) with the factors `origin` (bodies, 4, 4): the inverse of `inertia.log_cholesky_factor`."""
+    last = origin[:, 3, 3]
+    relative = origin / last[:, None, None]
+    logarithms = np.log(np.stack([last, *(relative[:, i, i] for i in range(3))], axis=1))
+    others = np.stack([relative[(slice(None), *place)] for place in _LOG_CHOLESKY_PLACES[3:]], axis=1)
+    return np.concatenate([logarithms, others], axis=1)[:, :count]
 
 
 class InteriorPoint(Method):
@@ -189,7 +249,7 @@ class InteriorPoint(Method):
     def init(self, start, kept):
         """Evaluate the start, with multipliers that make the barrier as strong as the data."""
         problem, positive = self.problem, self.linear.positive
-        terms, origin = np.asarray(start, np.float64), np.broadcast_to(np.eye(4), (len(self.linear.bodies), 4, 4))
+        terms, origin = np.asarray(start, np.float64), np.broadcast_to(np.eye(4), (len(self.linear.factors), 4, 4))
         # Degree of the barrier: log det of a 4 x 4 matrix counts four, an inequality one.
         count = 4 * len(origin) + max(self.inequalities, 1)
         # Not below the prior, which is the final strength of the bodies' barrier.

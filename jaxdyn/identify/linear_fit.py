@@ -6,7 +6,7 @@ from typing import NamedTuple
 import equinox as eqx
 import numpy as np
 
-from jaxdyn.identify.condensed import Blocks, condense_rows
+from jaxdyn.identify.condensed import condense_rows
 from jaxdyn.identify.logs import Log, as_logs, check_log
 from jaxdyn.identify.regression import (
     BaseParameters,
@@ -142,7 +142,11 @@ def least_squares(
     size = effective_sample_size(
         [model_torques(model, log, fitted, v_s) - np.asarray(log.tau, np.float64) for log in logs]
     )
-    std, factor = _scatter(parts, fitted, places, fit.half, weights, size)
+    # In coordinates y with x[places] = half y, in which the Hessian of all samples is the identity.
+    gradients = parts.scores(fitted, weights)[:, places] @ fit.half
+    grams = parts.grams(weights)[:, places][:, :, places]
+    grams = np.einsum("pi,bpq,qj->bij", fit.half, grams, fit.half, optimize=True)
+    std, factor = scatter(grams, gradients, fit.half, size)
     std = np.where(fit.unknown, np.inf, std)
     nominal = base.values(x0[columns])
     parameters = x0.copy()
@@ -165,13 +169,11 @@ def least_squares(
     )
 
 
-def _scatter(blocks: Blocks, x: np.ndarray, places, half: np.ndarray, weights, size: float) -> tuple[np.ndarray, float]:
-    """Jackknife standard deviations of x[places], and the factor of a 95 % interval.
+def scatter(grams, gradients, half: np.ndarray, size: float) -> tuple[np.ndarray, float]:
+    """Jackknife standard deviations of numbers half y, and the factor of a 95 % interval.
 
-    In coordinates y with x[places] = half y, in which the Hessian of all samples is the identity.
+    `grams` (blocks, n, n) and `gradients` (blocks, n) of blocks of samples by y; `size`: effective sample size of the errors.
     """
-    gradients = blocks.scores(x, weights)[:, places] @ half
-    grams = np.einsum("pi,bpq,qj->bij", half, blocks.grams(weights)[:, places][:, :, places], half, optimize=True)
     # There is no prior here: in these coordinates the blocks' curvatures add up to the identity.
     estimate = jackknife(grams, gradients, np.zeros((half.shape[1],) * 2), size)
     return np.sqrt(np.sum((half @ estimate.root) ** 2, axis=1)), estimate.factor
@@ -252,12 +254,22 @@ def identifiability(
     rank = int(np.sum(s > rcond * s.max(initial=0.0)))
     # A parameter with any share in the null space is not determined, whatever its other components.
     unknown = np.sum(Vt[rank:] ** 2, axis=0) > 1e-12
-    # Singular values descend: the last ones are the weakest directions.
-    order = range(len(s) - 1, max(len(s) - 1 - count, -1), -1)
-    weakest = [Direction(float(s[i] / s[0]) if i < rank else 0.0, _words(Vt[i], base.names)) for i in order]
+    weakest = _weakest(s, Vt, rank, base.names, count)
     silent = tuple(name for name, is_unknown in zip(base.names, unknown, strict=True) if is_unknown)
     condition = float(s[0] / s[rank - 1]) if rank else np.inf
     return Identifiability(base, rank, condition, weakest, silent, base.unidentifiable)
+
+
+def weakest_directions(A: np.ndarray, names: Sequence[str], count: int = 3) -> list[Direction]:
+    """The least identifiable directions of a regressor (rows, p) of full rank, the weakest first."""
+    _, s, Vt = np.linalg.svd(np.linalg.qr(A / np.linalg.norm(A, axis=0))[1])
+    return _weakest(s, Vt, len(s), names, count)
+
+
+def _weakest(s: np.ndarray, Vt: np.ndarray, rank: int, names: Sequence[str], count: int) -> list[Direction]:
+    # Singular values descend: the last ones are the weakest directions.
+    order = range(len(s) - 1, max(len(s) - 1 - count, -1), -1)
+    return [Direction(float(s[i] / s[0]) if i < rank else 0.0, _words(Vt[i], names)) for i in order]
 
 
 def base_terms(terms) -> tuple[str, ...]:

@@ -1,6 +1,7 @@
 """Mechanisms with only some joints measured: the nearest states on the constraints, and logs completed by them."""
 
 from collections.abc import Sequence
+from functools import partial
 from typing import Any
 
 import equinox as eqx
@@ -15,7 +16,9 @@ from jaxdyn.constraints.base import layout, position_residual, rows, velocity_re
 from jaxdyn.constraints.branches import degrees_of_freedom
 from jaxdyn.constraints.codes import CODES, RESULTS, code_of
 from jaxdyn.constraints.selection import independent_rows
+from jaxdyn.dynamics import quantities as dynamics
 from jaxdyn.identify.logs import Log
+from jaxdyn.identify.torque_terms import friction_regressor
 from jaxdyn.model.arguments import Numbers, as_array, state_dtype, warn
 from jaxdyn.model.topology import velocity_indices
 from jaxdyn.model.tree import Model
@@ -104,6 +107,58 @@ def nearest_velocity(scene: Scene, q, v, t, columns: tuple[int, ...]) -> tuple[F
     return velocity, _is_small(changes[-1], velocity)
 
 
+def motor_basis(scene: Scene, q, v, t, columns: tuple[int, ...]) -> tuple[Float[Array, "nv m"], Float[Array, " nv"]]:
+    """Tangent basis N (nv, m) and drift (nv,) of a mechanism: a = N a_m + drift for the accelerations a_m of its motors.
+
+    `columns`: indices in v of the motors, as many as there are degrees of freedom. Rows of N at the motors are those of the
+    identity, so that N^T takes the torques at all joints to those of the motors with the same power: the forces of ideal
+    constraints do no work, and cancel.
+    """
+    row, motors = rows(scene, q, v, t), np.array(columns)
+    passive = np.setdiff1d(np.arange(scene.nv), motors)
+    # Redundant rows are consistent: least squares solves them exactly, where the motors determine the passive joints.
+    own = row.A[:, passive]
+    known = jnp.concatenate([-row.A[:, motors], row.gamma[:, None]], axis=1)
+    solved = jax.vmap(partial(solve_positive, own.T @ own), 1, 1)(own.T @ known)
+    N = jnp.zeros((scene.nv, len(motors)), q.dtype).at[motors].set(jnp.eye(len(motors), dtype=q.dtype))
+    return N.at[passive].set(solved[:, :-1]), jnp.zeros((scene.nv,), q.dtype).at[passive].set(solved[:, -1])
+
+
+def motor_regressor(scene: Scene, log: Log, motors: Sequence[Any], terms: Sequence[str], v_s: float) -> np.ndarray:
+    """Regressor (n, m, 10 nb + terms m) of the torques of a mechanism's motors along a log: N^T Y of the tree, then friction.
+
+    Columns are the inertias of all bodies, then `terms` of the motors. The passive joints have no friction.
+
+    **Raises:** ValueError unless there are as many motors as degrees of freedom.
+    """
+    columns = check_motors(scene, log, motors)
+    signals = [jnp.asarray(x, state_dtype(scene.system)) for x in (log.q, log.v, log.a, log.t)]
+    return np.asarray(_motor_regressor(scene, columns, tuple(terms), v_s, *signals), np.float64)
+
+
+@eqx.filter_jit
+def _motor_regressor(scene, columns, terms, v_s, *signals):
+    def one(q, v, a, t):
+        N, _ = motor_basis(scene, q, v, t, columns)
+        own = np.array(columns)
+        Y = dynamics.torque_regressor(scene.system, q, v, a)
+        return jnp.concatenate([N.T @ Y, friction_regressor(v[own], a[own], terms, v_s)], axis=1)
+
+    return jax.vmap(one)(*signals)
+
+
+def check_motors(scene: Scene, log: Log, motors: Sequence[Any]) -> tuple[int, ...]:
+    """Indices in v of a mechanism's motors. **Raises:** ValueError unless there are as many as degrees of freedom."""
+    columns = observation_columns(scene.system, motors)
+    count = degrees_of_freedom(scene, jnp.asarray(np.asarray(log.q)[0], state_dtype(scene.system)))
+    if len(columns) != count:
+        raise ValueError(
+            f"observed has {len(columns)} joints, and the mechanism has {count} degrees of freedom; name as many motors, whose "
+            "torques determine its motion"
+        )
+    return columns
+
+
 def _is_small(change, value) -> Bool[Array, ""]:
     """True for the last step of a search that has converged; false for NaN."""
     change, value = lax.stop_gradient((change, value))
@@ -128,12 +183,12 @@ def complete_log(scene: SceneLike, t: Numbers, measured: dict[Any, Any], tau: Nu
     **Arguments:**
 
     - `scene`: a scene with constraints. `t` (n,): times of the samples, s.
-    - `measured`: {joint: (q (n,), v (n,))}, rad and rad/s or m and m/s, of joints with one degree of freedom. Keys are names, or
-      indices for a system without bodies.
+    - `measured`: {joint: (q (n,), v (n,))}, rad and rad/s or m and m/s, of joints with one degree of freedom, or (q, v, a) with
+      accelerations. Keys are names, or indices for a system without bodies.
     - `tau` (n, nv): N m or N, zero where there are no motors. `guess` (nq,): a configuration near the first sample.
 
-    **Returns:** `Log` without accelerations, in which measured joints keep their measured values. Pass the joints as
-    `observed=` to `fit_parameters`, which then compares them alone.
+    **Returns:** `Log` in which measured joints keep their measured values, without accelerations unless these are measured of as
+    many joints as there are degrees of freedom. Pass the joints as `observed=` to `Objective`, which then compares them alone.
 
     **Raises:** ValueError for joints that do not exist or have several degrees of freedom, wrong shapes, and for a sample at
     which the mechanism cannot be assembled, no nearest state is found, or no velocity on the constraints has the measured ones,
@@ -152,10 +207,13 @@ def complete_log(scene: SceneLike, t: Numbers, measured: dict[Any, Any], tau: Nu
         raise ValueError(f"measured names {names}; name joints with one degree of freedom each")
     t = np.asarray(as_array(t, "t"), np.float64)
     motion = {name: [jnp.asarray(as_array(x, f"measured[{name!r}]", dtype)) for x in measured[name]] for name in names}
-    for name, (q, v) in motion.items():
-        if q.shape != t.shape or v.shape != t.shape:
-            raise ValueError(f"measured[{name!r}] has shapes {q.shape} and {v.shape}; give q and v, {t.shape} each")
-    positions, velocities = (jnp.stack([motion[name][i] for name in names], axis=1) for i in (0, 1))
+    for name, signals in motion.items():
+        if len(signals) not in (2, 3) or any(x.shape != t.shape for x in signals):
+            shapes = ", ".join(str(x.shape) for x in signals)
+            raise ValueError(f"measured[{name!r}] has shapes {shapes}; give q and v, or q, v and a, {t.shape} each")
+    if len({len(signals) for signals in motion.values()}) > 1:
+        raise ValueError("measured has accelerations of some joints only; give those of all, or none")
+    positions, velocities, *accelerations = (jnp.stack(x, axis=1) for x in zip(*motion.values(), strict=True))
     guess = jnp.asarray(as_array(guess, "guess", dtype))
     if guess.shape != (system.nq,):
         raise ValueError(f"guess has shape {guess.shape}, expected {(system.nq,)} = (nq,)")
@@ -188,7 +246,20 @@ def complete_log(scene: SceneLike, t: Numbers, measured: dict[Any, Any], tau: Nu
         raise ValueError(f"the {what} at sample {i} (t = {t[i]:.6g} s); check measured, lengths and guess")
     q, v = np.array(q), np.array(v)
     q[:, np.array(q_indices)], v[:, np.array(columns)] = positions, velocities
-    return Log(t, q, v, None, np.asarray(tau, np.float64))
+    log, a = Log(t, q, v, None, np.asarray(tau, np.float64)), None
+    if accelerations:
+        check_motors(scene, log, names)
+        a = _complete_accelerations(scene, columns, *(jnp.asarray(x, dtype) for x in (q, v, t)), *accelerations)
+    return log if a is None else Log(t, q, v, np.asarray(a), log.tau)
+
+
+@eqx.filter_jit
+def _complete_accelerations(scene, columns, q, v, t, a):
+    def one(q, v, t, a):
+        N, drift = motor_basis(scene, q, v, t, columns)
+        return N @ a + drift
+
+    return jax.vmap(one)(q, v, t, a)
 
 
 def completed(scene: SceneLike, t: Numbers, measured: dict[Any, Any], tau: Numbers, guess: Numbers) -> Log:

@@ -38,7 +38,7 @@ from jaxdyn.identify.replay import (
     simulate_segment,
     simulation_options,
 )
-from jaxdyn.identify.result import inverse_torque
+from jaxdyn.identify.result import inverse_torque, project_to_motors
 from jaxdyn.identify.sensors import Measured
 from jaxdyn.model.arguments import Checked, FilePath, SystemLike, check_mapping, warn
 from jaxdyn.model.numbers import as_static, check_count, check_seed
@@ -71,7 +71,8 @@ class Objective(eqx.Module):
     **Arguments:**
 
     - `error`: the quantity to compare.
-      "torque": M a + h less the scene's forces. Needs accelerations, and no simulation.
+      "torque": M a + h less the scene's forces. Needs accelerations, and no simulation. Of a mechanism with constraints the
+      torques of its motors are compared, `observed`, as many as it has degrees of freedom.
       "momentum", "energy": balances over segments of `horizon` steps (20 by default), which need no accelerations.
       "trajectory": motions of segments of `horizon` steps, simulated with the measured torques (multiple shooting).
       "closed-loop": the same under the logged controller; its torques are compared too. Unlike this, open-loop replay of a
@@ -163,16 +164,26 @@ class Objective(eqx.Module):
         return motion if self.error == "trajectory" else jnp.concatenate([motion, torque[None]])
 
     def errors(
-        self, measured: Measured, segment: Segments, change: Float[Array, "2 nv"] | None, scale: Array
+        self,
+        measured: Measured,
+        segment: Segments,
+        change: Float[Array, "2 nv"] | None,
+        scale: Array,
+        torque: Callable = inverse_torque,
     ) -> Float[Array, "n k"]:
-        """Errors of one segment, a row for each sample (one row for a balance); `change` (2, nv): of its initial state."""
+        """Errors of one segment, a row for each sample (one row for a balance); `change` (2, nv): of its initial state.
+
+        `torque(scene, q, v, a, t)`: `inverse_torque`, or an equal function.
+        """
         scene, system = measured.scene, measured.scene.system
         segment = correct_sensors(measured, segment, None if self.error in SIMULATED else self.hold)
         if self.error == "torque":
-            tau = jax.vmap(lambda t, q, v, a: inverse_torque(scene, q, v, a, t))(
-                segment.t, segment.q, segment.v, segment.a
-            )
-            return self._select_columns((tau - segment.tau) / scale[None])
+            errors = jax.vmap(partial(torque, scene))(segment.q, segment.v, segment.a, segment.t) - segment.tau
+            if scene.constraints:
+                errors = jax.vmap(partial(project_to_motors, scene, self.observed))(
+                    segment.q, segment.v, segment.t, errors
+                )
+            return self._select_columns(errors / scale[None])
         if self.error == "momentum":
             return self._select_columns((momentum_balance(scene, segment) / scale)[None])
         if self.error == "energy":

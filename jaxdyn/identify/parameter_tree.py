@@ -27,7 +27,7 @@ from jaxdyn.identify.blocks import (
     select,
 )
 from jaxdyn.identify.chart import METRICS, make_chart
-from jaxdyn.identify.sensors import FitSystem, with_sensors
+from jaxdyn.identify.sensors import FitSystem, Measured, with_sensors
 from jaxdyn.model import host_math
 from jaxdyn.model.arguments import Function, Number, state_dtype, warn
 from jaxdyn.model.arguments import Numbers as Values
@@ -252,6 +252,19 @@ class Parameters(eqx.Module):
     def dtype(self) -> np.dtype:
         """Floating-point type of the coordinates."""
         return state_dtype(with_sensors(self.given).scene.system)
+
+    @property
+    def keeps_regressor(self) -> bool:
+        """True where inertias are free and the kinematics, gravity and encoders, on which their regressor depends, are not."""
+        models = find_models(self.given)
+        if len(models) != 1 or not any(isinstance(block, Inertias) for block in self.blocks):
+            return False
+        model, leaves = models[0], jax.tree.leaves(self.given)
+        sensors = self.given.position_bias if isinstance(self.given, Measured) else None
+        others = [model.inertias, model.armature, model.damping, model.friction]
+        # By identity, as in `_model`.
+        fixed = {id(x) for x in jax.tree.leaves((model, sensors))} - {id(x) for x in others}
+        return not any(id(leaves[block.place]) in fixed for block in self.blocks)  # pyright: ignore[reportAttributeAccessIssue]
 
     def system(self, y: Float[Array, " p"]) -> PyTree:
         """System as given, with the numbers of y."""

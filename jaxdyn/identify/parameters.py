@@ -10,7 +10,11 @@ import jax.numpy as jnp
 import numpy as np
 
 from jaxdyn.constraints.codes import RESULTS
+from jaxdyn.identify.blocks import Inertias
+from jaxdyn.identify.condensed import condense_rows
+from jaxdyn.identify.condensed_fit import minimize_torque_error
 from jaxdyn.identify.descent import Descent, Method, Watch, checkpoint_at, descend
+from jaxdyn.identify.interior import TorqueProblem, block_chart, log_cholesky_coordinates
 from jaxdyn.identify.logs import Log
 from jaxdyn.identify.methods import (
     DAMPING,
@@ -38,14 +42,18 @@ from jaxdyn.identify.problem import (
 )
 from jaxdyn.identify.result import ParameterFit
 from jaxdyn.identify.sensors import FitSystem
+from jaxdyn.identify.threads import on_one_thread
 from jaxdyn.identify.uncertainty import error_groups, standard_deviations, student
 from jaxdyn.model.arguments import Checked, Function
 from jaxdyn.tasks import count_workers, map_tasks
 
+# Of the interior point: most steps, and the excess of its loss over the minimum as a share of the prior's weight.
+_CONVEX_STEPS, _EXCESS = 200, 1e-9
 # Of the starts: rough, as the best one is fitted to the end afterwards, so that only the order of the losses matters.
 _STEPS, _TOLERANCE = 20, 1e-4
 
 
+@on_one_thread
 def fit_parameters(
     system: FitSystem,
     log: Log | Sequence[Log],
@@ -120,6 +128,7 @@ def fit_parameters(
         result=end.result,
         method=f"{objective.error} fit by {solver.name}",
         cause=explain_not_finite(problem, watch.failed, logs) if end.result is RESULTS.nonfinite else None,
+        motors=problem.objective.observed,
     )
 
 
@@ -129,12 +138,12 @@ def _minimise(
     """End of a minimisation, and the errors near it; None where the method takes no Jacobian."""
     rounding = float(jnp.finfo(unknowns.y.dtype).eps)
     if solver.name == GAUSS_NEWTON:
-        end = descend(GaussNewton(partial(linearise, problem), solver.tolerance, rounding), unknowns, watch)
+        start, before = minimize_linear_torques(problem, unknowns) if solver.starts == 1 else (unknowns, np.zeros(0))
+        end = descend(GaussNewton(partial(linearise, problem), solver.tolerance, rounding), start, watch)
         # Only steps that lower the loss are accepted: the last point is the best one.
-        linear = end.last.state[0]
-        return end._replace(
-            best=end.last, result=confirm_minimum(end.result, linear, solver.tolerance, rounding)
-        ), linear
+        linear, history = end.last.state[0], np.concatenate([before, end.history])
+        result = confirm_minimum(end.result, linear, solver.tolerance, rounding)
+        return Descent(end.last, end.last, history, result), linear
     if solver.name in SOLVERS:
         steps: Method = LeastSquaresSteps(errors_of, problem, solver.name, solver.tolerance)
     else:
@@ -151,6 +160,33 @@ def _minimise(
         return end, None
     linear = linearise(problem, end.best.point)
     return end._replace(result=confirm_minimum(end.result, linear, solver.tolerance, rounding)), linear
+
+
+def minimize_linear_torques(problem: Problem, unknowns: Unknowns) -> tuple[Unknowns, np.ndarray]:
+    """Minimum of the error of torques that are linear in the numbers, by the steps of `fit_torques`, and the losses before it.
+
+    The errors along straight lines in the numbers are those at the start and their Jacobian there times the change z. Unknowns
+    other than those of `block_chart` stay where they are. Where the minimum is none, as the torques are not linear after all, so
+    do these.
+    """
+    chart = block_chart(problem.tree.blocks) if problem.objective.error == "torque" else None
+    here = None if chart is None else linearise(problem, unknowns)
+    if chart is None or here is None or not here.is_finite:
+        return unknowns, np.zeros(0)
+    (weight,) = (float(block.weight) for block in problem.tree.blocks if isinstance(block, Inertias))
+    # The divergence replaces the residuals of the inertias' prior; those of other numbers are linear.
+    data = np.arange(len(here.errors)) < len(here.errors) - here.priors
+    kept = data | ~np.any(here.rows[:, chart.places.reshape(-1)] != 0, axis=1)
+    # Twice the loss: `TorqueProblem` has half of the squares.
+    rows = 2**0.5 * np.concatenate([here.rows[kept], -here.errors[kept, None]], axis=1)
+    condensed, prior = condense_rows(rows, int(data.sum())), weight * problem.prior_weight
+    convex = TorqueProblem(chart, condensed.R, condensed.d, condensed.rest, prior)
+    end = minimize_torque_error(convex, _CONVEX_STEPS, _EXCESS * prior)
+    y = np.zeros(unknowns.y.size)
+    y[chart.places.reshape(-1)] = log_cholesky_coordinates(end.origin, chart.count).reshape(-1)
+    y[chart.term_places] = np.where(chart.positive, np.log(np.where(chart.positive, end.terms, 1.0)), end.terms)
+    there = Unknowns(jnp.asarray(y, unknowns.y.dtype), None)
+    return (there, end.history[:-1]) if linearise(problem, there).loss < here.loss else (unknowns, np.zeros(0))
 
 
 def _best_start(problem: Problem, unknowns: Unknowns, solver: Solver, execution: Execution) -> Unknowns:

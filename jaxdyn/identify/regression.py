@@ -230,14 +230,29 @@ def base_parameters(model: Model, terms: Terms = (), *, v_s: float = 0.01, seed:
     displacement, v, a = generator.normal(size=(3, count, model.nv))
     q = _displace_neutral(model, jnp.asarray(2 * displacement, model.home.dtype))
     W = regressor(model, q, v, a, v_s=v_s)[:, :, free_columns(model.nb, model.nv, terms)].reshape(-1, p)
-    scale = np.linalg.norm(W, axis=0)
+    base, rank = group_columns(W, names, model.nb, np.dtype(model.home.dtype))
+    # Two tests of the rank: they differ where a pivot is close to the tolerance.
+    if rank != len(base):
+        raise ValueError(
+            f"base parameters of {model.name!r} are not clear in {model.home.dtype}: {len(base)} by "
+            f"elimination, {rank} by singular values; use a float64 model (jax_enable_x64)"
+        )
+    return base
+
+
+def group_columns(W: np.ndarray, names: tuple[str, ...], nb: int, dtype: np.dtype) -> tuple[BaseParameters, int]:
+    """Base parameters of a stacked regressor (rows, p), whose first 10 nb columns are those of bodies, and its rank by SVD.
+
+    `dtype`: of the computation of its entries, whose rounding decides which columns are dependent.
+    """
+    p, scale = W.shape[1], np.linalg.norm(W, axis=0)
     # A column of rounding errors is zero too, and must not be scaled to unit length.
-    noise = np.finfo(np.dtype(model.home.dtype)).eps
+    noise = np.finfo(dtype).eps
     scale[scale < 1e3 * noise * scale.max(initial=0.0)] = np.inf
 
     order = np.array(
-        [10 * body + k for kept in (_KEPT_FIRST, _KEPT_LAST) for body in range(model.nb) for k in kept]
-        + list(range(10 * model.nb, p)),
+        [10 * body + k for kept in (_KEPT_FIRST, _KEPT_LAST) for body in range(nb) for k in kept]
+        + list(range(10 * nb, p)),
         int,
     )
     # QR without column pivoting: the order decides which of dependent parameters stands for the combination.
@@ -249,12 +264,6 @@ def base_parameters(model: Model, terms: Terms = (), *, v_s: float = 0.01, seed:
     scaled = (W / scale)[:, independent]
     singular = np.linalg.svd(W / scale, compute_uv=False)
     rank = int(np.sum(singular > tolerance * singular.max(initial=0.0)))
-    # Two tests of the rank: they differ where a pivot is close to the tolerance.
-    if rank != len(independent):
-        raise ValueError(
-            f"base parameters of {model.name!r} are not clear in {model.home.dtype}: {len(independent)} by "
-            f"elimination, {rank} by singular values; use a float64 model (jax_enable_x64)"
-        )
     dependent = np.setdiff1d(np.arange(p), independent)
     beta = np.linalg.lstsq(scaled, (W / scale)[:, dependent], rcond=None)[0]
     # Rounding errors would otherwise appear in the combinations as parameters.
@@ -265,7 +274,7 @@ def base_parameters(model: Model, terms: Terms = (), *, v_s: float = 0.01, seed:
     factor = np.where(finite, scale[dependent], 0.0)
     # Back from unit columns, W x = (W / scale) (scale x).
     matrix[:, dependent] = beta * factor / scale[independent][:, None]
-    return BaseParameters(matrix, independent, names)
+    return BaseParameters(matrix, independent, names), rank
 
 
 def noise_level(condensed: Condensed, *, rcond: float = 1e-9) -> float:

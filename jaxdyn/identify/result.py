@@ -11,6 +11,7 @@ import numpy as np
 from jaxdyn.constraints.codes import Outcome, name_of
 from jaxdyn.dynamics import quantities as dynamics
 from jaxdyn.identify.logs import Log, check_log
+from jaxdyn.identify.mechanisms import motor_basis
 from jaxdyn.identify.regression import nominal_parameters, parameter_names, torque_error
 from jaxdyn.identify.sensors import Measured, with_sensors
 from jaxdyn.identify.torque_terms import ExtraTorque, Friction, coulomb_column, coulomb_through_filter
@@ -37,10 +38,7 @@ class AbstractFit(Outcome):
 
     def torques(self, log: Log) -> np.ndarray:
         """Torques (n, nv) that the fitted system needs along a log, over and above its forces and friction (N m, N)."""
-        scene = self.scene
-        check_log(log, scene.system)
-        dtype = state_dtype(scene.system)
-        return np.asarray(_torques(scene, *(jnp.asarray(x, dtype) for x in (log.t, log.q, log.v, log.a))), np.float64)
+        return torques_along(self.scene, log)
 
     def error(self, log: Log) -> float:
         """Torque error along a log in per cent, 100 |tau_fit - tau| / |tau| over all samples and joints."""
@@ -110,10 +108,8 @@ class Fit(AbstractFit):
             return torque
         load = np.zeros_like(torque)
         if self.extra.needs_load:
-            dtype = state_dtype(self.model)
-            signals = (jnp.asarray(x, dtype) for x in (log.t, log.q, log.v, log.a))
             # Without friction: the load of the gears is the torque of bodies and rotors, as in the fit.
-            load = np.asarray(_torques(Scene(self.model), *signals), np.float64)
+            load = torques_along(Scene(self.model), log)
         return torque + self.extra.torque(log, load)
 
     @property
@@ -149,6 +145,7 @@ class ParameterFit(AbstractFit):
     - `history` (steps,): loss before each step and at the end. `result`: one of `RESULTS`, `successful` where it has
       converged, else `max_steps_reached`, `stopped`, `no_descent` where no step lowers the loss at a point that is no minimum, or
       `nonfinite`; `cause` then names the log, the sample and the parameters.
+    - `motors`: indices in v of the observed coordinates, where the fit named them; `torques` of a mechanism are theirs.
     """
 
     system: Any
@@ -162,6 +159,7 @@ class ParameterFit(AbstractFit):
     method: str = eqx.field(static=True)
     cause: str | None = eqx.field(static=True, default=None)
     factor: float = np.nan
+    motors: tuple[int, ...] | None = eqx.field(static=True, default=None)
 
     @property
     def scene(self) -> Scene:
@@ -170,11 +168,11 @@ class ParameterFit(AbstractFit):
 
     def torques(self, log: Log) -> np.ndarray:
         """Torques (n, nv) that the fitted system needs along a log, in the log's units: as its sensors would measure them."""
+        torques = torques_along(self.scene, log, self.motors)
         if not isinstance(self.system, Measured):
-            return super().torques(log)
-        measured = self.system
-        bias, gain = (np.asarray(x, np.float64) for x in (measured.torque_bias, measured.torque_gain))
-        return (super().torques(log) - bias) / gain
+            return torques
+        bias, gain = (np.asarray(x, np.float64) for x in (self.system.torque_bias, self.system.torque_gain))
+        return (torques - bias) / gain
 
     @property
     def parameters(self) -> list[tuple[str, float, float, float]]:
@@ -187,6 +185,19 @@ class ParameterFit(AbstractFit):
         return [("parameter", "nominal", "fitted", "std"), *self.parameters]
 
 
+def torques_along(scene: Scene, log: Log, motors: tuple[int, ...] | None = None) -> np.ndarray:
+    """Torques (n, nv) that a scene needs along a log; of a mechanism those of its `motors`, zero elsewhere.
+
+    **Raises:** ValueError for a log that does not fit, and for a mechanism without `motors`.
+    """
+    check_log(log, scene.system)
+    if scene.constraints and motors is None:
+        raise ValueError("the torques of a mechanism are those of its motors; name them as observed= in the fit")
+    dtype = state_dtype(scene.system)
+    signals = (jnp.asarray(x, dtype) for x in (log.t, log.q, log.v, log.a))
+    return np.asarray(_torques(scene, motors if scene.constraints else None, *signals), np.float64)
+
+
 def inverse_torque(scene: Scene, q, v, a, t):
     """Torque tau (nv,) of a motion of a scene without constraints: inverse dynamics less the scene's forces."""
     tau = dynamics.inverse_dynamics(scene.system, q, v, a, t)
@@ -194,6 +205,25 @@ def inverse_torque(scene: Scene, q, v, a, t):
     return tau if force is None else tau - force
 
 
+def project_to_motors(scene: Scene, columns, q, v, t, tau):
+    """Torques (nv,) of the motors that have the power of torques (nv,) at all joints of a mechanism; zero elsewhere."""
+    N, _ = motor_basis(scene, q, v, t, columns)
+    return jnp.zeros_like(tau).at[np.array(columns)].set(N.T @ tau)
+
+
+def regressor_torque(scene: Scene, q, v, a, t):
+    """`inverse_torque` of a model by its regressor, whose derivative by the inertias is the regressor itself."""
+    model: Any = scene.system
+    tau = dynamics.torque_regressor(model, q, v, a) @ model.inertias.reshape(-1)
+    tau = tau if model.armature is None else tau + model.armature * a
+    force = scene.applied_force(q, v, t)
+    return tau if force is None else tau - force
+
+
 @eqx.filter_jit
-def _torques(scene: Scene, t, q, v, a):
-    return jax.vmap(lambda t, q, v, a: inverse_torque(scene, q, v, a, t))(t, q, v, a)
+def _torques(scene: Scene, motors, t, q, v, a):
+    def one(t, q, v, a):
+        tau = inverse_torque(scene, q, v, a, t)
+        return tau if motors is None else project_to_motors(scene, motors, q, v, t, tau)
+
+    return jax.vmap(one)(t, q, v, a)

@@ -18,7 +18,7 @@ from jaxdyn.identify.condensed_fit import (
     intervals,
     is_negligible,
 )
-from jaxdyn.identify.interior import LinearChart
+from jaxdyn.identify.interior import robot_chart
 from jaxdyn.identify.logs import Log, idle_coordinates, log_rate, signal_sizes
 from jaxdyn.identify.regression import log_regressor
 from jaxdyn.identify.result import Fit
@@ -49,7 +49,7 @@ class RobotProblem:
         # Caches: `_data` depends on loads and sample weights, `_rows` on joint weights too.
         self._data: dict[tuple, Data] = {}
         self._rows: dict[tuple, np.ndarray] = {}
-        self.chart = LinearChart(model, basic, inertia, self.sizes)
+        self.chart = robot_chart(model, basic, inertia, self.sizes)
 
     def data(self, setting: Setting) -> Data:
         """Condensed logs for the v_s and the loss of a setting."""

@@ -1,14 +1,18 @@
 """Mechanisms with loops, rolling and grasps, identified from logs of a few joints; a tossed cube from its flight."""
 
+import json
+
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
 
 import jaxdyn as jd
+from jaxdyn.cli import main
 from jaxdyn.constraints.codes import RESULTS
 from jaxdyn.identify.mechanisms import on_constraints
 from jaxdyn.identify.replay import Segments, simulate_segment
+from jaxdyn.identify.workflows.mechanism_fit import fit_mechanism
 
 T = np.linspace(0.0, 1.0, 41)
 
@@ -196,3 +200,106 @@ def test_measured_joints_that_contradict_the_rows_are_said(monkeypatch):
     fixed, zero = slides(lambda q, t: q[:1]), np.zeros(2)
     with pytest.raises(ValueError, match="do not determine the mechanism's state at sample 1"):
         jd.identify.complete_log(fixed, [0.0, 0.1], {"x": (zero, np.array([0.0, 1.0]))}, np.zeros((2, 2)), zero)
+
+
+# --- torques of motors ------------------------------------------------------------------------------------------------
+
+FOUR_BAR = """<mujoco model="four-bar"><compiler angle="radian"/><worldbody>
+<body name="crank"><joint name="j1" axis="0 1 0"/>
+  <inertial pos="0.1 0.01 0.03" mass="1.2" diaginertia="0.02 0.03 0.025"/>
+  <body name="coupler" pos="0.25 0 0"><joint name="j2" axis="0 1 0"/>
+    <inertial pos="0.3 0 0.02" mass="{a}" diaginertia="0.03 0.05 0.045"/></body></body>
+<body name="rocker" pos="0.6 0 -0.1"><joint name="j3" axis="0 1 0" stiffness="1.5"/>
+  <inertial pos="0 0 0.25" mass="{b}" diaginertia="0.04 0.04 0.02"/></body>
+</worldbody><equality><connect body1="coupler" body2="rocker" anchor="0.45 0 0.3"/></equality></mujoco>"""
+FIVE_BAR = """<mujoco model="five-bar"><compiler angle="radian"/><worldbody>
+<body name="left"><joint name="m1" axis="0 1 0"/>
+  <inertial pos="0.02 0 0.1" mass="1.2" diaginertia="0.02 0.03 0.025"/>
+  <body name="forearm" pos="-0.1 0 0.25"><joint name="p1" axis="0 1 0"/>
+    <inertial pos="0.1 0 0.1" mass="{a}" diaginertia="0.03 0.05 0.045"/></body></body>
+<body name="right" pos="0.3 0 0"><joint name="m2" axis="0 1 0"/>
+  <inertial pos="0.02 0.01 0.12" mass="1.1" diaginertia="0.02 0.03 0.025"/>
+  <body name="shin" pos="0.1 0 0.25"><joint name="p2" axis="0 1 0"/>
+    <inertial pos="-0.1 0 0.1" mass="{b}" diaginertia="0.03 0.05 0.045"/></body></body>
+</worldbody><equality><connect body1="forearm" body2="shin" anchor="0.25 0 0.3"/></equality></mujoco>"""
+LOOPS = {"four-bar": (FOUR_BAR, ("j1",)), "five-bar": (FIVE_BAR, ("m1", "m2"))}
+TERMS = ("viscous", "offset", "armature")
+
+
+def driven(scene, motors, t, viscous=0.3, offset=0.2, rotor=0.05):
+    """Log of a smooth motion, with the torques of the motors that constrained forward dynamics needs for it.
+
+    The accelerations are affine in the torques of the motors: as many linear equations as motors in every sample.
+    """
+    phase = np.arange(len(motors))[None] * 1.1
+    w = np.array([1.7, 3.1])[:, None, None]
+    size, at = np.array([0.4, 0.2])[:, None, None], w * t[None, :, None] + phase[None]
+    q = np.sum(size * (np.sin(at) - np.sin(phase)), 0)
+    v, a = np.sum(size * w * np.cos(at), 0), np.sum(-size * w**2 * np.sin(at), 0)
+    measured = {name: (q[:, i], v[:, i], a[:, i]) for i, name in enumerate(motors)}
+    start = scene.starts["reference"].q
+    log = jd.identify.complete_log(scene, t, measured, np.zeros((len(t), scene.nv)), start)
+    own = [scene.system.v_index(name) for name in motors]
+    dynamics = jax.jit(jax.vmap(lambda q, v, tau: jd.constrained_dynamics(scene, q, v, tau).acceleration))
+    free = np.asarray(dynamics(log.q, log.v, log.tau))
+    unit = [np.asarray(dynamics(log.q, log.v, log.tau + np.eye(scene.nv)[i])) - free for i in own]
+    tau = np.linalg.solve(np.stack(unit, axis=2)[:, own], (a - free[:, own])[..., None])[..., 0]
+    reached = free + np.einsum("nij,nj->ni", np.stack(unit, axis=2), tau)
+    np.testing.assert_allclose(log.a, reached, atol=1e-10)  # of the passive joints too
+    full = np.zeros((len(t), scene.nv))
+    full[:, own] = tau + viscous * v + offset + rotor * a
+    return jd.identify.Log(t, log.q, log.v, log.a, full), q, tau + viscous * v + offset + rotor * a
+
+
+def loaded(tmp_path, name, masses):
+    path = tmp_path / f"{name}-{masses[0]}.xml"
+    path.write_text(LOOPS[name][0].format(a=masses[0], b=masses[1]))
+    return jd.load(path)
+
+
+@pytest.mark.long
+@pytest.mark.parametrize("name", LOOPS)
+def test_base_parameters_of_a_mechanism_from_its_motors(tmp_path, name):
+    """Those of the true mechanism, without noise; the truth is forward dynamics with multipliers, which knows no basis."""
+    true, wrong, motors = loaded(tmp_path, name, (0.9, 1.5)), loaded(tmp_path, name, (1.1, 1.2)), LOOPS[name][1]
+    log, *_ = driven(true, motors, np.linspace(0, 8, 400))
+    result = fit_mechanism(wrong, log, motors, TERMS)
+    friction = np.repeat([0.3, 0.2, 0.05], len(motors))
+    truth = result.base.values(np.concatenate([np.asarray(true.system.inertias).reshape(-1), friction]))
+    # The least noise of a fit is a millionth of the torque; directions are weaker than the strongest by up to 600.
+    np.testing.assert_allclose(result.values, truth, rtol=1e-8, atol=1e-9)
+    assert np.abs(result.nominal - truth).max() > 1e-2
+    assert result.fit.result == RESULTS.successful and len(result.fit.history) < 60
+    np.testing.assert_allclose(result.fit.torques(log), log.tau, atol=1e-8)
+    # A planar mechanism: of every body the first moments in the plane and one moment of inertia at most.
+    assert len(result.base) <= 3 * true.system.nb + 3 * len(motors)
+
+
+def test_motors_must_be_as_many_as_degrees_of_freedom(tmp_path):
+    scene = loaded(tmp_path, "five-bar", (0.9, 1.5))
+    log, *_ = driven(scene, ("m1", "m2"), np.linspace(0, 1, 11))
+    with pytest.raises(ValueError, match="2 degrees of freedom"):
+        fit_mechanism(scene, log, ("m1",))
+    with pytest.raises(ValueError, match="name the motors"):
+        jd.identify.fit_parameters(
+            scene, log, jd.identify.Parameters(scene).inertias(), jd.identify.Objective("torque")
+        )
+
+
+@pytest.mark.long
+def test_the_command_identifies_a_mechanism_from_a_log_of_its_motor(tmp_path, capsys):
+    true, _ = loaded(tmp_path, "four-bar", (0.9, 1.5)), loaded(tmp_path, "four-bar", (1.1, 1.2))
+    t = np.linspace(0, 10, 1001)
+    _, q, tau = driven(true, ("j1",), t)
+    path, report = tmp_path / "motor.csv", tmp_path / "fit.json"
+    rows = np.column_stack([t, q[:, 0], tau[:, 0]])
+    np.savetxt(path, rows, delimiter=",", header="t,q_j1,tau_j1", comments="", fmt="%.17g")
+    command = ["identify", "--urdf", str(tmp_path / "four-bar-1.1.xml"), "--log", str(path), "--terms", *TERMS]
+    main([*command, "--cutoff", "20", "--report", str(report)])
+    printed = capsys.readouterr().out
+    assert "the motors' torques determine 10 combinations" in printed and len(printed.splitlines()) < 60
+    found = json.loads(report.read_text())
+    # The low-pass of a nonlinear mechanism's motion and torque is not quite that of its model.
+    assert max(found["test_percent"].values()) < 0.1 and found["outcome"] == "successful"
+    assert main([*command, "--out", str(tmp_path / "fitted.urdf")]) != 0
+    assert "--out: not for a mechanism" in capsys.readouterr().err

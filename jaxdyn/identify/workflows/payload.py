@@ -11,7 +11,7 @@ from jaxdyn.constraints.codes import RESULTS, Outcome, name_of
 from jaxdyn.identify.chart import check_bodies
 from jaxdyn.identify.condensed import Blocks, condense_rows
 from jaxdyn.identify.condensed_fit import MOST_ROUNDS, eliminate, gather, is_negligible, minimize_torque_error
-from jaxdyn.identify.interior import LOG_CHOLESKY_BASIS, LinearChart, TorqueProblem
+from jaxdyn.identify.interior import LOG_CHOLESKY_BASIS, TorqueProblem, robot_chart
 from jaxdyn.identify.logs import Log, as_logs
 from jaxdyn.identify.regression import least_squares_by_svd, log_regressor, noise_level
 from jaxdyn.identify.robot import RobotFit, fit_robot
@@ -163,7 +163,7 @@ def _solve(blocks: Blocks, is_loaded, own: slice, kept, weights, rows, sigma: fl
     table[:, :10], table[:, -1] = R[:, :-1], R[:, -1]
     # No terms are fitted, so that their units do not matter.
     sizes = [np.ones(alone.nv)] * 3
-    chart = LinearChart(alone, (), "full", sizes)
+    chart = robot_chart(alone, (), "full", sizes)
     problem = TorqueProblem.of(chart, condense_rows(table, blocks.count()), sigma, 1.0)
     minimum = minimize_torque_error(problem, 200, 1e-6)
     if minimum.result is not RESULTS.successful:
