@@ -15,8 +15,12 @@ import numpy as np
 from jaxdyn.compile import program as numbers
 from jaxdyn.compile.graph import Graph
 from jaxdyn.compile.look_ups import scatter_at, select_among
-from jaxdyn.compile.program import NotNumbers, Number, as_kind, as_objects, kind_or_refuse, objects
+from jaxdyn.compile.program import NotNumbers, Number, as_kind, as_objects, dtype_of, is_number, kind_or_refuse, objects
 from jaxdyn.compile.rearrange import scatter_places
+from jaxdyn.compile.rolled import MIN_ITERATIONS, roll
+
+# Operations of the columns of a solution, up to which they are written out: what goes in and out of a loop is copied.
+_MAX_COLUMNS_WRITTEN_OUT = 4000
 
 
 def polynomial(expansion, params, args, eqn):
@@ -134,9 +138,29 @@ def triangular_solve(expansion, params, args, eqn):
     if not params["left_side"]:  # x a = b is a^T x^T = b^T
         a, b, lower = np.swapaxes(a, -1, -2), np.swapaxes(b, -1, -2), not lower
     pairs = zip(a.reshape(-1, *a.shape[-2:]), b.reshape(-1, *b.shape[-2:]), strict=True)
-    solutions = [_solve_triangle(expansion.graph, x, y, lower, params["unit_diagonal"]) for x, y in pairs]
+    solutions = [_solve_columns(expansion.graph, x, y, lower, params["unit_diagonal"]) for x, y in pairs]
     solutions = np.stack(solutions).reshape(b.shape)
     return [solutions if params["left_side"] else np.swapaxes(solutions, -1, -2)]
+
+
+def _solve_columns(graph: Graph, a: np.ndarray, b: np.ndarray, lower: bool, unit: bool) -> np.ndarray:
+    """a^-1 b; where neither has known zeros, which differ from column to column, as a loop over the columns of b."""
+    (n, columns), triangle = b.shape, a[np.tril_indices(len(a))] if lower else a[np.triu_indices(len(a))]
+    inverses = [1.0 if unit else graph.div(1.0, x) for x in np.diagonal(a).tolist()]
+    if columns >= MIN_ITERATIONS and all(map(is_number, (*triangle.tolist(), *b.ravel().tolist()))):
+
+        def body(inner, consts, carries, rows):
+            matrix = consts[0].T if is_turned else consts[0]
+            return [_solve_triangle(inner, matrix, rows[0][:, None], lower, consts[1].tolist())[:, 0]]
+
+        # Entries in the order of their array in memory, which then is passed without a copy.
+        is_turned = a.strides[0] < a.strides[1]
+        dtype, consts = dtype_of(triangle[0].kind), [a.T if is_turned else a, objects(inverses, (n,))]
+        dtypes = [dtype, dtype], [], [dtype], [dtype]
+        found = roll(graph, body, (consts, [], [b.T]), dtypes, columns, False, None, _MAX_COLUMNS_WRITTEN_OUT)
+        if found is not None:
+            return found[0].T
+    return _solve_triangle(graph, a, b, lower, inverses)
 
 
 # --- matrices whose entries are single numbers ---
@@ -195,22 +219,22 @@ def _cholesky_factor(graph: Graph, matrix: np.ndarray) -> np.ndarray:
     return lower
 
 
-def _solve_triangle(graph: Graph, a: np.ndarray, b: np.ndarray, lower: bool, unit: bool) -> np.ndarray:
-    """x with a x = b, for a triangular matrix (n, n), whose diagonal is taken as ones if `unit`, and b (n, columns)."""
+def _solve_triangle(graph: Graph, a: np.ndarray, b: np.ndarray, lower: bool, inverses: list) -> np.ndarray:
+    """x with a x = b, for a triangular matrix (n, n), the inverses of its diagonal, and b (n, columns)."""
     n, matrix, solution = a.shape[0], a.tolist(), b.copy()
     rows: list[dict] = [
         {} for _ in range(n)
     ]  # of the solution, without known zeros: most of it for the branches of a tree
     for i in range(n) if lower else reversed(range(n)):
         row = {j: x for j, x in enumerate(b[i].tolist()) if _is_nonzero(x)}
-        for k in range(i) if lower else range(i + 1, n):
+        # The row that was solved last comes last: sums of several rows are on the way at a time.
+        for k in range(i) if lower else reversed(range(i + 1, n)):
             x = matrix[i][k]
             if type(x) is Number or x != 0:
                 for j, y in rows[k].items():
                     row[j] = graph.sub(row.get(j, 0.0), graph.mul(x, y))
-        inverse = 1.0 if unit else graph.div(1.0, matrix[i][i])
         for j, x in row.items():
-            solution[i, j] = rows[i][j] = graph.mul(x, inverse)
+            solution[i, j] = rows[i][j] = graph.mul(x, inverses[i])
     return solution
 
 
