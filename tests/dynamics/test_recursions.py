@@ -134,8 +134,6 @@ PLAIN = [name for name, rule in RULES.items() if isinstance(rule, np.ufunc)] + [
 
 def everything(model, q, v, a, tau, wrenches):
     """All quantities at one sample."""
-    columns = jnp.stack([tau, a], 1)
-    free, times = recursions.aba_with_columns(model, q, v, tau, columns)
     again, tangent = recursions.aba_tangent(model, q, v, tau, lambda acc: tau - 0.5 * acc)
     return {
         "rnea": recursions.rnea(model, q, v, a),
@@ -146,8 +144,6 @@ def everything(model, q, v, a, tau, wrenches):
         "crba": recursions.crba(model, q),
         "sqrt": recursions.mass_matrix_sqrt(model, q),
         "inverse": recursions.mass_matrix_inverse_times(model, q, tau),
-        "free": free,
-        "times": times,
         "again": again,
         "tangent": tangent,
     }
@@ -174,8 +170,6 @@ def expected(model, q, v, a, tau, wrenches):
         "aba": free,
         "crba": mass,
         "inverse": np.linalg.solve(mass, tau),
-        "free": free,
-        "times": np.linalg.solve(mass, np.stack([tau, a], 1)),
         "again": free,
         "tangent": np.linalg.solve(mass, tau - 0.5 * free),
     }

@@ -13,7 +13,6 @@ Source: EQUATIONS section 5; Featherstone (2008) section 7.3; Rodriguez, Jain & 
 from collections.abc import Callable
 from typing import Any, NamedTuple
 
-import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
@@ -183,20 +182,6 @@ def _free_and_inverse(model: Model, q, v, tau) -> tuple[Array, Callable]:
     wrenches = body_wrenches(links, chains, unit_velocity(links, v))
     factors = factorize_at(links, chains)
     return solve(factors, tau, wrenches), lambda force: solve(factors, force)
-
-
-def aba_with_columns(
-    model: Model,
-    q: Float[Array, " nq"],
-    v: Float[Array, " nv"],
-    tau: Float[Array, " nv"],
-    columns: Float[Array, "nv k"],
-) -> tuple[Float[Array, " nv"], Float[Array, "nv k"]]:
-    """Forward dynamics a (nv,), and M^-1 times `columns` (nv, k), from one factorisation of M, in O(nb k) operations."""
-    check_shapes(model, q=q, v=v, tau=tau)
-    a, times = _free_and_inverse(model, q, v, tau)
-    # Batching over columns shares the factors, which do not depend on them.
-    return a, jax.vmap(times, 1, 1)(columns)
 
 
 def aba_tangent(
