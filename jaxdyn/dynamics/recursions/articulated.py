@@ -197,12 +197,6 @@ def aba_tangent(
     return a, times(force_change(a))
 
 
-def mass_matrix_inverse_times(model: Model, q: Float[Array, " nq"], forces: Float[Array, " nv"]) -> Float[Array, " nv"]:
-    """Product of M(q)^-1 and generalised forces (nv,), without forming M: two sweeps over the articulated bodies."""
-    check_shapes(model, q=q, forces=forces)
-    return solve(factorize(model, q), forces)
-
-
 def mass_matrix_sqrt(model: Model, q: Float[Array, " nq"]) -> Float[Array, "nv nv"]:
     r"""Square root W (nv, nv) of the mass matrix from the articulated bodies; no Cholesky factorisation.
 
