@@ -22,7 +22,6 @@ from jaxdyn.constraints.codes import RESULTS, Outcome, require_finite
 from jaxdyn.constraints.rank import (
     check_tolerance,
     eps_of,
-    fill_diagonal,
     has_clear_rank,
     least_pivot,
     least_refinable_pivot,
@@ -35,7 +34,6 @@ from jaxdyn.constraints.rank import (
 from jaxdyn.constraints.redundancy import distribute_multipliers, has_selection, row_mask
 from jaxdyn.constraints.selection import independent_rows, rank_code
 from jaxdyn.dynamics.quantities import bias_force, mass_matrix
-from jaxdyn.dynamics.recursions import aba_with_columns
 from jaxdyn.lie.so3 import matmul
 from jaxdyn.model.arguments import Numbers, check_state, zeros_if_none
 from jaxdyn.model.tree import Model
@@ -45,7 +43,7 @@ from jaxdyn.systems.scene import Scene, as_scene, check_force
 # Steps of refinement near singular positions: the first one is made always, and each gains some four digits.
 _MOST_REFINEMENTS = 4
 
-METHODS = ("rank_aware", "schur", "range_space")
+METHODS = ("rank_aware", "schur")
 
 
 class ConstrainedDynamics(Outcome):
@@ -99,15 +97,13 @@ def constrained_dynamics(
 
     - `q` (nq,), `v` (nv,), `tau` (nv,) in N m or N (None: zero), `t` in s. The scene's forces are added to tau.
     - `method`: "rank_aware" is for any rows: where they are dependent, the acceleration is still right and the multipliers are
-      those of least norm. "schur" factors $A M^{-1} A^T$ by Cholesky: faster, for independent rows. "range_space" is the same
-      without forming M: articulated bodies of a `Model` apply $M^{-1}$ to the nc rows in O(nb nc) operations, which pays for few
-      rows on a large tree of nb bodies, in batches. Systems that are no `Model` use their dense M.
+      those of least norm. "schur" factors $A M^{-1} A^T$ by Cholesky: faster, for independent rows.
     - `rank_tol`: singular values of $Y = U^{-1} A^T$, with $M = U U^T$, count as zero below `rank_tol` times the largest.
       The default is $\epsilon^{4/7}$, 1.1e-9 in float64 and 1.1e-4 in float32: above the 1e-12 to 1e-10 by which
       dependent rows differ when loops are open by rounding and projection errors, below the least singular values of
       mechanisms that move.
 
-    **Returns:** `ConstrainedDynamics`. Under "schur" and "range_space", dependent rows give the code `dependent_rows`.
+    **Returns:** `ConstrainedDynamics`. Under "schur", dependent rows give the code `dependent_rows`.
 
     Differentiable any number of times where the rank is constant, by the derivative of the pseudo-inverse: no factorisation is
     differentiated.
@@ -118,7 +114,8 @@ def constrained_dynamics(
     Source: EQUATIONS section 7; Udwadia & Kalaba (1992).
     """
     if method not in METHODS:
-        raise ValueError(f"method is {method!r}; choose from {', '.join(METHODS)}")
+        removed = ' ("range_space" is "schur" now)' if method == "range_space" else ""
+        raise ValueError(f"method is {method!r}; choose from {', '.join(METHODS)}{removed}")
     rank_tol = check_tolerance(rank_tol)
     scene = as_scene(scene)
     tau = zeros_if_none(tau, scene.nv)
@@ -129,7 +126,7 @@ def constrained_dynamics(
     state = q, v, tau, t
     scene = independent_rows(scene, q, t, rank_tol)
     if method != "rank_aware":
-        return _by_schur(scene, *state, method=method)
+        return _by_schur(scene, *state)
     a, lam, rank, result = _accelerate(rank_tol, scene, *state)
     # Redundant rows share the constraint force: the one of least norm is unique.
     lam = distribute_multipliers(scene, q, t, lam)
@@ -284,10 +281,9 @@ def _min_norm_solution(Y, deficit, rank_tol):
     return matmul(inverse, w), w, inverse
 
 
-def _by_schur(scene: Scene, q, v, tau, t, *, method: str) -> ConstrainedDynamics:
+def _by_schur(scene: Scene, q, v, tau, t) -> ConstrainedDynamics:
     """Dynamics with independent rows, by the Cholesky factor of A M^-1 A^T."""
-    by_tree = method == "range_space" and isinstance(scene.system, Model)
-    a, lam, independent, is_definite = kernel(_by_aba if by_tree else _by_delassus)(scene, q, v, tau, t)
+    a, lam, independent, is_definite = kernel(_by_delassus)(scene, q, v, tau, t)
     if has_selection(scene):
         independent = independent & (_count_rows(scene) == lam.shape[0])
     result = RESULTS.where(independent, RESULTS.successful, RESULTS.dependent_rows)  # pyright: ignore[reportArgumentType]
@@ -299,30 +295,12 @@ def _by_schur(scene: Scene, q, v, tau, t, *, method: str) -> ConstrainedDynamics
 def _by_delassus(scene: Scene, q, v, tau, t):
     """Acceleration, multipliers, whether the rows are independent, and whether M is definite."""
     metric, Y, free, deficit, _ = _gauss_problem(scene, q, v, tau, t)
-    lam, independent = _solve_delassus(scene, matmul(Y.T, Y), deficit)
-    return metric.unwhiten(free + matmul(Y, lam)), lam, independent, metric.is_definite()
-
-
-def _by_aba(scene: Scene, q, v, tau, t):
-    """`_by_delassus` without M: a0 and X = M^-1 A^T from one articulated-body factorisation, a = a0 + X lam.
-
-    Here `free` is a0 itself, without whitening.
-    """
-    row, force = rows(scene, q, v, t), total_force(scene, q, v, tau, t)
-    free, X = aba_with_columns(scene.system, q, v, force, row.A.T)
-    lam, independent = _solve_delassus(scene, matmul(row.A, X), row.gamma - matmul(row.A, free))
-    return free + matmul(X, lam), lam, independent, jnp.isfinite(free).all()
-
-
-def _solve_delassus(scene: Scene, delassus, deficit):
-    """lam with A M^-1 A^T lam = deficit by Cholesky, and whether the rows were independent."""
-    # A X is symmetric up to rounding. Cholesky reads one triangle only; the mean gives both the same weight.
-    delassus = 0.5 * (delassus + delassus.T)
-    factor = cholesky(fill_diagonal(delassus) if has_selection(scene) else delassus)
+    factor = cholesky(regular_gram(Y) if has_selection(scene) else matmul(Y.T, Y))
     # The same limit for pivots as in `_rank_and_result`. The factor's diagonal has their square roots.
     roots = jnp.diagonal(factor)
-    independent = jnp.min(roots) > (10 * scene.nv * eps_of(delassus)) ** 0.5 * jnp.max(roots)
-    return solve_cholesky(factor, deficit), independent
+    independent = jnp.min(roots) > (10 * scene.nv * eps_of(q)) ** 0.5 * jnp.max(roots)
+    lam = solve_cholesky(factor, deficit)
+    return metric.unwhiten(free + matmul(Y, lam)), lam, independent, metric.is_definite()
 
 
 def projections(

@@ -64,15 +64,11 @@ def clear_pivot(like) -> float:
 
 
 def regular_gram(Y: Float[Array, "n m"]) -> Float[Array, "m m"]:
-    """Y^T Y, made regular by `fill_diagonal`."""
-    return fill_diagonal(matmul(Y.T, Y))
-
-
-def fill_diagonal(gram: Float[Array, "m m"]) -> Float[Array, "m m"]:
-    """A Gram matrix with the largest entry of its diagonal in place of zeros there, which are of rows that were dropped.
+    """Y^T Y with the largest entry of its diagonal in place of zeros there, which are of rows that were dropped.
 
     Solutions with right-hand sides that are zero there, such as (Y^T Y)^-1 Y^T, are those of the other rows.
     """
+    gram = matmul(Y.T, Y)
     squares = jnp.diagonal(gram)
     largest = jnp.max(squares)
     # The largest entry, so that the filled pivots never are the least one in `quality_of`.

@@ -27,7 +27,7 @@ def kinetic_energy(
     **Returns:** (), J.
     """
     if isinstance(model, System):
-        return system_quantity(model, "kinetic_energy", *check_state(model, q=q, v=v, t=t))
+        return system_quantity("kinetic_energy", model, *check_state(model, q=q, v=v, t=t))
     q, v = check_shapes(model, q=q, v=v)
     return by_recursion(_kinetic_energy, _kinetic_energy, model, q, v)
 
@@ -52,7 +52,7 @@ def potential_energy(model: Model | System, q: Float[Array, " nq"], t: Numbers =
     **Returns:** (), J. Zero when `model.gravity` is None.
     """
     if isinstance(model, System):
-        return system_quantity(model, "potential_energy", *check_state(model, q=q, t=t))
+        return system_quantity("potential_energy", model, *check_state(model, q=q, t=t))
     (q,) = check_shapes(model, q=q)
     if model.gravity is None:
         return jnp.zeros((), model.home.dtype)

@@ -8,8 +8,7 @@ from jaxdyn.dynamics.kinematics import (
     all_coordinates,
     body_frames,
     body_jacobian,
-    kinematic_part,
-    named_frame,
+    of_frame,
     twists_in_frame,
 )
 from jaxdyn.dynamics.tree_frames import take
@@ -38,11 +37,7 @@ def frame_jacobian(
     if axes != "world":
         raise ValueError(f"axes is {axes!r}; choose from world, body")
     (q,) = check_shapes(model, q=q)
-    body, offset = named_frame(model, frame)
-    if body < 0:
-        # A frame fixed to the world does not move, and has no body whose pose could be taken.
-        return jnp.zeros((6, model.nv), model.home.dtype)
-    return _jacobian(body, (kinematic_part(model), offset), q)
+    return of_frame(_jacobian, (6, model.nv), model, frame, q)
 
 
 @kernel(static=1)
@@ -69,10 +64,7 @@ def frame_velocity(
     Source: Murray, Li & Sastry (1994), section 2.4.2; EQUATIONS section 1.
     """
     q, v = check_shapes(model, q=q, v=v)
-    body, offset = named_frame(model, frame)
-    if body < 0:
-        return jnp.zeros((6,), model.home.dtype)
-    return _velocity(body, (kinematic_part(model), offset), q, v)
+    return of_frame(_velocity, (6,), model, frame, q, v)
 
 
 @kernel(static=1)
@@ -108,10 +100,7 @@ def frame_acceleration(
     ```
     """
     q, v, a = check_shapes(model, q=q, v=v, a=a)
-    body, offset = named_frame(model, frame)
-    if body < 0:
-        return jnp.zeros((6,), model.home.dtype)
-    return _acceleration(body, (kinematic_part(model), offset), q, v, a)
+    return of_frame(_acceleration, (6,), model, frame, q, v, a)
 
 
 @kernel(static=1)
@@ -148,10 +137,7 @@ def jacobian_dot_v(
     **Raises:** ValueError for an unknown name or shapes that do not fit.
     """
     q, v = check_shapes(model, q=q, v=v)
-    body, offset = named_frame(model, frame)
-    if body < 0:
-        return jnp.zeros((6,), model.home.dtype)
-    return _jacobian_dot_v(body, (kinematic_part(model), offset), q, v)
+    return of_frame(_jacobian_dot_v, (6,), model, frame, q, v)
 
 
 @kernel(static=1)

@@ -124,9 +124,7 @@ def articulated_bodies(
     # The scans need at least one body: the largest size of a joint is a maximum over them.
     if model.nb == 0:
         return ArticulatedBodies(jnp.zeros((0, 6, 6), q.dtype), jnp.zeros((0, 6), q.dtype))
-    return _articulated_bodies(model, q, v, tau, external)
+    return ArticulatedBodies(*_articulated_bodies(model, q, v, tau, external))
 
 
-@entry_point
-def _articulated_bodies(model: Model, q, v, tau, external) -> ArticulatedBodies:
-    return ArticulatedBodies(*scans.articulated_bodies(model, q, v, tau, external))
+_articulated_bodies = entry_point(scans.articulated_bodies)

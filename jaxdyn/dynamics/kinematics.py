@@ -4,7 +4,7 @@ Poses are those of `tree_frames`.
 """
 
 import functools
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from typing import Any, NamedTuple
 
 import jax.numpy as jnp
@@ -53,9 +53,7 @@ def body_frames(
         pose = jnp.broadcast_to(jnp.eye(4, dtype=q.dtype), (n, 4, 4))
         none, at_rest = np.zeros(0, int), None if v is None else jnp.zeros((n, 6), q.dtype)
         nowhere = jnp.zeros((0, 6), q.dtype)
-        return BodyFrames(
-            pose, jnp.zeros((n, 3), q.dtype), nowhere, none, np.zeros((n, 0), bool), at_rest, at_rest, nowhere
-        )
+        return BodyFrames(pose, jnp.zeros((n, 3), q.dtype), nowhere, none, np.zeros((n, 0), bool), at_rest, at_rest)
     coordinates = _coordinate_indices(topology.v_slices, kept)
     # Constraints touch few bodies of a large tree; the remaining bodies need not be placed at all.
     if len(kept) < model.nb:
@@ -181,10 +179,7 @@ def body_jacobian(model: Model, q: Float[Array, " nq"], frame: str | None) -> Fl
     Source: Murray, Li & Sastry (1994), eq. 3.55; EQUATIONS section 2.
     """
     (q,) = check_shapes(model, q=q)
-    body, offset = named_frame(model, frame)
-    if body < 0:
-        return jnp.zeros((6, model.nv), model.home.dtype)
-    return _body_jacobian(body, (kinematic_part(model), offset), q)
+    return of_frame(_body_jacobian, (6, model.nv), model, frame, q)
 
 
 @kernel(static=1)
@@ -209,14 +204,12 @@ def spatial_jacobian(model: Model, q: Float[Array, " nq"], frame: str | None) ->
     Source: Murray, Li & Sastry (1994), eq. 3.54.
     """
     (q,) = check_shapes(model, q=q)
-    body, _ = named_frame(model, frame)
-    if body < 0:
-        return jnp.zeros((6, model.nv), model.home.dtype)
-    return _spatial_jacobian(body, kinematic_part(model), q)
+    return of_frame(_spatial_jacobian, (6, model.nv), model, frame, q)
 
 
 @kernel(static=1)
-def _spatial_jacobian(body: int, model: Model, q):
+def _spatial_jacobian(body: int, tree, q):
+    model, _ = tree
     frames = body_frames(model, q, [body])
     shift = se3.from_parts(jnp.eye(3, dtype=model.home.dtype), frames.origin[0])
     columns = map_rows(functools.partial(se3.Ad_apply, shift), frames.subspace)
@@ -229,6 +222,14 @@ def kinematic_part(model: Model) -> Model:
     if all(x is None for x in (model.gravity, model.armature)):
         return model
     return model.replace(gravity=None, armature=None)
+
+
+def of_frame(function: Callable, shape: tuple[int, ...], model: Model, frame: str | None, *args):
+    """Evaluate function(body, (model, pose of the frame in it), *args); zeros of a shape for the world, which has no body."""
+    body, offset = named_frame(model, frame)
+    if body < 0:
+        return jnp.zeros(shape, model.home.dtype)
+    return function(body, (kinematic_part(model), offset), *args)
 
 
 def named_frame(model: Model, name: str | None) -> tuple[int, Any]:

@@ -37,7 +37,7 @@ def mass_matrix(model: Model | System, q: Float[Array, " nq"], t: Numbers = 0.0)
     Source: Murray, Li & Sastry (1994), eq. 4.19; EQUATIONS sections 2 and 4.
     """
     if isinstance(model, System):
-        return system_quantity(model, "mass_matrix", *check_state(model, q=q, t=t))
+        return system_quantity("mass_matrix", model, *check_state(model, q=q, t=t))
     (q,) = check_shapes(model, q=q)
     if model.nb > MAX_BODIES or model.topology.ancestors.sum() > MAX_PAIRS:
         return world_frame.mass_matrix_by_loops(model, q)
@@ -62,7 +62,7 @@ def coriolis_matrix(
     Source: EQUATIONS section 4, Cs and erratum E11.
     """
     if isinstance(model, System):
-        return system_quantity(model, "coriolis_matrix", *check_state(model, q=q, v=v, t=t))
+        return system_quantity("coriolis_matrix", model, *check_state(model, q=q, v=v, t=t))
     q, v = check_shapes(model, q=q, v=v)
     return _by_matrices(world_frame.coriolis_matrix, model, q, v)
 
@@ -79,7 +79,7 @@ def gravity_force(model: Model | System, q: Float[Array, " nq"], t: Numbers = 0.
     **Returns:** (nv,), N m or N: the torques that keep the mechanism at rest. Zero when `model.gravity` is None.
     """
     if isinstance(model, System):
-        return system_quantity(model, "gravity_force", *check_state(model, q=q, t=t))
+        return system_quantity("gravity_force", model, *check_state(model, q=q, t=t))
     (q,) = check_shapes(model, q=q)
     if model.gravity is None:
         # Zero is known without a compiled program.
@@ -99,7 +99,7 @@ def bias_force(
     **Returns:** (nv,), N m or N.
     """
     if isinstance(model, System):
-        return system_quantity(model, "bias_force", *check_state(model, q=q, v=v, t=t))
+        return system_quantity("bias_force", model, *check_state(model, q=q, v=v, t=t))
     q, v = check_shapes(model, q=q, v=v)
     return by_recursion(recursions.bias_force, _bias_force, model, q, v)
 
@@ -126,7 +126,7 @@ def inverse_dynamics(
     """
     if isinstance(model, System):
         q, v, a, t, _ = check_state(model, q=q, v=v, a=a, t=t, external=external)
-        return system_quantity(model, "inverse_dynamics", q, v, a, t)
+        return system_quantity("inverse_dynamics", model, q, v, a, t)
     q, v, a, external = check_shapes(model, q=q, v=v, a=a, external=external)
     # The recursion does not take wrenches: a kernel without them is smaller, and their forces are one linear term.
     tau = by_recursion(recursions.rnea, _inverse_dynamics, model, q, v, a)
@@ -159,16 +159,12 @@ def forward_dynamics(
     if isinstance(model, System):
         q, v, tau, time, _ = check_state(model, q=q, v=v, tau=tau, t=t, external=external)
         model.check_start(q, v, time)
-        return system_quantity(model, "forward_dynamics", q, v, tau, time)
+        return system_quantity("forward_dynamics", model, q, v, tau, time)
     q, v, tau, external = check_shapes(model, q=q, v=v, tau=tau, external=external)
     if external is not None:
         tau = tau + generalized_force(model, q, external)
     # The derivative of the solve is M^-1 times that of inverse dynamics, so ABA itself is never differentiated.
-    form, tangent = {
-        recursions: (recursions.aba, _tangent_by_recursions),
-        sweeps: (sweeps.aba, _tangent_by_sweeps),
-        scans: (scans.forward_dynamics, _tangent_by_scans),
-    }[_recursions(model)]
+    form, tangent = _FORWARD_DYNAMICS[_recursions(model)]
     return kernel(form, fallback=_solve_for_acceleration, derivative=tangent)(model, q, v, tau)
 
 
@@ -208,12 +204,8 @@ MAX_PAIRS = 1000
 _MAX_BODIES_IN_MATRICES = 16
 
 
-def _least_bodies_in_kernels() -> int:
-    # What is written out shares its numbers with the rest of a kernel, such as the rows of loops.
-    return MAX_BODIES + 1
-
-
-@variant(_least_bodies_in_kernels)
+# Inside of kernels, what is written out shares its numbers with the rest, such as the rows of loops.
+@variant(lambda: MAX_BODIES + 1)
 def _least_bodies_in_sweeps() -> int:
     return MIN_BODIES_IN_SWEEPS
 
@@ -267,9 +259,15 @@ def _acceleration_tangent(inverse, solve, model: Model, q, v, tau, steps):
     return solve(model, q, v, tau, _force_tangent(inverse, model, q, v, tau, steps))[1]
 
 
-_tangent_by_recursions = functools.partial(_acceleration_tangent, recursions.rnea, recursions.aba_tangent)
-_tangent_by_sweeps = functools.partial(_acceleration_tangent, sweeps.rnea, sweeps.aba_tangent)
-_tangent_by_scans = functools.partial(_acceleration_tangent, scans.inverse_dynamics, scans.forward_dynamics_tangent)
+# For each module of recursions its forward dynamics and their derivative.
+_FORWARD_DYNAMICS: dict[Any, tuple[Callable, Callable]] = {
+    module: (value, functools.partial(_acceleration_tangent, inverse, solve))
+    for module, value, inverse, solve in (
+        (recursions, recursions.aba, recursions.rnea, recursions.aba_tangent),
+        (sweeps, sweeps.aba, sweeps.rnea, sweeps.aba_tangent),
+        (scans, scans.forward_dynamics, scans.inverse_dynamics, scans.forward_dynamics_tangent),
+    )
+}
 
 
 def _force_tangent(inverse, model, q, v, tau, steps):
@@ -341,19 +339,14 @@ def mass_matrix_derivative(model: Model, q: Float[Array, " nq"]) -> Float[Array,
 def first_kind_symbols(model: Model | System, q: Float[Array, " nq"], t: Numbers = 0.0) -> Float[Array, "nv nv nv"]:
     """Christoffel symbols of the first kind of the mass matrix, (nv, nv, nv); see `jd.geometry.christoffel_symbols`."""
     if isinstance(model, System):
-        return system_quantity(model, "christoffel_symbols", *check_state(model, q=q, t=t))
+        return system_quantity("christoffel_symbols", model, *check_state(model, q=q, t=t))
     (q,) = check_shapes(model, q=q)
     _check_coordinates(model, "christoffel_symbols")
     return symbols(mass_matrix_derivative(model, q))
 
 
-def system_quantity(system: System, name: str, *args):
-    """Evaluate a quantity of a system that is no tree of bodies."""
-    return _method(name, system, *args)
-
-
 @kernel(static=1)
-def _method(name: str, system: System, *args):
+def system_quantity(name: str, system: System, *args):
     # The method is chosen by a static name, so that each quantity is one cached program.
     return getattr(system, name)(*args)
 

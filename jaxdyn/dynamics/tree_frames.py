@@ -50,8 +50,10 @@ def relative_poses(model: Model, q: Float[Array, " nq"]) -> Float[Array, "nb 4 4
     home, screws = map(jnp.asarray, geometry(model))
     order, transforms = [], []
     # One batched evaluation per joint kind, instead of one per joint: the program does not grow with the number of
-    # bodies.
-    for kind, bodies in _bodies_by_kind(topology):
+    # bodies. Revolute and continuous joints differ in limits only and share one batch.
+    labels = np.array(["revolute" if kind == "continuous" else kind for kind in topology.kinds], str)
+    for kind in dict.fromkeys(labels.tolist()):
+        bodies = np.flatnonzero(labels == kind)
         if kind in SCREW_KINDS:
             coordinates = np.array([topology.q_slices[i].start for i in bodies])
             place = functools.partial(screw_transform, kind)
@@ -102,29 +104,30 @@ def tree_frame(model: Model, q: Float[Array, " nq"]) -> TreeFrame:
     return TreeFrame(pose, origin, subspace)
 
 
-def _map_in_loop(function: Callable, *rows):
-    """`map_rows` inside of a kernel: of many rows as a loop, whose code does not grow with their number."""
-    if len(rows[0]) < MIN_BODIES_IN_LOOPS:
+@variant(lambda count: count >= MIN_BODIES_IN_LOOPS)
+def _has_loops(count: int) -> bool:
+    """Decide whether a kernel is traced and so many bodies are loops in it, whose code does not grow with their number."""
+    del count
+    return False
+
+
+def map_rows(function: Callable, *rows):
+    """Evaluate function(row of each array) for all rows of arrays (n, ...), one for each body or coordinate."""
+    if not _has_loops(len(rows[0])):
         return jax.vmap(function)(*rows)
     # A chain without a carry.
     return sweep(lambda carry, row: (carry, function(*row)), range(-1, len(rows[0]) - 1), (), rows)[1]
 
 
-@variant(_map_in_loop)
-def map_rows(function: Callable, *rows):
-    """Evaluate function(row of each array) for all rows of arrays (n, ...), one for each body or coordinate."""
-    return jax.vmap(function)(*rows)
+def _accumulate(topology: Topology, combine: Callable, start, rows, inward: bool = False):
+    """For each body combine(that of its parent, or the sum over its children, own row), by a loop."""
+    return sweep(lambda x, own: (combine(x, own),) * 2, topology.parents, start, rows, inward=inward)[1]
 
 
 def _products_in_order(topology: Topology, pose: Float[Array, "nb 4 4"]) -> Float[Array, "nb 4 4"]:
     """`_tree_products` with one product per body: in a kernel pointer jumping would multiply the operations by log2(depth)."""
-    if topology.nb >= MIN_BODIES_IN_LOOPS:
-
-        def step(outer, own):
-            inner = matmul(outer, own)
-            return inner, inner
-
-        return sweep(step, topology.parents, jnp.eye(4, dtype=pose.dtype), pose)[1]
+    if _has_loops(topology.nb):
+        return _accumulate(topology, matmul, jnp.eye(4, dtype=pose.dtype), pose)
     products: list = []
     for i, parent in enumerate(topology.parents):
         products.append(pose[i] if parent < 0 else matmul(products[parent], pose[i]))
@@ -154,50 +157,22 @@ def subspace_rate(model: Model, frame: TreeFrame, twists: Float[Array, "nb 6"]) 
     return map_rows(se3.ad_apply, take(twists, model.topology.dof_body), frame.subspace)
 
 
-def _sweep_to_bodies(model: Model, rows: Float[Array, "nv n"]) -> Float[Array, "nb n"]:
-    """`sum_to_bodies` inside of a kernel, where a product with a mask has an operation for each pair on one path."""
-    topology = model.topology
-    if topology.nb < MIN_BODIES_IN_LOOPS:
-        return _sum_to_bodies(model, rows)
-    # Of joints with several coordinates the sum over these.
-    own = rows if topology.nv == topology.nb else matmul(jnp.asarray(_own_coordinates(topology), rows.dtype), rows)
-    return sweep(lambda outer, x: (outer + x, outer + x), topology.parents, jnp.zeros_like(rows[0]), own)[1]
-
-
-def _sum_to_bodies(model: Model, rows: Float[Array, "nv n"]) -> Float[Array, "nb n"]:
-    return matmul(jnp.asarray(model.topology.dof_ancestors, rows.dtype), rows)
-
-
-@variant(_sweep_to_bodies)
 def sum_to_bodies(model: Model, rows: Float[Array, "nv n"]) -> Float[Array, "nb n"]:
     """G rows: for each body the sum of the rows of the coordinates that move it."""
-    return _sum_to_bodies(model, rows)
-
-
-def _sweep_to_coordinates(model: Model, rows: Float[Array, "nb n"]) -> Float[Array, "nv n"]:
     topology = model.topology
-    if topology.nb < MIN_BODIES_IN_LOOPS:
-        return _sum_to_coordinates(model, rows)
-
-    def step(total, x):
-        return total + x, total + x
-
-    return take(sweep(step, topology.parents, jnp.zeros_like(rows[0]), rows, inward=True)[1], topology.dof_body)
+    if not _has_loops(topology.nb):
+        return matmul(jnp.asarray(topology.dof_ancestors, rows.dtype), rows)
+    if topology.nv > topology.nb:  # of joints with several coordinates the sum over these
+        rows = matmul(jnp.asarray(np.arange(topology.nb)[:, None] == topology.dof_body, rows.dtype), rows)
+    return _accumulate(topology, jnp.add, jnp.zeros_like(rows[0]), rows)
 
 
-def _sum_to_coordinates(model: Model, rows: Float[Array, "nb n"]) -> Float[Array, "nv n"]:
-    return matmul(jnp.asarray(model.topology.dof_ancestors.T, rows.dtype), rows)
-
-
-@variant(_sweep_to_coordinates)
 def sum_to_coordinates(model: Model, rows: Float[Array, "nb n"]) -> Float[Array, "nv n"]:
     """G^T rows: for each velocity coordinate the sum of the rows of the bodies that it moves."""
-    return _sum_to_coordinates(model, rows)
-
-
-def _own_coordinates(topology: Topology) -> np.ndarray:
-    """Mask (nb, nv) of the coordinates of each body's own joint."""
-    return np.arange(topology.nb)[:, None] == topology.dof_body
+    topology = model.topology
+    if not _has_loops(topology.nb):
+        return matmul(jnp.asarray(topology.dof_ancestors.T, rows.dtype), rows)
+    return take(_accumulate(topology, jnp.add, jnp.zeros_like(rows[0]), rows, inward=True), topology.dof_body)
 
 
 def take(rows: Array, index: np.ndarray) -> Array:
@@ -207,9 +182,3 @@ def take(rows: Array, index: np.ndarray) -> Array:
     if index.shape == rows.shape[:1] and (index == np.arange(len(index))).all():
         return rows
     return rows[index]
-
-
-def _bodies_by_kind(topology: Topology) -> list[tuple[str, np.ndarray]]:
-    # The two kinds differ in limits only and share one batch.
-    labels = np.array(["revolute" if kind == "continuous" else kind for kind in topology.kinds], str)
-    return [(str(kind), np.flatnonzero(labels == kind)) for kind in dict.fromkeys(labels.tolist())]

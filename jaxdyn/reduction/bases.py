@@ -22,7 +22,7 @@ from jaxdyn.constraints.rank import condition_number, pseudo_inverse, rank_of, t
 from jaxdyn.constraints.selection import independent_rows
 from jaxdyn.lie.so3 import matmul
 from jaxdyn.model.arguments import Number, Numbers, batch_hint, check_state
-from jaxdyn.systems.mass_factor import cholesky, solve_cholesky, solve_lower
+from jaxdyn.systems.mass_factor import cholesky, solve_lower
 from jaxdyn.systems.scene import Scene, as_pytree, as_scene
 from jaxdyn.systems.system import velocity_to_rate
 
@@ -262,12 +262,6 @@ class VelocityAndDrift(NamedTuple):
     quality: Array
 
 
-def velocity_and_drift(scene: Scene, choice: Basis, q, nu, t) -> VelocityAndDrift:
-    """Velocity v = N nu + v0 and drift Ndot nu + v0dot, from one factorisation of the rows."""
-
-    return choice.along(scene, q, nu, t)
-
-
 def _check_columns(nu, N):
     if nu.shape != N.shape[1:]:
         raise ValueError(
@@ -372,13 +366,6 @@ def orthonormal(columns: Float[Array, "n k"]) -> tuple[Float[Array, "n k"], Floa
     factor = cholesky(matmul(columns.T, columns))
     pivots = jnp.diagonal(factor)
     return solve_lower(factor, columns.T).T, jnp.min(pivots) / jnp.max(pivots), factor
-
-
-def minimal_velocity(parametrization: Parametrization, v: Float[Array, " nv"]) -> Float[Array, " nr"]:
-    """Minimal velocities nu (nr,) with N nu + v0 = v for an admissible v."""
-    # Exact for an admissible v; the least-squares fit for any other.
-    factor = cholesky(matmul(parametrization.N.T, parametrization.N))
-    return solve_cholesky(factor, matmul(parametrization.N.T, v - parametrization.v0))
 
 
 def least_quality(dtype) -> float:

@@ -28,10 +28,10 @@ from jaxdyn.reduction.bases import (
     Basis,
     BasisLike,
     FullBasis,
+    Parametrization,
     VelocityAndDrift,
     as_basis,
     least_quality,
-    velocity_and_drift,
 )
 from jaxdyn.systems.mass_factor import cholesky, is_definite, solve_cholesky
 from jaxdyn.systems.scene import Scene, as_scene
@@ -116,7 +116,7 @@ def reduce(scene: Scene, choice: Basis, q, nu, tau, t) -> ReducedDynamics:
 
 def _reduce(given: tuple[Scene, Basis], q, nu, tau, t) -> ReducedDynamics:
     scene, choice = given
-    return solve_in_basis(scene, velocity_and_drift(scene, choice, q, nu, t), q, tau, t)
+    return solve_in_basis(scene, choice.along(scene, q, nu, t), q, tau, t)
 
 
 def solve_in_basis(scene: Scene, motion: VelocityAndDrift, q, tau, t) -> ReducedDynamics:
@@ -136,3 +136,10 @@ def solve_in_basis(scene: Scene, motion: VelocityAndDrift, q, tau, t) -> Reduced
 
 
 _reduce_compiled = entry_point(reduce)
+
+
+def minimal_velocity(parametrization: Parametrization, v: Float[Array, " nv"]) -> Float[Array, " nr"]:
+    """Minimal velocities nu (nr,) with N nu + v0 = v for an admissible v."""
+    # Exact for an admissible v; the least-squares fit for any other.
+    factor = cholesky(matmul(parametrization.N.T, parametrization.N))
+    return solve_cholesky(factor, matmul(parametrization.N.T, v - parametrization.v0))

@@ -42,11 +42,9 @@ from jaxdyn.reduction.bases import (
     VelocityAndDrift,
     as_basis,
     least_quality,
-    minimal_velocity,
     tangent_basis,
-    velocity_and_drift,
 )
-from jaxdyn.reduction.minimal import solve_in_basis
+from jaxdyn.reduction.minimal import minimal_velocity, solve_in_basis
 from jaxdyn.simulation.options import Solver, Stepsize
 from jaxdyn.systems.scene import Scene, as_pytree, is_given
 from jaxdyn.systems.system import displace, needs_retraction, rate_to_velocity, retract, velocity_to_rate
@@ -287,14 +285,14 @@ class Reduced(Method):
     def to_qv_and_basis(self, scene: Scene, y: State, t: Number) -> tuple[Array, Array, VelocityAndDrift | None]:
         """Configuration, and v = N nu + v0 with dv/dt = N dnu/dt + drift from one decomposition of the rows."""
         q = retract(scene.system, y["q"])
-        in_basis = velocity_and_drift(scene, self._basis(y), q, y["nu"], t)
+        in_basis = self._basis(y).along(scene, q, y["nu"], t)
         return q, in_basis.v, in_basis
 
     def rates(
         self, scene: Scene, y: State, q: Q, v: V, t: Number, force: Force, in_basis: VelocityAndDrift | None = None
     ) -> State:
         """Rate of the reduced equations."""
-        motion = velocity_and_drift(scene, self._basis(y), q, y["nu"], t) if in_basis is None else in_basis
+        motion = self._basis(y).along(scene, q, y["nu"], t) if in_basis is None else in_basis
         # Without the scene's forces, which `force` includes.
         reduced = solve_in_basis(Scene(scene.system, scene.constraints), motion, q, force, t)
         fixed = {name: jnp.zeros_like(y[name]) for name in self.step_constants}

@@ -134,8 +134,6 @@ PLAIN = [name for name, rule in RULES.items() if isinstance(rule, np.ufunc)] + [
 
 def everything(model, q, v, a, tau, wrenches):
     """All quantities at one sample."""
-    columns = jnp.stack([tau, a], 1)
-    free, times = recursions.aba_with_columns(model, q, v, tau, columns)
     again, tangent = recursions.aba_tangent(model, q, v, tau, lambda acc: tau - 0.5 * acc)
     return {
         "rnea": recursions.rnea(model, q, v, a),
@@ -145,9 +143,6 @@ def everything(model, q, v, a, tau, wrenches):
         "aba": recursions.aba(model, q, v, tau),
         "crba": recursions.crba(model, q),
         "sqrt": recursions.mass_matrix_sqrt(model, q),
-        "inverse": recursions.mass_matrix_inverse_times(model, q, tau),
-        "free": free,
-        "times": times,
         "again": again,
         "tangent": tangent,
     }
@@ -173,9 +168,6 @@ def expected(model, q, v, a, tau, wrenches):
         "gravity": weight,
         "aba": free,
         "crba": mass,
-        "inverse": np.linalg.solve(mass, tau),
-        "free": free,
-        "times": np.linalg.solve(mass, np.stack([tau, a], 1)),
         "again": free,
         "tangent": np.linalg.solve(mass, tau - 0.5 * free),
     }
@@ -314,16 +306,6 @@ def test_canonical_frames_are_the_home_poses():
             if parent >= 0 and parent not in first and model.topology.kinds[parent] != "planar":
                 assert computed.frames.screws[i].phi == (1, 0) and computed.frames.screws[i].e == 0
             first.add(parent)
-
-
-def test_pose_in_a_link():
-    model = random_tree(1, ["revolute", "helical"])
-    computed = links.links_of(model)
-    for body, pose in ((0, model.frame_poses[2]), (1, model.frame_poses[3]), (-1, model.frame_poses[2])):
-        R, p = links.pose_in_link(computed, body, pose)
-        B = computed.frames.placement[body] if body >= 0 else np.eye(4)
-        assert_close(B[:3, :3] @ R, pose[:3, :3], 1e-15)
-        assert_close(B[:3, :3] @ p + B[:3, 3], pose[:3, 3], 1e-15)
 
 
 def test_nearly_parallel_axes():

@@ -198,7 +198,9 @@ def test_loops_of_joints_of_any_kinds(kinds, given, monkeypatch):
         assert_close(a, b, 1e-12)
 
 
-@pytest.mark.parametrize("kinds", [("revolute",), ("revolute", "spherical", "prismatic")])
+@pytest.mark.parametrize(
+    "kinds", [pytest.param(("revolute",), marks=pytest.mark.slow), ("revolute", "spherical", "prismatic")]
+)
 def test_many_joints_of_several_kinds(kinds):
     """Public functions of a tree with more bodies than are written out, and their derivatives against differences."""
     model = random_tree(3, quantities.MAX_BODIES + 4, branching=1.3, skew=1.0, taper=0.95, kinds=kinds)

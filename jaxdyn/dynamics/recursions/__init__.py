@@ -21,8 +21,6 @@ This package imports `jaxdyn.compile`, the Lie groups and `jaxdyn.model.tree`. I
 
 from jaxdyn.dynamics.recursions.articulated import aba as aba
 from jaxdyn.dynamics.recursions.articulated import aba_tangent as aba_tangent
-from jaxdyn.dynamics.recursions.articulated import aba_with_columns as aba_with_columns
-from jaxdyn.dynamics.recursions.articulated import mass_matrix_inverse_times as mass_matrix_inverse_times
 from jaxdyn.dynamics.recursions.articulated import mass_matrix_sqrt as mass_matrix_sqrt
 from jaxdyn.dynamics.recursions.newton_euler import bias_force as bias_force
 from jaxdyn.dynamics.recursions.newton_euler import crba as crba

@@ -13,7 +13,6 @@ Source: EQUATIONS section 5; Featherstone (2008) section 7.3; Rodriguez, Jain & 
 from collections.abc import Callable
 from typing import Any, NamedTuple
 
-import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
@@ -185,20 +184,6 @@ def _free_and_inverse(model: Model, q, v, tau) -> tuple[Array, Callable]:
     return solve(factors, tau, wrenches), lambda force: solve(factors, force)
 
 
-def aba_with_columns(
-    model: Model,
-    q: Float[Array, " nq"],
-    v: Float[Array, " nv"],
-    tau: Float[Array, " nv"],
-    columns: Float[Array, "nv k"],
-) -> tuple[Float[Array, " nv"], Float[Array, "nv k"]]:
-    """Forward dynamics a (nv,), and M^-1 times `columns` (nv, k), from one factorisation of M, in O(nb k) operations."""
-    check_shapes(model, q=q, v=v, tau=tau)
-    a, times = _free_and_inverse(model, q, v, tau)
-    # Batching over columns shares the factors, which do not depend on them.
-    return a, jax.vmap(times, 1, 1)(columns)
-
-
 def aba_tangent(
     model: Model, q: Float[Array, " nq"], v: Float[Array, " nv"], tau: Float[Array, " nv"], force_change: Callable
 ) -> tuple[Float[Array, " nv"], Float[Array, " nv"]]:
@@ -210,12 +195,6 @@ def aba_tangent(
     check_shapes(model, q=q, v=v, tau=tau)
     a, times = _free_and_inverse(model, q, v, tau)
     return a, times(force_change(a))
-
-
-def mass_matrix_inverse_times(model: Model, q: Float[Array, " nq"], forces: Float[Array, " nv"]) -> Float[Array, " nv"]:
-    """Product of M(q)^-1 and generalised forces (nv,), without forming M: two sweeps over the articulated bodies."""
-    check_shapes(model, q=q, forces=forces)
-    return solve(factorize(model, q), forces)
 
 
 def mass_matrix_sqrt(model: Model, q: Float[Array, " nq"]) -> Float[Array, "nv nv"]:

@@ -227,25 +227,6 @@ def _simplify(steps) -> Chain:
     return (*chain, Transform(shift, None)) if shift is not None else tuple(chain)
 
 
-def pose_in_link(links: Links, body: int, given):
-    """Rotation (3, 3) and position (3,) of a pose (4, 4), converted from a body's frame to its canonical frame; -1: the world."""
-    pose: Any = as_numpy_if_known(given)
-    if body >= 0:
-        B = entry(links.frames.placement, body)
-        R = part(part(B, 0, 3), 0, 3, 1)
-        converted = dot_transpose(
-            R, part(pose, 0, 3) - join([np.zeros((3, 3), pose.dtype), part(part(B, 0, 3), 3, 4, 1)], 1)
-        )
-    else:
-        converted = part(pose, 0, 3)
-    rotation, place = part(converted, 0, 3, 1), entry(converted, 3, 1)
-    if isinstance(rotation, np.ndarray):
-        # Within rounding of 0, 1 and -1 as above, so that scalar programs drop the products.
-        near = np.round(rotation)
-        rotation = np.where(np.abs(rotation - near) <= 8 * np.finfo(rotation.dtype).eps, near, rotation)
-    return rotation, place
-
-
 def wrench_in_link(links: Links, body: int, F):
     """Convert a wrench (6,) from a body's frame to its canonical frame."""
     B = entry(links.frames.placement, body)

@@ -80,28 +80,15 @@ class _Bodies:
         if self.first:
             self.base = self.Row(*(None if x is None else x[0] for x in others), of_base)
 
-    def home(self, row):
-        """Home pose (4, 4) of the base."""
-        raise NotImplementedError
-
     # The coordinate of (v, omega) that all joints move along, or None.
     column: int | None = None
-
-    def place(self, row, q):
-        """Numbers that the pose of a body in its parent depends on."""
-        raise NotImplementedError
-
-    def chain(self, row, place) -> Chain:
-        """The pose."""
-        raise NotImplementedError
-
-    def subspace(self, row):
-        """Motion subspace (6,)."""
-        raise NotImplementedError
-
-    def moments(self, row):
-        """Pseudo-inertia (4, 4)."""
-        raise NotImplementedError
+    # Of one row: the base's home pose (4, 4); the numbers that a body's pose in its parent depends on, with q, and the pose, from
+    # these; the motion subspace (6,); the pseudo-inertia (4, 4).
+    home: Callable[[Any], Any]
+    place: Callable[[Any, Any], Any]
+    chain: Callable[[Any, Any], Chain]
+    subspace: Callable[[Any], Any]
+    moments: Callable[[Any], Any]
 
 
 class _Canonical(_Bodies):
