@@ -113,6 +113,26 @@ def _blocks(derivatives, along) -> list:
     return blocks
 
 
+def _begin_sticking(groups: Groups, y, width, is_first, blocks, right):
+    """Blocks and right-hand side of a step, which is the first one from zero to where all contacts that close stick, if `is_first`.
+
+    There the step is exact, and most problems of feet that stand end. Newton's step from zero takes those for sliding whose
+    tangential velocity without impulses is the larger part.
+    """
+    parts = split(groups, y)
+    corrected, along = _correct_velocities(parts, width)
+    sticking, rights = [], []
+    for y, s, unit, (D, DS), old in zip(parts, corrected, along, blocks, split(groups, right), strict=True):
+        one = jnp.eye(y.shape[1], dtype=y.dtype)
+        closes = (y[:, :1] < 0).astype(y.dtype)
+        S = one + one[:, :1] * jnp.concatenate([jnp.zeros_like(closes), unit], 1)[:, None, :]
+        sticking.append(
+            tuple(jnp.where(is_first, closes[:, :, None] * new, old) for new, old in ((one[None], D), (S, DS)))
+        )
+        rights.append(jnp.where(is_first, -closes * s, old))
+    return sticking, join(rights)
+
+
 def _apply(groups: Groups, blocks, rows) -> Array:
     """Product of a block-diagonal matrix with rows (m, n)."""
     parts, start = [], 0
@@ -171,8 +191,9 @@ def _step(groups: Groups, W, q, floor, shift, state: _State) -> _State:
     own = jnp.where(stage == _SHIFTED, shift, 0.0)
     y = matmul(W, x) + q + own * x
     residual, D, along = _residual(groups, x, y, width)
-    matrix = _newton_matrix(groups, _blocks(D, along), W, jnp.where(stage == _PLAIN, 0.0, shift))
-    change, pivot = eliminate(matrix, -residual[:, None])
+    blocks, right = _begin_sticking(groups, y, width, step == 0, _blocks(D, along), -residual)
+    matrix = _newton_matrix(groups, blocks, W, jnp.where(stage == _PLAIN, 0.0, shift))
+    change, pivot = eliminate(matrix, right[:, None])
     change = change[:, 0]
     rate = matmul(W, change) + own * change
     before = jnp.sqrt(jnp.sum(residual * residual))
