@@ -114,7 +114,7 @@ def _blocks(derivatives, along) -> list:
 
 
 def _begin_sticking(groups: Groups, y, width, is_first, blocks, right):
-    """Blocks and right-hand side of a step, which is the first one from zero to where all contacts that close stick, if `is_first`.
+    """Blocks and right-hand side of a step; if `is_first`, of the one from zero to where all contacts that close stick.
 
     There the step is exact, and most problems of feet that stand end. Newton's step from zero takes those for sliding whose
     tangential velocity without impulses is the larger part.
@@ -125,7 +125,7 @@ def _begin_sticking(groups: Groups, y, width, is_first, blocks, right):
     for y, s, unit, (D, DS), old in zip(parts, corrected, along, blocks, split(groups, right), strict=True):
         one = jnp.eye(y.shape[1], dtype=y.dtype)
         closes = (y[:, :1] < 0).astype(y.dtype)
-        S = one + one[:, :1] * jnp.concatenate([jnp.zeros_like(closes), unit], 1)[:, None, :]
+        S = one[None] + one[None, :, :1] * jnp.concatenate([jnp.zeros_like(closes), unit], 1)[:, None, :]
         sticking.append(
             tuple(jnp.where(is_first, closes[:, :, None] * new, old) for new, old in ((one[None], D), (S, DS)))
         )
