@@ -150,15 +150,16 @@ def _newton_matrix(groups: Groups, blocks, W, shift) -> Array:
     return unit - _apply(groups, D, unit) + _apply(groups, DS, W + jnp.diag(shift))
 
 
-def eliminate(matrix, right) -> tuple[Array, Array]:
-    """Solution of matrix x = right (n, k) by elimination without exchange of rows, and the least size () of a pivot.
+def eliminate(matrix, right, exponent: float = 0.5) -> tuple[Array, Array]:
+    """Solution of matrix x = right (n, k) by elimination without exchange of rows, and the pivots (n,).
 
-    The diagonal blocks need no exchange. A pivot below the square root of rounding is replaced by that: the rows are dependent.
+    The diagonal blocks of cones need no exchange. A pivot whose size is below this power of rounding is replaced by it: the rows
+    are dependent.
     """
-    rows, pivots, least = [], [], float(jnp.finfo(matrix.dtype).eps) ** 0.5
+    rows, pivots, least = [], [], float(jnp.finfo(matrix.dtype).eps) ** exponent
     for _ in range(matrix.shape[0]):
         pivot = matrix[0, 0]
-        pivots.append(jnp.abs(pivot))
+        pivots.append(pivot)
         inverse = 1 / jnp.where(jnp.abs(pivot) > least, pivot, least)
         rows.append((inverse, matrix[0, 1:], right[0]))
         share = matrix[1:, :1] * inverse
@@ -167,7 +168,7 @@ def eliminate(matrix, right) -> tuple[Array, Array]:
     for inverse, row, value in reversed(rows):
         rest = value - matmul(row, solution) if row.shape[0] else value
         solution = jnp.concatenate([(rest * inverse)[None], solution])
-    return solution, jnp.min(jnp.stack(pivots))
+    return solution, jnp.stack(pivots)
 
 
 def _shift(scale, exponent: float = _SHIFT) -> Array:
@@ -193,7 +194,7 @@ def _step(groups: Groups, W, q, floor, shift, state: _State) -> _State:
     residual, D, along = _residual(groups, x, y, width)
     blocks, right = _begin_sticking(groups, y, width, step == 0, _blocks(D, along), -residual)
     matrix = _newton_matrix(groups, blocks, W, jnp.where(stage == _PLAIN, 0.0, shift))
-    change, pivot = eliminate(matrix, right[:, None])
+    change, pivots = eliminate(matrix, right[:, None])
     change = change[:, 0]
     rate = matmul(W, change) + own * change
     before = jnp.sqrt(jnp.sum(residual * residual))
@@ -214,7 +215,7 @@ def _step(groups: Groups, W, q, floor, shift, state: _State) -> _State:
     better = ~is_stuck & jnp.isfinite(after)
     x, error = jnp.where(better, best, x), jnp.where(better, after, before)
     is_done = is_last & ((error <= _ROUNDING * eps) | is_stuck)
-    is_unique = pivot > 1e2 * eps**0.5
+    is_unique = jnp.min(jnp.abs(pivots)) > 1e2 * eps**0.5
     ends = is_done & ((stage == _PROXIMAL) | ((stage == _PLAIN) & is_unique))
     following = jnp.where(is_done & (stage == _PLAIN), _SHIFTED, stage)
     # Where impulses are undetermined, the last digits of the shifted equations may not be found.

@@ -15,6 +15,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array
 
+from jaxdyn.contact.coulomb import eliminate
 from jaxdyn.dynamics.quantities import bias_force
 from jaxdyn.lie.so3 import matmul
 from jaxdyn.simulation.hybrid.modes import Elements, Mode, force_at
@@ -125,10 +126,11 @@ def react(elements: Elements, mode: Mode, gram: Gram, friction, loads, along, ta
         pick = jnp.stack([sign[i] for i in elements.frictional])
         # Sliding friction changes its own normal forces: N = S (base + by_normal N), S the rows and signs of `pick`.
         K = jnp.eye(count, dtype=dtype) - pick[:, None] * by_normal[jnp.asarray(at)]
-        normal, own = _eliminate(K, pick * base[jnp.asarray(at)])
-        is_sliding = slides(elements, mode)
-        for i, pivot in zip(elements.frictional, own, strict=True):
-            pivots[i] = jnp.where(is_sliding[i], pivot, jnp.ones_like(pivot))
+        # Without exchange of rows, because the sign of each pivot tells where friction leaves no forces.
+        solution, own = eliminate(K, (pick * base[jnp.asarray(at)])[:, None], 1.0)
+        normal, is_sliding = solution[:, 0], slides(elements, mode)
+        for k, i in enumerate(elements.frictional):
+            pivots[i] = jnp.where(is_sliding[i], own[k], jnp.ones_like(own[k]))
     lam = (base + matmul(by_normal, normal)) * active
     normals = [sign[i] * lam[one.normal] if one.normal >= 0 else loads[i] for i, one in enumerate(elements.each)]
     return Reaction(
@@ -140,33 +142,6 @@ def depends_on_others(elements: Elements, gram: Gram, mode: Mode):
     """Mask of the elements (n,) whose friction depends on that of others: only their sum is determined."""
     free = gram.factor(elements.active(mode).astype(gram.Y.dtype)).nullity() > 1e-3
     return jnp.stack([jnp.stack([free[k] for k in one.tangent] or [free[0] & False]).any() for one in elements.each])
-
-
-def _eliminate(K, right):
-    """Solution x of K x = right, and the pivots of the elimination in order.
-
-    Without exchange of rows, because the sign of each pivot tells where friction leaves no forces.
-    """
-    n, pivots = K.shape[0], []
-    matrix = [K[i] for i in range(n)]
-    values = [right[i] for i in range(n)]
-    for i in range(n):
-        pivot = matrix[i][i]
-        pivots.append(pivot)
-        # The recorded pivot stays zero, which ends the mode; the division needs another number.
-        pivot = jnp.where(pivot == 0, jnp.full_like(pivot, float(jnp.finfo(pivot.dtype).eps)), pivot)
-        for j in range(i + 1, n):
-            share = matrix[j][i] / pivot
-            matrix[j] = matrix[j] - share * matrix[i]
-            values[j] = values[j] - share * values[i]
-    unknowns: list[Any] = [None] * n
-    for i in reversed(range(n)):
-        rest = values[i]
-        for j in range(i + 1, n):
-            rest = rest - matrix[i][j] * unknowns[j]
-        pivot = matrix[i][i]
-        unknowns[i] = rest / jnp.where(pivot == 0, jnp.full_like(pivot, float(jnp.finfo(pivot.dtype).eps)), pivot)
-    return jnp.stack(unknowns), pivots
 
 
 class ModeDynamics(NamedTuple):
