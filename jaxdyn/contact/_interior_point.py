@@ -22,6 +22,7 @@ from jaxtyping import Array, Bool, Int
 from jaxdyn.compile import kernel
 from jaxdyn.compile.batch import any_sample, cond
 from jaxdyn.contact import jordan
+from jaxdyn.contact.jordan import dot, largest, map_groups, rows_times, transpose_times
 from jaxdyn.lie.so3 import matmul
 from jaxdyn.systems.mass_factor import cholesky, solve_cholesky
 
@@ -66,47 +67,22 @@ class End(NamedTuple):
     infeasible: Bool[Array, ""]
 
 
-def _times(G, x):
-    """Product G x of each group, (k, d)."""
-    return tuple(matmul(g.reshape(-1, x.shape[0]), x).reshape(g.shape[:2]) for g in G)
-
-
-def _transpose_times(G, z, like):
-    """Sum of G^T z over the groups, (n,)."""
-    parts = [matmul(g.reshape(-1, g.shape[-1]).T, y.reshape(-1)) for g, y in zip(G, z, strict=True)]
-    # The start value gives the sum its shape where there are no groups.
-    return sum(parts, jnp.zeros_like(like))
-
-
-def _zip(function, *groups):
-    return tuple(function(*each) for each in zip(*groups, strict=True))
-
-
-def _largest(*groups):
-    parts = [jnp.max(jnp.abs(x), initial=0) for group in groups for x in group]
-    return jnp.max(jnp.stack(parts))
-
-
-def _dot(a, b, like):
-    return sum((jnp.sum(x * y) for x, y in zip(a, b, strict=True)), jnp.zeros_like(like))
-
-
 def _residuals(program: Program, point: Point):
     """Residuals Q x + q + G^T z, and G x + s - h."""
     x, s, z = point
-    stationary = matmul(program.Q, x) + program.q + _transpose_times(program.G, z, x)
-    return stationary, _zip(lambda a, b, c: a + b - c, _times(program.G, x), s, program.h)
+    stationary = matmul(program.Q, x) + program.q + transpose_times(program.G, z, x)
+    return stationary, map_groups(lambda a, b, c: a + b - c, rows_times(program.G, x), s, program.h)
 
 
 def _residuals_and_measure(program: Program, point: Point):
     """Residuals, and the larger of their maximum and the duality gap."""
     rx, rz = _residuals(program, point)
-    return (rx, rz), jnp.maximum(_largest((rx,), rz), _gap(point))
+    return (rx, rz), jnp.maximum(largest((rx,), rz), _gap(point))
 
 
 def _gap(point: Point):
     # The mean over the cones, each of degree one, as CVXOPT's mu.
-    return _dot(point.s, point.z, point.x[0]) / sum(y.shape[0] for y in point.s)
+    return dot(point.s, point.z, point.x[0]) / sum(y.shape[0] for y in point.s)
 
 
 def _is_certificate(program: Program, point: Point, tol: float):
@@ -114,8 +90,8 @@ def _is_certificate(program: Program, point: Point, tol: float):
 
     Up to rounding, it excludes every x below 1 / tol.
     """
-    level = -_dot(program.h, point.z, point.x[0])
-    return (level > 0) & (jnp.max(jnp.abs(_transpose_times(program.G, point.z, point.x))) < tol * level)
+    level = -dot(program.h, point.z, point.x[0])
+    return (level > 0) & (jnp.max(jnp.abs(transpose_times(program.G, point.z, point.x))) < tol * level)
 
 
 def _where(condition, new, old):
@@ -132,17 +108,17 @@ def _start(pattern: Pattern, _, program: Program):
     # x minimises x^T Q x / 2 + q^T x + |G x - h|^2 / 2.
     factor = cholesky(Q + matmul(rows.T, rows))
     x = solve_cholesky(factor, matmul(rows.T, level) - q)
-    slack = _zip(lambda a, b: b - a, _times(G, x), h)
+    slack = map_groups(lambda a, b: b - a, rows_times(G, x), h)
 
     def inside(groups):
         least = jnp.min(jnp.stack([jnp.min(jordan.boundary_distance(v), initial=jnp.inf) for v in groups]))
-        size = jnp.maximum(_largest(groups), 1)
+        size = jnp.maximum(largest(groups), 1)
         # Far enough from the boundary that the first steps are not cut short.
         shift = jnp.where(least > 0.1 * size, 0, jnp.maximum(-least, 0) + size)
-        return _zip(lambda v: v + shift * jordan.identity(v), groups)
+        return map_groups(lambda v: v + shift * jordan.identity(v), groups)
 
     # In the least-squares problem above the multipliers are z = G x - h, minus the slacks.
-    point = Point(x, inside(slack), inside(_zip(lambda v: -v, slack)))
+    point = Point(x, inside(slack), inside(map_groups(lambda v: -v, slack)))
     return point, *_residuals_and_measure(program, point)
 
 
@@ -150,32 +126,32 @@ def _newton(program: Program, s, z):
     """Scaled point lam, and a solver (dx, ds, dz) of the Newton equations for right-hand sides."""
     Q, _, G, _ = program
     # W z = W^-1 s: both scaled points coincide, which makes the Newton equations symmetric.
-    W = _zip(jordan.scaling, s, z)
+    W = map_groups(jordan.scaling, s, z)
     n = Q.shape[0]
     # W^-1 G once: both right-hand sides of the step use the same factor.
-    scaled = _zip(lambda w, g: jax.vmap(w.inverse_times, 2, 2)(g), W, G)
+    scaled = map_groups(lambda w, g: jax.vmap(w.inverse_times, 2, 2)(g), W, G)
     rows = jnp.concatenate([g.reshape(-1, n) for g in scaled])
     factor = cholesky(Q + matmul(rows.T, rows))
 
     def solve(rx, rz, u, is_refined: bool = True):
         """Solve Q dx + G^T dz = -rx, G dx + ds = -rz, W dz + W^-1 ds = u; return also W^-1 ds and W dz."""
-        right = _zip(lambda w, r, y: w.inverse_times(r) + y, W, rz, u)
-        dx = solve_cholesky(factor, -rx - _transpose_times(scaled, right, rx))
-        wdz = _zip(lambda a, b: a + b, _times(scaled, dx), right)
+        right = map_groups(lambda w, r, y: w.inverse_times(r) + y, W, rz, u)
+        dx = solve_cholesky(factor, -rx - transpose_times(scaled, right, rx))
+        wdz = map_groups(lambda a, b: a + b, rows_times(scaled, dx), right)
         # The normal matrix squares the condition number; one step of refinement recovers the lost digits.
         if is_refined:
-            more = solve_cholesky(factor, -rx - matmul(Q, dx) - _transpose_times(scaled, wdz, rx))
-            dx, wdz = dx + more, _zip(lambda a, b: a + b, wdz, _times(scaled, more))
-        wds = _zip(lambda a, b: a - b, u, wdz)
-        dz, ds = (_zip(lambda w, y: w.inverse_times(y), W, wdz), _zip(lambda w, y: w.times(y), W, wds))
+            more = solve_cholesky(factor, -rx - matmul(Q, dx) - transpose_times(scaled, wdz, rx))
+            dx, wdz = dx + more, map_groups(lambda a, b: a + b, wdz, rows_times(scaled, more))
+        wds = map_groups(lambda a, b: a - b, u, wdz)
+        dz, ds = (map_groups(lambda w, y: w.inverse_times(y), W, wdz), map_groups(lambda w, y: w.times(y), W, wds))
         return dx, ds, dz, wds, wdz
 
-    return _zip(lambda w, y: w.times(y), W, z), solve
+    return map_groups(lambda w, y: w.times(y), W, z), solve
 
 
 def _step(program: Program, point: Point, residuals) -> Point:
     """Take one predictor-corrector step."""
-    x, s, z = point
+    _, s, z = point
     rx, rz = residuals
     # mu is the target of complementarity: s o z = mu e on the central path.
     mu = _gap(point)
@@ -188,14 +164,14 @@ def _step(program: Program, point: Point, residuals) -> Point:
         )
 
     # The affine predictor needs no refinement: it only sets the centring parameter and the second-order term.
-    *_, wds, wdz = solve(rx, rz, _zip(lambda v: -v, lam), is_refined=False)
+    *_, wds, wdz = solve(rx, rz, map_groups(lambda v: -v, lam), is_refined=False)
     # Mehrotra's heuristic: centre little where the affine step is long. Near the apex of a cone one eigenvalue of lam may run to
     # zero ahead of the others, a hundredth a step, until rounding ends the iteration: there some centring is kept.
     least = jnp.min(jnp.stack([jnp.min(jordan.boundary_distance(v)) for v in lam]))
     floor = jnp.where(least * least < _OFF_CENTRE * mu, _LEAST_CENTRING, 0.0).astype(mu.dtype)
     centring = jnp.maximum((1 - 1 / jnp.maximum(inverse_step(wds, wdz), 1)) ** 3, floor)
     # Linearised complementarity with the second-order term (W^-1 ds) o (W dz) of the predictor.
-    u = _zip(
+    u = map_groups(
         lambda v, a, b: jordan.quotient(
             v, centring * mu * jordan.identity(v) - jordan.product(v, v) - jordan.product(a, b)
         ),
@@ -206,8 +182,7 @@ def _step(program: Program, point: Point, residuals) -> Point:
     dx, ds, dz, wds, wdz = solve(rx, rz, u)
     # 0.99 keeps the iterate strictly inside, where the scaling exists.
     length = 1 / jnp.maximum(inverse_step(wds, wdz) / 0.99, 1)
-    move = lambda v, dv: v + length * dv  # noqa: E731
-    return Point(move(x, dx), _zip(move, s, ds), _zip(move, z, dz))
+    return jax.tree.map(lambda v, dv: v + length * dv, point, Point(dx, ds, dz))
 
 
 class _State(NamedTuple):
@@ -273,21 +248,21 @@ def _refinement(pattern: Pattern, _, program: Program, state: _Refined) -> _Refi
     going, eps = _is_refining(state), float(jnp.finfo(state.error.dtype).eps)
     x, s, z = state.point
     # v = s - z determines both, s = P(v) and z = P(v) - v: complementarity holds by construction.
-    v = _zip(lambda a, b: a - b, s, z)
+    v = map_groups(lambda a, b: a - b, s, z)
 
     def at(x, v):
-        s = _zip(jordan.projection, v)
-        point = Point(x, s, _zip(lambda a, b: a - b, s, v))
+        s = map_groups(jordan.projection, v)
+        point = Point(x, s, map_groups(lambda a, b: a - b, s, v))
         rx, rz = _residuals(program, point)
-        return point, rx, rz, _largest((rx,), rz)
+        return point, rx, rz, largest((rx,), rz)
 
     # Interior points are not complementary; the projection makes them so, at the price of a residual.
     here, rx, rz, residual = at(x, v)
-    D = _projection_derivatives(v, eps, 0.5)
-    dx, dv = _solve_projection_equations(program, D, -rx, _zip(lambda r: -r, rz), 1)
+    D = tuple(jordan.projection_derivative(y, eps, 0.5) for y in v)
+    dx, dv = _solve_projection_equations(program, D, -rx, map_groups(lambda r: -r, rz), 1)
     # A full step without line search. The equations are linear between kinks: from the wrong side of one the first step raises
     # the residual, and the second one is exact.
-    there, *_, less = at(x + dx, _zip(lambda a, b: a + b, v, dv))
+    there, *_, less = at(x + dx, map_groups(lambda a, b: a + b, v, dv))
     # A NaN residual compares false, so that it is rejected.
     is_here = ~(less < residual)
     new, least = _where(is_here, here, there), jnp.where(is_here, residual, less)
@@ -298,10 +273,6 @@ def _refinement(pattern: Pattern, _, program: Program, state: _Refined) -> _Refi
     credit = jnp.where(better, jnp.full_like(state.credit, 2), state.credit - spent)
     point = _where(going & jnp.isfinite(less), there, state.point)
     return _Refined(point, best, error, jnp.where(going, credit, state.credit))
-
-
-def _projection_derivatives(v, width, at_kink):
-    return tuple(jordan.projection_derivative(y, width, at_kink) for y in v)
 
 
 def _solve_projection_equations(program: Program, D, right_x, right_s, corrections: int):
@@ -320,27 +291,22 @@ def _solve_projection_equations(program: Program, D, right_x, right_s, correctio
     inverse = tuple(d.map(lambda x: 1 / (x + delta * (1 - x))) for d in D)
 
     def times(derivatives, y):
-        return _zip(lambda d, x: d.times(x), derivatives, y)
+        return map_groups(lambda d, x: d.times(x), derivatives, y)
 
-    weighted = _zip(lambda r, i, g: jax.vmap(lambda x: r.times(i.times(x)), 2, 2)(g), rest, inverse, G)
+    weighted = map_groups(lambda r, i, g: jax.vmap(lambda x: r.times(i.times(x)), 2, 2)(g), rest, inverse, G)
     rows, weighted = (jnp.concatenate([g.reshape(-1, n) for g in groups]) for groups in (G, weighted))
     normal = Q + matmul(rows.T, weighted)
     # A shift by rounding keeps the matrix positive definite.
     factor = cholesky(normal + jnp.diag(n * eps * jnp.diagonal(normal)))
-    dx, dv = jnp.zeros_like(right_x), _zip(jnp.zeros_like, right_s)
+    dx, dv = jnp.zeros_like(right_x), map_groups(jnp.zeros_like, right_s)
     # Iterative refinement with residuals of the unmodified equations.
     for _ in range(1 + corrections):
-        rx = right_x - matmul(Q, dx) + _transpose_times(G, times(rest, dv), dx)
-        rs = _zip(lambda r, a, b: r - a - b, right_s, _times(G, dx), times(D, dv))
-        more = solve_cholesky(factor, rx + _transpose_times(G, times(rest, times(inverse, rs)), dx))
-        dv = _zip(lambda a, b: a + b, dv, times(inverse, _zip(lambda r, a: r - a, rs, _times(G, more))))
+        rx = right_x - matmul(Q, dx) + transpose_times(G, times(rest, dv), dx)
+        rs = map_groups(lambda r, a, b: r - a - b, right_s, rows_times(G, dx), times(D, dv))
+        more = solve_cholesky(factor, rx + transpose_times(G, times(rest, times(inverse, rs)), dx))
+        dv = map_groups(lambda a, b: a + b, dv, times(inverse, map_groups(lambda r, a: r - a, rs, rows_times(G, more))))
         dx = dx + more
     return dx, dv
-
-
-def width_of(dtype):
-    """Distance from a kink of the projection, in scaled numbers, up to which the solution counts as at it."""
-    return float(jnp.finfo(dtype).eps) ** 0.5
 
 
 def _end(pattern: Pattern, tol: float, _, program: Program, last: Point, error, refined: Point, less, infeasible):
@@ -404,7 +370,7 @@ def _attach_derivative_jvp(pattern: Pattern, primals, tangents):
     # The recursion lets higher-order derivatives account for the motion of the point.
     point = attach_derivative(pattern, program, point)
     _, s, z = jax.lax.stop_gradient(point)
-    width = width_of(point.x.dtype)
+    width = jordan.width_of(point.x.dtype)
     kinks = [jnp.any(jordan.is_near_kink(a - b, width)) for a, b in zip(s, z, strict=True)]
 
     def tangent(at_kink: float):
@@ -423,10 +389,11 @@ def _tangent(pattern: Pattern, at_kink: float, _, program: Program, point: Point
     # The pattern is static, so that the tangent of a known zero is zero too.
     program, change = _sparse(program, pattern), _sparse(change, pattern)
     x, s, z = point
-    right_x = -matmul(change.Q, x) - change.q - _transpose_times(change.G, z, x)
-    right_s = _zip(lambda a, b: b - a, _times(change.G, x), change.h)
-    D = _projection_derivatives(_zip(lambda a, b: a - b, s, z), width_of(x.dtype), at_kink)
+    right_x = -matmul(change.Q, x) - change.q - transpose_times(change.G, z, x)
+    right_s = map_groups(lambda a, b: b - a, rows_times(change.G, x), change.h)
+    v, width = map_groups(lambda a, b: a - b, s, z), jordan.width_of(x.dtype)
+    D = tuple(jordan.projection_derivative(y, width, at_kink) for y in v)
     dx, dv = _solve_projection_equations(program, D, right_x, right_s, 2)
     # From s = P(v) and z = s - v.
-    ds = _zip(lambda d, dy: d.times(dy), D, dv)
-    return Point(dx, ds, _zip(lambda a, b: a - b, ds, dv))
+    ds = map_groups(lambda d, dy: d.times(dy), D, dv)
+    return Point(dx, ds, map_groups(lambda a, b: a - b, ds, dv))

@@ -113,6 +113,26 @@ def _blocks(derivatives, along) -> list:
     return blocks
 
 
+def _begin_sticking(groups: Groups, y, width, is_first, blocks, right):
+    """Blocks and right-hand side of a step; if `is_first`, of the one from zero to where all contacts that close stick.
+
+    There the step is exact, and most problems of feet that stand end. Newton's step from zero takes those for sliding whose
+    tangential velocity without impulses is the larger part.
+    """
+    parts = split(groups, y)
+    corrected, along = _correct_velocities(parts, width)
+    sticking, rights = [], []
+    for y, s, unit, (D, DS), old in zip(parts, corrected, along, blocks, split(groups, right), strict=True):
+        one = jnp.eye(y.shape[1], dtype=y.dtype)
+        closes = (y[:, :1] < 0).astype(y.dtype)
+        S = one[None] + one[None, :, :1] * jnp.concatenate([jnp.zeros_like(closes), unit], 1)[:, None, :]
+        sticking.append(
+            tuple(jnp.where(is_first, closes[:, :, None] * new, old) for new, old in ((one[None], D), (S, DS)))
+        )
+        rights.append(jnp.where(is_first, -closes * s, old))
+    return sticking, join(rights)
+
+
 def _apply(groups: Groups, blocks, rows) -> Array:
     """Product of a block-diagonal matrix with rows (m, n)."""
     parts, start = [], 0
@@ -130,15 +150,16 @@ def _newton_matrix(groups: Groups, blocks, W, shift) -> Array:
     return unit - _apply(groups, D, unit) + _apply(groups, DS, W + jnp.diag(shift))
 
 
-def eliminate(matrix, right) -> tuple[Array, Array]:
-    """Solution of matrix x = right (n, k) by elimination without exchange of rows, and the least size () of a pivot.
+def eliminate(matrix, right, exponent: float = 0.5) -> tuple[Array, Array]:
+    """Solution of matrix x = right (n, k) by elimination without exchange of rows, and the pivots (n,).
 
-    The diagonal blocks need no exchange. A pivot below the square root of rounding is replaced by that: the rows are dependent.
+    The diagonal blocks of cones need no exchange. A pivot whose size is below this power of rounding is replaced by it: the rows
+    are dependent.
     """
-    rows, pivots, least = [], [], float(jnp.finfo(matrix.dtype).eps) ** 0.5
+    rows, pivots, least = [], [], float(jnp.finfo(matrix.dtype).eps) ** exponent
     for _ in range(matrix.shape[0]):
         pivot = matrix[0, 0]
-        pivots.append(jnp.abs(pivot))
+        pivots.append(pivot)
         inverse = 1 / jnp.where(jnp.abs(pivot) > least, pivot, least)
         rows.append((inverse, matrix[0, 1:], right[0]))
         share = matrix[1:, :1] * inverse
@@ -147,7 +168,7 @@ def eliminate(matrix, right) -> tuple[Array, Array]:
     for inverse, row, value in reversed(rows):
         rest = value - matmul(row, solution) if row.shape[0] else value
         solution = jnp.concatenate([(rest * inverse)[None], solution])
-    return solution, jnp.min(jnp.stack(pivots))
+    return solution, jnp.stack(pivots)
 
 
 def _shift(scale, exponent: float = _SHIFT) -> Array:
@@ -171,8 +192,9 @@ def _step(groups: Groups, W, q, floor, shift, state: _State) -> _State:
     own = jnp.where(stage == _SHIFTED, shift, 0.0)
     y = matmul(W, x) + q + own * x
     residual, D, along = _residual(groups, x, y, width)
-    matrix = _newton_matrix(groups, _blocks(D, along), W, jnp.where(stage == _PLAIN, 0.0, shift))
-    change, pivot = eliminate(matrix, -residual[:, None])
+    blocks, right = _begin_sticking(groups, y, width, step == 0, _blocks(D, along), -residual)
+    matrix = _newton_matrix(groups, blocks, W, jnp.where(stage == _PLAIN, 0.0, shift))
+    change, pivots = eliminate(matrix, right[:, None])
     change = change[:, 0]
     rate = matmul(W, change) + own * change
     before = jnp.sqrt(jnp.sum(residual * residual))
@@ -193,7 +215,7 @@ def _step(groups: Groups, W, q, floor, shift, state: _State) -> _State:
     better = ~is_stuck & jnp.isfinite(after)
     x, error = jnp.where(better, best, x), jnp.where(better, after, before)
     is_done = is_last & ((error <= _ROUNDING * eps) | is_stuck)
-    is_unique = pivot > 1e2 * eps**0.5
+    is_unique = jnp.min(jnp.abs(pivots)) > 1e2 * eps**0.5
     ends = is_done & ((stage == _PROXIMAL) | ((stage == _PLAIN) & is_unique))
     following = jnp.where(is_done & (stage == _PLAIN), _SHIFTED, stage)
     # Where impulses are undetermined, the last digits of the shifted equations may not be found.

@@ -11,6 +11,7 @@ from typing import NamedTuple
 import jax.numpy as jnp
 
 from jaxdyn.lie.series import safe_sqrt
+from jaxdyn.lie.so3 import matmul
 
 
 def identity(like):
@@ -208,3 +209,39 @@ def is_near_kink(v, width):
     """Decide whether an eigenvalue v0 -+ |v1| is at most `width`, (k,)."""
     norm = _norm(v[..., 1:])
     return (jnp.abs(v[..., 0] - norm) <= width) | (jnp.abs(v[..., 0] + norm) <= width)
+
+
+def width_of(dtype):
+    """Distance from a kink of the projection, in scaled numbers, up to which the solution counts as at it."""
+    return float(jnp.finfo(dtype).eps) ** 0.5
+
+
+# Arrays by groups of cones of one dimension, (k, d) each.
+
+
+def rows_times(G, x):
+    """Product G x of each group, (k, d)."""
+    return tuple(matmul(g.reshape(-1, x.shape[0]), x).reshape(g.shape[:2]) for g in G)
+
+
+def transpose_times(G, z, like):
+    """Sum of G^T z over the groups, (n,)."""
+    parts = [matmul(g.reshape(-1, g.shape[-1]).T, y.reshape(-1)) for g, y in zip(G, z, strict=True)]
+    # The start value gives the sum its shape where there are no groups.
+    return sum(parts, jnp.zeros_like(like))
+
+
+def map_groups(function, *groups):
+    """Values of a function of the arrays of each group."""
+    return tuple(function(*each) for each in zip(*groups, strict=True))
+
+
+def largest(*groups):
+    """Largest absolute value () of all arrays, zero of none."""
+    parts = [jnp.max(jnp.abs(x), initial=0) for group in groups for x in group]
+    return jnp.max(jnp.stack(parts))
+
+
+def dot(a, b, like):
+    """Sum of the products a b over all groups, ()."""
+    return sum((jnp.sum(x * y) for x, y in zip(a, b, strict=True)), jnp.zeros_like(like))

@@ -4,8 +4,8 @@ import equinox as eqx
 import jax
 from jaxtyping import Array, Float
 
-from jaxdyn.contact.coordinates import contact_coordinates
 from jaxdyn.contact.surfaces import Surface, check_surface
+from jaxdyn.contact.touching import contact_coordinates
 from jaxdyn.dynamics.kinematics import frame_pose
 from jaxdyn.lie import se3
 from jaxdyn.lie.so3 import matmul

@@ -9,8 +9,7 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from jaxdyn.constraints.loops import Loop, loop, pose_leaf
-from jaxdyn.contact.cones import FrictionCone
-from jaxdyn.contact.kinds import wrench_basis
+from jaxdyn.contact.cones import FrictionCone, wrench_basis
 from jaxdyn.dynamics.kinematics import body_jacobian, frame_pose
 from jaxdyn.lie import se3
 from jaxdyn.lie.so3 import matmul

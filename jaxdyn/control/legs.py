@@ -16,7 +16,7 @@ from jaxtyping import Array, Float
 
 from jaxdyn.constraints.codes import RESULTS, Outcome
 from jaxdyn.constraints.rank import pseudo_inverse, tolerance
-from jaxdyn.contact.optimal import cone_bounds
+from jaxdyn.contact.forces import cone_bounds
 from jaxdyn.contact.qp import solve_qp
 from jaxdyn.control.feet import Foot, check_feet
 from jaxdyn.dynamics.quantities import inverse_dynamics

@@ -3,9 +3,9 @@
 Source: Murray, Li & Sastry (1994), chapters 5 and 6.
 """
 
+from jaxdyn.contact.cones import wrench_basis as wrench_basis
 from jaxdyn.contact.forces import ContactForces as ContactForces
 from jaxdyn.contact.forces import contact_forces as contact_forces
-from jaxdyn.contact.kinds import wrench_basis as wrench_basis
 from jaxdyn.grasp.contacts import Contact as Contact
 from jaxdyn.grasp.contacts import contact as contact
 from jaxdyn.grasp.contacts import point_contacts as point_contacts

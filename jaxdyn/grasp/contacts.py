@@ -18,7 +18,7 @@ from jaxdyn.constraints.base import Constraint
 from jaxdyn.constraints.frames import Pair
 from jaxdyn.constraints.loops import attitude, check_bodies
 from jaxdyn.constraints.rolling import RollingSphere, RollingWheel
-from jaxdyn.contact.kinds import components
+from jaxdyn.contact.cones import components
 from jaxdyn.model import host_math
 from jaxdyn.model.arguments import DType, Numbers, SystemLike, check_body, check_new_name, pose_leaf
 

@@ -6,9 +6,8 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from jaxdyn.contact.height_field import HeightField
-from jaxdyn.contact.hulls import hull_vertices
 from jaxdyn.contact.shape_contacts import shape_contacts
-from jaxdyn.contact.shapes import Box, Capsule, ConvexHull
+from jaxdyn.contact.shapes import Box, Capsule, ConvexHull, hull_vertices
 from jaxdyn.contact.surfaces import Cylinder, Ellipsoid, Plane, Sphere
 from jaxdyn.contact.unilateral import UnilateralContact
 from jaxdyn.dynamics.kinematics import named_frame

@@ -11,8 +11,8 @@ import numpy as np
 from jaxdyn.constraints.base import layout
 from jaxdyn.constraints.frames import Pair
 from jaxdyn.constraints.loops import Distance, Loop
+from jaxdyn.contact.cones import components
 from jaxdyn.contact.forces import contacts_with_cones
-from jaxdyn.contact.kinds import components
 from jaxdyn.dynamics.kinematics import forward_kinematics
 from jaxdyn.grasp.contacts import Contact
 from jaxdyn.model.arguments import as_array

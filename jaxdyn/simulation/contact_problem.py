@@ -332,7 +332,7 @@ def pose(contacts: Contacts, scene: Scene, q, v, z, tau, t, h) -> _Problem:
     bound = _bounds(contacts, scene, terms, v, free, h)
     place = jnp.where(closes, place, displace(scene.system, flow.place, 0.5 * h * free))
     if not scene.constraints:
-        Y, reaction = metric.whiten(terms.J.T), _Reaction(h * loads, None)
+        Y, reaction = metric.whiten(terms.J.T), _Reaction(h * loads, {})
         return _in_units(contacts, flow, Y, place, free, terms, terms.velocity, bound, reaction)
     place = project_state(bare, place, free, end)[0]
     terms = contact_terms(contacts, whole, place, free, end)
@@ -356,7 +356,7 @@ class _Reaction(NamedTuple):
     """Impulses of loads (k,), N s, of either sign where they are multipliers, and their rates (m,) by those of the cones."""
 
     loads: Array
-    rates: dict[int, Array] | None
+    rates: dict[int, Array]
 
 
 def _loads(contacts: Contacts, scene: Scene, q, v, t) -> Array:
@@ -387,7 +387,7 @@ def _in_units(contacts: Contacts, flow: _Flow, Y, place, velocity, terms, veloci
     # The normal impulse of a friction moves nothing but a mass of its own.
     for k, (at, closes) in enumerate(zip(contacts.normals, contacts.closing, strict=True)):
         if not closes:
-            if k in (reaction.rates or ()):
+            if k in reaction.rates:
                 gram = gram.at[at].set(-reaction.rates[k] * unit / unit[at])
             gram, relative = gram.at[at, at].set(one), relative.at[at].set(-reaction.loads[k] / unit[at])
     return _Problem(flow.place, flow.drives, place, velocity, flow.metric, Y, gram, relative, unit, terms.side)

@@ -9,7 +9,7 @@ import pytest
 
 import jaxdyn as jd
 from jaxdyn.contact import HeightField, Plane
-from jaxdyn.contact.hulls import hull_vertices
+from jaxdyn.contact.shapes import hull_vertices
 
 INERTIAL = '<inertial><mass value="1"/><inertia ixx="1" iyy="1" izz="1" ixy="0" ixz="0" iyz="0"/></inertial>'
 SIZES = {

@@ -176,8 +176,10 @@ def test_box_that_lands_flat_stops_and_slides(fallen):
     after = 2.0 - mu * G * touch
     rest = touch + after / (mu * G)
     assert motion.success
-    assert list(motion.events.name[:5]) == ["left: touch", "right: touch", "left: stick", "right: stick", ""]
-    np.testing.assert_allclose(motion.events.time[:4], [touch, touch, rest, rest], atol=1e-10)
+    # Events "inner" change how a mode is computed, and not the motion.
+    seen = [i for i, name in enumerate(motion.events.name) if name and "inner" not in name]
+    assert list(motion.events.name[seen]) == ["left: touch", "right: touch", "left: stick", "right: stick"]
+    np.testing.assert_allclose(motion.events.time[np.array(seen)], [touch, touch, rest, rest], atol=1e-10)
     np.testing.assert_allclose(motion.q[-1], [2 * touch + after**2 / (2 * mu * G), 0.1, 0], atol=1e-9)
     flying = motion.ts < touch
     np.testing.assert_allclose(motion.energy[flying], m * (G * 0.5 + 2.0), rtol=1e-11)

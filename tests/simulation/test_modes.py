@@ -56,8 +56,8 @@ def all_modes(G, free, mu, slides, tol=1e-9):
             else:
                 valid &= p[n] >= -tol and (slides[i] != 0 or kind * rate[t] >= -tol)
         if valid:
-            # A unit of each normal force of a sliding contact changes them all by 1 - K, through its friction, while what is closed
-            # remains closed. Minors of K that are not positive are pivots that are not.
+            # A unit of each normal force of a sliding contact changes them all by 1 - K, through its friction, while the closed
+            # contacts remain closed. Minors of K that are not positive are pivots that are not.
             slide = [i for i, kind in enumerate(kinds) if kind not in ("open", "stick")]
             act = [r for r in rows if r % 2 == 0 or kinds[r // 2] == "stick"]
             push = (

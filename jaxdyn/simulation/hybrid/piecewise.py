@@ -8,8 +8,8 @@ from jax import lax
 from jax.flatten_util import ravel_pytree
 
 from jaxdyn.forces.piecewise import Pieces
-from jaxdyn.simulation.hybrid.impacts import Collision
 from jaxdyn.simulation.hybrid.modes import Elements, Mode
+from jaxdyn.simulation.hybrid.reactions import Collision
 from jaxdyn.simulation.hybrid.replay import HybridRun
 from jaxdyn.simulation.hybrid.system import HybridSystem
 from jaxdyn.simulation.hybrid.transitions import Transition

@@ -15,10 +15,11 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array
 
+from jaxdyn.contact.coulomb import eliminate
 from jaxdyn.dynamics.quantities import bias_force
 from jaxdyn.lie.so3 import matmul
 from jaxdyn.simulation.hybrid.modes import Elements, Mode, force_at
-from jaxdyn.simulation.hybrid.rows import Gram, StateTerms, by_element, tolerance
+from jaxdyn.simulation.hybrid.rows import Gram, StateTerms, by_element, by_normal_row, force_tolerance, gaps, tolerance
 from jaxdyn.systems.scene import Scene
 
 
@@ -125,10 +126,11 @@ def react(elements: Elements, mode: Mode, gram: Gram, friction, loads, along, ta
         pick = jnp.stack([sign[i] for i in elements.frictional])
         # Sliding friction changes its own normal forces: N = S (base + by_normal N), S the rows and signs of `pick`.
         K = jnp.eye(count, dtype=dtype) - pick[:, None] * by_normal[jnp.asarray(at)]
-        normal, own = _eliminate(K, pick * base[jnp.asarray(at)])
-        is_sliding = slides(elements, mode)
-        for i, pivot in zip(elements.frictional, own, strict=True):
-            pivots[i] = jnp.where(is_sliding[i], pivot, jnp.ones_like(pivot))
+        # Without exchange of rows, because the sign of each pivot tells where friction leaves no forces.
+        solution, own = eliminate(K, (pick * base[jnp.asarray(at)])[:, None], 1.0)
+        normal, is_sliding = solution[:, 0], slides(elements, mode)
+        for k, i in enumerate(elements.frictional):
+            pivots[i] = jnp.where(is_sliding[i], own[k], jnp.ones_like(own[k]))
     lam = (base + matmul(by_normal, normal)) * active
     normals = [sign[i] * lam[one.normal] if one.normal >= 0 else loads[i] for i, one in enumerate(elements.each)]
     return Reaction(
@@ -142,35 +144,8 @@ def depends_on_others(elements: Elements, gram: Gram, mode: Mode):
     return jnp.stack([jnp.stack([free[k] for k in one.tangent] or [free[0] & False]).any() for one in elements.each])
 
 
-def _eliminate(K, right):
-    """Solution x of K x = right, and the pivots of the elimination in order.
-
-    Without exchange of rows, because the sign of each pivot tells where friction leaves no forces.
-    """
-    n, pivots = K.shape[0], []
-    matrix = [K[i] for i in range(n)]
-    values = [right[i] for i in range(n)]
-    for i in range(n):
-        pivot = matrix[i][i]
-        pivots.append(pivot)
-        # The recorded pivot stays zero, which ends the mode; the division needs another number.
-        pivot = jnp.where(pivot == 0, jnp.full_like(pivot, float(jnp.finfo(pivot.dtype).eps)), pivot)
-        for j in range(i + 1, n):
-            share = matrix[j][i] / pivot
-            matrix[j] = matrix[j] - share * matrix[i]
-            values[j] = values[j] - share * values[i]
-    unknowns: list[Any] = [None] * n
-    for i in reversed(range(n)):
-        rest = values[i]
-        for j in range(i + 1, n):
-            rest = rest - matrix[i][j] * unknowns[j]
-        pivot = matrix[i][i]
-        unknowns[i] = rest / jnp.where(pivot == 0, jnp.full_like(pivot, float(jnp.finfo(pivot.dtype).eps)), pivot)
-    return jnp.stack(unknowns), pivots
-
-
-class Motion(NamedTuple):
-    """Motion in a mode."""
+class ModeDynamics(NamedTuple):
+    """Acceleration and reaction in a mode."""
 
     acceleration: Array  # (nv,)
     reaction: Reaction
@@ -188,10 +163,109 @@ def free_motion(scene: Scene, terms: StateTerms, generalized_force, q, v, t) -> 
 
 def motion_at(
     scene: Scene, elements: Elements, mode: Mode, terms: StateTerms, reference, generalized_force, q, v, t
-) -> Motion:
-    """Motion in a mode; `generalized_force` as of `free_motion`."""
+) -> ModeDynamics:
+    """Dynamics in a mode; `generalized_force` as of `free_motion`."""
     along = directions(scene, elements, mode, terms.slip, reference)
     loads, friction = normal_loads(scene, elements, q, v, t), coefficients(scene, elements, v.dtype).sliding
     free, rates = free_motion(scene, terms, generalized_force, q, v, t)
     reaction = react(elements, mode, terms.gram, friction, loads, along, -rates)
-    return Motion(terms.metric.unwhiten(free + matmul(terms.gram.Y, reaction.along)), reaction)
+    return ModeDynamics(terms.metric.unwhiten(free + matmul(terms.gram.Y, reaction.along)), reaction)
+
+
+class Collision(NamedTuple):
+    """Data of an impact beside the state: a mode, directions of sliding (n, 2), and the fate of each contact.
+
+    `rebound` (n,) multiplies coefficients of restitution. Contacts that are `held` (n,) rest behind the impact whatever the sign
+    of their impulse, as their flight would be too short to be seen; elements that are `stopped` (n,) stick behind it.
+    """
+
+    mode: Mode
+    slip: Array
+    rebound: Array
+    held: Array
+    stopped: Array
+
+
+def rebounds(elements: Elements, terms: StateTerms, restitution) -> Array:
+    """Velocity of each gap (n,) after an impact by Newton's hypothesis: e times that with which it closes."""
+    zero = jnp.zeros((), restitution.dtype)
+    rates = jnp.stack([-terms.row.velocity[one.normal] if one.opens else zero for one in elements.each])
+    # A contact that rests closes with the rounding of its velocity.
+    return restitution * jnp.where(rates > 10 * tolerance(zero.dtype), rates, 0.0)
+
+
+def impact(scene: Scene, elements: Elements, collision: Collision, terms: StateTerms, v) -> tuple[Array, Reaction]:
+    """Velocity (nv,) after an impact, and its impulses."""
+    # An impact changes no positions: the rows and the mass matrix are those before it.
+    of = coefficients(scene, elements, v.dtype)
+    rebound = rebounds(elements, terms, of.restitution * collision.rebound)
+    friction = jnp.where(collision.held, 0.0, of.sliding)
+    # Finite forces have no impulse, nor has the friction under them.
+    loads = jnp.zeros_like(rebound)
+    along = directions(scene, elements, collision.mode, jnp.zeros_like(collision.slip), collision.slip)
+    target = by_normal_row(elements, rebound) - terms.row.velocity
+    reaction = react(elements, collision.mode, terms.gram, friction, loads, along, target)
+    return v + terms.metric.unwhiten(matmul(terms.gram.Y, reaction.along)), reaction
+
+
+ROUNDING = 1e-4  # share of the levels of guards that is rounding: of gaps 1e-14 of a metre
+
+
+def guards_and_levels(
+    scene: Scene, elements: Elements, mode: Mode, terms: StateTerms, motion: ModeDynamics, reference, q, v, t
+):
+    """Guards (n, CHANNELS), which are positive while the mode holds, 1 where it has no condition; and their levels.
+
+    A guard below zero by less than its level does not end a mode. Levels are the tolerances with which modes are chosen, so that
+    a mode that was chosen holds: of contacts that depend on others, forces, gaps and velocities are zero up to rounding.
+    """
+    gap, friction, dtype = gaps(scene, elements, q, t), coefficients(scene, elements, q.dtype), q.dtype
+    reaction, small = motion.reaction, tolerance(dtype)
+    speeds = jnp.sum(jnp.abs(terms.row.A) * jnp.abs(v)[None], 1)
+    total = jnp.sum(jnp.abs(reaction.normal))
+    force = force_tolerance(dtype) * (total + jnp.sum(jnp.abs(reaction.holding)))
+    reach = small * (1 + jnp.max(jnp.abs(q)))
+    # Every element has all channels: the index of a guard means the same condition in every mode.
+    one_, guards, levels = jnp.ones((), dtype), [], []
+    for i, one in enumerate(elements.each):
+        normal = one_
+        if one.opens:
+            normal = jnp.where(mode.closed[i], reaction.normal[i], gap[i])
+        elif one.normal >= 0:
+            normal = reaction.normal[i]
+        sliding, pivot = one_, one_
+        if one.tangent and not one.smooth:
+            hold = reaction.holding[i]
+            square = jnp.sum(hold * hold)
+            # The length has no derivative at zero, and an element that slides has a holding force of zero.
+            size = jnp.sqrt(jnp.where(square > 0, square, one_)) * (square > 0).astype(dtype)
+            margin = friction.static[i] * reaction.normal[i] + mode.excess[i] * total - size
+            # Sliding is guarded by a signed speed, which crosses zero; the length of the velocity only touches it.
+            speed = jnp.sum(reference[i] * terms.slip[i])
+            # In a fixed direction it slides from rest to the speed of `creep`: one guard for both ends, in units of a speed.
+            is_fixed = mode.creep[i] > 0
+            square = jnp.sum(terms.slip[i] * terms.slip[i]) / jnp.where(is_fixed, mode.creep[i], one_) ** 2
+            share = jnp.where(speed > 0, 1 - square, one_)  # both factors are negative behind a fast reversal
+            speed = jnp.where(is_fixed, speed * share, speed + mode.creep[i])
+            sliding = jnp.where(mode.stick[i], margin, speed)
+            sliding = jnp.where(mode.closed[i], sliding, one_)
+        if one.tangent:
+            pivot = reaction.pivots[i]
+        guards.append(jnp.stack([normal, sliding, pivot]))
+        speed = small * (1 + jnp.max(jnp.stack([speeds[k] for k in one.tangent] or [jnp.zeros((), dtype)])))
+        # Of a contact that falls the gap is known to rounding; of one that rests beside others it is as zero as its velocity.
+        # One that rises leaves a gap below zero by itself: it has that of the projection on others at the event before.
+        falls = jnp.zeros((), bool)
+        if one.opens:
+            falls = terms.row.velocity[one.normal] < -4 * small * (1 + speeds[one.normal])
+        # The pivots are of the size of one.
+        levels.append(
+            jnp.stack(
+                [
+                    jnp.where(mode.closed[i], force, jnp.where(falls, ROUNDING * reach, reach)),
+                    jnp.where(mode.stick[i], force, speed),
+                    jnp.full((), float(jnp.finfo(dtype).eps), dtype),
+                ]
+            )
+        )
+    return jnp.stack(guards), jnp.stack(levels)

@@ -20,9 +20,8 @@ from jax.flatten_util import ravel_pytree
 
 from jaxdyn.compile.batch import cond
 from jaxdyn.constraints.codes import RESULTS
-from jaxdyn.simulation.hybrid.event_loop import guards_at, run_events
+from jaxdyn.simulation.hybrid.event_loop import Records, guards_at, run_events
 from jaxdyn.simulation.hybrid.modes import Mode
-from jaxdyn.simulation.hybrid.records import Records
 from jaxdyn.simulation.hybrid.system import HybridSystem
 from jaxdyn.simulation.solvers.driver import step_control
 from jaxdyn.simulation.solvers.guards import delay

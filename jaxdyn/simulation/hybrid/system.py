@@ -19,11 +19,20 @@ from jaxdyn.compile.batch import cond, while_loop
 from jaxdyn.constraints.base import holonomic_rows, layout, position_residual, velocity_residual
 from jaxdyn.forces.piecewise import values_and_levels
 from jaxdyn.lie.so3 import matmul
-from jaxdyn.simulation.hybrid.impacts import Collision, impact, rebounds
-from jaxdyn.simulation.hybrid.impulses import impulsive_mode
-from jaxdyn.simulation.hybrid.mode_guards import ROUNDING, guards_and_levels
 from jaxdyn.simulation.hybrid.modes import Elements, Mode, extend
-from jaxdyn.simulation.hybrid.reactions import coefficients, directions, free_motion, motion_at, normal_loads, react
+from jaxdyn.simulation.hybrid.reactions import (
+    ROUNDING,
+    Collision,
+    coefficients,
+    directions,
+    free_motion,
+    guards_and_levels,
+    impact,
+    motion_at,
+    normal_loads,
+    react,
+    rebounds,
+)
 from jaxdyn.simulation.hybrid.rows import StateTerms, by_element, by_normal_row, gaps, terms_at, tolerance
 from jaxdyn.simulation.hybrid.transitions import (
     SLIDES,
@@ -35,6 +44,7 @@ from jaxdyn.simulation.hybrid.transitions import (
     find_jams,
     first_guess,
     guess_again,
+    impulsive_mode,
     length,
     rates_of,
     search_mode,
@@ -48,7 +58,12 @@ from jaxdyn.systems.system import displace, rate_to_velocity, retract, velocity_
 # open in proportion to the first correction, which only coarse tolerances make large.
 _ROUNDS, _SAVED_ROUNDS = 2, 6
 _STOPPED = 30  # tolerances of the velocity below which sliding has ended
-_IMPACTS = (0, 0, STICKS, SLIDES)  # guesses of the mode of an impact; the second one is replaced by that of Coulomb's law
+_IMPACTS = (
+    0,
+    0,
+    STICKS,
+    SLIDES,
+)  # guesses of the mode of an impact; the second one is replaced by that of Coulomb's law
 _SLOWER = 0.1  # part of the speed up to which sliding begins in a fixed direction, below which it ends in one
 
 

@@ -8,8 +8,9 @@ It is solved by changing the first element that disagrees, one at a time, which 
 Each time the forces of all elements are computed from their modes, those of dependent rows by least norm: a contact whose force
 of least norm would pull is opened, and rests beside the others without force.
 
-Directions of sliding change with the modes, so that changes may cycle: then an impact begins from the modes of its impulses by
-Newton's method (`impulses`).
+Directions of sliding change with the modes, so that changes may cycle. Then an impact begins from the modes of its impulses by
+Newton's method on Coulomb's law (`impulsive_mode`): this cone complementarity problem has a solution for all impacts on the
+ground. Forces are searched from all modes of four elements in order (`search_mode`).
 
 The impact is plastic, or has rebounds by Newton's hypothesis (Moreau's law: friction is against the velocity after it). A plastic
 impact loses energy, p.u <= 0. With rebounds and friction Newton's law can gain some (Kane 1984): the coefficients of
@@ -27,11 +28,13 @@ import numpy as np
 from jax import lax
 from jaxtyping import Array
 
+from jaxdyn.compile import kernel
 from jaxdyn.compile.batch import while_loop
 from jaxdyn.compile.loops import Carry, Given, Iteration, Task, run_loop
-from jaxdyn.simulation.hybrid.impacts import Collision
+from jaxdyn.contact import coulomb
+from jaxdyn.lie.so3 import matmul
 from jaxdyn.simulation.hybrid.modes import Elements, Mode
-from jaxdyn.simulation.hybrid.reactions import Reaction, depends_on_others, react
+from jaxdyn.simulation.hybrid.reactions import Collision, Reaction, depends_on_others, react
 from jaxdyn.simulation.hybrid.rows import Gram, force_tolerance, tolerance
 
 STICKS, SLIDES = 41, 81  # guesses in which all elements stick, or slide; the last one
@@ -166,15 +169,10 @@ def search_mode(elements: Elements, problem: Problem, mode: Mode, slip, released
 def choose_mode(elements: Elements, problem: Problem, mode: Mode, slip) -> Choice:
     """Change the first element that disagrees until none does."""
     begin = Carry(Choice(mode, slip, jnp.zeros((), jnp.int32), *jnp.zeros((2,), bool)))
-    return run_loop(Task(_turn, (elements,)), None, problem, Given(), begin).state
+    return run_loop(Task(_change_first, (elements,)), None, problem, Given(), begin).state
 
 
-def _turn(elements: Elements, _, problem: Problem, choice: Choice, __) -> Iteration:
-    after = _change(elements, None, problem, choice)
-    return Iteration(after, ~choice.done, ~after.done)
-
-
-def _change(elements: Elements, _, problem: Problem, choice: Choice) -> Choice:
+def _change_first(elements: Elements, _, problem: Problem, choice: Choice, __) -> Iteration:
     """Change the first element that disagrees."""
     mode, slip, changes = choice.mode, choice.slip, choice.changes
     reaction = react(elements, mode, problem.gram, problem.sliding, problem.loads, slip, -problem.free)
@@ -195,7 +193,7 @@ def _change(elements: Elements, _, problem: Problem, choice: Choice) -> Choice:
     slip = jnp.where(leaves[:, None], against, jnp.where(moves[:, None], turned, slip))
     changes = changes + jnp.where(wrong.any(), _WEIGHT, 1).astype(jnp.int32)
     done = ~(wrong.any() | moves.any()) | (changes >= _WEIGHT * most_changes(elements))
-    return Choice(changed, slip, changes, wrong.any(), done)
+    return Iteration(Choice(changed, slip, changes, wrong.any(), done), ~choice.done, ~done)
 
 
 def most_changes(elements: Elements) -> int:
@@ -279,3 +277,55 @@ def rates_of(elements: Elements, rates) -> tuple[Array, Array]:
     normal = jnp.stack([rates[one.normal] if one.opens else zero for one in elements.each])
     tangent = [[rates[one.tangent[k]] if k < len(one.tangent) else zero for k in range(2)] for one in elements.each]
     return normal, jnp.stack([jnp.stack(pair) for pair in tangent])
+
+
+def impulsive_mode(elements: Elements, problem: Problem, wanted, mode: Mode, slip) -> tuple[Mode, Array]:
+    """Mode of an impact and directions of sliding (n, 2), if `wanted` (); those of other elements than contacts are kept."""
+    if not elements.opening.any():
+        return mode, slip
+    return kernel(_impulsive_mode, static=1, derivative=False)(elements, problem, wanted, mode, slip)
+
+
+def _impulsive_mode(elements: Elements, problem: Problem, wanted, mode: Mode, slip):
+    contacts = [i for i, one in enumerate(elements.each) if one.opens]
+    contacts.sort(key=lambda i: -len(elements.each[i].tangent))
+    sizes = [1 + len(elements.each[i].tangent) for i in contacts]
+    groups = tuple((sizes.count(size), size) for size in (3, 2, 1) if size in sizes)
+    rows = np.array([k for i in contacts for k in (elements.each[i].normal, *elements.each[i].tangent)])
+    gram, free, dtype = problem.gram, problem.free, problem.free.dtype
+    Y = gram.Y[:, rows]
+    W, q = matmul(Y.T, Y), free[rows]
+    if len(rows) < elements.count:
+        # Other rows that act are eliminated: what is left are the velocities of the contacts when these rows hold.
+        others = np.setdiff1d(np.arange(elements.count), rows)
+        act = elements.active(mode).astype(dtype) * jnp.zeros((elements.count,), dtype).at[others].set(1.0)
+        right = jnp.concatenate([matmul(gram.Y.T, Y), free[:, None]], 1)
+        change = matmul(Y.T, matmul(gram.Y, gram.factor(act).solve(right * act[:, None])))
+        W, q = W - change[:, :-1], q - change[:, -1]
+    # Coordinates in which the friction coefficient is one; contacts that do not touch are far away.
+    one, scales, parts, start = jnp.ones((), dtype), [], [], 0
+    for i, size in zip(contacts, sizes, strict=True):
+        mean = sum(W[k, k] for k in range(start, start + size)) / size
+        unit = jnp.where(mean > 0, 1 / jnp.sqrt(jnp.where(mean > 0, mean, one)), one)
+        touches = problem.may_close[i]
+        scales += [jnp.where(touches, unit, 0.0), *[jnp.where(touches, unit * problem.static[i], 0.0)] * (size - 1)]
+        parts += [jnp.where(touches, unit * q[start], one), *[scales[-1] * q[start + k] for k in range(1, size)]]
+        start += size
+    scale, q = jnp.stack(scales), jnp.stack(parts)
+    normals = np.cumsum([0, *sizes])[:-1]
+    largest = jnp.max(jnp.where(scale > 0, jnp.abs(q), 0.0))
+    largest = jnp.where(largest > 0, largest, one)
+    q = jnp.where(scale > 0, q / largest, q)
+    W = W * scale[:, None] * scale[None]
+    x = coulomb.solve(groups, True, W, q, scale, jnp.zeros((), dtype), wanted).x
+    y = matmul(W, x) + q
+    tiny = float(jnp.finfo(dtype).eps) ** 0.5
+    closed, stick, along = list(mode.closed), list(mode.stick), list(slip)
+    for i, k, size in zip(contacts, normals, sizes, strict=True):
+        closed[i] = problem.may_close[i] & ((x[k] > tiny) | (y[k] < tiny))
+        if size > 1:
+            speed, unit = length(jnp.concatenate([y[k + 1 : k + size], jnp.zeros((3 - size,), dtype)])[None])
+            stick[i] = closed[i] & (speed[0] <= tiny)
+            along[i] = jnp.where(stick[i], slip[i], unit[0])
+    found = mode._replace(closed=jnp.stack(closed), stick=jnp.stack(stick)), jnp.stack(along)
+    return jax.tree.map(lambda a, b: jnp.where(wanted, a, b), found, (mode, slip))
