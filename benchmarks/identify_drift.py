@@ -13,7 +13,6 @@ or the last 30 % of a single one. --recorded: the recorded robots of `benchmarks
 
 import argparse
 import functools
-import json
 from collections.abc import Iterator
 from importlib.metadata import distribution
 from pathlib import Path
@@ -29,6 +28,7 @@ from scipy.signal import lfilter  # noqa: E402
 import jaxdyn as jd  # noqa: E402
 from benchmarks.identify_franka import panda, recorded  # noqa: E402
 from benchmarks.identify_robots import ROOT, kuka, kuka_log  # noqa: E402
+from benchmarks.identify_selection import write_rows  # noqa: E402
 from jaxdyn import identify, inertia  # noqa: E402
 from jaxdyn.io.urdf import load_urdf  # noqa: E402
 
@@ -163,9 +163,7 @@ def main() -> None:
     print(
         f"worst {ratios.max():.3f}, mean {np.exp(np.mean(np.log(ratios))):.3f}, {np.mean(ratios > 1.02):.0%} above 1.02"
     )
-    if options.out:
-        options.out.parent.mkdir(parents=True, exist_ok=True)
-        options.out.write_text(json.dumps(rows, indent=1))
+    write_rows(options.out, rows)
 
 
 if __name__ == "__main__":

@@ -83,6 +83,13 @@ def false_choices(seeds, v_s: float | None = None) -> list[dict]:
     return rows
 
 
+def write_rows(path: Path | None, rows: list[dict]) -> None:
+    """Write rows as JSON, where there is a path."""
+    if path is not None:
+        path.parent.mkdir(parents=True, exist_ok=True)
+        path.write_text(json.dumps(rows, indent=1))
+
+
 def main() -> None:
     """Print a row for each false choice, and the count of each kind."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
@@ -101,9 +108,7 @@ def main() -> None:
         print(
             f"{kind:16} {count} logs: {terms} with an extra term, {losses} with a robust loss, {len(own)} with either"
         )
-    if options.out:
-        options.out.parent.mkdir(parents=True, exist_ok=True)
-        options.out.write_text(json.dumps(rows, indent=1))
+    write_rows(options.out, rows)
 
 
 if __name__ == "__main__":

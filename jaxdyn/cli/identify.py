@@ -25,9 +25,9 @@ from jaxdyn.cli.identify_tables import error_table, gains_text, payload_text, ta
 from jaxdyn.cli.repair import load_for_repair
 from jaxdyn.constraints.codes import name_of
 from jaxdyn.identify import EXTRA, TERMS, Fit, LeastSquares, Log, RobotFit
+from jaxdyn.identify.devices import on_one_thread
 from jaxdyn.identify.linear_fit import base_terms
 from jaxdyn.identify.regression import log_regressor
-from jaxdyn.identify.threads import on_one_thread
 from jaxdyn.identify.workflows.log_checks import check_log_content, check_rest
 from jaxdyn.identify.workflows.raw_logs import vibration
 from jaxdyn.io import save_urdf

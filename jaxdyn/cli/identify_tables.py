@@ -1,5 +1,7 @@
 """Tables printed by `jaxdyn identify`."""
 
+from collections.abc import Sequence
+
 import numpy as np
 
 from jaxdyn.cli.common import short, table
@@ -11,6 +13,14 @@ from jaxdyn.model.configuration import columns_of
 from jaxdyn.model.tree import Model
 from jaxdyn.reports.identification import Findings, model_joint, total_percent
 
+# Sources of numbers (`Spread.sources`), as the tables explain them.
+_SOURCES = {
+    "data": "mostly the logs",
+    "prior": "mostly the URDF's bodies, as the logs do not determine it",
+    "bound": "held at zero, its least value",
+    "confounded": "an extra term explains the same torque",
+    "hardly moved": "the joint stood nearly still",
+}
 # Rows of base parameters on the screen, so that the output of an arm stays below sixty lines.
 _BASE_ROWS = 16
 
@@ -146,7 +156,14 @@ def _robot_base_table(result: RobotFit, model: Model) -> str:
         share = np.nan_to_num(base.std / np.maximum(np.abs(base.values), 1e-300), nan=0.0, posinf=1e300)
         rows = [rows[i] for i in sorted(np.argsort(-share, kind="stable")[:_BASE_ROWS])]
         text += f"; the {_BASE_ROWS} of {len(base.names)} with the widest interval for their size, all in the report"
-    return text + "\n" + table(["combination", "URDF", "fitted", "+-", "from"], rows)
+    return "\n".join(
+        [text, table(["combination", "URDF", "fitted", "+-", "from"], rows), _explain([row[-1] for row in rows])]
+    )
+
+
+def _explain(sources: Sequence[str]) -> str:
+    """Line below a table on the sources in it."""
+    return "  from " + "; ".join(f"{name}: {text}" for name, text in _SOURCES.items() if name in sources)
 
 
 def _mass_table(findings: Findings) -> str:
@@ -163,7 +180,8 @@ def _mass_table(findings: Findings) -> str:
         centre = [short(x, 3) for x in new[1:4] / new[0]] if new[0] > 0 else ["-"] * 3
         rows.append([name, short(old[0]), short(new[0]), sources.get(f"{name}.m", "-"), *centre])
     text = "Bodies: mass (kg) in the URDF and fitted, source, fitted centre of mass (m)"
-    return text + "\n" + table(["body", "URDF", "fitted", "from", "x", "y", "z"], rows)
+    lines = [text, table(["body", "URDF", "fitted", "from", "x", "y", "z"], rows)]
+    return "\n".join([*lines, _explain([row[3] for row in rows])] if sources else lines)
 
 
 def gains_text(gains: DriveGains, labels) -> str:

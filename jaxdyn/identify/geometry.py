@@ -16,16 +16,19 @@ from jaxdyn.identify.geometry_errors import (
     Measurements,
     Mechanism,
     change_scene,
+    check_configurations,
+    check_markers,
+    check_measurements,
     close_loops,
     free_directions,
     linearise,
     make_mechanism,
+    nearest_motion,
     null_coordinates,
     null_space,
     redundant_directions,
 )
 from jaxdyn.lie import se3
-from jaxdyn.model import host_math
 from jaxdyn.model.arguments import Checked, Numbers, as_array
 from jaxdyn.model.numbers import check_count, check_seed
 from jaxdyn.model.tree import Model
@@ -141,8 +144,8 @@ def fit_geometry(
     ```
     """
     mechanism = make_mechanism(system, frame, measured)
-    q = _check_configurations(mechanism, q)
-    data = _check_measurements(len(q), poses, positions, markers)
+    q = check_configurations(mechanism, q)
+    data = check_measurements(len(q), poses, positions, markers)
     names, directions, units = free_directions(mechanism, free)
     expected = None
     if not mechanism.loops:
@@ -158,7 +161,7 @@ def fit_geometry(
         tips = _frame_poses(mechanism.model, q, frame)
         points = np.einsum("nij,kj->nki", tips[:, :3, :3], data.markers) + tips[:, None, :3, 3]
         # The device may stand anywhere: the steps start from the rigid motion that brings the points nearest to each other.
-        data = data._replace(base=_nearest_motion(points.reshape(-1, 3), data.positions.reshape(-1, 3)))
+        data = data._replace(base=nearest_motion(points.reshape(-1, 3), data.positions.reshape(-1, 3)))
     minimum = _minimise(mechanism, data, directions, q, expected)
     here, weights = minimum.here, minimum.weights
     _, s, Vt = here.decompose(weights)
@@ -305,7 +308,7 @@ def choose_poses(
     mechanism = make_mechanism(system, frame, measured)
     count, rng = check_count(count, "count"), np.random.default_rng(check_seed(seed))
     _, directions, _ = free_directions(mechanism, free)
-    points = np.zeros((1, 3)) if markers is None else _check_markers(markers)
+    points = np.zeros((1, 3)) if markers is None else check_markers(markers)
     q = _random_configurations(mechanism, _CANDIDATES * count, guess, rng)
     data = Measurements(
         np.broadcast_to(np.eye(4), (len(q), 4, 4)), np.zeros((len(q), 1, 3)), points, np.eye(4), np.eye(4)
@@ -378,57 +381,3 @@ def _poses_of(model: Model, q, frame: str):
 
 def _frame_poses(model: Model, q: np.ndarray, frame: str) -> np.ndarray:
     return np.asarray(_poses_of(model, jnp.asarray(q, model.home.dtype), frame), np.float64)
-
-
-def _nearest_motion(points: np.ndarray, seen: np.ndarray) -> np.ndarray:
-    """Rigid motion (4, 4) that brings points (n, 3) nearest to others (Kabsch 1976)."""
-    centre, other = points.mean(axis=0), seen.mean(axis=0)
-    U, _, Vt = np.linalg.svd((seen - other).T @ (points - centre))
-    # The last column's sign makes it a rotation, and no reflection.
-    rotation = U @ np.diag([1.0, 1.0, np.sign(np.linalg.det(U @ Vt))]) @ Vt
-    return np.asarray(host_math.pose_of(rotation, other - rotation @ centre))
-
-
-def _check_configurations(mechanism: Mechanism, q) -> np.ndarray:
-    q, nq = np.array(as_array(q, "q"), np.float64), mechanism.model.nq
-    if q.ndim != 2 or q.shape[1] != nq or not len(q) or not np.isfinite(q).all():
-        raise ValueError(f"q has shape {q.shape}; give finite numbers of shape (n, {nq}), a row for each pose")
-    return q
-
-
-def _check_measurements(count: int, poses, positions, markers) -> Measurements:
-    """Measurements as arrays, with base and tool at the identity. **Raises:** ValueError as `fit_geometry`."""
-    if (poses is None) == (positions is None):
-        raise ValueError("give poses (n, 4, 4), or positions (n, 3) of markers: one of them")
-    if poses is not None:
-        if markers is not None:
-            raise ValueError("markers are given with poses; they belong to positions")
-        T = np.array(as_array(poses, "poses"), np.float64)
-        if T.shape != (count, 4, 4) or not np.isfinite(T).all():
-            raise ValueError(
-                f"poses has shape {T.shape}; give finite numbers of shape ({count}, 4, 4), as q has {count} rows"
-            )
-        off = np.abs(np.swapaxes(T[:, :3, :3], 1, 2) @ T[:, :3, :3] - np.eye(3)).max(axis=(1, 2))
-        off = np.maximum(off, np.abs(T[:, 3] - [0, 0, 0, 1]).max(axis=1)) + 9 * (np.linalg.det(T[:, :3, :3]) < 0)
-        if off.max() > 1e-4:
-            row = int(np.argmax(off))
-            raise ValueError(
-                f"poses[{row}] is no pose: its rotation is off by {off[row]:.3g}; give rigid motions (4, 4), m"
-            )
-        return Measurements(T, T[:, None, :3, 3], np.zeros((1, 3)), np.eye(4), np.eye(4))
-    points = np.zeros((1, 3)) if markers is None else _check_markers(markers)
-    seen = np.array(as_array(positions, "positions"), np.float64)
-    seen = seen[:, None] if seen.ndim == 2 else seen
-    if seen.shape != (count, len(points), 3) or not np.isfinite(seen).all():
-        raise ValueError(
-            f"positions has shape {np.shape(positions)}; give finite numbers of shape ({count}, {len(points)}, 3), as q has "
-            f"{count} rows, and markers {len(points)}"
-        )
-    return Measurements(None, seen, points, np.eye(4), np.eye(4))
-
-
-def _check_markers(markers) -> np.ndarray:
-    points = np.atleast_2d(np.array(as_array(markers, "markers"), np.float64))
-    if points.ndim != 2 or points.shape[1] != 3 or not np.isfinite(points).all():
-        raise ValueError(f"markers has shape {points.shape}; give finite numbers of shape (k, 3), m in the frame")
-    return points

@@ -31,6 +31,7 @@ from jaxdyn.dynamics.kinematics import frame_pose
 from jaxdyn.identify.blocks import perpendicular_basis
 from jaxdyn.lie import se3, so3
 from jaxdyn.model import host_math
+from jaxdyn.model.arguments import as_array
 from jaxdyn.model.joints import SCREW_KINDS
 from jaxdyn.model.topology import frame_index
 from jaxdyn.model.tree import Model
@@ -303,3 +304,59 @@ def _ad(twist: np.ndarray) -> np.ndarray:
     """Matrix of the bracket [twist, .] (6, 6), linear part first."""
     v, w = host_math.hat(twist[:3]), host_math.hat(twist[3:])
     return np.block([[w, v], [np.zeros((3, 3)), w]])
+
+
+def nearest_motion(points: np.ndarray, seen: np.ndarray) -> np.ndarray:
+    """Rigid motion (4, 4) that brings points (n, 3) nearest to others (Kabsch 1976)."""
+    centre, other = points.mean(axis=0), seen.mean(axis=0)
+    U, _, Vt = np.linalg.svd((seen - other).T @ (points - centre))
+    # The last column's sign makes it a rotation, and no reflection.
+    rotation = U @ np.diag([1.0, 1.0, np.sign(np.linalg.det(U @ Vt))]) @ Vt
+    return np.asarray(host_math.pose_of(rotation, other - rotation @ centre))
+
+
+def check_configurations(mechanism: Mechanism, q) -> np.ndarray:
+    """Configurations (n, nq) as an array. **Raises:** ValueError for other shapes and numbers that are not finite."""
+    q, nq = np.array(as_array(q, "q"), np.float64), mechanism.model.nq
+    if q.ndim != 2 or q.shape[1] != nq or not len(q) or not np.isfinite(q).all():
+        raise ValueError(f"q has shape {q.shape}; give finite numbers of shape (n, {nq}), a row for each pose")
+    return q
+
+
+def check_measurements(count: int, poses, positions, markers) -> Measurements:
+    """Measurements as arrays, with base and tool at the identity. **Raises:** ValueError as `fit_geometry`."""
+    if (poses is None) == (positions is None):
+        raise ValueError("give poses (n, 4, 4), or positions (n, 3) of markers: one of them")
+    if poses is not None:
+        if markers is not None:
+            raise ValueError("markers are given with poses; they belong to positions")
+        T = np.array(as_array(poses, "poses"), np.float64)
+        if T.shape != (count, 4, 4) or not np.isfinite(T).all():
+            raise ValueError(
+                f"poses has shape {T.shape}; give finite numbers of shape ({count}, 4, 4), as q has {count} rows"
+            )
+        off = np.abs(np.swapaxes(T[:, :3, :3], 1, 2) @ T[:, :3, :3] - np.eye(3)).max(axis=(1, 2))
+        off = np.maximum(off, np.abs(T[:, 3] - [0, 0, 0, 1]).max(axis=1)) + 9 * (np.linalg.det(T[:, :3, :3]) < 0)
+        if off.max() > 1e-4:
+            row = int(np.argmax(off))
+            raise ValueError(
+                f"poses[{row}] is no pose: its rotation is off by {off[row]:.3g}; give rigid motions (4, 4), m"
+            )
+        return Measurements(T, T[:, None, :3, 3], np.zeros((1, 3)), np.eye(4), np.eye(4))
+    points = np.zeros((1, 3)) if markers is None else check_markers(markers)
+    seen = np.array(as_array(positions, "positions"), np.float64)
+    seen = seen[:, None] if seen.ndim == 2 else seen
+    if seen.shape != (count, len(points), 3) or not np.isfinite(seen).all():
+        raise ValueError(
+            f"positions has shape {np.shape(positions)}; give finite numbers of shape ({count}, {len(points)}, 3), as q has "
+            f"{count} rows, and markers {len(points)}"
+        )
+    return Measurements(None, seen, points, np.eye(4), np.eye(4))
+
+
+def check_markers(markers) -> np.ndarray:
+    """Markers (k, 3) as an array. **Raises:** ValueError for other shapes and numbers that are not finite."""
+    points = np.atleast_2d(np.array(as_array(markers, "markers"), np.float64))
+    if points.ndim != 2 or points.shape[1] != 3 or not np.isfinite(points).all():
+        raise ValueError(f"markers has shape {points.shape}; give finite numbers of shape (k, 3), m in the frame")
+    return points

@@ -7,6 +7,7 @@ import equinox as eqx
 import numpy as np
 
 from jaxdyn.identify.condensed import condense_rows
+from jaxdyn.identify.devices import on_one_thread
 from jaxdyn.identify.logs import Log, as_logs, check_log
 from jaxdyn.identify.regression import (
     BaseParameters,
@@ -20,7 +21,6 @@ from jaxdyn.identify.regression import (
     nominal_parameters,
     torque_error,
 )
-from jaxdyn.identify.threads import on_one_thread
 from jaxdyn.identify.torque_terms import TERMS, Terms, check_terms
 from jaxdyn.identify.uncertainty import effective_sample_size, jackknife
 from jaxdyn.model.arguments import Numbers

@@ -13,15 +13,14 @@ from jaxdyn.constraints.codes import RESULTS
 from jaxdyn.identify.blocks import Inertias
 from jaxdyn.identify.condensed import condense_rows
 from jaxdyn.identify.condensed_fit import minimize_torque_error
-from jaxdyn.identify.descent import Descent, Method, Watch, checkpoint_at, descend
+from jaxdyn.identify.descent import Descent, Watch, checkpoint_at, descend
+from jaxdyn.identify.devices import on_one_thread
 from jaxdyn.identify.interior import TorqueProblem, block_chart, log_cholesky_coordinates
 from jaxdyn.identify.logs import Log
 from jaxdyn.identify.methods import (
     DAMPING,
-    SOLVERS,
     GaussNewton,
     GradientSteps,
-    LeastSquaresSteps,
     LinearErrors,
     Unknowns,
     confirm_minimum,
@@ -42,7 +41,6 @@ from jaxdyn.identify.problem import (
 )
 from jaxdyn.identify.result import ParameterFit
 from jaxdyn.identify.sensors import FitSystem
-from jaxdyn.identify.threads import on_one_thread
 from jaxdyn.identify.uncertainty import error_groups, standard_deviations, student
 from jaxdyn.model.arguments import Checked, Function
 from jaxdyn.tasks import count_workers, map_tasks
@@ -144,22 +142,15 @@ def _minimise(
         linear, history = end.last.state[0], np.concatenate([before, end.history])
         result = confirm_minimum(end.result, linear, solver.tolerance, rounding)
         return Descent(end.last, end.last, history, result), linear
-    if solver.name in SOLVERS:
-        steps: Method = LeastSquaresSteps(errors_of, problem, solver.name, solver.tolerance)
-    else:
-        steps = GradientSteps(
-            loss_of,
-            problem,
-            method=solver.method,
-            steps=watch.steps,
-            learning_rate=solver.learning_rate,
-            tolerance=solver.tolerance,
-        )
-    end = descend(steps, unknowns, watch)
-    if solver.name not in SOLVERS:
-        return end, None
-    linear = linearise(problem, end.best.point)
-    return end._replace(result=confirm_minimum(end.result, linear, solver.tolerance, rounding)), linear
+    steps = GradientSteps(
+        loss_of,
+        problem,
+        method=solver.method,
+        steps=watch.steps,
+        learning_rate=solver.learning_rate,
+        tolerance=solver.tolerance,
+    )
+    return descend(steps, unknowns, watch), None
 
 
 def minimize_linear_torques(problem: Problem, unknowns: Unknowns) -> tuple[Unknowns, np.ndarray]:

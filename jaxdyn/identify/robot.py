@@ -9,12 +9,12 @@ import numpy as np
 from jaxdyn.identify.chart import check_bodies
 from jaxdyn.identify.condensed_fit import Intervals, Setting
 from jaxdyn.identify.delays import Delays, find_delays, shift_torques, with_delays
+from jaxdyn.identify.devices import on_one_thread
 from jaxdyn.identify.logs import Log, as_logs
 from jaxdyn.identify.regression import check_weights
 from jaxdyn.identify.result import Fit
 from jaxdyn.identify.robot_problem import RobotProblem, cross_validation
 from jaxdyn.identify.selection import PRIORS, ROBUST, VELOCITIES, Choice, Search, search, splits
-from jaxdyn.identify.threads import on_one_thread
 from jaxdyn.identify.torque_terms import EXTRA, TERMS, RobotTerms, Terms, check_terms, split_terms
 from jaxdyn.model.arguments import Checked, Numbers, warn
 from jaxdyn.model.tree import Model

@@ -18,11 +18,11 @@ from jaxdyn.identify.condensed_fit import (
     intervals,
     is_negligible,
 )
+from jaxdyn.identify.devices import on_one_thread
 from jaxdyn.identify.interior import robot_chart
 from jaxdyn.identify.logs import Log, idle_coordinates, log_rate, signal_sizes
 from jaxdyn.identify.regression import log_regressor
 from jaxdyn.identify.result import Fit
-from jaxdyn.identify.threads import on_one_thread
 from jaxdyn.identify.torque_terms import TERMS, ExtraTorque, Friction, TorqueTerm
 from jaxdyn.identify.uncertainty import effective_sample_size, is_white, model_error_factors
 from jaxdyn.model.tree import Model

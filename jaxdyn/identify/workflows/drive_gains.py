@@ -20,6 +20,7 @@ import numpy as np
 from jaxdyn.constraints.codes import RESULTS, Outcome
 from jaxdyn.identify.condensed import Blocks
 from jaxdyn.identify.condensed_fit import MOST_ROUNDS, is_negligible
+from jaxdyn.identify.devices import on_one_thread
 from jaxdyn.identify.logs import Log, as_logs
 from jaxdyn.identify.regression import (
     base_parameters,
@@ -29,7 +30,6 @@ from jaxdyn.identify.regression import (
     log_regressor,
 )
 from jaxdyn.identify.selection import VELOCITIES
-from jaxdyn.identify.threads import on_one_thread
 from jaxdyn.identify.torque_terms import TERMS, Terms, check_terms, coulomb_through_filter
 from jaxdyn.identify.uncertainty import jackknife
 from jaxdyn.model import inertia as _inertia

@@ -7,6 +7,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from jaxdyn.forces.elements import CoulombFriction, JointDamping
+from jaxdyn.identify.devices import on_one_thread
 from jaxdyn.identify.linear_fit import Direction, scatter, weakest_directions
 from jaxdyn.identify.logs import Log, as_logs, signal_sizes
 from jaxdyn.identify.mechanisms import check_motors, motor_regressor
@@ -15,7 +16,6 @@ from jaxdyn.identify.parameter_tree import Parameters
 from jaxdyn.identify.parameters import fit_parameters
 from jaxdyn.identify.regression import BaseParameters, group_columns, least_squares_by_svd, parameter_names
 from jaxdyn.identify.result import ParameterFit, torques_along
-from jaxdyn.identify.threads import on_one_thread
 from jaxdyn.identify.torque_terms import TERMS, Friction, Terms, check_terms
 from jaxdyn.identify.uncertainty import effective_sample_size
 from jaxdyn.model.tree import Model

@@ -11,11 +11,11 @@ from jaxdyn.constraints.codes import RESULTS, Outcome, name_of
 from jaxdyn.identify.chart import check_bodies
 from jaxdyn.identify.condensed import Blocks, condense_rows
 from jaxdyn.identify.condensed_fit import MOST_ROUNDS, eliminate, gather, is_negligible, minimize_torque_error
+from jaxdyn.identify.devices import on_one_thread
 from jaxdyn.identify.interior import LOG_CHOLESKY_BASIS, TorqueProblem, robot_chart
 from jaxdyn.identify.logs import Log, as_logs
 from jaxdyn.identify.regression import least_squares_by_svd, log_regressor, noise_level
 from jaxdyn.identify.robot import RobotFit, fit_robot
-from jaxdyn.identify.threads import on_one_thread
 from jaxdyn.identify.torque_terms import RobotTerms, split_terms
 from jaxdyn.identify.uncertainty import effective_sample_size, jackknife
 from jaxdyn.model import host_math
