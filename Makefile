@@ -25,7 +25,7 @@ QUICK := JAXDYN_COMPILATION_OPTIONS=least
 .DEFAULT_GOAL := help
 .NOTPARALLEL:
 .DELETE_ON_ERROR:
-.PHONY: help venv demo test test-ci test-all test-oldest coverage lint types bench docs notebooks wheel clean
+.PHONY: help venv demo test test-ci test-all test-oldest coverage lint types bench figures docs notebooks wheel clean
 
 help:  ## print the targets
 	@sed -n 's/^\([a-z-]*\):.*  ## \(.*\)/  \1\t\2/p' $(MAKEFILE_LIST) | expand -t 14
@@ -63,6 +63,9 @@ types: $(VENV)/.installed-dev  ## static types
 
 bench: $(VENV)/.installed-bench  ## dynamics against peers, into out/; the other benchmarks: benchmarks/README.md
 	$(BIN)/python -m benchmarks
+
+figures: $(VENV)/.installed-bench  ## measure the tables of figures in the documents and write them in place: a quiet machine, hours
+	$(BIN)/python -m benchmarks.figures
 
 docs: $(VENV)/.installed-docs  ## the site, into out/site; pictures of the gallery that are missing are made first
 	$(BIN)/python -m benchmarks.site

@@ -147,7 +147,30 @@ def _rods(model: Model, i: int, points: list[np.ndarray], thin: float) -> list[S
     start = points[0] if points else com
     # A rod ends at the home position of the child joint.
     ends = points[1:] if len(points) > 1 or not mass else [com]
-    return [rod(name, start, end, thin, source="inertia") for end in ends if np.linalg.norm(end - start) > 2 * thin]
+    rods = [rod(name, start, end, thin, source="inertia") for end in ends if np.linalg.norm(end - start) > 2 * thin]
+    return rods + _plate(name, np.array(points), thin)
+
+
+def _plate(frame: str, points: np.ndarray, thin: float) -> list[Shape]:
+    """Flat plate between three or more joints of a body that are in a plane, as of a ternary link."""
+    if len(points) < 3:
+        return []
+    points = points - (middle := points.mean(0))
+    # The plane of least squares; its normal is the last direction.
+    _, extents, directions = np.linalg.svd(points, full_matrices=False)
+    if extents[1] < 2 * thin or extents[2] > 0.1 * extents[1]:
+        return []
+    around = np.argsort(np.arctan2(points @ directions[1], points @ directions[0]))
+    corners, half = middle + points[around], 0.4 * thin * directions[2]
+    count = len(corners)
+    vertices = np.concatenate([[middle + half, middle - half], corners + half, corners - half])
+    faces = []
+    for k in range(count):
+        a, b = 2 + k, 2 + (k + 1) % count
+        faces += [(0, a, b), (1, b + count, a + count), (a, a + count, b), (b, a + count, b + count)]
+    # Counter-clockwise from outside, whichever way the directions are handed.
+    faces = np.array(faces) if np.linalg.det(directions) > 0 else np.array(faces)[:, ::-1]
+    return [Shape(frame, "mesh", (1.0,) * 3, vertices=vertices, faces=faces, source="inertia")]
 
 
 def _or_mark(solid: Shape, longest: float, thin: float) -> Shape:
