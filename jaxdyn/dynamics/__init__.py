@@ -12,7 +12,9 @@ from jaxdyn.dynamics.articulated_motion import articulated_bodies as articulated
 from jaxdyn.dynamics.base_frame import base_twists as base_twists
 from jaxdyn.dynamics.base_frame import link_adjoints as link_adjoints
 from jaxdyn.dynamics.center_of_mass import ComDynamics as ComDynamics
+from jaxdyn.dynamics.center_of_mass import SpatialForm as SpatialForm
 from jaxdyn.dynamics.center_of_mass import com_dynamics as com_dynamics
+from jaxdyn.dynamics.center_of_mass import spatial_form as spatial_form
 from jaxdyn.dynamics.centroidal import centroidal_momentum as centroidal_momentum
 from jaxdyn.dynamics.centroidal import centroidal_momentum_matrix as centroidal_momentum_matrix
 from jaxdyn.dynamics.frame_motion import frame_acceleration as frame_acceleration
@@ -34,6 +36,7 @@ __all__ = [
     "ArticulatedBodies",
     "ComDynamics",
     "NewtonEulerMatrices",
+    "SpatialForm",
     "WorkspaceDynamics",
     "aba",
     "articulated_bodies",
@@ -50,6 +53,7 @@ __all__ = [
     "mass_matrix_derivative",
     "mass_matrix_sqrt",
     "rnea",
+    "spatial_form",
     "spatial_jacobian",
     "torque_regressor",
     "workspace_dynamics",

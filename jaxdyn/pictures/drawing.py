@@ -14,7 +14,7 @@ from jaxdyn.model.tree import Model
 from jaxdyn.pictures.default_solids import frame_poses
 from jaxdyn.pictures.motion import Cone, Force, Motion, cones, forces, joint_axes, marks, motion_of
 from jaxdyn.pictures.solids import Shapes, refine, simplify
-from jaxdyn.pictures.stage import AXIS, COLORS, LOOP, Stage, all_solids, color_of, painted, rgb, stage_of
+from jaxdyn.pictures.stage import AXIS, COLORS, LOOP, Stage, all_solids, color_of, paint_sectors, rgb, stage_of
 from jaxdyn.reports.plotting import Axes
 from jaxdyn.simulation.solution import Solution
 from jaxdyn.systems.system import SceneLike
@@ -178,7 +178,7 @@ class _Picture:
         self.ax, fits = _axes(ax), ax is None
         model = motion.scene.system
         self.solids = []
-        for shape in painted(parts, model, self.stage.size):
+        for shape in paint_sectors(parts, model, self.stage.size):
             vertices, faces = simplify(*shape.triangles(), _MOST_VERTICES)
             vertices, faces = refine(vertices, faces, _LONGEST * self.stage.size)
             # Faces of files may have any orientation, and of a translucent solid both sides show.
@@ -413,7 +413,7 @@ def _set_stage(ax, stage: Stage) -> None:
     ax.view_init(elevation, azimuth, roll, vertical_axis=vertical)
     ax.set(xlim=(low[0], high[0]), ylim=(low[1], high[1]), zlim=(low[2], high[2]))
     ax.set_box_aspect(high - low, zoom=1.1)  # after the vertical axis is set, by which matplotlib turns the numbers
-    if stage.grounded:
+    if stage.has_ground:
         lines = _grid(low, high, axis, np.sign(stage.up[axis]) * stage.ground)
         # Below all solids. One line with gaps is drawn faster than many.
         ax.plot(*lines.T, color="0.82", linewidth=0.8, zorder=0)

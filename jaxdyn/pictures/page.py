@@ -26,7 +26,7 @@ from jaxdyn.pictures.server import (
     stop_server,
 )
 from jaxdyn.pictures.solids import Shapes, by_frame, merge_meshes, sharpen, simplify
-from jaxdyn.pictures.stage import COLORS, LOOP, Stage, all_solids, color_of, painted, rgb, stage_of
+from jaxdyn.pictures.stage import COLORS, LOOP, Stage, all_solids, color_of, paint_sectors, rgb, stage_of
 from jaxdyn.simulation.solution import Solution
 from jaxdyn.systems.system import SceneLike
 
@@ -207,7 +207,7 @@ class _Content:
         self.size = stage.size
         _set_stage(server, stage)
         self.bodies: list[tuple[int, str | None, Any]] = []
-        meshes = list(_meshes(motion, painted(parts, motion.scene.system, stage.size), vertices))
+        meshes = list(_meshes(motion, paint_sectors(parts, motion.scene.system, stage.size), vertices))
         for n in range(len(motion.q)):
             self._add_bodies(n, meshes)
         self.marks = [(mark, self._ball(k)) for k, mark in enumerate(marks(motion))]

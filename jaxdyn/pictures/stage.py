@@ -28,14 +28,14 @@ COLORS = {
 _CIRCLES = np.array(
     [[1.0, 0.0, np.sqrt(5) / 2 + 0.5], [np.sqrt(5) / 2 + 0.5, 1.0, 0.0], [0.0, np.sqrt(5) / 2 + 0.5, 1.0]]
 )
-_PAINTED = 0.03  # smallest half axis of a solid with painted sectors, as a fraction of the stage's size
+_PAINTED = 0.03  # smallest half axis of a solid with paint_sectors sectors, as a fraction of the stage's size
 
 
 class Stage(NamedTuple):
     """Surroundings of the mechanism, in world axes and m.
 
     - `low`, `high` (3,): corners of the box around the motion; `centre` (3,), `size`, its middle and diagonal.
-    - `up` (3,): against gravity; `ground`: height of the ground along it; `grounded`: whether something is in contact with it.
+    - `up` (3,): against gravity; `ground`: height of the ground along it; `has_ground`: whether something is in contact with it.
     - `eye` (3,): unit vector from the centre towards the viewer.
     """
 
@@ -45,7 +45,7 @@ class Stage(NamedTuple):
     size: float
     up: np.ndarray
     ground: float
-    grounded: bool
+    has_ground: bool
     eye: np.ndarray
 
 
@@ -96,8 +96,8 @@ def stage_of(motion: Motion, shapes: Shapes) -> Stage:
     low, high = every.min(0), every.max(0)
     size = max(float(np.linalg.norm(high - low)), 1e-3)
     up = _up(model)
-    ground, grounded = _ground(motion, float((every @ up).min()), up, size)
-    return Stage(low, high, (low + high) / 2, size, up, ground, grounded, _eye(motion, high - low, up, grounded))
+    ground, has_ground = _ground(motion, float((every @ up).min()), up, size)
+    return Stage(low, high, (low + high) / 2, size, up, ground, has_ground, _eye(motion, high - low, up, has_ground))
 
 
 def _up(model) -> np.ndarray:
@@ -125,7 +125,7 @@ def _ground(motion: Motion, lowest: float, up: np.ndarray, size: float) -> tuple
     return (0.0 if -0.02 * size <= lowest <= 0.15 * size else lowest), False
 
 
-def _eye(motion: Motion, extent: np.ndarray, up: np.ndarray, grounded: bool) -> np.ndarray:
+def _eye(motion: Motion, extent: np.ndarray, up: np.ndarray, has_ground: bool) -> np.ndarray:
     joints = motion.poses[:, :, :, :3, 3].reshape(-1, 3)
     spread = np.ptp(joints, axis=0)
     flat = int(np.argmin(spread))
@@ -136,7 +136,7 @@ def _eye(motion: Motion, extent: np.ndarray, up: np.ndarray, grounded: bool) -> 
             # A mechanism in a vertical plane is seen from the front, slightly from above.
             side = np.cross(up, across)
             return _unit(-across * (1.0 if flat == 1 else -1.0) + 0.35 * side + 0.3 * up)
-        if not grounded and not (motion.scene.constraints and extent @ np.abs(up) > 0.2 * widest):
+        if not has_ground and not (motion.scene.constraints and extent @ np.abs(up) > 0.2 * widest):
             return _unit(0.35 * _sideways(up)[1] + 1.1 * up)
     one, other = _sideways(up)
     return _unit(one + 0.75 * other + 0.55 * up)
@@ -153,10 +153,10 @@ def _unit(vector: np.ndarray) -> np.ndarray:
     return vector / np.linalg.norm(vector)
 
 
-def painted(shapes: Shapes, model: Model, size: float) -> Shapes:
+def paint_sectors(shapes: Shapes, model: Model, size: float) -> Shapes:
     """Paint alternate sectors of round default solids darker, so that their turning is seen.
 
-    A painted solid becomes two meshes. Solids of files keep their own colours, and small ones are marks of points.
+    A paint_sectors solid becomes two meshes. Solids of files keep their own colours, and small ones are marks of points.
     """
     parts = []
     for shape in shapes:
