@@ -74,12 +74,7 @@ def spatial_form(model: Model, q: Float[Array, " nq"], v: Float[Array, " nv"], a
     Source: EQUATIONS section 3.
     """
     q, v, a = check_shapes(model, q=q, v=v, a=a)
-    mass = model.inertias[:, :1]
-    com = jnp.where(mass > 0, model.inertias[:, 1:4] / jnp.where(mass > 0, mass, 1.0), 0.0)
-    # About the centre of mass: I - m (c.c 1 - c c^T).
-    about_origin = jax.vmap(rotational_inertia)(model.inertias)
-    moved = jnp.sum(com * com, axis=1)[:, None, None] * jnp.eye(3, dtype=q.dtype) - com[:, :, None] * com[:, None, :]
-    about_com = about_origin - mass[:, :, None] * moved
+    mass, com, about_com = jax.vmap(_at_center)(model.inertias)
 
     def placed(q):
         poses = forward_kinematics(model, q)
@@ -94,7 +89,16 @@ def spatial_form(model: Model, q: Float[Array, " nq"], v: Float[Array, " nv"], a
         return velocity, jnp.einsum("bij,bj->bi", inertia, omega), inertia
 
     (_, momentum, inertia), (acceleration, torque, _) = jax.jvp(moving, (q, v), (configuration_rate(model, q, v), a))
-    return SpatialForm(mass * acceleration, torque, momentum, inertia)
+    return SpatialForm(mass[:, None] * acceleration, torque, momentum, inertia)
+
+
+def _at_center(parameters):
+    """Mass, centre of mass (3,), and inertia (3, 3) about it, of a body; of a massless one about its origin."""
+    mass = parameters[0]
+    com = jnp.where(mass > 0, parameters[1:4] / jnp.where(mass > 0, mass, 1.0), 0.0)
+    # I - m (c.c 1 - c c^T).
+    moved = jnp.sum(com * com) * jnp.eye(3, dtype=com.dtype) - jnp.outer(com, com)
+    return mass, com, rotational_inertia(parameters) - mass * moved
 
 
 def com_dynamics(model: Model, q: Float[Array, " nq"], v: Float[Array, " nv"]) -> ComDynamics:

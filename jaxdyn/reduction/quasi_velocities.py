@@ -116,8 +116,8 @@ def gauge_invariant(
 
 
 def quasi_connection(
-    system: SceneLike, q: Float[Array, " n"], v: Float[Array, " n"], t: Numbers = 0.0
-) -> Float[Array, "n n"]:
+    system: SceneLike, q: Float[Array, " nq"], v: Float[Array, " nv"], t: Numbers = 0.0
+) -> Float[Array, "nv nv"]:
     r"""Li and Wu's connection of quasi velocities, which is not skew.
 
     $$\Gamma = W^{-1} \left(\dot W - \frac{\partial w^T}{\partial q}\right), \quad w = W(q)^T \dot q, \quad M = W W^T$$

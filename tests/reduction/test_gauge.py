@@ -197,7 +197,7 @@ def test_connection_asks_for_rates_of_coordinates():
         jd.reduction.quasi_connection(jd.scenes.free_box(), jnp.zeros(7), jnp.zeros(6))
 
 
-@pytest.mark.parametrize("name", ("four_bar", "rolling_disk"))
+@pytest.mark.parametrize("name", ("four_bar", "rolling_coin"))
 def test_kane_equation_is_the_motion(name):
     """Its right-hand side is the rate of q and, by W and V2, the acceleration of constrained dynamics."""
     scene, (q, v) = getattr(jd.scenes, name)(), getattr(jd.scenes, name).start()
