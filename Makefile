@@ -73,11 +73,12 @@ docs: $(VENV)/.installed-docs  ## the site, into out/site; pictures of the galle
 wheel: $(VENV)/.installed-test  ## build the wheel, install it elsewhere and try it without the repository
 	$(BIN)/python -m benchmarks.wheel
 
-notebooks: $(VENV)/.installed-notebook  ## run the notebooks, into out/notebooks
+notebooks: $(VENV)/.installed-notebook $(VENV)/.installed-test  ## run the notebooks, compare what they print, and write them with outputs into out/notebooks
+	$(PYTEST) tests/package/test_notebooks.py --durations=0
 	$(BIN)/python -m nbconvert --to notebook --execute --output-dir out/notebooks notebooks/*.ipynb
 
 clean:  ## remove outputs and caches, keep .venv
-	rm -rf out build dist docs/gallery .coverage .pytest_cache .ruff_cache .hypothesis
+	rm -rf out build dist docs/gallery docs/notebooks .coverage .pytest_cache .ruff_cache .hypothesis
 	find jaxdyn tests $(wildcard benchmarks notebooks) -name __pycache__ -prune -exec rm -rf {} +
 
 # An interpreter without pip is what a failed set-up leaves behind, so it is removed.

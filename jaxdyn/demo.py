@@ -1,4 +1,4 @@
-"""A batch of rollouts of a real arm, a thousand rolling coins, and the arm's inertias recovered from a noisy log: `python -m jaxdyn.demo`, or `make demo`.
+"""Rollouts of a real arm, a thousand rolling coins, and inertias from a noisy log: `python -m jaxdyn.demo`, or `make demo`.
 
 No file is needed: the arm is the KUKA iiwa of `jaxdyn.robots`. A drawing of it and three figures are written into out/.
 """
@@ -77,7 +77,7 @@ def coin_figure(leans, solution) -> Any:
     drift = np.abs(energy - energy[:, :1]) / np.abs(energy[:, :1])
     right.semilogy(ts[1:], drift.max(0)[1:] + 1e-17, color=ORANGE, label="energy, relative")
     right.semilogy(
-        ts, np.asarray(solution.constraint_residual).max(0) + 1e-17, color=BLUE, label="gap to the ground (m)"
+        ts, np.asarray(solution.constraint_residual).max((0, -1)) + 1e-17, color=BLUE, label="constraints (m, m/s)"
     )
     right.set(xlabel="time (s)", ylabel="worst of all coins")
     right.legend(fontsize=8, frameon=False)
