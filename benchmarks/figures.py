@@ -19,7 +19,9 @@ from typing import NamedTuple
 ROOT = Path(__file__).resolve().parent.parent
 _TABLE = re.compile(r"(?:^\|.*\n)+", re.MULTILINE)
 _STAMP = re.compile(r"\n\*Measured at commit ([0-9a-f]+),.*\*\n")
-_COMMAND = re.compile(r"python -m ((?:benchmarks|jaxdyn)\.[^`\n]*?)(?=[`\n])|\b(jaxdyn report)\b|make (bench|demo|test[\w-]*)")
+_COMMAND = re.compile(
+    r"python -m ((?:benchmarks|jaxdyn)\.[^`\n]*?)(?=[`\n])|\b(jaxdyn report)\b|make (bench|demo|test[\w-]*)"
+)
 # A table of which more cells than this begin with a number has figures; the others have words.
 _NUMBERS = 0.4
 

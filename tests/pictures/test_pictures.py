@@ -409,7 +409,9 @@ def test_draw_and_animate(turning, solids, urdf, tmp_path):
     assert axes.name == "3d" and axes.get_xlabel() == "x (m)"
     axes.figure.savefig(tmp_path / "one.png")
     assert (tmp_path / "one.png").stat().st_size > 5_000
-    jd.animate(scene, solution, tmp_path / "turn.gif", fps=10)
+    jd.animate(
+        scene, solution, tmp_path / "turn.gif", fps=10, frames=("rocker",), points={"P": ("coupler", (1.0, 0.0, 0.0))}
+    )
     from PIL import Image
 
     with Image.open(tmp_path / "turn.gif") as picture:
