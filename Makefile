@@ -25,7 +25,7 @@ QUICK := JAXDYN_COMPILATION_OPTIONS=least
 .DEFAULT_GOAL := help
 .NOTPARALLEL:
 .DELETE_ON_ERROR:
-.PHONY: help venv demo test test-ci test-all test-oldest coverage lint types bench docs notebooks wheel clean
+.PHONY: help venv demo test test-ci test-all test-oldest coverage lint types bench figures docs notebooks wheel clean
 
 help:  ## print the targets
 	@sed -n 's/^\([a-z-]*\):.*  ## \(.*\)/  \1\t\2/p' $(MAKEFILE_LIST) | expand -t 14
@@ -64,17 +64,21 @@ types: $(VENV)/.installed-dev  ## static types
 bench: $(VENV)/.installed-bench  ## dynamics against peers, into out/; the other benchmarks: benchmarks/README.md
 	$(BIN)/python -m benchmarks
 
+figures: $(VENV)/.installed-bench  ## measure the tables of figures in the documents and write them in place: a quiet machine, hours
+	$(BIN)/python -m benchmarks.figures
+
 docs: $(VENV)/.installed-docs  ## the site, into out/site; pictures of the gallery that are missing are made first
 	$(BIN)/python -m benchmarks.site
 
 wheel: $(VENV)/.installed-test  ## build the wheel, install it elsewhere and try it without the repository
 	$(BIN)/python -m benchmarks.wheel
 
-notebooks: $(VENV)/.installed-notebook  ## run the notebooks, into out/notebooks
+notebooks: $(VENV)/.installed-notebook $(VENV)/.installed-test  ## run the notebooks, compare what they print, and write them with outputs into out/notebooks
+	$(PYTEST) tests/package/test_notebooks.py --durations=0
 	$(BIN)/python -m nbconvert --to notebook --execute --output-dir out/notebooks notebooks/*.ipynb
 
 clean:  ## remove outputs and caches, keep .venv
-	rm -rf out build dist docs/gallery .coverage .pytest_cache .ruff_cache .hypothesis
+	rm -rf out build dist docs/gallery docs/notebooks .coverage .pytest_cache .ruff_cache .hypothesis
 	find jaxdyn tests $(wildcard benchmarks notebooks) -name __pycache__ -prune -exec rm -rf {} +
 
 # An interpreter without pip is what a failed set-up leaves behind, so it is removed.

@@ -10,9 +10,11 @@ from pathlib import Path
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 
 import jaxdyn as jd
 from benchmarks.hand_figure import turned_ball
+from jaxdyn.pictures.solids import Shape, along, rod
 
 # Length of the motion, s.
 SCENES = {
@@ -26,12 +28,12 @@ SCENES = {
     "windows": 3.0,
     "closed_ring": 2.0,
     "parallel_manipulator": 2.0,
-    "rolling_coin": 1.5,
+    "rolling_coin": 1.0,
     "ball_on_turntable": 4.0,
-    "chaplygin_sleigh": 4.0,
-    "snakeboard": 4.0,
-    "differential_drive": 4.0,
-    "bicycle": 0.8,
+    "chaplygin_sleigh": 3.0,
+    "snakeboard": 2.0,
+    "differential_drive": 3.0,
+    "bicycle": 0.4,
     "hand_rolling_ball": 0.3,
     "coordinated_lifting": 0.5,
     "sphere_arm": 2.0,
@@ -42,6 +44,85 @@ SCENES = {
     "allegro_with_cube": 0.1,
     "box_on_table": 4.0,
 }
+# Points whose paths are drawn.
+POINTS = {
+    "four_bar": {"middle of the coupler": ("coupler", (1.0, 0.0, 0.0))},
+    "rolling_coin": {"": ("coin", (0.0, 0.0, 0.0))},
+    "ball_on_turntable": {"": ("ball", (0.0, 0.0, 0.0))},
+    "chaplygin_sleigh": {"blade": ("sleigh", (0.0, 0.0, 0.0))},
+    "snakeboard": {"": ("board", (0.0, 0.0, 0.0))},
+    "differential_drive": {"": ("chassis", (0.0, 0.0, 0.0))},
+}
+
+
+def solids(name: str) -> list[Shape] | None:
+    """Solids of vehicles, whose inertia alone does not show what they are; None for the default ones."""
+
+    def at(x, y, z):
+        pose = np.eye(4)
+        pose[:3, 3] = x, y, z
+        return pose
+
+    if name == "bicycle":
+        # Origins: the rear frame in the rear hub, 0.3 m above the ground, the front frame on the steer axis above the axle.
+        tilt = np.pi / 10
+        front = (
+            np.array([1.02, 0.0, 0.35])
+            - (1.1, 0.0, 0.0)
+            + 0.35 / np.cos(tilt) * np.array([np.sin(tilt), 0, -np.cos(tilt)])
+        )
+        steer, side = np.array([-np.sin(tilt), 0.0, np.cos(tilt)]), np.array([0.0, 0.28, 0.0])
+        crank, seat, head, hub = (0.42, 0, -0.02), (0.22, 0, 0.6), (0.8, 0, 0.57), (0.0, 0.0, 0.0)
+        frame = [
+            rod("rear frame", a, b, 0.018)
+            for a, b in ((hub, crank), (hub, seat), (crank, seat), (seat, head), (crank, head))
+        ]
+        fork = [
+            rod("front frame", front, 0.75 * steer, 0.016),
+            rod("front frame", 0.75 * steer - side, 0.75 * steer + side, 0.014),
+        ]
+        wheels = [
+            Shape(f"{end} wheel", "cylinder", (radius, 0.035), along((0, 0, 0), (0, 1, 0)), source="constraint")
+            for end, radius in (("rear", 0.3), ("front", 0.35))
+        ]
+        return [*frame, Shape("rear frame", "box", (0.25, 0.14, 0.05), at(0.2, 0, 0.64)), *fork, *wheels]
+    if name == "snakeboard":
+        board = Shape("board", "box", (0.5, 0.08, 0.02), at(0, 0, 0.09))
+        rider = Shape("rotor", "box", (0.07, 0.4, 0.02), at(0, 0, 0.35))
+        trucks = [Shape(f"{end} truck", "box", (0.14, 0.26, 0.02), at(0, 0, 0.09)) for end in ("front", "back")]
+        wheels = [
+            Shape(
+                f"{end} truck",
+                "cylinder",
+                (0.04, 0.03),
+                along((0, y, 0.04), (0, 1, 0)),
+                source="constraint",
+                color=(0.3,) * 3,
+            )
+            for end in ("front", "back")
+            for y in (-0.1, 0.1)
+        ]
+        return [board, rod("rotor", (0, 0, 0.1), (0, 0, 0.34), 0.025), rider, *trucks, *wheels]
+    if name == "chaplygin_sleigh":
+        return [
+            Shape("sleigh", "box", (0.9, 0.5, 0.06), at(0.3, 0, 0.12)),
+            Shape("sleigh", "box", (0.3, 0.02, 0.12), at(0, 0, 0.06)),
+            Shape("sleigh", "ellipsoid", (0.05,) * 3, at(0.3, 0, 0.17)),
+            *(Shape("sleigh", "ellipsoid", (0.04,) * 3, at(0.65, y, 0.05)) for y in (-0.2, 0.2)),
+        ]
+    if name == "differential_drive":
+        wheels = [
+            Shape(f"{side} wheel", "cylinder", (0.1, 0.04), along((0, 0, 0), (0, 1, 0)), source="constraint")
+            for side in ("left", "right")
+        ]
+        return [
+            Shape("chassis", "cylinder", (0.24, 0.1), at(0.02, 0, 0.03)),
+            Shape("chassis", "box", (0.08, 0.12, 0.08), at(0.2, 0, 0.1)),
+            *wheels,
+        ]
+    return None
+
+
 # Scenes whose pictures show the forces of their contacts.
 _FORCES = ("hand_with_ball", "box_on_table")
 _FRAMES = 40
@@ -61,7 +142,8 @@ def write(name: str, folder: Path) -> float:
         events = [] if scene.cones is None else [jd.events.ContactLost(stop=False)]
         motion = jd.simulate(scene, start[0], start[1], ts, events=events, outputs=outputs)
     partial = folder / f"{name}.part.gif"
-    jd.animate(scene, motion, partial, fps=15, speed=duration * 15 / _FRAMES)
+    speed, points = duration * 15 / _FRAMES, POINTS.get(name)
+    jd.animate(scene, motion, partial, fps=15, speed=speed, shapes=solids(name), points=points)
     partial.replace(folder / f"{name}.gif")
     return time.perf_counter() - began
 

@@ -1,8 +1,9 @@
 """The site: `python -m benchmarks.site` (`make docs`), into out/site.
 
-Makes the pictures of the gallery that are missing, builds the pages with zensical (strict), puts KaTeX beside them, which is
-fetched from the npm registry and kept in out/, and the sources that pages link to, and follows every link and anchor of the
-pages that came out. Without npm the pages take KaTeX from the net when they are read, and a line says so.
+Makes the pictures of the gallery that are missing, turns the notebooks with their outputs into pages, builds the pages with
+zensical (strict), puts KaTeX beside them, which is fetched from the npm registry and kept in out/, and the sources that pages
+link to, and follows every link and anchor of the pages that came out. Without npm the pages take KaTeX from the net when they
+are read, and a line says so.
 """
 
 import argparse
@@ -81,6 +82,22 @@ def dead_links(site: Path) -> tuple[int, list[str]]:
     return count, dead
 
 
+def notebooks(folder: Path) -> int:
+    """Write the notebooks of the repository, with the outputs that they hold, as pages into a folder; their number."""
+    from nbconvert import MarkdownExporter
+
+    folder.mkdir(parents=True, exist_ok=True)
+    paths = sorted((ROOT / "notebooks").glob("*.ipynb"))
+    for path in paths:
+        names = {"unique_key": path.stem, "output_files_dir": f"{path.stem}_files"}
+        body, extras = MarkdownExporter().from_filename(str(path), resources=names)
+        (folder / f"{path.stem}.md").write_text(body, encoding="utf-8")
+        for name, data in extras["outputs"].items():
+            (folder / name).parent.mkdir(exist_ok=True)
+            (folder / name).write_bytes(data)
+    return len(paths)
+
+
 def bring_sources(site: Path) -> int:
     """Copy the repository's files that pages link to into SITE/source, as plain text, and let the links lead there."""
     brought = set()
@@ -113,6 +130,7 @@ def main(argv=None) -> int:
     options = parser.parse_args(argv)
     if not options.no_gallery:
         gallery.main([])
+    print(f"{notebooks(ROOT / 'docs' / 'notebooks')} notebooks are pages")
     strict = [] if options.no_gallery else ["--strict"]
     zensical = Path(sys.executable).with_name("zensical")
     if subprocess.run([zensical, "build", "--clean", "-f", "mkdocs.yml", *strict], cwd=ROOT, check=False).returncode:

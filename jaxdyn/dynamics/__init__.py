@@ -9,7 +9,9 @@ Imports `systems` and what is below it. The four algorithms do not import each o
 from jaxdyn.dynamics.base_frame import base_twists as base_twists
 from jaxdyn.dynamics.base_frame import link_adjoints as link_adjoints
 from jaxdyn.dynamics.center_of_mass import ComDynamics as ComDynamics
+from jaxdyn.dynamics.center_of_mass import SpatialForm as SpatialForm
 from jaxdyn.dynamics.center_of_mass import com_dynamics as com_dynamics
+from jaxdyn.dynamics.center_of_mass import spatial_form as spatial_form
 from jaxdyn.dynamics.centroidal import centroidal_momentum as centroidal_momentum
 from jaxdyn.dynamics.centroidal import centroidal_momentum_matrix as centroidal_momentum_matrix
 from jaxdyn.dynamics.frame_motion import frame_acceleration as frame_acceleration
@@ -33,6 +35,7 @@ __all__ = [
     "ArticulatedBodies",
     "ComDynamics",
     "NewtonEulerMatrices",
+    "SpatialForm",
     "WorkspaceDynamics",
     "aba",
     "articulated_bodies",
@@ -49,6 +52,7 @@ __all__ = [
     "mass_matrix_derivative",
     "mass_matrix_sqrt",
     "rnea",
+    "spatial_form",
     "spatial_jacobian",
     "torque_regressor",
     "workspace_dynamics",

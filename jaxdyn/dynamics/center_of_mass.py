@@ -11,6 +11,8 @@ Then X^T M X = blkdiag(m 1, M'), and X^T N = (-m g, 0): the centre of mass moves
 with F the generalised forces in v other than gravity.
 """
 
+from typing import NamedTuple
+
 import equinox as eqx
 import jax
 import jax.numpy as jnp
@@ -19,10 +21,12 @@ from jaxtyping import Array, Float
 
 from jaxdyn.compile import entry_point
 from jaxdyn.dynamics.centroidal import com_jacobian
+from jaxdyn.dynamics.kinematics import forward_kinematics
 from jaxdyn.dynamics.quantities import coriolis_matrix, mass_matrix
 from jaxdyn.lie.so3 import matmul
 from jaxdyn.model.arguments import check_shapes, is_concrete
 from jaxdyn.model.configuration import configuration_rate
+from jaxdyn.model.inertia import rotational_inertia
 from jaxdyn.model.tree import Model
 
 
@@ -42,6 +46,59 @@ class ComDynamics(eqx.Module):
     jacobian: Float[Array, "nv nv"]
     jacobian_rate: Float[Array, "nv nv"]
     inverse: Float[Array, "nv nv"]
+
+
+class SpatialForm(NamedTuple):
+    """Newton's and Euler's equations of all bodies at their centres of mass, in the axes of the world.
+
+    `force` (nb, 3) f = m pdd, N; `torque` (nb, 3) I_s wdot_s + w_s x (I_s w_s), N m; `angular_momentum` (nb, 3) I_s w_s,
+    N m s; `inertia` (nb, 3, 3) I_s = R I R^T, kg m^2.
+    """
+
+    force: Float[Array, "nb 3"]
+    torque: Float[Array, "nb 3"]
+    angular_momentum: Float[Array, "nb 3"]
+    inertia: Float[Array, "nb 3 3"]
+
+
+def spatial_form(model: Model, q: Float[Array, " nq"], v: Float[Array, " nv"], a: Float[Array, " nv"]) -> SpatialForm:
+    r"""Resultant force and torque that move each body, in the spatial form of Newton's and Euler's equations.
+
+    $$f_s = m \ddot p, \quad \tau_s = \tfrac{d}{dt} (I_s \omega_s) = I_s \dot\omega_s + \omega_s \times I_s \omega_s$$
+
+    **Arguments:** `q` (nq,); `v` (nv,); `a` (nv,), the rate of v.
+
+    **Returns:** `SpatialForm`, gravity and joint forces included in the resultants. `generalized_force(model, q, wrenches,
+    axes="inertial")` of them is the inverse dynamics without gravity and armature.
+
+    Source: EQUATIONS section 3.
+    """
+    q, v, a = check_shapes(model, q=q, v=v, a=a)
+    mass, com, about_com = jax.vmap(_at_center)(model.inertias)
+
+    def placed(q):
+        poses = forward_kinematics(model, q)
+        rotations = poses[:, :3, :3]
+        return poses[:, :3, 3] + jnp.einsum("bij,bj->bi", rotations, com), rotations
+
+    def moving(q, v):
+        (_, rotations), (velocity, rate) = jax.jvp(placed, (q,), (configuration_rate(model, q, v),))
+        spin = jnp.einsum("bij,bkj->bik", rate, rotations)
+        omega = jnp.stack([spin[:, 2, 1], spin[:, 0, 2], spin[:, 1, 0]], axis=1)
+        inertia = jnp.einsum("bij,bjk,blk->bil", rotations, about_com, rotations)
+        return velocity, jnp.einsum("bij,bj->bi", inertia, omega), inertia
+
+    (_, momentum, inertia), (acceleration, torque, _) = jax.jvp(moving, (q, v), (configuration_rate(model, q, v), a))
+    return SpatialForm(mass[:, None] * acceleration, torque, momentum, inertia)
+
+
+def _at_center(parameters):
+    """Mass, centre of mass (3,), and inertia (3, 3) about it, of a body; of a massless one about its origin."""
+    mass = parameters[0]
+    com = jnp.where(mass > 0, parameters[1:4] / jnp.where(mass > 0, mass, 1.0), 0.0)
+    # I - m (c.c 1 - c c^T).
+    moved = jnp.sum(com * com) * jnp.eye(3, dtype=com.dtype) - jnp.outer(com, com)
+    return mass, com, rotational_inertia(parameters) - mass * moved
 
 
 def com_dynamics(model: Model, q: Float[Array, " nq"], v: Float[Array, " nv"]) -> ComDynamics:

@@ -18,6 +18,7 @@ from jaxtyping import Array, Float
 
 from jaxdyn.compile import implicit, kernel, value_and_jvp, variant
 from jaxdyn.dynamics import recursions, scans, world_frame
+from jaxdyn.dynamics.kinematics import forward_kinematics
 from jaxdyn.dynamics.recursions import sweeps
 from jaxdyn.model.arguments import Numbers, check_shapes, check_state
 from jaxdyn.model.tree import Model
@@ -284,17 +285,32 @@ def _force_tangent(inverse, model, q, v, tau, steps):
     return change
 
 
-def generalized_force(model: Model, q: Float[Array, " nq"], external: Float[Array, "nb 6"]) -> Float[Array, " nv"]:
+def generalized_force(
+    model: Model, q: Float[Array, " nq"], external: Float[Array, "nb 6"], *, axes: str = "body"
+) -> Float[Array, " nv"]:
     r"""Generalised forces of wrenches on the bodies.
 
     $$\tau = \sum_i J_i^T F_i$$
 
-    **Arguments:** `q` (nq,); `external` (nb, 6), wrench (f, tau) ON each body, at its frame's origin and in its axes
-    (N, N m).
+    **Arguments:** `q` (nq,); `external` (nb, 6), wrench (f, tau) ON each body (N, N m). `axes`: "body", at the origin of the
+    body's frame and in its axes, or "inertial", at the body's centre of mass and in the axes of the world.
 
     **Returns:** (nv,), N m or N; it is on the right-hand side, with tau.
+
+    **Raises:** ValueError for other axes.
+
+    Source: EQUATIONS sections 1 and 12 (external wrenches).
     """
     q, external = check_shapes(model, q=q, external=external)
+    if axes not in ("body", "inertial"):
+        raise ValueError(f"axes is {axes!r}; give 'body' or 'inertial'")
+    if axes == "inertial":
+        rotations = forward_kinematics(model, q)[:, :3, :3]
+        force, torque = (jnp.einsum("bji,bj->bi", rotations, part) for part in (external[:, :3], external[:, 3:]))
+        # A massless body has no centre of mass; its wrench is at its frame's origin.
+        mass = model.inertias[:, :1]
+        com = jnp.where(mass > 0, model.inertias[:, 1:4] / jnp.where(mass > 0, mass, 1.0), 0.0)
+        external = jnp.concatenate([force, torque + jnp.cross(com, force)], axis=1)
     return by_recursion(world_frame.generalized_force, world_frame.generalized_force, model, q, external)
 
 

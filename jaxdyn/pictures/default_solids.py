@@ -147,7 +147,40 @@ def _rods(model: Model, i: int, points: list[np.ndarray], thin: float) -> list[S
     start = points[0] if points else com
     # A rod ends at the home position of the child joint.
     ends = points[1:] if len(points) > 1 or not mass else [com]
-    return [rod(name, start, end, thin, source="inertia") for end in ends if np.linalg.norm(end - start) > 2 * thin]
+    rods = [rod(name, start, end, thin, source="inertia") for end in ends if np.linalg.norm(end - start) > 2 * thin]
+    if mass and rods and min(_distance(com, start, end) for end in ends) > 3 * thin:
+        # The centre of mass would float beside its body.
+        rods.append(rod(name, start, com, 0.5 * thin, source="inertia"))
+    return rods + _plate(name, np.array(points), thin)
+
+
+def _distance(point: np.ndarray, start: np.ndarray, end: np.ndarray) -> float:
+    """Distance (m) of a point from a line segment."""
+    along, length = end - start, float((end - start) @ (end - start))
+    share = np.clip((point - start) @ along / length, 0.0, 1.0) if length > 0 else 0.0
+    return float(np.linalg.norm(point - start - share * along))
+
+
+def _plate(frame: str, points: np.ndarray, thin: float) -> list[Shape]:
+    """Flat plate between three or more joints of a body that are in a plane, as of a ternary link."""
+    if len(points) < 3:
+        return []
+    points = points - (middle := points.mean(0))
+    # The plane of least squares; its normal is the last direction.
+    _, extents, directions = np.linalg.svd(points, full_matrices=False)
+    if extents[1] < 2 * thin or extents[2] > 0.1 * extents[1]:
+        return []
+    around = np.argsort(np.arctan2(points @ directions[1], points @ directions[0]))
+    corners, half = middle + points[around], 0.4 * thin * directions[2]
+    count = len(corners)
+    vertices = np.concatenate([[middle + half, middle - half], corners + half, corners - half])
+    faces = []
+    for k in range(count):
+        a, b = 2 + k, 2 + (k + 1) % count
+        faces += [(0, a, b), (1, b + count, a + count), (a, a + count, b), (b, a + count, b + count)]
+    # Counter-clockwise from outside, whichever way the directions are handed.
+    faces = np.array(faces) if np.linalg.det(directions) > 0 else np.array(faces)[:, ::-1]
+    return [Shape(frame, "mesh", (1.0,) * 3, vertices=vertices, faces=faces, source="inertia")]
 
 
 def _or_mark(solid: Shape, longest: float, thin: float) -> Shape:
@@ -155,7 +188,7 @@ def _or_mark(solid: Shape, longest: float, thin: float) -> Shape:
     # In the solid's own axes, so that its orientation does not change the edges.
     edges = np.sort(np.ptp(solid.triangles()[0] @ solid.pose[:3, :3], axis=0))
     if longest and (edges[2] > _BULKY[0] * longest or edges[1] > _BULKY[1] * longest):
-        return dataclasses.replace(solid, kind="ellipsoid", size=(2.5 * thin,) * 3)
+        return dataclasses.replace(solid, kind="ellipsoid", size=(2.5 * thin,) * 3, source="mark")
     return solid
 
 
@@ -181,7 +214,7 @@ def _of_inertia(model: Model, i: int, thin: float, rolls: bool) -> list[Shape]:
     options: dict = dict(source="inertia")
     # A point mass has no shape; a ball of the rods' thickness shows it.
     if moments[2] <= mass * least**2:
-        return [Shape(name, "ellipsoid", (2 * thin,) * 3, pose, **options)]
+        return [Shape(name, "ellipsoid", (2 * thin,) * 3, pose, source="mark")]
     equal = [abs(moments[a] - moments[b]) <= _EQUAL * moments[2] for a, b in ((0, 1), (1, 2))]
     if all(equal):
         radius = float(np.sqrt(2.5 * moments.mean() / mass))

@@ -42,7 +42,7 @@ class Force(NamedTuple):
     """Arrows of one constraint or joint: points (n, nt, 3), m, and vectors (n, nt, 3), N (or N m of a torque)."""
 
     name: str
-    kind: str  # "force" or "torque"
+    kind: str  # "normal", "friction", "bearing", "contact" (both, of a contact with a cone), "force" or "torque" of a joint
     places: np.ndarray
     vectors: np.ndarray
 
@@ -205,9 +205,22 @@ def forces(motion: Motion) -> list[Force]:
     """Arrows of the solution's constraint forces, on frame B (for grasps: on the object), and of its joint torques."""
     arrows = []
     if motion.multipliers is not None:
+        coned = {cone.name for cone in cones(motion)}
+        normals = {mark.name: mark.axis for mark in marks(motion) if mark.kind == "contact"}
         for constraint, place in zip(motion.scene.constraints, layout(motion.scene), strict=True):
-            if isinstance(constraint, Pair):
-                arrows.append(_force(motion, constraint, place.name, motion.multipliers[..., place.start : place.end]))
+            if not isinstance(constraint, Pair):
+                continue
+            force = _force(motion, constraint, place.name, motion.multipliers[..., place.start : place.end])
+            if place.name in coned:
+                # One arrow, to be compared with its cone.
+                arrows.append(force)
+            elif constraint.name in normals:
+                normal = normals[constraint.name]
+                along = np.sum(force.vectors * normal, axis=-1, keepdims=True) * normal
+                arrows.append(force._replace(kind="normal", vectors=along))
+                arrows.append(force._replace(kind="friction", vectors=force.vectors - along))
+            else:
+                arrows.append(force._replace(kind="bearing"))
     if motion.torque is not None:
         model = motion.scene.system
         top = model.topology
@@ -221,8 +234,11 @@ def forces(motion: Motion) -> list[Force]:
             size = motion.torque[:, :, top.v_slices[i]]
             word = "force" if kind == "prismatic" else "torque"
             arrows.append(Force(top.joint_names[i], word, motion.poses[:, :, i, :3, 3], direction * size))
-    # A force that is zero throughout would be an arrow without a direction.
-    return [force for force in arrows if np.abs(force.vectors).max(initial=0.0) > 0]
+    # A force that is zero throughout would be an arrow without a direction, and what is left of a difference no friction.
+    most = max(
+        (float(np.abs(force.vectors).max(initial=0.0)) for force in arrows if force.kind != "torque"), default=0.0
+    )
+    return [f for f in arrows if np.abs(f.vectors).max(initial=0.0) > (0.0 if f.kind == "torque" else 1e-9 * most)]
 
 
 def _force(motion: Motion, constraint: Pair, name: str, multipliers: np.ndarray) -> Force:
@@ -235,7 +251,7 @@ def _force(motion: Motion, constraint: Pair, name: str, multipliers: np.ndarray)
     # Multipliers of grasps act on the object, which is frame A; others on frame B.
     vectors = (a[..., :3, :3] @ wrench[..., None])[..., 0] * (-1.0 if isinstance(constraint, Contact) else 1.0)
     at = b[..., :3, 3] if isinstance(constraint, Loop | Distance) else _contact(motion, constraint, a, b)[0]
-    return Force(name, "force", at, vectors)
+    return Force(name, "contact", at, vectors)
 
 
 def cones(motion: Motion) -> list[Cone]:

@@ -26,7 +26,7 @@ from jaxdyn.pictures.server import (
     stop_server,
 )
 from jaxdyn.pictures.solids import Shapes, by_frame, merge_meshes, sharpen, simplify
-from jaxdyn.pictures.stage import FORCE, LOOP, TORQUE, Stage, all_solids, color_of, rgb, stage_of
+from jaxdyn.pictures.stage import COLORS, LOOP, Stage, all_solids, color_of, paint_sectors, rgb, stage_of
 from jaxdyn.simulation.solution import Solution
 from jaxdyn.systems.system import SceneLike
 
@@ -207,7 +207,7 @@ class _Content:
         self.size = stage.size
         _set_stage(server, stage)
         self.bodies: list[tuple[int, str | None, Any]] = []
-        meshes = list(_meshes(motion, parts, vertices))
+        meshes = list(_meshes(motion, paint_sectors(parts, motion.scene.system, stage.size), vertices))
         for n in range(len(motion.q)):
             self._add_bodies(n, meshes)
         self.marks = [(mark, self._ball(k)) for k, mark in enumerate(marks(motion))]
@@ -215,7 +215,7 @@ class _Content:
         self.forces = list(scale_forces(forces(motion), arrow_length([cone for cone, _ in self.cones], self.size)))
         self.arrows = None
         if self.forces:
-            colors = np.array([rgb(FORCE if force.kind == "force" else TORQUE) for force, _ in self.forces])
+            colors = np.array([rgb(COLORS[force.kind]) for force, _ in self.forces])
             self.arrows = self.scene.add_arrows(
                 "/forces",
                 self._arrows(0),

@@ -26,7 +26,7 @@ class Shape:
       `jaxdyn.pictures.solids.SIZES` (m).
     - `color` (3,) from 0 to 1, None for the colour of the body; `opacity` from 0 to 1.
     - `vertices` (n, 3) and `faces` (m, 3) of a mesh, before they are scaled by `size`.
-    - `source`: "file", "constraint" or "inertia": origin of the solid.
+    - `source`: origin of the solid: "file", "constraint", "inertia", or "mark" for a ball that marks a centre of mass.
     """
 
     frame: str | None

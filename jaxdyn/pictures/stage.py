@@ -1,10 +1,12 @@
 """Stage of a picture: vertical direction, ground, view and colours."""
 
+import dataclasses
 from typing import NamedTuple
 
 import numpy as np
 
 from jaxdyn.constraints.loops import Distance, Loop
+from jaxdyn.model.tree import Model
 from jaxdyn.pictures.default_solids import complete_solids, frame_poses, pairs
 from jaxdyn.pictures.motion import Motion
 from jaxdyn.pictures.solids import Shape, Shapes
@@ -12,14 +14,28 @@ from jaxdyn.reports.plotting import BLUE, GREEN, ORANGE
 
 # Colours of bodies without one, cycled: muted, so that arrows and marks stand out.
 _BODIES = ("#8fa9c4", "#d9b382", "#93b8a1", "#c79c94", "#a9a3c2", "#b9b8a0")
-FORCE, TORQUE, LOOP, AXIS = "#c8201e", GREEN, ORANGE, BLUE
+LOOP, AXIS = ORANGE, BLUE
+# Kinds of arrows, in the order of a legend.
+COLORS = {
+    "normal": "#c8201e",
+    "friction": "#8e44ad",
+    "bearing": "#d2691e",
+    "contact": "#c8201e",
+    "force": "#1b7f79",
+    "torque": GREEN,
+}
+# Normals (columns) of three of the six great circles of sides that a subdivided icosahedron has.
+_CIRCLES = np.array(
+    [[1.0, 0.0, np.sqrt(5) / 2 + 0.5], [np.sqrt(5) / 2 + 0.5, 1.0, 0.0], [0.0, np.sqrt(5) / 2 + 0.5, 1.0]]
+)
+_PAINTED = 0.03  # smallest half axis of a solid with paint_sectors sectors, as a fraction of the stage's size
 
 
 class Stage(NamedTuple):
     """Surroundings of the mechanism, in world axes and m.
 
     - `low`, `high` (3,): corners of the box around the motion; `centre` (3,), `size`, its middle and diagonal.
-    - `up` (3,): against gravity; `ground`: height of the ground along it.
+    - `up` (3,): against gravity; `ground`: height of the ground along it; `has_ground`: whether something is in contact with it.
     - `eye` (3,): unit vector from the centre towards the viewer.
     """
 
@@ -29,6 +45,7 @@ class Stage(NamedTuple):
     size: float
     up: np.ndarray
     ground: float
+    has_ground: bool
     eye: np.ndarray
 
 
@@ -79,8 +96,8 @@ def stage_of(motion: Motion, shapes: Shapes) -> Stage:
     low, high = every.min(0), every.max(0)
     size = max(float(np.linalg.norm(high - low)), 1e-3)
     up = _up(model)
-    ground = _ground(motion, float((every @ up).min()), up, size)
-    return Stage(low, high, (low + high) / 2, size, up, ground, _eye(motion, high - low, up))
+    ground, has_ground = _ground(motion, float((every @ up).min()), up, size)
+    return Stage(low, high, (low + high) / 2, size, up, ground, has_ground, _eye(motion, high - low, up, has_ground))
 
 
 def _up(model) -> np.ndarray:
@@ -92,7 +109,8 @@ def _up(model) -> np.ndarray:
     return -np.sign(gravity[axis]) * np.eye(3)[axis]
 
 
-def _ground(motion: Motion, lowest: float, up: np.ndarray, size: float) -> float:
+def _ground(motion: Motion, lowest: float, up: np.ndarray, size: float) -> tuple[float, bool]:
+    """Height of the ground, and whether a contact of the scene is with it."""
     heights = []
     for constraint in pairs(motion.scene):
         if isinstance(constraint, Loop | Distance):
@@ -102,12 +120,12 @@ def _ground(motion: Motion, lowest: float, up: np.ndarray, size: float) -> float
         if surface is None and np.asarray(pose, float)[:3, 2] @ up > 0.9:
             heights.append(float(np.asarray(pose, float)[:3, 3] @ up))
     if heights and min(heights) <= lowest + 0.05 * size:
-        return min(heights)
+        return min(heights), True
     # The plane z = 0 is the ground where the mechanism is on it or just above.
-    return 0.0 if -0.02 * size <= lowest <= 0.15 * size else lowest
+    return (0.0 if -0.02 * size <= lowest <= 0.15 * size else lowest), False
 
 
-def _eye(motion: Motion, extent: np.ndarray, up: np.ndarray) -> np.ndarray:
+def _eye(motion: Motion, extent: np.ndarray, up: np.ndarray, has_ground: bool) -> np.ndarray:
     joints = motion.poses[:, :, :, :3, 3].reshape(-1, 3)
     spread = np.ptp(joints, axis=0)
     flat = int(np.argmin(spread))
@@ -118,7 +136,7 @@ def _eye(motion: Motion, extent: np.ndarray, up: np.ndarray) -> np.ndarray:
             # A mechanism in a vertical plane is seen from the front, slightly from above.
             side = np.cross(up, across)
             return _unit(-across * (1.0 if flat == 1 else -1.0) + 0.35 * side + 0.3 * up)
-        if not (motion.scene.constraints and extent @ np.abs(up) > 0.2 * widest):
+        if not has_ground and not (motion.scene.constraints and extent @ np.abs(up) > 0.2 * widest):
             return _unit(0.35 * _sideways(up)[1] + 1.1 * up)
     one, other = _sideways(up)
     return _unit(one + 0.75 * other + 0.55 * up)
@@ -133,6 +151,36 @@ def _sideways(up: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
 
 def _unit(vector: np.ndarray) -> np.ndarray:
     return vector / np.linalg.norm(vector)
+
+
+def paint_sectors(shapes: Shapes, model: Model, size: float) -> Shapes:
+    """Paint alternate sectors of round default solids darker, so that their turning is seen.
+
+    A paint_sectors solid becomes two meshes. Solids of files keep their own colours, and small ones are marks of points.
+    """
+    parts = []
+    for shape in shapes:
+        if (
+            shape.source == "file"
+            or shape.kind not in ("ellipsoid", "cylinder")
+            or min(shape.size[:1]) < _PAINTED * size
+        ):
+            parts.append(shape)
+            continue
+        vertices, faces = shape.triangles()
+        middle = (vertices[faces].mean(1) - shape.pose[:3, 3]) @ shape.pose[:3, :3]
+        # Quarters of a wheel; parts of a ball between three great circles along the sides of its triangles.
+        across = middle[:, :2] if shape.kind == "cylinder" else middle / shape.size @ _CIRCLES
+        dark = np.prod(across, axis=1) > 0
+        color = np.array(color_of(shape, model))
+        for chosen, factor in ((dark, 0.62), (~dark, 1.0)):
+            parts.append(
+                dataclasses.replace(
+                    shape, kind="mesh", size=(1.0,) * 3, pose=np.eye(4), vertices=vertices, faces=faces[chosen],
+                    color=tuple(factor * color),
+                )
+            )  # fmt: skip
+    return Shapes(parts, shapes.missing)
 
 
 def color_of(shape: Shape, model) -> tuple[float, float, float]:

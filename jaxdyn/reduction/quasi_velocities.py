@@ -14,7 +14,7 @@ orthogonal Q change the form and not the motion: the gauge. Here V is parallel-t
 V1^T V2dot = -Lam_r^+ Lamdot V2. Source: EQUATIONS section 9, with errata E23 to E26.
 """
 
-from typing import Any
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -34,7 +34,7 @@ from jaxdyn.model.numbers import as_float
 from jaxdyn.reduction.bases import count_dof, orthonormal, split_directions
 from jaxdyn.systems.mass_factor import cholesky, solve_lower
 from jaxdyn.systems.scene import Scene, as_scene
-from jaxdyn.systems.system import velocity_to_rate
+from jaxdyn.systems.system import SceneLike, velocity_to_rate
 
 
 class GaugeInvariantDynamics(Outcome):
@@ -113,6 +113,81 @@ def gauge_invariant(
         for name, value, size in (("rotation", rotation, scene.nv), ("motion_rotation", motion_rotation, dof))
     )
     return _decouple(scene, q, v, tau, t, rotation, motion_rotation, dof, rank_tol)
+
+
+def quasi_connection(
+    system: SceneLike, q: Float[Array, " nq"], v: Float[Array, " nv"], t: Numbers = 0.0
+) -> Float[Array, "nv nv"]:
+    r"""Li and Wu's connection of quasi velocities, which is not skew.
+
+    $$\Gamma = W^{-1} \left(\dot W - \frac{\partial w^T}{\partial q}\right), \quad w = W(q)^T \dot q, \quad M = W W^T$$
+
+    With the force u = W^-1 (tau - N) and without constraints, wdot + Gamma w = u. `gauge_invariant` returns the skew matrix with
+    the same product Gamma w.
+
+    **Arguments:** a system with nq = nv whose velocities are the rates of its coordinates; `q`, `v` (n,); `t`, s.
+
+    **Returns:** (n, n), 1/s, with the Cholesky factor W of M.
+
+    **Raises:** ValueError for a system whose velocities are not the rates of its coordinates.
+
+    Source: EQUATIONS section 9, with erratum E25.
+    """
+    system = as_scene(system).system
+    q, v, t = check_state(system, q=q, v=v, t=t)
+    kinds = getattr(getattr(system, "topology", None), "kinds", ())
+    if system.nq != system.nv or {"planar", "spherical", "free"} & set(kinds):
+        raise ValueError(
+            "the velocities of the system are not the rates of its coordinates (planar, spherical and free joints); "
+            "jd.reduction.gauge_invariant has the skew form for these"
+        )
+
+    def root(q, t):
+        return cholesky(mass_matrix(system, q, t))
+
+    W, Wdot = jax.jvp(root, (q, t), (v, jnp.ones_like(t)))
+    # Row i of dw^T/dq holds the derivatives by q_i.
+    slope = jax.jacfwd(lambda q: matmul(root(q, t).T, v))(q).T
+    return solve_lower(W, Wdot - slope)
+
+
+class KaneEquation(NamedTuple):
+    """Stacked equation d/dt (q, w_r) = `matrix` @ `reduced_velocity` + `force`, and its `result`.
+
+    `matrix` (nq + nr, nr), `force` (nq + nr,), `reduced_velocity` (nr,) w_r, in sqrt(J).
+    """
+
+    matrix: Float[Array, "n nr"]
+    force: Float[Array, " n"]
+    reduced_velocity: Float[Array, " nr"]
+    result: Any
+
+
+def kane_equation(
+    scene: Scene,
+    q: Float[Array, " nq"],
+    v: Float[Array, " nv"],
+    tau: Float[Array, " nv"] | None = None,
+    t: Numbers = 0.0,
+) -> KaneEquation:
+    r"""Kane's form of constrained dynamics: rates of coordinates and of reduced quasi velocities in one equation.
+
+    $$\frac{d}{dt} \begin{pmatrix} q \\ w_r \end{pmatrix}
+    = \begin{pmatrix} W^{-T} V_2 \\ -\Gamma_r \end{pmatrix} w_r + \begin{pmatrix} 0 \\ u_r \end{pmatrix}$$
+
+    Where the rows have $b(q, t) \ne 0$, `force` has their further terms. **Arguments** and errors as in `gauge_invariant`.
+
+    Source: EQUATIONS section 9, Kane form.
+    """
+    found = gauge_invariant(scene, q, v, tau, t)
+    system = as_scene(scene).system
+    q, v = check_state(system, q=q, v=v)
+    along = jnp.linalg.solve(found.W.T, found.V2)
+    rates = jax.vmap(lambda column: velocity_to_rate(system, q, column), in_axes=1, out_axes=1)(along)
+    w_r = found.reduced_velocity
+    rest = velocity_to_rate(system, q, v) - matmul(rates, w_r)
+    force = jnp.concatenate([rest, found.reduced_acceleration + matmul(found.Gamma_r, w_r)])
+    return KaneEquation(jnp.concatenate([rates, -found.Gamma_r]), force, w_r, found.result)
 
 
 @entry_point

@@ -83,7 +83,8 @@ def figure(title: str, known: SceneReference, records: Sequence[Record]) -> Any:
     panels = [p for p in panels if any(getattr(r, p[0]) is not None and getattr(r, p[1]) is not None for r in records)]
     if not panels:
         return None
-    drawn, axes = new_figure(4.3 * len(panels), 4.4, 1, len(panels))
+    # As wide as a page of text, so that labels keep their size there.
+    drawn, axes = new_figure(3.0 * len(panels), 4.0, 1, len(panels))
     for ax, (error, cost, label) in zip(axes[0], panels, strict=True):
         panel(ax, records, error, cost)
         ax.set(xscale="log", yscale="log", ylabel=label)
@@ -93,7 +94,7 @@ def figure(title: str, known: SceneReference, records: Sequence[Record]) -> Any:
             ax.axvspan(ax.get_xlim()[0], max(known.error, ax.get_xlim()[0]), color="0.93", zorder=0)
     # Panels have the same lines; a dictionary shows each label once.
     shown = {label: handle for ax in axes[0] for handle, label in zip(*ax.get_legend_handles_labels(), strict=True)}
-    drawn.legend(shown.values(), shown.keys(), loc="outside lower center", ncols=3, fontsize=8, frameon=False)
+    drawn.legend(shown.values(), shown.keys(), loc="outside lower center", ncols=2, fontsize=8, frameon=False)
     drawn.suptitle(title, fontsize=10)
     return drawn
 

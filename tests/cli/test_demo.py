@@ -24,6 +24,7 @@ def test_demo(tmp_path, capsys):
         )
     assert (tmp_path / "arm.png").stat().st_size > 10_000
     assert (tmp_path / "rollouts.png").stat().st_size > 10_000 and (tmp_path / "fit.png").stat().st_size > 10_000
-    assert numbers["energy minus work"] < 1e-6
+    assert numbers["energy minus work"] < 1e-6 and numbers["gap of the coins"] < 1e-10
+    assert (tmp_path / "coins.png").stat().st_size > 10_000
     assert numbers["fitted"] < numbers["nominal"]
     assert "70 numbers" in capsys.readouterr().out

@@ -21,6 +21,8 @@ REFERENCE = ROOT / "docs" / "reference"
 PAGES = sorted(path.stem for path in REFERENCE.glob("*.md") if path.stem != "index")
 # What another export returns, whose example shows it.
 SHOWN_BY = {
+    "dynamics.SpatialForm": "dynamics.spatial_form",
+    "reduction.KaneEquation": "reduction.kane_equation",
     "pictures.Viewer": "view",
     "control.OptimalControl": "control.ilqr",
     "control.LeggedDynamics": "control.underactuated_inverse_dynamics",

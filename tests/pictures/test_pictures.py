@@ -12,8 +12,8 @@ import pytest
 import jaxdyn as jd
 from jaxdyn.io import NotTakenWarning
 from jaxdyn.model import host_math
-from jaxdyn.pictures import default_solids, motion
-from jaxdyn.pictures.drawing import cone_sides
+from jaxdyn.pictures import default_solids, motion, stage
+from jaxdyn.pictures.drawing import cone_sides, scale_forces
 from jaxdyn.pictures.solids import SIZES, Shape, Shapes, merge_meshes, refine, sharpen, simplify
 
 
@@ -235,7 +235,7 @@ def test_marks_and_forces_of_a_loop(turning):
     moved = motion.motion_of(scene, solution)
     (mark,) = motion.marks(moved)
     force, *torques = motion.forces(moved)
-    assert mark.kind == "loop" and force.kind == "force"
+    assert mark.kind == "loop" and force.kind == "bearing"
     assert force.places.shape == force.vectors.shape == (2, 9, 3)
     np.testing.assert_array_equal(force.places, mark.b)
     rows = np.asarray(jd.constraint_jacobian(scene, solution.q[0, 0]))
@@ -264,13 +264,89 @@ def test_force_of_a_wheel_is_at_its_contact_and_as_newton_has_it():
     dynamics = jd.constrained_dynamics(scene, q, v)
     solution = solution_of(scene, q[None], [0.0], multipliers=dynamics.multipliers[None])
     moved = motion.motion_of(scene, solution)
-    (force,), (mark,) = motion.forces(moved), motion.marks(moved)
-    assert mark.kind == "contact"
-    np.testing.assert_allclose(force.places[..., 2], 0.0, atol=1e-12)  # on the ground
+    (normal, friction), (mark,) = motion.forces(moved), motion.marks(moved)
+    assert mark.kind == "contact" and (normal.kind, friction.kind) == ("normal", "friction")
+    np.testing.assert_allclose(normal.places[..., 2], 0.0, atol=1e-12)  # on the ground
+    np.testing.assert_allclose(normal.vectors[..., :2], 0.0, atol=1e-12)
+    np.testing.assert_allclose(friction.vectors[..., 2], 0.0, atol=1e-12)
     np.testing.assert_allclose(mark.axis[0, 0], [0, 0, 1.0], atol=1e-12)
     # The ground is all that touches the coin: the force that its motion asks for.
     asked = np.asarray(jd.inverse_dynamics(scene.system, q, v, dynamics.acceleration))[:3]
-    np.testing.assert_allclose(force.vectors[0, 0], moved.poses[0, 0, 0, :3, :3] @ asked, atol=1e-10)
+    total = normal.vectors[0, 0] + friction.vectors[0, 0]
+    np.testing.assert_allclose(total, moved.poses[0, 0, 0, :3, :3] @ asked, atol=1e-10)
+
+
+def test_each_kind_of_force_has_a_scale_of_its_own():
+    """A small friction is drawn as long as a large normal force; two bearings keep their ratio."""
+
+    def force(kind, size):
+        return motion.Force(kind, kind, np.zeros((1, 1, 3)), np.array([[[size, 0.0, 0.0]]]))
+
+    drawn = scale_forces(
+        [force("normal", 1e3), force("friction", 1.0), force("bearing", 4.0), force("bearing", 2.0)], 0.5
+    )
+    assert [(f.kind, f.vectors[0, 0, 0] * scale) for f, scale in drawn] == [
+        ("normal", 0.5), ("friction", 0.5), ("bearing", 0.5), ("bearing", 0.25),
+    ]  # fmt: skip
+
+
+def test_marks_of_turning_solids_are_their_whole_surface():
+    """Painted halves of a ball and of a wheel are equally large, and together the solid."""
+    model = jd.scenes.rolling_coin().system
+    for kind, size in (("ellipsoid", (0.5,) * 3), ("cylinder", (0.5, 0.1))):
+        solid = Shape("coin", kind, size, source="constraint")
+        dark, light = stage.paint_sectors(Shapes([solid]), model, 1.0)
+        areas = []
+        for part in (dark, light):
+            vertices, faces = part.triangles()
+            sides = vertices[faces]
+            areas.append(
+                np.linalg.norm(np.cross(sides[:, 1] - sides[:, 0], sides[:, 2] - sides[:, 0]), axis=1).sum() / 2
+            )
+        assert areas[0] == pytest.approx(areas[1], rel=1e-9)
+        assert len(dark.faces) + len(light.faces) == len(solid.triangles()[1])
+    # A solid of a file keeps its colours, and a mark of a point is too small to be paint_sectors.
+    kept = Shapes([Shape("coin", "ellipsoid", (0.5,) * 3), Shape("coin", "ellipsoid", (0.01,) * 3, source="inertia")])
+    assert stage.paint_sectors(kept, model, 1.0) == kept
+
+
+def test_a_link_with_three_joints_is_a_plate():
+    """Closed, counter-clockwise from outside, of the triangle's area."""
+    corners = np.array([[0.0, 0.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.5, 0.0]])
+    builder = jd.ModelBuilder("links").add_body("link", inertia=(1.0, (0.3, 0.2, 0.0), (0.1, 0.1, 0.2)))
+    for name, place in zip("ab", corners[1:], strict=True):
+        builder.add_body(name, "link", inertia=(1.0, (0.2, 0.0, 0.0), (0.1, 0.1, 0.1)), pose=tuple(place))
+    solids = default_solids.complete_solids(jd.Scene(builder.build()), Shapes())
+    (plate,) = [solid for solid in solids if solid.frame == "link" and solid.kind == "mesh"]
+    vertices, faces = plate.triangles()
+    assert volume(vertices, faces) == pytest.approx(0.25 * np.ptp(vertices[:, 2]), rel=1e-9)
+
+
+def test_points_and_frames_are_named_and_leave_paths(turning):
+    scene, solution = turning
+    first = jax.tree.map(lambda x: x[0], solution)
+    axes = jd.draw(scene, first, frames=("rocker",), points={"P": ("coupler", (0.3, 0.1, 0.0))})
+    assert {text.get_text() for text in axes.texts} == {"rocker", "P"}
+    (path,) = [np.array(line.get_data_3d()).T for line in axes.lines if line.get_color() == "0.25"]
+    poses = [jd.frame_pose(scene.system, q, "coupler") for q in first.q]
+    np.testing.assert_allclose(path, [pose[:3, :3] @ [0.3, 0.1, 0.0] + pose[:3, 3] for pose in poses], atol=1e-12)
+    with pytest.raises(ValueError, match="the frame 'elbow', which the model lacks"):
+        jd.draw(scene, first.q[0], frames=("elbow",))
+    with pytest.raises(ValueError, match=r"points\['P'\] is"):
+        jd.draw(scene, first.q[0], points={"P": (0.3, 0.1, 0.0)})
+
+
+@pytest.mark.parametrize("name", ("four_bar", "rolling_coin", "bicycle"))
+def test_labels_are_within_the_figure_and_the_box_fills_it(name):
+    axes = jd.draw(getattr(jd.scenes, name)(), getattr(jd.scenes, name).start()[0])
+    figure = axes.figure
+    figure.canvas.draw()
+    renderer = figure.canvas.get_renderer()
+    boxes = [axis.get_tightbbox(renderer).get_points() for axis in (axes.xaxis, axes.yaxis, axes.zaxis)]
+    low, high = np.concatenate(boxes).min(0), np.concatenate(boxes).max(0)
+    width, height = figure.bbox.size
+    assert (low > -1).all() and (high < (width + 1, height + 1)).all()
+    assert (high - low)[0] > 0.6 * width or (high - low)[1] > 0.6 * height
 
 
 def test_friction_cones_are_where_their_forces_are():
@@ -333,7 +409,9 @@ def test_draw_and_animate(turning, solids, urdf, tmp_path):
     assert axes.name == "3d" and axes.get_xlabel() == "x (m)"
     axes.figure.savefig(tmp_path / "one.png")
     assert (tmp_path / "one.png").stat().st_size > 5_000
-    jd.animate(scene, solution, tmp_path / "turn.gif", fps=10)
+    jd.animate(
+        scene, solution, tmp_path / "turn.gif", fps=10, frames=("rocker",), points={"P": ("coupler", (1.0, 0.0, 0.0))}
+    )
     from PIL import Image
 
     with Image.open(tmp_path / "turn.gif") as picture:

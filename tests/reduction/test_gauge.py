@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 from pinocchio_bridge import assert_close, quick
 
+import jaxdyn as jd
 from jaxdyn import scenes
 from jaxdyn.constraints import Pfaffian
 from jaxdyn.constraints.base import constraint_jacobian
@@ -174,3 +175,42 @@ def test_derivatives_and_float32(state):
     assert computed.acceleration.dtype == computed.Gamma_r.dtype == jnp.float32
     exact = quick(lambda q, v: constrained_dynamics(disk, q, v).acceleration)(q, v)
     np.testing.assert_allclose(computed.acceleration, exact, atol=1e-5)
+
+
+@pytest.mark.parametrize("name", ("planar_arm", "spatial_arm"))
+def test_connection_of_li_and_wu_moves_a_free_arm(name):
+    """wdot + Gamma w = u with the accelerations of forward dynamics; v^T Gamma v = 0, and Gamma is not skew (E25)."""
+    system = getattr(jd.scenes, name)()
+    system = getattr(system, "system", system)
+    key = jax.random.split(jax.random.key(0), 3)
+    q, v, tau = (jax.random.normal(k, (system.nv,)) for k in key)
+    Gamma = jd.reduction.quasi_connection(system, q, v)
+    W, Wdot = jax.jvp(lambda q: jnp.linalg.cholesky(jd.mass_matrix(system, q)), (q,), (v,))
+    w, rate = W.T @ v, W.T @ jd.forward_dynamics(system, q, v, tau) + Wdot.T @ v
+    u = jnp.linalg.solve(W, tau - jd.gravity_force(system, q))
+    np.testing.assert_allclose(rate + Gamma @ w, u, atol=1e-10 * np.abs(u).max())
+    assert abs(w @ Gamma @ w) < 1e-10 * np.abs(Gamma).max() and np.abs(Gamma + Gamma.T).max() > 1e-2
+
+
+def test_connection_asks_for_rates_of_coordinates():
+    with pytest.raises(ValueError, match="not the rates of its coordinates"):
+        jd.reduction.quasi_connection(jd.scenes.free_box(), jnp.zeros(7), jnp.zeros(6))
+
+
+@pytest.mark.parametrize("name", ("four_bar", "rolling_coin"))
+def test_kane_equation_is_the_motion(name):
+    """Its right-hand side is the rate of q and, by W and V2, the acceleration of constrained dynamics."""
+    scene, (q, v) = getattr(jd.scenes, name)(), getattr(jd.scenes, name).start()
+    tau = jax.random.normal(jax.random.key(1), (scene.nv,))
+    found, kane = jd.reduction.gauge_invariant(scene, q, v, tau), jd.reduction.kane_equation(scene, q, v, tau)
+    rate = kane.matrix @ kane.reduced_velocity + kane.force
+    assert kane.matrix.shape == (scene.nq + len(kane.reduced_velocity), len(kane.reduced_velocity))
+    np.testing.assert_allclose(rate[: scene.nq], jd.configuration_rate(scene.system, q, v), atol=1e-10)
+    a = jd.constrained_dynamics(scene, q, v, tau).acceleration
+    W, Wdot = jax.jvp(
+        lambda q: jnp.linalg.cholesky(jd.mass_matrix(scene.system, q)),
+        (q,),
+        (jd.configuration_rate(scene.system, q, v),),
+    )
+    wanted = found.V2.T @ (W.T @ a + Wdot.T @ v)
+    np.testing.assert_allclose(rate[scene.nq :], wanted, atol=1e-10 * max(1.0, float(jnp.abs(wanted).max())))

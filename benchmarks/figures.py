@@ -1,0 +1,149 @@
+"""Figures of the documents: `python -m benchmarks.figures [--list] [WORD ...]` (`make figures`).
+
+A table of measured figures is below a heading whose text names its command, `python -m benchmarks.NAME ...`. This runs the
+commands and writes what they print in place: a table of a page is replaced by the printed table with the same first row. A
+line below it gives the commit, the machine and the versions. With words, only commands that contain one of them run. Tables
+whose command prints no table with that row are named. Commands that write pages on their own (`--readme`) are only run.
+
+`--list` runs nothing: each table with its command and the number of commits to the package since it was measured.
+"""
+
+import argparse
+import re
+import shlex
+import subprocess
+import sys
+from pathlib import Path
+from typing import NamedTuple
+
+ROOT = Path(__file__).resolve().parent.parent
+_TABLE = re.compile(r"(?:^\|.*\n)+", re.MULTILINE)
+_STAMP = re.compile(r"\n\*Measured at commit ([0-9a-f]+),.*\*\n")
+_COMMAND = re.compile(
+    r"python -m ((?:benchmarks|jaxdyn)\.[^`\n]*?)(?=[`\n])|\b(jaxdyn report)\b|make (bench|demo|test[\w-]*)"
+)
+# A table of which more cells than this begin with a number has figures; the others have words.
+_NUMBERS = 0.4
+
+
+class Table(NamedTuple):
+    """Table of figures of a page: where it is in the text, its commands, and the commit at which it was measured."""
+
+    page: Path
+    start: int
+    end: int
+    commands: tuple[str, ...]
+    commit: str | None
+
+
+def header(table: str) -> str:
+    """First row of a table, without its spaces."""
+    return re.sub(r"\s+", "", table.splitlines()[0])
+
+
+def has_figures(table: str) -> bool:
+    """Decide whether most cells of a table are numbers."""
+    rows = [[cell.strip() for cell in row.strip().strip("|").split("|")] for row in table.splitlines()[2:]]
+    cells = [cell for row in rows for cell in row[1:]]
+    return sum(bool(re.match(r"[-+<>~*]*\s*\d", cell)) for cell in cells) > _NUMBERS * max(len(cells), 1)
+
+
+def tables(page: Path) -> list[Table]:
+    """Tables of figures of a page, with the commands named in their section, or else at the head of the page."""
+    text = page.read_text(encoding="utf-8")
+    # Blocks of code have no tables and no headings, but their commands count.
+    plain = re.sub(r"```.*?```", lambda block: re.sub(r"[^\n]", " ", block[0]), text, flags=re.DOTALL)
+    headings = [0, *(match.start() for match in re.finditer(r"^#+ ", plain, re.MULTILINE)), len(text)]
+    found = []
+    for match in _TABLE.finditer(plain):
+        if not has_figures(match[0]):
+            continue
+        first = max(place for place in headings if place <= match.start())
+        last = min(place for place in headings if place > match.start())
+        head = text[: re.search(r"^## |\Z", plain, re.MULTILINE).start()]  # pyright: ignore[reportOptionalMemberAccess]
+        commands = _commands(text[first:last]) or _commands(head)
+        stamp = _STAMP.match(text, match.end())
+        found.append(Table(page, match.start(), match.end(), commands, stamp[1] if stamp else None))
+    return found
+
+
+def _commands(text: str) -> tuple[str, ...]:
+    return tuple(dict.fromkeys(next(filter(None, groups)).split("#")[0].strip() for groups in _COMMAND.findall(text)))
+
+
+def replace(page: Path, command: str, printed: str, note: str) -> tuple[int, list[str]]:
+    """Write printed tables over those of the page that name the command; their number, and the headers without a match."""
+    fresh: dict[str, list[str]] = {}
+    for match in _TABLE.finditer(printed):
+        fresh.setdefault(header(match[0]), []).append(match[0])
+    text, written, missing = page.read_text(encoding="utf-8"), 0, []
+    chosen = []
+    for table in (table for table in tables(page) if command in table.commands):
+        old = text[table.start : table.end]
+        # Tables with one header are taken in their order.
+        if same := fresh.get(header(old)):
+            chosen.append((table, same.pop(0)))
+        else:
+            missing.append(old.splitlines()[0])
+    # From the last on, so that the places of the others stay.
+    for table, new in reversed(chosen):
+        stamp = _STAMP.match(text, table.end)
+        text = text[: table.start] + new + f"\n*{note}*\n" + text[stamp.end() if stamp else table.end :]
+        written += 1
+    page.write_text(text, encoding="utf-8")
+    return written, missing
+
+
+def _git(*words: str) -> str:
+    return subprocess.run(["git", *words], cwd=ROOT, capture_output=True, text=True, check=True).stdout.strip()
+
+
+def main(argv=None) -> int:
+    """List or measure; the exit status."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("words", nargs="*", help="run only commands that contain one of these")
+    parser.add_argument("--list", action="store_true", help="run nothing; print tables, commands and ages")
+    options = parser.parse_args(argv)
+    every = [table for page in (ROOT / "README.md", *sorted((ROOT / "docs").rglob("*.md"))) for table in tables(page)]
+    if options.list:
+        for table in every:
+            line = table.page.read_text(encoding="utf-8").count("\n", 0, table.start) + 1
+            since = table.commit and _git("rev-list", "--count", f"{table.commit}..HEAD", "--", "jaxdyn")
+            age = f"{since} commits since {table.commit}" if table.commit else "commit not recorded"
+            print(f"{table.page.relative_to(ROOT)}:{line}: {'; '.join(table.commands) or 'NO COMMAND'} ({age})")
+        return int(any(not table.commands for table in every))
+    # Imported on use: it asks the machine.
+    from benchmarks import timing
+
+    machine = timing.machine()
+    failed = 0
+    for command in dict.fromkeys(command for table in every for command in table.commands):
+        # A command with a placeholder or of another machine is run by hand.
+        runs = command.startswith("benchmarks.") and not re.search(r"\[|\.\.\.|[A-Z]{2}|<", command)
+        if not runs or (options.words and not any(word in command for word in options.words)):
+            continue
+        print(f"python -m {command}", flush=True)
+        ended = subprocess.run(
+            [sys.executable, "-m", *shlex.split(command)], cwd=ROOT, stdout=subprocess.PIPE, text=True, check=False
+        )
+        if ended.returncode:
+            print(f"  ended with status {ended.returncode}; its tables stay")
+            failed += 1
+            continue
+        if re.search(r"--(readme|docs|out docs)", command):
+            continue  # it has written its pages
+        versions = ", ".join(f"{name} {number}" for name, number in machine["versions"].items() if number)
+        note = (
+            f"Measured at commit {_git('rev-parse', '--short', 'HEAD')}, {machine['processor']}, {machine['cores']} cores, "
+            f"{versions}; `python -m {command}`."
+        )
+        for page in dict.fromkeys(table.page for table in every if command in table.commands):
+            written, missing = replace(page, command, ended.stdout, note)
+            print(f"  {page.relative_to(ROOT)}: {written} tables written")
+            for row in missing:
+                print(f"    not printed by it: {row}")
+    return int(failed > 0)
+
+
+if __name__ == "__main__":
+    sys.exit(main())
