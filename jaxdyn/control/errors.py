@@ -52,7 +52,7 @@ def gain(value: Any, name: str) -> Array:
         # Only the symmetric part enters e . K e, so it alone decides definiteness.
         known = np.asarray(array, float)
         # `initial` admits a gain for no rows, which has no least entry.
-        least = np.linalg.eigvalsh((known + known.T) / 2).min() if _is_matrix(known) else known.min(initial=np.inf)
+        least = np.linalg.eigvalsh((known + known.T) / 2).min() if known.ndim == 2 else known.min(initial=np.inf)
         if not (np.isfinite(known).all() and least > 0):
             raise ValueError(f"{name} is {known.tolist()}, which is not positive definite; give positive gains")
     # Integer gains become floating-point leaves: `jax.grad` refuses integers.
@@ -76,10 +76,6 @@ def as_matrix(gain: Array, like: Float[Array, " n"], name: str) -> Float[Array, 
     # Column by column through `times`, so that numbers, diagonals and matrices follow one rule.
     unit = jnp.eye(like.shape[0], dtype=like.dtype)
     return jnp.stack([times(gain, column, name) for column in unit], 1)
-
-
-def _is_matrix(known: np.ndarray) -> bool:
-    return known.ndim == 2
 
 
 if TYPE_CHECKING:
@@ -338,8 +334,8 @@ class ForceLoop(ForceIntegral):
         return jnp.asarray(force, q.dtype)
 
     def force_command(self, q: Float[Array, " nq"], t: Number, state: PyTree) -> Float[Array, " nc"]:
-        # The sign follows M a + h = tau + A^T lam: a reference multiplier is cancelled by the opposite torque.
         """Force command -lam_d + KI z."""
+        # The sign follows M a + h = tau + A^T lam: a reference multiplier is cancelled by the opposite torque.
         wanted = -self.reference_force(q, t)
         # A law that is called outside of a simulation has no state; its integral then counts as zero.
         return wanted if state is None or self.ki is None else wanted + times(self.ki, state, "ki")

@@ -129,10 +129,8 @@ class OperationalSpace(eqx.Module):
         self.scene = unconstrained(scene)
         self.error = frame_error(self.scene.system, frame, target, task)
         self.kp, self.kd = gain(kp, "kp"), gain(kd, "kd")
-        self.damping, self.stiffness = (
-            as_number(damping, "damping", zero=True),
-            as_number(stiffness, "stiffness", zero=True),
-        )
+        self.damping = as_number(damping, "damping", zero=True)
+        self.stiffness = as_number(stiffness, "stiffness", zero=True)
         self.posture = None if posture is None else as_float(posture, "posture", like=state_dtype(self.scene.system))
 
     def __check_init__(self):

@@ -120,10 +120,8 @@ class WholeBody(eqx.Module):
         self.turn_kd = self.kd if turn_kd is None else gain(turn_kd, "turn_kd")
         dtype = model.inertias.dtype
         self.posture = None if posture is None else jnp.asarray(posture, dtype)
-        self.stiffness, self.damping = (
-            as_number(stiffness, "stiffness", zero=True),
-            as_number(damping, "damping", zero=True),
-        )
+        self.stiffness = as_number(stiffness, "stiffness", zero=True)
+        self.damping = as_number(damping, "damping", zero=True)
         self.preload = as_number(preload, "preload", zero=True)
         self.torque_weight = as_number(torque_weight, "torque_weight", zero=True)
         self.force_weight = as_number(force_weight, "force_weight", zero=True)

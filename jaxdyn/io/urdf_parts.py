@@ -49,7 +49,10 @@ def check_elements(file: XmlFile) -> tuple[list, dict[str, str]]:
             raise fault(element, f"the {tag} name {name!r} is taken at {places[f'{tag} {name}']}; rename one")
         places[f"{tag} {name}"] = f"{file.path}:{element.line}"
         for parent, part in _parts(element):
-            _check_once(parent, part, f"{tag} {name!r}", fault)
+            # `find` takes the first, and would ignore the second silently.
+            if parent.tag in _PARENTS and (first := parent.find(part.tag)) is not part:
+                text = f"a second <{part.tag}> of {tag} {name!r}, the first is on line {first.line}; keep one"
+                raise fault(part, text)
             for key in REQUIRED.get(part.tag, ()):
                 if part.get(key) is None:
                     raise fault(part, f"<{part.tag}> of {tag} {name!r} has no {key}")
@@ -89,13 +92,6 @@ def _parts(element) -> Iterator[tuple]:
         if element.tag not in ("visual", "collision") and part.tag in _READ:
             yield element, part
         yield from _parts(part)
-
-
-def _check_once(parent, part, what: str, fault) -> None:
-    first = parent.find(part.tag)
-    # `find` takes the first, and would ignore the second silently.
-    if parent.tag in _PARENTS and first is not part:
-        raise fault(part, f"a second <{part.tag}> of {what}, the first is on line {first.line}; keep one")
 
 
 # Attributes of <inertia>, in the order of the entries of the matrix.
@@ -187,7 +183,9 @@ def _inertial(element) -> Inertial | None:
 
 def _joint(element) -> Joint:
     axis, limit, mimic = (element.find(tag) for tag in ("axis", "limit", "mimic"))
-    origin = _origin(element)
+    origin, coupling = _origin(element), None
+    if mimic is not None:
+        coupling = Mimic(mimic.get("joint"), float(mimic.get("multiplier", "1")), float(mimic.get("offset", "0")))
     return Joint(
         element.get("name"),
         element.get("type"),
@@ -198,12 +196,8 @@ def _joint(element) -> Joint:
         _vector(axis, "xyz", "1 0 0"),
         None if limit is None else _numbers(limit),
         _numbers(element.find("dynamics")),
-        None if mimic is None else _mimic(mimic),
+        coupling,
     )
-
-
-def _mimic(element) -> Mimic:
-    return Mimic(element.get("joint"), float(element.get("multiplier", "1")), float(element.get("offset", "0")))
 
 
 def _origin(element) -> np.ndarray | None:
@@ -211,10 +205,8 @@ def _origin(element) -> np.ndarray | None:
     if origin is None:
         return None
     pose = np.eye(4)
-    pose[:3, :3], pose[:3, 3] = (
-        host_math.rotation_from_rpy(_vector(origin, "rpy", "0 0 0")),
-        _vector(origin, "xyz", "0 0 0"),
-    )
+    pose[:3, :3] = host_math.rotation_from_rpy(_vector(origin, "rpy", "0 0 0"))
+    pose[:3, 3] = _vector(origin, "xyz", "0 0 0")
     return pose
 
 

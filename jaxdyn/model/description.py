@@ -39,7 +39,10 @@ def system_line(system) -> str:
 def scene_lines(scene) -> str:
     """Description of a scene: the system, each constraint with its numbers of rows, and the forces."""
     lines = [f"{type(scene).__name__} of {system_line(scene.system)}"]
-    lines += [f"constraint {_constraint_label(one)}: {_rows(one, scene.system)}" for one in scene.constraints]
+    lines += [
+        f"constraint {getattr(one, 'name', '')!r} ({type(one).__name__}): {_rows(one, scene.system)}"
+        for one in scene.constraints
+    ]
     lines += [f"force {_force_name(one)}" for one in scene.forces]
     return "\n".join(lines)
 
@@ -48,10 +51,6 @@ def _force_name(force) -> str:
     # A static wrapper shows the name of the function that it holds.
     function = getattr(force, "function", None)
     return getattr(function, "__name__", type(force).__name__)
-
-
-def _constraint_label(constraint) -> str:
-    return f"{getattr(constraint, 'name', '')!r} ({type(constraint).__name__})"
 
 
 def _rows(constraint, system) -> str:

@@ -182,8 +182,8 @@ def joint_rate(kind: str, q: Float[Array, " nqj"], v: Float[Array, " nvj"]) -> F
 def joint_random(
     kind: str, key: Array, lower: Array | np.ndarray, upper: Array | np.ndarray, dtype
 ) -> Float[Array, " nqj"]:
-    # A normal vector in four dimensions has a uniform direction, and so gives uniform rotations.
     """Random configuration: uniform between the limits for coordinates, uniform over rotations for quaternions."""
+    # A normal vector in four dimensions has a uniform direction, and so gives uniform rotations.
     if kind in ("spherical", "free"):
         ends, quat_key = jax.random.split(key)
         quat = so3.quat_normalize(jax.random.normal(quat_key, (4,), dtype))

@@ -31,8 +31,8 @@ class Topology:
     frame_bodies: tuple[int, ...]
     couplings: tuple[tuple[int, int], ...] = ()  # (joint, source): the joint's coordinate is a function of the source's
 
-    @cached_property
     # Cached: JAX hashes and compares static fields at every call of a jitted function.
+    @cached_property
     def _key(self):
         return tuple(getattr(self, field.name) for field in dataclasses.fields(self))
 

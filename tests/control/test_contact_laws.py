@@ -10,14 +10,13 @@ from test_sphere_arm import A1, ETA, MASS, RADIUS, TIP, at_contact, light, print
 
 import jaxdyn as jd
 from jaxdyn import scenes, se3
-from jaxdyn.contact import Ellipsoid, Plane, Sphere, montana
 
-OBJECT, FINGER, CENTER = Sphere(RADIUS, poles="y"), Sphere(TIP), (0.5, 0.0, 0.0)
+OBJECT, FINGER, CENTER = jd.contact.Sphere(RADIUS, poles="y"), jd.contact.Sphere(TIP), (0.5, 0.0, 0.0)
 PAIRS = {
     "spheres": (OBJECT, FINGER),
-    "plane and sphere": (Plane(), FINGER),
-    "sphere and plane": (OBJECT, Plane()),
-    "ellipsoids": (Ellipsoid([0.2, 0.1, 0.15], poles="y"), Ellipsoid([0.03, 0.02, 0.05])),
+    "plane and sphere": (jd.contact.Plane(), FINGER),
+    "sphere and plane": (OBJECT, jd.contact.Plane()),
+    "ellipsoids": (jd.contact.Ellipsoid([0.2, 0.1, 0.15], poles="y"), jd.contact.Ellipsoid([0.03, 0.02, 0.05])),
 }
 
 
@@ -29,7 +28,7 @@ def test_contact_coordinates_are_the_inverse_of_the_pose(pair):
 
     @quick
     def compute(eta, twist):
-        at = montana(*surfaces, eta)
+        at = jd.contact.montana(*surfaces, eta)
         moved = at.finger.pose
         # The finger moves by V_of = Ad V_c, and lifts along its own normal.
         lifted = at.g_of @ moved @ se3.exp(jnp.asarray([0, 0, -0.01, 0, 0, 0])) @ se3.inverse(moved)
@@ -48,8 +47,8 @@ def test_contact_coordinates_are_the_inverse_of_the_pose(pair):
 @pytest.mark.long
 def test_surfaces_without_a_single_pair_of_closest_points_give_nan():
     """Concentric ones, whose search ends where it begins, with zero steps; the other batch element keeps its numbers."""
-    flat, thin = Ellipsoid([0.1, 0.02, 0.01]), Ellipsoid([0.3, 0.01, 0.005])
-    for pair in ((flat, thin), (Sphere(0.2), Sphere(0.1))):
+    flat, thin = jd.contact.Ellipsoid([0.1, 0.02, 0.01]), jd.contact.Ellipsoid([0.3, 0.01, 0.005])
+    for pair in ((flat, thin), (jd.contact.Sphere(0.2), jd.contact.Sphere(0.1))):
 
         def first(p, pair=pair):
             pose = jnp.eye(4).at[:3, 3].set(p)
@@ -178,9 +177,9 @@ def test_what_does_not_fit_is_refused():
     model = scenes.sphere_arm().system
     parametrised = jd.contact.Parametrised(lambda a: jnp.stack([a[0], a[1], a @ a]))
     for call, words in (
-        (lambda: jd.contact.contact_coordinates(Plane(), Plane(), jnp.eye(4)), "both planes"),
-        (lambda: jd.contact.contact_coordinates(Plane(), parametrised, jnp.eye(4)), "Parametrised"),
-        (lambda: jd.contact.contact_coordinates(Plane(), FINGER, jnp.eye(3)), r"pose has shape \(3, 3\)"),
+        (lambda: jd.contact.contact_coordinates(jd.contact.Plane(), jd.contact.Plane(), jnp.eye(4)), "both planes"),
+        (lambda: jd.contact.contact_coordinates(jd.contact.Plane(), parametrised, jnp.eye(4)), "Parametrised"),
+        (lambda: jd.contact.contact_coordinates(jd.contact.Plane(), FINGER, jnp.eye(3)), r"pose has shape \(3, 3\)"),
         (lambda: jd.control.ContactCoordinates(model, "toe", OBJECT, FINGER), "'toe'"),
         (lambda: jd.control.ContactCoordinates(scenes.sphere_arm(), "tip", OBJECT, FINGER), "model is a Scene"),
     ):

@@ -9,16 +9,10 @@ import pytest
 from pinocchio_bridge import assert_close, quick
 from scipy.optimize import lsq_linear
 
+import jaxdyn as jd
 from jaxdyn import scenes
 from jaxdyn.constraints.base import position_residual
-from jaxdyn.constraints.codes import RESULTS
-from jaxdyn.control import ilqr
 from jaxdyn.control.box_qp import minimize_in_box
-from jaxdyn.dynamics.kinematics import frame_pose
-from jaxdyn.dynamics.quantities import gravity_force
-from jaxdyn.model import inertia, robots
-from jaxdyn.model.builder import ModelBuilder
-from jaxdyn.simulation.stepping import stepper
 
 RNG = np.random.default_rng(4)
 A, B = np.eye(3) + 0.2 * RNG.normal(size=(3, 3)), RNG.normal(size=(3, 2))
@@ -45,7 +39,9 @@ def test_one_iteration_is_the_riccati_equation():
         K = -np.linalg.solve(R + B.T @ P @ B, B.T @ P @ A + S)
         P = Q + A.T @ P @ A + (A.T @ P @ B + S.T) @ K
         gains.insert(0, K)
-    plan = quick(lambda x0: ilqr(linear_step, quadratic, final, x0, jnp.zeros((n, 2)), iterations=1))(jnp.asarray(x0))
+    plan = quick(lambda x0: jd.control.ilqr(linear_step, quadratic, final, x0, jnp.zeros((n, 2)), iterations=1))(
+        jnp.asarray(x0)
+    )
     assert_close(plan.gains, np.stack(gains), 1e-10)
     assert_close(plan.cost, 0.5 * x0 @ P @ x0, 1e-10)
     x, us = x0, []
@@ -53,9 +49,9 @@ def test_one_iteration_is_the_riccati_equation():
         us.append(K @ x)
         x = A @ x + B @ us[-1]
     assert_close(plan.us, np.stack(us), 1e-10)
-    assert plan.result == RESULTS.nonlinear_max_steps_reached
-    full = quick(lambda x0: ilqr(linear_step, quadratic, final, x0, jnp.zeros((n, 2))))(jnp.asarray(x0))
-    assert full.result == RESULTS.successful and int(full.iterations) == 2
+    assert plan.result == jd.RESULTS.nonlinear_max_steps_reached
+    full = quick(lambda x0: jd.control.ilqr(linear_step, quadratic, final, x0, jnp.zeros((n, 2))))(jnp.asarray(x0))
+    assert full.result == jd.RESULTS.successful and int(full.iterations) == 2
 
 
 @pytest.mark.long
@@ -70,7 +66,7 @@ def test_limits_are_those_of_a_quadratic_program():
     # sum of 0.01 u^2 + 10 |x_n|^2
     matrix = np.concatenate([0.1 * np.eye(n), np.sqrt(10) * np.concatenate(rows, 1)])
     want = lsq_linear(matrix, np.concatenate([np.zeros(n), -np.sqrt(10) * power @ x0]), (-1.5, 1.0), tol=1e-14)
-    plan = ilqr(
+    plan = jd.control.ilqr(
         lambda x, u: jnp.asarray(F) @ x + jnp.asarray(G) @ u,
         lambda x, u, k: 0.01 * u @ u,
         lambda x: 10 * x @ x,
@@ -79,7 +75,7 @@ def test_limits_are_those_of_a_quadratic_program():
         limits=(-1.5, jnp.array([1.0])),
         tol=1e-14,
     )
-    assert plan.result == RESULTS.successful
+    assert plan.result == jd.RESULTS.successful
     np.testing.assert_allclose(plan.us[:, 0], want.x, atol=1e-5)  # SciPy's own tolerance on its optimality
     assert np.isclose(plan.us, -1.5).any() and np.isclose(plan.us, 1.0).any()
     assert np.all((plan.gains == 0).all((1, 2))[np.isclose(plan.us[:, 0], -1.5)])
@@ -142,7 +138,7 @@ def test_limits_with_an_ill_conditioned_cost():
         Q = np.linalg.qr(rng.normal(size=(4, 4)))[0]
         roots = np.sqrt(np.logspace(0, -6, 4))[:, None] * Q.T
         target = rng.normal(size=4) * np.array([1.0, 0.3, 0.1, 0.03])
-        plan = ilqr(
+        plan = jd.control.ilqr(
             lambda x, u: x,
             lambda x, u, k, A=roots, b=target: 0.5 * jnp.sum((jnp.asarray(A) @ u - b) ** 2),
             lambda x: 0.0 * x[0],
@@ -151,20 +147,20 @@ def test_limits_with_an_ill_conditioned_cost():
             limits=(-1.0, 1.0),
         )
         want = lsq_linear(roots, target, (-1.0, 1.0), method="bvls", tol=1e-14)
-        assert plan.result == RESULTS.successful
+        assert plan.result == jd.RESULTS.successful
         np.testing.assert_allclose(plan.cost, want.cost, rtol=1e-9)
 
 
 def cart_pole():
-    builder = ModelBuilder("cart-pole")
-    builder.add_body("cart", None, "prismatic", inertia.box(1.0, (0.2, 0.2, 0.1)), axis=(1, 0, 0))
+    builder = jd.ModelBuilder("cart-pole")
+    builder.add_body("cart", None, "prismatic", jd.inertia.box(1.0, (0.2, 0.2, 0.1)), axis=(1, 0, 0))
     builder.add_body("pole", "cart", "continuous", (0.2, (0, 0, -0.5), (0.01, 0.01, 0.0)), axis=(0, 1, 0))
     return builder.build()
 
 
 def controlled(scene, dt, motors):
     """The stepper, with torques of motors alone."""
-    step, columns = stepper(scene, dt), jnp.eye(scene.nv)[:, np.asarray(motors)]
+    step, columns = jd.stepper(scene, dt), jnp.eye(scene.nv)[:, np.asarray(motors)]
     return lambda x, u: step(x, columns @ u)
 
 
@@ -181,7 +177,7 @@ def test_cart_pole_swings_up(second_order):
 
     @jax.jit
     def solve(q0):
-        return ilqr(
+        return jd.control.ilqr(
             step,
             lambda x, u, k: 0.01 * u @ u + 0.01 * upright(x),
             upright,
@@ -194,7 +190,7 @@ def test_cart_pole_swings_up(second_order):
 
     plan = solve(jnp.zeros(2))
     q, v = plan.xs
-    assert plan.result == RESULTS.successful
+    assert plan.result == jd.RESULTS.successful
     assert abs(np.cos(q[-1, 1]) + 1) < 1e-2 and np.abs(v[-1]).max() < 0.3
     assert np.abs(plan.us).max() <= 15.0 and np.isclose(np.abs(plan.us), 15.0).any()
     assert np.all(np.diff(plan.costs) <= 0)
@@ -207,30 +203,30 @@ def test_cart_pole_swings_up(second_order):
 @pytest.mark.long
 def test_arm_reaches_places_in_a_batch():
     """A UR5 from rest; each sample of a batch is the solution alone, whatever the others need."""
-    model = robots.ur5()
+    model = jd.robots.ur5()
     # Steps that are short against the time constants of the light wrist: the iterations do not converge with 50 ms.
     step, tip = controlled(model, 0.02, range(6)), model.body_names[-1]
     q0 = jnp.array([0.3, -1.2, 1.4, 0.2, 0.5, 0.0])
-    hold = gravity_force(model, q0)
+    hold = jd.gravity_force(model, q0)
     us = jnp.broadcast_to(hold, (30, 6))
 
     def solve(goal):
-        return ilqr(
+        return jd.control.ilqr(
             step,
             lambda x, u, k: 1e-4 * (u - hold) @ (u - hold) + 0.01 * x[1] @ x[1],
-            lambda x: 1e4 * jnp.sum((frame_pose(model, x[0], tip)[:3, 3] - goal) ** 2) + 0.1 * jnp.sum(x[1] ** 2),
+            lambda x: 1e4 * jnp.sum((jd.frame_pose(model, x[0], tip)[:3, 3] - goal) ** 2) + 0.1 * jnp.sum(x[1] ** 2),
             (q0, jnp.zeros(6)),
             us,
             iterations=40,
         )
 
-    start = frame_pose(model, q0, tip)[:3, 3]
+    start = jd.frame_pose(model, q0, tip)[:3, 3]
     goals = start[None] + 0.1 * jnp.asarray(np.random.default_rng(2).normal(size=(3, 3)))
     batch, one = jax.jit(jax.vmap(solve))(goals), jax.jit(solve)(goals[1])
     assert batch.success.all() and one.success
     # Kernels of one sample and of a batch round differently, which the iterations amplify until they converge.
     np.testing.assert_allclose(batch.cost[1], one.cost, rtol=1e-6)
-    ends = jax.vmap(lambda q: frame_pose(model, q, tip)[:3, 3])(batch.xs[0][:, -1])
+    ends = jax.vmap(lambda q: jd.frame_pose(model, q, tip)[:3, 3])(batch.xs[0][:, -1])
     assert np.abs(ends - goals).max() < 1e-3 and np.all(batch.cost < 1e-3 * batch.costs[:, 0])
 
 
@@ -243,7 +239,7 @@ def test_car_with_rolling_wheels():
     step = controlled(scene, 0.1, motors)
     goal = q0[:2] + jnp.array([0.0, 0.3])
     plan = jax.jit(
-        lambda q0: ilqr(
+        lambda q0: jd.control.ilqr(
             step,
             lambda x, u, k: 1e-2 * u @ u,
             lambda x: 100 * jnp.sum((x[0][:2] - goal) ** 2) + jnp.sum(x[1] ** 2),
@@ -265,7 +261,7 @@ def test_four_bar_by_its_crank():
     scene, (q0, _) = scenes.four_bar(), scenes.four_bar.start()
     step = controlled(scene, 0.05, [0])
     plan = jax.jit(
-        lambda q0: ilqr(
+        lambda q0: jd.control.ilqr(
             step,
             lambda x, u, k: 1e-4 * u @ u,
             lambda x: 100 * (x[0][0] - 1.5) ** 2 + x[1] @ x[1],
@@ -289,7 +285,7 @@ def test_warm_start_needs_fewer_iterations():
 
     @jax.jit
     def solve(x0, us):
-        return ilqr(
+        return jd.control.ilqr(
             pendulum, lambda x, u, k: 0.05 * (x @ x + 0.1 * u @ u), lambda x: 5 * x @ x, x0, us, limits=(-3.0, 3.0)
         )
 
@@ -303,45 +299,45 @@ def test_warm_start_needs_fewer_iterations():
     starts = [solve(hit, guess).costs[0] for guess in (first.shift().us, first.shift())]
     assert starts[1] < starts[0]
     with pytest.raises(ValueError, match=r"us is a plan with gains \(25, 1, 2\), expected \(25, 1, 3\)"):
-        ilqr(lambda x, u: x, lambda x, u, k: u @ u, lambda x: x @ x, jnp.zeros(3), first)
+        jd.control.ilqr(lambda x, u: x, lambda x, u, k: u @ u, lambda x: x @ x, jnp.zeros(3), first)
 
 
 @pytest.mark.long
 def test_refusals_and_codes():
     x0, us = jnp.zeros(3), jnp.zeros((4, 2))
     with pytest.raises(ValueError, match=r"us has shape \(4,\); give controls"):
-        ilqr(linear_step, quadratic, final, x0, us[:, 0])
+        jd.control.ilqr(linear_step, quadratic, final, x0, us[:, 0])
     with pytest.raises(ValueError, match="iterations is 0"):
-        ilqr(linear_step, quadratic, final, x0, us, iterations=0)
+        jd.control.ilqr(linear_step, quadratic, final, x0, us, iterations=0)
     with pytest.raises(ValueError, match="tol is 2"):
-        ilqr(linear_step, quadratic, final, x0, us, tol=2.0)
+        jd.control.ilqr(linear_step, quadratic, final, x0, us, tol=2.0)
     with pytest.raises(ValueError, match="cost takes"):
-        ilqr(linear_step, lambda x, u: 0.0, final, x0, us)
+        jd.control.ilqr(linear_step, lambda x, u: 0.0, final, x0, us)
     with pytest.raises(ValueError, match=r"cost returned shape \(3,\); return one number"):
-        ilqr(linear_step, lambda x, u, k: x, final, x0, us)
+        jd.control.ilqr(linear_step, lambda x, u, k: x, final, x0, us)
     with pytest.raises(ValueError, match="step returned shapes"):
-        ilqr(lambda x, u: x[:2], quadratic, final, x0, us)
+        jd.control.ilqr(lambda x, u: x[:2], quadratic, final, x0, us)
     with pytest.raises(ValueError, match="step returned PyTreeDef"):
-        ilqr(lambda x, u: (x, u), quadratic, final, x0, us)
+        jd.control.ilqr(lambda x, u: (x, u), quadratic, final, x0, us)
     with pytest.raises(ValueError, match="every lower limit has to be below"):
-        ilqr(linear_step, quadratic, final, x0, us, limits=(1.0, -1.0))
+        jd.control.ilqr(linear_step, quadratic, final, x0, us, limits=(1.0, -1.0))
     with pytest.raises(ValueError, match="regularization is -1"):
-        ilqr(linear_step, quadratic, final, x0, us, regularization=-1.0)
-    bad = ilqr(linear_step, quadratic, lambda x: jnp.log(x[0]), x0 - 1.0, us)
-    assert bad.result == RESULTS.nonfinite
+        jd.control.ilqr(linear_step, quadratic, final, x0, us, regularization=-1.0)
+    bad = jd.control.ilqr(linear_step, quadratic, lambda x: jnp.log(x[0]), x0 - 1.0, us)
+    assert bad.result == jd.RESULTS.nonfinite
     # No curvature in u and no minimum: damping grows, the cost falls as long as it is asked to.
-    endless = ilqr(
+    endless = jd.control.ilqr(
         lambda x, u: x + u, lambda x, u, k: -jnp.sum(u), lambda x: 0.0 * x[0], jnp.zeros(2), us, iterations=5
     )
-    assert endless.result == RESULTS.nonlinear_max_steps_reached and endless.cost < 0
+    assert endless.result == jd.RESULTS.nonlinear_max_steps_reached and endless.cost < 0
     # A derivative of the wrong sign: no step along the search direction reduces the cost, however large the damping.
     reversed_slope = jax.custom_jvp(lambda x: x)
     reversed_slope.defjvp(lambda primals, tangents: (primals[0], -tangents[0]))
-    wrong = ilqr(
+    wrong = jd.control.ilqr(
         lambda x, u: x + u,
         lambda x, u, k: 0.1 * (u @ u),
         lambda x: jnp.sum((reversed_slope(x) - 1.0) ** 2),
         jnp.zeros(2),
         us,
     )
-    assert wrong.result == RESULTS.no_descent
+    assert wrong.result == jd.RESULTS.no_descent

@@ -9,7 +9,6 @@ from pinocchio_bridge import quick
 
 import jaxdyn as jd
 from jaxdyn import scenes, se3
-from jaxdyn.contact import Sphere, montana
 
 RADIUS, TIP, MASS = 0.15, 0.03, 0.2
 ETA, ROLLING, SLIDE, SPIN = jnp.array([0.2, -0.1, 0.15, 0.1, 0.3]), (0.5, -0.3), (0.2, 0.1), 0.7
@@ -31,7 +30,7 @@ def light(kind):
 
 
 def at_contact(eta):
-    return montana(Sphere(RADIUS, poles="y"), Sphere(TIP), eta)
+    return jd.contact.montana(jd.contact.Sphere(RADIUS, poles="y"), jd.contact.Sphere(TIP), eta)
 
 
 # For numbers: one program.

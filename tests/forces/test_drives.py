@@ -8,7 +8,6 @@ import pytest
 from scipy.linalg import expm
 
 import jaxdyn as jd
-from jaxdyn.identify.replay import SampledTorque
 
 # Steps of order 8 that end on the save points.
 FINE = {"solver": diffrax.Dopri8(), "stepsize": 2.5e-4}
@@ -292,7 +291,7 @@ def test_controller_with_a_state_before_a_drive():
 def simulated_log(scene, taus, dt=0.01):
     """Log of a motion from rest under torques that are linear between the samples, by steps as of the fit."""
     ts, rest = dt * np.arange(len(taus)), jnp.zeros(scene.nv)
-    motion = jd.simulate(scene, rest, rest, ts, control=SampledTorque(jnp.asarray(ts), jnp.asarray(taus)),
+    motion = jd.simulate(scene, rest, rest, ts, control=jd.identify.SampledTorque(jnp.asarray(ts), jnp.asarray(taus)),
                          stepsize=dt / 4, solver=diffrax.Tsit5())  # fmt: skip
     return jd.identify.Log(ts, motion.q, v=motion.v, tau=taus)
 

@@ -6,13 +6,7 @@ import numpy as np
 import pytest
 from pinocchio_bridge import quick
 
-from jaxdyn.dynamics.kinematics import forward_kinematics, frame_pose
-from jaxdyn.dynamics.quantities import generalized_force
-from jaxdyn.forces.elements import CoulombFriction, Drive, ExternalWrench, JointDamping, JointSpring
-from jaxdyn.model.builder import ModelBuilder
-from jaxdyn.model.configuration import difference, integrate, neutral
-from jaxdyn.simulation.run import simulate
-from jaxdyn.systems.scene import Scene
+import jaxdyn as jd
 
 MASS = {"coast": 2.0, "drive": 1.5, "dry": 0.8, "pull": 3.0, "ring": 1.2, "shake": 0.7}
 BALL = 0.35  # principal moment of the ball
@@ -21,7 +15,7 @@ BALL = 0.35  # principal moment of the ball
 @pytest.fixture(scope="module")
 def sliders():
     """Independent sliders without gravity, one for each force, and a ball on a spherical joint."""
-    builder = ModelBuilder("sliders", gravity=None)
+    builder = jd.ModelBuilder("sliders", gravity=None)
     for name, mass in MASS.items():
         builder.add_body(name, joint="prismatic", joint_name=name, axis=(1, 0, 0), inertia=(mass, (0, 0, 0), (0, 0, 0)))
     builder.add_body("turn", joint="spherical", joint_name="turn", inertia=(1.0, (0, 0, 0), (BALL, BALL, BALL)))
@@ -31,7 +25,7 @@ def sliders():
 @pytest.fixture(scope="module")
 def arm():
     """A branched model with every kind of joint, damping and friction."""
-    builder = ModelBuilder("arm")
+    builder = jd.ModelBuilder("arm")
     moments = (0.02, 0.03, 0.04)
     builder.add_body("base", joint="free", inertia=(2.0, (0.1, 0.0, 0.2), moments), damping=0.1)
     builder.add_body("hip", "base", "spherical", inertia=(1.0, (0, 0.1, 0), moments), pose=(0.1, 0.2, 0.3))
@@ -47,7 +41,7 @@ def evaluate(force, model, q, v):
 
 
 APPLIED = quick(lambda scene, q, v: scene.applied_force(q, v))
-DIFFERENCE = quick(difference)
+DIFFERENCE = quick(jd.difference)
 
 
 def push(system, q, v, t):
@@ -64,18 +58,18 @@ def oscillation(x0, v0, k, c, m, t):
 @pytest.mark.long
 def test_motions_against_closed_forms(sliders):
     ts = np.linspace(0.0, 3.0, 16)
-    scene = Scene(
+    scene = jd.Scene(
         sliders,
         forces=(
-            JointDamping(0.6, joints=("coast",)),
-            Drive(4.0, 1.1, target=0.5, target_velocity=0.2, joints="drive"),
-            CoulombFriction(0.5, v_s=0.3, joints=["dry"]),
-            ExternalWrench("pull", (1.7, 0.4, -2.0, 0.1, 0.2, 0.3), axes="body"),
-            JointSpring(5.0, rest=0.1, joints=("ring",)),
-            JointDamping(0.4, joints=("ring",)),
-            JointSpring([3.0], rest=[0.0], joints=("shake",)),
+            jd.forces.JointDamping(0.6, joints=("coast",)),
+            jd.forces.Drive(4.0, 1.1, target=0.5, target_velocity=0.2, joints="drive"),
+            jd.forces.CoulombFriction(0.5, v_s=0.3, joints=["dry"]),
+            jd.forces.ExternalWrench("pull", (1.7, 0.4, -2.0, 0.1, 0.2, 0.3), axes="body"),
+            jd.forces.JointSpring(5.0, rest=0.1, joints=("ring",)),
+            jd.forces.JointDamping(0.4, joints=("ring",)),
+            jd.forces.JointSpring([3.0], rest=[0.0], joints=("shake",)),
             push,
-            JointSpring(0.8, joints=("turn",)),
+            jd.forces.JointSpring(0.8, joints=("turn",)),
         ),
     )
     axis = np.array([0.6, 0.0, 0.8])
@@ -84,7 +78,7 @@ def test_motions_against_closed_forms(sliders):
     q0 = np.concatenate([start, [np.cos(0.5)], np.sin(0.5) * axis])
     v0 = np.concatenate([speed, 0.3 * axis])
     # Dense output is an order of magnitude less accurate than the steps, hence the tight tolerances.
-    solution = simulate(scene, q0, v0, ts, rtol=1e-14, atol=1e-14)
+    solution = jd.simulate(scene, q0, v0, ts, rtol=1e-14, atol=1e-14)
     names = list(sliders.joint_names)
     assert names == [*MASS, "turn"]
     expected = {}
@@ -127,22 +121,22 @@ def test_defaults_of_the_model(arm):
     damping = np.concatenate([np.full(6, 0.1), np.zeros(7)])
     friction = np.concatenate([np.zeros(10), [0.3, 0.4, 0.5]])
     assert arm.joint_names == ("base_joint", "hip_joint", "knee_joint", "slide_joint")
-    np.testing.assert_allclose(evaluate(JointDamping(), arm, q, v), -damping * v, rtol=1e-15)
+    np.testing.assert_allclose(evaluate(jd.forces.JointDamping(), arm, q, v), -damping * v, rtol=1e-15)
     expected = -friction * np.tanh(v / 0.2)
-    np.testing.assert_allclose(evaluate(CoulombFriction(v_s=0.2), arm, q, v), expected, rtol=1e-14)
-    total = Scene(arm, forces=(JointDamping(), CoulombFriction(v_s=0.2))).applied_force(q, v)
+    np.testing.assert_allclose(evaluate(jd.forces.CoulombFriction(v_s=0.2), arm, q, v), expected, rtol=1e-14)
+    total = jd.Scene(arm, forces=(jd.forces.JointDamping(), jd.forces.CoulombFriction(v_s=0.2))).applied_force(q, v)
     np.testing.assert_allclose(total, expected - damping * v, rtol=1e-14)
-    assert Scene(arm).applied_force(q, v) is None
+    assert jd.Scene(arm).applied_force(q, v) is None
 
 
 def test_joints_are_taken_in_the_order_named(arm):
     q, v = sample(arm)
     coefficient = np.arange(1.0, 5.0)
-    force = evaluate(JointDamping(coefficient, joints=("slide_joint", "knee_joint")), arm, q, v)
+    force = evaluate(jd.forces.JointDamping(coefficient, joints=("slide_joint", "knee_joint")), arm, q, v)
     expected = np.zeros(13)
     expected[10:], expected[9] = -coefficient[:3] * v[10:], -coefficient[3] * v[9]
     np.testing.assert_allclose(force, expected, rtol=1e-15)
-    spring = JointSpring(coefficient, rest=[0.1, 0.2, 0.3, 0.4], joints=("knee_joint", "hip_joint"))
+    spring = jd.forces.JointSpring(coefficient, rest=[0.1, 0.2, 0.3, 0.4], joints=("knee_joint", "hip_joint"))
     with pytest.raises(ValueError, match=r"JointSpring: rest has shape \(4,\), expected a scalar or \(5,\)"):
         evaluate(spring, arm, q, v)
 
@@ -153,36 +147,36 @@ def test_spring_and_drive_move_along_the_manifold(arm):
     q, v = sample(arm, 3)
     rest, _ = sample(arm, 7)
     np.testing.assert_allclose(
-        evaluate(JointSpring(2.0, rest), arm, q, v), -2 * np.asarray(DIFFERENCE(arm, rest, q)), rtol=1e-14
+        evaluate(jd.forces.JointSpring(2.0, rest), arm, q, v), -2 * np.asarray(DIFFERENCE(arm, rest, q)), rtol=1e-14
     )
     # A drive pulls along the twist from q to the target; the spring's twist from its rest is the opposite one.
-    drive = evaluate(Drive(2.0, 0.3, rest, target_velocity=0.7), arm, q, v)
+    drive = evaluate(jd.forces.Drive(2.0, 0.3, rest, target_velocity=0.7), arm, q, v)
     along = np.asarray(DIFFERENCE(arm, q, rest))
     np.testing.assert_allclose(drive, 2 * along + 0.3 * (0.7 - np.asarray(v)), rtol=0, atol=1e-13)
     place = slice(6, 10)  # the spherical and the revolute joint
 
     def energy(step):
-        return 0.5 * 2.0 * jnp.sum(difference(arm, rest, integrate(arm, q, step))[place] ** 2)
+        return 0.5 * 2.0 * jnp.sum(jd.difference(arm, rest, jd.integrate(arm, q, step))[place] ** 2)
 
     gradient = quick(jax.grad(energy))(jnp.zeros(13))[place]
-    spring = evaluate(JointSpring(2.0, rest[7:12], joints=("hip_joint", "knee_joint")), arm, q, v)
+    spring = evaluate(jd.forces.JointSpring(2.0, rest[7:12], joints=("hip_joint", "knee_joint")), arm, q, v)
     np.testing.assert_allclose(spring[place], -gradient, rtol=1e-12, atol=1e-13)
     assert not np.any(spring[:6]) and not np.any(spring[10:])
-    assert not np.any(evaluate(JointSpring(2.0), arm, neutral(arm), v))
+    assert not np.any(evaluate(jd.forces.JointSpring(2.0), arm, jd.neutral(arm), v))
 
 
 def test_effort_limit(arm):
     q, v = sample(arm, 3)
     target, _ = sample(arm, 7)
-    free = evaluate(Drive(50.0, 1.0, target), arm, q, v)
+    free = evaluate(jd.forces.Drive(50.0, 1.0, target), arm, q, v)
     limits = np.where(np.arange(13) % 2, 4.0, np.inf)
-    held = evaluate(Drive(50.0, 1.0, target, effort_limit=limits), arm, q, v)
+    held = evaluate(jd.forces.Drive(50.0, 1.0, target, effort_limit=limits), arm, q, v)
     np.testing.assert_allclose(held[::2], free[::2], rtol=1e-15)
     np.testing.assert_allclose(held[1::2], 4 * np.tanh(free[1::2] / 4), rtol=1e-14)
     # Far below the limit tanh is the identity but for a third of the squared ratio to it.
-    small, same = (evaluate(Drive(0.05, 0.0, target, effort_limit=x), arm, q, v) for x in (4.0, np.inf))
+    small, same = (evaluate(jd.forces.Drive(0.05, 0.0, target, effort_limit=x), arm, q, v) for x in (4.0, np.inf))
     np.testing.assert_allclose(small, same, rtol=1e-2)
-    total = quick(jax.grad(lambda limit: jnp.sum(Drive(50.0, 1.0, target, 0.0, limit)(arm, q, v, 0.0))))
+    total = quick(jax.grad(lambda limit: jnp.sum(jd.forces.Drive(50.0, 1.0, target, 0.0, limit)(arm, q, v, 0.0))))
     gradient = total(jnp.asarray(limits))
     assert np.isfinite(gradient).all() and np.all(gradient[1::2] != 0)
 
@@ -192,17 +186,19 @@ def test_external_wrench(arm, axes):
     """Against the wrench carried to the body by hand, and against virtual work by finite differences."""
     q, v = sample(arm, 5)
     wrench = np.array([1.0, -2.0, 3.0, 0.4, 0.5, -0.6])
-    value = evaluate(ExternalWrench("foot", wrench, axes), arm, q, v)
+    value = evaluate(jd.forces.ExternalWrench("foot", wrench, axes), arm, q, v)
     steps = 1e-5 * np.concatenate([np.zeros((1, 13)), np.eye(13), -np.eye(13)])
-    poses = quick(jax.vmap(lambda step: frame_pose(arm, integrate(arm, q, step), "foot")))(jnp.asarray(steps))
+    poses = quick(jax.vmap(lambda step: jd.frame_pose(arm, jd.integrate(arm, q, step), "foot")))(jnp.asarray(steps))
     pose = np.asarray(poses[0])
     rotation = pose[:3, :3]
     force, torque = (wrench[:3], wrench[3:]) if axes == "world" else (rotation @ wrench[:3], rotation @ wrench[3:])
-    knee = np.asarray(quick(forward_kinematics)(arm, q))[arm.body_names.index("knee")]
+    knee = np.asarray(quick(jd.forward_kinematics)(arm, q))[arm.body_names.index("knee")]
     torque_knee = torque + np.cross(pose[:3, 3] - knee[:3, 3], force)
     external = np.zeros((4, 6))
     external[arm.body_names.index("knee")] = [*(knee[:3, :3].T @ force), *(knee[:3, :3].T @ torque_knee)]
-    np.testing.assert_allclose(value, quick(generalized_force)(arm, q, jnp.asarray(external)), rtol=0, atol=1e-13)
+    np.testing.assert_allclose(
+        value, quick(jd.dynamics.generalized_force)(arm, q, jnp.asarray(external)), rtol=0, atol=1e-13
+    )
     rate = (np.asarray(poses[1:14]) - np.asarray(poses[14:])) / 2e-5
     spin = rate[:, :3, :3] @ rotation.T
     omega = np.stack([spin[:, 2, 1], spin[:, 0, 2], spin[:, 1, 0]], 1)
@@ -211,15 +207,15 @@ def test_external_wrench(arm, axes):
 
 
 def all_forces(arm, coefficient):
-    rest = neutral(arm)
-    return Scene(
+    rest = jd.neutral(arm)
+    return jd.Scene(
         arm,
         forces=(
-            JointDamping(coefficient),
-            CoulombFriction(coefficient, v_s=0.5),
-            JointSpring(coefficient),
-            Drive(coefficient, coefficient, rest, coefficient, effort_limit=9.0),
-            ExternalWrench("foot", jnp.full(6, 1.0) * coefficient),
+            jd.forces.JointDamping(coefficient),
+            jd.forces.CoulombFriction(coefficient, v_s=0.5),
+            jd.forces.JointSpring(coefficient),
+            jd.forces.Drive(coefficient, coefficient, rest, coefficient, effort_limit=9.0),
+            jd.forces.ExternalWrench("foot", jnp.full(6, 1.0) * coefficient),
         ),
     )
 
@@ -227,7 +223,7 @@ def all_forces(arm, coefficient):
 @pytest.mark.long
 def test_derivatives():
     """Reverse mode and forward over reverse against central differences at a general point; finite at rest."""
-    builder = ModelBuilder("leg")
+    builder = jd.ModelBuilder("leg")
     moments = (0.02, 0.03, 0.04)
     builder.add_body("hip", joint="spherical", inertia=(1.0, (0, 0.1, 0), moments))
     builder.add_body("knee", "hip", "revolute", axis=(0, 1, 0), inertia=(0.5, (0, 0, -0.2), moments), pose=(0, 0, -0.4))
@@ -235,7 +231,7 @@ def test_derivatives():
     leg = builder.build()
 
     def total(z, q):
-        force = all_forces(leg, z[0]).applied_force(integrate(leg, q, z[1:5]), z[5:])
+        force = all_forces(leg, z[0]).applied_force(jd.integrate(leg, q, z[1:5]), z[5:])
         return jnp.sum(force * jnp.arange(1.0, 5.0))
 
     @quick
@@ -247,7 +243,7 @@ def test_derivatives():
     point, step = np.concatenate([[0.7], np.zeros(4), v]), 1e-5
     rest = np.concatenate([[0.7], np.zeros(8)])
     points = np.concatenate([point + step * np.eye(9), point - step * np.eye(9), [point, rest]])
-    places = np.concatenate([np.tile(q, (19, 1)), [neutral(leg)]])
+    places = np.concatenate([np.tile(q, (19, 1)), [jd.neutral(leg)]])
     value, gradient, hessian = (np.asarray(x) for x in derivatives(jnp.asarray(points), jnp.asarray(places)))
     # Central differences of step 1e-5: truncation 1e-10 of the third derivative, rounding 1e-11 of the value.
     slope = (value[:9] - value[9:18]) / (2 * step)
@@ -284,7 +280,12 @@ def test_float32(arm):
 def test_leaves_are_not_weakly_typed():
     """A coefficient given as a Python number must not compile anew when an array takes its place."""
     leaves = jax.tree.leaves(
-        (JointDamping(1), CoulombFriction(0.5), Drive(1, 2, 3, 4, 5), ExternalWrench("a", [0] * 6))
+        (
+            jd.forces.JointDamping(1),
+            jd.forces.CoulombFriction(0.5),
+            jd.forces.Drive(1, 2, 3, 4, 5),
+            jd.forces.ExternalWrench("a", [0] * 6),
+        )
     )
     assert len(leaves) == 9 and all(x.dtype == jnp.float64 and not x.weak_type for x in leaves)
 
@@ -292,14 +293,17 @@ def test_leaves_are_not_weakly_typed():
 @pytest.mark.parametrize(
     ("make", "message"),
     [
-        (lambda m: Scene(3), "system is a int, which has no nq and nv"),
-        (lambda m: Scene(m, forces=JointDamping(1.0)), r"forces is a JointDamping; pass a tuple or a list"),
-        (lambda m: Scene(m, forces=(3.0,)), r"forces\[0\] is 3.0, which cannot be called"),
-        (lambda m: Scene(m, constraints="loop"), "constraints is a str; pass a tuple"),
-        (lambda m: CoulombFriction(1.0, v_s=0.0), "v_s is 0.0; give a positive smoothing velocity"),
-        (lambda m: Drive(1.0, 1.0, 0.0, effort_limit=-1.0), "effort_limit is -1.0; give positive limits"),
-        (lambda m: ExternalWrench("foot", [1.0]), r"wrench has shape \(1,\), expected \(6,\)"),
-        (lambda m: ExternalWrench("foot", [1.0] * 6, "tool"), "axes is 'tool'; choose 'world' or 'body'"),
+        (lambda m: jd.Scene(3), "system is a int, which has no nq and nv"),
+        (
+            lambda m: jd.Scene(m, forces=jd.forces.JointDamping(1.0)),
+            r"forces is a JointDamping; pass a tuple or a list",
+        ),
+        (lambda m: jd.Scene(m, forces=(3.0,)), r"forces\[0\] is 3.0, which cannot be called"),
+        (lambda m: jd.Scene(m, constraints="loop"), "constraints is a str; pass a tuple"),
+        (lambda m: jd.forces.CoulombFriction(1.0, v_s=0.0), "v_s is 0.0; give a positive smoothing velocity"),
+        (lambda m: jd.forces.Drive(1.0, 1.0, 0.0, effort_limit=-1.0), "effort_limit is -1.0; give positive limits"),
+        (lambda m: jd.forces.ExternalWrench("foot", [1.0]), r"wrench has shape \(1,\), expected \(6,\)"),
+        (lambda m: jd.forces.ExternalWrench("foot", [1.0] * 6, "tool"), "axes is 'tool'; choose 'world' or 'body'"),
     ],
 )
 def test_refused_when_made(arm, make, message):
@@ -310,24 +314,36 @@ def test_refused_when_made(arm, make, message):
 @pytest.mark.parametrize(
     ("force", "message"),
     [
-        (JointDamping(1.0, joints=("elbow",)), r"JointDamping: joints \['elbow'\] are not in model 'arm'; it has"),
-        (JointDamping([1.0, 2.0]), r"coefficient has shape \(2,\), expected a scalar or \(13,\)"),
-        (JointSpring(1.0, rest=0.0), "rest is a scalar, but a joint with a quaternion needs all its coordinates, 15"),
-        (Drive(1.0, 1.0, [0.0, 0.0], joints=("knee_joint",)), r"target has shape \(2,\), expected a scalar or \(1,\)"),
-        (Drive(1.0, [1.0, 1.0], 0.0, joints=("knee_joint",)), r"kd has shape \(2,\), expected a scalar or \(1,\)"),
-        (ExternalWrench("fot", [0.0] * 6), "frame 'fot' is not in model 'arm'; did you mean foot"),
+        (
+            jd.forces.JointDamping(1.0, joints=("elbow",)),
+            r"JointDamping: joints \['elbow'\] are not in model 'arm'; it has",
+        ),
+        (jd.forces.JointDamping([1.0, 2.0]), r"coefficient has shape \(2,\), expected a scalar or \(13,\)"),
+        (
+            jd.forces.JointSpring(1.0, rest=0.0),
+            "rest is a scalar, but a joint with a quaternion needs all its coordinates, 15",
+        ),
+        (
+            jd.forces.Drive(1.0, 1.0, [0.0, 0.0], joints=("knee_joint",)),
+            r"target has shape \(2,\), expected a scalar or \(1,\)",
+        ),
+        (
+            jd.forces.Drive(1.0, [1.0, 1.0], 0.0, joints=("knee_joint",)),
+            r"kd has shape \(2,\), expected a scalar or \(1,\)",
+        ),
+        (jd.forces.ExternalWrench("fot", [0.0] * 6), "frame 'fot' is not in model 'arm'; did you mean foot"),
         (lambda system, q, v, t: q, r"forces\[0\] returned shape \(15,\), expected \(13,\)"),
     ],
 )
 def test_refused_when_called(arm, force, message):
     q, v = sample(arm)
     with pytest.raises(ValueError, match=message):
-        Scene(arm, forces=(force,)).applied_force(q, v)
+        jd.Scene(arm, forces=(force,)).applied_force(q, v)
 
 
 def test_refused_without_a_coefficient(sliders):
-    q, v = neutral(sliders), jnp.zeros(sliders.nv)
+    q, v = jd.neutral(sliders), jnp.zeros(sliders.nv)
     with pytest.raises(ValueError, match="JointDamping: no value given and the system has no damping"):
-        JointDamping()(sliders, q, v, 0.0)
+        jd.forces.JointDamping()(sliders, q, v, 0.0)
     with pytest.raises(ValueError, match="CoulombFriction: no value given and the system has no friction"):
-        CoulombFriction()(sliders, q, v, 0.0)
+        jd.forces.CoulombFriction()(sliders, q, v, 0.0)

@@ -8,19 +8,9 @@ import pytest
 from jax.tree_util import Partial
 from pinocchio_bridge import assert_close, quick
 
+import jaxdyn as jd
 from jaxdyn import geometry
-from jaxdyn.constraints import Holonomic
-from jaxdyn.constraints.base import constraint_jacobian
-from jaxdyn.constraints.dynamics import constrained_dynamics
 from jaxdyn.dynamics import quantities as dynamics
-from jaxdyn.forces.elements import JointDamping
-from jaxdyn.geometry.immersion import constrain_by_immersion, pull_back, reaction_force
-from jaxdyn.model.builder import ModelBuilder
-from jaxdyn.model.configuration import configuration_rate
-from jaxdyn.simulation.run import simulate
-from jaxdyn.systems.lagrangian import LagrangianSystem
-from jaxdyn.systems.scene import Scene
-from jaxdyn.systems.system import MetricSystem
 
 STATES = np.random.default_rng(4).normal(size=(4, 20, 3))
 
@@ -73,8 +63,8 @@ def levi_civita(q, v, w):
         "Bianchi": (R + R.transpose(0, 2, 3, 1), -R.transpose(0, 3, 1, 2)),
     }
     rest = jnp.zeros(())
-    lagrangian = LagrangianSystem(lambda q, v: 0.5 * jnp.sum(v * (bumpy(q) @ v)), 3)
-    metric = MetricSystem(bumpy, 3)
+    lagrangian = jd.LagrangianSystem(lambda q, v: 0.5 * jnp.sum(v * (bumpy(q) @ v)), 3)
+    metric = jd.MetricSystem(bumpy, 3)
     pairs |= {
         "geodesic": (geometry.geodesic_acceleration(bumpy, q, v), dynamics.forward_dynamics(lagrangian, q, v, 0 * v)),
         "bias": (metric.bias_force(q, v, rest), lagrangian.bias_force(q, v, rest)),
@@ -109,9 +99,9 @@ def test_surfaces_have_their_curvature():
     flat = lambda x: jnp.eye(x.shape[0])  # noqa: E731
     polar = lambda q: q[0] * jnp.stack([jnp.cos(q[1]), jnp.sin(q[1])])  # noqa: E731
     metrics = {
-        "sphere": (pull_back(flat, sphere), lambda q: 1 / 1.7**2 + 0 * q[0]),
-        "torus": (pull_back(flat, torus), lambda q: jnp.cos(q[0]) / (0.6 * (2 + 0.6 * jnp.cos(q[0])))),
-        "plane": (pull_back(flat, polar), lambda q: 0 * q[0]),
+        "sphere": (jd.geometry.pull_back(flat, sphere), lambda q: 1 / 1.7**2 + 0 * q[0]),
+        "torus": (jd.geometry.pull_back(flat, torus), lambda q: jnp.cos(q[0]) / (0.6 * (2 + 0.6 * jnp.cos(q[0])))),
+        "plane": (jd.geometry.pull_back(flat, polar), lambda q: 0 * q[0]),
         "hyperbolic": (lambda q: jnp.eye(2) / q[1] ** 2, lambda q: -1 + 0 * q[0]),
     }
     u, w = jnp.asarray([0.3, 1.1]), jnp.asarray([-0.8, 0.4])
@@ -134,7 +124,7 @@ def test_surfaces_have_their_curvature():
 
 def test_covariant_rate_is_the_tangent_part_of_the_rate_in_space():
     """Gauss: on a surface Dw/dt is what a rate in the surrounding space leaves in the tangent plane."""
-    metric = pull_back(lambda x: jnp.eye(3), torus)
+    metric = jd.geometry.pull_back(lambda x: jnp.eye(3), torus)
 
     @quick
     @jax.vmap
@@ -155,7 +145,7 @@ def test_pull_back_of_functions_forms_and_tensors():
 
     @quick
     def compute(s):
-        pulled = [pull_back(f, torus)(s) for f in (lambda x: x[2], jnp.sin, third)]
+        pulled = [jd.geometry.pull_back(f, torus)(s) for f in (lambda x: x[2], jnp.sin, third)]
         return torus(s), jax.jacfwd(torus)(s), *pulled
 
     x, J, height, form, tensor = (np.asarray(x) for x in compute(s))
@@ -190,20 +180,20 @@ def on_torus(q, t):
 
 def test_immersion_equals_multipliers():
     """A particle on a torus with drag and a given force: the same motion, and A^T lam is the reaction."""
-    particle = LagrangianSystem(in_gravity, 3)
-    immersed = constrain_by_immersion(Scene(particle, forces=(drag,)), torus, 2)
-    held = Scene(particle, (Holonomic(on_torus),), (drag,))
+    particle = jd.LagrangianSystem(in_gravity, 3)
+    immersed = jd.geometry.constrain_by_immersion(jd.Scene(particle, forces=(drag,)), torus, 2)
+    held = jd.Scene(particle, (jd.Holonomic(on_torus),), (drag,))
 
     @quick
     @jax.vmap
     def both(s, v, force):
         s, v = s[:2], v[:2]
         J = jax.jacfwd(torus)(s)
-        a = constrained_dynamics(immersed, s, v, J.T @ force).acceleration
+        a = jd.constrained_dynamics(immersed, s, v, J.T @ force).acceleration
         curve = lambda s, v: jax.jvp(torus, (s,), (v,))  # noqa: E731
         (q, speed), (_, whole) = jax.jvp(curve, (s, v), (v, a))
-        other = constrained_dynamics(held, q, speed, force)
-        reaction = reaction_force(immersed, s, v, force)
+        other = jd.constrained_dynamics(held, q, speed, force)
+        reaction = jd.geometry.reaction_force(immersed, s, v, force)
         A = jax.grad(on_torus)(q, 0.0)
         energies = [dynamics.kinetic_energy(of, *at) for of, at in ((immersed.system, (s, v)), (particle, (q, speed)))]
         return {
@@ -220,7 +210,7 @@ def test_immersion_equals_multipliers():
             ),
             "metric": (
                 dynamics.mass_matrix(immersed.system, s),
-                pull_back(lambda x: dynamics.mass_matrix(particle, x), torus)(s),
+                jd.geometry.pull_back(lambda x: dynamics.mass_matrix(particle, x), torus)(s),
             ),
         }
 
@@ -243,11 +233,11 @@ def on_helix(q, t):
 @pytest.mark.long
 def test_immersion_of_a_body_with_a_quaternion_equals_multipliers():
     """A body off its centre of mass on a helix, damped: velocities are body twists and not rates of coordinates."""
-    builder = ModelBuilder("nut")
+    builder = jd.ModelBuilder("nut")
     builder.add_body("nut", None, "free", (1.3, (0.1, -0.2, 0.05), (1.0, 2.0, 2.5)))
-    model, damping = builder.build(), (JointDamping(0.4),)
-    immersed = constrain_by_immersion(Scene(model, forces=damping), helix, 1)
-    held = Scene(model, (Holonomic(on_helix),), damping)
+    model, damping = builder.build(), (jd.forces.JointDamping(0.4),)
+    immersed = jd.geometry.constrain_by_immersion(jd.Scene(model, forces=damping), helix, 1)
+    held = jd.Scene(model, (jd.Holonomic(on_helix),), damping)
 
     @quick
     @jax.vmap
@@ -255,13 +245,16 @@ def test_immersion_of_a_body_with_a_quaternion_equals_multipliers():
         s, v, t = s[:1], v[:1], jnp.zeros(())
         system = immersed.system
         (twist,), (rate,) = system.velocities(s, v, t), jax.jvp(helix, (s,), (v,))[1:]
-        a = constrained_dynamics(immersed, s, v).acceleration
+        a = jd.constrained_dynamics(immersed, s, v).acceleration
         (whole,) = jax.jvp(lambda s, v: system.velocities(s, v, t), (s, v), (v, a))[1]
-        other = constrained_dynamics(held, helix(s), twist)
+        other = jd.constrained_dynamics(held, helix(s), twist)
         return {
-            "rate": (configuration_rate(model, helix(s), twist), rate),
+            "rate": (jd.configuration_rate(model, helix(s), twist), rate),
             "acceleration": (whole, other.acceleration),
-            "reaction": (reaction_force(immersed, s, v), constraint_jacobian(held, helix(s)).T @ other.multipliers),
+            "reaction": (
+                jd.geometry.reaction_force(immersed, s, v),
+                jd.constraint_jacobian(held, helix(s)).T @ other.multipliers,
+            ),
         }
 
     for name, (got, want) in both(*(jnp.asarray(x) for x in STATES[:2])).items():
@@ -271,7 +264,7 @@ def test_immersion_of_a_body_with_a_quaternion_equals_multipliers():
 def test_moving_immersion_is_a_bead_on_a_turning_hoop():
     """theta'' = w^2 sin cos - (g/r) sin; the moment that turns the hoop does the work by which the energy changes."""
     radius, rate = jnp.asarray(0.8), jnp.asarray(3.0)
-    system = constrain_by_immersion(LagrangianSystem(in_gravity, 3), Hoop(radius, rate), 1, moving=True)
+    system = jd.geometry.constrain_by_immersion(jd.LagrangianSystem(in_gravity, 3), Hoop(radius, rate), 1, moving=True)
 
     @quick
     @jax.vmap
@@ -288,7 +281,7 @@ def test_moving_immersion_is_a_bead_on_a_turning_hoop():
             (v, a, jnp.ones(())),
         )[1]
         _, across = jax.jvp(lambda t: Hoop(radius, rate)(s, t), (t,), (jnp.ones(()),))
-        reaction = reaction_force(system, s, v, t=t)
+        reaction = jd.geometry.reaction_force(system, s, v, t=t)
         return {"acceleration": (a[0], want), "power": (reaction @ across, power)}
 
     for name, (got, want) in both(*(jnp.asarray(x) for x in STATES[:3])).items():
@@ -299,8 +292,8 @@ def test_moving_immersion_is_a_bead_on_a_turning_hoop():
 def test_geodesic_of_the_sphere_is_a_great_circle():
     """Simulated, in float64; and the acceleration in float32."""
     q0, v0, ts = jnp.asarray([1.1, 0.3]), jnp.asarray([0.4, 0.9]), jnp.asarray([0.0, 0.5, 1.0])
-    system = MetricSystem(pull_back(lambda x: jnp.eye(3), sphere), 2)
-    solution = simulate(system, q0, v0, ts, rtol=1e-11, atol=1e-11)
+    system = jd.MetricSystem(jd.geometry.pull_back(lambda x: jnp.eye(3), sphere), 2)
+    solution = jd.simulate(system, q0, v0, ts, rtol=1e-11, atol=1e-11)
     x, speed = jax.jvp(sphere, (q0,), (v0,))
     rate = jnp.sqrt(jnp.sum(speed * speed)) / 1.7
     circle = jnp.cos(rate * ts)[:, None] * x[None] + jnp.sin(rate * ts)[:, None] * (speed / rate)[None]
@@ -314,27 +307,29 @@ def test_geodesic_of_the_sphere_is_a_great_circle():
 
 
 def test_bad_immersions_and_metrics_are_refused():
-    particle = LagrangianSystem(in_gravity, 3)
+    particle = jd.LagrangianSystem(in_gravity, 3)
     pole, one = jnp.asarray([0.0, 0.4]), jnp.ones(2)
-    on_sphere = constrain_by_immersion(particle, sphere, 2)
+    on_sphere = jd.geometry.constrain_by_immersion(particle, sphere, 2)
     with pytest.raises(ValueError, match=r"the immersion has rank 1 at s = \[0.0, 0.4\], expected 2"):
-        pull_back(bumpy, sphere)(pole)
+        jd.geometry.pull_back(bumpy, sphere)(pole)
     with pytest.raises(ValueError, match=r"the immersion has rank 1 at s = \[0.0, 0.4\], t = 0, expected 2"):
         dynamics.forward_dynamics(on_sphere, pole, one, one)
     with pytest.raises(ValueError, match=r"the immersion has rank 1 at s = \[0.0, 0.4\], t = 0, expected 2"):
-        simulate(on_sphere, pole, one, jnp.asarray([0.0, 1.0]))
+        jd.simulate(on_sphere, pole, one, jnp.asarray([0.0, 1.0]))
     with pytest.raises(ValueError, match=r"xi returned shapes \[\(3,\)\], expected \[\(2,\)\]"):
-        dynamics.mass_matrix(constrain_by_immersion(MetricSystem(lambda q: jnp.eye(2), 2), sphere, 2), one)
+        dynamics.mass_matrix(
+            jd.geometry.constrain_by_immersion(jd.MetricSystem(lambda q: jnp.eye(2), 2), sphere, 2), one
+        )
     with pytest.raises(ValueError, match="a scene has 1 constraints; an immersion takes their place"):
-        constrain_by_immersion(Scene(particle, (Holonomic(on_torus),)), torus, 2)
+        jd.geometry.constrain_by_immersion(jd.Scene(particle, (jd.Holonomic(on_torus),)), torus, 2)
     with pytest.raises(ValueError, match=r"field returned shape \(2, 2\), expected \(3, ...\)"):
-        pull_back(lambda x: jnp.eye(2), torus)(one)
+        jd.geometry.pull_back(lambda x: jnp.eye(2), torus)(one)
     with pytest.raises(ValueError, match="nq is 0"):
-        constrain_by_immersion(particle, torus, 0)
+        jd.geometry.constrain_by_immersion(particle, torus, 0)
     with pytest.raises(ValueError, match="forces or constraints in s, whose share in q is not known"):
-        reaction_force(Scene(on_sphere, forces=(drag,)), one, one)
+        jd.geometry.reaction_force(jd.Scene(on_sphere, forces=(drag,)), one, one)
     with pytest.raises(ValueError, match="system is a LagrangianSystem; pass the result of constrain_by_immersion"):
-        reaction_force(particle, jnp.ones(3), jnp.ones(3))
+        jd.geometry.reaction_force(particle, jnp.ones(3), jnp.ones(3))
     with pytest.raises(ValueError, match="kind is 'third'; choose from first, second"):
         geometry.christoffel_symbols(bumpy, jnp.ones(3), "third")
     with pytest.raises(ValueError, match=r"metric returned shape \(3, 3\), expected \(2, 2\)"):

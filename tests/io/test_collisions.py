@@ -8,7 +8,6 @@ import numpy as np
 import pytest
 
 import jaxdyn as jd
-from jaxdyn.contact import HeightField, Plane
 from jaxdyn.contact.shapes import hull_vertices
 
 INERTIAL = '<inertial><mass value="1"/><inertia ixx="1" iyy="1" izz="1" ixy="0" ixz="0" iyz="0"/></inertial>'
@@ -223,7 +222,7 @@ def test_mjcf_height_fields_and_no_ground(tmp_path):
     path.write_text(MJCF.format(ground=field, more=""))
     touching = touching_of(load(path, contacts=["d"]))
     on = touching["d"].contact.on
-    assert isinstance(on, HeightField)
+    assert isinstance(on, jd.contact.HeightField)
     m = mujoco.MjModel.from_xml_path(str(path))
     d = mujoco.MjData(m)
     mujoco.mj_kinematics(m, d)
@@ -237,7 +236,7 @@ def test_mjcf_height_fields_and_no_ground(tmp_path):
     path.write_text(MJCF.format(ground="", more=""))
     scene = load(path, contacts=["d"])
     contact = touching_of(scene)["d"].contact
-    assert isinstance(contact.on, Plane)
+    assert isinstance(contact.on, jd.contact.Plane)
     np.testing.assert_allclose(contact.position(scene.system, scene.starts["reference"].q, 0.0), 3.8, atol=1e-15)
     path.write_text(MJCF.format(ground=FLOOR, more='<option><flag contact="disable"/></option>'))
     scene = load(path, contacts="ground")

@@ -7,7 +7,6 @@ import numpy as np
 import pytest
 
 import jaxdyn as jd
-from jaxdyn.model.builder import ModelBuilder
 
 URDF = """<robot name="r"><link name="a"/><link name="b"><inertial><origin xyz="0 0 0.5"/><mass value="2"/>
 <inertia ixx="1" iyy="1" izz="1" ixy="0" ixz="0" iyz="0"/></inertial></link>
@@ -64,7 +63,7 @@ def test_the_model_of_a_log_says_which_columns_are_angles(tmp_path):
     np.savetxt(path, np.stack([t, wrapped, np.cos(t)], 1), delimiter=",", header="t,q1,tau1", comments="")
 
     def model(kind):
-        builder = ModelBuilder("one")
+        builder = jd.ModelBuilder("one")
         builder.add_body("a", None, kind, (1.0, (0, 0, 0), (0.1, 0.1, 0.1)), axis=(0, 0, 1))
         return builder.build()
 

@@ -14,13 +14,7 @@ from hypothesis import strategies as st
 
 import jaxdyn as jd
 from jaxdyn import inertia, robots
-from jaxdyn.dynamics import kinematics
-from jaxdyn.dynamics.centroidal import center_of_mass
-from jaxdyn.io import load_urdf
-from jaxdyn.model import configuration as mdl
 from jaxdyn.model import host_math, joints
-from jaxdyn.model.builder import ModelBuilder
-from jaxdyn.model.tree import inertia_report, repair_inertias
 from tests.pinocchio_bridge import quick, to_pinocchio
 
 BALL = (2.0, (0.1, 0.2, 0.3), (0.03, 0.04, 0.05))
@@ -30,14 +24,14 @@ LEAVES += ("velocity_limit", "effort_limit", "coupling_values")
 
 def built(**options):
     """The model of one body with the given options of `add_body`."""
-    return ModelBuilder("one").add_body("b", **{"inertia": BALL, **options}).build()
+    return jd.ModelBuilder("one").add_body("b", **{"inertia": BALL, **options}).build()
 
 
 def test_order_is_depth_first_by_joint_name_whatever_the_order_of_addition():
     #        world -> c, a;  a -> z, m(fixed);  m -> k
     bodies = {"a": None, "c": None, "z": "a", "m": "a", "k": "m"}
     for order in (["c", "a", "z", "m", "k"], ["a", "m", "k", "z", "c"]):
-        builder = ModelBuilder("order")
+        builder = jd.ModelBuilder("order")
         for name in order:
             joint = "fixed" if name == "m" else "prismatic"
             builder.add_body(name, bodies[name], joint, BALL, joint_name=f"j{name}", pose=(1, 0, 0))
@@ -53,7 +47,7 @@ def test_order_is_depth_first_by_joint_name_whatever_the_order_of_addition():
 
 def test_fixed_bodies_are_merged_with_their_inertia():
     pose, rpy = (0.3, -0.2, 0.5), (0.4, -0.9, 1.3)
-    builder = ModelBuilder().add_body("a", None, "free", BALL)
+    builder = jd.ModelBuilder().add_body("a", None, "free", BALL)
     builder.add_body("b", "a", "fixed", BALL, pose=(pose, rpy)).add_body("c", "b", "fixed", BALL, pose=(pose, rpy))
     builder.add_frame("f", "c", (0, 0, 1)).add_frame("w", None, (1, 2, 3))
     model = builder.build()
@@ -67,7 +61,7 @@ def test_fixed_bodies_are_merged_with_their_inertia():
 
 
 def test_inertia_fixed_to_the_world_is_dropped_and_its_frame_kept():
-    model = ModelBuilder().add_body("base", joint="fixed", inertia=BALL, pose=(1, 2, 3)).build()
+    model = jd.ModelBuilder().add_body("base", joint="fixed", inertia=BALL, pose=(1, 2, 3)).build()
     assert (model.nb, model.nq, model.nv) == (0, 0, 0)
     assert model.frame_names == ("base",) and model.topology.frame_bodies == (-1,)
     np.testing.assert_array_equal(model.frame_poses[0][:3, 3], [1, 2, 3])
@@ -95,7 +89,7 @@ def test_screws():
 
 
 def test_joint_leaves_are_absent_until_one_joint_has_them():
-    builder = ModelBuilder().add_body("a", None, "planar", BALL, damping=0.5, lower=(-1, -2, -3), effort_limit=7)
+    builder = jd.ModelBuilder().add_body("a", None, "planar", BALL, damping=0.5, lower=(-1, -2, -3), effort_limit=7)
     builder.add_body("b", "a", "revolute", BALL, armature=0.1, upper=2.0, velocity_limit=4)
     model = builder.build()
     np.testing.assert_array_equal(model.armature, [0, 0, 0, 0.1])
@@ -108,7 +102,7 @@ def test_joint_leaves_are_absent_until_one_joint_has_them():
 
 
 def test_couplings_are_static_pairs_with_values_as_leaves():
-    builder = ModelBuilder().add_body("a", None, inertia=BALL).add_body("b", "a", inertia=BALL)
+    builder = jd.ModelBuilder().add_body("a", None, inertia=BALL).add_body("b", "a", inertia=BALL)
     builder.add_body("c", "b", "prismatic", BALL).add_coupling("c_joint", "a_joint", -0.5, 0.25)
     model = builder.build()
     assert model.topology.couplings == ((2, 0),)
@@ -120,8 +114,8 @@ def test_couplings_are_static_pairs_with_values_as_leaves():
 
 def test_gravity_and_dtype():
     assert built().gravity.tolist() == [0, 0, -9.81]
-    assert ModelBuilder(gravity=None).add_body("b", inertia=BALL).build().gravity is None
-    model = ModelBuilder(dtype=jnp.float32).add_body("b", inertia=BALL, armature=1).build()
+    assert jd.ModelBuilder(gravity=None).add_body("b", inertia=BALL).build().gravity is None
+    model = jd.ModelBuilder(dtype=jnp.float32).add_body("b", inertia=BALL, armature=1).build()
     assert {leaf.dtype for leaf in jax.tree.leaves(model)} == {jnp.dtype("float32")}
     assert not any(leaf.weak_type for leaf in jax.tree.leaves(model))
 
@@ -161,7 +155,7 @@ def test_order_of_addition_does_not_matter(order, seed):
     kinds = rng.choice(["revolute", "fixed", "free"], 8)
 
     def build(order):
-        builder, done, left = ModelBuilder(), {None}, list(order)
+        builder, done, left = jd.ModelBuilder(), {None}, list(order)
         while left:
             i = next(i for i in left if parents[i] in done)
             left.remove(i)
@@ -228,14 +222,14 @@ BAD_BODIES = {
 @pytest.mark.parametrize("case", BAD_BODIES)
 def test_bad_bodies(case):
     options, message = BAD_BODIES[case]
-    builder = ModelBuilder().add_body("a", inertia=EYE).add_frame("f", "a")
+    builder = jd.ModelBuilder().add_body("a", inertia=EYE).add_frame("f", "a")
     with pytest.raises(ValueError, match=f"(?s){message}"):
         builder.add_body(**{"name": "b", "inertia": EYE, **options})
     assert builder.build().body_names == ("a",)  # nothing half-built
 
 
 def test_bad_frames_couplings_and_settings():
-    builder = ModelBuilder().add_body("a", inertia=EYE).add_body("b", "a", "prismatic", EYE)
+    builder = jd.ModelBuilder().add_body("a", inertia=EYE).add_body("b", "a", "prismatic", EYE)
     builder.add_body("s", "b", "spherical", EYE).add_body("c", "s", "fixed").add_frame("f", "a")
     bad = {
         "the name 'f' is taken": lambda: builder.add_frame("f", "a"),
@@ -246,8 +240,8 @@ def test_bad_frames_couplings_and_settings():
         "'c_joint' is fixed": lambda: builder.add_coupling("b_joint", "c_joint"),
         "would follow itself": lambda: builder.add_coupling("b_joint", "b_joint"),
         "is nan|is .*nan.*finite": lambda: builder.add_coupling("b_joint", "a_joint", np.nan),
-        r"gravity has shape \(2,\)": lambda: ModelBuilder(gravity=(0, 0)),
-        "dtype is .*floating-point": lambda: ModelBuilder(dtype=jnp.int32),
+        r"gravity has shape \(2,\)": lambda: jd.ModelBuilder(gravity=(0, 0)),
+        "dtype is .*floating-point": lambda: jd.ModelBuilder(dtype=jnp.int32),
     }
     for message, act in bad.items():
         with pytest.raises(ValueError, match=message):
@@ -260,11 +254,11 @@ def test_bad_frames_couplings_and_settings():
     with jax.enable_x64(False):
         assert built().home.dtype == jnp.float32
         with pytest.raises(ValueError, match="dtype is float64, but jax runs in 32 bits"):
-            ModelBuilder(dtype=jnp.float64)
+            jd.ModelBuilder(dtype=jnp.float64)
 
 
 def singular(*bodies):
-    builder = ModelBuilder()
+    builder = jd.ModelBuilder()
     for body in bodies:
         builder.add_body(**body)
     return builder
@@ -340,32 +334,32 @@ def test_what_is_singular_at_one_configuration_alone_is_accepted():
 
 
 def test_inertia_report_and_repair():
-    builder = ModelBuilder().add_body("whole", inertia=BALL)
+    builder = jd.ModelBuilder().add_body("whole", inertia=BALL)
     builder.add_body("flat", "whole", inertia=(1.0, (0, 0, 1), (0.1, -0.2, 0.3)))
     builder.add_body("long", "flat", inertia=(1.0, (1, 0, 1), (0.1, 0.2, 0.4)))
     builder.add_body("none", "long", armature=1.0)
     builder.add_body("rotor", "none", inertia=[0, 0, 0, 0, 1, 0, 1, 0, 0, 1])
     model = builder.build()
-    report = inertia_report(model)
+    report = jd.model.inertia_report(model)
     assert [name for name, _ in report] == ["flat", "long", "none", "rotor"]
     texts = dict(report)
     assert texts["flat"] == "not positive definite: principal moments -0.2, 0.1, 0.3 kg m^2"
     assert texts["long"] == "triangle inequality violated: principal moments 0.1, 0.2, 0.4 kg m^2"
     assert texts["none"] == "massless"
     assert texts["rotor"].startswith("mass 0.0 kg with")
-    repaired = repair_inertias(model)
-    assert [name for name, _ in inertia_report(repaired)] == ["none", "rotor"]
+    repaired = jd.model.repair_inertias(model)
+    assert [name for name, _ in jd.model.inertia_report(repaired)] == ["none", "rotor"]
     assert all(inertia.is_feasible(repaired.inertias[i]) for i in (0, 1, 2))
     np.testing.assert_array_equal(repaired.inertias[jnp.array([0, 3, 4])], model.inertias[jnp.array([0, 3, 4])])
     np.testing.assert_allclose(repaired.inertias[:, 0], model.inertias[:, 0], rtol=1e-14)
     # What is not feasible has to change; first moments (kg m) stay near those that were given.
     np.testing.assert_allclose(repaired.inertias[1:3, 1:4], model.inertias[1:3, 1:4], atol=0.1)
-    assert inertia_report(robots.iiwa()) == inertia_report(robots.iiwa(dtype=jnp.float32)) == []
+    assert jd.model.inertia_report(robots.iiwa()) == jd.model.inertia_report(robots.iiwa(dtype=jnp.float32)) == []
 
 
 def test_iiwa_kinematics_are_the_published_ones():
     model = robots.iiwa()
-    poses = quick(jax.vmap(kinematics.forward_kinematics, (None, 0)))
+    poses = quick(jax.vmap(jd.forward_kinematics, (None, 0)))
     q = jnp.radians(jnp.array([[0.0] * 7, [60, 30, 60, 30, 60, 30, 60]]))
     straight, bent = poses(model, q)[:, -1]
     np.testing.assert_allclose(straight[:3, :3], np.eye(3), atol=1e-15)
@@ -384,11 +378,11 @@ def test_iiwa_kinematics_are_the_published_ones():
 
 def test_ur5_has_the_places_and_masses_of_its_description(robots_dir):
     """Frames against the URDF of example-robot-data, whose right angles have eleven digits; moments are ours."""
-    model, theirs = robots.ur5(), load_urdf(robots_dir / "ur_description" / "urdf" / "ur5_robot.urdf")
-    assert model.nv == 6 and inertia_report(model) == []
+    model, theirs = robots.ur5(), jd.load_urdf(robots_dir / "ur_description" / "urdf" / "ur5_robot.urdf")
+    assert model.nv == 6 and jd.model.inertia_report(model) == []
     np.testing.assert_allclose(model.inertias[:, :4], theirs.inertias[:, :4], atol=1e-9)
     np.testing.assert_allclose(model.upper, theirs.upper, rtol=1e-11)
-    pose = quick(lambda model, q: kinematics.frame_pose(model, q, "tool0"))
+    pose = quick(lambda model, q: jd.frame_pose(model, q, "tool0"))
     for q in jnp.asarray(np.random.default_rng(0).uniform(-3, 3, (3, 6))):
         np.testing.assert_allclose(pose(model, q), pose(theirs, q), atol=1e-10)
 
@@ -396,19 +390,19 @@ def test_ur5_has_the_places_and_masses_of_its_description(robots_dir):
 @pytest.mark.parametrize("floating", [True, False])
 def test_quadruped_stands_on_its_feet(floating):
     model = robots.quadruped(floating_base=floating)
-    assert (model.nv, inertia_report(model)) == (18 if floating else 12, [])
-    q = mdl.neutral(model)
+    assert (model.nv, jd.model.inertia_report(model)) == (18 if floating else 12, [])
+    q = jd.neutral(model)
     for leg in ("FL", "FR", "RL", "RR"):
         for joint, angle in (("hip", 0.0), ("thigh", 0.8), ("knee", -1.6)):
             q = q.at[model.q_index(f"{leg}_{joint}")].set(angle)
     # Thigh and shank make an isosceles triangle: the feet stand under the hips, 0.4 cos 0.8 below.
     for leg, x, y in (("FL", 0.2, 0.14), ("RR", -0.2, -0.14)):
-        foot = quick(lambda model, q, leg=leg: kinematics.frame_pose(model, q, f"{leg}_foot"))(model, q)
+        foot = quick(lambda model, q, leg=leg: jd.frame_pose(model, q, f"{leg}_foot"))(model, q)
         np.testing.assert_allclose(foot[:3, 3], [x, y, -0.4 * np.cos(0.8)], atol=1e-15)
     moving = 6.0 * floating + 4 * 1.5
     np.testing.assert_allclose(model.inertias[:, 0].sum(), moving, rtol=1e-14)
     # Thighs and shanks, 0.5 kg each, have their centres 0.1 sin 0.8 behind the hips.
-    center = quick(center_of_mass)(model, q)
+    center = quick(jd.center_of_mass)(model, q)
     np.testing.assert_allclose(center[:2], [-0.4 * np.sin(0.8) / moving, 0.0], atol=1e-15)
 
 
@@ -444,7 +438,7 @@ def test_random_trees_are_seeded_and_have_every_kind():
     again, other = robots.random_tree(3, 21, branching=2), robots.random_tree(4, 21, branching=2)
     np.testing.assert_array_equal(model.home, again.home)
     assert not np.allclose(model.home, other.home)
-    assert inertia_report(model) == []
+    assert jd.model.inertia_report(model) == []
     assert max(model.topology.parents.count(i) for i in range(21)) == 2
     assert robots.random_tree(0, 6, branching=1).topology.parents == (-1, 0, 1, 2, 3, 4)
     assert robots.random_tree(0, 6, branching=6).topology.parents == (-1, 0, 0, 0, 0, 0)
@@ -454,7 +448,7 @@ def test_random_trees_are_seeded_and_have_every_kind():
     np.testing.assert_array_equal(
         robots.random_tree(jax.random.key(5), 4).home, robots.random_tree(jax.random.key(5), 4).home
     )
-    assert mdl.neutral(model).shape == (model.nq,)
+    assert jd.neutral(model).shape == (model.nq,)
     for options, message in ((dict(nb=0), "nb is 0"), (dict(nb=2, branching=0.5), "branching 0.5")):
         with pytest.raises(ValueError, match=message):
             robots.random_tree(0, **options)
@@ -474,7 +468,7 @@ def test_mass_matrix_is_singular_exactly_where_a_build_is_refused(seed):
         axes, poses = rng.normal(size=(7, 3)), rng.normal(size=(7, 2, 3))
 
         def assemble(armature, kinds=kinds, parents=parents, heavy=heavy, axes=axes, poses=poses):
-            builder = ModelBuilder()
+            builder = jd.ModelBuilder()
             for i in range(7):
                 body = BALL if heavy[i] else None
                 builder.add_body(
@@ -592,7 +586,7 @@ def test_swapped_arguments_of_inertias_are_named():
 @pytest.mark.long
 def test_a_motion_that_starts_where_a_gimbal_locks_says_so():
     """Three hinges with massless links: where the first and the last are parallel, no inertia answers to their difference."""
-    builder = ModelBuilder("gimbal", gravity=None)
+    builder = jd.ModelBuilder("gimbal", gravity=None)
     for name, parent, axis in (("x", None, (1, 0, 0)), ("y", "x", (0, 1, 0)), ("z", "y", (0, 0, 1))):
         builder.add_body(name, parent, axis=axis, inertia=BALL if name == "z" else None)
     model, v = builder.build(), jnp.asarray([0.1, 0.2, 0.3])

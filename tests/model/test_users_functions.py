@@ -11,8 +11,6 @@ import pytest
 from pinocchio_bridge import assert_close, quick, random_inertia, random_states, random_tree, to_pinocchio
 
 import jaxdyn as jd
-from jaxdyn.constraints.base import constraint_jacobian
-from jaxdyn.lie import se3
 
 KINDS = ("free", "revolute", "planar", "helical", "spherical", "prismatic", "revolute")
 URDF = """<robot name="arm">
@@ -60,7 +58,7 @@ def test_selection_matrix_takes_the_motors(tree):
 
 def test_payload_is_a_body_welded_there():
     own, carried = (random_inertia(np.random.default_rng(k)) for k in range(2))
-    pose = np.asarray(se3.exp(jnp.array([0.1, -0.2, 0.3, 0.4, 0.5, -0.6])))
+    pose = np.asarray(jd.se3.exp(jnp.array([0.1, -0.2, 0.3, 0.4, 0.5, -0.6])))
 
     def arm(welded):
         builder = jd.ModelBuilder("arm").add_body("upper", axis=(0, 1, 0), inertia=own)
@@ -167,7 +165,7 @@ def test_degrees_of_freedom(name, freedom):
     scene, q = make(), make.start()[0]
     computed = jd.degrees_of_freedom(scene, q)
     assert computed == freedom and isinstance(computed, int)
-    assert freedom == scene.nv - np.linalg.matrix_rank(constraint_jacobian(scene, q), tol=1e-8)
+    assert freedom == scene.nv - np.linalg.matrix_rank(jd.constraint_jacobian(scene, q), tol=1e-8)
     traced = jax.jit(jax.vmap(lambda q: jd.degrees_of_freedom(scene, q)))(jnp.stack([q, q]))
     np.testing.assert_array_equal(traced, [freedom, freedom])
     assert jd.degrees_of_freedom(scene.system, q) == scene.nv

@@ -20,9 +20,8 @@ from pinocchio_bridge import assert_close, quick
 from scipy.linalg import expm
 from scipy.optimize import brentq
 
+import jaxdyn as jd
 from jaxdyn import scenes
-from jaxdyn.dynamics.quantities import mass_matrix
-from jaxdyn.simulation.run import simulate
 
 ROLL, REAR, STEER = 3, 6, 7  # places in v
 GRAVITY, RADIUS = 9.81, 0.3
@@ -79,7 +78,7 @@ def linear():
         q, _ = leaning(scene, x, jnp.zeros(()))
         basis = jax.vmap(lambda rates: leaning(scene, rates, jnp.zeros(()))[1])(jnp.eye(4)[2:])
         starts = [scenes.bicycle.start(speed=0.0, **rate) for rate in ({"roll_rate": 1.0}, {"steer_rate": 1.0})]
-        return J, basis.T, mass_matrix(scene.system, q), jnp.stack([v for _, v in starts], 1)
+        return J, basis.T, jd.mass_matrix(scene.system, q), jnp.stack([v for _, v in starts], 1)
 
     J, N, full, starts = (np.asarray(x) for x in compute(jnp.arange(11.0)))
     M = N.T @ full @ N
@@ -166,7 +165,7 @@ def test_nonlinear_motion_after_a_push(linear):
     def run(roll_rate):
         q, v = scenes.bicycle.start(speed=4.6, roll_rate=roll_rate)
         options = {"stepsize": 0.02, "solver": diffrax.Dopri8(), "outputs": ("energy", "constraint_residual")}
-        return simulate(scene, q, v, ts, **options)
+        return jd.simulate(scene, q, v, ts, **options)
 
     computed = run(jnp.asarray(0.5))
     assert bool(computed.success) and float(computed.constraint_residual.max()) <= 1e-12

@@ -13,10 +13,7 @@ from pinocchio_bridge import assert_close, quick
 import jaxdyn as jd
 from benchmarks.overconstrained import MECHANISMS, distance
 from jaxdyn.constraints.assembly import residuals
-from jaxdyn.constraints.base import constraint_jacobian
-from jaxdyn.constraints.dynamics import RESULTS, constrained_dynamics
 from jaxdyn.constraints.selection import select_rows
-from jaxdyn.dynamics.centroidal import kinetic_energy, potential_energy
 
 # Name, rows, rank, freedom.
 COUNTS = [
@@ -61,7 +58,7 @@ def test_rank_and_freedom(name, rows, rank, freedom):
     assert selection.kept.shape == (rows,) and selection.kept.sum() == rank
     assert jd.degrees_of_freedom(one.scene, q) == freedom == one.scene.nv - rank
     assert float(jnp.max(jnp.asarray(residuals(one.scene, q, v)))) < 1e-14 * (1 + float(jnp.abs(v).max()))
-    singular = np.linalg.svd(constraint_jacobian(one.scene, q), compute_uv=False)
+    singular = np.linalg.svd(jd.constraint_jacobian(one.scene, q), compute_uv=False)
     assert (singular > 1e-9 * singular[0]).sum() == rank
 
 
@@ -76,16 +73,16 @@ def test_energies_and_accelerations_in_minimal_coordinates(name):
 
     @quick
     def compute(q, v):
-        computed = constrained_dynamics(one.scene, q, v)
-        return kinetic_energy(system, q, v), potential_energy(system, q), computed.acceleration, computed.result
+        computed = jd.constrained_dynamics(one.scene, q, v)
+        return jd.kinetic_energy(system, q, v), jd.potential_energy(system, q), computed.acceleration, computed.result
 
     kinetic, potential, acceleration, result = compute(q, v)
     wanted = one.energies(jnp.asarray(x), jnp.asarray(rate))
-    assert result == RESULTS.successful
+    assert result == jd.RESULTS.successful
     np.testing.assert_allclose(kinetic, wanted[0], rtol=1e-12)
     # Heights count from another place in the scene where bars do not start at the hinges of the ground.
     moved = x + 0.05
-    change = potential_energy(system, jnp.asarray(one.start(moved, rate)[0])) - potential
+    change = jd.potential_energy(system, jnp.asarray(one.start(moved, rate)[0])) - potential
     np.testing.assert_allclose(change, one.energies(jnp.asarray(moved), jnp.asarray(rate))[1] - wanted[1], atol=1e-11)
     rates = jnp.asarray(rate), one.acceleration()(x, rate)
     change = jax.jvp(lambda x, rate: one.start(x, rate)[1], (jnp.asarray(x), jnp.asarray(rate)), rates)[1]
@@ -100,7 +97,7 @@ def test_the_height_of_sarrus_linkage_by_hand():
     @quick
     @jax.vmap
     def compute(q, v):
-        a = constrained_dynamics(scene, q, v).acceleration
+        a = jd.constrained_dynamics(scene, q, v).acceleration
         height = lambda q: 2 * lengths[0] * jnp.sin(q[0])  # noqa: E731
         rate = lambda q, v: jax.jvp(height, (q,), (v,))[1]  # noqa: E731
         place = jd.frame_pose(scene.system, q, "platform")

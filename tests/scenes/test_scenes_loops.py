@@ -8,16 +8,10 @@ import pytest
 from pinocchio_bridge import assert_close, quick
 from scipy.integrate import solve_ivp
 
+import jaxdyn as jd
 from benchmarks.report_cases import test_set
 from jaxdyn import scenes
-from jaxdyn.constraints.assembly import assemble, residuals
-from jaxdyn.constraints.base import constraint_jacobian
-from jaxdyn.constraints.dynamics import RESULTS, constrained_dynamics, projections
-from jaxdyn.dynamics.centroidal import kinetic_energy, potential_energy
-from jaxdyn.simulation.methods import Projected
-from jaxdyn.simulation.run import simulate
-from jaxdyn.systems.lagrangian import LagrangianSystem
-from jaxdyn.systems.system import ExplicitSystem
+from jaxdyn.constraints.assembly import residuals
 
 
 @pytest.fixture(scope="module")
@@ -30,8 +24,13 @@ def parallel():
 
     @quick
     def solve(taus):
-        dynamics = jax.vmap(lambda tau: constrained_dynamics(scene, q, v, tau))(taus)
-        return dynamics, residuals(scene, q, v), constraint_jacobian(scene, q), projections(scene, q).P_omega
+        dynamics = jax.vmap(lambda tau: jd.constrained_dynamics(scene, q, v, tau))(taus)
+        return (
+            dynamics,
+            residuals(scene, q, v),
+            jd.constraint_jacobian(scene, q),
+            jd.constraints.projections(scene, q).P_omega,
+        )
 
     M, h, J, carried = np.zeros((6, 6)), np.zeros(6), np.zeros((6, 2)), np.zeros(6)
     unit = mass * length**2
@@ -95,7 +94,11 @@ def test_ring_of_bars():
     scene = scenes.closed_ring(count=count, mass=mass, length=length)
     solve = quick(
         jax.vmap(
-            lambda q, v: (residuals(scene, q, v), constrained_dynamics(scene, q, v), constraint_jacobian(scene, q))
+            lambda q, v: (
+                residuals(scene, q, v),
+                jd.constrained_dynamics(scene, q, v),
+                jd.constraint_jacobian(scene, q),
+            )
         )
     )
     polygon = scenes.closed_ring.start(count=count, length=length, rate=rate)
@@ -186,13 +189,13 @@ class Bennett:
 def test_bennett_linkage():
     """Five rows of rank two: one freedom that counting does not find, with the right acceleration."""
     scene, oracle = scenes.bennett(), Bennett()
-    solve = quick(jax.vmap(lambda q, v: (residuals(scene, q, v), constrained_dynamics(scene, q, v))))
+    solve = quick(jax.vmap(lambda q, v: (residuals(scene, q, v), jd.constrained_dynamics(scene, q, v))))
     cases = [(0.8, 1.0), (2.5, -0.7), (-1.2, 2.0)]
     starts = [scenes.bennett.start(angle=angle, rate=rate) for angle, rate in cases]
     error, computed = solve(*(jnp.stack(x) for x in zip(*starts, strict=True)))
     assert float(error.max()) < 1e-14
     assert (np.asarray(computed.rank) == 2).all() and computed.multipliers.shape == (3, 5)
-    assert bool((computed.result == RESULTS.successful).all())
+    assert bool((computed.result == jd.RESULTS.successful).all())
     for (angle, rate), a in zip(cases, np.asarray(computed.acceleration), strict=True):
         first = oracle.acceleration(angle, rate)
         follower = oracle.angles(angle)[1]
@@ -216,15 +219,15 @@ def test_andrews_from_its_bodies():
 
     @quick
     def compute(q, v):
-        state = assemble(printed, q, v)
+        state = jd.assemble(printed, q, v)
         q, v = state.q, state.v
         x, w = q[order], v[order]
         rows = []
         for scene, place, rate in ((printed, q, v), (built, x, w)):
-            energy = kinetic_energy(scene.system, place, rate)
-            a = constrained_dynamics(scene, place, rate).acceleration
+            energy = jd.kinetic_energy(scene.system, place, rate)
+            a = jd.constrained_dynamics(scene, place, rate).acceleration
             rows.append((a, energy, residuals(scene, place, rate)))
-        return rows, potential_energy(printed.system, q), built.forces[0].energy(built.system, x)
+        return rows, jd.potential_energy(printed.system, q), built.forces[0].energy(built.system, x)
 
     rates = [1140.0, -1424.0, 11.0, 19.0, 0.6, -19.0, 0.3]
     for q, v in ((q0, v0), (jnp.asarray(rough), jnp.asarray(rates))):
@@ -253,15 +256,15 @@ def test_spherical_pendulum_three_ways():
 
     start = {"length": radius, "theta": 0.9, "phi": 0.3, "theta_rate": 0.4, "phi_rate": 1.1}
     state = scenes.spherical_pendulum.start(**start)
-    angles = LagrangianSystem(kinetic_minus_potential, 2)
-    form = ExplicitSystem(lambda q: jnp.eye(3), pull, 3)
+    angles = jd.LagrangianSystem(kinetic_minus_potential, 2)
+    form = jd.ExplicitSystem(lambda q: jnp.eye(3), pull, 3)
 
     @quick
     def run():
         options = {"stepsize": 0.02, "solver": diffrax.Dopri8()}
-        first = simulate(angles, jnp.asarray([0.9, 0.3]), jnp.asarray([0.4, 1.1]), t, **options).q
-        projected = simulate(scenes.spherical_pendulum(length=radius), *state, t, **options).q
-        return first, projected, simulate(form, *state, t, **options).q
+        first = jd.simulate(angles, jnp.asarray([0.9, 0.3]), jnp.asarray([0.4, 1.1]), t, **options).q
+        projected = jd.simulate(scenes.spherical_pendulum(length=radius), *state, t, **options).q
+        return first, projected, jd.simulate(form, *state, t, **options).q
 
     chart, projected, form = (np.asarray(x) for x in run())
     sine = np.sin(chart[:, 0])
@@ -288,12 +291,12 @@ def test_motion_of_the_bennett_linkage():
         t_eval=ts,
     ).y
     q0, v0 = scenes.bennett.start(angle=0.8, rate=1.0)
-    motion = simulate(
+    motion = jd.simulate(
         scenes.bennett(),
         q0,
         v0,
         ts,
-        method=Projected(rank_tol=1e-4),
+        method=jd.Projected(rank_tol=1e-4),
         stepsize=0.002,
         outputs=("constraint_residual",),
     )
@@ -313,7 +316,7 @@ def test_a01_pendulum_for_2000_seconds():
     @jax.jit
     def run():
         options = {"stepsize": 0.02, "solver": diffrax.Dopri8(), "outputs": ("energy", "constraint_residual")}
-        return simulate(scene, q, v, ts, max_steps=110_000, **options)
+        return jd.simulate(scene, q, v, ts, max_steps=110_000, **options)
 
     computed = run()
     want = [

@@ -8,10 +8,9 @@ import pytest
 from linearisation import admissible, motion_jacobian
 from pinocchio_bridge import assert_close, quick
 
+import jaxdyn as jd
 from jaxdyn import scenes, so3
 from jaxdyn.constraints.assembly import residuals
-from jaxdyn.constraints.dynamics import constrained_dynamics
-from jaxdyn.simulation.run import simulate
 
 
 def motion(scene, state, ts, stepsize):
@@ -20,7 +19,7 @@ def motion(scene, state, ts, stepsize):
     @quick
     def run(q, v):
         options = {"stepsize": stepsize, "solver": diffrax.Dopri8(), "outputs": ("constraint_residual",)}
-        return simulate(scene, q, v, jnp.asarray(ts), **options)
+        return jd.simulate(scene, q, v, jnp.asarray(ts), **options)
 
     computed = run(*state)
     assert bool(computed.success) and float(computed.constraint_residual.max()) <= 1e-12
@@ -29,7 +28,7 @@ def motion(scene, state, ts, stepsize):
 
 def solved(scene, state, tau):
     """Residuals and acceleration at a state."""
-    compute = quick(lambda q, v, tau: (residuals(scene, q, v), constrained_dynamics(scene, q, v, tau)))
+    compute = quick(lambda q, v, tau: (residuals(scene, q, v), jd.constrained_dynamics(scene, q, v, tau)))
     error, computed = compute(*state, jnp.asarray(tau))
     assert float(error.max()) < 1e-14
     return computed

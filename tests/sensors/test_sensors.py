@@ -9,14 +9,6 @@ from pinocchio_bridge import assert_close, quick
 
 import jaxdyn as jd
 from jaxdyn import scenes, sensors
-from jaxdyn.constraints.dynamics import constrained_dynamics
-from jaxdyn.dynamics.joint_wrenches import joint_wrench
-from jaxdyn.dynamics.kinematics import frame_pose
-from jaxdyn.dynamics.quantities import forward_dynamics
-from jaxdyn.lie import so3
-from jaxdyn.model import inertia, robots
-from jaxdyn.model.builder import ModelBuilder
-from jaxdyn.systems.scene import Scene
 
 FILE = """
 <mujoco>
@@ -87,7 +79,7 @@ def test_mujoco_reads_the_same(tmp_path):
     v = rng.normal(size=scene.nv)
     oracle.set(q, v)
     mujoco.mj_sensorPos(oracle.m, oracle.data)
-    readings = sensors.measure(Scene(scene.system), scene.sensors, jnp.asarray(q), jnp.asarray(v))
+    readings = sensors.measure(jd.Scene(scene.system), scene.sensors, jnp.asarray(q), jnp.asarray(v))
     names = [oracle.m.sensor(i).name or f"sensor{i}" for i in range(oracle.m.nsensor)]
     assert set(readings) == set(names) - {"now"}
     for i, name in enumerate(names):
@@ -105,7 +97,7 @@ def test_mujoco_reads_the_same(tmp_path):
 
 
 def pendulum():
-    builder = ModelBuilder("pendulum")
+    builder = jd.ModelBuilder("pendulum")
     builder.add_body("rod", None, "continuous", (2.0, (0.5, 0, 0), (0.0, 0.2, 0.2)), axis=(0, 1, 0), joint_name="hinge")
     return builder.add_frame("tip", "rod", (1.0, 0, 0)).build()
 
@@ -114,9 +106,9 @@ def test_pendulum_in_closed_form():
     """Specific force of the tip: -l w^2 + g sin along the rod, l alpha + g cos across it; the hinge bears the rest."""
     model, angle, rate = pendulum(), 0.7, 1.3
     q, v = jnp.array([angle]), jnp.array([rate])
-    imu, hinge, free = sensors.Imu("tip"), sensors.ForceTorque("rod"), ModelBuilder("ball")
+    imu, hinge, free = sensors.Imu("tip"), sensors.ForceTorque("rod"), jd.ModelBuilder("ball")
     readings = sensors.measure(model, [imu, hinge], q, v)
-    alpha = float(forward_dynamics(model, q, v, jnp.zeros(1))[0])
+    alpha = float(jd.forward_dynamics(model, q, v, jnp.zeros(1))[0])
     # x of the rod points down by the angle, so gravity has the component g sin(angle) along it.
     along, across = 9.81 * np.sin(angle), 9.81 * np.cos(angle)
     np.testing.assert_allclose(readings["imu of tip"][:3], [-(rate**2) - along, 0, -alpha + across], atol=1e-12)
@@ -126,7 +118,7 @@ def test_pendulum_in_closed_form():
         [2 * (-0.5 * rate**2 - along), 0, 2 * (-0.5 * alpha + across), 0, 0, 0],
         atol=1e-10,
     )
-    body = free.add_body("ball", None, "free", inertia.sphere(1.0, 0.1)).build()
+    body = free.add_body("ball", None, "free", jd.inertia.sphere(1.0, 0.1)).build()
     falling = sensors.measure(body, [sensors.Accelerometer("ball")], jnp.array([0, 0, 0, 1.0, 0, 0, 0]), jnp.zeros(6))
     np.testing.assert_allclose(falling["accelerometer of ball"], 0, atol=1e-12)
 
@@ -135,26 +127,26 @@ def test_pendulum_in_closed_form():
 def test_forces_under_constraints():
     """Contact forces are the multipliers; the wrench in a joint includes those of the loop."""
     scene, (q, v) = scenes.four_bar(), scenes.four_bar.start()
-    dynamics = constrained_dynamics(scene, q, v)
+    dynamics = jd.constrained_dynamics(scene, q, v)
     readings = sensors.measure(scene, [sensors.ContactForce("knee"), sensors.ForceTorque("rocker")], q, v)
     np.testing.assert_array_equal(readings["force of knee"], dynamics.multipliers)
     # The rocker turns about a hinge: its moment equation about that is met by the loop, which leaves the hinge without torque.
     assert abs(float(readings["wrench of rocker"][5])) < 1e-9
-    without = joint_wrench(scene.system, q, v, dynamics.acceleration, "3")
+    without = jd.dynamics.joint_wrench(scene.system, q, v, dynamics.acceleration, "3")
     assert np.abs(readings["wrench of rocker"] - without).max() > 0.1
 
 
 def test_mount_inside_a_body():
     """A mount carries the part beyond it: the inertia that is cut off, at rest its weight."""
-    model = robots.iiwa()
+    model = jd.robots.iiwa()
     q = jnp.asarray(np.random.default_rng(0).normal(size=7))
     whole = sensors.ForceTorque("iiwa_link_5", name="joint")
     same = sensors.ForceTorque("iiwa_link_5", name="mount", inertia=model.inertias[4], joints=["iiwa_joint_6"])
-    tool = sensors.ForceTorque("iiwa_link_5", name="tool", inertia=inertia.sphere(0.5, 0.1), joints=[])
+    tool = sensors.ForceTorque("iiwa_link_5", name="tool", inertia=jd.inertia.sphere(0.5, 0.1), joints=[])
     readings = sensors.measure(model, [whole, same, tool], q, jnp.ones(7), jnp.ones(7))
     assert_close(readings["mount"], readings["joint"], 1e-12)
-    still = sensors.Motion(Scene(model), q, jnp.zeros(7), jnp.zeros(7), jnp.zeros(0))
-    weight = frame_pose(model, q, "iiwa_link_5")[:3, :3].T @ jnp.array([0, 0, 0.5 * 9.81])
+    still = sensors.Motion(jd.Scene(model), q, jnp.zeros(7), jnp.zeros(7), jnp.zeros(0))
+    weight = jd.frame_pose(model, q, "iiwa_link_5")[:3, :3].T @ jnp.array([0, 0, 0.5 * 9.81])
     np.testing.assert_allclose(tool.read(still), [*weight, 0, 0, 0], atol=1e-12)
 
 
@@ -201,8 +193,8 @@ def about(x):
 
 def test_inertia_of_a_floating_body_from_imu_and_force_sensor():
     """Closed form: the wrench in a mount is linear in the ten parameters beyond it, with the IMU's readings as regressor."""
-    wrist = ModelBuilder("hand").add_body("hand", None, "free", inertia.box(1.0, (0.1, 0.2, 0.1))).build()
-    want = jnp.asarray(inertia.displaced(inertia.box(0.8, (0.05, 0.1, 0.2)), (0.02, -0.01, 0.1)))
+    wrist = jd.ModelBuilder("hand").add_body("hand", None, "free", jd.inertia.box(1.0, (0.1, 0.2, 0.1))).build()
+    want = jnp.asarray(jd.inertia.displaced(jd.inertia.box(0.8, (0.05, 0.1, 0.2)), (0.02, -0.01, 0.1)))
     imu, mount = sensors.Imu("hand"), sensors.ForceTorque("hand", inertia=want)
     rng = np.random.default_rng(2)
     rows, wrenches = [], []
@@ -210,7 +202,7 @@ def test_inertia_of_a_floating_body_from_imu_and_force_sensor():
         v, a = rng.normal(size=(2, 6))
         q = rng.normal(size=7)
         q[3:] /= np.linalg.norm(q[3:])
-        motion = sensors.Motion(Scene(wrist), *map(jnp.asarray, (q, v, a)), jnp.zeros(0))
+        motion = sensors.Motion(jd.Scene(wrist), *map(jnp.asarray, (q, v, a)), jnp.zeros(0))
         f, w, alpha = *np.split(np.asarray(imu.read(motion)), 2), a[3:]
         force = np.concatenate([f[:, None], hat(alpha) + hat(w) @ hat(w), np.zeros((3, 6))], 1)
         torque = np.concatenate([np.zeros((3, 1)), -hat(f), about(alpha) + hat(w) @ about(w)], 1)
@@ -303,7 +295,7 @@ def test_outer_forces_springs_and_stops_against_mujoco(tmp_path):
         torque = push[3:] + np.cross(data.xipos[i] - data.xpos[i], push[:3])
         forces.append(jd.forces.ExternalWrench(name, np.append(push[:3], torque)))
     mujoco.mj_forward(m, data)
-    scene = Scene(loaded.system, forces=forces)
+    scene = jd.Scene(loaded.system, forces=forces)
     readings = sensors.measure(scene, loaded.sensors, jnp.asarray(q), jnp.asarray(v))
     for i in range(m.nsensor):
         want = data.sensordata[m.sensor_adr[i] :][:3]
@@ -315,7 +307,7 @@ def test_outer_forces_springs_and_stops_against_mujoco(tmp_path):
 def test_orientations_are_delayed_and_disturbed_on_the_group(mode):
     """A body that turns about a fixed axis beyond a full turn: its delayed orientation is that of an earlier time."""
     axis, rate, late = np.array([2.0, -1.0, 2.0]) / 3, 5.7, 0.0123
-    ball = ModelBuilder("ball", gravity=None).add_body("ball", None, "free", inertia.sphere(1.0, 0.1)).build()
+    ball = jd.ModelBuilder("ball", gravity=None).add_body("ball", None, "free", jd.inertia.sphere(1.0, 0.1)).build()
     ts = np.linspace(0, 2, 201)
     half = rate * ts / 2
     turns = np.column_stack([np.cos(half), np.sin(half)[:, None] * axis])
@@ -343,8 +335,8 @@ def test_orientations_are_delayed_and_disturbed_on_the_group(mode):
         np.testing.assert_allclose(np.linalg.norm(got[:, 3:], axis=1), 1, atol=1e-12)
         assert (np.sum(got[1:, 3:] * got[:-1, 3:], 1) > 0.9).all()
         place = got[:, :3] - np.column_stack([before, 2 * before, 0 * before])
-        error = jax.vmap(so3.quat_multiply)(jax.vmap(so3.quat_conjugate)(jnp.asarray(truth)), got[:, 3:])
-        errors = np.column_stack([place, jax.vmap(so3.quat_log)(error)])
+        error = jax.vmap(jd.so3.quat_multiply)(jax.vmap(jd.so3.quat_conjugate)(jnp.asarray(truth)), got[:, 3:])
+        errors = np.column_stack([place, jax.vmap(jd.so3.quat_log)(error)])
         if mode == "delay":
             np.testing.assert_allclose(errors, 0, atol=1e-12)
         else:
