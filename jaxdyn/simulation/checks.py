@@ -21,14 +21,12 @@ from jaxdyn.constraints.redundancy import holds_rows, keep_rows
 from jaxdyn.constraints.selection import most_rounding, rows_and_doubts, select_rows
 from jaxdyn.contact.forces import contacts_with_cones
 from jaxdyn.dynamics.quantities import mass_matrix
-from jaxdyn.forces.piecewise import has_pieces
 from jaxdyn.model import host_math
-from jaxdyn.model.arguments import batch_hint, check_shape
+from jaxdyn.model.arguments import check_shape
 from jaxdyn.model.configuration import neutral
 from jaxdyn.model.topology import frame_index
 from jaxdyn.model.tree import Model
 from jaxdyn.simulation.controls import Controller, Sampled
-from jaxdyn.simulation.events import Terminal, Watch
 from jaxdyn.simulation.methods import Baumgarte, Free, Method, Multipliers, Projected, Reduced, is_regular, start_limit
 from jaxdyn.simulation.options import is_backsolve, is_step_length, is_variational
 from jaxdyn.simulation.solution import RESULTS
@@ -120,14 +118,6 @@ def check_angles(scene: Scene, q0, dtype) -> None:
         )
 
 
-def check_tolerance(name: str, value) -> None:
-    """Refuse tolerances that are not one finite number, or negative."""
-    if value.shape != ():
-        raise ValueError(f"{name} has shape {value.shape}; pass one number{batch_hint(value, ())}")
-    if is_concrete(value) and not (np.isfinite(value) and value >= 0):
-        raise ValueError(f"{name} is {value}; pass a finite number that is not negative, such as 1e-8")
-
-
 def check_times(ts) -> None:
     """Refuse times that are fewer than two, not finite, or not increasing."""
     if ts.ndim != 1 or ts.shape[0] < 2:
@@ -182,16 +172,6 @@ def check_combination(control, method: Method, solver, adjoint) -> None:
         )
 
 
-def check_conditions(conditions, adjoint) -> None:
-    """Refuse an adjoint that does not go back through the event that may end a run."""
-    if any(conditions) and is_backsolve(adjoint):
-        raise ValueError(
-            "adjoint is 'backsolve', which does not go back through events, and contacts, limits, a terminal event or the "
-            "control may end the run; take 'reverse', or jd.events.ContactLost(stop=False), no other events and a control "
-            "without `allowance`"
-        )
-
-
 def check_drives(scene: Scene, control, solver, modal: bool) -> None:
     """Refuse drives with a state where nothing integrates it."""
     if not has_drives(scene):
@@ -232,50 +212,6 @@ def check_modal_options(control, stepsize, solver, adjoint, outputs) -> None:
             raise ValueError(
                 f"outputs has {name!r}, and {what}; choose from {', '.join(MODAL_OUTPUTS)} and 'pose:<frame>'"
             )
-
-
-def check_tolerances(solver, stepsize, given: list[str]) -> None:
-    """Refuse tolerances that were given and have no effect on this run."""
-    if not given or stepsize is None:
-        return
-    from jaxdyn.simulation.solvers.choice import choose_solver, label, uses_tolerances
-
-    solver, steps = choose_solver(solver, stepsize), "fixed" if is_step_length(stepsize) else "their own"
-    if not uses_tolerances(solver):
-        raise ValueError(
-            f"{given[0]} is given, and {label(solver)} has no use for it with {steps} steps (stepsize); omit one of them"
-        )
-
-
-def check_events(scene: Scene, watch: Watch, modal: bool) -> None:
-    """Refuse events that cannot happen in a scene, and ends at limits in a motion with modes."""
-    if watch.switches is not None and not modal and not any(has_pieces(force) for force in scene.forces):
-        raise ValueError(
-            f"events has {watch.switches}, and no force of the scene has events (jd.contact.DryFriction, "
-            "jd.contact.UnilateralContact, jd.forces.PiecewiseForce); omit it"
-        )
-    if watch.contacts is not None and scene.cones is None:
-        raise ValueError(
-            f"events has {watch.contacts}, and the scene has no cones; omit it, or give jd.Scene(cones=...)"
-        )
-    if watch.limits is None:
-        return
-    if not isinstance(scene.system, Model):
-        raise ValueError(f"events has {watch.limits}, and a {type(scene.system).__name__} has no joint limits; omit it")
-    if watch.limits.stop and modal:
-        raise ValueError(
-            f"events has {watch.limits}, which a scene whose forces have modes (jd.contact.DryFriction, "
-            "jd.contact.UnilateralContact) does not support; pass jd.events.JointLimit(stop=False)"
-        )
-
-
-def check_terminals(terminals: tuple[Terminal, ...], modal: bool) -> None:
-    """Refuse terminal events of motions with modes."""
-    if terminals and modal:
-        raise ValueError(
-            "events has a jd.events.Terminal, which a scene whose forces have modes (jd.contact.DryFriction, "
-            "jd.contact.UnilateralContact) does not support; end ts earlier"
-        )
 
 
 def check_cones(scene: Scene, outputs) -> None:

@@ -10,8 +10,10 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
+from jaxdyn.forces.piecewise import has_pieces
 from jaxdyn.model.arguments import Function, Number, as_array, check_flag, warn
-from jaxdyn.systems.scene import as_pytree
+from jaxdyn.model.tree import Model
+from jaxdyn.systems.scene import Scene, as_pytree
 
 __all__ = ["ContactLost", "JointLimit", "ModeSwitches", "Progress", "Terminal"]
 
@@ -153,6 +155,37 @@ def sort_events(events: Iterable[Event]) -> tuple[Watch, tuple[Terminal, ...]]:
             raise ValueError(f"events has {len(given)} of jd.events.{kind.__name__}; give one")
     watch = Watch(*(given[0] if given else None for given in by_kind))
     return watch, tuple(one for one in events if isinstance(one, Terminal))
+
+
+def check_events(scene: Scene, watch: Watch, modal: bool) -> None:
+    """Refuse events that cannot happen in a scene, and ends at limits in a motion with modes."""
+    if watch.switches is not None and not modal and not any(has_pieces(force) for force in scene.forces):
+        raise ValueError(
+            f"events has {watch.switches}, and no force of the scene has events (jd.contact.DryFriction, "
+            "jd.contact.UnilateralContact, jd.forces.PiecewiseForce); omit it"
+        )
+    if watch.contacts is not None and scene.cones is None:
+        raise ValueError(
+            f"events has {watch.contacts}, and the scene has no cones; omit it, or give jd.Scene(cones=...)"
+        )
+    if watch.limits is None:
+        return
+    if not isinstance(scene.system, Model):
+        raise ValueError(f"events has {watch.limits}, and a {type(scene.system).__name__} has no joint limits; omit it")
+    if watch.limits.stop and modal:
+        raise ValueError(
+            f"events has {watch.limits}, which a scene whose forces have modes (jd.contact.DryFriction, "
+            "jd.contact.UnilateralContact) does not support; pass jd.events.JointLimit(stop=False)"
+        )
+
+
+def check_terminals(terminals: tuple[Terminal, ...], modal: bool) -> None:
+    """Refuse terminal events of motions with modes."""
+    if terminals and modal:
+        raise ValueError(
+            "events has a jd.events.Terminal, which a scene whose forces have modes (jd.contact.DryFriction, "
+            "jd.contact.UnilateralContact) does not support; end ts earlier"
+        )
 
 
 def events_of(

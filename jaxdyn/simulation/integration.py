@@ -10,9 +10,8 @@ from jax.flatten_util import ravel_pytree
 
 from jaxdyn.simulation import controls, terminal_events
 from jaxdyn.simulation.equations import KEPT, Equations
-from jaxdyn.simulation.hybrid.piecewise import MIN_EVENTS, PiecewiseSystem, piecewise_motion
 from jaxdyn.simulation.methods import Reduced, is_regular
-from jaxdyn.simulation.options import is_step_length
+from jaxdyn.simulation.options import Options, is_step_length
 from jaxdyn.simulation.solution import RESULTS, from_diffrax
 from jaxdyn.simulation.solvers import ExplicitSteps, ProjectedSolver
 from jaxdyn.simulation.solvers.choice import (
@@ -40,11 +39,11 @@ class Outcome(NamedTuple):
     last: Any = None
 
 
-def integrate(term, project, eqs: Equations, args, method, y0, ts, steps, options) -> Outcome:
+def integrate(term, project, eqs: Equations, args, method, y0, ts, steps, options: Options) -> Outcome:
     """Integrate from the start to the save points."""
-    adjoint, has_length = options["adjoint"], is_step_length(steps[-1])
+    adjoint, has_length = options.adjoint, is_step_length(steps[-1])
     solver: Any
-    solver, controller, dt0 = solver_and_control(options["solver"], term, ts, *steps)
+    solver, controller, dt0 = solver_and_control(options.solver, term, ts, *steps)
     # The continuous adjoint integrates another vector field backwards: projections and events of y do not apply to it.
     continuous = isinstance(adjoint, diffrax.BacksolveAdjoint)
     step_constants = (*method.step_constants, *({controls.HELD, KEPT} & set(y0)))
@@ -68,8 +67,7 @@ def integrate(term, project, eqs: Equations, args, method, y0, ts, steps, option
         outcome = _by_diffrax(term, solver, controller, event, dt0, inputs, steps, options)
         return outcome._replace(rows=_without_mark(outcome.rows), last=_without_mark(outcome.last))
     if eqs.pieces.names and not of_kinks:
-        system = PiecewiseSystem(solver.plan(y0), eqs.pieces, eqs.switching)
-        return _by_pieces(system, inputs, controller, steps, options)
+        return _by_pieces(solver.plan(y0), eqs, inputs, controller, steps, options)
     plan = solver.plan(y0)._replace(quality=quality, guards=guards)
     return _by_steps(solver, plan, controller, inputs, steps, options)
 
@@ -88,13 +86,13 @@ def _monitors(eqs: Equations, method) -> tuple[Callable | None, Callable | None]
 def _reason_for_diffrax(solver, controller, adjoint, options) -> str | None:
     """Reason why diffrax makes the steps, or None: the library's own loop makes them."""
     if not is_explicit(solver):
-        return f"solver is {label(options['solver'])}; take an explicit one, such as diffrax.Dopri8()"
+        return f"solver is {label(options.solver)}; take an explicit one, such as diffrax.Dopri8()"
     # Subclasses and wrappers, such as a clip to samples, have rules that our loops do not know.
     if type(controller) not in (Adaptive, ErrorMonitoredSteps):
         return "stepsize is a controller; leave it out"
     if isinstance(adjoint, diffrax.BacksolveAdjoint) or not has_name(adjoint):
         return f"adjoint is {type(adjoint).__name__}; take 'reverse'"
-    return "progress is shown; leave it out" if options["progress"] else None
+    return "progress is shown; leave it out" if options.progress else None
 
 
 def _reason_for_crossing(quality, guards) -> str | None:
@@ -135,7 +133,7 @@ def _is_direct(adjoint) -> bool:
     return isinstance(adjoint, (diffrax.ForwardMode, diffrax.DirectAdjoint))
 
 
-def _by_diffrax(term, solver, controller, event, dt0, inputs, steps, options) -> Outcome:
+def _by_diffrax(term, solver, controller, event, dt0, inputs, steps, options: Options) -> Outcome:
     """Integrate in diffrax's loop."""
     ts = inputs[2]
     diffrax_options = {
@@ -143,13 +141,13 @@ def _by_diffrax(term, solver, controller, event, dt0, inputs, steps, options) ->
         "solver": solver,
         "controller": controller,
         "event": event,
-        "adjoint": options["adjoint"],
-        "max_steps": options["max_steps"],
-        "progress": progress_meter(options["progress"]),
+        "adjoint": options.adjoint,
+        "max_steps": options.max_steps,
+        "progress": progress_meter(options.progress),
         "dt0": dt0,
     }
     if not is_step_length(steps[-1]):
-        solved: Any = run_adaptively(inputs, diffrax_options, options["limit_is_given"])
+        solved: Any = run_adaptively(inputs, diffrax_options, options.limit_is_given)
         rows, (result, *facts) = solved
         return Outcome(rows, from_diffrax(result), *facts)
     rows, (result, counts, reached, *last), solution = run(inputs, **diffrax_options)
@@ -163,33 +161,37 @@ def _by_diffrax(term, solver, controller, event, dt0, inputs, steps, options) ->
     return Outcome(rows, result, counts, reached, *last)
 
 
-def _by_pieces(system, inputs, controller, steps, options) -> Outcome:
+def _by_pieces(plan: Plan, eqs: Equations, inputs, controller, steps, options: Options) -> Outcome:
     """Integrate by steps that end at the kinks of forces."""
+    # Imported here, because most scenes have no pieces and a first call should not wait for these modules.
+    from jaxdyn.simulation.hybrid.piecewise import MIN_EVENTS, PiecewiseSystem, piecewise_motion
+
+    system = PiecewiseSystem(plan, eqs.pieces, eqs.switching)
     rtol, atol, stepsize = steps
     (y0, args, ts), has_length = inputs, is_step_length(stepsize)
-    room, most = options["max_steps"], max(MIN_EVENTS, options["max_events"])
+    room, most = options.max_steps, max(MIN_EVENTS, options.max_events)
     if not has_length:
         rtol, atol, stepsize = controller.rtol, controller.atol, None
-        room = room if options["limit_is_given"] else min(room, ROOM)
+        room = room if options.limit_is_given else min(room, ROOM)
     rows, end = piecewise_motion(
-        system, y0, args, ts, rtol, atol, stepsize, options["max_steps"], room, most, _is_direct(options["adjoint"])
+        system, y0, args, ts, rtol, atol, stepsize, options.max_steps, room, most, _is_direct(options.adjoint)
     )
     return Outcome(rows, end.result, end.counts, end.t)
 
 
-def _by_steps(solver: ExplicitSteps, plan: Plan, controller, inputs, steps, options) -> Outcome:
+def _by_steps(solver: ExplicitSteps, plan: Plan, controller, inputs, steps, options: Options) -> Outcome:
     """Integrate by explicit steps in the library's own loop."""
     # Attempts that locate the end do not count among the user's steps.
-    most = options["max_steps"] + (0 if plan.guards is None else 2 * SEARCH_STEPS)
+    most = options.max_steps + (0 if plan.guards is None else 2 * SEARCH_STEPS)
     if isinstance(controller, Adaptive):
         room, control = (
-            most if options["limit_is_given"] else min(most, ROOM),
+            most if options.limit_is_given else min(most, ROOM),
             step_control(solver, None, controller.norm),
         )
         run = ExplicitRun(plan, control, controller.rtol, controller.atol, None, most, room=room)
     else:
         run = ExplicitRun(plan, step_control(solver, steps[-1]), None, None, steps[-1], most, room=most)
-    rows, (result, counts, reached) = (run.direct if _is_direct(options["adjoint"]) else run)(*inputs)
+    rows, (result, counts, reached) = (run.direct if _is_direct(options.adjoint) else run)(*inputs)
     if plan.guards is None:
         return Outcome(rows, result, counts, reached)
     rows, end = (jax.tree.map(lambda x, at=at: x[at], rows) for at in (slice(-1), -1))

@@ -20,7 +20,6 @@ from jaxdyn.simulation import controls
 from jaxdyn.simulation.checks import (
     Inputs,
     angle_coordinates,
-    check_conditions,
     has_definite_mass,
     largest_angle,
     safe_inputs,
@@ -28,12 +27,12 @@ from jaxdyn.simulation.checks import (
 from jaxdyn.simulation.equations import DRIVES, KEPT, Equations, at_save_point, equations
 from jaxdyn.simulation.integration import integrate
 from jaxdyn.simulation.methods import Method, consistent, is_regular, satisfies_redundant_rows, start_limit
-from jaxdyn.simulation.options import is_step_length
+from jaxdyn.simulation.options import Options, is_step_length
 from jaxdyn.simulation.solution import RESULTS, Solution, invalidate_failures, rows_where
 from jaxdyn.simulation.solvers import LieGroup, Stepper
-from jaxdyn.simulation.solvers.choice import as_objects, is_split, label
+from jaxdyn.simulation.solvers.choice import choose_adjoint, choose_solver, is_split, label
 from jaxdyn.simulation.solvers.differentiable import COUNTS
-from jaxdyn.simulation.terminal_events import Conditions, Violation, first_violation
+from jaxdyn.simulation.terminal_events import Conditions, Violation, check_conditions, first_violation
 from jaxdyn.systems.scene import Scene, check_callback
 from jaxdyn.systems.system import displace, has_dependent_coordinates
 
@@ -63,17 +62,18 @@ def _as_arrays(known: Known) -> Any:
         return jax.tree.map(jnp.asarray, known(()))
 
 
-def smooth_motion(given_scene: Scene | Known, control, method: Method, numbers, options) -> Solution:
+def smooth_motion(given_scene: Scene | Known, control, method: Method, numbers, options: Options) -> Solution:
     """Run of `simulate`; `numbers`: q0, v0, ts, rtol, atol and the length of steps or a controller of them."""
     scene: Scene = _as_arrays(given_scene) if isinstance(given_scene, Known) else given_scene
-    options = as_objects(options, numbers[-1])
-    given, inputs = (scene, control, numbers), safe_inputs(scene.system, numbers)
-    scene, inputs, faults = _project_start(scene, method, inputs, options["selects_rows"])
+    solver = choose_solver(options.solver, numbers[-1])
+    options = options._replace(solver=solver, adjoint=choose_adjoint(options.adjoint, solver))
+    given, inputs = (scene, control, numbers, options.terminals), safe_inputs(scene.system, numbers)
+    scene, inputs, faults = _project_start(scene, method, inputs, options.selects_rows)
     run, y0 = _set_up(scene, control, method, inputs, options)
     ts, good = inputs.ts, inputs.good
-    solver, term, corrector = _solver(run, y0, options["solver"])
+    solver, term, corrector = _solver(run, y0, options.solver)
     rows, result, counts, time_reached, last = integrate(
-        term, corrector, run.eqs, run.args, method, y0, ts, inputs.steps, options | {"solver": solver}
+        term, corrector, run.eqs, run.args, method, y0, ts, inputs.steps, options._replace(solver=solver)
     )
     y = jax.tree.map(lambda start, later: jnp.concatenate([start[None], later]), y0, rows)
     # Loops fill rows that they did not reach with infinity.
@@ -115,7 +115,7 @@ def smooth_motion(given_scene: Scene | Known, control, method: Method, numbers, 
 
     def outputs_of(row):
         y, *state = row
-        return at_save_point(run.scene_at(y), control, method, run.eqs, run.args, options["outputs"], *state)
+        return at_save_point(run.scene_at(y), control, method, run.eqs, run.args, options.outputs, *state)
 
     values = map_rows(outputs_of, (y, q, v, ts, of_control))
     rows = {"q": q, "v": v} | values | ({} if work is None else {"work": work})
@@ -169,18 +169,18 @@ def _set_up(scene: Scene, control, method: Method, inputs: Inputs, options) -> t
     entries = controls.initial_entries(control, *start)
     if (of_drives := scene.drive_state(*start)) is not None:
         entries = entries | {DRIVES: of_drives}
-    at_contacts, at_limits = options["stops"]
-    conditions = Conditions(at_contacts, at_limits, controls.can_end(control, *start), len(options["terminals"]))
-    for one in options["terminals"]:
+    at_contacts, at_limits = options.stops
+    conditions = Conditions(at_contacts, at_limits, controls.can_end(control, *start), len(options.terminals))
+    for one in options.terminals:
         check_callback(one.function, "Terminal: function", "function(q, v, t)", *start)
-    check_conditions(conditions, options["adjoint"])
-    eqs, args = equations(scene, control, method, entries, *start, conditions, options["terminals"])
+    check_conditions(conditions, options.adjoint)
+    eqs, args = equations(scene, control, method, entries, *start, conditions, options.terminals)
     # Shapes that do not fit are reported here, with the user's function at the end of the traceback.
     eqx.filter_eval_shape(eqs.generalized_force, args, entries, *start)
     y0 = method.start(scene, *start) | entries
-    if has_selection(scene) and not isinstance(options["solver"], Stepper):
+    if has_selection(scene) and not isinstance(options.solver, Stepper):
         y0 = y0 | {KEPT: rows_of(scene, start[0].dtype)}
-    y0 = y0 | {"work": jnp.zeros((), start[0].dtype)} if "work" in options["outputs"] else y0
+    y0 = y0 | {"work": jnp.zeros((), start[0].dtype)} if "work" in options.outputs else y0
     return _Run(scene, control, method, eqs, args), y0
 
 
@@ -217,7 +217,7 @@ def _violation(run: _Run, rows, reached, result, time_reached, last) -> Violatio
 def _faults_of_start(run: _Run, y0, inputs: Inputs, options) -> list[tuple[Array, Any]]:
     """Cases of the result: a singular mass matrix, and a singular basis."""
     faults = []
-    if options["checks_mass"]:
+    if options.checks_mass:
         definite = kernel(has_definite_mass)(run.scene.system, inputs.q0, inputs.ts[0])
         faults.append((~definite, RESULTS.singular_mass_matrix))
     quality = run.method.quality(run.scene, y0, inputs.ts[0])

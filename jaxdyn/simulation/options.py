@@ -1,6 +1,6 @@
 """Options of a run as users give them, without diffrax, whose import takes longer than a run from stored programs."""
 
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import jax
 import numpy as np
@@ -8,6 +8,7 @@ from jax.typing import ArrayLike
 
 from jaxdyn.compile.known import is_concrete
 from jaxdyn.model.arguments import batch_hint
+from jaxdyn.simulation.events import Terminal
 
 if TYPE_CHECKING:
     import diffrax
@@ -21,6 +22,27 @@ else:
     Solver = Stepsize = Adjoint = Any  # `choose_solver` and `choose_adjoint` check them
 
 ADJOINTS = ("reverse", "direct", "forward", "backsolve")
+
+
+class Options(NamedTuple):
+    """Options of a run, checked. `solver` None and an adjoint's name are replaced by diffrax's objects in the program of the run.
+
+    `stops`: whether lost contacts and joint limits end the run; `limit_is_given`: whether `max_steps` is the user's;
+    `selects_rows`: whether the independent rows are chosen in the program, because the start is traced; `checks_mass`: whether
+    the mass matrix may be singular.
+    """
+
+    solver: Any
+    adjoint: Any
+    outputs: tuple[str, ...]
+    stops: tuple[bool, bool]
+    max_events: int
+    progress: bool
+    checks_mass: bool
+    terminals: tuple[Terminal, ...] = ()
+    max_steps: int = 0
+    limit_is_given: bool = False
+    selects_rows: bool = False
 
 
 def is_step_length(stepsize) -> bool:
@@ -56,6 +78,14 @@ def check_step_length(stepsize) -> None:
         raise ValueError(f"stepsize has shape {np.shape(stepsize)}; pass one number (s){batch_hint(stepsize, ())}")
     if is_concrete(stepsize) and not (np.isfinite(stepsize) and stepsize > 0):
         raise ValueError(f"stepsize is {stepsize}; pass a positive number (s), or None for adaptive steps")
+
+
+def check_tolerance(name: str, value) -> None:
+    """Refuse tolerances that are not one finite number, or negative."""
+    if value.shape != ():
+        raise ValueError(f"{name} has shape {value.shape}; pass one number{batch_hint(value, ())}")
+    if is_concrete(value) and not (np.isfinite(value) and value >= 0):
+        raise ValueError(f"{name} is {value}; pass a finite number that is not negative, such as 1e-8")
 
 
 def step_limit(max_steps, ts, stepsize, adjoint) -> int:

@@ -19,14 +19,23 @@ from jaxdyn.model.arguments import Numbers, as_array, check_flag, state_dtype
 from jaxdyn.simulation import checks, controls
 from jaxdyn.simulation.checks import check_constraints, choose_method, may_have_singular_mass
 from jaxdyn.simulation.controls import Control
-from jaxdyn.simulation.events import Event, Watch, accept_former_events, sort_events
+from jaxdyn.simulation.events import (
+    Event,
+    Watch,
+    accept_former_events,
+    check_events,
+    check_terminals,
+    sort_events,
+)
 from jaxdyn.simulation.methods import Method, may_have_redundant_rows
 from jaxdyn.simulation.options import (
     ADJOINTS,
     Adjoint,
+    Options,
     Solver,
     Stepsize,
     check_step_length,
+    check_tolerance,
     is_backsolve,
     is_step_length,
     step_limit,
@@ -128,18 +137,18 @@ def simulate(
     start = tuple([np.asarray(x) if concrete else as_numpy_if_known(x) for x in arrays[:3]])
     scene, method = _prepare_start(scene, method, start, stepsize, modal, concrete)
     controls.check_steps(control, stepsize)
-    checks.check_terminals(terminals, modal)
+    check_terminals(terminals, modal)
     solver = _solver_at_start(scene, control, solver, stepsize, adjoint, arrays, modal)
     options = _choose(
         scene, control, method, solver, stepsize, adjoint,
         outputs=checks.sort_outputs(scene, outputs), watch=watch, tolerances=(rtol is not None, atol is not None), modal=modal,
     )  # fmt: skip
-    options = options | {
-        "terminals": terminals,
-        "max_steps": step_limit(max_steps, start[-1], stepsize, options["adjoint"]),
-        "limit_is_given": max_steps is not None,
-        "selects_rows": not concrete and _selects_rows(scene, method, *start),
-    }
+    options = options._replace(
+        terminals=terminals,
+        max_steps=step_limit(max_steps, start[-1], stepsize, options.adjoint),
+        limit_is_given=max_steps is not None,
+        selects_rows=not concrete and _selects_rows(scene, method, *start),
+    )
     dtype, has_length = state_dtype(scene.system), is_step_length(stepsize)
     # Known numbers go to the compiled program as they are: each array of JAX made before would be a transfer of its own.
     to_array = np.asarray if concrete and not modal else jnp.asarray
@@ -197,7 +206,7 @@ def _tolerance(name: str, value):
     if value is None:
         return _DEFAULT_TOLERANCE
     value = as_array(value, name)
-    checks.check_tolerance(name, value)
+    check_tolerance(name, value)
     return value
 
 
@@ -241,8 +250,8 @@ def _solver_at_start(scene: Scene, control, solver, stepsize, adjoint, arrays, m
 def _choose(
     scene: Scene, control, method: Method, solver, stepsize, adjoint,
     *, outputs, watch: Watch, tolerances: tuple[bool, bool], modal: bool,
-) -> dict[str, Any]:  # fmt: skip
-    """Options of a run that the numbers do not decide; defaults and names stay what they are (see `as_objects`)."""
+) -> Options:  # fmt: skip
+    """Options of a run that the numbers do not decide; defaults and names stay what they are."""
     solver = method.stepper(solver, stepsize)
     is_default = solver is None and (stepsize is None or is_step_length(stepsize)) and not modal
     if is_default and (adjoint is None or (isinstance(adjoint, str) and adjoint in ADJOINTS)):
@@ -250,29 +259,25 @@ def _choose(
         if stepsize is not None:
             check_step_length(stepsize)
     else:
-        from jaxdyn.simulation.solvers.choice import as_objects
+        from jaxdyn.simulation.solvers.choice import choose_adjoint, choose_solver
 
-        solver, adjoint = as_objects({"solver": solver, "adjoint": adjoint}, stepsize).values()
+        solver = choose_solver(solver, stepsize)
+        adjoint = choose_adjoint(adjoint, solver)
     checks.check_drives(scene, control, solver, modal)
     checks.check_combination(control, method, solver, adjoint)
     if modal:
         checks.check_modal_options(control, stepsize, solver, adjoint, outputs)
     given = [name for name, is_given in zip(("rtol", "atol"), tolerances, strict=True) if is_given]
-    checks.check_tolerances(solver, stepsize, given)
-    checks.check_events(scene, watch, modal)
+    if given and stepsize is not None:
+        from jaxdyn.simulation.solvers.choice import check_tolerances
+
+        check_tolerances(solver, stepsize, given)
+    check_events(scene, watch, modal)
     checks.check_cones(scene, () if modal else outputs)
-    return {
-        "solver": solver,
-        "adjoint": adjoint,
-        "outputs": outputs,
-        "stops": (
-            scene.cones is not None and (watch.contacts is None or watch.contacts.stop),
-            watch.limits is not None and watch.limits.stop,
-        ),
-        "max_events": watch.max_events,
-        "progress": watch.progress is not None,
-        "checks_mass": may_have_singular_mass(scene.system),
-    }
+    at_contacts = scene.cones is not None and (watch.contacts is None or watch.contacts.stop)
+    stops = at_contacts, watch.limits is not None and watch.limits.stop
+    checks_mass, shows_progress = may_have_singular_mass(scene.system), watch.progress is not None
+    return Options(solver, adjoint, outputs, stops, watch.max_events, shows_progress, checks_mass)
 
 
 def _selects_rows(scene: Scene, method: Method, q0, v0, ts) -> bool:

@@ -213,9 +213,9 @@ def _is_explicit(solver) -> bool:
 
 
 def _advice(name: str, solution: Solution, scene: Scene, control, options) -> str:
-    advice = ADVICE.get(name, "try smaller steps, other tolerances, or another solver").format(**options)
+    advice = ADVICE.get(name, "try smaller steps, other tolerances, or another solver").format(**options._asdict())
     # The scene may have become stiff on the way, so that the choice of the solver at the start has not seen it.
-    if name == "max_steps_reached" and _is_explicit(options["solver"]):
+    if name == "max_steps_reached" and _is_explicit(options.solver):
         from jaxdyn.simulation.solvers.choice import find_stiffness, is_stiff
 
         last = int(np.flatnonzero(np.isfinite(solution.q).all(1))[-1])
@@ -225,7 +225,7 @@ def _advice(name: str, solution: Solution, scene: Scene, control, options) -> st
             advice = (
                 f"the scene is stiff: the fastest decay is {float(rates.decay):.3g} 1/s, so explicit steps are unstable above "
                 f"{float(rates.explicit_step):.3g} s; pass solver=jd.solvers.Rodas5P(), or "
-                f"raise max_steps (now {options['max_steps']})"
+                f"raise max_steps (now {options.max_steps})"
             )
     slides = any(isinstance(force, SlidingFriction) for force in scene.forces)
     if name in ("max_steps_reached", "too_many_events") and slides:

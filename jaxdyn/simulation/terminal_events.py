@@ -21,6 +21,7 @@ from jaxtyping import Array, Bool, Float, Int, PyTree
 from jaxdyn.contact.forces import contact_forces, contacts_with_cones
 from jaxdyn.model.arguments import Number
 from jaxdyn.model.tree import Model
+from jaxdyn.simulation.options import is_backsolve
 from jaxdyn.simulation.solution import RESULTS, Solution, joint_of
 from jaxdyn.simulation.solvers.base import Flag, StepOutput, Wrapped
 from jaxdyn.systems.scene import Scene
@@ -42,6 +43,16 @@ class Conditions(NamedTuple):
         """Numbers of allowances of contacts, limits, the control and terminal events, in this order among all."""
         contacts = len(contacts_with_cones(scene)) if self.contacts else 0
         return contacts, 2 * scene.nq if self.limits else 0, int(self.control), self.terminals
+
+
+def check_conditions(conditions: Conditions, adjoint) -> None:
+    """Refuse an adjoint that does not go back through the event that may end a run."""
+    if any(conditions) and is_backsolve(adjoint):
+        raise ValueError(
+            "adjoint is 'backsolve', which does not go back through events, and contacts, limits, a terminal event or the "
+            "control may end the run; take 'reverse', or jd.events.ContactLost(stop=False), no other events and a control "
+            "without `allowance`"
+        )
 
 
 def contact_allowances(scene: Scene, multipliers: Float[Array, " nc"]) -> Float[Array, " k"]:

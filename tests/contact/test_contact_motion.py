@@ -141,7 +141,7 @@ def test_an_error_names_the_contact_and_the_time():
 def test_bad_input_is_refused():
     scene = block()
     for call, match in (
-        (lambda: jd.simulate(scene, *STILL, TIMES, events=["report"]), "events has 'report'"),
+        (lambda: jd.simulate(scene, *STILL, TIMES, contacts="ignore"), "contacts is 'ignore'"),
         (lambda: jd.simulate(jd.Scene(scene.system, scene.constraints), *STILL, TIMES, outputs=WORDS), "has no cones"),
         (lambda: jd.simulate(jd.Scene(scene.system, scene.constraints, cones={"floor": 1}), *STILL, TIMES), "floor"),
         (lambda: jd.simulate(jd.Scene(scene.system, scene.constraints, cones=friction_cone("hard-finger", 0.2)),

@@ -226,6 +226,8 @@ OPTIONS = [
         {"events": [jd.events.ModeSwitches(8)]},
         r"events has ModeSwitches\(max_events=8\), and no force of the scene has events",
     ),
+    ({"events": jd.events.JointLimit()}, "events is JointLimit.*; pass a list"),
+    ({"events": ["stop"]}, "events has 'stop'; give objects of jd.events"),
     ({"events": [jd.events.ContactLost()]}, "ContactLost.*, and the scene has no cones"),
     ({"control": lambda q, v, t: np.sin(q)}, "control needs the values .* jax.numpy"),
     ({"control": stiffer}, r"control needs the values .* jax\.lax\.cond instead of if"),

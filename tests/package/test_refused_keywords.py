@@ -22,7 +22,6 @@ IGNORED = {
 }
 FLOWING = ("t", "preload", "dt")
 CLASSES = {
-    "Baumgarte": ((), {}),
     "contact.DryFriction": ((0.3, 1.0), {"static": 0.4, "smoothing": 0.1}),
     "contact.Parametrised": ((lambda u: jnp.array([u[0], u[1], 0.0]),), {}),
     "contact.Sphere": ((0.1,), {}),
@@ -31,6 +30,9 @@ CLASSES = {
     "control.GraspForce": ((GRASP, lambda t: jnp.eye(4), 10.0, 1.0), {"ki": 0.1}),
     "control.HybridForce": ((BAR, lambda q: q[:1], lambda t: jnp.zeros(1), 4.0), {"kd": 1.0}),
     "control.OperationalSpace": ((ARM, HAND, lambda t: jnp.eye(4), 10.0, 1.0), {"posture": Q}),
+    "events.ContactLost": ((), {}),
+    "events.JointLimit": ((), {}),
+    "events.ModeSwitches": ((), {}),
     "forces.CoulombFriction": ((), {"level": 0.1, "joints": "a"}),
     "forces.Drive": ((1.0, 0.1, 0.0), {"effort_limit": 1.0, "joints": "a"}),
     "forces.EffortLimits": ((), {"limit": 2.0}),
@@ -55,6 +57,7 @@ CLASSES = {
     "Projected": ((), {}),
     "Reduced": ((), {}),
     "Variational": ((), {}),
+    "simulation.Baumgarte": ((), {}),
     "sensors.Encoder": (("a",), {"resolution": 0.1, "noise": jd.sensors.Noise(0.1)}),
     "sensors.ForceTorque": (("a",), {"noise": jd.sensors.Noise(0.1)}),
     "sensors.FramePose": (("a",), {"noise": jd.sensors.Noise(0.1)}),

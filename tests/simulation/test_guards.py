@@ -236,7 +236,10 @@ def test_a_guard_that_is_violated_within_a_step_ends_the_motion():
 
     # q = v t - t^2/4 has its top v^2 at 2 v, and is above one for 0.13 s; the second step has its middle there.
     v = np.sqrt(top)
-    ts, options = np.linspace(0.0, 4 * v, 3), {"limits": "stop", "stepsize": 4 * v / 3, "throw": False}
+    ts, options = (
+        np.linspace(0.0, 4 * v, 3),
+        {"events": [jd.events.JointLimit()], "stepsize": 4 * v / 3, "throw": False},
+    )
     solution = jd.simulate(RAIL, [0.0], [v], ts, control=back, **options)
     assert solution.result == jd.RESULTS.joint_limit_passed
     time = 2 * (v - np.sqrt(v * v - 1 - ROUNDING))

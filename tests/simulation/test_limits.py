@@ -1,5 +1,6 @@
 """Position limits of joints in a motion: told, or the end of the run, at the time of the closed form."""
 
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -77,3 +78,74 @@ def test_refusals(cart):
     system = jd.LagrangianSystem(lambda q, v: 0.5 * jnp.sum(v * v), 1)
     with pytest.raises(ValueError, match="a LagrangianSystem has no joint limits"):
         jd.simulate(system, [0.0], [0.0], TS, events=[jd.events.JointLimit()])
+
+
+class Below(eqx.Module):
+    """The height of a body above a level, m."""
+
+    level: jax.Array
+
+    def __call__(self, q, v, t):
+        return q[2] - self.level
+
+
+def fall(level, *others, **options):
+    """Motion of a ball from rest at 2 m to a level (m), or to the first of the other events."""
+    builder = jd.ModelBuilder("ball")
+    builder.add_body("ball", None, "free", jd.inertia.sphere(0.5, 0.1))
+    q0 = jnp.array([0.0, 0.0, 2.0, 1.0, 0.0, 0.0, 0.0])
+    terminal = [*(jd.events.Terminal(one) for one in others), jd.events.Terminal(Below(jnp.asarray(level)))]
+    ts = jnp.linspace(0.0, 1.0, 11)
+    return jd.simulate(builder.build(), q0, jnp.zeros(6), ts, events=terminal, rtol=1e-10, atol=1e-10, **options)
+
+
+def test_a_terminal_event_ends_a_run_at_its_time():
+    """Free fall to a level: t = sqrt(2 h / g), with its derivatives; the end of the fall counts as a success."""
+    run = fall(0.5)
+    time = np.sqrt(2 * 1.5 / 9.81)
+    np.testing.assert_allclose(run.stats["time_reached"], time, rtol=1e-12)
+    assert bool(run.success) and run.result == jd.RESULTS.event_occurred
+    assert np.isfinite(run.q[:6]).all() and np.isnan(run.q[6:]).all() and int(run.stats["terminal_event"]) == 0
+    beyond = fall(-5.0)
+    assert beyond.result == jd.RESULTS.successful and int(beyond.stats["terminal_event"]) == -1
+    # A velocity of -2 m/s is reached before the level.
+    assert int(fall(0.5, lambda q, v, t: v[2] + 2.0).stats["terminal_event"]) == 0
+    assert int(fall(1.9, lambda q, v, t: v[2] + 2.0).stats["terminal_event"]) == 1
+
+
+@pytest.mark.long
+def test_the_time_of_a_terminal_event_has_derivatives():
+    time = np.sqrt(2 * 1.5 / 9.81)
+    reached = jax.jit(lambda level: fall(level).stats["time_reached"])
+    directly = jax.jit(lambda level: fall(level, adjoint="forward").stats["time_reached"])
+    slope, bend = -1 / (9.81 * time), -1 / (9.81**2 * time**3)
+    np.testing.assert_allclose(jax.grad(reached)(0.5), slope, rtol=1e-10)
+    np.testing.assert_allclose(jax.jacfwd(directly)(0.5), slope, rtol=1e-10)
+    np.testing.assert_allclose(jax.hessian(reached)(0.5), bend, rtol=1e-10)
+    levels = jnp.array([0.5, 1.0])
+    np.testing.assert_allclose(jax.vmap(reached)(levels), np.sqrt(2 * (2 - levels) / 9.81), rtol=1e-12)
+    with pytest.raises(ValueError, match="backsolve"):
+        fall(0.5, adjoint="backsolve")
+
+
+def test_former_arguments_warn_with_the_new_form(cart):
+    new = r"events=\[jd.events.JointLimit\(stop=True\)\]"
+    with pytest.warns(DeprecationWarning, match=new):
+        end = jd.simulate(cart, [0.0], [0.0], TS, control=push, limits="stop", throw=False)  # pyright: ignore[reportCallIssue]
+    wanted = jd.simulate(cart, [0.0], [0.0], TS, control=push, events=[jd.events.JointLimit()], throw=False)
+    np.testing.assert_array_equal(end.q, wanted.q)
+
+
+@pytest.mark.parametrize(
+    ("events", "match"),
+    [
+        ([jd.events.JointLimit(), jd.events.JointLimit(False)], "has 2 of"),
+        ([jd.events.Terminal(lambda q, v, t: q)], "return one number"),
+        ([jd.events.ContactLost()], "no cones"),
+    ],
+)
+def test_events_that_do_not_fit_are_refused(cart, events, match):
+    with pytest.raises(ValueError, match=match):
+        jd.simulate(cart, [0.0], [0.0], TS, events=events)
+    with pytest.raises(ValueError, match="Terminal: function"):
+        jd.events.Terminal(lambda q: q)

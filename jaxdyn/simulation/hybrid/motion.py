@@ -70,7 +70,7 @@ def hybrid_motion(scene: Scene, control, numbers, options) -> Solution:
     for i, force in enumerate(extend(scene).forces):
         first = numbers[0], numbers[1], numbers[2][0]
         check_callback(force, f"forces[{i}]", "force(system, q, v, t)", *first, first=(scene.system,))
-    if options["selects_rows"]:
+    if options.selects_rows:
         scene = independent_rows(scene, numbers[0], numbers[2][0])
     unknown, known = partition_tracers((scene, control))
     unknown, bind = tuple(unknown), _Binder(known, scene.nv)
@@ -88,14 +88,14 @@ def hybrid_motion(scene: Scene, control, numbers, options) -> Solution:
     mode = mode._replace(positive=bind(unknown)[2](q0, v0, ts[0]) > 0)
     if scene.constraints:
         start_ok = start_ok & consistent(Scene(scene.system, scene.constraints), q0, v0, ts[0])
-    y0, most, max_steps = {"q": q0, "v": v0, "slip": slip}, options["max_events"], options["max_steps"]
-    if stepsize is not None and not options["limit_is_given"]:
+    y0, most, max_steps = {"q": q0, "v": v0, "slip": slip}, options.max_events, options.max_steps
+    if stepsize is not None and not options.limit_is_given:
         max_steps += SEARCH_STEPS * most
-    system = ModalSystem(bind, elements, options["solver"], y0)
+    system = ModalSystem(bind, elements, options.solver, y0)
     room = max_steps if stepsize is not None else min(max_steps, ROOM)
     run: Any = HybridRun(system, mode, rtol, atol, stepsize, max_steps, most, room=room)
     # A custom rule for reverse mode admits no forward mode: these adjoints need the run without it.
-    if isinstance(options["adjoint"], (diffrax.ForwardMode, diffrax.DirectAdjoint)):
+    if isinstance(options.adjoint, (diffrax.ForwardMode, diffrax.DirectAdjoint)):
         run = run.direct
     rows, times, (end, records, begun) = run(y0, unknown, ts)
     # A save point at an event shows the state before it.
@@ -111,7 +111,7 @@ def hybrid_motion(scene: Scene, control, numbers, options) -> Solution:
         return project(bind(unknown)[0], elements, mode, t, y, None)[0]
 
     def outputs_of(unknown, row):
-        return _outputs(bind, elements, options["outputs"], unknown, *row)
+        return _outputs(bind, elements, options.outputs, unknown, *row)
 
     later = lax.map(partial(kernel(correct), unknown), jax.tree.map(lambda x: x[1:], (y, modes, ts)))
     y = jax.tree.map(lambda a, b: jnp.concatenate([a[:1], b]), y, later)
@@ -131,7 +131,7 @@ def hybrid_motion(scene: Scene, control, numbers, options) -> Solution:
     rows, times = {"q": y["q"], "v": y["v"], **values}, (jnp.where(good, time_reached, ts[0]), events)
     rows, (time_reached, events) = invalidate_failures(rows, times, result, reached, (scene, control, numbers))
     stats = end.counts | {"time_reached": time_reached}
-    return Solution(ts=inputs.given, result=result, stats=stats, events=events, solver=label(options["solver"]), **rows)
+    return Solution(ts=inputs.given, result=result, stats=stats, events=events, solver=label(options.solver), **rows)
 
 
 def _outputs(bind: _Binder, elements: Elements, outputs, unknown, y, mode: Mode, t) -> dict[str, Any]:

@@ -125,12 +125,6 @@ def choose_adjoint(adjoint, solver) -> diffrax.AbstractAdjoint:
     raise ValueError(f"adjoint is {adjoint!r}; choose one of {', '.join(ADJOINTS)}, or pass a diffrax adjoint")
 
 
-def as_objects(options: dict[str, Any], stepsize) -> dict[str, Any]:
-    """Options of a run with diffrax's objects in the place of defaults and names."""
-    solver = choose_solver(options["solver"], stepsize)
-    return options | {"solver": solver, "adjoint": choose_adjoint(options["adjoint"], solver)}
-
-
 def has_name(adjoint: diffrax.AbstractAdjoint) -> bool:
     """True for the adjoints that have a name, whose derivatives the library's own loops give too.
 
@@ -144,6 +138,15 @@ def has_name(adjoint: diffrax.AbstractAdjoint) -> bool:
 def uses_tolerances(solver) -> bool:
     """True for an implicit method whose equations are solved to the tolerances of the run."""
     return isinstance(solver, diffrax.AbstractImplicitSolver) and not eqx.is_array_like(solver.root_finder.rtol)
+
+
+def check_tolerances(solver, stepsize, given: list[str]) -> None:
+    """Refuse tolerances that were given and have no effect on this run."""
+    solver, steps = choose_solver(solver, stepsize), "fixed" if is_step_length(stepsize) else "their own"
+    if not uses_tolerances(solver):
+        raise ValueError(
+            f"{given[0]} is given, and {label(solver)} has no use for it with {steps} steps (stepsize); omit one of them"
+        )
 
 
 def solver_and_control(solver, term, ts, rtol, atol, stepsize):
