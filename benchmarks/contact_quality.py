@@ -76,7 +76,7 @@ def with_mujoco(slope: float, height: float, v, dt: float, count: int):
 
 def with_drake(slope: float, height: float, v, dt: float, count: int):
     """The same by Drake."""
-    import pydrake.all as _drake
+    import pydrake.all as _drake  # pyright: ignore[reportMissingImports]
 
     drake: Any = _drake  # without types
     builder, radius = drake.DiagramBuilder(), 1e-3
