@@ -1,12 +1,14 @@
-"""Quality of steps through contacts beside C MuJoCo: penetration, creep, the law of friction, and energy, at one step length.
+"""Quality of steps through contacts beside C MuJoCo and Drake: penetration, creep, friction, and energy, at one step length.
 
     python -m benchmarks.contact_quality [--dt 0.002]
 
 A box on its four lower corners: it rests on a slope below the friction angle for ten seconds, slides down one above it, where the
-acceleration is known, and tumbles in flight for half a second. MuJoCo has elliptic cones and its defaults.
+acceleration is known, and tumbles in flight for half a second. MuJoCo has elliptic cones and its defaults. Drake, if it is
+installed, has point contacts of small spheres at the corners, its discrete solver and its defaults.
 """
 
 import argparse
+import importlib.util
 from typing import Any
 
 import jax
@@ -72,6 +74,41 @@ def with_mujoco(slope: float, height: float, v, dt: float, count: int):
     return map(np.array, zip(*rows, strict=True))
 
 
+def with_drake(slope: float, height: float, v, dt: float, count: int):
+    """The same by Drake."""
+    import pydrake.all as _drake  # pyright: ignore[reportMissingImports]
+
+    drake: Any = _drake  # without types
+    builder, radius = drake.DiagramBuilder(), 1e-3
+    plant, _ = drake.AddMultibodyPlantSceneGraph(builder, dt)
+    plant.set_contact_model(drake.ContactModel.kPoint)
+    plant.mutable_gravity_field().set_gravity_vector(gravity(slope))
+    plant.AddRigidBody("box", drake.SpatialInertia(1.0, np.zeros(3), drake.UnitInertia.SolidBox(*SIZE)))
+    shapes = [(plant.world_body(), np.zeros(3), drake.HalfSpace())]
+    corners = [SIZE / 2 * (x, y, -1) + (0, 0, radius) for x in (-1, 1) for y in (-1, 1)]
+    shapes += [(plant.GetBodyByName("box"), at, drake.Sphere(radius)) for at in corners]
+    for i, (body, at, shape) in enumerate(shapes):
+        friction = drake.CoulombFriction(MU, MU)
+        plant.RegisterCollisionGeometry(body, drake.RigidTransform(at), shape, f"shape {i}", friction)
+    plant.Finalize()
+    simulator = drake.Simulator(builder.Build())
+    context = plant.GetMyMutableContextFromRoot(simulator.get_mutable_context())
+    plant.SetPositions(context, [1, 0, 0, 0, 0, 0, height])
+    plant.SetVelocities(context, np.roll(v, 3))  # angular first
+    rows = []
+    for k in range(count):
+        simulator.AdvanceTo(dt * (k + 1))
+        results, forces, low = plant.get_contact_results_output_port().Eval(context), np.zeros((4, 3)), np.inf
+        for i in range(results.num_point_pair_contacts()):
+            contact = results.point_pair_contact_info(i)
+            force, low = contact.contact_force(), min(low, -contact.point_pair().depth)
+            forces[i] = force * np.sign(force[2])
+        energy = plant.CalcKineticEnergy(context) + plant.CalcPotentialEnergy(context)
+        q = plant.GetPositions(context)
+        rows.append((low, np.roll(q, 3), energy, forces))
+    return map(np.array, zip(*rows, strict=True))
+
+
 def quality(run, dt: float) -> dict[str, float]:
     """Measures of one program."""
     count = round(1 / dt)
@@ -100,9 +137,12 @@ def main():
     given = parser.parse_args()
     jax.config.update("jax_enable_x64", True)
     print(timing.machine())
-    a, b = (quality(run, given.dt) for run in (ours, with_mujoco))
-    for name in a:
-        print(f"{name}: jaxdyn {a[name]:.1e}, MuJoCo {b[name]:.1e}")
+    programs = {"jaxdyn": ours, "MuJoCo": with_mujoco}
+    if importlib.util.find_spec("pydrake"):
+        programs["Drake"] = with_drake
+    found = {name: quality(run, given.dt) for name, run in programs.items()}
+    for measure in found["jaxdyn"]:
+        print(f"{measure}:", ", ".join(f"{name} {measures[measure]:.1e}" for name, measures in found.items()))
 
 
 if __name__ == "__main__":

@@ -69,7 +69,7 @@ class Contacts(NamedTuple):
         return np.array([k for one in each for k in (one.normal if one.opens else -1, *one.tangent)], int)
 
     @property
-    def loaded(self) -> list[tuple[int, int]]:
+    def load_rows(self) -> list[tuple[int, int]]:
         """Cones whose load is the multiplier of a constraint, and its row among the scene's own."""
         each = [self.elements[i] for i in self.order]
         return [(k, one.normal) for k, one in enumerate(each) if not one.opens and one.normal >= 0]
@@ -270,7 +270,7 @@ def scaled(contacts: Contacts, problem: _Problem, friction) -> Scaled:
 def load_signs(contacts: Contacts, problem: Scaled, x) -> Array:
     """Signs (m,) of the loads that are multipliers, for impulses x (m,), at the normals of their frictions; 1 elsewhere."""
     signs = jnp.ones_like(x)
-    for k, _ in contacts.loaded:
+    for k, _ in contacts.load_rows:
         at = int(contacts.normals[k])
         load = x[at] - problem.q[at] - jnp.sum(problem.W[at] * x)
         signs = signs.at[at].set(jnp.where(load < 0, -1.0, 1.0))
@@ -279,7 +279,7 @@ def load_signs(contacts: Contacts, problem: Scaled, x) -> Array:
 
 def with_signs(contacts: Contacts, problem: Scaled, signs) -> Scaled:
     """Problem in which loads are their sizes, if they have these signs (m,)."""
-    if not contacts.loaded:
+    if not contacts.load_rows:
         return problem
     unit = jnp.eye(len(signs), dtype=signs.dtype)
     return problem._replace(W=jnp.where(unit > 0, problem.W, problem.W * signs[:, None]), q=problem.q * signs)
@@ -323,7 +323,7 @@ def pose(contacts: Contacts, scene: Scene, q, v, z, tau, t, h) -> _Problem:
     terms = contact_terms(contacts, whole, place, free, end)
     loads = _loads(contacts, scene, flow.place, v, t + 0.5 * h)
     closes = jnp.any(terms.velocity[contacts.normals] < _bounds(contacts, scene, terms, v, free, h))
-    closes = closes | jnp.any(loads > 0) | bool(contacts.loaded)
+    closes = closes | jnp.any(loads > 0) | bool(contacts.load_rows)
     # Halfway to a velocity without contact forces, damping would be that of a motion that contacts prevent.
     half = v + 0.5 * h * start
     rate, multipliers = flow.acceleration(half, jnp.where(closes, v, half))
@@ -346,9 +346,9 @@ def pose(contacts: Contacts, scene: Scene, q, v, z, tau, t, h) -> _Problem:
     closed, rest = matmul(of_loops, closing), Y + matmul(of_loops, against)
     velocities = terms.velocity + matmul(Y.T, closed)
     loads, total = h * loads, h * multipliers + closing
-    for k, row in contacts.loaded:
+    for k, row in contacts.load_rows:
         loads = loads.at[k].set(total[row])
-    reaction = _Reaction(loads, {k: against[row] for k, row in contacts.loaded})
+    reaction = _Reaction(loads, {k: against[row] for k, row in contacts.load_rows})
     return _in_units(contacts, flow, rest, place, free + metric.unwhiten(closed), terms, velocities, bound, reaction)
 
 

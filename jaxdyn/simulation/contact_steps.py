@@ -213,7 +213,7 @@ def _solve(contacts: Contacts, scene: Scene, of: Scaled, width, wanted: Any = Tr
     """Solution of a step's problem, and the cones (k,) whose velocities were made consistent with each other."""
     signs = load_signs(contacts, of, jnp.zeros_like(of.q))
     found = _solve_relaxed(contacts, scene, with_signs(contacts, of, signs), width, wanted)
-    if not contacts.loaded:
+    if not contacts.load_rows:
         return found
     # The impulses may turn the sign of a load: then it has the other one, or none.
     turned = load_signs(contacts, of, found[0].x)
