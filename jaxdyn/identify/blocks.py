@@ -223,6 +223,23 @@ def _write_entries(leaves: list, place: int, index: Any, values: Array) -> None:
     leaves[place] = flat.reshape(leaf.shape)
 
 
+@eqx.filter_jit
+def apply_blocks(parameters: Any, y, method: str | None):
+    """Leaves of `parameters.given` with the numbers of y, by their places, and a method's results of `parameters.blocks`."""
+    leaves = jax.tree.leaves(parameters.given)
+    begin, parts = 0, [jnp.zeros((0,), y.dtype)]
+    # In order: a tied block reads what the blocks before it have written.
+    for block in parameters.blocks:
+        part = y[begin : begin + block.size]
+        begin += block.size
+        leaves[block.place] = jnp.asarray(leaves[block.place])  # pyright: ignore[reportAttributeAccessIssue]
+        if method is not None:
+            parts.append(getattr(block, method)(part, leaves).astype(y.dtype))
+        block.write(part, leaves)
+    places = {block.place for block in parameters.blocks}  # pyright: ignore[reportAttributeAccessIssue]
+    return {place: leaves[place] for place in sorted(places)}, jnp.concatenate(parts)
+
+
 def find_models(system) -> list[Model]:
     """All models in a pytree."""
     return [x for x in jax.tree.leaves(system, is_leaf=lambda x: isinstance(x, Model)) if isinstance(x, Model)]

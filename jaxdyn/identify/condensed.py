@@ -81,10 +81,6 @@ class Blocks:
             [[np.sum((R @ c) ** 2) for R, c in zip(self.triangles[i], columns, strict=True)] for i in chosen_blocks]
         )
 
-    def torque_squares(self, chosen=None) -> np.ndarray:
-        """Sums of the squared torques measured (blocks, nv)."""
-        return self.squares(np.zeros(self.size), chosen)
-
     def scores(self, x: np.ndarray, weights: np.ndarray) -> np.ndarray:
         """Half the gradients (blocks, p) of each block's weighted squared error at x."""
         result = np.zeros((len(self), self.size))

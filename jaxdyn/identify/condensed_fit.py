@@ -286,9 +286,8 @@ def intervals(
     max(prior, 1) H^-1 P H^-1 the prior's. All in the coordinates of the chart, then carried over to x.
 
     `size`: effective sample size of the errors, which determines the length of the groups left out. `widening` (nv,): as of
-    `Intervals`. `curved`: logs
-    whose curvature counts, where the loss is not made of squares: Huber's has none beyond its threshold, though it has a gradient
-    there. `still`: indices of the torques whose joints hardly moved.
+    `Intervals`. `curved`: logs whose curvature counts, where the loss is not made of squares: Huber's has none beyond its
+    threshold, though it has a gradient there. `still`: indices of the torques whose joints hardly moved.
 
     Source: Efron (1982), the jackknife; Cameron & Miller (2015), cluster-robust inference (CR3); Huber
     (1981), "Robust statistics", section 6.4, whose curvature is that of psi'; Kutner, Nachtsheim, Neter & Li (2005), "Applied

@@ -17,6 +17,7 @@ from jaxdyn.identify.blocks import (
     Poses,
     Rows,
     Tied,
+    apply_blocks,
     entries_of_block,
     find_models,
     free_bodies,
@@ -256,10 +257,10 @@ class Parameters(eqx.Module):
     @property
     def keeps_regressor(self) -> bool:
         """True where inertias are free and the kinematics, gravity and encoders, on which their regressor depends, are not."""
-        models = find_models(self.given)
-        if len(models) != 1 or not any(isinstance(block, Inertias) for block in self.blocks):
+        if not any(isinstance(block, Inertias) for block in self.blocks):
             return False
-        model, leaves = models[0], jax.tree.leaves(self.given)
+        # Inertias are free in the only model of a system (`inertias`).
+        (model,), leaves = find_models(self.given), jax.tree.leaves(self.given)
         sensors = self.given.position_bias if isinstance(self.given, Measured) else None
         others = [model.inertias, model.armature, model.damping, model.friction]
         # By identity, as in `_model`.
@@ -270,7 +271,7 @@ class Parameters(eqx.Module):
         """System as given, with the numbers of y."""
         leaves, structure = jax.tree.flatten(self.given)
         # Frozen leaves stay the same objects, by whose identity other code recognises them.
-        for place, leaf in _apply_blocks(self, y, None)[0].items():
+        for place, leaf in apply_blocks(self, y, None)[0].items():
             leaves[place] = leaf
         return jax.tree.unflatten(structure, leaves)
 
@@ -280,11 +281,11 @@ class Parameters(eqx.Module):
 
     def values(self, y: Float[Array, " p"]) -> Float[Array, " m"]:
         """Numbers (m,) in the order of `names`."""
-        return _apply_blocks(self, y, "values")[1]
+        return apply_blocks(self, y, "values")[1]
 
     def residual(self, y: Float[Array, " p"]) -> Float[Array, " k"]:
         """Residuals of the prior (k,), of unit standard deviation: half of their sum of squares is its negative logarithm."""
-        return _apply_blocks(self, y, "residual")[1]
+        return apply_blocks(self, y, "residual")[1]
 
     # Construction.
 
@@ -384,20 +385,3 @@ def select_leaves(system: Any, positive=None, free=None) -> Parameters:
     if positive is not None:
         tree = tree.positive(positive)
     return tree if free is None else tree.free(free)
-
-
-@eqx.filter_jit
-def _apply_blocks(parameters: Parameters, y, method: str | None):
-    """Leaves with the numbers of y, by their places, and a method's results of all blocks, one after the other."""
-    leaves = jax.tree.leaves(parameters.given)
-    begin, parts = 0, [jnp.zeros((0,), y.dtype)]
-    # In order: a tied block reads what the blocks before it have written.
-    for block in parameters.blocks:
-        part = y[begin : begin + block.size]
-        begin += block.size
-        leaves[block.place] = jnp.asarray(leaves[block.place])  # pyright: ignore[reportAttributeAccessIssue]
-        if method is not None:
-            parts.append(getattr(block, method)(part, leaves).astype(y.dtype))
-        block.write(part, leaves)
-    places = {block.place for block in parameters.blocks}  # pyright: ignore[reportAttributeAccessIssue]
-    return {place: leaves[place] for place in sorted(places)}, jnp.concatenate(parts)

@@ -77,8 +77,8 @@ def pose_problem(
         objective.error == "momentum" or (objective.error == "torque" and objective.observed is None)
     ):
         raise ValueError(
-            f"the scene has {len(scene.constraints)} constraints, whose forces cannot be identified from torques; name the motors as "
-            "error='torque', or take 'trajectory' or 'energy'"
+            f"the scene has {len(scene.constraints)} constraints, whose forces cannot be identified from torques; name "
+            "the motors as observed= with error='torque', or take 'trajectory' or 'energy'"
         )
     logs, horizon = as_logs(log, scene.system, needs=objective.needs), objective.horizon
     if objective.observed is not None:
