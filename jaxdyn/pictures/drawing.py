@@ -178,7 +178,7 @@ class _Picture:
         self.ax, fits = _axes(ax), ax is None
         model = motion.scene.system
         self.solids = []
-        for shape in paint_sectors(parts, model, self.stage.size):
+        for shape in paint_sectors(parts, model):
             vertices, faces = simplify(*shape.triangles(), _MOST_VERTICES)
             vertices, faces = refine(vertices, faces, _LONGEST * self.stage.size)
             # Faces of files may have any orientation, and of a translucent solid both sides show.
@@ -380,7 +380,8 @@ def _fit(ax) -> None:
     for _ in range(4):
         ax.set_position(((centre[0] - side / 2) / width, (centre[1] - side / 2) / height, side / width, side / height))
         figure.canvas.draw()
-        flat = np.stack(proj3d.proj_transform(*corners.T, ax.get_proj())[:2], -1)
+        x, y, z = corners.T
+        flat = np.stack(proj3d.proj_transform(x, y, z, ax.get_proj())[:2], -1)
         boxes = [axis.get_tightbbox(figure.canvas.get_renderer()) for axis in (ax.xaxis, ax.yaxis, ax.zaxis)]
         edges = [ax.transData.transform(flat), *(box.get_points() for box in boxes if box is not None)]
         low, high = np.concatenate(edges).min(0) / figure.dpi, np.concatenate(edges).max(0) / figure.dpi

@@ -28,7 +28,6 @@ COLORS = {
 _CIRCLES = np.array(
     [[1.0, 0.0, np.sqrt(5) / 2 + 0.5], [np.sqrt(5) / 2 + 0.5, 1.0, 0.0], [0.0, np.sqrt(5) / 2 + 0.5, 1.0]]
 )
-_PAINTED = 0.03  # smallest half axis of a solid with paint_sectors sectors, as a fraction of the stage's size
 
 
 class Stage(NamedTuple):
@@ -153,18 +152,15 @@ def _unit(vector: np.ndarray) -> np.ndarray:
     return vector / np.linalg.norm(vector)
 
 
-def paint_sectors(shapes: Shapes, model: Model, size: float) -> Shapes:
+def paint_sectors(shapes: Shapes, model: Model) -> Shapes:
     """Paint alternate sectors of round default solids darker, so that their turning is seen.
 
-    A paint_sectors solid becomes two meshes. Solids of files keep their own colours, and small ones are marks of points.
+    A painted solid becomes two meshes. Wheels and balls of constraints are painted, and round bodies that turn freely.
     """
     parts = []
     for shape in shapes:
-        if (
-            shape.source == "file"
-            or shape.kind not in ("ellipsoid", "cylinder")
-            or min(shape.size[:1]) < _PAINTED * size
-        ):
+        turns = shape.source == "constraint" or (shape.source == "inertia" and _turns_freely(shape, model))
+        if not turns or shape.kind not in ("ellipsoid", "cylinder"):
             parts.append(shape)
             continue
         vertices, faces = shape.triangles()
@@ -181,6 +177,11 @@ def paint_sectors(shapes: Shapes, model: Model, size: float) -> Shapes:
                 )
             )  # fmt: skip
     return Shapes(parts, shapes.missing)
+
+
+def _turns_freely(shape: Shape, model: Model) -> bool:
+    body = -1 if shape.frame is None else model.topology.frame_bodies[model.frame_names.index(shape.frame)]
+    return body >= 0 and model.topology.kinds[body] in ("free", "spherical", "planar")
 
 
 def color_of(shape: Shape, model) -> tuple[float, float, float]:
