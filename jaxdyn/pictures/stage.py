@@ -181,7 +181,8 @@ def paint_sectors(shapes: Shapes, model: Model) -> Shapes:
 
 def _turns_freely(shape: Shape, model: Model) -> bool:
     body = -1 if shape.frame is None else model.topology.frame_bodies[model.frame_names.index(shape.frame)]
-    return body >= 0 and model.topology.kinds[body] in ("free", "spherical", "planar")
+    kinds = ("free", "spherical", "planar", *(["continuous"] if shape.kind == "cylinder" else []))
+    return body >= 0 and model.topology.kinds[body] in kinds
 
 
 def color_of(shape: Shape, model) -> tuple[float, float, float]:
