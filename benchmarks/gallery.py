@@ -14,7 +14,7 @@ import numpy as np
 
 import jaxdyn as jd
 from benchmarks.hand_figure import turned_ball
-from jaxdyn.pictures.solids import Shape, along, rod
+from jaxdyn.pictures.solids import Shape, Shapes, along, rod
 
 # Length of the motion, s.
 SCENES = {
@@ -55,8 +55,13 @@ POINTS = {
 }
 
 
-def solids(name: str) -> list[Shape] | None:
+def solids(name: str) -> Shapes | None:
     """Solids of vehicles, whose inertia alone does not show what they are; None for the default ones."""
+    parts = _vehicle(name)
+    return Shapes(parts) if parts else None
+
+
+def _vehicle(name: str) -> list[Shape] | None:
 
     def at(x, y, z):
         pose = np.eye(4)

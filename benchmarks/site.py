@@ -84,7 +84,8 @@ def dead_links(site: Path) -> tuple[int, list[str]]:
 
 def notebooks(folder: Path) -> int:
     """Write the notebooks of the repository, with the outputs that they hold, as pages into a folder; their number."""
-    from nbconvert import MarkdownExporter
+    # Imported on use: it is an extra of the site.
+    from nbconvert import MarkdownExporter  # pyright: ignore[reportMissingImports]
 
     folder.mkdir(parents=True, exist_ok=True)
     paths = sorted((ROOT / "notebooks").glob("*.ipynb"))

@@ -4,7 +4,6 @@ import os
 import shutil
 import subprocess
 from collections.abc import Mapping, Sequence
-from typing import Any
 
 import numpy as np
 
@@ -14,7 +13,19 @@ from jaxdyn.model.tree import Model
 from jaxdyn.pictures.default_solids import frame_poses
 from jaxdyn.pictures.motion import Cone, Force, Motion, cones, forces, joint_axes, marks, motion_of
 from jaxdyn.pictures.solids import Shapes, refine, simplify
-from jaxdyn.pictures.stage import AXIS, COLORS, LOOP, Stage, all_solids, color_of, paint_sectors, rgb, stage_of
+from jaxdyn.pictures.stage import (
+    AXIS,
+    COLORS,
+    LOOP,
+    all_solids,
+    color_of,
+    fit_axes,
+    new_axes,
+    paint_sectors,
+    rgb,
+    set_stage,
+    stage_of,
+)
 from jaxdyn.reports.plotting import Axes
 from jaxdyn.simulation.solution import Solution
 from jaxdyn.systems.system import SceneLike
@@ -175,10 +186,10 @@ class _Picture:
         self.motion = motion
         parts = all_solids(motion, shapes)
         self.stage = stage_of(motion, parts)
-        self.ax, fits = _axes(ax), ax is None
+        self.ax, fits = new_axes(ax), ax is None
         model = motion.scene.system
         self.solids = []
-        for shape in paint_sectors(parts, model, self.stage.size):
+        for shape in paint_sectors(parts, model):
             vertices, faces = simplify(*shape.triangles(), _MOST_VERTICES)
             vertices, faces = refine(vertices, faces, _LONGEST * self.stage.size)
             # Faces of files may have any orientation, and of a translucent solid both sides show.
@@ -191,11 +202,11 @@ class _Picture:
             (name, axes, (frame_poses(model, motion.poses, frame), point)) for name, frame, point, axes in named
         ]
         self.drawn: list = []
-        _set_stage(self.ax, self.stage)
+        set_stage(self.ax, self.stage)
         if self.scales:
             _add_legend(self.ax, self.scales)
         if fits:
-            _fit(self.ax)
+            fit_axes(self.ax)
 
     def images(self) -> list[np.ndarray]:
         """Pixels (height, width, 3) of all rows."""
@@ -346,102 +357,3 @@ def _add_legend(ax, scales) -> None:
         for kind, size in longest.items()
     ]
     ax.figure.legend(handles=lines, loc="lower center", ncols=2, fontsize=8, frameon=False)
-
-
-def _axes(ax) -> Any:
-    if ax is None:
-        from matplotlib.backends.backend_agg import FigureCanvasAgg
-        from matplotlib.figure import Figure
-
-        figure = Figure(figsize=(5.2, 4.6), dpi=110)
-        # A canvas without a display; `savefig` and animations need one.
-        FigureCanvasAgg(figure)
-        return figure.add_axes((0.0, 0.0, 1.0, 1.0), projection="3d")
-    if getattr(ax, "name", "") != "3d":
-        raise ValueError(
-            f"ax is {type(ax).__name__}; give axes of projection '3d': figure.add_subplot(projection='3d')"
-        )
-    return ax
-
-
-def _fit(ax) -> None:
-    """Choose the height of the figure and the place of the axes, so that the box and its labels fill it."""
-    from mpl_toolkits.mplot3d import proj3d
-
-    figure, width = ax.figure, ax.figure.get_figwidth()
-    # Kept free (inches): of the legend below, of the time of animations above.
-    below = 0.08 + (0.2 * -(-len(figure.legends[0].get_texts()) // 2) if figure.legends else 0.0)
-    margin, above = 0.16, 0.22
-    limits = [ax.get_xlim(), ax.get_ylim(), ax.get_zlim()]
-    corners = np.stack(np.meshgrid(*limits, indexing="ij"), -1).reshape(-1, 3)
-    height = figure.get_figheight()
-    side, centre = height, np.array([width, height]) / 2
-    # Labels keep their size while the box is scaled, so that the scale is found by repetition.
-    for _ in range(4):
-        ax.set_position(((centre[0] - side / 2) / width, (centre[1] - side / 2) / height, side / width, side / height))
-        figure.canvas.draw()
-        flat = np.stack(proj3d.proj_transform(*corners.T, ax.get_proj())[:2], -1)
-        boxes = [axis.get_tightbbox(figure.canvas.get_renderer()) for axis in (ax.xaxis, ax.yaxis, ax.zaxis)]
-        edges = [ax.transData.transform(flat), *(box.get_points() for box in boxes if box is not None)]
-        low, high = np.concatenate(edges).min(0) / figure.dpi, np.concatenate(edges).max(0) / figure.dpi
-        room = np.array([width - margin, np.clip((high - low)[1] / (high - low)[0], 0.4, 1.0) * (width - margin)])
-        scale = float((room / (high - low)).min())
-        height = room[1] + below + above
-        middle = np.array([width / 2, below + room[1] / 2])
-        centre, side = middle - scale * ((low + high) / 2 - centre), scale * side
-        figure.set_figheight(height)
-    ax.set_position(((centre[0] - side / 2) / width, (centre[1] - side / 2) / height, side / width, side / height))
-
-
-def _set_stage(ax, stage: Stage) -> None:
-    """Set equal scales, limits down to the ground, and the view."""
-    # A flat mechanism would have limits of zero width, which matplotlib widens with a warning.
-    extent = np.maximum(stage.high - stage.low, 0.12 * stage.size)
-    low, high = stage.centre - 0.53 * extent, stage.centre + 0.53 * extent
-    axis = int(np.argmax(np.abs(stage.up)))
-    if stage.up[axis] > 0:
-        low[axis] = min(low[axis], stage.ground)
-    else:
-        high[axis] = max(high[axis], -stage.ground)
-    # matplotlib's angles are about the axis that it calls vertical, the other two in cyclic order.
-    vertical = "xyz"[axis]
-    a, b = np.eye(3)[(axis + 1) % 3], np.eye(3)[(axis + 2) % 3]
-    elevation = np.rad2deg(np.arcsin(np.clip(stage.eye @ np.eye(3)[axis], -1, 1)))
-    azimuth = np.rad2deg(np.arctan2(stage.eye @ b, stage.eye @ a))
-    # matplotlib draws its vertical axis upwards; gravity along the positive axis turns the picture over.
-    roll = 0.0 if stage.up[axis] > 0 else 180.0
-    ax.view_init(elevation, azimuth, roll, vertical_axis=vertical)
-    ax.set(xlim=(low[0], high[0]), ylim=(low[1], high[1]), zlim=(low[2], high[2]))
-    ax.set_box_aspect(high - low, zoom=1.1)  # after the vertical axis is set, by which matplotlib turns the numbers
-    if stage.has_ground:
-        lines = _grid(low, high, axis, np.sign(stage.up[axis]) * stage.ground)
-        # Below all solids. One line with gaps is drawn faster than many.
-        ax.plot(*lines.T, color="0.82", linewidth=0.8, zorder=0)
-        ax.grid(False)
-    for pane in (ax.xaxis, ax.yaxis, ax.zaxis):
-        pane.set_pane_color((1.0, 1.0, 1.0, 0.0))
-    for name, length in zip("xyz", high - low, strict=True):
-        if length < 0.25 * (high - low).max():  # tick labels along a short axis would overlap
-            getattr(ax, f"set_{name}ticks")([])
-            continue
-        getattr(ax, f"set_{name}label")(f"{name} (m)", fontsize=8)
-        ax.tick_params(axis=name, labelsize=7)
-        ax.locator_params(axis=name, nbins=5)
-
-
-def _grid(low: np.ndarray, high: np.ndarray, axis: int, height: float) -> np.ndarray:
-    """Points (k, 3) of the lines of a ground with square cells, with a gap (NaN) after each line."""
-    across = [k for k in range(3) if k != axis]
-    # A cell of 1, 2 or 5 times a power of ten can be read as a scale.
-    wanted = (high - low)[across].max() / 12
-    power = 10.0 ** np.floor(np.log10(wanted))
-    cell = power * min(k for k in (1, 2, 5, 10) if k * power >= wanted)
-    first, last = np.floor(low / cell) * cell, np.ceil(high / cell) * cell
-    lines = []
-    for along, other in (across, across[::-1]):
-        for place in np.arange(first[other], last[other] + cell / 2, cell):
-            line = np.full((3, 3), np.nan)
-            line[:2, axis], line[:2, other] = height, place
-            line[:2, along] = first[along], last[along]
-            lines.append(line)
-    return np.concatenate(lines)

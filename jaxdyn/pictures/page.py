@@ -207,7 +207,7 @@ class _Content:
         self.size = stage.size
         _set_stage(server, stage)
         self.bodies: list[tuple[int, str | None, Any]] = []
-        meshes = list(_meshes(motion, paint_sectors(parts, motion.scene.system, stage.size), vertices))
+        meshes = list(_meshes(motion, paint_sectors(parts, motion.scene.system), vertices))
         for n in range(len(motion.q)):
             self._add_bodies(n, meshes)
         self.marks = [(mark, self._ball(k)) for k, mark in enumerate(marks(motion))]

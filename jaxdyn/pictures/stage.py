@@ -1,7 +1,7 @@
-"""Stage of a picture: vertical direction, ground, view and colours."""
+"""Stage of a picture: vertical direction, ground, view and colours, and matplotlib's axes that show it."""
 
 import dataclasses
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -28,7 +28,6 @@ COLORS = {
 _CIRCLES = np.array(
     [[1.0, 0.0, np.sqrt(5) / 2 + 0.5], [np.sqrt(5) / 2 + 0.5, 1.0, 0.0], [0.0, np.sqrt(5) / 2 + 0.5, 1.0]]
 )
-_PAINTED = 0.03  # smallest half axis of a solid with paint_sectors sectors, as a fraction of the stage's size
 
 
 class Stage(NamedTuple):
@@ -153,18 +152,15 @@ def _unit(vector: np.ndarray) -> np.ndarray:
     return vector / np.linalg.norm(vector)
 
 
-def paint_sectors(shapes: Shapes, model: Model, size: float) -> Shapes:
+def paint_sectors(shapes: Shapes, model: Model) -> Shapes:
     """Paint alternate sectors of round default solids darker, so that their turning is seen.
 
-    A paint_sectors solid becomes two meshes. Solids of files keep their own colours, and small ones are marks of points.
+    A painted solid becomes two meshes. Wheels and balls of constraints are painted, and round bodies that turn freely.
     """
     parts = []
     for shape in shapes:
-        if (
-            shape.source == "file"
-            or shape.kind not in ("ellipsoid", "cylinder")
-            or min(shape.size[:1]) < _PAINTED * size
-        ):
+        turns = shape.source == "constraint" or (shape.source == "inertia" and _turns_freely(shape, model))
+        if not turns or shape.kind not in ("ellipsoid", "cylinder"):
             parts.append(shape)
             continue
         vertices, faces = shape.triangles()
@@ -183,6 +179,12 @@ def paint_sectors(shapes: Shapes, model: Model, size: float) -> Shapes:
     return Shapes(parts, shapes.missing)
 
 
+def _turns_freely(shape: Shape, model: Model) -> bool:
+    body = -1 if shape.frame is None else model.topology.frame_bodies[model.frame_names.index(shape.frame)]
+    kinds = ("free", "spherical", "planar", *(["continuous"] if shape.kind == "cylinder" else []))
+    return body >= 0 and model.topology.kinds[body] in kinds
+
+
 def color_of(shape: Shape, model) -> tuple[float, float, float]:
     """Colour (3,) from 0 to 1 of a solid: its own, or that of its body."""
     if shape.color is not None:
@@ -194,3 +196,104 @@ def color_of(shape: Shape, model) -> tuple[float, float, float]:
 def rgb(code: str) -> tuple[float, float, float]:
     """Colour (3,) from 0 to 1 of a code #rrggbb."""
     return tuple(int(code[k : k + 2], 16) / 255 for k in (1, 3, 5))  # pyright: ignore[reportReturnType]
+
+
+def new_axes(ax) -> Any:
+    """Check 3D axes of matplotlib, or create them in a figure of their own for None."""
+    if ax is None:
+        from matplotlib.backends.backend_agg import FigureCanvasAgg
+        from matplotlib.figure import Figure
+
+        figure = Figure(figsize=(5.2, 4.6), dpi=110)
+        # A canvas without a display; `savefig` and animations need one.
+        FigureCanvasAgg(figure)
+        return figure.add_axes((0.0, 0.0, 1.0, 1.0), projection="3d")
+    if getattr(ax, "name", "") != "3d":
+        raise ValueError(
+            f"ax is {type(ax).__name__}; give axes of projection '3d': figure.add_subplot(projection='3d')"
+        )
+    return ax
+
+
+def fit_axes(ax) -> None:
+    """Choose the height of the figure and the place of the axes, so that the box and its labels fill it."""
+    from mpl_toolkits.mplot3d import proj3d
+
+    figure, width = ax.figure, ax.figure.get_figwidth()
+    # Kept free (inches): of the legend below, of the time of animations above.
+    below = 0.08 + (0.2 * -(-len(figure.legends[0].get_texts()) // 2) if figure.legends else 0.0)
+    margin, above = 0.16, 0.22
+    limits = [ax.get_xlim(), ax.get_ylim(), ax.get_zlim()]
+    corners = np.stack(np.meshgrid(*limits, indexing="ij"), -1).reshape(-1, 3)
+    height = figure.get_figheight()
+    side, centre = height, np.array([width, height]) / 2
+    # Labels keep their size while the box is scaled, so that the scale is found by repetition.
+    for _ in range(4):
+        ax.set_position(((centre[0] - side / 2) / width, (centre[1] - side / 2) / height, side / width, side / height))
+        figure.canvas.draw()
+        x, y, z = corners.T
+        flat = np.stack(proj3d.proj_transform(x, y, z, ax.get_proj())[:2], -1)
+        boxes = [axis.get_tightbbox(figure.canvas.get_renderer()) for axis in (ax.xaxis, ax.yaxis, ax.zaxis)]
+        edges = [ax.transData.transform(flat), *(box.get_points() for box in boxes if box is not None)]
+        low, high = np.concatenate(edges).min(0) / figure.dpi, np.concatenate(edges).max(0) / figure.dpi
+        room = np.array([width - margin, np.clip((high - low)[1] / (high - low)[0], 0.4, 1.0) * (width - margin)])
+        scale = float((room / (high - low)).min())
+        height = room[1] + below + above
+        middle = np.array([width / 2, below + room[1] / 2])
+        centre, side = middle - scale * ((low + high) / 2 - centre), scale * side
+        figure.set_figheight(height)
+    ax.set_position(((centre[0] - side / 2) / width, (centre[1] - side / 2) / height, side / width, side / height))
+
+
+def set_stage(ax, stage: Stage) -> None:
+    """Set equal scales, limits down to the ground, and the view."""
+    # A flat mechanism would have limits of zero width, which matplotlib widens with a warning.
+    extent = np.maximum(stage.high - stage.low, 0.12 * stage.size)
+    low, high = stage.centre - 0.53 * extent, stage.centre + 0.53 * extent
+    axis = int(np.argmax(np.abs(stage.up)))
+    if stage.up[axis] > 0:
+        low[axis] = min(low[axis], stage.ground)
+    else:
+        high[axis] = max(high[axis], -stage.ground)
+    # matplotlib's angles are about the axis that it calls vertical, the other two in cyclic order.
+    vertical = "xyz"[axis]
+    a, b = np.eye(3)[(axis + 1) % 3], np.eye(3)[(axis + 2) % 3]
+    elevation = np.rad2deg(np.arcsin(np.clip(stage.eye @ np.eye(3)[axis], -1, 1)))
+    azimuth = np.rad2deg(np.arctan2(stage.eye @ b, stage.eye @ a))
+    # matplotlib draws its vertical axis upwards; gravity along the positive axis turns the picture over.
+    roll = 0.0 if stage.up[axis] > 0 else 180.0
+    ax.view_init(elevation, azimuth, roll, vertical_axis=vertical)
+    ax.set(xlim=(low[0], high[0]), ylim=(low[1], high[1]), zlim=(low[2], high[2]))
+    ax.set_box_aspect(high - low, zoom=1.1)  # after the vertical axis is set, by which matplotlib turns the numbers
+    if stage.has_ground:
+        lines = _grid(low, high, axis, np.sign(stage.up[axis]) * stage.ground)
+        # Below all solids. One line with gaps is drawn faster than many.
+        ax.plot(*lines.T, color="0.82", linewidth=0.8, zorder=0)
+        ax.grid(False)
+    for pane in (ax.xaxis, ax.yaxis, ax.zaxis):
+        pane.set_pane_color((1.0, 1.0, 1.0, 0.0))
+    for name, length in zip("xyz", high - low, strict=True):
+        if length < 0.25 * (high - low).max():  # tick labels along a short axis would overlap
+            getattr(ax, f"set_{name}ticks")([])
+            continue
+        getattr(ax, f"set_{name}label")(f"{name} (m)", fontsize=8)
+        ax.tick_params(axis=name, labelsize=7)
+        ax.locator_params(axis=name, nbins=5)
+
+
+def _grid(low: np.ndarray, high: np.ndarray, axis: int, height: float) -> np.ndarray:
+    """Points (k, 3) of the lines of a ground with square cells, with a gap (NaN) after each line."""
+    across = [k for k in range(3) if k != axis]
+    # A cell of 1, 2 or 5 times a power of ten can be read as a scale.
+    wanted = (high - low)[across].max() / 12
+    power = 10.0 ** np.floor(np.log10(wanted))
+    cell = power * min(k for k in (1, 2, 5, 10) if k * power >= wanted)
+    first, last = np.floor(low / cell) * cell, np.ceil(high / cell) * cell
+    lines = []
+    for along, other in (across, across[::-1]):
+        for place in np.arange(first[other], last[other] + cell / 2, cell):
+            line = np.full((3, 3), np.nan)
+            line[:2, axis], line[:2, other] = height, place
+            line[:2, along] = first[along], last[along]
+            lines.append(line)
+    return np.concatenate(lines)

@@ -133,21 +133,22 @@ def quasi_connection(
 
     Source: EQUATIONS section 9, with erratum E25.
     """
-    system = as_scene(system).system
-    q, v, t = check_state(system, q=q, v=v, t=t)
-    kinds = getattr(getattr(system, "topology", None), "kinds", ())
-    if system.nq != system.nv or {"planar", "spherical", "free"} & set(kinds):
+    of: Any = as_scene(system).system
+    q, v, t = check_state(of, q=q, v=v, t=t)
+    kinds = getattr(getattr(of, "topology", None), "kinds", ())
+    if of.nq != of.nv or {"planar", "spherical", "free"} & set(kinds):
         raise ValueError(
             "the velocities of the system are not the rates of its coordinates (planar, spherical and free joints); "
             "jd.reduction.gauge_invariant has the skew form for these"
         )
 
     def root(q, t):
-        return cholesky(mass_matrix(system, q, t))
+        return cholesky(mass_matrix(of, q, t))
 
-    W, Wdot = jax.jvp(root, (q, t), (v, jnp.ones_like(t)))
+    time = jnp.asarray(t, q.dtype)
+    W, Wdot = jax.jvp(root, (q, time), (v, jnp.ones_like(time)))
     # Row i of dw^T/dq holds the derivatives by q_i.
-    slope = jax.jacfwd(lambda q: matmul(root(q, t).T, v))(q).T
+    slope = jax.jacfwd(lambda q: matmul(root(q, time).T, v))(q).T
     return solve_lower(W, Wdot - slope)
 
 

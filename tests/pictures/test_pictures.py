@@ -295,7 +295,7 @@ def test_marks_of_turning_solids_are_their_whole_surface():
     model = jd.scenes.rolling_coin().system
     for kind, size in (("ellipsoid", (0.5,) * 3), ("cylinder", (0.5, 0.1))):
         solid = Shape("coin", kind, size, source="constraint")
-        dark, light = stage.paint_sectors(Shapes([solid]), model, 1.0)
+        dark, light = stage.paint_sectors(Shapes([solid]), model)
         areas = []
         for part in (dark, light):
             vertices, faces = part.triangles()
@@ -305,9 +305,9 @@ def test_marks_of_turning_solids_are_their_whole_surface():
             )
         assert areas[0] == pytest.approx(areas[1], rel=1e-9)
         assert len(dark.faces) + len(light.faces) == len(solid.triangles()[1])
-    # A solid of a file keeps its colours, and a mark of a point is too small to be paint_sectors.
-    kept = Shapes([Shape("coin", "ellipsoid", (0.5,) * 3), Shape("coin", "ellipsoid", (0.01,) * 3, source="inertia")])
-    assert stage.paint_sectors(kept, model, 1.0) == kept
+    # A solid of a file keeps its colours, and a mark of a point is without an attitude.
+    kept = Shapes([Shape("coin", "ellipsoid", (0.5,) * 3), Shape("coin", "ellipsoid", (0.01,) * 3, source="mark")])
+    assert stage.paint_sectors(kept, model) == kept
 
 
 def test_a_link_with_three_joints_is_a_plate():
@@ -328,7 +328,7 @@ def test_points_and_frames_are_named_and_leave_paths(turning):
     axes = jd.draw(scene, first, frames=("rocker",), points={"P": ("coupler", (0.3, 0.1, 0.0))})
     assert {text.get_text() for text in axes.texts} == {"rocker", "P"}
     (path,) = [np.array(line.get_data_3d()).T for line in axes.lines if line.get_color() == "0.25"]
-    poses = [jd.frame_pose(scene.system, q, "coupler") for q in first.q]
+    poses = [np.asarray(jd.frame_pose(scene.system, q, "coupler")) for q in first.q]
     np.testing.assert_allclose(path, [pose[:3, :3] @ [0.3, 0.1, 0.0] + pose[:3, 3] for pose in poses], atol=1e-12)
     with pytest.raises(ValueError, match="the frame 'elbow', which the model lacks"):
         jd.draw(scene, first.q[0], frames=("elbow",))
