@@ -11,8 +11,8 @@ values), `batch` (decisions for a batch, repetitions) and `loops`. Only `jaxdyn.
 kernels ahead of time, and `jaxdyn.exports`, which writes object files, import the compiler's own modules.
 """
 
-from jaxdyn.compile.calls import entry_point as entry_point
-from jaxdyn.compile.calls import jit as jit
+from jaxdyn.compile.executables import entry_point as entry_point
+from jaxdyn.compile.executables import jit as jit
 from jaxdyn.compile.first_calls import wait_for_code as wait_for_code
 from jaxdyn.compile.flags import mark_invalid as mark_invalid
 from jaxdyn.compile.jacobi import gram_eigenvectors as gram_eigenvectors
@@ -27,10 +27,10 @@ from jaxdyn.compile.mode import current as compilation_mode  # noqa: F401 (under
 from jaxdyn.compile.mode import is_standalone as is_standalone
 from jaxdyn.compile.mode import values_of_rules as values_of_rules
 from jaxdyn.compile.pivots import eliminate_rows as eliminate_rows
-from jaxdyn.compile.reverse_mode import reverse_only as reverse_only
 from jaxdyn.compile.rules import batch_alike as batch_alike
 from jaxdyn.compile.rules import implicit as implicit
 from jaxdyn.compile.rules import invalidate_derivatives as invalidate_derivatives
+from jaxdyn.compile.rules import reverse_only as reverse_only
 from jaxdyn.compile.rules import value_and_jvp as value_and_jvp
 from jaxdyn.compile.sweeps import sweep as sweep
 from jaxdyn.compile.trial import run_trial as _run_trial  # noqa: F401 (it registers itself)

@@ -16,7 +16,6 @@ from jaxdyn.compile import jax_adapter, mode
 from jaxdyn.compile.derive import without_unread
 from jaxdyn.compile.flags import has_marks
 from jaxdyn.compile.known import is_known, partition, partition_tracers
-from jaxdyn.compile.messages import say_without_kernel
 from jaxdyn.compile.primitive import kernel_p, target
 from jaxdyn.compile.trace import function_of_leaves, inline_call, name_of, program_of, trace_program
 
@@ -97,7 +96,7 @@ def _by_kernel(function, static, tree, args, fallback: Callable | None, **how) -
         return values
     if isinstance(results, str):
         if fallback is None:
-            say_without_kernel(name_of(function), results)
+            mode.say_without_kernel(name_of(function), results)
         return None
     return results
 

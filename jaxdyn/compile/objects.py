@@ -3,8 +3,8 @@
 An object file is found by the identity of the program that it computes, and by what its code depends on beside that: the sources
 of this subpackage, which write the text, the versions of LLVM, and the processor's name and features.
 
-A long text is compiled twice: at LLVM's lowest level, in a quarter of the time, and later once more (see `ahead`). The bits of
-results are those of the text at every level.
+A long text is compiled twice: at LLVM's lowest level, in a quarter of the time, and later once more (see `first_calls`). The bits
+of results are those of the text at every level.
 """
 
 import functools

@@ -15,11 +15,10 @@ import jax
 import jax.numpy as jnp
 from jax import lax
 
-from jaxdyn.compile import ahead, derive, jax_adapter, mode
+from jaxdyn.compile import derive, first_calls, jax_adapter, mode
 from jaxdyn.compile.careful import guard
 from jaxdyn.compile.flags import mark_invalid
 from jaxdyn.compile.jax_adapter import ShapedArray, define_primitive, is_linear, is_zero, lowering_of, zero_tangent
-from jaxdyn.compile.messages import say_without_kernel
 from jaxdyn.compile.operations import as_operations, by_jax
 from jaxdyn.compile.program import NotNumbers, Program, TooLong
 from jaxdyn.compile.shared import split_program
@@ -48,7 +47,7 @@ def _implement(*args, program, rows):
 
 def _result_types(*avals, program, rows):
     is_one = not any(len(x.shape) > 1 for x in avals)
-    if is_one and ahead.is_active() and not mode.is_expanding():
+    if is_one and first_calls.is_active() and not mode.is_expanding():
         assert target is not None
         # JAX asks for the types first, long before it lowers: LLVM works while Python traces on. An error is raised, with
         # its message, where the kernel is lowered.
@@ -105,7 +104,7 @@ def _tangent_or_none(program, moving: tuple[bool, ...]) -> Program | None:
     except (NotNumbers, TooLong) as reason:
         if program.fallback is None:
             raise
-        say_without_kernel(f"the derivative of {program.name}", str(reason))
+        mode.say_without_kernel(f"the derivative of {program.name}", str(reason))
     except Exception as error:
         if program.fallback is None or not jax_adapter.forgive(error):
             raise

@@ -18,8 +18,7 @@ from jaxdyn.compile.directions import Directions
 from jaxdyn.compile.graph import Graph
 from jaxdyn.compile.inlining import inline, replay
 from jaxdyn.compile.llvm import Emitter
-from jaxdyn.compile.messages import remedy_of
-from jaxdyn.compile.mode import careful, standalone
+from jaxdyn.compile.mode import careful, remedy_of, standalone
 from jaxdyn.compile.program import FLOATS, Array, Constant, Program, kind_of, objects
 from jaxdyn.compile.trace import program_of
 

@@ -11,7 +11,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from jaxdyn.compile import ahead, objects
+from jaxdyn.compile import first_calls, objects
 from jaxdyn.compile.body import symbol_of
 from jaxdyn.compile.careful import Careful, run_apart
 from jaxdyn.compile.careful_text import CAREFUL, identity_of, number_of
@@ -222,7 +222,7 @@ class _Kernel:
         self.careful: Careful | None = None
         self.recover: Callable | None = None  # makes the program again, of a kernel that was read from disk
         self.is_made = False
-        self.is_awaited = False  # whether a worker is to compile it (see `ahead`)
+        self.is_awaited = False  # whether a worker is to compile it (see `first_calls`)
         self.sizes = (ctypes.c_int64 * len(row.sizes))(*row.sizes)
         self.entry = free_entry(_table, number)
         self.entry.kernel, self.entry.chunk, self.entry.least = 0, row.chunk, 2 * row.chunk
@@ -366,7 +366,7 @@ def make_ahead(number: int) -> None:
     made = _kernels[number]
     if not made.is_made and not made.is_awaited:
         made.is_awaited = True
-        ahead.make_later(made.address)
+        first_calls.make_later(made.address)
 
 
 def publish_ahead(program, width: int) -> None:
@@ -381,7 +381,7 @@ def publish_ahead(program, width: int) -> None:
                 with phase("LLVM"), _making:
                     _publish(symbol, width, calls)
 
-        ahead.make_later(make)
+        first_calls.make_later(make)
 
 
 def _publish(symbol: str, width: int, programs: dict[str, Any], recover: Callable | None = None) -> bool:

@@ -12,7 +12,7 @@ from jax import monitoring
 
 import jaxdyn as jd
 from jaxdyn import compile as backend
-from jaxdyn.compile import ahead, calls, objects, target
+from jaxdyn.compile import executables, first_calls, objects, target
 
 pytestmark = pytest.mark.native
 
@@ -24,9 +24,9 @@ def options(name):
 
     def in_force(monkeypatch):
         monkeypatch.setenv("JAXDYN_COMPILATION_OPTIONS", name)
-        calls.quick_options.cache_clear()
+        executables.quick_options.cache_clear()
         yield
-        calls.quick_options.cache_clear()
+        executables.quick_options.cache_clear()
 
     return pytest.fixture(in_force, name=name)
 
@@ -100,7 +100,7 @@ def test_no_thread_outlives_the_call_and_the_collector_stays_on():
     def function(x):
         for k in range(3):
             x = native(lambda x, k=k: jnp.sin(x) * (1.48484 + k))(x)
-        ahead.make_later(lambda: slow.wait(0.2))
+        first_calls.make_later(lambda: slow.wait(0.2))
         seen.append((gc.isenabled(), len(set(threading.enumerate()) - before)))
         return x
 
@@ -136,11 +136,11 @@ def test_the_environment_turns_both_off(usual, monkeypatch):
     seen = []
 
     def function(x):
-        seen.append(ahead.is_active())
+        seen.append(first_calls.is_active())
         return native(lambda x: jnp.sin(x) * 1.67676)(x)
 
     np.testing.assert_allclose(backend.entry_point(function)(jnp.ones(2)), np.sin(1) * 1.67676, rtol=1e-15)
-    assert set(seen) == {False} and calls.quick_options() is None
+    assert set(seen) == {False} and executables.quick_options() is None
 
 
 def test_both_ways_agree(request):
@@ -171,7 +171,7 @@ def test_the_least_optimisation_gives_other_code_and_the_same_numbers(request):
     request.getfixturevalue("least")
     np.testing.assert_allclose(torque(2.0), 2 * one, rtol=1e-14)
     assert objects.name_of_file("a program") != key
-    options = calls.quick_options()
+    options = executables.quick_options()
     assert options is not None and options["xla_backend_optimization_level"] == 0
 
 
@@ -210,7 +210,7 @@ def programs():
         if event.endswith("backend_compile_duration"):
             names.append(of.get("fun_name"))
 
-    calls.quick_options()
+    executables.quick_options()
     monitoring.register_event_duration_secs_listener(seen)
     yield names
     monitoring.unregister_event_duration_listener(seen)
