@@ -9,19 +9,19 @@ Sources: EQUATIONS sections 8 to 10.
 
 from types import ModuleType as _ModuleType
 
-from jaxdyn.control.contacts import ContactCoordinates as ContactCoordinates
-from jaxdyn.control.feet import Foot as Foot
-from jaxdyn.control.feet import foot as foot
-from jaxdyn.control.gauge_invariant import GaugeInvariant as GaugeInvariant
 from jaxdyn.control.grasping import GraspForce as GraspForce
+from jaxdyn.control.hybrid_force import GaugeInvariant as GaugeInvariant
 from jaxdyn.control.hybrid_force import HybridForce as HybridForce
 from jaxdyn.control.ilqr import OptimalControl as OptimalControl
 from jaxdyn.control.ilqr import ilqr as ilqr
+from jaxdyn.control.legs import Foot as Foot
 from jaxdyn.control.legs import LeggedDynamics as LeggedDynamics
+from jaxdyn.control.legs import foot as foot
 from jaxdyn.control.legs import missing_wrench as missing_wrench
 from jaxdyn.control.legs import underactuated_inverse_dynamics as underactuated_inverse_dynamics
 from jaxdyn.control.motion import CartesianStiffness as CartesianStiffness
 from jaxdyn.control.motion import ComputedTorque as ComputedTorque
+from jaxdyn.control.motion import ContactCoordinates as ContactCoordinates
 from jaxdyn.control.motion import OperationalSpace as OperationalSpace
 from jaxdyn.control.whole_body import WholeBody as WholeBody
 from jaxdyn.control.whole_body import standing as standing

@@ -27,8 +27,14 @@ from jaxdyn.control.errors import (
     hierarchical_acceleration,
     target_rows,
 )
-from jaxdyn.control.feet import Foot, check_feet
-from jaxdyn.control.legs import LeggedDynamics, missing_wrench, passive_velocities, underactuated_inverse_dynamics
+from jaxdyn.control.legs import (
+    Foot,
+    LeggedDynamics,
+    check_feet,
+    missing_wrench,
+    passive_velocities,
+    underactuated_inverse_dynamics,
+)
 from jaxdyn.lie.so3 import matmul
 from jaxdyn.model.arguments import Checked, Number, Numbers
 from jaxdyn.model.numbers import as_number

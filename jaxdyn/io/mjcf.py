@@ -30,9 +30,9 @@ from jaxdyn.io.mjcf_file import (
     compile_file,
     import_mujoco,
     pose_of,
+    sensors,
 )
 from jaxdyn.io.mjcf_parts import actuators, constraints, tendon_forces
-from jaxdyn.io.mjcf_sensors import sensors
 from jaxdyn.io.solids import geom_solid
 from jaxdyn.io.xml_lines import LARGEST_ROUNDING, XmlFile, rounding_of_digits
 from jaxdyn.model import host_math
