@@ -95,11 +95,11 @@ class Terminal(eqx.Module):
     **Raises:** ValueError for what cannot be called so.
 
     ```python
-    def height(q, v, t):
-        return q[2]
+    def first_angle(q, v, t):
+        return q[0]
 
 
-    jd.simulate(model, q0, v0, ts, events=[jd.events.Terminal(height)])
+    jd.simulate(model, q0, v0, ts, events=[jd.events.Terminal(first_angle)])
     ```
     """
 

@@ -187,7 +187,10 @@ def test_events_are_those_of_the_exact_mechanism(event, folder):
             forces = [jd.contact.ground_contact(system.body_names[crank], (1.0, 0.0, 0.0), plane=GROUND)]
         elif event == "limit":
             lower = jnp.full(3, -jnp.inf).at[crank].set(0.7)
-            system, options = system.replace(lower=lower, upper=jnp.full(3, jnp.inf)), {"limits": "stop"}
+            system, options = (
+                system.replace(lower=lower, upper=jnp.full(3, jnp.inf)),
+                {"events": [jd.events.JointLimit()]},
+            )
         else:
             forces = [jd.contact.DryFriction(0.4, 60.0, crank, static=0.6)]
         whole = jd.Scene(system, scene.constraints, forces)

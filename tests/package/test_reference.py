@@ -112,6 +112,7 @@ log = jd.identify.Log(log.t, log.q, log.v, log.a, log.tau / np.array([11.0, 8.5]
     }
     | dict.fromkeys(
         (
+            "events.Terminal",
             "solvers.LieGroup",
             "Sampled",
             "Variational",

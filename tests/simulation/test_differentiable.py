@@ -229,7 +229,7 @@ RUNS = {
     "backsolve": ("backsolve", {}),
     "diffrax": ("reverse", {"solver": diffrax.Kvaerno5()}),
     "diffrax direct": ("direct", {"solver": jd.solvers.Rodas5P()}),
-    "limits": ("reverse", {"limits": "stop"}),
+    "limits": ("reverse", {"events": [jd.events.JointLimit()]}),
 }
 
 

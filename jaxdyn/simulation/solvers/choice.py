@@ -1,7 +1,7 @@
 """Choice of solver, step-size control and adjoint: the user's options as diffrax's objects."""
 
 import importlib.util
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import diffrax
 import equinox as eqx
@@ -15,8 +15,10 @@ from jaxdyn.simulation.solvers.fixed_steps import RK4
 from jaxdyn.simulation.solvers.lie import LieGroup
 from jaxdyn.simulation.solvers.rosenbrock import Rodas5P
 from jaxdyn.simulation.solvers.step_control import Adaptive, ErrorMonitoredSteps
-from jaxdyn.simulation.stiffness import Stiffness, stiffness
 from jaxdyn.systems.scene import Scene
+
+if TYPE_CHECKING:
+    from jaxdyn.simulation.stiffness import Stiffness
 
 # Degree of the dense output, by the classes that diffrax's methods use.
 _INTERPOLATION_DEGREE = {
@@ -53,7 +55,7 @@ def choose_solver(solver, stepsize):
     return solver
 
 
-def is_stiff(rates: Stiffness, span: float) -> bool:
+def is_stiff(rates: "Stiffness", span: float) -> bool:
     """True if stability alone, and not accuracy, would limit explicit steps.
 
     Dopri8, stable up to a decay of 5 over a step, would take 1000 steps and more for a transient that is over at once.
@@ -71,8 +73,11 @@ def solver_for_start(scene: Scene, control, q0, v0, ts) -> diffrax.AbstractSolve
     return Rodas5P() if rates is not None and is_stiff(rates, float(ts[-1] - ts[0])) else None
 
 
-def find_stiffness(scene: Scene, q, v, t, control) -> Stiffness | None:
+def find_stiffness(scene: Scene, q, v, t, control) -> "Stiffness | None":
     """Rates at a state; None where they are not finite, or the forces have no forward derivative, as callbacks."""
+    # Imported here, because few runs ask for it and a first call should not wait for it.
+    from jaxdyn.simulation.stiffness import stiffness
+
     try:
         rates = stiffness(scene, q, v, t, control)
     except (TypeError, ValueError, NotImplementedError, np.linalg.LinAlgError):
