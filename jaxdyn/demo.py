@@ -38,7 +38,7 @@ def rollouts(model, count: int, duration: float, progress: bool):
     def one(control):
         return jd.simulate(
             scene, jnp.asarray(HOME), jnp.zeros(model.nv), ts, control=control, outputs=("energy", "work"), stepsize=0.004,
-            progress=progress, throw=False,
+            events=[jd.events.Progress()] if progress else (), throw=False,
         )  # fmt: skip
 
     start = time.perf_counter()

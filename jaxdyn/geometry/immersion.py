@@ -21,6 +21,7 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from jaxdyn.compile.known import is_known
+from jaxdyn.dynamics import centroidal
 from jaxdyn.dynamics import quantities as dynamics
 from jaxdyn.lie.so3 import matmul
 from jaxdyn.model.arguments import Checked, Function, Numbers, check_flag, check_state
@@ -168,12 +169,12 @@ class ImmersedSystem(System):
         """Sum of the units' kinetic energies, (), J."""
         # From the velocities and not from rho: with xi(s, t) the energy has terms linear in sdot, and constant ones.
         states = zip(self.units, self.configurations(s, t), self.velocities(s, v, t), strict=True)
-        return _sum(dynamics.kinetic_energy(unit, q, w, t) for unit, q, w in states)
+        return _sum(centroidal.kinetic_energy(unit, q, w, t) for unit, q, w in states)
 
     def potential_energy(self, s, t):
         """Sum of the units' potential energies, (), J."""
         states = zip(self.units, self.configurations(s, t), strict=True)
-        return _sum(dynamics.potential_energy(unit, q, t) for unit, q in states)
+        return _sum(centroidal.potential_energy(unit, q, t) for unit, q in states)
 
     def check_start(self, q, v, t) -> None:
         """Check the start as for any system, and that the immersion has full rank."""

@@ -25,7 +25,8 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from jaxdyn.dynamics import quantities as dynamics
-from jaxdyn.identify.methods import METHODS, Optimizer
+from jaxdyn.dynamics.centroidal import kinetic_energy, potential_energy
+from jaxdyn.identify.methods import METHODS, SOLVERS, Optimizer
 from jaxdyn.identify.replay import (
     HOLDS,
     INITIAL,
@@ -246,8 +247,7 @@ def energy_balance(scene, segment: Segments) -> Float[Array, ""]:
     work = _integral(jax.vmap(power)(segment.t, segment.q, segment.v, segment.tau), segment.t)
     t: Any = segment.t
     energy = [
-        dynamics.kinetic_energy(system, segment.q[i], segment.v[i], t[i])
-        + dynamics.potential_energy(system, segment.q[i], t[i])
+        kinetic_energy(system, segment.q[i], segment.v[i], t[i]) + potential_energy(system, segment.q[i], t[i])
         for i in (0, -1)
     ]
     return energy[1] - energy[0] - work
@@ -270,7 +270,7 @@ class Solver(eqx.Module):
     - `method`: "gauss-newton" for up to some hundred numbers: damped Gauss-Newton steps with exact Jacobians by forward mode,
       which eliminate free initial states segment by segment, until the next one predicts a decrease of the loss by less than
       `tolerance` of it. Torques that are linear in feasible inertias and other numbers take the interior-point steps of
-      `fit_torques` first. For more numbers,
+      `fit_torques` first. "levenberg-marquardt" and "dogleg" are those of optimistix, with the same Jacobians. For more numbers,
       as of a network, "lbfgs", "adam" or an optax.GradientTransformation, by reverse mode.
     - `steps`: the most steps. `learning_rate`: of adam, a share of each number (of one where it starts at zero), decaying to zero
       along a cosine. `tolerance`: "lbfgs" ends where ten steps have lowered the loss by less than this share of it.
@@ -295,7 +295,7 @@ class Solver(eqx.Module):
     seed: int = 0
 
     def __check_init__(self):
-        methods = (GAUSS_NEWTON, *METHODS)
+        methods = (GAUSS_NEWTON, *SOLVERS, *METHODS)
         if isinstance(self.method, str) and self.method not in methods:
             raise ValueError(f"method is {self.method!r}; give one of {methods} or an optax.GradientTransformation")
         if not (isinstance(self.method, str) or (hasattr(self.method, "init") and hasattr(self.method, "update"))):
