@@ -12,8 +12,8 @@ from jaxdyn.constraints.codes import name_of
 from jaxdyn.constraints.loops import Loop
 from jaxdyn.identify import TERMS, Log
 from jaxdyn.identify.workflows.mechanism_fit import MechanismFit, fit_mechanism
-from jaxdyn.io.files import write_text
 from jaxdyn.io.loaded import LoadedScene
+from jaxdyn.io.urdf_write import write_text
 from jaxdyn.systems.scene import Scene
 
 # Configurations between the one of the file and the first sample, so that the loops stay on their branch.

@@ -95,11 +95,8 @@ class Terminal(eqx.Module):
     **Raises:** ValueError for what cannot be called so.
 
     ```python
-    def first_angle(q, v, t):
-        return q[0]
-
-
-    jd.simulate(model, q0, v0, ts, events=[jd.events.Terminal(first_angle)])
+    reached = jd.events.Terminal(lambda q, v, t: q[0] - 0.5)
+    jd.simulate(model, q0, v0, ts, events=[reached])
     ```
     """
 

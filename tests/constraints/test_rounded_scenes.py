@@ -258,6 +258,7 @@ OTHERS = {
     "forces of a scene, not of its rows": ("forces.external_wrenches",),
     "data": ("scenes.NamedScene", "sensors.Motion"),
     "dense algebra of `reduced_dynamics`, for v = dq/dt and symmetric Lagrangians": ("reduction.spurious_terms",),
+    "runs `gauge_invariant`": ("reduction.kane_equation",),
 }
 INDEPENDENT = {}
 

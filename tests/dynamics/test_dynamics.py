@@ -21,6 +21,7 @@ from pinocchio_bridge import (
 )
 from scipy.spatial.transform import Rotation
 
+import jaxdyn as jd
 from jaxdyn import se3
 from jaxdyn.dynamics import centroidal, kinematics
 from jaxdyn.dynamics import quantities as dynamics
@@ -57,8 +58,8 @@ def values(model, q, v, a, tau, external):
         "bias_force": matrix_form.inverse_dynamics(model, q, v, None),
         "inverse_dynamics": matrix_form.inverse_dynamics(model, q, v, a, external),
         "forward_dynamics": matrix_form.forward_dynamics(model, q, v, tau, external),
-        "kinetic_energy": dynamics.kinetic_energy(model, q, v),
-        "potential_energy": dynamics.potential_energy(model, q),
+        "kinetic_energy": jd.kinetic_energy(model, q, v),
+        "potential_energy": jd.potential_energy(model, q),
         "center_of_mass": centroidal.center_of_mass(model, q),
         "centroidal_momentum": centroidal.centroidal_momentum(model, q, v),
         "centroidal_momentum_matrix": centroidal.centroidal_momentum_matrix(model, q),
@@ -167,7 +168,7 @@ def test_identities_along_the_motion(name):
             return jax.jvp(function, (q, v), (qdot, acceleration))[1]
 
         def energy(q, v):
-            return dynamics.kinetic_energy(model, q, v) + dynamics.potential_energy(model, q)
+            return jd.kinetic_energy(model, q, v) + jd.potential_energy(model, q)
 
         coriolis = dynamics.coriolis_matrix(model, q, v)
         acceleration = matrix_form.forward_dynamics(model, q, v, tau)
@@ -175,7 +176,7 @@ def test_identities_along_the_motion(name):
         last = jnp.zeros_like(external).at[-1].set(external[-1])
         return {
             "skew": (along(lambda q: matrix_form.mass_matrix(model, q)), coriolis + coriolis.T),
-            "gravity": (along(lambda q: dynamics.potential_energy(model, q)), dynamics.gravity_force(model, q) @ v),
+            "gravity": (along(lambda q: jd.potential_energy(model, q)), dynamics.gravity_force(model, q) @ v),
             "power": (along_motion(energy, acceleration), v @ tau),
             "momentum": (
                 jnp.sum(model.inertias[:, 0]) * along(lambda q: centroidal.center_of_mass(model, q)),
@@ -362,9 +363,7 @@ def test_without_gravity_and_armature_nothing_of_them_is_compiled():
     bare = model.replace(gravity=None, armature=None)
     zero = model.replace(gravity=jnp.zeros(3), armature=jnp.zeros(model.nv))
     state = [x[0] for x in random_states(model, 1, 0)]
-    one = quick(
-        lambda m, q, v, a, tau, _: (matrix_form.forward_dynamics(m, q, v, tau), dynamics.kinetic_energy(m, q, v))
-    )
+    one = quick(lambda m, q, v, a, tau, _: (matrix_form.forward_dynamics(m, q, v, tau), jd.kinetic_energy(m, q, v)))
     for got, want in zip(one(bare, *state), one(zero, *state), strict=True):
         assert_close(got, want, 1e-13)
 
@@ -374,7 +373,7 @@ def test_without_gravity_and_armature_nothing_of_them_is_compiled():
     q, v, a, tau, _ = state
     for function, args in ((matrix_form.forward_dynamics, (q, v, tau)), (matrix_form.inverse_dynamics, (q, v, a))):
         assert operations(function, bare, *args) < operations(function, zero, *args) - 4
-    for function in (dynamics.gravity_force, dynamics.potential_energy):
+    for function in (dynamics.gravity_force, jd.potential_energy):
         jaxpr = str(jax.make_jaxpr(lambda m, q, f=function: f(m, q))(bare, q))
         assert "dot_general" not in jaxpr and "sin" not in jaxpr
         np.testing.assert_array_equal(
@@ -424,7 +423,7 @@ def _flat(model, leaves, q, v, u):
     terms = [
         matrix_form.forward_dynamics(model, q, v, u),
         dynamics.coriolis_matrix(model, q, v) @ u,
-        dynamics.potential_energy(model, q)[None],
+        jd.potential_energy(model, q)[None],
         centroidal.centroidal_momentum(model, q, v),
     ]
     return jnp.concatenate(terms)
@@ -526,7 +525,7 @@ def test_refusals(monkeypatch):
         dynamics.forward_dynamics(model, q, v, q)
     with pytest.raises(ValueError, match=r"external has shape \(4, 6\), expected \(2, 6\)"):
         dynamics.generalized_force(model, q, jnp.zeros((4, 6)))
-    for function in (dynamics.coriolis_matrix, dynamics.bias_force, dynamics.kinetic_energy):
+    for function in (dynamics.coriolis_matrix, dynamics.bias_force, jd.kinetic_energy):
         with pytest.raises(ValueError, match=r"v has shape \(5,\)"):
             function(model, q, q)
     with pytest.raises(ValueError, match=r"v has shape"):

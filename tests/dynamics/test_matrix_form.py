@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 from pinocchio_bridge import assert_close, load_robot, make_model, quick, random_states, random_tree
 
+import jaxdyn as jd
 from jaxdyn.dynamics import kinematics
 from jaxdyn.dynamics import quantities as dynamics
 from jaxdyn.dynamics import world_frame as matrix_form
@@ -109,7 +110,7 @@ def printed_quantities(model, q, v, a):
         dynamics.gravity_force(model, q),
         dynamics.first_kind_symbols(model, q),
         matrix_form.inverse_dynamics(model, q, v, a),
-        dynamics.potential_energy(model, q),
+        jd.potential_energy(model, q),
     )
 
 

@@ -195,14 +195,14 @@ def test_immersion_equals_multipliers():
         other = jd.constrained_dynamics(held, q, speed, force)
         reaction = jd.geometry.reaction_force(immersed, s, v, force)
         A = jax.grad(on_torus)(q, 0.0)
-        energies = [dynamics.kinetic_energy(of, *at) for of, at in ((immersed.system, (s, v)), (particle, (q, speed)))]
+        energies = [jd.kinetic_energy(of, *at) for of, at in ((immersed.system, (s, v)), (particle, (q, speed)))]
         return {
             "acceleration": (whole, other.acceleration),
             "reaction": (reaction, A * other.multipliers),
             # Beside 1 N m, as reactions of some 10 N leave rounding errors of 1e-14 of them.
             "work": (1 + J.T @ reaction, jnp.ones(2)),
             "kinetic": tuple(energies),
-            "potential": (dynamics.potential_energy(immersed.system, s), 1.3 * 9.81 * q[2]),
+            "potential": (jd.potential_energy(immersed.system, s), 1.3 * 9.81 * q[2]),
             "gravity": (dynamics.gravity_force(immersed.system, s), 1.3 * 9.81 * J[2]),
             "coriolis": (
                 dynamics.coriolis_matrix(immersed.system, s, v) @ v + dynamics.gravity_force(immersed.system, s),
@@ -274,9 +274,7 @@ def test_moving_immersion_is_a_bead_on_a_turning_hoop():
         (angle,) = s
         want = rate**2 * jnp.sin(angle) * jnp.cos(angle) - 9.81 / radius * jnp.sin(angle)
         power = jax.jvp(
-            lambda *state: (
-                dynamics.kinetic_energy(system, *state) + dynamics.potential_energy(system, state[0], state[2])
-            ),
+            lambda *state: jd.kinetic_energy(system, *state) + jd.potential_energy(system, state[0], state[2]),
             (s, v, t),
             (v, a, jnp.ones(())),
         )[1]

@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 from pinocchio_bridge import assert_close, quick
 
+import jaxdyn as jd
 from jaxdyn import geometry, scenes, se3
 from jaxdyn.compile import compilation
 from jaxdyn.constraints.dynamics import constrained_dynamics
@@ -57,8 +58,8 @@ def first_pages(q, v, a):
             dynamics.inverse_dynamics(swing, angle, rate, turn),
             1.3 * 0.49 * turn + 1.3 * G * 0.7 * jnp.sin(angle),
         ),
-        "swing T": (dynamics.kinetic_energy(swing, angle, rate), 1.3 * 0.49 * rate[0] ** 2 / 2),
-        "swing V": (dynamics.potential_energy(swing, angle), 1.3 * G * 0.7 * (1 - jnp.cos(angle[0]))),
+        "swing T": (jd.kinetic_energy(swing, angle, rate), 1.3 * 0.49 * rate[0] ** 2 / 2),
+        "swing V": (jd.potential_energy(swing, angle), 1.3 * G * 0.7 * (1 - jnp.cos(angle[0]))),
     }
 
     q, v, a = q[:2], v[:2], a[:2]
@@ -192,7 +193,7 @@ def spatial_arm(q, v, a):
         "in space axes": (in_space_axes + in_space_axes.T, mass_rate),
         "in body axes": (in_body_axes + in_body_axes.T, mass_rate),
         "in body axes C v": (in_body_axes @ v, coriolis),
-        "V": (dynamics.potential_energy(model, q), G * (3.0 * h1 + 2.0 * h2 + 1.0 * h3)),
+        "V": (jd.potential_energy(model, q), G * (3.0 * h1 + 2.0 * h2 + 1.0 * h3)),
         "N": (gravity, N),
         "weight at the centre of mass": (-sum(LINK_MASSES) * whole.T @ jnp.asarray([0.0, 0.0, -G]), N),
         "wrenches": (dynamics.generalized_force(model, q, jnp.stack(wrenches)), pushed),
@@ -300,8 +301,8 @@ def test_double_pendulum_in_four_formulations():
             phi = got[0] + got[1] if name == "model" else got[-1]
             rows.append(jnp.stack([theta, phi]))
             kinetic, potential = (
-                dynamics.kinetic_energy(scene.system, q, v),
-                dynamics.potential_energy(scene.system, q),
+                jd.kinetic_energy(scene.system, q, v),
+                jd.potential_energy(scene.system, q),
             )
             energies.append(jnp.stack([kinetic, potential]))
         (m1, m2), (l1, l2) = (1.0, 0.5), (1.0, 0.7)
@@ -529,9 +530,7 @@ def test_inertia_of_a_box_and_its_change_of_frame():
     pose = se3.exp(jnp.asarray([0.3, -0.2, 0.5, 0.4, 1.1, -0.6]))
     centred, moved = (scenes.free_box(mass=mass, size=(l, w, h), frame=frame).system for frame in (None, pose))
     q, V = scenes.free_box.start(velocity=(0.3, -1.0, 0.4))
-    computed = quick(
-        lambda q, V: [(dynamics.mass_matrix(m, q), dynamics.kinetic_energy(m, q, V)) for m in (centred, moved)]
-    )
+    computed = quick(lambda q, V: [(dynamics.mass_matrix(m, q), jd.kinetic_energy(m, q, V)) for m in (centred, moved)])
     ((at_centre, energy), (away, other)), Ad = computed(q, V), se3.Ad(pose)
     assert_close(at_centre, M, 1e-15)
     assert_close(energy, mass * V[:3] @ V[:3] / 2 + V[3:] @ (moments * V[3:]) / 2, 1e-14)
