@@ -2,8 +2,10 @@
 
 import argparse
 import csv
+import dataclasses
 from typing import Any
 
+import jax.numpy as jnp
 import numpy as np
 
 from jaxdyn import identify
@@ -13,6 +15,8 @@ from jaxdyn.identify.geometry_errors import PARTS
 from jaxdyn.io import save_urdf
 from jaxdyn.model import host_math
 from jaxdyn.model.arguments import as_path
+from jaxdyn.model.topology import frame_index
+from jaxdyn.model.tree import Model
 
 HELP = "calibrate joint offsets, axes and link lengths from poses or markers measured at the tip"
 DESCRIPTION = """\
@@ -26,9 +30,11 @@ examples:
 
 The CSV file has a header: a column for each joint by its name (rad, m, as the encoders read it), the measured position x, y, z
 (m), and for poses the unit quaternion qw, qx, qy, qz of the frame's rotation, all in axes of the measuring device. The device may
-stand anywhere. Without a quaternion the position is that of one marker at the frame's origin, or near it.
+stand anywhere: the written robot has its frame, measuring_device, and the measured one at the tip, FRAME_measured, so that the
+file gives measured poses by itself. Without a quaternion the position is that of one marker at the frame's origin, or near it.
 """
 _POSITION, _QUATERNION = ("x", "y", "z"), ("qw", "qx", "qy", "qz")
+_DEVICE = "measuring_device"
 # Largest deviation of a quaternion from length one: files have some four digits.
 _UNIT = 1e-2
 
@@ -87,9 +93,31 @@ def run(args: argparse.Namespace) -> int:
     if fit.expected is not None and fit.rank < fit.expected:
         print(f"{fit.expected - fit.rank} directions stay as in the file; measure poses that differ more (--choose)")
     if out is not None:
-        save_urdf(fit.model, out)
-        print(f"Wrote {out}.")
+        save_urdf(with_measured_frames(fit), out)
+        print(f"Wrote {out}: the pose of {args.frame}_measured in axes of {_DEVICE} is the measured one.")
     return 0
+
+
+def with_measured_frames(fit: identify.GeometryFit) -> Model:
+    """Calibrated model with two more frames: that of the measuring device in the world, and the measured one at the tool.
+
+    The root stays where it is, because gravity is in its axes.
+    """
+    model, top = fit.model, fit.model.topology
+    tip = frame_index(model, fit.frame)
+    added = {
+        _DEVICE: (-1, host_math.inverse(fit.base)),
+        f"{fit.frame}_measured": (top.frame_bodies[tip], np.asarray(model.frame_poses)[tip] @ fit.tool),
+    }
+    # A file that was calibrated before has these frames already.
+    kept = [k for k, name in enumerate(top.frame_names) if name not in added]
+    poses = np.concatenate([np.asarray(model.frame_poses)[kept], [pose for _, pose in added.values()]])
+    topology = dataclasses.replace(
+        top,
+        frame_names=(*(top.frame_names[k] for k in kept), *added),
+        frame_bodies=(*(top.frame_bodies[k] for k in kept), *(body for body, _ in added.values())),
+    )
+    return dataclasses.replace(model, topology=topology, frame_poses=jnp.asarray(poses, model.home.dtype))
 
 
 def read_poses(path: str, joints) -> tuple[np.ndarray, np.ndarray]:
@@ -98,23 +126,26 @@ def read_poses(path: str, joints) -> tuple[np.ndarray, np.ndarray]:
     **Raises:** ValueError for missing columns, entries that are no numbers (their row), and quaternions that are not of length 1.
     """
     file = as_path(path, "--poses")
+    if not file.is_file():
+        raise ValueError(f"--poses is {path!r}, which is no file; give a CSV file of measured poses")
     with open(file, newline="", encoding="utf-8") as lines:
         rows = [row for row in csv.reader(lines) if row]
     header = [name.strip() for name in rows[0]] if rows else []
-    turned = all(name in header for name in _QUATERNION)
+    # One column of a quaternion announces all: a file with three is no file of markers.
+    turned = any(name in header for name in _QUATERNION)
     wanted = (*joints, *_POSITION, *(_QUATERNION if turned else ()))
     missing = [name for name in wanted if name not in header]
     if missing or len(rows) < 2:
         what = f"has no columns {', '.join(missing)}" if missing else "has no rows"
         raise ValueError(
-            f"{file} {what}; give a header with {', '.join((*joints, *_POSITION))}, and a row for each pose"
+            f"{file} {what}; give a header with {', '.join((*joints, *_POSITION))}, for poses with "
+            f"{', '.join(_QUATERNION)} too, and a row for each pose"
         )
     places = [header.index(name) for name in wanted]
-    try:
-        numbers = np.array([[float(row[k]) for k in places] for row in rows[1:]])
-    except (ValueError, IndexError):
-        bad = next(i for i, row in enumerate(rows[1:], 2) if len(row) < len(header) or not all(map(_is_number, row)))
-        raise ValueError(f"{file}, line {bad}: {', '.join(rows[bad - 1])!r} are not {len(header)} numbers") from None
+    for i, row in enumerate(rows[1:], 2):
+        if len(row) != len(header) or not all(_is_number(row[k]) for k in places):
+            raise ValueError(f"{file}, line {i}: {', '.join(row)!r} are not {len(header)} finite numbers")
+    numbers = np.array([[float(row[k]) for k in places] for row in rows[1:]])
     q, position = numbers[:, : len(joints)], numbers[:, len(joints) : len(joints) + 3]
     if not turned:
         return q, position
@@ -138,7 +169,6 @@ def _rotation(quaternion: np.ndarray) -> np.ndarray:
 
 def _is_number(text: str) -> bool:
     try:
-        float(text)
+        return bool(np.isfinite(float(text)))
     except ValueError:
         return False
-    return True

@@ -1,5 +1,6 @@
 """Calibration of a mechanism's geometry by poses or marker positions measured at its tip, and the choice of such poses."""
 
+import warnings
 from collections.abc import Sequence
 from typing import Any, NamedTuple
 
@@ -11,7 +12,6 @@ import numpy as np
 from jaxdyn.constraints.codes import RESULTS, Outcome, name_of
 from jaxdyn.dynamics.kinematics import frame_pose
 from jaxdyn.identify.geometry_errors import (
-    FAR,
     PARTS,
     Measurements,
     Mechanism,
@@ -25,10 +25,10 @@ from jaxdyn.identify.geometry_errors import (
     make_mechanism,
     nearest_motion,
     null_coordinates,
-    null_space,
     redundant_directions,
+    solve_loops,
 )
-from jaxdyn.lie import se3
+from jaxdyn.lie import se3, so3
 from jaxdyn.model.arguments import Checked, Numbers, as_array
 from jaxdyn.model.numbers import check_count, check_seed
 from jaxdyn.model.tree import Model
@@ -41,6 +41,11 @@ _RANK = 1e-8
 _STEPS, _HALVINGS, _ROUNDS = 60, 30, 5
 # A step that changes no number by more than this (rad, shares of the arm's size) ends a fit; least deviation of errors.
 _SETTLED, _FLOOR = 1e-11, 1e-14
+# Largest ratio of the weights of positions and rotations, on the lever of the arm's size. Derivatives are exact to about 1e-13,
+# so that directions which the heavier kind does not see keep five digits; the lost efficiency, the inverse square, is 1e-10.
+_RATIO = 1e5
+# Largest noise of positions over the arm's size, and of rotations (rad), that is not doubted.
+_DOUBTFUL = 0.05
 # Share of the information of all candidates with which a choice of poses starts.
 _FAINT = 1e-6
 # Random configurations for each pose that is to be chosen, and their span about zero where a joint has no limits (rad, m).
@@ -53,11 +58,13 @@ class GeometryFit(Outcome):
     - `model`: calibrated, with new home poses; `scene`: the same with its loops. `base` (4, 4): pose of the model's world in the
       frame of the measuring device; `tool` (4, 4): pose of the measured frame in `frame`. `predict(q)` combines them.
     - `names`, `values`, `std` (w,): changes of the free numbers (rad, m), the smallest that explain the measurements, and their
-      standard deviations; `covariance` (w, w). Those of the base count from the rigid motion nearest to the measured points, and
-      what may be attributed to the base or to a joint is the base's. The prediction at the tip has no such choice: `tip_std`.
-    - `rank`: number of directions that these poses determine; `expected`: that any poses can, by theory, None with loops.
-      `redundant` (w, d): combinations of the numbers that these poses do not determine, orthonormal in units of the arm's size.
-    - `condition`: of the errors in the directions that are determined.
+      standard deviations; `covariance` (w, w). What may be attributed to the base or to other parts is the base's, whose values
+      are its position and rotation vector in the device's frame. The prediction at the tip has no such choice: `tip_std`.
+    - `rank`: number of directions that these poses determine to better than 1 rad or the arm's size; `expected`: that any poses
+      can, by theory, None with loops.
+      `redundant` (w, d): combinations of the numbers that these poses do not determine, orthonormal in units of the arm's size,
+      and with twists of the base in its own axes.
+    - `condition`: of the errors in the directions that are determined, rotations times the arm's size.
     - `noise`: standard deviations of a measured position (m) and rotation (rad; NaN for markers). `tip_std` (m): root mean
       square deviation of the calibrated tip, over the measured poses.
     - `q` (n, nq): configurations, with the joints that the loops determine. `errors` (n, k): m and rad.
@@ -67,6 +74,7 @@ class GeometryFit(Outcome):
     model: Model
     scene: Scene
     frame: str = eqx.field(static=True)
+    measured: tuple[str, ...] | None = eqx.field(static=True)
     base: np.ndarray
     tool: np.ndarray
     names: tuple[str, ...] = eqx.field(static=True)
@@ -85,8 +93,15 @@ class GeometryFit(Outcome):
     result: Any
 
     def predict(self, q: Numbers) -> np.ndarray:
-        """Poses (n, 4, 4) of the measured frame in the device's frame at configurations (n, nq)."""
-        return self.base @ _frame_poses(self.model, np.asarray(q, np.float64), self.frame) @ self.tool
+        """Poses (n, 4, 4) of the measured frame in the device's frame at configurations (n, nq).
+
+        Joints of loops that were not measured are computed from the others, next to their columns.
+
+        **Raises:** ValueError for other shapes, numbers that are not finite, and loops that cannot be closed.
+        """
+        mechanism = make_mechanism(self.scene, self.frame, self.measured)
+        q = close_loops(mechanism, check_configurations(mechanism, q))
+        return self.base @ _frame_poses(self.model, q, self.frame) @ self.tool
 
     def summary(self) -> str:
         """Text of the result."""
@@ -135,7 +150,9 @@ def fit_geometry(
     **Returns:** `GeometryFit`.
 
     **Raises:** ValueError for unknown names, wrong shapes, matrices that are no poses, joints with several degrees of freedom,
-    fewer measurements than directions to find, and loops that cannot be closed.
+    no more measurements than directions to find, and loops that q leaves open at the start.
+
+    **Warns:** UserWarning where the remaining errors are no noise of a device: wrong data, or a local minimum.
 
     Source: Mooring, Roth & Driels (1991), "Fundamentals of manipulator calibration"; Park & Okamura (1994).
 
@@ -154,42 +171,54 @@ def fit_geometry(
     rows = data.positions.size if data.poses is None else 6 * len(q)
     if rows <= (wanted := directions.shape[1] if expected is None else expected):
         raise ValueError(
-            f"{len(q)} poses give {rows} numbers for {wanted} directions to find; measure more poses, or free fewer parts"
+            f"{len(q)} poses give {rows} numbers; {wanted} directions to find and the noise need at least {wanted + 1}: measure "
+            "more poses, or free fewer parts"
         )
-    q = close_loops(mechanism, np.zeros((len(mechanism.places), 6)), q)
+    q = close_loops(mechanism, q)
     if "base" in free:
         tips = _frame_poses(mechanism.model, q, frame)
         points = np.einsum("nij,kj->nki", tips[:, :3, :3], data.markers) + tips[:, None, :3, 3]
         # The device may stand anywhere: the steps start from the rigid motion that brings the points nearest to each other.
         data = data._replace(base=nearest_motion(points.reshape(-1, 3), data.positions.reshape(-1, 3)))
-    minimum = _minimise(mechanism, data, directions, q, expected)
-    here, weights = minimum.here, minimum.weights
-    _, s, Vt = here.decompose(weights)
-    covariance = Vt.T / s**2 @ Vt
-    # In the same units for all: those of the base prefer it in the fit alone.
-    even = np.array([FAR if name.startswith("base ") else 1.0 for name in names])
-    singular = here._replace(jacobian=here.jacobian / even, expected=len(s)).decompose(weights)[1]
+    minimum = _minimise(mechanism, data, directions, q, names, expected)
+    here, noise = minimum.here, minimum.noise
+    inverse, _ = here.invert(minimum.weights)
+    # Not the inverse of the information: the weights may be bounded, and then are not those of the noise.
+    root = inverse * here.rows(noise)
+    tip = here.jacobian[:, ~here.turns].reshape(-1, len(units)) @ root
     twists = (directions @ minimum.y).reshape(-1, 6)
     scene: Any = change_scene(mechanism, jnp.asarray(twists, mechanism.model.home.dtype))
     base, tool = (np.asarray(se3.exp(jnp.asarray(twists[place]))) for place in (0, mechanism.tool))
-    tip = here.jacobian[:, ~here.turns].reshape(-1, len(units))
+    base, values = data.base @ base, minimum.y * units
+    root *= units[:, None]
+    if "base" in free:
+        # Position and rotation vector instead of the twist from a start that follows the noise; the base's numbers come first.
+        values[:6] = _position_and_turn(base, np.zeros(6))
+        root[:6] = np.asarray(jax.jacfwd(_position_and_turn, 1)(base, np.zeros(6))) @ root[:6]
+    if max(noise[0] / mechanism.size, noise[1] * here.turns.any()) > _DOUBTFUL:
+        warnings.warn(
+            f"the errors that remain, {noise[0]:.3g} m and {noise[1]:.3g} rad, are no noise of a device on an arm of "
+            f"{mechanism.size:.3g} m; check units, signs and rows of the measurements, or start nearer to the true geometry",
+            stacklevel=2,
+        )
     return GeometryFit(
         model=scene.system,
         scene=scene,
         frame=frame,
-        base=data.base @ base,
+        measured=None if measured is None else tuple(measured),
+        base=base,
         tool=tool,
         names=names,
-        values=minimum.y * units,
-        std=np.sqrt(np.diag(covariance)) * units,
-        covariance=covariance * units[:, None] * units,
-        rank=len(s),
+        values=values,
+        std=np.linalg.norm(root, axis=1),
+        covariance=root @ root.T,
+        rank=here.seen.shape[1],
         expected=expected,
-        redundant=null_space(Vt),
-        condition=float(singular[0] / singular[-1]),
-        noise=(float(1 / weights[0]), float(1 / weights[1]) if here.turns.any() else np.nan),
+        redundant=here.unseen,
+        condition=here.condition,
+        noise=(float(noise[0]), float(noise[1]) if here.turns.any() else np.nan),
         # Three coordinates of a point: the sum of their variances, in the mean over all points.
-        tip_std=float(np.sqrt(3 * np.mean(np.einsum("ij,jk,ik->i", tip, covariance, tip)))),
+        tip_std=float(np.sqrt(3 * np.mean(np.sum(tip**2, axis=1)))),
         q=here.q,
         errors=here.errors,
         history=np.array(minimum.history),
@@ -197,74 +226,97 @@ def fit_geometry(
     )
 
 
+def _position_and_turn(pose, twist):
+    """Position and rotation vector (6,) of a pose that is moved by a twist in its own axes."""
+    moved = pose @ se3.exp(jnp.asarray(twist))
+    return jnp.concatenate([moved[:3, 3], so3.log(moved[:3, :3])])
+
+
 class _Linear(NamedTuple):
-    """Errors (n, k) at configurations `q`, their Jacobian (n, k, w), which of the k are rotations, and the rank by theory."""
+    """Errors (n, k) at configurations `q`, their Jacobian (n, k, w), and which of the k are rotations.
+
+    `seen` (w, r) and `unseen` (w, d): orthonormal directions that the errors determine, and that they do not.
+    """
 
     q: np.ndarray
     errors: np.ndarray
     jacobian: np.ndarray
     turns: np.ndarray
-    expected: int | None
+    seen: np.ndarray
+    unseen: np.ndarray
+    condition: float
 
-    def _weigh(self, weights: np.ndarray) -> np.ndarray:
-        """Weights (n k,): those of positions and of rotations."""
-        return np.tile(np.where(self.turns, weights[1], weights[0]), len(self.errors))
+    def rows(self, kinds: np.ndarray) -> np.ndarray:
+        """Numbers (n k,) of all errors, from those (2,) of positions and of rotations."""
+        return np.tile(np.where(self.turns, kinds[1], kinds[0]), len(self.errors))
 
     def loss(self, weights: np.ndarray) -> float:
         """Sum of the squares of the weighted errors."""
-        return float(np.sum((self._weigh(weights) * self.errors.reshape(-1)) ** 2))
+        return float(np.sum((self.rows(weights) * self.errors.reshape(-1)) ** 2))
 
-    def decompose(self, weights: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Singular values and vectors of the weighted Jacobian, without the directions that are not determined."""
+    def invert(self, weights: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Generalised inverse (w, n k) of the Jacobian, of the least weighted errors, and their leverages (n, k)."""
+        weigh = self.rows(weights)
+        # In the determined directions alone, so that no ratio of the weights changes the rank.
         U, s, Vt = np.linalg.svd(
-            self._weigh(weights)[:, None] * self.jacobian.reshape(self.errors.size, -1), full_matrices=False
+            weigh[:, None] * (self.jacobian.reshape(self.errors.size, -1) @ self.seen), full_matrices=False
         )
-        rank = int(np.sum(s > _RANK * s.max(initial=0.0)))
-        # Away from the nominal geometry theory's rank is the same: what is beyond it is rounding.
-        rank = rank if self.expected is None else min(rank, self.expected)
-        return U[:, :rank], s[:rank], Vt[:rank]
+        return self.seen @ (Vt.T / s) @ (U.T * weigh), np.sum(U**2, axis=1).reshape(self.errors.shape)
 
-    def step(self, weights: np.ndarray) -> np.ndarray:
-        """Gauss-Newton step (w,), the shortest one."""
-        U, s, Vt = self.decompose(weights)
-        return -Vt.T @ ((U.T @ (self._weigh(weights) * self.errors.reshape(-1))) / s)
-
-    def new_weights(self, weights: np.ndarray, floor: np.ndarray) -> np.ndarray:
-        """Weights (2,) of positions and rotations: one over the deviations of their errors."""
-        U = self.decompose(weights)[0]
-        squares, spare = self.errors**2, 1 - np.sum(U**2, axis=1).reshape(self.errors.shape)
+    def deviations(self, weights: np.ndarray) -> np.ndarray:
+        """Standard deviations (2,) of positions and rotations."""
+        weighted = self.errors**2 * self.rows(weights).reshape(self.errors.shape) ** 2
         # Each error has used up its leverage of the degrees of freedom.
-        kinds = [squares[:, kind].sum() / max(spare[:, kind].sum(), 1e-9) for kind in (~self.turns, self.turns)]
-        return 1 / np.maximum(np.sqrt(kinds), floor)
+        spare = 1 - self.invert(weights)[1]
+        sums, spares = (np.array([x[:, kind].sum() for kind in (~self.turns, self.turns)]) for x in (weighted, spare))
+        # A kind of error without degrees of freedom says nothing about its noise: both then have one ratio to the weights.
+        pooled = sums.sum() / max(spares.sum(), 1e-9)
+        return np.sqrt(np.where(spares < 1, pooled, sums / np.maximum(spares, 1))) / weights
 
 
 class _Minimum(NamedTuple):
-    """End of `_minimise`: the free numbers, the errors there, the weights, all losses, and the result."""
+    """End of `_minimise`: the free numbers, the errors there, weights and noise (2,), all losses, and the result."""
 
     y: np.ndarray
     here: _Linear
     weights: np.ndarray
+    noise: np.ndarray
     history: list[float]
     result: Any
 
 
-def _minimise(mechanism: Mechanism, data: Measurements, directions: np.ndarray, q: np.ndarray, expected) -> _Minimum:
+def _minimise(
+    mechanism: Mechanism, data: Measurements, directions: np.ndarray, q: np.ndarray, names, expected
+) -> _Minimum:
     """Minimise the squared errors by Gauss-Newton steps, and weigh positions against rotations by what remains of them."""
     turns = np.arange(6) >= 3 if data.poses is not None else np.zeros(data.positions[0].size, bool)
+    others = np.array([not name.startswith("base ") for name in names])
+    # A lever of the arm's size makes both kinds comparable before their errors are known.
+    lever = np.array([1.0, mechanism.size])
 
     def evaluate(y, q):
-        return _Linear(*linearise(mechanism, data, directions, y, q), turns, expected)
+        q, errors, jacobian = linearise(mechanism, data, directions, y, q)
+        scaled = (jacobian * np.where(turns, lever[1], lever[0])[:, None]).reshape(errors.size, -1)
+        _, s, Vt = np.linalg.svd(np.linalg.qr(scaled, mode="r"))
+        # Directions whose deviation would be above one (rad, the arm's size) are not determined: nothing is linear so far away.
+        noise = min(np.sqrt(np.mean(x**2)) for x in (errors[:, ~turns], lever[1] * errors[:, turns]) if x.size)
+        rank = int(np.sum(s > max(_RANK * s.max(initial=0.0), noise)))
+        # Away from the nominal geometry theory's rank is the same: what is beyond it is rounding.
+        rank = rank if expected is None else min(rank, expected)
+        seen, unseen = Vt[:rank].T, Vt[rank:].T
+        # The device may stand anywhere: of all equal changes the one with the least numbers of other parts than the base.
+        seen = seen - unseen @ (np.linalg.pinv(unseen[others], rcond=1e-9) @ seen[others])
+        return _Linear(q, errors, jacobian, turns, seen, unseen, float(s[0] / s[rank - 1]) if rank else np.nan)
 
-    # A lever of the arm's size makes both kinds comparable before their errors are known; noise-free ones keep finite weights.
-    y, weights = np.zeros(directions.shape[1]), np.array([1.0, mechanism.size])
-    floor, here, history = _FLOOR * np.array([mechanism.size, 1.0]), evaluate(y, q), []
-    for _ in range(_ROUNDS):
+    y, weights = np.zeros(directions.shape[1]), lever
+    here, history = evaluate(y, q), []
+    for left in reversed(range(_ROUNDS)):
         history.append(here.loss(weights))
         result = RESULTS.max_steps_reached
         for _ in range(_STEPS):
             if not np.isfinite(history[-1]):
-                return _Minimum(y, here, weights, history, RESULTS.nonfinite)
-            step = here.step(weights)
+                return _Minimum(y, here, weights, 1 / weights, history, RESULTS.nonfinite)
+            step = -here.invert(weights)[0] @ here.errors.reshape(-1)
             trials = (evaluate(y + 0.5**k * step, here.q) for k in range(_HALVINGS))
             k, following = next(((k, x) for k, x in enumerate(trials) if x.loss(weights) < history[-1]), (0, None))
             if following is None:
@@ -276,10 +328,12 @@ def _minimise(mechanism: Mechanism, data: Measurements, directions: np.ndarray, 
             if np.abs(step).max() < _SETTLED:
                 result = RESULTS.successful
                 break
-        weights = here.new_weights(weights, floor)
-        if not turns.any():
+        noise = np.maximum(here.deviations(weights), _FLOOR * mechanism.size / lever)
+        if not left or not turns.any():
             break
-    return _Minimum(y, here, weights, history, result)
+        shares = noise * lever
+        weights = lever / np.maximum(shares, shares.max() / _RATIO)
+    return _Minimum(y, here, weights, noise, history, result)
 
 
 def choose_poses(
@@ -360,18 +414,19 @@ def _random_configurations(mechanism: Mechanism, count: int, guess, rng) -> np.n
     for _ in range(20 * count):
         change = 0.2 * rng.normal(size=model.nq)
         change[list(mechanism.passive)] = 0
-        try:
-            trial = close_loops(
-                mechanism, np.zeros((len(mechanism.places), 6)), np.clip(q + change, lower, upper)[None]
-            )[0]
-        except ValueError:
-            continue
-        if np.abs(trial - q).max() < 1.0:
+        trials, is_closed, _ = solve_loops(
+            mechanism, np.zeros((len(mechanism.places), 6)), np.clip(q + change, lower, upper)[None]
+        )
+        trial = trials[0]
+        is_within = np.all((trial >= model.lower) & (trial <= model.upper))
+        if is_closed[0] and is_within and np.abs(trial - q).max() < 1.0:
             q = trial
             found.append(q)
         if len(found) == count:
             return np.stack(found)
-    raise ValueError(f"only {len(found)} configurations with closed loops were found near guess; give another one")
+    raise ValueError(
+        f"only {len(found)} configurations with closed loops and within the limits were found near guess; give another one"
+    )
 
 
 @eqx.filter_jit

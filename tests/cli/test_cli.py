@@ -876,6 +876,15 @@ def test_calibrate(tmp_path, capsys):
     assert float(text.split("held out: ")[1].split(" mm")[0]) < 0.1
     fitted = jd.load_urdf(out)
     assert fitted.joint_names == ("j0", "j1", "j2")
+    seen = np.stack(
+        [
+            np.linalg.inv(jd.frame_pose(fitted, jnp.asarray(x), "measuring_device"))
+            @ jd.frame_pose(fitted, jnp.asarray(x), "l2_measured")
+            for x in q
+        ]
+    )
+    # The file alone gives the measured places, to the noise of 0.01 mm.
+    np.testing.assert_allclose(seen[:, :3, 3], places, atol=1e-4)
     for bad, words in (
         (["--choose", "5", "--poses", str(poses)], "one of them"),
         (["--poses", str(poses), "--test", "2"], "--test is 2.0"),
@@ -884,6 +893,9 @@ def test_calibrate(tmp_path, capsys):
     for content, words in (
         ("j0,j1,j2,x,y\n1,2,3,4,5\n", "has no columns z"),
         ("j0,j1,j2,x,y,z\n1,2,3,4,5,six\n", "line 2"),
+        ("j0,j1,j2,x,y,z\n1,2,3,4,5,6\n1,2,3,4,5,6,7\n", "line 3"),
+        ("j0,j1,j2,x,y,z\n1,2,3,4,5,nan\n", "line 2"),
+        ("j0,j1,j2,x,y,z,qw,qx,qy\n1,2,3,4,5,6,1,0,0\n", "has no columns qz"),
     ):
         poses.write_text(content)
         assert main(["calibrate", nominal, "--frame", "l2", "--poses", str(poses)]) == 2
