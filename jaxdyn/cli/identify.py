@@ -138,7 +138,8 @@ def run(args: argparse.Namespace) -> None:
         # Negated, so that NaN is refused.
         if (value := getattr(args, name)) is not None and not value > 0:
             raise ValueError(f"--{name.replace('_', '-')} is {value}; give a positive number")
-    mechanism = load_mechanism(args.urdf, args)
+    # A file that needs repair cannot be loaded before it; the repair is for trees.
+    mechanism = None if args.repair else load_mechanism(args.urdf, args)
     if mechanism is not None:
         run_mechanism(mechanism, args)
         return
