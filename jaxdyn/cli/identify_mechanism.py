@@ -118,8 +118,10 @@ def _text(scene: Scene, judge: MechanismFit, final: MechanismFit, tests: dict[st
     if unseen:
         lines.append(f"some numbers of {', '.join(unseen)} are in no combination; they stay near the file's")
     lines += [
-        "Base parameters of the mechanism: first parameter of each combination, the file's, fitted, and 95 % of the scatter of",
-        "the torque errors; noise of the measured angles biases the values by more, above all along the directions named above",
+        "Base parameters of the mechanism: first parameter of each combination, the file's, fitted, and half-width of the 95 % "
+        "interval",
         table(["combination", "file", "fitted", "+-"], rows),
+        "Every interval holds for itself, in 95 % of logs. Errors lie mostly along the least identifiable directions, which the "
+        "combinations share: where one interval misses, most may",
     ]
     return "\n".join(lines)

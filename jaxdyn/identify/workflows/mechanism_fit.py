@@ -29,9 +29,7 @@ class MechanismFit(NamedTuple):
 
     - `fit`: the feasible bodies and the motors' friction, `fit.torques(log)` their torques.
     - `base`: combinations of the parameters that the logs determine; `nominal`, `values`, `std` (nbase,): of the scene given,
-      fitted, and the jackknife standard deviation by the scatter of the torque errors; `factor`: 95 % of this scatter is plus and
-      minus this many. Noise of the measured angles biases the values, which `std` does not contain: on a simulated four-bar with
-      1e-5 rad of noise and a low-pass of 8 Hz, 8 of 10 combinations were 1 to 2 such widths from the truth.
+      fitted, and the jackknife standard deviation; `factor`: a 95 % interval is plus and minus this many, for each by itself.
     - `condition`: of the regressor in these combinations, columns of unit length; `weakest`: the least identifiable directions.
     """
 
