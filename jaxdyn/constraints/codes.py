@@ -154,6 +154,8 @@ class RESULTS(metaclass=_Enumeration):
     )
     # Of steps with contacts.
     no_contact_impulses = _code("No contact impulses that satisfy Coulomb's law were found for the step.")
+    # Of terminal events.
+    bad_event = _code("The function of a terminal event is not above zero at the start.")
 
     @staticmethod
     def where(condition: Bool[ArrayLike, ""], code: Result, otherwise: Result) -> Result:

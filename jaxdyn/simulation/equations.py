@@ -191,9 +191,14 @@ class Equations:
         if self.conditions.control:
             margins.append(control.allowance(q, v, t)[None])
         if self.conditions.terminals:
-            terminals = self._known((args or ())[: self._count])[3]
-            margins.append(jnp.stack([one.margin(q, v, t) for one in terminals]))
+            values = self.terminal_values(args, q, v, t)
+            # NaN compares with nothing, so that a run would pass it in silence.
+            margins.append(jnp.where(jnp.isnan(values), -jnp.ones_like(values), values))
         return jnp.concatenate(margins)
+
+    def terminal_values(self, args, q, v, t):
+        """Values of the functions of the terminal events."""
+        return jnp.stack([one.margin(q, v, t) for one in self._known((args or ())[: self._count])[3]])
 
     def _guards(self, t, y, args):
         scene, _, method = self.unpack(args, y)

@@ -41,12 +41,13 @@ class ContactLost:
 
 @dataclass(frozen=True)
 class JointLimit:
-    """A joint that passes a limit of its model (`model.lower`, `model.upper`), which nothing enforces.
+    r"""A joint that passes a limit of its model (`model.lower`, `model.upper`), which nothing enforces.
 
     **Arguments:** `stop`: if True (default) the run ends there, with the code `joint_limit_passed` and the time, found within the
     step. If False it continues; `stats["passed_limit"]` is the entry of q of the first limit that is passed at a save point,
     or -1, and a concrete run warns (`jd.simulation.JointLimitWarning`).
 
+    A limit is passed beyond rounding, $\epsilon^{1/2}$ of its size or of one, by which the time is late.
     Without this event limits are ignored. Passages that end within a step are found too, except short ones: of less than about
     1e-3 of what the joint moves in the step with explicit methods, which predict where it comes nearest to the limit, and of
     less than an eighth of the step's time with others. If only a save point shows a passage, its time is that of the save point.
@@ -89,10 +90,13 @@ class Terminal(eqx.Module):
     The code is `event_occurred`, which counts as a success. `stats["terminal_event"]` is the index of the event among the
     terminal ones, or -1, and `stats["time_reached"]` its time, found within the step, with derivatives. Later rows are NaN.
 
-    **Arguments:** `function`: function(q (nq,), v (nv,), t ()) -> (), smooth and not negative at the start. An equinox Module or
+    **Arguments:** `function`: function(q (nq,), v (nv,), t ()) -> (), smooth, and above zero at the start. An equinox Module or
     a `jax.tree_util.Partial` carries leaves that can be differentiated and batched; a plain function is static: define it once.
+    NaN counts as below zero, as behind the end of a root's domain. A traced run that does not start above zero has the code
+    `bad_event`.
 
-    **Raises:** ValueError for what cannot be called so.
+    **Raises:** ValueError for what cannot be called so, and, by `jd.simulate`, for a known start at which it is not above zero
+    and for a scene whose forces have modes.
 
     ```python
     reached = jd.events.Terminal(lambda q, v, t: q[0] - 0.5)
@@ -110,6 +114,8 @@ class Terminal(eqx.Module):
         value = self.function(q, v, t)
         if jnp.shape(value) != ():
             raise ValueError(f"Terminal: function returned shape {jnp.shape(value)}; return one number, ()")
+        if jnp.issubdtype(jnp.result_type(value), jnp.bool_):
+            raise ValueError("Terminal: function returned a bool, which cannot fall below zero; return a difference")
         return as_array(value, "Terminal: function", q.dtype)
 
 
@@ -176,13 +182,21 @@ def check_events(scene: Scene, watch: Watch, modal: bool) -> None:
         )
 
 
-def check_terminals(terminals: tuple[Terminal, ...], modal: bool) -> None:
-    """Refuse terminal events of motions with modes."""
+def check_terminals(terminals: tuple[Terminal, ...], modal: bool, start: tuple[Any, Any, Any] | None) -> None:
+    """Refuse terminal events of motions with modes, and those not above zero at the start (q, v, t), None where it is traced."""
     if terminals and modal:
         raise ValueError(
             "events has a jd.events.Terminal, which a scene whose forces have modes (jd.contact.DryFriction, "
             "jd.contact.UnilateralContact) does not support; end ts earlier"
         )
+    for i, one in enumerate(terminals if start is not None else ()):
+        value = float(one.margin(*map(jnp.asarray, start or ())))
+        # Negated, so that NaN is refused. At zero, rounding would decide whether the run ends at once.
+        if not value > 0:
+            raise ValueError(
+                f"the function of terminal event {i} is {value:.6g} at the start; give one that is above zero there, such as a "
+                "distance that the motion has still to go"
+            )
 
 
 def events_of(

@@ -215,8 +215,11 @@ def _violation(run: _Run, rows, reached, result, time_reached, last) -> Violatio
 
 
 def _faults_of_start(run: _Run, y0, inputs: Inputs, options) -> list[tuple[Array, Any]]:
-    """Cases of the result: a singular mass matrix, and a singular basis."""
+    """Cases of the result: a singular mass matrix, a singular basis, and a terminal event that has no sign at the start."""
     faults = []
+    if run.eqs.conditions.terminals:
+        values = run.eqs.terminal_values(run.args, inputs.q0, inputs.v0, inputs.ts[0])
+        faults.append((~(values > 0).all(), RESULTS.bad_event))
     if options.checks_mass:
         definite = kernel(has_definite_mass)(run.scene.system, inputs.q0, inputs.ts[0])
         faults.append((~definite, RESULTS.singular_mass_matrix))

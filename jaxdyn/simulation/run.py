@@ -137,7 +137,7 @@ def simulate(
     start = tuple([np.asarray(x) if concrete else as_numpy_if_known(x) for x in arrays[:3]])
     scene, method = _prepare_start(scene, method, start, stepsize, modal, concrete)
     controls.check_steps(control, stepsize)
-    check_terminals(terminals, modal)
+    check_terminals(terminals, modal, (start[0], start[1], start[2][0]) if concrete else None)
     solver = _solver_at_start(scene, control, solver, stepsize, adjoint, arrays, modal)
     options = _choose(
         scene, control, method, solver, stepsize, adjoint,

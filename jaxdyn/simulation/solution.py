@@ -81,6 +81,7 @@ ADVICE = {
     "no_freedom": "leave a constraint out, or free a joint; rows that repeat others but for more than 1e-3 need a rank_tol, "
     "as in method=jd.Projected(rank_tol=1e-2)",
     "inconsistent_start": "start from jd.assemble(scene, q0, v0)",
+    "bad_event": "give jd.events.Terminal a function that is above zero at the start",
     "singular_basis": "choose another basis: jd.Reduced() continues one automatically where the rank of the rows is constant; "
     "method='projected' needs none",
     "nonlinear_divergence": "take a smaller stepsize, or look for a singular mass matrix or a force that is not finite",

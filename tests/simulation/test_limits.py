@@ -96,7 +96,9 @@ def fall(level, *others, **options):
     q0 = jnp.array([0.0, 0.0, 2.0, 1.0, 0.0, 0.0, 0.0])
     terminal = [*(jd.events.Terminal(one) for one in others), jd.events.Terminal(Below(jnp.asarray(level)))]
     ts = jnp.linspace(0.0, 1.0, 11)
-    return jd.simulate(builder.build(), q0, jnp.zeros(6), ts, events=terminal, rtol=1e-10, atol=1e-10, **options)
+    return jd.simulate(
+        builder.build(), q0, jnp.zeros(6), ts, events=terminal, **{"rtol": 1e-10, "atol": 1e-10} | options
+    )
 
 
 def test_a_terminal_event_ends_a_run_at_its_time():
@@ -111,6 +113,25 @@ def test_a_terminal_event_ends_a_run_at_its_time():
     # A velocity of -2 m/s is reached before the level.
     assert int(fall(0.5, lambda q, v, t: v[2] + 2.0).stats["terminal_event"]) == 0
     assert int(fall(1.9, lambda q, v, t: v[2] + 2.0).stats["terminal_event"]) == 1
+
+
+OTHER_STEPS = [{}, {"stepsize": 0.01, "rtol": None, "atol": None}, {"solver": jd.solvers.Rodas5P()}]
+
+
+@pytest.mark.parametrize("options", OTHER_STEPS, ids=["adaptive", "fixed", "stiff"])
+@pytest.mark.parametrize("function", [lambda q, v, t: jnp.sqrt(q[2] - 1), lambda q, v, t: jnp.log(q[2])])
+def test_a_function_that_is_nan_past_its_zero_ends_the_run_there(options, function):
+    np.testing.assert_allclose(fall(-9.0, function, **options).stats["time_reached"], np.sqrt(2 / 9.81), rtol=1e-9)
+
+
+@pytest.mark.parametrize("options", OTHER_STEPS, ids=["adaptive", "fixed", "stiff"])
+@pytest.mark.parametrize("level", [2.0, 3.0, np.nan])
+def test_a_terminal_event_must_be_above_zero_at_the_start(options, level):
+    """At zero, the method and rounding would decide between the start and the first save point."""
+    with pytest.raises(ValueError, match="at the start"):
+        fall(level, **options)
+    run = jax.jit(lambda level: fall(level, throw=False, **options))(level)
+    assert run.result == jd.RESULTS.bad_event and not bool(run.success)
 
 
 @pytest.mark.long
@@ -141,6 +162,7 @@ def test_former_arguments_warn_with_the_new_form(cart):
     [
         ([jd.events.JointLimit(), jd.events.JointLimit(False)], "has 2 of"),
         ([jd.events.Terminal(lambda q, v, t: q)], "return one number"),
+        ([jd.events.Terminal(lambda q, v, t: q[0] < 1)], "returned a bool"),
         ([jd.events.ContactLost()], "no cones"),
     ],
 )
