@@ -92,6 +92,18 @@ def pytest_runtest_protocol(item: pytest.Item) -> Iterator[None]:
             file.write(f"{seconds:.2f} {item.nodeid}\n")
 
 
+@pytest.fixture(scope="module", autouse=True)
+def few_mappings() -> Iterator[None]:
+    """Drop the programs of earlier files before XLA runs out of mappings, of which Linux allows 65530 to a process.
+
+    Each program takes some 27 of them, and XLA ends the process when there are none left.
+    """
+    yield
+    maps = Path("/proc/self/maps")
+    if maps.exists() and len(maps.read_bytes().splitlines()) > 20_000:
+        jax.clear_caches()
+
+
 @pytest.fixture(params=["auto", "plain"])
 def mode(request: pytest.FixtureRequest) -> Iterator[str]:
     """Both modes of `jaxdyn.compilation`."""
