@@ -74,7 +74,7 @@ class Cluster:
         """
         import cloudpickle
 
-        from jaxdyn.tasks.local import TargetPlugin
+        from jaxdyn.tasks.worker import TargetPlugin
 
         self._plugin = TargetPlugin(self._name, cloudpickle.dumps(target), self.mark)
         self.client.register_plugin(self._plugin, name=self._name)
@@ -124,7 +124,7 @@ class Cluster:
 
     def submit(self, group: str, method: str, places: list[int], items: list[Any]) -> list[Any]:
         """Futures of tasks, with keys (group, place)."""
-        from jaxdyn.tasks.local import RESOURCE, call_target
+        from jaxdyn.tasks.worker import RESOURCE, call_target
 
         return self.client.map(
             call_target,

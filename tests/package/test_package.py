@@ -71,6 +71,8 @@ USERS = {
     "distributed": {"tasks", "cli"},
 }
 LIGHT = {"equinox", "jax", "jaxtyping", "numpy"}
+NEEDED = {"llvmlite", "diffrax", "optax", "optimistix", "scipy", "threadpoolctl"}
+OPTIONAL = (USERS.keys() - NEEDED) | {"collada", "xacro"}
 
 
 def sources() -> dict[str, ast.Module]:
@@ -234,6 +236,23 @@ try:
 except RuntimeError:
     raise SystemExit("importing jaxdyn runs jax: a module makes an array or calls a jax function when it is imported")
 assert not jax.config.jax_enable_x64
+""")
+
+
+@pytest.mark.long
+def test_modules_import_without_optional_packages():
+    """Every module but the command and the one that Dask's workers import, as after `pip install jaxdyn`."""
+    run_in_new_process(f"""
+import importlib, pkgutil, sys
+class Missing:
+    def find_spec(self, name, path=None, target=None):
+        if name.partition(".")[0] in {sorted(OPTIONAL)}:
+            raise ModuleNotFoundError(f"No module named {{name!r}}", name=name)
+sys.meta_path.insert(0, Missing())
+import jaxdyn
+for module in pkgutil.walk_packages(jaxdyn.__path__, "jaxdyn."):
+    if module.name not in ("jaxdyn.__main__", "jaxdyn.tasks.worker"):
+        importlib.import_module(module.name)
 """)
 
 

@@ -492,7 +492,7 @@ def test_a_store_that_workers_do_not_see_is_refused(client, tmp_path):
 
 def test_a_worker_of_another_version_that_joins_gets_no_task(client, monkeypatch):
     """Each worker compares its versions with those of the client, which are changed here."""
-    monkeypatch.setattr("jaxdyn.tasks.local.package_versions", lambda: package_versions() | {"jaxdyn": "0.0.1"})
+    monkeypatch.setattr("jaxdyn.tasks.worker.package_versions", lambda: package_versions() | {"jaxdyn": "0.0.1"})
     with (
         Cluster(client) as cluster,
         pytest.raises(ValueError, match=r"worker tcp://.* and this process 0\.0\.1; install"),
