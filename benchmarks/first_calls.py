@@ -163,7 +163,8 @@ def four_bar_by_hand() -> tuple[Callable, Any]:
     def path(masses):
         steps, saved = diffrax.PIDController(rtol=1e-8, atol=1e-8), diffrax.SaveAt(ts=ts)
         args = diffrax.ODETerm(rates), diffrax.Dopri8(), 0.0, 1.0, None, jd.scenes.four_bar.start(), masses
-        return diffrax.diffeqsolve(*args, saveat=saved, stepsize_controller=steps).ys[0]
+        states: Any = diffrax.diffeqsolve(*args, saveat=saved, stepsize_controller=steps).ys
+        return states[0]
 
     return path, jnp.array([1.0, 3.0, 2.5])
 
