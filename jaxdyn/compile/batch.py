@@ -65,25 +65,26 @@ def repeat_while(goes_on: Callable[[T], Any], step: Callable[[T], T], state: T, 
     written out, or with `marks` such samples are left to its second program.
     """
     if not is_expanding() or (is_standalone() and most > MOST_WRITTEN_OUT):
-
-        def again(carry):
-            count, state = carry
-            return count + 1, step(state)
-
         leaves, structure = jax.tree.flatten(state)
-        state = jax.tree.unflatten(structure, vary_alike([*map(jnp.asarray, leaves)]))
-        return lax.while_loop(lambda carry: goes_on(carry[1]) & (carry[0] < most), again, (0, state))[1]
+        return _loop(goes_on, step, jax.tree.unflatten(structure, vary_alike([*map(jnp.asarray, leaves)])), most)
     if goes_on(state) is True:
         state, most = step(state), most - 1
     if not has_branches() and (marks or not is_standalone()) and not is_careful():
         return mark_floats(goes_on(state), state)
+    if has_branches():
+        return _loop(goes_on, step, state, most)
     for _ in range(most):
         flag = goes_on(state)
-        if has_branches():
-            state = lax.cond(flag, step, lambda state: state, state)
-        else:
-            state = jax.tree.map(lambda new, old, flag=flag: jnp.where(flag, new, old), step(state), state)
+        state = jax.tree.map(lambda new, old, flag=flag: jnp.where(flag, new, old), step(state), state)
     return state
+
+
+def _loop(goes_on: Callable[[T], Any], step: Callable[[T], T], state: T, most: int) -> T:
+    def again(carry):
+        count, state = carry
+        return count + 1, step(state)
+
+    return lax.while_loop(lambda carry: goes_on(carry[1]) & (carry[0] < most), again, (0, state))[1]
 
 
 def each_row(function: Callable, *rows):

@@ -1,4 +1,4 @@
-"""Independent rows of a matrix by Gram-Schmidt with pivots, as a kernel: which row comes next depends on the numbers."""
+"""Elimination: independent rows by Gram-Schmidt with pivots, as a kernel of loops, and solutions without exchange of rows."""
 
 import contextlib
 import functools
@@ -13,6 +13,8 @@ with contextlib.suppress(ImportError):  # no kernels without llvmlite
     from jaxdyn.compile.matrix_loops import INT
 
 
+# Unknowns up to which an elimination is written out.
+_MOST_WRITTEN_OUT = 24
 # Rows whose distances differ by less than this part are equally far.
 _ALIKE = 1e-3
 
@@ -138,3 +140,36 @@ def eliminate_rows(B: jax.Array, first: jax.Array, least, most) -> tuple[jax.Arr
     numbers = [jnp.broadcast_to(jnp.asarray(x, B.dtype), first.shape) for x in (first, least, most)]
     chosen = _independent_rows(*B.shape, B.dtype)(jnp.concatenate([B, jnp.stack(numbers, 1)], 1))
     return chosen[:, 0], chosen[:, 1], chosen[:, 2]
+
+
+def eliminate(matrix: jax.Array, right: jax.Array, least: float) -> tuple[jax.Array, jax.Array]:
+    """Solution of matrix x = right (n, k) by elimination without exchange of rows, and the pivots (n,).
+
+    A pivot whose size is at most `least` is replaced by it. Many unknowns are eliminated by a loop: the operations of what is
+    written out grow with their third power.
+    """
+    n = len(matrix)
+    if n > _MOST_WRITTEN_OUT:
+        rows, pivots = lax.scan(functools.partial(_clear_column, least), jnp.concatenate([matrix, right], 1), None, n)
+        return rows[:, n:], pivots
+    rows, pivots = [], []
+    for _ in range(n):
+        pivot = matrix[0, 0]
+        pivots.append(pivot)
+        inverse = 1 / jnp.where(jnp.abs(pivot) > least, pivot, least)
+        rows.append((inverse, matrix[0, 1:], right[0]))
+        share = matrix[1:, :1] * inverse
+        matrix, right = matrix[1:, 1:] - share * matrix[:1, 1:], right[1:] - share * right[:1]
+    solution = jnp.zeros((0, right.shape[1]), right.dtype)
+    for inverse, row, value in reversed(rows):
+        rest = value - jnp.matmul(row, solution, precision="highest") if row.shape[0] else value
+        solution = jnp.concatenate([(rest * inverse)[None], solution])
+    return solution, jnp.stack(pivots)
+
+
+def _clear_column(least: float, rows, _):
+    """A step of Gauss and Jordan on the first row and column, which become the last ones; after n of them all are in place."""
+    n, pivot = len(rows), rows[0, 0]
+    first = rows[:1, 1:] / jnp.where(jnp.abs(pivot) > least, pivot, least)
+    rest = jnp.concatenate([rows[1:, 1:] - rows[1:, :1] * first, first])
+    return jnp.concatenate([rest[:, : n - 1], jnp.zeros_like(rest[:, :1]), rest[:, n - 1 :]], 1), pivot

@@ -23,7 +23,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
-from jaxdyn.compile import batch
+from jaxdyn.compile import batch, eliminate
 from jaxdyn.contact import jordan
 from jaxdyn.lie.series import safe_sqrt
 from jaxdyn.lie.so3 import matmul
@@ -150,25 +150,12 @@ def _newton_matrix(groups: Groups, blocks, W, shift) -> Array:
     return unit - _apply(groups, D, unit) + _apply(groups, DS, W + jnp.diag(shift))
 
 
-def eliminate(matrix, right, exponent: float = 0.5) -> tuple[Array, Array]:
-    """Solution of matrix x = right (n, k) by elimination without exchange of rows, and the pivots (n,).
+def _solve(matrix, right, exponent: float = 0.5) -> tuple[Array, Array]:
+    """Solution (n, k) and pivots (n,) of `eliminate`; pivots of this power of rounding are replaced: rows are dependent.
 
-    The diagonal blocks of cones need no exchange. A pivot whose size is below this power of rounding is replaced by it: the rows
-    are dependent.
+    The diagonal blocks of cones need no exchange of rows.
     """
-    rows, pivots, least = [], [], float(jnp.finfo(matrix.dtype).eps) ** exponent
-    for _ in range(matrix.shape[0]):
-        pivot = matrix[0, 0]
-        pivots.append(pivot)
-        inverse = 1 / jnp.where(jnp.abs(pivot) > least, pivot, least)
-        rows.append((inverse, matrix[0, 1:], right[0]))
-        share = matrix[1:, :1] * inverse
-        matrix, right = matrix[1:, 1:] - share * matrix[:1, 1:], right[1:] - share * right[:1]
-    solution = jnp.zeros((0, right.shape[1]), right.dtype)
-    for inverse, row, value in reversed(rows):
-        rest = value - matmul(row, solution) if row.shape[0] else value
-        solution = jnp.concatenate([(rest * inverse)[None], solution])
-    return solution, jnp.stack(pivots)
+    return eliminate(matrix, right, float(jnp.finfo(matrix.dtype).eps) ** exponent)
 
 
 def _shift(scale, exponent: float = _SHIFT) -> Array:
@@ -194,7 +181,7 @@ def _step(groups: Groups, W, q, floor, shift, state: _State) -> _State:
     residual, D, along = _residual(groups, x, y, width)
     blocks, right = _begin_sticking(groups, y, width, step == 0, _blocks(D, along), -residual)
     matrix = _newton_matrix(groups, blocks, W, jnp.where(stage == _PLAIN, 0.0, shift))
-    change, pivots = eliminate(matrix, right[:, None])
+    change, pivots = _solve(matrix, right[:, None])
     change = change[:, 0]
     rate = matmul(W, change) + own * change
     before = jnp.sqrt(jnp.sum(residual * residual))
@@ -300,7 +287,7 @@ def _attach_derivative_jvp(groups: Groups, primals, tangents):
     (_, DS), shift = zip(*blocks, strict=True), _shift(scale, _SHIFT_OF_DERIVATIVE)
     matrix = _newton_matrix(groups, blocks, W, shift)
     right = -_apply(groups, DS, tangents[1][:, None])
-    change, _ = eliminate(matrix, right)
+    change, _ = _solve(matrix, right)
     # One refinement removes the shift along the range of W.
-    rest, _ = eliminate(matrix, _apply(groups, DS, shift[:, None] * change))
+    rest, _ = _solve(matrix, _apply(groups, DS, shift[:, None] * change))
     return moving, (change + rest)[:, 0]

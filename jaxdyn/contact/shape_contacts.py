@@ -22,11 +22,12 @@ from jaxtyping import Array, Float
 from jaxdyn.constraints.rolling import Touching, TouchingPoint, tangents
 from jaxdyn.contact.contact_equations import inverse_2x2
 from jaxdyn.contact.height_field import HeightField
-from jaxdyn.contact.shapes import Ball, Box, Capsule, Feature, features_of, outward
+from jaxdyn.contact.shapes import Ball, Box, Capsule, ConvexHull, Feature, LowestCorner, features_of, outward
 from jaxdyn.contact.surfaces import Plane, Sphere
 from jaxdyn.contact.unilateral import UnilateralContact
 from jaxdyn.lie.so3 import matmul
 from jaxdyn.model.arguments import Checked, Numbers, check_body, pose_leaf
+from jaxdyn.model.numbers import check_count
 
 _EXPANSIONS = 3  # Taylor polynomials of uneven ground, each about the point of the one before
 
@@ -108,6 +109,7 @@ def shape_contacts(
     friction: Numbers = 0.0,
     static: Numbers | None = None,
     restitution: Numbers = 0.0,
+    lowest: int | None = None,
     name: str | None = None,
 ) -> tuple[UnilateralContact, ...]:
     r"""Unilateral contacts of a shape on a body with ground, or of a sphere with a shape.
@@ -138,13 +140,18 @@ def shape_contacts(
     - `surface`: pose of `on` in `surface_body` (None: the world), with the z axis of a plane and of uneven ground as their
       normal; by default the identity.
     - `friction`, `static`, `restitution`: see `UnilateralContact`.
+    - `lowest`: of a `Box` or a `ConvexHull` on a `Plane`, so many contacts at the most, in the corners that are lowest: others as
+      the shape turns. For `jd.stepper`, whose cost grows with the number of contacts; `simulate` refuses them. Four are all
+      that touch of a box, one is a pointed foot. Of more corners that are equally low four carry in a step, and others in the
+      next one. None: a contact for each corner.
     - `name`: of the contact, or of several with a number behind it; by default "BODY SHAPE".
 
     **Returns:** the contacts, to be listed among the forces of a scene. Their forces are the normal force and the friction along
     two tangents: x and y of a plane; elsewhere those of Duff et al. (2017).
 
-    **Raises:** ValueError for pairs that are not listed here, a Cylinder without a length, corners on a `HeightField` that is
-    not smooth with anything but corners and rims, a bad pose or coefficient; when used, for unknown bodies.
+    **Raises:** ValueError for pairs that are not listed here, `lowest` of others than corners on a plane, a Cylinder
+    without a length, a `HeightField` that is not smooth with anything but corners and rims, a bad pose or coefficient; when
+    used, for unknown bodies.
 
     ```python
     ground = jd.contact.shape_contacts("body", jd.contact.Box((0.3, 0.2, 0.1)), friction=0.6, name="box")
@@ -154,6 +161,8 @@ def shape_contacts(
     kind = type(shape).__name__
     name = f"{body} {kind.lower()}" if name is None else name
     features = _check_pair(shape, on, name)
+    if lowest is not None:
+        features = _lowest_corners(shape, on, features, lowest, name)
     place, ground = pose_leaf(pose, f"{name!r}: pose"), pose_leaf(surface, f"{name!r}: surface")
     contacts = []
     for i, feature in enumerate(features):
@@ -192,3 +201,15 @@ def _check_pair(shape, on, name: str) -> tuple[Feature, ...]:
     elif not isinstance(on, Plane):
         raise ValueError(f"{pair} has no contacts here; on is a Plane, HeightField, Sphere, Capsule or Box")
     return features
+
+
+def _lowest_corners(shape, on, features: tuple[Feature, ...], lowest: int, name: str) -> tuple[Feature, ...]:
+    """Features of the lowest corners, or all features where they are not more. **Raises:** ValueError."""
+    check_count(lowest, f"shape_contacts {name!r}: lowest")
+    if not (isinstance(shape, (Box, ConvexHull)) and isinstance(on, Plane)):
+        raise ValueError(
+            f"shape_contacts {name!r}: lowest is {lowest}, for a {type(shape).__name__} on a {type(on).__name__}; it is for a "
+            "Box or a ConvexHull on a Plane"
+        )
+    corners = jnp.stack([feature.place for feature in features if isinstance(feature, Ball)])
+    return tuple(LowestCorner(corners, k) for k in range(lowest)) if lowest < len(features) else features

@@ -9,6 +9,7 @@ import itertools
 from typing import Any
 
 import equinox as eqx
+import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
@@ -96,6 +97,24 @@ class Ball(Feature):
     def support(self, R, p, along):
         point = self.centre(R, p)
         return point if self.radius is None else point + self.radius.astype(p.dtype) * along
+
+
+class LowestCorner(Feature):
+    """Of some points the one that comes after `before` others in a direction: another one as the shape turns."""
+
+    places: Float[Array, "n 3"]
+    before: int = eqx.field(static=True)
+    is_smooth = False
+
+    def centre(self, R, p):
+        return p + matmul(R, jnp.mean(self.places.astype(p.dtype), 0))
+
+    def support(self, R, p, along):
+        places = self.places.astype(p.dtype)
+        reach = jax.lax.stop_gradient(matmul(places, matmul(R.T, along)))
+        for _ in range(self.before):
+            reach = jnp.where(jnp.arange(len(places)) == jnp.argmax(reach), -jnp.inf, reach)
+        return p + matmul(R, places[jnp.argmax(reach)])
 
 
 class Rim(Feature):

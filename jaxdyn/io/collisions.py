@@ -1,6 +1,6 @@
 """Contacts of the collision shapes of a file with its ground."""
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -16,6 +16,7 @@ from jaxdyn.io.loaded import summarize
 from jaxdyn.io.solids import Element, Solid
 from jaxdyn.model import host_math
 from jaxdyn.model.builder import unknown
+from jaxdyn.model.numbers import check_count
 from jaxdyn.model.tree import Model
 
 FRICTION = 1.0  # where a format or a file has none: the default of Gazebo and of MuJoCo
@@ -36,11 +37,15 @@ class Collision(NamedTuple):
     key: Any = None
 
 
-def check_choice(contacts: Any) -> str | tuple[str, ...] | None:
+def check_choice(contacts: Any) -> str | tuple[str, ...] | dict[str, int] | None:
     """Check the option `contacts` of a reader. **Raises:** ValueError."""
     if contacts is None or (isinstance(contacts, str) and contacts == "ground"):
         return contacts
-    names = tuple(contacts) if isinstance(contacts, Iterable) and not isinstance(contacts, (str, dict)) else (None,)
+    if isinstance(contacts, Mapping):
+        for name, lowest in contacts.items():
+            check_count(lowest, f"contacts[{name!r}]")
+        return dict(contacts)
+    names = tuple(contacts) if isinstance(contacts, Iterable) and not isinstance(contacts, str) else (None,)
     if not all(isinstance(name, str) for name in names):
         raise ValueError(f"contacts is {contacts!r}; give 'ground', a list of names of links that touch it, or None")
     return names  # pyright: ignore[reportReturnType]
@@ -54,7 +59,8 @@ def contacts_with_ground(
 ) -> tuple[list[UnilateralContact], list[str], set[str]]:
     """Contacts of the chosen links with planes and height fields that are fixed to the world, else with its plane z = 0.
 
-    `friction_of(a, b)`: the coefficient of two collisions, None for a pair that does not touch; by default the smaller one.
+    `contacts`: "ground", links, or links with the number of their lowest corners that touch. `friction_of(a, b)`: the
+    coefficient of two collisions, None for a pair that does not touch; by default the smaller one.
 
     **Returns:** contacts; descriptions of what is left out; the links that have contacts.
 
@@ -92,6 +98,8 @@ def contacts_with_ground(
             on, turn = _ground(ground)
             name = one.frame + (f" {place}" if counts[one.frame] > 1 else "") + (f" on {k}" if len(grounds) > 1 else "")
             options: dict[str, Any] = {"surface": ground.pose @ turn, "surface_body": ground.frame}
+            if isinstance(contacts, Mapping) and isinstance(shape, (Box, ConvexHull)) and isinstance(on, Plane):
+                options["lowest"] = contacts[one.frame]
             made += shape_contacts(
                 one.frame, shape, one.pose, on=on, friction=friction, name=names.new(name), **options
             )

@@ -20,6 +20,7 @@ from jaxdyn.constraints.rank import LEAST_GAP
 from jaxdyn.constraints.redundancy import holds_rows, keep_rows
 from jaxdyn.constraints.selection import most_rounding, rows_and_doubts, select_rows
 from jaxdyn.contact.forces import contacts_with_cones
+from jaxdyn.contact.shapes import LowestCorner
 from jaxdyn.dynamics.quantities import mass_matrix
 from jaxdyn.model import host_math
 from jaxdyn.model.arguments import check_shape
@@ -185,6 +186,17 @@ def check_drives(scene: Scene, control, solver, modal: bool) -> None:
         raise ValueError(f"{what}, which the steps of method 'variational' do not integrate; take another method")
     if isinstance(control, Controller) and control.takes_multipliers:
         raise ValueError(f"{what}, behind which multipliers do not depend on the command; use a control without them")
+
+
+def check_contacts(scene: Scene) -> None:
+    """Refuse contacts that change their place on a body, which have no events."""
+    for force in scene.forces:
+        touching: Any = getattr(force, "contact", None)
+        if isinstance(getattr(touching, "feature", None), LowestCorner):
+            raise ValueError(
+                f"contact {touching.name!r} is in a lowest corner, another one as the body turns: take jd.stepper, or contacts "
+                "in all corners (lowest=None)"
+            )
 
 
 def check_modal_options(control, stepsize, solver, adjoint, outputs) -> None:

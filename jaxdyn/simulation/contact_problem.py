@@ -8,6 +8,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array
 
+from jaxdyn.compile import eliminate
 from jaxdyn.constraints.base import constraint_jacobian, position_residual, velocity_residual
 from jaxdyn.constraints.dynamics import constrained_dynamics
 from jaxdyn.constraints.projection import project_state
@@ -420,8 +421,12 @@ def make_consistent(contacts: Contacts, problem: Scaled, closes) -> Scaled:
     gram, wanted = W * act[:, None] * act[None], q * act
     # Between the squares of independent rows and rounding. The second step leaves a share of its square.
     shift = float(jnp.finfo(q.dtype).eps) ** 0.55
-    factor = cholesky(gram + shift * jnp.eye(len(act), dtype=q.dtype))
-    x = solve_cholesky(factor, wanted)
-    x = x + solve_cholesky(factor, wanted - matmul(gram, x))
+    shifted = gram + shift * jnp.eye(len(act), dtype=q.dtype)
+
+    def solve(right):
+        return eliminate(shifted, right[:, None], float(jnp.finfo(q.dtype).eps))[0][:, 0]
+
+    x = solve(wanted)
+    x = x + solve(wanted - matmul(gram, x))
     rest = wanted - matmul(gram, x)
     return problem._replace(q=q - jnp.where(act > 0, rest / jnp.where(act > 0, act, 1), 0))

@@ -231,10 +231,16 @@ def _solve_relaxed(contacts: Contacts, scene: Scene, of: Scaled, width, wanted: 
     if not may_contradict(contacts, scene):
         return solution, jnp.zeros((len(contacts.sizes),), bool)
     fails = ~solution.solved & wanted
-    # Contacts that only impulses of others close may contradict them too.
-    closes = closing_cones(contacts, of, solution.x) & fails
-    again = coulomb.solve(contacts.groups, True, of.W, make_consistent(contacts, of, closes).q, of.scale, width, fails)
-    # The residual is that of the law itself.
-    residual = coulomb.residual_at(contacts.groups, again.x, matmul(of.W, again.x) + of.q, width)
-    again = again._replace(residual=residual, steps=solution.steps + again.steps)
-    return jax.tree.map(lambda a, b: jnp.where(fails, a, b), again, solution), closes
+
+    def relax():
+        # Contacts that only impulses of others close may contradict them too.
+        closes = closing_cones(contacts, of, solution.x) & fails
+        q = make_consistent(contacts, of, closes).q
+        again = coulomb.solve(contacts.groups, True, of.W, q, of.scale, width, fails)
+        # The residual is that of the law itself.
+        residual = coulomb.residual_at(contacts.groups, again.x, matmul(of.W, again.x) + of.q, width)
+        return again._replace(residual=residual, steps=solution.steps + again.steps), closes
+
+    # Few problems need it, and in a kernel no others compute it.
+    none = jnp.zeros((len(contacts.sizes),), bool)
+    return jax.lax.cond(fails, relax, lambda: (solution, none))

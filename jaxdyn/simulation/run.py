@@ -266,6 +266,7 @@ def _choose(
     checks.check_drives(scene, control, solver, modal)
     checks.check_combination(control, method, solver, adjoint)
     if modal:
+        checks.check_contacts(scene)
         checks.check_modal_options(control, stepsize, solver, adjoint, outputs)
     given = [name for name, is_given in zip(("rtol", "atol"), tolerances, strict=True) if is_given]
     if given and stepsize is not None:

@@ -1,4 +1,4 @@
-"""Independent rows of a matrix, in native code and by JAX, against an elimination in NumPy."""
+"""Elimination in native code and by JAX: independent rows, and solutions, against NumPy."""
 
 import jax
 import jax.numpy as jnp
@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 import jaxdyn as jd
-from jaxdyn.compile import eliminate_rows
+from jaxdyn.compile import eliminate, eliminate_rows, kernel
 
 pytestmark = pytest.mark.native
 
@@ -59,3 +59,28 @@ def test_rows_that_are_no_numbers(mode):
     with jd.compilation(mode):
         kept, rest, pivots = jax.jit(eliminate_rows)(B, jnp.zeros(3), 1e-4, 2.0)
     assert kept.tolist() == [0, 0, 0] and pivots.tolist() == [0, 0, 0] and np.isnan(rest[0])
+
+
+@pytest.mark.parametrize("mode", ["auto", "plain"])
+@pytest.mark.parametrize("count", [3, 24, 25, 40])
+def test_solutions_of_few_and_many_unknowns(mode, count):
+    """Written out and by a loop; pivots by leading minors; derivatives of the solution, and a pivot of zero."""
+    rng = np.random.default_rng(count)
+    matrices, rights = rng.normal(size=(5, count, count)) + count * np.eye(count), rng.normal(size=(5, count, 1))
+
+    @kernel
+    def solve(_, matrix, right):
+        return eliminate(matrix, right, 1e-10)
+
+    with jd.compilation(mode):
+        found, pivots = jax.jit(jax.vmap(solve, (None, 0, 0)))((), matrices, rights)
+        # d tr(b^T A^-1 b) / dA = -A^-T b b^T A^-T
+        slope = jax.grad(lambda A: jnp.sum(rights[0].T @ solve((), A, rights[0])[0]))(matrices[0])
+        none = matrices[0].copy()
+        none[0] = none[:, 0] = 0
+        assert abs(eliminate(jnp.asarray(none), jnp.zeros((count, 1)), 1e-10)[1][0]) == 0
+    np.testing.assert_allclose(found, np.linalg.solve(matrices, rights), rtol=0, atol=1e-13)
+    minors = [np.linalg.det(matrices[0][:k, :k]) if k else 1.0 for k in (0, 1, 2, 3)]
+    np.testing.assert_allclose(pivots[0][:3], np.divide(minors[1:], minors[:-1]), rtol=1e-12)
+    inverse = np.linalg.inv(matrices[0]).T
+    np.testing.assert_allclose(slope, -inverse @ rights[0] @ rights[0].T @ inverse, rtol=0, atol=1e-13)

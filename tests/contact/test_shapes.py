@@ -450,3 +450,56 @@ def test_gradient_of_steps_on_uneven_ground():
     differences = (value(1 + h, 0.0) - value(1 - h, 0.0)) / (2 * h), (value(1.0, h) - value(1.0, -h)) / (2 * h)
     np.testing.assert_allclose(found, differences, rtol=1e-6)
     assert min(abs(float(x)) for x in found) > 1e-3
+
+
+@pytest.mark.parametrize("name", ["box", "hull"])
+def test_lowest_corners_are_those_of_all_in_order(name):
+    """Gaps and points, of which also the derivatives are those of the corner; as many as there are at the most."""
+    shape = SHAPES[name][0]
+    every, lowest = shape_contacts("b", shape), shape_contacts("b", shape, lowest=4)
+    R, p = poses(50)
+    (point, _, gap, _), (some, _, least, _) = gaps(every, R, p), gaps(lowest, R, p)
+    order = np.argsort(gap, 1)[:, :4]
+    np.testing.assert_allclose(least, np.take_along_axis(gap, order, 1), rtol=0, atol=1e-15)
+    np.testing.assert_allclose(some, np.take_along_axis(point, order[:, :, None], 1), rtol=0, atol=1e-15)
+    slopes = [
+        jax.jacfwd(lambda w, one=one: one.contact.touching(so3.exp(w) @ R[0], p[0] + w).gap)(jnp.zeros(3))
+        for one in (every[order[0, 2]], lowest[2])
+    ]
+    np.testing.assert_allclose(*slopes, rtol=0, atol=1e-15)
+    assert len(shape_contacts("b", shape, lowest=100)) == len(every)
+
+
+def test_a_box_falls_on_its_lowest_corners_as_on_all():
+    """Impacts on corners, edges and a face."""
+    builder = jd.ModelBuilder("box")
+    size = (0.3, 0.2, 0.1)
+    builder.add_body("box", None, "free", jd.inertia.box(2.0, size))
+    turned = np.array([0.9, 0.3, 0.2, 0.1])
+    q = jnp.array([0, 0, 0.3, *(turned / np.linalg.norm(turned))])
+    ends = []
+    for lowest in (None, 4):
+        contacts = shape_contacts("box", Box(size), friction=0.6, restitution=0.2, lowest=lowest)
+        scene = jd.Scene(builder.build(), forces=contacts)
+        step = jd.stepper(scene, dt=0.005)
+        state = q, jnp.array([0.5, 0.2, 0, 1.0, 2.0, 0.5])
+        ends.append(
+            jax.jit(lambda s, step=step: jax.lax.scan(lambda x, _: (step(x, jnp.zeros(6)), x), s, length=160)[1])(state)
+        )
+    np.testing.assert_allclose(ends[0][0], ends[1][0], rtol=0, atol=1e-10)
+    np.testing.assert_allclose(ends[1][0][-1, 2], 0.05, atol=1e-10)
+    with pytest.raises(ValueError, match=r"lowest corner.*jd\.stepper"):
+        jd.simulate(scene, *state, [0.0, 0.1])
+
+
+@pytest.mark.parametrize(
+    ("shape", "options", "words"),
+    [
+        (Sphere(0.1), {"lowest": 1}, "for a Sphere on a Plane"),
+        (Box((1, 1, 1)), {"lowest": 4, "on": FIELD}, "for a Box on a HeightField"),
+        (Box((1, 1, 1)), {"lowest": 0}, "lowest is 0; give a positive"),
+    ],
+)
+def test_lowest_corners_are_refused(shape, options, words):
+    with pytest.raises(ValueError, match=words):
+        shape_contacts("b", shape, **options)

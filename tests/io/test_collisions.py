@@ -84,9 +84,13 @@ def test_chosen_links_and_refusals(urdf):
         ValueError, match=r"link 'sphre' is unknown \(did you mean sphere.*\); it has no collision shape"
     ):
         load(urdf, contacts=["sphre"])
-    for wrong in ("floor", 3, [1], {"sphere": 1}):
+    for wrong in ("floor", 3, [1]):
         with pytest.raises(ValueError, match="give 'ground', a list of names of links"):
             load(urdf, contacts=wrong)
+    with pytest.raises(ValueError, match=r"contacts\['sphere'\] is 0; give a positive"):
+        load(urdf, contacts={"sphere": 0})
+    lowest = touching_of(load(urdf, contacts={"sphere": 1, "box": 4}))
+    assert sorted(lowest) == ["box 0", "box 1", "box 2", "box 3", "sphere"]
 
 
 def test_meshes_that_cannot_be_read_are_named(urdf):

@@ -549,3 +549,16 @@ def test_friction_of_a_rod_changes_the_force_that_loads_it():
     differences = (speed(1 + 1e-5) - speed(1 - 1e-5)) / 2e-5
     assert float(gradient) == pytest.approx(float(differences), rel=1e-9)
     assert float(second) == pytest.approx(float(jax.grad(speed)(1 + 1e-5) - jax.grad(speed)(1 - 1e-5)) / 2e-5, rel=1e-6)
+
+
+def test_a_table_on_twelve_points_stands_and_slides():
+    """Many contacts, whose equations are solved by a loop: forces of least norm, and the motion of a sliding block."""
+    points = [(x, y, -0.1) for x in (-0.3, -0.1, 0.1, 0.3) for y in (-0.2, 0.0, 0.2)]
+    contacts = [jd.contact.ground_contact("body", point, 0.5, name=f"p{i}") for i, point in enumerate(points)]
+    scene, start, dt = free_body(contacts), jnp.array([0, 0, 0.1, 1, 0, 0, 0.0]), 0.01
+    (q, _), report = run(scene, dt, (start, jnp.zeros(6)), 2)
+    np.testing.assert_allclose(q[-1], start, rtol=0, atol=1e-13)
+    # Half of the digits are those of forces that are not unique.
+    np.testing.assert_allclose([report.forces[f"p{i}"][-1, 2] for i in range(12)], 9.81 / 12, rtol=0, atol=1e-7)
+    (_, v), _ = run(scene, dt, (start, jnp.zeros(6).at[0].set(1.0)), 10)
+    np.testing.assert_allclose(v[:, 0], 1.0 - 0.5 * 9.81 * dt * np.arange(1, 11), rtol=0, atol=1e-10)

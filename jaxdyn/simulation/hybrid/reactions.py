@@ -15,7 +15,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array
 
-from jaxdyn.contact.coulomb import eliminate
+from jaxdyn.compile import eliminate
 from jaxdyn.dynamics.quantities import bias_force
 from jaxdyn.lie.so3 import matmul
 from jaxdyn.simulation.hybrid.modes import Elements, Mode, force_at
@@ -127,7 +127,7 @@ def react(elements: Elements, mode: Mode, gram: Gram, friction, loads, along, ta
         # Sliding friction changes its own normal forces: N = S (base + by_normal N), S the rows and signs of `pick`.
         K = jnp.eye(count, dtype=dtype) - pick[:, None] * by_normal[jnp.asarray(at)]
         # Without exchange of rows, because the sign of each pivot tells where friction leaves no forces.
-        solution, own = eliminate(K, (pick * base[jnp.asarray(at)])[:, None], 1.0)
+        solution, own = eliminate(K, (pick * base[jnp.asarray(at)])[:, None], float(jnp.finfo(dtype).eps))
         normal, is_sliding = solution[:, 0], slides(elements, mode)
         for k, i in enumerate(elements.frictional):
             pivots[i] = jnp.where(is_sliding[i], own[k], jnp.ones_like(own[k]))
