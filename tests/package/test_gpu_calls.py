@@ -14,6 +14,7 @@ from jax.interpreters import mlir
 from jax.sharding import Mesh, NamedSharding, PartitionSpec
 
 import jaxdyn as jd
+from benchmarks import gpu as benchmark
 from jaxdyn import compile as backend
 from jaxdyn.compile import jax_adapter, mode, primitive
 from jaxdyn.compile.gpu import device, driver, ptx
@@ -403,6 +404,25 @@ def test_the_same_jaxpr_runs_on_cpus_and_gpus(gpu):
     with jd.compilation("auto"):
         text = jax.jit(jax.vmap(dynamics)).trace(*states(2)).lower(lowering_platforms=("cuda",)).as_text()
     assert "jaxdyn_cuda_kernel" not in text
+
+
+@pytest.mark.parametrize("fails", [None, "cuLaunchKernel"])
+def test_the_benchmark_compares_and_decides(gpu, monkeypatch, capsys, fails):
+    """Also after an error of the driver."""
+    functions = {"multiplied": (lambda x: backend.kernel(lambda _, x: 47.0 * x)((), x), (2,))}
+    monkeypatch.setattr(benchmark, "functions", lambda *_: functions)
+    monkeypatch.setattr(benchmark, "on_gpu", lambda: True)
+    gpu.fails = fails
+    with jd.compilation("auto"):
+        benchmark.measure(["arm"], [64], 1, 2**10, ("auto", "native"))
+    printed = capsys.readouterr().out
+    rows = [[cell.strip() for cell in line.split("|")] for line in printed.splitlines() if line.startswith("| arm")]
+    assert [row[4] for row in rows] == ["auto", "native"]
+    assert rows[1][7] == ("inf" if fails else "0.0e+00")
+    assert bool(gpu.launches) != bool(fails)
+    if fails:
+        assert "arm, multiplied, batch 64, native: JaxRuntimeError" in printed
+        assert "not to be the default on this GPU:\narm, multiplied, batch 64: error inf" in printed
 
 
 def test_export_is_refused_by_name(gpu):

@@ -78,15 +78,19 @@ def nearly_singular():
     return lambda q, v: jd.simulate(scene, q, v, TS, stepsize=1e-2, throw=False).q, [q, speeds * v]
 
 
-def held_quadruped():
-    """Accelerations of a free trunk on four legs whose feet are held."""
+def held_quadruped(**options):
+    """Accelerations of a free trunk on four legs whose feet are held, or a motion with these options."""
     model = jd.robots.quadruped()
     q = jd.neutral(model).at[7:].set(jnp.tile(jnp.array([0.0, 0.8, -1.6]), 4))
     feet = [f"{leg}_foot" for leg in ("FL", "FR", "RL", "RR")]
     loops = [jd.loop(foot, None, None, tuple(jd.frame_pose(model, q, foot)[:3, 3]), "spherical") for foot in feet]
     scene = jd.Scene(model, loops)
-    (v,) = random(model.nv)
-    return lambda v: jd.constrained_dynamics(scene, q, v).acceleration, [v]
+    if not options:
+        return lambda v: jd.constrained_dynamics(scene, q, v).acceleration, random(model.nv)
+    free = np.linalg.svd(np.asarray(jd.constraint_jacobian(scene, q)))[2][-1:]  # the trunk moves, the feet do not
+    return lambda v: jd.simulate(scene, q, v, TS, throw=False, **options).q, [
+        jnp.linspace(0.1, 1.0, SAMPLES)[:, None] * free
+    ]
 
 
 def constrained(named):
@@ -136,6 +140,7 @@ CASES = {
     "singular positions": singular,
     "projection": projection,
     "rows of a held quadruped": held_quadruped,
+    "adaptive steps of a held quadruped": lambda: held_quadruped(rtol=1e-6),
     "fixed steps of an arm": lambda: steps_of_arm(stepsize=1e-2),
     "reverse mode of these": lambda: of_end(*steps_of_arm(stepsize=1e-2)),
     "adaptive steps to a joint's limit": lambda: steps_of_arm(events=(jd.events.JointLimit(),)),
@@ -165,7 +170,10 @@ def calls_of(name):
     return list(calls.values())
 
 
-@pytest.mark.parametrize("name", CASES)
+LONG = "adaptive steps of a held quadruped", "impacts and changes of mode", "reverse mode of a four-bar's steps"
+
+
+@pytest.mark.parametrize("name", [pytest.param(x, marks=pytest.mark.long) if x in LONG else x for x in CASES])
 def test_threads_compute_what_the_cpu_computes(name):
     for program, args, wanted in calls_of(name):
         for computed, want in zip(run_threads(program, args), wanted, strict=True):
@@ -214,7 +222,7 @@ REGISTERS = {
 }
 
 
-@pytest.mark.parametrize("name", CASES)
+@pytest.mark.parametrize("name", [x for x in CASES if x not in LONG])
 def test_ptx_is_written_without_a_toolkit(name):
     for program, args, _ in calls_of(name):
         written = ptx.ptx_of(text.module_ir(program, uniform_of(args)), 90)
