@@ -233,7 +233,7 @@ def test_ptx_is_written_without_a_toolkit(name):
 
 
 @pytest.mark.long
-@pytest.mark.parametrize("name", CASES)
+@pytest.mark.parametrize("name", REGISTERS)
 def test_registers_and_spills(name, tmp_path):
     tool = shutil.which("ptxas")
     if tool is None:
