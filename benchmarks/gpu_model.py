@@ -37,7 +37,7 @@ import jaxdyn as jd
 from benchmarks import gpu
 from jaxdyn.compile.gpu import ptx, text
 
-# An H100 SXM: NVIDIA's data sheet, but the clock under load, and the rate of the L2 cache, which others have measured.
+# An H100 SXM: NVIDIA's data sheet, but for assumptions: a launch, the clock under load, and the rates of memory and L2 cache.
 LAUNCH, CLOCK, MULTIPROCESSORS, SCHEDULERS, WARP = 2.5e-6, 1.7e9, 132, 4 * 132, 32
 MEMORY, CACHE, CACHE_BYTES = 3.0e12, 5.5e12, 50e6
 CYCLES_OF_A_WARP = 1.7
