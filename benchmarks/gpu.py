@@ -5,10 +5,13 @@
 
 Times are those of the first device of `jax.devices()`: best of some calls, in float32, with the error against the CPU relative to
 the largest number. The last lines decide: native kernels are to be the default on GPUs where they are right and faster in every
-row. The roofline is the larger of two times: operations over the operations a second that a long chain of multiply-adds reaches
-on this device, and bytes over the bytes a second that adding two long arrays reaches, both measured here. Operations are those
+row, compile in five seconds and close loops. Forward dynamics of frax and MJX are rows too where these are installed. What
+fails is printed, and the other rows follow.
+
+The roofline is the larger of two times: operations over the operations a second that a long chain of multiply-adds reaches
+here, and bytes over the bytes a second that adding two long arrays reaches, both measured in the same run. Operations are those
 of the scalar programs, times the steps of a rollout; bytes are those of the arguments and the results. Adaptive motions have no
-roofline, as their steps are not known beforehand, nor has a CPU.
+roofline, as their steps are not known beforehand, nor has a CPU. `benchmarks/gpu_model.py` has a model without a device.
 
 `--count` compiles for an H100 without one, where the CUDA plugin is installed (`pip install jax-cuda12-plugin
 jax-cuda12-pjrt nvidia-cuda-nvcc-cu12`, of jax's version), and counts what a call launches: kernels, calls of libraries
@@ -24,7 +27,7 @@ import re
 import sys
 import time
 from collections import Counter
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from types import SimpleNamespace
 from typing import NamedTuple
 
@@ -36,6 +39,7 @@ import jax.numpy as jnp
 import numpy as np
 
 import jaxdyn as jd
+from benchmarks import jax_peers
 
 # What XLA has to know of an H100 SXM to compile for it: NVIDIA's data sheet, and limits of compute capability 9.0.
 H100 = """
@@ -54,7 +58,9 @@ runtime_version { major: 12 minor: 9 patch: 0 }
 FREE = {"parameter", "constant", "bitcast", "tuple", "get-tuple-element", "after-all", "partition-id", "replica-id"}
 MAX_ERROR = 1e-5  # of the largest number, in float32
 MAX_COMPILATION = 5.0  # s
+MAX_RESIDUAL = 1e-6  # of closed loops, m
 LIBRARIES = ("cublas", "cusolver", "cudnn", "cufft")
+MECHANISMS = ("four-bar", "quadruped")
 
 
 def robot(name: str):
@@ -69,21 +75,43 @@ def robot(name: str):
     return load(name)[0]
 
 
-def functions(name: str, steps: int) -> dict[str, tuple[Callable, tuple[int, ...]]]:
-    """What is measured of a robot, or of "four-bar": functions of one sample, and the lengths of their arguments."""
+def mechanism(name: str):
+    """A mechanism with loops in float32 and a start q, v: "four-bar", or "quadruped", a free trunk on four feet that are held."""
     if name == "four-bar":
-        scene = jd.scenes.four_bar()
-        sizes = (scene.nq, scene.nv)
-        ts = np.linspace(0.0, 1.0, 2, dtype=np.float32)
+        q, v = jd.scenes.four_bar.start()
+        return jd.scenes.four_bar(), np.asarray(q, np.float32), np.asarray(v, np.float32)
+    model = jd.robots.quadruped(dtype=jnp.float32)
+    q = jd.neutral(model).at[7:].set(jnp.tile(jnp.array([0.0, 0.8, -1.6]), 4))
+    feet = [f"{leg}_foot" for leg in ("FL", "FR", "RL", "RR")]
+    loops = [jd.loop(foot, None, None, tuple(jd.frame_pose(model, q, foot)[:3, 3]), "spherical") for foot in feet]
+    scene = jd.Scene(model, loops)
+    free = np.linalg.svd(np.asarray(jd.constraint_jacobian(scene, q)))[2][-1]  # the trunk moves, the feet do not
+    return scene, np.asarray(q), 0.3 * free
+
+
+def functions(name: str, steps: int) -> dict[str, tuple[Callable, tuple[int, ...]]]:
+    """What is measured of a robot, or of a `mechanism`: functions of one sample, and the lengths of their arguments.
+
+    The last result of a motion of a mechanism are the errors of its loops, m and rad, and of their rates.
+    """
+    if name in MECHANISMS:
+        scene = mechanism(name)[0]
+        end = 1.0 if name == "four-bar" else 5e-3 * steps
 
         def motion(q, v, **options):
-            return jd.simulate(scene, q, v, ts, throw=False, **options).q[-1]
+            ts = np.linspace(0.0, end, 2, dtype=np.float32)
+            solution = jd.simulate(scene, q, v, ts, throw=False, outputs=["constraint_residual"], **options)
+            assert solution.constraint_residual is not None
+            return solution.q[-1], solution.constraint_residual[-1]
 
-        return {
-            "constrained dynamics": (lambda q, v: jd.constrained_dynamics(scene, q, v).acceleration, sizes),
-            f"{steps} steps over one second": (functools.partial(motion, stepsize=1.0 / steps), sizes),
-            "adaptive steps over one second": (motion, sizes),
+        fixed = functools.partial(motion, stepsize=end / steps)
+        computed = {
+            "constrained dynamics": lambda q, v: jd.constrained_dynamics(scene, q, v).acceleration,
+            f"{steps} steps": fixed,
+            "gradient of these": jax.grad(lambda q, v: jnp.sum(fixed(q, v)[0] ** 2), (0, 1)),
+            "adaptive steps": motion,
         }
+        return {label: (function, (scene.nq, scene.nv)) for label, function in computed.items()}
     model = robot(name)
     ts = np.linspace(0.0, 1e-3 * steps, 2, dtype=np.float32)
 
@@ -99,6 +127,7 @@ def functions(name: str, steps: int) -> dict[str, tuple[Callable, tuple[int, ...
         "inverse dynamics": (lambda q, v, a: jd.inverse_dynamics(model, q, v, a), three),
         "gradient of forward dynamics": (gradient, three),
         f"RK4 rollout, {steps} steps": (rollout, three[:2]),
+        "gradient of the rollout": (jax.grad(lambda q, v: jnp.sum(rollout(q, v) ** 2), (0, 1)), three[:2]),
     }
 
 
@@ -213,29 +242,32 @@ def _chained(y, x):
 
 
 def arguments(name: str, sizes, batch: int) -> list[jax.Array]:
-    """States of a batch; those of a four-bar are assembled, at several speeds."""
-    if name == "four-bar":
-        q, v = (np.asarray(x, np.float32) for x in jd.scenes.four_bar.start())
-        return [
-            jnp.asarray(np.tile(q, (batch, 1))),
-            jnp.asarray(np.linspace(0.5, 2.0, batch, dtype=np.float32)[:, None] * v),
-        ]
+    """States of a batch; those of a mechanism are assembled, at several speeds."""
+    if name in MECHANISMS:
+        _, q, v = mechanism(name)
+        speeds = np.linspace(0.5, 2.0, batch, dtype=np.float32)[:, None]
+        return [jnp.asarray(np.tile(q, (batch, 1))), jnp.asarray(speeds * v)]
     keys = jax.random.split(jax.random.key(0), len(sizes))
     return [0.3 * jax.random.normal(key, (batch, n), jnp.float32) for key, n in zip(keys, sizes, strict=True)]
 
 
-def operations_of(function: Callable, args, steps: int) -> float | None:
-    """Operations of the kernels of a call, for all samples; None where the number of steps is not known."""
-    total = 0.0
+def kernel_calls(function: Callable, args) -> Iterator[tuple]:
+    """The kernels that a function calls: the program, the number of samples, and which operands these share."""
     jaxprs = [jax.make_jaxpr(function)(*args).jaxpr]
     while jaxprs:
         for eqn in jaxprs.pop().eqns:
             program = eqn.params.get("program")
             if program is not None:
-                samples = max((math.prod(getattr(x.aval, "shape", ())[:-1]) for x in eqn.invars), default=1)
-                total += samples * program.cost * (steps if program.turns > 1 else 1)
+                shapes = [getattr(x.aval, "shape", ()) for x in eqn.invars]
+                samples = max((math.prod(x[:-1]) for x in shapes), default=1)
+                yield program, samples, [len(x) == 1 and samples > 1 for x in shapes]
             jaxprs += [x.jaxpr for x in jax.tree.leaves(list(eqn.params.values())) if hasattr(x, "jaxpr")]
-    return total or None
+
+
+def operations_of(function: Callable, args, steps: int) -> float | None:
+    """Operations of the kernels of a call, for all samples; None where there is no kernel."""
+    calls = kernel_calls(function, args)
+    return sum(n * program.cost * (steps if program.turns > 1 else 1) for program, n, _ in calls) or None
 
 
 class Row(NamedTuple):
@@ -244,26 +276,32 @@ class Row(NamedTuple):
     seconds: float
     error: float
     compilation: float
+    residual: float = 0.0  # of closed loops
 
 
-def measure_one(function: Callable, args, reference) -> Row:
-    """The time and the error of a call."""
+def measure_one(function: Callable, args, reference, closes: bool = False) -> Row:
+    """The time and the error of a call; `closes`: whether its last result are the errors of loops."""
     before = time.perf_counter()
     program = jax.jit(function).lower(*args).compile()
     compilation = time.perf_counter() - before
-    error = 0.0
-    for computed, want in zip(jax.tree.leaves(program(*args)), reference, strict=True):
+    results, error = jax.tree.leaves(program(*args)), 0.0
+    for computed, want in zip(results, reference, strict=True):
         # A motion of a few samples may end early in one precision: those that have no number in both do not count.
         difference = np.abs(np.asarray(computed) - want) / max(1.0, np.nanmax(np.abs(want)))
         both = np.isnan(np.asarray(computed)) & np.isnan(want)
         error = max(error, float(np.max(np.where(both, 0.0, np.where(np.isnan(difference), np.inf, difference)))))
-    return Row(seconds(program, *args), error, compilation)
+    residual = float(np.abs(np.asarray(results[-1])[:, 0]).max()) if closes else 0.0
+    return Row(seconds(program, *args), error, compilation, residual)
+
+
+def on_gpu() -> bool:
+    """Whether JAX computes on a GPU here."""
+    return jax.devices()[0].platform == "gpu"
 
 
 def measure(names, batches, steps: int, size: int, modes=("auto",)) -> None:
     """Print times with their roofline, and what they decide."""
-    device = jax.devices()[0]
-    is_gpu = device.platform == "gpu"
+    device, is_gpu = jax.devices()[0], on_gpu()
     print(f"device: {device.device_kind} ({device.platform}), float32, jax {jax.__version__}")
     if not is_gpu:
         print("no GPU here: the figures below are those of this CPU, without roofline")
@@ -271,36 +309,48 @@ def measure(names, batches, steps: int, size: int, modes=("auto",)) -> None:
     else:
         operations, bandwidth = peaks(size)
         print(f"reached by a chain of multiply-adds: {operations:.3g} 1/s; by adding arrays: {bandwidth:.3g} B/s")
-    head = "robot|function|batch|mode|us a call|samples/s|error|operations|bytes|roofline us|share|compile s".split("|")
+    head = "robot|function|batch|mode|us a call|samples/s|error|operations|bytes|roofline us|share|compile s|loops to".split(
+        "|"
+    )
     print("| " + " | ".join(head) + " |")
     print("|" + "---|" * len(head))
     against = []
     for name in names:
         for label, (one, sizes) in functions(name, steps).items():
+            called = dict.fromkeys(modes, one)
+            if is_gpu and label == "forward dynamics":
+                called |= jax_peers.forward_dynamics(robot(name))
             for batch in batches:
-                args, function = arguments(name, sizes, batch), jax.vmap(one)
+                args, rows = arguments(name, sizes, batch), {}
                 on_cpu = jax.device_put(args, jax.devices("cpu")[0])
-                reference = [np.asarray(x) for x in jax.tree.leaves(jax.jit(function)(*on_cpu))]
-                rows = {}
-                for mode in modes:
-                    with jd.compilation(mode):
-                        rows[mode] = measure_one(function, args, reference)
-                    took, rest = rows[mode].seconds, ["-"] * 4
-                    if is_gpu and not label.startswith("adaptive"):
-                        flops = operations_of(function, args, steps) or 0.0
-                        moved = sum(x.nbytes for x in (*args, *reference))
-                        least = max(flops / operations, moved / bandwidth)
-                        rest = [f"{flops:.3g}", f"{moved:.3g}", f"{1e6 * least:.3g}", f"{least / took:.2f}"]
+                reference = [np.asarray(x) for x in jax.tree.leaves(jax.jit(jax.vmap(one))(*on_cpu))]
+                rest = ["-"] * 3
+                if is_gpu and not label.startswith("adaptive"):
+                    flops = operations_of(jax.vmap(one), args, steps) or 0.0
+                    moved = sum(x.nbytes for x in (*args, *reference))
+                    least = max(flops / operations, moved / bandwidth)
+                    rest = [f"{flops:.3g}", f"{moved:.3g}", f"{1e6 * least:.3g}"]
+                for what, function in called.items():
+                    try:
+                        with jd.compilation(what if what in modes else "auto"):
+                            rows[what] = measure_one(
+                                jax.vmap(function), args, reference, name in MECHANISMS and "steps" in label
+                            )
+                    except Exception as error:  # the time on a device is short: the other rows are wanted too
+                        print(f"{name}, {label}, batch {batch}, {what}: {type(error).__name__}: {str(error)[:500]}")
+                        rows[what] = Row(math.inf, math.inf, math.inf)
+                    took, *others = rows[what]
                     row = [
                         name,
                         label,
                         batch,
-                        mode,
+                        what,
                         f"{1e6 * took:.3g}",
                         f"{batch / took:.3g}",
-                        f"{rows[mode].error:.1e}",
+                        f"{others[0]:.1e}",
+                        *rest,
                     ]
-                    row += [*rest, f"{rows[mode].compilation:.1f}"]
+                    row += [f"{least / took:.2f}" if rest[0] != "-" else "-", f"{others[1]:.1f}", f"{others[2]:.0e}"]
                     print("| " + " | ".join(map(str, row)) + " |", flush=True)
                 against += reasons_against(f"{name}, {label}, batch {batch}", rows)
     if is_gpu and {"auto", "native"} <= set(modes):
@@ -314,8 +364,10 @@ def reasons_against(what: str, rows: dict[str, Row]) -> list[str]:
         return []
     usual, native = rows["auto"], rows["native"]
     found = []
-    if not native.error <= max(MAX_ERROR, 2 * usual.error):
+    if not native.error <= max(MAX_ERROR, 2 * usual.error if usual.error < math.inf else 0.0):
         found.append(f"{what}: error {native.error:.1e} against {usual.error:.1e}")
+    if native.residual > MAX_RESIDUAL:
+        found.append(f"{what}: loops are closed to {native.residual:.1e}")
     if native.seconds > usual.seconds:
         found.append(f"{what}: {1e6 * native.seconds:.3g} us against {1e6 * usual.seconds:.3g}")
     if native.compilation > max(MAX_COMPILATION, usual.compilation):
@@ -328,7 +380,7 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--batches", type=int, nargs="+", default=[4096, 65536])
     parser.add_argument(
-        "--robots", nargs="+", default=["panda", "g1", "four-bar"], help="panda, g1, iiwa, four-bar, a URDF file"
+        "--robots", nargs="+", default=["panda", "g1", *MECHANISMS], help="panda, g1, iiwa, a mechanism, a URDF file"
     )
     parser.add_argument("--steps", type=int, default=100, help="of a rollout")
     parser.add_argument(

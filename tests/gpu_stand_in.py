@@ -3,6 +3,7 @@
 import ctypes
 import functools
 import math
+from types import SimpleNamespace
 
 import jax
 import numpy as np
@@ -90,7 +91,7 @@ def recorded_calls(function, *args) -> list[tuple]:
 
 # --- a driver that is none ---
 
-DEVICES, SUCCESS, OUT_OF_MEMORY = 2, 0, 2
+DEVICES, SUCCESS, OUT_OF_MEMORY, INVALID_PTX = 2, 0, 2, 218
 _P, _I = ctypes.c_void_p, ctypes.c_int
 
 
@@ -98,13 +99,14 @@ class StandInDriver:
     """The driver's functions as far as kernels call them: modules are loaded for the host, launches recorded and carried out.
 
     `launches`: (function's handle, blocks, threads, stream). `fails`: the name of the function that returns an error.
-    Streams are numbers above 1000, contexts above 2000, by device.
+    `refusal`: what the assembler says of a text that it does not take.
+    Streams are numbers from 1001 on by device, and a hundred more for each other one of it; contexts from 2001 on.
     """
 
     def __init__(self, capability=(9, 0), version=12040, devices=DEVICES):
         self.capability, self.version, self.devices = capability, version, devices
         self.launches, self.loaded, self.contexts, self.kernels = [], [], [], {}
-        self.fails, self.registers = None, 80
+        self.fails, self.refusal, self.registers = None, None, 80
         for name, arguments in driver._FUNCTIONS.items():
             function = functools.partial(self._run, name, getattr(self, f"_{name}"))
             setattr(self, name, ctypes.CFUNCTYPE(_I, *[_kind(x) for x in arguments])(function))
@@ -131,7 +133,7 @@ class StandInDriver:
         _I.from_address(at).value = {75: self.capability[0], 76: self.capability[1], 16: 10}[which]
 
     def _cuStreamGetCtx(self, stream, at):
-        _P.from_address(at).value = stream + 1000
+        _P.from_address(at).value = 2000 + (stream - 1000) % 100
 
     def _cuCtxPushCurrent_v2(self, context):
         self.contexts.append(context)
@@ -144,6 +146,10 @@ class StandInDriver:
 
     def _cuModuleLoadDataEx(self, at, image, count, options, values):
         assert count == 2 and list((_I * 2).from_address(options)) == [5, 6]
+        log, size = (_P * 2).from_address(values)
+        if self.refusal is not None:
+            ctypes.memmove(log, self.refusal, min(size, len(self.refusal)))
+            return INVALID_PTX
         self.loaded.append(self.contexts[-1])
         handle = 10 + len(self.kernels)
         self.kernels[handle] = HostKernel(image.decode())
@@ -177,38 +183,61 @@ def _kind(argument):
     return argument if argument is ctypes.c_char_p or not hasattr(argument, "contents") else _P
 
 
-_HANDLER = ctypes.CFUNCTYPE(_P, _P)
-_ASK = ctypes.CFUNCTYPE(_P, _P)
-_kept = []
+# What XLA says when a handler asks: the stream of a device, 0 or more; the number of the device, or None for the CPU's own; and
+# which of the two functions fails.
+XLA = SimpleNamespace(stream=0, device=None, fails=None)
+# Offsets of functions in XLA's table of them.
+_ERROR, _STREAM, _DEVICE = 48, 80, 184
+_FUNCTION = ctypes.CFUNCTYPE(_P, _P)
+_of_cpu, _kept = {}, []
 
 
-@_ASK
+def _fail():
+    """An error of XLA's."""
+    message = ctypes.create_string_buffer(b"XLA has no answer")
+    return _of_cpu[_ERROR](ctypes.addressof((ctypes.c_int64 * 4)(28, 0, ctypes.addressof(message), 13)))
+
+
+@_FUNCTION
+def _device_get(args):
+    if XLA.fails == "device":
+        return _fail()
+    error = _of_cpu[_DEVICE](args)
+    if XLA.device is not None:
+        _I.from_address(args + 24).value = XLA.device
+    return error
+
+
+@_FUNCTION
 def _stream_get(args):
-    """The stream of the device that XLA calls for."""
-    context = _P.from_address(args + 16).value
-    asked = (ctypes.c_int64 * 4)(28, 0, context, 0)
-    _ASK(_api_of_cpu["device"])(ctypes.addressof(asked))
-    _P.from_address(args + 24).value = 1001 + (asked[3] & 0xFFFFFFFF)
+    if XLA.fails == "stream":
+        return _fail()
+    asked = (ctypes.c_int64 * 4)(28, 0, _P.from_address(args + 16).value, 0)
+    _of_cpu[_DEVICE](ctypes.addressof(asked))
+    _P.from_address(args + 24).value = 1001 + (asked[3] & 0xFFFFFFFF) + 100 * XLA.stream
     return None
-
-
-_api_of_cpu = {}
 
 
 def on_cpu(address: int) -> int | None:
     """A handler for XLA's CPUs that calls one for GPUs, with a stream, which XLA has not on a CPU."""
 
-    @_HANDLER
+    @_FUNCTION
     def handler(frame):
         if _P.from_address(frame + 8).value:  # XLA asks for the version
-            return _HANDLER(address)(frame)
-        api = _P.from_address(frame + 16).value
-        own_api = ctypes.create_string_buffer(ctypes.string_at(api, ctypes.c_int64.from_address(api).value))
-        _api_of_cpu["device"] = _P.from_address(api + 184).value
-        _P.from_address(ctypes.addressof(own_api) + 80).value = ctypes.cast(_stream_get, _P).value
-        own = ctypes.create_string_buffer(ctypes.string_at(frame, ctypes.c_int64.from_address(frame).value))
+            return _FUNCTION(address)(frame)
+        api, own_api = _copy(_P.from_address(frame + 16).value)
+        for offset, function in ((_ERROR, None), (_STREAM, _stream_get), (_DEVICE, _device_get)):
+            _of_cpu[offset] = _FUNCTION(_P.from_address(api + offset).value)
+            if function is not None:
+                _P.from_address(ctypes.addressof(own_api) + offset).value = ctypes.cast(function, _P).value
+        _, own = _copy(frame)
         _P.from_address(ctypes.addressof(own) + 16).value = ctypes.addressof(own_api)
-        return _HANDLER(address)(ctypes.addressof(own))
+        return _FUNCTION(address)(ctypes.addressof(own))
 
     _kept.append(handler)
     return ctypes.cast(handler, _P).value
+
+
+def _copy(address):
+    """A structure's address, and a copy of the structure, which begins with its size."""
+    return address, ctypes.create_string_buffer(ctypes.string_at(address, ctypes.c_int64.from_address(address).value))

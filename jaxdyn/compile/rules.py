@@ -122,8 +122,8 @@ def _invalid_tangents(primals, tangents):
         tangent = jnp.zeros_like(value) if isinstance(tangent, zero) else tangent
         here = failed.reshape(failed.shape + (1,) * (value.ndim - failed.ndim))
         # At both ends, so that neither tangents nor cotangents that cancel in the sum hide the failure.
-        total = sum((jnp.sum(_nan_where(failed.any(), x)) for x in moving), jnp.zeros(()))
-        return tangent + _nan_where(here, jnp.broadcast_to(total.astype(value.dtype), value.shape))
+        terms = (jnp.sum(_nan_where(failed.any(), x)).astype(value.dtype) for x in moving)
+        return tangent + _nan_where(here, jnp.broadcast_to(sum(terms, jnp.zeros((), value.dtype)), value.shape))
 
     return _with_invalid_derivatives(*primals), jax.tree.map(
         add, values, of_values, is_leaf=lambda x: isinstance(x, zero)

@@ -24,11 +24,11 @@ def scan_ir(scan: Any, width: int) -> str:
 
 
 def scan_definition(scan: Any, symbol: str) -> dict[str, str]:
-    """The function for one sample, and what it calls, by names in a module's text."""
+    """The function for one sample, and the loops that it calls, by names in a module's text. Programs are declared."""
     text = _ScanText(scan, 1, symbol)
     parts = {symbol: text.function().replace("define void", "define internal void", 1)}
     for called in scan.subprograms:
-        if (name := symbol_of(called, 1)) in text.e.declared:
+        if (name := symbol_of(called, 1)) in text.e.declared and hasattr(called, "definition"):
             text.e.declared |= called.definition(name)
     return text.e.declared | parts
 

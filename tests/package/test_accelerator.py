@@ -2,15 +2,17 @@
 
 Numbers are skipped where JAX has the CPU alone; there the programs are written for a GPU, which needs none. Neither this
 folder's settings nor beartype are needed:
-`python -m pytest --noconftest tests/package/test_accelerator.py`.
+`PYTHONPATH=tests python -m pytest --noconftest tests/package/test_accelerator.py`.
 """
 
 import re
+import threading
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from test_gpu_kernels import CASES as KERNELS
 
 import jaxdyn as jd
 
@@ -103,6 +105,33 @@ def test_an_accelerator_has_the_numbers_of_the_cpu(name, batch, mode):
     for computed, want in zip(*map(jax.tree.leaves, results), strict=True):
         assert np.isfinite(want).all()
         np.testing.assert_allclose(computed, want, rtol=0, atol=bound * max(1.0, np.abs(want).max()))
+
+
+@pytest.mark.skipif(jax.devices()[0].platform == "cpu", reason="JAX has no accelerator here")
+@pytest.mark.parametrize("name", KERNELS)
+def test_kernels_that_run_thread_by_thread_on_a_cpu_run_on_an_accelerator(name):
+    """At the same bounds, with donated arguments, and from two threads."""
+    function, arguments = KERNELS[name]()
+    kinds = {np.asarray(x).dtype for x in arguments}
+    call, results = jax.jit(jax.vmap(function), donate_argnums=0), []
+
+    def run(device):
+        results.append(jax.tree.map(np.asarray, call(*(jax.device_put(np.array(x), device) for x in arguments))))
+
+    with jd.compilation("native"):
+        run(jax.devices("cpu")[0])
+        threads = [threading.Thread(target=run, args=(jax.devices()[0],)) for _ in range(2)]
+        for thread in threads:
+            thread.start()
+        for thread in threads:
+            thread.join()
+    want, *others = map(jax.tree.leaves, results)
+    assert len(others) == 2
+    for computed in others:
+        for x, y in zip(computed, want, strict=True):
+            # Steps of a motion that is adaptive, or near a singular position, amplify roundings.
+            bound = 1e-7 if np.dtype(np.float64) in kinds else 1e-4
+            np.testing.assert_allclose(x, y, rtol=0, atol=bound * max(1.0, np.abs(y).max(initial=0.0)))
 
 
 SLOW = "four-bar's gradient", "Bennett's linkage", "four-bar"

@@ -1,6 +1,8 @@
 """Calls of kernels for GPUs through XLA's interface, on the CPU: a library of ours stands in for CUDA's driver."""
 
 import logging
+import threading
+from types import SimpleNamespace
 
 import gpu_stand_in
 import jax
@@ -12,6 +14,7 @@ from jax.interpreters import mlir
 from jax.sharding import Mesh, NamedSharding, PartitionSpec
 
 import jaxdyn as jd
+from benchmarks import gpu as benchmark
 from jaxdyn import compile as backend
 from jaxdyn.compile import jax_adapter, mode, primitive
 from jaxdyn.compile.gpu import device, driver, ptx
@@ -52,6 +55,7 @@ def gpu(of_process):
     with jd.compilation("native"):
         of_process.launches.clear()
         of_process.fails = None
+        vars(gpu_stand_in.XLA).update(stream=0, device=None, fails=None)
         yield of_process
 
 
@@ -187,6 +191,45 @@ def test_two_devices_load_a_module_each(gpu):
     assert len(gpu.loaded) == 2 and len(gpu.launches) == 4
 
 
+def doubled(factor):
+    """A kernel that no other test calls, and that is loaded at its first call."""
+    return jax.jit(jax.vmap(lambda x: backend.kernel(lambda _, x: factor * x)((), x)))
+
+
+def test_streams_of_a_device_share_a_module(gpu):
+    call, x = doubled(41.0), jnp.ones((3, 2))
+    gpu.loaded.clear()
+    for stream in (0, 2, 1):
+        gpu_stand_in.XLA.stream = stream
+        np.testing.assert_array_equal(call(x), 41.0 * x)
+    assert gpu.loaded == [2001]
+    assert [launch[3] for launch in gpu.launches] == [1001, 1201, 1101]
+
+
+def test_threads_that_call_a_new_kernel_load_it_once(gpu):
+    call, x, found = doubled(42.0), jnp.ones((3, 2)), []
+    compiled = call.lower(x).compile()
+    gpu.loaded.clear()
+    threads = [threading.Thread(target=lambda: found.append(np.asarray(compiled(x)))) for _ in range(6)]
+    for thread in threads:
+        thread.start()
+    for thread in threads:
+        thread.join()
+    assert len(found) == 6 and all((y == 42.0).all() for y in found)
+    assert gpu.loaded == [2001] and len(gpu.launches) == 6
+
+
+def test_a_kernel_is_loaded_while_another_one_is_made(gpu):
+    """Who makes one may wait for results of the thread that loads."""
+    compiled, x, found = doubled(43.0).lower(jnp.ones((3, 2))).compile(), jnp.ones((3, 2)), []
+    with device._lock:
+        thread = threading.Thread(target=lambda: found.append(np.asarray(compiled(x))))
+        thread.start()
+        thread.join(timeout=60)
+        assert found and (found[0] == 43.0).all()
+    thread.join()
+
+
 def test_donated_buffers(gpu):
     q, v, tau = states(9)
     wanted = by_jax(jax.vmap(dynamics), q, v, tau)
@@ -203,8 +246,7 @@ LOADING = (
 @pytest.mark.parametrize("name", LOADING)
 def test_errors_of_the_driver_are_errors_of_xla(gpu, name):
     factor = 20.0 + LOADING.index(name)  # a kernel that is not loaded yet
-    call = jax.jit(jax.vmap(lambda x: backend.kernel(lambda _, x: factor * x)((), x)))
-    x = jnp.ones((3, 2))
+    call, x = doubled(factor), jnp.ones((3, 2))
     gpu.fails = name
     with pytest.raises(
         jax.errors.JaxRuntimeError, match=f"{name} of CUDA's driver failed with CUDA_ERROR_OUT_OF_MEMORY"
@@ -213,6 +255,35 @@ def test_errors_of_the_driver_are_errors_of_xla(gpu, name):
     gpu.fails = None
     gpu.contexts.clear()
     np.testing.assert_array_equal(call(x), factor * x)
+
+
+def test_an_error_without_a_name_has_its_number(gpu, monkeypatch):
+    of_gpus = device.driver()
+    monkeypatch.setattr(gpu, "fails", "cuGetErrorName")
+    assert of_gpus.explain("cuLaunchKernel", 999) == "jaxdyn: cuLaunchKernel of CUDA's driver failed with 999"
+
+
+def test_the_assembler_says_what_it_refuses(gpu, monkeypatch):
+    monkeypatch.setattr(gpu, "refusal", b"ptxas error : line 3")
+    with pytest.raises(jax.errors.JaxRuntimeError, match=r"cuModuleLoadDataEx of .*: ptxas error : line 3"):
+        doubled(46.0)(jnp.ones((3, 2)))
+
+
+@pytest.mark.parametrize("what", ["device", "stream"])
+def test_errors_of_xla_are_handed_on(gpu, what):
+    call, x = doubled(44.0), jnp.ones((3, 2))
+    gpu_stand_in.XLA.fails = what
+    with pytest.raises(jax.errors.JaxRuntimeError, match="XLA has no answer"):
+        call(x)
+    assert not gpu.launches
+
+
+def test_a_device_beyond_the_table_is_an_error(gpu):
+    call, x = doubled(45.0), jnp.ones((3, 2))
+    gpu_stand_in.XLA.device = device.MAX_DEVICES
+    with pytest.raises(jax.errors.JaxRuntimeError, match="kernels know 64 devices of a process"):
+        call(x)
+    assert not gpu.launches
 
 
 def test_a_kernel_of_another_process_is_an_error(gpu):
@@ -224,7 +295,11 @@ def test_a_kernel_of_another_process_is_an_error(gpu):
     with pytest.raises(ValueError, match="compiled by another process"):
         call(x)
     for number, entry in entries.items():
-        entry.hash = number
+        entry.hash, entry.buffers = number, entry.buffers + 1
+    with pytest.raises(ValueError, match="another size than the kernel was written for"):
+        call(x)
+    for entry in entries.values():
+        entry.buffers -= 1
     np.testing.assert_array_equal(call(x), 7.5 * x)
 
 
@@ -253,12 +328,42 @@ def test_a_build_of_llvm_without_the_target_is_unsupported(monkeypatch):
         ptx.ptx_of("", 90)
 
 
-@pytest.mark.parametrize("name", ["cuInit", "cuDriverGetVersion", "cuDeviceGetCount", "cuDeviceGet"])
-def test_a_driver_that_fails_at_its_start_is_refused_by_name(name):
+@pytest.mark.parametrize(
+    "name", ["cuInit", "cuDriverGetVersion", "cuDeviceGetCount", "cuDeviceGet", "cuDeviceGetAttribute"]
+)
+def test_a_driver_that_fails_at_its_start_is_unsupported_by_name(name, monkeypatch):
     stand_in = gpu_stand_in.StandInDriver()
     stand_in.fails = name
-    with pytest.raises(driver.DriverError, match=f"{name} of CUDA's driver failed"):
-        driver.Driver(stand_in)
+    monkeypatch.setattr(driver, "open_library", lambda: stand_in)
+    with pytest.raises(jax_adapter.Unsupported, match=f"^{name} of CUDA's driver failed"):
+        driver.driver.__wrapped__()
+
+
+def test_a_driver_without_a_function_is_unsupported():
+    missing = "cuModuleLoadDataEx"
+    names = {name: getattr(gpu_stand_in.StandInDriver(), name) for name in driver._FUNCTIONS if name != missing}
+    with pytest.raises(jax_adapter.Unsupported, match=f"no function {missing}"):
+        driver.Driver(SimpleNamespace(**names))
+
+
+def test_the_driver_is_found_under_its_names(monkeypatch):
+    asked = []
+
+    def find(name, found=()):
+        asked.append(name)
+        if name not in found:
+            raise OSError(name)
+        return name
+
+    monkeypatch.setattr(driver.ctypes, "CDLL", lambda name: find(name, ["libcuda.so"]))
+    monkeypatch.setattr(driver.sys, "platform", "linux")
+    assert driver.open_library() == "libcuda.so" and asked == ["libcuda.so.1", "libcuda.so"]
+    monkeypatch.setattr(driver.ctypes, "CDLL", find)
+    with pytest.raises(jax_adapter.Unsupported, match=r"CUDA's driver is not installed \(libcuda\.so\.1\)"):
+        driver.open_library()
+    monkeypatch.setattr(driver.sys, "platform", "win32")
+    with pytest.raises(jax_adapter.Unsupported, match=r"nvcuda\.dll"):
+        driver.open_library()
 
 
 @pytest.mark.parametrize(
@@ -299,6 +404,25 @@ def test_the_same_jaxpr_runs_on_cpus_and_gpus(gpu):
     with jd.compilation("auto"):
         text = jax.jit(jax.vmap(dynamics)).trace(*states(2)).lower(lowering_platforms=("cuda",)).as_text()
     assert "jaxdyn_cuda_kernel" not in text
+
+
+@pytest.mark.parametrize("fails", [None, "cuLaunchKernel"])
+def test_the_benchmark_compares_and_decides(gpu, monkeypatch, capsys, fails):
+    """Also after an error of the driver."""
+    functions = {"multiplied": (lambda x: backend.kernel(lambda _, x: 47.0 * x)((), x), (2,))}
+    monkeypatch.setattr(benchmark, "functions", lambda *_: functions)
+    monkeypatch.setattr(benchmark, "on_gpu", lambda: True)
+    gpu.fails = fails
+    with jd.compilation("auto"):
+        benchmark.measure(["arm"], [64], 1, 2**10, ("auto", "native"))
+    printed = capsys.readouterr().out
+    rows = [[cell.strip() for cell in line.split("|")] for line in printed.splitlines() if line.startswith("| arm")]
+    assert [row[4] for row in rows] == ["auto", "native"]
+    assert rows[1][7] == ("inf" if fails else "0.0e+00")
+    assert bool(gpu.launches) != bool(fails)
+    if fails:
+        assert "arm, multiplied, batch 64, native: JaxRuntimeError" in printed
+        assert "not to be the default on this GPU:\narm, multiplied, batch 64: error inf" in printed
 
 
 def test_export_is_refused_by_name(gpu):

@@ -25,6 +25,8 @@ _DEVICE = f"jaxdyn: kernels know {MAX_DEVICES} devices of a process"
 
 logger = logging.getLogger("jaxdyn")
 _lock = threading.RLock()
+# Of modules alone: who makes a kernel may wait for results of XLA's thread, which waits here.
+_loading = threading.Lock()
 _kernels: dict[int, "_Kernel"] = {}
 _messages: dict[str, ctypes.Array] = {}  # which XLA copies, so that one of each text is kept
 
@@ -93,16 +95,13 @@ _codes: list[Code] = []  # for as long as the process lives
 
 
 def _keep(message: str) -> int:
-    with _lock:
-        if message not in _messages:
-            _messages[message] = ctypes.create_string_buffer(message.encode())
-        return ctypes.addressof(_messages[message])
+    return ctypes.addressof(_messages.setdefault(message, ctypes.create_string_buffer(message.encode())))
 
 
 def _load(number: int, device: int, stream: int | None) -> int:
     """Load a kernel that is called on a device for the first time; a message where that fails. The handler calls this."""
     try:
-        with _lock:
+        with _loading:
             if not _kernels[number].functions[device]:
                 _kernels[number].load(device, stream)
         return 0

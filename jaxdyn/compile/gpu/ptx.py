@@ -58,6 +58,7 @@ def ptx_of(module: str, architecture: int) -> str:
     passes.add_global_dead_code_eliminate_pass()
     passes.run(parsed, llvm.create_pass_builder(machine, llvm.create_pipeline_tuning_options(speed_level=1)))
     text = machine.emit_assembly(parsed)
-    # How many threads a block has decides how many registers each may take. LLVM's own notes of it depend on its version.
+    # How many threads a block has decides how many registers each may take, and that one block is enough lets it take them: by
+    # itself the assembler prefers more blocks, and spills. LLVM's own notes of it depend on its version.
     head = re.compile(rf"(\.entry {KERNEL}\([^)]*\)\s*)(?:\.\w+ [^\n]*\n)*\{{")
-    return head.sub(rf"\1.maxntid {MAX_THREADS}, 1, 1\n{{", text, count=1)
+    return head.sub(rf"\1.maxntid {MAX_THREADS}, 1, 1\n.minnctapersm 1\n{{", text, count=1)

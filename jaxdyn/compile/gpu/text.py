@@ -83,6 +83,11 @@ def with_careful_programs(program):
         loop.turn = with_careful_programs(program.turn)
         loop.subprograms, loop.derived = loop.turn.subprograms, {}
         return loop
+    if hasattr(program, "body"):
+        scan = copy.copy(program)
+        scan.body, scan.derived = with_careful_programs(program.body), {}
+        vars(scan).pop("digest", None)
+        return scan
     return program
 
 
