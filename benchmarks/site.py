@@ -1,6 +1,6 @@
 """The site: `python -m benchmarks.site` (`make docs`), into out/site.
 
-Makes the pictures of the gallery that are missing, turns the notebooks with their outputs into pages, builds the pages with
+Makes the pictures of the gallery that are missing or older than their code, turns the notebooks with their outputs into pages, builds the pages with
 zensical (strict), puts KaTeX beside them, which is fetched from the npm registry and kept in out/, and the sources that pages
 link to, and follows every link and anchor of the pages that came out. Without npm the pages take KaTeX from the net when they
 are read, and a line says so.
@@ -92,7 +92,8 @@ def notebooks(folder: Path) -> int:
     for path in paths:
         names = {"unique_key": path.stem, "output_files_dir": f"{path.stem}_files"}
         body, extras = MarkdownExporter().from_filename(str(path), resources=names)
-        (folder / f"{path.stem}.md").write_text(body, encoding="utf-8")
+        # Beside the pages, which a notebook finds in a folder beside its own.
+        (folder / f"{path.stem}.md").write_text(body.replace("](../docs/", "](../"), encoding="utf-8")
         for name, data in extras["outputs"].items():
             (folder / name).parent.mkdir(exist_ok=True)
             (folder / name).write_bytes(data)
