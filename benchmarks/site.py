@@ -1,9 +1,9 @@
 """The site: `python -m benchmarks.site` (`make docs`), into out/site.
 
-Makes the pictures of the gallery that are missing or older than their code, turns the notebooks with their outputs into pages, builds the pages with
-zensical (strict), puts KaTeX beside them, which is fetched from the npm registry and kept in out/, and the sources that pages
-link to, and follows every link and anchor of the pages that came out. Without npm the pages take KaTeX from the net when they
-are read, and a line says so.
+Makes the pictures of the gallery that are missing or older than their code, turns the notebooks with their outputs into
+pages, builds the pages with zensical (strict), puts KaTeX beside them, which is fetched from the npm registry and kept in
+out/, and the sources that pages link to, and follows every link and anchor of the pages that came out. Without npm the pages
+take KaTeX from the net when they are read, and a line says so.
 """
 
 import argparse

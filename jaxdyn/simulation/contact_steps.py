@@ -62,7 +62,7 @@ class ContactStep(Outcome):
     - `forces`: by the contact's name, (n,), N: the friction along the rows of slip, and the normal force as the last one; means
       over the step, so that those of an impact are its impulse over the step's length.
     - `limit_forces` (nv,): of joint limits, N or N m.
-    - `result`: one of `jd.RESULTS`. Where it is neither `successful` nor `coarse_steps` the state is NaN, with derivatives of NaN.
+    - `result`: one of `jd.RESULTS`. Unless it is `successful` or `coarse_steps`, the state is NaN, with derivatives of NaN.
     - `residual` (): of Coulomb's law, in numbers scaled to one.
     """
 

@@ -222,7 +222,9 @@ def test_steps_and_derivatives_where_rows_are_dependent():
         np.testing.assert_allclose(mine, theirs, rtol=1e-10, atol=1e-11)
 
 
-@pytest.mark.parametrize(("dt", "substeps", "is_coarse"), [(0.01, 1, False), (0.3, 1, True), (0.3, 2, False), (1.0, 2, True)])
+@pytest.mark.parametrize(
+    ("dt", "substeps", "is_coarse"), [(0.01, 1, False), (0.3, 1, True), (0.3, 2, False), (1.0, 2, True)]
+)
 def test_coarse_steps_are_reported_as_by_simulate(dt, substeps, is_coarse):
     """Of a double pendulum, also where steps may end at limits of the effort that are not met."""
     model, state = jd.robots.chain(2), (jnp.asarray([1.0, 0.5]), jnp.zeros(2))
