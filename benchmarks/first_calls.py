@@ -3,12 +3,13 @@
     python -m benchmarks.first_calls [CASE ...] [--rounds 3] [--clock cpu]
 
 Every case runs in two processes, one after the other. The first one has an empty folder of object files, the second one finds
-those of the first; JAX's own cache of programs is off in both. "build" is the time to read or build the mechanism, and to bring
-it to a start. A call is timed to its end. Numbers are the best of the rounds. Processor time ("cpu", of all threads) holds on a
-busy machine too.
+those of the first; JAX's own cache of programs is off in both, and Python has compiled the modules before, as pip does. "build"
+is the time to read or build the mechanism, and to bring it to a start. A call is timed to its end. Numbers are the best of the
+rounds. Processor time ("cpu", of all threads) holds on a busy machine too.
 """
 
 import argparse
+import compileall
 import importlib.util
 import json
 import math
@@ -19,6 +20,7 @@ import tempfile
 import time
 from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
 HERE = Path(__file__).resolve().parent.parent
 STEPS = ("import", "build", "first call", "second call")
@@ -98,6 +100,92 @@ def simulate_four_bar() -> Callable:
 
     scene, (q, v) = jd.scenes.four_bar(), jd.scenes.four_bar.start()
     return lambda: jd.simulate(scene, q, v, jnp.linspace(0.0, 1.0, 11)).q
+
+
+def gradient_of_four_bar() -> Callable:
+    """Derivative of where a four-bar is after a second by the masses of its bars."""
+    import jax
+    import jax.numpy as jnp
+
+    import jaxdyn as jd
+
+    (q, v), ts = jd.scenes.four_bar.start(), jnp.linspace(0.0, 1.0, 11)
+
+    def end(masses):
+        return jnp.sum(jd.simulate(jd.scenes.four_bar(masses=masses), q, v, ts).q[-1] ** 2)
+
+    run = jax.jit(jax.grad(end))
+    return lambda: run(jnp.array([1.0, 3.0, 2.5]))
+
+
+def four_bar_by_hand() -> tuple[Callable, Any]:
+    """The motion of the same four-bar by its masses, written without jaxdyn, and its masses: what a user would write.
+
+    Lagrange's equations with multipliers, whose terms are derivatives by JAX, integrated by diffrax.
+    """
+    import diffrax
+    import jax
+    import jax.numpy as jnp
+
+    import jaxdyn as jd
+
+    lengths, ground, ts = jnp.array([1.0, 3.0, 2.5]), jnp.array([3.5, 0.0]), jnp.linspace(0.0, 1.0, 11)
+
+    def bars(q):
+        """Starts, directions and angles of crank, coupler and rocker."""
+        angles = jnp.array([q[0], q[0] + q[1], q[2]])
+        directions = jnp.stack([jnp.cos(angles), jnp.sin(angles)], 1)
+        return jnp.stack([jnp.zeros(2), lengths[0] * directions[0], ground]), directions, angles
+
+    def centres(q):
+        starts, directions, angles = bars(q)
+        return starts + 0.5 * lengths[:, None] * directions, angles
+
+    def closure(q):
+        starts, directions, _ = bars(q)
+        return starts[1] + lengths[1] * directions[1] - starts[2] - lengths[2] * directions[2]
+
+    def lagrangian(q, v, masses):
+        (places, _), (rates, turning) = jax.jvp(centres, (q,), (v,))
+        kinetic = 0.5 * jnp.sum(masses * (jnp.sum(rates**2, 1) + lengths**2 / 12 * turning**2))
+        return kinetic - 9.81 * jnp.sum(masses * places[:, 1])
+
+    def rates(t, state, masses):
+        q, v = state
+        mass = jax.hessian(lagrangian, 1)(q, v, masses)
+        _, change = jax.jvp(lambda q: jax.grad(lagrangian, 1)(q, v, masses), (q,), (v,))
+        force = jax.grad(lagrangian)(q, v, masses) - change
+        rows = jax.jacobian(closure)(q)
+        _, bias = jax.jvp(lambda q: jax.jvp(closure, (q,), (v,))[1], (q,), (v,))
+        matrix = jnp.block([[mass, rows.T], [rows, jnp.zeros((2, 2))]])
+        return v, jnp.linalg.solve(matrix, jnp.concatenate([force, -bias]))[:3]
+
+    def path(masses):
+        steps, saved = diffrax.PIDController(rtol=1e-8, atol=1e-8), diffrax.SaveAt(ts=ts)
+        args = diffrax.ODETerm(rates), diffrax.Dopri8(), 0.0, 1.0, None, jd.scenes.four_bar.start(), masses
+        states: Any = diffrax.diffeqsolve(*args, saveat=saved, stepsize_controller=steps).ys
+        return states[0]
+
+    return path, jnp.array([1.0, 3.0, 2.5])
+
+
+def simulate_by_hand() -> Callable:
+    """`simulate_four_bar` by hand."""
+    import jax
+
+    path, masses = four_bar_by_hand()
+    run = jax.jit(path)
+    return lambda: run(masses)
+
+
+def gradient_by_hand() -> Callable:
+    """`gradient_of_four_bar` by hand."""
+    import jax
+    import jax.numpy as jnp
+
+    path, masses = four_bar_by_hand()
+    run = jax.jit(jax.grad(lambda masses: jnp.sum(path(masses)[-1] ** 2)))
+    return lambda: run(masses)
 
 
 def gradient_of_path() -> Callable:
@@ -182,6 +270,21 @@ def simulate_stewart() -> Callable:
     return lambda: jd.simulate(scene, start.q, start.v, jnp.linspace(0.0, 0.1, 3)).q
 
 
+def assemble_delta() -> Callable:
+    """A delta robot with six rods on balls, read from MJCF and assembled."""
+    import jaxdyn as jd
+    from benchmarks.linkages import delta
+
+    def load_and_assemble():
+        with tempfile.TemporaryDirectory() as folder:
+            path = Path(folder) / "delta.xml"
+            path.write_text(delta())
+            scene = jd.io.load_mjcf(path)
+        return jd.assemble(scene, scene.starts["reference"].q).q
+
+    return load_and_assemble
+
+
 def gradient_of_legs() -> Callable:
     """Derivative of where 256 quadrupeds on four held feet are after 50 steps by a gain of their joints."""
     import jax
@@ -251,10 +354,14 @@ CASES: dict[str, tuple[str, Callable[[], Callable]]] = {
     "panda_motion": ("simulate a Panda", simulate_panda),
     "panda_gradient": ("gradient through 100 fixed steps of a Panda", gradient_of_panda),
     "four_bar": ("simulate a four-bar", simulate_four_bar),
+    "four_bar_gradient": ("gradient of its motion by its masses, under jit", gradient_of_four_bar),
+    "by_hand": ("its equations by hand in diffrax, under jit", simulate_by_hand),
+    "by_hand_gradient": ("gradient of these, under jit", gradient_by_hand),
     "path": ("gradient of a four-bar's path by its lengths, under jit", gradient_of_path),
     "stewart": ("accelerations of a Stewart platform, under jit", accelerate_stewart),
     "stewart_assembly": ("assemble a Stewart platform", assemble_stewart),
     "stewart_motion": ("simulate a Stewart platform", simulate_stewart),
+    "delta": ("load a delta robot from MJCF and assemble it", assemble_delta),
     "legs_gradient": (
         "gradient through 50 steps of a quadruped on four held feet, batch 256, under jit",
         gradient_of_legs,
@@ -287,7 +394,9 @@ def here(case: str, clock_name: str) -> dict[str, float]:
 
 def elsewhere(case: str, cache: str, clock: str) -> dict[str, float]:
     """The same in a fresh process."""
-    kept = {name: value for name, value in os.environ.items() if not name.startswith("JAX_COMPILATION_CACHE")}
+    # As for a user: without JAX's cache, and with modules that Python has compiled before.
+    dropped = "JAX_COMPILATION_CACHE", "PYTHONDONTWRITEBYTECODE"
+    kept = {name: value for name, value in os.environ.items() if not name.startswith(dropped)}
     call = [sys.executable, "-m", "benchmarks.first_calls", "--here", case, "--clock", clock]
     done = subprocess.run(
         call, env=kept | {"XDG_CACHE_HOME": cache}, cwd=HERE, capture_output=True, text=True, check=False
@@ -310,6 +419,7 @@ def main(argv=None) -> None:
         return
     from benchmarks import timing
 
+    compileall.compile_dir(HERE / "jaxdyn", quiet=1)
     rows = []
     print(
         "| seconds | import | build | first call | second call | second process: first call |\n|---|---|---|---|---|---|"

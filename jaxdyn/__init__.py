@@ -6,6 +6,8 @@ import importlib.util
 import pkgutil
 from typing import Any
 
+import jaxdyn.trace_context  # noqa: F401 (made before the user traces a function)
+
 __version__ = "0.2.0"
 
 

@@ -1,7 +1,7 @@
 """Modes of compilation: native kernels, or, under `compilation("plain")`, JAX alone.
 
-Every mode that tracing depends on is a user context of JAX. Contexts are part of the keys of JAX's caches, so that a function
-under `jax.jit` is traced once in each of them: results do not depend on how the function was traced before.
+What tracing depends on is a user context of JAX (`trace_context`). Contexts are part of the keys of JAX's caches, so that a
+function under `jax.jit` is traced once for each of its values: results do not depend on how the function was traced before.
 """
 
 import contextlib
@@ -14,6 +14,7 @@ import jax
 import numpy as np
 
 from jaxdyn.compile import jax_adapter
+from jaxdyn.trace_context import modes
 
 logger = logging.getLogger("jaxdyn")
 MODES = ("auto", "native", "plain")
@@ -22,22 +23,18 @@ OPTIONS = ("", "usual", "least")
 # program, however large it is (see `listing`). Products of matrices of hundreds of rows are none.
 MAX_OPERATIONS, MAX_OPERATIONS_PER_ENTRY = 60_000, 500
 
-# None: the environment decides, which is read at each use, so that a test can set it.
-_mode = jax.make_user_context(None)
-_expanding = jax.make_user_context("")
-# Whether the traced function computes the samples that a kernel has marked as not valid (see `careful`).
-_careful = jax.make_user_context("")
-# Whether an axis that `vmap` adds to a kernel is one of rows (see `batch.map_rows`).
-in_rows = jax.make_user_context(False)
-_standalone = jax.make_user_context(False)
-_by_rules = jax.make_user_context(False)
 _said: set[str] = set()
+
+
+def _changed(**change):
+    """Context in which some of the modes are others."""
+    return modes(modes.value._replace(**change))
 
 
 def current() -> str:
     """The mode in force. **Raises:** ValueError where the environment asks for one that does not exist."""
     # On a JAX that failed the trial "auto" is "plain" for the whole process.
-    asked = _mode.value or _check_mode(
+    asked = modes.value.compilation or _check_mode(
         os.environ.get("JAXDYN_COMPILATION", "auto"), "the environment's JAXDYN_COMPILATION"
     )
     return asked if asked == "plain" or jax_adapter.reason_against_kernels() is None else "plain"
@@ -69,7 +66,7 @@ def compilation(mode: str) -> Iterator[None]:
         a = jd.forward_dynamics(model, q, v, tau)
     ```
     """
-    with _mode(_check_mode(mode, "compilation: mode")):
+    with _changed(compilation=_check_mode(mode, "compilation: mode")):
         yield
 
 
@@ -80,37 +77,37 @@ def most_operations(arrays) -> int:
 
 def is_expanding() -> bool:
     """Decide whether a function is being traced to become a program, so that kernels within it are inlined."""
-    return bool(_expanding.value)
+    return bool(modes.value.expanding)
 
 
 def has_branches() -> bool:
     """Decide whether a function is being traced to become a program that may take branches (see `expand`)."""
-    return _expanding.value == "branches"
+    return modes.value.expanding == "branches"
 
 
 def expanding(branches: bool = False):
     """Context in which a function is traced to become a program of numbers."""
-    return _expanding("branches" if branches else "straight")
+    return _changed(expanding="branches" if branches else "straight")
 
 
 def is_standalone() -> bool:
     """Decide whether a function is traced for code that runs without JAX."""
-    return bool(_standalone.value)
+    return modes.value.standalone
 
 
 def standalone():
     """Context in which a function is traced for code that runs without JAX, where no fallback of JAX computes a sample."""
-    return _standalone(True)
+    return _changed(standalone=True)
 
 
 def is_careful() -> bool:
     """Decide whether a function is traced for the samples that another program marks as not valid: it marks none itself."""
-    return bool(_careful.value)
+    return bool(modes.value.careful)
 
 
 def is_careful_within() -> bool:
     """Decide whether kernels within a careful function are their fallbacks: they have failed for the sample, or may fail."""
-    return _careful.value == "within"
+    return modes.value.careful == "within"
 
 
 def careful(which: str = "within"):
@@ -118,40 +115,47 @@ def careful(which: str = "within"):
 
     `which`: "within"; "own", where kernels within the function compute their own flagged samples; "" for none.
     """
-    return _careful(which)
+    return _changed(careful=which)
+
+
+def has_rows() -> bool:
+    """Decide whether an axis that `vmap` adds to a kernel is one of rows (see `batch.map_rows`)."""
+    return modes.value.in_rows
+
+
+def in_rows(is_wanted: bool):
+    """Context in which an axis that `vmap` adds to a kernel is one of rows."""
+    return _changed(in_rows=is_wanted)
 
 
 def has_values_of_rules() -> bool:
     """Decide whether a function with a rule for its derivative is traced for the rule's own values (see `rules.implicit`)."""
-    return _by_rules.value
+    return modes.value.by_rules
 
 
 def values_of_rules(is_wanted: bool = True):
     """Context in which functions with rules for their derivatives have the values of these rules."""
-    return _by_rules(is_wanted)
+    return _changed(by_rules=is_wanted)
 
 
 def state() -> tuple:
     """All modes that the trace of a function depends on."""
-    return current(), *(x.value for x in (_expanding, _careful, in_rows, _standalone, _by_rules))
+    return current(), *modes.value[1:]
 
 
 def state_of_programs() -> tuple:
     """The modes that the program of a function depends on, wherever the function is called."""
-    return tuple(x.value for x in (_careful, _standalone, _by_rules))
+    return modes.value.careful, modes.value.standalone, modes.value.by_rules
 
 
 def remember() -> Callable[[], contextlib.AbstractContextManager]:
     """The modes in force, as a context in which another thread, or a later call, finds them again."""
     has_x64 = jax.dtypes.canonicalize_dtype(np.float64) == np.float64
-    values = [(x, x.value) for x in (_mode, _expanding, _careful, in_rows, _standalone, _by_rules)]
+    value = modes.value
 
     @contextlib.contextmanager
     def enter() -> Iterator[None]:
-        with contextlib.ExitStack() as stack:
-            stack.enter_context(jax.enable_x64(has_x64))
-            for context, value in values:
-                stack.enter_context(context(value))
+        with jax.enable_x64(has_x64), modes(value):
             yield
 
     return enter

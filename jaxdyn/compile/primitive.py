@@ -72,7 +72,7 @@ def _batch(args, axes, *, program, rows):
         elif v and lead != inner:
             x = jnp.broadcast_to(x.reshape(size, *[1] * len(inner), x.shape[-1]), (size, *inner, x.shape[-1]))
         full.append(x)
-    rows += mode.in_rows.value and not mode.is_expanding()
+    rows += mode.has_rows() and not mode.is_expanding()
     if program.turns > 1 and not mode.is_expanding() and target is not None and jax.default_backend() == "cpu":
         # A loop is the main part of a program: LLVM works on it while Python traces on.
         target.publish_ahead(program, target.width_of(program, size))

@@ -1,6 +1,8 @@
 """Reading and writing mechanisms. File libraries are imported here alone, and only when a file is read."""
 
 from types import ModuleType as _ModuleType
+from typing import TYPE_CHECKING as _TYPE_CHECKING
+from typing import Any as _Any
 
 from jaxdyn.io.formats import load as load
 from jaxdyn.io.loaded import Actuators as Actuators
@@ -8,8 +10,6 @@ from jaxdyn.io.loaded import LoadedScene as LoadedScene
 from jaxdyn.io.loaded import NotTakenWarning as NotTakenWarning
 from jaxdyn.io.loaded import Start as Start
 from jaxdyn.io.loaded import UnitsWarning as UnitsWarning
-from jaxdyn.io.logs import read_log as read_log
-from jaxdyn.io.logs import write_log as write_log
 from jaxdyn.io.mjcf import load_mjcf as load_mjcf
 from jaxdyn.io.sdf import load_sdf as load_sdf
 from jaxdyn.io.urdf import load_urdf as load_urdf
@@ -17,7 +17,21 @@ from jaxdyn.io.urdf import urdf_inertia_report as urdf_inertia_report
 from jaxdyn.io.urdf_write import read_torque_terms as read_torque_terms
 from jaxdyn.io.urdf_write import save_urdf as save_urdf
 
+if _TYPE_CHECKING:
+    from jaxdyn.io.logs import read_log as read_log
+    from jaxdyn.io.logs import write_log as write_log
+
+
+def __getattr__(name: str) -> _Any:
+    # At their first use: identification, which they import, takes longer to import than a mechanism to read.
+    if name in ("read_log", "write_log"):
+        from jaxdyn.io import logs
+
+        return getattr(logs, name)
+    raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+
 
 def __dir__() -> list[str]:
     """Names of the namespace; its modules are internal."""
-    return [x for x, value in globals().items() if x[0] != "_" and not isinstance(value, _ModuleType)]
+    names = [x for x, value in globals().items() if x[0] != "_" and not isinstance(value, _ModuleType)]
+    return sorted({*names, "read_log", "write_log"})

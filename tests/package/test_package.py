@@ -21,6 +21,7 @@ PACKAGE = Path(jaxdyn.__file__).parent
 
 # Rooms, from the bottom up. A room may use those on floors below its own.
 FLOORS = (
+    "trace_context",
     "compile lie",
     "model tasks",
     "systems",
@@ -257,7 +258,7 @@ for module in pkgutil.walk_packages(jaxdyn.__path__, "jaxdyn."):
 
 
 @pytest.mark.long
-def test_dynamics_and_scenes_import_no_integrator():
+def test_dynamics_scenes_and_readers_of_mechanisms_import_no_integrator():
     run_in_new_process("""
 import sys
 import jax
@@ -267,8 +268,27 @@ model = jd.robots.chain(2)
 jd.forward_dynamics(model, np.ones(2), np.ones(2), np.ones(2))
 jax.jit(jax.grad(lambda q: jd.potential_energy(model, q)))(np.ones(2, np.float32))
 jd.scenes.four_bar()
+jd.io.load_mjcf
 names = {"diffrax", "lineax", "matplotlib", "optax", "optimistix", "scipy", "jaxdyn.simulation"}
 assert not names & sys.modules.keys(), names & sys.modules.keys()
+""")
+
+
+@pytest.mark.long
+def test_functions_that_were_compiled_before_the_first_use_stay_compiled():
+    """No module makes a context of JAX, for which JAX would trace every function of the process again."""
+    run_in_new_process("""
+import jax
+import jaxdyn
+traced = []
+function = jax.jit(lambda x: traced.append(x) or 2 * x)
+function(1.0)
+for name in jaxdyn.__all__:
+    getattr(jaxdyn, name)
+import diffrax, optax, optimistix
+jaxdyn.simulate(jaxdyn.robots.chain(1), [0.1], [0.0], [0.0, 0.1])
+function(1.0)
+assert len(traced) == 1
 """)
 
 
