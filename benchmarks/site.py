@@ -7,6 +7,7 @@ take KaTeX from the net when they are read, and a line says so.
 """
 
 import argparse
+import re
 import shutil
 import subprocess
 import sys
@@ -100,6 +101,50 @@ def notebooks(folder: Path) -> int:
     return len(paths)
 
 
+# Names of other packages in the prose of a page, whose first mention leads to their documentation.
+_PEERS = {
+    "diffrax": "https://docs.kidger.site/diffrax/",
+    "equinox": "https://docs.kidger.site/equinox/",
+    "MuJoCo": "https://mujoco.readthedocs.io/",
+    "Pinocchio": "https://github.com/stack-of-tasks/pinocchio",
+}
+_UNLINKED = {"a", "pre", "h1", "h2", "h3", "h4", "h5", "script", "title", "nav"}
+
+
+def link_names(site: Path) -> int:
+    """Let `jd.NAME` in the prose of the pages lead to its entry of the reference, and packages to their pages; the links."""
+    places = {}
+    for path in sorted((site / "reference").glob("*.html")):
+        for place in _Page(path.read_text(encoding="utf-8")).places:
+            if place.startswith("jaxdyn."):
+                places[place.removeprefix("jaxdyn.")] = f"reference/{path.name}"
+    count = 0
+    for path in site.rglob("*.html"):
+        up = "../" * len(path.relative_to(site).parent.parts)
+        head, mark, body = path.read_text(encoding="utf-8").partition("<article")
+        open_tags: list[str] = []
+        parts, peers = re.split(r"(<[^>]+>)", body), dict(_PEERS)
+        for i, part in enumerate(parts):
+            if tag := re.match(r"<(/?)(\w+)", part):
+                if tag[2] in _UNLINKED and not tag[1]:
+                    open_tags.append(tag[2])
+                elif tag[2] in open_tags:
+                    open_tags.remove(tag[2])
+                continue
+            if open_tags or not part.strip():
+                continue
+            name = re.match(r"jd\.([A-Za-z_][\w.]*)", part)
+            if name and parts[i - 1] == "<code>" and name[1] in places:
+                parts[i] = f'<a href="{up}{places[name[1]]}#jaxdyn.{name[1]}">{part}</a>'
+                count += 1
+            elif parts[i - 1] != "<code>" and (found := [peer for peer in peers if re.search(rf"\b{peer}\b", part)]):
+                for peer in found:
+                    parts[i] = re.sub(rf"\b{peer}\b", f'<a href="{peers.pop(peer)}">{peer}</a>', parts[i], count=1)
+                count += len(found)
+        path.write_text(head + mark + "".join(parts), encoding="utf-8")
+    return count
+
+
 def bring_sources(site: Path) -> int:
     """Copy the repository's files that pages link to into SITE/source, as plain text, and let the links lead there."""
     brought = set()
@@ -142,6 +187,7 @@ def main(argv=None) -> int:
         print(f"KaTeX is not part of the site ({fault}): its formulas need the net when they are read")
     else:
         shutil.copytree(kept, SITE / "javascripts" / "katex", dirs_exist_ok=True)
+    print(f"{link_names(SITE)} names in the prose are links")
     print(f"{bring_sources(SITE)} files of the repository that pages link to are beside them")
     count, dead = dead_links(SITE)
     dead = [link for link in dead if not options.no_gallery or "gallery/" not in link]
