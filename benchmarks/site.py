@@ -86,13 +86,19 @@ def dead_links(site: Path) -> tuple[int, list[str]]:
 def notebooks(folder: Path) -> int:
     """Write the notebooks of the repository, with the outputs that they hold, as pages into a folder; their number."""
     # Imported on use: it is an extra of the site.
+    import nbformat  # pyright: ignore[reportMissingImports]
     from nbconvert import MarkdownExporter  # pyright: ignore[reportMissingImports]
 
     folder.mkdir(parents=True, exist_ok=True)
     paths = sorted((ROOT / "notebooks").glob("*.ipynb"))
     for path in paths:
         names = {"unique_key": path.stem, "output_files_dir": f"{path.stem}_files"}
-        body, extras = MarkdownExporter().from_filename(str(path), resources=names)
+        notebook = nbformat.read(path, as_version=4)
+        for output in (output for cell in notebook.cells for output in cell.get("outputs", ())):
+            # The page of an xarray dataset needs its own styles and is wider than a telephone; its text is not.
+            if "xr-wrap" in output.get("data", {}).get("text/html", ""):
+                del output.data["text/html"]
+        body, extras = MarkdownExporter().from_notebook_node(notebook, resources=names)
         # Beside the pages, which a notebook finds in a folder beside its own.
         (folder / f"{path.stem}.md").write_text(body.replace("](../docs/", "](../"), encoding="utf-8")
         for name, data in extras["outputs"].items():
