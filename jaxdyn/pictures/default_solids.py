@@ -59,7 +59,7 @@ def complete_solids(scene: Scene, shapes: Shapes) -> Shapes:
             continue
         drawn += rods + [_or_mark(shape, longest, thin) for shape in solid]
     if whole:
-        drawn += _fixed_links(scene, thin)
+        drawn += _ground_links(scene, thin)
     return Shapes(drawn, shapes.missing)
 
 
@@ -136,7 +136,7 @@ def _joints_on(scene: Scene) -> dict[int, list[np.ndarray]]:
     return points
 
 
-def _fixed_links(scene: Scene, thin: float) -> list[Shape]:
+def _ground_links(scene: Scene, thin: float) -> list[Shape]:
     """Rods of the world to where loops are closed with it, without which a closed chain would look open."""
     model = scene.system
     home, frames = np.asarray(model.home, float), model.topology.frame_bodies

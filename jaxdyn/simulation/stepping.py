@@ -101,6 +101,8 @@ def stepper(
     by_numbers = jax.checkpoint(advance) if check_flag(remat, "stepper: remat") else advance
 
     def step(state, tau, t: Any = 0.0):
+        if report and not by_contacts and is_standalone():
+            raise ValueError("stepper: exported steps have no report; leave report out")
         if len(state) != (2 if start is None else 3):
             names = "(q, v)" if start is None else "(q, v, z) with z = scene.drive_state(q, v) at the start"
             raise ValueError(f"stepper: the state has {len(state)} entries, expected {names}")
@@ -191,8 +193,6 @@ def _advance(scene: Scene, length, substeps: int, is_direct: bool, report: bool)
             rows, end = piecewise_motion(system, y, args, ts, 0.0, 0.0, size, substeps, substeps + 1, EVENTS, is_direct)
             result = end.result
         elif is_standalone():
-            if report:
-                raise ValueError("stepper: exported steps have no report; leave report out")
             # A scalar program has no loop over steps; they are written one after the other.
             flat = ravel_pytree(y)[0]
             for i in range(substeps):

@@ -245,3 +245,9 @@ def test_report_of_a_step_has_derivatives_in_both_modes_and_at_rest():
 
     reverse = jax.jacrev(lambda q: end(q, "reverse"))(jnp.zeros(2))
     np.testing.assert_allclose(reverse, jax.jacfwd(lambda q: end(q, "forward"))(jnp.zeros(2)), rtol=0, atol=1e-14)
+
+
+def test_exported_steps_have_no_report():
+    step = jd.stepper(jd.robots.chain(1), 0.01, report=True)
+    with pytest.raises(ValueError, match="exported steps have no report"):
+        jd.export(lambda q, v: step((q, v), jnp.zeros(1))[0][0], jnp.zeros(1), jnp.zeros(1), name="step")
