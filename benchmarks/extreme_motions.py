@@ -7,8 +7,8 @@ import numpy as np
 
 import jaxdyn as jd
 from benchmarks.extremes import FIXED, Outcome, Row, as_dtype, case, name_of, outcome, quick, study, table
-from benchmarks.report_cases import references
 from jaxdyn.constraints.codes import code_of
+from jaxdyn.reports import references
 
 LOOSE = {"float64": 1e-6, "float32": 1e-3}
 

@@ -1,10 +1,12 @@
 """Moving pictures of scenes for the page docs/gallery.md: `python -m benchmarks.gallery [--out docs/gallery] [SCENE ...]`.
 
 Each scene of the page is simulated from its start and written as a GIF. The files are not kept in the repository: `make docs`
-makes those that are missing.
+makes those that are missing, and those whose scene or drawing has changed since.
 """
 
 import argparse
+import hashlib
+import inspect
 import time
 from pathlib import Path
 
@@ -153,19 +155,32 @@ def write(name: str, folder: Path) -> float:
     return time.perf_counter() - began
 
 
+def digest(name: str) -> str:
+    """SHA-256 of the code that a picture shows: the scene's module, the package that draws, and this file."""
+    scene = Path(inspect.getfile(inspect.unwrap(getattr(jd.scenes, name))))
+    drawing = Path(inspect.getfile(jd.animate)).parent.glob("*.py")
+    return hashlib.sha256(b"".join(path.read_bytes() for path in (scene, Path(__file__), *sorted(drawing)))).hexdigest()
+
+
 def main(argv=None) -> None:
-    """Write the pictures of the scenes named, or of all that are missing."""
+    """Write the pictures of the scenes named, or of all that are missing or were made by other code."""
     parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("scenes", nargs="*", help="by default all whose file is missing")
+    parser.add_argument("scenes", nargs="*", help="by default all that are missing or were made by other code")
     parser.add_argument("--out", type=Path, default=Path("docs/gallery"))
     options = parser.parse_args(argv)
     jax.config.update("jax_enable_x64", True)
     options.out.mkdir(parents=True, exist_ok=True)
-    chosen = options.scenes or [name for name in SCENES if not (options.out / f"{name}.gif").exists()]
+    key = {name: options.out / f"{name}.sha256" for name in SCENES}
+    chosen = options.scenes or [
+        name
+        for name in SCENES
+        if not ((options.out / f"{name}.gif").exists() and key[name].exists() and key[name].read_text() == digest(name))
+    ]
     if unknown := [name for name in chosen if name not in SCENES]:
         raise ValueError(f"no scenes of the gallery: {', '.join(unknown)}; they are {', '.join(SCENES)}")
     for name in chosen:
         print(f"{name}: {write(name, options.out):.0f} s", flush=True)
+        key[name].write_text(digest(name))
 
 
 if __name__ == "__main__":

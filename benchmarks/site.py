@@ -1,12 +1,13 @@
 """The site: `python -m benchmarks.site` (`make docs`), into out/site.
 
-Makes the pictures of the gallery that are missing, turns the notebooks with their outputs into pages, builds the pages with
-zensical (strict), puts KaTeX beside them, which is fetched from the npm registry and kept in out/, and the sources that pages
-link to, and follows every link and anchor of the pages that came out. Without npm the pages take KaTeX from the net when they
-are read, and a line says so.
+Makes the pictures of the gallery that are missing or older than their code, turns the notebooks with their outputs into
+pages, builds the pages with zensical (strict), puts KaTeX beside them, which is fetched from the npm registry and kept in
+out/, and the sources that pages link to, and follows every link and anchor of the pages that came out. Without npm the pages
+take KaTeX from the net when they are read, and a line says so.
 """
 
 import argparse
+import re
 import shutil
 import subprocess
 import sys
@@ -85,18 +86,69 @@ def dead_links(site: Path) -> tuple[int, list[str]]:
 def notebooks(folder: Path) -> int:
     """Write the notebooks of the repository, with the outputs that they hold, as pages into a folder; their number."""
     # Imported on use: it is an extra of the site.
+    import nbformat  # pyright: ignore[reportMissingImports]
     from nbconvert import MarkdownExporter  # pyright: ignore[reportMissingImports]
 
     folder.mkdir(parents=True, exist_ok=True)
     paths = sorted((ROOT / "notebooks").glob("*.ipynb"))
     for path in paths:
         names = {"unique_key": path.stem, "output_files_dir": f"{path.stem}_files"}
-        body, extras = MarkdownExporter().from_filename(str(path), resources=names)
-        (folder / f"{path.stem}.md").write_text(body, encoding="utf-8")
+        notebook = nbformat.read(path, as_version=4)
+        for output in (output for cell in notebook.cells for output in cell.get("outputs", ())):
+            # The page of an xarray dataset needs its own styles and is wider than a telephone; its text is not.
+            if "xr-wrap" in output.get("data", {}).get("text/html", ""):
+                del output.data["text/html"]
+        body, extras = MarkdownExporter().from_notebook_node(notebook, resources=names)
+        # Beside the pages, which a notebook finds in a folder beside its own.
+        (folder / f"{path.stem}.md").write_text(body.replace("](../docs/", "](../"), encoding="utf-8")
         for name, data in extras["outputs"].items():
             (folder / name).parent.mkdir(exist_ok=True)
             (folder / name).write_bytes(data)
     return len(paths)
+
+
+# Names of other packages in the prose of a page, whose first mention leads to their documentation.
+_PEERS = {
+    "diffrax": "https://docs.kidger.site/diffrax/",
+    "equinox": "https://docs.kidger.site/equinox/",
+    "MuJoCo": "https://mujoco.readthedocs.io/",
+    "Pinocchio": "https://github.com/stack-of-tasks/pinocchio",
+}
+_UNLINKED = {"a", "pre", "h1", "h2", "h3", "h4", "h5", "script", "title", "nav"}
+
+
+def link_names(site: Path) -> int:
+    """Let `jd.NAME` in the prose of the pages lead to its entry of the reference, and packages to their pages; the links."""
+    places = {}
+    for path in sorted((site / "reference").glob("*.html")):
+        for place in _Page(path.read_text(encoding="utf-8")).places:
+            if place.startswith("jaxdyn."):
+                places[place.removeprefix("jaxdyn.")] = f"reference/{path.name}"
+    count = 0
+    for path in site.rglob("*.html"):
+        up = "../" * len(path.relative_to(site).parent.parts)
+        head, mark, body = path.read_text(encoding="utf-8").partition("<article")
+        open_tags: list[str] = []
+        parts, peers = re.split(r"(<[^>]+>)", body), dict(_PEERS)
+        for i, part in enumerate(parts):
+            if tag := re.match(r"<(/?)(\w+)", part):
+                if tag[2] in _UNLINKED and not tag[1]:
+                    open_tags.append(tag[2])
+                elif tag[2] in open_tags:
+                    open_tags.remove(tag[2])
+                continue
+            if open_tags or not part.strip():
+                continue
+            name = re.match(r"jd\.([A-Za-z_][\w.]*)", part)
+            if name and parts[i - 1] == "<code>" and name[1] in places:
+                parts[i] = f'<a href="{up}{places[name[1]]}#jaxdyn.{name[1]}">{part}</a>'
+                count += 1
+            elif parts[i - 1] != "<code>" and (found := [peer for peer in peers if re.search(rf"\b{peer}\b", part)]):
+                for peer in found:
+                    parts[i] = re.sub(rf"\b{peer}\b", f'<a href="{peers.pop(peer)}">{peer}</a>', parts[i], count=1)
+                count += len(found)
+        path.write_text(head + mark + "".join(parts), encoding="utf-8")
+    return count
 
 
 def bring_sources(site: Path) -> int:
@@ -141,6 +193,7 @@ def main(argv=None) -> int:
         print(f"KaTeX is not part of the site ({fault}): its formulas need the net when they are read")
     else:
         shutil.copytree(kept, SITE / "javascripts" / "katex", dirs_exist_ok=True)
+    print(f"{link_names(SITE)} names in the prose are links")
     print(f"{bring_sources(SITE)} files of the repository that pages link to are beside them")
     count, dead = dead_links(SITE)
     dead = [link for link in dead if not options.no_gallery or "gallery/" not in link]

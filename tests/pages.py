@@ -35,7 +35,7 @@ def links(text: str) -> list[str]:
     """Targets of the links and pictures of a page, outside of code."""
     text = re.sub(r"```.*?```", "", text, flags=re.DOTALL)
     text = re.sub(r"`[^`\n]*`", "", text)
-    return re.findall(r"\]\(([^)\s]+)\)", text)
+    return re.findall(r"(?:\]\(|^\[[^]]+\]: )([^)\s]+)(?:\)|$)", text, flags=re.MULTILINE)
 
 
 def anchors(text: str) -> set[str]:

@@ -13,6 +13,7 @@ from benchmarks.report_cases.mechanisms import mechanisms
 from benchmarks.report_cases.test_set import andrews, car_axis
 from jaxdyn.forces.elements import Drive
 from jaxdyn.model import robots
+from jaxdyn.reports import references as closed_forms
 from jaxdyn.reports.case import Case
 from jaxdyn.systems.scene import Scene
 
@@ -46,7 +47,7 @@ def _cases() -> tuple[Case, ...]:
             "pendulum_in_plane",
             "Plane pendulum in x and y, 10 s (problem A01 of the IFToMM library)",
             scene_builder("pendulum_in_plane"),
-            lambda start: references.plane_pendulum(ten),
+            lambda start: closed_forms.plane_pendulum(ten),
             ten,
             500,
         ),
@@ -54,7 +55,7 @@ def _cases() -> tuple[Case, ...]:
             "spherical_pendulum",
             "Spherical pendulum in x, y and z, 10 s",
             scene_builder("spherical_pendulum"),
-            lambda start: references.sphere_pendulum(ten),
+            lambda start: closed_forms.sphere_pendulum(ten),
             ten,
             250,
         ),
@@ -62,7 +63,7 @@ def _cases() -> tuple[Case, ...]:
             "free_body",
             "Free rigid body with three different moments of inertia, 20 s",
             scene_builder("free_body"),
-            lambda start: references.free_top(2 * ten),
+            lambda start: closed_forms.free_top(2 * ten),
             2 * ten,
             100,
         ),
@@ -78,7 +79,7 @@ def _cases() -> tuple[Case, ...]:
             "rolling_disk",
             "Upright disk that rolls on a circle, 10 s",
             scene_builder("rolling_disk"),
-            lambda start: references.upright_disk(ten),
+            lambda start: closed_forms.upright_disk(ten),
             ten,
             50,
         ),
@@ -86,7 +87,7 @@ def _cases() -> tuple[Case, ...]:
             "chaplygin_sleigh",
             "Chaplygin's sleigh, 10 s",
             scene_builder("chaplygin_sleigh"),
-            lambda start: references.sleigh(ten),
+            lambda start: closed_forms.sleigh(ten),
             ten,
             50,
         ),
@@ -94,7 +95,7 @@ def _cases() -> tuple[Case, ...]:
             "rolling_coin",
             "Leaning disk that rolls steadily on a circle, 5 s: close to one turn",
             scene_builder("rolling_coin"),
-            lambda start: references.coin(ten / 2),
+            lambda start: closed_forms.coin(ten / 2),
             ten / 2,
             250,
         ),
@@ -118,7 +119,7 @@ def _cases() -> tuple[Case, ...]:
             "windows",
             "Two four-bar windows, 10 s (problem A02 of the IFToMM library, N = 2), through positions where rows lose rank",
             scene_builder("windows", count=2),
-            lambda start: references.windows(ten, 2),
+            lambda start: closed_forms.windows(ten, 2),
             ten,
             500,
         ),
@@ -127,7 +128,7 @@ def _cases() -> tuple[Case, ...]:
             "Forty four-bar windows, 1 s of the 20 s of problem A02 of the IFToMM library, through one position where rows "
             "lose rank",
             scene_builder("windows", count=40),
-            lambda start: references.windows(ten / 10, 40),
+            lambda start: closed_forms.windows(ten / 10, 40),
             ten / 10,
             10,
         ),

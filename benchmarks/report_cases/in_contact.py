@@ -2,8 +2,8 @@
 
 import numpy as np
 
-from benchmarks.report_cases import references
 from benchmarks.report_cases.builders import scene_builder
+from jaxdyn.reports import references
 from jaxdyn.reports.case import Case
 
 

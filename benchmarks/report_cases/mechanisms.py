@@ -6,6 +6,7 @@ import jaxdyn as jd
 from benchmarks.report_cases import references
 from benchmarks.report_cases.builders import scene_builder
 from benchmarks.report_cases.test_set import ANDREWS_ORDER, andrews_bodies
+from jaxdyn.reports import references as closed_forms
 from jaxdyn.reports.case import Case, Reference
 
 
@@ -29,7 +30,7 @@ def _systems(ten: np.ndarray) -> tuple[Case, ...]:
             "pendulum",
             "Pendulum by its angle, from rest at the level of its axis, 10 s",
             scene_builder("pendulum"),
-            lambda start: references.swing(ten),
+            lambda start: closed_forms.swing(ten),
             ten,
             250,
         ),
@@ -37,7 +38,7 @@ def _systems(ten: np.ndarray) -> tuple[Case, ...]:
             "particle_in_plane",
             "Particle thrown in a plane, 1 s: every method of order two is exact",
             scene_builder("particle_in_plane"),
-            lambda start: references.projectile(ten / 10),
+            lambda start: closed_forms.projectile(ten / 10),
             ten / 10,
             5,
         ),
@@ -210,7 +211,7 @@ def _vehicles(ten: np.ndarray) -> tuple[Case, ...]:
             "knife_edge_on_incline",
             "Skate on an inclined plane, 5 s: a cycloid that does not go downhill",
             scene_builder("knife_edge_on_incline"),
-            lambda start: references.skate(ten / 2),
+            lambda start: closed_forms.skate(ten / 2),
             ten / 2,
             50,
         ),
@@ -227,7 +228,7 @@ def _vehicles(ten: np.ndarray) -> tuple[Case, ...]:
             "ball_on_turntable",
             "Ball on a turntable that is driven, 5 s",
             scene_builder("ball_on_turntable"),
-            None,
+            lambda start: closed_forms.turntable(ten / 2),
             ten / 2,
             100,
             conserves=False,

@@ -58,6 +58,8 @@ def complete_solids(scene: Scene, shapes: Shapes) -> Shapes:
             drawn += _object_solids(scene, solid, thin)
             continue
         drawn += rods + [_or_mark(shape, longest, thin) for shape in solid]
+    if whole:
+        drawn += _ground_links(scene, thin)
     return Shapes(drawn, shapes.missing)
 
 
@@ -132,6 +134,21 @@ def _joints_on(scene: Scene) -> dict[int, list[np.ndarray]]:
                 offset = np.asarray(model.frame_poses, float)[index] @ np.asarray(pose, float)
                 points[model.topology.frame_bodies[index]].append(offset[:3, 3])
     return points
+
+
+def _ground_links(scene: Scene, thin: float) -> list[Shape]:
+    """Rods of the world to where loops are closed with it, without which a closed chain would look open."""
+    model = scene.system
+    home, frames = np.asarray(model.home, float), model.topology.frame_bodies
+    carried = zip(model.topology.parents, model.topology.kinds, home, strict=True)
+    joints = [pose[:3, 3] for parent, kind, pose in carried if parent < 0 and kind != "free"]
+    rods = []
+    for body, pose in (end for one in pairs(scene) if isinstance(one, Loop) for end in one.ends()):
+        if joints and (body is None or frames[frame_index(model, body)] < 0):
+            end = (frame_poses(model, home, body) @ np.asarray(pose, float))[:3, 3]
+            start = min(joints, key=lambda joint: float(np.linalg.norm(joint - end)))
+            rods += [rod(None, start, end, 0.7 * thin, source="inertia")] if np.linalg.norm(end - start) > thin else []
+    return rods
 
 
 def _has_middles(constraint: Pair) -> bool:
@@ -212,8 +229,10 @@ def _of_inertia(model: Model, i: int, thin: float, rolls: bool) -> list[Shape]:
         axes[:, 0] *= -1
     pose[:3, :3] = axes
     options: dict = dict(source="inertia")
-    # A point mass has no shape; a ball of the rods' thickness shows it.
+    # A point mass has no shape; a ball of the rods' thickness shows it, and a block what slides.
     if moments[2] <= mass * least**2:
+        if model.topology.kinds[i] == "prismatic":
+            return [Shape(name, "box", (6 * thin, 6 * thin, 6 * thin), pose, **options)]
         return [Shape(name, "ellipsoid", (2 * thin,) * 3, pose, source="mark")]
     equal = [abs(moments[a] - moments[b]) <= _EQUAL * moments[2] for a, b in ((0, 1), (1, 2))]
     if all(equal):
@@ -264,7 +283,7 @@ def _rolling(scene: Scene, carried: set[int]) -> tuple[list[Shape], set[int]]:
         ):
             bodies.add(body)
         reach = getattr(constraint, "surface_radius", None)
-        if reach is not None and not constraint.inside and constraint.surface_body is not None:  # pyright: ignore[reportAttributeAccessIssue]
+        if reach is not None and not constraint.inside:  # pyright: ignore[reportAttributeAccessIssue]
             surface = np.asarray(constraint.surface, float)
             kind, size = ("ellipsoid", (float(reach),) * 3)
             if constraint.on == "cylinder":  # pyright: ignore[reportAttributeAccessIssue]

@@ -160,7 +160,7 @@ def paint_sectors(shapes: Shapes, model: Model) -> Shapes:
     parts = []
     for shape in shapes:
         turns = shape.source == "constraint" or (shape.source == "inertia" and _turns_freely(shape, model))
-        if not turns or shape.kind not in ("ellipsoid", "cylinder"):
+        if not turns or shape.frame is None or shape.kind not in ("ellipsoid", "cylinder"):
             parts.append(shape)
             continue
         vertices, faces = shape.triangles()

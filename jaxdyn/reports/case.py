@@ -8,25 +8,9 @@ import numpy as np
 
 from jaxdyn import scenes
 from jaxdyn.contact.unilateral import has_modes
+from jaxdyn.reports.references import CLOSED_FORMS
+from jaxdyn.reports.references import Reference as Reference
 from jaxdyn.systems.scene import Scene
-
-# Rounding error of a closed form in double precision, in the error measure of the report.
-ROUNDING = 1e-13
-
-
-class Reference(NamedTuple):
-    """Reference motion at times `ts` (nt,): `q` (nt, nq) and `v` (nt, nv); the first row is the start.
-
-    `kind` is "closed form", "printed" or "converged"; `source` cites its origin; `error` is its own
-    error in the measure of the report: points of a work-precision plot below it are meaningless.
-    """
-
-    ts: np.ndarray
-    q: np.ndarray
-    v: np.ndarray
-    kind: str
-    source: str
-    error: float = ROUNDING
 
 
 class Case(NamedTuple):
@@ -51,7 +35,7 @@ class Case(NamedTuple):
 
 
 def case_of_scene(name: str) -> Case:
-    """Case of a scene of `jd.scenes`: its default start, one second, and a converged solution as the reference.
+    """Case of a scene of `jd.scenes`: its default start, one second, and its closed form, or else a converged solution.
 
     **Raises:** ValueError for other names, and for scenes with forces that have modes, whose steps end at events.
     """
@@ -64,4 +48,6 @@ def case_of_scene(name: str) -> Case:
     text = (inspect.getdoc(scene) or name).partition("\n")[0]
     # The energy of an arbitrary scene need not be constant, so its error is not reported.
     build = lambda: (scene(), tuple(np.asarray(x) for x in scene.start()))  # noqa: E731
-    return Case(name, text, build, None, np.linspace(0.0, 1.0, 11), 250, conserves=False)
+    ts, known = np.linspace(0.0, 1.0, 11), CLOSED_FORMS.get(name)
+    reference = None if known is None else lambda start: known(ts)
+    return Case(name, text, build, reference, ts, 250, conserves=False)

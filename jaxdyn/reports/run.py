@@ -59,8 +59,8 @@ def report(
 
     **Arguments:**
 
-    - `scenes`: names of `jd.scenes`, from their default starts for one second against a converged solution; and your own, each a
-      `jaxdyn.reports.Case` with its start, its times, and its motion where it is known.
+    - `scenes`: names of `jd.scenes`, from their default starts for one second against their closed form, or else a
+      converged solution; and your own, each a `jaxdyn.reports.Case` with its start, its times, and its motion where it is known.
     - `dtypes`: of "float64" and "float32"; `batches`: numbers of trajectories at once.
     - `integrators`: pairs of a method and a solver instead of the usual ones.
     - `rounds`: timings of each run, at least 20 for a figure to be quoted.

@@ -57,12 +57,12 @@ from jaxdyn.systems.scene import Scene
 
 
 class ContactStep(Outcome):
-    """Contact forces of a step.
+    """Report of a step of `jd.stepper`: its result code, and its contact forces, none in a scene without contacts.
 
     - `forces`: by the contact's name, (n,), N: the friction along the rows of slip, and the normal force as the last one; means
       over the step, so that those of an impact are its impulse over the step's length.
     - `limit_forces` (nv,): of joint limits, N or N m.
-    - `result`: one of `jd.RESULTS`. Where it is not `successful` the state is NaN, with derivatives of NaN.
+    - `result`: one of `jd.RESULTS`. Unless it is `successful` or `coarse_steps`, the state is NaN, with derivatives of NaN.
     - `residual` (): of Coulomb's law, in numbers scaled to one.
     """
 

@@ -17,7 +17,7 @@ from jaxdyn.forces.piecewise import fix_pieces, guards, pieces_of, values_and_le
 from jaxdyn.model.arguments import Numbers, as_array, check_flag, check_shape, state_dtype
 from jaxdyn.simulation.checks import choose_method
 from jaxdyn.simulation.contact_problem import contacts_of
-from jaxdyn.simulation.contact_steps import contact_step, mean_of_steps
+from jaxdyn.simulation.contact_steps import ContactStep, contact_step, mean_of_steps
 from jaxdyn.simulation.equations import DRIVES
 from jaxdyn.simulation.hybrid.piecewise import PiecewiseSystem, piecewise_motion
 from jaxdyn.simulation.methods import may_have_redundant_rows
@@ -71,9 +71,10 @@ def stepper(
     - `limits`: "hold" for the model's joint limits as contacts without friction; None to ignore them.
     - `smoothing`: kappa in J, for learning: normal force times gap of a contact at rest is kappa instead of zero, so that
       contacts that are open have derivatives. Zero by default, for Coulomb's law.
-    - `report`: of a scene with contacts; a step then returns (state, `ContactStep`): forces in N by name, those of limits, and a
-      result code. A step whose contacts were not solved has the code `no_contact_impulses`; with and without a report its state
-      and derivatives are NaN.
+    - `report`: if True, a step returns (state, `ContactStep`), with a result code, and of a scene with contacts with forces in N
+      by name and those of limits. The code is `coarse_steps` where the state after the step may be wrong by more than a tenth of
+      its change in it; steps through contacts have no such estimate. A step whose contacts were not solved has the code
+      `no_contact_impulses`; with and without a report its state and derivatives are NaN.
 
     **Raises:** ValueError for a dt that is not positive, substeps that are no count, another adjoint, dry friction
     with smoothing, unknown limits, negative smoothing; (when called) for shapes that do not fit.
@@ -88,17 +89,20 @@ def stepper(
     seconds = _check_options(scene, dt, substeps, adjoint)
     system, dtype = scene.system, state_dtype(scene.system)
     by_contacts = limits is not None or has_modes(scene)
-    _check_contact_options(by_contacts, smoothing, report)
+    _check_smoothing(by_contacts, smoothing)
+    report = check_flag(report, "stepper: report")
     # In numpy a known length stays known inside a jit, where jax would trace it.
     length = np.asarray(seconds, dtype) if is_concrete(seconds) else jnp.asarray(seconds, dtype)
     if by_contacts:
         q, v = (jnp.zeros((n,), dtype) for n in (scene.nq, scene.nv))
         start, advance = scene.drive_state(q, v), _advance_contacts(scene, length, substeps, limits, smoothing, report)
     else:
-        start, advance = _advance(scene, length, substeps, adjoint != "reverse")
+        start, advance = _advance(scene, length, substeps, adjoint != "reverse", report)
     by_numbers = jax.checkpoint(advance) if check_flag(remat, "stepper: remat") else advance
 
     def step(state, tau, t: Any = 0.0):
+        if report and not by_contacts and is_standalone():
+            raise ValueError("stepper: exported steps have no report; leave report out")
         if len(state) != (2 if start is None else 3):
             names = "(q, v)" if start is None else "(q, v, z) with z = scene.drive_state(q, v) at the start"
             raise ValueError(f"stepper: the state has {len(state)} entries, expected {names}")
@@ -131,8 +135,11 @@ def _check_options(scene: Scene, dt, substeps, adjoint):
     return seconds
 
 
-def _advance(scene: Scene, length, substeps: int, is_direct: bool) -> tuple[Any, Callable]:
-    """States of the scene's drives or None, and a function (q, v, tau, t, *z) -> (q, v, *z) of a step under a constant tau."""
+def _advance(scene: Scene, length, substeps: int, is_direct: bool, report: bool) -> tuple[Any, Callable]:
+    """States of the scene's drives or None, and a function (q, v, tau, t, *z) of a step under a constant tau.
+
+    It returns (q, v, *z), or ((q, v, *z), ContactStep) with `report`.
+    """
     selects_rows = bool(scene.constraints) and may_have_redundant_rows(scene)
     method, dtype = choose_method(scene, "auto"), state_dtype(scene.system)
     unknown, known = partition_tracers(scene)
@@ -183,7 +190,8 @@ def _advance(scene: Scene, length, substeps: int, is_direct: bool) -> tuple[Any,
         if pieces.names:
             _refuse_export(pieces)
             system = PiecewiseSystem(plan, pieces, switching)
-            rows = piecewise_motion(system, y, args, ts, 0.0, 0.0, size, substeps, substeps + 1, EVENTS, is_direct)[0]
+            rows, end = piecewise_motion(system, y, args, ts, 0.0, 0.0, size, substeps, substeps + 1, EVENTS, is_direct)
+            result = end.result
         elif is_standalone():
             # A scalar program has no loop over steps; they are written one after the other.
             flat = ravel_pytree(y)[0]
@@ -193,19 +201,19 @@ def _advance(scene: Scene, length, substeps: int, is_direct: bool) -> tuple[Any,
             return state_of(plan.structure(flat), t + length)
         else:
             run = ExplicitRun(plan, step_control(solver, size), None, None, size, substeps, room=substeps)
-            rows = (run.direct if is_direct else run)(y, args, ts)[0]
-        return state_of(jax.tree.map(lambda x: x[0], rows), t + length)
+            rows, (result, *_) = (run.direct if is_direct else run)(y, args, ts)
+        state = state_of(jax.tree.map(lambda x: x[0], rows), t + length)
+        return (state, ContactStep({}, jnp.zeros_like(v), result, jnp.zeros((), v.dtype))) if report else state
 
     return start, advance
 
 
-def _check_contact_options(by_contacts: bool, smoothing, report) -> None:
+def _check_smoothing(by_contacts: bool, smoothing) -> None:
     energy = as_array(smoothing, "stepper: smoothing")
     if energy.shape != () or (is_concrete(energy) and not 0 <= float(energy) < np.inf):
         raise ValueError(f"stepper: smoothing is {smoothing!r}; give one energy (J), zero or more")
-    if not by_contacts and (check_flag(report, "stepper: report") or (is_concrete(energy) and float(energy) > 0)):
-        name = "report" if report else "smoothing"
-        raise ValueError(f"stepper: {name} is for scenes with contacts, and this one has none; leave it out")
+    if not by_contacts and is_concrete(energy) and float(energy) > 0:
+        raise ValueError("stepper: smoothing is for scenes with contacts, and this one has none; leave it out")
 
 
 def _advance_contacts(scene: Scene, length, substeps: int, limits, smoothing, report: bool) -> Callable:

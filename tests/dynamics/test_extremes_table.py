@@ -9,9 +9,9 @@ import pytest
 
 from benchmarks import extremes
 from benchmarks.extreme_motions import SOLVERS, run_oscillator, stability_limits
-from benchmarks.report_cases import references
 from jaxdyn import robots, scenes
 from jaxdyn.constraints.codes import code_of
+from jaxdyn.reports import references
 from jaxdyn.simulation.run import simulate
 
 CASES = extremes.load()

@@ -15,30 +15,30 @@ from scipy.spatial.transform import Rotation
 import jaxdyn as jd
 from benchmarks.fronts import beaten_by, cost_at
 from benchmarks.report_cases import cases
-from benchmarks.report_cases.references import (
-    car_axis,
+from benchmarks.report_cases.references import car_axis, rolling_down, sliding_block
+from jaxdyn.cli import main
+from jaxdyn.contact.unilateral import has_modes
+from jaxdyn.reports import Record, Report, html_page, pareto_front
+from jaxdyn.reports import run as running
+from jaxdyn.reports.case import Case, Reference, case_of_scene
+from jaxdyn.reports.measurement import Contestant, Motion, evaluations, ladder, measure
+from jaxdyn.reports.programs import FIXED, SOLVERS, Programs, prepare
+from jaxdyn.reports.records import SceneReference
+from jaxdyn.reports.references import (
+    CLOSED_FORMS,
     coin,
     falling_table,
     free_top,
     integral,
     plane_pendulum,
     projectile,
-    rolling_down,
     skate,
     sleigh,
-    sliding_block,
     sphere_pendulum,
     swing,
+    turntable,
     windows,
 )
-from jaxdyn.cli import main
-from jaxdyn.contact.unilateral import has_modes
-from jaxdyn.reports import Record, Report, html_page, pareto_front
-from jaxdyn.reports import run as running
-from jaxdyn.reports.case import Case, Reference
-from jaxdyn.reports.measurement import Contestant, Motion, evaluations, ladder, measure
-from jaxdyn.reports.programs import FIXED, SOLVERS, Programs, prepare
-from jaxdyn.reports.records import SceneReference
 from jaxdyn.reports.timing import time_interleaved
 from jaxdyn.simulation.checks import choose_method
 from jaxdyn.simulation.solvers import RK4
@@ -561,3 +561,25 @@ def test_printed_ends_are_as_printed():
     (xl, yl, xr, yr), (vxl, vyl, vxr, vyr) = computed.q[-1], computed.v[-1]
     assert (xl - xr) ** 2 + (yl - yr) ** 2 == pytest.approx(1.0, abs=1e-14)
     assert (xl - xr) * (vxl - vxr) + (yl - yr) * (vyl - vyr) == pytest.approx(0.0, abs=1e-14)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", CLOSED_FORMS)
+def test_a_named_scene_is_compared_with_its_closed_form(name):
+    """Which a run of the library follows from the scene's default start for a second."""
+    prepared = prepare(case_of_scene(name))
+    assert prepared.reference.kind == "closed form" and prepared.reference.error < 1e-11
+    assert prepared.errors(*prepared.programs.solve("auto", "Dopri8", 1e-13)).max() < 1e-10
+
+
+def test_ball_on_a_turntable_in_closed_form_rolls():
+    """Its velocity at the contact is the table's; the rate of its quaternion is that of its angular velocity, by differences."""
+    ts = np.linspace(0.0, 1.0, 2001)
+    known = turntable(ts)
+    turned = Rotation.from_quat(np.roll(known.q[:, 4:], -1, 1))
+    spin, place = turned.apply(known.v[:, 4:]), known.q[:, 1:4] * [1, 1, 0]
+    at_contact = turned.apply(known.v[:, 1:4]) + np.cross(spin, [0.0, 0.0, -0.2])
+    np.testing.assert_allclose(at_contact, np.cross([0.0, 0.0, 3.0], place), rtol=0, atol=1e-13)
+    # Of the second order in the step of 0.5 ms.
+    steps = (turned[:-2].inv() * turned[2:]).as_rotvec() / (ts[2] - ts[0])
+    np.testing.assert_allclose(steps, known.v[1:-1, 4:], rtol=0, atol=2e-4)

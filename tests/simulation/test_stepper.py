@@ -220,3 +220,34 @@ def test_steps_and_derivatives_where_rows_are_dependent():
     for mine, theirs in zip(jax.tree.leaves(computed), jax.tree.leaves(plain), strict=True):
         assert jnp.isfinite(mine).all()
         np.testing.assert_allclose(mine, theirs, rtol=1e-10, atol=1e-11)
+
+
+@pytest.mark.parametrize(
+    ("dt", "substeps", "is_coarse"), [(0.01, 1, False), (0.3, 1, True), (0.3, 2, False), (1.0, 2, True)]
+)
+def test_coarse_steps_are_reported_as_by_simulate(dt, substeps, is_coarse):
+    """Of a double pendulum, also where steps may end at limits of the effort that are not met."""
+    model, state = jd.robots.chain(2), (jnp.asarray([1.0, 0.5]), jnp.zeros(2))
+    motion = jd.simulate(model, *state, jnp.asarray([0.0, dt]), stepsize=dt / substeps, throw=False)
+    for forces in ((), (jd.forces.EffortLimits(50.0),)):
+        scene = jd.Scene(model, forces=forces)
+        (q, v), report = jax.jit(jd.stepper(scene, dt, substeps, report=True))(state, jnp.zeros(2))
+        assert (report.result == jd.RESULTS.coarse_steps) == (motion.result == jd.RESULTS.coarse_steps) == is_coarse
+        assert bool(report.success) != is_coarse and not report.forces
+        plain = jd.stepper(scene, dt, substeps)(state, jnp.zeros(2))
+        np.testing.assert_allclose(np.stack([q, v]), np.stack(plain), rtol=0, atol=1e-13)
+        np.testing.assert_allclose(q, motion.q[-1], rtol=0, atol=1e-12)
+
+
+def test_report_of_a_step_has_derivatives_in_both_modes_and_at_rest():
+    def end(q, adjoint):
+        return jd.stepper(jd.robots.chain(2), 0.01, report=True, adjoint=adjoint)((q, jnp.zeros(2)), jnp.zeros(2))[0][0]
+
+    reverse = jax.jacrev(lambda q: end(q, "reverse"))(jnp.zeros(2))
+    np.testing.assert_allclose(reverse, jax.jacfwd(lambda q: end(q, "forward"))(jnp.zeros(2)), rtol=0, atol=1e-14)
+
+
+def test_exported_steps_have_no_report():
+    step = jd.stepper(jd.robots.chain(1), 0.01, report=True)
+    with pytest.raises(ValueError, match="exported steps have no report"):
+        jd.export(lambda q, v: step((q, v), jnp.zeros(1))[0][0], jnp.zeros(1), jnp.zeros(1), name="step")

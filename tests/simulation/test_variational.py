@@ -7,13 +7,13 @@ import numpy as np
 import pytest
 from pinocchio_bridge import quick
 
-from benchmarks.report_cases import references
 from jaxdyn import scenes
 from jaxdyn.constraints import Holonomic, Pfaffian
 from jaxdyn.constraints.codes import CODES
 from jaxdyn.dynamics.centroidal import center_of_mass, centroidal_momentum, kinetic_energy, potential_energy
 from jaxdyn.model.builder import ModelBuilder
 from jaxdyn.model.configuration import integrate, random_configuration
+from jaxdyn.reports import references
 from jaxdyn.simulation import variational
 from jaxdyn.simulation.run import simulate
 from jaxdyn.simulation.solution import RESULTS
