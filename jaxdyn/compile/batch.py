@@ -60,9 +60,9 @@ def repeat_while(goes_on: Callable[[T], Any], step: Callable[[T], T], state: T, 
     """Repeat state = step(state) while goes_on(state), `most` times at most; few samples need more than a certain first time.
 
     The first repetition is certain where `goes_on(state)` is True itself. For others a native loop, and a kernel without a
-    derivative, branches where a block of samples needs it. Other kernels have no branches: samples that need a repetition are
-    marked as not valid, and computed again outside of the kernel. In code without JAX many repetitions are a loop; a few are
-    written out, or with `marks` such samples are left to its second program.
+    derivative, branches where a block of samples needs it; there many repetitions are a loop. Other kernels have no branches:
+    samples that need a repetition are marked as not valid, and computed again outside of the kernel. In code without JAX many
+    repetitions are a loop; a few are written out, or with `marks` such samples are left to its second program.
     """
     if not is_expanding() or (is_standalone() and most > MOST_WRITTEN_OUT):
         leaves, structure = jax.tree.flatten(state)
@@ -71,11 +71,14 @@ def repeat_while(goes_on: Callable[[T], Any], step: Callable[[T], T], state: T, 
         state, most = step(state), most - 1
     if not has_branches() and (marks or not is_standalone()) and not is_careful():
         return mark_floats(goes_on(state), state)
-    if has_branches():
+    if has_branches() and most > MOST_WRITTEN_OUT:
         return _loop(goes_on, step, state, most)
     for _ in range(most):
         flag = goes_on(state)
-        state = jax.tree.map(lambda new, old, flag=flag: jnp.where(flag, new, old), step(state), state)
+        if has_branches():
+            state = lax.cond(flag, step, lambda state: state, state)
+        else:
+            state = jax.tree.map(lambda new, old, flag=flag: jnp.where(flag, new, old), step(state), state)
     return state
 
 

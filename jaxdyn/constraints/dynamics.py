@@ -324,9 +324,8 @@ def projections(
     scene = independent_rows(scene, q, t, rank_tol)
     metric, Y = kernel(whiten_rows)(scene, q, t)
     inverse = pseudo_inverse(Y, tolerance(rank_tol, Y))
-    tangential = jnp.eye(Y.shape[0], dtype=Y.dtype) - matmul(Y, inverse)
-    # U^-T (1 - Y Y^+) U^T; `momentum` of the unit velocities gives the columns of U^T.
-    P_T = metric.unwhiten(matmul(tangential, metric.momentum(jnp.eye(scene.nv, dtype=Y.dtype))))
+    # U^-T (1 - Y Y^+) U^T = 1 - U^-T (Y^+)^T A, by two products as thin as the rows.
+    P_T = jnp.eye(scene.nv, dtype=Y.dtype) - matmul(metric.unwhiten(inverse.T), constraint_jacobian(scene, q, t))
     return Projections(P_T, P_T.T)
 
 

@@ -18,6 +18,7 @@ from jaxdyn.contact.unilateral import DryFriction, WithModes
 from jaxdyn.dynamics.quantities import bias_force, mass_matrix
 from jaxdyn.forces.piecewise import Pieces
 from jaxdyn.lie.so3 import matmul
+from jaxdyn.model.arguments import warn
 from jaxdyn.model.joints import KINDS
 from jaxdyn.model.tree import Model
 from jaxdyn.simulation.hybrid.modes import elements_of, extend, force_at
@@ -28,6 +29,8 @@ from jaxdyn.systems.system import displace
 # An approach counts as an impact, with restitution, above this many times what forces change in a step: a rebound from a slower
 # one would end within a few steps.
 _IMPACT = 2.0
+# Contacts up to which a step takes milliseconds.
+_MANY = 16
 _OF_SLIP = 0.1  # weight of slips beside gaps, where velocities are made consistent: gaps close
 
 
@@ -92,6 +95,13 @@ def contacts_of(scene: Scene, limits: str | None) -> Contacts:
     elements = elements_of(scene, Pieces((), ())) if any(isinstance(f, WithModes) for f in scene.forces) else None
     each = () if elements is None else elements.each
     order = sorted(range(len(each)), key=lambda i: -len(each[i].tangent))
+    if len(order) > _MANY:
+        warn(
+            f"stepper: the scene has {len(order)} contacts and frictions, and a step takes time with their cube, seconds or "
+            'minutes to compile; list the links that touch, or their lowest corners: contacts={"foot": 1} of a reader, '
+            "jd.contact.shape_contacts(..., lowest=1)",
+            UserWarning,
+        )
     return Contacts(
         each,
         tuple(order),

@@ -35,7 +35,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from jaxdyn.compile import implicit, invalidate_derivatives, kernel, value_and_jvp
+from jaxdyn.compile import batch, implicit, invalidate_derivatives, kernel, value_and_jvp
 from jaxdyn.constraints.codes import RESULTS, Outcome, Result
 from jaxdyn.contact import coulomb
 from jaxdyn.lie.so3 import matmul
@@ -232,15 +232,16 @@ def _solve_relaxed(contacts: Contacts, scene: Scene, of: Scaled, width, wanted: 
         return solution, jnp.zeros((len(contacts.sizes),), bool)
     fails = ~solution.solved & wanted
 
-    def relax():
+    def relax(state):
         # Contacts that only impulses of others close may contradict them too.
         closes = closing_cones(contacts, of, solution.x) & fails
         q = make_consistent(contacts, of, closes).q
         again = coulomb.solve(contacts.groups, True, of.W, q, of.scale, width, fails)
         # The residual is that of the law itself.
         residual = coulomb.residual_at(contacts.groups, again.x, matmul(of.W, again.x) + of.q, width)
-        return again._replace(residual=residual, steps=solution.steps + again.steps), closes
+        again = again._replace(residual=residual, steps=solution.steps + again.steps)
+        return jax.tree.map(lambda new, old: jnp.where(fails, new, old), (fails, again, closes), state)
 
-    # Few problems need it, and in a kernel no others compute it.
-    none = jnp.zeros((len(contacts.sizes),), bool)
-    return jax.lax.cond(fails, relax, lambda: (solution, none))
+    # Few problems need it, and a kernel computes it for no others.
+    start = fails, solution, jnp.zeros((len(contacts.sizes),), bool)
+    return batch.repeat_while(lambda state: state[0], relax, start, 1)[1:]

@@ -562,3 +562,10 @@ def test_a_table_on_twelve_points_stands_and_slides():
     np.testing.assert_allclose([report.forces[f"p{i}"][-1, 2] for i in range(12)], 9.81 / 12, rtol=0, atol=1e-7)
     (_, v), _ = run(scene, dt, (start, jnp.zeros(6).at[0].set(1.0)), 10)
     np.testing.assert_allclose(v[:, 0], 1.0 - 0.5 * 9.81 * dt * np.arange(1, 11), rtol=0, atol=1e-10)
+
+
+def test_many_contacts_are_announced():
+    points = 0.1 * np.random.default_rng(0).normal(size=(17, 3))
+    scene = free_body([jd.contact.ground_contact("body", point, 0.5, name=f"p{i}") for i, point in enumerate(points)])
+    with pytest.warns(UserWarning, match=r"17 contacts.*lowest=1"):
+        jd.stepper(scene, 0.01)
