@@ -6,9 +6,10 @@ differentiated there (`derive`), written as LLVM IR (`code`, `llvm`), and called
 (`target`, `objects`). A primitive of JAX stands for the kernel, with rules for batches and derivatives; where there is no
 native code, operations of JAX do the same (`primitive`).
 
-Of jaxdyn the context of tracing alone is imported here. Other rooms import the names below, and those of the modules `known` (known and traced
-values), `batch` (decisions for a batch, repetitions) and `loops`. Only `jaxdyn.scale`, which compiles programs around
-kernels ahead of time, and `jaxdyn.exports`, which writes object files, import the compiler's own modules.
+Of jaxdyn the context of tracing alone is imported here. Other rooms import the names below, and those of the modules
+`known` (known and traced values), `batch` (decisions for a batch, repetitions) and `loops`. Only `jaxdyn.scale`, which
+compiles programs around kernels ahead of time, and `jaxdyn.exports`, which writes object files, import the compiler's own
+modules.
 """
 
 from jaxdyn.compile.executables import entry_point as entry_point
