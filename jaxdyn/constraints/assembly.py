@@ -224,10 +224,10 @@ def _from_elsewhere(assembly: Assembly, guesses: int, from_guess: Callable, scen
 
 def _assemble(locked, q, v, t, rank_tol, atol, steps, scene):
     """Assemble the scene `locked`; velocities satisfy the constraints of `scene`, or of `locked` if it is None."""
-    bare = Scene(locked.system, locked.constraints)
+    bare = locked.without_forces
     start, passed, selection = _select_near(bare, q, t, rank_tol, steps)
     if scene is not None:
-        scene = Scene(scene.system, scene.constraints)
+        scene = scene.without_forces
         # A tree has no rows: its velocities are free, whatever is held.
         scene = keep_rows(scene, select_rows(scene, start, t, rank_tol)) if scene.constraints else scene
     return _close(bare, q, start, passed, selection, v, t, rank_tol, atol, scene)
@@ -253,7 +253,7 @@ def independent_rows_near(scene: Scene, guess, t) -> Scene:
     """`independent_rows` where the path from a guess meets the constraints: off them all rows are independent."""
     if not (scene.rounding and scene.constraints):
         return scene
-    selection = _select_near(Scene(scene.system, scene.constraints), guess, t, None, 100)[2]
+    selection = _select_near(scene.without_forces, guess, t, None, 100)[2]
     return scene if selection is None else keep_rows(scene, hide_unclear(selection))
 
 
@@ -343,7 +343,7 @@ def _with_velocity(scene, q, v, t, rank_tol):
 
 def residuals(scene: Scene, q, v, t=0.0) -> Float[Array, "2"]:
     """Largest |phi| (m or rad) and |A v - b| (m/s or rad/s) of the state q (nq,), v (nv,) at t (s): (2,)."""
-    return kernel(_largest_residuals)(Scene(scene.system, scene.constraints), q, v, jnp.asarray(t, q.dtype))
+    return kernel(_largest_residuals)(scene.without_forces, q, v, jnp.asarray(t, q.dtype))
 
 
 def _largest_residuals(scene: Scene, q, v, t):
@@ -385,11 +385,11 @@ def _residuals_and_limits(scene, q, v, t, relative):
 @once
 def start_openness(scene: Scene, *, relative: float) -> Evaluation:
     """`largest_ratio` of a known scene, at (q, v, t)."""
-    bare = Scene(scene.system, scene.constraints)
+    bare = scene.without_forces
     # By the kernel that the program of a run uses too, so that it is compiled once.
     return Evaluation(largest_ratio, bare, (relative,), is_input=is_given(bare))
 
 
 def largest_residuals(scene: Scene, q, v, t) -> np.ndarray:
     """Largest residuals (2,), of positions and velocities, at a concrete state."""
-    return evaluate(_largest_residuals, Scene(scene.system, scene.constraints), q, v, t)
+    return evaluate(_largest_residuals, scene.without_forces, q, v, t)

@@ -154,7 +154,7 @@ def _without_kernel(rank_tol, scene: Scene, q, v, tau, t):
         return _by_rank(rank_tol, scene, q, v, tau, t)
     # A user's force may use operations that kernels do not have. It is evaluated here and enters as tau, so that the rest can be
     # a kernel.
-    bare = Scene(scene.system, scene.constraints)
+    bare = scene.without_forces
     return _accelerate(rank_tol, bare, q, v, total_force(scene, q, v, tau, t), t)
 
 

@@ -69,7 +69,7 @@ def project_step(scene: Scene, q, v, t, errors: tuple = (), rank_tol: float | No
 
     # Errors decide step sizes, which have no derivatives. The scene enters without forces, which constraints do not see.
     errors = lax.stop_gradient(tuple(errors))
-    return implicit(Scene(scene.system, scene.constraints), (q, v, t, *errors), project, tangent)
+    return implicit(scene.without_forces, (q, v, t, *errors), project, tangent)
 
 
 def _in_rounds(again: Callable, q, v, errors):

@@ -201,7 +201,7 @@ def distribute_multipliers(scene: Scene, q, t, lam: Float[Array, " nc"]) -> Floa
     if not has_selection(scene):
         return lam
     kept, whole = row_mask(scene), all_rows(scene)
-    return _distribute(Scene(whole.system, whole.constraints), q, jnp.asarray(t, q.dtype), lam, kept)
+    return _distribute(whole.without_forces, q, jnp.asarray(t, q.dtype), lam, kept)
 
 
 @kernel

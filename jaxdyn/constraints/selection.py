@@ -179,7 +179,7 @@ def rank_code(scene: Scene, result: Any) -> Any:
 def _select_in_kernel(scene: Scene, q, t, rank_tol: float | None = None) -> Selection:
     """All rows; invalid where some may repeat others, whose choice takes more than a kernel should hold."""
     every = _every_row(scene, q.dtype)
-    is_doubtful = _has_doubtful_rows(_least_doubtless(q, rank_tol), Scene(scene.system, scene.constraints), q, t)
+    is_doubtful = _has_doubtful_rows(_least_doubtless(q, rank_tol), scene.without_forces, q, t)
     return every._replace(kept=mark_invalid(is_doubtful, jnp.asarray(every.kept)))
 
 
@@ -204,9 +204,9 @@ def _search_rows(scene: Scene, q, t: Any, rank_tol: float | None) -> Selection:
         if not every.kept.size or not has_doubtful_rows(*place):
             return every
         with jax.ensure_compile_time_eval():
-            chosen = _select(Scene(scene.system, scene.constraints), *map(jnp.asarray, place), rank_tol)
+            chosen = _select(scene.without_forces, *map(jnp.asarray, place), rank_tol)
         return Selection(*map(np.asarray, chosen))  # pyright: ignore[reportArgumentType]
-    bare = stop_gradient(Scene(scene.system, scene.constraints))
+    bare = stop_gradient(scene.without_forces)
     q, t = stop_gradient((q, t))
     every = _every_row(bare, q.dtype)
     if not every.kept.size:
@@ -220,7 +220,7 @@ def _search_rows(scene: Scene, q, t: Any, rank_tol: float | None) -> Selection:
 @once
 def rows_and_doubts(scene: Scene, *, rank_tol: float | None, dtype) -> tuple[Selection, Evaluation]:
     """All rows of a known scene, and whether some are doubtful at (q, t)."""
-    bare, every = Scene(scene.system, scene.constraints), _every_row(scene, dtype)
+    bare, every = scene.without_forces, _every_row(scene, dtype)
     return every, Evaluation(
         _has_doubtful_rows, bare, (_least_doubtless(every.kept, rank_tol),), is_input=is_given(bare)
     )
@@ -270,7 +270,7 @@ def renew_rows(scene: Scene, q, t, is_projected: bool) -> Float[Array, " n"]:
     """
     old = rows_of(scene, q.dtype)
     whole = all_rows(scene)
-    bare, q, t = stop_gradient((Scene(whole.system, whole.constraints), q, jnp.asarray(t, q.dtype)))
+    bare, q, t = stop_gradient((whole.without_forces, q, jnp.asarray(t, q.dtype)))
     return _renew(bare, q, t, old, True) if is_projected else _checked_rows(bare, q, t, old)
 
 

@@ -77,7 +77,7 @@ def row_limits(scene: Scene, q, v, t, relative: float) -> tuple[Float[Array, " n
 
 def openness(scene: Scene, q, v, t, relative: float) -> Float[Array, ""]:
     """Largest residual over what counts as closed (see `row_limits`): at most 1 for a state on the constraints. A constant."""
-    state = stop_gradient((Scene(scene.system, scene.constraints), q, v, jnp.asarray(t, q.dtype)))
+    state = stop_gradient((scene.without_forces, q, v, jnp.asarray(t, q.dtype)))
     return kernel(largest_ratio, static=1)(relative, *state)
 
 

@@ -192,7 +192,7 @@ class _Flow(NamedTuple):
 
 def _flow(scene: Scene, q, v, z, tau, t, h) -> _Flow:
     """Motion of a scene without contacts."""
-    system, middle, unforced = scene.system, t + 0.5 * h, Scene(scene.system, scene.constraints)
+    system, middle, unforced = scene.system, t + 0.5 * h, scene.without_forces
     place = displace(system, q, 0.5 * h * v)
     metric = mass_factor(mass_matrix(system, place, middle))
     # States of drives in the middle, by their rates at the start.

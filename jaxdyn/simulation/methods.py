@@ -294,7 +294,7 @@ class Reduced(Method):
         """Rate of the reduced equations."""
         motion = self._basis(y).along(scene, q, y["nu"], t) if in_basis is None else in_basis
         # Without the scene's forces, which `force` includes.
-        reduced = solve_in_basis(Scene(scene.system, scene.constraints), motion, q, force, t)
+        reduced = solve_in_basis(scene.without_forces, motion, q, force, t)
         fixed = {name: jnp.zeros_like(y[name]) for name in self.step_constants}
         return {"q": velocity_to_rate(scene.system, q, motion.v), "nu": reduced.nu_rate} | fixed
 
@@ -333,7 +333,7 @@ def _position_error(scene: Scene, q, error) -> Array:
 def dynamics(scene: Scene, q, v, t, force, rank_tol: float | None = None):
     """Acceleration and multipliers at a state; `force` (nv,) is tau plus the scene's forces, or None."""
     # `force` includes the scene's forces, so that the scene is passed without them: they would act twice.
-    return constrained_dynamics(Scene(scene.system, scene.constraints), q, v, force, t, rank_tol=rank_tol)
+    return constrained_dynamics(scene.without_forces, q, v, force, t, rank_tol=rank_tol)
 
 
 def is_regular(quality) -> Array:
@@ -363,7 +363,7 @@ def may_have_redundant_rows(scene: Scene) -> bool:
     True for a scene of rounded numbers, and for one that is traced, too. A motion of exact numbers with redundant rows among
     fewer than that is right without a selection, by the rank at every evaluation, in short steps.
     """
-    bare = Scene(scene.system, scene.constraints)
+    bare = scene.without_forces
     if scene.rounding or not is_concrete(bare):
         return True
     # Away from the neutral configuration, at which entries of A may vanish that do not vanish elsewhere.

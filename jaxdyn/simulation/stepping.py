@@ -220,7 +220,7 @@ def _advance_contacts(scene: Scene, length, substeps: int, limits, smoothing, re
     """Function (q, v, tau, t, *z) -> (q, v, *z), or ((q, v, *z), ContactStep) with `report`, of a step with contacts."""
     contacts = contacts_of(scene, limits)
     selects_rows = bool(scene.constraints) and may_have_redundant_rows(scene)
-    bare = Scene(scene.system, scene.constraints)
+    bare = scene.without_forces
 
     def advance(q, v, tau, t, *z):
         whole, size = scene, length / np.asarray(substeps, length.dtype)

@@ -175,6 +175,11 @@ class Scene(eqx.Module):
         return self.system.nv
 
     @property
+    def without_forces(self) -> "Scene":
+        """The system with its constraints alone: what rows, projections and assembly depend on."""
+        return Scene(self.system, self.constraints)
+
+    @property
     def rounding(self) -> float:
         """Size of the rounding of the system's poses (`Model.rounding`), 0 for exact ones."""
         # Of the system, so that a scene made of a file's system and other constraints or forces keeps it.

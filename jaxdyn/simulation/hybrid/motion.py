@@ -87,7 +87,7 @@ def hybrid_motion(scene: Scene, control, numbers, options) -> Solution:
     mode, slip, start_ok = _guess(scene, elements, q0, v0, ts[0])
     mode = mode._replace(positive=bind(unknown)[2](q0, v0, ts[0]) > 0)
     if scene.constraints:
-        start_ok = start_ok & consistent(Scene(scene.system, scene.constraints), q0, v0, ts[0])
+        start_ok = start_ok & consistent(scene.without_forces, q0, v0, ts[0])
     y0, most, max_steps = {"q": q0, "v": v0, "slip": slip}, options.max_events, options.max_steps
     if stepsize is not None and not options.limit_is_given:
         max_steps += SEARCH_STEPS * most
