@@ -1,11 +1,15 @@
-"""Steps through contacts of a quadruped with twelve joints and four feet, against `mujoco.rollout`.
+"""Steps through contacts of a quadruped with twelve joints and four feet, or of a box, against `mujoco.rollout`.
 
-    python -m benchmarks.contact_steps [--batch 4096] [--steps 50] [--rounds 5] [--dt 0.002] [--skip-mujoco]
+    python -m benchmarks.contact_steps [quadruped] [--batch 4096] [--steps 50] [--rounds 5] [--dt 0.002] [--skip-mujoco]
+    python -m benchmarks.contact_steps box --batch 64 --steps 250
 
-Both read one MJCF file: a trunk on four legs of three joints, spherical feet on a plane, friction 0.8, motors that hold the
-stance. The trunk starts with random velocities, so that feet stick, slide and lift. Printed are steps a second of both on all
-cores, the time of a gradient of a step over that of the step, both as wall time and as processor time, which counts on a busy
-machine; and errors of the trunk's position against steps of a sixteenth of the length, each program against itself.
+Both read one MJCF file. The quadruped is a trunk on four legs of three joints, with spherical feet on a plane, friction 0.8, and
+torques that hold the stance. The trunk starts with random velocities, so that feet stick, slide and lift. The box falls from
+0.1 m with random velocities, tumbles and comes to rest; jaxdyn takes contacts of its four lowest corners.
+
+Printed are steps a second of both on all cores, the processor time of a simulated second, the time of a gradient of a step over
+that of the step, both as wall time and as processor time, which counts on a busy machine; and errors of the trunk's position
+against steps of a sixteenth of the length, each program against itself, with those of jaxdyn at longer steps.
 """
 
 import argparse
@@ -25,6 +29,29 @@ from jaxdyn.compile import wait_for_code
 
 RADIUS, FRICTION, LEG = 0.02, 0.8, 0.2
 STANCE = (0.0, 0.8, -1.6)
+SIZE = np.array([0.2, 0.15, 0.1])  # of the box
+
+
+def box_mjcf() -> str:
+    """A box of 1 kg above a plane."""
+    x, y, z = SIZE / 2
+    return f"""<mujoco><option gravity="0 0 -9.81" cone="elliptic"/><default><geom friction="{FRICTION} 0.005 0.0001"/></default>
+    <worldbody><geom name="floor" type="plane" size="5 5 1"/><body name="trunk" pos="0 0 0.15"><freejoint name="root"/>
+      <geom type="box" size="{x} {y} {z}" mass="1"/></body></worldbody></mujoco>"""
+
+
+def box_scene(path) -> jd.Scene:
+    """The file's model with its four lowest corners on the ground."""
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", jd.io.NotTakenWarning)  # the shape, which follows here
+        model = jd.io.load_mjcf(path).system
+    return jd.Scene(model, forces=jd.contact.shape_contacts("trunk", jd.contact.Box(SIZE), friction=FRICTION, lowest=4))
+
+
+def box_states(built, batch: int):
+    """Level boxes with random velocities and no torques."""
+    v = np.random.default_rng(0).normal(size=(batch, 6)) * np.array([0.5, 0.5, 0.5, 4, 4, 4])
+    return np.tile([0, 0, 0.15, 1, 0, 0, 0.0], (batch, 1)), v, np.zeros((batch, 6))
 
 
 def mjcf() -> str:
@@ -137,8 +164,14 @@ def measure(call, rounds: int) -> tuple[float, float]:
     return min(wall), min(cpu)
 
 
+def describe_cost(seconds: float, dt: float) -> str:
+    """Processor time of a step and of a simulated second."""
+    return f"{1e6 * seconds:.3g} us of a core a step, {1e3 * seconds / dt:.3g} ms a simulated second"
+
+
 def main():
-    parser = argparse.ArgumentParser(description=__doc__)
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("robot", nargs="?", choices=["quadruped", "box"], default="quadruped")
     parser.add_argument("--batch", type=int, default=4096)
     parser.add_argument("--steps", type=int, default=50)
     parser.add_argument("--rounds", type=int, default=5)
@@ -147,38 +180,42 @@ def main():
     given = parser.parse_args()
     jax.config.update("jax_enable_x64", True)
     print(timing.machine())
+    text, scene_of, states_of = (box_mjcf, box_scene, box_states) if given.robot == "box" else (mjcf, scene, states)
     with tempfile.TemporaryDirectory() as folder:
-        path = Path(folder) / "quadruped.xml"
-        path.write_text(mjcf())
-        built = scene(path)
-        batch = states(built, given.batch)
+        path = Path(folder) / "robot.xml"
+        path.write_text(text())
+        built = scene_of(path)
+        batch = states_of(built, given.batch)
         arrays = [jnp.asarray(x) for x in batch]
         count = given.batch * given.steps
         run = ours(built, given.dt, given.steps)
         finite = np.isfinite(np.asarray(run(*arrays)[0])).all(1)
         print(f"jaxdyn: {np.sum(~finite)} of {given.batch} runs without a solution")
         wall, cpu = measure(lambda: jax.block_until_ready(run(*arrays)), given.rounds)
-        print(f"jaxdyn: {count / wall:.3g} steps/s, {1e6 * cpu / count:.3g} us of a core a step")
+        print(f"jaxdyn: {count / wall:.3g} steps/s, {describe_cost(cpu / count, given.dt)}")
         grad, one = gradient(built, given.dt)
         (w1, c1), (w2, c2) = (measure(lambda f=f: jax.block_until_ready(f(*arrays)), given.rounds) for f in (one, grad))
         print(f"gradient of a step over the step: {w2 / w1:.2f} (wall), {c2 / c1:.2f} (processor)")
         if not given.skip_mujoco:
             call = mujoco_rollout(path, given.dt, given.steps, batch)
             other, used = measure(call, given.rounds)
-            print(f"mujoco: {count / other:.3g} steps/s, {1e6 * used / count:.3g} us of a core a step")
+            print(f"mujoco: {count / other:.3g} steps/s, {describe_cost(used / count, given.dt)}")
             print(f"ratio: {other / wall:.2f} (wall), {used / cpu:.2f} (processor)")
         few = [x[:64] for x in batch]
-        errors = {}
-        for name in ("jaxdyn",) if given.skip_mujoco else ("jaxdyn", "mujoco"):
+        programs = [("jaxdyn", (1, 2, 4))] + [("mujoco", (1,))] * (not given.skip_mujoco)
+        for name, factors in programs:
 
             def place(dt, steps, name=name):
                 if name == "mujoco":
                     return mujoco_rollout(path, dt, steps, few)()[:, :3]
                 return np.asarray(ours(built, dt, steps)(*map(jnp.asarray, few))[0])[:, :3]
 
-            error = place(given.dt, given.steps) - place(given.dt / 16, 16 * given.steps)
-            errors[name] = np.median(np.linalg.norm(error, axis=1))
-        print("median error of the trunk's position, m:", errors)
+            steps = given.steps // max(factors) * max(factors)
+            exact = place(given.dt / 16, 16 * steps)
+            for factor in factors:
+                error = np.linalg.norm(place(factor * given.dt, steps // factor) - exact, axis=1)
+                length, middle = 1e3 * factor * given.dt, np.median(error)
+                print(f"{name}, steps of {length:g} ms: median error of the trunk's position {middle:.2g} m")
 
 
 if __name__ == "__main__":

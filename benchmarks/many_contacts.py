@@ -1,6 +1,8 @@
 """Steps of a quadruped that stands on one to four points of each foot: first call, and time of a step of one sample.
 
-    python -m benchmarks.many_contacts [--points 1 2 3 4] [--steps 500]
+    python -m benchmarks.many_contacts [--points 1 2 3 4] [--steps 500] [--gradient]
+
+With `--gradient` a gradient of all steps by the first velocity, in place of the steps.
 
 The robot is that of `benchmarks.contact_steps`, held by springs and dampers of its joints.
 """
@@ -36,8 +38,8 @@ def scene(points: int) -> jd.Scene:
     return jd.Scene(model, forces=feet)
 
 
-def measure(points: int, steps: int) -> tuple[float, float]:
-    """Seconds of the first call, and microseconds of a step."""
+def measure(points: int, steps: int, with_gradient: bool) -> tuple[float, float]:
+    """Seconds of the first call, and microseconds of a step, or of its part of a gradient."""
     robot = scene(points)
     step, rest = jd.stepper(robot, dt=0.002), jnp.tile(jnp.array([0.0, 0.8, -1.6]), 4)
     q = jd.neutral(robot.system).at[2].set(0.28).at[7:].set(rest)
@@ -46,12 +48,15 @@ def measure(points: int, steps: int) -> tuple[float, float]:
         q, v = state
         return step(state, jnp.concatenate([jnp.zeros(6), 40 * (rest - q[7:]) - v[6:]])), None
 
-    run = jax.jit(lambda q, v: jax.lax.scan(stand, (q, v), length=steps)[0])
+    def run(q, v):
+        return jax.lax.scan(stand, (q, v), length=steps)[0]
+
+    call = jax.jit(jax.grad(lambda q, v: jnp.sum(run(q, v)[0] ** 2), 1) if with_gradient else run)
     clock = [time.perf_counter()]
     for prepare in (lambda: None, wait_for_code):
         prepare()
         clock.append(time.perf_counter())
-        jax.block_until_ready(run(q, jnp.zeros(robot.nv)))
+        jax.block_until_ready(call(q, jnp.zeros(robot.nv)))
         clock.append(time.perf_counter())
     return clock[2] - clock[0], (clock[4] - clock[3]) / steps * 1e6
 
@@ -61,11 +66,14 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--points", type=int, nargs="+", default=[1, 2, 3, 4])
     parser.add_argument("--steps", type=int, default=500)
+    parser.add_argument("--gradient", action="store_true")
     options = parser.parse_args()
     jax.config.update("jax_enable_x64", True)
     print("| contacts | first call, s | step, us |\n|---|---|---|")
     for points in options.points:
-        print("| {} | {:.1f} | {:.3g} |".format(4 * points, *measure(points, options.steps)), flush=True)
+        print(
+            "| {} | {:.1f} | {:.3g} |".format(4 * points, *measure(points, options.steps, options.gradient)), flush=True
+        )
 
 
 if __name__ == "__main__":
