@@ -14,7 +14,7 @@ with contextlib.suppress(ImportError):  # no kernels without llvmlite
 
 
 # Unknowns up to which an elimination is written out.
-_MOST_WRITTEN_OUT = 24
+MOST_WRITTEN_OUT = 24
 # Rows whose distances differ by less than this part are equally far.
 _ALIKE = 1e-3
 
@@ -149,9 +149,10 @@ def eliminate(matrix: jax.Array, right: jax.Array, least: float) -> tuple[jax.Ar
     written out grow with their third power.
     """
     n = len(matrix)
-    if n > _MOST_WRITTEN_OUT:
-        rows, pivots = lax.scan(functools.partial(_clear_column, least), jnp.concatenate([matrix, right], 1), None, n)
-        return rows[:, n:], pivots
+    if n > MOST_WRITTEN_OUT:
+        # Two carries: of a derivative the right side alone is linear.
+        (_, right), pivots = lax.scan(functools.partial(_clear_column, least), (matrix, right), None, n)
+        return right, pivots
     rows, pivots = [], []
     for _ in range(n):
         pivot = matrix[0, 0]
@@ -167,9 +168,13 @@ def eliminate(matrix: jax.Array, right: jax.Array, least: float) -> tuple[jax.Ar
     return solution, jnp.stack(pivots)
 
 
-def _clear_column(least: float, rows, _):
+def _clear_column(least: float, state, _):
     """A step of Gauss and Jordan on the first row and column, which become the last ones; after n of them all are in place."""
-    n, pivot = len(rows), rows[0, 0]
-    first = rows[:1, 1:] / jnp.where(jnp.abs(pivot) > least, pivot, least)
-    rest = jnp.concatenate([rows[1:, 1:] - rows[1:, :1] * first, first])
-    return jnp.concatenate([rest[:, : n - 1], jnp.zeros_like(rest[:, :1]), rest[:, n - 1 :]], 1), pivot
+    matrix, right = state
+    pivot = matrix[0, 0]
+    scale = jnp.where(jnp.abs(pivot) > least, pivot, least)
+    row, value = matrix[:1, 1:] / scale, right[:1] / scale
+    rest = jnp.concatenate([matrix[1:, 1:] - matrix[1:, :1] * row, row])
+    # The first column is zero from here on, and is not read again.
+    rest = jnp.concatenate([rest, jnp.zeros_like(matrix[:, :1])], 1)
+    return (rest, jnp.concatenate([right[1:] - matrix[1:, :1] * value, value])), pivot

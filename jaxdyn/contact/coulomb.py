@@ -16,14 +16,17 @@ Sources: Acary & Cadoux, Applications of an existence result for the Coulomb fri
 simulation of nonsmooth rigid multibody dynamics (2006); Hayashi, Yamashita & Fukushima, SIAM J. Optim. 15 (2005), 593-615.
 """
 
+from collections.abc import Callable
 from functools import partial
 from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
+from jax import lax
 from jaxtyping import Array, Bool, Float
 
 from jaxdyn.compile import batch, eliminate
+from jaxdyn.compile.pivots import MOST_WRITTEN_OUT
 from jaxdyn.contact import jordan
 from jaxdyn.lie.series import safe_sqrt
 from jaxdyn.lie.so3 import matmul
@@ -150,12 +153,31 @@ def _newton_matrix(groups: Groups, blocks, W, shift) -> Array:
     return unit - _apply(groups, D, unit) + _apply(groups, DS, W + jnp.diag(shift))
 
 
-def _solve(matrix, right, exponent: float = 0.5) -> tuple[Array, Array]:
-    """Solution (n, k) and pivots (n,) of `eliminate`; pivots of this power of rounding are replaced: rows are dependent.
+def solver_of(matrix) -> Callable:
+    """Function that maps right sides (n, k) to the solutions of a regular system with derivatives of all orders.
 
     The diagonal blocks of cones need no exchange of rows.
     """
-    return eliminate(matrix, right, float(jnp.finfo(matrix.dtype).eps) ** exponent)
+    inverse = None
+    if len(matrix) > MOST_WRITTEN_OUT:
+        # Products transpose well. A loop that eliminates would keep the matrix of each of its steps.
+        unit = jnp.eye(len(matrix), dtype=matrix.dtype)
+        inverse = lax.stop_gradient(eliminate(matrix, unit, float(jnp.finfo(matrix.dtype).eps))[0])
+    return partial(_solve_regular, inverse, matrix)
+
+
+@jax.custom_jvp
+def _solve_regular(inverse, matrix, right):
+    if inverse is None:
+        return eliminate(matrix, right, float(jnp.finfo(matrix.dtype).eps))[0]
+    return matmul(inverse, right)
+
+
+@_solve_regular.defjvp
+def _solve_regular_jvp(primals, tangents):
+    # The derivative of the operations would be that of each pivot, most of which cancels.
+    solution = _solve_regular(*primals)
+    return solution, _solve_regular(*primals[:2], tangents[2] - matmul(tangents[1], solution))
 
 
 def _shift(scale, exponent: float = _SHIFT) -> Array:
@@ -181,7 +203,8 @@ def _step(groups: Groups, W, q, floor, shift, state: _State) -> _State:
     residual, D, along = _residual(groups, x, y, width)
     blocks, right = _begin_sticking(groups, y, width, step == 0, _blocks(D, along), -residual)
     matrix = _newton_matrix(groups, blocks, W, jnp.where(stage == _PLAIN, 0.0, shift))
-    change, pivots = _solve(matrix, right[:, None])
+    # Pivots of the root of rounding are replaced: rows are dependent.
+    change, pivots = eliminate(matrix, right[:, None], eps**0.5)
     change = change[:, 0]
     rate = matmul(W, change) + own * change
     before = jnp.sqrt(jnp.sum(residual * residual))
@@ -287,7 +310,8 @@ def _attach_derivative_jvp(groups: Groups, primals, tangents):
     (_, DS), shift = zip(*blocks, strict=True), _shift(scale, _SHIFT_OF_DERIVATIVE)
     matrix = _newton_matrix(groups, blocks, W, shift)
     right = -_apply(groups, DS, tangents[1][:, None])
-    change, _ = _solve(matrix, right)
+    solve = solver_of(matrix)
+    change = solve(right)
     # One refinement removes the shift along the range of W.
-    rest, _ = _solve(matrix, _apply(groups, DS, shift[:, None] * change))
+    rest = solve(_apply(groups, DS, shift[:, None] * change))
     return moving, (change + rest)[:, 0]

@@ -76,6 +76,7 @@ def test_solutions_of_few_and_many_unknowns(mode, count):
         found, pivots = jax.jit(jax.vmap(solve, (None, 0, 0)))((), matrices, rights)
         # d tr(b^T A^-1 b) / dA = -A^-T b b^T A^-T
         slope = jax.grad(lambda A: jnp.sum(rights[0].T @ solve((), A, rights[0])[0]))(matrices[0])
+        of_right = jax.grad(lambda b: jnp.sum(rights[1].T @ solve((), matrices[0], b)[0]))(rights[0])
         none = matrices[0].copy()
         none[0] = none[:, 0] = 0
         assert abs(eliminate(jnp.asarray(none), jnp.zeros((count, 1)), 1e-10)[1][0]) == 0
@@ -83,4 +84,5 @@ def test_solutions_of_few_and_many_unknowns(mode, count):
     minors = [np.linalg.det(matrices[0][:k, :k]) if k else 1.0 for k in (0, 1, 2, 3)]
     np.testing.assert_allclose(pivots[0][:3], np.divide(minors[1:], minors[:-1]), rtol=1e-12)
     inverse = np.linalg.inv(matrices[0]).T
+    np.testing.assert_allclose(of_right, inverse @ rights[1], rtol=0, atol=1e-13)
     np.testing.assert_allclose(slope, -inverse @ rights[0] @ rights[0].T @ inverse, rtol=0, atol=1e-13)

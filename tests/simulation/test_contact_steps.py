@@ -564,6 +564,24 @@ def test_a_table_on_twelve_points_stands_and_slides():
     np.testing.assert_allclose(v[:, 0], 1.0 - 0.5 * 9.81 * dt * np.arange(1, 11), rtol=0, atol=1e-10)
 
 
+@pytest.mark.long
+def test_derivatives_of_a_block_that_slides_on_twelve_points():
+    """Speeds after a step of a sliding block are v + h (f / m - mu g): the derivatives by friction, force and speed."""
+    points = [(x, y, -0.1) for x in (-0.3, -0.1, 0.1, 0.3) for y in (-0.2, 0.0, 0.2)]
+    start, dt = jnp.array([0, 0, 0.1, 1, 0, 0, 0.0]), 0.01
+
+    def speed(mu, force, before):
+        contacts = [jd.contact.ground_contact("body", point, mu, name=f"p{i}") for i, point in enumerate(points)]
+        step = jd.stepper(free_body(contacts), dt)
+        return step((start, jnp.zeros(6).at[0].set(before)), jnp.zeros(6).at[0].set(force))[1][0]
+
+    x = 0.5, 0.3, 1.0
+    value, found = jax.jit(jax.value_and_grad(speed, (0, 1, 2)))(*x)
+    assert float(value) == pytest.approx(1 + dt * (0.3 - 0.5 * 9.81), abs=1e-10)
+    np.testing.assert_allclose(found, [-9.81 * dt, dt, 1.0], rtol=0, atol=1e-8)  # forces are unique to half of the digits
+    np.testing.assert_allclose(jax.jit(jax.jacfwd(speed, (0, 1, 2)))(*x), found, rtol=0, atol=1e-10)
+
+
 def test_many_contacts_are_announced():
     points = 0.1 * np.random.default_rng(0).normal(size=(17, 3))
     scene = free_body([jd.contact.ground_contact("body", point, 0.5, name=f"p{i}") for i, point in enumerate(points)])
