@@ -37,7 +37,7 @@ def integer_pow(expansion, params, args, eqn):
     if args[0].dtype.kind != "O":
         return [np.asarray(args[0] ** params["y"] if params["y"] >= 0 else 1 / args[0] ** -params["y"], args[0].dtype)]
     one = as_kind(1, kind_or_refuse(eqn.outvars[0].aval.dtype))
-    return [objects([expansion.graph.power(x, params["y"], one) for x in args[0].ravel().tolist()], args[0].shape)]  # pyright: ignore[reportArgumentType]
+    return [objects([expansion.graph.power(x, params["y"], one) for x in args[0].ravel().tolist()], args[0].shape)]
 
 
 def convert(expansion, params, args, eqn):

@@ -167,7 +167,7 @@ class Pair(Program):
     Its operations are made when they are read: a kernel is written from those of the fast program.
     """
 
-    fast: Program  # pyright: ignore[reportIncompatibleVariableOverride]
+    fast: Program
     careful: Careful
 
     def __init__(self, fast: Program, careful: Careful):
@@ -179,27 +179,27 @@ class Pair(Program):
         self.key = key_within(fast, "pair", careful.digest) if careful.is_kept else None
 
     @functools.cached_property
-    def digest(self) -> str:  # pyright: ignore[reportIncompatibleVariableOverride]
+    def digest(self) -> str:
         """Hash of the digests of both programs."""
         return _digest("pair", self.fast.digest, self.careful.digest)
 
     @property
-    def cost(self) -> int:  # pyright: ignore[reportIncompatibleVariableOverride]
+    def cost(self) -> int:
         """Cost of the fast program."""
         return self.fast.cost
 
     @property
-    def read_places(self) -> tuple[int, ...]:  # pyright: ignore[reportIncompatibleVariableOverride]
+    def read_places(self) -> tuple[int, ...]:
         """All inputs: which of them the careful program reads is not known."""
         return tuple(range(len(self.inputs)))
 
     @property
-    def operations(self) -> list[Operation]:  # pyright: ignore[reportIncompatibleVariableOverride]
+    def operations(self) -> list[Operation]:
         """Operations of both programs."""
         return self._body[0]
 
     @property
-    def results(self) -> tuple[tuple, ...]:  # pyright: ignore[reportIncompatibleVariableOverride]
+    def results(self) -> tuple[tuple, ...]:
         """Entries of the outputs."""
         return self._body[1]
 

@@ -196,7 +196,7 @@ def _mark_jvp(primals, tangents, *, message: str):
 
 def _tangent_jvp(primals, tangents, *, message: str):
     (x,), (tangent,) = primals, tangents
-    bind = _tangent_p.bind  # pyright: ignore[reportOptionalMemberAccess]
+    bind = _tangent_p.bind
     return bind(x, message=message), tangent if is_zero(tangent) else bind(tangent, message=message)
 
 

@@ -90,12 +90,12 @@ class StoredProgram(Program):
         self.__dict__ |= description.known
 
     @functools.cached_property
-    def operations(self) -> list[Operation]:  # pyright: ignore[reportIncompatibleVariableOverride]
+    def operations(self) -> list[Operation]:
         """Operations of the program."""
         return self._body[0]
 
     @functools.cached_property
-    def results(self) -> tuple[tuple, ...]:  # pyright: ignore[reportIncompatibleVariableOverride]
+    def results(self) -> tuple[tuple, ...]:
         """Entries of its outputs."""
         return self._body[1]
 

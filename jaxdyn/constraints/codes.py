@@ -158,8 +158,8 @@ class RESULTS(metaclass=_Enumeration):
     bad_event = _code("The function of a terminal event is not above zero at the start.")
 
     @staticmethod
-    def where(condition: Bool[ArrayLike, ""], code: Result, otherwise: Result) -> Result:
-        """The first code where a condition () holds, else the second."""
+    def where(condition: Any, code: Result, otherwise: Result) -> Result:
+        """The first code where a condition () of any kind of truth value holds, else the second."""
         # Equal known codes stay known when the condition is traced.
         if code.index is otherwise.index:
             return code
@@ -174,7 +174,7 @@ CODES = tuple(name for name, code in vars(RESULTS).items() if isinstance(code, R
 def require_finite(result: Any, *values) -> Any:
     """The result, or `nonfinite` where it is `successful` and a value is not finite."""
     is_finite = jnp.stack([jnp.isfinite(x).all() for x in values]).all()
-    return RESULTS.where(is_finite | (result != RESULTS.successful), result, RESULTS.nonfinite)  # pyright: ignore[reportArgumentType]
+    return RESULTS.where(is_finite | (result != RESULTS.successful), result, RESULTS.nonfinite)
 
 
 def code_of(result: Any) -> Array:

@@ -193,7 +193,7 @@ def _rank_and_result(scene: Scene, q, quality):
     # Rounding makes zero pivots of a singular matrix about nv eps times the largest; the limit is ten times that. NaN marks a
     # mass matrix that is not positive definite.
     rank = _count_rows(scene)
-    result = RESULTS.where(quality > 10 * scene.nv * eps_of(q), RESULTS.successful, RESULTS.dependent_rows)  # pyright: ignore[reportArgumentType]
+    result = RESULTS.where(quality > 10 * scene.nv * eps_of(q), RESULTS.successful, RESULTS.dependent_rows)
     return rank, RESULTS.where(jnp.isfinite(quality), result, RESULTS.singular_mass_matrix)
 
 
@@ -213,7 +213,7 @@ def total_force(scene: Scene, q, v, tau, t) -> Array:
 def _free_dynamics(scene, q, v, force, t) -> ConstrainedDynamics:
     metric = mass_factor(mass_matrix(scene.system, q, t))
     a = metric.solve(force - bias_force(scene.system, q, v, t))
-    result = RESULTS.where(metric.is_definite(), RESULTS.successful, RESULTS.singular_mass_matrix)  # pyright: ignore[reportArgumentType]
+    result = RESULTS.where(metric.is_definite(), RESULTS.successful, RESULTS.singular_mass_matrix)
     return ConstrainedDynamics(a, jnp.zeros((0,), v.dtype), jnp.zeros((), jnp.int32), require_finite(result, a), ())
 
 
@@ -286,7 +286,7 @@ def _by_schur(scene: Scene, q, v, tau, t) -> ConstrainedDynamics:
     a, lam, independent, is_definite = kernel(_by_delassus)(scene, q, v, tau, t)
     if has_selection(scene):
         independent = independent & (_count_rows(scene) == lam.shape[0])
-    result = RESULTS.where(independent, RESULTS.successful, RESULTS.dependent_rows)  # pyright: ignore[reportArgumentType]
+    result = RESULTS.where(independent, RESULTS.successful, RESULTS.dependent_rows)
     result = RESULTS.where(is_definite, result, RESULTS.singular_mass_matrix)
     result = rank_code(scene, require_finite(result, a))
     return ConstrainedDynamics(a, lam, _count_rows(scene), result, layout(scene))

@@ -173,7 +173,7 @@ def rank_code(scene: Scene, result: Any) -> Any:
     if not has_selection(scene):
         return result
     is_clear = scene.constraints[0].gap >= LEAST_GAP
-    return RESULTS.where(is_clear, result, RESULTS.unclear_rank)  # pyright: ignore[reportArgumentType]
+    return RESULTS.where(is_clear, result, RESULTS.unclear_rank)
 
 
 def _select_in_kernel(scene: Scene, q, t, rank_tol: float | None = None) -> Selection:

@@ -243,22 +243,22 @@ def _solve(Q, q, G, h, A, b, cones, pattern: tuple[bytes | None, ...], tol: floa
     if scaled.inverse is not None:
         # Contradictory equality rows: the least-squares solution x0 misses them.
         met = jnp.max(jnp.abs(matmul(scaled.A, scaled.x0) - scaled.b)) <= 10 * tol
-        result = RESULTS.where(met, result, RESULTS.infeasible)  # pyright: ignore[reportArgumentType]
+        result = RESULTS.where(met, result, RESULTS.infeasible)
     if kept:
         pattern = tuple(pattern[i] for i in kept)
         # The loop is not differentiated: `attach_derivative` differentiates the equations of its solution.
         end = solve(jax.lax.stop_gradient(program), pattern, tol, max_steps)
         point = attach_derivative(pattern, program, jax.lax.stop_gradient(end.point))
         steps = end.steps
-        result = RESULTS.where(end.solved, result, RESULTS.stalled)  # pyright: ignore[reportArgumentType]
-        result = RESULTS.where(end.infeasible, RESULTS.infeasible, result)  # pyright: ignore[reportArgumentType]
+        result = RESULTS.where(end.solved, result, RESULTS.stalled)
+        result = RESULTS.where(end.infeasible, RESULTS.infeasible, result)
     else:
         point = Point(-solve_cholesky(cholesky(program.Q), program.q), (), ())
-    result = RESULTS.where(is_definite(scaled.Q, cholesky(scaled.Q)), result, RESULTS.indefinite)  # pyright: ignore[reportArgumentType]
+    result = RESULTS.where(is_definite(scaled.Q, cholesky(scaled.Q)), result, RESULTS.indefinite)
     # Comparisons with NaN are false, and zeroed rows without a bound hide nonfinite entries, so finiteness is checked
     # separately.
     finite = finite & (jnp.isfinite(point.x).all() | (result != RESULTS.successful))
-    result = RESULTS.where(finite, result, RESULTS.nonfinite)  # pyright: ignore[reportArgumentType]
+    result = RESULTS.where(finite, result, RESULTS.nonfinite)
     x, y, z, s = _unscale(scaled, point, kept)
     solution = x, jnp.where(bounded, z[0][:, 0], 0), jnp.where(bounded, s[0][:, 0], h), y, tuple(z[1:]), tuple(s[1:])
     failed = result != RESULTS.successful

@@ -161,7 +161,7 @@ class HybridForce(ForceLoop):
             return tau + matmul(constraint_jacobian(self.scene, q, t).T, self.force_command(q, t, state))
         # Projected by P_omega the constraint forces vanish, so that the motors' torques need only match along the
         # motion.
-        P_omega, motors = projections(self.scene, q, t).P_omega, np.array(self.actuated, int)  # pyright: ignore[reportArgumentType]
+        P_omega, motors = projections(self.scene, q, t).P_omega, np.array(self.actuated, int)
         by_motors = P_omega[:, motors]
         # P_omega has the rank of the degrees of freedom: with more motors than these its columns are dependent.
         inverse = pseudo_inverse(by_motors, tolerance(None, P_omega), True)
@@ -251,9 +251,9 @@ class GaugeInvariant(ForceLoop):
         scene, system, t = self.scene, self.scene.system, jnp.asarray(t, q.dtype)
         J, along, change = self._reference_motion(q, v, t)
         # The Coriolis matrix and not h: it multiplies the reference velocity J s and not v.
-        M, C = mass_matrix(system, q, t), coriolis_matrix(system, q, v, t)  # pyright: ignore[reportArgumentType]
+        M, C = mass_matrix(system, q, t), coriolis_matrix(system, q, v, t)
         # The count is given: under tracing it would be nv minus the number of rows, wrong for dependent ones.
-        gauge = gauge_invariant(scene, q, v, None, t, dof=J.shape[1])  # pyright: ignore[reportArgumentType]
+        gauge = gauge_invariant(scene, q, v, None, t, dof=J.shape[1])
         # W^T J (ed + Kp e), which lies along V2.
         eps = matmul(gauge.V2.T, matmul(gauge.W.T, v - along))
         push = matmul(M, change) + matmul(C, along)
@@ -265,7 +265,7 @@ class GaugeInvariant(ForceLoop):
         free = matmul(gauge.V2, matmul(gauge.V2.T, solve_square(gauge.W, push)))
         tau = matmul(gauge.W, free + matmul(gauge.V1, normal))
         # C v is taken out of h, because `push` has C J s in its place.
-        potential, force = bias_force(system, q, v, t) - matmul(C, v), scene.applied_force(q, v, t)  # pyright: ignore[reportArgumentType]
+        potential, force = bias_force(system, q, v, t) - matmul(C, v), scene.applied_force(q, v, t)
         return tau + potential if force is None else tau + potential - force
 
     def composite_error(self, q: Float[Array, " nq"], v: Float[Array, " nv"], t: Number = 0.0) -> Float[Array, " nr"]:

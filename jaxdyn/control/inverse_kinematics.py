@@ -221,8 +221,8 @@ def _solve(scene: Scene, rows, guess, factors, posture, t, limits: bool, steps: 
     reached = _reaches_targets(fixed, lax.stop_gradient(q), time, aims)
     reached = reached & (opening_of_redundant(scene, q, t) <= most_rounding(q.dtype))
     closed = jnp.all(~exact | (jnp.abs(lax.stop_gradient(values)) <= aims.tolerances))
-    result = RESULTS.where(closed, RESULTS.targets_not_reached, RESULTS.not_assembled)  # pyright: ignore[reportArgumentType]
-    result = RESULTS.where(reached, RESULTS.where(is_nearest, RESULTS.successful, RESULTS.not_nearest), result)  # pyright: ignore[reportArgumentType]
+    result = RESULTS.where(closed, RESULTS.targets_not_reached, RESULTS.not_assembled)
+    result = RESULTS.where(reached, RESULTS.where(is_nearest, RESULTS.successful, RESULTS.not_nearest), result)
     return InverseKinematics(q, jnp.max(counted, initial=0.0), errors, opening, result, tried)
 
 

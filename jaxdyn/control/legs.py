@@ -224,7 +224,7 @@ def underactuated_inverse_dynamics(
     force_weight = as_number(force_weight, "force_weight", zero=True).astype(q.dtype)
     needed = inverse_dynamics(model, q, v, a)
     if not feet:
-        result = RESULTS.where(jnp.any(needed[base] != 0), RESULTS.infeasible, RESULTS.successful)  # pyright: ignore[reportArgumentType]
+        result = RESULTS.where(jnp.any(needed[base] != 0), RESULTS.infeasible, RESULTS.successful)
         tau = needed.at[base].set(0)
         return LeggedDynamics(tau, jnp.zeros((0,), q.dtype), jnp.zeros((0,), q.dtype), result, ())
     # With tau eliminated, |tau|^2 = |needed - across^T f|^2: only f remains in the program.
@@ -249,7 +249,7 @@ def underactuated_inverse_dynamics(
     optimum = solve_qp(Q, linear, A=along, b=needed[base], tol=tol, **bounds)
     # The last iterate of an infeasible program diverges, so it is replaced by the least-norm forces.
     shortest = matmul(pseudo_inverse(along.T, tolerance(None, along)).T, needed[base])
-    forces = jnp.where(optimum.result == RESULTS.infeasible, shortest, optimum.x)  # pyright: ignore[reportArgumentType]
+    forces = jnp.where(optimum.result == RESULTS.infeasible, shortest, optimum.x)
     sizes = np.cumsum([one.size for one in feet])[:-1]
     margins = [one.cone.margin(f) for one, f in zip(feet, jnp.split(forces, sizes), strict=True)]
     # The rows of the base vanish up to the tolerance of the program only.

@@ -226,7 +226,7 @@ def _solve_dynamics(grasp: Grasp, q, nu, tau, t, N, Ndot, is_regular, multiplier
     lam = multipliers(matmul(M, a) + matmul(C, v) + gravity - force)
 
     # The Cholesky factor of an indefinite matrix is NaN.
-    result = RESULTS.where(jnp.isfinite(factor).all(), RESULTS.successful, RESULTS.singular_mass_matrix)  # pyright: ignore[reportArgumentType]
+    result = RESULTS.where(jnp.isfinite(factor).all(), RESULTS.successful, RESULTS.singular_mass_matrix)
     result = RESULTS.where(is_regular, result, RESULTS.singular_basis)
     push = N[velocity_rows(grasp)[0]].T
     return ObjectDynamics(mass, coriolis, gravity_part, force_part, push, rate, v, a, lam, N, result, layout(grasp))

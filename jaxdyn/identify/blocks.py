@@ -232,11 +232,11 @@ def apply_blocks(parameters: Any, y, method: str | None):
     for block in parameters.blocks:
         part = y[begin : begin + block.size]
         begin += block.size
-        leaves[block.place] = jnp.asarray(leaves[block.place])  # pyright: ignore[reportAttributeAccessIssue]
+        leaves[block.place] = jnp.asarray(leaves[block.place])
         if method is not None:
             parts.append(getattr(block, method)(part, leaves).astype(y.dtype))
         block.write(part, leaves)
-    places = {block.place for block in parameters.blocks}  # pyright: ignore[reportAttributeAccessIssue]
+    places = {block.place for block in parameters.blocks}
     return {place: leaves[place] for place in sorted(places)}, jnp.concatenate(parts)
 
 

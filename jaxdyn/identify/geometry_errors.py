@@ -60,7 +60,7 @@ class Mechanism(NamedTuple):
     @property
     def model(self) -> Model:
         """The scene's model."""
-        return self.scene.system  # pyright: ignore[reportReturnType]
+        return self.scene.system
 
     @property
     def places(self) -> tuple[str, ...]:

@@ -50,7 +50,7 @@ def observation_columns(system: Any, observed: Sequence[Any]) -> tuple[int, ...]
         raise ValueError(
             f"{list(columns)} are no coordinates of a {type(system).__name__}; give indices below {system.nv}"
         )
-    return columns  # pyright: ignore[reportReturnType]
+    return columns
 
 
 def on_constraints(scene: Scene, q, v, t, columns: tuple[int, ...] | None) -> Assembly:

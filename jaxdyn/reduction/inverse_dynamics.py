@@ -154,7 +154,7 @@ def _reason(dynamics, chosen) -> str:
 
 def _motors(scene: Scene, motors, dtype) -> tuple[Any, tuple[int, ...] | None]:
     """S (nv, nm), and the velocities that have the motors, None for a matrix."""
-    if motors is not None and np.ndim(motors) == 2:  # pyright: ignore[reportArgumentType]
+    if motors is not None and np.ndim(motors) == 2:
         S = as_array(motors, "motors", dtype)
         if S.shape[0] != scene.nv or not S.shape[1]:
             raise ValueError(f"motors has shape {S.shape}, expected ({scene.nv}, nm) = (nv, nm)")
@@ -197,7 +197,7 @@ def _solve_by_program(scene: Scene, q, v, a_independent, S, weights, t, chosen: 
         chosen, rank_tol, scene, q, v, a_independent, S, weights, t
     )
     # Later codes override earlier ones: torques have no meaning where the motion is not determined.
-    result = RESULTS.where(is_actuated, RESULTS.successful, RESULTS.underactuated)  # pyright: ignore[reportArgumentType]
+    result = RESULTS.where(is_actuated, RESULTS.successful, RESULTS.underactuated)
     result = RESULTS.where(agrees, result, RESULTS.contradictory_rows)
     result = RESULTS.where(is_determined, result, RESULTS.singular_basis)
     result = RESULTS.where(definite, result, RESULTS.singular_mass_matrix)

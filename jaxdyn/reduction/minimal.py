@@ -128,7 +128,7 @@ def solve_in_basis(scene: Scene, motion: VelocityAndDrift, q, tau, t) -> Reduced
     force = matmul(N.T, total_force(scene, q, v, tau, t))
     factor = cholesky(mass)
     rate = solve_cholesky(factor, force - bias)
-    result = RESULTS.where(is_definite(mass, factor), RESULTS.successful, RESULTS.singular_mass_matrix)  # pyright: ignore[reportArgumentType]
+    result = RESULTS.where(is_definite(mass, factor), RESULTS.successful, RESULTS.singular_mass_matrix)
     # The sign of the quality is that of a determinant, and no measure.
     is_regular = jnp.abs(quality) > least_quality(q.dtype)
     result = require_finite(RESULTS.where(is_regular, result, RESULTS.singular_basis), rate)

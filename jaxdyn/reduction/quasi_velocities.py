@@ -231,7 +231,7 @@ def _decouple(scene, q, v, tau, t, rotation, motion_rotation, dof, rank_tol) -> 
     change = matmul(null_projector, free) + matmul(back, wanted)
     rank = rank_of(Lambda, back)
     # The bases have a static number of columns, which is valid for this rank alone.
-    result = RESULTS.where(rank == scene.nv - dof, RESULTS.successful, RESULTS.singular_basis)  # pyright: ignore[reportArgumentType]
+    result = RESULTS.where(rank == scene.nv - dof, RESULTS.successful, RESULTS.singular_basis)
     result = rank_code(scene, result)
     a = matmul(inverse.T, change - matmul(Wdot.T, v))
     return GaugeInvariantDynamics(

@@ -96,9 +96,9 @@ def contact_step(contacts: Contacts, scene: Scene, q, v, z, tau, t, h, smoothing
         & jnp.isfinite(found.v).all()
         & jnp.isfinite(found.z).all()
     )
-    result = RESULTS.where(found.solved, RESULTS.successful, RESULTS.no_contact_impulses)  # pyright: ignore[reportArgumentType]
-    result = RESULTS.where(fine | ~found.solved, result, RESULTS.nonfinite)  # pyright: ignore[reportArgumentType]
-    result = RESULTS.where(found.regular, result, RESULTS.singular_mass_matrix)  # pyright: ignore[reportArgumentType]
+    result = RESULTS.where(found.solved, RESULTS.successful, RESULTS.no_contact_impulses)
+    result = RESULTS.where(fine | ~found.solved, result, RESULTS.nonfinite)
+    result = RESULTS.where(found.regular, result, RESULTS.singular_mass_matrix)
     *state, forces = (jnp.where(fine, x, jnp.nan) for x in (found.q, found.v, found.z, found.impulses / h))
     *state, forces = invalidate_derivatives((*state, forces), ~fine, (scene, q, v, z, tau, t, h))
     by_name, start = {}, 0

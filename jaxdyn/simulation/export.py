@@ -125,7 +125,7 @@ def dimensions(signal: Signal) -> tuple[str, ...]:
 def as_xarray(solution: Any, scene: Any) -> Any:
     """Convert a solution to a dataset of xarray; see `Solution.to_xarray`."""
     try:
-        import xarray  # pyright: ignore[reportMissingImports]
+        import xarray
     except ImportError as error:
         raise ImportError("Solution.to_xarray needs xarray: pip install xarray") from error
     batch = tuple(f"batch{k}" for k in range(np.ndim(solution.q) - 2)) if np.ndim(solution.q) > 3 else ("rollout",)

@@ -148,7 +148,7 @@ class GuardedSolver(Wrapped):
         return self.solver.term_compatible_contr_kwargs
 
     @property
-    def interpolation_cls(self) -> Callable[..., diffrax.AbstractLocalInterpolation]:  # pyright: ignore[reportIncompatibleVariableOverride]
+    def interpolation_cls(self) -> Callable[..., diffrax.AbstractLocalInterpolation]:
         """Dense output of the wrapped method."""
         return self.solver.interpolation_cls
 

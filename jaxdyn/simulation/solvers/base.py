@@ -145,7 +145,7 @@ class ProjectedSolver(Wrapped):
         return self.solver.term_compatible_contr_kwargs
 
     @property
-    def interpolation_cls(self) -> Callable[..., diffrax.AbstractLocalInterpolation]:  # pyright: ignore[reportIncompatibleVariableOverride]
+    def interpolation_cls(self) -> Callable[..., diffrax.AbstractLocalInterpolation]:
         """Dense output of the wrapped method, ending at the projected point."""
         return functools.partial(ProjectedInterpolation, self.solver.interpolation_cls)
 

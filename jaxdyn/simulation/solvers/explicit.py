@@ -57,7 +57,7 @@ class ExplicitSteps(ProjectedSolver):
     field: Callable = eqx.field(static=True, kw_only=True)
 
     @property
-    def interpolation_cls(self) -> Callable[..., diffrax.AbstractLocalInterpolation]:  # pyright: ignore[reportIncompatibleVariableOverride]
+    def interpolation_cls(self) -> Callable[..., diffrax.AbstractLocalInterpolation]:
         """Dense output of the wrapped method, ending at the projected point if there is a projection."""
         interpolation = partial(_Interpolation, self.solver.interpolation_cls)
         return interpolation if self.project is None else partial(ProjectedInterpolation, interpolation)

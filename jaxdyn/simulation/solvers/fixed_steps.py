@@ -90,7 +90,7 @@ class Stepper(diffrax.AbstractSolver):
     term_structure: ClassVar = diffrax.AbstractTerm
 
     @property
-    def interpolation_cls(self) -> Callable[..., diffrax.AbstractLocalInterpolation]:  # pyright: ignore[reportIncompatibleVariableOverride]
+    def interpolation_cls(self) -> Callable[..., diffrax.AbstractLocalInterpolation]:
         """Dense output from the ends of a step and its mean velocity."""
 
         def interpolation(**given):

@@ -53,7 +53,7 @@ class LieGroup(Wrapped):
         return self.solver
 
     @property
-    def interpolation_cls(self) -> Callable[..., diffrax.AbstractLocalInterpolation]:  # pyright: ignore[reportIncompatibleVariableOverride]
+    def interpolation_cls(self) -> Callable[..., diffrax.AbstractLocalInterpolation]:
         """Dense output of the wrapped method in the coordinates of the step."""
         return functools.partial(_Interpolation, self.solver.interpolation_cls, self.topology)
 
