@@ -52,8 +52,8 @@ def expand(
     **Raises:** `NotNumbers`, `TooLong`.
     """
     graph = Graph(most)
-    inputs = [Array(x.aval.shape, np.dtype(x.aval.dtype)) for x in closed.jaxpr.invars]  # pyright: ignore[reportAttributeAccessIssue]
-    outputs = [Array(x.aval.shape, np.dtype(x.aval.dtype)) for x in closed.jaxpr.outvars]  # pyright: ignore[reportAttributeAccessIssue]
+    inputs = _arrays_of(closed.jaxpr.invars)
+    outputs = _arrays_of(closed.jaxpr.outvars)
     for array in (*inputs, *outputs):
         if array.dtype.name not in ("float64", "float32", "bool", "int32", "int64"):
             raise NotNumbers(f"an array of {array.dtype}")
@@ -370,6 +370,11 @@ def _join_entries(x: np.ndarray, known: tuple | None, array: Array) -> np.ndarra
     return objects([next(unknown) if y is None else as_kind(float(y), kind) for y in known], array.shape)
 
 
+def _arrays_of(variables: Any) -> list[Array]:
+    """Shapes and dtypes of variables of a jaxpr."""
+    return [Array(x.aval.shape, np.dtype(x.aval.dtype)) for x in variables]
+
+
 @functools.lru_cache(maxsize=256)
 def _subprogram(inner: ClosedJaxpr, known: tuple, most: int) -> tuple[Program, bool]:
     """The program of a function that others call, and whether it has rules.
@@ -379,7 +384,7 @@ def _subprogram(inner: ClosedJaxpr, known: tuple, most: int) -> tuple[Program, b
     """
     # By the identity of the jaxpr, which JAX keeps for a function under `jit`: of all calls of a function one program is made.
     graph = Graph(most)
-    arrays = [Array(x.aval.shape, np.dtype(x.aval.dtype)) for x in inner.jaxpr.invars]  # pyright: ignore[reportAttributeAccessIssue]
+    arrays = _arrays_of(inner.jaxpr.invars)
     # A subprogram makes no calls of its own but branches: only programs that have both call it.
     expansion, inputs, args = _Expansion(graph, False, True), [], []
     for array, x in zip(arrays, known, strict=True):
@@ -390,7 +395,7 @@ def _subprogram(inner: ClosedJaxpr, known: tuple, most: int) -> tuple[Program, b
         inputs.append(array if x is None else Array((x.count(None),), array.dtype))
         args.append(_join_entries(graph.inputs(len(inputs) - 1, inputs[-1]), x, array))
     results = [as_objects(x) for x in expansion.evaluate(inner, args)]
-    outputs = [Array(x.aval.shape, np.dtype(x.aval.dtype)) for x in inner.jaxpr.outvars]  # pyright: ignore[reportAttributeAccessIssue]
+    outputs = _arrays_of(inner.jaxpr.outvars)
     if expansion.flagged is not False:
         outputs.append(_FLAG)
         results.append(objects([expansion.flagged], ()))
