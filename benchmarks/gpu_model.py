@@ -35,7 +35,7 @@ import numpy as np
 
 import jaxdyn as jd
 from benchmarks import gpu
-from jaxdyn.compile.gpu import ptx, text
+from jaxdyn.compile.gpu import ptx
 
 # An H100 SXM: NVIDIA's data sheet, but for assumptions: a launch, the clock under load, and the rates of memory and L2 cache.
 LAUNCH, CLOCK, MULTIPROCESSORS, SCHEDULERS, WARP = 2.5e-6, 1.7e9, 132, 4 * 132, 32
@@ -52,14 +52,14 @@ def assembled(program, uniform: tuple[bool, ...]) -> SimpleNamespace | None:
         return None
     with tempfile.TemporaryDirectory() as folder:
         path = Path(folder) / "kernel.ptx"
-        path.write_text(ptx.ptx_of(text.module_ir(program, uniform), 90))
+        path.write_text(ptx.ptx_of(ptx.module_ir(program, uniform), 90))
         done = subprocess.run(
             [tool, "-v", "-arch=sm_90", str(path), "-o", str(path.with_suffix(".cubin"))],
             capture_output=True,
             text=True,
         )
     found = re.search(
-        rf"properties for {text.KERNEL}\n\s+(\d+) bytes stack frame, (\d+) bytes spill stores, (\d+) bytes spill loads\n"
+        rf"properties for {ptx.KERNEL}\n\s+(\d+) bytes stack frame, (\d+) bytes spill stores, (\d+) bytes spill loads\n"
         r".*Used (\d+) registers",
         done.stderr,
     )

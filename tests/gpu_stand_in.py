@@ -10,7 +10,7 @@ import numpy as np
 
 from jaxdyn.compile import objects, primitive
 from jaxdyn.compile.code import varying_first
-from jaxdyn.compile.gpu import driver, text
+from jaxdyn.compile.gpu import driver, ptx
 
 HOST_SAMPLE = """@jaxdyn_sample = thread_local global i64 0
 define internal i64 @sample() {
@@ -29,8 +29,8 @@ class HostKernel:
 
     def __init__(self, module: str):
         self.code = objects.Code(objects.compile_text(host_text(module)))
-        self.address = self.code.address(text.KERNEL)
-        self.arrays = module.partition(f"@{text.KERNEL}(")[2].partition(")")[0].count("ptr ")
+        self.address = self.code.address(ptx.KERNEL)
+        self.arrays = module.partition(f"@{ptx.KERNEL}(")[2].partition(")")[0].count("ptr ")
         self.sample = ctypes.c_int64.from_address(self.code.engine.get_global_value_address("jaxdyn_sample"))
 
     def run(self, pointers, samples: int, threads: int) -> None:
@@ -55,15 +55,15 @@ def run_threads(program, args) -> list[np.ndarray]:
 
     def placed(x, array, same):
         flat = x.reshape(array.size) if same else x.reshape(samples, array.size)
-        return np.ascontiguousarray(flat.T if text.is_interleaved(array, same) else flat)
+        return np.ascontiguousarray(flat.T if ptx.is_interleaved(array, same) else flat)
 
     given = [placed(x, array, same) for x, array, same in zip(args, program.inputs, uniform, strict=True)]
     results = [placed(np.zeros((samples, x.size), x.dtype), x, False) for x in program.outputs]
-    kernel = HostKernel(text.module_ir(program, uniform))
+    kernel = HostKernel(ptx.module_ir(program, uniform))
     pointers = [given[i].ctypes.data for i in varying_first(uniform)] + [x.ctypes.data for x in results]
     kernel.run(pointers, samples, samples + 3)  # threads beyond the last sample do nothing
     return [
-        (x.T if text.is_interleaved(array, False) else x).reshape(*lead, array.size)
+        (x.T if ptx.is_interleaved(array, False) else x).reshape(*lead, array.size)
         for x, array in zip(results, program.outputs, strict=True)
     ]
 
@@ -156,7 +156,7 @@ class StandInDriver:
         _P.from_address(at).value = handle
 
     def _cuModuleGetFunction(self, at, module, name):
-        assert name == text.KERNEL.encode()
+        assert name == ptx.KERNEL.encode()
         _P.from_address(at).value = module
 
     def _cuFuncGetAttribute(self, at, which, function):

@@ -11,7 +11,7 @@ from jax import lax
 
 from jaxdyn.compile import objects, target
 from jaxdyn.compile.expansion import expand
-from jaxdyn.compile.gpu import ptx, text
+from jaxdyn.compile.gpu import ptx
 from jaxdyn.compile.gpu.functions import FUNCTIONS, library_text
 
 pytestmark = pytest.mark.native
@@ -133,4 +133,4 @@ def test_every_operation(dtype, integer):
         want = np.stack([row[k] for row in wanted]).reshape(samples, -1)
         assert result.dtype == want.dtype
         np.testing.assert_allclose(result, want, rtol=bound, atol=0)
-    assert ".entry" in ptx.ptx_of(text.module_ir(program, [False, False]), 70)
+    assert ".entry" in ptx.ptx_of(ptx.module_ir(program, [False, False]), 70)

@@ -14,7 +14,7 @@ from gpu_stand_in import recorded_calls, run_threads, uniform_of
 import jaxdyn as jd
 from jaxdyn import compile as backend
 from jaxdyn.compile import target
-from jaxdyn.compile.gpu import ptx, text
+from jaxdyn.compile.gpu import ptx
 
 pytestmark = pytest.mark.native
 
@@ -225,9 +225,9 @@ REGISTERS = {
 @pytest.mark.parametrize("name", [x for x in CASES if x not in LONG])
 def test_ptx_is_written_without_a_toolkit(name):
     for program, args, _ in calls_of(name):
-        written = ptx.ptx_of(text.module_ir(program, uniform_of(args)), 90)
-        assert f".visible .entry {text.KERNEL}(" in written
-        assert ".target sm_90" in written and f".maxntid {text.MAX_THREADS}" in written
+        written = ptx.ptx_of(ptx.module_ir(program, uniform_of(args)), 90)
+        assert f".visible .entry {ptx.KERNEL}(" in written
+        assert ".target sm_90" in written and f".maxntid {ptx.MAX_THREADS}" in written
         # Nothing is left to be linked: every function that is called has a body.
         assert ".extern" not in written
 
@@ -240,13 +240,13 @@ def test_registers_and_spills(name, tmp_path):
         pytest.skip("ptxas is not installed (pip install nvidia-cuda-nvcc-cu12)")
     program, args, _ = max(calls_of(name), key=lambda call: call[0].cost)
     path = tmp_path / "kernel.ptx"
-    path.write_text(ptx.ptx_of(text.module_ir(program, uniform_of(args)), 90))
+    path.write_text(ptx.ptx_of(ptx.module_ir(program, uniform_of(args)), 90))
     done = subprocess.run(
         [tool, "-v", "-arch=sm_90", str(path), "-o", str(tmp_path / "kernel.cubin")], capture_output=True, text=True
     )
     assert done.returncode == 0, done.stderr
     found = re.search(
-        rf"properties for {text.KERNEL}\n\s+(\d+) bytes stack frame, (\d+) bytes spill stores, (\d+) bytes spill loads\n"
+        rf"properties for {ptx.KERNEL}\n\s+(\d+) bytes stack frame, (\d+) bytes spill stores, (\d+) bytes spill loads\n"
         r".*Used (\d+) registers",
         done.stderr,
     )

@@ -23,7 +23,7 @@ import pytest
 import jaxdyn as jd
 from jaxdyn.scale import program
 from jaxdyn.scale import store as stores
-from jaxdyn.scale.lock import lock_store
+from jaxdyn.scale.batch import lock_store
 from jaxdyn.scale.members import members
 
 zarr = pytest.importorskip("zarr", reason="zarr is not installed: the extra scale")

@@ -578,7 +578,9 @@ def test_derivatives_of_a_block_that_slides_on_twelve_points():
     x = 0.5, 0.3, 1.0
     value, found = jax.jit(jax.value_and_grad(speed, (0, 1, 2)))(*x)
     assert float(value) == pytest.approx(1 + dt * (0.3 - 0.5 * 9.81), abs=1e-10)
-    np.testing.assert_allclose(found, [-9.81 * dt, dt, 1.0], rtol=0, atol=1e-8)  # forces are unique to half of the digits
+    np.testing.assert_allclose(
+        found, [-9.81 * dt, dt, 1.0], rtol=0, atol=1e-8
+    )  # forces are unique to half of the digits
     np.testing.assert_allclose(jax.jit(jax.jacfwd(speed, (0, 1, 2)))(*x), found, rtol=0, atol=1e-10)
 
 

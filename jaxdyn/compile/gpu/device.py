@@ -9,9 +9,8 @@ from importlib import resources
 
 from jaxdyn.compile.careful_text import number_of
 from jaxdyn.compile.gpu.driver import DriverError, driver
-from jaxdyn.compile.gpu.ptx import ptx_of
-from jaxdyn.compile.gpu.text import KERNEL, MAX_THREADS, is_interleaved, module_ir
-from jaxdyn.compile.gpu.text import TooLarge as TooLarge
+from jaxdyn.compile.gpu.ptx import KERNEL, MAX_THREADS, is_interleaved, module_ir, ptx_of
+from jaxdyn.compile.gpu.ptx import TooLarge as TooLarge
 from jaxdyn.compile.jax_adapter import ffi_version, register_handler
 from jaxdyn.compile.objects import Code, compile_text
 from jaxdyn.compile.target import SLOTS, Entry, Row, fill_handler, free_entry
