@@ -49,7 +49,6 @@ def test_notebook_prints_what_it_shows(path, tmp_path, monkeypatch):
     monkeypatch.chdir(folder)
     # Outside of a notebook nothing is displayed, so that IPython need not be installed.
     shows_nothing = SimpleNamespace(display=lambda *shown: None, HTML=str)
-    monkeypatch.setitem(sys.modules, "IPython", SimpleNamespace(display=shows_nothing))
     monkeypatch.setitem(sys.modules, "IPython.display", shows_nothing)
     names: dict = {"__name__": "__main__"}
     # A reader has jax's own settings, not the strict ones of the tests.
