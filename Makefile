@@ -74,7 +74,7 @@ wheel: $(VENV)/.installed-test  ## build the wheel, install it elsewhere and try
 	$(BIN)/python -m benchmarks.wheel
 
 notebooks: $(VENV)/.installed-notebook $(VENV)/.installed-test  ## run the notebooks, compare what they print, and write them with outputs into out/notebooks
-	$(PYTEST) tests/package/test_notebooks.py --durations=0
+	$(QUICK) $(PYTEST) tests/package/test_notebooks.py --durations=0
 	$(BIN)/python -m nbconvert --to notebook --execute --output-dir out/notebooks notebooks/*.ipynb
 
 clean:  ## remove outputs and caches, keep .venv

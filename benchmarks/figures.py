@@ -3,9 +3,11 @@
 A table of measured figures is below a heading whose text names its command, `python -m benchmarks.NAME ...`. This runs the
 commands and writes what they print in place: a table of a page is replaced by the printed table with the same first row. A
 line below it gives the commit, the machine and the versions. With words, only commands that contain one of them run. Tables
-whose command prints no table with that row are named. Commands that write pages on their own (`--readme`) are only run.
+whose command prints no table with that row are named. Commands that write pages on their own (`--readme`) are run, and their
+tables get the line.
 
-`--list` runs nothing: each table with its command and the number of commits to the package since it was measured.
+`--list` runs nothing: each table with its command and the number of commits to the package since it was measured, or, without
+that line, since its text was last changed.
 """
 
 import argparse
@@ -94,6 +96,36 @@ def replace(page: Path, command: str, printed: str, note: str) -> tuple[int, lis
     return written, missing
 
 
+def stamp(page: Path, command: str, note: str) -> int:
+    """Write the note below the tables of the page that name the command; their number."""
+    text = page.read_text(encoding="utf-8")
+    chosen = [table for table in tables(page) if command in table.commands]
+    for table in reversed(chosen):
+        old = _STAMP.match(text, table.end)
+        text = text[: table.end] + f"\n*{note}*\n" + text[old.end() if old else table.end :]
+    page.write_text(text, encoding="utf-8")
+    return len(chosen)
+
+
+def age(table: Table) -> str:
+    """Commits to the package since a table was measured, as its note says, or since its text was last changed."""
+    text = table.page.read_text(encoding="utf-8")
+    if table.commit:
+        commit, what = table.commit, "measured"
+    else:
+        first, last = (text.count("\n", 0, place) + 1 for place in (table.start, table.end - 1))
+        blame = _git("blame", "--line-porcelain", f"-L{first},{last}", "--", str(table.page))
+        times = dict(
+            zip(
+                re.findall(r"(?m)^([0-9a-f]{40}) ", blame), re.findall(r"(?m)^committer-time (\d+)", blame), strict=True
+            )
+        )
+        commit, what = max(times, key=lambda name: int(times[name])), "no note; text changed"
+        commit = "HEAD" if not commit.strip("0") else commit[:8]  # not committed yet
+    since = _git("rev-list", "--count", f"{commit}..HEAD", "--", "jaxdyn")
+    return f"{what} at {commit}, {since} commits to jaxdyn ago"
+
+
 def _git(*words: str) -> str:
     return subprocess.run(["git", *words], cwd=ROOT, capture_output=True, text=True, check=True).stdout.strip()
 
@@ -108,9 +140,7 @@ def main(argv=None) -> int:
     if options.list:
         for table in every:
             line = table.page.read_text(encoding="utf-8").count("\n", 0, table.start) + 1
-            since = table.commit and _git("rev-list", "--count", f"{table.commit}..HEAD", "--", "jaxdyn")
-            age = f"{since} commits since {table.commit}" if table.commit else "commit not recorded"
-            print(f"{table.page.relative_to(ROOT)}:{line}: {'; '.join(table.commands) or 'NO COMMAND'} ({age})")
+            print(f"{table.page.relative_to(ROOT)}:{line}: {'; '.join(table.commands) or 'NO COMMAND'} ({age(table)})")
         return int(any(not table.commands for table in every))
     # Imported on use: it asks the machine.
     from benchmarks import timing
@@ -130,14 +160,15 @@ def main(argv=None) -> int:
             print(f"  ended with status {ended.returncode}; its tables stay")
             failed += 1
             continue
-        if re.search(r"--(readme|docs|out docs)", command):
-            continue  # it has written its pages
         versions = ", ".join(f"{name} {number}" for name, number in machine["versions"].items() if number)
         note = (
             f"Measured at commit {_git('rev-parse', '--short', 'HEAD')}, {machine['processor']}, {machine['cores']} cores, "
             f"{versions}; `python -m {command}`."
         )
         for page in dict.fromkeys(table.page for table in every if command in table.commands):
+            if re.search(r"--(readme|docs|out docs)", command):  # it has written its pages
+                print(f"  {page.relative_to(ROOT)}: {stamp(page, command, note)} tables have a note")
+                continue
             written, missing = replace(page, command, ended.stdout, note)
             print(f"  {page.relative_to(ROOT)}: {written} tables written")
             for row in missing:

@@ -1,6 +1,6 @@
 """Cost of one mechanism from its fullest to its barest version: what a scene does not list should not be paid for.
 
-    python -m benchmarks.scene_cost [--batch 1024] [--rounds 20] [--steps 50]
+    python -m benchmarks.scene_cost [--batch 1024] [--rounds 10] [--steps 50]
 
 The ladder takes one thing away at a time: outputs, friction, rows of the loop that depend on others in a plane, the loop,
 gravity, float64. Per rung: operations of the kernels of one evaluation of the accelerations, and the time of it, of one
@@ -184,7 +184,7 @@ def main(argv=None) -> None:
     """Print the tables and write them as JSON."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--batch", type=int, default=1024)
-    parser.add_argument("--rounds", type=int, default=20)
+    parser.add_argument("--rounds", type=int, default=10)
     parser.add_argument("--steps", type=int, default=50)
     options = parser.parse_args(argv)
     jax.config.update("jax_enable_x64", True)

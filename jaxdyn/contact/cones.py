@@ -164,8 +164,8 @@ class FrictionCone(eqx.Module):
         N m for a soft finger's gamma f_n -+ tz, and those of its rows for a surface.
 
         **Arguments:** `force` (m,), N and N m. `smoothing` (), N: the norm is replaced by
-        $\sqrt{f_x^2 + f_y^2 + \mathrm{smoothing}^2}$
-        - that is smooth at a force along the normal too, and the margin is then too small by at most `smoothing`, on the
+        $\sqrt{f_x^2 + f_y^2 + \mathrm{smoothing}^2}$.
+        That is smooth at a force along the normal too, and the margin is then too small by at most `smoothing`, on the
         safe side. With zero the margin has a kink there, at which its derivative is that along the normal.
 
         **Raises:** ValueError for a force of another size.

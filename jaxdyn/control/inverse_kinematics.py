@@ -91,7 +91,7 @@ def inverse_kinematics(
 
     **Arguments:**
 
-    - `scene`: a `Model`, or a scene of one. `guess` (nq,).
+    - `scene`: a `Model`, or a scene of one. `guess` (nq,): the configuration from which the search starts.
     - `targets`: by names of frames: a pose (4, 4), an orientation (3, 3) or a position (3,) in the world; or a dictionary with
       some of `pose`, `position`, `orientation`, and `direction` (3,), along which an `axis` (3,) of the frame (by default its z)
       is to point. "center_of_mass": (3,).

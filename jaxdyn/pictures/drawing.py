@@ -204,7 +204,9 @@ class _Picture:
         self.drawn: list = []
         set_stage(self.ax, self.stage)
         if self.scales:
-            _add_legend(self.ax, self.scales)
+            # In a figure of the user's every drawing has a legend of its own.
+            place, loc = (self.ax.figure, "lower center") if fits else (self.ax, "upper left")
+            place.legend(handles=_legend(self.scales), loc=loc, ncols=2, fontsize=8, frameon=False)
         if fits:
             fit_axes(self.ax)
 
@@ -344,16 +346,15 @@ def scale_forces(forces: list[Force], length: float):
         yield from ((force, length / largest) for force in members)
 
 
-def _add_legend(ax, scales) -> None:
-    """Name the kinds of arrows, each with what its longest arrow stands for."""
+def _legend(scales) -> list:
+    """Lines that name the kinds of arrows, each with what its longest arrow stands for."""
     from matplotlib.lines import Line2D
 
     longest: dict[str, float] = {}
     for force, _ in scales:
         size = float(np.linalg.norm(force.vectors, axis=-1).max())
         longest[force.kind] = max(longest.get(force.kind, 0.0), size)
-    lines = [
+    return [
         Line2D([], [], color=COLORS[kind], label=f"{kind}, longest {size:.3g} N{' m' if kind == 'torque' else ''}")
         for kind, size in longest.items()
     ]
-    ax.figure.legend(handles=lines, loc="lower center", ncols=2, fontsize=8, frameon=False)

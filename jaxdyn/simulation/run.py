@@ -81,14 +81,16 @@ def simulate(
       `jax.tree_util.Partial` carries leaves that can be differentiated and batched; a plain function is static: define
       it once. A `jd.Controller` has a state of its own, integrated with the motion, and receives the multipliers; a
       `jd.Sampled` law is called once a period, and its torque is held.
-    - `method`: "free" or "variational" for a scene without constraints. With them
-      "projected": accelerations with multipliers, and q and v projected onto the constraints after every step and at save
-      points, by the least change in the mass metric;
-      "multipliers": the same without the projection, so that the constraints open as the local errors add up;
-      "reduced": minimal velocities are integrated, and q by v = N nu + v0; `jd.Reduced(basis)` chooses them;
-      "variational": steps of fixed length that keep the energy over long times, with a solver of their own;
-      "baumgarte": feedback of violated rows, for comparison, with the rates `jd.simulation.Baumgarte(alpha, beta)`.
-      "auto" is "free", or "projected", which handles redundant rows and rank loss on the way and needs no choice.
+    - `method`: the form of the equations. "auto", the default, is "free" without constraints and "projected" with them.
+
+        - "free": no constraints.
+        - "projected": accelerations with multipliers, and q and v projected onto the constraints after every step and at save
+          points, by the least change in the mass metric. It handles redundant rows and rank loss.
+        - "multipliers": the same without the projection, so that the constraints open as the local errors add up.
+        - "reduced": minimal velocities are integrated, and q by v = N nu + v0; `jd.Reduced(basis)` chooses them.
+        - "variational": steps of fixed length that keep the energy over long times, with a solver of their own; with or
+          without constraints.
+        - "baumgarte": feedback of violated constraints, for comparison, with the rates `jd.simulation.Baumgarte(alpha, beta)`.
     - `solver`: any diffrax method of an `ODETerm`, `jd.solvers.Rodas5P()`, `jd.solvers.LieGroup(...)` of one of them, or a
       method that takes an implicit and an explicit part (`diffrax.KenCarp4`): implicit are dq/dt = H v and the share of
       the scene's forces in the acceleration, explicit all the rest (inertia, gravity, `control`). Default: `RK4` for fixed steps;
@@ -97,15 +99,18 @@ def simulate(
     - `stepsize`: None for adaptive steps, a number (s) for fixed ones, or a diffrax step-size controller.
     - `rtol`, `atol`: local error of a step, relative to the size of each entry of (q, v), and absolute; by default 1e-8. Values
       below ten times the rounding error of the dtype are raised to that. With fixed steps, tolerances of an implicit solver.
-    - `adjoint`: "reverse" (default) for reverse mode with checkpoints, and Hessians over it; "forward" for jvp, jacfwd and
-      Hessians by forward over forward mode; "direct" for both modes, at a cost that grows with `max_steps`; "backsolve" for the
-      continuous adjoint, whose gradients are approximate, of runs that no event can end; or a diffrax adjoint, with which diffrax
-      makes the steps.
+    - `adjoint`: how derivatives are computed.
+
+        - "reverse" (default): reverse mode with checkpoints, and Hessians over it.
+        - "forward": `jax.jvp`, `jax.jacfwd`, and Hessians by forward over forward mode.
+        - "direct": both modes, at a cost that grows with `max_steps`.
+        - "backsolve": the continuous adjoint, whose gradients are approximate, of runs that no event can end.
+        - a diffrax adjoint: diffrax makes the steps.
     - `outputs`: any of "energy", "power", "work" (one more state, under the same error control), "acceleration" (the rate
       of v: of a free joint that of its body twist; `jd.dynamics.frame_acceleration` gives those of frames in world axes),
       "multipliers", "constraint_residual", "contact_forces" (N, by the names of contacts: two components of friction, then
       the normal force), "contact_margins", "torque" (of the control, behind drives and limits), "control_state" (of a
-      controller), "drive_state" (of drives) and "pose:<frame>". They are computed only if asked for.
+      controller), "drive_state" (of drives) and `"pose:<frame>"`. They are computed only if asked for.
     - `events`: objects of `jd.events`, each kind at most once: `ContactLost` (of a scene with `cones`, whose contacts end the run
       where they are lost unless `ContactLost(stop=False)` is listed), `JointLimit` (without it limits are ignored),
       `ModeSwitches(max_events)` (of forces with modes or pieces), and any number of `Terminal(function)`, which end the run where

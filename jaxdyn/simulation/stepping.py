@@ -61,13 +61,12 @@ def stepper(
     **Arguments:**
 
     - `scene`: a `Scene` or `Model`. `jd.contact.DryFriction` has steps of the same kind.
-    - `dt`: s; `substeps`: steps in it.
+    - `dt`: length of a step, s; `substeps`: integration steps in it.
     - `remat`: if True, reverse mode keeps no more of a step than its state and tau, and computes the rest again. With several
       substeps that costs a step. A run of n steps then keeps 8 (nq + 2 nv) n bytes a sample in float64; with a law as tau,
       which is computed again too, 8 (nq + nv) n bytes and no intermediates of the law.
     - `adjoint`: "reverse" (default), for `jax.grad`, `jax.jacrev` and, over them, `jax.hessian`; "forward" or "direct", for
-      forward mode too (`jax.jvp`, `jax.jacfwd`), in which reverse mode takes longer. Forward mode of "reverse" is refused.
-
+      forward mode too (`jax.jvp`, `jax.jacfwd`), in which reverse mode takes longer. Forward mode of "reverse" raises an error.
     - `limits`: "hold" for the model's joint limits as contacts without friction; None to ignore them.
     - `smoothing`: kappa in J, for learning: normal force times gap of a contact at rest is kappa instead of zero, so that
       contacts that are open have derivatives. Zero by default, for Coulomb's law.

@@ -1,8 +1,5 @@
 """Surfaces that roll on each other: against the equations of Montana and of Lagrange, and spheres in closed form."""
 
-import re
-from pathlib import Path
-
 import diffrax
 import jax
 import jax.numpy as jnp
@@ -336,17 +333,6 @@ def test_a_valley_that_becomes_too_narrow_ends_the_motion():
         solution = jd.simulate(scene, q, v, jnp.linspace(0.0, 0.5, 51), throw=False, max_steps=2000, **options)
         assert solution.result == jd.RESULTS.no_single_contact, solution.result
         assert 0 < float(solution.stats["time_reached"]) < 0.5 and np.isnan(solution.q[-1]).all()
-
-
-@pytest.mark.slow
-def test_the_page_on_constraints_runs():
-    page = (Path(__file__).resolve().parents[2] / "docs/constraints.md").read_text(encoding="utf-8")
-    block = re.search(r"## Rolling of surfaces.*?```python\n(.*?)```", page, flags=re.DOTALL)
-    assert block is not None
-    names: dict = {}
-    with jax.numpy_dtype_promotion("standard"), jax.numpy_rank_promotion("allow"):
-        exec(compile(block[1], "constraints.md", "exec"), names)
-    assert float(names["motion"].constraint_residual.max()) < 1e-11 and names["eta"].shape == (1, 5)
 
 
 BALL = jnp.array([0.0, 0.0, 0.3, 1.0, 0.0, 0.0, 0.0])

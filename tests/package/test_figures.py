@@ -45,6 +45,9 @@ def test_printed_tables_replace_those_of_the_page(tmp_path):
         and "Text." in text
     )
     assert [table.commit for table in figures.tables(page)] == ["2ab", "2ab", None]
+    # Commands that write their pages themselves: the note alone is put below their tables.
+    assert figures.stamp(page, "benchmarks.stiff a", "Measured at commit 5ab, machine.") == 2
+    assert [table.commit for table in figures.tables(page)] == ["5ab", "5ab", None] and "| x | 7 |" in page.read_text()
     written, missing = figures.replace(page, "benchmarks.stiff a", "", "Measured at commit 3, m.")
     assert written == 0 and missing == ["| case | us |", "|  case | us |"]
 
@@ -54,3 +57,11 @@ def test_printed_tables_replace_those_of_the_page(tmp_path):
 )
 def test_tables_of_words_need_no_command(row, is_figures):
     assert figures.has_figures(f"| h | i | j |\n|---|---|---|\n{row}\n") is is_figures
+
+
+@pytest.mark.skipif(not (ROOT / ".git").exists(), reason="no history of the repository")
+def test_ages_are_those_of_the_note_or_of_the_text():
+    one = next(table for table in figures.tables(ROOT / "docs" / "report.md"))
+    assert "no note; text changed at " in figures.age(one) or "measured at " in figures.age(one)
+    head = figures._git("rev-parse", "--short", "HEAD")
+    assert figures.age(one._replace(commit=head)) == f"measured at {head}, 0 commits to jaxdyn ago"

@@ -5,6 +5,7 @@ import inspect
 import re
 from urllib.parse import unquote
 
+import jax
 import numpy as np
 import pytest
 from pages import ROOT, anchors, links, pages, run
@@ -227,6 +228,22 @@ def test_pages_of_robots(page, tmp_path, monkeypatch):
         "sensors": lambda n: n["log"]["wrist"].shape == (51, 6),
     }
     assert checks[page](names)
+
+
+@pytest.mark.slow
+def test_examples_of_the_page_on_constraints_run():
+    names = run("docs/constraints.md", least=6)
+    # Power of the motor that turns the crank at a constant rate: the rate of the energy.
+    q, v, model = names["moving"].q, names["moving"].v, names["model"]
+    dynamics = jd.constrained_dynamics(names["driven"], q, v)
+    _, rate = jax.jvp(lambda q, v: jd.kinetic_energy(model, q, v), (q, v), (v, dynamics.acceleration))
+    np.testing.assert_allclose(names["torque"] * v[0], rate + jd.gravity_force(model, q) @ v, rtol=1e-10)
+    assert float(names["start"].residual.max()) < 1e-11 and names["eta"].shape == (1, 5)
+    # Half of the weight and a newton of margin in each contact: mu f_z - |f_x| = 1.
+    np.testing.assert_allclose(names["forces"].contact_forces, 2 * [0.1 * 9.81, (1 + 0.981) / 0.8], rtol=1e-5)
+    assert all(margin > 1 for margin in names["least"].values())
+    np.testing.assert_allclose(names["motion"].q[-1, 2:5], [0.0, 0.32, 0.0], atol=1e-3)
+    assert names["motion"].success
 
 
 def recipe(section: str, least: int = 2) -> dict:

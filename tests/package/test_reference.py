@@ -13,6 +13,7 @@ import pytest
 from pages import ROOT
 
 import jaxdyn as jd
+from benchmarks import argument_tables
 from jaxdyn.constraints.base import Constraint
 from jaxdyn.simulation.controls import Controller
 from jaxdyn.systems.system import System
@@ -255,3 +256,38 @@ def test_examples_of_docstrings_run(page, tmp_path, monkeypatch):
                     before = dict(names)
                     exec(compile(text, f"{page}: {name}", "exec"), names)
                 use_what_was_made(before, names)
+
+
+def _arguments(function):
+    return [
+        argument_tables.Argument(name, "", None if p.default is p.empty else repr(p.default))
+        for name, p in inspect.signature(function).parameters.items()
+    ]
+
+
+@pytest.mark.parametrize(
+    "function", [jd.simulate, jd.stepper, jd.assemble, jd.inverse_kinematics], ids=lambda f: f.__name__
+)
+def test_every_argument_has_a_description_in_the_table(function):
+    arguments = _arguments(function)
+    general, table = argument_tables.rows(argument_tables.split(inspect.getdoc(function))[1], arguments)
+    names = [argument.name for row in table for argument, _ in row.arguments]
+    assert sorted(names) == sorted(argument.name for argument in arguments)
+    assert not general and all(row.text for row in table)
+    text = argument_tables.with_table(inspect.getdoc(function), arguments)
+    assert all(f"<code>= {argument.default}".replace("'", '"') in text for argument in arguments if argument.default)
+
+
+def test_tables_of_arguments_keep_names_shapes_and_groups():
+    arguments = [
+        argument_tables.Argument(name, "Float[Array, ' nq'] | None", None) for name in ("model", "q", "v", "t")
+    ]
+    general, table = argument_tables.rows("as of `f`; `q` (nq,), `v` (nv,): the state. `t`, s.", arguments)
+    assert general == "as of `f`;"
+    shown = [([name for _, name in row.arguments], row.text) for row in table]
+    assert shown == [
+        (["`model`"], "the bodies and joints."),
+        (["`q` (nq,)", "`v` (nv,)"], "the state."),
+        (["`t`"], "s."),
+    ]
+    assert argument_tables.readable("Float[Array, ' nq'] | None") == "array (nq,) | None"

@@ -1,0 +1,217 @@
+"""Tables of arguments in the reference: an extension of griffe, which mkdocs.yml names.
+
+A docstring describes arguments in prose or as a list, after the mark "**Arguments:**". Here that part becomes a table: names and
+shapes, types and defaults as in the signature, and the description. Arguments without a description have a row with their type.
+"""
+
+import ast
+import re
+from collections.abc import Sequence
+from functools import cache
+from html import escape
+from pathlib import Path
+from typing import NamedTuple
+
+try:
+    from griffe import Extension  # pyright: ignore[reportMissingImports]
+except ImportError:  # an extra of the site; the tables themselves need nothing
+    Extension = object
+
+ROOT = Path(__file__).resolve().parent.parent
+MARK = "**Arguments:**"
+# Plain words for annotations that say little to a reader.
+_WORDS = {"Numbers": "array", "Number": "float", "Row": "array", "Function": "Callable", "ArrayLike": "array"}
+# What these names mean wherever a docstring says no more of them.
+_COMMON = {
+    "model": "the bodies and joints.",
+    "scene": "the mechanism, with its constraints and forces.",
+    "q": "configuration: rad or m, unit quaternions of free and spherical joints.",
+    "v": "velocity: rad/s or m/s, body twists of free joints.",
+    "a": "acceleration, the rate of `v`.",
+    "tau": "generalised force, N m or N.",
+    "t": "time, s.",
+}
+# A name, perhaps with its own arguments, its symbol and its shape or unit.
+_NAME = re.compile(
+    r"`\*{0,2}(\w+)(?:\([^`]*)?`(?: (?:[A-Za-z]|\$[^$]+\$)(?![\w']))?(?:\s\([^()]*(?:\([^()]*\)[^()]*)*\))?"
+)
+
+
+class Argument(NamedTuple):
+    """An argument of a signature."""
+
+    name: str
+    annotation: str
+    default: str | None
+
+
+class Row(NamedTuple):
+    """Arguments that a docstring describes together: their names with symbols and shapes, and the description."""
+
+    arguments: list[tuple[Argument, str]]
+    text: str
+
+
+@cache
+def aliases() -> dict[str, str]:
+    """Annotations that are names for others, of all modules: name and what it stands for."""
+    found = {}
+    for path in (ROOT / "jaxdyn").rglob("*.py"):
+        for node in ast.parse(path.read_text(encoding="utf-8")).body:
+            if isinstance(node, ast.If) and ast.unparse(node.test) == "TYPE_CHECKING":
+                for line in (line for line in node.body if isinstance(line, ast.Assign)):
+                    found[ast.unparse(line.targets[0])] = ast.unparse(line.value)
+    return found | _WORDS
+
+
+def readable(annotation: str) -> str:
+    """An annotation in the words of a reader: aliases replaced, arrays with their shapes."""
+    text = re.sub(r"\bChecked\[(.*)\]$", r"\1", annotation)
+    text = re.sub(r"Float\[Array, ['\"] ?(.*?)['\"]\]", lambda m: _shaped(m[1].split()), text)
+    for _ in range(2):  # aliases of aliases
+        text = re.sub(r"\b\w+\b", lambda m: aliases().get(m[0], m[0]), text)
+    text = re.sub(r"\b[a-z]+\.(?=[A-Z])", "", text)  # classes without their packages
+    parts = dict.fromkeys(re.split(r" \| (?![^\[]*\])", text))
+    return " | ".join(part for part in parts if part != "Sequence[Any]" or "array" not in parts)
+
+
+def _shaped(sizes: Sequence[str]) -> str:
+    return f"array ({', '.join(sizes)}{',' if len(sizes) == 1 else ''})" if sizes else "float"
+
+
+def split(docstring: str) -> tuple[str, str, str]:
+    """A docstring before its arguments, their part without the mark, and the rest; the last two are empty without the mark."""
+    before, mark, rest = docstring.partition(MARK)
+    # Paragraphs belong to the arguments as long as they are items of the list.
+    end = re.search(
+        r"(?m)\*\*[A-Z]\w*:\*\*|^```" + (r"|^(?![-\s])" if rest.lstrip().startswith("- ") else r"|\n\n"), rest
+    )
+    place = end.start() if mark and end else len(rest)
+    return before, rest[:place].strip(), rest[place:]
+
+
+def rows(text: str, arguments: Sequence[Argument]) -> tuple[str, list[Row]]:
+    """What the text says of all arguments, and the rows of a table: each argument once, in the order of the signature."""
+    left = {argument.name.lstrip("*"): argument for argument in arguments}
+    items = [re.sub(r"(?m)^  ", "", item) for item in re.split(r"(?m)^- ", text) if item.strip()]
+    # A name that an item begins with is described there, even if an earlier one mentions it.
+    heads = [match[1] if (match := _NAME.match(item)) else None for item in items]
+    general, found = [], []
+    for item, head in zip(items, heads, strict=True):
+        groups: list[tuple[list[tuple[Argument, str]], int]] = []  # arguments, and where their description begins
+        starts = []
+        for match in _NAME.finditer(item):
+            before = item[: match.start()].replace("\n", " ")
+            chained = groups and re.fullmatch(r",? ?(?:and |or )?", before[groups[-1][1] :])
+            begins = not before or re.search(r"([;.]|, and) $", before)
+            if match[1] not in left or (match[1] in heads and match[1] != head) or not (chained or begins):
+                continue
+            pair = (left.pop(match[1]), match[0])
+            if chained:
+                groups[-1] = ([*groups[-1][0], pair], match.end())
+            else:
+                groups.append(([pair], match.end()))
+                starts.append(match.start())
+        general.append(item[: starts[0]] if starts else item)
+        found += [
+            Row(group, _tidy(item[start:end])) for (group, start), end in zip(groups, [*starts[1:], None], strict=False)
+        ]
+    # Arguments without a description of their own have rows of their own.
+    found = [
+        each
+        for row in found
+        for each in ([row] if row.text else [Row([pair], _COMMON.get(pair[0].name, "")) for pair in row.arguments])
+    ]
+    described = {row.arguments[0][0].name: row for row in found}
+    others = {argument.name for row in found for argument, _ in row.arguments[1:]}
+    table = [
+        described.get(argument.name) or Row([(argument, f"`{argument.name}`")], _COMMON.get(argument.name, ""))
+        for argument in arguments
+        if argument.name not in others
+    ]
+    return " ".join(text.strip() for text in general if text.strip()), table
+
+
+def _tidy(text: str) -> str:
+    return re.sub(r"^[,:;.]?\s+|^[.:;,]$|;?\s+$", "", text)
+
+
+def table(text: str, arguments: Sequence[Argument]) -> str:
+    """Arguments as a table in HTML whose names and descriptions are Markdown."""
+    general, described = rows(text, arguments)
+    lines = [general, "", '<div class="arguments" markdown="1">', '<table markdown="1">']
+    lines += ["<thead><tr><th>Argument</th><th>Type and default</th><th>Description</th></tr></thead>"]
+    lines += ['<tbody markdown="1">']
+    for row in described:
+        for k, (argument, name) in enumerate(row.arguments):
+            kind = readable(argument.annotation)
+            shape = re.search(r" (\(.*\))$", kind)
+            kind = kind.removesuffix(f" {shape[1]}") if shape and shape[1] in name else kind
+            kind = [kind] if kind else []
+            default = [f"= {argument.default}".replace("'", '"')] if argument.default is not None else []
+            cell = "<br>".join(f"<code>{escape(part, quote=False)}</code>" for part in (*kind, *default))
+            lines += ['<tr markdown="1">', f'<td markdown="span">{name}</td>', f"<td>{cell}</td>"]
+            if not k:
+                span = f' rowspan="{len(row.arguments)}"' if len(row.arguments) > 1 else ""
+                lines += [f'<td markdown="1"{span}>', "", row.text, "", "</td>"]
+            lines.append("</tr>")
+    return "\n".join([*lines, "</tbody>", "</table>", "</div>"])
+
+
+def with_table(docstring: str, arguments: Sequence[Argument]) -> str:
+    """A docstring whose arguments are a table."""
+    before, text, after = split(docstring)
+    if not text or not arguments:
+        return docstring
+    return f"{before}{MARK} {table(text, arguments)}\n\n{after}"
+
+
+class ArgumentTables(Extension):  # pyright: ignore[reportGeneralTypeIssues]
+    """Replace the descriptions of arguments by tables in all docstrings of a package."""
+
+    def on_package(self, *, pkg, **_) -> None:
+        """Called once all modules are read."""
+        for module in _members(pkg, "module"):
+            for thing in (*_members(module, "function"), *_members(module, "class")):
+                _write_table(thing)
+                for method in _members(thing, "function") if thing.kind.value == "class" else ():
+                    _write_table(method)
+
+
+def _members(of, kind: str) -> list:
+    own = [member for member in of.members.values() if not member.is_alias and member.kind.value == kind]
+    return [of, *(inner for module in own for inner in _members(module, kind))] if kind == "module" else own
+
+
+def _write_table(thing) -> None:
+    if thing.docstring is None or MARK not in thing.docstring.value:
+        return
+    maker = thing.members.get("__init__") if thing.kind.value == "class" else thing
+    if maker is not None:
+        arguments = [
+            Argument(
+                {"variadic positional": "*", "variadic keyword": "**"}.get(p.kind.value if p.kind else "", "") + p.name,
+                "" if p.annotation is None else str(p.annotation),
+                None if p.default is None or (p.kind and p.kind.value.startswith("variadic")) else str(p.default),
+            )
+            for p in maker.parameters
+            if p.name not in ("self", "cls")
+        ]
+    else:
+        # The fields of a module of equinox, as `field: annotation = default`, and those of its bases.
+        fields = {}
+        for base in (*reversed(thing.mro()), thing):
+            for name, member in base.members.items():
+                if not member.is_alias and member.kind.value == "attribute" and member.annotation is not None:
+                    fields[name] = Argument(name, str(member.annotation), _default(member.value))
+        arguments = [field for field in fields.values() if f"`{field.name}" in thing.docstring.value]
+    thing.docstring.value = with_table(thing.docstring.value, arguments)
+
+
+def _default(value) -> str | None:
+    """Default of a field, `eqx.field(default=...)` included."""
+    text = None if value is None else str(value)
+    if text is None or "field(" not in text:
+        return text
+    given = re.search(r"\bdefault=(.*?)(?:, \w+=|\)$)", text)
+    return given[1] if given else None
