@@ -219,6 +219,9 @@ class Tied(Block):
 
 def _write_entries(leaves: list, place: int, index: Any, values: Array) -> None:
     leaf = leaves[place]
+    if len(index) == leaf.size and np.array_equal(index, np.arange(leaf.size)):
+        leaves[place] = values.astype(leaf.dtype).reshape(leaf.shape)
+        return
     flat = leaf.reshape(-1).at[np.array(index)].set(values.astype(leaf.dtype))
     leaves[place] = flat.reshape(leaf.shape)
 
