@@ -31,7 +31,6 @@ from jaxdyn.identify.replay import SampledTorque as SampledTorque
 from jaxdyn.identify.replay import rollout as rollout
 from jaxdyn.identify.replay import trajectory_error as trajectory_error
 from jaxdyn.identify.result import Fit as Fit
-from jaxdyn.identify.result import ParameterFit as ParameterFit
 from jaxdyn.identify.robot import RobotFit as RobotFit
 from jaxdyn.identify.robot import fit_robot as fit_robot
 from jaxdyn.identify.robot import fit_torques as fit_torques
@@ -53,6 +52,7 @@ from jaxdyn.identify.workflows.payload import fit_payload as fit_payload
 from jaxdyn.identify.workflows.raw_logs import Cutoff as Cutoff
 from jaxdyn.identify.workflows.raw_logs import choose_cutoff as choose_cutoff
 from jaxdyn.identify.workflows.raw_logs import from_raw as from_raw
+from jaxdyn.model.arguments import warn as _warn
 
 __all__ = [
     "EXTRA",
@@ -74,7 +74,6 @@ __all__ = [
     "LogWarning",
     "Measured",
     "Objective",
-    "ParameterFit",
     "Parameters",
     "Payload",
     "RobotFit",
@@ -119,6 +118,9 @@ def __getattr__(name: str) -> Any:
         from jaxdyn.identify.mechanisms import completed
 
         return completed
+    if name == "ParameterFit":
+        _warn("jd.identify.ParameterFit is deprecated; the result of every fit is jd.identify.Fit", DeprecationWarning)
+        return Fit
     if name == "fit_trajectory":
         raise AttributeError(
             "jd.identify.fit_trajectory is gone; call jd.identify.fit_parameters(scene, log, jd.identify.Parameters(scene)"

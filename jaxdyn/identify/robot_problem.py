@@ -21,11 +21,12 @@ from jaxdyn.identify.condensed_fit import (
 from jaxdyn.identify.devices import on_one_thread
 from jaxdyn.identify.interior import robot_chart
 from jaxdyn.identify.logs import Log, idle_coordinates, log_rate, signal_sizes
-from jaxdyn.identify.regression import log_regressor
+from jaxdyn.identify.regression import log_regressor, nominal_parameters, parameter_names
 from jaxdyn.identify.result import Fit
 from jaxdyn.identify.torque_terms import TERMS, ExtraTorque, Friction, TorqueTerm
 from jaxdyn.identify.uncertainty import effective_sample_size, is_white, model_error_factors
 from jaxdyn.model.tree import Model
+from jaxdyn.systems.scene import Scene
 from jaxdyn.tasks import Engine, results
 
 # Share of errors beyond three standard deviations from which on their tails are heavy: 0.3 % of normal ones are, and of those of
@@ -218,7 +219,6 @@ class RobotProblem:
     def result(self, setting: Setting, estimate: Estimate) -> Fit:
         """Estimate as a `Fit`."""
         data = self.data(setting)
-        model, friction = model_with_parameters(self.model, estimate.x[: data.basic], self.basic, setting.v_s)
         used = dict(setting.extra)
         coefficients = estimate.x[data.basic :].reshape(-1, self.model.nv)
         edges = dict(zip(data.counts, np.cumsum((0, *data.counts.values()))[:-1], strict=True))
@@ -226,10 +226,13 @@ class RobotProblem:
         counts = tuple(data.counts[term.name] for term in terms)
         rows = [coefficients[edges[term.name] :][:count] for term, count in zip(terms, counts, strict=True)]
         extra = ExtraTorque(terms, counts, np.concatenate(rows), setting.v_s) if terms else None
+        values = estimate.x[: data.basic]
         return Fit(
-            model=model,
-            friction=friction,
+            system=scene_with_parameters(self.model, values, self.basic, setting.v_s),
             nominal=self.model,
+            names=parameter_names(self.model),
+            values=values,
+            nominal_values=nominal_parameters(self.model),
             history=estimate.minimum.history,
             result=estimate.minimum.result,
             method="torque fit by newton",
@@ -268,8 +271,8 @@ def cross_validation(problem: RobotProblem, engine: Engine) -> Callable:
     return squares
 
 
-def model_with_parameters(model: Model, x: np.ndarray, terms, v_s: float) -> tuple[Model, Friction]:
-    """Model with the parameters x (10 nb + 4 nv,), and the friction law with its offset."""
+def scene_with_parameters(model: Model, x: np.ndarray, terms, v_s: float) -> Scene:
+    """Scene of a model with the parameters x (10 nb + 4 nv,), whose force is the friction law with its offset."""
     dtype, split = model.home.dtype, 10 * model.nb
     viscous, coulomb, offset, armature = jnp.asarray(x[split:].reshape(len(TERMS), model.nv), dtype)
     # A leaf that is absent and not fitted stays absent, so that no program compiles it.
@@ -279,7 +282,7 @@ def model_with_parameters(model: Model, x: np.ndarray, terms, v_s: float) -> tup
         damping=None if model.damping is None and "viscous" not in terms else viscous,
         friction=None if model.friction is None and "coulomb" not in terms else coulomb,
     )
-    return model, Friction(viscous, coulomb, offset, jnp.asarray(v_s, dtype))
+    return Scene(model, forces=(Friction(viscous, coulomb, offset, jnp.asarray(v_s, dtype)),))
 
 
 def huber_weights(errors: Sequence[np.ndarray], threshold: float) -> list[np.ndarray]:
