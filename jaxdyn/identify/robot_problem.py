@@ -21,9 +21,10 @@ from jaxdyn.identify.condensed_fit import (
 from jaxdyn.identify.devices import on_one_thread
 from jaxdyn.identify.interior import robot_chart
 from jaxdyn.identify.logs import Log, idle_coordinates, log_rate, signal_sizes
-from jaxdyn.identify.regression import log_regressor, nominal_parameters, parameter_names
+from jaxdyn.identify.omitted_terms import find_shifts, include_shifts
+from jaxdyn.identify.regression import free_columns, log_regressor, nominal_parameters, parameter_names
 from jaxdyn.identify.result import Fit
-from jaxdyn.identify.torque_terms import TERMS, ExtraTorque, Friction, TorqueTerm
+from jaxdyn.identify.torque_terms import TERMS, ExtraTorque, Friction, TorqueTerm, candidates
 from jaxdyn.identify.uncertainty import effective_sample_size, is_white, model_error_factors
 from jaxdyn.model.tree import Model
 from jaxdyn.systems.scene import Scene
@@ -180,9 +181,19 @@ class RobotProblem:
         data, curved = self.data(setting), self.curvature_data(setting)
         errors = [fit.torques(log) - np.asarray(log.tau, np.float64) for log in self.logs]
         size, widening = effective_sample_size(errors), model_error_factors(self.logs, errors)
-        return intervals(
+        found = intervals(
             self.model, data, setting, estimate, self.weights, self.basic, size, widening, curved, self.still
         )
+        # Columns of the terms that the fit lacks, after its own.
+        known = {term.name for term in self.extra}
+        every = (*self.extra, *(term for term in candidates(self.model) if term.name not in known))
+        loads = [self._load(log, estimate.x) for log in self.logs]
+        weights = None if setting.robust is None else self.sample_weights.get(setting.robust)
+        wide = gather(self.model, self.logs, setting.v_s, every, loads, self.blocks, weights)
+        shifts = find_shifts(wide, setting, estimate, self.weights, size, self.still)
+        fitted = {*range(data.basic), *data.places(setting.extra).tolist()}
+        columns = free_columns(self.model.nb, self.model.nv, self.basic)
+        return include_shifts(found, shifts, np.array(sorted(fitted)), columns)
 
     def with_term(self, term: TorqueTerm) -> "RobotProblem":
         """Copy with the columns of one more term, after all others."""
