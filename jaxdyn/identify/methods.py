@@ -190,6 +190,8 @@ METHODS = ("lbfgs", "adam")
 _CLEAR = 1e-6
 # Steps without a lower loss after which only rounding is left to remove.
 _STALE = 10
+# Random changes that a step tries.
+_CHANGES = 16
 
 
 @contextlib.contextmanager
@@ -267,6 +269,39 @@ class GradientSteps(Method):
     def _iterate(y, state: "_Descent") -> Iterate:
         is_finite = all(bool(jnp.isfinite(x).all()) for x in jax.tree.leaves((state.value, state.gradient)))
         return Iterate(y, float(state.value), state, is_finite)
+
+
+class RandomSteps(Method):
+    """Steps to the best of sixteen random changes: for losses that are infinite beyond limits, where gradients do not help.
+
+    Changes grow after a step that lowers the loss, and shrink after others: a one-plus-lambda evolution strategy with
+    Rechenberg's rule. The state of an iterate is their size.
+
+    **Arguments:** `losses`, from points, stacked leaf by leaf, to their losses (k,); `sizes`: pytree of the first deviations.
+    """
+
+    floor = -np.inf
+
+    def __init__(self, losses: Callable, sizes: Any, seed: int):
+        self.losses, self.sizes, self.seed = losses, sizes, seed
+
+    def init(self, start, kept):
+        """Evaluate the start."""
+        return Iterate(start, float(self.losses(jax.tree.map(lambda x: x[None], start))[0]), 1.0)
+
+    def step(self, iterate, history, best):
+        """Make one step."""
+        rng = np.random.default_rng((self.seed, len(history)))
+        points = jax.tree.map(
+            lambda x, size: np.asarray(x) + iterate.state * size * rng.normal(size=(_CHANGES, *x.shape)),
+            iterate.point,
+            self.sizes,
+        )
+        losses = np.asarray(self.losses(points))
+        k = int(np.argmin(losses))
+        if losses[k] < iterate.loss:
+            return Iterate(jax.tree.map(lambda x: x[k], points), float(losses[k]), 1.5 * iterate.state), None
+        return iterate._replace(state=iterate.state / 1.3), None
 
 
 class _Descent(NamedTuple):

@@ -68,7 +68,7 @@ def fit_mechanism(
     """
     terms = check_terms(terms, v_s)
     logs = as_logs(log, scene.system)
-    columns = np.array(check_motors(scene, logs[0], motors))
+    columns = np.array(check_motors(scene, np.asarray(logs[0].q)[0], motors))
     start = _with_friction(scene, columns, terms, v_s, signal_sizes(logs))
     model: Model = start.system
     every = parameter_names(model, terms)
