@@ -24,6 +24,7 @@ class Block(eqx.Module):
     """Some numbers of a system as functions of coordinates y (size,)."""
 
     names: eqx.AbstractVar[tuple[str, ...]]
+    place: eqx.AbstractVar[int]
 
     @property
     @abc.abstractmethod
@@ -39,8 +40,12 @@ class Block(eqx.Module):
         """Write the numbers into the list of the system's leaves."""
 
     def residual(self, y: Float[Array, " size"], leaves: list) -> Float[Array, " k"]:
-        """Residuals of the prior (k,), of unit standard deviation."""
-        return jnp.zeros((0,), y.dtype)
+        """Residuals of the prior (k,), of unit standard deviation: of a Gaussian one with a `root`, those of y by default."""
+        root = getattr(self, "root", None)
+        return jnp.zeros((0,), y.dtype) if root is None else root @ self._deviation(y, leaves)
+
+    def _deviation(self, y, leaves):
+        return y
 
 
 class Numbers(Block):
@@ -78,11 +83,9 @@ class Numbers(Block):
     def write(self, y, leaves):
         _write_entries(leaves, self.place, self.index, self.values(y, leaves))
 
-    def residual(self, y, leaves):
-        if self.root is None:
-            return super().residual(y, leaves)
+    def _deviation(self, y, leaves):
         mean: Any = self.mean
-        return self.root @ (self.values(y, leaves) - mean)
+        return self.values(y, leaves) - mean
 
 
 class Poses(Block):
@@ -106,9 +109,6 @@ class Poses(Block):
         index = (np.array(self.rows)[:, None] * 16 + np.arange(16)).reshape(-1)
         _write_entries(leaves, self.place, index, poses.reshape(-1))
 
-    def residual(self, y, leaves):
-        return super().residual(y, leaves) if self.root is None else self.root @ y
-
 
 class Directions(Block):
     """Vectors (3,), or screws (6,), of constant length, rotated by exp(hat(B y)), B (3, 2) perpendicular to the vector."""
@@ -131,9 +131,6 @@ class Directions(Block):
 
     def write(self, y, leaves):
         _write_entries(leaves, self.place, self.index, self.values(y, leaves))
-
-    def residual(self, y, leaves):
-        return super().residual(y, leaves) if self.root is None else self.root @ y
 
 
 class Inertias(Block):
@@ -235,11 +232,11 @@ def apply_blocks(parameters: Any, y, method: str | None):
     for block in parameters.blocks:
         part = y[begin : begin + block.size]
         begin += block.size
-        leaves[block.place] = jnp.asarray(leaves[block.place])  # pyright: ignore[reportAttributeAccessIssue]
+        leaves[block.place] = jnp.asarray(leaves[block.place])
         if method is not None:
             parts.append(getattr(block, method)(part, leaves).astype(y.dtype))
         block.write(part, leaves)
-    places = {block.place for block in parameters.blocks}  # pyright: ignore[reportAttributeAccessIssue]
+    places = {block.place for block in parameters.blocks}
     return {place: leaves[place] for place in sorted(places)}, jnp.concatenate(parts)
 
 

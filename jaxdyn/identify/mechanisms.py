@@ -19,7 +19,7 @@ from jaxdyn.constraints.selection import independent_rows
 from jaxdyn.dynamics import quantities as dynamics
 from jaxdyn.identify.logs import Log
 from jaxdyn.identify.torque_terms import friction_regressor
-from jaxdyn.model.arguments import Numbers, as_array, state_dtype, warn
+from jaxdyn.model.arguments import Numbers, as_array, deprecated, state_dtype
 from jaxdyn.model.topology import velocity_indices
 from jaxdyn.model.tree import Model
 from jaxdyn.systems.mass_factor import solve_positive
@@ -286,7 +286,4 @@ def _complete_accelerations(scene, columns, q, v, t, a):
     return jax.vmap(one)(q, v, t, a)
 
 
-def completed(scene: SceneLike, t: Numbers, measured: dict[Any, Any], tau: Numbers, guess: Numbers) -> Log:
-    """Deprecated name of `complete_log`."""
-    warn("jd.identify.completed is deprecated; call complete_log", DeprecationWarning)
-    return complete_log(scene, t, measured, tau, guess)
+completed = deprecated("jd.identify.completed", complete_log)

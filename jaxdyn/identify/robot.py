@@ -16,7 +16,7 @@ from jaxdyn.identify.result import Fit
 from jaxdyn.identify.robot_problem import RobotProblem, cross_validation
 from jaxdyn.identify.selection import PRIORS, ROBUST, VELOCITIES, Choice, Search, search, splits
 from jaxdyn.identify.torque_terms import TERMS, RobotTerms, Terms, candidates, check_terms, split_terms
-from jaxdyn.model.arguments import Checked, Numbers, warn
+from jaxdyn.model.arguments import Checked, Numbers, deprecated
 from jaxdyn.model.tree import Model
 from jaxdyn.tasks import DaskClient, open_engine
 
@@ -49,10 +49,7 @@ class RobotFit(eqx.Module):
         """Shift the torques of a log of this robot by the delays, as for the fit, before `fit.torques` and `fit.error`."""
         return log if self.delays is None else shift_torques(log, self.delays.seconds)
 
-    def aligned(self, log: Log) -> Log:
-        """Deprecated name of `align`."""
-        warn("RobotFit.aligned is deprecated; call align", DeprecationWarning)
-        return self.align(log)
+    aligned = deprecated("RobotFit.aligned", align)
 
 
 @on_one_thread

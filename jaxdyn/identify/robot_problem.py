@@ -59,8 +59,12 @@ class RobotProblem:
         # Terms and prior are not in the key: all candidate columns are condensed, and the prior enters in the fit.
         key = setting.v_s, None if weights is None else setting.robust
         if key not in self._data:
-            self._data[key] = gather(self.model, self.logs, setting.v_s, self.extra, self.loads, self.blocks, weights)
+            self._data[key] = self._gather(setting, weights)
         return self._data[key]
+
+    def _gather(self, setting: Setting, weights, extra=None, loads=None) -> Data:
+        extra, loads = self.extra if extra is None else extra, self.loads if loads is None else loads
+        return gather(self.model, self.logs, setting.v_s, extra, loads, self.blocks, weights)
 
     def fit(self, setting: Setting, **options) -> Estimate:
         """Fit all blocks, unless `options` of `fit_blocks` select some."""
@@ -96,20 +100,12 @@ class RobotProblem:
         plain = setting._replace(robust=None)
         data = fitted = self.data(plain)
         for remaining in reversed(range(1 if setting.robust is None else _WEIGHINGS)):
-            rows = np.asarray(np.linalg.qr(fitted.blocks.rows(self.weights, rest), mode="r"))
-            estimate = fit_blocks(
-                self.chart,
-                fitted,
-                plain,
-                self.sizes,
-                self.weights,
-                rows=rows,
-                count=data.blocks.count(rest),
-                is_rough=True,
-            )
+            rows, count = fitted.blocks.rows(self.weights, rest), data.blocks.count(rest)
+            options = {"rows": rows, "count": count, "is_rough": True}
+            estimate = fit_blocks(self.chart, fitted, plain, self.sizes, self.weights, **options)
             if remaining and setting.robust is not None:
                 weights = huber_weights(self._errors(plain, estimate), setting.robust)
-                fitted = gather(self.model, self.logs, setting.v_s, self.extra, self.loads, self.blocks, weights)
+                fitted = self._gather(setting, weights)
         return data.blocks.squares(estimate.x, part)
 
     def weigh_samples(self, setting: Setting) -> None:
@@ -174,7 +170,7 @@ class RobotProblem:
             return None
         # psi' of Huber's loss: one within the threshold, zero beyond.
         kept = [np.where(weight < 1, 0.0, 1.0) for weight in weights]
-        return gather(self.model, self.logs, setting.v_s, self.extra, self.loads, self.blocks, kept)
+        return self._gather(setting, kept)
 
     def intervals(self, setting: Setting, estimate: Estimate, fit: Fit) -> Intervals:
         """Standard deviations of an estimate, which is this fit."""
@@ -189,7 +185,7 @@ class RobotProblem:
         every = (*self.extra, *(term for term in candidates(self.model) if term.name not in known))
         loads = [self._load(log, estimate.x) for log in self.logs]
         weights = None if setting.robust is None else self.sample_weights.get(setting.robust)
-        wide = gather(self.model, self.logs, setting.v_s, every, loads, self.blocks, weights)
+        wide = self._gather(setting, weights, every, loads)
         shifts = find_shifts(wide, setting, estimate, self.weights, size, self.still)
         fitted = {*range(data.basic), *data.places(setting.extra).tolist()}
         columns = free_columns(self.model.nb, self.model.nv, self.basic)

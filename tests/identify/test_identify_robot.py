@@ -391,7 +391,8 @@ def lasting(seed, n, keep=0.97):
 LEFT_OUT = {
     "ripple": lambda q, v, rigid, v_s: 0.05 * np.sin(11 * q + [0, 1]),
     "quadratic": lambda q, v, rigid, v_s: 0.05 * v * np.abs(v),
-    "spring": lambda q, v, rigid, v_s: 0.1 * np.sin(q + np.array([0.3, 0.5])),
+    # At the second joint: at the first one, about a horizontal axis, a spring is the link's weight.
+    "spring": lambda q, v, rigid, v_s: 0.1 * np.sin(q + 0.5) * np.array([0.0, 1.0]),
     "load": lambda q, v, rigid, v_s: 0.05 * np.abs(rigid) * np.tanh(v / v_s),
     "asymmetric": lambda q, v, rigid, v_s: 0.05 * np.abs(v),
 }

@@ -17,7 +17,7 @@ from jaxdyn.identify.methods import GradientSteps, RandomSteps
 from jaxdyn.identify.regression import base_parameters, free_columns, group_columns
 from jaxdyn.identify.torque_terms import TERMS, Terms, check_terms, friction_regressor
 from jaxdyn.identify.workflows.driven import DrivenRobot, driven_signals, make_driven
-from jaxdyn.identify.workflows.excitation import FourierMotion, random_motion
+from jaxdyn.identify.workflows.excitation import FourierMotion, motion_from_rest, random_motion
 from jaxdyn.model.arguments import Checked, Numbers
 from jaxdyn.model.tree import Model
 from jaxdyn.systems.scene import as_scene
@@ -249,15 +249,6 @@ def _amplitudes(motion: FourierMotion):
     return motion.center, motion.cosine, motion.sine
 
 
-def _with_amplitudes(amplitudes, motion: FourierMotion) -> FourierMotion:
-    """Motion with other amplitudes, at rest at t = 0: both conditions are distributed over all harmonics."""
-    center, cosine, sine = amplitudes
-    k = jnp.arange(1, cosine.shape[0] + 1, dtype=cosine.dtype)[:, None]
-    cosine = cosine - jnp.mean(cosine, axis=0, keepdims=True)
-    sine = sine - jnp.mean(k * sine, axis=0, keepdims=True) / k
-    return FourierMotion(center, cosine, sine, motion.period)
-
-
 @eqx.filter_jit
 def _rows(motion: FourierMotion, task: _Task, places: tuple[int, ...]):
     """Regressor in base parameters (samples * m, p), rows over the torque limits."""
@@ -277,7 +268,7 @@ def _regressor(task: _Task, places: tuple[int, ...], q, v, a, N):
 
 @eqx.filter_jit
 def _loss(amplitudes, motion: FourierMotion, task: _Task, places: tuple[int, ...], objective: str):
-    q, v, a, tau, N, gap = driven_signals(_with_amplitudes(amplitudes, motion), task.robot, task.times)
+    q, v, a, tau, N, gap = driven_signals(motion_from_rest(*amplitudes, period=motion.period), task.robot, task.times)
     W = _regressor(task, places, q, v, a, N) / task.scale[None]
     size = W.shape[1]
     # The floor keeps the logarithm finite where a motion does not excite a direction at all.
@@ -336,7 +327,8 @@ def _descend(motion, task, places, objective, steps, learning_rate, seed, callba
         method = RandomSteps(partial(_losses_of_units, args), sizes, seed)
     report = None if callback is None else lambda step, loss, _: callback(step, loss)
     end = descend(method, _scale_amplitudes(_amplitudes(motion), 1 / task.span), Watch(steps, report))
-    return _with_amplitudes(_scale_amplitudes(end.best.point, task.span), motion), end.history, end.result
+    found = _scale_amplitudes(end.best.point, task.span)
+    return motion_from_rest(*found, period=motion.period), end.history, end.result
 
 
 def _scale_amplitudes(amplitudes, span):
