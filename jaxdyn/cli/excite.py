@@ -18,6 +18,7 @@ from jaxdyn.cli.common import (
     table,
     whole,
 )
+from jaxdyn.cli.identify_mechanism import load_mechanism
 from jaxdyn.constraints.codes import RESULTS
 from jaxdyn.identify import TERMS
 from jaxdyn.identify.workflows.excitation_search import OBJECTIVES
@@ -27,12 +28,14 @@ from jaxdyn.simulation.solution import Solution
 
 HELP = "optimise an exciting motion within limits for the identification of inertias and friction"
 DESCRIPTION = """\
-Find a periodic motion of all joints (a finite Fourier series that starts at rest), within limits of position, velocity and
-torque, whose measured torques identify the robot's inertias and friction best, and write it for a controller.
+Find a periodic motion of all joints, or of the motors of a robot with loops (a finite Fourier series that starts at rest),
+within limits of position, velocity and torque, whose measured torques identify the robot's inertias and friction best, and
+write it for a controller.
 """
 EPILOG = """\
 examples:
   jaxdyn excite panda.urdf --lock panda_finger_joint1 panda_finger_joint2 --out motion.csv --plot motion.png
+  jaxdyn excite five_bar.xml --motors left right --velocity 2 --torque 20 --out motion.csv
   jaxdyn excite arm.urdf --period 20 --harmonics 8 --velocity 1.0 --torque 50 --objective condition --out motion.csv
 
 The CSV file has columns t, q_.., v_.., a_.. and tau_.., the torques of the file's bodies (N m). Run it, log q and
@@ -45,6 +48,12 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Add the arguments of the command."""
     parser.add_argument("urdf", help="the robot; its limits of position, velocity and effort are respected")
     add_model_options(parser)
+    parser.add_argument(
+        "--motors",
+        nargs="+",
+        metavar="JOINT",
+        help="driven joints of a robot with loops, as many as degrees of freedom",
+    )
     parser.add_argument("--out", metavar="FILE", help="write the motion, .csv or .npz")
     parser.add_argument("--plot", metavar="FILE", help="plot the motion to FILE.png, .pdf or .svg")
     parser.add_argument("--period", type=real, default=10.0, metavar="S", help="period of the motion, s (default: 10)")
@@ -89,20 +98,30 @@ def run(args: argparse.Namespace) -> None:
             f"--rate {args.rate:g} --period {args.period:g}: {args.rate * args.period:.3g} rows a period do not hold "
             f"{args.harmonics} harmonics; give more than {2 * args.harmonics}"
         )
-    model = load_model(args.urdf, args)
+    mechanism = load_mechanism(args.urdf, args)
+    model = load_model(args.urdf, args) if mechanism is None else mechanism.system
+    if args.motors and mechanism is None:
+        raise ValueError("--motors: the robot has no loops, and all of its joints are driven; omit it")
     rows = args.rate * args.period * args.periods
     check_memory(
         rows * (1 + model.nq + 3 * model.nv), f"--rate {args.rate:g} --period {args.period:g} --periods {args.periods}"
     )
     # 14 parameters for each joint: ten of its body, four of friction and rotor.
     check_memory(100.0 * args.harmonics * (model.nv * 14) ** 2, f"--harmonics {args.harmonics}")
-    velocity, torque = (
-        None if value is None else per_coordinate(model, value, f"--{name}")
-        for name, value in (("velocity", args.velocity), ("torque", args.torque))
-    )
+    velocity, torque = args.velocity, args.torque
+    if mechanism is None:
+        velocity, torque = (
+            None if value is None else per_coordinate(model, value, f"--{name}")
+            for name, value in (("velocity", velocity), ("torque", torque))
+        )
+    elif not args.motors:
+        joints = ", ".join(model.joint_names)
+        raise ValueError(f"{args.urdf} has loops; name the joints that are driven in --motors, of {joints}")
     motion = identify.exciting_motion(
-        model,
+        model if mechanism is None else mechanism,
         args.terms,
+        motors=args.motors,
+        guess=None if mechanism is None else mechanism.starts["reference"].q,
         period=args.period,
         harmonics=args.harmonics,
         objective=args.objective,
@@ -113,7 +132,7 @@ def run(args: argparse.Namespace) -> None:
         torque=torque,
     )
     log = motion.log(args.rate, args.periods)
-    names = columns_of(model)
+    names, driven = columns_of(model), motion.robot.driven.tolist()
     print(
         f"condition of the regressor {motion.condition:.4g}, of a random motion within the same limits "
         f"{motion.start_condition:.4g}; log det of the information matrix larger by {motion.logdet:.3g}"
@@ -122,14 +141,12 @@ def run(args: argparse.Namespace) -> None:
     q, v, tau = (np.asarray(x) for x in (log.q, log.v, log.tau))
     # For a check by eye against the limits before the motion is run.
     extremes = [q.min(axis=0), q.max(axis=0), abs(v).max(axis=0), abs(tau).max(axis=0)]
-    rows = [
-        [label, *(f"{float(x[j]):.3g}" for x in extremes), unit]
-        for j, (label, unit) in enumerate(zip(names.v, names.force_units, strict=True))
-    ]
+    rows = [[names.v[i], *(f"{float(x[j]):.3g}" for x in extremes), names.force_units[i]] for j, i in enumerate(driven)]
     print(table(["joint", "lowest", "highest", "fastest", "torque", "unit"], rows))
     if out is not None:
         write_log(out, log)
         print(f"Wrote {out}.")
     if plot is not None:
-        ts, q, v, torque = (jnp.asarray(x) for x in (log.t, q, v, tau))
+        log = motion.log(args.rate, args.periods, whole=True)
+        ts, q, v, torque = (jnp.asarray(x) for x in (log.t, log.q, log.v, log.tau))
         plot_motion(plot, model, Solution(ts, q, v, RESULTS.successful, {}, torque=torque))

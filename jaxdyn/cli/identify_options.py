@@ -10,6 +10,7 @@ from jaxdyn import identify
 from jaxdyn.cli.common import number
 from jaxdyn.identify import EXTRA, TERMS, Fit, LeastSquares, Log, RobotFit
 from jaxdyn.model.tree import Model
+from jaxdyn.systems.scene import Scene
 
 # Longest step of the simulation in a trajectory fit, s.
 _LONGEST_STEP = 0.0025
@@ -174,18 +175,10 @@ def refine_by_motion(
         elif rows:
             tree = tree.positive(where, rows=rows)
     refined = identify.fit_parameters(scene, log, tree, objective, solver, execution)
-    friction, model = refined.system.forces[0], refined.system.system
-    return dataclasses.replace(
-        fit,
-        model=model.replace(
-            # A term that the model lacks stays absent.
-            damping=None if model.damping is None else friction.viscous,
-            friction=None if model.friction is None else friction.coulomb,
-        ),
-        friction=friction,
-        history=refined.history,
-        result=refined.result,
-        method=refined.method,
-        sigma=None,
-        as_measured=False,
+    friction, model = refined.friction, refined.model
+    # A term that the model lacks stays absent.
+    model = model.replace(
+        damping=None if model.damping is None else friction.viscous,
+        friction=None if model.friction is None else friction.coulomb,
     )
+    return dataclasses.replace(refined, system=Scene(model, forces=(friction,)), nominal=fit.nominal, terms=fit.terms)

@@ -124,10 +124,16 @@ def _choice_text(choice: Choice, model: Model) -> str:
 
 
 def _widening_text(result: RobotFit, labels) -> list[str]:
-    """Line on joints whose errors show that the model lacks something; none where there is no such joint."""
+    """Lines on joints whose errors show that the model lacks something, and on the terms that these support."""
     cells = [f"{label} {x:.2g}" for label, x in zip(labels, result.intervals.widening, strict=True) if x > 1]
     line = f"The model lacks something that recurs in the errors; intervals are wider by the factors {', '.join(cells)}"
-    return [line] if cells else []
+    lines = [line] if cells else []
+    if omitted := result.intervals.omitted:
+        terms = ", ".join(f"{name} at {labels[joint]}" for name, joint in omitted)
+        lines.append(
+            f"The logs support terms that the fit lacks: {terms}. The intervals include the fits with them (--terms)"
+        )
+    return lines
 
 
 def delays_text(delays: Delays, labels) -> str:

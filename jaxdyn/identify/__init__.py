@@ -1,6 +1,7 @@
 """Identification of parameters from logs: least squares, feasible fits of robots, and fits of any numbers of any system."""
 
-from typing import Any
+from types import ModuleType as _ModuleType
+from typing import Any as _Any
 
 from jaxdyn.identify.condensed_fit import Intervals as Intervals
 from jaxdyn.identify.delays import Delays as Delays
@@ -31,7 +32,6 @@ from jaxdyn.identify.replay import SampledTorque as SampledTorque
 from jaxdyn.identify.replay import rollout as rollout
 from jaxdyn.identify.replay import trajectory_error as trajectory_error
 from jaxdyn.identify.result import Fit as Fit
-from jaxdyn.identify.result import ParameterFit as ParameterFit
 from jaxdyn.identify.robot import RobotFit as RobotFit
 from jaxdyn.identify.robot import fit_robot as fit_robot
 from jaxdyn.identify.robot import fit_torques as fit_torques
@@ -53,72 +53,25 @@ from jaxdyn.identify.workflows.payload import fit_payload as fit_payload
 from jaxdyn.identify.workflows.raw_logs import Cutoff as Cutoff
 from jaxdyn.identify.workflows.raw_logs import choose_cutoff as choose_cutoff
 from jaxdyn.identify.workflows.raw_logs import from_raw as from_raw
-
-__all__ = [
-    "EXTRA",
-    "TERMS",
-    "BaseParameters",
-    "Construction",
-    "Cutoff",
-    "Delays",
-    "DriveGains",
-    "Excitation",
-    "Execution",
-    "Fit",
-    "Friction",
-    "GeometryFit",
-    "Identifiability",
-    "Intervals",
-    "LeastSquares",
-    "Log",
-    "LogWarning",
-    "Measured",
-    "Objective",
-    "ParameterFit",
-    "Parameters",
-    "Payload",
-    "RobotFit",
-    "SampledTorque",
-    "Solver",
-    "TorqueTerm",
-    "Whiteness",
-    "base_parameters",
-    "choose_cutoff",
-    "choose_poses",
-    "complete_log",
-    "exciting_motion",
-    "fit_gains",
-    "fit_geometry",
-    "fit_parameters",
-    "fit_payload",
-    "fit_robot",
-    "fit_torques",
-    "from_raw",
-    "identifiability",
-    "least_squares",
-    "nominal_parameters",
-    "parameter_error",
-    "parameter_names",
-    "regressor",
-    "rollout",
-    "shift_torques",
-    "split",
-    "torque_error",
-    "trajectory_error",
-    "whiteness",
-]
+from jaxdyn.model.arguments import warn as _warn
 
 
 def __dir__() -> list[str]:
     """Names of the namespace; its modules are internal."""
-    return __all__
+    return [x for x, value in globals().items() if x[0] != "_" and not isinstance(value, _ModuleType)]
 
 
-def __getattr__(name: str) -> Any:
+__all__ = __dir__()  # pyright: ignore[reportUnsupportedDunderAll]
+
+
+def __getattr__(name: str) -> _Any:
     if name == "completed":  # the deprecated name of `complete_log`, which warns when it is called
         from jaxdyn.identify.mechanisms import completed
 
         return completed
+    if name == "ParameterFit":
+        _warn("jd.identify.ParameterFit is deprecated; the result of every fit is jd.identify.Fit", DeprecationWarning)
+        return Fit
     if name == "fit_trajectory":
         raise AttributeError(
             "jd.identify.fit_trajectory is gone; call jd.identify.fit_parameters(scene, log, jd.identify.Parameters(scene)"

@@ -24,6 +24,7 @@ class Block(eqx.Module):
     """Some numbers of a system as functions of coordinates y (size,)."""
 
     names: eqx.AbstractVar[tuple[str, ...]]
+    place: eqx.AbstractVar[int]
 
     @property
     @abc.abstractmethod
@@ -39,8 +40,12 @@ class Block(eqx.Module):
         """Write the numbers into the list of the system's leaves."""
 
     def residual(self, y: Float[Array, " size"], leaves: list) -> Float[Array, " k"]:
-        """Residuals of the prior (k,), of unit standard deviation."""
-        return jnp.zeros((0,), y.dtype)
+        """Residuals of the prior (k,), of unit standard deviation: of a Gaussian one with a `root`, those of y by default."""
+        root = getattr(self, "root", None)
+        return jnp.zeros((0,), y.dtype) if root is None else root @ self._deviation(y, leaves)
+
+    def _deviation(self, y, leaves):
+        return y
 
 
 class Numbers(Block):
@@ -78,11 +83,9 @@ class Numbers(Block):
     def write(self, y, leaves):
         _write_entries(leaves, self.place, self.index, self.values(y, leaves))
 
-    def residual(self, y, leaves):
-        if self.root is None:
-            return super().residual(y, leaves)
+    def _deviation(self, y, leaves):
         mean: Any = self.mean
-        return self.root @ (self.values(y, leaves) - mean)
+        return self.values(y, leaves) - mean
 
 
 class Poses(Block):
@@ -106,9 +109,6 @@ class Poses(Block):
         index = (np.array(self.rows)[:, None] * 16 + np.arange(16)).reshape(-1)
         _write_entries(leaves, self.place, index, poses.reshape(-1))
 
-    def residual(self, y, leaves):
-        return super().residual(y, leaves) if self.root is None else self.root @ y
-
 
 class Directions(Block):
     """Vectors (3,), or screws (6,), of constant length, rotated by exp(hat(B y)), B (3, 2) perpendicular to the vector."""
@@ -131,9 +131,6 @@ class Directions(Block):
 
     def write(self, y, leaves):
         _write_entries(leaves, self.place, self.index, self.values(y, leaves))
-
-    def residual(self, y, leaves):
-        return super().residual(y, leaves) if self.root is None else self.root @ y
 
 
 class Inertias(Block):
@@ -219,6 +216,9 @@ class Tied(Block):
 
 def _write_entries(leaves: list, place: int, index: Any, values: Array) -> None:
     leaf = leaves[place]
+    if len(index) == leaf.size and np.array_equal(index, np.arange(leaf.size)):
+        leaves[place] = values.astype(leaf.dtype).reshape(leaf.shape)
+        return
     flat = leaf.reshape(-1).at[np.array(index)].set(values.astype(leaf.dtype))
     leaves[place] = flat.reshape(leaf.shape)
 

@@ -257,6 +257,8 @@ class Intervals(NamedTuple):
     - `base`: the identifiable combinations of inertias and terms, and `combinations`, their definition.
     - `factor`: a 95 % interval is the value plus and minus this many standard deviations (Student's t, blocks - 1).
     - `widening` (nv,): factor of the scatter of each torque's errors, above 1 where these show that the model is wrong.
+    - `omitted`: terms of `EXTRA`, with the index of a torque, that the logs support and the fit lacks. The intervals hold those
+      of the fits with them.
     """
 
     parameters: Spread
@@ -265,6 +267,7 @@ class Intervals(NamedTuple):
     base_covariance: np.ndarray
     factor: float
     widening: np.ndarray
+    omitted: tuple[tuple[str, int], ...] = ()
 
 
 def intervals(
@@ -293,7 +296,7 @@ def intervals(
     (1981), "Robust statistics", section 6.4, whose curvature is that of psi'; Kutner, Nachtsheim, Neter & Li (2005), "Applied
     linear statistical models", section 10.5, variance inflation.
     """
-    jacobian, curvature, free = _local(data, setting, estimate)
+    jacobian, curvature, free = local_coordinates(data, setting, estimate)
     blocks, sigma = data.blocks, estimate.sigma
     # In the chart's coordinates, in which the prior's curvature is known and bounds are inactive or eliminated.
     # A score is quadratic in the weights: their roots make the scatter of a torque's errors larger by the factor itself.
@@ -368,7 +371,7 @@ def _make_spread(names, values, changes, pulled, fitted, marks) -> Spread:
     return Spread(tuple(names), np.asarray(values), np.where(fitted, np.sqrt(total), np.nan), share, marks)
 
 
-def _local(data: Data, setting: Setting, estimate: Estimate):
+def local_coordinates(data: Data, setting: Setting, estimate: Estimate):
     """Jacobian of x by the free coordinates, the prior's curvature in them, and a mask of the free basic parameters."""
     linear, minimum = estimate.chart, estimate.minimum
     derivatives = linear.jacobian(minimum.origin)

@@ -1,15 +1,14 @@
 """Minimisation: the protocol of all methods, the loop that reports and ends a fit, and its checkpoints.
 
-A checkpoint is a line of JSON (the problem, the arrays, the checksum of the rest), then the arrays, as
-`equinox.tree_serialise_leaves` writes them. It is written next to its final name, flushed to the disk, and renamed: a
-process that is killed at any time leaves the previous checkpoint, or the new one, and never half of one.
+A checkpoint is its checksum and an archive of NumPy arrays, with the hash of the problem. It is written next to its
+final name, flushed to the disk, and renamed: a process that is killed at any time leaves the previous checkpoint, or the new one,
+and never half of one.
 """
 
 import abc
 import dataclasses
 import hashlib
 import io
-import json
 import os
 import pathlib
 import re
@@ -25,8 +24,6 @@ import numpy as np
 
 from jaxdyn.constraints.codes import RESULTS
 from jaxdyn.model.arguments import as_path
-
-_FORMAT = 2
 
 
 def fingerprint(*trees: Any) -> str:
@@ -63,14 +60,13 @@ class Checkpoint:
         """
         if not (self.resume and self.path.exists()):
             return None
-        header, payload = read(self.path)
-        if header["problem"] != self.problem:
+        arrays = read(self.path)
+        if str(arrays.pop("problem")) != self.problem:
             raise ValueError(
                 f"checkpoint {self.path} is of another problem (other log, model, parameters or options); name another file, or "
                 "pass resume=False to overwrite it"
             )
-        like = {name: np.zeros(shape, dtype) for name, (shape, dtype) in header["arrays"].items()}
-        return eqx.tree_deserialise_leaves(io.BytesIO(payload), like)
+        return arrays
 
     def save(self, step: int, state: dict[str, Any], *, last: bool = False) -> None:
         """Write the state where the interval has passed, or `last`."""
@@ -97,20 +93,13 @@ def checkpoint_at(path: Any, problem: Any, every: Any, resume: bool) -> Checkpoi
 def write(path: pathlib.Path, problem: str, arrays: dict[str, np.ndarray]) -> None:
     """Write a checkpoint atomically: `path` holds the previous one or this one whenever the process ends."""
     buffer = io.BytesIO()
-    eqx.tree_serialise_leaves(buffer, arrays)
-    payload = buffer.getvalue()
-    header = {
-        "format": _FORMAT,
-        "problem": problem,
-        "arrays": {name: (array.shape, array.dtype.name) for name, array in arrays.items()},
-        "sha256": hashlib.sha256(payload).hexdigest(),
-    }
+    np.savez(buffer, problem=np.array(problem), **arrays)  # pyright: ignore[reportArgumentType]
     path.parent.mkdir(parents=True, exist_ok=True)
     # In the same folder, as a rename is atomic within one file system only; by process, so that two fits do not share it.
     partial = path.with_name(f".{path.name}.{os.getpid()}.part")
     try:
         with open(partial, "wb") as file:
-            file.write(json.dumps(header).encode() + b"\n" + payload)
+            file.write(hashlib.sha256(buffer.getvalue()).digest() + buffer.getvalue())
             file.flush()
             os.fsync(file.fileno())
         os.replace(partial, path)
@@ -118,21 +107,16 @@ def write(path: pathlib.Path, problem: str, arrays: dict[str, np.ndarray]) -> No
         partial.unlink(missing_ok=True)
 
 
-def read(path: pathlib.Path) -> tuple[dict, bytes]:
-    """Read the header and the arrays of a checkpoint.
+def read(path: pathlib.Path) -> dict[str, np.ndarray]:
+    """Read the arrays of a checkpoint, and the hash of its "problem".
 
     **Raises:** ValueError for a file that is no complete checkpoint.
     """
-    # json.dumps writes no line breaks, so that the first one ends the header.
-    line, _, payload = path.read_bytes().partition(b"\n")
-    try:
-        header = json.loads(line)
-        whole = header["format"] == _FORMAT and header["sha256"] == hashlib.sha256(payload).hexdigest()
-    except (ValueError, KeyError, TypeError):
-        whole, header = False, {}
-    if not whole:
+    content, size = path.read_bytes(), hashlib.sha256().digest_size
+    if hashlib.sha256(content[size:]).digest() != content[:size]:
         raise ValueError(f"{path} is no complete checkpoint of a fit; remove it, or name another file")
-    return header, payload
+    with np.load(io.BytesIO(content[size:]), allow_pickle=False) as archive:
+        return dict(archive)
 
 
 class Watch:

@@ -11,7 +11,7 @@ import numpy as np
 
 from jaxdyn.constraints.codes import RESULTS
 from jaxdyn.identify.blocks import Block, Inertias, Numbers, Tied
-from jaxdyn.identify.chart import make_chart
+from jaxdyn.identify.chart import FROM_PSEUDO, LOG_CHOLESKY_BASIS, LOG_CHOLESKY_PLACES, make_chart
 from jaxdyn.identify.condensed import Condensed
 from jaxdyn.identify.descent import Iterate, Method
 from jaxdyn.identify.regression import free_columns, nominal_parameters
@@ -63,39 +63,6 @@ class _State(NamedTuple):
     terms: np.ndarray
     dual: np.ndarray
     slack: np.ndarray
-
-
-# Entries of the factor that the coordinates after the first one change.
-_LOG_CHOLESKY_PLACES = [(0, 0), (1, 1), (2, 2), (0, 1), (1, 2), (0, 2), (0, 3), (1, 3), (2, 3)]
-
-
-def _log_cholesky_basis() -> np.ndarray:
-    """U + U^T (10, 4, 4) for the derivatives U of `inertia.log_cholesky_factor` at zero."""
-    basis = np.zeros((10, 4, 4))
-    # The first coordinate scales the whole factor: the density of the body.
-    basis[0] = np.eye(4)
-    for k, place in enumerate(_LOG_CHOLESKY_PLACES, 1):
-        basis[(k, *place)] = 1
-    # d(U U^T) = dU + dU^T at U = 1.
-    return basis + np.swapaxes(basis, 1, 2)
-
-
-def _from_pseudo() -> np.ndarray:
-    """The linear map (10, 4, 4) of `inertia.parameters_from_pseudo`: m, m c and tr(Sigma) 1 - Sigma of a pseudo-inertia."""
-    rows = np.zeros((10, 4, 4))
-    rows[0, 3, 3] = 1
-    for k in range(3):
-        rows[1 + k, k, 3] = 1
-    for row, (i, j) in zip(rows[4:], ((0, 0), (0, 1), (1, 1), (0, 2), (1, 2), (2, 2)), strict=True):
-        if i == j:
-            # tr(Sigma) is in every diagonal entry of tr(Sigma) 1 - Sigma.
-            row[np.arange(3), np.arange(3)] = 1
-        row[i, j] -= 1
-    return rows
-
-
-# Traces of products of these are the curvature of the divergence along straight lines in x: tr(P^-1 dP P^-1 dP).
-LOG_CHOLESKY_BASIS, _FROM_PSEUDO = _log_cholesky_basis(), _from_pseudo()
 
 
 class LinearChart(NamedTuple):
@@ -176,7 +143,7 @@ def robot_chart(model: Model, terms: tuple[str, ...], inertia: str, sizes) -> Li
     # At a bound a barrier is infinite: start inside.
     start = np.where(positive, np.where(own > 0, own / scale, 0.1), 0.0)
     factors = np.asarray(chart.factors, np.float64)
-    return LinearChart(given, factors, _FROM_PSEUDO, places, chart.count, term_places, scale, positive, start)
+    return LinearChart(given, factors, FROM_PSEUDO, places, chart.count, term_places, scale, positive, start)
 
 
 def block_chart(blocks: Sequence[Block]) -> LinearChart | None:
@@ -221,7 +188,7 @@ def log_cholesky_coordinates(origin: np.ndarray, count: int) -> np.ndarray:
     last = origin[:, 3, 3]
     relative = origin / last[:, None, None]
     logarithms = np.log(np.stack([last, *(relative[:, i, i] for i in range(3))], axis=1))
-    others = np.stack([relative[(slice(None), *place)] for place in _LOG_CHOLESKY_PLACES[3:]], axis=1)
+    others = np.stack([relative[(slice(None), *place)] for place in LOG_CHOLESKY_PLACES[3:]], axis=1)
     return np.concatenate([logarithms, others], axis=1)[:, :count]
 
 

@@ -19,7 +19,7 @@ from jaxdyn.constraints.selection import independent_rows
 from jaxdyn.dynamics import quantities as dynamics
 from jaxdyn.identify.logs import Log
 from jaxdyn.identify.torque_terms import friction_regressor
-from jaxdyn.model.arguments import Numbers, as_array, state_dtype, warn
+from jaxdyn.model.arguments import Numbers, as_array, deprecated, state_dtype
 from jaxdyn.model.topology import velocity_indices
 from jaxdyn.model.tree import Model
 from jaxdyn.systems.mass_factor import solve_positive
@@ -36,6 +36,8 @@ _CONSTRAINT_WEIGHT = 1e2
 # Weight of the squared change of every coordinate: so small that it determines only the coordinates that neither constraints nor
 # measurements do.
 _REGULARISATION = 1e-8
+# Newton steps from one sample of a motion to the next.
+_CLOSING = 4
 
 
 def observation_columns(system: Any, observed: Sequence[Any]) -> tuple[int, ...]:
@@ -124,6 +126,28 @@ def motor_basis(scene: Scene, q, v, t, columns: tuple[int, ...]) -> tuple[Float[
     return N.at[passive].set(solved[:, :-1]), jnp.zeros((scene.nv,), q.dtype).at[passive].set(solved[:, -1])
 
 
+def follow_motors(scene: Scene, columns: tuple[int, ...], start, positions):
+    """Configurations (n, nq) of a mechanism whose motors pass through positions (n, m), from a closed one, and their gaps (n,).
+
+    Newton's method from each sample to the next, with a few steps, for motions of some hundredths of a radian or metre between
+    samples. The gap is the largest residual of a row (m, rad): far from zero where the loops cannot be closed. Joints have one
+    coordinate each. Differentiable in the positions.
+    """
+    motors = np.array(columns)
+    passive = np.setdiff1d(np.arange(scene.nv), motors)
+    holonomic = np.concatenate([np.arange(place.start, place.nonholonomic) for place in layout(scene)])
+
+    def follow(q, position):
+        q = q.at[motors].set(position)
+        for _ in range(_CLOSING):
+            jacobian = rows(scene, q, jnp.zeros_like(q), 0.0).A[holonomic][:, passive]
+            normal = jacobian.T @ jacobian + _REGULARISATION * jnp.eye(len(passive), dtype=q.dtype)
+            q = q.at[passive].add(-solve_positive(normal, jacobian.T @ position_residual(scene, q)))
+        return q, (q, jnp.max(jnp.abs(position_residual(scene, q))))
+
+    return lax.scan(follow, start, positions)[1]
+
+
 def motor_regressor(scene: Scene, log: Log, motors: Sequence[Any], terms: Sequence[str], v_s: float) -> np.ndarray:
     """Regressor (n, m, 10 nb + terms m) of the torques of a mechanism's motors along a log: N^T Y of the tree, then friction.
 
@@ -131,7 +155,7 @@ def motor_regressor(scene: Scene, log: Log, motors: Sequence[Any], terms: Sequen
 
     **Raises:** ValueError unless there are as many motors as degrees of freedom.
     """
-    columns = check_motors(scene, log, motors)
+    columns = check_motors(scene, np.asarray(log.q)[0], motors)
     signals = [jnp.asarray(x, state_dtype(scene.system)) for x in (log.q, log.v, log.a, log.t)]
     return np.asarray(_motor_regressor(scene, columns, tuple(terms), v_s, *signals), np.float64)
 
@@ -147,10 +171,10 @@ def _motor_regressor(scene, columns, terms, v_s, *signals):
     return jax.vmap(one)(*signals)
 
 
-def check_motors(scene: Scene, log: Log, motors: Sequence[Any]) -> tuple[int, ...]:
-    """Indices in v of a mechanism's motors. **Raises:** ValueError unless there are as many as degrees of freedom."""
+def check_motors(scene: Scene, q, motors: Sequence[Any]) -> tuple[int, ...]:
+    """Indices in v of a mechanism's motors. **Raises:** ValueError unless there are as many as degrees of freedom at q."""
     columns = observation_columns(scene.system, motors)
-    count = degrees_of_freedom(scene, jnp.asarray(np.asarray(log.q)[0], state_dtype(scene.system)))
+    count = degrees_of_freedom(scene, jnp.asarray(q, state_dtype(scene.system)))
     if len(columns) != count:
         raise ValueError(
             f"observed has {len(columns)} joints, and the mechanism has {count} degrees of freedom; name as many motors, whose "
@@ -248,7 +272,7 @@ def complete_log(scene: SceneLike, t: Numbers, measured: dict[Any, Any], tau: Nu
     q[:, np.array(q_indices)], v[:, np.array(columns)] = positions, velocities
     log, a = Log(t, q, v, None, np.asarray(tau, np.float64)), None
     if accelerations:
-        check_motors(scene, log, names)
+        check_motors(scene, np.asarray(log.q)[0], names)
         a = _complete_accelerations(scene, columns, *(jnp.asarray(x, dtype) for x in (q, v, t)), *accelerations)
     return log if a is None else Log(t, q, v, np.asarray(a), log.tau)
 
@@ -262,7 +286,4 @@ def _complete_accelerations(scene, columns, q, v, t, a):
     return jax.vmap(one)(q, v, t, a)
 
 
-def completed(scene: SceneLike, t: Numbers, measured: dict[Any, Any], tau: Numbers, guess: Numbers) -> Log:
-    """Deprecated name of `complete_log`."""
-    warn("jd.identify.completed is deprecated; call complete_log", DeprecationWarning)
-    return complete_log(scene, t, measured, tau, guess)
+completed = deprecated("jd.identify.completed", complete_log)

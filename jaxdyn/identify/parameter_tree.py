@@ -30,7 +30,7 @@ from jaxdyn.identify.blocks import (
 from jaxdyn.identify.chart import METRICS, make_chart
 from jaxdyn.identify.sensors import FitSystem, Measured, with_sensors
 from jaxdyn.model import host_math
-from jaxdyn.model.arguments import Function, Number, state_dtype, warn
+from jaxdyn.model.arguments import Function, Number, deprecated, state_dtype
 from jaxdyn.model.arguments import Numbers as Values
 from jaxdyn.model.tree import Model
 from jaxdyn.systems.scene import Scene
@@ -222,15 +222,8 @@ class Parameters(eqx.Module):
         numbers = self._arrays(np.asarray(float(scale)), np.asarray(float(offset)))
         return self._with([*self.blocks, Tied(labels, leaf, tuple(index), other, tuple(other_index), *numbers)])
 
-    def bounded(self, where: Function, lower: Values, upper: Values, **options: Any) -> "Parameters":
-        """Deprecated name of `bound`."""
-        warn("Parameters.bounded is deprecated; call bound", DeprecationWarning)
-        return self.bound(where, lower, upper, **options)
-
-    def tied(self, where: Function, to: Function, **options: Any) -> "Parameters":
-        """Deprecated name of `tie`."""
-        warn("Parameters.tied is deprecated; call tie", DeprecationWarning)
-        return self.tie(where, to, **options)
+    bounded = deprecated("Parameters.bounded", bound)
+    tied = deprecated("Parameters.tied", tie)
 
     # Quantities that a fit needs.
 
@@ -265,7 +258,7 @@ class Parameters(eqx.Module):
         others = [model.inertias, model.armature, model.damping, model.friction]
         # By identity, as in `_model`.
         fixed = {id(x) for x in jax.tree.leaves((model, sensors))} - {id(x) for x in others}
-        return not any(id(leaves[block.place]) in fixed for block in self.blocks)  # pyright: ignore[reportAttributeAccessIssue]
+        return not any(id(leaves[block.place]) in fixed for block in self.blocks)
 
     def system(self, y: Float[Array, " p"]) -> PyTree:
         """System as given, with the numbers of y."""
@@ -328,7 +321,7 @@ class Parameters(eqx.Module):
 
     def _refuse_twice(self, place: int, name: str, argument: str, index: Sequence[int] | None = None) -> None:
         for block in self.blocks:
-            if block.place != place:  # pyright: ignore[reportAttributeAccessIssue]
+            if block.place != place:
                 continue
             taken = entries_of_block(block)
             if index is None or taken is None or set(index) & set(taken):

@@ -19,10 +19,8 @@ from jaxdyn.identify.interior import TorqueProblem, block_chart, log_cholesky_co
 from jaxdyn.identify.logs import Log
 from jaxdyn.identify.methods import (
     DAMPING,
-    SOLVERS,
     GaussNewton,
     GradientSteps,
-    LeastSquaresSteps,
     LinearErrors,
     Unknowns,
     confirm_minimum,
@@ -41,7 +39,7 @@ from jaxdyn.identify.problem import (
     pose_problem,
     values_and_jacobian,
 )
-from jaxdyn.identify.result import ParameterFit
+from jaxdyn.identify.result import Fit
 from jaxdyn.identify.sensors import FitSystem
 from jaxdyn.identify.uncertainty import error_groups, standard_deviations, student
 from jaxdyn.model.arguments import Checked, Function
@@ -65,7 +63,7 @@ def fit_parameters(
     positive: Function | None = None,
     free: Function | None = None,
     **options: Any,
-) -> ParameterFit:
+) -> Fit:
     """Fit numbers of a model, a Lagrangian, a force, a sensor, ..., to one or several logs.
 
     Numbers that neither logs nor prior determine stay near their start, and their deviation is infinite.
@@ -84,7 +82,7 @@ def fit_parameters(
       reports, a `jd.identify.Execution`.
     - `options`: deprecated, options of these three by their own names.
 
-    **Returns:** `ParameterFit`. Its `result` is `stopped` when the callback or the time limit stopped it, `nonfinite` when errors
+    **Returns:** `Fit`. Its `result` is `stopped` when the callback or the time limit stopped it, `nonfinite` when errors
     are not finite; `cause` then names the log, the sample and the parameters.
 
     **Raises:** ValueError when log and system do not fit together, for leaves that cannot be selected, where no start has finite
@@ -116,7 +114,7 @@ def fit_parameters(
         groups = error_groups(problem, logs, linear.errors[: len(linear.errors) - linear.priors])
         # Groups are numbered from zero: the largest number is the degrees of freedom, groups - 1.
         deviation, factor = standard_deviations(linear, jacobian, groups), student(int(groups.max(initial=1)))
-    return ParameterFit(
+    return Fit(
         system=tree.system(y),
         nominal=system,
         names=tree.names,
@@ -144,10 +142,6 @@ def _minimise(
         linear, history = end.last.state[0], np.concatenate([before, end.history])
         result = confirm_minimum(end.result, linear, solver.tolerance, rounding)
         return Descent(end.last, end.last, history, result), linear
-    if solver.name in SOLVERS:
-        end = descend(LeastSquaresSteps(errors_of, problem, solver.name, solver.tolerance), unknowns, watch)
-        linear = linearise(problem, end.best.point)
-        return end._replace(result=confirm_minimum(end.result, linear, solver.tolerance, rounding)), linear
     steps = GradientSteps(
         loss_of,
         problem,

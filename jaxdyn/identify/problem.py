@@ -84,7 +84,11 @@ def pose_problem(
     if objective.observed is not None:
         # The torques of motors determine those of a mechanism only where there are as many as degrees of freedom.
         is_driven = scene.constraints and objective.error == "torque"
-        find = partial(check_motors, scene, logs[0]) if is_driven else partial(observation_columns, scene.system)
+        find = (
+            partial(check_motors, scene, np.asarray(logs[0].q)[0])
+            if is_driven
+            else partial(observation_columns, scene.system)
+        )
         objective = dataclasses.replace(objective, observed=find(objective.observed))
     if has_drives(scene) and objective.error not in SIMULATED:
         raise ValueError(

@@ -1,6 +1,5 @@
-"""Results of fits."""
+"""Result of a fit, and the torques that a scene needs along a log."""
 
-import abc
 from typing import Any
 
 import equinox as eqx
@@ -12,7 +11,7 @@ from jaxdyn.constraints.codes import Outcome, name_of
 from jaxdyn.dynamics import quantities as dynamics
 from jaxdyn.identify.logs import Log, check_log
 from jaxdyn.identify.mechanisms import motor_basis
-from jaxdyn.identify.regression import nominal_parameters, parameter_names, torque_error
+from jaxdyn.identify.regression import torque_error
 from jaxdyn.identify.sensors import Measured, with_sensors
 from jaxdyn.identify.torque_terms import ExtraTorque, Friction, coulomb_column, coulomb_through_filter
 from jaxdyn.model.arguments import state_dtype
@@ -20,25 +19,77 @@ from jaxdyn.model.tree import Model
 from jaxdyn.systems.scene import Scene
 
 
-class AbstractFit(Outcome):
-    """Common part of all fits: how they ended, and the errors of their torques along a log."""
+class Fit(Outcome):
+    """Result of a fit: of a robot by its torques (`fit_torques`, `fit_robot`), or of any numbers (`fit_parameters`).
 
-    history: eqx.AbstractVar[np.ndarray]
-    result: eqx.AbstractVar[Any]
-    method: eqx.AbstractVar[str]
+    - `system`: the system or the scene with the fitted numbers, of a robot by its torques the scene of `model` and `friction`;
+      `nominal`: as given, where the fit started. `scene`: of the system, with its forces.
+    - `names` (p,): of the fitted numbers, of a robot as of `parameter_names`, else their paths within the system, as in
+      "parameters['mass']". `values`, `nominal_values` (p,).
+    - `deviation` (p,): standard deviation of each, infinite for numbers that the log does not determine, None where the method
+      computes none (`RobotFit.intervals` has those of a robot): the larger of that for independent errors of one size, and of a
+      delete-a-group jackknife, whose groups are consecutive samples twice as long as the autocorrelation time, or whole logs
+      where there are twenty or more. `factor`: a 95 % interval is plus and minus this many of them (Student's t).
+    - `history` (steps,): loss before each step and at the end. `result`: one of `RESULTS`, `successful` where it has
+      converged, else `max_steps_reached`, `stopped`, `no_descent` where no step lowers the loss at a point that is no minimum, or
+      `nonfinite`; `cause` then names the log, the sample and the parameters.
+    - `motors`: indices in v of the observed coordinates, where the fit named them; `torques` of a mechanism are theirs.
+    - `terms`: names of the fitted torque terms. `sigma`: torque noise (N m) that weighed the data against the prior, or None.
+    - `extra`: fitted torque terms beyond `friction`, or None. They belong to logs, and are no force of the scene.
+    - `as_measured`: whether friction was fitted, and is predicted, as the low-pass of a log leaves it (`from_raw`).
+    """
+
+    system: Any
+    nominal: Any
+    names: tuple[str, ...] = eqx.field(static=True)
+    values: np.ndarray
+    nominal_values: np.ndarray
+    history: np.ndarray
+    result: Any
+    method: str = eqx.field(static=True)
+    deviation: np.ndarray | None = None
+    factor: float = np.nan
+    cause: str | None = eqx.field(static=True, default=None)
+    motors: tuple[int, ...] | None = eqx.field(static=True, default=None)
+    terms: tuple[str, ...] = eqx.field(static=True, default=())
+    sigma: float | None = None
+    extra: ExtraTorque | None = None
+    as_measured: bool = eqx.field(static=True, default=False)
 
     @property
-    @abc.abstractmethod
     def scene(self) -> Scene:
-        """Fitted scene, with its forces."""
+        """Fitted scene; of a system, its scene without constraints and forces."""
+        return with_sensors(self.system).scene
 
-    @abc.abstractmethod
-    def _table(self) -> list[tuple]:
-        """Header and rows of the parameters."""
+    @property
+    def model(self) -> Model:
+        """Fitted model, with its inertias, armature, damping and friction."""
+        return self.scene.system  # pyright: ignore[reportReturnType]
+
+    @property
+    def friction(self) -> Friction:
+        """Fitted friction law, with its offset: a force for `Scene(fit.model, forces=[fit.friction])`."""
+        return next(force for force in self.scene.forces if isinstance(force, Friction))
 
     def torques(self, log: Log) -> np.ndarray:
-        """Torques (n, nv) that the fitted system needs along a log, over and above its forces and friction (N m, N)."""
-        return torques_along(self.scene, log)
+        """Torques (n, nv) that the fitted system needs along a log, in the log's units: as its sensors would measure them.
+
+        With its friction and all extra terms (N m, N), over and above the other forces of the scene.
+        """
+        torque = torques_along(self.scene, log, self.motors)
+        if isinstance(self.system, Measured):
+            bias, gain = (np.asarray(x, np.float64) for x in (self.system.torque_bias, self.system.torque_gain))
+            torque = (torque - bias) / gain
+        if self.as_measured:
+            v_s = float(self.friction.v_s)
+            # The scene has the unfiltered law, and the log's torque went through the low-pass: the difference corrects it.
+            change = coulomb_through_filter(log, v_s) - coulomb_column(log, v_s)
+            torque = torque + np.asarray(self.friction.coulomb) * change
+        if self.extra is None:
+            return torque
+        # Without friction: the load of the gears is the torque of bodies and rotors, as in the fit.
+        load = torques_along(Scene(self.model), log) if self.extra.needs_load else np.zeros_like(torque)
+        return torque + self.extra.torque(log, load)
 
     def error(self, log: Log) -> float:
         """Torque error along a log in per cent, 100 |tau_fit - tau| / |tau| over all samples and joints."""
@@ -47,6 +98,24 @@ class AbstractFit(Outcome):
     def rms(self, log: Log) -> np.ndarray:
         """Root mean square of the torque error of each coordinate (nv,)."""
         return np.sqrt(np.mean((self.torques(log) - np.asarray(log.tau)) ** 2, axis=0))
+
+    @property
+    def vector(self) -> np.ndarray:
+        """All parameters x (10 nb + 4 nv,) of a robot in the order of `jd.identify.parameter_names(model)`."""
+        model, friction = self.model, self.friction
+        rotors = np.zeros(model.nv) if model.armature is None else model.armature
+        parts = (model.inertias, friction.viscous, friction.coulomb, friction.offset, rotors)
+        return np.concatenate([np.asarray(part, np.float64).reshape(-1) for part in parts])
+
+    @property
+    def parameters(self) -> list[tuple[str, float, float, float]]:
+        """Rows (name, nominal, fitted, standard deviation), the last NaN where the method computes none.
+
+        Of single inertial numbers only combinations are identifiable (`base_parameters`); the prior determines the rest.
+        """
+        deviation = np.full_like(self.values, np.nan) if self.deviation is None else self.deviation
+        columns = (self.nominal_values, self.values, deviation)
+        return list(zip(self.names, *(column.tolist() for column in columns), strict=True))
 
     def summary(self, *logs: Log) -> str:
         """Summary of the fit: how it ended, the error on each log given, and the parameters."""
@@ -60,129 +129,12 @@ class AbstractFit(Outcome):
             lines.append(
                 f"log {i + 1}: {len(log)} samples, torque error {self.error(log):.3f} %, rms per joint {per_joint}"
             )
-        (name, *columns), *rows = self._table()
-        width = max((len(row[0]) for row in rows), default=0)
-        lines.append(f"{name:{width}}" + "".join(f"  {column:>12}" for column in columns))
-        lines += [f"{row[0]:{width}}" + "".join(f"  {x:12.5g}" for x in row[1:]) for row in rows]
+        columns = ("nominal", "fitted") if self.deviation is None else ("nominal", "fitted", "std")
+        width = max(map(len, self.names), default=0)
+        lines.append(f"{'parameter':{width}}" + "".join(f"  {column:>12}" for column in columns))
+        for name, *numbers in self.parameters:
+            lines.append(f"{name:{width}}" + "".join(f"  {x:12.5g}" for x in numbers[: len(columns)]))
         return "\n".join(lines)
-
-
-class Fit(AbstractFit):
-    """Fitted, physically feasible model.
-
-    - `model`: with the fitted inertias, armature, damping and friction. `friction`: the friction law, with its offset;
-      a force for `Scene(fit.model, forces=[fit.friction])`.
-    - `nominal`: the model the fit started from.
-    - `history` (steps,): loss before each step and at the end. `result`: one of `RESULTS`, `successful` where it has
-      converged, else `max_steps_reached` or `nonfinite`.
-    - `sigma`: torque noise (N m) that weighed the data against the prior, or None.
-    - `extra`: fitted torque terms beyond `friction`, or None. They belong to logs, and are no force of the scene.
-    - `as_measured`: whether friction was fitted, and is predicted, as the low-pass of a log leaves it (`from_raw`).
-    """
-
-    model: Model
-    friction: Friction
-    nominal: Model
-    history: np.ndarray
-    result: Any
-    method: str = eqx.field(static=True)
-    terms: tuple[str, ...] = eqx.field(static=True)
-    sigma: float | None = None
-    extra: ExtraTorque | None = None
-    as_measured: bool = eqx.field(static=True, default=False)
-
-    @property
-    def scene(self) -> Scene:
-        """Scene of the model with its friction."""
-        return Scene(self.model, forces=(self.friction,))
-
-    def torques(self, log: Log) -> np.ndarray:
-        """Torques (n, nv) that the fitted robot needs along a log, with friction and all extra terms (N m, N)."""
-        torque = super().torques(log)
-        if self.as_measured:
-            v_s = float(self.friction.v_s)
-            # The scene has the unfiltered law, and the log's torque went through the low-pass: the difference corrects it.
-            change = coulomb_through_filter(log, v_s) - coulomb_column(log, v_s)
-            torque = torque + np.asarray(self.friction.coulomb) * change
-        if self.extra is None:
-            return torque
-        load = np.zeros_like(torque)
-        if self.extra.needs_load:
-            # Without friction: the load of the gears is the torque of bodies and rotors, as in the fit.
-            load = torques_along(Scene(self.model), log)
-        return torque + self.extra.torque(log, load)
-
-    @property
-    def vector(self) -> np.ndarray:
-        """All parameters x (10 nb + 4 nv,) in the order of `jd.identify.parameter_names(model)`."""
-        friction = self.friction
-        rotors = np.zeros(self.model.nv) if self.model.armature is None else self.model.armature
-        parts = (self.model.inertias, friction.viscous, friction.coulomb, friction.offset, rotors)
-        return np.concatenate([np.asarray(part, np.float64).reshape(-1) for part in parts])
-
-    @property
-    def parameters(self) -> list[tuple[str, float, float]]:
-        """Rows (name, nominal, fitted).
-
-        Of single inertial numbers only combinations are identifiable
-        (`base_parameters`); the prior determines the rest."""
-        names = parameter_names(self.model)
-        return list(zip(names, nominal_parameters(self.nominal).tolist(), self.vector.tolist(), strict=True))
-
-    def _table(self):
-        return [("parameter", "nominal", "fitted"), *self.parameters]
-
-
-class ParameterFit(AbstractFit):
-    """Fitted numbers of a system or a scene.
-
-    - `system`: the system or the scene with the fitted numbers; `nominal`: as given, where the fit started.
-    - `names` (p,): paths of the fitted numbers within the system, as in "parameters['mass']".
-    - `deviation` (p,): standard deviation of each, infinite for numbers that the log does not determine, None where the method
-      computes none: the larger of that for independent errors of one size, and of a delete-a-group jackknife, whose groups are
-      consecutive samples twice as long as the autocorrelation time, or whole logs where there are twenty or more. `factor`: a
-      95 % interval is plus and minus this many of them (Student's t).
-    - `history` (steps,): loss before each step and at the end. `result`: one of `RESULTS`, `successful` where it has
-      converged, else `max_steps_reached`, `stopped`, `no_descent` where no step lowers the loss at a point that is no minimum, or
-      `nonfinite`; `cause` then names the log, the sample and the parameters.
-    - `motors`: indices in v of the observed coordinates, where the fit named them; `torques` of a mechanism are theirs.
-    """
-
-    system: Any
-    nominal: Any
-    names: tuple[str, ...] = eqx.field(static=True)
-    values: np.ndarray
-    nominal_values: np.ndarray
-    deviation: np.ndarray | None
-    history: np.ndarray
-    result: Any
-    method: str = eqx.field(static=True)
-    cause: str | None = eqx.field(static=True, default=None)
-    factor: float = np.nan
-    motors: tuple[int, ...] | None = eqx.field(static=True, default=None)
-
-    @property
-    def scene(self) -> Scene:
-        """Fitted scene; of a system, its scene without constraints and forces."""
-        return with_sensors(self.system).scene
-
-    def torques(self, log: Log) -> np.ndarray:
-        """Torques (n, nv) that the fitted system needs along a log, in the log's units: as its sensors would measure them."""
-        torques = torques_along(self.scene, log, self.motors)
-        if not isinstance(self.system, Measured):
-            return torques
-        bias, gain = (np.asarray(x, np.float64) for x in (self.system.torque_bias, self.system.torque_gain))
-        return (torques - bias) / gain
-
-    @property
-    def parameters(self) -> list[tuple[str, float, float, float]]:
-        """Rows (name, nominal, fitted, standard deviation), the last NaN where the method computes none."""
-        deviation = np.full_like(self.values, np.nan) if self.deviation is None else self.deviation
-        columns = (self.nominal_values, self.values, deviation)
-        return list(zip(self.names, *(column.tolist() for column in columns), strict=True))
-
-    def _table(self):
-        return [("parameter", "nominal", "fitted", "std"), *self.parameters]
 
 
 def torques_along(scene: Scene, log: Log, motors: tuple[int, ...] | None = None) -> np.ndarray:

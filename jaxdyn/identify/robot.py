@@ -15,8 +15,8 @@ from jaxdyn.identify.regression import check_weights
 from jaxdyn.identify.result import Fit
 from jaxdyn.identify.robot_problem import RobotProblem, cross_validation
 from jaxdyn.identify.selection import PRIORS, ROBUST, VELOCITIES, Choice, Search, search, splits
-from jaxdyn.identify.torque_terms import EXTRA, TERMS, RobotTerms, Terms, check_terms, split_terms
-from jaxdyn.model.arguments import Checked, Numbers, warn
+from jaxdyn.identify.torque_terms import TERMS, RobotTerms, Terms, candidates, check_terms, split_terms
+from jaxdyn.model.arguments import Checked, Numbers, deprecated
 from jaxdyn.model.tree import Model
 from jaxdyn.tasks import DaskClient, open_engine
 
@@ -49,10 +49,7 @@ class RobotFit(eqx.Module):
         """Shift the torques of a log of this robot by the delays, as for the fit, before `fit.torques` and `fit.error`."""
         return log if self.delays is None else shift_torques(log, self.delays.seconds)
 
-    def aligned(self, log: Log) -> Log:
-        """Deprecated name of `align`."""
-        warn("RobotFit.aligned is deprecated; call align", DeprecationWarning)
-        return self.align(log)
+    aligned = deprecated("RobotFit.aligned", align)
 
 
 @on_one_thread
@@ -175,10 +172,8 @@ def _start(model: Model, terms, v_s, prior, robust):
         check_prior(prior)
     if robust not in (None, "auto") and (isinstance(robust, str) or not robust > 0):
         raise ValueError(f'robust is {robust!r}; give a positive number of standard deviations, None or "auto"')
-    # These two need one angle for each torque (`torque_terms._angles`).
-    candidates = [term for term in EXTRA.values() if model.nq == model.nv or term.name not in ("spring", "dahl")]
     is_auto = isinstance(terms, str) and terms == "auto"
-    basic, extra, where = (TERMS, tuple(candidates), ()) if is_auto else split_terms(terms, model.nv)
+    basic, extra, where = (TERMS, candidates(model), ()) if is_auto else split_terms(terms, model.nv)
     setting = Setting(
         _V_S if isinstance(v_s, str) else float(v_s),
         where,

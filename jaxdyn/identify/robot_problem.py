@@ -21,11 +21,13 @@ from jaxdyn.identify.condensed_fit import (
 from jaxdyn.identify.devices import on_one_thread
 from jaxdyn.identify.interior import robot_chart
 from jaxdyn.identify.logs import Log, idle_coordinates, log_rate, signal_sizes
-from jaxdyn.identify.regression import log_regressor
+from jaxdyn.identify.omitted_terms import find_shifts, include_shifts
+from jaxdyn.identify.regression import free_columns, log_regressor, nominal_parameters, parameter_names
 from jaxdyn.identify.result import Fit
-from jaxdyn.identify.torque_terms import TERMS, ExtraTorque, Friction, TorqueTerm
+from jaxdyn.identify.torque_terms import TERMS, ExtraTorque, Friction, TorqueTerm, candidates
 from jaxdyn.identify.uncertainty import effective_sample_size, is_white, model_error_factors
 from jaxdyn.model.tree import Model
+from jaxdyn.systems.scene import Scene
 from jaxdyn.tasks import Engine, results
 
 # Share of errors beyond three standard deviations from which on their tails are heavy: 0.3 % of normal ones are, and of those of
@@ -57,8 +59,12 @@ class RobotProblem:
         # Terms and prior are not in the key: all candidate columns are condensed, and the prior enters in the fit.
         key = setting.v_s, None if weights is None else setting.robust
         if key not in self._data:
-            self._data[key] = gather(self.model, self.logs, setting.v_s, self.extra, self.loads, self.blocks, weights)
+            self._data[key] = self._gather(setting, weights)
         return self._data[key]
+
+    def _gather(self, setting: Setting, weights, extra=None, loads=None) -> Data:
+        extra, loads = self.extra if extra is None else extra, self.loads if loads is None else loads
+        return gather(self.model, self.logs, setting.v_s, extra, loads, self.blocks, weights)
 
     def fit(self, setting: Setting, **options) -> Estimate:
         """Fit all blocks, unless `options` of `fit_blocks` select some."""
@@ -94,20 +100,12 @@ class RobotProblem:
         plain = setting._replace(robust=None)
         data = fitted = self.data(plain)
         for remaining in reversed(range(1 if setting.robust is None else _WEIGHINGS)):
-            rows = np.asarray(np.linalg.qr(fitted.blocks.rows(self.weights, rest), mode="r"))
-            estimate = fit_blocks(
-                self.chart,
-                fitted,
-                plain,
-                self.sizes,
-                self.weights,
-                rows=rows,
-                count=data.blocks.count(rest),
-                is_rough=True,
-            )
+            rows, count = fitted.blocks.rows(self.weights, rest), data.blocks.count(rest)
+            options = {"rows": rows, "count": count, "is_rough": True}
+            estimate = fit_blocks(self.chart, fitted, plain, self.sizes, self.weights, **options)
             if remaining and setting.robust is not None:
                 weights = huber_weights(self._errors(plain, estimate), setting.robust)
-                fitted = gather(self.model, self.logs, setting.v_s, self.extra, self.loads, self.blocks, weights)
+                fitted = self._gather(setting, weights)
         return data.blocks.squares(estimate.x, part)
 
     def weigh_samples(self, setting: Setting) -> None:
@@ -172,16 +170,26 @@ class RobotProblem:
             return None
         # psi' of Huber's loss: one within the threshold, zero beyond.
         kept = [np.where(weight < 1, 0.0, 1.0) for weight in weights]
-        return gather(self.model, self.logs, setting.v_s, self.extra, self.loads, self.blocks, kept)
+        return self._gather(setting, kept)
 
     def intervals(self, setting: Setting, estimate: Estimate, fit: Fit) -> Intervals:
         """Standard deviations of an estimate, which is this fit."""
         data, curved = self.data(setting), self.curvature_data(setting)
         errors = [fit.torques(log) - np.asarray(log.tau, np.float64) for log in self.logs]
         size, widening = effective_sample_size(errors), model_error_factors(self.logs, errors)
-        return intervals(
+        found = intervals(
             self.model, data, setting, estimate, self.weights, self.basic, size, widening, curved, self.still
         )
+        # Columns of the terms that the fit lacks, after its own.
+        known = {term.name for term in self.extra}
+        every = (*self.extra, *(term for term in candidates(self.model) if term.name not in known))
+        loads = [self._load(log, estimate.x) for log in self.logs]
+        weights = None if setting.robust is None else self.sample_weights.get(setting.robust)
+        wide = self._gather(setting, weights, every, loads)
+        shifts = find_shifts(wide, setting, estimate, self.weights, size, self.still)
+        fitted = {*range(data.basic), *data.places(setting.extra).tolist()}
+        columns = free_columns(self.model.nb, self.model.nv, self.basic)
+        return include_shifts(found, shifts, np.array(sorted(fitted)), columns)
 
     def with_term(self, term: TorqueTerm) -> "RobotProblem":
         """Copy with the columns of one more term, after all others."""
@@ -218,7 +226,6 @@ class RobotProblem:
     def result(self, setting: Setting, estimate: Estimate) -> Fit:
         """Estimate as a `Fit`."""
         data = self.data(setting)
-        model, friction = model_with_parameters(self.model, estimate.x[: data.basic], self.basic, setting.v_s)
         used = dict(setting.extra)
         coefficients = estimate.x[data.basic :].reshape(-1, self.model.nv)
         edges = dict(zip(data.counts, np.cumsum((0, *data.counts.values()))[:-1], strict=True))
@@ -226,10 +233,13 @@ class RobotProblem:
         counts = tuple(data.counts[term.name] for term in terms)
         rows = [coefficients[edges[term.name] :][:count] for term, count in zip(terms, counts, strict=True)]
         extra = ExtraTorque(terms, counts, np.concatenate(rows), setting.v_s) if terms else None
+        values = estimate.x[: data.basic]
         return Fit(
-            model=model,
-            friction=friction,
+            system=scene_with_parameters(self.model, values, self.basic, setting.v_s),
             nominal=self.model,
+            names=parameter_names(self.model),
+            values=values,
+            nominal_values=nominal_parameters(self.model),
             history=estimate.minimum.history,
             result=estimate.minimum.result,
             method="torque fit by newton",
@@ -268,8 +278,8 @@ def cross_validation(problem: RobotProblem, engine: Engine) -> Callable:
     return squares
 
 
-def model_with_parameters(model: Model, x: np.ndarray, terms, v_s: float) -> tuple[Model, Friction]:
-    """Model with the parameters x (10 nb + 4 nv,), and the friction law with its offset."""
+def scene_with_parameters(model: Model, x: np.ndarray, terms, v_s: float) -> Scene:
+    """Scene of a model with the parameters x (10 nb + 4 nv,), whose force is the friction law with its offset."""
     dtype, split = model.home.dtype, 10 * model.nb
     viscous, coulomb, offset, armature = jnp.asarray(x[split:].reshape(len(TERMS), model.nv), dtype)
     # A leaf that is absent and not fitted stays absent, so that no program compiles it.
@@ -279,7 +289,7 @@ def model_with_parameters(model: Model, x: np.ndarray, terms, v_s: float) -> tup
         damping=None if model.damping is None and "viscous" not in terms else viscous,
         friction=None if model.friction is None and "coulomb" not in terms else coulomb,
     )
-    return model, Friction(viscous, coulomb, offset, jnp.asarray(v_s, dtype))
+    return Scene(model, forces=(Friction(viscous, coulomb, offset, jnp.asarray(v_s, dtype)),))
 
 
 def huber_weights(errors: Sequence[np.ndarray], threshold: float) -> list[np.ndarray]:

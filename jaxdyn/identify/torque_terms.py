@@ -23,6 +23,7 @@ from jaxtyping import Array, Float
 from jaxdyn.identify.logs import Log, filter_like_log, refine_samples, samples_for_jumps
 from jaxdyn.model.arguments import Number, SystemLike, warn
 from jaxdyn.model.numbers import as_number
+from jaxdyn.model.tree import Model
 
 TERMS = ("viscous", "coulomb", "offset", "armature")
 # Terms that are physical only when they are not negative.
@@ -176,6 +177,11 @@ EXTRA = {
     "quadratic": TorqueTerm("quadratic", _quadratic),
     "spring": TorqueTerm("spring", _spring),
 }
+
+
+def candidates(model: Model) -> tuple[TorqueTerm, ...]:
+    """Terms of `EXTRA` that a model may have: pre-sliding and springs need one angle for each torque."""
+    return tuple(term for term in EXTRA.values() if model.nq == model.nv or term.name not in ("spring", "dahl"))
 
 
 if TYPE_CHECKING:

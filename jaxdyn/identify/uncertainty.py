@@ -89,12 +89,12 @@ def _inverse(matrix: np.ndarray) -> np.ndarray:
     return (vectors / np.maximum(values, 1e-12)) @ vectors.T
 
 
-def student(degrees: int) -> float:
-    """Half-width of a 95 % interval in standard deviations, by Student's t with so many degrees of freedom."""
+def student(degrees: int, level: float = 0.05) -> float:
+    """Half-width of a 95 % interval in standard deviations by Student's t; `level`: the share outside of another one."""
     from scipy.special import stdtrit
 
-    # Two-sided: 2.5 % beyond each end.
-    return float(stdtrit(degrees, 0.975))
+    # Two-sided: half of the level is beyond each end.
+    return float(stdtrit(degrees, 1 - level / 2))
 
 
 class Whiteness(NamedTuple):

@@ -1,5 +1,6 @@
 """Arguments of functions of a system: numbers become arrays of its dtype, and values that do not fit are refused."""
 
+import functools
 import os
 import pathlib
 import sys
@@ -19,6 +20,7 @@ from jaxdyn.compile.known import is_known
 from jaxdyn.model import host_math
 
 _T = TypeVar("_T")
+_F = TypeVar("_F", bound=Callable[..., Any])
 _OPTIONAL = ("a", "external")
 
 if TYPE_CHECKING:
@@ -173,6 +175,19 @@ def warn(text: str, category: type[Warning]) -> None:
     while frame.f_back is not None and frame.f_globals.get("__name__", "").partition(".")[0] in _WRAPPERS:
         frame, level = frame.f_back, level + 1
     warnings.warn(text, category, stacklevel=level)
+
+
+def deprecated(old: str, function: _F) -> _F:
+    """The function under its old name, which warns when it is called."""
+    name = getattr(function, "__name__", "")
+
+    @functools.wraps(function)
+    def call(*args, **kwargs):
+        warn(f"{old} is deprecated; call {name}", DeprecationWarning)
+        return function(*args, **kwargs)
+
+    call.__doc__ = f"Deprecated name of `{name}`."
+    return call  # pyright: ignore[reportReturnType]
 
 
 def state_dtype(system, q=None):

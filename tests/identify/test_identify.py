@@ -20,7 +20,7 @@ from jaxdyn.identify.interior import LOG_CHOLESKY_BASIS, InteriorPoint, TorquePr
 from jaxdyn.identify.methods import Unknowns
 from jaxdyn.identify.problem import errors_of, pose_problem
 from jaxdyn.identify.regression import condense
-from jaxdyn.identify.robot_problem import RobotProblem, model_with_parameters
+from jaxdyn.identify.robot_problem import RobotProblem, scene_with_parameters
 from jaxdyn.io.urdf import load_urdf
 from jaxdyn.model.builder import ModelBuilder
 from jaxdyn.simulation.run import simulate
@@ -352,7 +352,8 @@ def test_feasible_fit_recovers_base_parameters_without_noise(iiwa, wrong_iiwa, i
     assert fit.error(iiwa_log) < 1e-5
     np.testing.assert_allclose(fit.friction.offset, 0.3, atol=1e-6)
     np.testing.assert_allclose(fit.model.damping, 0.5, atol=1e-6)
-    name, nominal, fitted = fit.parameters[0]
+    name, nominal, fitted, deviation = fit.parameters[0]
+    assert np.isnan(deviation)  # those of a robot are of `fit_robot`
     assert name == "iiwa_link_1.m" and nominal == float(wrong_iiwa.inertias[0, 0])
     assert fitted == float(fit.model.inertias[0, 0])
 
@@ -370,7 +371,8 @@ def test_every_iterate_is_feasible(wrong_iiwa, noisy):
 
     def watch(step, loss, point):
         losses.append(loss)
-        model, friction = model_with_parameters(wrong_iiwa, problem.chart.x(*point), identify.TERMS, 0.01)
+        scene = scene_with_parameters(wrong_iiwa, problem.chart.x(*point), identify.TERMS, 0.01)
+        (friction,), model = scene.forces, scene.system
         lowest.append(lowest_eigenvalue(model))
         assert min(float(x.min()) for x in (friction.viscous, friction.coulomb, model.armature)) >= 0
 

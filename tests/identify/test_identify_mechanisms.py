@@ -9,6 +9,7 @@ import pytest
 
 import jaxdyn as jd
 from jaxdyn.cli import main
+from jaxdyn.constraints.base import position_residual
 from jaxdyn.constraints.codes import RESULTS
 from jaxdyn.identify.mechanisms import on_constraints
 from jaxdyn.identify.replay import Segments, simulate_segment
@@ -327,3 +328,55 @@ def test_the_command_identifies_a_mechanism_from_a_log_of_its_motor(tmp_path, ca
     assert max(found["test_percent"].values()) < 0.1 and found["outcome"] == "successful"
     assert main([*command, "--out", str(tmp_path / "fitted.urdf")]) != 0
     assert "--out: not for a mechanism" in capsys.readouterr().err
+
+
+@pytest.mark.long
+def test_an_exciting_motion_of_the_motors_of_a_five_bar(tmp_path):
+    """Within all limits, passive joints included; loops close along it, and the rest of the motion is that of `complete_log`."""
+    scene, motors = loaded(tmp_path, "five-bar", (0.9, 1.5)), ("m1", "m2")
+    start = scene.starts["reference"].q
+    options = dict(guess=start, period=6.0, harmonics=3, starts=2, torque=30.0, velocity=(1.5, 2.0))
+    found = jd.identify.exciting_motion(scene, TERMS, motors=motors, steps=25, **options)
+    assert found.logdet > 1 and found.condition < found.start_condition
+    assert max(found.used.values()) <= 1 and set(found.used) == {"position", "velocity", "torque"}
+    log, whole = found.log(), found.log(whole=True)
+    assert log.joint_names == motors and log.tau.shape == (601, 2) and whole.q.shape == (601, 4)
+    assert np.abs(log.v).max(axis=0)[0] <= 0.9 * 1.5 * (1 + 1e-6) and np.abs(log.tau).max() <= 27.0 * (1 + 1e-6)
+    assert np.abs(log.v[0]).max() < 1e-10  # starts at rest
+    closed = jax.jit(jax.vmap(lambda q: position_residual(scene, q)))(whole.q)
+    np.testing.assert_allclose(closed, 0.0, atol=1e-12)
+    measured = {name: (log.q[:, i], log.v[:, i], log.a[:, i]) for i, name in enumerate(motors)}
+    completed = jd.identify.complete_log(scene, log.t, measured, whole.tau, whole.q[0])
+    for name in ("q", "v", "a"):
+        np.testing.assert_allclose(getattr(completed, name), getattr(whole, name), atol=1e-9)
+    # The torques of the motors: those for which constrained forward dynamics gives the accelerations.
+    dynamics = jax.jit(jax.vmap(lambda q, v, tau: jd.constrained_dynamics(scene, q, v, tau).acceleration))
+    np.testing.assert_allclose(dynamics(whole.q, whole.v, whole.tau), whole.a, atol=1e-9)
+    refused = {"name as many of its joints in motors": {}, "2 degrees of freedom": {"motors": ("m1",)}}
+    for message, arguments in refused.items():
+        with pytest.raises(ValueError, match=message):
+            jd.identify.exciting_motion(scene, TERMS, **options, **arguments)
+
+
+def test_the_command_excites_a_mechanism_by_named_motors_alone(tmp_path, capsys):
+    loaded(tmp_path, "four-bar", (0.9, 1.5))
+    assert main(["excite", str(tmp_path / "four-bar-0.9.xml")]) != 0
+    assert "has loops; name the joints that are driven in --motors, of j1, j2, j3" in capsys.readouterr().err
+
+
+@pytest.mark.slow
+def test_the_command_writes_what_identify_reads(tmp_path, capsys):
+    """An exciting motion of a motor, and the combinations that its own torques determine: those of the file."""
+    loaded(tmp_path, "four-bar", (0.9, 1.5))
+    file, log = str(tmp_path / "four-bar-0.9.xml"), str(tmp_path / "motion.csv")
+    options = ["--period", "6", "--harmonics", "3", "--steps", "20", "--torque", "30", "--terms", *TERMS]
+    main(["excite", file, "--motors", "j1", "--out", log, "--plot", str(tmp_path / "motion.png"), *options])
+    printed = capsys.readouterr().out
+    assert "limits used" in printed and "j1" in printed and "j2" not in printed
+    main(["identify", "--urdf", file, "--log", log, "--report", str(tmp_path / "fit.json"), "--terms", *TERMS])
+    found = json.loads((tmp_path / "fit.json").read_text())
+    assert max(found["test_percent"].values()) < 1e-3
+    base = found["base_parameters"]
+    # A rotor adds to the crank's moment of inertia, and the start of a fit has one.
+    bodies = [k for k, name in enumerate(base["expressions"]) if not name.startswith(("j1", "crank.Iyy"))]
+    np.testing.assert_allclose(np.array(base["fitted"])[bodies], np.array(base["nominal"])[bodies], atol=1e-8)

@@ -76,7 +76,7 @@ def test_a_killed_fit_resumes_to_the_same_numbers(tmp_path, method, least, point
     )
     try:
         until = time.monotonic() + 300
-        while not path.exists() or len(descent.read(path)[0]) == 0 or _steps(path) < least:
+        while not path.exists() or len(descent.read(path)) == 0 or _steps(path) < least:
             assert run.poll() is None and time.monotonic() < until
             time.sleep(0.02)
     finally:
@@ -92,11 +92,11 @@ def test_a_killed_fit_resumes_to_the_same_numbers(tmp_path, method, least, point
 
 
 def _steps(path):
-    return descent.read(path)[0]["arrays"]["history"][0][0]
+    return len(descent.read(path)["history"])
 
 
 @pytest.mark.long
-@pytest.mark.parametrize("method", ["gauss-newton", "levenberg-marquardt", "lbfgs"])
+@pytest.mark.parametrize("method", ["gauss-newton", "lbfgs"])
 def test_a_stopped_fit_resumes_to_the_same_numbers(tmp_path, method):
     path = tmp_path / "fit.ckpt"
     start = dict(method=method, start=(0.2, 2.6, 0.9), steps=12)
@@ -132,7 +132,7 @@ def test_a_write_that_fails_leaves_the_checkpoint_before(tmp_path, monkeypatch):
     monkeypatch.setattr(os, "fsync", lambda _: (_ for _ in ()).throw(OSError("disk full")))
     with pytest.raises(OSError, match="disk full"):
         descent.write(path, "p", {"y": np.zeros(3)})
-    assert descent.read(path)[0]["arrays"]["y"][0] == [3] and len(list(tmp_path.iterdir())) == 1
+    assert descent.read(path)["y"].shape == (3,) and len(list(tmp_path.iterdir())) == 1
 
 
 @pytest.mark.long
@@ -141,7 +141,7 @@ def test_solvers_agree_and_progress_is_shown(capsys):
     log, linear = recorded(), lambda system: [system.parameters["size"]]
     rows = np.sin(3.0 * log.t + 0.3)
     want = rows @ (log.a + log.tau * -1)[:, 0] / (rows @ rows)
-    for method in ("gauss-newton", "levenberg-marquardt", "dogleg", "lbfgs"):
+    for method in ("gauss-newton", "lbfgs"):
         fit = jd.identify.fit_parameters(
             system(size=0.4),
             log,

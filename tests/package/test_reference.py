@@ -31,7 +31,6 @@ SHOWN_BY = {
     "identify.Cutoff": "identify.choose_cutoff",
     "identify.Excitation": "identify.exciting_motion",
     "identify.Identifiability": "identify.identifiability",
-    "identify.ParameterFit": "identify.fit_parameters",
     "identify.Whiteness": "identify.whiteness",
     "solvers.ExplicitSteps": "simulate",
     "solvers.ProjectedSolver": "Projected",

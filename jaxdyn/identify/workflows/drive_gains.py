@@ -33,7 +33,7 @@ from jaxdyn.identify.selection import VELOCITIES
 from jaxdyn.identify.torque_terms import TERMS, Terms, check_terms, coulomb_through_filter
 from jaxdyn.identify.uncertainty import jackknife
 from jaxdyn.model import inertia as _inertia
-from jaxdyn.model.arguments import Numbers, warn
+from jaxdyn.model.arguments import Numbers, deprecated, warn
 from jaxdyn.model.tree import Model
 
 # Most Gauss-Newton steps.
@@ -71,10 +71,7 @@ class DriveGains(Outcome):
         """Scale a log of these drives to torques in N m, as all fits expect them."""
         return dataclasses.replace(log, tau=np.asarray(log.tau, np.float64) * self.gains)
 
-    def scaled(self, log: Log) -> Log:
-        """Deprecated name of `scale`."""
-        warn("DriveGains.scaled is deprecated; call scale", DeprecationWarning)
-        return self.scale(log)
+    scaled = deprecated("DriveGains.scaled", scale)
 
     @property
     def told(self) -> tuple[str, ...]:

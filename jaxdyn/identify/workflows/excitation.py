@@ -90,19 +90,22 @@ def random_motion(key: Array, center, size, *, period=10.0, harmonics: int = 5) 
         raise ValueError(
             f"center has shape {center.shape}, size {size.shape}, harmonics is {harmonics}; give (nq,), (nq,) and >= 2"
         )
-    cosine, sine = _falling_amplitudes(key, size, harmonics)
-    return FourierMotion(center, cosine, sine, jnp.asarray(period, center.dtype))
+    return _random_motion(key, center, size, jnp.asarray(period, center.dtype), harmonics)
 
 
 @eqx.filter_jit
-def _falling_amplitudes(key, size, harmonics: int):
-    k = jnp.arange(1, harmonics + 1, dtype=size.dtype)[:, None]
+def _random_motion(key, center, size, period, harmonics: int):
     # As 1 / k all harmonics have the same share of the velocity.
-    weight = size[None] / k
+    weight = size[None] / jnp.arange(1, harmonics + 1, dtype=size.dtype)[:, None]
     cosine, sine = jax.random.normal(key, (2, harmonics, size.shape[0]), size.dtype) * weight[None]
-    # Position and velocity of the sum vanish at t = 0: both conditions are distributed over all harmonics.
+    return motion_from_rest(center, cosine, sine, period)
+
+
+def motion_from_rest(center, cosine, sine, period) -> FourierMotion:
+    """Motion at rest at its center at t = 0: what the amplitudes lack for it is distributed over all harmonics."""
+    k = jnp.arange(1, cosine.shape[0] + 1, dtype=cosine.dtype)[:, None]
     cosine = cosine - jnp.mean(cosine, axis=0, keepdims=True)
-    return cosine, sine - jnp.mean(k * sine, axis=0, keepdims=True) / k
+    return FourierMotion(center, cosine, sine - jnp.mean(k * sine, axis=0, keepdims=True) / k, period)
 
 
 class Tracking(eqx.Module):

@@ -1,6 +1,7 @@
 """Exciting motions: periodic, within limits, with information about the parameters maximised by gradient descent."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
+from functools import partial
 from typing import Any, NamedTuple
 
 import equinox as eqx
@@ -9,23 +10,26 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from jaxdyn.dynamics.quantities import inverse_dynamics, torque_regressor
-from jaxdyn.identify.chart import check_bodies
+from jaxdyn.dynamics.quantities import torque_regressor
 from jaxdyn.identify.descent import Watch, descend
 from jaxdyn.identify.logs import Log
-from jaxdyn.identify.methods import GradientSteps
-from jaxdyn.identify.regression import base_parameters, free_columns
+from jaxdyn.identify.methods import GradientSteps, RandomSteps
+from jaxdyn.identify.regression import base_parameters, free_columns, group_columns
 from jaxdyn.identify.torque_terms import TERMS, Terms, check_terms, friction_regressor
-from jaxdyn.identify.workflows.excitation import FourierMotion, random_motion
-from jaxdyn.model.arguments import Numbers
-from jaxdyn.model.configuration import neutral
+from jaxdyn.identify.workflows.driven import DrivenRobot, driven_signals, make_driven
+from jaxdyn.identify.workflows.excitation import FourierMotion, motion_from_rest, random_motion
+from jaxdyn.model.arguments import Checked, Numbers
 from jaxdyn.model.tree import Model
+from jaxdyn.systems.scene import as_scene
+from jaxdyn.systems.system import SceneLike
 
 OBJECTIVES = ("logdet", "condition")
 # Range and speed of a joint without limits of its own (rad, rad/s).
 _TURN, _SPEED = np.pi, 2.0
 # 100 samples are 20 in a period of the fifth harmonic, the default; peaks are checked on a finer grid.
 _SAMPLES, _CHECKED = 100, 1000
+# Speed of a passive joint without a limit of its own over that of a motor; largest residual of closed loops (m, rad).
+_PASSIVE, _CLOSED = 5.0, 1e-8
 
 
 class Excitation(NamedTuple):
@@ -44,7 +48,7 @@ class Excitation(NamedTuple):
     """
 
     motion: FourierMotion
-    model: Model
+    robot: DrivenRobot
     condition: float
     start_condition: float
     logdet: float
@@ -52,38 +56,59 @@ class Excitation(NamedTuple):
     used: dict[str, float]
     result: Any
 
-    def log(self, rate: float = 100.0, periods: int = 1) -> Log:
-        """Log of the motion at so many samples a second with the torques of the nominal model, for a controller or a file."""
-        period = float(self.motion.period)
+    @property
+    def model(self) -> Model:
+        """Nominal model."""
+        return self.robot.model
+
+    def log(self, rate: float = 100.0, periods: int = 1, *, whole: bool = False) -> Log:
+        """Log of the motion at so many samples a second with the torques of the nominal model, for a controller or a file.
+
+        Of a mechanism with loops it has the columns of the motors, or those of all joints (`whole`).
+        """
+        period, robot = float(self.motion.period), self.robot
         count = round(period * rate * periods) + 1
         t = np.linspace(0, period * periods, count)
-        signals = _signals(self.motion, self.model, jnp.asarray(t, self.model.home.dtype))
-        q, v, a, tau = (np.asarray(x, np.float64) for x in signals)
-        return Log(t, q, v, a, tau, joint_names=self.model.joint_names)
+        signals = driven_signals(self.motion, robot, jnp.asarray(t, self.model.home.dtype))
+        q, v, a, own, *_ = (np.asarray(x, np.float64) for x in signals)
+        tau = np.zeros_like(v)
+        tau[:, robot.driven] = own
+        columns = np.arange(self.model.nv) if whole else robot.driven
+        names = tuple(self.model.joint_names[i] for i in columns)
+        return Log(t, *(x[:, columns] for x in (q, v, a, tau)), joint_names=names)
 
 
 class _Limits(eqx.Module):
+    """Limits of positions and speeds of all joints (nv,), and of the torques of the driven ones (m,)."""
+
     lower: Float[Array, " n"]
     upper: Float[Array, " n"]
     speed: Float[Array, " n"]
-    torque_limit: Float[Array, " n"]
+    torque_limit: Float[Array, " m"]
+    middle: Float[Array, " m"]
 
 
 class _Task(eqx.Module):
     """Arguments of the loss other than the motion."""
 
-    model: Model
+    robot: DrivenRobot
     limits: _Limits
     times: Float[Array, " samples"]
     scale: Float[Array, " p"]
-    weights: Float[Array, " nv"]
     v_s: Float[Array, ""]
+
+    @property
+    def span(self):
+        """Half of the range (m,) of each driven joint."""
+        return ((self.limits.upper - self.limits.lower) / 2)[self.robot.driven]
 
 
 def exciting_motion(
-    model: Model,
+    system: SceneLike,
     terms: Terms = TERMS,
     *,
+    motors: Checked[Sequence[str] | None] = None,
+    guess: Checked[Numbers | None] = None,
     period: float = 10.0,
     harmonics: int = 5,
     objective: str = "logdet",
@@ -102,34 +127,35 @@ def exciting_motion(
     The best of some random motions is improved by Adam with exact gradients of the information matrix $W^T W$, where W is the
     regressor in base parameters, rows over the torque limits and columns over their lengths along the start. Excess over a limit
     of position, velocity or torque has a quadratic penalty during the search; at the end the amplitudes shrink until there is
-    none.
+    none. Motions of loops are improved by random changes that exceed no limit, as near a dead point speeds have no bound.
 
     **Arguments:**
 
-    - `model`: with one coordinate a joint; its own limits hold where it has them. `terms`: to be identified with the bodies.
+    - `system`: a model with one coordinate a joint, or a scene with loops; the model's limits hold where it has them.
+      `terms`: to be identified with the bodies.
+    - `motors`: names of the driven joints of a scene with loops, as many as degrees of freedom; the loops determine the others,
+      whose limits hold too. `guess` (nq,): a configuration near closed loops, about which the motors move; zeros by default.
     - `period` (s), `harmonics` (at least 2): of the series.
     - `objective`: "logdet", the volume of all uncertainty (D-optimal), or "condition", the worst against the best direction.
     - `margin`: usable share of all limits. `velocity`, `torque` (nv,): limits instead of the model's, rad/s and N m.
     - `v_s`: smoothing velocity of Coulomb friction while searching; larger than the fit's, so that the gradient is not zero
       almost everywhere.
-    - `seed`, `starts`: of the random motions. `steps`, `learning_rate`: of Adam.
+    - `seed`, `starts`: of the random motions. `steps`, `learning_rate`: of Adam; with loops sixteen changes
+      are a step, and the first ones are five times as large.
     - `callback(step, loss)`: before every step and at the end; True stops the search.
 
     **Returns:** `Excitation`. Collisions with the ground, or of the robot with itself, are not checked: view the motion first
     (`jd.animate`).
 
-    **Raises:** ValueError for joints of several coordinates, arguments out of range, and where the torque limits cannot
-    hold the robot at its centre.
+    **Raises:** ValueError for joints of several coordinates, arguments out of range, where the torque limits cannot hold the
+    robot at its centre, and for loops without `motors`, with another number of them than degrees of
+    freedom, or that cannot be closed.
 
     Source: Swevers et al. (1997), "Optimal robot excitation and identification"; Park (2006), "Fourier-based optimal excitation
     trajectories for the dynamic identification of robots".
     """
-    check_bodies(model)
-    terms = check_terms(terms, v_s)
-    if model.nq != model.nv:
-        raise ValueError(
-            f"model has nq={model.nq}, nv={model.nv}; exciting motions are for joints with one coordinate each"
-        )
+    terms, robot = check_terms(terms, v_s), make_driven(as_scene(system), motors, guess)
+    model, driven = robot.model, robot.driven
     if objective not in OBJECTIVES:
         raise ValueError(f"objective is {objective!r}; give one of {OBJECTIVES}")
     for name, value, good in (
@@ -143,61 +169,70 @@ def exciting_motion(
             raise ValueError(f"{name} is {value!r}; give " + {"margin": "a share in (0, 1]", "harmonics": "at least 2"}.get(
                 name, "a positive number"))  # fmt: skip
     dtype = model.home.dtype
-    limits = _limits(model, margin, velocity, torque)
-    center = (limits.lower + limits.upper) / 2
+    limits = _limits(robot, margin, velocity, torque)
     # Two standard deviations reach from the middle to the limits.
-    size = np.asarray(limits.upper - limits.lower) / 4
-    columns = free_columns(model.nb, model.nv, terms)[base_parameters(model, terms).independent]
+    size = np.asarray(limits.upper - limits.lower)[driven] / 4
     # Without the end of the period, which repeats its first sample.
     times = jnp.asarray(np.arange(_SAMPLES) * period / _SAMPLES, dtype)
-    weights = 1 / limits.torque_limit
-    task = _Task(model, limits, times, jnp.ones(len(columns), dtype), weights, jnp.asarray(v_s, dtype))
+    task = _Task(robot, limits, times, jnp.ones(1, dtype), jnp.asarray(v_s, dtype))
 
     keys = jax.random.split(jax.random.key(seed), starts)
     speed = 2 * np.pi / period * np.asarray(size)
-    share = np.minimum(1.0, 0.5 * np.asarray(limits.speed) / np.where(speed > 0, speed, 1))
-    motions = [random_motion(key, center, size * share, period=period, harmonics=harmonics) for key in keys]
+    share = np.minimum(1.0, 0.5 * np.asarray(limits.speed)[driven] / np.where(speed > 0, speed, 1))
+    motions = [random_motion(key, limits.middle, size * share, period=period, harmonics=harmonics) for key in keys]
     motions = [_shrink(motion, task) for motion in motions]
-    lengths = [np.linalg.norm(_rows(motion, task, tuple(columns.tolist())), axis=0) for motion in motions]
+    places = _base_places(robot, terms, motions, task)
+    lengths = np.linalg.norm(_rows(motions[0], task, places), axis=0)
     # One scale for all starts makes their losses comparable.
-    task = eqx.tree_at(lambda t: t.scale, task, jnp.asarray(np.where(lengths[0] > 0, lengths[0], 1), dtype))
-    places = tuple(columns.tolist())
-    first = [float(_loss(_amplitudes(motion), motion, task, places, objective)) for motion in motions]
+    task = eqx.tree_at(lambda t: t.scale, task, jnp.asarray(np.where(lengths > 0, lengths, 1), dtype))
+    stacked = jax.tree.map(lambda *x: jnp.stack(x), *map(_amplitudes, motions))
+    first = np.asarray(_losses(stacked, motions[0], task, places, objective))
     motion = motions[int(np.argmin(np.where(np.isfinite(first), first, np.inf)))]
 
-    excitation, history, result = _descend(motion, task, places, objective, steps, learning_rate, callback)
+    excitation, history, result = _descend(motion, task, places, objective, steps, learning_rate, seed, callback)
     excitation = _shrink(excitation, task)
     before, after = (np.asarray(_rows(m, task, places), np.float64) for m in (motion, excitation))
     scale = np.asarray(task.scale, np.float64)
     ratio = [np.linalg.slogdet((W / scale).T @ (W / scale))[1] for W in (before, after)]
-    return Excitation(
-        excitation,
-        model,
-        _condition(after),
-        _condition(before),
-        float(ratio[1] - ratio[0]),
-        history,
-        _limit_shares(excitation, task),
-        result,
-    )
+    used = {name: share for name, share in _limit_shares(excitation, task).items() if name != "closure"}
+    change = float(ratio[1] - ratio[0])
+    return Excitation(excitation, robot, _condition(after), _condition(before), change, history, used, result)
 
 
-def _limits(model: Model, margin: float, velocity, torque) -> _Limits:
+def _base_places(robot: DrivenRobot, terms, motions: Sequence[FourierMotion], task: _Task) -> tuple[int, ...]:
+    """Columns of `_rows` that are independent on general motions, for some terms."""
+    model, count = robot.model, len(robot.driven)
+    columns = free_columns(model.nb, count, terms)
+    if robot.motors is None:
+        return tuple(columns[base_parameters(model, terms).independent].tolist())
+    W = np.concatenate([np.asarray(_rows(motion, task, tuple(columns.tolist())), np.float64) for motion in motions])
+    base, _ = group_columns(W, tuple(map(str, columns)), model.nb, np.dtype(model.home.dtype))
+    return tuple(columns[base.independent].tolist())
+
+
+def _limits(robot: DrivenRobot, margin: float, velocity, torque) -> _Limits:
+    model, driven = robot.model, robot.driven
     n, dtype = model.nv, model.home.dtype
 
-    def of(value, otherwise):
-        numbers = (
-            np.full(n, otherwise) if value is None else np.broadcast_to(np.asarray(value, np.float64), (n,)).copy()
-        )
+    def of(value, otherwise, n=n):
+        numbers = np.full(n, otherwise) if value is None else np.asarray(value, np.float64)
+        if numbers.shape not in ((), (n,)):
+            raise ValueError(f"limits {numbers.tolist()} are of {numbers.size} joints; give one number, or {n}")
+        numbers = np.broadcast_to(numbers, (n,)).copy()
         return np.where(np.isfinite(numbers), numbers, otherwise)
 
-    start = np.asarray(neutral(model), np.float64)
+    start = np.asarray(robot.start, np.float64)
     lower, upper = of(model.lower, -np.inf), of(model.upper, np.inf)
     lower = np.where(np.isfinite(lower), lower, np.where(np.isfinite(upper), upper, start) - _TURN)
     upper = np.where(np.isfinite(upper), upper, lower + 2 * _TURN)
     middle, half = (lower + upper) / 2, margin * (upper - lower) / 2
-    speed = margin * of(model.velocity_limit if velocity is None else velocity, _SPEED)
-    torque_limit = margin * of(model.effort_limit if torque is None else torque, np.inf)
+    # Passive joints may be faster than the motors.
+    usual = np.where(np.isin(np.arange(n), driven), _SPEED, _PASSIVE * _SPEED)
+    speed = margin * of(model.velocity_limit, usual)
+    if velocity is not None:
+        speed[driven] = margin * of(velocity, _SPEED, len(driven))
+    own = np.asarray(model.effort_limit)[driven] if torque is None else torque
+    torque_limit = margin * of(own, np.inf, len(driven))
     for name, value in (("velocity", speed), ("torque", torque_limit), ("the range of positions", half)):
         if not np.all(value > 0):
             raise ValueError(f"{name} has limits {value.tolist()}; they must be positive")
@@ -205,7 +240,8 @@ def _limits(model: Model, margin: float, velocity, torque) -> _Limits:
     if not np.isfinite(torque_limit).all():
         mass = float(np.asarray(model.inertias)[:, 0].sum())
         torque_limit = np.where(np.isfinite(torque_limit), torque_limit, 1e3 * max(mass, 1e-3))
-    arrays = (middle - half, middle + half, speed, torque_limit)
+    centre = middle if robot.motors is None else start[driven]
+    arrays = (middle - half, middle + half, speed, torque_limit, centre)
     return _Limits(*(jnp.asarray(x, dtype) for x in arrays))
 
 
@@ -213,37 +249,27 @@ def _amplitudes(motion: FourierMotion):
     return motion.center, motion.cosine, motion.sine
 
 
-def _with_amplitudes(amplitudes, motion: FourierMotion) -> FourierMotion:
-    """Motion with other amplitudes, at rest at t = 0: both conditions are distributed over all harmonics."""
-    center, cosine, sine = amplitudes
-    k = jnp.arange(1, cosine.shape[0] + 1, dtype=cosine.dtype)[:, None]
-    cosine = cosine - jnp.mean(cosine, axis=0, keepdims=True)
-    sine = sine - jnp.mean(k * sine, axis=0, keepdims=True) / k
-    return FourierMotion(center, cosine, sine, motion.period)
-
-
-@eqx.filter_jit
-def _signals(motion: FourierMotion, model: Model, times):
-    q, v, a = jax.vmap(motion)(times)
-    return q, v, a, jax.vmap(lambda q, v, a: inverse_dynamics(model, q, v, a))(q, v, a)
-
-
 @eqx.filter_jit
 def _rows(motion: FourierMotion, task: _Task, places: tuple[int, ...]):
-    """Weighted regressor in base parameters (samples * nv, p)."""
+    """Regressor in base parameters (samples * m, p), rows over the torque limits."""
+    return _regressor(task, places, *task.robot.states(motion, task.times)[:4])
 
-    def one(t):
-        q, v, a = motion(t)
-        W = jnp.concatenate([torque_regressor(task.model, q, v, a), friction_regressor(v, a, TERMS, task.v_s)], axis=1)
-        return task.weights[:, None] * W[:, np.array(places)]
 
-    return jax.vmap(one)(task.times).reshape(-1, len(places))
+def _regressor(task: _Task, places: tuple[int, ...], q, v, a, N):
+    driven, limit = task.robot.driven, task.limits.torque_limit
+
+    def one(q, v, a, N):
+        friction = friction_regressor(v[driven], a[driven], TERMS, task.v_s)
+        W = jnp.concatenate([N.T @ torque_regressor(task.robot.model, q, v, a), friction], axis=1)
+        return W[:, np.array(places)] / limit[:, None]
+
+    return jax.vmap(one)(q, v, a, N).reshape(-1, len(places))
 
 
 @eqx.filter_jit
 def _loss(amplitudes, motion: FourierMotion, task: _Task, places: tuple[int, ...], objective: str):
-    changed = _with_amplitudes(amplitudes, motion)
-    W = _rows(changed, task, places) / task.scale[None]
+    q, v, a, tau, N, gap = driven_signals(motion_from_rest(*amplitudes, period=motion.period), task.robot, task.times)
+    W = _regressor(task, places, q, v, a, N) / task.scale[None]
     size = W.shape[1]
     # The floor keeps the logarithm finite where a motion does not excite a direction at all.
     floor = 1e-12 * jnp.eye(size, dtype=W.dtype)
@@ -256,7 +282,6 @@ def _loss(amplitudes, motion: FourierMotion, task: _Task, places: tuple[int, ...
         unit = W / jnp.sqrt(jnp.sum(W**2, axis=0, keepdims=True) + 1e-12)
         values = jnp.linalg.eigvalsh(unit.T @ unit + floor)
         value = 0.5 * jnp.log(values[-1] / values[0])
-    q, v, _, tau = _signals(changed, task.model, task.times)
     limits = task.limits
     span = (limits.upper - limits.lower)[None]
     over = [
@@ -265,7 +290,22 @@ def _loss(amplitudes, motion: FourierMotion, task: _Task, places: tuple[int, ...
         jnp.abs(v) / limits.speed[None] - 1,
         jnp.abs(tau) / limits.torque_limit[None] - 1,
     ]
+    if task.robot.motors is not None:
+        # Near a dead point speeds have no bound, beyond it the loops stay open: such motions are left out.
+        excess = [*(jnp.max(x) for x in over), jnp.max(gap) - _CLOSED]
+        return jnp.where(jnp.max(jnp.stack(excess)) <= 0, value, jnp.inf)
     return value + 100 * sum(jnp.mean(jnp.maximum(x, 0) ** 2) for x in over)
+
+
+@eqx.filter_jit
+def _losses(amplitudes, motion: FourierMotion, task: _Task, places: tuple[int, ...], objective: str):
+    """Losses (k,) of several motions."""
+    return jax.vmap(lambda one: _loss(one, motion, task, places, objective))(amplitudes)
+
+
+def _losses_of_units(args, scaled):
+    span, motion, *rest = args
+    return _losses(_scale_amplitudes(scaled, span), motion, *rest)
 
 
 def _unit_loss(scaled, args):
@@ -273,45 +313,47 @@ def _unit_loss(scaled, args):
     return _loss(_scale_amplitudes(scaled, span), motion, *rest)
 
 
-def _descend(motion, task, places, objective, steps, learning_rate, callback):
+def _descend(motion, task, places, objective, steps, learning_rate, seed, callback):
     import optax  # not when jaxdyn is imported
 
-    span = (task.limits.upper - task.limits.lower) / 2
-    method = GradientSteps(
-        _unit_loss,
-        (span, motion, task, places, objective),
-        method=optax.adam(optax.cosine_decay_schedule(learning_rate, steps, alpha=0.05)),
-    )
+    args = (task.span, motion, task, places, objective)
+    if task.robot.motors is None:
+        adam = optax.adam(optax.cosine_decay_schedule(learning_rate, steps, alpha=0.05))
+        method = GradientSteps(_unit_loss, args, method=adam)
+    else:
+        # Higher harmonics have smaller amplitudes at the same speed.
+        shares = 1 / np.arange(1.0, 1 + len(motion.sine))[:, None]
+        sizes = tuple(5 * learning_rate * x for x in (1.0, shares, shares))
+        method = RandomSteps(partial(_losses_of_units, args), sizes, seed)
     report = None if callback is None else lambda step, loss, _: callback(step, loss)
-    end = descend(method, _scale_amplitudes(_amplitudes(motion), 1 / span), Watch(steps, report))
-    return _with_amplitudes(_scale_amplitudes(end.best.point, span), motion), end.history, end.result
+    end = descend(method, _scale_amplitudes(_amplitudes(motion), 1 / task.span), Watch(steps, report))
+    found = _scale_amplitudes(end.best.point, task.span)
+    return motion_from_rest(*found, period=motion.period), end.history, end.result
 
 
 def _scale_amplitudes(amplitudes, span):
     """Centre (nq,), cosines and sines (harmonics, nq) times a number for each joint."""
-    return jax.tree.map(lambda x: x * (span if x.ndim == 1 else span[None]), amplitudes)
+    return jax.tree.map(lambda x: x * span.reshape(*[1] * (x.ndim - 1), -1), amplitudes)
 
 
 def _limit_shares(motion: FourierMotion, task: _Task) -> dict[str, float]:
     """Largest share of each kind of limit along a fine grid."""
     times = jnp.asarray(np.arange(_CHECKED) * float(motion.period) / _CHECKED, task.times.dtype)
-    q, v, _, tau = (np.asarray(x, np.float64) for x in _signals(motion, task.model, times))
-    limits = [
-        np.asarray(x, np.float64)
-        for x in (task.limits.lower, task.limits.upper, task.limits.speed, task.limits.torque_limit)
-    ]
-    middle, half = (limits[0] + limits[1]) / 2, (limits[1] - limits[0]) / 2
+    q, v, _, tau, _, gap = (np.asarray(x, np.float64) for x in driven_signals(motion, task.robot, times))
+    lower, upper, speed, torque, _ = (np.asarray(x, np.float64) for x in jax.tree.leaves(task.limits))
     sizes = {
-        "position": np.abs(q - middle) / half,
-        "velocity": np.abs(v) / limits[2],
-        "torque": np.abs(tau) / limits[3],
+        "position": np.abs(q - (lower + upper) / 2) / ((upper - lower) / 2),
+        "velocity": np.abs(v) / speed,
+        "torque": np.abs(tau) / torque,
+        "closure": gap / _CLOSED,
     }
-    return {name: float(values.max()) for name, values in sizes.items()}
+    # Newton's method on loops that cannot be closed may leave the numbers.
+    return {name: float(np.nan_to_num(values, nan=np.inf).max()) for name, values in sizes.items()}
 
 
 def _shrink(motion: FourierMotion, task: _Task) -> FourierMotion:
     """Scale the amplitudes, and the distance from the middle, by the largest factor up to 1 that exceeds no limit."""
-    middle = (task.limits.lower + task.limits.upper) / 2
+    middle = task.limits.middle
 
     def at(share):
         center = middle + share * (motion.center - middle)
@@ -321,8 +363,13 @@ def _shrink(motion: FourierMotion, task: _Task) -> FourierMotion:
         return motion
     low, high = 0.0, 1.0
     if (used := _limit_shares(at(0.0), task))["torque"] > 1:
+        where = "the middle of its ranges" if task.robot.motors is None else "guess"
         raise ValueError(
-            f"torque: holding the robot at the middle of its ranges needs {used['torque']:.3g} times the limits; give larger ones"
+            f"torque: holding the robot at {where} needs {used['torque']:.3g} times the limits; give larger ones"
+        )
+    if used["position"] > 1:
+        raise ValueError(
+            f"position: guess uses {used['position']:.3g} times the ranges of the joints; give another one"
         )
     # 20 bisections determine the factor to 1e-6.
     for _ in range(20):

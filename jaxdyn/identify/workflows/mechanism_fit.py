@@ -15,7 +15,7 @@ from jaxdyn.identify.options import Objective
 from jaxdyn.identify.parameter_tree import Parameters
 from jaxdyn.identify.parameters import fit_parameters
 from jaxdyn.identify.regression import BaseParameters, group_columns, least_squares_by_svd, parameter_names
-from jaxdyn.identify.result import ParameterFit, torques_along
+from jaxdyn.identify.result import Fit, torques_along
 from jaxdyn.identify.torque_terms import TERMS, Friction, Terms, check_terms
 from jaxdyn.identify.uncertainty import effective_sample_size
 from jaxdyn.model.tree import Model
@@ -33,7 +33,7 @@ class MechanismFit(NamedTuple):
     - `condition`: of the regressor in these combinations, columns of unit length; `weakest`: the least identifiable directions.
     """
 
-    fit: ParameterFit
+    fit: Fit
     base: BaseParameters
     nominal: np.ndarray
     values: np.ndarray
@@ -68,7 +68,7 @@ def fit_mechanism(
     """
     terms = check_terms(terms, v_s)
     logs = as_logs(log, scene.system)
-    columns = np.array(check_motors(scene, logs[0], motors))
+    columns = np.array(check_motors(scene, np.asarray(logs[0].q)[0], motors))
     start = _with_friction(scene, columns, terms, v_s, signal_sizes(logs))
     model: Model = start.system
     every = parameter_names(model, terms)

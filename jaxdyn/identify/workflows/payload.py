@@ -213,7 +213,7 @@ def _residuals(robot: RobotFit, loaded: Sequence[Log], own: slice, payload) -> t
     """Errors (n, nv) along each loaded log, of robot and payload, and of the robot alone."""
     inertias = robot.fit.model.inertias
     with_payload = eqx.tree_at(
-        lambda fit: fit.model.inertias,
+        lambda fit: fit.system.system.inertias,
         robot.fit,
         inertias.at[own.start // 10].add(jnp.asarray(payload, inertias.dtype)),
     )
