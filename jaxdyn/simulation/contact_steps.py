@@ -196,7 +196,7 @@ def _step(
         # The residual is no more than a reader of all arguments: programs leave out those that no value depends on.
         residual = coulomb.residual_at(groups, x, y, width)
         solved, steps = residual >= 0, residual
-        x = coulomb.attach_derivative(groups, of.W, y, of.scale, jax.lax.stop_gradient(width), x)
+        x = coulomb.attach_derivative(groups, of.W, y, of.scale, width, x)
     # Impulses of frictions' loads move nothing: their rows are zero.
     velocity = problem.velocity + problem.metric.unwhiten(matmul(problem.Y * of.scale[None], x) * of.size)
     signs = jnp.concatenate([jnp.ones((len(x) - len(contacts.limited),), q.dtype), problem.side])
