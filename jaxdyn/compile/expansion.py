@@ -265,6 +265,13 @@ class _Expansion:
         chosen = [self.graph.select(flag, x, math.nan, kind) for flag, x in zip(flags, entries, strict=True)]
         return [objects(chosen, args[1].shape)]
 
+    def _nan_where(self, params, args, eqn):
+        """NaN where a flag is set and the number is not zero, else zero: derivatives of what has failed."""
+        g, kind = self.graph, kind_or_refuse(eqn.outvars[0].aval.dtype)
+        pairs = zip(*(as_objects(x).ravel().tolist() for x in args), strict=True)
+        chosen = [g.select(g.both(flag, g.compare("ne", x, 0.0)), 0.0, math.nan, kind) for flag, x in pairs]
+        return [objects(chosen, args[1].shape)]
+
     def _cond(self, params, args, eqn):
         which, branches = as_objects(args[0]).item(), params["branches"]
         if type(which) is Number:
@@ -435,6 +442,7 @@ _OTHER: dict[str, Callable] = {
     "triangular_solve": array_rules.triangular_solve,
     "jaxdyn_kernel": _Expansion._kernel,
     "jaxdyn_invalid": _Expansion._invalid,
+    "jaxdyn_nan_where": _Expansion._nan_where,
     "jaxdyn_guarded": _Expansion._guard,
 }
 

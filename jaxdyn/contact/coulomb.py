@@ -309,7 +309,8 @@ def _attach_derivative_jvp(groups: Groups, primals, tangents):
     blocks = _blocks(D, along)
     (_, DS), shift = zip(*blocks, strict=True), _shift(scale, _SHIFT_OF_DERIVATIVE)
     matrix = _newton_matrix(groups, blocks, W, shift)
-    right = -_apply(groups, DS, tangents[1][:, None])
+    _, by_width = jax.jvp(lambda width: _residual(groups, moving, y, width)[0], (width,), (tangents[3],))
+    right = -(by_width[:, None] + _apply(groups, DS, tangents[1][:, None]))
     solve = solver_of(matrix)
     change = solve(right)
     # One refinement removes the shift along the range of W.

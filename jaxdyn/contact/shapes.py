@@ -69,6 +69,8 @@ class ConvexHull(eqx.Module):
         self.vertices = as_float(vertices, "ConvexHull: vertices", (None, 3))
         if not len(self.vertices):
             raise ValueError("ConvexHull: vertices has no points; give (n, 3) of them, m")
+        if is_concrete(self.vertices) and not bool(jnp.all(jnp.isfinite(self.vertices))):
+            raise ValueError("ConvexHull: vertices has infinite numbers; give places in m")
 
 
 class Feature(eqx.Module):
@@ -205,7 +207,8 @@ def outward(shape: Any, point: Float[Array, "3"]) -> tuple[Float[Array, "3"], Fl
         inside = jnp.where(chosen, sides, jnp.zeros_like(sides))
         away = point - jnp.clip(point, -half, half)
         is_outside = deepest > 0
-        normal = jnp.where(is_outside, unit_or(away, jnp.asarray([1.0, 0.0, 0.0], point.dtype)), inside)
+        # Where the point is a rounding above a face, the direction to it is rounding: it has the normal of the face.
+        normal = jnp.where(is_outside, unit_or(away, inside), inside)
         return normal, jnp.where(is_outside, jnp.sum(normal * away), deepest)
     away = point
     if isinstance(shape, Capsule):

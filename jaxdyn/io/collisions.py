@@ -22,6 +22,8 @@ from jaxdyn.model.tree import Model
 FRICTION = 1.0  # where a format or a file has none: the default of Gazebo and of MuJoCo
 # Contacts of a mesh. The equations of a step grow with the square of the number of contacts.
 _MOST_VERTICES = 12
+# Contacts that "ground" gives: of more, the first call of a step takes minutes, and each step a second or so.
+_MOST_CONTACTS = 64
 
 
 class Collision(NamedTuple):
@@ -64,7 +66,7 @@ def contacts_with_ground(
 
     **Returns:** contacts; descriptions of what is left out; the links that have contacts.
 
-    **Raises:** ValueError for chosen links without a shape.
+    **Raises:** ValueError for chosen links without a shape, and for more than 64 contacts of "ground".
     """
     grounds = [one for one in collisions if _is_ground(one) and _is_fixed(model, one)]
     known = list(dict.fromkeys(str(one.frame) for one in collisions if one.frame is not None))
@@ -104,6 +106,12 @@ def contacts_with_ground(
                 one.frame, shape, one.pose, on=on, friction=friction, name=names.new(name), **options
             )
             taken.add(one.frame)
+    if isinstance(contacts, str) and len(made) > _MOST_CONTACTS:
+        raise ValueError(
+            f"contacts='ground' gives {len(made)} contacts, of the links {', '.join(sorted(taken))}; a step takes time with the "
+            f"cube of their number, and {_MOST_CONTACTS} are the most of 'ground'. List the links that touch, as "
+            "contacts=['left_foot', 'right_foot'], or with the number of their lowest corners, {'left_foot': 4}"
+        )
     return (
         made,
         [

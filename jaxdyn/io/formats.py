@@ -69,8 +69,9 @@ def load(
       `.forces`. The ground is the file's planes and height fields that are fixed to the world, else the plane z = 0; URDF
       has none. A mesh counts by at most 12 vertices of its convex hull. Coefficients of friction are those of the file; in a URDF
       `<mu1>` in the `<gazebo>` element of the link or `<lateral_friction>` in its `<contact>`, and 1 without.
-      Steps take time with the number of contacts cubed: name the feet, and {"LF_FOOT": 1} for contacts in the lowest corner
-      alone of their boxes and meshes, or {"LF_FOOT": 4} of a flat foot (`lowest` of `shape_contacts`, for `jd.stepper`).
+      Steps take time with the number of contacts cubed, and "ground" is refused where it gives more than 64: name the feet,
+      and {"LF_FOOT": 1} for contacts in the lowest corner alone of their boxes and meshes, or {"LF_FOOT": 4} of a flat foot
+      (`lowest` of `shape_contacts`, for `jd.stepper`).
     - `arguments`: of the `<xacro:arg>` elements of a file whose name ends in .xacro, {"prefix": "left_"}. The package xacro
       expands it to a URDF; lines in errors are those of the expanded text.
     - `dtype`: as for `ModelBuilder`.

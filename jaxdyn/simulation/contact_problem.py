@@ -141,16 +141,9 @@ def contact_terms(contacts: Contacts, scene: Scene, q, v, t) -> _Terms:
     """Contacts and joint limits at q; `scene` is the extended one."""
     parts_gap, parts_J, parts_velocity, side = [], [], [], jnp.zeros((0,), q.dtype)
     if contacts.elements:
-        # The rows of the contacts alone, which come behind those of the scene's constraints.
-        own = Scene(scene.system, scene.constraints[len(scene.constraints) - len(contacts.elements) :])
+        own, far = _own_rows(contacts, scene), jnp.ones((), q.dtype)
         rows = contacts.rows - contacts.own
-        gaps = position_residual(own, q, t)
-        # Frictions have no gap, and are far from closing one.
-        opening = np.cumsum([one.opens for one in contacts.elements]) - 1
-        far = jnp.ones((), q.dtype)
-        parts_gap.append(
-            jnp.stack([gaps[int(opening[i])] if contacts.elements[i].opens else far for i in contacts.order])
-        )
+        parts_gap.append(_gaps(contacts, own, q, t))
         is_row = contacts.rows >= 0
         J, velocity = constraint_jacobian(own, q, t), velocity_residual(own, q, v, t)
         parts_J.append(
@@ -174,6 +167,20 @@ def contact_terms(contacts: Contacts, scene: Scene, q, v, t) -> _Terms:
         parts_velocity.append(side * v[at_v])
     gap, rows, velocity = map(jnp.concatenate, (parts_gap, parts_J, parts_velocity))
     return _Terms(gap, rows, velocity, side)
+
+
+def _own_rows(contacts: Contacts, scene: Scene) -> Scene:
+    """The rows of the contacts alone, which come behind those of the scene's constraints."""
+    return Scene(scene.system, scene.constraints[len(scene.constraints) - len(contacts.elements) :])
+
+
+def _gaps(contacts: Contacts, own: Scene, q, t) -> Array:
+    """Gaps of the contacts in their order; `own` as of `_own_rows`."""
+    gaps = position_residual(own, q, t)
+    # Frictions have no gap, and are far from closing one.
+    opening = np.cumsum([one.opens for one in contacts.elements]) - 1
+    far = jnp.ones((), q.dtype)
+    return jnp.stack([gaps[int(opening[i])] if contacts.elements[i].opens else far for i in contacts.order])
 
 
 class _Flow(NamedTuple):
@@ -209,18 +216,22 @@ def _flow(scene: Scene, q, v, z, tau, t, h) -> _Flow:
     return _Flow(place, metric, acceleration, z if drives is None else drives)
 
 
-def _bounds(contacts: Contacts, scene: Scene, terms: _Terms, v, free, h):
-    """Bounds (k,) of the normal velocities; v (nv,) is the velocity at the start, `free` that without contact forces."""
+def _bounds(contacts: Contacts, scene: Scene, terms: _Terms, gaps, v, free, h):
+    """Bounds (k,) of the normal velocities; v (nv,) is the velocity at the start, and `gaps` are those of contacts there; `free`
+    (nv,) is the velocity without contact forces."""
     at = contacts.normals
     change, free = matmul(terms.J[at], free - v), terms.velocity[at]
     now = free - change
+    # Velocities by which curved ways of the step have closed gaps: of a rolling ball, whose velocity turns with the body.
+    count = len(contacts.elements)
+    bent = jnp.zeros_like(now).at[:count].set((terms.gap[:count] - gaps) / h - now[:count])
     restitution = [
         force_at(scene, contacts.elements[i]).restitution if contacts.elements[i].opens else jnp.zeros(())
         for i in contacts.order
     ]
     e = jnp.stack([*restitution, *[jnp.zeros(())] * len(contacts.limited)]).astype(free.dtype)
     reach = -terms.gap / h
-    bound = jnp.where(terms.gap < 0, jnp.minimum(reach, -free), reach)
+    bound = jnp.where(terms.gap < 0, jnp.minimum(reach, jnp.maximum(-free, bent)), reach)
     # Closing in the next step, and faster than forces close it.
     is_impact = (free < bound) & (-now > _IMPACT * jnp.abs(change)) & (e > 0)
     # Under a constant force, which changes the velocity by d in the step, the velocity u after the way h u is the root of
@@ -331,22 +342,23 @@ def pose(contacts: Contacts, scene: Scene, q, v, z, tau, t, h) -> _Problem:
     place, metric, start = displace(scene.system, flow.place, 0.5 * h * v), flow.metric, flow.acceleration(v, v)[0]
     free = v + h * start
     terms = contact_terms(contacts, whole, place, free, end)
+    gaps = _gaps(contacts, _own_rows(contacts, whole), q, t) if contacts.elements else jnp.zeros((0,), q.dtype)
     loads = _loads(contacts, scene, flow.place, v, t + 0.5 * h)
-    closes = jnp.any(terms.velocity[contacts.normals] < _bounds(contacts, scene, terms, v, free, h))
+    closes = jnp.any(terms.velocity[contacts.normals] < _bounds(contacts, scene, terms, gaps, v, free, h))
     closes = closes | jnp.any(loads > 0) | bool(contacts.load_rows)
     # Halfway to a velocity without contact forces, damping would be that of a motion that contacts prevent.
     half = v + 0.5 * h * start
     rate, multipliers = flow.acceleration(half, jnp.where(closes, v, half))
     change = h * (rate - start)
     free, terms = free + change, terms._replace(velocity=terms.velocity + matmul(terms.J, change))
-    bound = _bounds(contacts, scene, terms, v, free, h)
+    bound = _bounds(contacts, scene, terms, gaps, v, free, h)
     place = jnp.where(closes, place, displace(scene.system, flow.place, 0.5 * h * free))
     if not scene.constraints:
         Y, reaction = metric.whiten(terms.J.T), _Reaction(h * loads, {})
         return _in_units(contacts, flow, Y, place, free, terms, terms.velocity, bound, reaction)
     place = project_state(bare, place, free, end)[0]
     terms = contact_terms(contacts, whole, place, free, end)
-    bound = _bounds(contacts, scene, terms, v, free, h)
+    bound = _bounds(contacts, scene, terms, gaps, v, free, h)
     # The rows of the scene's constraints are eliminated: what is left of Y is orthogonal to them.
     of_loops, Y = metric.whiten(constraint_jacobian(bare, place, end).T), metric.whiten(terms.J.T)
     factor = cholesky(regular_gram(of_loops))

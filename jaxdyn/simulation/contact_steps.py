@@ -9,8 +9,10 @@ with the rows A of the constraints and J of the contacts there and M at the midp
 where the normal velocity counts from a bound n . v' >= c:
 
     c = -gap / h             the contact closes in the next step at the earliest,
-    c = min(-gap / h, -u)    for a gap below zero; u = n . v_f: no more velocity comes out than has come in,
+    c = min(-gap / h, max(-u, w))    for a gap below zero; u = n . v_f: no more velocity comes out than has come in,
     c = e |u|                for an impact: the contact closes in the next step, with restitution e.
+
+The step along v bends, as that of a ball whose velocity turns with it; w is the velocity by which this has closed the gap.
 
 If no contact closes, and no friction has a load, q' is that of the midpoint rule, q + h v/2 + h v'/2, and the step is of order
 two. A contact at rest has v = 0, and so q' = q to rounding: nothing creeps. q' is projected onto the holonomic constraints
@@ -196,7 +198,7 @@ def _step(
         # The residual is no more than a reader of all arguments: programs leave out those that no value depends on.
         residual = coulomb.residual_at(groups, x, y, width)
         solved, steps = residual >= 0, residual
-        x = coulomb.attach_derivative(groups, of.W, y, of.scale, jax.lax.stop_gradient(width), x)
+        x = coulomb.attach_derivative(groups, of.W, y, of.scale, width, x)
     # Impulses of frictions' loads move nothing: their rows are zero.
     velocity = problem.velocity + problem.metric.unwhiten(matmul(problem.Y * of.scale[None], x) * of.size)
     signs = jnp.concatenate([jnp.ones((len(x) - len(contacts.limited),), q.dtype), problem.side])

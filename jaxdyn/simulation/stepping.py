@@ -69,7 +69,7 @@ def stepper(
       forward mode too (`jax.jvp`, `jax.jacfwd`), in which reverse mode takes longer. Forward mode of "reverse" raises an error.
     - `limits`: "hold" for the model's joint limits as contacts without friction; None to ignore them.
     - `smoothing`: kappa in J, for learning: normal force times gap of a contact at rest is kappa instead of zero, so that
-      contacts that are open have derivatives. Zero by default, for Coulomb's law.
+      contacts that are open have derivatives. Zero by default, for Coulomb's law. Positive, it may be differentiated by.
     - `report`: if True, a step returns (state, `ContactStep`), with a result code, and of a scene with contacts with forces in N
       by name and those of limits. The code is `coarse_steps` where the state after the step may be wrong by more than a tenth of
       its change in it; steps through contacts have no such estimate. A step whose contacts were not solved has the code

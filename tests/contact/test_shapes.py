@@ -301,6 +301,19 @@ def test_derivatives_are_finite_in_singular_places(case):
         assert np.isfinite(jax.jit(f)(x)).all()
 
 
+@pytest.mark.parametrize("dtype", [jnp.float32, jnp.float64])
+def test_normal_of_a_box_a_rounding_above_its_face_is_that_of_the_face(dtype):
+    """The centre of a sphere as near as numbers are, outside and inside, on each face."""
+    contact = shape_contacts("body", Sphere(0.1), on=Box((2.0, 2.0, 2.0)))[0].contact
+    for axis in range(3):
+        for side in (-1.0, 1.0):
+            for steps in (-2, -1, 0, 1, 2):
+                p = np.full(3, 0.25)
+                p[axis] = side * (1.0 + steps * float(jnp.finfo(dtype).eps))
+                touch = contact.touching(jnp.eye(3, dtype=dtype), jnp.asarray(p, dtype))
+                np.testing.assert_array_equal(touch.normal, side * np.eye(3)[axis])
+
+
 @pytest.mark.parametrize(
     ("options", "message"),
     [
@@ -328,6 +341,7 @@ def test_bad_shapes_are_refused():
         (lambda: Box((1, 0, 1)), "three positive lengths"),
         (lambda: Capsule(0.1, -1.0), "Capsule: length is -1"),
         (lambda: ConvexHull(np.zeros((0, 3))), "has no points"),
+        (lambda: ConvexHull([[np.inf, 0.0, 0.0]]), "has infinite numbers"),
         (lambda: HeightField([[1.0, 2.0]], 1.0), "two finite heights or more"),
         (lambda: HeightField(HEIGHTS), "give the distance of the heights"),
         (lambda: HeightField(HEIGHTS, -1.0), "give the distance of the heights"),

@@ -345,6 +345,31 @@ def test_a_step_with_contacts(tmp_path):
 
 
 @pytest.mark.long
+def test_derivatives_of_a_step_with_smoothed_contacts():
+    """A ball above and on the ground: values and derivatives by all arguments, smoothing among them, are those of the library."""
+    builder = jd.ModelBuilder("ball", gravity=(0, 0, -9.81))
+    builder.add_body("rail", None, "prismatic", (0.2, (0, 0, 0), (0.1, 0.1, 0.1)), axis=(1, 0, 0))
+    builder.add_body("ball", "rail", "prismatic", (1.0, (0, 0, 0), (0.1, 0.1, 0.1)), axis=(0, 0, 1))
+    scene = jd.Scene(builder.build(), forces=[jd.contact.ground_contact("ball", (0, 0, 0), 0.5)])
+
+    def advance(q, v, tau, smoothing):
+        return jd.stepper(scene, 0.01, smoothing=smoothing)((q, v), tau)[1]
+
+    v, tau, kappa = np.array([0.3, -0.2]), np.array([0.1, -0.2]), np.array(1e-3)
+    exported = jd.export(advance, v, v, tau, kappa, name="ball", derivatives=("jacobian",))
+    derivatives = jax.jit(jax.jacrev(advance, (0, 1, 2, 3)))
+    for height in (0.001, 0.05):
+        given = (np.array([0.0, height]), v, tau, kappa)
+        np.testing.assert_allclose(exported(*given), advance(*given), rtol=1e-12)
+        found = exported.jacobian(*given)
+        for got, expected in zip(found, derivatives(*given), strict=True):
+            np.testing.assert_allclose(got.reshape(expected.shape), expected, rtol=1e-9, atol=1e-12)
+        # By smoothing too, also of a contact that stays open: by differences.
+        ends = [np.asarray(advance(*given[:3], kappa * (1 + sign * 1e-4))) for sign in (1, -1)]
+        np.testing.assert_allclose(found[3][:, 0], (ends[0] - ends[1]) / 2e-7, rtol=1e-6)
+
+
+@pytest.mark.long
 def test_a_step_of_an_arm_behind_drives(tmp_path):
     """Drives of first and second order, their states as an argument and a result; steps that end at kinks are refused."""
     forces = jd.forces.FirstOrderDrive(0.01), jd.forces.SecondOrderDrive(80.0, 0.6)

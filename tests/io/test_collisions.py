@@ -93,6 +93,23 @@ def test_chosen_links_and_refusals(urdf):
     assert sorted(lowest) == ["box 0", "box 1", "box 2", "box 3", "sphere"]
 
 
+def test_ground_for_a_whole_robot_asks_for_the_links_that_touch(tmp_path):
+    """Nine boxes have 72 contacts: the error names the links; a list of them, or their lowest corners, is taken."""
+    links = [f"leg {i}" for i in range(9)]
+    parts = [
+        f"""<link name="{name}">{INERTIAL}<collision><geometry><box size="0.1 0.1 0.1"/></geometry></collision></link>
+        <joint name="j {name}" type="prismatic"><parent link="base"/><child link="{name}"/><axis xyz="0 0 1"/>
+        <limit lower="-1" upper="1" velocity="1" effort="1"/></joint>"""
+        for name in links
+    ]
+    path = tmp_path / "robot.urdf"
+    path.write_text(f'<robot name="r"><link name="base"/>{"".join(parts)}</robot>')
+    with pytest.raises(ValueError, match=r"'ground' gives 72 contacts, of the links leg 0, leg 1.*List the links"):
+        load(path, contacts="ground")
+    assert len(touching_of(load(path, contacts=links))) == 72
+    assert len(touching_of(load(path, contacts=dict.fromkeys(links, 4)))) == 36
+
+
 def test_meshes_that_cannot_be_read_are_named(urdf):
     """A missing file; a hull of many vertices, of which twelve are contacts."""
     pytest.importorskip("trimesh")

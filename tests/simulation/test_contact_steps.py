@@ -348,6 +348,22 @@ def test_derivatives_are_those_of_differences():
     np.testing.assert_allclose(found, expected, rtol=1e-6, atol=1e-7)
 
 
+@pytest.mark.parametrize("slope", [0.0, 0.2])
+def test_ball_that_rolls_fast_does_not_sink(slope):
+    """At 2 m/s, where v^2/r is above 2 g: below the ground by the bend of one step, w^2 r h^2/2, and as fast as it should be."""
+    h, radius, spin, end = 0.0025, 0.1, 20.0, 1.0
+    normal, down = np.array([np.sin(slope), 0, np.cos(slope)]), np.array([np.cos(slope), 0, -np.sin(slope)])
+    contact = jd.contact.ground_contact("body", None, 1.0, radius=radius, plane=((0, 0, 0), (0, slope, 0)), name="0")
+    scene = free_body([contact], (0.4 * radius**2,) * 3)
+    start = jnp.asarray([*(radius * normal), 1, 0, 0, 0]), jnp.asarray([*(spin * radius * down), 0, spin, 0])
+    (q, v), _ = jax.jit(lambda start: run(scene, h, start, round(end / h)))(start)
+    acceleration = 5 / 7 * G * np.sin(slope)
+    fastest = spin + acceleration / radius * end
+    assert np.min(q[:, :3] @ normal) - radius > -1.1 * fastest**2 * radius * h**2 / 2
+    np.testing.assert_allclose(v[-1, 4], fastest, rtol=1e-3)
+    np.testing.assert_allclose(q[-1, :3] @ down, spin * radius * end + acceleration * end**2 / 2, rtol=1e-3)
+
+
 @pytest.mark.long
 def test_grazing_has_finite_derivatives_and_smoothing_a_hover():
     """At rest without load both modes are finite. With smoothing the force f acts at a gap of kappa / f."""

@@ -164,3 +164,43 @@ def test_random_drops_come_to_their_end(name, count, seconds):
     outcome = jax.device_get(jax.jit(jax.vmap(once))(*drops.samples(starts, count)))
     failures = drops.failures(outcome)
     assert not failures, failures
+
+
+@pytest.mark.parametrize("gap", [-1e-10, -3e-10, -1e-8])
+def test_contact_that_opens_below_its_zero_has_no_event_again_and_again(gap):
+    """Pulled up from a gap below zero by rounding, in steps in which it does not get above: q0 + g t^2/2, without an event."""
+    builder = jd.ModelBuilder("point", gravity=(0, 0, G))
+    builder.add_body("point", None, "prismatic", (1.0, (0, 0, 0), (0.1, 0.1, 0.1)), axis=(0, 0, 1))
+    scene = jd.Scene(builder.build(), forces=[jd.contact.ground_contact("point", friction=0.5)])
+    motion = jd.simulate(
+        scene, [gap], [0.0], [0.0, 1e-4], stepsize=1e-6, events=[jd.events.ModeSwitches(8)], throw=False
+    )
+    assert motion.success, motion.result
+    assert motion.events.count == 0
+    np.testing.assert_allclose(motion.q[-1], G * 1e-8 / 2, atol=2e-8 if gap == -1e-8 else 1e-9)
+
+
+@pytest.mark.long
+def test_contacts_that_hold_do_not_slip_where_another_one_stops():
+    """Of a hand with events in plenty (index 7): no contact begins to slip at a speed that counts as zero, to stop at once."""
+    drop = drops.DROPS["hand"]()
+    softness = drops.SOFTNESS["hand"]
+    control = drops.Held(jnp.asarray(drop.rest), drops.SPRING * softness, drops.DAMPER * softness)
+    q0, v0, mu, e = (x[7] for x in drops.samples(drop.starts, 1000))
+    motion = jd.simulate(
+        drop.scene(mu, e),
+        q0,
+        v0,
+        [0.0, 0.57],
+        control=jax.tree_util.Partial(control),
+        rtol=drops.TOLERANCE,
+        atol=drops.TOLERANCE,
+        events=[jd.events.ModeSwitches(1200)],
+    )
+    times, names = np.asarray(motion.events.time), motion.events.name
+    lasting = []
+    for finger in range(3):
+        slips, sticks = (times[names == f"finger {finger}: {kind}"] for kind in ("slip", "stick"))
+        lasting += [np.min(sticks[sticks >= slip] - slip, initial=np.inf) for slip in slips]
+    assert len(lasting) > 20
+    assert min(lasting) > 1e-10

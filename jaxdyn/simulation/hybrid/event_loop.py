@@ -146,10 +146,7 @@ def guards_at(plan: Plan, args, t, y):
 @kernel(static=1, derivative=False)
 def _begin_mode(system: HybridSystem, args, t, y):
     """State behind an event on the rows that act, its rate of change if steps reuse it, and its guards."""
-    plan = system.plan
-    if system.elements.each:
-        # A gap is closed where it has fallen below zero by its level, which the first step behind would count as its error.
-        y = plan.project_end(args, t, y, jnp.zeros_like(y))[0]
+    plan, y = system.plan, system.begin(args, t, y)
     return y, plan.first_rate(args, t, y), plan.guards_of(args, t, y)[0]
 
 
@@ -163,6 +160,8 @@ def run_events(system: HybridSystem, unknown, ts, y0, mode, rtol, atol, stepsize
     # The start may be an impact, or its mode may not hold: it passes a transition before the first step.
     begun = system.reset(unknown, ts[0], y0, mode, system.slip(y0), hit, True, atol)
     y = system.with_slip(y0, begun.v, begun.slip)
+    if elements.each:
+        y = _begin_mode(system, (unknown, begun.mode), ts[0], y)[0]
     if stepsize is not None:
         # One grid for the whole run: steps that an event has cut return to it.
         stepsize = (ts[-1] - ts[0]) / driver.number_of_steps(ts[0], ts[-1], stepsize).astype(ts.dtype)

@@ -18,10 +18,11 @@ from jaxdyn.forces.piecewise import Pieces, fix_pieces, guards, pieces_of
 from jaxdyn.simulation.checks import safe_inputs
 from jaxdyn.simulation.equations import state_outputs
 from jaxdyn.simulation.hybrid.modes import KINDS, Elements, Events, Mode, elements_of, extend
+from jaxdyn.simulation.hybrid.projection import project
 from jaxdyn.simulation.hybrid.reactions import coefficients, directions, motion_at, slides
 from jaxdyn.simulation.hybrid.replay import HybridRun
 from jaxdyn.simulation.hybrid.rows import by_element, gaps, terms_at, tolerance
-from jaxdyn.simulation.hybrid.system import ModalSystem, project
+from jaxdyn.simulation.hybrid.system import ModalSystem
 from jaxdyn.simulation.hybrid.transitions import length
 from jaxdyn.simulation.methods import consistent, satisfies_redundant_rows
 from jaxdyn.simulation.solution import Solution, invalidate_failures, rows_where

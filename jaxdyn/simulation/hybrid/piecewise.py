@@ -52,6 +52,9 @@ class PiecewiseSystem(HybridSystem):
     def impact(self, unknown, collision, t, y):
         return y
 
+    def begin(self, args, t, y):
+        return y
+
     def slip(self, y):
         return jnp.zeros((0, 2), y.dtype)
 

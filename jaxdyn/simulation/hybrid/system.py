@@ -16,10 +16,10 @@ from jax.flatten_util import ravel_pytree
 
 from jaxdyn.compile import kernel
 from jaxdyn.compile.batch import cond, while_loop
-from jaxdyn.constraints.base import holonomic_rows, layout, position_residual, velocity_residual
 from jaxdyn.forces.piecewise import values_and_levels
 from jaxdyn.lie.so3 import matmul
-from jaxdyn.simulation.hybrid.modes import Elements, Mode, extend
+from jaxdyn.simulation.hybrid.modes import Elements, Mode
+from jaxdyn.simulation.hybrid.projection import project
 from jaxdyn.simulation.hybrid.reactions import (
     ROUNDING,
     Collision,
@@ -33,13 +33,12 @@ from jaxdyn.simulation.hybrid.reactions import (
     react,
     rebounds,
 )
-from jaxdyn.simulation.hybrid.rows import StateTerms, by_element, by_normal_row, gaps, terms_at, tolerance
+from jaxdyn.simulation.hybrid.rows import StateTerms, by_normal_row, gaps, terms_at, tolerance
 from jaxdyn.simulation.hybrid.transitions import (
     SLIDES,
     STICKS,
     Problem,
     Transition,
-    align,
     choose_mode,
     find_jams,
     first_guess,
@@ -52,11 +51,8 @@ from jaxdyn.simulation.hybrid.transitions import (
 )
 from jaxdyn.simulation.solvers.explicit import Plan
 from jaxdyn.systems.scene import Scene
-from jaxdyn.systems.system import displace, rate_to_velocity, retract, velocity_to_rate
+from jaxdyn.systems.system import retract, velocity_to_rate
 
-# Rounds of a projection at the end of a step, and of one at a save point. All have the factor of the first: each reduces what is
-# open in proportion to the first correction, which only coarse tolerances make large.
-_ROUNDS, _SAVED_ROUNDS = 2, 6
 _STOPPED = 30  # tolerances of the velocity below which sliding has ended
 _IMPACTS = (
     0,
@@ -90,6 +86,10 @@ class HybridSystem:
     @abstractmethod
     def impact(self, unknown, collision: Collision, t, y) -> Any:
         """State after an impact."""
+
+    @abstractmethod
+    def begin(self, args, t, y) -> Any:
+        """State from which the first step in a mode is made, on the rows that act."""
 
     @abstractmethod
     def slip(self, y) -> Any:
@@ -139,6 +139,13 @@ class ModalSystem(HybridSystem):
         values, levels = values_and_levels(lambda q, v: switching(q, v, t), q, v)
         return jnp.where(positive, values, -values), levels
 
+    def begin(self, args, t, y):
+        # A gap is closed where it has fallen below zero by its level, which the first step behind would count as its error. To
+        # close it may push another contact that opens there as far below zero: its guard would end the mode at once, again
+        # without a force, and so on without end.
+        scene = self._bind(args[0])[0]
+        return ravel_pytree(project(scene, self.elements, args[1], t, self.plan.structure(y), None, True)[0])[0]
+
     def guards(self, t, y, args):
         mode = args[1]
         scene, q, v, terms, motion = self._motion(args, t, y)
@@ -158,13 +165,14 @@ class ModalSystem(HybridSystem):
         least = least if atol is None else jnp.maximum(least, _STOPPED * atol)
         is_impact = (jnp.asarray(self.elements.opening) & hit[:, 0] & ~mode.closed).any()
         # In a fixed direction it ends where it turns round, with what is left across.
-        ends = (speed <= least * (1 + size)) | (hit[:, 1] & (mode.creep > 0) & (speed < mode.creep / 2))
+        slow = least * (1 + size)
+        ends = (speed <= slow) | (hit[:, 1] & (mode.creep > 0) & (speed < mode.creep / 2))
         stopped = jnp.asarray(self.elements.rough) & mode.closed & ~mode.stick & ends & ~is_impact
         before = mode.closed
         mode, slip, begins = first_guess(self.elements, mode, slip, holding, speed, hit)
         mode = mode._replace(stick=mode.stick | (stopped & mode.closed))
         after = self._pass(
-            unknown, mode, slip, begins, stopped & mode.closed, before & ~mode.closed, happens, t, q, v, atol
+            unknown, mode, slip, begins, stopped & mode.closed, before & ~mode.closed, slow, happens, t, q, v, atol
         )
         # Switching functions that the impact has carried across their zeros.
         values, levels = self._switches(unknown, after.mode.positive, q, after.v, t)
@@ -176,8 +184,9 @@ class ModalSystem(HybridSystem):
         *_, terms, motion = self._motion((unknown, mode), t, {"q": q, "v": v, "slip": slip})
         return motion.reaction.holding, length(terms.slip)[0], self._speeds(terms, v)
 
-    def _pass(self, unknown, mode, slip, begins, stopped, released, happens, t, q, v, atol) -> Transition:
-        """Transition from a first guess of the mode; `begins` (n,) marks elements that slide from rest."""
+    def _pass(self, unknown, mode, slip, begins, stopped, released, slow, happens, t, q, v, atol) -> Transition:
+        """Transition from a first guess of the mode; `begins` (n,) marks elements that slide from rest, and speeds up to `slow`
+        (n,) count as zero."""
         elements, n = self.elements, len(self.elements.each)
         least = tolerance(q.dtype) * (1 + jnp.max(jnp.abs(q)))
         height = 4 * least if atol is None else jnp.maximum(4 * least, atol)
@@ -201,7 +210,13 @@ class ModalSystem(HybridSystem):
             choice = choose_mode(elements, problem, begin._replace(stick=begin.stick | (stopped & begin.closed)), along)
             collision = Collision(choice.mode, choice.slip, rebound, held, stopped)
             still = kernel(self._find_jams, derivative=False)(problem, choice.mode, choice.slip)
-            resting, at, after, gains = kernel(self._after, derivative=False)(unknown, collision, begins, t, q, v)
+            resting, at, after, gains, speed = kernel(self._after, derivative=False)(
+                unknown, collision, begins, t, q, v
+            )
+            # Sliding slower than what has ended would end at once. The impulse that stops one contact gives such a speed to
+            # others, whose stop gives it back: each of them would have an event, and a step behind it.
+            slides = resting.closed & ~resting.stick & jnp.asarray(elements.rough)
+            still = still | (slides & ~begins & ~stopped & (speed <= slow))
             problem, along = kernel(self._forces, derivative=False)(unknown, resting, at, t, q, after)
             final = search_mode(elements, problem, resting, along, released, busy & ~choice.wrong)
             follows, soft, short, paradox, tail = kernel(self._flights, derivative=False)(
@@ -257,7 +272,8 @@ class ModalSystem(HybridSystem):
         return jnp.maximum(across, jnp.max(beside, 1))
 
     def _after(self, unknown, collision: Collision, begins, t, q, v):
-        """Mode and directions behind an impact before forces are known, the velocity (nv,), and whether it gains energy."""
+        """Mode and directions behind an impact before forces are known, the velocity (nv,), whether it gains energy, and speeds
+        (n,) of sliding."""
         scene, elements = self._bind(unknown)[0], self.elements
         terms, of = terms_at(scene, elements, q, v, t), coefficients(scene, elements, v.dtype)
         after, reaction = impact(scene, elements, collision, terms, v)
@@ -273,7 +289,7 @@ class ModalSystem(HybridSystem):
             (reaction.along, rates + terms.row.velocity), (jnp.abs(reaction.along), jnp.abs(rates) + jnp.abs(terms.row.velocity))
         ))  # fmt: skip
         gains = (work > 1e-6 * size) & (opened & (collision.rebound > 0)).any()
-        return mode, jnp.where(is_sliding[:, None], unit, collision.slip), after, gains
+        return mode, jnp.where(is_sliding[:, None], unit, collision.slip), after, gains, speed
 
     def _forces(self, unknown, mode: Mode, slip, t, q, v):
         """Problem of the forces, and directions of sliding (n, 2)."""
@@ -353,44 +369,3 @@ class ModalSystem(HybridSystem):
     def with_slip(self, y, v, slip):
         y = self.plan.structure(y)
         return ravel_pytree(y | {"v": y["v"] if v is None else v, "slip": slip})[0]
-
-
-def project(scene: Scene, elements: Elements, mode: Mode, t, y, error):
-    """Project q and v by the least change onto the rows that act, and the error (or None) onto their tangent space.
-
-    The last change of q, from which what is left open follows, counts as an error too: a step that is too long for the projection
-    is rejected.
-    """
-    whole, dtype = extend(scene), y["v"].dtype
-    q, v = retract(scene.system, y["q"]), y["v"]
-    terms = terms_at(scene, elements, q, v, t)
-    holonomic = holonomic_rows(layout(whole))
-    # Masks keep the shapes of all modes: rows that do not act are multiplied by zero.
-    active = elements.active(mode).astype(dtype)
-    holds = jnp.zeros((elements.count,), dtype).at[holonomic].set(1.0) * active
-
-    def change(residual, mask):
-        """Least velocity that changes the rows of a mask by `residual`."""
-        lam = terms.gram.factor(mask).solve((residual * mask)[:, None])[:, 0]
-        return terms.metric.unwhiten(matmul(terms.gram.Y, lam))
-
-    start, last, blank = q, jnp.zeros_like(v), jnp.zeros((elements.count,), dtype)
-    rounds = _SAVED_ROUNDS if error is None else _ROUNDS
-    if holonomic.size:
-        for _ in range(rounds):
-            last = change(blank.at[holonomic].set(position_residual(whole, q, t)), holds)
-            q = displace(scene.system, q, -last)
-    tangent = None
-    if error is not None:
-        e = rate_to_velocity(scene.system, start, error["q"])
-        # Rows on velocities do not confine a displacement: an error of q is projected by rows on positions alone.
-        e = e - change(matmul(terms.row.A, e), holds) + last
-        tangent = error | {
-            "q": velocity_to_rate(scene.system, start, e),
-            "v": error["v"] - change(matmul(terms.row.A, error["v"]), active),
-        }
-    for _ in range(rounds):
-        v = v - change(velocity_residual(whole, q, v, t), active)
-    slip = by_element(elements, velocity_residual(whole, q, v, t))
-    aligned = jnp.where((mode.creep > 0)[:, None], y["slip"], align(slip, y["slip"]))
-    return y | {"q": q, "v": v, "slip": aligned}, tangent
