@@ -18,6 +18,7 @@ from jaxdyn.compile.first_calls import wait_for_code as wait_for_code
 from jaxdyn.compile.flags import mark_invalid as mark_invalid
 from jaxdyn.compile.jacobi import gram_eigenvectors as gram_eigenvectors
 from jaxdyn.compile.jacobi import inverse as inverse
+from jaxdyn.compile.jacobi import pseudo_inverse_by_pivots as pseudo_inverse_by_pivots
 from jaxdyn.compile.jacobi import pseudo_inverse_by_rotations as pseudo_inverse_by_rotations
 from jaxdyn.compile.kernels import Evaluation as Evaluation
 from jaxdyn.compile.kernels import evaluate as evaluate
@@ -36,3 +37,5 @@ from jaxdyn.compile.rules import reverse_only as reverse_only
 from jaxdyn.compile.rules import value_and_jvp as value_and_jvp
 from jaxdyn.compile.sweeps import sweep as sweep
 from jaxdyn.compile.trial import run_trial as _run_trial  # noqa: F401 (it registers itself)
+from jaxdyn.compile.triangular import cholesky_factor as cholesky_factor
+from jaxdyn.compile.triangular import triangular_solution as triangular_solution

@@ -16,6 +16,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from jaxdyn.compile.matrix_loops import LoopWriter, MatrixProgram
+from jaxdyn.compile.normal_equations import write_normal_equations
 
 with contextlib.suppress(ImportError):  # no kernels without llvmlite
     import llvmlite.ir as ir
@@ -33,15 +34,33 @@ def _cost(n: int, m: int) -> int:
 
 
 class PseudoInverse(MatrixProgram):
-    """A (rows, columns) -> its pseudo-inverse (columns, rows)."""
+    """A (rows, columns) -> its pseudo-inverse (columns, rows).
+
+    By normal equations where the least of their pivots is above `least` times the largest; by rotations elsewhere, or for None.
+    """
 
     name = "pseudo_inverse"
 
-    def __init__(self, rows: int, columns: int, dtype, tolerance: float):
+    def __init__(self, rows: int, columns: int, dtype, tolerance: float, least: float | None = None):
         super().__init__(rows, columns, (columns, rows), dtype, tolerance)
-        self.cost = _cost(max(rows, columns), min(rows, columns))
+        self.least = least
+        n, m = max(rows, columns), min(rows, columns)
+        self.cost = _cost(n, m) if least is None else 8 * n * m * m + 1
+
+    @property
+    def title(self) -> str:
+        """What the code depends on."""
+        return super().title if self.least is None else f"{super().title}, pivots above {self.least!r}"
 
     def write(self, w: LoopWriter, matrix, result) -> None:
+        """Normal equations, then rotations where these are poor."""
+        if self.least is None:
+            return self._write_by_rotations(w, matrix, result)
+        is_accurate = write_normal_equations(w, matrix, result, self.rows, self.columns, self.least)
+        with w.b.if_then(w.b.not_(is_accurate)):
+            self._write_by_rotations(w, matrix, result)
+
+    def _write_by_rotations(self, w: LoopWriter, matrix, result) -> None:
         """Rotations, and J D U^T from them."""
         rows, columns = self.rows, self.columns
         # The smaller side is made orthogonal: rotations of m vectors of length n >= m cost n m^2 a sweep.
@@ -158,6 +177,14 @@ def pseudo_inverse_by_rotations(matrix: jax.Array, tolerance: float) -> jax.Arra
     It has no derivative: put it under a rule that gives one.
     """
     return _pseudo_inverse(*matrix.shape, matrix.dtype, float(tolerance))(matrix)
+
+
+def pseudo_inverse_by_pivots(matrix: jax.Array, tolerance: float, least: float) -> jax.Array:
+    """`pseudo_inverse_by_rotations` of a matrix (n, m) with n >= m, by normal equations where these are accurate.
+
+    They are where their least pivot is above `least` times the largest. Columns of zeros have no pivot.
+    """
+    return _pseudo_inverse(*matrix.shape, matrix.dtype, float(tolerance), float(least))(matrix)
 
 
 @jax.custom_jvp
