@@ -26,7 +26,7 @@ from jaxtyping import Array, Float
 
 from jaxdyn.dynamics import quantities as dynamics
 from jaxdyn.dynamics.centroidal import kinetic_energy, potential_energy
-from jaxdyn.identify.methods import METHODS, Optimizer
+from jaxdyn.identify.methods import METHODS, SOLVERS, Optimizer
 from jaxdyn.identify.replay import (
     HOLDS,
     INITIAL,
@@ -262,14 +262,6 @@ def _integral(rate, t):
 GAUSS_NEWTON = "gauss-newton"
 
 
-def _current_method(method):
-    """The method, Gauss-Newton in place of two deprecated names: its damping is Levenberg's and Marquardt's."""
-    if method not in ("levenberg-marquardt", "dogleg"):
-        return method
-    warn(f"method {method!r} is deprecated; take {GAUSS_NEWTON!r}, which is damped", DeprecationWarning)
-    return GAUSS_NEWTON
-
-
 class Solver(eqx.Module):
     """Method of minimisation of `fit_parameters`.
 
@@ -278,7 +270,8 @@ class Solver(eqx.Module):
     - `method`: "gauss-newton" for up to some hundred numbers: damped Gauss-Newton steps with exact Jacobians by forward mode,
       which eliminate free initial states segment by segment, until the next one predicts a decrease of the loss by less than
       `tolerance` of it. Torques that are linear in feasible inertias and other numbers take the interior-point steps of
-      `fit_torques` first. For more numbers, as of a network, "lbfgs", "adam" or an optax.GradientTransformation, by reverse mode.
+      `fit_torques` first. "levenberg-marquardt" and "dogleg" are those of optimistix, with the same Jacobians. For more numbers,
+      as of a network, "lbfgs", "adam" or an optax.GradientTransformation, by reverse mode.
     - `steps`: the most steps. `learning_rate`: of adam, a share of each number (of one where it starts at zero), decaying to zero
       along a cosine. `tolerance`: "lbfgs" ends where ten steps have lowered the loss by less than this share of it.
     - `starts`: number of starting points: coordinates vary by `spread` (positive numbers by that share) around the given ones,
@@ -293,7 +286,7 @@ class Solver(eqx.Module):
     ```
     """
 
-    method: Checked[str | Optimizer] = eqx.field(default=GAUSS_NEWTON, converter=_current_method)
+    method: Checked[str | Optimizer] = GAUSS_NEWTON
     steps: int = 200
     learning_rate: float = 0.1
     tolerance: float = 1e-9
@@ -302,9 +295,10 @@ class Solver(eqx.Module):
     seed: int = 0
 
     def __check_init__(self):
-        methods = (GAUSS_NEWTON, *METHODS)
-        is_optax = hasattr(self.method, "init") and hasattr(self.method, "update")
-        if not (self.method in methods if isinstance(self.method, str) else is_optax):
+        methods = (GAUSS_NEWTON, *SOLVERS, *METHODS)
+        if isinstance(self.method, str) and self.method not in methods:
+            raise ValueError(f"method is {self.method!r}; give one of {methods} or an optax.GradientTransformation")
+        if not (isinstance(self.method, str) or (hasattr(self.method, "init") and hasattr(self.method, "update"))):
             raise ValueError(f"method is {self.method!r}; give one of {methods} or an optax.GradientTransformation")
         check_count(self.steps, "steps")
         check_count(self.starts, "starts")

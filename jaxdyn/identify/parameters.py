@@ -19,8 +19,10 @@ from jaxdyn.identify.interior import TorqueProblem, block_chart, log_cholesky_co
 from jaxdyn.identify.logs import Log
 from jaxdyn.identify.methods import (
     DAMPING,
+    SOLVERS,
     GaussNewton,
     GradientSteps,
+    LeastSquaresSteps,
     LinearErrors,
     Unknowns,
     confirm_minimum,
@@ -142,6 +144,10 @@ def _minimise(
         linear, history = end.last.state[0], np.concatenate([before, end.history])
         result = confirm_minimum(end.result, linear, solver.tolerance, rounding)
         return Descent(end.last, end.last, history, result), linear
+    if solver.name in SOLVERS:
+        end = descend(LeastSquaresSteps(errors_of, problem, solver.name, solver.tolerance), unknowns, watch)
+        linear = linearise(problem, end.best.point)
+        return end._replace(result=confirm_minimum(end.result, linear, solver.tolerance, rounding)), linear
     steps = GradientSteps(
         loss_of,
         problem,

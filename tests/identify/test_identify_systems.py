@@ -307,7 +307,7 @@ reversed_slope.defjvp(lambda primals, tangents: (primals[0], -tangents[0]))
 
 
 @pytest.mark.long
-@pytest.mark.parametrize("method", ["gauss-newton", "lbfgs"])
+@pytest.mark.parametrize("method", ["gauss-newton", "levenberg-marquardt", "dogleg", "lbfgs"])
 def test_steps_that_lower_no_loss_are_no_solution(method):
     """Every trial fails, until the damping or the line search has made steps too short to be seen."""
     t = np.linspace(0, 3, 20)
@@ -388,9 +388,7 @@ def test_trajectories_on_constraints():
 
 @pytest.mark.long
 def test_options_by_their_own_names_are_deprecated(oscillation):
-    """One release long they are those of the groups, and the warning names these; so are two names of damped steps."""
-    with pytest.warns(DeprecationWarning, match="take 'gauss-newton'"):
-        assert identify.Solver("dogleg").method == "gauss-newton"
+    """One release long they are those of the groups, and the warning names these."""
     start, pick = oscillator(inertia=2.0), lambda s: s.system.parameters["inertia"]
     objective = identify.Objective("torque", noise=0.02)
     want = identify.fit_parameters(start, oscillation, None, objective, identify.Solver(steps=2), free=pick)
