@@ -20,8 +20,9 @@ logger = logging.getLogger("jaxdyn")
 MODES = ("auto", "native", "plain")
 OPTIONS = ("", "usual", "least")
 # Operations of a program: so many, or so many for each entry of its arguments. A mechanism whose cost grows with its size is a
-# program, however large it is (see `listing`). Products of matrices of hundreds of rows are none.
-MAX_OPERATIONS, MAX_OPERATIONS_PER_ENTRY = 60_000, 500
+# program, however large it is (see `listing`): events of twelve contacts compile in half a minute, and by XLA in six. Products of
+# matrices of hundreds of rows are none.
+MAX_OPERATIONS, MAX_OPERATIONS_PER_ENTRY = 200_000, 500
 
 _said: set[str] = set()
 

@@ -204,3 +204,18 @@ def test_contacts_that_hold_do_not_slip_where_another_one_stops():
         lasting += [np.min(sticks[sticks >= slip] - slip, initial=np.inf) for slip in slips]
     assert len(lasting) > 20
     assert min(lasting) > 1e-10
+
+
+@pytest.mark.long
+def test_a_block_on_twelve_points_slides_to_rest(caplog):
+    """Events of many contacts are kernels, which compile in seconds: v = v0 - mu g t up to the rest, without a slip behind it."""
+    builder = jd.ModelBuilder("block", gravity=(0.0, 0.0, -G))
+    builder.add_body("block", None, "free", (1.0, (0, 0, 0), (0.1, 0.1, 0.1)))
+    points = [(x, y, -0.1) for x in (-0.3, -0.1, 0.1, 0.3) for y in (-0.2, 0.0, 0.2)]
+    feet = [jd.contact.ground_contact("block", point, 0.5, name=f"p{i}") for i, point in enumerate(points)]
+    start, ts = np.array([0, 0, 0.1, 1, 0, 0, 0.0]), np.linspace(0.0, 0.3, 7)
+    with caplog.at_level("WARNING", "jaxdyn"):
+        motion = jd.simulate(jd.Scene(builder.build(), forces=feet), start, np.array([1.0, 0, 0, 0, 0, 0]), ts)
+    assert motion.success and not caplog.records
+    np.testing.assert_allclose(motion.v[:, 0], np.maximum(1 - 0.5 * G * ts, 0), rtol=0, atol=1e-10)
+    np.testing.assert_allclose(motion.q[-1], start + np.eye(7)[0] / G, rtol=0, atol=1e-10)
