@@ -291,3 +291,4 @@ def test_tables_of_arguments_keep_names_shapes_and_groups():
         (["`t`"], "s."),
     ]
     assert argument_tables.readable("Float[Array, ' nq'] | None") == "array (nq,) | None"
+    assert argument_tables.readable("Checked[Float[Array, ...] | None]") == "array | None"
