@@ -30,6 +30,11 @@ _COMMON = {
     "a": "acceleration, the rate of `v`.",
     "tau": "generalised force, N m or N.",
     "t": "time, s.",
+    "grasp": "the hand, the object and their contacts.",
+    "system": "a `Model`, another system, or a `Scene`.",
+    "log": "one log or several.",
+    "v_s": "velocity over which Coulomb friction is smoothed, rad/s or m/s.",
+    "gravity": "m/s^2.",
 }
 # A name, perhaps with its own arguments, its symbol and its shape or unit.
 _NAME = re.compile(
@@ -116,7 +121,8 @@ def rows(text: str, arguments: Sequence[Argument]) -> tuple[str, list[Row]]:
                 starts.append(match.start())
         general.append(item[: starts[0]] if starts else item)
         found += [
-            Row(group, _tidy(item[start:end])) for (group, start), end in zip(groups, [*starts[1:], None], strict=False)
+            Row(group, re.sub(r"^s\.?$", _COMMON["t"], _tidy(item[start:end])))
+            for (group, start), end in zip(groups, [*starts[1:], None], strict=False)
         ]
     # Arguments without a description of their own have rows of their own.
     found = [
