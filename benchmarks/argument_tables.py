@@ -30,6 +30,11 @@ _COMMON = {
     "a": "acceleration, the rate of `v`.",
     "tau": "generalised force, N m or N.",
     "t": "time, s.",
+    "grasp": "the hand, the object and their contacts.",
+    "system": "a `Model`, another system, or a `Scene`.",
+    "log": "one log or several.",
+    "v_s": "velocity over which Coulomb friction is smoothed, rad/s or m/s.",
+    "gravity": "m/s^2.",
 }
 # A name, perhaps with its own arguments, its symbol and its shape or unit.
 _NAME = re.compile(
@@ -67,7 +72,7 @@ def aliases() -> dict[str, str]:
 def readable(annotation: str) -> str:
     """An annotation in the words of a reader: aliases replaced, arrays with their shapes."""
     text = re.sub(r"\bChecked\[(.*)\]$", r"\1", annotation)
-    text = re.sub(r"Float\[Array, ['\"] ?(.*?)['\"]\]", lambda m: _shaped(m[1].split()), text)
+    text = re.sub(r"Float\[Array, ['\"]?\s*([^'\"\]]*)['\"]?\]", lambda m: _shaped(m[1].split()), text)
     for _ in range(2):  # aliases of aliases
         text = re.sub(r"\b\w+\b", lambda m: aliases().get(m[0], m[0]), text)
     text = re.sub(r"\b[a-z]+\.(?=[A-Z])", "", text)  # classes without their packages
@@ -76,6 +81,8 @@ def readable(annotation: str) -> str:
 
 
 def _shaped(sizes: Sequence[str]) -> str:
+    if sizes == ["..."]:
+        return "array"
     return f"array ({', '.join(sizes)}{',' if len(sizes) == 1 else ''})" if sizes else "float"
 
 
@@ -114,7 +121,8 @@ def rows(text: str, arguments: Sequence[Argument]) -> tuple[str, list[Row]]:
                 starts.append(match.start())
         general.append(item[: starts[0]] if starts else item)
         found += [
-            Row(group, _tidy(item[start:end])) for (group, start), end in zip(groups, [*starts[1:], None], strict=False)
+            Row(group, re.sub(r"^s\.?$", _COMMON["t"], _tidy(item[start:end])))
+            for (group, start), end in zip(groups, [*starts[1:], None], strict=False)
         ]
     # Arguments without a description of their own have rows of their own.
     found = [
@@ -153,7 +161,7 @@ def table(text: str, arguments: Sequence[Argument]) -> str:
             lines += ['<tr markdown="1">', f'<td markdown="span">{name}</td>', f"<td>{cell}</td>"]
             if not k:
                 span = f' rowspan="{len(row.arguments)}"' if len(row.arguments) > 1 else ""
-                lines += [f'<td markdown="1"{span}>', "", row.text, "", "</td>"]
+                lines += [f'<td markdown="block"{span}>', "", row.text, "", "</td>"]
             lines.append("</tr>")
     return "\n".join([*lines, "</tbody>", "</table>", "</div>"])
 

@@ -287,6 +287,7 @@ def test_tables_of_arguments_keep_names_shapes_and_groups():
     assert shown == [
         (["`model`"], "the bodies and joints."),
         (["`q` (nq,)", "`v` (nv,)"], "the state."),
-        (["`t`"], "s."),
+        (["`t`"], "time, s."),
     ]
     assert argument_tables.readable("Float[Array, ' nq'] | None") == "array (nq,) | None"
+    assert argument_tables.readable("Checked[Float[Array, ...] | None]") == "array | None"
