@@ -20,7 +20,6 @@ from jaxdyn.identify.logs import Log
 from jaxdyn.identify.methods import RANK_TOLERANCE, LinearErrors
 from jaxdyn.identify.options import BALANCES
 from jaxdyn.identify.problem import Problem, segment_starts
-from jaxdyn.identify.regression import least_squares_by_svd
 
 # Least numbers of blocks and of independent errors in a group, where these leave at least so many groups: squares of Student's t
 # have no variance below five degrees of freedom.
@@ -286,9 +285,8 @@ def whiten_errors(end: LinearErrors, jacobian: np.ndarray) -> WhitenedErrors | N
         return None
     count = len(end.errors) - end.priors
     data = end.rows[:count]
-    fit = least_squares_by_svd(data, end.errors[:count], RANK_TOLERANCE)
     # Initial states were eliminated; each of their directions has used up one error.
-    spare = count - end.start_rank - (fit.rank if end.priors == 0 else 0)
+    spare = count - end.start_rank - (_rank(data) if end.priors == 0 else 0)
     if spare <= 0:
         return None
     # The estimated variance of errors; for errors that are all zero the smallest number keeps the division defined.
@@ -299,7 +297,7 @@ def whiten_errors(end: LinearErrors, jacobian: np.ndarray) -> WhitenedErrors | N
     size = np.linalg.norm(rows, axis=0)
     size[size <= 1e-12 * size.max(initial=0.0)] = np.inf
     # The triangle has the singular values of all rows. The full Vt holds the null space, where there are fewer rows than columns.
-    _, s, Vt = np.linalg.svd(np.linalg.qr(rows / size)[1], full_matrices=True)
+    _, s, Vt = np.linalg.svd(np.linalg.qr(rows / size, mode="r"), full_matrices=True)
     rank = int(np.sum(s > RANK_TOLERANCE * s.max(initial=0.0)))
     # No error depends on these coordinates: a number with a share in them is not determined.
     unseen = np.isinf(size)
@@ -311,3 +309,10 @@ def whiten_errors(end: LinearErrors, jacobian: np.ndarray) -> WhitenedErrors | N
     whitening = Vt[:rank].T / s[:rank]
     rows = (rows / size) @ whitening
     return WhitenedErrors(rows[:count], end.errors[:count] / noise, rows[count:], seen @ whitening, is_free)
+
+
+def _rank(rows: np.ndarray) -> int:
+    size = np.linalg.norm(rows, axis=0)
+    size[size <= 1e-12 * size.max(initial=0.0)] = np.inf
+    s = np.linalg.svd(np.linalg.qr(rows / size, mode="r"), compute_uv=False)
+    return int(np.sum(s > RANK_TOLERANCE * s.max(initial=0.0)))
