@@ -28,14 +28,13 @@ from jaxdyn.identify.blocks import (
     select,
 )
 from jaxdyn.identify.chart import METRICS, make_chart
+from jaxdyn.identify.regression import NUMBERS
 from jaxdyn.identify.sensors import FitSystem, Measured, with_sensors
 from jaxdyn.model import host_math
 from jaxdyn.model.arguments import Function, Number, deprecated, state_dtype
 from jaxdyn.model.arguments import Numbers as Values
 from jaxdyn.model.tree import Model
 from jaxdyn.systems.scene import Scene
-
-_TEN = ("m", "mcx", "mcy", "mcz", "Ixx", "Ixy", "Iyy", "Ixz", "Iyz", "Izz")
 
 
 class Parameters(eqx.Module):
@@ -180,7 +179,7 @@ class Parameters(eqx.Module):
         if chosen is not None and set(chosen) != set(chart.bodies):
             empty = [model.body_names[i] for i in chosen if i not in chart.bodies]
             raise ValueError(f"inertias frees {empty}, which have no mass; give them some, or leave them out")
-        names = [f"{name}[{model.body_names[i]}] {number}" for i in chart.bodies for number in _TEN]
+        names = [f"{name}[{model.body_names[i]}] {number}" for i in chart.bodies for number in NUMBERS]
         own = float(np.asarray(model.inertias)[:, 0].sum())
         frozen = own - float(np.asarray(model.inertias)[np.array(chart.bodies, int), 0].sum())
         if total is not None and not total > frozen:

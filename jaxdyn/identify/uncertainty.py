@@ -16,10 +16,11 @@ from typing import NamedTuple
 import numpy as np
 
 from jaxdyn.identify.condensed import block_slices
-from jaxdyn.identify.logs import Log
+from jaxdyn.identify.logs import Log, log_rate
 from jaxdyn.identify.methods import RANK_TOLERANCE, LinearErrors
 from jaxdyn.identify.options import BALANCES
 from jaxdyn.identify.problem import Problem, segment_starts
+from jaxdyn.identify.regression import least_squares_by_svd
 
 # Least numbers of blocks and of independent errors in a group, where these leave at least so many groups: squares of Student's t
 # have no variance below five degrees of freedom.
@@ -185,7 +186,7 @@ def is_white(logs: Sequence[Log], residuals: Sequence[np.ndarray]) -> np.ndarray
     """
     places, powers = [], []
     for log, residual in zip(logs, residuals, strict=True):
-        rate = max(len(log) - 1, 1) / float(log.t[-1] - log.t[0])
+        rate = log_rate(log)
         frequency = np.fft.rfftfreq(len(residual), 1 / rate)
         most = rate / 2 if log.cutoff is None else min(0.6 * log.cutoff, rate / 2)
         # Offsets are fitted, so that the mean says nothing.
@@ -286,7 +287,10 @@ def whiten_errors(end: LinearErrors, jacobian: np.ndarray) -> WhitenedErrors | N
     count = len(end.errors) - end.priors
     data = end.rows[:count]
     # Initial states were eliminated; each of their directions has used up one error.
-    spare = count - end.start_rank - (_rank(data) if end.priors == 0 else 0)
+    spare = count - end.start_rank
+    if end.priors == 0:
+        triangle = np.linalg.qr(data, mode="r")
+        spare -= least_squares_by_svd(triangle, np.zeros(len(triangle)), RANK_TOLERANCE).rank
     if spare <= 0:
         return None
     # The estimated variance of errors; for errors that are all zero the smallest number keeps the division defined.
@@ -309,10 +313,3 @@ def whiten_errors(end: LinearErrors, jacobian: np.ndarray) -> WhitenedErrors | N
     whitening = Vt[:rank].T / s[:rank]
     rows = (rows / size) @ whitening
     return WhitenedErrors(rows[:count], end.errors[:count] / noise, rows[count:], seen @ whitening, is_free)
-
-
-def _rank(rows: np.ndarray) -> int:
-    size = np.linalg.norm(rows, axis=0)
-    size[size <= 1e-12 * size.max(initial=0.0)] = np.inf
-    s = np.linalg.svd(np.linalg.qr(rows / size, mode="r"), compute_uv=False)
-    return int(np.sum(s > RANK_TOLERANCE * s.max(initial=0.0)))
