@@ -20,7 +20,6 @@ from jaxdyn.identify.blocks import (
     apply_blocks,
     entries_of_block,
     find_models,
-    free_bodies,
     leaves_with_names,
     perpendicular_basis,
     prior_root,
@@ -306,7 +305,7 @@ class Parameters(eqx.Module):
         for body, (centre, semi_axes) in ellipsoids.items():
             if body not in model.body_names or model.body_names.index(body) not in chart.bodies:
                 raise ValueError(
-                    f"ellipsoids names {body!r}, which is no free body; they are {free_bodies(model, chart)}"
+                    f"ellipsoids names {body!r}, which is no free body; they are {[model.body_names[i] for i in chart.bodies]}"
                 )
             k = chart.bodies.index(model.body_names.index(body))
             centre, inverse = np.asarray(centre, float), np.diag(1 / np.asarray(semi_axes, float) ** 2)
@@ -366,14 +365,3 @@ class Parameters(eqx.Module):
             numbers = self._arrays(origin, unit, *limits, center, root)
             tree = tree._with([*tree.blocks, Numbers(labels, place, tuple(index), kind, *numbers)])
         return tree
-
-
-def select_leaves(system: Any, positive=None, free=None) -> Parameters:
-    """Tree of the leaves that `positive` and `free` select; nothing else is free.
-
-    **Raises:** ValueError as `Parameters`, and where nothing is selected.
-    """
-    tree = Parameters(system)
-    if positive is not None:
-        tree = tree.positive(positive)
-    return tree if free is None else tree.free(free)

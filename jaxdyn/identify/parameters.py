@@ -27,7 +27,7 @@ from jaxdyn.identify.methods import (
     propose,
 )
 from jaxdyn.identify.options import GAUSS_NEWTON, Execution, Objective, Solver, merge_options
-from jaxdyn.identify.parameter_tree import Parameters, select_leaves
+from jaxdyn.identify.parameter_tree import Parameters
 from jaxdyn.identify.problem import (
     Problem,
     errors_of,
@@ -179,9 +179,9 @@ def minimize_linear_torques(problem: Problem, unknowns: Unknowns) -> tuple[Unkno
     condensed, prior = condense_rows(rows, int(data.sum())), weight * problem.prior_weight
     convex = TorqueProblem(chart, condensed.R, condensed.d, condensed.rest, prior)
     end = minimize_torque_error(convex, _CONVEX_STEPS, _EXCESS * prior)
-    y = np.zeros(unknowns.y.size)
-    y[chart.places.reshape(-1)] = log_cholesky_coordinates(end.origin, chart.count).reshape(-1)
-    y[chart.term_places] = np.where(chart.positive, np.log(np.where(chart.positive, end.terms, 1.0)), end.terms)
+    y, (origin, terms) = np.zeros(unknowns.y.size), end.last.point
+    y[chart.places.reshape(-1)] = log_cholesky_coordinates(origin, chart.count).reshape(-1)
+    y[chart.term_places] = np.where(chart.positive, np.log(np.where(chart.positive, terms, 1.0)), terms)
     there = Unknowns(jnp.asarray(y, unknowns.y.dtype), None)
     found = linearise(problem, there)
     return (there, found, end.history[:-1]) if found.loss < here.loss else (unknowns, here, np.zeros(0))
@@ -245,7 +245,9 @@ class _Improvement(NamedTuple):
 
 def _tree(system, parameters, positive, free) -> Parameters:
     if parameters is None:
-        tree = select_leaves(system, positive, free)
+        tree = Parameters(system)
+        tree = tree if positive is None else tree.positive(positive)
+        tree = tree if free is None else tree.free(free)
     elif positive is not None or free is not None:
         raise ValueError("parameters and positive or free are both given; put all into parameters")
     elif not isinstance(parameters, Parameters):

@@ -380,7 +380,7 @@ def test_every_iterate_is_feasible(wrong_iiwa, noisy):
 
     estimate = problem.fit(Setting(0.01, (), 1.0), callback=watch)
     assert min(lowest) > 0
-    np.testing.assert_array_equal(estimate.minimum.history, losses)
+    np.testing.assert_array_equal(estimate.history, losses)
     # Its linear algebra runs on one thread, with other rounding.
     np.testing.assert_allclose(fit.history, losses, rtol=1e-10)
     assert fit.result == RESULTS.successful and len(losses) < 60

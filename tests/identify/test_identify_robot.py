@@ -211,7 +211,7 @@ def test_loads_that_have_not_settled_are_said(truth, monkeypatch):
     basic, extra, where = split_terms(terms, 2)
     problem = RobotProblem(model, (log(1),), basic, extra, "full", 20)
     for rounds, code in ((3, RESULTS.max_steps_reached), (30, RESULTS.successful)):
-        assert problem.refine(Setting(0.01, where, 1.0), None, rounds).minimum.result is code
+        assert problem.refine(Setting(0.01, where, 1.0), None, rounds).result is code
 
 
 def test_friction_goes_through_the_filter_of_the_log(truth):
