@@ -72,17 +72,17 @@ def jackknife(grams, gradients, curvature: np.ndarray, size: float | None = None
     scale = unit[:, None] * unit[None, :]
     changes = np.stack(
         [
-            unit * (_inverse((H - gram) * scale) @ (unit * gradient))
+            unit * (invert((H - gram) * scale) @ (unit * gradient))
             for gram, gradient in zip(grams, gradients, strict=True)
         ]
     )
     # Jackknife variance: (g - 1) / g times the squares about the mean of the replicates, not about the estimate (Efron 1982).
     count = len(grams)
     root = (changes - changes.mean(axis=0)).T * np.sqrt((count - 1) / count)
-    return Jackknife(root, _inverse(H * scale) * scale, student(count - 1))
+    return Jackknife(root, invert(H * scale) * scale, student(count - 1))
 
 
-def _inverse(matrix: np.ndarray) -> np.ndarray:
+def invert(matrix: np.ndarray) -> np.ndarray:
     """Inverse of a symmetric matrix of unit diagonal; directions without curvature get that of rounding errors."""
     # Without a group the matrix may lose rank. The diagonal is of size one, so that 1e-12 is above rounding of the eigenvalues.
     values, vectors = np.linalg.eigh((matrix + matrix.T) / 2)
