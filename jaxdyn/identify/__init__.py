@@ -7,7 +7,6 @@ from jaxdyn.identify.condensed_fit import Intervals as Intervals
 from jaxdyn.identify.delays import Delays as Delays
 from jaxdyn.identify.delays import shift_torques as shift_torques
 from jaxdyn.identify.geometry import GeometryFit as GeometryFit
-from jaxdyn.identify.geometry import choose_poses as choose_poses
 from jaxdyn.identify.geometry import fit_geometry as fit_geometry
 from jaxdyn.identify.linear_fit import Identifiability as Identifiability
 from jaxdyn.identify.linear_fit import LeastSquares as LeastSquares
@@ -22,6 +21,7 @@ from jaxdyn.identify.options import Solver as Solver
 from jaxdyn.identify.parameter_tree import Parameters as Parameters
 from jaxdyn.identify.parameters import fit_parameters as fit_parameters
 from jaxdyn.identify.parameters import parameter_error as parameter_error
+from jaxdyn.identify.pose_choice import choose_poses as choose_poses
 from jaxdyn.identify.regression import BaseParameters as BaseParameters
 from jaxdyn.identify.regression import base_parameters as base_parameters
 from jaxdyn.identify.regression import nominal_parameters as nominal_parameters

@@ -252,11 +252,6 @@ def entries_of_block(block) -> tuple[int, ...] | None:
     return getattr(block, "index", None)
 
 
-def free_bodies(model: Model, chart) -> list[str]:
-    """Names of the bodies whose inertias a chart changes."""
-    return [model.body_names[i] for i in chart.bodies]
-
-
 if TYPE_CHECKING:
     Rows = str | int | Sequence[str | int] | None  # by index, or by the names of bodies or joints; None for all
 else:

@@ -18,7 +18,7 @@ import numpy as np
 
 from jaxdyn.constraints.codes import RESULTS
 from jaxdyn.identify.condensed import Blocks, condense_rows, pad_triangle
-from jaxdyn.identify.descent import Watch, descend
+from jaxdyn.identify.descent import Descent, Watch, descend
 from jaxdyn.identify.interior import LOG_CHOLESKY_BASIS, InteriorPoint, LinearChart, TorqueProblem
 from jaxdyn.identify.logs import Log, root_mean_square
 from jaxdyn.identify.regression import (
@@ -82,37 +82,30 @@ class Data(NamedTuple):
         return np.array(result, int)
 
 
-class Minimum(NamedTuple):
-    """Minimum by `minimize_torque_error`: `origin` (bodies, 4, 4) and `terms` (n,) of the chart, losses, and the result."""
+def minimize_torque_error(
+    problem: TorqueProblem, steps: int, tolerance: float, callback: Callable | None = None
+) -> Descent:
+    """Minimise by `InteriorPoint` from the start of the chart; `callback(step, loss, (origin, terms))` before each step."""
+    return descend(InteriorPoint(problem, tolerance), problem.chart.start, Watch(steps, callback))
 
+
+class Estimate(NamedTuple):
+    """Result of `fit_blocks`: all parameters x, the torque noise, the chart, and the minimum in it.
+
+    `origin` (bodies, 4, 4) and `terms` (n,) of the chart, losses, and the result.
+    """
+
+    x: np.ndarray
+    sigma: float
+    chart: LinearChart
     origin: np.ndarray
     terms: np.ndarray
     history: np.ndarray
     result: Any
 
-
-def minimize_torque_error(
-    problem: TorqueProblem, steps: int, tolerance: float, callback: Callable | None = None
-) -> Minimum:
-    """Minimise by `InteriorPoint` from the start of the chart; `callback(step, loss, (origin, terms))` before each step."""
-    end = descend(InteriorPoint(problem, tolerance), problem.chart.start, Watch(steps, callback))
-    origin, terms = end.last.point
-    return Minimum(origin, terms, end.history, end.result)
-
-
-class Estimate(NamedTuple):
-    """Result of `fit_blocks`: all parameters x, the torque noise, and the minimum in the chart."""
-
-    x: np.ndarray
-    sigma: float
-    chart: LinearChart
-    minimum: Minimum
-
     def give_up(self) -> "Estimate":
         """Copy whose result is `max_steps_reached`, unless it is another failure already."""
-        if self.minimum.result is not RESULTS.successful:
-            return self
-        return self._replace(minimum=self.minimum._replace(result=RESULTS.max_steps_reached))
+        return self._replace(result=RESULTS.max_steps_reached) if self.result is RESULTS.successful else self
 
 
 def is_negligible(W: np.ndarray, change: np.ndarray, sigma: float) -> bool:
@@ -190,13 +183,14 @@ def fit_blocks(
     # Noise-free logs stay well posed by a small share of the torque.
     sigma = max(float(sigma), _FINEST * float(np.sqrt(np.mean(sizes[0] ** 2))))
     problem = TorqueProblem.of(chart, condensed, sigma, setting.prior)
-    minimum = minimize_torque_error(problem, _STEPS, _ROUGH if is_rough else _FINE, callback)
+    end = minimize_torque_error(problem, _STEPS, _ROUGH if is_rough else _FINE, callback)
+    origin, terms = end.last.point
     # Interior points never reach a bound. Exact zeros let `intervals` recognise the terms that are held there.
-    minimum = minimum._replace(terms=chart.clip_terms(minimum.terms))
+    terms = chart.clip_terms(terms)
     x = np.zeros(size)
-    basic = chart.x(minimum.origin, minimum.terms)
+    basic = chart.x(origin, terms)
     x[kept] = np.append(basic, coefficients(basic))
-    return Estimate(x, sigma, chart, minimum)
+    return Estimate(x, sigma, chart, origin, terms, end.history, end.result)
 
 
 def eliminate(rows: np.ndarray, count: int, ridge: np.ndarray) -> tuple[np.ndarray, Callable]:
@@ -373,16 +367,16 @@ def _make_spread(names, values, changes, pulled, fitted, marks) -> Spread:
 
 def local_coordinates(data: Data, setting: Setting, estimate: Estimate):
     """Jacobian of x by the free coordinates, the prior's curvature in them, and a mask of the free basic parameters."""
-    linear, minimum = estimate.chart, estimate.minimum
-    derivatives = linear.jacobian(minimum.origin)
-    count, size = len(minimum.origin), linear.count
+    linear = estimate.chart
+    derivatives = linear.jacobian(estimate.origin)
+    count, size = len(estimate.origin), linear.count
     basis = LOG_CHOLESKY_BASIS[:size]
     # Hessian of the log-det divergence along straight lines in x, tr(S_k S_l) in the frame of the fitted body (`interior`).
     prior_curvature = setting.prior * np.kron(np.eye(count), np.einsum("kij,lji->kl", basis, basis))
     bodies = count * size
     is_free = np.ones(derivatives.shape[1], bool)
     # Terms at their bound stay there: the one-sided derivative is not that of a minimum.
-    is_free[bodies:] = ~(linear.positive & (minimum.terms == 0))
+    is_free[bodies:] = ~(linear.positive & (estimate.terms == 0))
     places = data.places(setting.extra)
     count = int(is_free.sum())
     jacobian = np.zeros((data.blocks.size, count + len(places)))

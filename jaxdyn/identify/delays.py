@@ -100,7 +100,7 @@ def find_delays(
             break
         # The first-order model holds for shifts that are short against the motion's reversals: longer steps are cut.
         delay = delay + np.clip(step, -_STEP, _STEP)
-    spread = problem.intervals(free, estimate, problem.result(free, estimate))
+    spread = problem.intervals(free, estimate, problem.result(free, estimate), with_omitted=False)
     std = spread.parameters.std[-model.nv :]
     # Changing weights of a robust loss may keep the steps from shrinking below a small share of the standard deviation.
     if np.any(np.abs(step) >= np.maximum(_SMALL, _SETTLED * std)):

@@ -7,7 +7,7 @@ Linear algebra on small matrices keeps to one thread: OpenBLAS shares products a
 processors, whose threads then wait for each other: on two busy ones a search for terms took 61 s of their time instead of 4.
 """
 
-import functools
+import contextlib
 import threading
 from collections.abc import Callable, Sequence
 from typing import Any
@@ -100,38 +100,25 @@ def _by_device(function: Callable, mesh: Any, results: Any) -> Callable:
     return call
 
 
-# The limit is one of the process. Of calls that overlap, in several threads, the first one sets it and the last one lifts it:
-# each for itself would take the limit of another one for the user's.
-_lock = threading.Lock()
-_running = 0
-_limit: Any = None
+class _OneThread(contextlib.ContextDecorator):
+    """Decorator of functions while which numpy's and scipy's linear algebra keeps to one thread."""
+
+    # The limit is one of the process. Of calls that overlap, in several threads, the first one sets it and the last one lifts it:
+    # each for itself would take the limit of another one for the user's.
+    lock, running = threading.Lock(), 0
+    limit: Any = None
+
+    def __enter__(self):
+        with self.lock:
+            if not self.running:
+                self.limit = threadpool_limits(limits=1, user_api="blas")
+            self.running += 1
+
+    def __exit__(self, *_):
+        with self.lock:
+            self.running -= 1
+            if not self.running:
+                self.limit.restore_original_limits()
 
 
-def on_one_thread(function: Callable) -> Callable:
-    """The function, while which runs numpy's and scipy's linear algebra keeps to one thread."""
-
-    @functools.wraps(function)
-    def call(*args, **kwargs):
-        _enter()
-        try:
-            return function(*args, **kwargs)
-        finally:
-            _leave()
-
-    return call
-
-
-def _enter() -> None:
-    global _running, _limit
-    with _lock:
-        if not _running:
-            _limit = threadpool_limits(limits=1, user_api="blas")
-        _running += 1
-
-
-def _leave() -> None:
-    global _running
-    with _lock:
-        _running -= 1
-        if not _running:
-            _limit.restore_original_limits()
+on_one_thread = _OneThread()

@@ -37,6 +37,8 @@ from jaxdyn.model.topology import frame_index
 from jaxdyn.model.tree import Model
 from jaxdyn.systems.scene import Scene, as_scene
 
+# Singular values below this share of the largest one are not determined: derivatives are exact to about 1e-13.
+RANK = 1e-8
 PARTS = ("base", "offsets", "axes", "lengths", "tool")
 # Steps that close the loops, and the largest residual (rad, m) of loops that are closed.
 _CLOSING, _CLOSED = 30, 1e-10

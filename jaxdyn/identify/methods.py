@@ -118,23 +118,31 @@ class GaussNewton(Method):
     """Gauss-Newton steps with Marquardt's damping, which grows tenfold with every trial that fails to lower the loss.
 
     **Arguments:** `linearise`, from unknowns to `LinearErrors`; `tolerance`: it has converged when the next step predicts a
-    decrease of the loss by less than this share of it; `rounding` of the unknowns.
+    decrease of the loss by less than this share of it; `rounding` of the unknowns; `known`: linear errors of the start, if known.
 
     The state of an iterate is its linear errors and the damping.
     """
 
-    def __init__(self, linearise: Callable[[Unknowns], LinearErrors], tolerance: float, rounding: float):
+    def __init__(
+        self,
+        linearise: Callable[[Unknowns], LinearErrors],
+        tolerance: float,
+        rounding: float,
+        known: LinearErrors | None = None,
+    ):
         if not tolerance >= 0:
             raise ValueError(f"tolerance is {tolerance}; it must not be negative")
         # A predicted decrease below rounding of the loss cannot be observed: every trial would count as failed.
-        self.linearise, self.tolerance = linearise, max(tolerance, 1e3 * rounding)
+        self.linearise, self.tolerance, self.known = linearise, max(tolerance, 1e3 * rounding), known
         # Errors are in units of their scale, so that their rounding appears squared in the loss.
         self.floor = (10 * rounding) ** 2
 
     def init(self, start, kept):
         """Linearise the start."""
         # The damping is the only state besides the point; the rest is evaluated again, to the same bits.
-        return self._iterate(start, self.linearise(start), DAMPING if kept is None else float(kept["damping"]))
+        if kept is not None:
+            return self._iterate(start, self.linearise(start), float(kept["damping"]))
+        return self._iterate(start, self.linearise(start) if self.known is None else self.known, DAMPING)
 
     def step(self, iterate, history, best):
         """Increase the damping until a step lowers the loss."""

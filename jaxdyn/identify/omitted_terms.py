@@ -15,7 +15,7 @@ from typing import NamedTuple
 import numpy as np
 
 from jaxdyn.identify.condensed_fit import Data, Estimate, Intervals, Setting, Spread, local_coordinates
-from jaxdyn.identify.uncertainty import jackknife, student
+from jaxdyn.identify.uncertainty import block_groups, invert, student
 
 # Two-sided level of the test for a coefficient: it is asked for every term at every joint.
 _LEVEL = 1e-2
@@ -62,23 +62,36 @@ def find_shifts(
     prior[:own, :own] = curvature
     gradients = blocks.scores(estimate.x, weights) @ T / variance
     grams = np.einsum("pi,bpq,qj->bij", T, blocks.grams(weights), T, optimize=True) / variance
+    groups = block_groups(len(grams), size)
+    G, g = (np.stack([x[group].sum(axis=0) for group in groups]) for x in (grams, gradients))
+    H = G.sum(axis=0) + prior
+    # Unit diagonal: parameters differ by many orders of magnitude in size.
+    unit = 1 / np.sqrt(np.maximum(np.diag(H), 1e-300))
+    T, g, G, H = T * unit, g * unit, G * unit * unit[:, None], H * unit * unit[:, None]
+    # With all groups, and without each of them. The fit's own parameters are eliminated once for all terms.
+    curvatures = np.concatenate([H[None], H - G])
+    inverses = np.stack([invert(one[:own, :own]) for one in curvatures])
 
     def extend(terms: tuple[tuple[str, int], ...], new: np.ndarray) -> Shift | None:
         """Shift by the coefficients `new`, None where independent errors alone explain them."""
-        kept = np.append(np.arange(own), new)
-        H = (grams.sum(axis=0) + prior)[np.ix_(kept, kept)]
-        scale = 1 / np.sqrt(np.maximum(np.diag(H), 1e-300))
-        inverse = np.linalg.pinv(H * scale * scale[:, None], rcond=1e-12, hermitian=True) * scale * scale[:, None]
+        kept, cross = np.append(np.arange(own), new), curvatures[:, :own, new]
+        eliminated = inverses @ cross
+        rest = curvatures[:, new][:, :, new] - np.swapaxes(cross, 1, 2) @ eliminated
+        inverse = np.linalg.inv(rest + 1e-12 * np.eye(len(new)))
         # The fit is a minimum: of the gradient of data and prior the part of the new coefficients alone is left.
-        step = inverse @ np.append(np.zeros(own), -gradients[:, new].sum(axis=0))
+        step = -inverse[0] @ g[:, new].sum(axis=0)
         # Costs no jackknife, and errs on the side of the term.
-        if not np.any(np.abs(step[own:]) > 2.5 * np.sqrt(np.diag(inverse)[own:])):
+        if not np.any(np.abs(step) > 2.5 * np.sqrt(np.maximum(np.diag(inverse[0]), 0))):
             return None
-        parts = grams[:, kept][:, :, kept]
-        spread = jackknife(parts, gradients[:, kept] + parts @ step, prior[np.ix_(kept, kept)], size)
-        least = student(spread.root.shape[1] - 1, _LEVEL) * np.sqrt(np.sum(spread.root[own:] ** 2, axis=1))
+        step = np.append(-eliminated[0] @ step, step)
+        right = (g[:, kept] + G[:, kept][:, :, kept] @ step)[..., None]
+        known = inverses[1:] @ right[:, :own]
+        last = inverse[1:] @ (right[:, own:] - np.swapaxes(cross[1:], 1, 2) @ known)
+        replicates = np.concatenate([known - eliminated[1:] @ last, last], axis=1)[..., 0]
+        root = (replicates - replicates.mean(axis=0)).T * np.sqrt((len(groups) - 1) / len(groups))
+        least = student(len(groups) - 1, _LEVEL) * np.linalg.norm(root[own:], axis=1)
         clearness = float(np.max(np.abs(step[own:]) / np.maximum(least, 1e-300)))
-        return Shift(terms, T[:, kept] @ step, T[:, kept] @ spread.root, spread.factor, clearness)
+        return Shift(terms, T[:, kept] @ step, T[:, kept] @ root, student(len(groups) - 1), clearness)
 
     ends = own + np.cumsum([len(places) for _, places in tried])
     indices = {term: np.arange(end - len(places), end) for end, (term, places) in zip(ends, tried, strict=True)}

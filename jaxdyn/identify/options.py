@@ -351,6 +351,8 @@ def merge_options(old: dict[str, Any], objective: Objective, *groups: Any) -> li
     Names of no group are options of the simulation.
     """
     every = (objective, *groups)
+    if not old:
+        return list(every)
     places = {field.name: k for k, group in enumerate(every) for field in dataclasses.fields(group)}
     changes: list[dict[str, Any]] = [{} for _ in every]
     for name, value in old.items():

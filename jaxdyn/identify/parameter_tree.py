@@ -20,7 +20,6 @@ from jaxdyn.identify.blocks import (
     apply_blocks,
     entries_of_block,
     find_models,
-    free_bodies,
     leaves_with_names,
     perpendicular_basis,
     prior_root,
@@ -28,14 +27,13 @@ from jaxdyn.identify.blocks import (
     select,
 )
 from jaxdyn.identify.chart import METRICS, make_chart
+from jaxdyn.identify.regression import NUMBERS
 from jaxdyn.identify.sensors import FitSystem, Measured, with_sensors
 from jaxdyn.model import host_math
 from jaxdyn.model.arguments import Function, Number, deprecated, state_dtype
 from jaxdyn.model.arguments import Numbers as Values
 from jaxdyn.model.tree import Model
 from jaxdyn.systems.scene import Scene
-
-_TEN = ("m", "mcx", "mcy", "mcz", "Ixx", "Ixy", "Iyy", "Ixz", "Iyz", "Izz")
 
 
 class Parameters(eqx.Module):
@@ -180,7 +178,7 @@ class Parameters(eqx.Module):
         if chosen is not None and set(chosen) != set(chart.bodies):
             empty = [model.body_names[i] for i in chosen if i not in chart.bodies]
             raise ValueError(f"inertias frees {empty}, which have no mass; give them some, or leave them out")
-        names = [f"{name}[{model.body_names[i]}] {number}" for i in chart.bodies for number in _TEN]
+        names = [f"{name}[{model.body_names[i]}] {number}" for i in chart.bodies for number in NUMBERS]
         own = float(np.asarray(model.inertias)[:, 0].sum())
         frozen = own - float(np.asarray(model.inertias)[np.array(chart.bodies, int), 0].sum())
         if total is not None and not total > frozen:
@@ -307,7 +305,7 @@ class Parameters(eqx.Module):
         for body, (centre, semi_axes) in ellipsoids.items():
             if body not in model.body_names or model.body_names.index(body) not in chart.bodies:
                 raise ValueError(
-                    f"ellipsoids names {body!r}, which is no free body; they are {free_bodies(model, chart)}"
+                    f"ellipsoids names {body!r}, which is no free body; they are {[model.body_names[i] for i in chart.bodies]}"
                 )
             k = chart.bodies.index(model.body_names.index(body))
             centre, inverse = np.asarray(centre, float), np.diag(1 / np.asarray(semi_axes, float) ** 2)
@@ -367,14 +365,3 @@ class Parameters(eqx.Module):
             numbers = self._arrays(origin, unit, *limits, center, root)
             tree = tree._with([*tree.blocks, Numbers(labels, place, tuple(index), kind, *numbers)])
         return tree
-
-
-def select_leaves(system: Any, positive=None, free=None) -> Parameters:
-    """Tree of the leaves that `positive` and `free` select; nothing else is free.
-
-    **Raises:** ValueError as `Parameters`, and where nothing is selected.
-    """
-    tree = Parameters(system)
-    if positive is not None:
-        tree = tree.positive(positive)
-    return tree if free is None else tree.free(free)

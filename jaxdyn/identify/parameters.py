@@ -29,7 +29,7 @@ from jaxdyn.identify.methods import (
     propose,
 )
 from jaxdyn.identify.options import GAUSS_NEWTON, Execution, Objective, Solver, merge_options
-from jaxdyn.identify.parameter_tree import Parameters, select_leaves
+from jaxdyn.identify.parameter_tree import Parameters
 from jaxdyn.identify.problem import (
     Problem,
     errors_of,
@@ -138,8 +138,10 @@ def _minimise(
     """End of a minimisation, and the errors near it; None where the method takes no Jacobian."""
     rounding = float(jnp.finfo(unknowns.y.dtype).eps)
     if solver.name == GAUSS_NEWTON:
-        start, before = minimize_linear_torques(problem, unknowns) if solver.starts == 1 else (unknowns, np.zeros(0))
-        end = descend(GaussNewton(partial(linearise, problem), solver.tolerance, rounding), start, watch)
+        start, known, before = unknowns, None, np.zeros(0)
+        if solver.starts == 1:
+            start, known, before = minimize_linear_torques(problem, unknowns)
+        end = descend(GaussNewton(partial(linearise, problem), solver.tolerance, rounding, known), start, watch)
         # Only steps that lower the loss are accepted: the last point is the best one.
         linear, history = end.last.state[0], np.concatenate([before, end.history])
         result = confirm_minimum(end.result, linear, solver.tolerance, rounding)
@@ -159,17 +161,21 @@ def _minimise(
     return descend(steps, unknowns, watch), None
 
 
-def minimize_linear_torques(problem: Problem, unknowns: Unknowns) -> tuple[Unknowns, np.ndarray]:
+def minimize_linear_torques(problem: Problem, unknowns: Unknowns) -> tuple[Unknowns, LinearErrors | None, np.ndarray]:
     """Minimum of the error of torques that are linear in the numbers, by the steps of `fit_torques`, and the losses before it.
+
+    With the linear errors there, None where the torques are no such function.
 
     The errors along straight lines in the numbers are those at the start and their Jacobian there times the change z. Unknowns
     other than those of `block_chart` stay where they are. Where the minimum is none, as the torques are not linear after all, so
     do these.
     """
     chart = block_chart(problem.tree.blocks) if problem.objective.error == "torque" else None
-    here = None if chart is None else linearise(problem, unknowns)
-    if chart is None or here is None or not here.is_finite:
-        return unknowns, np.zeros(0)
+    if chart is None:
+        return unknowns, None, np.zeros(0)
+    here = linearise(problem, unknowns)
+    if not here.is_finite:
+        return unknowns, here, np.zeros(0)
     (weight,) = (float(block.weight) for block in problem.tree.blocks if isinstance(block, Inertias))
     # The divergence replaces the residuals of the inertias' prior; those of other numbers are linear.
     data = np.arange(len(here.errors)) < len(here.errors) - here.priors
@@ -179,11 +185,12 @@ def minimize_linear_torques(problem: Problem, unknowns: Unknowns) -> tuple[Unkno
     condensed, prior = condense_rows(rows, int(data.sum())), weight * problem.prior_weight
     convex = TorqueProblem(chart, condensed.R, condensed.d, condensed.rest, prior)
     end = minimize_torque_error(convex, _CONVEX_STEPS, _EXCESS * prior)
-    y = np.zeros(unknowns.y.size)
-    y[chart.places.reshape(-1)] = log_cholesky_coordinates(end.origin, chart.count).reshape(-1)
-    y[chart.term_places] = np.where(chart.positive, np.log(np.where(chart.positive, end.terms, 1.0)), end.terms)
+    y, (origin, terms) = np.zeros(unknowns.y.size), end.last.point
+    y[chart.places.reshape(-1)] = log_cholesky_coordinates(origin, chart.count).reshape(-1)
+    y[chart.term_places] = np.where(chart.positive, np.log(np.where(chart.positive, terms, 1.0)), terms)
     there = Unknowns(jnp.asarray(y, unknowns.y.dtype), None)
-    return (there, end.history[:-1]) if linearise(problem, there).loss < here.loss else (unknowns, np.zeros(0))
+    found = linearise(problem, there)
+    return (there, found, end.history[:-1]) if found.loss < here.loss else (unknowns, here, np.zeros(0))
 
 
 def _best_start(problem: Problem, unknowns: Unknowns, solver: Solver, execution: Execution) -> Unknowns:
@@ -244,7 +251,9 @@ class _Improvement(NamedTuple):
 
 def _tree(system, parameters, positive, free) -> Parameters:
     if parameters is None:
-        tree = select_leaves(system, positive, free)
+        tree = Parameters(system)
+        tree = tree if positive is None else tree.positive(positive)
+        tree = tree if free is None else tree.free(free)
     elif positive is not None or free is not None:
         raise ValueError("parameters and positive or free are both given; put all into parameters")
     elif not isinstance(parameters, Parameters):

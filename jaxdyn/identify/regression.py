@@ -18,7 +18,7 @@ from jaxdyn.model.joints import KINDS
 from jaxdyn.model.numbers import check_seed
 from jaxdyn.model.tree import Model
 
-_NUMBERS = ("m", "mcx", "mcy", "mcz", "Ixx", "Ixy", "Iyy", "Ixz", "Iyz", "Izz")
+NUMBERS = ("m", "mcx", "mcy", "mcz", "Ixx", "Ixy", "Iyy", "Ixz", "Iyz", "Izz")
 # The order of elimination of a body's ten numbers, for a joint about z: Khalil & Dombre keep the first ones and group m, m cz and
 # Iyy into the parent. For other axes the elimination arrives at others.
 _KEPT_FIRST = (9, 1, 2, 4, 5, 7, 8)
@@ -38,7 +38,7 @@ def coordinate_names(model: Model) -> list[str]:
 def parameter_names(model: Model, terms: Terms = TERMS) -> tuple[str, ...]:
     """Names of x: the ten numbers of each body (`body.m`, `body.mcx`, ...), then the terms (`joint.viscous`)."""
     joints = coordinate_names(model)
-    bodies = [f"{body}.{number}" for body in model.body_names for number in _NUMBERS]
+    bodies = [f"{body}.{number}" for body in model.body_names for number in NUMBERS]
     return tuple(bodies + [f"{joint}.{term}" for term in check_terms(terms, v_s=1.0) for joint in joints])
 
 

@@ -172,21 +172,24 @@ class RobotProblem:
         kept = [np.where(weight < 1, 0.0, 1.0) for weight in weights]
         return self._gather(setting, kept)
 
-    def intervals(self, setting: Setting, estimate: Estimate, fit: Fit) -> Intervals:
-        """Standard deviations of an estimate, which is this fit."""
+    def intervals(self, setting: Setting, estimate: Estimate, fit: Fit, *, with_omitted: bool = True) -> Intervals:
+        """Standard deviations of an estimate, which is this fit; `with_omitted`: including fits with terms that it lacks."""
         data, curved = self.data(setting), self.curvature_data(setting)
         errors = [fit.torques(log) - np.asarray(log.tau, np.float64) for log in self.logs]
         size, widening = effective_sample_size(errors), model_error_factors(self.logs, errors)
         found = intervals(
             self.model, data, setting, estimate, self.weights, self.basic, size, widening, curved, self.still
         )
+        if not with_omitted:
+            return found
         # Columns of the terms that the fit lacks, after its own.
         known = {term.name for term in self.extra}
-        every = (*self.extra, *(term for term in candidates(self.model) if term.name not in known))
-        loads = [self._load(log, estimate.x) for log in self.logs]
-        weights = None if setting.robust is None else self.sample_weights.get(setting.robust)
-        wide = self._gather(setting, weights, every, loads)
-        shifts = find_shifts(wide, setting, estimate, self.weights, size, self.still)
+        others = [term for term in candidates(self.model) if term.name not in known]
+        if others:
+            loads = [self._load(log, estimate.x) for log in self.logs]
+            weights = None if setting.robust is None else self.sample_weights.get(setting.robust)
+            data = self._gather(setting, weights, (*self.extra, *others), loads)
+        shifts = find_shifts(data, setting, estimate, self.weights, size, self.still)
         fitted = {*range(data.basic), *data.places(setting.extra).tolist()}
         columns = free_columns(self.model.nb, self.model.nv, self.basic)
         return include_shifts(found, shifts, np.array(sorted(fitted)), columns)
@@ -240,8 +243,8 @@ class RobotProblem:
             names=parameter_names(self.model),
             values=values,
             nominal_values=nominal_parameters(self.model),
-            history=estimate.minimum.history,
-            result=estimate.minimum.result,
+            history=estimate.history,
+            result=estimate.result,
             method="torque fit by newton",
             terms=(*self.basic, *(term.name for term in terms)),
             sigma=estimate.sigma,

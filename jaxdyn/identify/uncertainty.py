@@ -16,7 +16,7 @@ from typing import NamedTuple
 import numpy as np
 
 from jaxdyn.identify.condensed import block_slices
-from jaxdyn.identify.logs import Log
+from jaxdyn.identify.logs import Log, log_rate
 from jaxdyn.identify.methods import RANK_TOLERANCE, LinearErrors
 from jaxdyn.identify.options import BALANCES
 from jaxdyn.identify.problem import Problem, segment_starts
@@ -72,17 +72,17 @@ def jackknife(grams, gradients, curvature: np.ndarray, size: float | None = None
     scale = unit[:, None] * unit[None, :]
     changes = np.stack(
         [
-            unit * (_inverse((H - gram) * scale) @ (unit * gradient))
+            unit * (invert((H - gram) * scale) @ (unit * gradient))
             for gram, gradient in zip(grams, gradients, strict=True)
         ]
     )
     # Jackknife variance: (g - 1) / g times the squares about the mean of the replicates, not about the estimate (Efron 1982).
     count = len(grams)
     root = (changes - changes.mean(axis=0)).T * np.sqrt((count - 1) / count)
-    return Jackknife(root, _inverse(H * scale) * scale, student(count - 1))
+    return Jackknife(root, invert(H * scale) * scale, student(count - 1))
 
 
-def _inverse(matrix: np.ndarray) -> np.ndarray:
+def invert(matrix: np.ndarray) -> np.ndarray:
     """Inverse of a symmetric matrix of unit diagonal; directions without curvature get that of rounding errors."""
     # Without a group the matrix may lose rank. The diagonal is of size one, so that 1e-12 is above rounding of the eigenvalues.
     values, vectors = np.linalg.eigh((matrix + matrix.T) / 2)
@@ -186,7 +186,7 @@ def is_white(logs: Sequence[Log], residuals: Sequence[np.ndarray]) -> np.ndarray
     """
     places, powers = [], []
     for log, residual in zip(logs, residuals, strict=True):
-        rate = max(len(log) - 1, 1) / float(log.t[-1] - log.t[0])
+        rate = log_rate(log)
         frequency = np.fft.rfftfreq(len(residual), 1 / rate)
         most = rate / 2 if log.cutoff is None else min(0.6 * log.cutoff, rate / 2)
         # Offsets are fitted, so that the mean says nothing.
@@ -286,9 +286,11 @@ def whiten_errors(end: LinearErrors, jacobian: np.ndarray) -> WhitenedErrors | N
         return None
     count = len(end.errors) - end.priors
     data = end.rows[:count]
-    fit = least_squares_by_svd(data, end.errors[:count], RANK_TOLERANCE)
     # Initial states were eliminated; each of their directions has used up one error.
-    spare = count - end.start_rank - (fit.rank if end.priors == 0 else 0)
+    spare = count - end.start_rank
+    if end.priors == 0:
+        triangle = np.linalg.qr(data, mode="r")
+        spare -= least_squares_by_svd(triangle, np.zeros(len(triangle)), RANK_TOLERANCE).rank
     if spare <= 0:
         return None
     # The estimated variance of errors; for errors that are all zero the smallest number keeps the division defined.
@@ -299,7 +301,7 @@ def whiten_errors(end: LinearErrors, jacobian: np.ndarray) -> WhitenedErrors | N
     size = np.linalg.norm(rows, axis=0)
     size[size <= 1e-12 * size.max(initial=0.0)] = np.inf
     # The triangle has the singular values of all rows. The full Vt holds the null space, where there are fewer rows than columns.
-    _, s, Vt = np.linalg.svd(np.linalg.qr(rows / size)[1], full_matrices=True)
+    _, s, Vt = np.linalg.svd(np.linalg.qr(rows / size, mode="r"), full_matrices=True)
     rank = int(np.sum(s > RANK_TOLERANCE * s.max(initial=0.0)))
     # No error depends on these coordinates: a number with a share in them is not determined.
     unseen = np.isinf(size)

@@ -4,7 +4,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from jaxdyn.identify.logs import Log, are_angles, idle_coordinates, travel_ranges
+from jaxdyn.identify.logs import Log, are_angles, idle_coordinates, root_mean_square, travel_ranges
 from jaxdyn.identify.regression import log_regressor, nominal_parameters
 from jaxdyn.model.tree import Model
 
@@ -32,8 +32,8 @@ def check_log_content(model: Model, log: Log, labels: Sequence[str]) -> list[str
             lines.append(
                 f"positions of {names} reach {q[:, far].max():.0f} rad, beyond three turns: are they in degrees?"
             )
-    needed = _rms(log_regressor(model, log) @ nominal_parameters(model))
-    measured = _rms(np.asarray(log.tau, np.float64))
+    needed = root_mean_square(log_regressor(model, log) @ nominal_parameters(model))
+    measured = root_mean_square(np.asarray(log.tau, np.float64))
     # Where the bodies need little torque, friction may be most of what is measured, and the ratio says nothing about units.
     compared = (needed > 0.1 * needed.max(initial=0)) & (measured > 0)
     ratio = measured[compared] / needed[compared]
@@ -82,7 +82,3 @@ def check_rest(log: Log, residual: np.ndarray, labels: Sequence[str]) -> list[st
                 "error is: no term predicts friction at rest; cut the log there, or move before you record"
             )
     return lines
-
-
-def _rms(x: np.ndarray) -> np.ndarray:
-    return np.sqrt(np.mean(x**2, axis=0))

@@ -165,14 +165,15 @@ def _solve(blocks: Blocks, is_loaded, own: slice, kept, weights, rows, sigma: fl
     sizes = [np.ones(alone.nv)] * 3
     chart = robot_chart(alone, (), "full", sizes)
     problem = TorqueProblem.of(chart, condense_rows(table, blocks.count()), sigma, 1.0)
-    minimum = minimize_torque_error(problem, 200, 1e-6)
-    if minimum.result is not RESULTS.successful:
-        raise ValueError(f"the payload's fit ended {name_of(minimum.result)!r}; do the loaded logs move the robot?")
-    payload = chart.x(minimum.origin, minimum.terms)[:10]
+    end = minimize_torque_error(problem, 200, 1e-6)
+    if end.result is not RESULTS.successful:
+        raise ValueError(f"the payload's fit ended {name_of(end.result)!r}; do the loaded logs move the robot?")
+    origin, terms = end.last.point
+    payload = chart.x(origin, terms)[:10]
 
     estimate = robot(payload)
     # In the coordinates of the chart, where the prior's curvature is known; it also determines what no log does.
-    (stretch,) = chart.body_jacobians(minimum.origin)
+    (stretch,) = chart.body_jacobians(origin)
     basis = LOG_CHOLESKY_BASIS
     curvature = np.zeros((count + 10, count + 10))
     # The weak rows that held the robot's parameters in the fit are a prior of theirs here.

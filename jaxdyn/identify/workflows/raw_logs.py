@@ -10,7 +10,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from jaxdyn.identify.logs import Log, pad_length, root_mean_square
+from jaxdyn.identify.logs import Log, log_rate, pad_length, root_mean_square
 from jaxdyn.identify.workflows.log_repair import LogWarning, repair_log
 from jaxdyn.model.arguments import Checked, Numbers, warn
 from jaxdyn.model.tree import Model
@@ -256,7 +256,7 @@ class _Spectra(NamedTuple):
 
 def motion_band(log: Log) -> float:
     """Frequency (Hz) below which 99 % of the power of the velocity lies, of the joint where that is highest; 0 at rest."""
-    frequency, velocity = power(np.asarray(log.v, np.float64), _rate(log))
+    frequency, velocity = power(np.asarray(log.v, np.float64), log_rate(log))
     return _band(frequency, velocity, 1e-6)
 
 
@@ -266,7 +266,7 @@ def vibration(log: Log, residual: np.ndarray) -> tuple[float, float]:
     A low-pass at that frequency removes it.
     """
     edge = _ABOVE * motion_band(log)
-    frequency, errors = power(np.asarray(residual, np.float64), _rate(log))
+    frequency, errors = power(np.asarray(residual, np.float64), log_rate(log))
     total = float(errors.sum())
     return (float(errors[frequency > edge].sum()) / total if total > 0 and edge > 0 else 0.0), edge
 
@@ -278,10 +278,6 @@ def power(x: np.ndarray, rate: float) -> tuple[np.ndarray, np.ndarray]:
     """
     window = np.hanning(len(x))[:, None]
     return np.fft.rfftfreq(len(x), 1 / rate), np.abs(np.fft.rfft(window * (x - x.mean(axis=0)), axis=0)) ** 2
-
-
-def _rate(log: Log) -> float:
-    return max(len(log) - 1, 1) / float(log.t[-1] - log.t[0])
 
 
 def _band(frequency: np.ndarray, velocity: np.ndarray, slow: float) -> float:
