@@ -59,7 +59,7 @@ def measure(points: int, steps: int) -> tuple[float, float]:
 def main() -> None:
     """Measure and print."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--points", type=int, nargs="+", default=[1, 2, 3, 4])
+    parser.add_argument("--points", type=int, nargs="+", choices=range(1, 5), default=[1, 2, 3, 4])
     parser.add_argument("--steps", type=int, default=500)
     options = parser.parse_args()
     jax.config.update("jax_enable_x64", True)
