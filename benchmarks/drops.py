@@ -185,7 +185,7 @@ class Outcome(NamedTuple):
     gain: Any
 
 
-def run(name: str, seconds: float = 1.0, most: int = 1000, **options) -> tuple[Callable, Callable]:
+def run(name: str, seconds: float = 1.0, most: int = 4000, **options) -> tuple[Callable, Callable]:
     """A function of one drop (q0, v0, mu, e) -> `Outcome`, and starts(rng, count)."""
     drop = DROPS[name]()
     control, softness = None, SOFTNESS.get(name, 1.0)

@@ -67,7 +67,7 @@ def measure(points: int, steps: int, with_gradient: bool) -> tuple[float, float]
 def main() -> None:
     """Measure and print."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--points", type=int, nargs="+", default=[1, 2, 3, 4])
+    parser.add_argument("--points", type=int, nargs="+", choices=range(1, 5), default=[1, 2, 3, 4])
     parser.add_argument("--steps", type=int, default=500)
     parser.add_argument("--gradient", action="store_true")
     options = parser.parse_args()
