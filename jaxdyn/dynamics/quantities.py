@@ -197,7 +197,7 @@ def _has_many_bodies(model: Model) -> bool:
 
 
 def _has_many_pairs(model: Model) -> bool:
-    return model.nb > sizes.MAX_BODIES or model.topology.ancestors.sum() > sizes.MAX_PAIRS
+    return model.nb > sizes.MAX_BODIES or int(model.topology.ancestors.sum()) > sizes.MAX_PAIRS
 
 
 def _rnea_of_many(model: Model, q, v, a, external=None):
