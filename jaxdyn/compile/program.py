@@ -154,8 +154,8 @@ def prune_calls(program: Program) -> None:
     needed: list[set[int]] = [set() for _ in program.subprograms]
     for op, _, args in program.operations:
         if op == "part":
-            _, _, (which, *_) = program.operations[args[0]]
-            needed[which.value].add(args[1].value)
+            # By its place: a call has thousands of operands, which would be unpacked for each of its parts.
+            needed[program.operations[args[0]][2][0].value].add(args[1].value)
     program.subprograms = tuple(map(_with_results, program.subprograms, needed))
 
 

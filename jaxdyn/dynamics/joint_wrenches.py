@@ -6,8 +6,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from jaxdyn.compile import entry_point, kernel
-from jaxdyn.dynamics import scans
-from jaxdyn.dynamics.quantities import MAX_BODIES
+from jaxdyn.dynamics import scans, sizes
 from jaxdyn.dynamics.tree_frames import tree_frame
 from jaxdyn.dynamics.world_frame import joint_wrenches
 from jaxdyn.lie import se3
@@ -60,8 +59,8 @@ def joint_wrench(
     function = _in_world if axes == "world" else _in_bodies
     # A program without external wrenches is smaller, so None is not replaced by zeros.
     given = (q, v, a) if external is None else (q, v, a, external)
-    # Beyond MAX_BODIES a scalar program would compile for too long.
-    wrenches = function(model, *given) if model.nb > MAX_BODIES else kernel(function)(model, *given)
+    # Beyond these a scalar program would compile for too long.
+    wrenches = function(model, *given) if model.nb > sizes.MAX_BODIES else kernel(function)(model, *given)
     # All joints share one program; one for each joint's name would be compiled again.
     return wrenches if index is None else wrenches[index]
 

@@ -17,7 +17,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from jaxdyn.compile import implicit, kernel, value_and_jvp, variant
-from jaxdyn.dynamics import recursions, scans, world_frame
+from jaxdyn.dynamics import recursions, scans, sizes, world_frame
 from jaxdyn.dynamics.kinematics import forward_kinematics
 from jaxdyn.dynamics.recursions import sweeps
 from jaxdyn.model.arguments import Numbers, check_shapes, check_state
@@ -40,7 +40,7 @@ def mass_matrix(model: Model | System, q: Float[Array, " nq"], t: Numbers = 0.0)
     if isinstance(model, System):
         return system_quantity("mass_matrix", model, *check_state(model, q=q, t=t))
     (q,) = check_shapes(model, q=q)
-    if model.nb > MAX_BODIES or model.topology.ancestors.sum() > MAX_PAIRS:
+    if _has_many_pairs(model):
         return world_frame.mass_matrix_by_loops(model, q)
     return by_recursion(recursions.crba, world_frame.mass_matrix, model, q)
 
@@ -169,8 +169,8 @@ def forward_dynamics(
     return kernel(form, fallback=_solve_for_acceleration, derivative=tangent)(model, q, v, tau)
 
 
-def _kernel_with_checks(recursion: Callable) -> Callable:
-    """Compile a recursion as a kernel with checks of its arguments."""
+def _kernel_with_checks(recursion: Callable, is_large: Callable, of_many: Callable) -> Callable:
+    """Compile a recursion as a kernel with checks of its arguments; `of_many` computes the same of models that are large."""
     signature = inspect.signature(recursion)
 
     # One kernel for each set of arguments that are given: kernels take them by position, and recursions some by name alone.
@@ -185,39 +185,48 @@ def _kernel_with_checks(recursion: Callable) -> Callable:
     def call(*args, **named):
         # Bound by name, so that positional and named arguments pass the same checks.
         (_, model), *rest = signature.bind(*args, **named).arguments.items()
+        if is_large(model):
+            return of_many(model, **dict(rest))
         return by_kernel(tuple(name for name, _ in rest))(model, *check_shapes(model, **dict(rest)))
 
     return call
 
 
-rnea, crba, aba, mass_matrix_sqrt = map(
-    _kernel_with_checks, (recursions.rnea, recursions.crba, recursions.aba, recursions.mass_matrix_sqrt)
-)
+def _has_many_bodies(model: Model) -> bool:
+    return _recursions(model) is not recursions
 
-# From so many bodies on the recursions are sweeps (see `recursions.sweeps`). For general geometry these are as fast from 15 on;
-# where axes are at right angles every body that is written out has zeros of its own.
-MIN_BODIES_IN_SWEEPS = 40
-# Scalar programs of more bodies, for joints without sweeps, compile for longer than a few seconds.
-MAX_BODIES = 128
-# Pairs of a body and one above it, or itself, beyond which a mass matrix is computed by loops: each is some 60 operations.
-MAX_PAIRS = 1000
+
+def _has_many_pairs(model: Model) -> bool:
+    return model.nb > sizes.MAX_BODIES or int(model.topology.ancestors.sum()) > sizes.MAX_PAIRS
+
+
+def _rnea_of_many(model: Model, q, v, a, external=None):
+    return inverse_dynamics(model, q, v, jnp.zeros_like(v) if a is None else a, external=external)
+
+
+rnea = _kernel_with_checks(recursions.rnea, _has_many_bodies, _rnea_of_many)
+crba = _kernel_with_checks(recursions.crba, _has_many_pairs, mass_matrix)
+aba = _kernel_with_checks(recursions.aba, _has_many_bodies, forward_dynamics)
+# A square root has no loops yet.
+mass_matrix_sqrt = _kernel_with_checks(recursions.mass_matrix_sqrt, lambda model: False, recursions.mass_matrix_sqrt)
+
 # In small batches the mask form of the matrices is as fast as the loops.
 _MAX_BODIES_IN_MATRICES = 16
 
 
 # Inside of kernels, what is written out shares its numbers with the rest, such as the rows of loops.
-@variant(lambda: MAX_BODIES + 1)
+@variant(lambda: sizes.MAX_BODIES + 1)
 def _least_bodies_in_sweeps() -> int:
-    return MIN_BODIES_IN_SWEEPS
+    return sizes.MIN_BODIES_IN_SWEEPS
 
 
 def _recursions(model: Model) -> Any:
     """The module with the recursions of a model."""
     # Robots with floating bases have most axes at right angles.
-    least = MAX_BODIES + 1 if sweeps.has_base(model) else _least_bodies_in_sweeps()
+    least = sizes.MAX_BODIES + 1 if sweeps.has_base(model) else _least_bodies_in_sweeps()
     if model.nb >= least and sweeps.has_sweeps(model):
         return sweeps
-    return recursions if model.nb <= MAX_BODIES else scans
+    return recursions if model.nb <= sizes.MAX_BODIES else scans
 
 
 def by_recursion(recursion, matrices, model: Model, *args):
@@ -232,11 +241,11 @@ def by_recursion(recursion, matrices, model: Model, *args):
 
 def _by_matrices(matrices, model: Model, *args):
     """Evaluate products of matrices, whose operations grow with the square of the bodies: as a kernel of few of them."""
-    return matrices(model, *args) if model.nb > MAX_BODIES else kernel(matrices)(model, *args)
+    return matrices(model, *args) if model.nb > sizes.MAX_BODIES else kernel(matrices)(model, *args)
 
 
 def _inverse_dynamics(model: Model, q, v, a):
-    return (scans if model.nb > MAX_BODIES else world_frame).inverse_dynamics(model, q, v, a)
+    return (scans if model.nb > sizes.MAX_BODIES else world_frame).inverse_dynamics(model, q, v, a)
 
 
 def _bias_force(model: Model, q, v):

@@ -20,14 +20,11 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from jaxdyn.compile import sweep, variant
+from jaxdyn.dynamics import sizes
 from jaxdyn.lie import se3
 from jaxdyn.lie.so3 import matmul
 from jaxdyn.model.joints import KINDS, SCREW_KINDS, joint_transform, screw_transform
 from jaxdyn.model.tree import Model, Topology, geometry
-
-# From so many bodies on, kernels of kinematics are loops over the bodies. Fewer are written out: zeros of a body's own are
-# dropped then, and so is what a result does not need.
-MIN_BODIES_IN_LOOPS = 64
 
 
 class TreeFrame(NamedTuple):
@@ -104,7 +101,7 @@ def tree_frame(model: Model, q: Float[Array, " nq"]) -> TreeFrame:
     return TreeFrame(pose, origin, subspace)
 
 
-@variant(lambda count: count >= MIN_BODIES_IN_LOOPS)
+@variant(lambda count: count >= sizes.MIN_BODIES_IN_LOOPS)
 def _has_loops(count: int) -> bool:
     """Decide whether a kernel is traced and so many bodies are loops in it, whose code does not grow with their number."""
     del count
