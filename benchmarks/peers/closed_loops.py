@@ -97,6 +97,7 @@ def with_exudyn(dt: float) -> float:
     settings = exu.SimulationSettings()
     settings.timeIntegration.numberOfSteps, settings.timeIntegration.endTime = round(1 / dt), 1.0
     settings.timeIntegration.verboseMode = 0
+    settings.solutionSettings.writeSolutionToFile = False
     system.SolveDynamic(settings)
     ends = [
         system.GetObjectOutputBody(bodies[i], exu.OutputVariableType.Position, localPosition=[LENGTHS[i], 0, 0])

@@ -58,6 +58,7 @@ def main() -> None:
         settings.timeIntegration.numberOfSteps = mechanism["steps"]
         settings.timeIntegration.endTime = mechanism["time"]
         settings.timeIntegration.verboseMode = 0
+        settings.solutionSettings.writeSolutionToFile = False
         settings.solution.file.write = False
         settings.linearSolver.solverType = exu.LinearSolverType.EigenSparse
         began = time.perf_counter()
