@@ -132,7 +132,7 @@ def run(args: argparse.Namespace) -> None:
         torque=torque,
     )
     log = motion.log(args.rate, args.periods)
-    names, driven = columns_of(model), motion.robot.driven.tolist()
+    names, driven = columns_of(model), motion.robot.joints.tolist()
     print(
         f"condition of the regressor {motion.condition:.4g}, of a random motion within the same limits "
         f"{motion.start_condition:.4g}; log det of the information matrix larger by {motion.logdet:.3g}"

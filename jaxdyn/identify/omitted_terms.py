@@ -35,6 +35,43 @@ class Shift(NamedTuple):
     clearness: float
 
 
+class _Extended(NamedTuple):
+    """Fit with the columns of further terms, in coordinates of unit curvature.
+
+    `jacobian` (p, n): of all parameters, the fit's own coordinates first; `gradients` (groups, n) and `grams` (groups, n, n);
+    `curvatures` (1 + groups, n, n): with all groups, and without each of them; `inverses`: of their own parts.
+    """
+
+    jacobian: np.ndarray
+    gradients: np.ndarray
+    grams: np.ndarray
+    curvatures: np.ndarray
+    inverses: np.ndarray
+
+    def extend(self, terms: tuple[tuple[str, int], ...], new: np.ndarray) -> Shift | None:
+        """Shift by the coefficients `new`, None where independent errors alone explain them."""
+        T, g, G, curvatures, inverses = self
+        own, groups = inverses.shape[1], len(G)
+        kept, cross = np.append(np.arange(own), new), curvatures[:, :own, new]
+        eliminated = inverses @ cross
+        rest = curvatures[:, new][:, :, new] - np.swapaxes(cross, 1, 2) @ eliminated
+        inverse = np.linalg.inv(rest + 1e-12 * np.eye(len(new)))
+        # The fit is a minimum: of the gradient of data and prior the part of the new coefficients alone is left.
+        step = -inverse[0] @ g[:, new].sum(axis=0)
+        # Costs no jackknife, and errs on the side of the term.
+        if not np.any(np.abs(step) > 2.5 * np.sqrt(np.maximum(np.diag(inverse[0]), 0))):
+            return None
+        step = np.append(-eliminated[0] @ step, step)
+        right = (g[:, kept] + G[:, kept][:, :, kept] @ step)[..., None]
+        known = inverses[1:] @ right[:, :own]
+        last = inverse[1:] @ (right[:, own:] - np.swapaxes(cross[1:], 1, 2) @ known)
+        replicates = np.concatenate([known - eliminated[1:] @ last, last], axis=1)[..., 0]
+        root = (replicates - replicates.mean(axis=0)).T * np.sqrt((groups - 1) / groups)
+        least = student(groups - 1, _LEVEL) * np.linalg.norm(root[own:], axis=1)
+        clearness = float(np.max(np.abs(step[own:]) / np.maximum(least, 1e-300)))
+        return Shift(terms, T[:, kept] @ step, T[:, kept] @ root, student(groups - 1), clearness)
+
+
 def find_shifts(
     data: Data, setting: Setting, estimate: Estimate, weights: np.ndarray, size: float, still: Sequence[int]
 ) -> list[Shift]:
@@ -72,35 +109,15 @@ def find_shifts(
     curvatures = np.concatenate([H[None], H - G])
     inverses = np.stack([invert(one[:own, :own]) for one in curvatures])
 
-    def extend(terms: tuple[tuple[str, int], ...], new: np.ndarray) -> Shift | None:
-        """Shift by the coefficients `new`, None where independent errors alone explain them."""
-        kept, cross = np.append(np.arange(own), new), curvatures[:, :own, new]
-        eliminated = inverses @ cross
-        rest = curvatures[:, new][:, :, new] - np.swapaxes(cross, 1, 2) @ eliminated
-        inverse = np.linalg.inv(rest + 1e-12 * np.eye(len(new)))
-        # The fit is a minimum: of the gradient of data and prior the part of the new coefficients alone is left.
-        step = -inverse[0] @ g[:, new].sum(axis=0)
-        # Costs no jackknife, and errs on the side of the term.
-        if not np.any(np.abs(step) > 2.5 * np.sqrt(np.maximum(np.diag(inverse[0]), 0))):
-            return None
-        step = np.append(-eliminated[0] @ step, step)
-        right = (g[:, kept] + G[:, kept][:, :, kept] @ step)[..., None]
-        known = inverses[1:] @ right[:, :own]
-        last = inverse[1:] @ (right[:, own:] - np.swapaxes(cross[1:], 1, 2) @ known)
-        replicates = np.concatenate([known - eliminated[1:] @ last, last], axis=1)[..., 0]
-        root = (replicates - replicates.mean(axis=0)).T * np.sqrt((len(groups) - 1) / len(groups))
-        least = student(len(groups) - 1, _LEVEL) * np.linalg.norm(root[own:], axis=1)
-        clearness = float(np.max(np.abs(step[own:]) / np.maximum(least, 1e-300)))
-        return Shift(terms, T[:, kept] @ step, T[:, kept] @ root, student(len(groups) - 1), clearness)
-
+    system = _Extended(T, g, G, curvatures, inverses)
     ends = own + np.cumsum([len(places) for _, places in tried])
     indices = {term: np.arange(end - len(places), end) for end, (term, places) in zip(ends, tried, strict=True)}
-    every = [extend((term,), new) for term, new in indices.items()]
+    every = [system.extend((term,), new) for term, new in indices.items()]
     shifts = [shift for shift in every if shift is not None and shift.clearness > 1]
     clearest = {shift.terms[0][1]: shift.terms[0] for shift in sorted(shifts, key=lambda shift: shift.clearness)}
     if len(clearest) > 1:
         # A second joint's term moves the first joint's parameters too.
-        both = extend(tuple(clearest.values()), np.concatenate([indices[term] for term in clearest.values()]))
+        both = system.extend(tuple(clearest.values()), np.concatenate([indices[term] for term in clearest.values()]))
         shifts += [] if both is None else [both]
     return shifts
 

@@ -335,8 +335,8 @@ def test_an_exciting_motion_of_the_motors_of_a_five_bar(tmp_path):
     """Within all limits, passive joints included; loops close along it, and the rest of the motion is that of `complete_log`."""
     scene, motors = loaded(tmp_path, "five-bar", (0.9, 1.5)), ("m1", "m2")
     start = scene.starts["reference"].q
-    options = dict(guess=start, period=6.0, harmonics=3, starts=2, torque=30.0, velocity=(1.5, 2.0))
-    found = jd.identify.exciting_motion(scene, TERMS, motors=motors, steps=25, **options)
+    options = dict(period=6.0, harmonics=3, starts=2, torque=30.0, velocity=(1.5, 2.0))
+    found = jd.identify.exciting_motion(scene, TERMS, motors=motors, guess=start, steps=25, **options)
     assert found.logdet > 1 and found.condition < found.start_condition
     assert max(found.used.values()) <= 1 and set(found.used) == {"position", "velocity", "torque"}
     log, whole = found.log(), found.log(whole=True)
@@ -355,7 +355,7 @@ def test_an_exciting_motion_of_the_motors_of_a_five_bar(tmp_path):
     refused = {"name as many of its joints in motors": {}, "2 degrees of freedom": {"motors": ("m1",)}}
     for message, arguments in refused.items():
         with pytest.raises(ValueError, match=message):
-            jd.identify.exciting_motion(scene, TERMS, **options, **arguments)
+            jd.identify.exciting_motion(scene, TERMS, guess=start, **options, **arguments)
 
 
 def test_the_command_excites_a_mechanism_by_named_motors_alone(tmp_path, capsys):

@@ -40,7 +40,7 @@ class DrivenRobot(eqx.Module):
         return self.scene.system  # pyright: ignore[reportReturnType]
 
     @property
-    def driven(self) -> np.ndarray:
+    def joints(self) -> np.ndarray:
         """Indices in v of the joints that follow the motion."""
         return np.arange(self.model.nv) if self.motors is None else np.array(self.motors)
 
@@ -52,7 +52,7 @@ class DrivenRobot(eqx.Module):
             return q, v, a, N, jnp.zeros(len(q), q.dtype)
         # From the start to the first sample, so that the loops stay on their branch.
         shares = jnp.arange(_APPROACH, dtype=q.dtype)[:, None] / _APPROACH
-        begin = self.start[self.driven][None]
+        begin = self.start[self.joints][None]
         approach = begin + shares * (q[:1] - begin)
         whole, gaps = follow_motors(self.scene, self.motors, self.start, jnp.concatenate([approach, q]))
         basis = partial(motor_basis, self.scene, columns=self.motors)
@@ -64,14 +64,14 @@ class DrivenRobot(eqx.Module):
 
 
 @eqx.filter_jit
-def driven_signals(motion: FourierMotion, robot: DrivenRobot, times):
+def joint_signals(motion: FourierMotion, robot: DrivenRobot, times):
     """q, v, a (n, nv) of all joints, torques (n, m) of the driven ones, tangent bases (n, nv, m), and the loops' gaps (n,)."""
     q, v, a, N, gap = robot.states(motion, times)
     tau = jax.vmap(partial(inverse_torque, robot.scene))(q, v, a, times)
     return q, v, a, jnp.einsum("nij,ni->nj", N, tau), N, gap
 
 
-def make_driven(scene: Scene, motors: Sequence[str] | None, guess) -> DrivenRobot:
+def make_robot(scene: Scene, motors: Sequence[str] | None, guess) -> DrivenRobot:
     model: Any = scene.system
     check_bodies(model)
     if model.nq != model.nv:

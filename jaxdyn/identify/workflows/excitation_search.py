@@ -16,7 +16,7 @@ from jaxdyn.identify.logs import Log
 from jaxdyn.identify.methods import GradientSteps, RandomSteps
 from jaxdyn.identify.regression import base_parameters, free_columns, group_columns
 from jaxdyn.identify.torque_terms import TERMS, Terms, check_terms, friction_regressor
-from jaxdyn.identify.workflows.driven import DrivenRobot, driven_signals, make_driven
+from jaxdyn.identify.workflows.driven import DrivenRobot, joint_signals, make_robot
 from jaxdyn.identify.workflows.excitation import FourierMotion, motion_from_rest, random_motion
 from jaxdyn.model.arguments import Checked, Numbers
 from jaxdyn.model.tree import Model
@@ -69,11 +69,11 @@ class Excitation(NamedTuple):
         period, robot = float(self.motion.period), self.robot
         count = round(period * rate * periods) + 1
         t = np.linspace(0, period * periods, count)
-        signals = driven_signals(self.motion, robot, jnp.asarray(t, self.model.home.dtype))
+        signals = joint_signals(self.motion, robot, jnp.asarray(t, self.model.home.dtype))
         q, v, a, own, *_ = (np.asarray(x, np.float64) for x in signals)
         tau = np.zeros_like(v)
-        tau[:, robot.driven] = own
-        columns = np.arange(self.model.nv) if whole else robot.driven
+        tau[:, robot.joints] = own
+        columns = np.arange(self.model.nv) if whole else robot.joints
         names = tuple(self.model.joint_names[i] for i in columns)
         return Log(t, *(x[:, columns] for x in (q, v, a, tau)), joint_names=names)
 
@@ -100,7 +100,7 @@ class _Task(eqx.Module):
     @property
     def span(self):
         """Half of the range (m,) of each driven joint."""
-        return ((self.limits.upper - self.limits.lower) / 2)[self.robot.driven]
+        return ((self.limits.upper - self.limits.lower) / 2)[self.robot.joints]
 
 
 def exciting_motion(
@@ -154,8 +154,8 @@ def exciting_motion(
     Source: Swevers et al. (1997), "Optimal robot excitation and identification"; Park (2006), "Fourier-based optimal excitation
     trajectories for the dynamic identification of robots".
     """
-    terms, robot = check_terms(terms, v_s), make_driven(as_scene(system), motors, guess)
-    model, driven = robot.model, robot.driven
+    terms, robot = check_terms(terms, v_s), make_robot(as_scene(system), motors, guess)
+    model, driven = robot.model, robot.joints
     if objective not in OBJECTIVES:
         raise ValueError(f"objective is {objective!r}; give one of {OBJECTIVES}")
     for name, value, good in (
@@ -201,7 +201,7 @@ def exciting_motion(
 
 def _base_places(robot: DrivenRobot, terms, motions: Sequence[FourierMotion], task: _Task) -> tuple[int, ...]:
     """Columns of `_rows` that are independent on general motions, for some terms."""
-    model, count = robot.model, len(robot.driven)
+    model, count = robot.model, len(robot.joints)
     columns = free_columns(model.nb, count, terms)
     if robot.motors is None:
         return tuple(columns[base_parameters(model, terms).independent].tolist())
@@ -211,7 +211,7 @@ def _base_places(robot: DrivenRobot, terms, motions: Sequence[FourierMotion], ta
 
 
 def _limits(robot: DrivenRobot, margin: float, velocity, torque) -> _Limits:
-    model, driven = robot.model, robot.driven
+    model, driven = robot.model, robot.joints
     n, dtype = model.nv, model.home.dtype
 
     def of(value, otherwise, n=n):
@@ -256,7 +256,7 @@ def _rows(motion: FourierMotion, task: _Task, places: tuple[int, ...]):
 
 
 def _regressor(task: _Task, places: tuple[int, ...], q, v, a, N):
-    driven, limit = task.robot.driven, task.limits.torque_limit
+    driven, limit = task.robot.joints, task.limits.torque_limit
 
     def one(q, v, a, N):
         friction = friction_regressor(v[driven], a[driven], TERMS, task.v_s)
@@ -268,7 +268,7 @@ def _regressor(task: _Task, places: tuple[int, ...], q, v, a, N):
 
 @eqx.filter_jit
 def _loss(amplitudes, motion: FourierMotion, task: _Task, places: tuple[int, ...], objective: str):
-    q, v, a, tau, N, gap = driven_signals(motion_from_rest(*amplitudes, period=motion.period), task.robot, task.times)
+    q, v, a, tau, N, gap = joint_signals(motion_from_rest(*amplitudes, period=motion.period), task.robot, task.times)
     W = _regressor(task, places, q, v, a, N) / task.scale[None]
     size = W.shape[1]
     # The floor keeps the logarithm finite where a motion does not excite a direction at all.
@@ -339,7 +339,7 @@ def _scale_amplitudes(amplitudes, span):
 def _limit_shares(motion: FourierMotion, task: _Task) -> dict[str, float]:
     """Largest share of each kind of limit along a fine grid."""
     times = jnp.asarray(np.arange(_CHECKED) * float(motion.period) / _CHECKED, task.times.dtype)
-    q, v, _, tau, _, gap = (np.asarray(x, np.float64) for x in driven_signals(motion, task.robot, times))
+    q, v, _, tau, _, gap = (np.asarray(x, np.float64) for x in joint_signals(motion, task.robot, times))
     lower, upper, speed, torque, _ = (np.asarray(x, np.float64) for x in jax.tree.leaves(task.limits))
     sizes = {
         "position": np.abs(q - (lower + upper) / 2) / ((upper - lower) / 2),
