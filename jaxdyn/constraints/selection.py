@@ -24,15 +24,7 @@ import numpy as np
 from jax import lax
 from jaxtyping import Array, Float
 
-from jaxdyn.compile import (
-    Evaluation,
-    eliminate_rows,
-    entry_point,
-    is_standalone,
-    kernel,
-    mark_invalid,
-    variant,
-)
+from jaxdyn.compile import Evaluation, eliminate_rows, entry_point, is_standalone, kernel, mark_invalid, variant
 from jaxdyn.compile.batch import cond
 from jaxdyn.compile.known import is_concrete, once, stop_gradient
 from jaxdyn.constraints.base import constraint_jacobian, holonomic_rows, layout, position_residual
