@@ -302,6 +302,38 @@ class LoopWriter:
                 total = total if scale is None else b.fmul(total, self._splat(scale))
                 b.store(total, self._vector_at(target, offset), align=self.dtype.itemsize)
 
+    def multiply_rows(self, x, y, rows: "PaddedRows"):
+        """Sum of products of two rows in memory like that of `rows`."""
+        b, place = self.b, self.variable(self.vector, ir.Constant(self.vector, [0.0] * self.width))
+        with self.loop(self.integer(0), self.integer(rows.stride // self.width)) as i:
+            offset = b.mul(i, self.integer(self.width))
+            term = b.fmul(self._load_vector(x, offset), self._load_vector(y, offset))
+            b.store(b.fadd(b.load(place, typ=self.vector), term), place)
+        total, width = b.load(place, typ=self.vector), self.width
+        while width > 1:
+            width //= 2
+            undefined = ir.Constant(ir.VectorType(self.float, 2 * width), ir.Undefined)
+            low, high = (
+                b.shuffle_vector(
+                    total, undefined, ir.Constant(ir.VectorType(ir.IntType(32), width), [*range(at, at + width)])
+                )
+                for at in (0, width)
+            )
+            total = b.fadd(low, high)
+        return b.extract_element(total, ir.Constant(ir.IntType(32), 0))
+
+    def subtract_row(self, target, row, factor, rows: "PaddedRows"):
+        """target -= factor row, of rows in memory like that of `rows`."""
+        b, each = self.b, self._splat(factor)
+        with self.loop(self.integer(0), self.integer(rows.stride // self.width)) as i:
+            offset = b.mul(i, self.integer(self.width))
+            change = b.fmul(each, self._load_vector(row, offset))
+            b.store(
+                b.fsub(self._load_vector(target, offset), change),
+                self._vector_at(target, offset),
+                align=self.dtype.itemsize,
+            )
+
     def _vector_at(self, row, offset):
         return self.b.bitcast(self.b.gep(row, [offset], source_etype=self.float), self.vector.as_pointer())
 

@@ -35,13 +35,13 @@ class IndependentRows(MatrixProgram):
     def write(self, w: LoopWriter, matrix, result) -> None:
         """One row after the other; the rest of each row is what the kept ones leave of it."""
         b, n, m, zero = w.b, self.rows, self.width, w.integer(0)
-        rest, along, lengths, orders = w.buffer(n * m), w.buffer(m), w.buffer(n), w.buffer(n)
+        rows, lengths, orders = w.rows(n, m), w.buffer(n), w.buffer(n)
+        rest, stride, along = rows.memory, rows.stride, w.rows(1, m).memory
         count = w.variable(w.float, w.number(0))
         with w.loop(zero, w.integer(n)) as i:
             for k in range(3):
                 b.store(w.number(0), w.at(result, (i, 3), (w.integer(k), 1)))
-            with w.loop(zero, w.integer(m)) as k:
-                b.store(w.load(w.at(matrix, (i, m + 3), (k, 1))), w.at(rest, (i, m), (k, 1)))
+        w.copy_rows(matrix, m + 3, 1, rows)
 
         def enlarge(most, x):
             """Store the larger one; what is not a number stays, as in JAX."""
@@ -52,9 +52,11 @@ class IndependentRows(MatrixProgram):
             """Lengths of what is left of each row, and the largest."""
             most = w.variable(w.float, w.number(0))
             with w.loop(zero, w.integer(n)) as i:
-                row = w.at(rest, (i, m))
+                row = w.at(rest, (i, stride))
                 # Rounding leaves a kept row a length of eps; it must not be chosen again.
-                length = b.fmul(w.root(w.product(row, row, m)), b.fsub(w.number(1), w.load(w.at(result, (i, 3)))))
+                length = b.fmul(
+                    w.root(w.multiply_rows(row, row, rows)), b.fsub(w.number(1), w.load(w.at(result, (i, 3))))
+                )
                 b.store(length, w.at(lengths, (i, 1)))
                 enlarge(most, length)
             return w.load(most)
@@ -83,14 +85,11 @@ class IndependentRows(MatrixProgram):
                 b.store(b.fadd(w.load(count), w.number(1)), count)
                 b.store(w.number(1), w.at(result, (row, 3)))
                 b.store(pivot, w.at(result, (row, 3), (w.integer(2), 1)))
-                with w.loop(zero, w.integer(m)) as k:
-                    b.store(b.fdiv(w.load(w.at(rest, (row, m), (k, 1))), pivot), w.at(along, (k, 1)))
+                with w.loop(zero, w.integer(stride)) as k:
+                    b.store(b.fdiv(w.load(w.at(rest, (row, stride), (k, 1))), pivot), w.at(along, (k, 1)))
                 with w.loop(zero, w.integer(n)) as i:
-                    other = w.at(rest, (i, m))
-                    share = w.product(other, along, m)
-                    with w.loop(zero, w.integer(m)) as k:
-                        at = w.at(other, (k, 1))
-                        b.store(b.fsub(w.load(at), b.fmul(share, w.load(w.at(along, (k, 1))))), at)
+                    other = w.at(rest, (i, stride))
+                    w.subtract_row(other, along, w.multiply_rows(other, along, rows), rows)
         measure()
         with w.loop(zero, w.integer(n)) as i:
             b.store(w.load(w.at(lengths, (i, 1))), w.at(result, (i, 3), (w.integer(1), 1)))

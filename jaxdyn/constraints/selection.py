@@ -24,15 +24,7 @@ import numpy as np
 from jax import lax
 from jaxtyping import Array, Float
 
-from jaxdyn.compile import (
-    Evaluation,
-    eliminate_rows,
-    entry_point,
-    is_standalone,
-    kernel,
-    mark_invalid,
-    variant,
-)
+from jaxdyn.compile import Evaluation, eliminate_rows, entry_point, is_standalone, kernel, mark_invalid, variant
 from jaxdyn.compile.batch import cond
 from jaxdyn.compile.known import is_concrete, once, stop_gradient
 from jaxdyn.constraints.base import constraint_jacobian, holonomic_rows, layout, position_residual
@@ -366,16 +358,22 @@ def _select_far_away(scene: Scene, q, t, sure, apart: float):
     direction = jnp.where(moves, direction / jnp.where(moves, length, jnp.ones_like(length)), direction)
     place = displace(scene.system, q, _FAR * direction * sizes)
 
-    def close(_, place):
+    def close(state):
+        count, place, _ = state
         place = retract(scene.system, place)
         A = (sure[:, None] * constraint_jacobian(scene, place, t))[held]
         step = solve_with_damping(A * sizes[None], sure[held] * position_residual(scene, place, t)) * sizes
         # A step longer than the distance itself would leave the branch.
         size = jnp.max(jnp.abs(step / sizes))
-        return displace(scene.system, place, -step * jnp.minimum(1.0, _FAR / jnp.where(size > 0, size, 1.0)))
+        place = displace(scene.system, place, -step * jnp.minimum(1.0, _FAR / jnp.where(size > 0, size, 1.0)))
+        return count + 1, place, size
+
+    def goes_on(state):
+        # Newton's steps square the distance: behind one of this size the next is lost in rounding. Also where it is not a number.
+        return (state[0] < _NEWTON_STEPS) & ~(state[2] < eps_of(q) ** 0.5)
 
     if held.size:
-        place = retract(scene.system, lax.fori_loop(0, _NEWTON_STEPS, close, place))
+        place = retract(scene.system, lax.while_loop(goes_on, close, (0, place, jnp.ones((), q.dtype)))[1])
         # Off the constraints rows that repeat others look independent: where the search did not close them, q itself decides.
         is_closed = largest_opening(scene, place, t, 1 - sure) <= eps_of(q) ** 0.4
         place = jnp.where(is_closed, place, q)

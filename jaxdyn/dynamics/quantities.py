@@ -42,7 +42,7 @@ def mass_matrix(model: Model | System, q: Float[Array, " nq"], t: Numbers = 0.0)
     (q,) = check_shapes(model, q=q)
     if _has_many_pairs(model):
         return world_frame.mass_matrix_by_loops(model, q)
-    return by_recursion(recursions.crba, world_frame.mass_matrix, model, q)
+    return kernel(recursions.crba, fallback=world_frame.mass_matrix)(model, q)
 
 
 def coriolis_matrix(
@@ -196,8 +196,18 @@ def _has_many_bodies(model: Model) -> bool:
     return _recursions(model) is not recursions
 
 
+def _count_pairs(model: Model) -> int:
+    return int(model.topology.ancestors.sum())
+
+
+def _is_dense(model: Model) -> bool:
+    # Within a kernel the products of all pairs, related or not, are written out: a sparse matrix is better written by its own.
+    return _count_pairs(model) > max(sizes.MAX_PAIRS, model.nb**2 // 3)
+
+
+@variant(_is_dense)
 def _has_many_pairs(model: Model) -> bool:
-    return model.nb > sizes.MAX_BODIES or int(model.topology.ancestors.sum()) > sizes.MAX_PAIRS
+    return model.nb > sizes.MAX_BODIES_IN_MATRIX or _count_pairs(model) > sizes.MAX_PAIRS
 
 
 def _rnea_of_many(model: Model, q, v, a, external=None):

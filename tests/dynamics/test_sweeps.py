@@ -264,3 +264,15 @@ def test_recursions_by_name_of_many_bodies(kinds):
         )
     for a, b, tolerance in zip(computed, expected, (1e-9, 1e-11, 1e-11, 1e-12), strict=True):
         assert_close(a, b, tolerance)  # of accelerations by the condition number of M
+
+
+@pytest.mark.parametrize("count", [140, pytest.param(420, marks=pytest.mark.slow)])
+def test_mass_matrix_of_a_shallow_tree(count):
+    """Of many bodies and few pairs, written out and beyond by loops, and within another kernel: forces of unit accelerations."""
+    model = random_tree(3, count, branching=20, skew=0.3, taper=1.0, kinds=("revolute",)).replace(gravity=None)
+    q = state(model)[0]
+    places = np.array([0, 7, count // 2, count - 1])
+    columns = quick(jax.vmap(lambda e: jd.inverse_dynamics(model, q, jnp.zeros(count), e)))(jnp.eye(count)[places])
+    twice = kernel(lambda model, q: 2 * jd.mass_matrix(model, q))
+    for M in (quick(lambda q: jd.mass_matrix(model, q))(q), 0.5 * quick(lambda q: twice(model, q))(q)):
+        assert_close(M[places], columns, 1e-12)
