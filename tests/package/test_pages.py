@@ -35,6 +35,18 @@ def test_every_page_is_in_the_menu_of_the_site():
     assert not missing, missing
 
 
+def test_modules_that_the_page_on_design_lists_exist():
+    """The tables of subpackages, and of the modules of the compiler."""
+    text, wrong = (ROOT / "docs" / "design.md").read_text(), []
+    for room, listed in re.findall(r"^\| \d+ \| `(\w+)/` \| \d+ \| (.*?) \|", text, re.M):
+        modules = {path.stem for path in (ROOT / "jaxdyn" / room).rglob("*")}
+        wrong += [f"{room}/{name}" for name in re.findall(r"`(\w+)/?`", listed) if name not in modules]
+    modules = {path.name.removesuffix(".py") for path in (ROOT / "jaxdyn" / "compile").iterdir()}
+    listed = re.findall(r"`([\w.]+)`", " ".join(re.findall(r"^\| (`.*?`) \| ", text, re.M)))
+    wrong += [name for name in listed if name not in modules]
+    assert listed and not wrong, wrong
+
+
 def test_gallery_shows_what_its_command_makes():
     shown = re.findall(r"\(gallery/(\w+)\.gif\)", (ROOT / "docs" / "gallery.md").read_text())
     assert shown == list(SCENES) and set(shown) <= set(jd.scenes.names())
