@@ -185,9 +185,10 @@ def _kernel_with_checks(recursion: Callable, is_large: Callable, of_many: Callab
     def call(*args, **named):
         # Bound by name, so that positional and named arguments pass the same checks.
         (_, model), *rest = signature.bind(*args, **named).arguments.items()
+        checked = check_shapes(model, **dict(rest))
         if is_large(model):
             return of_many(model, **dict(rest))
-        return by_kernel(tuple(name for name, _ in rest))(model, *check_shapes(model, **dict(rest)))
+        return by_kernel(tuple(name for name, _ in rest))(model, *checked)
 
     return call
 
