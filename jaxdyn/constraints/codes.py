@@ -158,8 +158,8 @@ class RESULTS(metaclass=_Enumeration):
     bad_event = _code("The function of a terminal event is not above zero at the start.")
 
     @staticmethod
-    def where(condition: Any, code: Result, otherwise: Result) -> Result:
-        """The first code where a condition () of any kind of truth value holds, else the second."""
+    def where(condition: Bool[ArrayLike, ""], code: Result, otherwise: Result) -> Result:
+        """The first code where a condition () holds, else the second."""
         # Equal known codes stay known when the condition is traced.
         if code.index is otherwise.index:
             return code
