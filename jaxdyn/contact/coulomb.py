@@ -25,8 +25,7 @@ import jax.numpy as jnp
 from jax import lax
 from jaxtyping import Array, Bool, Float
 
-from jaxdyn.compile import batch, eliminate
-from jaxdyn.compile.pivots import MOST_WRITTEN_OUT
+from jaxdyn.compile import MOST_WRITTEN_OUT, batch, eliminate
 from jaxdyn.contact import jordan
 from jaxdyn.lie.series import safe_sqrt
 from jaxdyn.lie.so3 import matmul

@@ -203,7 +203,8 @@ REGISTERS = {
     "redundant rows": (248, 560, 0),
     "singular positions": (96, 304, 0),
     "projection": (56, 368, 0),
-    "rows of a held quadruped": (255, 10608, 44976),
+    # Normal equations as loops over rows keep their matrices on the stack.
+    "rows of a held quadruped": (255, 25392, 45352),
     "fixed steps of an arm": (255, 688, 1496),
     "reverse mode of these": (255, 3312, 3272),
     "adaptive steps to a joint's limit": (255, 2480, 16824),
