@@ -28,9 +28,9 @@ from jaxdyn.compile.mode import compilation as compilation
 from jaxdyn.compile.mode import current as compilation_mode  # noqa: F401 (under a name that says of what)
 from jaxdyn.compile.mode import is_standalone as is_standalone
 from jaxdyn.compile.mode import values_of_rules as values_of_rules
-from jaxdyn.compile.pivots import MOST_WRITTEN_OUT as MOST_WRITTEN_OUT
 from jaxdyn.compile.pivots import eliminate as eliminate
 from jaxdyn.compile.pivots import eliminate_rows as eliminate_rows
+from jaxdyn.compile.pivots import solver_of as solver_of
 from jaxdyn.compile.rules import batch_alike as batch_alike
 from jaxdyn.compile.rules import implicit as implicit
 from jaxdyn.compile.rules import invalidate_derivatives as invalidate_derivatives

@@ -2,6 +2,7 @@
 
 import contextlib
 import functools
+from collections.abc import Callable
 
 import jax
 import jax.numpy as jnp
@@ -14,7 +15,7 @@ with contextlib.suppress(ImportError):  # no kernels without llvmlite
 
 
 # Unknowns up to which an elimination is written out.
-MOST_WRITTEN_OUT = 24
+_MOST_WRITTEN_OUT = 24
 # Rows whose distances differ by less than this part are equally far.
 _ALIKE = 1e-3
 
@@ -148,7 +149,7 @@ def eliminate(matrix: jax.Array, right: jax.Array, least: float) -> tuple[jax.Ar
     written out grow with their third power.
     """
     n = len(matrix)
-    if n > MOST_WRITTEN_OUT:
+    if n > _MOST_WRITTEN_OUT:
         # Two carries: of a derivative the right side alone is linear.
         (_, right), pivots = lax.scan(functools.partial(_clear_column, least), (matrix, right), None, n)
         return right, pivots
@@ -165,6 +166,34 @@ def eliminate(matrix: jax.Array, right: jax.Array, least: float) -> tuple[jax.Ar
         rest = value - jnp.matmul(row, solution, precision="highest") if row.shape[0] else value
         solution = jnp.concatenate([(rest * inverse)[None], solution])
     return solution, jnp.stack(pivots)
+
+
+def solver_of(matrix: jax.Array) -> Callable[[jax.Array], jax.Array]:
+    """Function that maps right sides (n, k) to the solutions of a regular system, with derivatives of all orders.
+
+    Elimination without exchange of rows, as for `eliminate`.
+    """
+    inverse = None
+    if len(matrix) > _MOST_WRITTEN_OUT:
+        # Products transpose well. A loop that eliminates would keep the matrix of each of its steps.
+        unit = jnp.eye(len(matrix), dtype=matrix.dtype)
+        inverse = lax.stop_gradient(eliminate(matrix, unit, float(jnp.finfo(matrix.dtype).eps))[0])
+    return functools.partial(_solve_regular, inverse, matrix)
+
+
+@jax.custom_jvp
+def _solve_regular(inverse, matrix, right):
+    if inverse is None:
+        return eliminate(matrix, right, float(jnp.finfo(matrix.dtype).eps))[0]
+    return jnp.matmul(inverse, right, precision="highest")
+
+
+@_solve_regular.defjvp
+def _solve_regular_jvp(primals, tangents):
+    # The derivative of the operations would be that of each pivot, most of which cancels.
+    solution = _solve_regular(*primals)
+    rest = tangents[2] - jnp.matmul(tangents[1], solution, precision="highest")
+    return solution, _solve_regular(*primals[:2], rest)
 
 
 def _clear_column(least: float, state, _):

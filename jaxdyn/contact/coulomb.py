@@ -16,16 +16,14 @@ Sources: Acary & Cadoux, Applications of an existence result for the Coulomb fri
 simulation of nonsmooth rigid multibody dynamics (2006); Hayashi, Yamashita & Fukushima, SIAM J. Optim. 15 (2005), 593-615.
 """
 
-from collections.abc import Callable
 from functools import partial
 from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
-from jax import lax
 from jaxtyping import Array, Bool, Float
 
-from jaxdyn.compile import MOST_WRITTEN_OUT, batch, eliminate
+from jaxdyn.compile import batch, eliminate, solver_of
 from jaxdyn.contact import jordan
 from jaxdyn.lie.series import safe_sqrt
 from jaxdyn.lie.so3 import matmul
@@ -150,33 +148,6 @@ def _newton_matrix(groups: Groups, blocks, W, shift) -> Array:
     unit = jnp.eye(W.shape[0], dtype=W.dtype)
     D, DS = zip(*blocks, strict=True)
     return unit - _apply(groups, D, unit) + _apply(groups, DS, W + jnp.diag(shift))
-
-
-def solver_of(matrix) -> Callable:
-    """Function that maps right sides (n, k) to the solutions of a regular system with derivatives of all orders.
-
-    The diagonal blocks of cones need no exchange of rows.
-    """
-    inverse = None
-    if len(matrix) > MOST_WRITTEN_OUT:
-        # Products transpose well. A loop that eliminates would keep the matrix of each of its steps.
-        unit = jnp.eye(len(matrix), dtype=matrix.dtype)
-        inverse = lax.stop_gradient(eliminate(matrix, unit, float(jnp.finfo(matrix.dtype).eps))[0])
-    return partial(_solve_regular, inverse, matrix)
-
-
-@jax.custom_jvp
-def _solve_regular(inverse, matrix, right):
-    if inverse is None:
-        return eliminate(matrix, right, float(jnp.finfo(matrix.dtype).eps))[0]
-    return matmul(inverse, right)
-
-
-@_solve_regular.defjvp
-def _solve_regular_jvp(primals, tangents):
-    # The derivative of the operations would be that of each pivot, most of which cancels.
-    solution = _solve_regular(*primals)
-    return solution, _solve_regular(*primals[:2], tangents[2] - matmul(tangents[1], solution))
 
 
 def _shift(scale, exponent: float = _SHIFT) -> Array:

@@ -8,6 +8,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array
 
+from jaxdyn.compile import solver_of
 from jaxdyn.constraints.base import constraint_jacobian, position_residual, velocity_residual
 from jaxdyn.constraints.dynamics import constrained_dynamics
 from jaxdyn.constraints.projection import project_state
@@ -443,7 +444,7 @@ def make_consistent(contacts: Contacts, problem: Scaled, closes) -> Scaled:
     # Between the squares of independent rows and rounding. The second step leaves a share of its square.
     shift = float(jnp.finfo(q.dtype).eps) ** 0.55
     shifted = gram + shift * jnp.eye(len(act), dtype=q.dtype)
-    solve = coulomb.solver_of(shifted)
+    solve = solver_of(shifted)
     x = solve(wanted[:, None])[:, 0]
     x = x + solve((wanted - matmul(gram, x))[:, None])[:, 0]
     rest = wanted - matmul(gram, x)

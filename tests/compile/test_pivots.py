@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 import jaxdyn as jd
-from jaxdyn.compile import eliminate, eliminate_rows, kernel
+from jaxdyn.compile import eliminate, eliminate_rows, kernel, solver_of
 
 pytestmark = pytest.mark.native
 
@@ -86,3 +86,24 @@ def test_solutions_of_few_and_many_unknowns(mode, count):
     inverse = np.linalg.inv(matrices[0]).T
     np.testing.assert_allclose(of_right, inverse @ rights[1], rtol=0, atol=1e-13)
     np.testing.assert_allclose(slope, -inverse @ rights[0] @ rights[0].T @ inverse, rtol=0, atol=1e-13)
+
+
+@pytest.mark.parametrize("count", [4, 30])
+def test_solutions_of_regular_systems_have_derivatives_of_both_orders(count):
+    """Along t, of A + t B with the right side b + t c: those of JAX's solution by LAPACK."""
+    rng = np.random.default_rng(count)
+    A, B = rng.normal(size=(2, count, count)) + 2 * count * np.array([1, 0])[:, None, None] * np.eye(count)
+    b, c = rng.normal(size=(2, count, 1))
+
+    def energy(solve, t):
+        return jnp.sum(solve(A + t * B, b + t * c) ** 2)
+
+    by_kernel = kernel(lambda _, t: energy(lambda matrix, right: solver_of(matrix)(right), t))
+    found = [jax.jit(f)(0.3) for f in derivatives(lambda t: by_kernel((), t))]
+    wanted = [f(0.3) for f in derivatives(lambda t: energy(jnp.linalg.solve, t))]
+    np.testing.assert_allclose(found, wanted, rtol=1e-12)
+
+
+def derivatives(f):
+    """The function, its first derivatives in both modes, and its second one."""
+    return f, jax.grad(f), jax.jacfwd(f), jax.grad(jax.grad(f)), jax.jacfwd(jax.grad(f))
