@@ -275,6 +275,8 @@ def main():
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--mujoco", action="store_true")
     options = parser.parse_args()
+    if options.drops % options.batch:
+        parser.error(f"--drops {options.drops} is no multiple of --batch {options.batch}")
     jax.config.update("jax_enable_x64", True)
     for name in timing.chosen_names(options.names, DROPS):
         once, starts = run(name, options.seconds)
