@@ -3,6 +3,7 @@
 import ctypes
 import functools
 import math
+import threading
 from types import SimpleNamespace
 
 import jax
@@ -32,13 +33,15 @@ class HostKernel:
         self.address = self.code.address(ptx.KERNEL)
         self.arrays = module.partition(f"@{ptx.KERNEL}(")[2].partition(")")[0].count("ptr ")
         self.sample = ctypes.c_int64.from_address(self.code.engine.get_global_value_address("jaxdyn_sample"))
+        self.lock = threading.Lock()  # the number of a thread of the GPU is one for all threads that launch
 
     def run(self, pointers, samples: int, threads: int) -> None:
         """Run so many threads, one after the other."""
         call = ctypes.CFUNCTYPE(None, *[ctypes.c_void_p] * len(pointers), ctypes.c_int64)(self.address)
-        for thread in range(threads):
-            self.sample.value = thread
-            call(*pointers, samples)
+        with self.lock:
+            for thread in range(threads):
+                self.sample.value = thread
+                call(*pointers, samples)
 
 
 def uniform_of(args) -> list[bool]:
