@@ -49,7 +49,7 @@ class PseudoInverse(MatrixProgram):
 
     @property
     def title(self) -> str:
-        """What the code depends on."""
+        """Text that names all on which the code depends."""
         return super().title if self.least is None else f"{super().title}, pivots above {self.least!r}"
 
     def write(self, w: LoopWriter, matrix, result) -> None:

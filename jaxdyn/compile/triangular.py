@@ -52,7 +52,7 @@ class TriangularSolution(MatrixProgram):
 
     @property
     def title(self) -> str:
-        """What the code depends on."""
+        """Text that names all on which the code depends."""
         return f"{super().title}, {self.inputs[1].shape[1]} columns, {'transposed' if self.transposed else 'as it is'}"
 
     def write(self, w: LoopWriter, factor, right, result) -> None:

@@ -102,7 +102,7 @@ class Ball(Feature):
 
 
 class LowestCorner(Feature):
-    """Of some points the one that comes after `before` others in a direction: another one as the shape turns."""
+    """Point of a shape that comes after `before` others in a direction: another one as the shape turns."""
 
     places: Float[Array, "n 3"]
     before: int = eqx.field(static=True)

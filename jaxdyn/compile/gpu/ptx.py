@@ -87,7 +87,7 @@ class TooLarge(Exception):
 
 
 def is_interleaved(array: Array, uniform: bool) -> bool:
-    """Whether an array is stored with the entries of neighbouring samples side by side."""
+    """Decide whether an array is stored with the entries of neighbouring samples side by side."""
     return not uniform and array.size <= MAX_INTERLEAVED_ENTRIES
 
 
