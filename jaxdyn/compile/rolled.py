@@ -13,7 +13,16 @@ import numpy as np
 
 from jaxdyn.compile.graph import Graph
 from jaxdyn.compile.jax_adapter import scan_counts
-from jaxdyn.compile.program import Array, FlaggedIteration, Number, as_objects, dtype_of, is_number, kind_or_refuse, objects
+from jaxdyn.compile.program import (
+    Array,
+    FlaggedIteration,
+    Number,
+    as_objects,
+    dtype_of,
+    is_number,
+    kind_or_refuse,
+    objects,
+)
 from jaxdyn.compile.scan import MAX_WRITTEN_OUT, Counts, Scan
 
 # Operations of an iteration beyond which there is no loop, but of a sweep.
