@@ -229,9 +229,18 @@ def program(case: Case, solver, dtype=float, **options) -> Callable:
         scene, control, q0, v0 = case.build(jnp.exp(log))
         if dtype is not float:
             scene, control = jax.tree.map(lambda x: x.astype(dtype), (scene, control))
-        tolerances = {"rtol": tolerance, "atol": tolerance, "throw": False}
+        tolerances = {} if "stepsize" in options else {"rtol": tolerance, "atol": tolerance}
         solution = jd.simulate(
-            scene, q0, v0, case.ts, control=control, solver=solver, adjoint="forward", **tolerances, **options
+            scene,
+            q0,
+            v0,
+            case.ts,
+            control=control,
+            solver=solver,
+            adjoint="forward",
+            throw=False,
+            **tolerances,
+            **options,
         )
         return solution.q, (solution.stats["num_steps"], solution.success, code_of(solution.result))
 

@@ -313,6 +313,15 @@ class _Expansion:
             rows = as_objects(args[0]).reshape(-1, inner.inputs[0].size)
             results = [self.graph.call(inner, [row])[0].ravel() for row in rows]
             return [np.stack(results).reshape(*lead, -1)]
+        lead = max((x.shape[:-1] for x in args), key=len)
+        if not lead:
+            return self._one_call(inner, args)
+        # A batch, such as the columns of a Jacobian: inputs that all of it share have no leading axes.
+        rows = [self._one_call(inner, [x[i] if x.ndim > 1 else x for x in args]) for i in np.ndindex(lead)]
+        return [np.stack(column).reshape(*lead, -1) for column in zip(*rows, strict=True)]
+
+    def _one_call(self, inner: Program, args) -> list:
+        """The results of a kernel within this one, for one sample."""
         shaped = [as_objects(x).reshape(array.shape) for x, array in zip(args, inner.inputs, strict=True)]
         self.has_rules |= inner.derivative is not None
         fast = inner if inner.fast is None else inner.fast

@@ -15,8 +15,11 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from jaxdyn.compile.flags import mark_invalid
+from jaxdyn.compile.kernels import variant
 from jaxdyn.compile.matrix_loops import LoopWriter, MatrixProgram
 from jaxdyn.compile.normal_equations import write_normal_equations
+from jaxdyn.compile.pivots import eliminate
 
 with contextlib.suppress(ImportError):  # no kernels without llvmlite
     import llvmlite.ir as ir
@@ -26,6 +29,8 @@ with contextlib.suppress(ImportError):  # no kernels without llvmlite
 # Sweeps converge quadratically: six to ten are enough. The bound ends those over numbers that are not finite, for which the
 # test of convergence never holds.
 MAX_SWEEPS = 60
+# Share of a diagonal entry that elimination without exchange of rows has to leave as a pivot.
+_LEAST_SHARE = 1e-4
 
 
 def _cost(n: int, m: int) -> int:
@@ -216,13 +221,27 @@ def _gram_eigenvectors_jvp(primals, tangents):
 @jax.custom_jvp
 def inverse(matrix: jax.Array) -> jax.Array:
     """The inverse (n, n) of a regular matrix by elimination; numbers that are not finite where it is singular."""
-    return matrix if 0 in matrix.shape else _inverse(matrix.shape[0], matrix.dtype)(matrix)
+    return matrix if 0 in matrix.shape else _regular_inverse(matrix)
 
 
 @inverse.defjvp
 def _inverse_jvp(primals, tangents):
     X = inverse(primals[0])
     return X, -jnp.matmul(X, jnp.matmul(tangents[0], X, precision="highest"), precision="highest")
+
+
+def _inverse_without_exchange(matrix):
+    """The inverse; samples are invalid where a pivot is what a cancellation of four digits leaves."""
+    unit, tiny = jnp.eye(len(matrix), dtype=matrix.dtype), float(jnp.finfo(matrix.dtype).tiny)
+    result, pivots = eliminate(matrix, unit, tiny)
+    diagonal = jnp.diagonal(matrix)
+    sizes = jnp.maximum(jnp.abs(diagonal), jnp.abs(diagonal - pivots))
+    return mark_invalid(~jnp.all(jnp.abs(pivots) > _LEAST_SHARE * sizes), result)
+
+
+@variant(_inverse_without_exchange, marks=True)
+def _regular_inverse(matrix):
+    return _inverse(matrix.shape[0], matrix.dtype)(matrix)
 
 
 def _orthogonalise(w: LoopWriter, matrix, n: int, m: int, of_vector: int, of_entry: int):

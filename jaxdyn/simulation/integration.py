@@ -16,7 +16,7 @@ from jaxdyn.simulation.solution import RESULTS, from_diffrax
 from jaxdyn.simulation.solvers import ExplicitSteps, ProjectedSolver
 from jaxdyn.simulation.solvers.choice import (
     has_name,
-    is_explicit,
+    has_own_loop,
     label,
     progress_meter,
     solver_and_control,
@@ -48,7 +48,7 @@ def integrate(term, project, eqs: Equations, args, method, y0, ts, steps, option
     continuous = isinstance(adjoint, diffrax.BacksolveAdjoint)
     step_constants = (*method.step_constants, *({controls.HELD, KEPT} & set(y0)))
     reason = _reason_for_diffrax(solver, controller, adjoint, options)
-    if is_explicit(solver) and not continuous:
+    if has_own_loop(solver) and not continuous:
         solver = ExplicitSteps(solver, project, step_constants, method.projects, field=term.vector_field)
     elif project:
         solver = ProjectedSolver(solver, project, step_constants, method.projects)
@@ -85,8 +85,8 @@ def _monitors(eqs: Equations, method) -> tuple[Callable | None, Callable | None]
 
 def _reason_for_diffrax(solver, controller, adjoint, options) -> str | None:
     """Reason why diffrax makes the steps, or None: the library's own loop makes them."""
-    if not is_explicit(solver):
-        return f"solver is {label(options.solver)}; take an explicit one, such as diffrax.Dopri8()"
+    if not has_own_loop(solver):
+        return f"solver is {label(options.solver)}; take jd.solvers.Rodas5P(), or an explicit one, such as diffrax.Dopri8()"
     # Subclasses and wrappers, such as a clip to samples, have rules that our loops do not know.
     if type(controller) not in (Adaptive, ErrorMonitoredSteps):
         return "stepsize is a controller; leave it out"

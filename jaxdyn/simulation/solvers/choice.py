@@ -92,9 +92,14 @@ def label(solver: diffrax.AbstractSolver) -> str:
 
 
 def is_explicit(solver: diffrax.AbstractSolver) -> bool:
-    """True for an explicit Runge-Kutta method, whose steps the library makes itself."""
+    """True for an explicit Runge-Kutta method."""
     # diffrax reports a method that wraps an explicit one as explicit.
     return isinstance(solver, diffrax.AbstractERK) and not isinstance(solver, diffrax.AbstractWrappedSolver)
+
+
+def has_own_loop(solver: diffrax.AbstractSolver) -> bool:
+    """True for a method whose steps the library makes itself: an explicit Runge-Kutta method, or `Rodas5P`."""
+    return is_explicit(solver) or type(solver) is Rodas5P
 
 
 def is_split(solver: diffrax.AbstractSolver) -> bool:
