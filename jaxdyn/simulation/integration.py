@@ -14,6 +14,7 @@ from jaxdyn.simulation.methods import Reduced, is_regular
 from jaxdyn.simulation.options import Options, is_step_length
 from jaxdyn.simulation.solution import RESULTS, from_diffrax
 from jaxdyn.simulation.solvers import ExplicitSteps, ProjectedSolver
+from jaxdyn.simulation.solvers.base import Adaptive, ErrorMonitoredSteps, too_coarse
 from jaxdyn.simulation.solvers.choice import (
     has_name,
     is_explicit,
@@ -21,12 +22,10 @@ from jaxdyn.simulation.solvers.choice import (
     progress_meter,
     solver_and_control,
 )
-from jaxdyn.simulation.solvers.differentiable import ROOM, run, run_adaptively
 from jaxdyn.simulation.solvers.driver import step_control
 from jaxdyn.simulation.solvers.explicit import Plan
 from jaxdyn.simulation.solvers.guards import SEARCH_STEPS, delay
-from jaxdyn.simulation.solvers.integrator import ExplicitRun
-from jaxdyn.simulation.solvers.step_control import Adaptive, ErrorMonitoredSteps, too_coarse
+from jaxdyn.simulation.solvers.integrator import ROOM, ExplicitRun, run, run_adaptively
 
 
 class Outcome(NamedTuple):
@@ -164,7 +163,7 @@ def _by_diffrax(term, solver, controller, event, dt0, inputs, steps, options: Op
 def _by_pieces(plan: Plan, eqs: Equations, inputs, controller, steps, options: Options) -> Outcome:
     """Integrate by steps that end at the kinks of forces."""
     # Imported here, because most scenes have no pieces and a first call should not wait for these modules.
-    from jaxdyn.simulation.hybrid.piecewise import MIN_EVENTS, PiecewiseSystem, piecewise_motion
+    from jaxdyn.simulation.hybrid.motion import MIN_EVENTS, PiecewiseSystem, piecewise_motion
 
     system = PiecewiseSystem(plan, eqs.pieces, eqs.switching)
     rtol, atol, stepsize = steps

@@ -31,7 +31,7 @@ from jaxdyn.simulation.options import Options, is_step_length
 from jaxdyn.simulation.solution import RESULTS, Solution, invalidate_failures, rows_where
 from jaxdyn.simulation.solvers import LieGroup, Stepper
 from jaxdyn.simulation.solvers.choice import choose_adjoint, choose_solver, is_split, label
-from jaxdyn.simulation.solvers.differentiable import COUNTS
+from jaxdyn.simulation.solvers.integrator import COUNTS
 from jaxdyn.simulation.terminal_events import Conditions, Violation, check_conditions, first_violation
 from jaxdyn.systems.scene import Scene, check_callback
 from jaxdyn.systems.system import displace, has_dependent_coordinates

@@ -13,7 +13,7 @@ from jaxdyn.simulation.events import Terminal
 if TYPE_CHECKING:
     import diffrax
 
-    from jaxdyn.simulation.solvers.fixed_steps import Stepper
+    from jaxdyn.simulation.solvers.diffrax_methods import Stepper
 
     Solver = diffrax.AbstractSolver | Stepper | None
     Stepsize = ArrayLike | diffrax.AbstractStepSizeController | None
@@ -67,7 +67,7 @@ def is_variational(solver) -> bool:
     """True for the steps of method "variational"."""
     if solver is None:
         return False
-    from jaxdyn.simulation.solvers.fixed_steps import Stepper
+    from jaxdyn.simulation.solvers.diffrax_methods import Stepper
 
     return isinstance(solver, Stepper)
 

@@ -9,8 +9,7 @@ import optimistix
 import pytest
 
 import jaxdyn as jd
-from jaxdyn.simulation.solvers import differentiable
-from jaxdyn.simulation.solvers.step_control import Adaptive
+from jaxdyn.simulation.solvers.base import Adaptive
 
 TS = np.linspace(0.0, 6.0, 5)
 

@@ -13,8 +13,7 @@ import jaxdyn as jd
 from jaxdyn.forces.piecewise import Pieces
 from jaxdyn.simulation.hybrid import transitions
 from jaxdyn.simulation.hybrid.event_loop import _cases
-from jaxdyn.simulation.hybrid.modes import Mode, elements_of
-from jaxdyn.simulation.hybrid.rows import Gram
+from jaxdyn.simulation.hybrid.modes import Gram, Mode, elements_of
 
 G, MU, MU_S, LOAD, RATE = 9.81, 0.3, 0.5, 6.0, 2.0
 PLANE = ((0, 0, 0), (-np.pi / 2, 0, 0))  # z of the ground along y of the world

@@ -12,8 +12,7 @@ import jaxdyn as jd
 from benchmarks.extremes import name_of
 from benchmarks.stiff import SOLVERS, cases, program, reference, runner
 from jaxdyn.model.configuration import map_joints
-from jaxdyn.simulation.solvers.lie import _local_rate
-from jaxdyn.simulation.solvers.rosenbrock import _A, _C, _GAMMA, _RATE, _TIME, Rodas5P
+from jaxdyn.simulation.solvers.diffrax_methods import _A, _C, _GAMMA, _RATE, _TIME, Rodas5P, _local_rate
 
 
 def slider(mass=1.0):

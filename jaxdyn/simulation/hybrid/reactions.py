@@ -18,8 +18,18 @@ from jaxtyping import Array
 from jaxdyn.compile import eliminate
 from jaxdyn.dynamics.quantities import bias_force
 from jaxdyn.lie.so3 import matmul
-from jaxdyn.simulation.hybrid.modes import Elements, Mode, force_at
-from jaxdyn.simulation.hybrid.rows import Gram, StateTerms, by_element, by_normal_row, force_tolerance, gaps, tolerance
+from jaxdyn.simulation.hybrid.modes import (
+    Elements,
+    Gram,
+    Mode,
+    StateTerms,
+    by_element,
+    by_normal_row,
+    force_at,
+    force_tolerance,
+    gaps,
+    tolerance,
+)
 from jaxdyn.systems.scene import Scene
 
 

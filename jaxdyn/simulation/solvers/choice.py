@@ -11,10 +11,8 @@ import optimistix
 
 from jaxdyn.compile.known import is_known
 from jaxdyn.simulation.options import ADJOINTS, check_step_length, is_backsolve, is_step_length
-from jaxdyn.simulation.solvers.fixed_steps import RK4
-from jaxdyn.simulation.solvers.lie import LieGroup
-from jaxdyn.simulation.solvers.rosenbrock import Rodas5P
-from jaxdyn.simulation.solvers.step_control import Adaptive, ErrorMonitoredSteps
+from jaxdyn.simulation.solvers.base import Adaptive, ErrorMonitoredSteps
+from jaxdyn.simulation.solvers.diffrax_methods import RK4, LieGroup, Rodas5P
 from jaxdyn.systems.scene import Scene
 
 if TYPE_CHECKING:
