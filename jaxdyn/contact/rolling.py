@@ -257,29 +257,22 @@ class RollingModel(Model):
 
     contacts: tuple[RollingContact, ...] = ()
 
-    def __init__(self, model: Checked[Model | None] = None, contacts: Sequence = (), **fields: Any):
-        if fields:  # from `dataclasses.replace`, with checked fields
-            for name, value in fields.items():
-                setattr(self, name, value)
-            self.contacts = tuple(contacts)
-            return
+    def __init__(self, model: Checked[Model], contacts: Sequence = ()):
         if not isinstance(model, Model) or isinstance(model, RollingModel):
             raise ValueError(f"model is a {type(model).__name__}; pass a Model, the bodies that carry the surfaces")
         if not isinstance(contacts, (tuple, list)) or not all(isinstance(one, RollingContact) for one in contacts):
             raise ValueError(f"contacts is {contacts!r}; pass a list of jd.contact.rolling_contact(...)")
-        for field in dataclasses.fields(Model):
-            setattr(self, field.name, getattr(model, field.name))
         names = [one.name for one in contacts]
         if len(set(names)) < len(names):
             raise ValueError(f"contacts have the names {names}; give each its own (name=)")
         for one in contacts:
             check_bodies(one.name, model, (one.body, one.surface_body))
+        super().__init__(**{field.name: getattr(model, field.name) for field in dataclasses.fields(Model)})
         self.contacts = tuple(contacts)
 
     def replace(self, **leaves: PyTree) -> "RollingModel":
         """Copy with some leaves of the model replaced, and the same contacts."""
-        model = Model(**{field.name: getattr(self, field.name) for field in dataclasses.fields(Model)})
-        return RollingModel(model.replace(**leaves), self.contacts)
+        return RollingModel(super().replace(**leaves), self.contacts)
 
     @property
     def nq(self) -> int:

@@ -10,9 +10,9 @@ from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
     from jaxdyn.simulation.contact_steps import ContactStep as ContactStep
+    from jaxdyn.simulation.events import JointLimitWarning as JointLimitWarning
     from jaxdyn.simulation.methods import Baumgarte as Baumgarte
     from jaxdyn.simulation.stiffness import Stiffness as Stiffness
-    from jaxdyn.simulation.terminal_events import JointLimitWarning as JointLimitWarning
 
 __all__ = [
     "Baumgarte",
@@ -28,11 +28,11 @@ def __dir__() -> list[str]:
 
 
 def __getattr__(name: str) -> Any:
-    # At their first use: diffrax, which two of them import, is not needed by runs whose programs are on disk.
+    # At their first use: diffrax, which one of them imports, is not needed by runs whose programs are on disk.
     homes = {
         "Baumgarte": "methods",
         "ContactStep": "contact_steps",
-        "JointLimitWarning": "terminal_events",
+        "JointLimitWarning": "events",
         "Stiffness": "stiffness",
     }
     if name not in homes:

@@ -16,8 +16,8 @@ from jaxdyn.dynamics.kinematics import frame_pose
 from jaxdyn.forces.piecewise import Pieces, fix_pieces, guards, pieces_of, values_and_levels
 from jaxdyn.simulation import controls
 from jaxdyn.simulation.checks import CONTACT_OUTPUTS, POSE
+from jaxdyn.simulation.events import Conditions, contact_allowances, limit_allowances
 from jaxdyn.simulation.methods import Method, Projected
-from jaxdyn.simulation.terminal_events import WITHIN, Conditions, contact_allowances, limit_allowances
 from jaxdyn.systems.scene import Scene
 from jaxdyn.systems.system import retract, velocity_to_rate
 
@@ -26,6 +26,8 @@ from jaxdyn.systems.system import retract, velocity_to_rate
 KEPT = "kept_rows"
 # Entry of the state: the states of the scene's drives.
 DRIVES = "drives"
+# Entry of the state in diffrax's loop: -1 where an allowance has been negative within the last step, else 1.
+WITHIN = "within_step"
 
 
 def power(force, v):

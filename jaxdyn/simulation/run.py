@@ -25,6 +25,7 @@ from jaxdyn.simulation.events import (
     accept_former_events,
     check_events,
     check_terminals,
+    report_limits,
     sort_events,
 )
 from jaxdyn.simulation.methods import Method, may_have_redundant_rows
@@ -166,8 +167,6 @@ def simulate(
         whole = as_constant(scene) if not is_tracing() and is_concrete(scene) and not is_given(scene) else scene
         solution = smooth_motion(whole, control, method, numbers, options)
     if watch.limits is not None and not watch.limits.stop:
-        from jaxdyn.simulation.terminal_events import report_limits
-
         solution = report_limits(scene, solution, concrete)
     throw = concrete if throw is None else check_flag(throw, "throw")
     if throw and concrete:

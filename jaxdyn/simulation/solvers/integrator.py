@@ -7,7 +7,7 @@ has no error estimates and no refused steps either.
 """
 
 from abc import abstractmethod
-from typing import Any
+from typing import Any, NamedTuple
 
 import diffrax
 import equinox as eqx
@@ -214,39 +214,56 @@ COUNTS = ("num_steps", "num_accepted_steps", "num_rejected_steps")
 ROOM = 4096  # steps that are recorded where the user gives no limit: 32 kB a trajectory
 
 
-def run(inputs, *, term, solver, controller, event, adjoint, max_steps, progress, dt0=None, record=False, end=None):
+class DiffraxRun(NamedTuple):
+    """Arguments of a run in diffrax's loop, as of `diffrax.diffeqsolve`.
+
+    `record`: True to save the times at which steps ended too; `end`, (), s: a time whose state is returned as that of the event.
+    """
+
+    term: Any
+    solver: Any
+    controller: Any
+    event: diffrax.Event | None
+    adjoint: diffrax.AbstractAdjoint
+    max_steps: int
+    progress: diffrax.AbstractProgressMeter
+    dt0: Any
+    record: bool = False
+    end: Any = None
+
+
+def run(inputs, given: DiffraxRun):
     """diffrax's solution from one end of the save points to the other.
 
     **Arguments:** `inputs`, what may be differentiated: the initial state, `args`, and the save points (nt,) with the start in
-    front; `record`: True to save the times at which steps ended too; `end`, (), s: a time whose state is returned as that of the
-    event; the rest as in diffrax.
+    front.
 
     **Returns:** rows of the state at ts[1:]; the result, the counts, the time reached and, if the time of an event is located,
     the state there; all that diffrax returned.
     """
     y0, args, ts = inputs
-    located = _is_located(event)
+    located, end = _is_located(given.event), given.end
     saves = diffrax.SubSaveAt(ts=ts[1:])
     last = diffrax.SubSaveAt(t1=True, fn=_state if located else _nothing)
     last = last if end is None else diffrax.SubSaveAt(ts=end[None])
-    ends = (diffrax.SubSaveAt(steps=True, fn=_nothing),) if record else ()
+    ends = (diffrax.SubSaveAt(steps=True, fn=_nothing),) if given.record else ()
     saveat = diffrax.SaveAt(subs=(saves, last, *ends), controller_state=True)
-    continuous = isinstance(adjoint, diffrax.BacksolveAdjoint)  # supports save points and nothing else
+    continuous = isinstance(given.adjoint, diffrax.BacksolveAdjoint)  # supports save points and nothing else
     solved: Any = diffrax.diffeqsolve(
-        term,
-        _with_scan(solver, adjoint),
+        given.term,
+        _with_scan(given.solver, given.adjoint),
         t0=ts[0],
         t1=ts[-1],
-        dt0=dt0,
+        dt0=given.dt0,
         y0=y0,
         args=args,
         saveat=diffrax.SaveAt(subs=saves) if continuous else saveat,
-        stepsize_controller=controller,
-        adjoint=adjoint,
-        event=event,
-        max_steps=max_steps,
+        stepsize_controller=given.controller,
+        adjoint=given.adjoint,
+        event=given.event,
+        max_steps=given.max_steps,
         throw=False,
-        progress_meter=progress,
+        progress_meter=given.progress,
     )
     counts = {name: solved.stats[name] for name in COUNTS}
     if continuous:
@@ -268,45 +285,45 @@ def _with_scan(solver, adjoint):
     return eqx.tree_at(lambda solver: innermost(solver).scan_kind, solver, kind, is_leaf=lambda x: x is None)
 
 
-def run_adaptively(inputs, options, limit_is_given: bool) -> tuple[Any, tuple]:
+def run_adaptively(inputs, given: DiffraxRun, limit_is_given: bool) -> tuple[Any, tuple]:
     """Rows and facts of `run` with adaptive steps whose ends are constants to reverse mode.
 
     The time of an event then follows from the state at its end.
     """
-    if not isinstance(options["controller"], diffrax.AbstractAdaptiveStepSizeController):
-        return run(inputs, **options)[:2]  # with steps that are given, as those of `diffrax.StepTo`
-    numbers, rest = eqx.partition(options, eqx.is_array)
+    if not isinstance(given.controller, diffrax.AbstractAdaptiveStepSizeController):
+        return run(inputs, given)[:2]  # with steps that are given, as those of `diffrax.StepTo`
+    numbers, rest = eqx.partition(given, eqx.is_array)
     # Tolerances and limits decide which steps are made, and the steps are constants here.
-    options = eqx.combine(jax.lax.stop_gradient(numbers), rest)
-    room = options["max_steps"] if limit_is_given else min(options["max_steps"], ROOM)
-    if isinstance(options["adjoint"], diffrax.RecursiveCheckpointAdjoint):
-        return _with_end(_run(reverse_only(inputs, FORWARD), options, room), inputs[1], options)
-    if isinstance(options["adjoint"], diffrax.DirectAdjoint):
+    given = eqx.combine(jax.lax.stop_gradient(numbers), rest)
+    room = given.max_steps if limit_is_given else min(given.max_steps, ROOM)
+    if isinstance(given.adjoint, diffrax.RecursiveCheckpointAdjoint):
+        return _with_end(_run(reverse_only(inputs, FORWARD), given, room), inputs[1], given)
+    if isinstance(given.adjoint, diffrax.DirectAdjoint):
         numbers, rest = eqx.partition(inputs, eqx.is_array)
-        facts, steps = _record(eqx.combine(jax.lax.stop_gradient(numbers), rest), options, options["max_steps"])[1:]
-        rows, repeated, _ = run(inputs, **_repeat(options, steps, facts[2]))
-        return _with_end((rows, (*facts[:3], *repeated[3:])), inputs[1], options)
-    return run(inputs, **options)[:2]
+        facts, steps = _record(eqx.combine(jax.lax.stop_gradient(numbers), rest), given, given.max_steps)[1:]
+        rows, repeated, _ = run(inputs, _repeat(given, steps, facts[2]))
+        return _with_end((rows, (*facts[:3], *repeated[3:])), inputs[1], given)
+    return run(inputs, given)[:2]
 
 
 @eqx.filter_custom_vjp
-def _run(inputs, options, room):
-    return run(inputs, **options)[:2]
+def _run(inputs, given, room):
+    return run(inputs, given)[:2]
 
 
 @_run.def_fwd
-def _(perturbed, inputs, options, room):
-    rows, facts, steps = _record(inputs, options, room)
+def _(perturbed, inputs, given, room):
+    rows, facts, steps = _record(inputs, given, room)
     return (rows, facts), (steps, facts[2])
 
 
 @_run.def_bwd
-def _(residuals, gradients, perturbed, inputs, options, room):
+def _(residuals, gradients, perturbed, inputs, given, room):
     free, fixed = eqx.partition(inputs, perturbed)
-    options = _repeat(options, *residuals)
+    given = _repeat(given, *residuals)
 
     def states(free):
-        rows, facts, _ = run(eqx.combine(free, fixed), **options)
+        rows, facts, _ = run(eqx.combine(free, fixed), given)
         return rows, facts[3:]
 
     values, pull = eqx.filter_vjp(states, free)
@@ -319,31 +336,32 @@ def _is_located(event) -> bool:
     return event is not None and event.root_finder is not None
 
 
-def _with_end(solved, args, options):
+def _with_end(solved, args, given: DiffraxRun):
     """Rows and facts, whose time of an event has its derivative."""
     rows, (result, counts, reached, *last) = solved
     if not last:
         return solved
     codes: Any = diffrax.RESULTS
-    event, term, (end,) = options["event"], options["term"], last
+    event: Any = given.event
+    term, (end,) = given.term, last
     y, unravel = ravel_pytree(end)
 
-    def guard(given, t, y):
-        args, condition = given
+    def guard(known, t, y):
+        args, condition = known
         return condition(t, unravel(y), args)
 
-    def field(given, t, y):
-        return ravel_pytree(term.vf_prod(t, unravel(y), given[0], term.contr(t, t + 1)))[0]
+    def field(known, t, y):
+        return ravel_pytree(term.vf_prod(t, unravel(y), known[0], term.contr(t, t + 1)))[0]
 
     late = delay(guard, field, (args, event.cond_fn), reached, y)
     return rows, (result, counts, reached + jnp.where(result == codes.event_occurred, late, 0.0), end)
 
 
-def _record(inputs, options, room):
+def _record(inputs, given: DiffraxRun, room):
     """Rows and facts of `run`, and the controller that repeats its steps."""
-    changes = {"adjoint": diffrax.ForwardMode(), "max_steps": room, "record": True}
-    rows, facts, solution = run(inputs, **options | changes)
-    starts, jumps = solution.ts[2], _jumps(options["controller"])
+    recorded = given._replace(adjoint=diffrax.ForwardMode(), max_steps=room, record=True)
+    rows, facts, solution = run(inputs, recorded)
+    starts, jumps = solution.ts[2], _jumps(given.controller)
     ends = starts
     if jumps is not None:
         # A step ends at the number before a jump, and the next one starts at the second one after it.
@@ -354,11 +372,11 @@ def _record(inputs, options, room):
     return rows, facts, jax.lax.stop_gradient(controller)
 
 
-def _repeat(options, controller, end):
+def _repeat(given: DiffraxRun, controller, end):
     """Options of a run that repeats steps, with the state at the time `end` if that is the time of an event."""
-    end = jax.lax.stop_gradient(end) if _is_located(options["event"]) else None
-    changes = {"controller": controller, "max_steps": controller.ends.shape[0], "progress": diffrax.NoProgressMeter()}
-    return options | changes | {"event": None, "end": end}
+    end = jax.lax.stop_gradient(end) if _is_located(given.event) else None
+    meter, most = diffrax.NoProgressMeter(), controller.ends.shape[0]
+    return given._replace(controller=controller, max_steps=most, progress=meter, event=None, end=end)
 
 
 class _GivenSteps(diffrax.AbstractStepSizeController):
