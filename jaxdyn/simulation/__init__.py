@@ -12,12 +12,14 @@ if TYPE_CHECKING:
     from jaxdyn.simulation.contact_steps import ContactStep as ContactStep
     from jaxdyn.simulation.events import JointLimitWarning as JointLimitWarning
     from jaxdyn.simulation.methods import Baumgarte as Baumgarte
+    from jaxdyn.simulation.options import Pose as Pose
     from jaxdyn.simulation.stiffness import Stiffness as Stiffness
 
 __all__ = [
     "Baumgarte",
     "ContactStep",
     "JointLimitWarning",
+    "Pose",
     "Stiffness",
 ]
 
@@ -33,6 +35,7 @@ def __getattr__(name: str) -> Any:
         "Baumgarte": "methods",
         "ContactStep": "contact_steps",
         "JointLimitWarning": "events",
+        "Pose": "options",
         "Stiffness": "stiffness",
     }
     if name not in homes:

@@ -29,14 +29,13 @@ from jaxdyn.model.topology import frame_index
 from jaxdyn.model.tree import Model
 from jaxdyn.simulation.controls import Controller, Sampled
 from jaxdyn.simulation.methods import Baumgarte, Free, Method, Multipliers, Projected, Reduced, is_regular, start_limit
-from jaxdyn.simulation.options import is_backsolve, is_step_length, is_variational
+from jaxdyn.simulation.options import Pose, is_backsolve, is_step_length, is_variational
 from jaxdyn.simulation.solution import RESULTS
 from jaxdyn.simulation.variational import Variational
 from jaxdyn.systems.mass_factor import mass_factor
 from jaxdyn.systems.scene import Scene, has_drives
 from jaxdyn.systems.system import has_quaternions, retract
 
-POSE = "pose:"  # prefix of the output of a frame
 CONTACT_OUTPUTS = ("contact_forces", "contact_margins")
 OUTPUTS = (
     *("energy", "power", "work", "acceleration", "multipliers", "constraint_residual", "torque", "control_state"),
@@ -142,17 +141,17 @@ def _check_finite(name: str, value) -> None:
         raise ValueError(f"{name} is {np.asarray(value)[bad[0]]} at index {bad[0]}; give finite numbers")
 
 
-def sort_outputs(scene: Scene, outputs) -> tuple[str, ...]:
+def sort_outputs(scene: Scene, outputs) -> tuple[str | Pose, ...]:
     """Names of outputs in order, each once; refuses names that are no outputs, and frames that do not exist."""
     if isinstance(outputs, str):
         raise ValueError(f"outputs is the string {outputs!r}; pass a tuple, e.g. outputs=({outputs!r},)")
     for name in outputs:
-        if isinstance(name, str) and name.startswith(POSE) and isinstance(scene.system, Model):
-            frame_index(scene.system, name.removeprefix(POSE))
+        if isinstance(name, Pose) and isinstance(scene.system, Model):
+            frame_index(scene.system, name.frame)
         elif name not in OUTPUTS:
-            raise ValueError(f"outputs has {name!r}; choose from {', '.join(OUTPUTS)} and '{POSE}<frame>'")
+            raise ValueError(f"outputs has {name!r}; choose from {', '.join(OUTPUTS)} and jd.simulation.Pose(frame)")
     # Names are static: in one order, the same outputs share a compiled program.
-    return tuple(sorted(set(outputs)))
+    return tuple(sorted(set(outputs), key=lambda name: (isinstance(name, Pose), name)))
 
 
 def check_combination(control, method: Method, solver, adjoint) -> None:
@@ -220,9 +219,9 @@ def check_modal_options(control, stepsize, solver, adjoint, outputs) -> None:
     if not has_name(adjoint):
         raise ValueError(f"adjoint is {adjoint}, which does not go back through events, and {what}; take 'reverse'")
     for name in outputs:
-        if name not in MODAL_OUTPUTS and not name.startswith(POSE):
+        if name not in MODAL_OUTPUTS and not isinstance(name, Pose):
             raise ValueError(
-                f"outputs has {name!r}, and {what}; choose from {', '.join(MODAL_OUTPUTS)} and 'pose:<frame>'"
+                f"outputs has {name!r}, and {what}; choose from {', '.join(MODAL_OUTPUTS)} and jd.simulation.Pose(frame)"
             )
 
 

@@ -1,10 +1,9 @@
 """Events of `jd.simulate`: conditions that end a motion or are reported, and the number of mode switches of a motion."""
 
-import functools
 import warnings
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass
-from typing import Any, NamedTuple, TypeAlias, TypeVar, cast
+from typing import Any, NamedTuple, TypeAlias
 
 import equinox as eqx
 import jax
@@ -14,7 +13,7 @@ from jaxtyping import Array, Bool, Float, Int
 
 from jaxdyn.contact.forces import contact_forces, contacts_with_cones
 from jaxdyn.forces.piecewise import has_pieces
-from jaxdyn.model.arguments import Function, Number, as_array, check_flag, warn
+from jaxdyn.model.arguments import Function, Number, as_array, check_flag
 from jaxdyn.model.tree import Model
 from jaxdyn.simulation.solution import RESULTS, Solution, joint_of
 from jaxdyn.systems.scene import Scene, as_pytree
@@ -123,7 +122,6 @@ class Terminal(eqx.Module):
         return as_array(value, "Terminal: function", q.dtype)
 
 
-F = TypeVar("F", bound=Callable)
 Event: TypeAlias = ContactLost | JointLimit | ModeSwitches | Progress | Terminal
 
 
@@ -143,8 +141,6 @@ class Watch(NamedTuple):
 
 _KINDS = (ContactLost, JointLimit, ModeSwitches, Progress)
 _NONE = Watch()
-# Arguments of `simulate` that `events` has replaced.
-_FORMER = {"contacts", "limits", "max_events", "progress"}
 
 
 def sort_events(events: Iterable[Event]) -> tuple[Watch, tuple[Terminal, ...]]:
@@ -213,23 +209,6 @@ def events_of(
             raise ValueError(f"{name} is {word!r}; choose from 'stop', 'report'")
         events += [] if word is None else [kind()] if word == "stop" else [kind(stop=False)]
     return events + ([] if max_events is None else [ModeSwitches(max_events)]) + ([Progress()] if progress else [])
-
-
-def accept_former_events(function: F) -> F:
-    """Decorator of `simulate`: the arguments that `events` has replaced warn, with the new form."""
-
-    @functools.wraps(function)
-    def call(*args: Any, **options: Any) -> Any:
-        if not _FORMER.isdisjoint(options):
-            given = {name: options.pop(name) for name in sorted(_FORMER & set(options))}
-            former = events_of(**given)
-            options["events"] = [*options.get("events", ()), *former]
-            old = ", ".join(f"{name}={value!r}" for name, value in given.items())
-            new = ", ".join(f"jd.events.{one!r}" for one in former)
-            warn(f"simulate({old}) is now simulate(events=[{new}])", DeprecationWarning)
-        return function(*args, **options)
-
-    return cast(F, call)
 
 
 # --- conditions that end a run ---

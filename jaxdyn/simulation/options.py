@@ -1,14 +1,18 @@
 """Options of a run as users give them, without diffrax, whose import takes longer than a run from stored programs."""
 
-from typing import TYPE_CHECKING, Any, NamedTuple
+import dataclasses
+import functools
+from collections.abc import Callable
+from typing import TYPE_CHECKING, Any, NamedTuple, TypeVar, cast
 
+import equinox as eqx
 import jax
 import numpy as np
 from jax.typing import ArrayLike
 
 from jaxdyn.compile.known import is_concrete
-from jaxdyn.model.arguments import batch_hint
-from jaxdyn.simulation.events import Terminal
+from jaxdyn.model.arguments import Numbers, batch_hint, warn
+from jaxdyn.simulation.events import Terminal, events_of
 
 if TYPE_CHECKING:
     import diffrax
@@ -20,6 +24,94 @@ if TYPE_CHECKING:
     Adjoint = str | diffrax.AbstractAdjoint | None
 else:
     Solver = Stepsize = Adjoint = Any  # `choose_solver` and `choose_adjoint` check them
+
+F = TypeVar("F", bound=Callable)
+
+
+class Steps(eqx.Module):
+    """Steps of a run: their length, or the tolerances that adaptive ones keep, and how many there may be.
+
+    - `size`: None for adaptive steps, a number (s) for fixed ones, or a diffrax step-size controller.
+    - `rtol`, `atol`: local error of a step, relative to the size of each entry of (q, v), and absolute; by default 1e-8. Values
+      below ten times the rounding error of the dtype are raised to that. With fixed steps, tolerances of an implicit solver.
+    - `max_steps`: most steps to take, rejected ones included. Default: what fixed steps need; 65536 for adaptive ones,
+      4096 with `adjoint="direct"`, and where derivatives go through adaptive steps: the end of each one is recorded, 8 bytes a
+      step and trajectory.
+
+    ```python
+    jd.simulate(model, q0, v0, ts, stepsize=jd.Steps(rtol=1e-10, atol=1e-12))
+    jd.simulate(model, q0, v0, ts, stepsize=jd.Steps(0.01, max_steps=1000))
+    ```
+    """
+
+    size: Stepsize = None
+    rtol: Numbers | None = eqx.field(default=None, kw_only=True)
+    atol: Numbers | None = eqx.field(default=None, kw_only=True)
+    max_steps: int | None = eqx.field(static=True, default=None, kw_only=True)
+
+    @classmethod
+    def of(cls, stepsize: Any) -> "Steps":
+        """Steps that the argument `stepsize` of `simulate` stands for."""
+        return stepsize if isinstance(stepsize, Steps) else cls(stepsize)
+
+
+class Pose(NamedTuple):
+    """Output of `simulate`: the pose (nt, 4, 4) of a frame of the model, in `Solution.poses` by its name."""
+
+    frame: str
+
+    def __str__(self) -> str:
+        return _POSE + self.frame
+
+
+_POSE = "pose:"  # prefix of names of poses, in descriptions and in files
+_FORMER_EVENTS = {"contacts", "limits", "max_events", "progress"}
+_FORMER_STEPS = {"rtol", "atol", "max_steps"}
+
+
+def pack_steps(options: dict[str, Any]) -> dict[str, Any]:
+    """Options of `simulate` by their names, with those of `Steps` in one."""
+    given = {name: value for name, value in options.items() if name in _FORMER_STEPS}
+    if not given:
+        return options
+    rest = {name: value for name, value in options.items() if name not in given}
+    return rest | {"stepsize": dataclasses.replace(Steps.of(rest.get("stepsize")), **given)}
+
+
+def as_output(name: str | Pose) -> str | Pose:
+    """Output by its name, "pose:<frame>" as a `Pose`."""
+    return Pose(name.removeprefix(_POSE)) if isinstance(name, str) and name.startswith(_POSE) else name
+
+
+def accept_former_arguments(function: F) -> F:
+    """Decorator of `simulate`: forms of the release before warn, with the new form."""
+
+    @functools.wraps(function)
+    def call(*args: Any, **options: Any) -> Any:
+        if not _FORMER_EVENTS.isdisjoint(options):
+            given = {name: options.pop(name) for name in sorted(_FORMER_EVENTS & set(options))}
+            former = events_of(**given)
+            options["events"] = [*options.get("events", ()), *former]
+            _warn(given, "events", f"[{', '.join(f'jd.events.{one!r}' for one in former)}]")
+        if not _FORMER_STEPS.isdisjoint(options):
+            given = {name: options[name] for name in sorted(_FORMER_STEPS & set(options))}
+            size = [] if options.get("stepsize") is None else ["stepsize"]
+            options = pack_steps(options)
+            _warn(given, "stepsize", f"jd.Steps({', '.join([*size, *(f'{name}=...' for name in given)])})")
+        outputs = options.get("outputs", ())
+        if not isinstance(outputs, str) and any(isinstance(x, str) and x.startswith(_POSE) for x in outputs):
+            options["outputs"] = tuple(map(as_output, outputs))
+            given = {"outputs": tuple(x for x in outputs if x not in options["outputs"])}
+            _warn(given, "outputs", f"({', '.join(f'jd.simulation.{as_output(x)!r}' for x in given['outputs'])},)")
+        return function(*args, **options)
+
+    return cast(F, call)
+
+
+def _warn(given: dict[str, Any], name: str, new: str) -> None:
+    old = ", ".join(f"{name}={value!r}" for name, value in given.items())
+    warn(f"simulate({old}) is now simulate({name}={new})", DeprecationWarning)
+
 
 ADJOINTS = ("reverse", "direct", "forward", "backsolve")
 
@@ -34,7 +126,7 @@ class Options(NamedTuple):
 
     solver: Any
     adjoint: Any
-    outputs: tuple[str, ...]
+    outputs: tuple[str | Pose, ...]
     stops: tuple[bool, bool]
     max_events: int
     progress: bool

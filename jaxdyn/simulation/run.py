@@ -22,7 +22,6 @@ from jaxdyn.simulation.controls import Control
 from jaxdyn.simulation.events import (
     Event,
     Watch,
-    accept_former_events,
     check_events,
     check_terminals,
     report_limits,
@@ -33,8 +32,11 @@ from jaxdyn.simulation.options import (
     ADJOINTS,
     Adjoint,
     Options,
+    Pose,
     Solver,
+    Steps,
     Stepsize,
+    accept_former_arguments,
     check_step_length,
     check_tolerance,
     is_backsolve,
@@ -46,7 +48,7 @@ from jaxdyn.systems.scene import Scene, as_scene, is_given
 from jaxdyn.systems.system import SceneLike, System, has_dependent_coordinates
 
 
-@accept_former_events
+@accept_former_arguments
 def simulate(
     scene: SceneLike,
     q0: Numbers,
@@ -56,13 +58,10 @@ def simulate(
     control: Control = None,
     method: str | Method = "auto",
     solver: Solver = None,
-    stepsize: Stepsize = None,
-    rtol: Numbers | None = None,
-    atol: Numbers | None = None,
+    stepsize: Stepsize | Steps = None,
     adjoint: Adjoint = None,
-    outputs: Sequence[str] = (),
+    outputs: Sequence[str | Pose] = (),
     events: Sequence[Event] = (),
-    max_steps: int | None = None,
     throw: bool | None = None,
 ) -> Solution:
     r"""Integrate the equations of motion from (q0, v0) and save the motion at the times `ts`.
@@ -97,30 +96,26 @@ def simulate(
       the scene's forces in the acceleration, explicit all the rest (inertia, gravity, `control`). Default: `RK4` for fixed steps;
       for adaptive ones `Dopri8`, or `Rodas5P` where the scene lists forces, all inputs are concrete and `jd.stiffness` at
       the start says that explicit steps would have to be shorter than a thousandth of the time.
-    - `stepsize`: None for adaptive steps, a number (s) for fixed ones, or a diffrax step-size controller.
-    - `rtol`, `atol`: local error of a step, relative to the size of each entry of (q, v), and absolute; by default 1e-8. Values
-      below ten times the rounding error of the dtype are raised to that. With fixed steps, tolerances of an implicit solver.
+    - `stepsize`: None for adaptive steps with tolerances of 1e-8, a number (s) for fixed ones, a diffrax step-size controller,
+      or `jd.Steps(size, rtol, atol, max_steps)`, which sets tolerances and limits too.
     - `adjoint`: how derivatives are computed.
 
         - "reverse" (default): reverse mode with checkpoints, and Hessians over it.
         - "forward": `jax.jvp`, `jax.jacfwd`, and Hessians by forward over forward mode.
-        - "direct": both modes, at a cost that grows with `max_steps`.
+        - "direct": both modes, at a cost that grows with `Steps.max_steps`.
         - "backsolve": the continuous adjoint, whose gradients are approximate, of runs that no event can end.
         - a diffrax adjoint: diffrax makes the steps.
     - `outputs`: any of "energy", "power", "work" (one more state, under the same error control), "acceleration" (the rate
       of v: of a free joint that of its body twist; `jd.dynamics.frame_acceleration` gives those of frames in world axes),
       "multipliers", "constraint_residual", "contact_forces" (N, by the names of contacts: two components of friction, then
       the normal force), "contact_margins", "torque" (of the control, behind drives and limits), "control_state" (of a
-      controller), "drive_state" (of drives) and `"pose:<frame>"`. They are computed only if asked for.
+      controller), "drive_state" (of drives), and `jd.simulation.Pose(frame)`. They are computed only if asked for.
     - `events`: objects of `jd.events`, each kind at most once: `ContactLost` (of a scene with `cones`, whose contacts end the run
       where they are lost unless `ContactLost(stop=False)` is listed), `JointLimit` (without it limits are ignored),
       `ModeSwitches(max_events)` (of forces with modes or pieces), and any number of `Terminal(function)`, which end the run where
       a function of the state falls below zero; `Progress()` shows a meter. Scenes with forces that have modes
       (`jd.contact.DryFriction`, `jd.contact.UnilateralContact`) take explicit methods with adaptive or fixed steps, which end at
       events.
-    - `max_steps`: most steps to take, rejected ones included. Default: what fixed steps need; 65536 for adaptive ones,
-      4096 with "direct", and where derivatives go through adaptive steps: the end of each one is recorded, 8 bytes a step
-      and trajectory.
     - `throw`: raise when the integration fails. Default: yes if all inputs are concrete, else see `Solution.result`.
 
     **Returns:** a `Solution`. Save points between steps come from the method's dense output. Where that is less
@@ -137,6 +132,8 @@ def simulate(
     """
     scene, control = as_scene(scene), controls.as_control(control)
     watch, terminals = sort_events(events)
+    steps = Steps.of(stepsize)
+    stepsize, rtol, atol, max_steps = steps.size, steps.rtol, steps.atol, steps.max_steps
     arrays, stepsize = _check_numbers(scene, q0, v0, ts, rtol, atol, stepsize)
     method, modal = choose_method(scene, method), has_modes(scene)
     concrete = is_known(scene, control, method, arrays, stepsize, terminals)

@@ -123,7 +123,7 @@ class Solution(Outcome):
       scene's forces, W; `work` (nt,), its integral from the start, J; `acceleration` (nt, nv); `multipliers`
       (nt, nc); `constraint_residual` (nt, 2), the largest |phi| and |A v - b|; `torque` (nt, nv), of the control, N m or N;
       `control_state`, rows of the controller's state, a pytree; `drive_state` (nt, n), of the scene's drives; `poses`,
-      one array (nt, 4, 4) by name for each frame asked for as `"pose:<frame>"`; `contact_forces` (nt, m) and `contact_margins`
+      one array (nt, 4, 4) by name for each `jd.simulation.Pose` asked for; `contact_forces` (nt, m) and `contact_margins`
       (nt,), by the names of the contacts that have a cone, along the columns of `jd.contact.wrench_basis`, N and N m.
     - `events`, of a scene with friction that sticks or contacts that open: an `Events` with `time`, `index` and `name`, else
       None. Its `contact_forces` (nt, 3) are the two components of friction and the normal force, N.

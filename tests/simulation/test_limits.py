@@ -97,7 +97,12 @@ def fall(level, *others, **options):
     terminal = [*(jd.events.Terminal(one) for one in others), jd.events.Terminal(Below(jnp.asarray(level)))]
     ts = jnp.linspace(0.0, 1.0, 11)
     return jd.simulate(
-        builder.build(), q0, jnp.zeros(6), ts, events=terminal, **{"rtol": 1e-10, "atol": 1e-10} | options
+        builder.build(),
+        q0,
+        jnp.zeros(6),
+        ts,
+        events=terminal,
+        **{"stepsize": jd.Steps(rtol=1e-10, atol=1e-10)} | options,
     )
 
 
@@ -115,7 +120,7 @@ def test_a_terminal_event_ends_a_run_at_its_time():
     assert int(fall(1.9, lambda q, v, t: v[2] + 2.0).stats["terminal_event"]) == 1
 
 
-OTHER_STEPS = [{}, {"stepsize": 0.01, "rtol": None, "atol": None}, {"solver": jd.solvers.Rodas5P()}]
+OTHER_STEPS = [{}, {"stepsize": 0.01}, {"solver": jd.solvers.Rodas5P()}]
 
 
 @pytest.mark.parametrize("options", OTHER_STEPS, ids=["adaptive", "fixed", "stiff"])
