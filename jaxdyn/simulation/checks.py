@@ -29,7 +29,7 @@ from jaxdyn.model.topology import frame_index
 from jaxdyn.model.tree import Model
 from jaxdyn.simulation.controls import Controller, Sampled
 from jaxdyn.simulation.methods import Baumgarte, Free, Method, Multipliers, Projected, Reduced, is_regular, start_limit
-from jaxdyn.simulation.options import Pose, is_backsolve, is_step_length, is_variational
+from jaxdyn.simulation.options import Pose, is_backsolve, is_step_length
 from jaxdyn.simulation.solution import RESULTS
 from jaxdyn.simulation.variational import Variational
 from jaxdyn.systems.mass_factor import mass_factor
@@ -154,14 +154,14 @@ def sort_outputs(scene: Scene, outputs) -> tuple[str | Pose, ...]:
     return tuple(sorted(set(outputs), key=lambda name: (isinstance(name, Pose), name)))
 
 
-def check_combination(control, method: Method, solver, adjoint) -> None:
+def check_combination(control, method: Method, adjoint) -> None:
     """Refuse controls and adjoints that a method does not support."""
-    if is_variational(solver) and isinstance(control, (Controller, Sampled)):
+    if isinstance(method, Variational) and isinstance(control, (Controller, Sampled)):
         raise ValueError(
             f"control is a {type(control).__name__}, whose state the steps of method 'variational' do not integrate; take "
             "another method"
         )
-    if is_variational(solver) and is_backsolve(adjoint):
+    if isinstance(method, Variational) and is_backsolve(adjoint):
         raise ValueError(
             "adjoint is 'backsolve', which needs a differential equation; take 'reverse' or another method"
         )
@@ -172,7 +172,7 @@ def check_combination(control, method: Method, solver, adjoint) -> None:
         )
 
 
-def check_drives(scene: Scene, control, solver, modal: bool) -> None:
+def check_drives(scene: Scene, control, method: Method, modal: bool) -> None:
     """Refuse drives with a state where nothing integrates it."""
     if not has_drives(scene):
         return
@@ -181,7 +181,7 @@ def check_drives(scene: Scene, control, solver, modal: bool) -> None:
         raise ValueError(
             f"{what} and forces with modes (jd.contact.DryFriction, jd.contact.UnilateralContact); leave one of them out"
         )
-    if is_variational(solver):
+    if isinstance(method, Variational):
         raise ValueError(f"{what}, which the steps of method 'variational' do not integrate; take another method")
     if isinstance(control, Controller) and control.takes_multipliers:
         raise ValueError(f"{what}, behind which multipliers do not depend on the command; use a control without them")

@@ -1,9 +1,7 @@
 """Options of a run as users give them, without diffrax, whose import takes longer than a run from stored programs."""
 
 import dataclasses
-import functools
-from collections.abc import Callable
-from typing import TYPE_CHECKING, Any, NamedTuple, TypeVar, cast
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import equinox as eqx
 import jax
@@ -11,8 +9,7 @@ import numpy as np
 from jax.typing import ArrayLike
 
 from jaxdyn.compile.known import is_concrete
-from jaxdyn.model.arguments import Numbers, batch_hint, warn
-from jaxdyn.simulation.events import Terminal, events_of
+from jaxdyn.model.arguments import Numbers, batch_hint
 
 if TYPE_CHECKING:
     import diffrax
@@ -24,8 +21,6 @@ if TYPE_CHECKING:
     Adjoint = str | diffrax.AbstractAdjoint | None
 else:
     Solver = Stepsize = Adjoint = Any  # `choose_solver` and `choose_adjoint` check them
-
-F = TypeVar("F", bound=Callable)
 
 
 class Steps(eqx.Module):
@@ -61,17 +56,17 @@ class Pose(NamedTuple):
     frame: str
 
     def __str__(self) -> str:
-        return _POSE + self.frame
+        return POSE + self.frame
 
 
-_POSE = "pose:"  # prefix of names of poses, in descriptions and in files
-_FORMER_EVENTS = {"contacts", "limits", "max_events", "progress"}
-_FORMER_STEPS = {"rtol", "atol", "max_steps"}
+POSE = "pose:"  # prefix of names of poses, in descriptions and in files
+# Names of what `Steps` holds, which were arguments of `simulate`.
+FORMER_STEPS = {"rtol", "atol", "max_steps"}
 
 
 def pack_steps(options: dict[str, Any]) -> dict[str, Any]:
     """Options of `simulate` by their names, with those of `Steps` in one."""
-    given = {name: value for name, value in options.items() if name in _FORMER_STEPS}
+    given = {name: value for name, value in options.items() if name in FORMER_STEPS}
     if not given:
         return options
     rest = {name: value for name, value in options.items() if name not in given}
@@ -80,37 +75,7 @@ def pack_steps(options: dict[str, Any]) -> dict[str, Any]:
 
 def as_output(name: str | Pose) -> str | Pose:
     """Output by its name, "pose:<frame>" as a `Pose`."""
-    return Pose(name.removeprefix(_POSE)) if isinstance(name, str) and name.startswith(_POSE) else name
-
-
-def accept_former_arguments(function: F) -> F:
-    """Decorator of `simulate`: forms of the release before warn, with the new form."""
-
-    @functools.wraps(function)
-    def call(*args: Any, **options: Any) -> Any:
-        if not _FORMER_EVENTS.isdisjoint(options):
-            given = {name: options.pop(name) for name in sorted(_FORMER_EVENTS & set(options))}
-            former = events_of(**given)
-            options["events"] = [*options.get("events", ()), *former]
-            _warn(given, "events", f"[{', '.join(f'jd.events.{one!r}' for one in former)}]")
-        if not _FORMER_STEPS.isdisjoint(options):
-            given = {name: options[name] for name in sorted(_FORMER_STEPS & set(options))}
-            size = [] if options.get("stepsize") is None else ["stepsize"]
-            options = pack_steps(options)
-            _warn(given, "stepsize", f"jd.Steps({', '.join([*size, *(f'{name}=...' for name in given)])})")
-        outputs = options.get("outputs", ())
-        if not isinstance(outputs, str) and any(isinstance(x, str) and x.startswith(_POSE) for x in outputs):
-            options["outputs"] = tuple(map(as_output, outputs))
-            given = {"outputs": tuple(x for x in outputs if x not in options["outputs"])}
-            _warn(given, "outputs", f"({', '.join(f'jd.simulation.{as_output(x)!r}' for x in given['outputs'])},)")
-        return function(*args, **options)
-
-    return cast(F, call)
-
-
-def _warn(given: dict[str, Any], name: str, new: str) -> None:
-    old = ", ".join(f"{name}={value!r}" for name, value in given.items())
-    warn(f"simulate({old}) is now simulate({name}={new})", DeprecationWarning)
+    return Pose(name.removeprefix(POSE)) if isinstance(name, str) and name.startswith(POSE) else name
 
 
 ADJOINTS = ("reverse", "direct", "forward", "backsolve")
@@ -131,7 +96,7 @@ class Options(NamedTuple):
     max_events: int
     progress: bool
     checks_mass: bool
-    terminals: tuple[Terminal, ...] = ()
+    terminals: tuple[Any, ...] = ()
     max_steps: int = 0
     limit_is_given: bool = False
     selects_rows: bool = False
@@ -153,15 +118,6 @@ def is_backsolve(adjoint) -> bool:
     import diffrax
 
     return isinstance(adjoint, diffrax.BacksolveAdjoint)
-
-
-def is_variational(solver) -> bool:
-    """True for the steps of method "variational"."""
-    if solver is None:
-        return False
-    from jaxdyn.simulation.solvers.diffrax_methods import Stepper
-
-    return isinstance(solver, Stepper)
 
 
 def check_step_length(stepsize) -> None:

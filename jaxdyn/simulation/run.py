@@ -5,8 +5,9 @@ normalised at the end of every step (`ProjectedSolver`), which keeps the order o
 no such projection.
 """
 
-from collections.abc import Sequence
-from typing import Any
+import functools
+from collections.abc import Callable, Sequence
+from typing import Any, TypeVar, cast
 
 import jax
 import jax.numpy as jnp
@@ -15,7 +16,7 @@ import numpy as np
 from jaxdyn.compile import entry_point
 from jaxdyn.compile.known import as_constant, as_numpy_if_known, is_concrete, is_known, is_tracing, once
 from jaxdyn.contact.unilateral import has_modes
-from jaxdyn.model.arguments import Numbers, as_array, check_flag, state_dtype
+from jaxdyn.model.arguments import Numbers, as_array, check_flag, state_dtype, warn
 from jaxdyn.simulation import checks, controls
 from jaxdyn.simulation.checks import check_constraints, choose_method, may_have_singular_mass
 from jaxdyn.simulation.controls import Control
@@ -24,31 +25,68 @@ from jaxdyn.simulation.events import (
     Watch,
     check_events,
     check_terminals,
+    events_of,
     report_limits,
     sort_events,
 )
 from jaxdyn.simulation.methods import Method, may_have_redundant_rows
 from jaxdyn.simulation.options import (
     ADJOINTS,
+    FORMER_STEPS,
+    POSE,
     Adjoint,
     Options,
     Pose,
     Solver,
     Steps,
     Stepsize,
-    accept_former_arguments,
+    as_output,
     check_step_length,
     check_tolerance,
     is_backsolve,
     is_step_length,
+    pack_steps,
     step_limit,
 )
 from jaxdyn.simulation.solution import Solution, raise_failure
 from jaxdyn.systems.scene import Scene, as_scene, is_given
 from jaxdyn.systems.system import SceneLike, System, has_dependent_coordinates
 
+F = TypeVar("F", bound=Callable)
+_FORMER_EVENTS = {"contacts", "limits", "max_events", "progress"}
 
-@accept_former_arguments
+
+def _accept_former_arguments(function: F) -> F:
+    """Decorator of `simulate`: forms of the release before warn, with the new form."""
+
+    @functools.wraps(function)
+    def call(*args: Any, **options: Any) -> Any:
+        if not _FORMER_EVENTS.isdisjoint(options):
+            given = {name: options.pop(name) for name in sorted(_FORMER_EVENTS & set(options))}
+            former = events_of(**given)
+            options["events"] = [*options.get("events", ()), *former]
+            _warn(given, "events", f"[{', '.join(f'jd.events.{one!r}' for one in former)}]")
+        if not FORMER_STEPS.isdisjoint(options):
+            given = {name: options[name] for name in sorted(FORMER_STEPS & set(options))}
+            size = [] if options.get("stepsize") is None else ["stepsize"]
+            options = pack_steps(options)
+            _warn(given, "stepsize", f"jd.Steps({', '.join([*size, *(f'{name}=...' for name in given)])})")
+        outputs = options.get("outputs", ())
+        if not isinstance(outputs, str) and any(isinstance(x, str) and x.startswith(POSE) for x in outputs):
+            options["outputs"] = tuple(map(as_output, outputs))
+            given = {"outputs": tuple(x for x in outputs if x not in options["outputs"])}
+            _warn(given, "outputs", f"({', '.join(f'jd.simulation.{as_output(x)!r}' for x in given['outputs'])},)")
+        return function(*args, **options)
+
+    return cast(F, call)
+
+
+def _warn(given: dict[str, Any], name: str, new: str) -> None:
+    old = ", ".join(f"{name}={value!r}" for name, value in given.items())
+    warn(f"simulate({old}) is now simulate({name}={new})", DeprecationWarning)
+
+
+@_accept_former_arguments
 def simulate(
     scene: SceneLike,
     q0: Numbers,
@@ -264,8 +302,8 @@ def _choose(
 
         solver = choose_solver(solver, stepsize)
         adjoint = choose_adjoint(adjoint, solver)
-    checks.check_drives(scene, control, solver, modal)
-    checks.check_combination(control, method, solver, adjoint)
+    checks.check_drives(scene, control, method, modal)
+    checks.check_combination(control, method, adjoint)
     if modal:
         checks.check_contacts(scene)
         checks.check_modal_options(control, stepsize, solver, adjoint, outputs)

@@ -154,12 +154,24 @@ def test_the_time_of_a_terminal_event_has_derivatives():
         fall(0.5, adjoint="backsolve")
 
 
-def test_former_arguments_warn_with_the_new_form(cart):
-    new = r"events=\[jd.events.JointLimit\(stop=True\)\]"
-    with pytest.warns(DeprecationWarning, match=new):
-        end = jd.simulate(cart, [0.0], [0.0], TS, control=push, limits="stop", throw=False)  # pyright: ignore[reportCallIssue]
-    wanted = jd.simulate(cart, [0.0], [0.0], TS, control=push, events=[jd.events.JointLimit()], throw=False)
+@pytest.mark.parametrize(
+    ("former", "present", "text"),
+    [
+        ({"limits": "stop"}, {"events": [jd.events.JointLimit()]}, r"events=\[jd.events.JointLimit\(stop=True\)\]"),
+        ({"rtol": 1e-4}, {"stepsize": jd.Steps(rtol=1e-4)}, r"stepsize=jd.Steps\(rtol="),
+        ({"stepsize": 0.1, "max_steps": 3}, {"stepsize": jd.Steps(0.1, max_steps=3)}, r"Steps\(stepsize, max_steps="),
+        ({"outputs": ("pose:cart",)}, {"outputs": (jd.simulation.Pose("cart"),)}, r"outputs=\(jd.simulation.Pose"),
+    ],
+)
+def test_former_arguments_warn_with_the_new_form(cart, former, present, text):
+    def run(**options):
+        return jd.simulate(cart, [0.0], [0.0], TS, control=push, throw=False, **options)
+
+    with pytest.warns(DeprecationWarning, match=text):
+        end = run(**former)
+    wanted = run(**present)
     np.testing.assert_array_equal(end.q, wanted.q)
+    assert end.poses.keys() == wanted.poses.keys() and end.result == wanted.result
 
 
 @pytest.mark.parametrize(

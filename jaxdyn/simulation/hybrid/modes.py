@@ -117,6 +117,15 @@ def force_at(scene: Scene, element: Element) -> Any:
     return scene.forces[element.place]
 
 
+def normal_load(scene: Scene, element: Element, q, v, t) -> Array:
+    """Given normal force of a friction, (), N, zero of other elements, and where it is negative: it would drive the motion."""
+    normal: Any = force_at(scene, element).normal if element.normal < 0 else 0.0
+    value: Any = normal(scene.system, q, v, t) if callable(normal) else normal
+    if jnp.shape(value) != ():
+        raise ValueError(f"friction {element.name!r}: normal gives shape {jnp.shape(value)}; expected one number, ()")
+    return jnp.maximum(jnp.asarray(value, q.dtype), 0.0)
+
+
 def extend(scene: Scene) -> Scene:
     """Scene with the rows of its elements behind its own, and without these forces."""
     return Scene(
