@@ -63,6 +63,7 @@ from jaxdyn.reports import report
 from jaxdyn.simulation import events, solvers
 from jaxdyn.simulation.controls import Controller, Sampled
 from jaxdyn.simulation.methods import Multipliers, Projected, Reduced
+from jaxdyn.simulation.options import Steps
 from jaxdyn.simulation.run import simulate
 from jaxdyn.simulation.solution import Solution
 from jaxdyn.simulation.stepping import stepper
@@ -90,6 +91,7 @@ __all__ = [
     "Sampled",
     "Scene",
     "Solution",
+    "Steps",
     "Variational",
     "animate",
     "assemble",

@@ -20,8 +20,7 @@ from jaxdyn.model.description import table as table
 from jaxdyn.model.tree import Model
 from jaxdyn.pictures import plot
 from jaxdyn.reports.plotting import BLUE, bands, new_figure
-from jaxdyn.simulation.export import signals, times
-from jaxdyn.simulation.solution import Solution
+from jaxdyn.simulation.solution import Solution, signals, times
 from jaxdyn.systems.system import SceneLike
 
 FILE = "a URDF, xacro, MJCF or SDF file, or a name of robot_descriptions such as go2_description"

@@ -19,6 +19,7 @@ from jaxdyn.io import load_urdf
 from jaxdyn.model.arguments import as_path
 from jaxdyn.model.configuration import integrate, neutral
 from jaxdyn.simulation.events import events_of
+from jaxdyn.simulation.options import as_output
 from jaxdyn.simulation.run import simulate
 
 HELP = "simulate a study of many rollouts into a Zarr store; resumable"
@@ -84,7 +85,7 @@ _KEYS: dict[str, tuple[type, ...]] = {
     "reductions": (dict,),
 }
 # Options of `jd.simulate` that a file can set, and of `jd.scale.run`.
-_OPTIONS = {"batch_size", *inspect.signature(simulate).parameters}
+_OPTIONS = {"batch_size", "rtol", "atol", "max_steps", *inspect.signature(simulate).parameters}
 # The study sets these itself, or a file cannot express them.
 _OPTIONS -= {"scene", "q0", "v0", "ts", "control", "outputs", "adjoint", "events", "throw"}
 # Events by words (`events_of`).
@@ -145,7 +146,7 @@ def run(args: argparse.Namespace) -> int:
             samples=given,
             seed=study.get("seed", 0) if args.seed is None else args.seed,
             out=out,
-            outputs=tuple(study.get("outputs", ())),
+            outputs=tuple(map(as_output, study.get("outputs", ()))),
             rows=study.get("rows", True),
             reductions={name: _reduction(name, one) for name, one in study.get("reductions", {}).items()},
             units={name: one["units"] for name, one in parameters.items() if isinstance(one, dict) and "units" in one},

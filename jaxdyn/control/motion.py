@@ -13,8 +13,8 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from jaxdyn.constraints.base import position_residual, rows
+from jaxdyn.contact.contact_equations import contact_coordinates
 from jaxdyn.contact.surfaces import Surface, check_surface
-from jaxdyn.contact.touching import contact_coordinates
 from jaxdyn.control.errors import (
     ConfigurationError,
     FrameError,

@@ -19,9 +19,14 @@ from jaxdyn.constraints.base import Layout, constraint_jacobian, layout
 from jaxdyn.constraints.codes import Outcome
 from jaxdyn.constraints.dynamics import total_force
 from jaxdyn.constraints.rank import pseudo_inverse, rank_of, tolerance
-from jaxdyn.contact.closure import ForceClosure, force_closure_of_map
 from jaxdyn.contact.cones import Cones, components
-from jaxdyn.contact.forces import ContactWithCone, contacts_with_cones, optimal_forces
+from jaxdyn.contact.forces import (
+    ContactWithCone,
+    ForceClosure,
+    contacts_with_cones,
+    force_closure_of_map,
+    optimal_forces,
+)
 from jaxdyn.dynamics.quantities import gravity_force
 from jaxdyn.grasp.contacts import Contact
 from jaxdyn.grasp.hand import Grasp, check_grasp, grasp_map, hand_jacobian

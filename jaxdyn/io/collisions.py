@@ -5,8 +5,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from jaxdyn.contact.height_field import HeightField
-from jaxdyn.contact.shape_contacts import shape_contacts
+from jaxdyn.contact.shape_contacts import HeightField, shape_contacts
 from jaxdyn.contact.shapes import Box, Capsule, ConvexHull, hull_vertices
 from jaxdyn.contact.surfaces import Cylinder, Ellipsoid, Plane, Sphere
 from jaxdyn.contact.unilateral import UnilateralContact

@@ -13,7 +13,7 @@ from typing import Any
 import jax.numpy as jnp
 import numpy as np
 
-from jaxdyn.contact.height_field import HeightField
+from jaxdyn.contact.shape_contacts import HeightField
 from jaxdyn.contact.unilateral import UnilateralContact
 from jaxdyn.forces.elements import CoulombFriction, JointDamping, JointSpring
 from jaxdyn.io.chains import Link, Names, add_chain, build_model

@@ -16,8 +16,7 @@ from jaxdyn.model.configuration import columns_of
 from jaxdyn.reports.page import panel
 from jaxdyn.reports.plotting import BLUE, RED, SERIES, Axes, bands, new_figure, style
 from jaxdyn.reports.records import Record
-from jaxdyn.simulation.export import times
-from jaxdyn.simulation.solution import Solution
+from jaxdyn.simulation.solution import Solution, times
 from jaxdyn.systems.scene import as_scene
 from jaxdyn.systems.system import SceneLike
 

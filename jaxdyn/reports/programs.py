@@ -17,6 +17,7 @@ from jaxdyn.model.tree import Model
 from jaxdyn.reports.case import Case, Reference
 from jaxdyn.simulation.checks import choose_method
 from jaxdyn.simulation.events import ContactLost
+from jaxdyn.simulation.options import Steps
 from jaxdyn.simulation.run import simulate
 from jaxdyn.simulation.solvers import RK4, Rodas5P
 from jaxdyn.systems.scene import Scene
@@ -65,11 +66,12 @@ class Programs:
 
         def one(q, v, ts, setting):
             # The setting is an argument of the program: a ladder of tolerances compiles once.
-            steps = {"stepsize": setting} if solver in FIXED else {"rtol": setting, "atol": setting}
+            size, tolerance = (setting, None) if solver in FIXED else (None, setting)
+            steps = Steps(size, rtol=tolerance, atol=tolerance, max_steps=MOST_STEPS)
             # Only the integration is measured: contacts that pull are reported and do not end it.
-            options = {"method": method, "solver": SOLVERS[solver](), "max_steps": MOST_STEPS, "throw": False}
+            options = {"method": method, "solver": SOLVERS[solver](), "stepsize": steps, "throw": False}
             options["events"] = () if scene.cones is None else (ContactLost(stop=False),)
-            solution = simulate(scene, q, v, ts, **steps, **options)
+            solution = simulate(scene, q, v, ts, **options)
             return solution.q, solution.v, solution.result, solution.stats
 
         several = one if batch == 1 else jax.vmap(one, (0, 0, 0, None))

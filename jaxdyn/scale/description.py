@@ -14,7 +14,7 @@ from jaxdyn.scale.program import Traced
 from jaxdyn.scale.reducer import QUANTITY
 from jaxdyn.scale.reductions import Reduction, quantities
 from jaxdyn.scale.store import Variable
-from jaxdyn.simulation.export import dimensions, signals_as_given
+from jaxdyn.simulation.solution import dimensions, signals_as_given
 
 OUTCOMES = ("successful", "failed")  # codes of functions that are no motions
 

@@ -17,6 +17,7 @@ from jaxdyn.scale.members import digest, members
 from jaxdyn.scale.reductions import Reduction
 from jaxdyn.simulation.checks import check_times
 from jaxdyn.simulation.controls import Control
+from jaxdyn.simulation.options import pack_steps
 from jaxdyn.simulation.run import simulate
 from jaxdyn.systems.scene import as_scene
 from jaxdyn.systems.system import SceneLike
@@ -43,7 +44,7 @@ class Rollout:
         if isinstance(scene, tuple):
             scene, control = scene
         q0, v0 = self.states(parameters) if self.states else ((row | self.fixed)[name] for name in ("q0", "v0"))
-        return simulate(scene, q0, v0, self.ts, control=control, throw=False, **self.options), scene
+        return simulate(scene, q0, v0, self.ts, control=control, throw=False, **pack_steps(self.options)), scene
 
 
 def run(
@@ -146,7 +147,7 @@ def run(
     given = {
         "ts": f"{ts[0]:g} to {ts[-1]:g} s, {len(ts)} points, {digest(ts)}",
         "scene": "built by a function" if builds else scene_lines(model),
-        "outputs": list(options.get("outputs", ())),
+        "outputs": [str(name) for name in options.get("outputs", ())],
     }
     return run_batch(partial(describe, partial(motion_values, rollout), batch, units or {}, ts), given, batch, shared)
 
