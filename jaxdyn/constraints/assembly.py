@@ -21,9 +21,15 @@ from jaxdyn.constraints.codes import RESULTS, Outcome, first_of, name_of, requir
 from jaxdyn.constraints.dynamics import correction
 from jaxdyn.constraints.loops import lock_joint
 from jaxdyn.constraints.rank import LEAST_GAP, check_tolerance, clear_pivot, tolerance
-from jaxdyn.constraints.redundancy import keep_rows, opening_of_redundant, row_mask
+from jaxdyn.constraints.redundancy import (
+    coordinate_sizes,
+    keep_rows,
+    largest_ratio,
+    opening_of_redundant,
+    row_limits,
+    row_mask,
+)
 from jaxdyn.constraints.selection import hide_unclear, most_rounding, select_rows
-from jaxdyn.constraints.tolerances import coordinate_sizes, largest_ratio, row_limits
 from jaxdyn.lie.so3 import matmul
 from jaxdyn.model.arguments import Numbers, check_mapping, check_state, zeros_if_none
 from jaxdyn.model.numbers import as_static, check_count

@@ -22,7 +22,7 @@ from jaxdyn.constraints.base import constraint_jacobian, holonomic_rows, layout,
 from jaxdyn.constraints.branches import passes_singular
 from jaxdyn.constraints.dynamics import correction, right_inverse, whiten_rows
 from jaxdyn.constraints.rank import eps_of, solve_square
-from jaxdyn.constraints.tolerances import coordinate_sizes
+from jaxdyn.constraints.redundancy import coordinate_sizes
 from jaxdyn.dynamics.quantities import mass_matrix
 from jaxdyn.lie.so3 import matmul
 from jaxdyn.model.configuration import difference

@@ -40,6 +40,7 @@ from jaxdyn.constraints.rank import (
 from jaxdyn.constraints.redundancy import (
     Selection,
     all_rows,
+    coordinate_sizes,
     has_selection,
     holds_rows,
     keep_rows,
@@ -47,7 +48,6 @@ from jaxdyn.constraints.redundancy import (
     largest_opening,
     rows_of,
 )
-from jaxdyn.constraints.tolerances import coordinate_sizes
 from jaxdyn.dynamics.quantities import mass_matrix
 from jaxdyn.lie.so3 import matmul
 from jaxdyn.model.arguments import Numbers, check_state

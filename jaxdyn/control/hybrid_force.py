@@ -42,7 +42,7 @@ from jaxdyn.lie.so3 import matmul
 from jaxdyn.model.arguments import Checked, Function, Number, Numbers, as_array, check_state
 from jaxdyn.model.numbers import as_number
 from jaxdyn.reduction.inverse_dynamics import velocity_choice
-from jaxdyn.reduction.quasi_velocities import gauge_invariant
+from jaxdyn.reduction.minimal import gauge_invariant
 from jaxdyn.systems.scene import Scene, as_pytree
 from jaxdyn.systems.system import SceneLike, velocity_to_rate
 

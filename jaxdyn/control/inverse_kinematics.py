@@ -22,9 +22,8 @@ from jaxdyn.constraints.assembly import check_search, closing_tolerance, indepen
 from jaxdyn.constraints.base import Constraint, holonomic_rows, layout, position_residual
 from jaxdyn.constraints.closing import nearest_configuration, polish, slide_to_nearest
 from jaxdyn.constraints.codes import RESULTS, Outcome, name_of, require_success
-from jaxdyn.constraints.redundancy import KeptRows, has_selection, opening_of_redundant
+from jaxdyn.constraints.redundancy import KeptRows, has_selection, opening_of_redundant, own_length
 from jaxdyn.constraints.selection import most_rounding
-from jaxdyn.constraints.tolerances import own_length
 from jaxdyn.control.targets import Aims, as_targets, clip_to_limits, screw_joints, search, target_rows
 from jaxdyn.model.arguments import Checked, Given, Number, Numbers, as_operand, check_flag, check_mapping, check_state
 from jaxdyn.model.tree import Model

@@ -6,7 +6,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from jaxdyn.compile import entry_point, kernel
-from jaxdyn.dynamics import scans, sizes
+from jaxdyn.dynamics import scans, tree_frames
 from jaxdyn.dynamics.tree_frames import tree_frame
 from jaxdyn.dynamics.world_frame import joint_wrenches
 from jaxdyn.lie import se3
@@ -60,7 +60,7 @@ def joint_wrench(
     # A program without external wrenches is smaller, so None is not replaced by zeros.
     given = (q, v, a) if external is None else (q, v, a, external)
     # Beyond these a scalar program would compile for too long.
-    wrenches = function(model, *given) if model.nb > sizes.MAX_BODIES else kernel(function)(model, *given)
+    wrenches = function(model, *given) if model.nb > tree_frames.MAX_BODIES else kernel(function)(model, *given)
     # All joints share one program; one for each joint's name would be compiled again.
     return wrenches if index is None else wrenches[index]
 

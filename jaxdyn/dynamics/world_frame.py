@@ -101,17 +101,10 @@ def inverse_dynamics(
 
 
 def forward_dynamics(
-    model: Model,
-    q: Float[Array, " nq"],
-    v: Float[Array, " nv"],
-    tau: Float[Array, " nv"],
-    external: Float[Array, "nb 6"] | None = None,
+    model: Model, q: Float[Array, " nq"], v: Float[Array, " nv"], tau: Float[Array, " nv"]
 ) -> Float[Array, " nv"]:
-    """Forward dynamics a = M^-1 (tau - C v - N + sum J_i^T external_i), by the Cholesky factor of M."""
-    frame = tree_frame(model, q)
-    inertias = tree_inertias(model, frame)
-    factor = cholesky(_mass_matrix(model, frame, inertias))
-    return solve_cholesky(factor, tau - _inverse_dynamics(model, frame, inertias, v, None, external))
+    """Forward dynamics a = M^-1 (tau - C v - N), by the Cholesky factor of M."""
+    return _acceleration_and_factor(model, q, v, tau)[0]
 
 
 def forward_dynamics_tangent(model: Model, q, v, tau, force_change):
@@ -120,11 +113,15 @@ def forward_dynamics_tangent(model: Model, q, v, tau, force_change):
     With ID(q, v, a) = tau, a change of (model, q, v, tau) changes a by M^-1 (dtau - dID at fixed a); `force_change`
     returns the bracket.
     """
+    a, factor = _acceleration_and_factor(model, q, v, tau)
+    return a, solve_cholesky(factor, force_change(a))
+
+
+def _acceleration_and_factor(model: Model, q, v, tau):
     frame = tree_frame(model, q)
     inertias = tree_inertias(model, frame)
     factor = cholesky(_mass_matrix(model, frame, inertias))
-    a = solve_cholesky(factor, tau - _inverse_dynamics(model, frame, inertias, v, None, None))
-    return a, solve_cholesky(factor, force_change(a))
+    return solve_cholesky(factor, tau - _inverse_dynamics(model, frame, inertias, v, None, None)), factor
 
 
 def generalized_force(model: Model, q: Float[Array, " nq"], external: Float[Array, "nb 6"]) -> Float[Array, " nv"]:

@@ -21,7 +21,7 @@ from jaxdyn.forces.limits import EffortLimits as EffortLimits
 from jaxdyn.forces.limits import JointStops as JointStops
 from jaxdyn.forces.limits import TorqueSpeedLimits as TorqueSpeedLimits
 from jaxdyn.forces.piecewise import PiecewiseForce as PiecewiseForce
-from jaxdyn.systems.drives import DriveDynamics as DriveDynamics
+from jaxdyn.systems.scene import DriveDynamics as DriveDynamics
 
 
 def __dir__() -> list[str]:

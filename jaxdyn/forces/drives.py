@@ -14,8 +14,7 @@ from jaxdyn.model.builder import ModelBuilder
 from jaxdyn.model.joining import join
 from jaxdyn.model.joints import KINDS
 from jaxdyn.model.tree import Model
-from jaxdyn.systems.drives import DriveDynamics
-from jaxdyn.systems.scene import Scene
+from jaxdyn.systems.scene import DriveDynamics, Scene
 
 
 class _Lag(DriveDynamics):

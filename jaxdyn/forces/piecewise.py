@@ -15,8 +15,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
 from jaxdyn.model.arguments import Number, SystemLike
-from jaxdyn.systems.drives import pass_command
-from jaxdyn.systems.scene import Scene
+from jaxdyn.systems.scene import Scene, pass_command
 
 
 class PiecewiseForce(eqx.Module):

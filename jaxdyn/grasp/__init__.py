@@ -6,9 +6,6 @@ Source: Murray, Li & Sastry (1994), chapters 5 and 6.
 from jaxdyn.contact.cones import wrench_basis as wrench_basis
 from jaxdyn.contact.forces import ContactForces as ContactForces
 from jaxdyn.contact.forces import contact_forces as contact_forces
-from jaxdyn.grasp.contacts import Contact as Contact
-from jaxdyn.grasp.contacts import contact as contact
-from jaxdyn.grasp.contacts import point_contacts as point_contacts
 from jaxdyn.grasp.dynamics import ObjectDynamics as ObjectDynamics
 from jaxdyn.grasp.dynamics import hand_dynamics as hand_dynamics
 from jaxdyn.grasp.dynamics import object_dynamics as object_dynamics
@@ -19,14 +16,17 @@ from jaxdyn.grasp.forces import hold as hold
 from jaxdyn.grasp.forces import internal_force_basis as internal_force_basis
 from jaxdyn.grasp.forces import joint_torques as joint_torques
 from jaxdyn.grasp.forces import normal_forces as normal_forces
+from jaxdyn.grasp.hand import Contact as Contact
 from jaxdyn.grasp.hand import Grasp as Grasp
+from jaxdyn.grasp.hand import contact as contact
 from jaxdyn.grasp.hand import grasp_map as grasp_map
 from jaxdyn.grasp.hand import hand_jacobian as hand_jacobian
 from jaxdyn.grasp.hand import internal_forces as internal_forces
-from jaxdyn.grasp.measures import Manipulability as Manipulability
-from jaxdyn.grasp.measures import manipulability as manipulability
+from jaxdyn.grasp.hand import point_contacts as point_contacts
 from jaxdyn.grasp.motions import HandMotions as HandMotions
+from jaxdyn.grasp.motions import Manipulability as Manipulability
 from jaxdyn.grasp.motions import hand_motions as hand_motions
+from jaxdyn.grasp.motions import manipulability as manipulability
 
 __all__ = [
     "Contact",

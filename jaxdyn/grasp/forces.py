@@ -23,8 +23,7 @@ from jaxdyn.contact.closure import ForceClosure, force_closure_of_map
 from jaxdyn.contact.cones import Cones, components
 from jaxdyn.contact.forces import ContactWithCone, contacts_with_cones, optimal_forces
 from jaxdyn.dynamics.quantities import gravity_force
-from jaxdyn.grasp.contacts import Contact
-from jaxdyn.grasp.hand import Grasp, check_grasp, grasp_map, hand_jacobian
+from jaxdyn.grasp.hand import Contact, Grasp, check_grasp, grasp_map, hand_jacobian
 from jaxdyn.lie.so3 import matmul
 from jaxdyn.model.arguments import Numbers, as_array, batch_hint, check_flag, check_state
 from jaxdyn.reduction.bases import orthonormal, split_directions

@@ -6,10 +6,10 @@ Imports `constraints` and the layers below. Source: EQUATIONS sections 6, 7 and 
 from jaxdyn.reduction.bases import tangent_basis as tangent_basis
 from jaxdyn.reduction.integrability import involutive as involutive
 from jaxdyn.reduction.integrability import spurious_terms as spurious_terms
-from jaxdyn.reduction.quasi_velocities import KaneEquation as KaneEquation
-from jaxdyn.reduction.quasi_velocities import gauge_invariant as gauge_invariant
-from jaxdyn.reduction.quasi_velocities import kane_equation as kane_equation
-from jaxdyn.reduction.quasi_velocities import quasi_connection as quasi_connection
+from jaxdyn.reduction.minimal import KaneEquation as KaneEquation
+from jaxdyn.reduction.minimal import gauge_invariant as gauge_invariant
+from jaxdyn.reduction.minimal import kane_equation as kane_equation
+from jaxdyn.reduction.minimal import quasi_connection as quasi_connection
 
 __all__ = [
     "KaneEquation",

@@ -137,7 +137,6 @@ def everything(model, q, v, a, tau, wrenches):
     again, tangent = recursions.aba_tangent(model, q, v, tau, lambda acc: tau - 0.5 * acc)
     return {
         "rnea": recursions.rnea(model, q, v, a),
-        "rnea external": recursions.rnea(model, q, v, a, external=wrenches),
         "bias": recursions.bias_force(model, q, v),
         "gravity": recursions.gravity_force(model, q),
         "aba": recursions.aba(model, q, v, tau),
@@ -149,21 +148,19 @@ def everything(model, q, v, a, tau, wrenches):
 
 
 def expected(model, q, v, a, tau, wrenches):
-    """The same from the matrix form's M, C v + N, N and forces of external wrenches."""
+    """The same from the matrix form's M, C v + N, and N."""
 
-    def at(q, v, wrenches):
+    def at(q, v):
         return (
             matrix_form.mass_matrix(model, q),
             matrix_form.inverse_dynamics(model, q, v, None),
             matrix_form.gravity_force(model, q),
-            matrix_form.generalized_force(model, q, wrenches),
         )
 
-    mass, bias, weight, pushed = (np.asarray(x) for x in quick(at)(q, v, wrenches))
+    mass, bias, weight = (np.asarray(x) for x in quick(at)(q, v))
     free = np.linalg.solve(mass, tau - bias)
     return {
         "rnea": mass @ a + bias,
-        "rnea external": mass @ a + bias - pushed,
         "bias": bias,
         "gravity": weight,
         "aba": free,

@@ -3,7 +3,7 @@
 | module             | equations                                                                                    |
 |--------------------|----------------------------------------------------------------------------------------------|
 | `frames`           | canonical link frames (joint axis on z, Denavit-Hartenberg) and masses transferred between bodies    |
-| `transforms`       | changes of frame of twists, wrenches and inertias                                            |
+| `transforms`       | changes of frame of twists, wrenches and inertias; products by numpy or by the traced program |
 | `links`            | joint transforms and motion subspaces of every joint kind                                    |
 | `newton_euler`     | recursive Newton-Euler: inverse dynamics, bias and gravity force; composite bodies: the mass matrix |
 | `sweeps`           | the same for many bodies, as loops whose code does not grow with their number                 |

@@ -17,7 +17,6 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from jaxdyn.dynamics.recursions._arrays import constants, contract, dot, entry, join, outer, select, symmetric
 from jaxdyn.dynamics.recursions.links import (
     Links,
     as_vector,
@@ -30,7 +29,20 @@ from jaxdyn.dynamics.recursions.links import (
     unit_velocity,
 )
 from jaxdyn.dynamics.recursions.newton_euler import ancestor_rows, body_wrenches, place_rows
-from jaxdyn.dynamics.recursions.transforms import Chain, inertia_to_parent, twist_to_child, wrench_to_parent
+from jaxdyn.dynamics.recursions.transforms import (
+    Chain,
+    constants,
+    contract,
+    dot,
+    entry,
+    inertia_to_parent,
+    join,
+    outer,
+    select,
+    symmetric,
+    twist_to_child,
+    wrench_to_parent,
+)
 from jaxdyn.model.arguments import check_shapes
 from jaxdyn.model.tree import Model
 

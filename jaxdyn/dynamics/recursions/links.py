@@ -11,17 +11,6 @@ import numpy as np
 from jax import lax
 
 from jaxdyn.compile.known import as_numpy_if_known
-from jaxdyn.dynamics.recursions._arrays import (
-    constants,
-    contract,
-    dot,
-    dot_transpose,
-    entry,
-    join,
-    outer,
-    part,
-    transpose,
-)
 from jaxdyn.dynamics.recursions.frames import Frames, PlaneAngle, canonical_frames, pseudo_inertias
 from jaxdyn.dynamics.recursions.transforms import (
     Chain,
@@ -31,7 +20,13 @@ from jaxdyn.dynamics.recursions.transforms import (
     Transform,
     X,
     Z,
-    wrench_to_parent,
+    constants,
+    contract,
+    dot,
+    entry,
+    join,
+    outer,
+    part,
 )
 from jaxdyn.model.joints import KINDS, SCREW_KINDS
 from jaxdyn.model.tree import Model
@@ -225,14 +220,6 @@ def _simplify(steps) -> Chain:
             chain.append(Transform(shift, step.rotation))
             shift = None
     return (*chain, Transform(shift, None)) if shift is not None else tuple(chain)
-
-
-def wrench_in_link(links: Links, body: int, F):
-    """Convert a wrench (6,) from a body's frame to its canonical frame."""
-    B = entry(links.frames.placement, body)
-    rotation, place = part(part(B, 0, 3), 0, 3, 1), entry(part(B, 0, 3), 3, 1)
-    # From the body frame's origin to the canonical one: rotate the wrench, then shift it.
-    return wrench_to_parent((Transform(-dot_transpose(rotation, place), GeneralRotation(transpose(rotation))),), F)
 
 
 def as_vector(parts, like):

@@ -16,17 +16,6 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from jaxdyn.dynamics.recursions._arrays import (
-    constants,
-    contract,
-    dot,
-    dot_transpose,
-    entry,
-    join,
-    part,
-    select,
-    transpose,
-)
 from jaxdyn.dynamics.recursions.links import (
     Links,
     as_vector,
@@ -35,13 +24,20 @@ from jaxdyn.dynamics.recursions.links import (
     joint_transforms,
     links_of,
     unit_velocity,
-    wrench_in_link,
 )
 from jaxdyn.dynamics.recursions.transforms import (
     Chain,
+    constants,
+    contract,
+    dot,
+    dot_transpose,
+    join,
     moments_to_parent,
     origin_in_parent,
+    part,
     rotate_to_child,
+    select,
+    transpose,
     wrench_to_parent,
 )
 from jaxdyn.model.arguments import check_shapes
@@ -59,11 +55,10 @@ def _hat(w):
     return dot(constants(w.dtype).hat, w)
 
 
-def body_wrenches(links: Links, chains: list[Chain], v=None, a=None, external=None) -> list:
+def body_wrenches(links: Links, chains: list[Chain], v=None, a=None) -> list:
     """Inertial wrenches (6,) of all bodies, gravity included: the outward pass.
 
-    **Arguments:** `chains` from `joint_transforms`; `v`, `a` (nv,) of unit screws, None for zero; `external` (nb, 6), wrenches
-    that act on the bodies in the model's body frames, or None.
+    **Arguments:** `chains` from `joint_transforms`; `v`, `a` (nv,) of unit screws, None for zero.
     """
     dtype = links.frames.home.dtype
     zero = np.zeros(3, dtype)
@@ -79,10 +74,7 @@ def body_wrenches(links: Links, chains: list[Chain], v=None, a=None, external=No
             move_with_joint(motion[parent] if parent >= 0 else at_rest, chains[i], links.subspaces[i], speed, rate)
         )
         _, _, K, acc = motion[-1]
-        wrench = wrench_of_acceleration(K, acc, links.moments[i])
-        if external is not None:
-            wrench = wrench - wrench_in_link(links, i, entry(external, i))
-        wrenches.append(wrench)
+        wrenches.append(wrench_of_acceleration(K, acc, links.moments[i]))
     return wrenches
 
 
@@ -133,11 +125,11 @@ def joint_forces(links: Links, chains: list[Chain], wrenches: list) -> list:
     return tau
 
 
-def _inverse(model: Model, q, v=None, a=None, external=None):
+def _inverse(model: Model, q, v=None, a=None):
     links = links_of(model)
     v, a = (None if x is None else unit_velocity(links, x) for x in (v, a))
     chains = joint_transforms(links, q)
-    tau = as_vector(joint_forces(links, chains, body_wrenches(links, chains, v, a, external)), q)
+    tau = as_vector(joint_forces(links, chains, body_wrenches(links, chains, v, a)), q)
     if a is not None and links.armature is not None:
         # Rotors turn with the joint's own rate and belong to no body, so they bypass the recursion.
         tau = tau + links.armature * a
@@ -145,27 +137,14 @@ def _inverse(model: Model, q, v=None, a=None, external=None):
 
 
 def rnea(
-    model: Model,
-    q: Float[Array, " nq"],
-    v: Float[Array, " nv"],
-    a: Float[Array, " nv"] | None,
-    *,
-    external: Float[Array, "nb 6"] | None = None,
+    model: Model, q: Float[Array, " nq"], v: Float[Array, " nv"], a: Float[Array, " nv"] | None
 ) -> Float[Array, " nv"]:
-    r"""Inverse dynamics by the recursive Newton-Euler algorithm.
-
-    $$\tau = M a + C v + N - \sum_i J_i^T F_i$$
-
-    **Arguments:** `q` (nq,); `v`, `a` (nv,) joint velocities and accelerations (rad/s or m/s, rad/s^2 or m/s^2); `a` None is
-    zero acceleration, whose terms are left out. `external` (nb, 6): wrenches $F_i$ that act on the bodies, at their origins
-    in their axes (N, N m), or None.
-
-    **Returns:** generalised forces (nv,), N m or N. Armature included.
+    """Inverse dynamics M a + C v + N (nv,), N m or N, armature included; `a` None is zero, whose terms are left out.
 
     Source: EQUATIONS section 4; Luh, Walker & Paul (1980); Featherstone (2008) table 5.1.
     """
-    check_shapes(model, q=q, v=v, a=a, external=external)
-    return _inverse(model, q, v, a, external)
+    check_shapes(model, q=q, v=v, a=a)
+    return _inverse(model, q, v, a)
 
 
 def bias_force(model: Model, q: Float[Array, " nq"], v: Float[Array, " nv"]) -> Float[Array, " nv"]:

@@ -17,7 +17,6 @@ from jaxtyping import Array, Float
 
 from jaxdyn.compile import sweep
 from jaxdyn.compile.known import as_numpy_if_known, is_concrete
-from jaxdyn.dynamics.recursions._arrays import contract, dot, join, part
 from jaxdyn.dynamics.recursions.articulated import eliminate, spatial_inertia
 from jaxdyn.dynamics.recursions.frames import MOMENTS, canonical_frames, pseudo_inertias
 from jaxdyn.dynamics.recursions.links import compose, quaternion_rotation
@@ -30,7 +29,11 @@ from jaxdyn.dynamics.recursions.transforms import (
     Transform,
     X,
     Z,
+    contract,
+    dot,
     inertia_to_parent,
+    join,
+    part,
     twist_to_child,
     wrench_to_parent,
 )
