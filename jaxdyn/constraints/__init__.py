@@ -1,5 +1,7 @@
 """Constraints: functions of the user, loops closed by joints, couplings, and rolling."""
 
+from types import ModuleType as _ModuleType
+
 from jaxdyn.constraints.base import Constraint as Constraint
 from jaxdyn.constraints.base import Holonomic as Holonomic
 from jaxdyn.constraints.base import Pfaffian as Pfaffian
@@ -18,27 +20,7 @@ from jaxdyn.constraints.rolling import rolling_sphere as rolling_sphere
 from jaxdyn.constraints.rolling import rolling_wheel as rolling_wheel
 from jaxdyn.constraints.selection import choose_rows as choose_rows
 
-__all__ = [
-    "Constraint",
-    "Holonomic",
-    "Pfaffian",
-    "body_wrenches",
-    "choose_rows",
-    "constraint_jacobian",
-    "constraint_wrenches",
-    "distance",
-    "gear",
-    "knife_edge",
-    "lock_joint",
-    "loop",
-    "model_couplings",
-    "projections",
-    "rolling_sphere",
-    "rolling_wheel",
-    "second_fundamental_form",
-]
-
 
 def __dir__() -> list[str]:
     """Names of the namespace; its modules are internal."""
-    return __all__
+    return [x for x, value in globals().items() if x[0] != "_" and not isinstance(value, _ModuleType)]

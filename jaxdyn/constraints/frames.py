@@ -27,7 +27,7 @@ from jaxdyn.dynamics.kinematics import BodyFrames, body_frames
 from jaxdyn.dynamics.tree_frames import take
 from jaxdyn.lie import se3, so3
 from jaxdyn.lie.so3 import matmul
-from jaxdyn.model.arguments import Number, Numbers, SystemLike, as_array, batch_hint, check_shapes, check_state
+from jaxdyn.model.arguments import Number, Numbers, SystemLike, as_shape, check_shapes, check_state
 from jaxdyn.model.topology import frame_index
 from jaxdyn.model.tree import Model
 from jaxdyn.systems.scene import Scene, as_scene
@@ -304,7 +304,7 @@ def constraint_forces(
     """
     scene = as_scene(scene)
     A = constraint_jacobian(scene, q, t)
-    multipliers = _check_multipliers(multipliers, A.shape[0], A.dtype)
+    multipliers = as_shape(multipliers, "multipliers", A.dtype, A.shape[:1], of=", one per row")
     return {p.name: matmul(A[p.start : p.end].T, multipliers[p.start : p.end]) for p in layout(scene)}
 
 
@@ -328,7 +328,8 @@ def constraint_wrenches(
     scene, wrenches = as_scene(scene), {}
     (q,) = check_state(scene.system, q=q)
     places = layout(scene)
-    multipliers = _check_multipliers(multipliers, places[-1].end if places else 0, q.dtype)
+    count = places[-1].end if places else 0
+    multipliers = as_shape(multipliers, "multipliers", q.dtype, (count,), of=", one per row")
     for constraint, place in zip(scene.constraints, places, strict=True):
         if isinstance(constraint, Pair):
             constraint = constraint.at(scene.system, q)
@@ -380,11 +381,3 @@ def body_wrenches_where(scene: Scene, q, multipliers, counts: Callable[[str], bo
             if body >= 0 and counts(str(frame)):
                 total = total.at[body].add(se3.Ad_inv_T_apply(pose, pull))
     return total
-
-
-def _check_multipliers(multipliers, count: int, dtype) -> Array:
-    multipliers = as_array(multipliers, "multipliers", dtype)
-    if multipliers.shape != (count,):
-        hint = batch_hint(multipliers, (1,))
-        raise ValueError(f"multipliers has shape {multipliers.shape}, expected {(count,)}, one per row{hint}")
-    return multipliers

@@ -21,7 +21,7 @@ from jaxdyn.constraints.base import (
     rows,
     velocity_residual,
 )
-from jaxdyn.constraints.rank import eps_of, share
+from jaxdyn.constraints.rank import REGULAR, eps_of, share
 from jaxdyn.lie.so3 import matmul
 from jaxdyn.model.arguments import Number, SystemLike
 from jaxdyn.model.joints import KINDS
@@ -228,7 +228,7 @@ def largest_of_each(scene: Scene, sizes) -> Array:
 def most_opening(scene: Scene, dtype):
     """Largest opening of dropped rows along a motion: a hundred times their opening or difference at its start, plus rounding."""
     # A hundred times, because the rounding of a file can cancel at the start: at the configuration in which it was written.
-    return 100 * scene.constraints[0].rounding + eps_of(jnp.zeros((), dtype)) ** 0.4
+    return 100 * scene.constraints[0].rounding + eps_of(jnp.zeros((), dtype)) ** REGULAR
 
 
 # Tolerances of residuals, relative to the length of the mechanism.

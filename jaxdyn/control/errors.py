@@ -27,7 +27,7 @@ from jaxdyn.dynamics.quantities import mass_matrix
 from jaxdyn.lie import so3
 from jaxdyn.lie.series import safe_sqrt
 from jaxdyn.lie.so3 import matmul
-from jaxdyn.model.arguments import Number, Numbers, as_array, batch_hint, is_concrete
+from jaxdyn.model.arguments import Number, Numbers, as_array, as_shape, batch_hint, is_concrete
 from jaxdyn.model.numbers import as_float
 from jaxdyn.model.topology import frame_index
 from jaxdyn.model.tree import Model
@@ -108,11 +108,8 @@ def as_target(target: Target, name: str = "target") -> Callable:
 
 def target_value(target: Callable, t, shape: tuple, like) -> Array:
     """Value of a target at time t, in the dtype of `like`. **Raises:** ValueError for another shape."""
-    values = target(t)
-    if jnp.shape(values) != shape:
-        raise ValueError(f"target has shape {jnp.shape(values)}, expected {shape}{batch_hint(values, shape)}")
     # A float64 target would promote the law of a float32 state.
-    return jnp.asarray(values, like.dtype)
+    return jnp.asarray(as_shape(target(t), "target", like.dtype, shape))
 
 
 class ConfigurationError(Constraint):
@@ -325,13 +322,8 @@ class ForceLoop(ForceIntegral):
         count = row_count(self.scene)
         if self.force is None:
             return jnp.zeros((count,), q.dtype)
-        force = self.force(t)
-        if jnp.shape(force) != (count,):
-            raise ValueError(
-                f"force has shape {jnp.shape(force)}, expected {(count,)}, one per row of the constraints"
-                f"{batch_hint(force, (count,))}"
-            )
-        return jnp.asarray(force, q.dtype)
+        of = ", one per row of the constraints"
+        return jnp.asarray(as_shape(self.force(t), "force", q.dtype, (count,), of=of))
 
     def force_command(self, q: Float[Array, " nq"], t: Number, state: PyTree) -> Float[Array, " nc"]:
         """Force command -lam_d + KI z."""

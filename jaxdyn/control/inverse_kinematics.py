@@ -129,7 +129,7 @@ def inverse_kinematics(
         (posture,) = check_state(model, q_posture=posture)
     factors = row_weights(rows, weights, guess.dtype)
     # Forces and cones do not affect configurations: they are left out, so that others do not cause a second compilation.
-    place = _solve_by_program(
+    place = _solve(
         Scene(model, scene.constraints),
         rows,
         guess,
@@ -176,10 +176,6 @@ def row_weights(rows: tuple[Constraint, ...], weights, dtype) -> Given:
 
 
 @entry_point
-def _solve_by_program(scene, rows, guess, factors, posture, t, limits: bool, steps: int, guesses: int, atol):
-    return _solve(scene, rows, guess, factors, posture, t, limits, steps, guesses, atol)
-
-
 def _solve(scene: Scene, rows, guess, factors, posture, t, limits: bool, steps: int, guesses: int, atol):
     model, every = scene.system, scene
     scene = independent_rows_near(scene, guess, t)

@@ -35,7 +35,7 @@ from jaxdyn.model.numbers import as_float, as_number
 from jaxdyn.model.topology import frame_index
 from jaxdyn.model.tree import Model
 from jaxdyn.systems.scene import Scene, as_scene
-from jaxdyn.systems.system import SceneLike, displacement, velocity_to_rate
+from jaxdyn.systems.system import SceneLike, displacement, has_coordinate_rates, velocity_to_rate
 
 
 class ComputedTorque(eqx.Module):
@@ -81,7 +81,7 @@ class ComputedTorque(eqx.Module):
         error = ConfigurationError(self.target)  # pyright: ignore[reportCallIssue]
         A, a = target_rows(system, error, self.kp, self.kd, q, v, t)
         # For v = dq/dt the rows are the unit matrix, and the right-hand side is the acceleration itself.
-        if not _is_flat(system):
+        if not has_coordinate_rates(system):
             a = least_acceleration(system, q, t, A, a, jnp.zeros_like(v))
         return torque_for(self.scene, q, v, a, t)
 
@@ -216,12 +216,6 @@ def unconstrained(scene: Any) -> Scene:
             "jd.control.HybridForce or jd.control.GaugeInvariant"
         )
     return scene
-
-
-def _is_flat(system) -> bool:
-    """Decide whether v = dq/dt, so that the rows of a configuration error are a unit matrix."""
-    # The velocities of these joints are twists, or in moving axes, and no rates of coordinates.
-    return not (isinstance(system, Model) and {"planar", "spherical", "free"} & set(system.topology.kinds))
 
 
 def torque_for(scene: Scene, q, v, a, t) -> Float[Array, " nv"]:

@@ -12,6 +12,7 @@ Sources: Murray, Li & Sastry (1994), section 6.4 (eqs 6.39-6.41); Li, Hsu & Sast
 """
 
 from collections.abc import Callable, Sequence
+from typing import Any
 
 import equinox as eqx
 import jax.numpy as jnp
@@ -34,6 +35,7 @@ from jaxdyn.control.errors import (
 )
 from jaxdyn.control.legs import (
     Foot,
+    GroundForces,
     LeggedDynamics,
     check_feet,
     missing_wrench,
@@ -45,7 +47,7 @@ from jaxdyn.grasp.forces import as_preload, split_forces
 from jaxdyn.grasp.hand import Grasp, check_grasp
 from jaxdyn.grasp.motions import velocity_rows
 from jaxdyn.lie.so3 import matmul
-from jaxdyn.model.arguments import Checked, Number, Numbers, batch_hint
+from jaxdyn.model.arguments import Checked, Number, Numbers, as_shape, warn
 from jaxdyn.model.numbers import as_number
 from jaxdyn.model.tree import Model
 from jaxdyn.systems.scene import Force, Scene
@@ -63,15 +65,10 @@ class ObjectError(Constraint):
         """Displacement from the target to the object's configuration."""
         top = self.grasp.system.topology
         place = top.q_slices[top.body_names.index(self.grasp.object)]
-        count = place.stop - place.start
-        target = self.target(t)
-        if jnp.shape(target) != (count,):
-            raise ValueError(
-                f"target has shape {jnp.shape(target)}, expected {(count,)}, the coordinates of {self.grasp.object!r}"
-                f"{batch_hint(target, (count,))}"
-            )
+        of = f", the coordinates of {self.grasp.object!r}"
+        target = as_shape(self.target(t), "target", q.dtype, (place.stop - place.start,), of=of)
         # Only the object's coordinates differ from q, so that its displacement is the only nonzero part.
-        wanted = q.at[place].set(jnp.asarray(target, q.dtype))
+        wanted = q.at[place].set(target)
         return displacement(system, wanted, q)[velocity_rows(self.grasp)[1]]
 
 
@@ -205,6 +202,36 @@ class GraspForce(ForceIntegral):
 # Torques and ground forces follow from it (`jaxdyn.control.legs`), inside their cones.
 
 
+class Attitude(eqx.Module):
+    r"""Target of the attitude of a frame, for `WholeBody`, with the gains of the error $\log(R_d^T R)$.
+
+    **Arguments:** `target` R_d (3, 3), or a function of t, differentiable twice; `frame`: a frame or body, by default the model's
+    first body; `kp` (1/s^2), `kd` (1/s): positive definite, by default those of the centre of mass.
+    """
+
+    target: Callable
+    frame: str | None = eqx.field(static=True)
+    kp: Array | None
+    kd: Array | None
+
+    def __init__(self, target: Target, frame: str | None = None, kp: Numbers | None = None, kd: Numbers | None = None):
+        self.target, self.frame = as_target(target), frame
+        self.kp, self.kd = (None if k is None else gain(k, f"Attitude: {x}") for k, x in ((kp, "kp"), (kd, "kd")))
+
+
+def _group_keywords(orientation, forces, old: dict[str, Any]):
+    """`orientation` and `forces` of a `WholeBody` from its keywords up to version 0.2, with a warning."""
+    known = {"base": "frame", "turn_kp": "kp", "turn_kd": "kd"}
+    turn = {new: old.pop(name) for name, new in known.items() if name in old}
+    if turn:
+        warn(f"WholeBody: give orientation=jd.control.Attitude(target, {', '.join(turn)})", DeprecationWarning)
+        orientation = None if orientation is None else Attitude(orientation, **turn)
+    if old:
+        warn(f"WholeBody: give forces=jd.control.GroundForces({', '.join(old)})", DeprecationWarning)
+        forces = GroundForces(**old)
+    return orientation, forces
+
+
 class WholeBody(eqx.Module):
     r"""Control of the centre of mass and the attitude of the base, with ground forces inside their cones.
 
@@ -221,11 +248,10 @@ class WholeBody(eqx.Module):
     - `model`: a `Model`; `contacts`: list of `jd.control.foot(frame, cone)`.
     - `com`: target c_d of the centre of mass, (3,) in world axes, m, or a function of t, differentiable twice.
     - `kp` (1/s^2), `kd` (1/s): of the centre of mass, positive definite: numbers, (3,) or (3, 3).
-    - `orientation`: target R_d (3, 3) of the frame `base`, or a function of t; None: its attitude follows from the posture.
-      `base`: name of a frame or body, by default the model's first body. `turn_kp`, `turn_kd`: its gains, of the error
-      $\log(R_d^T R)$; by default `kp` and `kd`.
+    - `orientation`: target R_d (3, 3) of the model's first body, or a function of t, with the gains `kp` and `kd`; or an
+      `Attitude`, of another frame or with other gains; None: attitudes follow from the posture.
     - `posture` (nq,): equilibrium of the remaining motion, with `stiffness` (1/s^2) and `damping` (1/s), zero or positive.
-    - `preload` (), N; `torque_weight`, `force_weight`, `effort_limit`, `passive`: of `jd.control.underactuated_inverse_dynamics`.
+    - `forces`: `GroundForces`, the weights and limits of the program for torques and ground forces.
 
     **Raises:** ValueError for gains that are not positive definite, unknown frames, no list of
     feet or an empty one, a `stiffness` without a posture; (when called) for inconsistent shapes.
@@ -242,18 +268,14 @@ class WholeBody(eqx.Module):
     model: Model
     feet: tuple[Foot, ...]
     center: CenterError
-    turn: FrameError | None
     kp: Array
     kd: Array
-    turn_kp: Array
-    turn_kd: Array
+    turn: FrameError | None
+    turn_gains: tuple[Array, Array]
     posture: Array | None
     stiffness: Array
     damping: Array
-    preload: Array
-    torque_weight: Array
-    force_weight: Array
-    effort_limit: Array | None
+    forces: GroundForces
     passive: tuple[int, ...] = eqx.field(static=True)
 
     def __init__(
@@ -264,37 +286,30 @@ class WholeBody(eqx.Module):
         kp: Numbers,
         kd: Numbers,
         *,
-        orientation: Numbers | None = None,
-        base: str | None = None,
-        turn_kp: Numbers | None = None,
-        turn_kd: Numbers | None = None,
+        orientation: Checked[Target | Attitude | None] = None,
         posture: Numbers | None = None,
         stiffness: Numbers = 0.0,
         damping: Numbers = 1.0,
-        preload: Numbers = 0.0,
-        torque_weight: Numbers = 1.0,
-        force_weight: Numbers = 1e-3,
-        effort_limit: Numbers | None = None,
-        passive: Checked[Sequence[int] | None] = None,
+        forces: GroundForces | None = None,
+        **old: Any,
     ):
+        orientation, forces = _group_keywords(orientation, forces, old) if old else (orientation, forces)
+        turn = orientation if orientation is None or isinstance(orientation, Attitude) else Attitude(orientation)
         self.feet, self.model = check_feet(model, contacts), model
         if not self.feet:
             raise ValueError("contacts is empty; without a foot on the ground nothing moves the centre of mass")
         self.center = CenterError(as_target(com, "com"))  # pyright: ignore[reportCallIssue]
-        frame = model.body_names[0] if base is None else base
-        self.turn = None if orientation is None else frame_error(model, frame, orientation, "orientation")
         self.kp, self.kd = gain(kp, "kp"), gain(kd, "kd")
-        self.turn_kp = self.kp if turn_kp is None else gain(turn_kp, "turn_kp")
-        self.turn_kd = self.kd if turn_kd is None else gain(turn_kd, "turn_kd")
+        self.turn, self.turn_gains = None, (self.kp, self.kd)
+        if turn is not None:
+            self.turn = frame_error(model, turn.frame or model.body_names[0], turn.target, "orientation")
+            self.turn_gains = (self.kp if turn.kp is None else turn.kp, self.kd if turn.kd is None else turn.kd)
         dtype = model.inertias.dtype
         self.posture = None if posture is None else jnp.asarray(posture, dtype)
         self.stiffness = as_number(stiffness, "stiffness", zero=True)
         self.damping = as_number(damping, "damping", zero=True)
-        self.preload = as_number(preload, "preload", zero=True)
-        self.torque_weight = as_number(torque_weight, "torque_weight", zero=True)
-        self.force_weight = as_number(force_weight, "force_weight", zero=True)
-        self.effort_limit = None if effort_limit is None else jnp.asarray(effort_limit, dtype)
-        self.passive = tuple(passive_velocities(model, passive).tolist())
+        self.forces = GroundForces() if forces is None else forces
+        self.passive = tuple(passive_velocities(model, self.forces.passive).tolist())
         # A traced stiffness may be positive, so that it needs a posture as well.
         if self.posture is None and not (is_concrete(self.stiffness) and float(self.stiffness) == 0):
             raise ValueError(f"stiffness is {self.stiffness} and posture is None; give the posture (nq,)")
@@ -328,10 +343,10 @@ class WholeBody(eqx.Module):
             self.acceleration(q, v, t),
             list(self.feet),
             passive=self.passive,
-            preload=self.preload,
-            torque_weight=self.torque_weight,
-            force_weight=self.force_weight,
-            effort_limit=self.effort_limit,
+            preload=self.forces.preload,
+            torque_weight=self.forces.torque_weight,
+            force_weight=self.forces.force_weight,
+            effort_limit=self.forces.effort_limit,
         )
 
     def missing_wrench(self, q: Float[Array, " nq"], v: Float[Array, " nv"], t: Number = 0.0) -> Float[Array, " np"]:
@@ -349,7 +364,7 @@ class WholeBody(eqx.Module):
         feet = rows(independent_rows(holds, q, jnp.asarray(t, q.dtype)), q, v, t)
         tasks = [target_rows(self.model, self.center, self.kp, self.kd, q, v, t)]
         if self.turn is not None:
-            tasks.append(target_rows(self.model, self.turn, self.turn_kp, self.turn_kd, q, v, t))
+            tasks.append(target_rows(self.model, self.turn, *self.turn_gains, q, v, t))
         A, wanted = (jnp.concatenate(x) for x in zip(*tasks, strict=True))
         return (feet.A, feet.gamma), (A, wanted)
 

@@ -16,7 +16,7 @@ from jaxdyn.dynamics.world_frame import momentum, tree_inertias
 from jaxdyn.lie.so3 import cross, matmul
 from jaxdyn.model.arguments import Numbers, check_shapes, check_state, is_concrete
 from jaxdyn.model.configuration import configuration_rate
-from jaxdyn.model.inertia import rotational_inertia
+from jaxdyn.model.inertia import mass_com_inertia
 from jaxdyn.model.tree import Model
 from jaxdyn.systems.system import System
 
@@ -236,7 +236,7 @@ def spatial_form(model: Model, q: Float[Array, " nq"], v: Float[Array, " nv"], a
     Source: EQUATIONS section 3.
     """
     q, v, a = check_shapes(model, q=q, v=v, a=a)
-    mass, com, about_com = jax.vmap(_at_center)(model.inertias)
+    mass, com, about_com = jax.vmap(mass_com_inertia)(model.inertias)
 
     def placed(q):
         poses = forward_kinematics(model, q)
@@ -252,15 +252,6 @@ def spatial_form(model: Model, q: Float[Array, " nq"], v: Float[Array, " nv"], a
 
     (_, momentum, inertia), (acceleration, torque, _) = jax.jvp(moving, (q, v), (configuration_rate(model, q, v), a))
     return SpatialForm(mass[:, None] * acceleration, torque, momentum, inertia)
-
-
-def _at_center(parameters):
-    """Mass, centre of mass (3,), and inertia (3, 3) about it, of a body; of a massless one about its origin."""
-    mass = parameters[0]
-    com = jnp.where(mass > 0, parameters[1:4] / jnp.where(mass > 0, mass, 1.0), 0.0)
-    # I - m (c.c 1 - c c^T).
-    moved = jnp.sum(com * com) * jnp.eye(3, dtype=com.dtype) - jnp.outer(com, com)
-    return mass, com, rotational_inertia(parameters) - mass * moved
 
 
 def com_dynamics(model: Model, q: Float[Array, " nq"], v: Float[Array, " nv"]) -> ComDynamics:

@@ -22,7 +22,7 @@ from jaxdyn.dynamics.kinematics import forward_kinematics
 from jaxdyn.dynamics.tree_frames import body_subspace, relative_poses, take
 from jaxdyn.lie import se3
 from jaxdyn.lie.so3 import matmul
-from jaxdyn.model.arguments import as_array, check_name, check_shapes
+from jaxdyn.model.arguments import as_shape, check_name, check_shapes
 from jaxdyn.model.configuration import neutral
 from jaxdyn.model.inertia import spatial_inertia
 from jaxdyn.model.topology import frame_index
@@ -179,10 +179,7 @@ def newton_euler_matrices(
 def _base_vector(name: str, value: Any, q) -> Array | None:
     if value is None:
         return None
-    value = as_array(value, name, q.dtype)
-    if value.shape != (6,):
-        raise ValueError(f"{name} has shape {value.shape}; give (6,): (v, omega) of the base, linear part first")
-    return value
+    return jnp.asarray(as_shape(value, name, q.dtype, (6,), of=": (v, omega) of the base, linear part first"))
 
 
 @entry_point

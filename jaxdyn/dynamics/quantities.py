@@ -271,42 +271,38 @@ def _solve_for_acceleration(model: Model, q, v, tau):
     """Forward dynamics without a kernel, differentiated by the implicit function theorem."""
     form = scans if model.nb > _MAX_BODIES_IN_MATRICES else world_frame
 
-    def tangent(model, q, v, tau, steps):
-        return form.forward_dynamics_tangent(
-            model, q, v, tau, _force_tangent(_inverse_dynamics, model, q, v, tau, steps)
-        )
+    def tangent(*args):
+        return _value_and_tangent(_inverse_dynamics, form.acceleration_and_inverse, *args)
 
     return implicit(model, (q, v, tau), form.forward_dynamics, tangent)
 
 
-def _acceleration_tangent(inverse, solve, model: Model, q, v, tau, steps):
-    """Tangent M^-1 (dtau - dID at fixed a) of the acceleration, for tangents of the leaves of (model, q, v, tau)."""
-    return solve(model, q, v, tau, _force_tangent(inverse, model, q, v, tau, steps))[1]
+def _value_and_tangent(inverse_dynamics, solve, model: Model, q, v, tau, steps):
+    """The acceleration a, and its tangent M^-1 (dtau - dID at fixed a) for tangents of the leaves of (model, q, v, tau).
+
+    With ID(q, v, a) = tau. In reverse this costs one more M^-1 and one reverse pass of inverse dynamics.
+    """
+    a, times_inverse = solve(model, q, v, tau)
+    # The tangent of tau enters linearly and needs no derivative; None marks a zero tangent, for which nothing is computed.
+    *steps, change = steps
+    change = jnp.zeros_like(tau) if change is None else change
+    _, rate = value_and_jvp(lambda model, q, v: inverse_dynamics(model, q, v, a), (model, q, v), steps)
+    return a, times_inverse(change if rate is None else change - rate)
+
+
+def _tangent(*args):
+    return _value_and_tangent(*args)[1]
 
 
 # For each module of recursions its forward dynamics and their derivative.
 _FORWARD_DYNAMICS: dict[Any, tuple[Callable, Callable]] = {
-    module: (value, functools.partial(_acceleration_tangent, inverse, solve))
-    for module, value, inverse, solve in (
-        (recursions, recursions.aba, recursions.rnea, recursions.aba_tangent),
-        (sweeps, sweeps.aba, sweeps.rnea, sweeps.aba_tangent),
-        (scans, scans.forward_dynamics, scans.inverse_dynamics, scans.forward_dynamics_tangent),
+    form: (value, functools.partial(_tangent, inverse, form.acceleration_and_inverse))
+    for form, value, inverse in (
+        (recursions, recursions.aba, recursions.rnea),
+        (sweeps, sweeps.aba, sweeps.rnea),
+        (scans, scans.forward_dynamics, scans.inverse_dynamics),
     )
 }
-
-
-def _force_tangent(inverse, model, q, v, tau, steps):
-    """Function a -> dtau - dID(q, v, a) at fixed a."""
-    # The tangent of tau enters linearly and needs no derivative.
-    *steps, tau_step = steps
-
-    def change(a):
-        # None marks a zero tangent, for which nothing is computed.
-        total = jnp.zeros_like(tau) if tau_step is None else tau_step
-        _, rate = value_and_jvp(lambda model, q, v: inverse(model, q, v, a), (model, q, v), steps)
-        return total if rate is None else total - rate
-
-    return change
 
 
 def generalized_force(

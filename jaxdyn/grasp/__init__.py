@@ -3,6 +3,8 @@
 Source: Murray, Li & Sastry (1994), chapters 5 and 6.
 """
 
+from types import ModuleType as _ModuleType
+
 from jaxdyn.contact.cones import wrench_basis as wrench_basis
 from jaxdyn.contact.forces import ContactForces as ContactForces
 from jaxdyn.contact.forces import contact_forces as contact_forces
@@ -28,34 +30,7 @@ from jaxdyn.grasp.motions import Manipulability as Manipulability
 from jaxdyn.grasp.motions import hand_motions as hand_motions
 from jaxdyn.grasp.motions import manipulability as manipulability
 
-__all__ = [
-    "Contact",
-    "ContactForces",
-    "Grasp",
-    "HandForces",
-    "HandMotions",
-    "Manipulability",
-    "ObjectDynamics",
-    "contact",
-    "contact_forces",
-    "force_closure",
-    "forces_for_wrench",
-    "grasp_map",
-    "hand_dynamics",
-    "hand_jacobian",
-    "hand_motions",
-    "hold",
-    "internal_force_basis",
-    "internal_forces",
-    "joint_torques",
-    "manipulability",
-    "normal_forces",
-    "object_dynamics",
-    "point_contacts",
-    "wrench_basis",
-]
-
 
 def __dir__() -> list[str]:
     """Names of the namespace; its modules are internal."""
-    return __all__
+    return [x for x, value in globals().items() if x[0] != "_" and not isinstance(value, _ModuleType)]

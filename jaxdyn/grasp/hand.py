@@ -1,5 +1,6 @@
 """Grasps: one model of the fingers and the object, with the contacts between them as constraints; kinds of contacts."""
 
+import dataclasses
 from collections.abc import Sequence
 
 import equinox as eqx
@@ -23,8 +24,7 @@ from jaxdyn.model.arguments import (
     DType,
     Numbers,
     SystemLike,
-    as_array,
-    batch_hint,
+    as_shape,
     check_body,
     check_new_name,
     pose_leaf,
@@ -149,11 +149,7 @@ def internal_forces(
     Source: Murray, Li & Sastry (1994), sections 5.3 and 6.3; EQUATIONS section 10.
     """
     G = grasp_map(grasp, q, t)
-    lam = as_array(lam, "lam", G.dtype)
-    if lam.shape != G.shape[1:]:
-        raise ValueError(
-            f"lam has shape {lam.shape}, expected {G.shape[1:]}, one per row of the grasp{batch_hint(lam, (1,))}"
-        )
+    lam = as_shape(lam, "lam", G.dtype, G.shape[1:], of=", one per row of the grasp")
     # G lam first: the projection matrix (nc, nc) is never formed.
     return lam - matmul(pseudo_inverse(G, tolerance(None, G)), matmul(G, lam))
 
@@ -338,8 +334,7 @@ def on_object(constraint: Constraint, name: str) -> Constraint:
                 "object out"
             )
         # Modules are frozen: the contact gets its object in a copy.
-        fields = ("name", "kind", "finger", "in_plane", "pose", "finger_pose")
-        return Contact(object=name, **{field: getattr(constraint, field) for field in fields})
+        return dataclasses.replace(constraint, object=name)
     if isinstance(constraint, (RollingSphere, RollingWheel)):
         if name not in (constraint.body, constraint.surface_body):
             raise ValueError(

@@ -22,7 +22,7 @@ from jaxtyping import Array, Bool, Float
 from jaxdyn.compile import entry_point, gram_eigenvectors
 from jaxdyn.compile.known import is_known
 from jaxdyn.constraints.base import constraint_jacobian, layout
-from jaxdyn.constraints.rank import condition_number, eps_of, pseudo_inverse, rank_of, tolerance
+from jaxdyn.constraints.rank import NEGLIGIBLE, condition_number, eps_of, pseudo_inverse, rank_of, tolerance
 from jaxdyn.constraints.selection import independent_rows
 from jaxdyn.grasp.hand import Grasp, check_grasp
 from jaxdyn.lie.series import safe_sqrt
@@ -185,8 +185,7 @@ def _projections(grasp: Grasp, q, t):
 
 def _negligible(like) -> float:
     """Relative size below which an entry is rounding error."""
-    # 4e-10 in float64, below the rank tolerance of 1.1e-9.
-    return eps_of(like) ** 0.6
+    return eps_of(like) ** NEGLIGIBLE
 
 
 # Manipulability of a hand: ellipsoids of object velocities and of wrenches.

@@ -26,9 +26,10 @@ from jaxdyn.constraints.redundancy import distribute_multipliers
 from jaxdyn.constraints.selection import independent_rows, rank_code
 from jaxdyn.dynamics.quantities import bias_force, coriolis_matrix, inverse_dynamics, mass_matrix
 from jaxdyn.lie.so3 import matmul
-from jaxdyn.model.arguments import Numbers, as_array, batch_hint, check_state, zeros_if_none
+from jaxdyn.model.arguments import Numbers, as_array, as_shape, check_state, zeros_if_none
 from jaxdyn.model.numbers import as_float
 from jaxdyn.reduction.bases import (
+    COLUMNS,
     Basis,
     BasisLike,
     FullBasis,
@@ -42,7 +43,7 @@ from jaxdyn.reduction.bases import (
 )
 from jaxdyn.systems.mass_factor import cholesky, is_definite, solve_cholesky, solve_lower
 from jaxdyn.systems.scene import Scene, as_scene
-from jaxdyn.systems.system import SceneLike, velocity_to_rate
+from jaxdyn.systems.system import SceneLike, has_coordinate_rates, velocity_to_rate
 
 
 class ReducedDynamics(Outcome):
@@ -98,7 +99,6 @@ def reduced_dynamics(
     scene = as_scene(scene)
     tau = zeros_if_none(tau, scene.nv)
     q, tau, time = check_state(scene.system, q=q, tau=tau, t=t)
-    nu = as_array(nu, "nu", q.dtype)
     if layout(scene):
         scene, choice = independent_rows(scene, q, time), as_basis(basis, scene)
     elif basis is None:
@@ -106,8 +106,8 @@ def reduced_dynamics(
     else:
         raise ValueError(f"the scene has no constraints, so that nu = v; basis is {basis!r}, omit it")
     size = choice.size(scene)
-    if size is not None and nu.shape != (size,):
-        raise ValueError(f"nu has shape {nu.shape}, expected {(size,)} as the basis has columns{batch_hint(nu, (1,))}")
+    # A basis without a size checks the columns that it computes.
+    nu = as_array(nu, "nu", q.dtype) if size is None else as_shape(nu, "nu", q.dtype, (size,), of=COLUMNS)
     dynamics = _reduce_compiled(scene, choice, q, nu, tau, time)
     dynamics = eqx.tree_at(lambda x: x.result, dynamics, rank_code(scene, dynamics.result))
     singular = dynamics.result == RESULTS.singular_basis
@@ -267,8 +267,7 @@ def quasi_connection(
     """
     of: Any = as_scene(system).system
     q, v, t = check_state(of, q=q, v=v, t=t)
-    kinds = getattr(getattr(of, "topology", None), "kinds", ())
-    if of.nq != of.nv or {"planar", "spherical", "free"} & set(kinds):
+    if of.nq != of.nv or not has_coordinate_rates(of):
         raise ValueError(
             "the velocities of the system are not the rates of its coordinates (planar, spherical and free joints); "
             "jd.reduction.gauge_invariant has the skew form for these"

@@ -87,7 +87,7 @@ def as_pytree(function: Any, argument: str, takes: str = "") -> Callable:
     if not callable(function):
         raise ValueError(f"{argument} is {function!r}, which cannot be called; pass a function or a callable Module")
     if takes:
-        _check_arguments(function, argument, takes)
+        _check_call(function, argument, f"({takes})", takes.split(", "))
     if not jax.tree_util.all_leaves([function]):
         return function
     # A bound method hides its object; a Partial keeps the object's leaves visible to transformations.
@@ -261,16 +261,16 @@ def check_force(value, q: Float[Array, " nq"], nv: int, argument: str) -> Float[
     return as_array(value, argument, q.dtype)
 
 
-def _check_arguments(function: Any, argument: str, takes: str) -> None:
+def _check_call(function: Any, name: str, call: str, args: Sequence[Any]) -> None:
+    """Refuse a function that cannot be called with so many arguments, `call` in words."""
     try:
-        signature = inspect.signature(function.function if isinstance(function, _Static) else function)
+        taken = inspect.signature(function.function if isinstance(function, _Static) else function)
     except (TypeError, ValueError):  # functions not written in Python have no signature
         return
     try:
-        # The names are placeholders: `bind` checks the number of arguments only.
-        signature.bind(*takes.split(", "))
+        taken.bind(*args)
     except TypeError as error:
-        raise ValueError(f"{argument} takes {signature}, but is called as ({takes}); {error}") from None
+        raise ValueError(f"{name} takes {taken}, but is called as {call}; {error}") from None
 
 
 def check_callback(function: Callable, name: str, signature: str, *args, first: tuple = ()) -> None:
@@ -278,15 +278,7 @@ def check_callback(function: Callable, name: str, signature: str, *args, first: 
 
     **Raises:** ValueError for a function with other arguments, and for one that needs the values of its arguments.
     """
-    try:
-        taken = inspect.signature(function.function if isinstance(function, _Static) else function)
-    except (TypeError, ValueError):  # functions not written in Python have no signature
-        taken = None
-    try:
-        if taken is not None:
-            taken.bind(*first, *args)
-    except TypeError as error:
-        raise ValueError(f"{name} takes {taken}, but is called as {signature}; {error}") from None
+    _check_call(function, name, signature, (*first, *args))
     try:
         # Abstract evaluation finds branches on traced values before a long compilation fails with a message about the
         # loop.

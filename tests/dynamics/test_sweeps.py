@@ -80,8 +80,14 @@ def test_floating_base(kinds, given, armature):
 
     def of(form):
         def all_of(model, q, v, x):
-            a, times = form.aba_tangent(model, q, v, x, lambda a: x * a)
-            return a, times, form.rnea(model, q, v, x), form.bias_force(model, q, v), form.gravity_force(model, q)
+            a, times = form.acceleration_and_inverse(model, q, v, x)
+            return (
+                a,
+                times(x * a),
+                form.rnea(model, q, v, x),
+                form.bias_force(model, q, v),
+                form.gravity_force(model, q),
+            )
 
         compiled = kernel(all_of)
         return quick(compiled)(model, q, v, x) if given else quick(lambda *s: compiled(model, *s))(q, v, x)
@@ -185,8 +191,8 @@ def test_loops_of_joints_of_any_kinds(kinds, given, monkeypatch):
         def values(model, q, v, x):
             frame = tree_frames.tree_frame(model, q)
             kinetic = centroidal._kinetic_energy(model, q, v), world_frame.generalized_force(model, q, wrenches)
-            pair = form.forward_dynamics_tangent(model, q, v, x, lambda a: x * a)
-            return frame, *kinetic, *pair, form.inverse_dynamics(model, q, v, x)
+            a, times = form.acceleration_and_inverse(model, q, v, x)
+            return frame, *kinetic, a, times(x * a), form.inverse_dynamics(model, q, v, x)
 
         return values
 

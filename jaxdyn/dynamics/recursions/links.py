@@ -1,7 +1,7 @@
 """Joint transforms and motion subspaces of every joint kind, in canonical link frames (see `frames`).
 
 Inside the recursions the velocity of a one-degree-of-freedom joint is that of a unit screw, rad/s or m/s; `unit_velocity` and
-`from_unit_force` convert where a model's screws have another norm.
+`unit_force` convert where a model's screws have another norm.
 """
 
 from typing import Any, NamedTuple
@@ -70,20 +70,14 @@ def links_of(model: Model) -> Links:
     return Links(model, frames, inertias, subspaces, as_numpy_if_known(model.gravity), armature, scale)
 
 
-def unit_velocity(links: Links, v):
-    """Scale velocities or accelerations (nv,) to unit screws; equally, forces of unit screws to the model's."""
-    return v if links.scale is None else v * links.scale
+def unit_velocity(of, v) -> Any:
+    """Velocities (nv,), or None, of unit screws, `of` links or bodies with a `scale`; equally, forces of the model's screws."""
+    return v if of.scale is None or v is None else v * of.scale
 
 
-from_unit_force = unit_velocity
-
-
-def unit_force(links: Links, tau):
-    """Scale generalised forces (nv,) to unit screws; equally, velocities of unit screws to the model's."""
-    return tau if links.scale is None else tau / links.scale
-
-
-from_unit_velocity = unit_force
+def unit_force(of, tau) -> Any:
+    """The inverse: generalised forces (nv,) on unit screws; equally, velocities of the model's screws."""
+    return tau if of.scale is None else tau / of.scale
 
 
 def by_joint(links: Links, values) -> list:
