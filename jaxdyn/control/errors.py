@@ -207,21 +207,8 @@ def target_rows(system, error: Constraint, kp, kd, q, v, t) -> tuple[Float[Array
     return row.A, row.gamma - times(kd, row.velocity, "kd") - times(kp, position_residual(scene, q, t), "kp")
 
 
-def least_acceleration(system, q, t, A, wanted, start) -> Float[Array, " nv"]:
-    """Acceleration closest to `start` (nv,), in the metric M, with A a = wanted.
-
-    Inconsistent rows are met in the least-squares sense.
-    """
-    metric = mass_factor(mass_matrix(system, q, t))
-    # With M = L L^T, |a - start|_M is Euclidean in L^T a, where a pseudo-inverse gives the minimum.
-    Y = metric.whiten(A.T)
-    # Only what `start` lacks is corrected, so that the change of it is the least one.
-    missing = wanted - matmul(A, start)
-    return start + metric.unwhiten(matmul(pseudo_inverse(Y, tolerance(None, Y)).T, missing))
-
-
 def hierarchical_acceleration(system, q, t, orders, start) -> Float[Array, " nv"]:
-    """Acceleration closest to `start` (nv,), in the metric M, that meets pairs (A, wanted) by priority.
+    """Acceleration closest to `start` (nv,), in the metric M, with A a = wanted for pairs (A, wanted) by priority.
 
     Each is met, in the least-squares sense, in the null space of all before it, which it does not disturb.
     """
@@ -230,17 +217,21 @@ def hierarchical_acceleration(system, q, t, orders, start) -> Float[Array, " nv"
     free, a = jnp.eye(start.shape[0], dtype=start.dtype), start
     for A, wanted in orders:
         Y = metric.whiten(A.T)
-        left = matmul(free, Y)
         # Rows spanned by those of higher priority leave rounding errors, which must not count as directions.
-        # A decision on rank has no derivative.
-        sizes = [jnp.sum(jax.lax.stop_gradient(x) ** 2) for x in (left, Y)]
-        left = jnp.where(sizes[0] > tolerance(None, Y) ** 2 * sizes[1], left, jnp.zeros_like(left))
+        left = drop_rounding(matmul(free, Y), Y)
         inverse = pseudo_inverse(left, tolerance(None, left)).T
         # Rows of lower priority correct what those above them have left, within the null space of these.
         a = a + metric.unwhiten(matmul(inverse, wanted - matmul(A, a)))
         # inverse left^T projects on the range of `left`, so that `free` remains an orthogonal projection.
         free = free - matmul(inverse, left.T)
     return a
+
+
+def drop_rounding(left: Array, whole: Array) -> Array:
+    """What a projection leaves of rows, or zeros where that is rounding of the whole rows."""
+    # A decision on rank has no derivative.
+    sizes = [jnp.sum(jax.lax.stop_gradient(x) ** 2) for x in (left, whole)]
+    return jnp.where(sizes[0] > tolerance(None, whole) ** 2 * sizes[1], left, jnp.zeros_like(left))
 
 
 def regularity(system, q, t, A, T) -> Float[Array, ""]:

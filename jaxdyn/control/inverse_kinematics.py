@@ -207,7 +207,8 @@ def _solve(scene: Scene, rows, guess, factors, posture, t, limits: bool, steps: 
 
     values = position_residual(whole, q, t)
     exact = aims.is_exact > 0
-    errors = values[np.flatnonzero(_is_target(scene, whole))]
+    # The rows of targets follow those of the constraints.
+    errors = values[holonomic_rows(layout(scene)).size :]
     counted = jnp.where(factors > 0, jnp.abs(errors), jnp.zeros_like(errors))
     opening = jnp.max(jnp.where(exact, jnp.abs(values), jnp.zeros_like(values)), initial=0.0)
     if has_selection(scene):
@@ -219,12 +220,6 @@ def _solve(scene: Scene, rows, guess, factors, posture, t, limits: bool, steps: 
     result = RESULTS.where(closed, RESULTS.targets_not_reached, RESULTS.not_assembled)
     result = RESULTS.where(reached, RESULTS.where(is_nearest, RESULTS.successful, RESULTS.not_nearest), result)
     return InverseKinematics(q, jnp.max(counted, initial=0.0), errors, opening, result, tried)
-
-
-def _is_target(scene: Scene, whole: Scene) -> np.ndarray:
-    """Mask of the position rows of `whole` that belong to targets; they follow those of the constraints."""
-    count = holonomic_rows(layout(scene)).size
-    return np.arange(holonomic_rows(layout(whole)).size) >= count
 
 
 def _reaches_targets(scene: Scene, q, t, aims: Aims):

@@ -67,22 +67,24 @@ def potential_energy(model: Model | System, q: Float[Array, " nq"], t: Numbers =
 
 def _potential_energy(model: Model, q):
     # Centres relative to the tree's root first; only their sum meets the large world position.
-    mass, first, origin, shift = first_moments(model, tree_frame(model, q))
+    mass, moment, origin, _ = first_moments(model, tree_frame(model, q))
     gravity: Any = model.gravity
-    return -jnp.sum(gravity * (jnp.sum(mass) * origin + jnp.sum(first + mass[:, None] * shift, axis=0)))
+    return -jnp.sum(gravity * (mass * origin + moment))
 
 
 def first_moments(model: Model, frame: TreeFrame):
-    """Masses (nb,), first moments (nb, 3) in the tree frames, world position (3,) of the first tree's origin, and shifts.
+    """Mass (), first moment (3,) about the first tree's origin, that origin in the world (3,), and shifts (nb, 3).
 
-    A shift (3,) is the position of a body's tree frame relative to the first one: exactly zero, not a difference of distant
-    positions, for one tree.
+    A shift is the position of a body's tree frame relative to the first one: exactly zero, not a difference of distant positions,
+    for one tree.
     """
     mass = model.inertias[:, 0]
     # First moments m c rather than centres c: massless bodies need no division.
     rotated = matmul(frame.pose[:, :3, :3], model.inertias[:, 1:4, None])[..., 0]
     origin = frame.origin[0] if model.nb else jnp.zeros((3,), mass.dtype)
-    return mass, rotated + mass[:, None] * frame.pose[:, :3, 3], origin, frame.origin - origin[None]
+    shift = frame.origin - origin[None]
+    moments = rotated + mass[:, None] * frame.pose[:, :3, 3] + mass[:, None] * shift
+    return jnp.sum(mass), jnp.sum(moments, axis=0), origin, shift
 
 
 def center_of_mass(model: Model, q: Float[Array, " nq"]) -> Float[Array, "3"]:
@@ -99,9 +101,9 @@ def center_of_mass(model: Model, q: Float[Array, " nq"]) -> Float[Array, "3"]:
 
 
 def _center_of_mass(model: Model, q):
-    mass, first, origin, shift = first_moments(model, tree_frame(model, q))
+    mass, moment, origin, _ = first_moments(model, tree_frame(model, q))
     # Positions relative to the tree's root: far from the world's origin, absolute positions would lose digits.
-    return origin + jnp.sum(first + mass[:, None] * shift, axis=0) / jnp.sum(mass)
+    return origin + moment / mass
 
 
 def centroidal_momentum(model: Model, q: Float[Array, " nq"], v: Float[Array, " nv"]) -> Float[Array, "6"]:
@@ -170,10 +172,9 @@ def com_jacobian(model: Model, q: Float[Array, " nq"]) -> Float[Array, "3 nv"]:
 
 def _about_center(model: Model, frame: TreeFrame, momenta: Array, bodies=None) -> Array:
     """Shift momenta (n, 6) of the given bodies from their tree frames to the centre of mass."""
-    mass, first, _, shift = first_moments(model, frame)
-    center = jnp.sum(first + mass[:, None] * shift, axis=0) / jnp.sum(mass)
+    mass, moment, _, shift = first_moments(model, frame)
     # The moment of momentum about another point changes by lever x l; the linear part stays.
-    lever = shift - center[None]
+    lever = shift - (moment / mass)[None]
     lever = lever if bodies is None else take(lever, bodies)
     angular = momenta[:, 3:] + jax.vmap(cross)(lever, momenta[:, :3])
     return jnp.concatenate([momenta[:, :3], angular], axis=1)
