@@ -366,5 +366,5 @@ def acceleration_and_inverse(model: Model, q, v, tau) -> tuple[Array, Callable]:
 
 
 def aba(model: Model, q, v, tau) -> Float[Array, " nv"]:
-    """Forward dynamics (see `articulated.aba`)."""
+    """Forward dynamics (see `newton_euler.aba`)."""
     return acceleration_and_inverse(model, q, v, tau)[0]
