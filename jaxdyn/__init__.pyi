@@ -26,7 +26,7 @@ from jaxdyn.constraints.assembly import assemble
 from jaxdyn.constraints.branches import degrees_of_freedom
 from jaxdyn.constraints.codes import RESULTS
 from jaxdyn.constraints.dynamics import constrained_dynamics
-from jaxdyn.constraints.reactions import constraint_forces
+from jaxdyn.constraints.frames import constraint_forces
 from jaxdyn.control.following import follow
 from jaxdyn.control.inverse_kinematics import inverse_kinematics
 from jaxdyn.dynamics.centroidal import center_of_mass, com_jacobian, kinetic_energy, potential_energy

@@ -22,8 +22,7 @@ from jaxdyn.model.joining import join
 from jaxdyn.model.joints import KINDS
 from jaxdyn.model.numbers import as_float
 from jaxdyn.model.tree import Model
-from jaxdyn.systems.drives import DriveDynamics
-from jaxdyn.systems.scene import Scene, as_pytree
+from jaxdyn.systems.scene import DriveDynamics, Scene, as_pytree
 
 
 class _Lag(DriveDynamics):

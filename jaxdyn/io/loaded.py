@@ -14,8 +14,7 @@ from jaxdyn.model import host_math
 from jaxdyn.model.arguments import Checked, Function, Number, Numbers, as_array, warn
 from jaxdyn.model.tree import Model
 from jaxdyn.sensors import Sensor
-from jaxdyn.systems.drives import DriveDynamics
-from jaxdyn.systems.scene import Force, Scene, as_pytree
+from jaxdyn.systems.scene import DriveDynamics, Force, Scene, as_pytree
 
 
 class NotTakenWarning(UserWarning):

@@ -14,7 +14,7 @@ from jaxdyn.constraints.loops import Distance, Loop
 from jaxdyn.contact.cones import components
 from jaxdyn.contact.forces import contacts_with_cones
 from jaxdyn.dynamics.kinematics import forward_kinematics
-from jaxdyn.grasp.contacts import Contact
+from jaxdyn.grasp.hand import Contact
 from jaxdyn.model.arguments import as_array
 from jaxdyn.model.joints import SCREW_KINDS
 from jaxdyn.model.tree import Model

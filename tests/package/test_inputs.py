@@ -18,7 +18,7 @@ from pinocchio_bridge import quick
 import jaxdyn as jd
 from jaxdyn.cli.common import output_path
 from jaxdyn.constraints.codes import CODES, name_of
-from jaxdyn.constraints.reactions import constraint_forces
+from jaxdyn.constraints.frames import constraint_forces
 from jaxdyn.simulation.solution import OF_DIFFRAX, from_diffrax
 
 ARM = jd.robots.chain(2)
