@@ -13,12 +13,11 @@ from typing import Any
 import jax
 import numpy as np
 
-from jaxdyn.compile import array_rules, jax_adapter, look_ups, mode, rolled
+from jaxdyn.compile import array_rules, jax_adapter, mode, rearrange, rolled
 from jaxdyn.compile import program as numbers
 from jaxdyn.compile.array_rules import bind_known, empty_reduction, evaluate_known
 from jaxdyn.compile.derive import without_unread
-from jaxdyn.compile.graph import Graph
-from jaxdyn.compile.inlining import replay
+from jaxdyn.compile.graph import Graph, replay
 from jaxdyn.compile.jax_adapter import ClosedJaxpr, Literal, Tracer  # pyright: ignore[reportPrivateImportUsage]
 from jaxdyn.compile.program import (
     Array,
@@ -149,7 +148,7 @@ class _Expansion:
             return rule(self, params, args, eqn)
         if name in AT_PLACES:
             if any(x.dtype.kind == "O" for x in args[_ARRAYS[name] :]):
-                return look_ups.at_place(AT_PLACES[name], self, params, args, eqn)
+                return rearrange.at_place(AT_PLACES[name], self, params, args, eqn)
             return AT_PLACES[name](params, args, eqn)
         out = eqn.outvars[0].aval
         known = all(x.dtype.kind != "O" for x in args)
@@ -436,19 +435,19 @@ _OTHER: dict[str, Callable] = {
     "dot_general": array_rules.dot_general,
     "scatter-add": array_rules.scatter,
     "scatter": array_rules.scatter,
-    "gather": look_ups.gather_at,
-    "argmax": look_ups.extreme_place,
-    "argmin": look_ups.extreme_place,
+    "gather": rearrange.gather_at,
+    "argmax": rearrange.extreme_place,
+    "argmin": rearrange.extreme_place,
     "call_hi_primitive": _Expansion._high,
     "polynomial": array_rules.polynomial,
-    **dict.fromkeys(("cumsum", "cumprod", "cummax", "cummin"), look_ups.cumulative),
+    **dict.fromkeys(("cumsum", "cumprod", "cummax", "cummin"), rearrange.cumulative),
     "scan": rolled.scan,
     "jaxdyn_sweep": rolled.sweep,
     "while": rolled.while_loop,
     "cond": _Expansion._cond,
     "custom_linear_solve": _Expansion._linear_solve,
     "cholesky": array_rules.cholesky,
-    "lu": look_ups.lu,
+    "lu": rearrange.lu,
     "triangular_solve": array_rules.triangular_solve,
     "jaxdyn_kernel": _Expansion._kernel,
     "jaxdyn_invalid": _Expansion._invalid,

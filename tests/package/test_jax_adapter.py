@@ -22,7 +22,7 @@ from jax.extend.core import Primitive
 import jaxdyn as jd
 from jaxdyn import compile as backend
 from jaxdyn.compile import expansion, jax_adapter, kernels, mode, target
-from jaxdyn.compile.trial import run_trial
+from jaxdyn.compile.kernels import run_trial
 
 ADAPTER = Path(jax_adapter.__file__)
 DOCS = "https://docs.jax.dev/en/latest/"
@@ -360,9 +360,7 @@ def test_a_missing_name_leaves_everything_or_nothing_to_jax(future, monkeypatch,
     assert_right(function, X, computed)
 
 
-def test_a_call_that_cannot_be_lowered_is_left_to_jax(future, monkeypatch):
-    monkeypatch.setattr(jax_adapter, "_trial", None)
-
+def test_a_call_that_cannot_be_lowered_leaves_everything_to_jax(future, monkeypatch):
     def broken(*args, **static):
         raise TypeError("ffi_lowering got an unexpected argument")
 
@@ -370,8 +368,10 @@ def test_a_call_that_cannot_be_lowered_is_left_to_jax(future, monkeypatch):
     function = fresh(sums)
     with one_warning("TypeError: ffi_lowering got an unexpected argument"):
         computed = results(function, X)
+    assert mode.current() == "plain"
     assert_right(function, X, computed)
     monkeypatch.setattr(jax, "__version_info__", (0, 12, 0))
+    monkeypatch.setattr(jax_adapter, "_against_kernels", None)
     with pytest.raises(TypeError, match="unexpected argument"):
         jax.jit(functools.partial(backend.kernel(lambda known, x: jnp.cos(x)), ()))(X)
 
@@ -379,7 +379,7 @@ def test_a_call_that_cannot_be_lowered_is_left_to_jax(future, monkeypatch):
 def test_wrong_numbers_leave_everything_to_jax(future, monkeypatch):
     """As those of jax 0.10.2 were."""
     rule = kernels.call_program
-    monkeypatch.setattr("jaxdyn.compile.trial.call_program", lambda *args: [2 * x for x in rule(*args)])
+    monkeypatch.setattr("jaxdyn.compile.kernels.call_program", lambda *args: [2 * x for x in rule(*args)])
     with one_warning("a kernel gives other numbers than JAX"):
         assert mode.current() == "plain"
 
