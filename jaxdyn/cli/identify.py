@@ -8,11 +8,12 @@ from typing import Any
 import numpy as np
 
 from jaxdyn import __version__, identify
-from jaxdyn.cli.clusters import add_cluster_options, connect
 from jaxdyn.cli.common import (
     Stopwatch,
+    add_cluster_options,
     add_model_options,
     check_least,
+    connect,
     load_model,
     output_path,
     real,

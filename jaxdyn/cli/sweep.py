@@ -13,8 +13,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from jaxdyn import scale, scenes
-from jaxdyn.cli.clusters import add_cluster_options, connect
-from jaxdyn.cli.common import Stopwatch, check_least, check_memory, whole
+from jaxdyn.cli.common import Stopwatch, add_cluster_options, check_least, check_memory, connect, whole
 from jaxdyn.io import load_urdf
 from jaxdyn.model.arguments import as_path
 from jaxdyn.model.configuration import integrate, neutral

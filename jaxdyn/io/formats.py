@@ -12,11 +12,10 @@ import numpy as np
 
 from jaxdyn.constraints.loops import model_couplings
 from jaxdyn.forces.elements import CoulombFriction, JointDamping
-from jaxdyn.io.collisions import FRICTION, check_choice, collision_of, contacts_with_ground
 from jaxdyn.io.loaded import LoadedScene, Start, summarize, warn_not_taken
 from jaxdyn.io.mjcf import load_mjcf
 from jaxdyn.io.sdf import load_sdf
-from jaxdyn.io.solids import urdf_elements
+from jaxdyn.io.solids import FRICTION, check_choice, collision_of, contacts_with_ground, urdf_elements
 from jaxdyn.io.urdf import urdf_model
 from jaxdyn.io.urdf_loops import loop_constraints, motors_of, plugin_followers, read_closures
 from jaxdyn.io.urdf_parts import elements_without_effect

@@ -17,7 +17,6 @@ from jaxdyn.contact.height_field import HeightField
 from jaxdyn.contact.unilateral import UnilateralContact
 from jaxdyn.forces.elements import CoulombFriction, JointDamping, JointSpring
 from jaxdyn.io.chains import Link, Names, add_chain, build_model
-from jaxdyn.io.collisions import Collision, check_choice, contacts_with_ground
 from jaxdyn.io.loaded import LoadedScene, Start, summarize, warn_not_taken, warn_of_units
 from jaxdyn.io.mjcf_file import (
     BALL,
@@ -33,7 +32,7 @@ from jaxdyn.io.mjcf_file import (
     sensors,
 )
 from jaxdyn.io.mjcf_parts import actuators, constraints, tendon_forces
-from jaxdyn.io.solids import geom_solid
+from jaxdyn.io.solids import Collision, check_choice, contacts_with_ground, geom_solid
 from jaxdyn.io.xml_lines import LARGEST_ROUNDING, XmlFile, rounding_of_digits
 from jaxdyn.model import host_math
 from jaxdyn.model.arguments import Checked, DType, as_path

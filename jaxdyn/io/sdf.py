@@ -10,11 +10,10 @@ from jaxdyn.constraints.base import Constraint
 from jaxdyn.constraints.loops import gear, lock_joint, loop
 from jaxdyn.forces.elements import CoulombFriction, JointDamping, JointSpring
 from jaxdyn.io.chains import Link, Names, add_chain, build_model
-from jaxdyn.io.collisions import FRICTION, check_choice, collision_of, contacts_with_ground
 from jaxdyn.io.loaded import LoadedScene, Start, summarize, summarize_all, warn_not_taken, warn_of_units
 from jaxdyn.io.sdf_frames import SdfFile
 from jaxdyn.io.sdf_joints import LOOPS, Axis, Edge, Joint, read_joints, spanning_tree
-from jaxdyn.io.solids import sdf_elements
+from jaxdyn.io.solids import FRICTION, check_choice, collision_of, contacts_with_ground, sdf_elements
 from jaxdyn.io.unread import SDF_FRAME, SDF_JOINT, SDF_LINK, SDF_MODEL, SDF_ROOT, SDF_WORLD, unread_parts
 from jaxdyn.io.urdf import ROOT_JOINT
 from jaxdyn.io.xml_lines import rounding_of_digits

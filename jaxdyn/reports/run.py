@@ -9,13 +9,10 @@ from pathlib import Path
 import jax.numpy as jnp
 import numpy as np
 
-from jaxdyn.reports.case import Case, case_of_scene
-from jaxdyn.reports.measurement import Contestant, ladder, measure
-from jaxdyn.reports.page import write
+from jaxdyn.reports.measurement import Contestant, ladder, machine, measure
+from jaxdyn.reports.page import Record, Report, SceneReference, write
 from jaxdyn.reports.plotting import new_figure
-from jaxdyn.reports.programs import FIXED, SOLVERS, Prepared, prepare
-from jaxdyn.reports.records import Record, Report, SceneReference
-from jaxdyn.reports.timing import machine
+from jaxdyn.reports.programs import FIXED, SOLVERS, Case, Prepared, case_of_scene, prepare
 from jaxdyn.simulation.checks import choose_method
 
 # Contestants of other libraries for a scene, a dtype and starts (q, v, ts); see `Contestant`.

@@ -13,12 +13,10 @@ import jax
 import numpy as np
 
 from jaxdyn.model.arguments import as_path
-from jaxdyn.scale.description import Description
-from jaxdyn.scale.members import Members
-from jaxdyn.scale.reducer import Reducer, Totals
-from jaxdyn.scale.reductions import Arrays, check_reductions, describe_reductions
+from jaxdyn.scale.program import Members
+from jaxdyn.scale.reductions import Arrays, Reducer, Totals, check_reductions, describe_reductions
 from jaxdyn.scale.store import Store, check_place, zarr_package
-from jaxdyn.scale.study import LISTED, Facts, Study, local_devices
+from jaxdyn.scale.study import LISTED, Description, Facts, Study, local_devices
 from jaxdyn.tasks import Cluster, Engine, Failure, Local, package_versions
 
 if TYPE_CHECKING:

@@ -12,9 +12,9 @@ from jaxtyping import Array, PyTree
 from jaxdyn.model.arguments import Checked, FilePath, Numbers, as_array
 from jaxdyn.model.description import scene_lines
 from jaxdyn.scale.batch import Options, Run, run_batch
-from jaxdyn.scale.description import describe, function_values, motion_values
-from jaxdyn.scale.members import digest, members
+from jaxdyn.scale.program import digest, members
 from jaxdyn.scale.reductions import Reduction
+from jaxdyn.scale.study import describe, function_values, motion_values
 from jaxdyn.simulation.checks import check_times
 from jaxdyn.simulation.controls import Control
 from jaxdyn.simulation.run import simulate

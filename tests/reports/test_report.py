@@ -20,10 +20,9 @@ from jaxdyn.cli import main
 from jaxdyn.contact.unilateral import has_modes
 from jaxdyn.reports import Record, Report, html_page, pareto_front
 from jaxdyn.reports import run as running
-from jaxdyn.reports.case import Case, Reference, case_of_scene
-from jaxdyn.reports.measurement import Contestant, Motion, evaluations, ladder, measure
-from jaxdyn.reports.programs import FIXED, SOLVERS, Programs, prepare
-from jaxdyn.reports.records import SceneReference
+from jaxdyn.reports.measurement import Contestant, Motion, evaluations, ladder, measure, time_interleaved
+from jaxdyn.reports.page import SceneReference
+from jaxdyn.reports.programs import FIXED, SOLVERS, Case, Programs, Reference, case_of_scene, prepare
 from jaxdyn.reports.references import (
     CLOSED_FORMS,
     coin,
@@ -39,7 +38,6 @@ from jaxdyn.reports.references import (
     turntable,
     windows,
 )
-from jaxdyn.reports.timing import time_interleaved
 from jaxdyn.simulation.checks import choose_method
 from jaxdyn.simulation.solvers import RK4
 from jaxdyn.simulation.solvers.choice import choose_solver

@@ -24,7 +24,7 @@ import jaxdyn as jd
 from jaxdyn.scale import program
 from jaxdyn.scale import store as stores
 from jaxdyn.scale.batch import lock_store
-from jaxdyn.scale.members import members
+from jaxdyn.scale.program import members
 
 zarr = pytest.importorskip("zarr", reason="zarr is not installed: the extra scale")
 xarray = pytest.importorskip("xarray", reason="xarray is not installed: the extra scale")
@@ -525,7 +525,7 @@ def test_chunks_without_rollouts_change_no_bit_of_a_result(reduction):
 
 
 def test_a_run_of_many_chunks_merges_as_they_come():
-    from jaxdyn.scale.reducer import Reducer, Totals
+    from jaxdyn.scale.reductions import Reducer, Totals
     from jaxdyn.scale.study import Summary
 
     values = np.random.default_rng(3).random(199)
