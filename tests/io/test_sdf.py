@@ -352,21 +352,6 @@ def test_what_is_not_taken_is_named(tmp_path):
         assert any(part in line for line in scene.not_taken)
 
 
-def test_units_that_look_wrong_are_said_aloud(tmp_path):
-    degrees = joint("j", "world", "a", axis="<xyz>0 0 1</xyz><limit><lower>-90</lower><upper>90</upper></limit>")
-    heavy = INERTIAL.replace("<izz>0.5", "<izz>500000")
-    text = link("a") + degrees + link("b", "0 0 350 0 0 0", heavy) + joint("k", "a", "b")
-    with pytest.warns(jd.io.UnitsWarning) as caught:
-        jd.io.load_sdf(write(tmp_path, f"<model name='m'>{text}</model>"))
-    for part in (
-        "robot.sdf",
-        "-90 to 90 rad of joint 'j' (degrees?)",
-        "body 'b' 350 m",
-        "radius of gyration 487.585 m",
-    ):
-        assert any(part in str(x.message) for x in caught if x.category is jd.io.UnitsWarning)
-
-
 def model_of(text: str) -> str:
     return f"<model name='m'>\n{text}\n</model>"
 
