@@ -134,7 +134,7 @@ def run(args: argparse.Namespace) -> int:
     draw = make_draw(parameters)
     scene, states = _scene(_require(study, path, "scene"), path, tuple(parameters))
     ts = np.linspace(0.0, duration, points)
-    watch = Stopwatch()
+    options, watch = _options(study), Stopwatch()
     with connect(args) as client:
         result = scale.run(
             scene,
@@ -148,10 +148,10 @@ def run(args: argparse.Namespace) -> int:
             rows=study.get("rows", True),
             reductions={name: _reduction(name, one) for name, one in study.get("reductions", {}).items()},
             units={name: one["units"] for name, one in parameters.items() if isinstance(one, dict) and "units" in one},
-            client=client,
-            chunk=args.chunk,
-            progress=not args.quiet,
-            **_options(study),
+            resources=scale.Resources(
+                client, batch_size=options.pop("batch_size", None), chunk=args.chunk, progress=not args.quiet
+            ),
+            **options,
         )
     print(f"{result}\nin {watch}, compilation included.")
     return int(not result.success)

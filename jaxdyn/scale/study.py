@@ -20,6 +20,7 @@ from jaxdyn.scale.program import MEMORY_FRACTION, Members, Program, Traced, avai
 from jaxdyn.scale.reductions import QUANTITY, Reducer, Reduction, Results, quantities
 from jaxdyn.scale.store import Store, Variable, zarr_package
 from jaxdyn.simulation.export import dimensions, signals_as_given
+from jaxdyn.simulation.run import simulate
 
 OUTCOMES = ("successful", "failed")  # codes of functions that are no motions
 
@@ -84,6 +85,29 @@ def describe(
 
 
 # Functions of a module, not within others: cloudpickle sends them by name, so that workers use the code of their own jaxdyn.
+
+
+@dataclass(frozen=True, eq=False)
+class Rollout:
+    """A rollout of `run`, as a function of its parameters (or None) and of its row of the arrays."""
+
+    # A class, not a function within `run`: cloudpickle sends it by name, so that workers use the code of their own jaxdyn.
+    scene: Any
+    builds: bool
+    states: Callable | None
+    fixed: dict[str, np.ndarray]
+    control: Any
+    ts: np.ndarray
+    options: dict[str, Any]
+
+    def __call__(self, parameters: Any, row: Any) -> tuple[Any, Any]:
+        """Solution and scene."""
+        scene, control = self.scene(parameters) if self.builds else self.scene, self.control
+        # A control with parameters of the rollout has to be built with the scene.
+        if isinstance(scene, tuple):
+            scene, control = scene
+        q0, v0 = self.states(parameters) if self.states else ((row | self.fixed)[name] for name in ("q0", "v0"))
+        return simulate(scene, q0, v0, self.ts, control=control, throw=False, **self.options), scene
 
 
 def motion_values(rollout: Callable[[Any, Any], tuple[Any, Any]], parameters: Any, row: Any) -> Values:
