@@ -279,7 +279,7 @@ def assemble_delta() -> Callable:
         with tempfile.TemporaryDirectory() as folder:
             path = Path(folder) / "delta.xml"
             path.write_text(delta())
-            scene = jd.io.load_mjcf(path)
+            scene = jd.load(path)
         return jd.assemble(scene, scene.starts["reference"].q).q
 
     return load_and_assemble

@@ -11,8 +11,10 @@ from typing import Any
 import equinox as eqx
 import numpy as np
 
-from jaxdyn.io import LoadedScene, load_urdf
+from jaxdyn.io import LoadedScene, load_urdf, urdf_inertia_report
 from jaxdyn.io.formats import find_description, load
+from jaxdyn.io.xml_lines import XmlFile
+from jaxdyn.model import inertia
 from jaxdyn.model.arguments import as_path, parse_number
 from jaxdyn.model.builder import GRAVITY
 from jaxdyn.model.description import short as short
@@ -71,7 +73,7 @@ def add_model_options(parser: argparse.ArgumentParser, title: str = "model") -> 
     )
 
 
-def load_model(path: str, args: argparse.Namespace) -> Model:
+def load_model(path: str, args: argparse.Namespace, missing_inertia: Any = None) -> Model:
     """Load the model of a URDF file under the options of `add_model_options`."""
     # A model alone imposes no couplings, so that joints which follow others are free by default.
     model = load_urdf(
@@ -80,9 +82,31 @@ def load_model(path: str, args: argparse.Namespace) -> Model:
         lock=_lock(args),
         mimic=args.mimic or "ignore",
         gravity=GRAVITY if args.gravity is None else tuple(args.gravity),
+        missing_inertia=missing_inertia,
         arguments=xacro_arguments(args),
     )
     return _movable(model, path)
+
+
+def load_for_repair(path: str, args: argparse.Namespace) -> tuple[Model, list[str]]:
+    """Load a model, and the names of the massless moving links that were given a small ball.
+
+    Links are changed only if the file cannot be loaded as it is. The ball makes the mass matrix positive definite and changes the
+    motion of the other links little; the fit replaces it.
+
+    **Raises:** ValueError as `load_model`, where balls do not help.
+    """
+    try:
+        return load_model(path, args), []
+    except ValueError:
+        file = XmlFile(path, "URDF", xacro_arguments(args))
+        masses = [parse_number(mass.get("value", "0")) for mass in file.root.iterfind("link/inertial/mass")]
+        # A hundredth of the heaviest link, of 1 kg if no link has a mass.
+        ball = inertia.sphere(1e-2 * (max(masses, default=0.0) or 1.0), 0.05)
+        model = load_model(path, args, ball)
+        report = urdf_inertia_report(path, arguments=xacro_arguments(args))
+        massless = [name for name, problem in report if problem.startswith("massless") and name in model.body_names]
+        return model, massless
 
 
 def load_scene(path: str, args: argparse.Namespace) -> tuple[LoadedScene, pathlib.Path]:

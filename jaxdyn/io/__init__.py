@@ -10,12 +10,11 @@ from jaxdyn.io.loaded import LoadedScene as LoadedScene
 from jaxdyn.io.loaded import NotTakenWarning as NotTakenWarning
 from jaxdyn.io.loaded import Start as Start
 from jaxdyn.io.loaded import UnitsWarning as UnitsWarning
-from jaxdyn.io.mjcf import load_mjcf as load_mjcf
-from jaxdyn.io.sdf import load_sdf as load_sdf
 from jaxdyn.io.urdf import load_urdf as load_urdf
 from jaxdyn.io.urdf import urdf_inertia_report as urdf_inertia_report
 from jaxdyn.io.urdf_write import read_torque_terms as read_torque_terms
 from jaxdyn.io.urdf_write import save_urdf as save_urdf
+from jaxdyn.model.arguments import deprecated as _deprecated
 
 if _TYPE_CHECKING:
     from jaxdyn.io.logs import read_log as read_log
@@ -28,6 +27,8 @@ def __getattr__(name: str) -> _Any:
         from jaxdyn.io import logs
 
         return getattr(logs, name)
+    if name in ("load_mjcf", "load_sdf"):  # deprecated names, which warn when they are called
+        return _deprecated(f"jd.io.{name}", load)
     raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
 
 

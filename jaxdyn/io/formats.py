@@ -13,8 +13,8 @@ import numpy as np
 from jaxdyn.constraints.loops import model_couplings
 from jaxdyn.forces.elements import CoulombFriction, JointDamping
 from jaxdyn.io.loaded import LoadedScene, Start, summarize, warn_not_taken
-from jaxdyn.io.mjcf import load_mjcf
-from jaxdyn.io.sdf import load_sdf
+from jaxdyn.io.mjcf import read_mjcf
+from jaxdyn.io.sdf import read_sdf
 from jaxdyn.io.solids import FRICTION, check_choice, collision_of, contacts_with_ground, urdf_elements
 from jaxdyn.io.urdf import urdf_model
 from jaxdyn.io.urdf_loops import loop_constraints, motors_of, plugin_followers, read_closures
@@ -52,6 +52,12 @@ def load(
     plugins in `<gazebo>` elements (`jaxdyn.io.urdf_loops`). They close with `jd.assemble(scene, scene.starts["reference"].q)`.
     `load_urdf` returns the `Model` of the tree alone.
 
+    MJCF is compiled by the mujoco package. Joints have MuJoCo's coordinates (a free body's q is its pose in the world), and
+    velocities in body axes; `equality` elements are exact, where MuJoCo softens them. In SDF, a joint beyond a tree is a
+    constraint; zero coordinates are the placement of the file, and those of a free root are its link's pose in the world. In
+    both every body or link keeps a frame of its name, limits are the model's `lower` and `upper`, and "reference" is the
+    placement of the file. What of each format is supported is on the page on files.
+
     **Arguments:**
 
     - `source`: a path; or a name such as "go2_description" or "go2_mj_description", whose file robot_descriptions has in its
@@ -67,7 +73,8 @@ def load(
       links that touch it, as ["LF_FOOT", "RF_FOOT"]; None for none. They are `jd.contact.shape_contacts`, named by their link, in
       `.forces`. The ground is the file's planes and height fields that are fixed to the world, else the plane z = 0; URDF
       has none. A mesh counts by at most 12 vertices of its convex hull. Coefficients of friction are those of the file; in a URDF
-      `<mu1>` in the `<gazebo>` element of the link or `<lateral_friction>` in its `<contact>`, and 1 without.
+      `<mu1>` in the `<gazebo>` element of the link or `<lateral_friction>` in its `<contact>`, and 1 without; in SDF the
+      smaller `<mu>` of both; in MJCF by the rules of bits, priority, pairs and exclusions, zero for condim 1, without softness.
       Steps take time with the number of contacts cubed, and "ground" is refused where it gives more than 64: name the feet,
       and {"LF_FOOT": 1} for contacts in the lowest corner alone of their boxes and meshes, or {"LF_FOOT": 4} of a flat foot
       (`lowest` of `shape_contacts`, for `jd.stepper`).
@@ -75,7 +82,10 @@ def load(
       expands it to a URDF; lines in errors are those of the expanded text.
     - `dtype`: as for `ModelBuilder`.
 
-    **Returns:** `LoadedScene`.
+    **Returns:** `LoadedScene`: `.system`, `.constraints`, `.forces`, `.starts`, `.actuators`, `.sensors`, `.not_taken`.
+
+    **Warns:** `NotTakenWarning` naming elements that the scene does not represent; `UnitsWarning` where limits look like
+    degrees, or lengths and inertias like millimetres.
 
     **Raises:** ValueError for a file that does not exist or is of no known format, an unknown name (similar ones are listed), a
     robot that could not be downloaded, an option that the loader of the format does not have, loops between frames that
@@ -123,9 +133,9 @@ def load(
             raise ValueError(
                 f"floating_base is {floating_base}, but {path} is MJCF, which states it by <freejoint>; leave it out"
             )
-        return load_mjcf(path, contacts=contacts, dtype=dtype)
+        return read_mjcf(path, contacts=contacts, dtype=dtype)
     # None means the default of the format, which is a free base in SDF and a fixed one in URDF.
-    return load_sdf(path, floating_base=floating_base is not False, contacts=contacts, dtype=dtype)
+    return read_sdf(path, floating_base=floating_base is not False, contacts=contacts, dtype=dtype)
 
 
 def _urdf_scene(

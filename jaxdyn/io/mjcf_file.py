@@ -65,7 +65,7 @@ def compile_file(mujoco, path: str):
     if file.root.tag != "mujoco":
         raise file.fault(
             file.root,
-            f"the root element is <{file.root.tag}>, expected <mujoco>; load_urdf and load_sdf read those formats",
+            f"the root element is <{file.root.tag}>, expected <mujoco>; jd.load reads all formats",
         )
     if not file.is_utf8:
         raise ValueError(f"{path}:1: mujoco reads files in UTF-8 alone; save the file as UTF-8")

@@ -13,12 +13,12 @@ from jaxdyn.io.chains import Link, Names, add_chain, build_model
 from jaxdyn.io.loaded import LoadedScene, Start, summarize, summarize_all, warn_not_taken, warn_of_units
 from jaxdyn.io.sdf_frames import SdfFile
 from jaxdyn.io.sdf_joints import LOOPS, Axis, Edge, Joint, read_joints, spanning_tree
-from jaxdyn.io.solids import FRICTION, check_choice, collision_of, contacts_with_ground, sdf_elements
+from jaxdyn.io.solids import FRICTION, collision_of, contacts_with_ground, sdf_elements
 from jaxdyn.io.unread import SDF_FRAME, SDF_JOINT, SDF_LINK, SDF_MODEL, SDF_ROOT, SDF_WORLD, unread_parts
 from jaxdyn.io.urdf import ROOT_JOINT
 from jaxdyn.io.xml_lines import rounding_of_digits
 from jaxdyn.model import host_math
-from jaxdyn.model.arguments import Checked, DType
+from jaxdyn.model.arguments import DType
 from jaxdyn.model.builder import GRAVITY, ModelBuilder
 from jaxdyn.model.joints import joint_neutral
 from jaxdyn.model.topology import body_index
@@ -31,56 +31,19 @@ _PARALLEL = 1e-4  # files give right angles with four or five digits
 _MIMIC = (("multiplier", 1.0), ("offset", 0.0), ("reference", 0.0))
 
 
-def load_sdf(
-    path: str | os.PathLike,
-    *,
-    floating_base: bool = True,
-    contacts: Checked[str | Iterable[str] | None] = None,
-    dtype: DType | None = None,
-) -> LoadedScene:
-    """Load the scene of an SDF file, with its loops. Meshes are not read, and no other package is needed.
+def read_sdf(path: str | os.PathLike, *, floating_base: bool, contacts, dtype: DType | None) -> LoadedScene:
+    """Scene of an SDF file, with options as of `jd.load`.
 
-    Supported are links with their inertias, all joints (of two axes as two joints, JOINT and JOINT_axis2), limits (as the
-    model's `lower`, `upper`), damping, dry friction and springs of joints, gearboxes and mimicked axes as couplings,
-    frames, nested models (their names start with MODEL::), static models, and the world's gravity. A joint that closes a
-    loop becomes a constraint; the choice keeps coordinates for springs, damping and limits, and cuts ball joints
-    first (`jaxdyn.io.sdf_joints.spanning_tree`). Defaults of the format apply: a link without
-    <inertial> has 1 kg and 1 kg m^2 about each axis.
-
-    `load_urdf` returns a `Model`, since a URDF describes only a tree; `load_mjcf` and `load_sdf` return a
-    `LoadedScene`, a `Scene` with that model as `.system`.
-
-    Coordinates: zero is the placement of the file; a positive angle rotates the child relative to the parent about the axis,
-    also where the tree runs from child to parent. The coordinates of a free root (joint "root_joint", or LINK_root_joint
-    of several) are its link's pose in the world. Every link keeps a frame of its name.
-
-    **Arguments:**
-
-    - `path`: the file.
-    - `floating_base`: whether parts without a joint to the world move freely, the default of the format; False fixes the root
-      links at the file's placement. The root of a part is its model's canonical link.
-    - `contacts`: "ground" for contacts of the collisions of all links with the planes of static models (with the plane z = 0
-      where there are none), or a list of the links that touch it, as for `jd.load`. The coefficient of friction is the smaller
-      `<mu>` in `<surface><friction><ode>` of both, by default 1, as Gazebo takes it. None: no contacts.
-    - `dtype`: as for `ModelBuilder`.
-
-    **Returns:** `LoadedScene`: `.system`, `.constraints`, `.forces` (springs, damping, and dry friction smoothed at
-    0.01 rad/s, `CoulombFriction`), `.starts` ("reference" is the placement of the file, on which all loops close),
-    `.actuators` (None), `.not_taken`. Gravity is that of the file's world (its default is 9.8 m/s^2), 9.81 m/s^2
-    downwards where the file has no world.
-
-    **Warns:** `NotTakenWarning` naming unsupported elements: collisions without contacts, sensors, plugins, includes, screws that
-    close loops, springs and damping of joints that close loops, and the like.
-
-    Elements and attributes that the format does not have are named too.
-
-    `UnitsWarning` where limits look like degrees, or lengths and inertias like millimetres.
+    A joint that closes a loop becomes a constraint; the choice keeps coordinates for springs, damping and limits, and cuts ball
+    joints first (`spanning_tree`). Two axes of one joint are two joints, JOINT and JOINT_axis2; names in nested models start with
+    MODEL::.
+    A positive angle rotates the child relative to the parent about the axis, also where the tree runs from child to parent. Free
+    roots have the joint "root_joint", or LINK_root_joint of several; the root of a part is its model's canonical link.
 
     **Raises:** ValueError with file and line for a file that cannot be read, malformed XML, entity declarations,
     another version, unknown names or types, reserved names, a part that is given twice, cyclic poses, bad numbers, an inertia
     that is to be computed from shapes, or whose pose is relative to another frame; for a joint that moves no inertia.
     """
-    contacts = check_choice(contacts)
     file = SdfFile(path)
     joints = read_joints(file)
     # A gearbox couples two other joints; as an edge of the graph it would close a loop that does not exist.

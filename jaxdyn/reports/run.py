@@ -2,7 +2,6 @@
 
 import datetime
 import time
-import warnings
 from collections.abc import Callable, Iterable, Sequence
 from pathlib import Path
 
@@ -47,7 +46,6 @@ def report(
     out: str | Path | None = None,
     peers: Peers | None = None,
     echo: Callable[[str], object] | None = None,
-    ways: Sequence[Sequence[str]] | None = None,
 ) -> Report:
     """Measure error against run time of scenes with every sensible method and solver.
 
@@ -64,7 +62,6 @@ def report(
     - `out`: directory for report.json, report.txt and report.html.
     - `peers(prepared, dtype, starts)` -> contestants that are timed in the same loop; see `jaxdyn.reports.measurement.measure`.
     - `echo`: receives lines of progress, e.g. `print`.
-    - `ways`: the former name of `integrators`.
 
     **Returns:** a `Report`; `print(report.table())`; `jaxdyn.reports.write(report, directory)` writes its page.
 
@@ -75,9 +72,6 @@ def report(
     quick = jd.report("pendulum_in_plane")
     ```
     """
-    if ways is not None:
-        warnings.warn("`ways` of jd.report is deprecated; pass `integrators`", DeprecationWarning, stacklevel=2)
-        integrators = ways
     # Before anything is measured, since a report may run for hours.
     chosen = _check_arguments(scenes, dtypes, batches, integrators, rounds)
     if out is not None:

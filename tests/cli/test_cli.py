@@ -105,7 +105,6 @@ def test_info_of_a_real_robot_says_what_is_not_used(panda, capsys):
     assert main(["info", str(panda)]) == 0
     text = capsys.readouterr().out
     assert "panda_hand_tcp" in text
-    assert "11 <visual>" in text
     assert "<mimic>" in text
 
 

@@ -23,13 +23,14 @@ def test_dtypes_bases_and_gravity(tmp_path):
         (tmp_path / name).write_text(text)
     readers = (
         lambda dtype: jd.io.load(tmp_path / "r.urdf", dtype=dtype).system,
-        lambda dtype: jd.io.load_mjcf(tmp_path / "b.xml", dtype=dtype).system,
-        lambda dtype: jd.io.load_sdf(tmp_path / "m.sdf", dtype=dtype).system,
+        lambda dtype: jd.load(tmp_path / "b.xml", dtype=dtype).system,
+        lambda dtype: jd.load(tmp_path / "m.sdf", dtype=dtype).system,
     )
     for read in readers:
         assert read(jnp.float32).home.dtype == np.float32 and read(jnp.float64).home.dtype == np.float64
-    assert jd.io.load_sdf(tmp_path / "m.sdf").system.nv == 7
-    assert jd.io.load_sdf(tmp_path / "m.sdf", floating_base=False).system.nv == 1
+    with pytest.warns(DeprecationWarning, match=r"jd\.io\.load_sdf is deprecated; call load"):
+        assert jd.io.load_sdf(tmp_path / "m.sdf").system.nv == 7
+    assert jd.load(tmp_path / "m.sdf", floating_base=False).system.nv == 1
     for g in (1.62, 9.81):
         model = jd.io.load(tmp_path / "r.urdf", gravity=(0.0, 0.0, -g)).system
         torque = jd.gravity_force(model, jnp.array([0.3]))

@@ -253,8 +253,8 @@ def test_forces_that_do_not_fit_are_named():
 
 def test_paths(tmp_path, monkeypatch):
     monkeypatch.setenv("HOME", str(tmp_path))
-    for load in (jd.load_urdf, jd.io.load_sdf):
-        with pytest.raises(ValueError, match="path is None; pass the path of a file"):
+    for load in (jd.load_urdf, jd.load):
+        with pytest.raises(ValueError, match=r"(path|source) is None; pass the path of a file"):
             load(None)
     jd.save_urdf(ARM, "~/arm.urdf")
     assert (tmp_path / "arm.urdf").exists()

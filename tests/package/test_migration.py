@@ -56,7 +56,7 @@ def of_mujoco(tmp_path):
     (tmp_path / "arm.xml").write_text(ARM)
     m = mujoco.MjModel.from_xml_path(str(tmp_path / "arm.xml"))
     d = mujoco.MjData(m)
-    robot = jd.io.load_mjcf(tmp_path / "arm.xml").system
+    robot = jd.load(tmp_path / "arm.xml").system
     q, v = np.array([0.3, -0.5, 0.8]), np.array([0.4, 0.2, -0.6])
     d.qpos[:], d.qvel[:] = q, v
     mujoco.mj_forward(m, d)

@@ -268,7 +268,7 @@ model = jd.robots.chain(2)
 jd.forward_dynamics(model, np.ones(2), np.ones(2), np.ones(2))
 jax.jit(jax.grad(lambda q: jd.potential_energy(model, q)))(np.ones(2, np.float32))
 jd.scenes.four_bar()
-jd.io.load_mjcf
+jd.load
 names = {"diffrax", "lineax", "matplotlib", "optax", "optimistix", "scipy", "jaxdyn.simulation"}
 assert not names & sys.modules.keys(), names & sys.modules.keys()
 """)
