@@ -16,8 +16,17 @@ import numpy as np
 from jaxdyn.contact.height_field import HeightField
 from jaxdyn.contact.unilateral import UnilateralContact
 from jaxdyn.forces.elements import CoulombFriction, JointDamping, JointSpring
-from jaxdyn.io.chains import Link, Names, add_chain, build_model
-from jaxdyn.io.loaded import LoadedScene, Start, summarize, warn_not_taken, warn_of_units
+from jaxdyn.io.loaded import (
+    Link,
+    LoadedScene,
+    Names,
+    Start,
+    add_chain,
+    build_model,
+    summarize,
+    warn_not_taken,
+    warn_of_units,
+)
 from jaxdyn.io.mjcf_file import (
     BALL,
     FREE,
@@ -37,7 +46,7 @@ from jaxdyn.io.xml_lines import LARGEST_ROUNDING, XmlFile, rounding_of_digits
 from jaxdyn.model import host_math
 from jaxdyn.model.arguments import DType, as_path
 from jaxdyn.model.builder import ModelBuilder
-from jaxdyn.model.joints import joint_neutral
+from jaxdyn.model.configuration import neutral
 from jaxdyn.model.tree import Model
 
 _HEIGHT_FIELD = 1  # mjtGeom
@@ -261,7 +270,7 @@ def _starts(file: CompiledFile, model: Model, drives) -> dict[str, Start]:
 def _state(file: CompiledFile, model: Model, qpos, qvel) -> tuple[np.ndarray, np.ndarray]:
     """Convert MuJoCo's state to the model's coordinates."""
     m = file.m
-    q = np.concatenate([np.zeros(0), *(joint_neutral(kind) for kind in model.topology.kinds)])
+    q = np.array(neutral(model), float)
     v = np.zeros(model.nv)
     for j, name in enumerate(file.joints):
         i = model.joint_names.index(name)

@@ -6,8 +6,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from jaxdyn.dynamics.kinematics import named_frame
-from jaxdyn.io.chains import Names
-from jaxdyn.io.loaded import summarize
+from jaxdyn.io.loaded import Names, summarize
 from jaxdyn.io.xml_lines import XmlFile
 from jaxdyn.model import host_math
 from jaxdyn.model.tree import Model

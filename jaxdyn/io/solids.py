@@ -14,9 +14,8 @@ from jaxdyn.contact.shapes import Box, Capsule, ConvexHull, hull_vertices
 from jaxdyn.contact.surfaces import Cylinder, Ellipsoid, Plane, Sphere
 from jaxdyn.contact.unilateral import UnilateralContact
 from jaxdyn.dynamics.kinematics import named_frame
-from jaxdyn.io.chains import Names
-from jaxdyn.io.loaded import summarize
-from jaxdyn.io.sdf_frames import SdfFile
+from jaxdyn.io.loaded import Names, summarize
+from jaxdyn.io.sdf_file import SdfFile
 from jaxdyn.io.xml_lines import XmlFile
 from jaxdyn.model import host_math
 from jaxdyn.model.builder import unknown

@@ -2,16 +2,17 @@
 
 import dataclasses
 import os
-from collections.abc import Iterator, Mapping
+from collections.abc import Mapping
 from typing import Any
 
 import numpy as np
 
 from jaxdyn.io.loaded import NotTakenWarning
 from jaxdyn.io.mjcf_file import assign_names, compile_file, import_mujoco, pose_of
-from jaxdyn.io.sdf_frames import SdfFile
+from jaxdyn.io.sdf_file import SdfFile
 from jaxdyn.io.solids import Element, geom_solid, sdf_elements, urdf_elements
 from jaxdyn.io.xml_lines import XmlFile
+from jaxdyn.model import host_math
 from jaxdyn.model.arguments import warn
 
 _SIDES = 24  # of a circle
@@ -84,20 +85,9 @@ def rod(frame: str | None, start, end, radius: float, **options) -> Shape:
     """Capsule between two points (3,) in the frame."""
     start, end = np.asarray(start, float), np.asarray(end, float)
     length = float(np.linalg.norm(end - start))
-    return Shape(frame, "capsule", (radius, length), along((start + end) / 2, end - start), **options)
-
-
-def along(place, direction) -> np.ndarray:
-    """Pose (4, 4) at a position with z along a direction; the identity rotation for a zero direction."""
-    pose, length = np.eye(4), np.linalg.norm(direction)
-    pose[:3, 3] = place
-    if length > 0:
-        z = np.asarray(direction, float) / length
-        # The unit vector least parallel to z keeps the cross product well conditioned.
-        helper = np.eye(3)[np.argmin(np.abs(z))]
-        x = np.cross(helper, z) / np.linalg.norm(np.cross(helper, z))
-        pose[:3, :3] = np.stack([x, np.cross(z, x), z], axis=1)
-    return pose
+    pose = host_math.rotation_from_z((end - start) / length) if length > 0 else np.eye(4)
+    pose[:3, 3] = (start + end) / 2
+    return Shape(frame, "capsule", (radius, length), pose, **options)
 
 
 def _triangles(kind: str, size: tuple[float, ...]) -> tuple[np.ndarray, np.ndarray]:
@@ -166,15 +156,6 @@ def sharpen(vertices: np.ndarray, faces: np.ndarray, angle: float = 0.6) -> tupl
     return np.asarray(mesh.vertices), np.asarray(mesh.faces)
 
 
-def by_frame(shapes: Shapes) -> Iterator[tuple[str | None, tuple | None, float, list[Shape]]]:
-    """Yield the solids in groups of equal frame, colour and opacity."""
-    groups: dict[tuple, list[Shape]] = {}
-    for shape in shapes:
-        groups.setdefault((shape.frame, shape.color, shape.opacity), []).append(shape)
-    for (frame, color, opacity), members in groups.items():
-        yield frame, color, opacity, members
-
-
 def merge_meshes(parts) -> tuple[np.ndarray, np.ndarray]:
     """Merge several meshes."""
     import trimesh
@@ -197,8 +178,9 @@ def shapes(
 ) -> Shapes:
     """Read the visual solids of a URDF, MJCF or SDF file, for `jd.view`, `jd.pictures.save_html` and `jd.draw`.
 
-    A model holds no geometry, so the file is read again. Meshes are STL, DAE, OBJ, PLY or
-    GLB files, searched at the path given in the file, `package://` and `model://` in the folders above the file and
+    They are the elements <visual>, or the geoms of groups 0 to 2, which MuJoCo shows, without planes and height fields. A body
+    whose mesh is missing is drawn by its inertia. A model holds no geometry, so the file is read again. Meshes are STL, DAE, OBJ,
+    PLY or GLB files, searched at the path given in the file, `package://` and `model://` in the folders above the file and
     in those of ROS_PACKAGE_PATH, AMENT_PREFIX_PATH and GZ_SIM_RESOURCE_PATH.
 
     **Arguments:** `path`, the file; its root element determines the format. `arguments`, `packages`: of a xacro file, as for
