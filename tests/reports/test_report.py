@@ -20,7 +20,6 @@ from jaxdyn.cli import main
 from jaxdyn.contact.unilateral import has_modes
 from jaxdyn.reports import Record, Report, html_page, pareto_front
 from jaxdyn.reports import run as running
-from jaxdyn.reports.measurement import Contestant, Motion, evaluations, ladder, measure, time_interleaved
 from jaxdyn.reports.page import SceneReference
 from jaxdyn.reports.programs import FIXED, SOLVERS, Case, Programs, Reference, case_of_scene, prepare
 from jaxdyn.reports.references import (
@@ -38,6 +37,7 @@ from jaxdyn.reports.references import (
     turntable,
     windows,
 )
+from jaxdyn.reports.run import Contestant, Motion, evaluations, ladder, measure, time_interleaved
 from jaxdyn.simulation.checks import choose_method
 from jaxdyn.simulation.solvers import RK4
 from jaxdyn.simulation.solvers.choice import choose_solver
