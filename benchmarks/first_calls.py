@@ -42,7 +42,7 @@ def robot(file: str, floating: bool, lock: tuple[str, ...]):
 
     import jaxdyn as jd
 
-    model = jd.load_urdf(robot_file(file), floating_base=floating, lock=lock)
+    model = jd.load_model(robot_file(file), floating_base=floating, lock=lock)
     return model, jd.neutral(model), jnp.full(model.nv, 0.1), jnp.zeros(model.nv)
 
 

@@ -11,8 +11,7 @@ from typing import Any
 import equinox as eqx
 import numpy as np
 
-from jaxdyn.io import LoadedScene, load_urdf, urdf_inertia_report
-from jaxdyn.io.formats import find_description, load
+from jaxdyn.io import LoadedScene, formats, urdf_inertia_report
 from jaxdyn.io.xml_lines import XmlFile
 from jaxdyn.model import inertia
 from jaxdyn.model.arguments import as_path, parse_number
@@ -76,7 +75,7 @@ def add_model_options(parser: argparse.ArgumentParser, title: str = "model") -> 
 def load_model(path: str, args: argparse.Namespace, missing_inertia: Any = None) -> Model:
     """Load the model of a URDF file under the options of `add_model_options`."""
     # A model alone imposes no couplings, so that joints which follow others are free by default.
-    model = load_urdf(
+    model = formats.load_model(
         path,
         floating_base=args.floating_base,
         lock=_lock(args),
@@ -113,12 +112,14 @@ def load_scene(path: str, args: argparse.Namespace) -> tuple[LoadedScene, pathli
     """Load the scene of a file or a named robot under the options of `add_model_options`; return it with its file."""
     file = as_path(path, "file")
     if not file.suffix and not file.exists():
-        file = find_description(path)
+        file = formats.find_description(path)
     if args.floating_base and args.fixed_base:
         raise ValueError("--floating-base and --fixed-base contradict each other; give one of them")
     # Neither option: None, for the default of the format.
     floating = False if args.fixed_base else True if args.floating_base else None
-    scene = load(file, floating_base=floating, lock=_lock(args), mimic=args.mimic, arguments=xacro_arguments(args))
+    scene = formats.load(
+        file, floating_base=floating, lock=_lock(args), mimic=args.mimic, arguments=xacro_arguments(args)
+    )
     _movable(scene.system, path)
     if args.gravity is not None:
         scene = eqx.tree_at(lambda s: s.system, scene, scene.system.replace(gravity=np.array(args.gravity)))

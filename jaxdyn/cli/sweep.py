@@ -14,7 +14,7 @@ import numpy as np
 
 from jaxdyn import scale, scenes
 from jaxdyn.cli.common import Stopwatch, add_cluster_options, check_least, check_memory, connect, whole
-from jaxdyn.io import load_urdf
+from jaxdyn.io import load_model
 from jaxdyn.model.arguments import as_path
 from jaxdyn.model.configuration import integrate, neutral
 from jaxdyn.simulation.events import events_of
@@ -259,7 +259,7 @@ def _scene(name: str, path: pathlib.Path, parameters: tuple[str, ...]) -> tuple[
             raise ValueError(f"{file} has no function {' and '.join(missing)} of the parameters")
         return module.scene, module.states
     if file.suffix == ".urdf":
-        model = load_urdf(file)
+        model = load_model(file)
         if unknown := set(parameters) - {"q0", "v0"}:
             raise ValueError(f"{path}: parameters of a .urdf are q0 and v0, not {', '.join(sorted(unknown))}")
 

@@ -57,7 +57,7 @@ class _Edge(NamedTuple):
 def save_urdf(
     model: Model, path: str | os.PathLike, *, torques: Mapping[str, Mapping[str, float]] | None = None
 ) -> None:
-    """Write a model as a URDF file; `load_urdf` returns the same model, to rounding.
+    """Write a model as a URDF file; `load_model` returns the same model, to rounding.
 
     Bodies become links, other frames become links on fixed joints; merged links stay merged. A single root body on
     a free joint "root_joint" becomes the root link (load it with `floating_base=True`); otherwise the root is a frame

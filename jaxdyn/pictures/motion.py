@@ -76,7 +76,7 @@ def drawable(scene: Any) -> Scene:
     if not isinstance(scene.system, Model):
         raise ValueError(
             f"the system is a {type(scene.system).__name__}, which has no bodies to draw; a Model has (jd.ModelBuilder, "
-            "jd.load_urdf, ...). Its coordinates over time: jd.plot.states(scene, solution)"
+            "jd.load_model, ...). Its coordinates over time: jd.plot.states(scene, solution)"
         )
     return scene
 

@@ -78,7 +78,7 @@ def test_info_locks_floats_and_repairs(arm, tmp_path, capsys):
     out = tmp_path / "repaired.urdf"
     assert main(["info", str(arm), "--lock", "lift=0.1", "--repair", str(out)]) == 0
     assert "2 degrees of freedom" in capsys.readouterr().out
-    repaired = jd.load_urdf(out)
+    repaired = jd.load_model(out)
     assert jd.model.inertia_report(repaired) == []
     np.testing.assert_allclose(repaired.inertias[:, 0].sum(), 4.5, rtol=1e-12)
     # The inertia of a base that is fixed to the world is not in the model, nor in the file: such a base cannot float.
@@ -103,7 +103,7 @@ def test_simulate_writes_the_motion_that_the_library_computes(arm, tmp_path, cap
     drift = float(text.split("at most ")[1].split(" J")[0])
     assert drift < 1e-7
     columns = columns_of(out)
-    model = jd.load_urdf(arm)
+    model = jd.load_model(arm)
     names = [f"{signal}_{joint}" for signal in ("q", "v", "tau") for joint in model.joint_names]
     assert [name.partition(" [")[0] for name in columns] == ["t", *names, "energy", "work"]
     log = read_log(out, joint_names=model.joint_names)
@@ -172,7 +172,7 @@ def test_identify_the_recorded_panda_from_raw_samples(panda, franka, tmp_path, c
     assert report["samples"] == {"train": 1744, "test": 748, "final": 2492}
 
     # What was written is what was fitted to all samples: bodies that exist, and with the offsets of the report the same torques.
-    fitted = jd.load_urdf(out)
+    fitted = jd.load_model(out)
     assert jd.model.inertia_report(fitted) == []
     log = jd.identify.from_raw(t, q, tau, trim=38 * 8)  # as the command does
     x = jd.identify.nominal_parameters(fitted)
@@ -243,7 +243,7 @@ def simulated_logs(model, folder, seeds, noise=0.0, delay=0.0, gains=1.0):
 @pytest.mark.long
 def test_identify_chooses_the_cutoff_and_warns_of_vibration(arm, tmp_path, capsys):
     """Raw logs of a motion up to 0.5 Hz, torques that vibrate at 9 Hz."""
-    model = jd.model.repair_inertias(jd.load_urdf(arm))
+    model = jd.model.repair_inertias(jd.load_model(arm))
     paths = []
     for seed in range(2):
         rng = np.random.default_rng(seed)
@@ -277,7 +277,7 @@ def test_identify_chooses_the_cutoff_and_warns_of_vibration(arm, tmp_path, capsy
 @pytest.mark.long
 def test_identify_from_several_logs_judged_on_another(arm, tmp_path, capsys):
     """Two logs fitted, one only predicted; JSON, page and URDF; what is not asked for is not tried."""
-    truth = jd.model.repair_inertias(jd.load_urdf(arm))
+    truth = jd.model.repair_inertias(jd.load_model(arm))
     a, b, c = simulated_logs(truth, tmp_path, (0, 1, 2), noise=0.01)
     out, page, report = (tmp_path / name for name in ("fitted.urdf", "fit.html", "fit.json"))
     wrong = tmp_path / "wrong.urdf"
@@ -297,7 +297,7 @@ def test_identify_from_several_logs_judged_on_another(arm, tmp_path, capsys):
     # Quadratic and viscous friction explain the same torque in part.
     assert set(sources.values()) <= {"data", "prior", "bound", "confounded"}
     assert all(name.endswith(("viscous", "coulomb", "quadratic")) for name, x in sources.items() if x == "confounded")
-    assert jd.model.inertia_report(jd.load_urdf(out)) == []
+    assert jd.model.inertia_report(jd.load_model(out)) == []
     # Nothing outside of the page: names of XML are the only addresses.
     text = page.read_text()
     assert "<svg" in text and text.count("http") == text.count("http://www.w3.org/")
@@ -306,7 +306,7 @@ def test_identify_from_several_logs_judged_on_another(arm, tmp_path, capsys):
 
 def test_identify_from_one_file_and_the_robot_it_writes(arm, tmp_path, capsys, monkeypatch):
     """Options of a file, overruled by the command line; Pinocchio and MuJoCo read the URDF, we its offsets and terms too."""
-    truth = jd.model.repair_inertias(jd.load_urdf(arm))
+    truth = jd.model.repair_inertias(jd.load_model(arm))
     simulated_logs(truth, tmp_path, (0, 1, 2), noise=0.01)
     jd.save_urdf(truth, tmp_path / "true.urdf")
     monkeypatch.chdir(tmp_path)
@@ -329,7 +329,7 @@ def test_identify_from_one_file_and_the_robot_it_writes(arm, tmp_path, capsys, m
     assert {torques[name]["v_s"] for name in truth.joint_names} == {0.02}
     assert [torques[name]["quadratic"] for name in truth.joint_names] == computed["extra_terms"]["quadratic"]
     read = pinocchio.buildModelFromUrdf(str(tmp_path / "fitted.urdf"))
-    fitted = jd.load_urdf(tmp_path / "fitted.urdf")
+    fitted = jd.load_model(tmp_path / "fitted.urdf")
     np.testing.assert_allclose(read.friction, fitted.friction, rtol=1e-12)
     np.testing.assert_allclose(read.damping, fitted.damping, rtol=1e-12)
     body = mujoco.MjModel.from_xml_path(str(tmp_path / "fitted.urdf"))
@@ -372,7 +372,7 @@ def test_files_of_options_are_refused(text, error, tmp_path, monkeypatch, capsys
 @pytest.mark.long
 def test_identify_finds_delays(arm, tmp_path, capsys, monkeypatch):
     """20 ms: found, printed, in both reports, judged on shifted logs, counted in a payload; given as a number, the same fit."""
-    truth = jd.model.repair_inertias(jd.load_urdf(arm))
+    truth = jd.model.repair_inertias(jd.load_model(arm))
     jd.save_urdf(truth, tmp_path / "true.urdf")
     simulated_logs(truth, tmp_path, (0, 1), noise=0.005, delay=0.02)
     held = truth.replace(inertias=truth.inertias.at[-1].add(jd.inertia.sphere(0.7, 0.05)))
@@ -410,7 +410,7 @@ def test_identify_finds_delays(arm, tmp_path, capsys, monkeypatch):
 
 
 def test_identify_repairs_a_link_of_zero_inertia(arm, tmp_path, capsys):
-    truth = jd.model.repair_inertias(jd.load_urdf(arm))
+    truth = jd.model.repair_inertias(jd.load_model(arm))
     a, b = simulated_logs(truth, tmp_path, (0, 1), noise=0.01)
     path = tmp_path / "zero.urdf"
     jd.save_urdf(truth.replace(inertias=truth.inertias.at[1, 4:].set(0.0).at[2].set(0.0)), path)
@@ -422,7 +422,7 @@ def test_identify_repairs_a_link_of_zero_inertia(arm, tmp_path, capsys):
 
 
 def test_identify_a_payload(arm, tmp_path, capsys):
-    truth = jd.model.repair_inertias(jd.load_urdf(arm))
+    truth = jd.model.repair_inertias(jd.load_model(arm))
     path, report = tmp_path / "true.urdf", tmp_path / "fit.json"
     jd.save_urdf(truth, path)
     held = jd.inertia.displaced(jd.inertia.sphere(0.7, 0.05), (0.05, 0, 0.1))
@@ -445,7 +445,7 @@ def test_identify_a_payload(arm, tmp_path, capsys):
 @pytest.mark.long
 def test_identify_the_gains_of_drives_from_a_known_payload(arm, tmp_path, capsys):
     """Currents of three drives; what is written is then the robot in newton metres."""
-    truth = jd.model.repair_inertias(jd.load_urdf(arm))
+    truth = jd.model.repair_inertias(jd.load_model(arm))
     jd.save_urdf(truth, tmp_path / "true.urdf")
     held = jd.inertia.displaced(jd.inertia.sphere(0.7, 0.05), (0.05, 0, 0.1))
     (tmp_path / "held").mkdir()
@@ -475,7 +475,7 @@ def test_identify_the_gains_of_drives_from_a_known_payload(arm, tmp_path, capsys
 
 @pytest.mark.long
 def test_identify_chooses_for_several_logs(arm, tmp_path, capsys):
-    truth = jd.model.repair_inertias(jd.load_urdf(arm))
+    truth = jd.model.repair_inertias(jd.load_model(arm))
     a, b = simulated_logs(truth, tmp_path, (0, 1), noise=0.01)
     path = tmp_path / "true.urdf"
     jd.save_urdf(truth, path)
@@ -488,7 +488,7 @@ def test_identify_chooses_for_several_logs(arm, tmp_path, capsys):
 
 def test_identify_recovers_a_simulated_arm(arm, tmp_path, capsys):
     """Noise-free samples at 100 Hz, filtered beforehand: the true base parameters come back."""
-    truth = jd.load_urdf(arm)
+    truth = jd.load_model(arm)
     (path,) = simulated_logs(truth, tmp_path, (0,))
     wrong = tmp_path / "wrong.urdf"
     inertias = np.array(truth.inertias)
@@ -507,7 +507,7 @@ def test_identify_recovers_a_simulated_arm(arm, tmp_path, capsys):
 def test_identify_by_trajectory_from_a_log_taken_as_filtered(arm, tmp_path, capsys):
     """A log that the command line itself simulated, accelerations left out: the mass error of a fifth is found."""
     log, wrong, out = tmp_path / "log.csv", tmp_path / "wrong.urdf", tmp_path / "fitted.urdf"
-    model = jd.model.repair_inertias(jd.load_urdf(arm))
+    model = jd.model.repair_inertias(jd.load_model(arm))
     jd.save_urdf(model, tmp_path / "true.urdf")
     jd.save_urdf(model.replace(inertias=1.2 * model.inertias), wrong)
     motion = ["--torque", "gravity+random", "--duration", "3", "--sample", "0.01", "--friction", "0", "--seed", "2"]
@@ -794,7 +794,7 @@ def test_calibrate(tmp_path, capsys):
         (tmp_path / name).write_text(arm.format(links="".join(links)))
         return str(tmp_path / name)
 
-    nominal, true = write("nominal.urdf", 0.0), jd.load_urdf(write("true.urdf", 0.004))
+    nominal, true = write("nominal.urdf", 0.0), jd.load_model(write("true.urdf", 0.004))
     poses = tmp_path / "poses.csv"
     assert main(["calibrate", nominal, "--frame", "l2", "--choose", "30", "--marker", "--out", str(poses)]) == 0
     header, *rows = poses.read_text().splitlines()
@@ -815,7 +815,7 @@ def test_calibrate(tmp_path, capsys):
     # of a marker beside it would determine.
     assert "error on the 6 poses held out" in text and "24 poses determine" in text
     assert float(text.split("held out: ")[1].split(" mm")[0]) < 0.1
-    fitted = jd.load_urdf(out)
+    fitted = jd.load_model(out)
     assert fitted.joint_names == ("j0", "j1", "j2")
     seen = np.stack(
         [

@@ -253,12 +253,12 @@ def test_forces_that_do_not_fit_are_named():
 
 def test_paths(tmp_path, monkeypatch):
     monkeypatch.setenv("HOME", str(tmp_path))
-    for load in (jd.load_urdf, jd.load):
+    for load in (jd.load_model, jd.load):
         with pytest.raises(ValueError, match=r"(path|source) is None; pass the path of a file"):
             load(None)
     jd.save_urdf(ARM, "~/arm.urdf")
     assert (tmp_path / "arm.urdf").exists()
-    assert jd.load_urdf("~/arm.urdf").joint_names == ARM.joint_names
+    assert jd.load_model("~/arm.urdf").joint_names == ARM.joint_names
     with pytest.raises(ValueError, match=r"--out nowhere/a\.csv: there is no directory nowhere"):
         output_path("nowhere/a.csv", (".csv",), "--out")
 

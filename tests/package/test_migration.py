@@ -41,7 +41,7 @@ def agree(section: str, theirs: dict, ours: dict, rtol: float) -> None:
 @pytest.mark.slow
 def test_calls_of_pinocchio(robots_dir):
     path = str(robots_dir / "ur_description" / "urdf" / "ur5_robot.urdf")
-    model, robot = pin.buildModelFromUrdf(path), jd.load_urdf(path)
+    model, robot = pin.buildModelFromUrdf(path), jd.load_model(path)
     q, v, a, tau, u = np.random.default_rng(0).normal(size=(5, robot.nv)) * 0.5
     tip = model.frames[model.nframes - 1].name
     names = {"model": model, "data": model.createData(), "pin": pin, "W": pin.LOCAL_WORLD_ALIGNED}

@@ -743,7 +743,7 @@ def test_sweep_draws_for_scenes_by_name_and_for_files(tmp_path, capsys):
     table = xarray.open_zarr(tmp_path / "a.zarr", chunks=None)
     # XLA may draw a number anew where it is used, and contracts products and sums as it likes: the last digit differs.
     np.testing.assert_allclose(table.q[:, 0], table.parameter_q0, rtol=4e-16)
-    assert list(table.coordinate.values) == list(jd.load_urdf(tmp_path / "arm.urdf").joint_names)
+    assert list(table.coordinate.values) == list(jd.load_model(tmp_path / "arm.urdf").joint_names)
     study.write_text(head + 'scene = "chaplygin_sleigh"\n[parameters]\nmass = { uniform = [1.0, 2.0] }\n')
     assert main(["sweep", str(study), "--quiet", "--out", str(tmp_path / "b.zarr")]) == 0
     drawn = xarray.open_zarr(tmp_path / "b.zarr", chunks=None)
