@@ -6,6 +6,8 @@ or rods between joints and solids of the bodies' inertias (`inferred`). Where th
 when it is used.
 """
 
+from types import ModuleType as _ModuleType
+
 from jaxdyn.pictures import plot as plot
 from jaxdyn.pictures.drawing import animate as animate
 from jaxdyn.pictures.drawing import draw as draw
@@ -16,19 +18,7 @@ from jaxdyn.pictures.solids import Shape as Shape
 from jaxdyn.pictures.solids import Shapes as Shapes
 from jaxdyn.pictures.solids import shapes as shapes
 
-__all__ = [
-    "Shape",
-    "Shapes",
-    "Viewer",
-    "animate",
-    "draw",
-    "plot",
-    "save_html",
-    "shapes",
-    "view",
-]
-
 
 def __dir__() -> list[str]:
-    """Names of the namespace; its modules are internal."""
-    return __all__
+    """Names of the namespace; of its modules `plot` alone is public."""
+    return [x for x, value in globals().items() if x == "plot" or (x[0] != "_" and not isinstance(value, _ModuleType))]

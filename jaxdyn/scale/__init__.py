@@ -6,6 +6,8 @@ a chunk, here or on a Dask worker (`jaxdyn.tasks`); `store` keeps the chunks (Za
 xarray and filelock, of the extra `scale`, are imported when a store is opened.
 """
 
+from types import ModuleType as _ModuleType
+
 from jaxdyn.scale.program import member as member
 from jaxdyn.scale.reductions import Histogram as Histogram
 from jaxdyn.scale.reductions import Mean as Mean
@@ -17,20 +19,7 @@ from jaxdyn.scale.run import Run as Run
 from jaxdyn.scale.run import evaluate as evaluate
 from jaxdyn.scale.run import run as run
 
-__all__ = [
-    "Histogram",
-    "Mean",
-    "Quantiles",
-    "Reduction",
-    "Resources",
-    "Run",
-    "Worst",
-    "evaluate",
-    "member",
-    "run",
-]
-
 
 def __dir__() -> list[str]:
     """Names of the namespace; its modules are internal."""
-    return __all__
+    return [x for x, value in globals().items() if x[0] != "_" and not isinstance(value, _ModuleType)]
