@@ -42,7 +42,7 @@ from jaxdyn.dynamics.quantities import (
     mass_matrix,
 )
 from jaxdyn.exports import Exported, export
-from jaxdyn.io import load, load_urdf, read_log, save_urdf
+from jaxdyn.io import load, load_model, read_log, save_urdf
 from jaxdyn.lie import se2, se3, so3
 from jaxdyn.model import inertia, robots
 from jaxdyn.model.builder import ModelBuilder
@@ -135,7 +135,7 @@ __all__ = [
     "join",
     "kinetic_energy",
     "load",
-    "load_urdf",
+    "load_model",
     "loop",
     "mass_matrix",
     "model",

@@ -15,10 +15,10 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from jaxdyn.compile.flags import mark_invalid
 from jaxdyn.compile.kernels import variant
 from jaxdyn.compile.matrix_loops import LoopWriter, MatrixProgram
 from jaxdyn.compile.pivots import eliminate
+from jaxdyn.compile.rules import mark_invalid
 
 with contextlib.suppress(ImportError):  # no kernels without llvmlite
     import llvmlite.ir as ir
