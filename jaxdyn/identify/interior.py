@@ -107,6 +107,16 @@ class LinearChart(NamedTuple):
         """Jacobian (p, n) of all parameters by the coordinates of the bodies, then by the terms."""
         return self.rows(np.eye(len(self.given)), self.body_jacobians(origin))
 
+    def coordinate_jacobian(self, origin: np.ndarray, terms: np.ndarray) -> np.ndarray:
+        """Jacobian (p, p) of all numbers by log-Cholesky coordinates and logarithms of positive terms, of a `block_chart`."""
+        half = log_cholesky_jacobian(origin, self.count) @ np.swapaxes(origin, 1, 2)[:, None]
+        blocks = np.einsum("cij,bkij->bck", self.read, half + np.swapaxes(half, 2, 3))
+        result = np.zeros((len(self.given),) * 2)
+        for places, block in zip(self.places, blocks, strict=True):
+            result[np.ix_(places, places)] = block
+        result[self.term_places, self.term_places] = np.where(self.positive, terms, 1.0)
+        return result
+
     def rows(self, R: np.ndarray, jacobians: np.ndarray) -> np.ndarray:
         """Jacobian (m, n) of R x by the coordinates of the bodies, then by the terms."""
         inertial = np.matmul(np.swapaxes(R[:, self.places], 0, 1), jacobians)
@@ -190,6 +200,16 @@ def log_cholesky_coordinates(origin: np.ndarray, count: int) -> np.ndarray:
     logarithms = np.log(np.stack([last, *(relative[:, i, i] for i in range(3))], axis=1))
     others = np.stack([relative[(slice(None), *place)] for place in LOG_CHOLESKY_PLACES[3:]], axis=1)
     return np.concatenate([logarithms, others], axis=1)[:, :count]
+
+
+def log_cholesky_jacobian(origin: np.ndarray, count: int) -> np.ndarray:
+    """Derivatives (bodies, count, 4, 4) of the factors `origin` (bodies, 4, 4) by their `log_cholesky_coordinates`."""
+    result = np.zeros((len(origin), 10, 4, 4))
+    result[:, 0] = origin
+    for k, place in enumerate(LOG_CHOLESKY_PLACES, 1):
+        # Entries on the diagonal are exponentials, the others multiples of the last one.
+        result[(slice(None), k, *place)] = origin[(slice(None), *place)] if k < 4 else origin[:, 3, 3]
+    return result[:, :count]
 
 
 class InteriorPoint(Method):

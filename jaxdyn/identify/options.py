@@ -41,6 +41,7 @@ from jaxdyn.identify.replay import (
 )
 from jaxdyn.identify.result import inverse_torque, project_to_motors
 from jaxdyn.identify.sensors import Measured
+from jaxdyn.identify.torque_terms import friction_of
 from jaxdyn.model.arguments import Checked, FilePath, SystemLike, check_mapping, warn
 from jaxdyn.model.numbers import as_static, check_count, check_seed
 from jaxdyn.simulation.controls import Control
@@ -180,6 +181,8 @@ class Objective(eqx.Module):
         segment = correct_sensors(measured, segment, None if self.error in SIMULATED else self.hold)
         if self.error == "torque":
             errors = jax.vmap(partial(torque, scene))(segment.q, segment.v, segment.a, segment.t) - segment.tau
+            if segment.smoothing is not None:
+                errors = errors + friction_of(scene).coulomb[None] * segment.smoothing
             if scene.constraints:
                 errors = jax.vmap(partial(project_to_motors, scene, self.observed))(
                     segment.q, segment.v, segment.t, errors

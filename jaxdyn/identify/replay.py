@@ -54,7 +54,8 @@ class SampledTorque(eqx.Module):
 class Segments(eqx.Module):
     """Segments of a log, simulated in one batch; each starts on the last sample of the previous one.
 
-    Under `jax.vmap` it is one segment, without the first axis.
+    Under `jax.vmap` it is one segment, without the first axis. `smoothing`: change of the column of Coulomb friction by the
+    low-pass of the log, for errors of torques.
     """
 
     t: Float[Array, "*segments n"]
@@ -62,6 +63,7 @@ class Segments(eqx.Module):
     v: Float[Array, "*segments n nv"]
     tau: Float[Array, "*segments n nv"]
     a: Float[Array, "*segments n nv"] | None = None
+    smoothing: Float[Array, "*segments n nv"] | None = None
 
 
 def segments(log: Log | Sequence[Log], horizon: int | None, dtype, *, restart: bool = True) -> Segments:

@@ -59,7 +59,8 @@ def _number(value) -> Float[Array, "..."]:
 
 
 def build_scene(system: Any) -> Scene:
-    """Scene of a construction or of a system, or a scene as it is."""
+    """Scene of a construction or of a system, or a scene as it is; of one with sensors without these."""
+    system = system.scene if isinstance(system, Measured) else system
     return system.scene if isinstance(system, Construction) else as_scene(system)
 
 
