@@ -195,7 +195,8 @@ class Objective(eqx.Module):
         start = None if change is None else change * scale[:2]
         simulated = partial(simulate_segment, scene, segment, start, self.hold, self.simulation, observed=self.observed)
         if self.error == "trajectory":
-            law = SampledTorque(segment.t + measured.delay, segment.tau, self.hold)
+            t, tau = jnp.asarray(segment.t), jnp.asarray(segment.tau)
+            law = SampledTorque(t + measured.delay, tau, self.hold)
             q, v = simulated(control=law)
             return jnp.concatenate(
                 [self._select_columns(e) for e in motion_errors(system, segment, q, v, scale)], axis=1
@@ -214,7 +215,7 @@ def correct_sensors(measured: Measured, segment: Segments, hold: str | None) -> 
     q = jax.vmap(lambda q: displace(system, q, -measured.position_bias))(segment.q)
     tau = measured.torque_gain[None] * segment.tau + measured.torque_bias[None]
     if hold is not None and segment.tau.shape[0] > 1:
-        law = SampledTorque(segment.t, tau, hold)
+        law = SampledTorque(jnp.asarray(segment.t), tau, hold)
         # Interpolated torques have kinks at the samples; the derivative there is that of the next interval.
         tau = jax.vmap(lambda t: law.at(t - measured.delay))(segment.t)
     return eqx.tree_at(lambda p: (p.q, p.tau), segment, (q, tau))

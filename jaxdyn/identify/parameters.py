@@ -33,6 +33,7 @@ from jaxdyn.identify.methods import (
 from jaxdyn.identify.options import GAUSS_NEWTON, Execution, Objective, Solver, merge_options
 from jaxdyn.identify.parameter_tree import Parameters
 from jaxdyn.identify.problem import (
+    NumbersAt,
     Problem,
     data_errors_at,
     errors_of,
@@ -109,8 +110,9 @@ def fit_parameters(
     report = None if callback is None else lambda step, loss, at: callback(step, loss, tree.system(at.y))
     key = checkpoint_at(execution.checkpoint, numbers, execution.every, execution.resume)
     watch = Watch(int(solver.steps), report, checkpoint=key, show=execution.progress, seconds=execution.seconds)
-    end, minimum = _minimise(problem, logs, unknowns, solver, watch)
-    at = numbers_at(tree, end.best.point.y)
+    nominal = numbers_at(tree, tree.start)
+    end, minimum = _minimise(problem, logs, unknowns, nominal, solver, watch)
+    at = numbers_at(tree, end.best.point.y) if minimum is None or minimum.numbers is None else minimum.numbers
     values, jacobian = (np.asarray(x, np.float64) for x in at[:2])
     deviation, factor = None, np.nan
     if minimum is not None:
@@ -120,7 +122,7 @@ def fit_parameters(
         nominal=system,
         names=tree.names,
         values=values,
-        nominal_values=np.asarray(numbers_at(tree, tree.start).values, np.float64),
+        nominal_values=np.asarray(nominal.values, np.float64),
         deviation=deviation,
         factor=factor,
         history=end.history,
@@ -135,7 +137,8 @@ def fit_parameters(
 class Minimum(NamedTuple):
     """Errors of the data near a minimum, condensed, and in full (n,); `prior` (k, p): rows of the prior, of unit deviation.
 
-    `layout`: rows of the errors; `used`: errors that initial states have used up. None for errors that are not finite.
+    `layout`: rows of the errors; `used`: errors that initial states have used up; `numbers` there, if known. No `blocks` for
+    errors that are not finite.
     """
 
     layout: ErrorRows
@@ -143,6 +146,7 @@ class Minimum(NamedTuple):
     errors: np.ndarray
     prior: np.ndarray
     used: int = 0
+    numbers: NumbersAt | None = None
 
     @classmethod
     def of(cls, problem: Problem, logs: Sequence[Log], linear: LinearErrors) -> "Minimum":
@@ -162,14 +166,14 @@ class Minimum(NamedTuple):
 
 
 def _minimise(
-    problem: Problem, logs: Sequence[Log], unknowns: Unknowns, solver: Solver, watch: Watch
+    problem: Problem, logs: Sequence[Log], unknowns: Unknowns, nominal: NumbersAt, solver: Solver, watch: Watch
 ) -> tuple[Descent, Minimum | None]:
     """End of a minimisation, and the errors near it; None where the method takes no Jacobian."""
     rounding = float(jnp.finfo(unknowns.y.dtype).eps)
     if solver.name == GAUSS_NEWTON:
         start, known, before, minimum = unknowns, None, np.zeros(0), None
         if solver.starts == 1:
-            start, known, before, minimum = minimize_linear_torques(problem, logs, unknowns)
+            start, known, before, minimum = minimize_linear_torques(problem, logs, unknowns, nominal)
         end = descend(GaussNewton(partial(linearise, problem), solver.tolerance, rounding, known), start, watch)
         # Only steps that lower the loss are accepted: the last point is the best one.
         linear, history = end.last.state[0], np.concatenate([before, end.history])
@@ -194,7 +198,7 @@ def _minimise(
 
 
 def minimize_linear_torques(
-    problem: Problem, logs: Sequence[Log], unknowns: Unknowns
+    problem: Problem, logs: Sequence[Log], unknowns: Unknowns, nominal: NumbersAt
 ) -> tuple[Unknowns, LinearErrors | None, np.ndarray, Minimum | None]:
     """Minimum of the error of torques that are linear in the numbers, by the steps of `fit_torques`, and the losses before it.
 
@@ -207,7 +211,7 @@ def minimize_linear_torques(
     chart = block_chart(problem.tree.blocks) if problem.objective.error == "torque" else None
     if chart is None:
         return unknowns, None, np.zeros(0), None
-    here = linearise(problem, unknowns)
+    here = linearise(problem, unknowns, nominal)
     if not here.is_finite:
         return unknowns, here, np.zeros(0), None
     (weight,) = (float(block.weight) for block in problem.tree.blocks if isinstance(block, Inertias))
@@ -238,9 +242,10 @@ def minimize_linear_torques(
     blocks = dataclasses.replace(blocks, triangles=triangles)
     rows = blocks.rows(np.ones(1))
     data = LinearErrors(float(errors @ errors), -rows[:, -1], rows[:, :-1])
-    residual, by_y = (np.asarray(x, np.float64) for x in numbers_at(problem.tree, there.y)[2:4])
+    numbers = numbers_at(problem.tree, there.y)
+    residual, by_y = (np.asarray(x, np.float64) for x in numbers[2:4])
     found = with_prior(data, residual, by_y, problem.prior_weight)
-    return there, found, end.history[:-1], first._replace(blocks=blocks, errors=errors, prior=by_y)
+    return there, found, end.history[:-1], first._replace(blocks=blocks, errors=errors, prior=by_y, numbers=numbers)
 
 
 def _best_start(problem: Problem, unknowns: Unknowns, solver: Solver, execution: Execution) -> Unknowns:

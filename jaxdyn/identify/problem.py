@@ -18,7 +18,7 @@ from jaxdyn.identify.mechanisms import check_motors, observation_columns
 from jaxdyn.identify.methods import LinearErrors, Unknowns, eliminate_starts, with_prior
 from jaxdyn.identify.options import BALANCES, SIMULATED, Objective
 from jaxdyn.identify.parameter_tree import Parameters
-from jaxdyn.identify.replay import Segments, check_spacing, segments, simulation_options, with_even_steps
+from jaxdyn.identify.replay import Segments, check_spacing, cut_segments, simulation_options, with_even_steps
 from jaxdyn.identify.result import inverse_torque, regressor_torque
 from jaxdyn.identify.sensors import Measured, build_scene, with_sensors
 from jaxdyn.identify.torque_terms import Friction, smoothing_by_filter
@@ -100,19 +100,19 @@ def pose_problem(
     # The time of a Model starts at zero in every segment; that of other systems, which may depend on it, is the log's.
     bare = isinstance(system, Measured) and not (scene.forces or scene.constraints)
     restart = isinstance(scene.system if bare else system, Model) and objective.error != "closed-loop"
-    cut = partial(segments, dtype=tree.dtype, restart=restart)
+    cut = partial(cut_segments, dtype=tree.dtype, restart=restart)
     if objective.error == "torque":
         parts = [cut(log, None) for log in logs]
         has_friction = any(isinstance(force, Friction) for force in scene.forces)
         if has_friction and not scene.constraints and any(log.cutoff is not None for log in logs):
-            changes = [jnp.asarray(smoothing_by_filter(scene, log)[None], tree.dtype) for log in logs]
+            changes = [np.asarray(smoothing_by_filter(scene, log)[None], tree.dtype) for log in logs]
             parts = [dataclasses.replace(part, smoothing=x) for part, x in zip(parts, changes, strict=True)]
-        flat = jax.tree.map(lambda *x: jnp.concatenate(x, axis=1), *parts)
+        flat = jax.tree.map(lambda *x: np.concatenate(x, axis=1), *parts)
         if not isinstance(system, Measured):
             # Without a delay samples are independent: each is a segment.
             batches = [jax.tree.map(lambda x: x[0, :, None], flat)]
         elif len({len(log) for log in logs}) == 1:
-            batches = [jax.tree.map(lambda *x: jnp.concatenate(x), *parts)]
+            batches = [jax.tree.map(lambda *x: np.concatenate(x), *parts)]
         else:
             batches = parts
     else:
@@ -125,7 +125,7 @@ def pose_problem(
             objective = dataclasses.replace(objective, substeps=None, simulation=options)
         batches = [flat]
     scale = _scale(objective, scene.system, flat)
-    shared = [shard_blocks(batch, devices) for batch in batches]
+    shared = [shard_blocks(jax.tree.map(jnp.asarray, batch), devices) for batch in batches]
     return Problem(tree, objective, tuple(x for x, _ in shared), scale, tuple(mesh for _, mesh in shared)), logs
 
 
@@ -200,9 +200,11 @@ def forward(problem: Problem) -> Problem:
     return dataclasses.replace(problem, objective=objective)
 
 
-def linearise(problem: Problem, estimate: Unknowns) -> LinearErrors:
-    """Linear errors near a point, those of the data followed by those of the prior."""
-    return _assemble(problem, estimate, jacobians_at(problem, estimate), numbers_at(problem.tree, estimate.y)[2:4])
+def linearise(problem: Problem, estimate: Unknowns, numbers: "NumbersAt | None" = None) -> LinearErrors:
+    """Linear errors near a point, those of the data followed by those of the prior; `numbers` at the point, if known."""
+    parts = jacobians_at(problem, estimate)
+    numbers = numbers_at(problem.tree, estimate.y) if numbers is None else numbers
+    return _assemble(problem, estimate, parts, numbers[2:4])
 
 
 def linearise_batch(problem: Problem, estimates: Sequence[Unknowns]) -> list[LinearErrors]:
