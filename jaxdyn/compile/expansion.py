@@ -22,6 +22,7 @@ from jaxdyn.compile.inlining import replay
 from jaxdyn.compile.jax_adapter import ClosedJaxpr, Literal, Tracer  # pyright: ignore[reportPrivateImportUsage]
 from jaxdyn.compile.program import (
     Array,
+    FlaggedIteration,
     NotNumbers,
     Number,
     Program,
@@ -129,7 +130,7 @@ class _Expansion:
         results = inside.evaluate(inner, args)
         self.has_rules |= inside.has_rules
         if inside.flagged is not False:
-            raise NotNumbers("samples that an iteration of a loop cannot compute")
+            raise FlaggedIteration("samples that an iteration of a loop cannot compute")
         return results
 
     def one(self, eqn, args) -> list:
