@@ -17,17 +17,19 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from jaxdyn.constraints.codes import RESULTS
-from jaxdyn.identify.condensed import Blocks, condense_rows, pad_triangle
 from jaxdyn.identify.descent import Descent, Watch, descend
 from jaxdyn.identify.interior import LOG_CHOLESKY_BASIS, InteriorPoint, LinearChart, TorqueProblem
 from jaxdyn.identify.logs import Log, root_mean_square
 from jaxdyn.identify.regression import (
     BaseParameters,
+    Blocks,
     base_parameters,
     condense_model,
+    condense_rows,
     coordinate_names,
     free_columns,
     noise_level,
+    pad_triangle,
     parameter_names,
 )
 from jaxdyn.identify.torque_terms import TorqueTerm, coulomb_through_filter, term_columns

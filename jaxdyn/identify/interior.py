@@ -12,9 +12,8 @@ import numpy as np
 from jaxdyn.constraints.codes import RESULTS
 from jaxdyn.identify.blocks import Block, Inertias, Numbers, Tied
 from jaxdyn.identify.chart import FROM_PSEUDO, LOG_CHOLESKY_BASIS, LOG_CHOLESKY_PLACES, make_chart
-from jaxdyn.identify.condensed import Condensed
 from jaxdyn.identify.descent import Iterate, Method
-from jaxdyn.identify.regression import free_columns, nominal_parameters
+from jaxdyn.identify.regression import Condensed, free_columns, nominal_parameters
 from jaxdyn.identify.torque_terms import POSITIVE
 from jaxdyn.model.tree import Model
 

@@ -26,6 +26,7 @@ from jaxtyping import Array, Float
 
 from jaxdyn.dynamics import quantities as dynamics
 from jaxdyn.dynamics.centroidal import kinetic_energy, potential_energy
+from jaxdyn.identify.mechanisms import Measured
 from jaxdyn.identify.methods import METHODS, SOLVERS, Optimizer
 from jaxdyn.identify.replay import (
     HOLDS,
@@ -40,7 +41,6 @@ from jaxdyn.identify.replay import (
     simulation_options,
 )
 from jaxdyn.identify.result import inverse_torque, project_to_motors
-from jaxdyn.identify.sensors import Measured
 from jaxdyn.identify.torque_terms import friction_of
 from jaxdyn.model.arguments import Checked, FilePath, SystemLike, check_mapping, warn
 from jaxdyn.model.numbers import as_static, check_count, check_seed

@@ -27,8 +27,8 @@ from jaxdyn.identify.blocks import (
     select,
 )
 from jaxdyn.identify.chart import METRICS, make_chart
+from jaxdyn.identify.mechanisms import FitSystem, Measured, build_scene
 from jaxdyn.identify.regression import NUMBERS
-from jaxdyn.identify.sensors import FitSystem, Measured, build_scene
 from jaxdyn.model import host_math
 from jaxdyn.model.arguments import Function, Number, deprecated, state_dtype
 from jaxdyn.model.arguments import Numbers as Values

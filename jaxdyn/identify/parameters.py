@@ -12,12 +12,11 @@ import numpy as np
 
 from jaxdyn.constraints.codes import RESULTS
 from jaxdyn.identify.blocks import Inertias
-from jaxdyn.identify.condensed import Blocks, condense_rows
 from jaxdyn.identify.condensed_fit import minimize_torque_error
-from jaxdyn.identify.descent import Descent, Watch, checkpoint_at, descend
-from jaxdyn.identify.devices import on_one_thread
+from jaxdyn.identify.descent import Descent, Watch, checkpoint_at, descend, on_one_thread
 from jaxdyn.identify.interior import TorqueProblem, block_chart, log_cholesky_coordinates
 from jaxdyn.identify.logs import Log
+from jaxdyn.identify.mechanisms import FitSystem
 from jaxdyn.identify.methods import (
     DAMPING,
     SOLVERS,
@@ -45,8 +44,8 @@ from jaxdyn.identify.problem import (
     on_one_device,
     pose_problem,
 )
+from jaxdyn.identify.regression import Blocks, condense_rows
 from jaxdyn.identify.result import Fit
-from jaxdyn.identify.sensors import FitSystem
 from jaxdyn.identify.uncertainty import ErrorRows, standard_deviations, student
 from jaxdyn.model.arguments import Checked, Function
 from jaxdyn.tasks import count_workers, map_tasks

@@ -1,7 +1,11 @@
-"""Errors of a fit and of its prior as functions of the unknowns, their Jacobians, and the cause where they are not finite."""
+"""Errors of a fit and of its prior as functions of the unknowns, their Jacobians, and the cause where they are not finite.
+
+Segments are independent, like the samples of a batch. Each device evaluates its own segments and their gradients; an iteration
+of a fit exchanges one all-reduce of as many numbers as there are unknowns.
+"""
 
 import dataclasses
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from functools import partial
 from typing import Any, NamedTuple
 
@@ -9,21 +13,102 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jax import lax
 from jaxtyping import Array, Float
 
 from jaxdyn.identify.blocks import apply_blocks
-from jaxdyn.identify.devices import map_by_device, shard_blocks, sum_over_devices
 from jaxdyn.identify.logs import Log, as_logs
-from jaxdyn.identify.mechanisms import check_motors, observation_columns
+from jaxdyn.identify.mechanisms import Measured, build_scene, check_motors, observation_columns, with_sensors
 from jaxdyn.identify.methods import LinearErrors, Unknowns, eliminate_starts, with_prior
 from jaxdyn.identify.options import BALANCES, SIMULATED, Objective
 from jaxdyn.identify.parameter_tree import Parameters
 from jaxdyn.identify.replay import Segments, check_spacing, cut_segments, simulation_options, with_even_steps
 from jaxdyn.identify.result import inverse_torque, regressor_torque
-from jaxdyn.identify.sensors import Measured, build_scene, with_sensors
 from jaxdyn.identify.torque_terms import Friction, smoothing_by_filter
 from jaxdyn.model.tree import Model
 from jaxdyn.systems.scene import has_drives
+
+AXIS = "segments"
+
+
+def shard_blocks(pieces: Any, devices: Sequence[Any] | None) -> tuple[Any, Any]:
+    """Shard segments (leading axis of arrays) over as many devices as divide their number, and make the mesh of these.
+
+    The mesh is None for one device, or where `devices` is None; the segments then stay where they are.
+
+    **Raises:** ValueError for no device.
+    """
+    if devices is None:
+        return pieces, None
+    if not len(devices):
+        raise ValueError("devices is empty; give some of jax.devices(), or None for one")
+    count = len(jax.tree.leaves(pieces)[0])
+    # Shards have equal size; segments added to fill one up would count in the loss.
+    most = max(n for n in range(1, len(devices) + 1) if count % n == 0)
+    if most == 1:
+        return pieces, None
+    mesh = jax.make_mesh((most,), (AXIS,), devices=list(devices)[:most], axis_types=(jax.sharding.AxisType.Auto,))
+    return jax.device_put(pieces, jax.NamedSharding(mesh, jax.P(AXIS))), mesh
+
+
+def map_by_device(function: Callable, mesh: Any) -> Callable:
+    """Map `function(shared, pieces)`, whose results have the axis of the segments, over the devices."""
+    return function if mesh is None else _by_device(function, mesh, jax.P(AXIS))
+
+
+def sum_over_devices(function: Callable, mesh: Any) -> Callable:
+    """Sum over devices of `function(searched, known)`, which adds up over the segments of one device.
+
+    `searched` and `known` are pairs of pytrees: shared by all devices, and with the axis of the segments. Derivatives are by
+    `searched`, in reverse mode and of first order. Each device computes its own, and those by shared unknowns
+    are in the same all-reduce as the sum itself.
+    """
+    if mesh is None:
+        return function
+    rows = jax.P(), jax.P(AXIS)
+
+    def value(shared, pieces):
+        return lax.psum(function((shared[0], pieces[0]), (shared[1], pieces[1])), AXIS)
+
+    def both(shared, pieces):
+        searched, known = (shared[0], pieces[0]), (shared[1], pieces[1])
+        loss, gradients = jax.value_and_grad(function)(searched, known)
+        loss, of_all = lax.psum((loss, gradients[0]), AXIS)
+        return (loss, of_all), gradients[1]
+
+    @eqx.filter_custom_vjp
+    def total(searched, known):
+        return _by_device(value, mesh, jax.P())(*zip(searched, known, strict=True))
+
+    @total.def_fwd
+    def _(perturbed, searched, known):
+        (loss, of_all), of_pieces = _by_device(both, mesh, rows)(*zip(searched, known, strict=True))
+        return loss, (of_all, of_pieces)
+
+    @total.def_bwd
+    def _(gradients, change, perturbed, searched, known):
+        return jax.tree.map(lambda gradient: change * gradient, gradients)
+
+    return total
+
+
+def _by_device(function: Callable, mesh: Any, results: Any) -> Callable:
+    """Wrap `function(shared, pieces)` in `jax.shard_map`."""
+
+    def call(shared, pieces):
+        # shard_map accepts arrays only; functions and settings pass through the closure.
+        arrays, rest = eqx.partition((shared, pieces), eqx.is_array)
+        each = jax.shard_map(
+            lambda *arrays: function(*eqx.combine(arrays, rest)),
+            mesh=mesh,
+            in_specs=(jax.P(), jax.P(AXIS)),
+            out_specs=results,
+            # The check that values agree on all devices refuses loops of simulations, which start from constants.
+            check_vma=False,
+        )
+        return each(*arrays)
+
+    return call
 
 
 class Problem(eqx.Module):

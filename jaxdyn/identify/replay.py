@@ -12,8 +12,7 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from jaxdyn.identify.logs import Log, as_logs
-from jaxdyn.identify.mechanisms import on_constraints
-from jaxdyn.identify.sensors import FitSystem
+from jaxdyn.identify.mechanisms import FitSystem, on_constraints
 from jaxdyn.identify.torque_terms import Friction
 from jaxdyn.model.arguments import Checked, Number, state_dtype
 from jaxdyn.model.tree import Model

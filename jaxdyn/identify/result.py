@@ -10,9 +10,8 @@ import numpy as np
 from jaxdyn.constraints.codes import Outcome, name_of
 from jaxdyn.dynamics import quantities as dynamics
 from jaxdyn.identify.logs import Log, check_log
-from jaxdyn.identify.mechanisms import motor_basis
+from jaxdyn.identify.mechanisms import Measured, build_scene, motor_basis
 from jaxdyn.identify.regression import torque_error
-from jaxdyn.identify.sensors import Measured, build_scene
 from jaxdyn.identify.torque_terms import ExtraTorque, Friction, friction_of, smoothing_by_filter
 from jaxdyn.model.arguments import state_dtype
 from jaxdyn.model.tree import Model

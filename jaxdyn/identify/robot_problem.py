@@ -18,7 +18,7 @@ from jaxdyn.identify.condensed_fit import (
     intervals,
     is_negligible,
 )
-from jaxdyn.identify.devices import on_one_thread
+from jaxdyn.identify.descent import on_one_thread
 from jaxdyn.identify.interior import robot_chart
 from jaxdyn.identify.logs import Log, idle_coordinates, log_rate, signal_sizes
 from jaxdyn.identify.omitted_terms import find_shifts, include_shifts

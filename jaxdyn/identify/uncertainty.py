@@ -16,12 +16,11 @@ from typing import NamedTuple
 
 import numpy as np
 
-from jaxdyn.identify.condensed import Blocks, block_slices
 from jaxdyn.identify.logs import Log, log_rate
 from jaxdyn.identify.methods import RANK_TOLERANCE
 from jaxdyn.identify.options import BALANCES
 from jaxdyn.identify.problem import Problem, segment_starts
-from jaxdyn.identify.regression import least_squares_by_svd
+from jaxdyn.identify.regression import Blocks, block_slices, least_squares_by_svd
 
 # Least numbers of blocks and of independent errors in a group, where these leave at least so many groups: squares of Student's t
 # have no variance below five degrees of freedom.

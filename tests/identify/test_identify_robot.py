@@ -11,16 +11,14 @@ from benchmarks.identify_selection import motion as random_motion
 from jaxdyn import identify, inertia
 from jaxdyn.cli.identify_tables import payload_text
 from jaxdyn.constraints.codes import RESULTS
-from jaxdyn.identify.condensed import block_slices, condense_rows
 from jaxdyn.identify.condensed_fit import Setting, eliminate, fit_blocks, share_of_extra
 from jaxdyn.identify.logs import filter_like_log, idle_coordinates, samples_for_jumps, travel_ranges
-from jaxdyn.identify.regression import condense, condense_model
+from jaxdyn.identify.raw_logs import check_log_content, check_rest, motion_band, vibration
+from jaxdyn.identify.regression import block_slices, condense, condense_model, condense_rows
 from jaxdyn.identify.robot_problem import RobotProblem, huber_weights
 from jaxdyn.identify.selection import improving_torques, is_clear, log_errors, splits, standard_error
 from jaxdyn.identify.torque_terms import PRESLIDING, split_terms
 from jaxdyn.identify.uncertainty import block_groups, effective_sample_size, is_white, jackknife, model_error_factors
-from jaxdyn.identify.workflows.log_checks import check_log_content, check_rest
-from jaxdyn.identify.workflows.raw_logs import motion_band, vibration
 from jaxdyn.model.builder import ModelBuilder
 
 
@@ -205,7 +203,7 @@ def test_loads_that_have_not_settled_are_said(truth, monkeypatch):
     loaded[10:20] += np.asarray(inertia.displaced(inertia.sphere(0.6, 0.05), (0.02, 0, -0.7)))
     held = measured(arm(), motion(3), loaded, noise=0.02, seed=3)
     assert bool(identify.fit_payload(model, log(1), held, robot=fit).success)
-    monkeypatch.setattr("jaxdyn.identify.workflows.payload.MOST_ROUNDS", 1)
+    monkeypatch.setattr("jaxdyn.identify.applied_fits.MOST_ROUNDS", 1)
     short = identify.fit_payload(model, log(1), held, robot=fit)
     assert short.result is RESULTS.max_steps_reached and "NOT CONVERGED" in payload_text(short)
     basic, extra, where = split_terms(terms, 2)
