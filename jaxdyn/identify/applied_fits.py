@@ -10,7 +10,7 @@ import numpy as np
 from jaxdyn.constraints.codes import RESULTS, Outcome, name_of
 from jaxdyn.forces.elements import CoulombFriction, JointDamping
 from jaxdyn.identify.chart import check_bodies
-from jaxdyn.identify.condensed_fit import MOST_ROUNDS, eliminate, gather, is_negligible, minimize_torque_error
+from jaxdyn.identify.condensed_fit import MOST_ROUNDS, eliminate, gather, is_negligible
 from jaxdyn.identify.descent import on_one_thread
 from jaxdyn.identify.interior import LOG_CHOLESKY_BASIS, TorqueProblem, robot_chart
 from jaxdyn.identify.linear_fit import Direction, scatter, weakest_directions
@@ -181,7 +181,7 @@ def _solve(blocks: Blocks, is_loaded, own: slice, kept, weights, rows, sigma: fl
     sizes = [np.ones(alone.nv)] * 3
     chart = robot_chart(alone, (), "full", sizes)
     problem = TorqueProblem.of(chart, condense_rows(table, blocks.count()), sigma, 1.0)
-    end = minimize_torque_error(problem, 200, 1e-6)
+    end = problem.minimize(1e-6)
     if end.result is not RESULTS.successful:
         raise ValueError(f"the payload's fit ended {name_of(end.result)!r}; do the loaded logs move the robot?")
     origin, terms = end.last.point

@@ -4,7 +4,7 @@ A fit takes some tens of steps with matrices of a few hundred rows, and a search
 takes about a millisecond, and nothing is compiled.
 """
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from typing import NamedTuple
 
 import numpy as np
@@ -12,16 +12,21 @@ import numpy as np
 from jaxdyn.constraints.codes import RESULTS
 from jaxdyn.identify.blocks import Block, Inertias, Numbers, Tied
 from jaxdyn.identify.chart import FROM_PSEUDO, LOG_CHOLESKY_BASIS, LOG_CHOLESKY_PLACES, make_chart
-from jaxdyn.identify.descent import Iterate, Method
+from jaxdyn.identify.descent import Descent, Iterate, Method, Watch, descend
 from jaxdyn.identify.regression import Condensed, free_columns, nominal_parameters
 from jaxdyn.identify.torque_terms import POSITIVE
 from jaxdyn.model.tree import Model
 
 _EPS = float(np.finfo(np.float64).eps)
+# Most steps.
+_STEPS = 200
 
 
 class TorqueProblem(NamedTuple):
-    """Convex problem 1/2 (|R x - d|^2 + rest) + prior D(x) in float64, squares over the variance, in a chart's coordinates."""
+    """Convex problem 1/2 (|R x - d|^2 + rest) + prior D(x) in float64, squares over the variance, in a chart's coordinates.
+
+    All fits by torques that are linear in the numbers pose it: of robots, of payloads, and of parameters.
+    """
 
     chart: "LinearChart"
     R: np.ndarray
@@ -42,6 +47,10 @@ class TorqueProblem(NamedTuple):
                 "the torques of the logs are all zero; a fit by torques needs logs of a robot that is driven"
             )
         return cls(chart, condensed.R / sigma, condensed.d / sigma, condensed.rest / sigma**2, prior)
+
+    def minimize(self, tolerance: float, callback: Callable | None = None) -> Descent:
+        """Minimise by `InteriorPoint` from the start of the chart; `callback(step, loss, (origin, terms))` before each step."""
+        return descend(InteriorPoint(self, tolerance), self.chart.start, Watch(_STEPS, callback))
 
     def loss(self, origin: np.ndarray, terms: np.ndarray) -> float:
         """Loss at relative pseudo-inertias A A^T, A the `origin`, and terms."""

@@ -12,7 +12,6 @@ import numpy as np
 
 from jaxdyn.constraints.codes import RESULTS
 from jaxdyn.identify.blocks import Inertias
-from jaxdyn.identify.condensed_fit import minimize_torque_error
 from jaxdyn.identify.descent import Descent, Watch, checkpoint_at, descend, on_one_thread
 from jaxdyn.identify.interior import TorqueProblem, block_chart, log_cholesky_coordinates
 from jaxdyn.identify.logs import Log
@@ -50,8 +49,8 @@ from jaxdyn.identify.uncertainty import ErrorRows, standard_deviations, student
 from jaxdyn.model.arguments import Checked, Function
 from jaxdyn.tasks import count_workers, map_tasks
 
-# Of the interior point: most steps, and the excess of its loss over the minimum as a share of the prior's weight.
-_CONVEX_STEPS, _EXCESS = 200, 1e-9
+# Excess of the loss of the interior point over the minimum, as a share of the prior's weight.
+_EXCESS = 1e-9
 # Of the starts: rough, as the best one is fitted to the end afterwards, so that only the order of the losses matters.
 _STEPS, _TOLERANCE = 20, 1e-4
 
@@ -221,10 +220,9 @@ def minimize_linear_torques(
     others = np.flatnonzero(~np.any(here.rows[count:, places] != 0, axis=1)) + count
     rows = np.concatenate([here.rows[others], -here.errors[others, None]], axis=1)
     rows = np.concatenate([blocks.rows(np.ones(1)), rows])
-    # Twice the loss: `TorqueProblem` has half of the squares.
-    condensed, prior = condense_rows(2**0.5 * rows, count), weight * problem.prior_weight
-    convex = TorqueProblem(chart, condensed.R, condensed.d, condensed.rest, prior)
-    end = minimize_torque_error(convex, _CONVEX_STEPS, _EXCESS * prior)
+    prior = weight * problem.prior_weight
+    # A deviation for which `TorqueProblem`, with half of the squares, has this loss.
+    end = TorqueProblem.of(chart, condense_rows(rows, count), 0.5**0.5, prior).minimize(_EXCESS * prior)
     y, (origin, terms) = np.zeros(unknowns.y.size), end.last.point
     y[places] = log_cholesky_coordinates(origin, chart.count).reshape(-1)
     y[chart.term_places] = np.where(chart.positive, np.log(np.where(chart.positive, terms, 1.0)), terms)

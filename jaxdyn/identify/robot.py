@@ -19,7 +19,7 @@ from jaxdyn.identify.descent import on_one_thread
 from jaxdyn.identify.logs import Log, as_logs
 from jaxdyn.identify.regression import check_weights
 from jaxdyn.identify.result import Fit
-from jaxdyn.identify.robot_problem import RobotProblem, cross_validation
+from jaxdyn.identify.robot_logs import RobotLogs, cross_validation
 from jaxdyn.identify.selection import PRIORS, ROBUST, VELOCITIES, Choice, Search, improving_torques, search, splits
 from jaxdyn.identify.torque_terms import TERMS, RobotTerms, Terms, TorqueTerm, candidates, check_terms, split_terms
 from jaxdyn.model.arguments import Checked, Numbers, deprecated
@@ -88,7 +88,7 @@ def find_delays(
     inertia: str,
     blocks: int,
 ) -> Delays:
-    """Fit the delays of all torques at a setting, from a first guess `start` (nv,); the other arguments as of `RobotProblem`.
+    """Fit the delays of all torques at a setting, from a first guess `start` (nv,); the other arguments as of `RobotLogs`.
 
     **Raises:** ValueError where the shifts do not converge, as for delays longer than the fastest reversals of the motion.
     """
@@ -97,7 +97,7 @@ def find_delays(
     free = setting._replace(extra=(*setting.extra, (_DELAY.name, every)))
     delay = np.array(start, np.float64)
     for _ in range(_ROUNDS):
-        problem = RobotProblem(model, _shift_logs(logs, delay), basic, (*used, _DELAY), inertia, blocks)
+        problem = RobotLogs(model, _shift_logs(logs, delay), basic, (*used, _DELAY), inertia, blocks)
         estimate = problem.refine(free, fixed, rounds=2)
         data = problem.data(free)
         # Coefficients are stored column after column, nv each; the delay's column comes after those of the other terms.
@@ -119,7 +119,7 @@ def find_delays(
     # away: shifted logs are compared instead.
     squares = []
     for shift in (np.zeros(model.nv), delay):
-        problem = RobotProblem(model, _shift_logs(logs, shift), basic, used, inertia, blocks)
+        problem = RobotLogs(model, _shift_logs(logs, shift), basic, used, inertia, blocks)
         # A new problem has weights of ones and no loads: folds of shifted logs are compared with weights of their own.
         problem.refine(setting, fixed, rounds=2)
         parts, _ = splits(problem.data(setting).blocks)
@@ -129,7 +129,7 @@ def find_delays(
 
 
 def with_delays(
-    problem: RobotProblem, setting: Setting, estimate: Estimate, fit: Fit, delays: Delays
+    problem: RobotLogs, setting: Setting, estimate: Estimate, fit: Fit, delays: Delays
 ) -> tuple[Intervals, Delays]:
     """Intervals of a fit to shifted logs in which delays are unknowns like all others, and the delays with theirs.
 
@@ -273,7 +273,7 @@ def fit_robot(
     delays = search_delays(setting, np.zeros(model.nv)) if is_found else _given_delays(delay, model.nv)
     if delays is not None:
         logs = tuple(shift_torques(log, delays.seconds) for log in given)
-    problem = RobotProblem(model, logs, basic, extra, inertia, blocks)
+    problem = RobotLogs(model, logs, basic, extra, inertia, blocks)
     # One set of joint weights and loads for the whole search: settings are compared on the same scale.
     problem.refine(setting, fixed, rounds=2)
     trials, by = (), "given"
@@ -295,7 +295,7 @@ def fit_robot(
     if is_found and delays is not None:  # at the setting chosen
         delays = search_delays(setting, delays.seconds)
         logs = tuple(shift_torques(log, delays.seconds) for log in given)
-        problem = RobotProblem(model, logs, basic, extra, inertia, blocks)
+        problem = RobotLogs(model, logs, basic, extra, inertia, blocks)
     estimate = problem.refine(setting, fixed)
     fit = problem.result(setting, estimate)
     if is_found and delays is not None and delays.seconds.any():
@@ -359,7 +359,7 @@ def fit_torques(
     check_bodies(model)
     logs, terms = as_logs(log, model), check_terms(terms, v_s)
     check_prior(prior)
-    problem, setting = RobotProblem(model, logs, terms, (), inertia, 1), Setting(float(v_s), (), float(prior))
+    problem, setting = RobotLogs(model, logs, terms, (), inertia, 1), Setting(float(v_s), (), float(prior))
     return problem.result(setting, problem.refine(setting, check_weights(weights, model.nv)))
 
 

@@ -22,7 +22,7 @@ from jaxdyn.identify.interior import LOG_CHOLESKY_BASIS, InteriorPoint, TorquePr
 from jaxdyn.identify.methods import Unknowns
 from jaxdyn.identify.problem import errors_of, pose_problem
 from jaxdyn.identify.regression import condense
-from jaxdyn.identify.robot_problem import RobotProblem, scene_with_parameters
+from jaxdyn.identify.robot_logs import RobotLogs, scene_with_parameters
 from jaxdyn.io.urdf import load_urdf
 from jaxdyn.model.builder import ModelBuilder
 from jaxdyn.simulation.run import simulate
@@ -369,7 +369,7 @@ def noisy(iiwa, wrong_iiwa):
 
 def test_every_iterate_is_feasible(wrong_iiwa, noisy):
     log, fit = noisy
-    problem, lowest, losses = RobotProblem(wrong_iiwa, (log,), identify.TERMS, (), "full", 1), [], []
+    problem, lowest, losses = RobotLogs(wrong_iiwa, (log,), identify.TERMS, (), "full", 1), [], []
 
     def watch(step, loss, point):
         losses.append(loss)
