@@ -26,11 +26,10 @@ from jaxdyn.cli.identify_options import find_gains, make_fit, parse_options, res
 from jaxdyn.cli.identify_tables import error_table, gains_text, payload_text, tables
 from jaxdyn.constraints.codes import name_of
 from jaxdyn.identify import EXTRA, TERMS, Fit, LeastSquares, Log, RobotFit
-from jaxdyn.identify.devices import on_one_thread
+from jaxdyn.identify.descent import on_one_thread
 from jaxdyn.identify.linear_fit import base_terms
+from jaxdyn.identify.raw_logs import check_log_content, check_rest, vibration
 from jaxdyn.identify.regression import log_regressor
-from jaxdyn.identify.workflows.log_checks import check_log_content, check_rest
-from jaxdyn.identify.workflows.raw_logs import vibration
 from jaxdyn.io import save_urdf
 from jaxdyn.io.urdf_write import write_text
 from jaxdyn.model.configuration import columns_of

@@ -10,7 +10,7 @@ import jaxdyn as jd
 from jaxdyn import identify
 from jaxdyn.cli import main
 from jaxdyn.identify import LogWarning
-from jaxdyn.identify.workflows.log_repair import find_outliers, repair_log, unwrap_angles
+from jaxdyn.identify.log_repair import find_outliers, repair_log, unwrap_angles
 from jaxdyn.io.logs import read_log, write_log
 from jaxdyn.model.builder import ModelBuilder
 
