@@ -2,9 +2,9 @@
 
     python -m benchmarks.identify_drift [--seeds 12] [--recorded] [--data ../shared/data] [--out out/identify_drift.json]
 
-Held-out torque error in per cent of least squares, of feasible least squares (`fit_torques`), of the feasible fit of the four plain
-terms with and without weights of joints (v_s, prior and loss chosen), and of the automatic choice; then the latter over the best of
-the others.
+Held-out torque error in per cent of least squares, of feasible least squares (`fit_torques`), of the feasible fit of the four
+plain terms with and without weights of joints (v_s, prior and loss chosen), and of the automatic choice; then the latter over
+the best of the others.
 
 Simulated arms have the geometry of a Panda, a KUKA KR300 and a UR5, bodies that differ from the nominal ones, an encoder with
 noise, white and slow noise of the torques, and friction that falls by up to 40 % while the arm warms up. Some have a term that no

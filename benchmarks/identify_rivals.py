@@ -2,10 +2,11 @@
 
     python -m benchmarks.identify_rivals [--figaroh VENV/bin/python] [--limit 300] [--data ../shared/data]
 
-Cases are those of `benchmarks.identify_robots`: the last 30 % of a Franka's log from the first 70 %, and the KUKA's log C from A
-and B. All programs get the same filtered samples and the same bodies to start from, and fit bodies, viscous and Coulomb friction,
-rotor inertia and offset; `fit_robot` chooses further terms. `least_squares` smooths Coulomb friction over 0.01 rad/s, and once more
-over the v_s that `fit_robot` chose. The error is 100 |tau_fit - tau| / |tau|; the time is that of the processor in one fit.
+Cases are those of `benchmarks.identify_robots`: the last 30 % of a Franka's log from the first 70 %, and the KUKA's log C from
+A and B. All programs get the same filtered samples and the same bodies to start from, and fit bodies, viscous and Coulomb
+friction, rotor inertia and offset; `fit_robot` chooses further terms. `least_squares` smooths Coulomb friction over 0.01 rad/s,
+and once more over the v_s that `fit_robot` chose. The error is 100 |tau_fit - tau| / |tau|; the time is that of the processor
+in one fit.
 
 figaroh needs an environment of its own (`pip install figaroh`), mujoco.sysid `pip install "mujoco[sysid]"`.
 """

@@ -1,8 +1,8 @@
 """Fits of a robot by figaroh in an environment of its own, without jaxdyn: `python with_figaroh.py FOLDER`.
 
-The folder holds `arm.urdf` and `logs.npz` with q, v, a, tau of the samples to fit ("train_*") and to predict ("test_*"). Printed
-is JSON: for each of four fits the predicted torques of the test, the processor time and the verdict of figaroh. Terms are those of
-jaxdyn's plain fit: viscous and Coulomb friction (sign v), rotor inertia and offset.
+The folder holds `arm.urdf` and `logs.npz` with q, v, a, tau of the samples to fit ("train_*") and to predict ("test_*").
+Printed is JSON: for each of four fits the predicted torques of the test, the processor time and the verdict of figaroh. Terms
+are those of jaxdyn's plain fit: viscous and Coulomb friction (sign v), rotor inertia and offset.
 """
 
 import contextlib
