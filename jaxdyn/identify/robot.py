@@ -14,7 +14,7 @@ from jaxdyn.identify.logs import Log, as_logs
 from jaxdyn.identify.regression import check_weights
 from jaxdyn.identify.result import Fit
 from jaxdyn.identify.robot_problem import RobotProblem, cross_validation
-from jaxdyn.identify.selection import PRIORS, ROBUST, VELOCITIES, Choice, Search, lowers_sum, search, splits
+from jaxdyn.identify.selection import PRIORS, ROBUST, VELOCITIES, Choice, Search, search, splits
 from jaxdyn.identify.torque_terms import TERMS, RobotTerms, Terms, candidates, check_terms, split_terms
 from jaxdyn.model.arguments import Checked, Numbers, deprecated
 from jaxdyn.model.tree import Model
@@ -147,10 +147,6 @@ def fit_robot(
                 priors=PRIORS if isinstance(prior, str) else (setting.prior,),
                 losses=ROBUST if isinstance(robust, str) else (setting.robust,),
             )
-            if fixed is None:
-                # Weights lower the variance, and move the fit where the model is wrong: the left-out parts decide.
-                equal = Search(cross_validation(problem.with_equal_weights(), engine), parts, problem.torque)
-                fixed = np.ones(model.nv) if lowers_sum(trying(setting), equal(setting)) else None
         trials = tuple(trying.trials.values())
     if is_found and delays is not None:  # at the setting chosen
         delays = search_delays(setting, delays.seconds)

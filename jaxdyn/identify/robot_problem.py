@@ -1,7 +1,6 @@
 """Logs of a robot's fit, with the weights and loads that are updated between fits."""
 
 from collections.abc import Callable, Iterator, Sequence
-from copy import copy
 from functools import partial
 from typing import NamedTuple
 
@@ -201,13 +200,6 @@ class RobotProblem:
         # Those of the fit: intervals are of the estimate that exists, not of a new one.
         wide.weights, wide.loads, wide.sample_weights = self.weights, self.loads, self.sample_weights
         return wide
-
-    def with_equal_weights(self) -> "RobotProblem":
-        """Copy with the same weight of all joints."""
-        equal = copy(self)
-        # Triangles of folds depend on the weights; condensed logs are shared.
-        equal.weights, equal._rows = np.ones(self.model.nv), {}
-        return equal
 
     def _weigh(self, setting: Setting, estimate: Estimate) -> None:
         threshold = setting.robust
