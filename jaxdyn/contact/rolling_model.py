@@ -38,7 +38,8 @@ _STEPS_SEARCHED, _TURNS = 30, 8
 class RollingModel(Model):
     """Model with rolling contacts: q = (joints' coordinates, places of the contacts), v of the model.
 
-    **Arguments:** `model`: a `Model`; `contacts`: a list of `jd.contact.rolling_contact(...)`.
+    **Arguments:** `model`: a `Model`; `contacts`: a list of `jd.contact.rolling_contact(...)`; `fields`: for
+    `dataclasses.replace` alone.
 
     Places are coordinates without chart singularities: a unit vector (3) on a sphere or an ellipsoid, (u, v) on a plane, a
     cylinder and a `Parametrised` surface. `place` computes them, `contact_coordinates` converts them to the surfaces'

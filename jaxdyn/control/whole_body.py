@@ -62,7 +62,7 @@ class WholeBody(eqx.Module):
     - `orientation`: target R_d (3, 3) of the frame `base`, or a function of t; None: its attitude follows from the posture.
       `base`: name of a frame or body, by default the model's first body. `turn_kp`, `turn_kd`: its gains, of the error
       $\log(R_d^T R)$; by default `kp` and `kd`.
-    - `posture` (nq,): equilibrium of the remaining motion, with `stiffness` (1/s^2) and `damping` (1/s), zero or positive.
+    - `posture` (nq,): equilibrium of the remaining motion. `stiffness` (1/s^2), `damping` (1/s): of it, zero or positive.
     - `preload` (), N; `torque_weight`, `force_weight`, `effort_limit`, `passive`: of `jd.control.underactuated_inverse_dynamics`.
 
     **Raises:** ValueError for gains that are not positive definite, unknown frames, no list of

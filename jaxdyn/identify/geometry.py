@@ -132,8 +132,8 @@ def fit_geometry(
 
     - `system`: model, or scene with loops (`jd.loop`), where the fit starts. Its joints have one degree of freedom each.
     - `q` (n, nq): positions of the joints (rad, m) in each pose, as the encoders read them.
-    - `poses` (n, 4, 4): of the frame, in the frame of the measuring device; or `positions` (n, 3) or (n, k, 3): of markers (m),
-      which are at `markers` (k, 3) in the frame, one at its origin by default.
+    - `poses` (n, 4, 4): of the frame, in the frame of the measuring device. `positions` (n, 3) or (n, k, 3): of markers, m, in
+      place of poses. `markers` (k, 3): their places in the frame, m; one at its origin by default.
     - `frame`: name of the frame that is measured.
     - `free`: some of "base", pose of the model's world in the device's frame; "offsets", the zeros of the encoders; "axes", the
       directions of axes; "lengths", the places of axes, and of the frames of loops; "tool", pose of the measured frame.

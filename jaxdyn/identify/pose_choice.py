@@ -41,8 +41,11 @@ def choose_poses(
     Of random configurations within the limits of the joints, each in turn is the one that adds most to the logarithm of the
     determinant (D-optimality); chosen ones are then exchanged for better ones.
 
-    **Arguments:** as of `fit_geometry`; `markers` (k, 3) if those are measured, None for poses. `guess` (nq,): a configuration
-    with closed loops. `seed` of the random configurations.
+    **Arguments:** as of `fit_geometry`, and
+
+    - `count`: number of poses to choose.
+    - `markers` (k, 3): their places in the frame, m, if those are measured; None for poses.
+    - `guess` (nq,): a configuration with closed loops. `seed`: of the random configurations.
 
     **Raises:** ValueError as `fit_geometry`, and for fewer poses than determine the directions.
 
