@@ -142,7 +142,8 @@ def covariant_rate(
 
     With $w = v = \dot q$ and the rate a it is the covariant acceleration $\nabla_v v$. It is zero for parallel transport.
 
-    **Arguments:** `metric` as above; `q` (n,), a point of the curve; `v` (n,), its rate; `w` (n,), the field there; `rate` (n,), dw/dt.
+    **Arguments:** `metric` as above; `q` (n,), a point of the curve; `v` (n,), its rate; `w` (n,), the field there; `rate` (n,),
+    dw/dt.
 
     **Returns:** (n,).
     """
