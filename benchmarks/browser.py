@@ -94,7 +94,13 @@ def faults(site: Path, widths=WIDTHS) -> list[str]:
     with ThreadingHTTPServer(("127.0.0.1", 0), partial(handler, directory=str(site))) as server:
         threading.Thread(target=server.serve_forever, daemon=True).start()
         with tempfile.TemporaryDirectory(ignore_cleanup_errors=True) as profile:
-            options = ["--headless", "--no-sandbox", "--disable-gpu", f"--user-data-dir={profile}", "--window-size=1400,1000"]
+            options = [
+                "--headless",
+                "--no-sandbox",
+                "--disable-gpu",
+                f"--user-data-dir={profile}",
+                "--window-size=1400,1000",
+            ]
             run = subprocess.Popen(
                 [str(browser()), *options, f"http://127.0.0.1:{server.server_port}/look"],
                 stdout=subprocess.DEVNULL,
