@@ -1,10 +1,11 @@
 """Moving pictures of scenes for the page docs/gallery.md: `python -m benchmarks.gallery [--out docs/gallery] [SCENE ...]`.
 
 Each scene of the page is simulated from its start and written as a GIF. The files are not kept in the repository: `make docs`
-makes those that are missing, and those whose scene or drawing has changed since.
+makes those that are missing, and those whose scene, settings or drawing have changed since.
 """
 
 import argparse
+import ast
 import hashlib
 import inspect
 import time
@@ -163,10 +164,24 @@ def write(name: str, folder: Path) -> float:
 
 
 def digest(name: str) -> str:
-    """SHA-256 of the code that a picture shows: the scene's module, the package that draws, and this file."""
+    """SHA-256 of the code that a picture shows, without docstrings and comments: its settings and what writes it, here, the
+    scene's module, and the package that draws.
+    """
     scene = Path(inspect.getfile(inspect.unwrap(getattr(jd.scenes, name))))
-    drawing = Path(inspect.getfile(jd.animate)).parent.glob("*.py")
-    return hashlib.sha256(b"".join(path.read_bytes() for path in (scene, Path(__file__), *sorted(drawing)))).hexdigest()
+    drawing = sorted(Path(inspect.getfile(jd.animate)).parent.glob("*.py"))
+    here = [inspect.getsource(function) for function in (write, _vehicle)]
+    settings = repr((SCENES[name], POINTS.get(name), name in _FORCES, _FRAMES))
+    code = [settings, *map(_code, [*here, *(path.read_text(encoding="utf-8") for path in (scene, *drawing))])]
+    return hashlib.sha256("\n".join(code).encode()).hexdigest()
+
+
+def _code(source: str) -> str:
+    """A program without its docstrings, comments and line breaks."""
+    tree = ast.parse(source)
+    for node in ast.walk(tree):
+        if isinstance(node, ast.Module | ast.ClassDef | ast.FunctionDef) and ast.get_docstring(node) is not None:
+            del node.body[0]
+    return ast.dump(tree)
 
 
 def main(argv=None) -> None:

@@ -97,8 +97,9 @@ class Holonomic(Constraint):
 
     **Arguments:**
 
-    - `phi`: phi(q, t) -> (n,) or (), m or rad; with `with_system=True` phi(system, q, t), evaluated on the scene's
-      system, so that gradients and batches of its leaves pass through. It must be differentiable twice. A plain
+    - `with_system`: pass the scene's system as the first argument, phi(system, q, t), so that gradients and batches of its
+      leaves pass through.
+    - `phi`: phi(q, t) -> (n,) or (), m or rad. It must be differentiable twice. A plain
       function is static: define it once. An equinox Module or `jax.tree_util.Partial` carries numbers as leaves.
     - `name`: for errors and reports; by default that of the function.
 
@@ -137,8 +138,8 @@ class Pfaffian(Constraint):
     **Arguments:**
 
     - `A`: A(q, t) -> (n, nv) or (nv,), acting on the velocity v of the system, which is dq/dt only where nq = nv.
-      With `with_system=True` A(system, q, t).
-    - `b`: b(q, t) -> (n,) or (), or None for zero; with `with_system=True` b(system, q, t).
+    - `b`: b(q, t) -> (n,) or (), or None for zero.
+    - `with_system`: pass the scene's system as the first argument, A(system, q, t) and b(system, q, t).
     - `name`: for errors and reports; by default that of the function.
 
     **Raises:** ValueError when A or b cannot be called so; (when used) when what they return does not fit.

@@ -67,11 +67,13 @@ class HybridForce(ForceLoop):
 
     - `scene`: with constraints; its forces are compensated.
     - `task`: x(q) -> (m,), or u(q, v) -> (m,); `target`: (m,), or a function of t, differentiable twice (once for velocities).
+    - `of`: what the task is, "position" or "velocity".
     - `kp`, `kd`: positive definite, numbers, (m,) or (m, m); 1/s^2 and 1/s, or 1/s for `kp` of velocities, without `kd`.
     - `force`: $\lambda_d$ (nc,), or a function of t; None for zero. `ki` (1/s): positive definite, or None for no
       integral action.
     - `actuated`: indices of the actuated velocities; None: all. The torques of least norm are used that
-      give the motion, plus the part of `internal` (na,), N m, along directions that change only forces: with as many motors as
+      give the motion.
+    - `internal` (na,), N m: torques that are added along directions that change only forces: with as many motors as
       degrees of freedom there are none. Forces are then not controlled, and `force` and `ki` must be omitted.
     - `least_regularity`: a number from 0 to 1. Where `regularity(q, v, t)` falls to it, a simulation ends with the code
       `control_singular` and the time. None: it continues, with the task followed in the least-squares sense.

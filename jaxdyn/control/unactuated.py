@@ -250,7 +250,7 @@ class WholeBody(eqx.Module):
     - `kp` (1/s^2), `kd` (1/s): of the centre of mass, positive definite: numbers, (3,) or (3, 3).
     - `orientation`: target R_d (3, 3) of the model's first body, or a function of t, with the gains `kp` and `kd`; or an
       `Attitude`, of another frame or with other gains; None: attitudes follow from the posture.
-    - `posture` (nq,): equilibrium of the remaining motion, with `stiffness` (1/s^2) and `damping` (1/s), zero or positive.
+    - `posture` (nq,): equilibrium of the remaining motion. `stiffness` (1/s^2), `damping` (1/s): of it, zero or positive.
     - `forces`: `GroundForces`, the weights and limits of the program for torques and ground forces.
 
     **Raises:** ValueError for gains that are not positive definite, unknown frames, no list of

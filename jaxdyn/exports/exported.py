@@ -254,6 +254,7 @@ class Exported:
 
         **Arguments:**
 
+        - `folder`: where the files are written.
         - `target`: "host", a short name ("x86_64", "x86_64-v3", "x86_64-v4", "aarch64", "cortex-m7", "riscv64", "wasm32"), or a
           triple of LLVM; `cpu` and `features` as LLVM writes them.
         - `abi`: "c", or "casadi" for `casadi.external(name, "./name.so")`, with exact first derivatives where the function was

@@ -28,7 +28,7 @@ def states(
 ) -> np.ndarray:
     """Positions and velocities over time, each with its joint's name and unit.
 
-    **Arguments:** `scene`, `solution`; `axes`: two matplotlib axes, or None.
+    **Arguments:** `scene`; `solution`: of `jd.simulate`, one motion; `axes`: two matplotlib axes, or None.
 
     **Returns:** array (2,) of axes: of q and of v.
 

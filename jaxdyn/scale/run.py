@@ -161,7 +161,8 @@ def run(
     - `states`: a pair (q0, v0) of arrays, (nq,) and (nv,) for all rollouts or (samples, nq) and (samples, nv), or a function
       of one rollout, `states(parameters) -> (q0, v0)`.
     - `parameters`: None; a pytree of arrays (samples, ...), one row per rollout; or a function `draw(key)` that draws those of
-      one rollout, traced. `samples` is then the number of rollouts, and nothing is held in memory. Rollout i has the key
+      one rollout, traced.
+    - `samples`: number of rollouts where parameters are drawn, which then are not held in memory. `seed`: rollout i has the key
       `jax.random.fold_in(jax.random.key(seed), i)`, for any chunks, devices and workers (see `jd.scale.member`).
     - `ts` (nt,): save points (s), `control` and further options: as in `jd.simulate`.
     - `out`: directory of the store. Its variables are those of `Solution.to_xarray` over "rollout" and t, with names and
@@ -246,8 +247,8 @@ def evaluate(
     """Evaluate a function of one sample for a batch of any size, as `run` simulates: fits from many starts, rewards, designs.
 
     **Arguments:** `function(parameters)`, traced, returns a dictionary of arrays, the variables of the store. One named "success"
-    is true for a sample that succeeded; without it, samples with values that are not finite fail. `parameters` and all others: as
-    in `run`; `units` are of parameters and of variables.
+    is true for a sample that succeeded; without it, samples with values that are not finite fail. All others are
+    as in `jd.scale.run`; `units`: of parameters and of variables.
 
     **Returns:** a `Run`.
 

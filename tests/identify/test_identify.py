@@ -22,8 +22,8 @@ from jaxdyn.identify.interior import LOG_CHOLESKY_BASIS, InteriorPoint, TorquePr
 from jaxdyn.identify.methods import Unknowns
 from jaxdyn.identify.problem import errors_of, pose_problem
 from jaxdyn.identify.regression import condense
-from jaxdyn.io import load_model
 from jaxdyn.identify.robot_logs import RobotLogs, scene_with_parameters
+from jaxdyn.io import load_model
 from jaxdyn.model.builder import ModelBuilder
 from jaxdyn.simulation.run import simulate
 from jaxdyn.systems.scene import Scene

@@ -214,6 +214,53 @@ def test_examples_of_docstrings_run(page, tmp_path, monkeypatch):
                 use_what_was_made(before, names)
 
 
+def _arguments(function):
+    return [
+        argument_tables.Argument(name, "", None if p.default is p.empty else repr(p.default))
+        for name, p in inspect.signature(function).parameters.items()
+    ]
+
+
+def test_no_row_of_a_table_is_empty():
+    """Of all exports and the methods of exported classes; what a docstring leaves to another one is found there."""
+    things = {}
+    for name in [name for page in PAGES for name, _ in entries(page)[1:]] + ["scale.run", "scale.evaluate"]:
+        value = jd
+        for part in name.split("."):
+            value = getattr(value, part)
+        methods = vars(value).items() if inspect.isclass(value) else ()
+        shown = {name: value} | {
+            f"{name}.{n}": f for n, f in methods if inspect.isfunction(f) and not n.startswith("_")
+        }
+        for full, one in shown.items():
+            if callable(one) and argument_tables.MARK in (inspect.getdoc(one) or ""):
+                given = [x for x in _arguments(one) if x.name not in ("self", "cls")]
+                # Fields that a class sets itself are no arguments.
+                if not inspect.isclass(one) or "__init__" in vars(one) or issubclass(one, tuple):
+                    things[full] = (inspect.getdoc(one), given)
+    known = argument_tables.descriptions(things)
+    assert len(things) > 250
+    empty = [
+        f"{name}: {', '.join(argument.name for argument, _ in row.arguments)}"
+        for name, (text, given) in things.items()
+        for row in argument_tables.rows(argument_tables.split(text)[1], given, known)[1]
+        if not row.text
+    ]
+    assert not empty, "\n".join(empty)
+
+
+def test_what_a_docstring_leaves_to_another_one_is_found_there():
+    given = [argument_tables.Argument(name, "", None) for name in ("tol", "steps")]
+    known = argument_tables.descriptions(
+        {
+            "jd.a.fit": ("**Arguments:** as of `solve`, and\n\n- `steps`: at most.\n\n**Returns:** x.", given),
+            "jd.a.solve": ("**Arguments:** `tol`: of the residual.", given[:1]),
+            "jd.b.check": ("**Arguments:** as of `a.fit`.", given),
+        }
+    )
+    assert known["jd.b.check"] == known["jd.a.fit"] == {"tol": "of the residual.", "steps": "at most."}
+
+
 def test_tables_of_arguments_keep_names_shapes_and_groups():
     arguments = [
         argument_tables.Argument(name, "Float[Array, ' nq'] | None", None) for name in ("model", "q", "v", "t")

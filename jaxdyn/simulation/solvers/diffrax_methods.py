@@ -38,7 +38,7 @@ class LieGroup(Wrapped):
     instead of nq + nv. The order is that of the wrapped method, which is used directly for systems without quaternions or
     planar joints. A step may turn a body by less than a full turn.
 
-    **Arguments:** `solver`, any diffrax method that `simulate` takes. The rest is filled in by `simulate`.
+    **Arguments:** `solver`, any diffrax method that `simulate` takes. `topology`: filled in by `simulate`.
 
     Source: Munthe-Kaas, Runge-Kutta methods on Lie groups (1998); Hairer, Lubich & Wanner 2006, section IV.8.2.
 

@@ -49,7 +49,7 @@ class ExplicitSteps(ProjectedSolver):
     projection also acts on the error, or where the manifold has no branches; and without `step_constants`, which change with
     the projection and change the stage with them.
 
-    **Arguments:** those of `ProjectedSolver`; `project` None for none; `field(t, y, args)`, the vector field of the term.
+    **Arguments:** those of `ProjectedSolver`; `project`: None for none; `field(t, y, args)`, the vector field of the term.
     """
 
     solver: diffrax.AbstractAdaptiveSolver
