@@ -332,7 +332,8 @@ def external_wrenches(
     **Raises:** ValueError for shapes that do not fit, and for unknown frames.
 
     ```python
-    scene = jd.Scene(model, forces=[jd.forces.ExternalWrench("tool", [0.0, 0.0, -50.0, 0.0, 0.0, 0.0])])
+    pull = jd.forces.ExternalWrench(model.body_names[-1], [0.0, 0.0, -50.0, 0.0, 0.0, 0.0])
+    scene = jd.Scene(model, forces=[pull])
     outer = jd.forces.external_wrenches(scene, q, v)
     bearings = jd.dynamics.joint_wrench(model, q, v, a, external=outer)
     ```

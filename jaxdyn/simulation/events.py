@@ -102,7 +102,7 @@ class Terminal(eqx.Module):
     and for a scene whose forces have modes.
 
     ```python
-    reached = jd.events.Terminal(lambda q, v, t: q[0] - 0.5)
+    reached = jd.events.Terminal(lambda q, v, t: 0.5 - q[0])
     jd.simulate(model, q0, v0, ts, events=[reached])
     ```
     """

@@ -218,6 +218,7 @@ def _arguments(function):
     return [
         argument_tables.Argument(name, "", None if p.default is p.empty else repr(p.default))
         for name, p in inspect.signature(function).parameters.items()
+        if p.kind is not p.VAR_KEYWORD  # former names, and options that the text passes on
     ]
 
 
