@@ -213,13 +213,6 @@ def test_far_robot_is_as_exact_as_at_home(dtype):
         assert {x.dtype for x in there} == {jnp.dtype(dtype)}
 
 
-def test_batch_equals_loop():
-    _, model, _, frames, q, v, ours = case("every_kind")
-    one = quick(lambda q, v: frame_motion.jacobian_dot_v(model, q, v, frames[-1]))
-    loop = jnp.stack([one(x, y) for x, y in zip(q, v, strict=True)])
-    assert_close(ours["rate2"], loop, 1e-13)
-
-
 def test_frames_of_the_world():
     model = random_tree(1, ["revolute", "revolute"])
     q = jnp.asarray([0.3, 0.4])
