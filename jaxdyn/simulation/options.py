@@ -44,11 +44,6 @@ class Steps(eqx.Module):
     atol: Numbers | None = eqx.field(default=None, kw_only=True)
     max_steps: int | None = eqx.field(static=True, default=None, kw_only=True)
 
-    @classmethod
-    def of(cls, stepsize: Any) -> "Steps":
-        """Steps that the argument `stepsize` of `simulate` stands for."""
-        return stepsize if isinstance(stepsize, Steps) else cls(stepsize)
-
 
 class Pose(NamedTuple):
     """Output of `simulate`: the pose (nt, 4, 4) of a frame of the model, in `Solution.poses` by its name."""
@@ -70,7 +65,9 @@ def pack_steps(options: dict[str, Any]) -> dict[str, Any]:
     if not given:
         return options
     rest = {name: value for name, value in options.items() if name not in given}
-    return rest | {"stepsize": dataclasses.replace(Steps.of(rest.get("stepsize")), **given)}
+    steps = rest.get("stepsize")
+    steps = steps if isinstance(steps, Steps) else Steps(steps)
+    return rest | {"stepsize": dataclasses.replace(steps, **given)}
 
 
 def as_output(name: str | Pose) -> str | Pose:

@@ -170,8 +170,9 @@ def simulate(
     """
     scene, control = as_scene(scene), controls.as_control(control)
     watch, terminals = sort_events(events)
-    steps = Steps.of(stepsize)
-    stepsize, rtol, atol, max_steps = steps.size, steps.rtol, steps.atol, steps.max_steps
+    rtol = atol = max_steps = None
+    if isinstance(stepsize, Steps):
+        stepsize, rtol, atol, max_steps = stepsize.size, stepsize.rtol, stepsize.atol, stepsize.max_steps
     arrays, stepsize = _check_numbers(scene, q0, v0, ts, rtol, atol, stepsize)
     method, modal = choose_method(scene, method), has_modes(scene)
     concrete = is_known(scene, control, method, arrays, stepsize, terminals)
