@@ -317,7 +317,14 @@ def whole_body():
     goal = center + jnp.asarray([0.05, 0.0, -0.03])
     attitude = jd.frame_pose(model, q, "trunk")[:3, :3]
     law = jd.control.WholeBody(
-        model, feet, goal, KP, KD, orientation=attitude, posture=q, passive=(0, 1, 2), preload=1.0
+        model,
+        feet,
+        goal,
+        KP,
+        KD,
+        orientation=attitude,
+        posture=q,
+        forces=jd.control.GroundForces(preload=1.0, passive=(0, 1, 2)),
     )
     scene = jd.control.standing(model, q, feet)
     options = {

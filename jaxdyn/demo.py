@@ -14,8 +14,8 @@ import jax.numpy as jnp
 import numpy as np
 
 import jaxdyn as jd
+from jaxdyn.identify.excitation import Tracking, random_motion, random_torque
 from jaxdyn.identify.replay import segments
-from jaxdyn.identify.workflows.excitation import Tracking, random_motion, random_torque
 from jaxdyn.reports.plotting import BLUE, GREY, ORANGE, RED, bands, new_figure
 
 # Standard deviation of the random torques of each joint (N m), about a tenth of what the arm's weight asks for.

@@ -28,7 +28,7 @@ from jaxdyn.constraints.assembly import assemble
 from jaxdyn.constraints.codes import RESULTS
 from jaxdyn.forces.elements import CoulombFriction, JointDamping
 from jaxdyn.identify import SampledTorque
-from jaxdyn.identify.workflows.excitation import FourierTorque, random_torque
+from jaxdyn.identify.excitation import FourierTorque, random_torque
 from jaxdyn.io import LoadedScene
 from jaxdyn.io.logs import read_log
 from jaxdyn.model.configuration import integrate

@@ -259,7 +259,7 @@ def force_closure_of_map(
 
     - `G` (p, m): grasp map, G f is the wrench of contact forces f on the object; `jd.grasp.grasp_map`. Known numbers.
     - `cones`: one per contact in the order of G's columns: `friction_cone(...)`, `surface_cone(...)`, or rows U (k, m_i) with
-    $U f \le 0$, for which the total normal force is the mean of $-U f$.
+      $U f \le 0$, for which the total normal force is the mean of $-U f$.
     - `faces`, `side`: of `FrictionCone.pyramid`; None: the round cones.
 
     **Returns:** `ForceClosure`.

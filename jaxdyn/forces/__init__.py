@@ -21,7 +21,7 @@ from jaxdyn.forces.piecewise import EffortLimits as EffortLimits
 from jaxdyn.forces.piecewise import JointStops as JointStops
 from jaxdyn.forces.piecewise import PiecewiseForce as PiecewiseForce
 from jaxdyn.forces.piecewise import TorqueSpeedLimits as TorqueSpeedLimits
-from jaxdyn.systems.drives import DriveDynamics as DriveDynamics
+from jaxdyn.systems.scene import DriveDynamics as DriveDynamics
 
 
 def __dir__() -> list[str]:

@@ -22,8 +22,7 @@ from jaxdyn.model.joining import join
 from jaxdyn.model.joints import KINDS
 from jaxdyn.model.numbers import as_float
 from jaxdyn.model.tree import Model
-from jaxdyn.systems.drives import DriveDynamics
-from jaxdyn.systems.scene import Scene, as_pytree
+from jaxdyn.systems.scene import DriveDynamics, Scene, as_pytree
 
 
 class _Lag(DriveDynamics):
@@ -228,11 +227,11 @@ def elastic_joints(
     $$M(q) \ddot q + h(q, \dot q) = K (\theta/n - q) + D (\dot\theta/n - \dot q) = \tau_s, \quad
         B \ddot\theta + \tau_s/n = \tau$$
 
-        The scene's q is (model's q, theta) and v is (model's v, rate of theta); torques of the motors are the last
-        entries of tau. The kinetic energy of a rotor is that of its own rotation, $B \dot\theta^2/2$; its mass belongs to
-        the link that carries it. Spong's model neglects the coupling with that link's rotation, which is of the order of
-        1/n: where it matters, add rotors as bodies on their links by a `ModelBuilder`, and `ElasticTransmission` to the
-        scene.
+    The scene's q is (model's q, theta) and v is (model's v, rate of theta); torques of the motors are the last
+    entries of tau. The kinetic energy of a rotor is that of its own rotation, $B \dot\theta^2/2$; its mass belongs to
+    the link that carries it. Spong's model neglects the coupling with that link's rotation, which is of the order of
+    1/n: where it matters, add rotors as bodies on their links by a `ModelBuilder`, and `ElasticTransmission` to the
+    scene.
 
     **Arguments:**
 

@@ -21,8 +21,7 @@ from jaxdyn.model.arguments import Checked, Number, Numbers, SystemLike, as_arra
 from jaxdyn.model.joints import KINDS
 from jaxdyn.model.numbers import as_number
 from jaxdyn.model.tree import Model
-from jaxdyn.systems.drives import pass_command
-from jaxdyn.systems.scene import Scene
+from jaxdyn.systems.scene import Scene, pass_command
 
 
 class PiecewiseForce(eqx.Module):

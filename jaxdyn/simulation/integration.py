@@ -21,7 +21,7 @@ from jaxdyn.simulation.solvers import ExplicitSteps, ProjectedSolver
 from jaxdyn.simulation.solvers.base import Adaptive, ErrorMonitoredSteps, Flag, StepOutput, Wrapped, too_coarse
 from jaxdyn.simulation.solvers.choice import (
     choose_loop,
-    is_explicit,
+    has_own_loop,
     progress_meter,
     solver_and_control,
 )
@@ -51,7 +51,7 @@ def integrate(term, project, eqs: Equations, args, method, y0, ts, steps, option
     step_constants = (*method.step_constants, *({controls.HELD, KEPT} & set(y0)))
     quality, guards = (None, None) if continuous else _monitors(eqs, method)
     loop, reason = choose_loop(solver, controller, options, guards, quality, eqs.pieces.names)
-    if is_explicit(solver) and not continuous:
+    if has_own_loop(solver) and not continuous:
         solver = ExplicitSteps(solver, project, step_constants, method.projects, field=term.vector_field)
     elif project:
         solver = ProjectedSolver(solver, project, step_constants, method.projects)

@@ -222,7 +222,7 @@ RUNS = {
     "forward": ("forward", {}),
     "backsolve": ("backsolve", {}),
     "diffrax": ("reverse", {"solver": diffrax.Kvaerno5()}),
-    "diffrax direct": ("direct", {"solver": jd.solvers.Rodas5P()}),
+    "diffrax direct": ("direct", {"solver": diffrax.Kvaerno3()}),
     "limits": ("reverse", {"events": [jd.events.JointLimit()]}),
 }
 

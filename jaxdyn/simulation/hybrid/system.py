@@ -106,7 +106,7 @@ class ModalSystem(HybridSystem):
     leaves, with forces in the pieces where the switching functions are `positive`; `y0`, a state.
     """
 
-    def __init__(self, bind: Callable, elements: Elements, solver: diffrax.AbstractERK, y0):
+    def __init__(self, bind: Callable, elements: Elements, solver: diffrax.AbstractAdaptiveSolver, y0):
         leaves, tree = jax.tree.flatten(y0)
         shapes = tuple(x.shape for x in leaves)
         self._bind, self.elements = bind, elements

@@ -101,10 +101,11 @@ def label(solver: diffrax.AbstractSolver) -> str:
     return f"{name}({label(inner)})" if isinstance(inner, diffrax.AbstractSolver) else name
 
 
-def is_explicit(solver: diffrax.AbstractSolver) -> bool:
-    """True for an explicit Runge-Kutta method, whose steps the library makes itself."""
+def has_own_loop(solver: diffrax.AbstractSolver) -> bool:
+    """True for a method whose steps the library makes itself: an explicit Runge-Kutta method, or `Rodas5P`."""
     # diffrax reports a method that wraps an explicit one as explicit.
-    return isinstance(solver, diffrax.AbstractERK) and not isinstance(solver, diffrax.AbstractWrappedSolver)
+    is_explicit = isinstance(solver, diffrax.AbstractERK) and not isinstance(solver, diffrax.AbstractWrappedSolver)
+    return is_explicit or type(solver) is Rodas5P
 
 
 def is_split(solver: diffrax.AbstractSolver) -> bool:
@@ -229,9 +230,9 @@ class _Facts(NamedTuple):
 # wrappers of controllers, such as a clip to samples, have rules that our loops do not know.
 _LOOPS: tuple[tuple[Callable[[_Facts], bool], str, str], ...] = (
     (
-        lambda x: not is_explicit(x.solver),
+        lambda x: not has_own_loop(x.solver),
         "diffrax",
-        "solver is {solver}; take an explicit one, such as diffrax.Dopri8()",
+        "solver is {solver}; take jd.solvers.Rodas5P(), or an explicit one, such as diffrax.Dopri8()",
     ),
     (
         lambda x: type(x.controller) not in (Adaptive, ErrorMonitoredSteps),

@@ -15,7 +15,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jax.flatten_util import ravel_pytree
-from jaxtyping import PyTree
+from jaxtyping import Array, PyTree
 
 from jaxdyn.compile import inverse
 from jaxdyn.lie import se2, se3, so3
@@ -38,7 +38,7 @@ class LieGroup(Wrapped):
     instead of nq + nv. The order is that of the wrapped method, which is used directly for systems without quaternions or
     planar joints. A step may turn a body by less than a full turn.
 
-    **Arguments:** `solver`, any diffrax method that `simulate` takes. The rest is filled in by `simulate`.
+    **Arguments:** `solver`, any diffrax method that `simulate` takes. `topology`: filled in by `simulate`.
 
     Source: Munthe-Kaas, Runge-Kutta methods on Lie groups (1998); Hairer, Lubich & Wanner 2006, section IV.8.2.
 
@@ -184,6 +184,8 @@ _C[7, :7] = (
     *(-40.06618937091002, -54.66780262877968, -9.48861652309627),
 )
 _TIME = np.array([0, 0.6358126895828704, 0.4095798393397535, 0.9769306725060716, 0.4288403609558664, 1, 1, 1])
+# What jumps where steps end is constant within them: the limits from after at the start, and from before at the end.
+_SIDE = (_TIME == 0).astype(float) - (_TIME == 1)
 _RATE = np.zeros(8)
 _RATE[:5] = _GAMMA, -0.42387512638858027, -0.3384627126235924, 1.8046452872882734, 2.325825639765069
 # Dense output: y0 (1 - x) + x (y1 + (1 - x) (K[0] + x (K[1] + x K[2]))), K = H U.
@@ -252,33 +254,47 @@ class Rodas5P(diffrax.AbstractAdaptiveSolver):
     ) -> StepOutput:
         """Make one step from t0 to t1."""
         start, unravel = ravel_pytree(y0)
-        h, control = t1 - t0, terms.contr(t0, t1)
+        control = terms.contr(t0, t1)
 
-        def change(point):
-            """h f at (y, t)."""
-            return ravel_pytree(terms.vf_prod(point[-1], unravel(point[:-1]), args, control))[0]
+        def change(y, t, _):
+            return ravel_pytree(terms.vf_prod(t, unravel(y), args, control))[0]
+
+        end, error, k = self.advance(change, start, t0, t1)
+        dense = {"y0": y0, "y1": unravel(end), "k": jax.vmap(unravel)(k)}
+        return unravel(end), unravel(error), dense, None, diffrax.RESULTS.successful
+
+    @staticmethod
+    def advance(change: Callable, start: Array, t0: Number, t1: Number) -> tuple[Array, Array, Array]:
+        """End (n,) of a step from a flat state, its error (n,), and the data (3, n) of its dense output.
+
+        `change(y, t, side)` (n,) is h f at a time t; `side` is 1 at the start of the step, -1 at its end, else 0.
+        """
+        h = t1 - t0
+
+        def of_point(point, side):
+            return change(point[:-1], point[-1], side)
 
         # One Jacobian with respect to (y, t): its last column is h df/dt.
-        jacobian = jax.jacfwd(change)(jnp.append(start, jnp.asarray(t0, start.dtype)))
+        begin = jnp.append(start, jnp.asarray(t0, start.dtype))
+        jacobian = jax.jacfwd(of_point)(begin, jnp.ones((), start.dtype))
         # `change` is h f, so that its Jacobian includes h.
         matrix = jnp.eye(start.size, dtype=start.dtype) - _GAMMA * jacobian[:, :-1]
         inverted = inverse(matrix)
 
         def stage(stages, row):
-            i, a, c, time, rate = row
-            point = jnp.append(start + matmul(a, stages), t0 + time * h)
-            right = _GAMMA * (change(point) + matmul(c, stages) + rate * h * jacobian[:, -1])
+            i, a, c, time, side, rate = row
+            point = jnp.append(start + matmul(a, stages), jnp.asarray(t0 + time * h, start.dtype))
+            right = _GAMMA * (of_point(point, side) + matmul(c, stages) + rate * h * jacobian[:, -1])
             solution = matmul(inverted, right)
             # Products with an inverse lose the digits of the condition number; one refinement restores those of elimination.
             solution = solution + matmul(inverted, right - matmul(matrix, solution))
             return stages.at[i].set(solution), None
 
         # A scan rather than eight copies of the vector field: the program of a stage is compiled once.
-        rows = [jnp.asarray(x, start.dtype) for x in (_A, _C, _TIME, _RATE)]
+        rows = [jnp.asarray(x, start.dtype) for x in (_A, _C, _TIME, _SIDE, _RATE)]
         stages, _ = jax.lax.scan(stage, jnp.zeros((8, start.size), start.dtype), (jnp.arange(8), *rows))
-        y1 = unravel(start + matmul(rows[0][-1], stages) + stages[-1])
-        dense = {"y0": y0, "y1": y1, "k": jax.vmap(unravel)(matmul(jnp.asarray(_H, start.dtype), stages))}
-        return y1, unravel(stages[-1]), dense, None, diffrax.RESULTS.successful
+        end = start + matmul(rows[0][-1], stages) + stages[-1]
+        return end, stages[-1], matmul(jnp.asarray(_H, start.dtype), stages)
 
 
 # --- methods for fixed steps: the classical Runge-Kutta method, and maps from one state to the next ---
