@@ -43,7 +43,13 @@ def measured(adjoint: str, steps: int) -> dict:
         arm = model.replace(inertias=inertias)
 
         motion = jd.simulate(
-            arm, q, jnp.zeros(7), ts, solver=RK4(), stepsize=jd.Steps(dt, max_steps=steps + 1), adjoint=adjoint
+            arm,
+            q,
+            jnp.zeros(7),
+            ts,
+            solver=RK4(),
+            stepsize=jd.simulation.Steps(dt, max_steps=steps + 1),
+            adjoint=adjoint,
         )
         return jnp.sum(motion.q[-1] ** 2)
 

@@ -38,7 +38,7 @@ def flat(dtypes, gradient, runs=FALLS):
             v = v0.astype(dtype) * (point + x)
             at = jnp.asarray(ts, dtype)
             bound = tolerance if stepsize is None else None
-            steps = jd.Steps(stepsize, rtol=bound, atol=bound, max_steps=4096)
+            steps = jd.simulation.Steps(stepsize, rtol=bound, atol=bound, max_steps=4096)
             options = {"method": method, "stepsize": steps}
             solution = jd.simulate(
                 as_dtype(base, dtype), q0.astype(dtype), v, at, outputs=("constraint_residual",), **options
@@ -107,7 +107,7 @@ def _held_by_planes(point, x, rank_tol):
     options = {
         "control": push,
         "method": method,
-        "stepsize": jd.Steps(max_steps=256),
+        "stepsize": jd.simulation.Steps(max_steps=256),
         "outputs": ("constraint_residual",),
     }
     solution = jd.simulate(scene, zero, zero, ts, **options)
@@ -127,7 +127,7 @@ def bases(dtypes, gradient):
     rows, base = [], jd.scenes.four_bar(gravity=None)
     q0, v0 = jd.scenes.four_bar.start(rate=3.0)
     ts = np.array([0.0, 1.0, 2.5])
-    tight = jd.simulate(base, q0, v0, ts, stepsize=jd.Steps(rtol=1e-12, atol=1e-12))
+    tight = jd.simulate(base, q0, v0, ts, stepsize=jd.simulation.Steps(rtol=1e-12, atol=1e-12))
     exact = np.concatenate([tight.q[-1], tight.v[-1]])[None]
     choices = {"rocker": jd.Reduced((2,)), "continued": jd.Reduced(dof=1)}
     for name, method in choices.items():
@@ -141,7 +141,7 @@ def bases(dtypes, gradient):
                     v0.astype(dtype) * (point + x),
                     jnp.asarray(ts, dtype),
                     method=method,
-                    stepsize=jd.Steps(stepsize, max_steps=2048),
+                    stepsize=jd.simulation.Steps(stepsize, max_steps=2048),
                     outputs=("constraint_residual",),
                     throw=False,
                 )
@@ -263,7 +263,7 @@ def starts(dtypes, gradient):
             v,
             jnp.asarray(ts, dtype),
             outputs=("constraint_residual", "energy"),
-            stepsize=jd.Steps(max_steps=512),
+            stepsize=jd.simulation.Steps(max_steps=512),
         )
         result = outcome(solution, end=(solution.energy[1:] - solution.energy[0]) / 50.0)
         if code is None:

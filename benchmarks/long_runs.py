@@ -58,7 +58,7 @@ def measure(name: str, length: float) -> Iterator[dict]:
     for integration in integrations(step):
 
         def run(q, v, numbers, options=integration.options):
-            steps = jd.Steps(**numbers, max_steps=2**24)
+            steps = jd.simulation.Steps(**numbers, max_steps=2**24)
             return jd.simulate(scene, q, v, ts, outputs=outputs, stepsize=steps, throw=False, **options)
 
         compiled = jax.jit(run).lower(q, v, next(iter(integration.numbers.values()))).compile()

@@ -231,7 +231,7 @@ def program(case: Case, solver, dtype=float, size=None, max_steps=None) -> Calla
             scene, control = jax.tree.map(lambda x: x.astype(dtype), (scene, control))
         # Explicit steps of a given length have no use for a tolerance.
         bound = None if isinstance(solver, jd.solvers.RK4) else tolerance
-        steps = jd.Steps(size, rtol=bound, atol=bound, max_steps=max_steps)
+        steps = jd.simulation.Steps(size, rtol=bound, atol=bound, max_steps=max_steps)
         options = {"control": control, "solver": solver, "stepsize": steps, "adjoint": "forward", "throw": False}
         solution = jd.simulate(scene, q0, v0, case.ts, **options)
         return solution.q, (solution.stats["num_steps"], solution.success, code_of(solution.result))

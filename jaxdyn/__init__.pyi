@@ -63,7 +63,6 @@ from jaxdyn.reports import report
 from jaxdyn.simulation import events, solvers
 from jaxdyn.simulation.controls import Controller, Sampled
 from jaxdyn.simulation.methods import Multipliers, Projected, Reduced
-from jaxdyn.simulation.options import Steps
 from jaxdyn.simulation.run import simulate
 from jaxdyn.simulation.solution import Solution
 from jaxdyn.simulation.stepping import stepper
@@ -91,7 +90,6 @@ __all__ = [
     "Sampled",
     "Scene",
     "Solution",
-    "Steps",
     "Variational",
     "animate",
     "assemble",

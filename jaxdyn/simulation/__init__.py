@@ -13,6 +13,7 @@ if TYPE_CHECKING:
     from jaxdyn.simulation.events import JointLimitWarning as JointLimitWarning
     from jaxdyn.simulation.methods import Baumgarte as Baumgarte
     from jaxdyn.simulation.options import Pose as Pose
+    from jaxdyn.simulation.options import Steps as Steps
     from jaxdyn.simulation.stiffness import Stiffness as Stiffness
 
 __all__ = [
@@ -20,6 +21,7 @@ __all__ = [
     "ContactStep",
     "JointLimitWarning",
     "Pose",
+    "Steps",
     "Stiffness",
 ]
 
@@ -36,6 +38,7 @@ def __getattr__(name: str) -> Any:
         "ContactStep": "contact_steps",
         "JointLimitWarning": "events",
         "Pose": "options",
+        "Steps": "options",
         "Stiffness": "stiffness",
     }
     if name not in homes:

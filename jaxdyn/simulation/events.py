@@ -291,7 +291,12 @@ class Violation(NamedTuple):
         }
 
 
-def first_violation(rows: Float[Array, "nt k"], reached, ts, within) -> Violation:
+def first_violation(
+    rows: Float[Array, "nt k"],
+    reached: Bool[Array, " nt"],
+    ts: Float[Array, " nt"],
+    within: tuple[Bool[Array, ""], Float[Array, ""], Float[Array, " k"]] | None,
+) -> Violation:
     """First negative allowance, from those at the save points and at the event that ended a step.
 
     `within` is None, or whether there was such an event, its time and the allowances (k,) there.

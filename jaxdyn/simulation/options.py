@@ -34,8 +34,8 @@ class Steps(eqx.Module):
       step and trajectory.
 
     ```python
-    jd.simulate(model, q0, v0, ts, stepsize=jd.Steps(rtol=1e-10, atol=1e-12))
-    jd.simulate(model, q0, v0, ts, stepsize=jd.Steps(0.01, max_steps=1000))
+    jd.simulate(model, q0, v0, ts, stepsize=jd.simulation.Steps(rtol=1e-10, atol=1e-12))
+    jd.simulate(model, q0, v0, ts, stepsize=jd.simulation.Steps(0.01, max_steps=1000))
     ```
     """
 
@@ -43,11 +43,6 @@ class Steps(eqx.Module):
     rtol: Numbers | None = eqx.field(default=None, kw_only=True)
     atol: Numbers | None = eqx.field(default=None, kw_only=True)
     max_steps: int | None = eqx.field(static=True, default=None, kw_only=True)
-
-    @classmethod
-    def of(cls, stepsize: Any) -> "Steps":
-        """Steps that the argument `stepsize` of `simulate` stands for."""
-        return stepsize if isinstance(stepsize, Steps) else cls(stepsize)
 
 
 class Pose(NamedTuple):
@@ -70,7 +65,9 @@ def pack_steps(options: dict[str, Any]) -> dict[str, Any]:
     if not given:
         return options
     rest = {name: value for name, value in options.items() if name not in given}
-    return rest | {"stepsize": dataclasses.replace(Steps.of(rest.get("stepsize")), **given)}
+    steps = rest.get("stepsize")
+    steps = steps if isinstance(steps, Steps) else Steps(steps)
+    return rest | {"stepsize": dataclasses.replace(steps, **given)}
 
 
 def as_output(name: str | Pose) -> str | Pose:

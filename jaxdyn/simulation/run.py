@@ -70,7 +70,7 @@ def _accept_former_arguments(function: F) -> F:
             given = {name: options[name] for name in sorted(FORMER_STEPS & set(options))}
             size = [] if options.get("stepsize") is None else ["stepsize"]
             options = pack_steps(options)
-            _warn(given, "stepsize", f"jd.Steps({', '.join([*size, *(f'{name}=...' for name in given)])})")
+            _warn(given, "stepsize", f"jd.simulation.Steps({', '.join([*size, *(f'{name}=...' for name in given)])})")
         outputs = options.get("outputs", ())
         if not isinstance(outputs, str) and any(isinstance(x, str) and x.startswith(POSE) for x in outputs):
             options["outputs"] = tuple(map(as_output, outputs))
@@ -135,7 +135,7 @@ def simulate(
       for adaptive ones `Dopri8`, or `Rodas5P` where the scene lists forces, all inputs are concrete and `jd.stiffness` at
       the start says that explicit steps would have to be shorter than a thousandth of the time.
     - `stepsize`: None for adaptive steps with tolerances of 1e-8, a number (s) for fixed ones, a diffrax step-size controller,
-      or `jd.Steps(size, rtol, atol, max_steps)`, which sets tolerances and limits too.
+      or `jd.simulation.Steps(size, rtol, atol, max_steps)`, which sets tolerances and limits too.
     - `adjoint`: how derivatives are computed.
 
         - "reverse" (default): reverse mode with checkpoints, and Hessians over it.
@@ -170,8 +170,9 @@ def simulate(
     """
     scene, control = as_scene(scene), controls.as_control(control)
     watch, terminals = sort_events(events)
-    steps = Steps.of(stepsize)
-    stepsize, rtol, atol, max_steps = steps.size, steps.rtol, steps.atol, steps.max_steps
+    rtol = atol = max_steps = None
+    if isinstance(stepsize, Steps):
+        stepsize, rtol, atol, max_steps = stepsize.size, stepsize.rtol, stepsize.atol, stepsize.max_steps
     arrays, stepsize = _check_numbers(scene, q0, v0, ts, rtol, atol, stepsize)
     method, modal = choose_method(scene, method), has_modes(scene)
     concrete = is_known(scene, control, method, arrays, stepsize, terminals)

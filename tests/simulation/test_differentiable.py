@@ -150,7 +150,7 @@ def test_runs_that_end_early(case):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("options", [{"stepsize": jd.Steps(rtol=1e-10, atol=1e-10)}, {"stepsize": 5e-3}])
+@pytest.mark.parametrize("options", [{"stepsize": jd.simulation.Steps(rtol=1e-10, atol=1e-10)}, {"stepsize": 5e-3}])
 def test_hessian_of_a_motion_over_the_default_adjoint(options):
     """Of q0 cos(w T) + v0 sin(w T)/w by q0, v0 and w, forward over reverse and reverse over reverse."""
 
@@ -209,7 +209,7 @@ def _end_of_pendulum(adjoint, **options):
 
     def end(k, q0, steps=400):
         here = model.replace(inertias=model.inertias * k)
-        given = {"adjoint": adjoint, "throw": False, "stepsize": jd.Steps(max_steps=steps)} | options
+        given = {"adjoint": adjoint, "throw": False, "stepsize": jd.simulation.Steps(max_steps=steps)} | options
         motion = jd.simulate(here, q0[None], jnp.zeros(1), jnp.linspace(0, 2.0, 3), **given)
         return jnp.stack([motion.q[-1, 0], motion.v[-1, 0]]), motion.success
 

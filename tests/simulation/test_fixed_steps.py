@@ -109,7 +109,7 @@ def test_reduced_and_projected_steps_are_watched():
 
         def run(h, method=method):
             solution = jd.simulate(
-                scene, q, v, [0.0, 1.2], method=method, stepsize=jd.Steps(h, max_steps=256), throw=False
+                scene, q, v, [0.0, 1.2], method=method, stepsize=jd.simulation.Steps(h, max_steps=256), throw=False
             )
             return solution.result
 

@@ -102,7 +102,7 @@ def fall(level, *others, **options):
         jnp.zeros(6),
         ts,
         events=terminal,
-        **{"stepsize": jd.Steps(rtol=1e-10, atol=1e-10)} | options,
+        **{"stepsize": jd.simulation.Steps(rtol=1e-10, atol=1e-10)} | options,
     )
 
 
@@ -158,8 +158,12 @@ def test_the_time_of_a_terminal_event_has_derivatives():
     ("former", "present", "text"),
     [
         ({"limits": "stop"}, {"events": [jd.events.JointLimit()]}, r"events=\[jd.events.JointLimit\(stop=True\)\]"),
-        ({"rtol": 1e-4}, {"stepsize": jd.Steps(rtol=1e-4)}, r"stepsize=jd.Steps\(rtol="),
-        ({"stepsize": 0.1, "max_steps": 3}, {"stepsize": jd.Steps(0.1, max_steps=3)}, r"Steps\(stepsize, max_steps="),
+        ({"rtol": 1e-4}, {"stepsize": jd.simulation.Steps(rtol=1e-4)}, r"stepsize=jd.simulation.Steps\(rtol="),
+        (
+            {"stepsize": 0.1, "max_steps": 3},
+            {"stepsize": jd.simulation.Steps(0.1, max_steps=3)},
+            r"Steps\(stepsize, max_steps=",
+        ),
         ({"outputs": ("pose:cart",)}, {"outputs": (jd.simulation.Pose("cart"),)}, r"outputs=\(jd.simulation.Pose"),
     ],
 )

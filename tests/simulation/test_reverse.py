@@ -45,9 +45,9 @@ def gradients(adjoint, jit=jax.jit, **options):
 @pytest.mark.parametrize(
     "options",
     [
-        {"stepsize": jd.Steps(0.05, max_steps=16)},
+        {"stepsize": jd.simulation.Steps(0.05, max_steps=16)},
         pytest.param(
-            {"stepsize": jd.Steps(rtol=1e-6, atol=1e-6, max_steps=64), "solver": diffrax.Tsit5()},
+            {"stepsize": jd.simulation.Steps(rtol=1e-6, atol=1e-6, max_steps=64), "solver": diffrax.Tsit5()},
             marks=pytest.mark.slow,
         ),
     ],
@@ -70,7 +70,7 @@ def test_derivatives_are_those_of_diffrax(options, monkeypatch):
 
 @pytest.mark.slow
 def test_derivatives_without_kernels():
-    options = {"stepsize": jd.Steps(0.05, max_steps=16)}
+    options = {"stepsize": jd.simulation.Steps(0.05, max_steps=16)}
     own = gradients("reverse", **options)
     with jd.compilation("plain"):
         plain = gradients("reverse", **options)

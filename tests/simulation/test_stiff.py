@@ -40,7 +40,9 @@ def test_first_step_is_the_same_in_any_unit_of_time():
         scene = jd.Scene(model, forces=(jd.forces.JointSpring(w * w),))
         start = jnp.ones(1), 0.5 * w[None]
         # Without atol, which is not the same for m/s in all units of time; powers of two make the numbers the same.
-        return jd.simulate(scene, *start, jnp.stack([0 * w, 10 / w]), stepsize=jd.Steps(atol=1e-30), throw=False)
+        return jd.simulate(
+            scene, *start, jnp.stack([0 * w, 10 / w]), stepsize=jd.simulation.Steps(atol=1e-30), throw=False
+        )
 
     computed = run(2.0 ** np.array([0, 20, -20]))
     assert computed.success.all()
@@ -354,7 +356,9 @@ def test_default_solver_and_advice_follow_stiffness():
 
     def run(stiffness, **options):
         scene, control, q0, v0 = case.build(jnp.asarray(stiffness))
-        return jd.simulate(scene, q0, v0, case.ts, control=control, stepsize=jd.Steps(max_steps=400), **options)
+        return jd.simulate(
+            scene, q0, v0, case.ts, control=control, stepsize=jd.simulation.Steps(max_steps=400), **options
+        )
 
     for stiffness, solver in ((1e3, "Dopri8"), (1e9, "Rodas5P")):
         computed = run(stiffness)
@@ -404,7 +408,12 @@ def test_gradient_of_a_whole_motion_of_adaptive_steps(solver):
 
     def end(log, adjoint=None):
         scene = jd.Scene(model, forces=(jd.forces.JointSpring(jnp.exp(log)), jd.forces.JointDamping(0.01)))
-        options = {"solver": solver, "adjoint": adjoint, "stepsize": jd.Steps(max_steps=1024), "throw": False}
+        options = {
+            "solver": solver,
+            "adjoint": adjoint,
+            "stepsize": jd.simulation.Steps(max_steps=1024),
+            "throw": False,
+        }
         solution = jd.simulate(scene, jnp.asarray([2.5]), jnp.asarray([0.1]), ts, **options)
         return jnp.sum(solution.q * solution.v), solution.stats["num_steps"]
 
@@ -495,7 +504,12 @@ def test_stiff_scenes_with_dry_friction():
 
         scene = jd.Scene(model, forces=[spring, jd.contact.DryFriction(0.4, 9.81, 0)])
         motion = jd.simulate(
-            scene, jnp.zeros(2), jnp.stack([speed, speed]), ts, solver=solver, stepsize=jd.Steps(rtol=1e-9, atol=1e-9)
+            scene,
+            jnp.zeros(2),
+            jnp.stack([speed, speed]),
+            ts,
+            solver=solver,
+            stepsize=jd.simulation.Steps(rtol=1e-9, atol=1e-9),
         )
         return motion.q[-1, 0], (motion.stats["num_steps"], motion.v[-1])
 
