@@ -22,8 +22,15 @@ from jaxdyn.identify.mechanisms import Measured, build_scene, check_motors, obse
 from jaxdyn.identify.methods import LinearErrors, Unknowns, eliminate_starts, with_prior
 from jaxdyn.identify.options import BALANCES, SIMULATED, Objective
 from jaxdyn.identify.parameter_tree import Parameters
-from jaxdyn.identify.replay import Segments, check_spacing, cut_segments, simulation_options, with_even_steps
-from jaxdyn.identify.result import inverse_torque, regressor_torque
+from jaxdyn.identify.result import (
+    Segments,
+    check_spacing,
+    cut_segments,
+    inverse_torque,
+    regressor_torque,
+    simulation_options,
+    with_even_steps,
+)
 from jaxdyn.identify.torque_terms import Friction, smoothing_by_filter
 from jaxdyn.model.tree import Model
 from jaxdyn.systems.scene import has_drives
