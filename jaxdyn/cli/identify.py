@@ -8,11 +8,13 @@ from typing import Any
 import numpy as np
 
 from jaxdyn import __version__, identify
-from jaxdyn.cli.clusters import add_cluster_options, connect
 from jaxdyn.cli.common import (
     Stopwatch,
+    add_cluster_options,
     add_model_options,
     check_least,
+    connect,
+    load_for_repair,
     load_model,
     output_path,
     real,
@@ -31,7 +33,6 @@ from jaxdyn.cli.identify_options import (
     resolve_options,
 )
 from jaxdyn.cli.identify_tables import error_table, gains_text, payload_text, tables
-from jaxdyn.cli.repair import load_for_repair
 from jaxdyn.constraints.codes import name_of
 from jaxdyn.identify import EXTRA, TERMS, Fit, LeastSquares, Log, RobotFit
 from jaxdyn.identify.descent import on_one_thread

@@ -135,8 +135,8 @@ def fit_geometry(
 
     - `system`: model, or scene with loops (`jd.loop`), where the fit starts. Its joints have one degree of freedom each.
     - `q` (n, nq): positions of the joints (rad, m) in each pose, as the encoders read them.
-    - `poses` (n, 4, 4): of the frame, in the frame of the measuring device; or `positions` (n, 3) or (n, k, 3): of markers (m),
-      which are at `markers` (k, 3) in the frame, one at its origin by default.
+    - `poses` (n, 4, 4): of the frame, in the frame of the measuring device. `positions` (n, 3) or (n, k, 3): of markers, m, in
+      place of poses. `markers` (k, 3): their places in the frame, m; one at its origin by default.
     - `frame`: name of the frame that is measured.
     - `free`: some of "base", pose of the model's world in the device's frame; "offsets", the zeros of the encoders; "axes", the
       directions of axes; "lengths", the places of axes, and of the frames of loops; "tool", pose of the measured frame.
@@ -362,8 +362,11 @@ def choose_poses(
     Of random configurations within the limits of the joints, each in turn is the one that adds most to the logarithm of the
     determinant (D-optimality); chosen ones are then exchanged for better ones.
 
-    **Arguments:** as of `fit_geometry`; `markers` (k, 3) if those are measured, None for poses. `guess` (nq,): a configuration
-    with closed loops. `seed` of the random configurations.
+    **Arguments:** as of `fit_geometry`, and
+
+    - `count`: number of poses to choose.
+    - `markers` (k, 3): their places in the frame, m, if those are measured; None for poses.
+    - `guess` (nq,): a configuration with closed loops. `seed`: of the random configurations.
 
     **Raises:** ValueError as `fit_geometry`, and for fewer poses than determine the directions.
 

@@ -234,7 +234,8 @@ def identifiability(
 ) -> Identifiability:
     """Identifiability of the bodies and the terms of a model from the motions of logs; their torques do not matter.
 
-    **Arguments:** as `least_squares`; `count`: number of the weakest directions to name.
+    **Arguments:** as `least_squares`; `rcond`: singular values below this share of the largest one count as zero; `count`: number
+    of the weakest directions to name.
 
     **Returns:** `Identifiability`.
 

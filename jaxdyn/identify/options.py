@@ -279,8 +279,8 @@ class Solver(eqx.Module):
       as of a network, "lbfgs", "adam" or an optax.GradientTransformation, by reverse mode.
     - `steps`: the most steps. `learning_rate`: of adam, a share of each number (of one where it starts at zero), decaying to zero
       along a cosine. `tolerance`: "lbfgs" ends where ten steps have lowered the loss by less than this share of it.
-    - `starts`: number of starting points: coordinates vary by `spread` (positive numbers by that share) around the given ones,
-      all points are improved in one `jax.vmap`, and the best is fitted to the end. `seed`: of the points.
+    - `starts`: number of starting points around the given one. All are improved in one `jax.vmap`, and the best is fitted to the
+      end. `spread`: standard deviation of the coordinates of the points, of positive numbers as a share. `seed`: of the points.
 
     **Raises:** ValueError for an unknown method, and numbers out of range.
 
@@ -331,9 +331,9 @@ class Execution(eqx.Module):
     - `client`: a `dask.distributed.Client`, whose workers share the starts.
     - `callback(step, loss, system)` is called at every point with the system there; True stops the fit. `progress`: print step,
       loss and time left on standard error. `seconds`: limit of the fit's duration.
-    - `checkpoint`: a file with the fit's state, written after every `every` steps (an integer) or seconds (a float). A fit of
-      the same problem resumes from it, even after kill -9, and ends in the same numbers, bit for bit on one machine;
-      `resume=False` starts again.
+    - `checkpoint`: a file with the fit's state. A fit of the same problem resumes from it, even after kill -9, and ends in the
+      same numbers, bit for bit on one machine. `every`: steps (an integer) or seconds (a float) between two writes.
+      `resume`: False starts again.
 
     ```python
     execution = jd.identify.Execution(progress=True, checkpoint="fit.ckpt", every=10)

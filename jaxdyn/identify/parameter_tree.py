@@ -42,7 +42,7 @@ class Parameters(eqx.Module):
     Nothing is free at first. Each method frees a leaf, or rows of it (bodies, joints), and returns a new tree.
 
     **Arguments:** `system`: a `Model`, another system, a `Scene`, a `jd.identify.Measured` scene with its sensors, or a
-    `jd.identify.Construction`.
+    `jd.identify.Construction`; `blocks`: what is free already, as the methods add it.
 
     **Raises:** ValueError in each method for a selection that is no floating-point leaf, is selected twice, or starts outside
     its bounds; the message names the leaf.

@@ -78,7 +78,8 @@ def fit_parameters(
       scene, or a `jd.identify.Construction`; the start of the fit.
     - `log` with q, v, tau, and a for error="torque"; or several logs.
     - `parameters`: the free numbers and their priors (`jd.identify.Parameters` of the same system). For plain numbers instead
-      `positive`, `free`: functions that select leaves, or whole parts, of `system`:
+      two functions.
+    - `positive`, `free`: functions that select leaves, or whole parts, of `system`:
       `lambda system: [system.parameters["mass"], system.parameters["length"]]`.
     - `objective`: what is minimised, a `jd.identify.Objective`. The time of a `Model` starts at zero in every segment, that of
       another system is the log's.

@@ -61,6 +61,7 @@ def from_raw(
       differences beyond pi, as `numpy.unwrap`; False, none. A `LogWarning` names joints and counts.
     - `outliers`: samples of q and tau that contradict their neighbours are an error, "refuse"; are interpolated, with a
       `LogWarning` that counts them, "drop"; or stay, "keep".
+    - `joint_names`: of the columns, for messages; by default those of `model`.
     - `model`: defines the columns that are angles, their joints' names and velocity limits. Without it any column of q may be
       one.
 

@@ -19,6 +19,7 @@ from jaxdyn.identify.regression import torque_error
 from jaxdyn.identify.torque_terms import ExtraTorque, Friction, friction_of, smoothing_by_filter
 from jaxdyn.model.arguments import Checked, Number, state_dtype
 from jaxdyn.model.tree import Model
+from jaxdyn.simulation.options import pack_steps
 from jaxdyn.simulation.run import simulate
 from jaxdyn.systems.scene import Scene, as_scene
 from jaxdyn.systems.system import displace, displacement
@@ -254,7 +255,7 @@ def simulate_segment(
         q0, v0 = (jnp.where(state.success, x, jnp.nan) for x in (state.q, state.v))
     control = SampledTorque(t, jnp.asarray(one.tau), hold) if control is None else control
     # No exception under jax.vmap: one failed segment must not end the others.
-    motion = simulate(scene, q0, v0, t, control=control, outputs=outputs, throw=False, **given)
+    motion = simulate(scene, q0, v0, t, control=control, outputs=outputs, throw=False, **pack_steps(given))
     return motion.q, motion.v, *(getattr(motion, name) for name in outputs)
 
 

@@ -23,7 +23,7 @@ from jaxdyn.identify.methods import Unknowns
 from jaxdyn.identify.problem import errors_of, pose_problem
 from jaxdyn.identify.regression import condense
 from jaxdyn.identify.robot_logs import RobotLogs, scene_with_parameters
-from jaxdyn.io.urdf import load_urdf
+from jaxdyn.io import load_model
 from jaxdyn.model.builder import ModelBuilder
 from jaxdyn.simulation.run import simulate
 from jaxdyn.systems.scene import Scene
@@ -484,7 +484,7 @@ def franka(data_dir, robots_dir):
     t, q, _, tau = prepare.raw()
     log = identify.from_raw(t, q, tau)
     path = robots_dir / "panda_description/urdf/panda.urdf"
-    model = load_urdf(path, lock=("panda_finger_joint1", "panda_finger_joint2"))
+    model = load_model(path, lock=("panda_finger_joint1", "panda_finger_joint2"))
     # The file's damping is the same placeholder in every joint; the protocol's nominal model has no friction.
     return model.replace(damping=None, friction=None), *identify.split(log, 0.7), path
 
