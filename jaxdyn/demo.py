@@ -15,7 +15,7 @@ import numpy as np
 
 import jaxdyn as jd
 from jaxdyn.identify.excitation import Tracking, random_motion, random_torque
-from jaxdyn.identify.replay import segments
+from jaxdyn.identify.result import segments
 from jaxdyn.reports.plotting import BLUE, GREY, ORANGE, RED, bands, new_figure
 
 # Standard deviation of the random torques of each joint (N m), about a tenth of what the arm's weight asks for.

@@ -20,9 +20,18 @@ from jaxdyn.cli.common import (
     real,
     whole,
 )
-from jaxdyn.cli.identify_logs import filter_log, log_cutoff, log_names, log_paths, raw_log
 from jaxdyn.cli.identify_mechanism import load_mechanism, run_mechanism
-from jaxdyn.cli.identify_options import find_gains, make_fit, parse_options, resolve_options
+from jaxdyn.cli.identify_options import (
+    filter_log,
+    find_gains,
+    log_cutoff,
+    log_names,
+    log_paths,
+    make_fit,
+    parse_options,
+    raw_log,
+    resolve_options,
+)
 from jaxdyn.cli.identify_tables import error_table, gains_text, payload_text, tables
 from jaxdyn.constraints.codes import name_of
 from jaxdyn.identify import EXTRA, TERMS, Fit, LeastSquares, Log, RobotFit
@@ -34,7 +43,7 @@ from jaxdyn.io import save_urdf
 from jaxdyn.io.urdf_write import write_text
 from jaxdyn.model.configuration import columns_of
 from jaxdyn.model.tree import Model, inertia_report, repair_inertias
-from jaxdyn.reports.identification import Evaluation, Findings, content, gains_content, payload_content
+from jaxdyn.reports.identification import Evaluation, Findings, content, gains_content, page, payload_content
 
 # Fraction of the residual's power far above the motion's band that triggers a warning.
 _VIBRATES = 0.3
@@ -246,9 +255,7 @@ def run(args: argparse.Namespace) -> None:
         write_text(json_path, json.dumps(report, indent=2) + "\n")
         print(f"Wrote {json_path}.")
     if html is not None:
-        # Imported on use: matplotlib is an extra.
-        from jaxdyn.reports.identification_page import page
-
+        # Needs matplotlib, an extra.
         write_text(html, page(findings, labels, units, f"jaxdyn identify: {model.name}", text))
         print(f"Wrote {html}.")
 

@@ -7,7 +7,7 @@ import numpy as np
 
 from jaxdyn import identify
 from jaxdyn.cli.common import load_scene, output_path, short, table
-from jaxdyn.cli.identify_logs import filter_log, log_cutoff, log_names, log_paths, raw_log
+from jaxdyn.cli.identify_options import filter_log, log_cutoff, log_names, log_paths, raw_log
 from jaxdyn.constraints.codes import name_of
 from jaxdyn.constraints.loops import Loop
 from jaxdyn.identify import TERMS, Log

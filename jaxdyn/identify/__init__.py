@@ -38,10 +38,10 @@ from jaxdyn.identify.regression import nominal_parameters as nominal_parameters
 from jaxdyn.identify.regression import parameter_names as parameter_names
 from jaxdyn.identify.regression import regressor as regressor
 from jaxdyn.identify.regression import torque_error as torque_error
-from jaxdyn.identify.replay import SampledTorque as SampledTorque
-from jaxdyn.identify.replay import rollout as rollout
-from jaxdyn.identify.replay import trajectory_error as trajectory_error
 from jaxdyn.identify.result import Fit as Fit
+from jaxdyn.identify.result import SampledTorque as SampledTorque
+from jaxdyn.identify.result import rollout as rollout
+from jaxdyn.identify.result import trajectory_error as trajectory_error
 from jaxdyn.identify.robot import Delays as Delays
 from jaxdyn.identify.robot import RobotFit as RobotFit
 from jaxdyn.identify.robot import fit_robot as fit_robot

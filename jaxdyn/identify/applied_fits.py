@@ -31,7 +31,7 @@ from jaxdyn.identify.regression import (
 )
 from jaxdyn.identify.result import Fit, torques_along
 from jaxdyn.identify.robot import RobotFit, fit_robot
-from jaxdyn.identify.torque_terms import TERMS, Friction, RobotTerms, Terms, check_terms, split_terms
+from jaxdyn.identify.torque_terms import LEAVES, TERMS, Friction, RobotTerms, Terms, check_terms, split_terms
 from jaxdyn.identify.uncertainty import effective_sample_size, jackknife
 from jaxdyn.model import host_math
 from jaxdyn.model import inertia as _inertia
@@ -312,7 +312,7 @@ def fit_mechanism(
     noise = max(float(np.sqrt(linear.rest / (len(flat) - linear.rank))), 1e-6)
     tree = Parameters(start).inertias(weight=prior)
     for term in terms:
-        where = _PLACES[term]
+        where = LEAVES[term]
         tree = (tree.free if term == "offset" else tree.positive)(where, rows=columns.tolist())
     fit = fit_parameters(start, logs, tree, Objective("torque", observed=tuple(motors), noise=2**0.5 * noise))
     edges = np.cumsum([len(one) for one in logs])[:-1]
@@ -331,14 +331,6 @@ def fit_mechanism(
         linear.condition,
         weakest_directions(flat, base.names),
     )
-
-
-_PLACES = {
-    "viscous": lambda scene: scene.forces[-1].viscous,
-    "coulomb": lambda scene: scene.forces[-1].coulomb,
-    "offset": lambda scene: scene.forces[-1].offset,
-    "armature": lambda scene: scene.system.armature,
-}
 
 
 def _with_friction(scene: Scene, motors: np.ndarray, terms, v_s: float, sizes) -> Scene:
@@ -360,10 +352,10 @@ def _with_friction(scene: Scene, motors: np.ndarray, terms, v_s: float, sizes) -
     friction = Friction(viscous, coulomb, jnp.asarray(zero, dtype), jnp.asarray(v_s, dtype))
     others = [force for force in scene.forces if not isinstance(force, (JointDamping, CoulombFriction))]
     rotors = armature if model.armature is not None or "armature" in terms else None
-    return Scene(model.replace(armature=rotors), scene.constraints, [*others, friction])
+    return Scene(model.replace(armature=rotors), scene.constraints, [friction, *others])
 
 
 def _numbers(scene: Scene, motors: np.ndarray, terms) -> np.ndarray:
     """Parameters x (10 nb + terms m,) in the order of the regressor's columns."""
-    friction = [np.asarray(_PLACES[term](scene), np.float64)[motors] for term in terms]
+    friction = [np.asarray(LEAVES[term](scene), np.float64)[motors] for term in terms]
     return np.concatenate([np.asarray(scene.system.inertias, np.float64).reshape(-1), *friction])

@@ -83,13 +83,11 @@ class Checkpoint:
         self._last = time.monotonic()
 
 
-def checkpoint_at(path: Any, problem: Any, every: Any, resume: bool) -> Checkpoint | None:
-    """Checkpoint of a fit, or None without a path. `every`: steps (an integer), or seconds (a float).
+def checkpoint_at(path: Any, problem: Any, every: Any, resume: bool) -> Checkpoint:
+    """Checkpoint of a fit. `every`: steps (an integer), or seconds (a float).
 
     **Raises:** ValueError for a path that is none, or an interval that is no positive number.
     """
-    if path is None:
-        return None
     if isinstance(every, bool) or not isinstance(every, (int, float)) or not every > 0:
         raise ValueError(f"every is {every!r}; give a number of steps, such as 10, or of seconds, such as 30.0")
     often: Any = {"steps": every, "seconds": float("inf")} if isinstance(every, int) else {"seconds": every}

@@ -28,19 +28,20 @@ from jaxdyn.dynamics import quantities as dynamics
 from jaxdyn.dynamics.centroidal import kinetic_energy, potential_energy
 from jaxdyn.identify.mechanisms import Measured
 from jaxdyn.identify.methods import METHODS, SOLVERS, Optimizer
-from jaxdyn.identify.replay import (
+from jaxdyn.identify.result import (
     HOLDS,
     INITIAL,
     SampledTorque,
     Segments,
     check_replay,
+    inverse_torque,
     motion_errors,
     motion_scale,
     moving_scale,
+    project_to_motors,
     simulate_segment,
     simulation_options,
 )
-from jaxdyn.identify.result import inverse_torque, project_to_motors
 from jaxdyn.identify.torque_terms import friction_of
 from jaxdyn.model.arguments import Checked, FilePath, SystemLike, check_mapping, warn
 from jaxdyn.model.numbers import as_static, check_count, check_seed

@@ -103,11 +103,20 @@ def fit_parameters(
     unknowns = problem.start
     if solver.starts > 1:
         unknowns = _best_start(problem, unknowns, solver, execution)
-    # The fingerprint is of the numbers, not of their devices: a fit may resume on others.
-    numbers = on_one_device(problem), unknowns, str(solver.method), solver.learning_rate, solver.tolerance, solver.seed
     callback = execution.callback
     report = None if callback is None else lambda step, loss, at: callback(step, loss, tree.system(at.y))
-    key = checkpoint_at(execution.checkpoint, numbers, execution.every, execution.resume)
+    key = None
+    if execution.checkpoint is not None:
+        # The fingerprint is of the numbers, not of their devices: a fit may resume on others.
+        numbers = (
+            on_one_device(problem),
+            unknowns,
+            str(solver.method),
+            solver.learning_rate,
+            solver.tolerance,
+            solver.seed,
+        )
+        key = checkpoint_at(execution.checkpoint, numbers, execution.every, execution.resume)
     watch = Watch(int(solver.steps), report, checkpoint=key, show=execution.progress, seconds=execution.seconds)
     nominal = numbers_at(tree, tree.start)
     end, minimum = _minimise(problem, logs, unknowns, nominal, solver, watch)

@@ -22,8 +22,15 @@ from jaxdyn.identify.mechanisms import Measured, build_scene, check_motors, obse
 from jaxdyn.identify.methods import LinearErrors, Unknowns, eliminate_starts, with_prior
 from jaxdyn.identify.options import BALANCES, SIMULATED, Objective
 from jaxdyn.identify.parameter_tree import Parameters
-from jaxdyn.identify.replay import Segments, check_spacing, cut_segments, simulation_options, with_even_steps
-from jaxdyn.identify.result import inverse_torque, regressor_torque
+from jaxdyn.identify.result import (
+    Segments,
+    check_spacing,
+    cut_segments,
+    inverse_torque,
+    regressor_torque,
+    simulation_options,
+    with_even_steps,
+)
 from jaxdyn.identify.torque_terms import Friction, smoothing_by_filter
 from jaxdyn.model.tree import Model
 from jaxdyn.systems.scene import has_drives
@@ -304,14 +311,15 @@ data_errors_at = eqx.filter_jit(data_errors)
 
 
 def _assemble(problem: Problem, estimate: Unknowns, parts, prior) -> LinearErrors:
-    if estimate.start is None:
-        errors = np.concatenate([np.reshape(errors, (1, -1)) for errors, _, _ in parts], axis=1)
-        rows = np.concatenate([np.reshape(rows, (1, -1, estimate.y.size)) for _, rows, _ in parts], axis=1)
-        # Without free initial states the boundaries of segments do not matter: batches of any lengths become one list.
-        data = eliminate_starts(errors, rows, None)
-    else:
-        # Only simulated errors have free initial states, and their segments are one batch.
-        data = eliminate_starts(*parts[0])
+    # Once: functions of NumPy would compute with arrays of JAX.
+    parts = jax.tree.map(np.asarray, parts)
+    if len(parts) > 1:
+        # Only simulated errors have free initial states, and their segments are one batch. Without these the boundaries of
+        # segments do not matter: batches of any lengths become one list.
+        errors = np.concatenate([errors.reshape(1, -1) for errors, _, _ in parts], axis=1)
+        rows = np.concatenate([rows.reshape(1, -1, estimate.y.size) for _, rows, _ in parts], axis=1)
+        parts = [(errors, rows, None)]
+    data = eliminate_starts(*parts[0])
     residual, by_y = prior
     return with_prior(data, residual, by_y, problem.prior_weight)
 

@@ -69,6 +69,15 @@ def friction_of(scene: Scene) -> Friction:
     return next(force for force in scene.forces if isinstance(force, Friction))
 
 
+# Leaf of a scene with the coefficients of each term.
+LEAVES: dict[str, Callable[[Any], Any]] = {
+    "viscous": lambda scene: friction_of(scene).viscous,
+    "coulomb": lambda scene: friction_of(scene).coulomb,
+    "offset": lambda scene: friction_of(scene).offset,
+    "armature": lambda scene: scene.system.armature,
+}
+
+
 def smoothing_by_filter(scene: Scene, log: Log) -> np.ndarray:
     """Change (n, nv) of the column of Coulomb friction by the low-pass of a log, zero for a log that was not filtered.
 

@@ -463,7 +463,7 @@ def test_identify_the_gains_of_drives_from_a_known_payload(arm, tmp_path, capsys
     assert "Drive gains, torque = gain" in (tmp_path / "fit.html").read_text()
     report = json.loads((tmp_path / "fit.json").read_text())
     drives = report["drive_gains"]
-    told = np.array([name in drives["told"] for name in truth.joint_names])
+    told = np.array([name in drives["identifiable"] for name in truth.joint_names])
     off = np.abs(np.array(drives["gains"]) - gains)
     assert told.any() and np.all(off <= 4 * np.array(drives["std"]))
     assert np.all(off[told] < 0.05) and abs(report["payload"]["mass"] - 0.7) < 0.03

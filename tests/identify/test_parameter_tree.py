@@ -10,7 +10,7 @@ import jaxdyn as jd
 from jaxdyn.constraints.codes import RESULTS
 from jaxdyn.identify import chart
 from jaxdyn.identify.options import energy_balance, momentum_balance
-from jaxdyn.identify.replay import segments
+from jaxdyn.identify.result import segments
 
 BOX = (0.3, 0.08, 0.06)
 
