@@ -15,7 +15,7 @@ import jax
 import numpy as np
 
 from jaxdyn.compile import compilation
-from jaxdyn.compile.stored import function_of, glue_options
+from jaxdyn.compile.kernels import function_of, glue_options
 from jaxdyn.scale.members import Members
 
 # Members per device in one program. On a CPU larger batches do not run faster; other devices need more to be busy.
