@@ -21,6 +21,7 @@ from jaxdyn.compile.graph import Graph, replay
 from jaxdyn.compile.jax_adapter import ClosedJaxpr, Literal, Tracer  # pyright: ignore[reportPrivateImportUsage]
 from jaxdyn.compile.program import (
     Array,
+    FlaggedIteration,
     NotNumbers,
     Number,
     Program,
@@ -127,7 +128,7 @@ class _Expansion:
         results = inside.evaluate(inner, args)
         self.has_rules |= inside.has_rules
         if inside.flagged is not False:
-            raise NotNumbers("samples that an iteration of a loop cannot compute")
+            raise FlaggedIteration("samples that an iteration of a loop cannot compute")
         return results
 
     def one(self, eqn, args) -> list:

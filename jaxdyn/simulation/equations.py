@@ -6,6 +6,7 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 
+from jaxdyn.compile import implicit, kernel, value_and_jvp
 from jaxdyn.compile.known import partition_tracers
 from jaxdyn.constraints.assembly import residuals
 from jaxdyn.constraints.redundancy import exchange_rows
@@ -61,7 +62,7 @@ class Equations:
         self.derivative, self.explicit_part, self.implicit_part = map(
             jax.jit, (self._derivative, self._explicit_part, self._implicit_part)
         )
-        self.advance, self.guards = jax.jit(self._advance), jax.jit(self._guards)
+        self.guards = jax.jit(self._guards)
 
     def unpack(self, args, y=None):
         """Scene with the rows that the step from y keeps, control and method."""
@@ -175,9 +176,23 @@ class Equations:
         scene, _, method = self.unpack(args, y)
         return method.begin(scene, y, t)
 
-    def _advance(self, t0, t1, y, args, carried):
-        scene, _, method = self.unpack(args, y)
-        return method.advance(scene, y, t0, t1, carried, functools.partial(self.generalized_force, args, y))
+    def advance(self, t0, t1, y, args, carried):
+        """A variational step: state, mean velocity, what the next step needs, and whether it succeeded."""
+        leaves, structure = jax.tree.flatten((t0, t1, y, carried))
+
+        def step(args, *leaves):
+            return _advance(self, args, *jax.tree.unflatten(structure, leaves))
+
+        def tangent(args, *rest):
+            *leaves, steps = rest
+            results, changes = value_and_jvp(step, (args, *leaves), steps)
+            return results, jax.tree.map(jnp.zeros_like, results) if changes is None else changes
+
+        def solve(args, *leaves):
+            whole: Any = kernel(_advance, static=1, derivative=False)
+            return whole(self, args, *jax.tree.unflatten(structure, leaves))
+
+        return implicit(args, tuple(leaves), solve, tangent)
 
     def allowances(self, args, y, q, v, t):
         """Distances of the contacts, joints and control from the conditions that end the run."""
@@ -205,6 +220,11 @@ class Equations:
         q, v = method.to_qv(scene, y, t)
         values = self.allowances(args, y, q, v, t)
         return values, jnp.zeros_like(values)  # allowances have the rounding in them
+
+
+def _advance(eqs: Equations, args, t0, t1, y, carried):
+    scene, _, method = eqs.unpack(args, y)
+    return method.advance(scene, y, t0, t1, carried, functools.partial(eqs.generalized_force, args, y))
 
 
 def _constants(y) -> dict[str, Any]:
