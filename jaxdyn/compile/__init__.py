@@ -19,7 +19,9 @@ from jaxdyn.compile.jacobi import inverse as inverse
 from jaxdyn.compile.jacobi import pseudo_inverse_by_pivots as pseudo_inverse_by_pivots
 from jaxdyn.compile.jacobi import pseudo_inverse_by_rotations as pseudo_inverse_by_rotations
 from jaxdyn.compile.kernels import Evaluation as Evaluation
+from jaxdyn.compile.kernels import entry_point as entry_point
 from jaxdyn.compile.kernels import evaluate as evaluate
+from jaxdyn.compile.kernels import jit as jit
 from jaxdyn.compile.kernels import kernel as kernel
 from jaxdyn.compile.kernels import run_trial as _run_trial  # noqa: F401 (it registers itself)
 from jaxdyn.compile.kernels import variant as variant
@@ -38,5 +40,3 @@ from jaxdyn.compile.rules import invalidate_derivatives as invalidate_derivative
 from jaxdyn.compile.rules import mark_invalid as mark_invalid
 from jaxdyn.compile.rules import reverse_only as reverse_only
 from jaxdyn.compile.rules import value_and_jvp as value_and_jvp
-from jaxdyn.compile.stored import entry_point as entry_point
-from jaxdyn.compile.stored import jit as jit

@@ -14,12 +14,8 @@ import numpy as np
 
 from jaxdyn.compile import program as numbers
 from jaxdyn.compile.graph import Graph
-from jaxdyn.compile.program import NotNumbers, Number, as_kind, as_objects, dtype_of, is_number, kind_or_refuse, objects
+from jaxdyn.compile.program import NotNumbers, Number, as_kind, as_objects, kind_or_refuse, objects
 from jaxdyn.compile.rearrange import scatter_at, scatter_places, select_among
-from jaxdyn.compile.rolled import MIN_ITERATIONS, roll
-
-# Operations of the columns of a solution, up to which they are written out: what goes in and out of a loop is copied.
-_MAX_COLUMNS_WRITTEN_OUT = 4000
 
 
 def polynomial(expansion, params, args, eqn):
@@ -136,30 +132,12 @@ def triangular_solve(expansion, params, args, eqn):
     lower = params["lower"] != params["transpose_a"]
     if not params["left_side"]:  # x a = b is a^T x^T = b^T
         a, b, lower = np.swapaxes(a, -1, -2), np.swapaxes(b, -1, -2), not lower
-    pairs = zip(a.reshape(-1, *a.shape[-2:]), b.reshape(-1, *b.shape[-2:]), strict=True)
-    solutions = [_solve_columns(expansion.graph, x, y, lower, params["unit_diagonal"]) for x, y in pairs]
+    g, is_unit, solutions = expansion.graph, params["unit_diagonal"], []
+    for x, y in zip(a.reshape(-1, *a.shape[-2:]), b.reshape(-1, *b.shape[-2:]), strict=True):
+        inverses = [1.0 if is_unit else g.div(1.0, z) for z in np.diagonal(x).tolist()]
+        solutions.append(_solve_triangle(g, x, y, lower, inverses))
     solutions = np.stack(solutions).reshape(b.shape)
     return [solutions if params["left_side"] else np.swapaxes(solutions, -1, -2)]
-
-
-def _solve_columns(graph: Graph, a: np.ndarray, b: np.ndarray, lower: bool, unit: bool) -> np.ndarray:
-    """a^-1 b; where neither has known zeros, which differ from column to column, as a loop over the columns of b."""
-    (n, columns), triangle = b.shape, a[np.tril_indices(len(a))] if lower else a[np.triu_indices(len(a))]
-    inverses = [1.0 if unit else graph.div(1.0, x) for x in np.diagonal(a).tolist()]
-    if columns >= MIN_ITERATIONS and all(map(is_number, (*triangle.tolist(), *b.ravel().tolist()))):
-
-        def body(inner, consts, carries, rows):
-            matrix = consts[0].T if is_turned else consts[0]
-            return [_solve_triangle(inner, matrix, rows[0][:, None], lower, consts[1].tolist())[:, 0]]
-
-        # Entries in the order of their array in memory, which then is passed without a copy.
-        is_turned = a.strides[0] < a.strides[1]
-        dtype, consts = dtype_of(triangle[0].kind), [a.T if is_turned else a, objects(inverses, (n,))]
-        dtypes = [dtype, dtype], [], [dtype], [dtype]
-        found = roll(graph, body, (consts, [], [b.T]), dtypes, columns, False, None, _MAX_COLUMNS_WRITTEN_OUT)
-        if found is not None:
-            return found[0].T
-    return _solve_triangle(graph, a, b, lower, inverses)
 
 
 # --- matrices whose entries are single numbers ---

@@ -19,6 +19,7 @@ import jax.numpy as jnp
 from jaxdyn.compile import derive, mode
 from jaxdyn.compile.llvm import Emitter
 from jaxdyn.compile.program import Array, Constant, Operation, Program, kind_of
+from jaxdyn.compile.rules import change_along
 from jaxdyn.compile.stored import error_of_retrace, key_within
 
 T = TypeVar("T")
@@ -246,15 +247,8 @@ def _without_flag(fallback: Callable, *flat) -> list:
 
 def _tangent_by_jax(base: Careful, moving, *flat) -> list:
     count = len(base.inputs)
-    places = [i for i, varies in enumerate(moving) if varies]
-
-    def at_values(*values):
-        point = list(flat[:count])
-        for i, value in zip(places, values, strict=True):
-            point[i] = value
-        return [x for x, array in zip(base.by_jax(*point), base.outputs, strict=True) if array.dtype.kind == "f"]
-
-    return jax.jvp(at_values, [flat[i] for i in places], list(flat[count:]))[1]
+    changes = change_along(base.by_jax, flat[:count], moving, flat[count:])
+    return [x for x, array in zip(changes, base.outputs, strict=True) if array.dtype.kind == "f"]
 
 
 def _transpose_by_jax(base: Careful, linear, given, *flat) -> list:

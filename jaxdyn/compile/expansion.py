@@ -69,7 +69,6 @@ def expand(
         results.append(objects([graph.invert(expansion.flagged)], ()))
     program = graph.finish(inputs, outputs, [as_objects(x) for x in results], name=name)
     program.reports_validity = reports
-    numbers.prune_calls(program)
     return program, expansion.has_rules
 
 

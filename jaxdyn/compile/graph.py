@@ -465,13 +465,13 @@ def repeat(graph: Graph, program: Program, op: str, kind: str, args: list, branc
 
 
 def _call(graph: Graph, program: Program, given: list, branches: bool) -> list[np.ndarray]:
-    inputs = _arrays(program.inputs, given)
+    inputs = arrays_of(program.inputs, given)
     return graph.call(program, inputs) if program.is_called else replay(graph, program, inputs, branches)[1]
 
 
 def _call_where(graph: Graph, program: Program, given: list, branches: bool) -> list[np.ndarray]:
     flag, *entries = given
-    arrays, count = _arrays((*program.inputs, *program.outputs), entries), len(program.inputs)
+    arrays, count = arrays_of((*program.inputs, *program.outputs), entries), len(program.inputs)
     inputs, otherwise = arrays[:count], arrays[count:]
     if branches or program.is_called:
         return graph.call_where(flag, program, inputs, otherwise)
@@ -484,7 +484,7 @@ def _call_where(graph: Graph, program: Program, given: list, branches: bool) -> 
     ]
 
 
-def _arrays(types: Sequence[Array], entries: list) -> list[np.ndarray]:
+def arrays_of(types: Sequence[Array], entries: list) -> list[np.ndarray]:
     """Arrays of entries that are given one after the other."""
     ends = np.cumsum([array.size for array in types]).tolist()
     return [objects(entries[end - array.size : end], array.shape) for end, array in zip(ends, types, strict=True)]

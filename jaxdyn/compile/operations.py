@@ -10,9 +10,8 @@ import jax.numpy as jnp
 import numpy as np
 from jax import lax
 
-from jaxdyn.compile.batch import cond
+from jaxdyn.compile.batch import cond, sweep
 from jaxdyn.compile.careful import Careful
-from jaxdyn.compile.code import find_slots
 from jaxdyn.compile.graph import inline
 from jaxdyn.compile.llvm import COSINE, HALF_PI, MAX_ANGLE, SINE
 from jaxdyn.compile.program import COMPARISONS, Constant, Program, dtype_of
@@ -257,28 +256,15 @@ def _scan(scan: Any, arrays: Sequence, compute: Callable) -> list:
     tables = [
         jnp.broadcast_to(jnp.asarray(x).reshape(n, *[1] * len(lead), -1), (n, *lead, x[0].size)) for x in scan.tables
     ]
-    count, slots = find_slots(range(-1, n - 1) if scan.parents is None else scan.parents)
-    parents = [slots[i] for i in range(n)] if scan.parents is None else [slots[x + 1] for x in scan.parents]
-    first, last = (slots[-1], slots[0]) if scan.inward else (slots[0], slots[-1])
-    memory = [jnp.zeros((count, *x.shape), x.dtype).at[first].set(x) for x in start]
-    sums = [jnp.zeros((*lead, x.size), x.dtype) for x in scan.split_outputs(scan.body.outputs)[1]]
 
     def step(carry, row):
-        memory, sums = carry
-        own, parent, rows, known = row
-        read, write = (own, parent) if scan.inward else (parent, own)
-        made = iteration(*consts, *(x[read] for x in memory), *rows, *known)
-        carries, terms, results = scan.split_outputs(made)
-        if scan.inward:
-            memory = [x.at[own].set(0).at[write].add(y) for x, y in zip(memory, carries, strict=True)]
-        else:
-            memory = [x.at[write].set(y) for x, y in zip(memory, carries, strict=True)]
-        return (memory, [x + y for x, y in zip(sums, terms, strict=True)]), results
+        carries, *made = scan.split_outputs(iteration(*consts, *carry, *row))
+        return list(carries), made
 
-    each = jnp.asarray(slots[1:]), jnp.asarray(parents), given, tables
-    (memory, sums), results = lax.scan(step, (memory, sums), each, reverse=scan.inward)
+    parents = range(-1, n - 1) if scan.parents is None else scan.parents
+    end, (terms, results) = sweep(step, parents, start, [*given, *tables], inward=scan.inward)
     rows = [jnp.moveaxis(x, 0, -2).reshape(*lead, -1) for x in results]
-    return [*(x[last] for x in memory), *sums, *rows]
+    return [*end, *(jnp.sum(x, 0) for x in terms), *rows]
 
 
 def _while(consts: list, start: list, iteration: Callable, condition: Callable) -> list:

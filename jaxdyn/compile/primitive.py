@@ -19,8 +19,8 @@ from jaxdyn.compile.careful import guard
 from jaxdyn.compile.code import MIN_SHARED_OPERATIONS
 from jaxdyn.compile.jax_adapter import ShapedArray, define_primitive, is_linear, is_zero, lowering_of, zero_tangent
 from jaxdyn.compile.operations import as_operations, by_jax
-from jaxdyn.compile.program import Array, Constant, NotNumbers, Program, Renumbering, TooLong, dtype_of
-from jaxdyn.compile.rules import mark_invalid
+from jaxdyn.compile.program import Array, Constant, NotNumbers, Operation, Program, TooLong, dtype_of
+from jaxdyn.compile.rules import change_along, mark_invalid
 from jaxdyn.compile.stored import key_within, load_or_make
 from jaxdyn.compile.trace import tangent_program
 
@@ -81,7 +81,8 @@ def _jvp(primals, tangents, *, program, rows):
     moving, steps = tuple(not is_zero(x) for x in tangents), [x for x in tangents if not is_zero(x)]
     tangent = _tangent_or_none(program, moving)
     if tangent is None:
-        changes = iter(_jvp_by_jax(program, moving, primals, steps))
+        every = change_along(functools.partial(by_jax, program=program), primals, moving, steps)
+        changes = (x for x, array in zip(every, program.outputs, strict=True) if array.dtype.kind == "f")
     else:
         changes = iter(kernel_p.bind(*primals, *steps, program=tangent, rows=rows))
     out = []
@@ -99,19 +100,6 @@ def _tangent_or_none(program, moving: tuple[bool, ...]) -> Program | None:
             raise
         mode.say_without_kernel(f"the derivative of {program.name}", str(reason))
         return None
-
-
-def _jvp_by_jax(program, moving, primals, steps) -> list:
-    places = [i for i, varies in enumerate(moving) if varies]
-
-    def at_values(*values):
-        point = list(primals)
-        for i, value in zip(places, values, strict=True):
-            point[i] = value
-        results = by_jax(*point, program=program)
-        return [x for x, array in zip(results, program.outputs, strict=True) if array.dtype.kind == "f"]
-
-    return jax.jvp(at_values, [primals[i] for i in places], steps)[1]
 
 
 def _transpose_program(program: Program, linear: tuple[bool, ...], given: tuple[bool, ...]) -> Program:
@@ -398,7 +386,7 @@ def _split(program: Program, uniform: Sequence[bool]) -> tuple[Program, Program]
 
     places = [i for i, same in enumerate(uniform) if same]
     # Operations keep their order in both programs and get new indices.
-    first = Renumbering()
+    first = _Renumbering()
     for i, (op, kind, args) in enumerate(program.operations):
         if is_shared[i]:
             args = (places.index(args[0]), args[1]) if op == "input" else first.args(args)
@@ -412,7 +400,7 @@ def _split(program: Program, uniform: Sequence[bool]) -> tuple[Program, Program]
     )
 
     # The second program takes all inputs, also those that only the first one reads, so that argument positions do not change.
-    count, rest = len(program.inputs), Renumbering()
+    count, rest = len(program.inputs), _Renumbering()
     for place, (kind, entries) in enumerate(zip(kinds, by_kind, strict=True), count):
         for k, i in enumerate(entries):
             rest.add(i, ("input", kind, (place, k)))
@@ -429,6 +417,23 @@ def _split(program: Program, uniform: Sequence[bool]) -> tuple[Program, Program]
         name=program.name,
     )
     return once, each
+
+
+class _Renumbering:
+    """Operations of a part of a program, with indices of their own."""
+
+    def __init__(self):
+        self.operations: list[Operation] = []
+        self.index: dict[int, int] = {}
+
+    def add(self, i: int, operation: Operation) -> None:
+        """Take operation i of the program, whose operands have the new indices."""
+        self.index[i] = len(self.operations)
+        self.operations.append(operation)
+
+    def args(self, args) -> tuple:
+        """Operands with their new indices."""
+        return tuple(x if type(x) is Constant else self.index[x] for x in args)
 
 
 def _interface(program: Program, is_shared: Sequence[bool]) -> list[int]:

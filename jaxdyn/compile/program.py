@@ -136,56 +136,6 @@ def _weight(operation: Operation) -> int:
     return len(args) - 1 if op in ("reduce_max", "reduce_min", "clamp") else 1
 
 
-class Renumbering:
-    """Operations of a part of a program, with indices of their own."""
-
-    def __init__(self):
-        self.operations: list[Operation] = []
-        self.index: dict[int, int] = {}
-
-    def add(self, i: int, operation: Operation) -> None:
-        """Take operation i of the program, whose operands have the new indices."""
-        self.index[i] = len(self.operations)
-        self.operations.append(operation)
-
-    def args(self, args) -> tuple:
-        """Operands with their new indices."""
-        return tuple(x if type(x) is Constant else self.index[x] for x in args)
-
-
-def prune_calls(program: Program) -> None:
-    """Let a program call its subprograms without the results that it does not need, where these are half of their work."""
-    needed: list[set[int]] = [set() for _ in program.subprograms]
-    for op, _, args in program.operations:
-        if op == "part":
-            # By its place: a call has thousands of operands, which would be unpacked for each of its parts.
-            needed[program.operations[args[0]][2][0].value].add(args[1].value)
-    program.subprograms = tuple(map(_with_results, program.subprograms, needed))
-
-
-def _with_results(program: Program, needed: set[int]) -> Program:
-    """The program with zeros in the place of all entries of its results but those needed; itself if that saves little."""
-    if program.is_called:
-        return program
-    results, at = [], 0
-    for row in program.results:
-        results.append([x if at + k in needed else Constant(0) for k, x in enumerate(row)])
-        at += len(row)
-    live = {x for row in results for x in row if type(x) is not Constant}
-    for i in reversed(range(len(program.operations))):
-        op, _, args = program.operations[i]
-        if i in live and op != "input":
-            live.update(x for x in args if type(x) is not Constant)
-    if 2 * len(live) > len(program.operations):  # a program of its own would be compiled for little
-        return program
-    few = Renumbering()
-    for i in sorted(live):
-        op, kind, args = program.operations[i]
-        few.add(i, (op, kind, args if op == "input" else few.args(args)))
-    rows = [few.args(row) for row in results]
-    return Program(program.inputs, program.outputs, few.operations, rows, program.subprograms, name=program.name)
-
-
 COMPARISONS: dict[str, Callable] = {
     "eq": lambda a, b: a == b,
     "ne": lambda a, b: a != b,

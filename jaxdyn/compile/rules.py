@@ -124,6 +124,12 @@ def value_and_jvp(function: Callable, args: tuple, steps):
     return jax.jvp(at_values, [base[i] for i in moving], [steps[i] for i in moving])
 
 
+def change_along(function: Callable, point, moving, steps) -> Any:
+    """The change of function(*point) for the `steps` of those of its arguments that are `moving`."""
+    given = iter(steps)
+    return value_and_jvp(function, tuple(point), [next(given) if varies else None for varies in moving])[1]
+
+
 def invalidate_derivatives(values: Any, failed: Any, inputs: Any) -> Any:
     """The values, a pytree, with derivatives of NaN by all inputs where `failed`, in forward and reverse mode.
 
@@ -283,15 +289,9 @@ def _batch_guard(args, axes, *, call, again):
 
 
 def _jvp_guard(primals, tangents, *, call, again):
-    places = [i for i, x in enumerate(tangents) if not is_zero(x)]
-
-    def at_values(*values):
-        point = list(primals)
-        for i, value in zip(places, values, strict=True):
-            point[i] = value
-        return function_of(call)(*point)
-
-    results, changes = jax.jvp(at_values, [primals[i] for i in places], [tangents[i] for i in places])
+    steps = [None if is_zero(x) else x for x in tangents]
+    results, changes = value_and_jvp(function_of(call), tuple(primals), steps)
+    assert changes is not None
     return results, [d if is_float(x) else zero_tangent(x) for x, d in zip(results, changes, strict=True)]
 
 

@@ -20,8 +20,8 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from jaxdyn.compile import derive
-from jaxdyn.compile.graph import Graph, replay
-from jaxdyn.compile.program import Array, Constant, Program, as_objects, is_number, objects
+from jaxdyn.compile.graph import Graph, arrays_of, replay
+from jaxdyn.compile.program import Array, Constant, Program, as_objects, is_number
 
 # Operations beyond which a loop is not written out. LLVM takes some 50 microseconds for each: one second.
 MAX_WRITTEN_OUT = 20_000
@@ -398,12 +398,6 @@ def with_changes(values: Sequence, changes: Sequence, flags: Sequence[bool]) -> 
 def entries_of(arrays: Sequence[np.ndarray]) -> list:
     """Entries of arrays, one after the other."""
     return [x for array in arrays for x in array.ravel().tolist()]
-
-
-def arrays_of(types: Sequence[Array], entries: list) -> list[np.ndarray]:
-    """Arrays of entries that are given one after the other."""
-    ends = np.cumsum([array.size for array in types]).tolist()
-    return [objects(entries[end - array.size : end], array.shape) for end, array in zip(ends, types, strict=True)]
 
 
 def tangent_of(body: Program, moving: tuple[bool, ...]) -> tuple[Program, list[bool]]:

@@ -18,7 +18,7 @@ from jaxdyn.compile.expansion import expand
 from jaxdyn.compile.first_calls import phase
 from jaxdyn.compile.known import Known, partition_tracers
 from jaxdyn.compile.program import Array, NotNumbers, Program, TooLong
-from jaxdyn.compile.rules import guarded_p, has_marks
+from jaxdyn.compile.rules import change_along, guarded_p, has_marks
 
 
 def program_of(
@@ -277,18 +277,12 @@ def _derivative_by_rule(tangent: Callable, known: Known, count: int, structure, 
 def _derivative_by_jax(flat: Callable, avals, flags: str, program: Program):
     """The derivative of a program by `jax.jvp`, which asks functions within the function for their own rules."""
 
+    def floats(*leaves):
+        return [x for x in jax.tree.leaves(flat(*leaves)) if jnp.issubdtype(x.dtype, jnp.floating)]
+
     def derivative(moving):
         def change(*leaves):
-            primal, steps = list(leaves[: len(avals)]), leaves[len(avals) :]
-            places = [i for i, varies in enumerate(moving) if varies]
-
-            def at_values(*values):
-                point = list(primal)
-                for i, value in zip(places, values, strict=True):
-                    point[i] = value
-                return [x for x in jax.tree.leaves(flat(*point)) if jnp.issubdtype(x.dtype, jnp.floating)]
-
-            return jax.jvp(at_values, [primal[i] for i in places], list(steps))[1]
+            return change_along(floats, leaves[: len(avals)], moving, leaves[len(avals) :])
 
         return tangent_program(change, avals, moving, flags, stored.key_within(program, "jvp", moving))
 

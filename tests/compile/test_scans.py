@@ -5,10 +5,9 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from jax import lax
-from jax.scipy.linalg import solve_triangular
 from kernel_helpers import assert_close as assert_array_close
 
-from jaxdyn.compile import array_rules, kernel, rolled, sweep
+from jaxdyn.compile import kernel, rolled, sweep
 from jaxdyn.compile.code import find_slots
 from jaxdyn.compile.operations import as_operations
 from jaxdyn.compile.scan import Scan
@@ -198,31 +197,6 @@ def test_a_loop_over_calls_is_written_out():
     _, (program, _) = program_of(function, (), (), (jnp.ones(()),), calls=True)
     assert program.cost > rolled.MAX_WRITTEN_OUT > len(program.operations)
     assert not any(isinstance(x, Scan) for x in program.subprograms)
-
-
-@pytest.mark.parametrize("transposed", [False, True])
-def test_columns_of_a_solution_are_a_loop(monkeypatch, transposed):
-    """With the bits of the columns that are written out, and the derivatives of JAX."""
-    rng = np.random.default_rng(7)
-    factor, right = np.tril(rng.normal(size=(5, 5))) + 4 * np.eye(5), rng.normal(size=(5, 9))
-
-    def solve(a, b):
-        return solve_triangular(a, b, lower=True, trans=int(transposed))
-
-    found, slopes = [], []
-    for most in (0, 10**9):
-        monkeypatch.setattr(array_rules, "_MAX_COLUMNS_WRITTEN_OUT", most)
-        one = kernel(lambda _, a, b: solve(a, b))
-        _, (program, _) = program_of(lambda _, a, b: solve(a, b), (), (), (factor, right))
-        assert [type(x) for x in program.subprograms] == ([] if most else [Scan])
-        found.append(np.asarray(jax.vmap(lambda a, f=one: f((), a, right))(np.stack([factor] * 3))))
-        slopes.append(
-            jax.jacrev(lambda a, f=one: jax.jvp(lambda b: f((), a, b), (right,), (right**2,))[1].sum())(factor)
-        )
-    np.testing.assert_array_equal(*found)
-    assert_close(found[0][1], solve(factor, right))
-    wanted = jax.jacrev(lambda a: jax.jvp(lambda b: solve(a, b), (right,), (right**2,))[1].sum())(factor)
-    assert_close(slopes, [wanted, wanted])
 
 
 def test_other_devices_compute_the_same(monkeypatch):

@@ -222,7 +222,7 @@ RUNS = {
     "forward": ("forward", {}),
     "backsolve": ("backsolve", {}),
     "diffrax": ("reverse", {"solver": diffrax.Kvaerno5()}),
-    "diffrax direct": ("direct", {"solver": diffrax.Kvaerno3()}),
+    "diffrax direct": ("direct", {"solver": diffrax.Kvaerno5()}),
     "limits": ("reverse", {"events": [jd.events.JointLimit()]}),
 }
 
