@@ -1,12 +1,13 @@
 """Tables of arguments in the reference: an extension of griffe, which mkdocs.yml names.
 
 A docstring describes arguments in prose or as a list, after the mark "**Arguments:**". Here that part becomes a table: names and
-shapes, types and defaults as in the signature, and the description. Arguments without a description have a row with their type.
+shapes, types and defaults as in the signature, and the description. What a docstring leaves to another one, "as of `NAME`", is
+taken from there.
 """
 
 import ast
 import re
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from functools import cache
 from html import escape
 from pathlib import Path
@@ -25,6 +26,10 @@ _WORDS = {"Numbers": "array", "Number": "float", "Row": "array", "Function": "Ca
 _COMMON = {
     "model": "the bodies and joints.",
     "scene": "the mechanism, with its constraints and forces.",
+    "name": "for errors and reports; by default made of the others.",
+    "dtype": "of the arrays; by default JAX's, as `jax_enable_x64` says.",
+    "surface_body": "name of the body or frame that carries the surface; None: the world.",
+    "plane_body": "name of the body or frame that carries the plane; None: the world.",
     "q": "configuration: rad or m, unit quaternions of free and spherical joints.",
     "v": "velocity: rad/s or m/s, body twists of free joints.",
     "a": "acceleration, the rate of `v`.",
@@ -89,16 +94,23 @@ def _shaped(sizes: Sequence[str]) -> str:
 def split(docstring: str) -> tuple[str, str, str]:
     """A docstring before its arguments, their part without the mark, and the rest; the last two are empty without the mark."""
     before, mark, rest = docstring.partition(MARK)
-    # Paragraphs belong to the arguments as long as they are items of the list.
-    end = re.search(
-        r"(?m)\*\*[A-Z]\w*:\*\*|^```" + (r"|^(?![-\s])" if rest.lstrip().startswith("- ") else r"|\n\n"), rest
-    )
+    # Paragraphs belong to the arguments as long as they are items of the list, which may follow a sentence.
+    sentence = re.match(r"(?:.+\n)*?.*\n\n(?=- )", rest)
+    end = re.compile(r"(?m)\*\*[A-Z]\w*:\*\*|^```" + (r"|^(?![-\s])" if sentence else r"|\n\n"))
+    end = end.search(rest, sentence.end() if sentence else 0)
     place = end.start() if mark and end else len(rest)
     return before, rest[:place].strip(), rest[place:]
 
 
-def rows(text: str, arguments: Sequence[Argument]) -> tuple[str, list[Row]]:
-    """What the text says of all arguments, and the rows of a table: each argument once, in the order of the signature."""
+# Descriptions of arguments by the full name of the function or class, and by the argument's.
+Known = Mapping[str, Mapping[str, str]]
+
+
+def rows(text: str, arguments: Sequence[Argument], known: Known | None = None) -> tuple[str, list[Row]]:
+    """What the text says of all arguments, and the rows of a table: each argument once, in the order of the signature.
+
+    Arguments that the text does not describe have the description of the first function that it names and that has them.
+    """
     left = {argument.name.lstrip("*"): argument for argument in arguments}
     items = [re.sub(r"(?m)^  ", "", item) for item in re.split(r"(?m)^- ", text) if item.strip()]
     # A name that an item begins with is described there, even if an earlier one mentions it.
@@ -137,16 +149,37 @@ def rows(text: str, arguments: Sequence[Argument]) -> tuple[str, list[Row]]:
         for argument in arguments
         if argument.name not in others
     ]
+    if known and not all(row.text for row in table):
+        named = re.findall(r"`(?:jd\.)?([\w.]+)(?:\([^`]*\))?`", text)
+        others = {k: v for name in reversed(named) for k, v in known.get(_resolve(name, known), {}).items()}
+        table = [row if row.text else Row(row.arguments, others.get(row.arguments[0][0].name, "")) for row in table]
     return " ".join(text.strip() for text in general if text.strip()), table
+
+
+def _resolve(name: str, known: Known) -> str:
+    """Full name of the first entry that ends like a name and has its other parts."""
+    *rooms, last = name.split(".")
+    fits = (key for key in known if key.rpartition(".")[2] == last and {*rooms} <= {*key.split(".")})
+    return next(fits, "")
+
+
+def descriptions(things: Mapping[str, tuple[str, Sequence[Argument]]]) -> Known:
+    """Descriptions of the arguments of functions and classes, of which each has a docstring and arguments."""
+    known: dict[str, dict[str, str]] = {}
+    for _ in range(2):  # descriptions that refer to one that refers to another
+        for name, (docstring, arguments) in things.items():
+            described = rows(split(docstring)[1], arguments, known)[1]
+            known[name] = {pair[0].name: row.text for row in described if row.text for pair in row.arguments}
+    return known
 
 
 def _tidy(text: str) -> str:
     return re.sub(r"^[,:;.]?\s+|^[.:;,]$|;?\s+$", "", text)
 
 
-def table(text: str, arguments: Sequence[Argument]) -> str:
+def table(text: str, arguments: Sequence[Argument], known: Known | None = None) -> str:
     """Arguments as a table in HTML whose names and descriptions are Markdown."""
-    general, described = rows(text, arguments)
+    general, described = rows(text, arguments, known)
     lines = [general, "", '<div class="arguments" markdown="1">', '<table markdown="1">']
     lines += ["<thead><tr><th>Argument</th><th>Type and default</th><th>Description</th></tr></thead>"]
     lines += ['<tbody markdown="1">']
@@ -166,12 +199,12 @@ def table(text: str, arguments: Sequence[Argument]) -> str:
     return "\n".join([*lines, "</tbody>", "</table>", "</div>"])
 
 
-def with_table(docstring: str, arguments: Sequence[Argument]) -> str:
+def with_table(docstring: str, arguments: Sequence[Argument], known: Known | None = None) -> str:
     """A docstring whose arguments are a table."""
     before, text, after = split(docstring)
     if not text or not arguments:
         return docstring
-    return f"{before}{MARK} {table(text, arguments)}\n\n{after}"
+    return f"{before}{MARK} {table(text, arguments, known)}\n\n{after}"
 
 
 class ArgumentTables(Extension):  # pyright: ignore[reportGeneralTypeIssues]
@@ -179,11 +212,14 @@ class ArgumentTables(Extension):  # pyright: ignore[reportGeneralTypeIssues]
 
     def on_package(self, *, pkg, **_) -> None:
         """Called once all modules are read."""
+        things = []
         for module in _members(pkg, "module"):
             for thing in (*_members(module, "function"), *_members(module, "class")):
-                _write_table(thing)
-                for method in _members(thing, "function") if thing.kind.value == "class" else ():
-                    _write_table(method)
+                things += [thing, *(_members(thing, "function") if thing.kind.value == "class" else ())]
+        things = [(thing, _arguments(thing)) for thing in things if thing.docstring and MARK in thing.docstring.value]
+        known = descriptions({thing.path: (thing.docstring.value, arguments) for thing, arguments in things})
+        for thing, arguments in things:
+            thing.docstring.value = with_table(thing.docstring.value, arguments, known)
 
 
 def _members(of, kind: str) -> list:
@@ -191,12 +227,10 @@ def _members(of, kind: str) -> list:
     return [of, *(inner for module in own for inner in _members(module, kind))] if kind == "module" else own
 
 
-def _write_table(thing) -> None:
-    if thing.docstring is None or MARK not in thing.docstring.value:
-        return
+def _arguments(thing) -> list[Argument]:
     maker = thing.members.get("__init__") if thing.kind.value == "class" else thing
     if maker is not None:
-        arguments = [
+        return [
             Argument(
                 {"variadic positional": "*", "variadic keyword": "**"}.get(p.kind.value if p.kind else "", "") + p.name,
                 "" if p.annotation is None else str(p.annotation),
@@ -205,15 +239,13 @@ def _write_table(thing) -> None:
             for p in maker.parameters
             if p.name not in ("self", "cls")
         ]
-    else:
-        # The fields of a module of equinox, as `field: annotation = default`, and those of its bases.
-        fields = {}
-        for base in (*reversed(thing.mro()), thing):
-            for name, member in base.members.items():
-                if not member.is_alias and member.kind.value == "attribute" and member.annotation is not None:
-                    fields[name] = Argument(name, str(member.annotation), _default(member.value))
-        arguments = [field for field in fields.values() if f"`{field.name}" in thing.docstring.value]
-    thing.docstring.value = with_table(thing.docstring.value, arguments)
+    # The fields of a module of equinox, as `field: annotation = default`, and those of its bases.
+    fields = {}
+    for base in (*reversed(thing.mro()), thing):
+        for name, member in base.members.items():
+            if not member.is_alias and member.kind.value == "attribute" and member.annotation is not None:
+                fields[name] = Argument(name, str(member.annotation), _default(member.value))
+    return [field for field in fields.values() if f"`{field.name}" in thing.docstring.value]
 
 
 def _default(value) -> str | None:

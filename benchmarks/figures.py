@@ -6,8 +6,8 @@ line below it gives the commit, the machine and the versions. With words, only c
 whose command prints no table with that row are named. Commands that write pages on their own (`--readme`) are run, and their
 tables get the line.
 
-`--list` runs nothing: each table with its command and the number of commits to the package since it was measured, or, without
-that line, since its text was last changed.
+`--list` runs nothing: each table with its command and the number of commits to the code that it measures since it was measured,
+or, without that line, since its text was last changed. `--stale` lists those of more than LIMIT commits only.
 """
 
 import argparse
@@ -26,6 +26,27 @@ _COMMAND = re.compile(
 )
 # A table of which more cells than this begin with a number has figures; the others have words.
 _NUMBERS = 0.4
+# Commits to the measured code after which a table is to be measured again.
+LIMIT = 200
+# Code that a command measures, by the first word of it that begins so: folders of the package. Others measure all of it.
+_DYNAMICS = ("compile", "dynamics", "model")
+_STEPS = (*_DYNAMICS, "constraints", "contact", "forces", "simulation")
+_MEASURED = {
+    "benchmarks.constraints": (*_DYNAMICS, "constraints"),
+    "benchmarks.contact_": _STEPS,
+    "benchmarks.dynamics": _DYNAMICS,
+    "benchmarks.export": ("exports", *_DYNAMICS),
+    "benchmarks.extremes": _STEPS,
+    "benchmarks.files": ("io",),
+    "benchmarks.fresh_pages": _DYNAMICS,
+    "benchmarks.identify_": ("identify",),
+    "benchmarks.inverse_kinematics": ("tasks", "constraints"),
+    "benchmarks.long_chains": _DYNAMICS,
+    "benchmarks.optimal_control": ("control", *_DYNAMICS),
+    "benchmarks.scale": ("scale",),
+    "benchmarks.stiff": _STEPS,
+    "benchmarks.work_precision": (*_STEPS, "reports"),
+}
 
 
 class Table(NamedTuple):
@@ -107,23 +128,38 @@ def stamp(page: Path, command: str, note: str) -> int:
     return len(chosen)
 
 
-def age(table: Table) -> str:
-    """Commits to the package since a table was measured, as its note says, or since its text was last changed."""
+def measured_code(commands: tuple[str, ...]) -> tuple[str, ...]:
+    """Folders whose code the commands measure, from the root of the repository."""
+    found = [next((rooms for name, rooms in _MEASURED.items() if c.startswith(name)), ("",)) for c in commands] or [
+        ("",)
+    ]
+    rooms = sorted({room for folders in found for room in folders})
+    return tuple(f"jaxdyn/{room}" for room in rooms) if rooms[0] else ("jaxdyn",)
+
+
+def age(table: Table) -> tuple[int, str]:
+    """Commits to the measured code since a table was measured, as its note says, or since its text was last changed; a line."""
     text = table.page.read_text(encoding="utf-8")
     if table.commit:
         commit, what = table.commit, "measured"
     else:
         first, last = (text.count("\n", 0, place) + 1 for place in (table.start, table.end - 1))
         blame = _git("blame", "--line-porcelain", f"-L{first},{last}", "--", str(table.page))
-        times = dict(
-            zip(
-                re.findall(r"(?m)^([0-9a-f]{40}) ", blame), re.findall(r"(?m)^committer-time (\d+)", blame), strict=True
-            )
-        )
-        commit, what = max(times, key=lambda name: int(times[name])), "no note; text changed"
+        names = re.findall(r"(?m)^([0-9a-f]{40}) ", blame)
+        times = dict(zip(names, map(int, re.findall(r"(?m)^committer-time (\d+)", blame)), strict=True))
+        commit, what = max(times, key=lambda name: times[name]), "no note; text changed"
         commit = "HEAD" if not commit.strip("0") else commit[:8]  # not committed yet
-    since = _git("rev-list", "--count", f"{commit}..HEAD", "--", "jaxdyn")
-    return f"{what} at {commit}, {since} commits to jaxdyn ago"
+    code = measured_code(table.commands)
+    count = int(_git("rev-list", "--count", "--no-merges", f"{commit}..HEAD", "--", *code))
+    return count, f"{what} at {commit}, {count} commits to {', '.join(code)} ago"
+
+
+def has_history() -> bool:
+    """Decide whether git knows all commits of the repository: an archive has none, and a shallow clone few."""
+    ended = subprocess.run(
+        ["git", "rev-parse", "--is-shallow-repository"], cwd=ROOT, capture_output=True, text=True, check=False
+    )
+    return ended.returncode == 0 and ended.stdout.strip() == "false"
 
 
 def _git(*words: str) -> str:
@@ -135,13 +171,16 @@ def main(argv=None) -> int:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("words", nargs="*", help="run only commands that contain one of these")
     parser.add_argument("--list", action="store_true", help="run nothing; print tables, commands and ages")
+    parser.add_argument("--stale", action="store_true", help=f"run nothing; print tables older than {LIMIT} commits")
     options = parser.parse_args(argv)
     every = [table for page in (ROOT / "README.md", *sorted((ROOT / "docs").rglob("*.md"))) for table in tables(page)]
-    if options.list:
-        for table in every:
+    if options.list or options.stale:
+        listed = [(table, *age(table)) for table in every]
+        listed = [row for row in listed if not options.stale or row[1] > LIMIT or not row[0].commands]
+        for table, _, note in listed:
             line = table.page.read_text(encoding="utf-8").count("\n", 0, table.start) + 1
-            print(f"{table.page.relative_to(ROOT)}:{line}: {'; '.join(table.commands) or 'NO COMMAND'} ({age(table)})")
-        return int(any(not table.commands for table in every))
+            print(f"{table.page.relative_to(ROOT)}:{line}: {'; '.join(table.commands) or 'NO COMMAND'} ({note})")
+        return int(bool(listed) if options.stale else any(not table.commands for table in every))
     # Imported on use: it asks the machine.
     from benchmarks import timing
 

@@ -1,10 +1,11 @@
 """Moving pictures of scenes for the page docs/gallery.md: `python -m benchmarks.gallery [--out docs/gallery] [SCENE ...]`.
 
 Each scene of the page is simulated from its start and written as a GIF. The files are not kept in the repository: `make docs`
-makes those that are missing, and those whose scene or drawing has changed since.
+makes those that are missing, and those whose scene, settings or drawing have changed since.
 """
 
 import argparse
+import ast
 import hashlib
 import inspect
 import time
@@ -16,7 +17,8 @@ import numpy as np
 
 import jaxdyn as jd
 from benchmarks.hand_figure import turned_ball
-from jaxdyn.pictures.solids import Shape, Shapes, along, rod
+from jaxdyn.model import host_math
+from jaxdyn.pictures.solids import Shape, Shapes, rod
 
 # Length of the motion, s.
 SCENES = {
@@ -57,6 +59,13 @@ POINTS = {
 }
 
 
+def axle(place=(0.0, 0.0, 0.0)) -> np.ndarray:
+    """Pose (4, 4) at a place with z along y."""
+    pose = host_math.rotation_from_z(np.array([0.0, 1.0, 0.0]))
+    pose[:3, 3] = place
+    return pose
+
+
 def solids(name: str) -> Shapes | None:
     """Solids of vehicles, whose inertia alone does not show what they are; None for the default ones."""
     parts = _vehicle(name)
@@ -89,7 +98,7 @@ def _vehicle(name: str) -> list[Shape] | None:
             rod("front frame", 0.75 * steer - side, 0.75 * steer + side, 0.014),
         ]
         wheels = [
-            Shape(f"{end} wheel", "cylinder", (radius, 0.035), along((0, 0, 0), (0, 1, 0)), source="constraint")
+            Shape(f"{end} wheel", "cylinder", (radius, 0.035), axle(), source="constraint")
             for end, radius in (("rear", 0.3), ("front", 0.35))
         ]
         return [*frame, Shape("rear frame", "box", (0.25, 0.14, 0.05), at(0.2, 0, 0.64)), *fork, *wheels]
@@ -102,7 +111,7 @@ def _vehicle(name: str) -> list[Shape] | None:
                 f"{end} truck",
                 "cylinder",
                 (0.04, 0.03),
-                along((0, y, 0.04), (0, 1, 0)),
+                axle((0, y, 0.04)),
                 source="constraint",
                 color=(0.3,) * 3,
             )
@@ -119,8 +128,7 @@ def _vehicle(name: str) -> list[Shape] | None:
         ]
     if name == "differential_drive":
         wheels = [
-            Shape(f"{side} wheel", "cylinder", (0.1, 0.04), along((0, 0, 0), (0, 1, 0)), source="constraint")
-            for side in ("left", "right")
+            Shape(f"{side} wheel", "cylinder", (0.1, 0.04), axle(), source="constraint") for side in ("left", "right")
         ]
         return [
             Shape("chassis", "cylinder", (0.24, 0.1), at(0.02, 0, 0.03)),
@@ -156,10 +164,24 @@ def write(name: str, folder: Path) -> float:
 
 
 def digest(name: str) -> str:
-    """SHA-256 of the code that a picture shows: the scene's module, the package that draws, and this file."""
+    """SHA-256 of the code that a picture shows, without docstrings and comments: its settings and what writes it, here, the
+    scene's module, and the package that draws.
+    """
     scene = Path(inspect.getfile(inspect.unwrap(getattr(jd.scenes, name))))
-    drawing = Path(inspect.getfile(jd.animate)).parent.glob("*.py")
-    return hashlib.sha256(b"".join(path.read_bytes() for path in (scene, Path(__file__), *sorted(drawing)))).hexdigest()
+    drawing = sorted(Path(inspect.getfile(jd.animate)).parent.glob("*.py"))
+    here = [inspect.getsource(function) for function in (write, _vehicle)]
+    settings = repr((SCENES[name], POINTS.get(name), name in _FORCES, _FRAMES))
+    code = [settings, *map(_code, [*here, *(path.read_text(encoding="utf-8") for path in (scene, *drawing))])]
+    return hashlib.sha256("\n".join(code).encode()).hexdigest()
+
+
+def _code(source: str) -> str:
+    """A program without its docstrings, comments and line breaks."""
+    tree = ast.parse(source)
+    for node in ast.walk(tree):
+        if isinstance(node, ast.Module | ast.ClassDef | ast.FunctionDef) and ast.get_docstring(node) is not None:
+            del node.body[0]
+    return ast.dump(tree)
 
 
 def main(argv=None) -> None:

@@ -31,7 +31,7 @@ from benchmarks.identify_franka import panda, recorded  # noqa: E402
 from benchmarks.identify_robots import ROOT, kuka, kuka_log  # noqa: E402
 from benchmarks.identify_selection import write_rows  # noqa: E402
 from jaxdyn import identify, inertia  # noqa: E402
-from jaxdyn.io.urdf import load_urdf  # noqa: E402
+from jaxdyn.io import load_model  # noqa: E402
 
 RATE = 250.0
 LEFT_OUT = {"drift": 0.8, "stribeck": 0.5, "load": 0.4, "spring": 0.4, "ripple": 0.5, "asymmetric": 0.3, "dahl": 0.4}
@@ -45,7 +45,7 @@ def arm(number: int) -> jd.Model:
     if number < 2:
         return (panda, kuka)[number]()
     robots = Path(str(distribution("example-robot-data").locate_file("cmeel.prefix/share/example-robot-data/robots")))
-    return load_urdf(robots / "ur_description/urdf/ur5_robot.urdf").replace(damping=None, friction=None)
+    return load_model(robots / "ur_description/urdf/ur5_robot.urdf").replace(damping=None, friction=None)
 
 
 def motion(rng, t: np.ndarray, nv: int, base: float) -> tuple[np.ndarray, np.ndarray, np.ndarray]:

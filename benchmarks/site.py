@@ -2,8 +2,9 @@
 
 Makes the pictures of the gallery that are missing or older than their code, turns the notebooks with their outputs into
 pages, builds the pages with zensical (strict), puts KaTeX beside them, which is fetched from the npm registry and kept in
-out/, and the sources that pages link to, and follows every link and anchor of the pages that came out. Without npm the pages
-take KaTeX from the net when they are read, and a line says so.
+out/, and the sources that pages link to, and follows every link and anchor of the pages that came out. Then a browser opens the
+pages at two widths (benchmarks/browser.py). Without npm the pages take KaTeX from the net when they are read, and without a
+browser nobody looks at them; a line says so.
 """
 
 import argparse
@@ -17,7 +18,7 @@ from html.parser import HTMLParser
 from pathlib import Path
 from urllib.parse import unquote, urlsplit
 
-from benchmarks import gallery
+from benchmarks import browser, gallery
 
 ROOT = Path(__file__).resolve().parent.parent
 SITE = ROOT / "out" / "site"
@@ -200,7 +201,12 @@ def main(argv=None) -> int:
     print(f"{len(list(SITE.rglob('*.html')))} pages, {count} links within the site, {len(dead)} of them dead")
     for link in dead:
         print(f"  {link}")
-    return int(bool(dead))
+    if options.no_gallery or browser.browser() is None:
+        print("no browser has looked at the pages" + ("" if options.no_gallery else ": none is installed"))
+        return int(bool(dead))
+    faults = browser.faults(SITE)
+    print("\n  ".join([f"a browser has looked at the pages at {browser.WIDTHS} pixels: {len(faults)} faults", *faults]))
+    return int(bool(dead or faults))
 
 
 if __name__ == "__main__":

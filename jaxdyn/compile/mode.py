@@ -51,11 +51,11 @@ def _check_mode(mode, what: str) -> str:
 def compilation(mode: str) -> Iterator[None]:
     """Choose how functions that are traced inside are compiled.
 
-    **Arguments:** `mode`:
+    **Arguments:**
 
-    - "auto": native kernels on a CPU where a function is a program of single numbers, operations of JAX elsewhere.
-    - "native": native kernels on NVIDIA's GPUs too, which have been tested without a GPU only.
-    - "plain": operations of JAX everywhere, which compile and run slower: a reference for tests.
+    - `mode`: "auto", native kernels on a CPU where a function is a program of single numbers, operations of JAX elsewhere;
+      "native", native kernels on NVIDIA's GPUs too, which have been tested without a GPU only; or
+      "plain", operations of JAX everywhere, which compile and run slower: a reference for tests.
 
     The mode counts when a function is traced, and `jax.jit` traces a function once in each mode. Without this context the
     environment variable JAXDYN_COMPILATION decides, and without that, "auto".

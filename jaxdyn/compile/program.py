@@ -24,6 +24,10 @@ class NotNumbers(Exception):
         return super().__str__() + (f", in {self.place}" if self.place else "")
 
 
+class FlaggedIteration(NotNumbers):
+    """A loop in native code whose iterations flag samples, of which nothing outside would know."""
+
+
 # An operation of a finished program: its name, its kind, and its operands, indices of operations and `Constant`s. Plain tuples,
 # which Python's collector of cycles forgets: with a class of their own it visited half a million of them again and again.
 Operation = tuple[str, str, tuple]

@@ -5,6 +5,7 @@ such as the zeros of joints of one kind. Other known columns are tables. Entries
 symmetric matrix, are one entry.
 """
 
+import contextlib
 from collections.abc import Callable, Sequence
 from typing import Any, NamedTuple
 
@@ -12,7 +13,16 @@ import numpy as np
 
 from jaxdyn.compile.graph import Graph
 from jaxdyn.compile.jax_adapter import scan_counts
-from jaxdyn.compile.program import Array, Number, as_objects, dtype_of, is_number, kind_or_refuse, objects
+from jaxdyn.compile.program import (
+    Array,
+    FlaggedIteration,
+    Number,
+    as_objects,
+    dtype_of,
+    is_number,
+    kind_or_refuse,
+    objects,
+)
 from jaxdyn.compile.scan import MAX_WRITTEN_OUT, Counts, Scan
 
 # Operations of an iteration beyond which there is no loop, but of a sweep.
@@ -32,9 +42,10 @@ def scan(expansion, params, args, eqn):
     if not length:
         return [*carry, *(np.zeros(x.shape, x.dtype) for x in outs)]
     if length >= MIN_ITERATIONS and any(x.dtype.kind == "O" for x in args):
-        results = _roll(
-            expansion, params["jaxpr"], [consts, carry, rows], eqn, length, params["reverse"], None, MAX_WRITTEN_OUT
-        )
+        arrays, results = [consts, carry, rows], None
+        # Flags of an iteration have no place but in what is written out.
+        with contextlib.suppress(FlaggedIteration):
+            results = _roll(expansion, params["jaxpr"], arrays, eqn, length, params["reverse"], None, MAX_WRITTEN_OUT)
         if results is not None:
             return results
     saved: list[list] = []
@@ -66,7 +77,7 @@ def _roll(expansion, inner, arrays, eqn, length: int, inward: bool, parents, mos
 
 
 def sweep(expansion, params, args, eqn):
-    """A sweep over a tree (see `sweeps`)."""
+    """A sweep over a tree (see `batch.sweep`)."""
     (before, count), parents, inward = params["counts"], params["parents"], params["inward"]
     consts, start, rows, inner = args[:before], args[before : before + count], args[before + count :], params["call"]
     # Whoever asks for a sweep has decided that a loop is faster. Without unknown numbers there is nothing to run.

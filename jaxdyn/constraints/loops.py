@@ -156,6 +156,7 @@ def loop(
     - `body_a`, `body_b`: names of bodies or frames of the scene's model; None is the world.
     - `pose_a`, `pose_b`: of the joint's frame in the body's: None (identity), (4, 4), (3,) or (xyz, rpy); m and rad.
     - `joint`: see the table.
+    - `in_plane`: only the rows within the x-y plane of frame A.
     - `name`: for errors and reports; by default made of the two bodies.
 
     **Raises:** ValueError for an unknown joint, a bad pose or twice the same body; when used, for a system that is no

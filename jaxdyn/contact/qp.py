@@ -83,7 +83,7 @@ def solve_qp(
     - `G` (m, n), `h` (m,): inequality rows. An infinite h is no bound.
     - `A` (p, n), `b` (p,): equality rows; they may be dependent.
     - `cones`: a pair (S, c) or a list of pairs, S (k, d, n) and c (k, d): $y = c - S x$, of each of the k cones, satisfies
-    $|(y_1, \ldots, y_{d-1})| \le y_0$. Rows of zeros fill up a smaller cone.
+      $|(y_1, \ldots, y_{d-1})| \le y_0$. Rows of zeros fill up a smaller cone.
     - `tol`: residuals and gap, with Q's diagonal, the rows and the largest of q scaled to one; by default 1e-9 in float64 and
       1e-4 in float32.
     - `max_steps`: of the interior point; about 10 are usual.

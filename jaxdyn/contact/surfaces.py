@@ -272,7 +272,7 @@ class SurfaceGeometry(eqx.Module):
 def surface_geometry(surface: Checked[Surface], alpha: Numbers) -> SurfaceGeometry:
     """Gauss frame, metric, curvature and torsion of a surface at alpha, by differentiating its parametrisation.
 
-    **Arguments:** `alpha` (2,): (u, v).
+    **Arguments:** `surface`: `Plane`, `Sphere` or another of `jd.contact`; `alpha` (2,): (u, v).
 
     **Returns:** `SurfaceGeometry`; where the chart ends, numbers are finite without meaning and `regular` is False.
 

@@ -61,8 +61,8 @@ class DryFriction(WithModes):
     - `along`: the sliding velocity w: an index of v, a function A(q, t) -> (nv,) or (2, nv) with w = A v, or a constraint with
       one or two rows on velocities, such as `jd.Pfaffian(A, b)` for a moving belt.
     - `smoothing`: v_s, m/s. The force is then the function $-\mu N \tanh(|w|/v_s) w/|w|$ of the state, without modes. It
-    never sticks: under a load F below $\mu N$ it creeps at $v_s \operatorname{artanh}(F/(\mu N))$. Above 2.65 v_s it is
-    within 1 % of $\mu N$.
+      never sticks: under a load F below $\mu N$ it creeps at $v_s \operatorname{artanh}(F/(\mu N))$. Above 2.65 v_s it is
+      within 1 % of $\mu N$.
     - `name`: name of its events.
 
     **Raises:** ValueError for coefficients and normal forces that are negative, a static one below the other, an invalid

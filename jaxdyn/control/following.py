@@ -57,9 +57,12 @@ def follow(
     The first one is searched for from the guess, all others by the least change, which keeps the branch where the path has steps
     short enough; `changes_branch` says where that was lost.
 
-    **Arguments:** as of `inverse_kinematics`, with its further `options`; every target has one row for each of its n places, such
-    as poses (n, 4, 4) or dictionaries of positions (n, 3) and directions (n, 3). `guesses` counts for the places after the first
-    one; the first is searched for from 16. A grid is followed row by row, forth and back.
+    **Arguments:** as of `inverse_kinematics`, and
+
+    - `targets`: as there, with one row for each of the n places: poses (n, 4, 4), or dictionaries of positions (n, 3) and
+      directions (n, 3). A grid is followed row by row, forth and back.
+    - `guesses`: number of starts at the places after the first one; the first is searched for from 16.
+    - `options`: further ones of `inverse_kinematics`.
 
     **Returns:** `Following`. Derivatives are those of each configuration by its own targets.
 

@@ -31,6 +31,7 @@ from jaxdyn.control.errors import (
     as_matrix,
     as_target,
     constrained,
+    drop_rounding,
     gain,
     regularity,
     row_count,
@@ -42,7 +43,7 @@ from jaxdyn.lie.so3 import matmul
 from jaxdyn.model.arguments import Checked, Function, Number, Numbers, as_array, check_state
 from jaxdyn.model.numbers import as_number
 from jaxdyn.reduction.inverse_dynamics import velocity_choice
-from jaxdyn.reduction.quasi_velocities import gauge_invariant
+from jaxdyn.reduction.minimal import gauge_invariant
 from jaxdyn.systems.scene import Scene, as_pytree
 from jaxdyn.systems.system import SceneLike, velocity_to_rate
 
@@ -66,11 +67,13 @@ class HybridForce(ForceLoop):
 
     - `scene`: with constraints; its forces are compensated.
     - `task`: x(q) -> (m,), or u(q, v) -> (m,); `target`: (m,), or a function of t, differentiable twice (once for velocities).
+    - `of`: what the task is, "position" or "velocity".
     - `kp`, `kd`: positive definite, numbers, (m,) or (m, m); 1/s^2 and 1/s, or 1/s for `kp` of velocities, without `kd`.
     - `force`: $\lambda_d$ (nc,), or a function of t; None for zero. `ki` (1/s): positive definite, or None for no
       integral action.
     - `actuated`: indices of the actuated velocities; None: all. The torques of least norm are used that
-      give the motion, plus the part of `internal` (na,), N m, along directions that change only forces: with as many motors as
+      give the motion.
+    - `internal` (na,), N m: torques that are added along directions that change only forces: with as many motors as
       degrees of freedom there are none. Forces are then not controlled, and `force` and `ki` must be omitted.
     - `least_regularity`: a number from 0 to 1. Where `regularity(q, v, t)` falls to it, a simulation ends with the code
       `control_singular` and the time. None: it continues, with the task followed in the least-squares sense.
@@ -340,10 +343,8 @@ class GaugeInvariant(ForceLoop):
         # Constraints first: J = d v / d xd is the inverse of the task's rows in the motions that these leave. It is the last
         # columns of the inverse of the stacked rows where that exists; elsewhere J s still satisfies the constraints.
         inverse = pseudo_inverse(A, tolerance(None, A))
-        left = T - matmul(matmul(T, inverse), A)
-        # Rounding errors of rows that depend on the constraints are no directions. Decisions on rank have no derivative.
-        sizes = [jnp.sum(jax.lax.stop_gradient(x) ** 2) for x in (left, T)]
-        left = jnp.where(sizes[0] > tolerance(None, T) ** 2 * sizes[1], left, jnp.zeros_like(left))
+        # Rounding errors of rows that depend on the constraints are no directions.
+        left = drop_rounding(T - matmul(matmul(T, inverse), A), T)
         J = pseudo_inverse(left, tolerance(None, left))
         s, sdot = jax.jvp(reference, (q, t), motion)
         along = matmul(J, s)

@@ -27,7 +27,7 @@ from jaxdyn.model.numbers import as_float
 from jaxdyn.model.tree import Model
 from jaxdyn.systems.mass_factor import solve_positive
 from jaxdyn.systems.scene import Scene
-from jaxdyn.systems.system import System, symbols
+from jaxdyn.systems.system import System, has_coordinate_rates, symbols
 
 KINDS = ("first", "second")
 
@@ -65,7 +65,9 @@ def sharp(metric: Metric, q: Float[Array, " n"], p: Float[Array, " n"]) -> Float
 
     $$v = g(q)^{-1} p$$
 
-    **Arguments:** `metric` as above; `q`, `p` (n,). **Returns:** (n,); NaN where g is not positive definite.
+    **Arguments:** `metric` as above; `q` (n,), a point; `p` (n,), a one-form there.
+
+    **Returns:** (n,); NaN where g is not positive definite.
     """
     return _sharp(metric, *_vectors(metric, q=q, p=p))
 
@@ -116,7 +118,7 @@ def connection(
 
     $$\Gamma(v, w)^i = \Gamma^i_{jk} v^j w^k$$
 
-    **Arguments:** `metric` as above; `q`, `v`, `w` (n,). **Returns:** (n,).
+    **Arguments:** `metric` as above; `q` (n,), a point; `v`, `w` (n,), vectors there. **Returns:** (n,).
     """
     return _connection(metric, *_vectors(metric, q=q, v=v, w=w))
 
@@ -140,7 +142,10 @@ def covariant_rate(
 
     With $w = v = \dot q$ and the rate a it is the covariant acceleration $\nabla_v v$. It is zero for parallel transport.
 
-    **Arguments:** `metric` as above; `q`, its rate `v`, `w` and its `rate` dw/dt, each (n,). **Returns:** (n,).
+    **Arguments:** `metric` as above; `q` (n,), a point of the curve; `v` (n,), its rate; `w` (n,), the field there; `rate` (n,),
+    dw/dt.
+
+    **Returns:** (n,).
     """
     q, v, w, rate = _vectors(metric, q=q, v=v, w=w, rate=rate)
     return rate + connection(metric, q, v, w)
@@ -245,14 +250,10 @@ def _as_function(metric, t: Numbers = 0.0) -> Callable:
     **Raises:** ValueError for an argument that gives no metric.
     """
     # The formulas are those of a coordinate basis, v = dq/dt; quasi-velocities would need the structure constants too.
-    if isinstance(metric, Model) and metric.nq != metric.nv:
+    if isinstance(metric, Model) and not has_coordinate_rates(metric):
         raise ValueError(
             f"metric is model {metric.name!r} with nq = {metric.nq}, nv = {metric.nv}; a metric needs coordinates with "
-            "v = dq/dt, so build the model without spherical and free joints, or give g(q) in coordinates"
-        )
-    if isinstance(metric, Model) and "planar" in metric.topology.kinds:
-        raise ValueError(
-            f"metric is model {metric.name!r}, which has a planar joint, whose v is not dq/dt; give g(q) in coordinates"
+            "v = dq/dt, so build the model without planar, spherical and free joints, or give g(q) in coordinates"
         )
     if isinstance(metric, (Model, System)):
         return lambda q: mass_matrix(metric, q, t)
@@ -283,8 +284,8 @@ def arnold_form(inertia: Float[Array, "n n"], c: Float[Array, " n"], a: Float[Ar
     On SO(3) it satisfies $I B(c, a) = (I c) \times a$, on SE(3) $I B(c, a) = \mathrm{ad}_a^T I c$. Without forces a rigid body
     moves by Euler's equations $\dot V = B(V, V)$: the geodesics of the metric, as the left translations of Lemma 7.1 show.
 
-    **Arguments:** `inertia` (3, 3), kg m^2, in body axes, with angular velocities `c`, `a` (3,), rad/s; or (6, 6), a spatial
-    inertia in a body frame (`jd.inertia.spatial_inertia`), with body twists (v, omega) (6,).
+    **Arguments:** `inertia` (3, 3), kg m^2, in body axes, or (6, 6), a spatial inertia in a body frame
+    (`jd.inertia.spatial_inertia`); `c`, `a`: angular velocities (3,), rad/s, or body twists (v, omega) (6,).
 
     **Returns:** (3,), rad/s^2, or (6,), m/s^2 and rad/s^2; NaN where the inertia is not positive definite.
 

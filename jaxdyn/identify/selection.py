@@ -28,8 +28,8 @@ from typing import NamedTuple
 
 import numpy as np
 
-from jaxdyn.identify.condensed import Blocks
 from jaxdyn.identify.condensed_fit import Setting
+from jaxdyn.identify.regression import Blocks
 
 VELOCITIES = (0.0003, 0.001, 0.003, 0.01, 0.03, 0.1)
 # Factors by which v_s is refined between two of these, in turn.

@@ -8,8 +8,8 @@ from typing import Any
 
 import numpy as np
 
+from jaxdyn.identify.log_repair import repair_log
 from jaxdyn.identify.logs import Log
-from jaxdyn.identify.workflows.log_repair import repair_log
 from jaxdyn.model.arguments import Checked, FilePath, as_path, parse_number
 from jaxdyn.model.tree import Model
 
@@ -35,7 +35,7 @@ def read_log(
     ignored, and so is a unit in brackets after a name of a CSV file, `q_shoulder [rad]`; numbers are taken in SI units.
     Columns of a CSV file may be separated by commas, semicolons or tabs; numbers have a decimal point.
 
-    **Arguments:** `path`; `joint_names`: order of the joints in the result for columns with joint names (a model's
+    **Arguments:** `path`: of the file; `joint_names`: order of the joints in the result for columns with joint names (a model's
     `joint_names`); columns of other joints are ignored. Without it the order of the file's tau columns. `rename`: from
     names of joints in the file to those of the model, {"motor1": "shoulder"}. `rollout`: which motion of a file that holds
     several, as `Solution.to_csv` and `to_npz` write them of a batch; the first is 1. `unwrap`, `outliers`, `model`: what becomes

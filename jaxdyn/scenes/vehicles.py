@@ -52,8 +52,9 @@ def bicycle(
     positive roll leans right.
 
     **Arguments:** `wheel_base`, `trail` (m) and `tilt` (rad) of the steer axis from the vertical, which passes
-    through the ground at wheel_base + trail; radii (m). Wheels: (mass, (Ixx, Iyy, Izz)); frames: (mass, centre of mass
-    from the rear contact, (Ixx, Iyy, Izz, Ixz)), kg, m, kg m^2, upright and straight.
+    through the ground at wheel_base + trail; `rear_radius`, `front_radius`, m, of the wheels; `rear_wheel`, `front_wheel`:
+    (mass, (Ixx, Iyy, Izz)), kg and kg m^2; `rear_frame`, `front_frame`: (mass, centre of mass from the rear contact, (Ixx, Iyy,
+    Izz, Ixz)), kg, m and kg m^2, upright and straight.
 
     Start: upright and straight at `speed` (m/s), with `roll_rate` and `steer_rate` (rad/s) that the wheels allow.
 

@@ -62,10 +62,12 @@ class Noise(eqx.Module):
     Errors of an orientation are small rotations, so that it stays a unit quaternion: three angles, rad, about the axes of the
     frame in place of its four numbers.
 
-    **Arguments:** each a number or one for each entry of the reading, in its units.
+    Each argument is a number, or has one for each entry of the reading, in its units.
+
+    **Arguments:**
 
     - `std`: standard deviation of the white noise of a sample. A density d (per root of Hz) sampled every dt is $d / \sqrt{dt}$.
-    - `bias`: constant. `walk`: the standard deviation of the random walk of the bias after 1 s; it grows as the root of time.
+    - `bias`: a constant error. `walk`: the standard deviation of the bias's random walk after 1 s; it grows as the root of time.
 
     **Raises:** ValueError for deviations that are negative.
 

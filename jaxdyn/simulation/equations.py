@@ -6,6 +6,7 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 
+from jaxdyn.compile import implicit, kernel, value_and_jvp
 from jaxdyn.compile.known import partition_tracers
 from jaxdyn.constraints.assembly import residuals
 from jaxdyn.constraints.redundancy import exchange_rows
@@ -15,9 +16,10 @@ from jaxdyn.dynamics.centroidal import kinetic_energy, potential_energy
 from jaxdyn.dynamics.kinematics import frame_pose
 from jaxdyn.forces.piecewise import Pieces, fix_pieces, guards, pieces_of, values_and_levels
 from jaxdyn.simulation import controls
-from jaxdyn.simulation.checks import CONTACT_OUTPUTS, POSE
+from jaxdyn.simulation.checks import CONTACT_OUTPUTS
+from jaxdyn.simulation.events import Conditions, contact_allowances, limit_allowances
 from jaxdyn.simulation.methods import Method, Projected
-from jaxdyn.simulation.terminal_events import WITHIN, Conditions, contact_allowances, limit_allowances
+from jaxdyn.simulation.options import Pose
 from jaxdyn.systems.scene import Scene
 from jaxdyn.systems.system import retract, velocity_to_rate
 
@@ -26,6 +28,8 @@ from jaxdyn.systems.system import retract, velocity_to_rate
 KEPT = "kept_rows"
 # Entry of the state: the states of the scene's drives.
 DRIVES = "drives"
+# Entry of the state in diffrax's loop: -1 where an allowance has been negative within the last step, else 1.
+WITHIN = "within_step"
 
 
 def power(force, v):
@@ -61,7 +65,7 @@ class Equations:
         self.derivative, self.explicit_part, self.implicit_part = map(
             jax.jit, (self._derivative, self._explicit_part, self._implicit_part)
         )
-        self.advance, self.guards = jax.jit(self._advance), jax.jit(self._guards)
+        self.guards = jax.jit(self._guards)
 
     def unpack(self, args, y=None):
         """Scene with the rows that the step from y keeps, control and method."""
@@ -175,9 +179,23 @@ class Equations:
         scene, _, method = self.unpack(args, y)
         return method.begin(scene, y, t)
 
-    def _advance(self, t0, t1, y, args, carried):
-        scene, _, method = self.unpack(args, y)
-        return method.advance(scene, y, t0, t1, carried, functools.partial(self.generalized_force, args, y))
+    def advance(self, t0, t1, y, args, carried):
+        """A variational step: state, mean velocity, what the next step needs, and whether it succeeded."""
+        leaves, structure = jax.tree.flatten((t0, t1, y, carried))
+
+        def step(args, *leaves):
+            return _advance(self, args, *jax.tree.unflatten(structure, leaves))
+
+        def tangent(args, *rest):
+            *leaves, steps = rest
+            results, changes = value_and_jvp(step, (args, *leaves), steps)
+            return results, jax.tree.map(jnp.zeros_like, results) if changes is None else changes
+
+        def solve(args, *leaves):
+            whole: Any = kernel(_advance, static=1, derivative=False)
+            return whole(self, args, *jax.tree.unflatten(structure, leaves))
+
+        return implicit(args, tuple(leaves), solve, tangent)
 
     def allowances(self, args, y, q, v, t):
         """Distances of the contacts, joints and control from the conditions that end the run."""
@@ -207,6 +225,11 @@ class Equations:
         return values, jnp.zeros_like(values)  # allowances have the rounding in them
 
 
+def _advance(eqs: Equations, args, t0, t1, y, carried):
+    scene, _, method = eqs.unpack(args, y)
+    return method.advance(scene, y, t0, t1, carried, functools.partial(eqs.generalized_force, args, y))
+
+
 def _constants(y) -> dict[str, Any]:
     """Rates of what is constant during a step and renewed at its end."""
     return {name: jnp.zeros_like(y[name]) for name in (KEPT, WITHIN) if name in y}
@@ -217,7 +240,7 @@ def state_outputs(system, outputs, q, v, t) -> dict[str, Any]:
     values: dict[str, Any] = {}
     if "energy" in outputs:
         values["energy"] = kinetic_energy(system, q, v, t) + potential_energy(system, q, t)
-    frames = [name.removeprefix(POSE) for name in outputs if name.startswith(POSE)]
+    frames = [one.frame for one in outputs if isinstance(one, Pose)]
     return values | {"poses": {frame: frame_pose(system, q, frame) for frame in frames}}
 
 

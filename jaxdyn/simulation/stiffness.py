@@ -94,7 +94,8 @@ def stiffness(
     $\delta q$ is along the manifold. On constraints $\delta a$, $\delta v$ and $\delta q$ are projected on their tangent
     space in the mass metric; the change of the rows along $\delta q$ is left out.
 
-    **Arguments:** `scene`, a `Scene` or a system; `q` (nq,); `v` (nv,); `t`, s; `drive_state` z (n,), by default
+    **Arguments:** `scene`: a `Scene` or a system; `q` (nq,); `v` (nv,); `t`, s; `control`: forces control(q, v, t) -> (nv,), a
+    function of the state; `drive_state`: z (n,), by default
     `scene.drive_state(q, v, t)`.
 
     **Raises:** ValueError for wrong shapes, and where forces or masses are not finite (NaN where numbers are traced).

@@ -27,7 +27,7 @@ import numpy as np
 from jax import lax
 from jaxtyping import Array, Bool, Float
 
-from jaxdyn.compile import pseudo_inverse_by_rotations
+from jaxdyn.compile import eliminate
 from jaxdyn.constraints.base import (
     constraint_jacobian,
     holonomic_rows,
@@ -119,12 +119,13 @@ def make_step(
         xi, momentum = z[:n], balance(z)[0]
         if A is None:
             return momentum
-        rows = jnp.zeros_like(z[n:])
+        rows = []
         if holonomic.size:
             # Divided by h, so that all unknowns and all residuals are of the size of velocities.
-            rows = rows.at[holonomic].set(position_residual(scene, displace(system, q, h * xi), t1) / h)
+            rows.append(position_residual(scene, displace(system, q, h * xi), t1) / h)
         if nonholonomic.size:
-            rows = rows.at[nonholonomic].set(velocity_residual(scene, halfway(xi), xi, middle)[nonholonomic])
+            rows.append(velocity_residual(scene, halfway(xi), xi, middle)[nonholonomic])
+        rows = jnp.concatenate(rows)[np.argsort(np.concatenate([holonomic, nonholonomic]))]
         return jnp.concatenate([momentum, rows])
 
     def jacobian(function, z):
@@ -175,7 +176,7 @@ def _newton(function, jacobian, z, n: int):
     def renew(state):
         z, _, before, count = state
         matrix = jacobian(z)
-        inverse = pseudo_inverse_by_rotations(matrix, float(jnp.finfo(z.dtype).eps))
+        inverse = eliminate(matrix, jnp.eye(len(matrix), dtype=matrix.dtype), eps)[0]
 
         def repeat(state):
             z, change, _, count = state
@@ -308,7 +309,7 @@ class Variational(Multipliers):
                 f"stepsize is {stepsize!r}; method 'variational' takes fixed steps, because adaptive ones lose its "
                 "conservation: pass a number (s), e.g. stepsize=0.01"
             )
-        from jaxdyn.simulation.solvers.fixed_steps import Stepper
+        from jaxdyn.simulation.solvers.diffrax_methods import Stepper
 
         return Stepper()
 

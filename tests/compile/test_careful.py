@@ -13,7 +13,7 @@ from kernel_helpers import assert_close, quick
 
 from jaxdyn import compile as backend
 from jaxdyn.compile import careful as pairs
-from jaxdyn.compile import kernel, mark_invalid, target
+from jaxdyn.compile import kernel, mark_invalid, rolled, target
 from jaxdyn.compile.batch import any_sample
 from jaxdyn.compile.loops import Carry, Given, Iteration, Task, run_loop
 from jaxdyn.compile.operations import as_operations
@@ -293,3 +293,20 @@ def test_careful_programs_of_functions_in_a_tree_are_not_taken_for_each_other():
         scale = Scale(lambda x, factor=factor: factor * x)
         values = jax.jit(jax.vmap(lambda x, scale=scale: flagged(scale, x)))(jnp.array([-1.0, 1.0]))
         assert values.tolist() == [-1.0, factor]
+
+
+def test_loops_that_flag_samples_are_written_out(monkeypatch):
+    """A flag of one iteration of ten: this sample is computed by the fallback, others by the kernel, at any limit."""
+    monkeypatch.setattr(rolled, "MAX_WRITTEN_OUT", 0)
+
+    def iterate(root, x):
+        return jax.lax.scan(lambda x, _: (root(x - 0.1), x), x, None, 10)[0]
+
+    def flagged(_, x):
+        return iterate(lambda x: mark_invalid(x < 0, jnp.sqrt(x)), x)
+
+    careful = backend.kernel(flagged, fallback=lambda _, x: iterate(lambda x: jnp.abs(x) ** 0.5, x))
+    x = jnp.array([0.05, 0.3, 2.0, 5.0])
+    want = jax.vmap(lambda x: iterate(lambda x: jnp.sqrt(jnp.abs(x)), x))(x)
+    assert "while" not in str(jax.make_jaxpr(lambda x: careful(None, x))(x[0]))
+    np.testing.assert_allclose(jax.jit(jax.vmap(lambda x: careful(None, x)))(x), want, rtol=1e-14)

@@ -20,8 +20,11 @@ def test_example_of_the_readme_runs(tmp_path, monkeypatch):
 
 
 @pytest.mark.long
-def test_examples_of_the_first_steps_run():
+def test_examples_of_the_first_steps_run(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
     names = run("docs/start.md")
+    assert np.abs(names["turning"].constraint_residual).max() < 1e-14 and np.ptp(names["turning"].q[:, 2]) > 0.05
+    assert (tmp_path / "engine.gif").stat().st_size > 50_000
     assert np.abs(names["a"]).max() < 1e-10, "gravity compensation holds the arm still"
     assert names["accelerations"].shape == (1000, 7)
     assert np.isfinite(names["gradient"]).all()
