@@ -20,6 +20,7 @@ _SOURCES = {
     "bound": "held at zero, its least value",
     "confounded": "an extra term explains the same torque",
     "hardly moved": "the joint stood nearly still",
+    "undetermined": "neither the logs nor the URDF determine it",
 }
 # Rows of base parameters on the screen, so that the output of an arm stays below sixty lines.
 _BASE_ROWS = 16

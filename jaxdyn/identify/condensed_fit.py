@@ -32,7 +32,7 @@ from jaxdyn.identify.regression import (
     parameter_names,
 )
 from jaxdyn.identify.torque_terms import TorqueTerm, coulomb_through_filter, term_columns
-from jaxdyn.identify.uncertainty import jackknife
+from jaxdyn.identify.uncertainty import depends_on, jackknife, null_space, psd_root
 from jaxdyn.model.tree import Model
 
 # A unit of a coefficient makes this share of the joint's torque.
@@ -207,13 +207,13 @@ def eliminate(rows: np.ndarray, count: int, ridge: np.ndarray) -> tuple[np.ndarr
 _FROM_PRIOR = 0.5
 # Share of the variance of a number, due to extra terms, above which it is confounded with these.
 _FROM_EXTRA = 0.5
-CONFOUNDED, STILL = "confounded", "hardly moved"
+CONFOUNDED, STILL, UNDETERMINED = "confounded", "hardly moved", "undetermined"
 
 
 class Spread(NamedTuple):
     """Numbers with uncertainty, all (n,): names, values, standard deviations, and the share of the variance from the prior.
 
-    `marks` (n,): "confounded" or "hardly moved" where that makes a number's interval meaningless, else empty.
+    `marks` (n,): "confounded", "hardly moved" or "undetermined" where that makes a number's interval meaningless, else empty.
     """
 
     names: tuple[str, ...]
@@ -227,14 +227,15 @@ class Spread(NamedTuple):
         """Source of each number.
 
         - "data" or "prior": the origin of most of its uncertainty, hence of its value;
-        - "bound": a term that the fit holds at zero;
+        - "bound": a term that the fit holds at zero, without a standard deviation (NaN);
+        - "undetermined": neither data nor prior determine it, as the offset of a joint that moves in one direction (NaN too);
         - "confounded": most of its variance would vanish with the extra terms, or, for the coefficient of an extra term, most of
           the variance of another number with it;
         - "hardly moved": friction or rotor inertia of a joint that stood nearly still in all logs.
         """
         source = np.where(self.prior_share > _FROM_PRIOR, "prior", "data")
         source = np.where(self.marks != "", self.marks, source)
-        return np.where(np.isfinite(self.std), source, "bound").tolist()
+        return np.where(np.isfinite(self.std) | (self.marks == UNDETERMINED), source, "bound").tolist()
 
 
 class Intervals(NamedTuple):
@@ -291,10 +292,12 @@ def intervals(
     gradients = blocks.scores(estimate.x, weights * np.sqrt(widening)) @ jacobian / sigma**2
     grams_of_curvature = (data if curved is None else curved).blocks.grams(weights)
     grams = np.einsum("pi,bpq,qj->bij", jacobian, grams_of_curvature, jacobian, optimize=True) / sigma**2
+    # Groups have no gradient along these directions either, so that the scatter would make their deviations zero.
+    null = null_space(grams.sum(axis=0), curvature)
     # The prior is in every replicate: it is no observation that could be left out.
     changes, inverse, factor = jackknife(grams, gradients, curvature, size)
     # A prior weaker than 1 expresses no belief that the nominal bodies are better: at least weight 1 counts.
-    changes, pulled = jacobian @ changes, jacobian @ inverse @ _root(curvature) * np.sqrt(max(setting.prior, 1.0))
+    changes, pulled = jacobian @ changes, jacobian @ inverse @ psd_root(curvature) * np.sqrt(max(setting.prior, 1.0))
 
     nb, nv = model.nb, model.nv
     names = list(parameter_names(model))
@@ -319,17 +322,21 @@ def intervals(
     for place in extra:
         # The share of an extra coefficient in its own variance is 1: it counts by what it takes from the base parameters instead.
         is_confounded[place] = np.any(share_of_extra(combine, covariance, np.array([place])) > _FROM_EXTRA)
-    marks = np.where(is_still, STILL, np.where(is_confounded, CONFOUNDED, ""))
+    is_lost = depends_on(jacobian, null) & ~is_still
+    marks = np.select([is_lost, is_still, is_confounded], [UNDETERMINED, STILL, CONFOUNDED], "")
+    fitted &= ~is_lost
     parameters = _make_spread(
         [names[i] for i in shown], estimate.x[shown], changes[shown], pulled[shown], fitted[shown], marks[shown]
     )
 
     # By absolute values: parameters enter with both signs, and a sum over them can vanish where none is zero.
     enters = np.abs(base.matrix) > 1e-9 * np.abs(base.matrix).max(axis=1, keepdims=True)
-    known = np.any(enters & fitted[columns], axis=1)
+    is_still = is_still[columns[base.independent]]
+    is_lost = depends_on(combine @ jacobian, null) & ~is_still
+    known = np.any(enters & fitted[columns], axis=1) & ~is_lost
     a, b = base.matrix @ changes[columns], base.matrix @ pulled[columns]
     is_confounded = share_of_extra(combine, covariance, extra) > _FROM_EXTRA
-    marks = np.where(is_still[columns[base.independent]], STILL, np.where(is_confounded, CONFOUNDED, ""))
+    marks = np.select([is_lost, is_still, is_confounded], [UNDETERMINED, STILL, CONFOUNDED], "")
     spread = _make_spread(base.names, base.values(estimate.x[columns]), a, b, known, marks)
     return Intervals(parameters, spread, base, a @ a.T + b @ b.T, factor, widening)
 
@@ -383,9 +390,3 @@ def local_coordinates(data: Data, setting: Setting, estimate: Estimate):
     curvature[count + np.arange(len(places)), count + np.arange(len(places))] = setting.prior / units**2
     # A basic parameter is free where any coordinate changes it; massless bodies and terms at their bound have zero rows.
     return jacobian, curvature, np.any(jacobian[: data.basic] != 0, axis=1)
-
-
-def _root(matrix: np.ndarray) -> np.ndarray:
-    # Semidefinite: coordinates without a prior have no curvature, which a Cholesky factorisation would refuse.
-    values, vectors = np.linalg.eigh(matrix)
-    return vectors * np.sqrt(np.maximum(values, 0))

@@ -1,12 +1,15 @@
 """Torque terms that the logs support and a fit lacks, and intervals that include the fits with them.
 
 A term left out moves the parameters that imitate it: half a per cent of the torque can hide ten standard deviations of viscous
-friction. The scatter over blocks shows nothing of it, as the errors that remain look the same in each of them. For every term of
-`EXTRA` at every joint the fit with it follows from the condensed logs by one Newton step. Where its coefficient differs from zero
-by Student's t, the intervals become those that hold both fits' intervals, also for the clearest terms of all joints together.
+friction. The scatter over blocks shows nothing of it, as the errors that remain look the same in each of them. For every term
+of `EXTRA` at every joint the fit with it follows from the condensed logs by one Newton step. Where the 95 % interval of its
+coefficient excludes zero, the intervals become those that hold both fits' intervals, also for the clearest terms of all joints
+together. Only terms that differ from zero at a stricter level are named: with so many tests some exceed the first one by
+chance. At the stricter level alone a term that is there and just fails the test leaves intervals that are too narrow (Bancroft
+1944).
 
-Source: Leamer (1983), "Let's take the con out of econometrics", bounds over specifications; Wooldridge (2010), section 4.3,
-omitted variables.
+Source: Bancroft (1944), "On biases in estimation due to the use of preliminary tests of significance"; Leamer (1983), "Let's
+take the con out of econometrics", bounds over specifications; Wooldridge (2010), section 4.3, omitted variables.
 """
 
 from collections.abc import Sequence
@@ -17,15 +20,15 @@ import numpy as np
 from jaxdyn.identify.condensed_fit import Data, Estimate, Intervals, Setting, Spread, local_coordinates
 from jaxdyn.identify.uncertainty import block_groups, invert, student
 
-# Two-sided level of the test for a coefficient: it is asked for every term at every joint.
+# Two-sided level at which a term is named: it is asked for every term at every joint.
 _LEVEL = 1e-2
 
 
 class Shift(NamedTuple):
     """Effect of further terms: change of all parameters (p,), and a root (p, groups) of their covariance with them.
 
-    `terms`: names and indices of torques; `factor`: of a 95 % interval; `clearness`: largest coefficient over the deviation at
-    which the test counts it.
+    `terms`: names and indices of torques; `factor`: of a 95 % interval; `clearness`: largest coefficient over its standard
+    deviation; `least`: clearness from which on the terms are named.
     """
 
     terms: tuple[tuple[str, int], ...]
@@ -33,6 +36,7 @@ class Shift(NamedTuple):
     root: np.ndarray
     factor: float
     clearness: float
+    least: float
 
 
 class _Extended(NamedTuple):
@@ -59,7 +63,7 @@ class _Extended(NamedTuple):
         # The fit is a minimum: of the gradient of data and prior the part of the new coefficients alone is left.
         step = -inverse[0] @ g[:, new].sum(axis=0)
         # Costs no jackknife, and errs on the side of the term.
-        if not np.any(np.abs(step) > 2.5 * np.sqrt(np.maximum(np.diag(inverse[0]), 0))):
+        if not np.any(np.abs(step) > 1.5 * np.sqrt(np.maximum(np.diag(inverse[0]), 0))):
             return None
         step = np.append(-eliminated[0] @ step, step)
         right = (g[:, kept] + G[:, kept][:, :, kept] @ step)[..., None]
@@ -67,9 +71,9 @@ class _Extended(NamedTuple):
         last = inverse[1:] @ (right[:, own:] - np.swapaxes(cross[1:], 1, 2) @ known)
         replicates = np.concatenate([known - eliminated[1:] @ last, last], axis=1)[..., 0]
         root = (replicates - replicates.mean(axis=0)).T * np.sqrt((groups - 1) / groups)
-        least = student(groups - 1, _LEVEL) * np.linalg.norm(root[own:], axis=1)
-        clearness = float(np.max(np.abs(step[own:]) / np.maximum(least, 1e-300)))
-        return Shift(terms, T[:, kept] @ step, T[:, kept] @ root, student(groups - 1), clearness)
+        clearness = float(np.max(np.abs(step[own:]) / np.maximum(np.linalg.norm(root[own:], axis=1), 1e-300)))
+        factor, least = student(groups - 1), student(groups - 1, _LEVEL)
+        return Shift(terms, T[:, kept] @ step, T[:, kept] @ root, factor, clearness, least)
 
 
 def find_shifts(
@@ -113,8 +117,9 @@ def find_shifts(
     ends = own + np.cumsum([len(places) for _, places in tried])
     indices = {term: np.arange(end - len(places), end) for end, (term, places) in zip(ends, tried, strict=True)}
     every = [system.extend((term,), new) for term, new in indices.items()]
-    shifts = [shift for shift in every if shift is not None and shift.clearness > 1]
-    clearest = {shift.terms[0][1]: shift.terms[0] for shift in sorted(shifts, key=lambda shift: shift.clearness)}
+    shifts = [shift for shift in every if shift is not None and shift.clearness > shift.factor]
+    named = [shift for shift in shifts if shift.clearness > shift.least]
+    clearest = {shift.terms[0][1]: shift.terms[0] for shift in sorted(named, key=lambda shift: shift.clearness)}
     if len(clearest) > 1:
         # A second joint's term moves the first joint's parameters too.
         both = system.extend(tuple(clearest.values()), np.concatenate([indices[term] for term in clearest.values()]))
@@ -137,7 +142,7 @@ def include_shifts(found: Intervals, shifts: Sequence[Shift], rows: np.ndarray, 
         parameters=parameters,
         base=base,
         base_covariance=found.base_covariance * grown * grown[:, None],
-        omitted=tuple(dict.fromkeys(term for shift in shifts for term in shift.terms)),
+        omitted=tuple(dict.fromkeys(term for shift in shifts if shift.clearness > shift.least for term in shift.terms)),
     )
 
 

@@ -170,15 +170,13 @@ def search(
     priors=PRIORS,
     losses=ROBUST,
 ) -> Setting:
-    """Coordinate descent over v_s, the loss, the prior, terms joint by joint in order of their gains, and the first three again.
+    """Coordinate descent over v_s, the loss, terms joint by joint in order of their gains, the prior, v_s and the loss again.
 
     `candidates`: from a setting to the indices of the torques that may get another term; `loss_squares`: squared errors (blocks,
     nv) for each of some losses, or None where the errors have no tails for which a robust loss may help.
     """
     setting = _choose_velocity(search, start, velocities)
     setting = _choose_loss(search, setting, losses, loss_squares)
-    # Terms at a prior that is too strong would explain what it withholds from the bodies.
-    setting = search.best([setting._replace(prior=prior) for prior in priors])
     remaining = list(extra)
     while remaining and (joints := tuple(candidates(setting))):
         trials = []

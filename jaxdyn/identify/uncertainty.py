@@ -29,6 +29,8 @@ _TOGETHER, _INDEPENDENT, _FEWEST = 2, 2, 6
 _LEVEL = 1e-3
 # Most independent samples that a log counts for where its errors are those of the model.
 _STATES = 10
+# Eigenvalues of a Hessian of unit diagonal below the first are those of rounding errors; least relative change of a number.
+_ROUNDING, _LEAST_CHANGE = 1e-13, 1e-4
 # About so many blocks are cut from all logs of a fit of parameters; each log has at least one.
 _BLOCKS = 20
 
@@ -68,7 +70,8 @@ def jackknife(grams, gradients, curvature: np.ndarray, size: float | None = None
     # One Newton step stands for a refit without the group: exact where the loss is quadratic.
     H = grams.sum(axis=0) + curvature
     # Unit diagonal first: parameters differ by many orders of magnitude in size.
-    unit = 1 / np.sqrt(np.maximum(np.diag(H), 1e-300))
+    # The floor is that of columns of zeros: its inverse times 1e12 of `invert` must not overflow.
+    unit = 1 / np.sqrt(np.maximum(np.diag(H), 1e-200))
     scale = unit[:, None] * unit[None, :]
     changes = np.stack(
         [
@@ -87,6 +90,32 @@ def invert(matrix: np.ndarray) -> np.ndarray:
     # Without a group the matrix may lose rank. The diagonal is of size one, so that 1e-12 is above rounding of the eigenvalues.
     values, vectors = np.linalg.eigh((matrix + matrix.T) / 2)
     return (vectors / np.maximum(values, 1e-12)) @ vectors.T
+
+
+def psd_root(matrix: np.ndarray) -> np.ndarray:
+    """Root R (n, n) of a positive semidefinite matrix R R^T."""
+    # Semidefinite: coordinates without a prior have no curvature, which a Cholesky factorisation would refuse.
+    values, vectors = np.linalg.eigh(matrix)
+    return vectors * np.sqrt(np.maximum(values, 0))
+
+
+def null_space(gram: np.ndarray, curvature: np.ndarray) -> np.ndarray:
+    """Directions (n, k), of length one, without curvature (n, n) of the data, to rounding, or of the prior."""
+    # The prior's curvature can be 1e-12 of the data's, and counts: only coordinates without any are compared with rounding.
+    free = np.flatnonzero(np.diag(curvature) == 0)
+    H = gram[np.ix_(free, free)]
+    # Unit diagonal: parameters differ by many orders of magnitude. A column of zeros is a direction of its own.
+    size = np.sqrt(np.maximum(np.diag(H), 0))
+    unit = np.divide(1.0, size, out=np.ones_like(size), where=size > 1e-150)
+    values, vectors = np.linalg.eigh(H * unit * unit[:, None])
+    directions = np.zeros((len(gram), int(np.sum(values < _ROUNDING))))
+    directions[free] = unit[:, None] * vectors[:, values < _ROUNDING]
+    return directions / np.linalg.norm(directions, axis=0)
+
+
+def depends_on(rows: np.ndarray, directions: np.ndarray) -> np.ndarray:
+    """Decide for numbers with the derivatives rows (m, n) whether they change along any of the directions (n, k)."""
+    return np.any(np.abs(rows @ directions) > _LEAST_CHANGE * np.linalg.norm(rows, axis=1, keepdims=True), axis=1)
 
 
 def student(degrees: int, level: float = 0.05) -> float:

@@ -462,6 +462,21 @@ def test_intervals_are_wider_where_a_term_is_left_out(kind):
     assert bodies >= COVERED[kind][0] and friction >= COVERED[kind][1]
 
 
+def test_numbers_of_a_direction_without_data_and_prior_have_no_interval(truth):
+    """A joint that moves one way shows the sum of Coulomb friction and offset: their deviations were 1e-6, and they 0.2 off."""
+    model, t = arm(), np.linspace(0, 1, 50)
+    wave = np.sin(3 * t)[:, None] * [1.0, 0.0]
+    q, v, a = (wave + t[:, None] * [0, 2.0], 3 * np.cos(3 * t)[:, None] * [1.0, 0.0] + [0, 2.0], -9 * wave)
+    log = measured(model, identify.Log(t, q, v, a, 0 * q), truth, noise=0.0)
+    found = identify.fit_robot(model, log, identify.TERMS, v_s=0.01, prior=1.0, robust=None).intervals.parameters
+    source = dict(zip(found.names, found.sources, strict=True))
+    lost = {name for name, word in source.items() if word == "undetermined"}
+    # At constant speed viscous friction is constant too, and no torque accelerates the rotor.
+    assert lost == {"b_joint.coulomb", "b_joint.offset", "b_joint.viscous", "b_joint.armature"}
+    assert not np.isfinite([found.std[found.names.index(name)] for name in lost]).any()
+    assert source["a_joint.coulomb"] in ("data", "prior")
+
+
 def test_a_term_that_is_left_out_is_named_and_within_the_intervals(truth):
     """Quadratic friction at one joint, which viscous friction imitates; with the term the intervals need no second fit."""
     model, log = arm(), motion(2, 600, 12.0)
