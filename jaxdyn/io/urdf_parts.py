@@ -5,7 +5,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from jaxdyn.io.loaded import summarize_all
+from jaxdyn.io.loaded import NotTaken
 from jaxdyn.io.unread import URDF_GAZEBO, URDF_JOINT, URDF_LINK, URDF_ROBOT, unread_parts
 from jaxdyn.io.xml_lines import XmlFile
 from jaxdyn.model import host_math
@@ -160,15 +160,16 @@ def read_parts(file: XmlFile) -> Parts:
     return Parts(file.root.get("name") or "", links, joints, places)
 
 
-def elements_without_effect(file: XmlFile) -> list[str]:
-    """Descriptions of elements and attributes of a file that a model does not represent."""
+def add_elements_without_effect(file: XmlFile, left: NotTaken) -> None:
+    """Add the elements and attributes of a file that a model does not represent."""
     robot = file.root.get("name") or "robot"
     elements: list = [(file.root, robot, URDF_ROBOT)]
     tables = {"link": URDF_LINK, "joint": URDF_JOINT, "gazebo": URDF_GAZEBO}
     for element in file.root:
         if element.tag in tables:
             elements.append((element, element.get("name") or element.get("reference") or robot, tables[element.tag]))
-    return summarize_all(unread_parts(file, elements))
+    for what, names in unread_parts(file, elements).items():
+        left.add(what, names)
 
 
 def _inertial(element) -> Inertial | None:
