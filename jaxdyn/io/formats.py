@@ -12,13 +12,13 @@ import numpy as np
 
 from jaxdyn.constraints.loops import model_couplings
 from jaxdyn.forces.elements import CoulombFriction, JointDamping
-from jaxdyn.io.loaded import LoadedScene, Start, summarize, warn_not_taken
+from jaxdyn.io.loaded import LoadedScene, NotTaken, Start
 from jaxdyn.io.mjcf import read_mjcf
 from jaxdyn.io.sdf import read_sdf
 from jaxdyn.io.solids import FRICTION, check_choice, collision_of, contacts_with_ground, urdf_elements
 from jaxdyn.io.urdf import urdf_model
 from jaxdyn.io.urdf_loops import loop_constraints, motors_of, plugin_followers, read_closures
-from jaxdyn.io.urdf_parts import elements_without_effect
+from jaxdyn.io.urdf_parts import add_elements_without_effect
 from jaxdyn.io.xml_lines import XmlFile
 from jaxdyn.model.arguments import Checked, DType, Numbers, as_path
 from jaxdyn.model.builder import GRAVITY
@@ -187,7 +187,9 @@ def load_model(
         return load(source, mimic=kept, arguments=arguments, packages=packages, **options).system
     file = XmlFile(source, "URDF", arguments, packages)
     model = urdf_model(file, mimic=mimic, **options)
-    warn_not_taken(file.path, elements_without_effect(file))
+    left = NotTaken()
+    add_elements_without_effect(file, left)
+    left.warn(file.path)
     return model
 
 
@@ -206,10 +208,11 @@ def _urdf_scene(file: XmlFile, loops, contacts, lock, **options: Any) -> LoadedS
     locked = lock if isinstance(lock, Mapping) else dict.fromkeys(lock)
     locked = {**dict.fromkeys(closures.locked), **locked}
     model = urdf_model(file, lock=locked, balls=closures.balls, followers=plugin_followers(file), **options)
-    rows, not_taken = loop_constraints(closures, file, model)
-    touching, apart = ([], []) if contacts is None else _contacts(file, model, contacts)
-    not_taken = [*not_taken, *elements_without_effect(file), *apart]
-    warn_not_taken(file.path, not_taken)
+    left = NotTaken()
+    rows = loop_constraints(closures, file, model, left)
+    add_elements_without_effect(file, left)
+    touching = [] if contacts is None else _contacts(file, model, contacts, left)
+    not_taken = left.warn(file.path)
     # Zeros in <dynamics> are common; a force of zeros would be compiled and evaluated in every step.
     forces: list = []
     for leaf, force in ((model.damping, JointDamping), (model.friction, CoulombFriction)):
@@ -223,8 +226,8 @@ def _urdf_scene(file: XmlFile, loops, contacts, lock, **options: Any) -> LoadedS
     return LoadedScene(model, rows, forces, starts=starts, actuators=drives, not_taken=not_taken)
 
 
-def _contacts(file: XmlFile, model: Model, contacts) -> tuple[list, list[str]]:
-    """Contacts of a URDF with the plane z = 0, and descriptions of what is left out."""
+def _contacts(file: XmlFile, model: Model, contacts, left: NotTaken) -> list:
+    """Contacts of a URDF with the plane z = 0."""
     friction: dict[str, float] = {}
     for link in file.root.findall("link"):
         part = link.find("contact/lateral_friction")
@@ -240,8 +243,9 @@ def _contacts(file: XmlFile, model: Model, contacts) -> tuple[list, list[str]]:
         for element in urdf_elements(file, "collision", missing)
         for one in collision_of(element, friction.get(element.frame, FRICTION))
     ]
-    made, left, _ = contacts_with_ground(model, collisions, contacts)
-    return made, [*left, *summarize("collisions", missing)]
+    made, _ = contacts_with_ground(model, collisions, contacts, left)
+    left.add("collisions", missing)
+    return made
 
 
 def format_of(path: pathlib.Path) -> str:

@@ -268,22 +268,24 @@ class LoadedScene(Scene):
 _NAMES = 8
 
 
-def summarize(what: str, names: Sequence[str]) -> list[str]:
-    """One entry of `not_taken`: a description and the first names; empty when there are none."""
-    return summarize_all({what: names})
+class NotTaken(dict[str, dict[str, None]]):
+    """Names of a file's elements that a scene does not represent, by their descriptions, each once and in their order."""
 
+    def add(self, what: str, names: Iterable[str]) -> None:
+        """Add names, if there are any."""
+        for name in names:
+            self.setdefault(what, {})[name] = None
 
-def summarize_all(left: Mapping[str, Sequence[str]]) -> list[str]:
-    """Entries of `not_taken`, of names by their descriptions."""
-    # A warning that lists hundreds of geoms hides the other entries.
-    more = {what: f" and {len(names) - _NAMES} more" * (len(names) > _NAMES) for what, names in left.items()}
-    return [f"{what}: {', '.join(names[:_NAMES])}{more[what]}" for what, names in left.items() if names]
-
-
-def warn_not_taken(path, not_taken: Iterable[str]) -> None:
-    """Warn once, naming all elements of a file that are not represented."""
-    if not_taken:
-        warn(f"{path}: not taken from the file: {'; '.join(not_taken)}", NotTakenWarning)
+    def warn(self, path) -> list[str]:
+        """Entries of `not_taken`: a description and the first names; warn once with all of them."""
+        lines = []
+        for what, names in self.items():
+            # A warning that lists hundreds of geoms hides the other entries.
+            more = f" and {len(names) - _NAMES} more" * (len(names) > _NAMES)
+            lines.append(f"{what}: {', '.join(list(names)[:_NAMES])}{more}" if names else what)
+        if lines:
+            warn(f"{path}: not taken from the file: {'; '.join(lines)}", NotTakenWarning)
+        return lines
 
 
 # Robot joints turn by two or three turns at most, and links are shorter than 100 m; ships and cranes may trigger the warning.

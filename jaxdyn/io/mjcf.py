@@ -20,11 +20,10 @@ from jaxdyn.io.loaded import (
     Link,
     LoadedScene,
     Names,
+    NotTaken,
     Start,
     add_chain,
     build_model,
-    summarize,
-    warn_not_taken,
     warn_of_units,
 )
 from jaxdyn.io.mjcf_file import (
@@ -53,13 +52,14 @@ _HEIGHT_FIELD = 1  # mjtGeom
 
 
 def contacts_of(
-    file: CompiledFile, model: Model, contacts: str | Iterable[str] | None, has_missing_meshes: bool
-) -> tuple[list[UnilateralContact], list[str], set[str]]:
-    """Contacts with the ground, descriptions of what is left out, and the bodies that have contacts."""
+    file: CompiledFile, model: Model, contacts: str | Iterable[str] | None, has_missing_meshes: bool, left: NotTaken
+) -> tuple[list[UnilateralContact], set[str]]:
+    """Contacts with the ground, and the bodies that have them."""
     if contacts is None:
-        return [], [], set()
+        return [], set()
     if file.off("CONTACT"):
-        return [], ["contacts, which the file disables"], set()
+        left["contacts, which the file disables"] = {}
+        return [], set()
     m, collisions, spinning, soft = file.m, [], [], []
     in_pairs = {int(g) for pair in (m.pair_geom1, m.pair_geom2) for g in pair}
     for g in range(m.ngeom):
@@ -77,10 +77,11 @@ def contacts_of(
             spinning.append(body)
         if body is not None and m.geom_margin[g]:
             soft.append(body)
-    made, left, taken = contacts_with_ground(model, collisions, contacts, lambda a, b: _friction(m, a.key, b.key))
-    left += summarize("torsional and rolling friction of bodies", [x for x in dict.fromkeys(spinning) if x in taken])
-    left += summarize("margin of contacts of bodies", [x for x in dict.fromkeys(soft) if x in taken])
-    return made, left, taken
+    friction = lambda a, b: _friction(m, a.key, b.key)  # noqa: E731
+    made, taken = contacts_with_ground(model, collisions, contacts, left, friction)
+    left.add("torsional and rolling friction of bodies", [x for x in spinning if x in taken])
+    left.add("margin of contacts of bodies", [x for x in soft if x in taken])
+    return made, taken
 
 
 def _own_friction(m, g: int) -> float:
@@ -130,13 +131,14 @@ def read_mjcf(path: str | os.PathLike, *, contacts, dtype: DType | None) -> Load
     m, missing = compile_file(mujoco, given)
     file = assign_names(mujoco, m, given)
     model = _model(file, dtype)
-    rows, left = constraints(file, model)
-    tendons, also = tendon_forces(file, model)
-    drives, idle = actuators(file, model)
-    touching, apart, taken = contacts_of(file, model, contacts, bool(missing))
-    readings, unread = sensors(file, model, taken)
-    not_taken = (*missing, *left, *also, *idle, *_elements_without_effect(file, taken), *apart, *unread)
-    warn_not_taken(path, not_taken)
+    left = NotTaken({line: {} for line in missing})
+    rows = constraints(file, model, left)
+    tendons = tendon_forces(file, model, left)
+    drives = actuators(file, model, left)
+    touching, taken = contacts_of(file, model, contacts, bool(missing), left)
+    readings = sensors(file, model, taken, left)
+    _add_elements_without_effect(file, taken, left)
+    not_taken = left.warn(path)
     warn_of_units(path, model)
     forces = (*_joint_forces(file, model), *tendons, *touching)
     starts = _starts(file, model, drives)
@@ -287,8 +289,8 @@ def _state(file: CompiledFile, model: Model, qpos, qvel) -> tuple[np.ndarray, np
     return q, v
 
 
-def _elements_without_effect(file: CompiledFile, taken: set[str]) -> list[str]:
-    """Elements of the file that the scene does not represent, apart from constraints, tendons and actuators.
+def _add_elements_without_effect(file: CompiledFile, taken: set[str], left: NotTaken) -> None:
+    """Add the elements of the file that the scene does not represent, apart from constraints, tendons and actuators.
 
     `taken`: bodies with contacts.
     """
@@ -298,33 +300,26 @@ def _elements_without_effect(file: CompiledFile, taken: set[str]) -> list[str]:
     def joints(condition) -> list[str]:
         return [file.joints[j] for j in range(m.njnt) if condition(j)]
 
-    # A joint with several degrees of freedom is listed once.
     def dofs(values) -> list[str]:
-        return list(dict.fromkeys(file.joints[m.dof_jntid[i]] for i in np.flatnonzero(values)))
+        return [file.joints[m.dof_jntid[i]] for i in np.flatnonzero(values)]
 
     # Geoms without contype and conaffinity are visual and touch nothing unless a pair names them.
     touching = {m.geom_bodyid[g] for g in range(m.ngeom) if m.geom_contype[g] or m.geom_conaffinity[g]}
     touching |= {m.geom_bodyid[g] for pair in (m.pair_geom1, m.pair_geom2) for g in pair}
     names = [file.bodies[b] or "world" for b in sorted(touching) if not taken or file.bodies[b] is not None]
     names = [name for name in names if name not in taken] if not file.off("CONTACT") else []
-    fluid = [key for key in ("density", "viscosity") if getattr(m.opt, key)]
     flexes = [mujoco.mj_id2name(m, mujoco.mjtObj.mjOBJ_FLEX, i) or f"flex{i}" for i in range(m.nflex)]
-    return [
-        *summarize("contact geometry of bodies", names),
-        *summarize("limit of ball joints", joints(lambda j: m.jnt_type[j] == BALL and m.jnt_limited[j])),
-        *summarize("spring of free joints", joints(lambda j: m.jnt_type[j] == FREE and m.jnt_stiffness[j])),
-        *summarize("nonlinear spring of joints", joints(lambda j: m.jnt_stiffnesspoly[j].any())),
-        *summarize("plastic spring of joints", joints(lambda j: m.jnt_plasticadr[j] >= 0)),
-        *summarize("nonlinear damping of joints", dofs(m.dof_dampingpoly.any(1))),
-        *summarize(
-            "gyroscopic part of the armature of free joints (MuJoCo adds it in world axes)",
-            [name for name in dofs(m.dof_armature) if name in free],
-        ),
-        *summarize(
-            "gravity compensation of bodies", [str(file.bodies[b]) for b in np.flatnonzero(m.body_gravcomp) if b]
-        ),
-        *summarize("mocap bodies, fixed here", [str(file.bodies[b]) for b in range(m.nbody) if m.body_mocapid[b] >= 0]),
-        *summarize("fluid forces", fluid),
-        *summarize("flexible bodies", flexes),
-        *(["plugins"] if m.nplugin else []),
-    ]
+    left.add("contact geometry of bodies", names)
+    left.add("limit of ball joints", joints(lambda j: m.jnt_type[j] == BALL and m.jnt_limited[j]))
+    left.add("spring of free joints", joints(lambda j: m.jnt_type[j] == FREE and m.jnt_stiffness[j]))
+    left.add("nonlinear spring of joints", joints(lambda j: m.jnt_stiffnesspoly[j].any()))
+    left.add("plastic spring of joints", joints(lambda j: m.jnt_plasticadr[j] >= 0))
+    left.add("nonlinear damping of joints", dofs(m.dof_dampingpoly.any(1)))
+    gyroscopic = "gyroscopic part of the armature of free joints (MuJoCo adds it in world axes)"
+    left.add(gyroscopic, [name for name in dofs(m.dof_armature) if name in free])
+    left.add("gravity compensation of bodies", [str(file.bodies[b]) for b in np.flatnonzero(m.body_gravcomp) if b])
+    left.add("mocap bodies, fixed here", [str(file.bodies[b]) for b in range(m.nbody) if m.body_mocapid[b] >= 0])
+    left.add("fluid forces", [key for key in ("density", "viscosity") if getattr(m.opt, key)])
+    left.add("flexible bodies", flexes)
+    if m.nplugin:
+        left["plugins"] = {}

@@ -6,7 +6,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from jaxdyn.dynamics.kinematics import named_frame
-from jaxdyn.io.loaded import Names, summarize
+from jaxdyn.io.loaded import Names, NotTaken
 from jaxdyn.io.xml_lines import XmlFile
 from jaxdyn.model import host_math
 from jaxdyn.model.tree import Model
@@ -186,10 +186,9 @@ _ON_JOINTS = {"JOINTPOS": Encoder, "BALLQUAT": Encoder, "JOINTVEL": Tachometer, 
 _WRENCHES = {"FORCE": "force", "TORQUE": "torque"}
 
 
-def sensors(file: CompiledFile, model: Model, touching: set[str]) -> tuple[tuple[Sensor, ...], list[str]]:
-    """The sensors of a file, and descriptions of those that are not taken; `touching`: bodies with contacts."""
-    m, mujoco = file.m, file.mujoco
-    taken, left, clipped, sampled, touch = [], [], [], [], []
+def sensors(file: CompiledFile, model: Model, touching: set[str], left: NotTaken) -> list[Sensor]:
+    """The sensors of a file; `touching`: bodies with contacts."""
+    m, mujoco, taken = file.m, file.mujoco, []
     for i in range(m.nsensor):
         name = mujoco.mj_id2name(m, mujoco.mjtObj.mjOBJ_SENSOR, i) or f"sensor{i}"
         kind = mujoco.mjtSensor(int(m.sensor_type[i])).name.removeprefix("mjSENS_")
@@ -201,19 +200,17 @@ def sensors(file: CompiledFile, model: Model, touching: set[str]) -> tuple[tuple
         if kind == "TOUCH" and file.bodies[m.site_bodyid[m.sensor_objid[i]]] in touching:
             # All contacts of the body count, wherever they are.
             sensor = Touch(file.sites[m.sensor_objid[i]], **options)
-            touch.append(name)
+            left.add("volume of touch sensors", [name])
         if sensor is None:
-            left.append(name)
+            left.add("sensors", [name])
             continue
         taken.append(sensor)
         # The sensor is taken without its clipping, and a warning says so.
         if m.sensor_cutoff[i] > 0:
-            clipped.append(name)
+            left.add("cutoff of sensors", [name])
         if getattr(m, "sensor_interval", np.zeros((m.nsensor, 1)))[i].any():
-            sampled.append(name)
-    more = [*summarize("cutoff of sensors", clipped), *summarize("interval of sensors", sampled)]
-    more += summarize("volume of touch sensors", touch)
-    return tuple(taken), [*summarize("sensors", left), *more]
+            left.add("interval of sensors", [name])
+    return taken
 
 
 def _sensor(file: CompiledFile, model: Model, i: int, kind: str, options: dict) -> Sensor | None:

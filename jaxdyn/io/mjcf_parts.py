@@ -13,7 +13,7 @@ from jaxtyping import Array, Float
 
 from jaxdyn.constraints.base import Constraint, Holonomic
 from jaxdyn.constraints.loops import gear, lock_joint, loop
-from jaxdyn.io.loaded import Actuators, summarize, summarize_all
+from jaxdyn.io.loaded import Actuators, NotTaken
 from jaxdyn.io.mjcf_file import HINGE, SLIDE, CompiledFile, pose_of
 from jaxdyn.model.topology import body_index
 from jaxdyn.model.tree import Model
@@ -78,14 +78,14 @@ _ON_JOINT, _IN_PARENT, _ON_TENDON, _AT_SITE = 0, 1, 3, 4  # mjtTrn
 _NO_TURN = (1.0, 0.0, 0.0, 0.0)
 
 
-def constraints(file: CompiledFile, model: Model) -> tuple[list[Constraint], list[str]]:
-    """Exact constraints of the `equality` elements, and descriptions of the unsupported ones."""
-    m, taken, left = file.m, [], {}
+def constraints(file: CompiledFile, model: Model, left: NotTaken) -> list[Constraint]:
+    """Exact constraints of the `equality` elements."""
+    m, taken = file.m, []
     for i in range(m.neq):
         name = file.mujoco.mj_id2name(m, file.mujoco.mjtObj.mjOBJ_EQUALITY, i) or f"equality{i}"
         # Equalities can be switched at run time in MuJoCo; a scene has a fixed set, that of the file's start.
         if not m.eq_active0[i] or file.off("EQUALITY") or file.off("CONSTRAINT"):
-            left.setdefault("equalities that the file switches off", []).append(name)
+            left.add("equalities that the file switches off", [name])
             continue
         kind = m.eq_type[i]
         if kind in (_CONNECT, _WELD):
@@ -95,8 +95,8 @@ def constraints(file: CompiledFile, model: Model) -> tuple[list[Constraint], lis
         else:
             made, reason = None, "equalities of flexible bodies"
         taken += [] if made is None else [made]
-        left.setdefault(reason, []).extend([name] if made is None else [])
-    return taken, summarize_all(left)
+        left.add(reason, [name] if made is None else [])
+    return taken
 
 
 def _loop(file: CompiledFile, model: Model, i: int, name: str) -> tuple[Constraint | None, str]:
@@ -166,8 +166,8 @@ def _row(file: CompiledFile, tendon: int) -> dict[int, float] | None:
     return row
 
 
-def tendon_forces(file: CompiledFile, model: Model) -> tuple[list[TendonForce], list[str]]:
-    """Springs and dampers of linear tendons, and descriptions of unsupported features of tendons."""
+def tendon_forces(file: CompiledFile, model: Model, left: NotTaken) -> list[TendonForce]:
+    """Springs and dampers of linear tendons."""
     m = file.m
     # Flags leave the numbers of the compiled model as they are.
     springs = m.tendon_stiffness * (not file.off("SPRING"))
@@ -175,22 +175,18 @@ def tendon_forces(file: CompiledFile, model: Model) -> tuple[list[TendonForce], 
     rows = [_row(file, t) for t in range(m.ntendon)]
     taken = [t for t, row in enumerate(rows) if row is not None and (springs[t] or dampers[t])]
 
-    def those(condition) -> list[str]:
-        return [name for t, name in enumerate(file.tendons) if condition(t)]
+    def leave(what: str, condition) -> None:
+        left.add(what, [name for t, name in enumerate(file.tendons) if condition(t)])
 
-    left = [
-        *summarize("forces of spatial tendons", those(lambda t: rows[t] is None and (springs[t] or dampers[t]))),
-        *summarize("limits of tendons", those(lambda t: m.tendon_limited[t])),
-        *summarize("dry friction of tendons", those(lambda t: m.tendon_frictionloss[t])),
-        *summarize("armature of tendons", those(lambda t: m.tendon_armature[t])),
-        *summarize("plastic springs of tendons", those(lambda t: m.tendon_plasticadr[t] >= 0)),
-        *summarize(
-            "nonlinear springs or damping of tendons",
-            those(lambda t: m.tendon_stiffnesspoly[t].any() or m.tendon_dampingpoly[t].any()),
-        ),
-    ]
+    leave("forces of spatial tendons", lambda t: rows[t] is None and (springs[t] or dampers[t]))
+    leave("limits of tendons", lambda t: m.tendon_limited[t])
+    leave("dry friction of tendons", lambda t: m.tendon_frictionloss[t])
+    leave("armature of tendons", lambda t: m.tendon_armature[t])
+    leave("plastic springs of tendons", lambda t: m.tendon_plasticadr[t] >= 0)
+    nonlinear = lambda t: m.tendon_stiffnesspoly[t].any() or m.tendon_dampingpoly[t].any()  # noqa: E731
+    leave("nonlinear springs or damping of tendons", nonlinear)
     if not taken:
-        return [], left
+        return []
     joints = sorted({j for t in taken for j in rows[t] or ()})
     places = [_places(file, model, j) for j in joints]
     force = TendonForce(
@@ -201,20 +197,18 @@ def tendon_forces(file: CompiledFile, model: Model) -> tuple[list[TendonForce], 
         jnp.asarray(dampers[taken], float),
         jnp.asarray(m.tendon_lengthspring[taken], float),
     )
-    return [force], left
+    return [force]
 
 
-def actuators(file: CompiledFile, model: Model) -> tuple[Actuators | None, list[str]]:
-    """Actuators, None without any, and descriptions of the unsupported ones."""
-    m, left = file.m, {}
-    taken = []
+def actuators(file: CompiledFile, model: Model, left: NotTaken) -> Actuators | None:
+    """Actuators, None without any."""
+    m, taken = file.m, []
     for i, name in enumerate(file.actuators):
         if reason := _fault(file, i):
-            left.setdefault(reason, []).append(name)
+            left.add(f"actuators {reason}", [name])
         else:
             taken.append(i)
-    lines = summarize_all({f"actuators {reason}": names for reason, names in left.items()})
-    lines += summarize(
+    left.add(
         "armature or damping of actuators on tendons and sites",
         [
             file.actuators[i]
@@ -224,7 +218,7 @@ def actuators(file: CompiledFile, model: Model) -> tuple[Actuators | None, list[
         ],
     )
     if not taken:
-        return None, lines
+        return None
     n = len(taken)
     moment, wrenches = np.zeros((n, model.nv)), np.zeros((n, 6))
     # -1 marks coordinates of ball and free joints, for which no length is defined.
@@ -273,7 +267,7 @@ def actuators(file: CompiledFile, model: Model) -> tuple[Actuators | None, list[
         limited = m.actuator_actlimited[active].astype(bool)[:, None]
         of_active = m.actuator_dynprm[active, 0], np.where(limited, m.actuator_actrange[active], [-np.inf, np.inf])
         leaves += [jnp.asarray(x, model.home.dtype) for x in of_active]
-    return Actuators(names, tuple(sites), tuple(int(x) for x in places), *leaves, dynamics=dynamics), lines
+    return Actuators(names, tuple(sites), tuple(int(x) for x in places), *leaves, dynamics=dynamics)
 
 
 def _dynamics(file: CompiledFile, i: int) -> str | None:

@@ -14,12 +14,10 @@ from jaxdyn.io.loaded import (
     Link,
     LoadedScene,
     Names,
+    NotTaken,
     Start,
     add_chain,
     build_model,
-    summarize,
-    summarize_all,
-    warn_not_taken,
     warn_of_units,
 )
 from jaxdyn.io.sdf_file import LOOPS, Axis, Joint, SdfFile, inertia_of, read_joints
@@ -64,12 +62,13 @@ def read_sdf(path: str | os.PathLike, *, floating_base: bool, contacts, dtype: D
     edges, cut = spanning_tree(file.links, static, moving, first)
     model, roots = _model(file, edges, set(static), floating_base, dtype)
     tree = {edge.joint.name: edge.joint for edge in edges if edge.joint is not None}
-    loops, left = _loops(file, model, cut)
+    left = NotTaken()
+    loops = _loops(file, model, cut, left)
     # Joints that were cut have no coordinate, so couplings are looked up among those of the tree.
-    couplings, also = _couplings(file, joints, tree)
-    touching, apart, taken = ([], [], set()) if contacts is None else _contacts(file, model, contacts)
-    not_taken = (*left, *also, *_elements_without_effect(file, taken), *apart)
-    warn_not_taken(path, not_taken)
+    couplings = _couplings(file, joints, tree, left)
+    touching, taken = ([], set()) if contacts is None else _contacts(file, model, contacts, left)
+    _add_elements_without_effect(file, taken, left)
+    not_taken = left.warn(path)
     warn_of_units(path, model)
     starts = {"reference": _start(file, model, roots)}
     forces = [*_forces(model, tree), *touching]
@@ -242,24 +241,24 @@ def _links(edge: Edge, place: np.ndarray) -> list[Link]:
     return links[::-1] if edge.backwards else links
 
 
-def _loops(file: SdfFile, model: Model, cut: list[Joint]) -> tuple[list[Constraint], list[str]]:
-    """Loop constraints, and descriptions of unsupported features of loop joints."""
-    taken, left = [], {}
+def _loops(file: SdfFile, model: Model, cut: list[Joint], left: NotTaken) -> list[Constraint]:
+    """Loop constraints."""
+    taken = []
     for joint in cut:
         ends = (joint.parent, joint.child)
         if len(bodies := {body_index(model, end) for end in ends}) == 1:
             # Files often join rigidly connected links twice; such a joint adds nothing.
             if joint.kind != "fixed" and bodies != {-1}:
-                left.setdefault("joints between two parts of one body", []).append(joint.name)
+                left.add("joints between two parts of one body", [joint.name])
             continue
         # A universal loop has axes at right angles; other angles would change the constraint.
         skew = len(joint.axes) == 2 and abs(joint.axes[0].direction @ joint.axes[1].direction) > _PARALLEL
         if joint.kind == "screw" or skew:
             reason = "screws that close loops" if joint.kind == "screw" else "skew joints of two axes that close loops"
-            left.setdefault(reason, []).append(joint.name)
+            left.add(reason, [joint.name])
             continue
         if any(axis.stiffness or axis.leaves for axis in joint.axes):
-            left.setdefault("springs, damping, friction and limits of joints that close loops", []).append(joint.name)
+            left.add("springs, damping, friction and limits of joints that close loops", [joint.name])
         poses = []
         for k, end in enumerate(ends):
             # A universal joint has one axis on each body; other joints share theirs.
@@ -269,11 +268,11 @@ def _loops(file: SdfFile, model: Model, cut: list[Joint]) -> tuple[list[Constrai
             place[:3, 3] = joint.pose[:3, 3]
             poses.append(place if end is None else host_math.inverse(file.pose(end)) @ place)
         taken.append(loop(ends[0], poses[0], ends[1], poses[1], LOOPS[joint.kind], name=joint.name))
-    return taken, summarize_all(left)
+    return taken
 
 
-def _couplings(file: SdfFile, joints: list[Joint], tree: dict[str, Joint]) -> tuple[list[Constraint], list[str]]:
-    """Couplings by gearboxes and mimicked axes, and descriptions of those whose joints have no coordinate."""
+def _couplings(file: SdfFile, joints: list[Joint], tree: dict[str, Joint], left: NotTaken) -> list[Constraint]:
+    """Couplings by gearboxes and mimicked axes."""
     couplings: list[tuple[str, Constraint | None]] = []
     for joint in joints:
         if joint.kind == "gearbox":
@@ -282,9 +281,9 @@ def _couplings(file: SdfFile, joints: list[Joint], tree: dict[str, Joint]) -> tu
         # <mimic> is an element of an axis and not of the joint.
         axes = [x for x in zip(_axis_names(joint), joint.axes, strict=False) if x[1].mimic is not None]
         couplings += [(name, _mimic(file, joint, name, axis, tree)) for name, axis in axes]
-    left = [name for name, coupling in couplings if coupling is None]
     text = "couplings of joints that have no coordinate or axes that are not parallel"
-    return [coupling for _, coupling in couplings if coupling is not None], summarize(text, left)
+    left.add(text, [name for name, coupling in couplings if coupling is None])
+    return [coupling for _, coupling in couplings if coupling is not None]
 
 
 def _gearbox(file: SdfFile, joint: Joint, tree: Iterable[Joint]) -> Constraint | None:
@@ -361,8 +360,8 @@ def _start(file: SdfFile, model: Model, roots: dict[str, str]) -> Start:
     return Start(jnp.asarray(q, model.home.dtype), jnp.zeros(model.nv, model.home.dtype))
 
 
-def _contacts(file: SdfFile, model: Model, contacts) -> tuple[list, list[str], set[str]]:
-    """Contacts with the ground, descriptions of what is left out, and the links that have contacts."""
+def _contacts(file: SdfFile, model: Model, contacts, left: NotTaken) -> tuple[list, set[str]]:
+    """Contacts with the ground, and the links that have them."""
     missing: list[str] = []
     collisions, uneven, bouncing = [], [], []
     for element in sdf_elements(file, "collision", missing):
@@ -373,25 +372,23 @@ def _contacts(file: SdfFile, model: Model, contacts) -> tuple[list, list[str], s
         bounce = file.number(element.xml, "surface/bounce/restitution_coefficient", 0.0, what)
         bouncing += [element.frame] * (bounce != 0)
         collisions += collision_of(element, mu)
-    made, left, taken = contacts_with_ground(model, collisions, contacts)
-    left += summarize("friction of collisions in a second direction", [x for x in dict.fromkeys(uneven) if x in taken])
-    left += summarize("restitution of collisions", [x for x in dict.fromkeys(bouncing) if x in taken])
-    return made, [*left, *summarize("collisions", missing)], taken
+    made, taken = contacts_with_ground(model, collisions, contacts, left)
+    left.add("friction of collisions in a second direction", [x for x in uneven if x in taken])
+    left.add("restitution of collisions", [x for x in bouncing if x in taken])
+    left.add("collisions", missing)
+    return made, taken
 
 
-def _elements_without_effect(file: SdfFile, taken: set[str]) -> list[str]:
-    """Elements of the file that the scene does not represent; `taken`: links with contacts."""
+def _add_elements_without_effect(file: SdfFile, taken: set[str], left: NotTaken) -> None:
+    """Add the elements of the file that the scene does not represent; `taken`: links with contacts."""
     elements = [(element, name, SDF_LINK) for name, (element, _) in file.links.items()]
     elements += [(element, name, SDF_JOINT) for name, (element, _) in file.joints.items()]
     elements += [(element, name, SDF_FRAME) for name, (element, _) in file.frames.items()]
     elements += [(scope.element, scope.element.get("name") or name, SDF_MODEL) for name, scope in file.models.items()]
     elements += [] if file.world is None else [(file.world, file.world.get("name") or "world", SDF_WORLD)]
     elements += [(file.root, os.path.basename(file.path), SDF_ROOT)]
-    unread = unread_parts(file, elements)
     grounds = {name for name, (_, scope) in file.links.items() if scope.static} if taken else set()
-    unread["<collision> of links"] = [
-        name for name in unread.get("<collision> of links", ()) if name not in taken and name not in grounds
-    ]
-    lines = summarize_all(unread)
-    lines += summarize("links with the reserved name of the world, which they stand for", file.of_world)
-    return [*lines, *summarize("includes", file.includes)]
+    for what, names in unread_parts(file, elements).items():
+        left.add(what, [x for x in names if what != "<collision> of links" or x not in taken | grounds])
+    left.add("links with the reserved name of the world, which they stand for", file.of_world)
+    left.add("includes", file.includes)

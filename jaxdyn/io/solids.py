@@ -13,7 +13,7 @@ from jaxdyn.contact.shapes import Box, Capsule, ConvexHull, hull_vertices
 from jaxdyn.contact.surfaces import Cylinder, Ellipsoid, Plane, Sphere
 from jaxdyn.contact.unilateral import UnilateralContact
 from jaxdyn.dynamics.kinematics import named_frame
-from jaxdyn.io.loaded import Names, summarize
+from jaxdyn.io.loaded import Names, NotTaken
 from jaxdyn.io.sdf_file import SdfFile
 from jaxdyn.io.xml_lines import XmlFile
 from jaxdyn.model import host_math
@@ -279,14 +279,15 @@ def contacts_with_ground(
     model: Model,
     collisions: Sequence[Collision],
     contacts: str | Iterable[str],
+    left: NotTaken,
     friction_of: Any = None,
-) -> tuple[list[UnilateralContact], list[str], set[str]]:
+) -> tuple[list[UnilateralContact], set[str]]:
     """Contacts of the chosen links with planes and height fields that are fixed to the world, else with its plane z = 0.
 
     `contacts`: "ground", links, or links with the number of their lowest corners that touch. `friction_of(a, b)`: the
     coefficient of two collisions, None for a pair that does not touch; by default the smaller one.
 
-    **Returns:** contacts; descriptions of what is left out; the links that have contacts.
+    **Returns:** contacts; the links that have contacts.
 
     **Raises:** ValueError for chosen links without a shape, and for more than 64 contacts of "ground".
     """
@@ -298,23 +299,23 @@ def contacts_with_ground(
             raise ValueError(f"contacts: {unknown('link', name, known)}; it has no collision shape")
     friction_of = friction_of or (lambda a, b: min(a.friction, b.friction))
     floor = Collision(None, np.eye(4), Solid("plane", (0.0, 0.0, 1.0)), np.inf)
-    names, made, taken, left, hulls = Names(), [], set(), [], []
+    names, made, taken, apart = Names(), [], set(), "collision shapes without contacts"
     counts = {name: sum(one.frame == name for one in collisions) for name in chosen}
     places = dict.fromkeys(chosen, 0)
     for one in collisions:
         if _is_fixed(model, one):
             if not _is_ground(one):
-                left.append(f"{one.frame or 'world'} (fixed)")
+                left.add(apart, [f"{one.frame or 'world'} (fixed)"])
             continue
         if one.frame not in counts:
             continue
         if _is_ground(one):
-            left.append(f"{one.frame} (a plane or height field that moves)")
+            left.add(apart, [f"{one.frame} (a plane or height field that moves)"])
             continue
         place, places[one.frame] = places[one.frame], places[one.frame] + 1
         assert isinstance(one.solid, Solid)
         shape, note = _shape(one.solid, str(one.frame))
-        hulls += note
+        left.add("hulls of meshes", note)
         for k, ground in enumerate(grounds or [floor]):
             friction = friction_of(one, ground) if grounds else one.friction
             if friction is None:
@@ -334,14 +335,7 @@ def contacts_with_ground(
             f"cube of their number, and {_MOST_CONTACTS} are the most of 'ground'. List the links that touch, as "
             "contacts=['left_foot', 'right_foot'], or with the number of their lowest corners, {'left_foot': 4}"
         )
-    return (
-        made,
-        [
-            *summarize("collision shapes without contacts", list(dict.fromkeys(left))),
-            *summarize("hulls of meshes", hulls),
-        ],
-        taken,
-    )
+    return made, taken
 
 
 def collision_of(element: Element, friction: float) -> list[Collision]:

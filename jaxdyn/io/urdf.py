@@ -7,12 +7,12 @@ converts them. Meshes and other visual elements are not read.
 import os
 import re
 from collections.abc import Iterable, Mapping
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 
 from jaxdyn.io.loaded import warn_of_units
-from jaxdyn.io.urdf_parts import JOINTS, Inertial, Joint, Mimic, read_parts
+from jaxdyn.io.urdf_parts import JOINTS, Joint, Mimic, Parts, read_parts
 from jaxdyn.io.xml_lines import XmlFile, rounding_of_digits
 from jaxdyn.model import host_math
 from jaxdyn.model.arguments import DType, Numbers
@@ -24,15 +24,6 @@ from jaxdyn.model.tree import Model, inertia_problems
 NO_LIMIT = float(np.finfo(np.float64).max)
 ROOT_JOINT = "root_joint"
 _Z = np.array([0.0, 0.0, 1.0])
-
-
-class _Description(NamedTuple):
-    name: str
-    links: dict[str, Inertial | None]
-    joints: dict[str, Joint]  # by name, in the file's order
-    places: dict[str, str]  # "joint NAME" and "link NAME" -> file:line
-    children: dict[str, list[str]]  # link -> names of the joints it carries
-    root: str
 
 
 def urdf_model(
@@ -56,7 +47,7 @@ def urdf_model(
     """
     if mimic not in ("ignore", "couple", "error"):
         raise ValueError(f"mimic is {mimic!r}; give 'ignore', 'couple' or 'error'")
-    urdf, path = _read(file), file.path
+    urdf, path = read_parts(file), file.path
     root_joint = ROOT_JOINT
     # The root's joint is ours; a joint of the file keeps its name.
     while root_joint in urdf.joints:
@@ -134,7 +125,7 @@ def urdf_inertia_report(
 
     **Raises:** ValueError as `jd.load_model` does for a file that cannot be read.
     """
-    urdf = _read(XmlFile(path, "URDF", arguments, packages))
+    urdf = read_parts(XmlFile(path, "URDF", arguments, packages))
     # A massless link on a fixed joint is a frame, as of a tool or a sensor.
     moved = {joint.child for joint in urdf.joints.values() if joint.type != "fixed"}
     report = []
@@ -147,7 +138,7 @@ def urdf_inertia_report(
 
 
 def _add_joint(
-    builder: ModelBuilder, joint: Joint, kind: str, inertia, urdf: _Description, locked: dict[str, np.ndarray]
+    builder: ModelBuilder, joint: Joint, kind: str, inertia, urdf: Parts, locked: dict[str, np.ndarray]
 ) -> None:
     name = joint.child
     pose, parent, axis, turn = joint.origin, joint.parent, _Z, np.eye(4)
@@ -188,7 +179,7 @@ def _leaves(joint: Joint, kind: str) -> dict[str, Any]:
     return leaves
 
 
-def _inertia(urdf: _Description, link: str, missing: host_math.Values | None = None) -> host_math.Values:
+def _inertia(urdf: Parts, link: str, missing: host_math.Values | None = None) -> host_math.Values:
     """Ten inertial parameters of a link; `missing` of one that has no mass and no inertia."""
     inertial = urdf.links[link]
     none = np.zeros(10) if missing is None else missing
@@ -265,40 +256,3 @@ def _resolve_couplings(
         if name in locked:
             raise ValueError(f"lock: joint {name!r} follows {coupling.joint!r}; lock that one instead")
     return left
-
-
-def _read(file: XmlFile) -> _Description:
-    parts = read_parts(file)
-    children: dict[str, list[str]] = {name: [] for name in parts.links}
-    for joint in parts.joints.values():
-        children[joint.parent].append(joint.name)
-    return _Description(*parts, children, _root(parts.joints, parts.links, parts.places, file.path))
-
-
-def _root(joints: dict[str, Any], links: dict[str, Any], places: dict[str, str], path) -> str:
-    """Root link, the only one that no joint moves. **Raises:** ValueError unless the links form one tree."""
-    moved_by: dict[str, str] = {}
-    for joint in joints.values():
-        if joint.child in moved_by:
-            where, other = places[f"joint {joint.name}"], moved_by[joint.child]
-            fault = f"link {joint.child!r} is the child of joints {other!r} and {joint.name!r}"
-            raise ValueError(f"{where}: {fault}; a URDF is a tree, close loops with a constraint")
-        moved_by[joint.child] = joint.name
-    roots = [name for name in links if name not in moved_by]
-    if len(roots) > 1:
-        raise ValueError(f"{path}: there are {len(roots)} root links: {', '.join(roots)}; join them by a joint")
-    # The chain of parents of every link ends at the root, unless it is a cycle.
-    sound = set(roots)
-    for start in links:
-        visited, link = [], start
-        while link not in sound:
-            if link in visited:
-                circle = visited[visited.index(link) :]
-                where = places[f"joint {moved_by[link]}"]
-                raise ValueError(
-                    f"{where}: the links {', '.join(circle)} form a cycle; a URDF is a tree, remove a joint"
-                )
-            visited.append(link)
-            link = joints[moved_by[link]].parent
-        sound.update(visited)
-    return roots[0]

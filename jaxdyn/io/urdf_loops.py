@@ -21,7 +21,7 @@ import numpy as np
 
 from jaxdyn.constraints.base import Constraint
 from jaxdyn.constraints.loops import loop
-from jaxdyn.io.loaded import Actuators, summarize, summarize_all
+from jaxdyn.io.loaded import Actuators, NotTaken
 from jaxdyn.io.sdf_file import LOOPS
 from jaxdyn.io.urdf_parts import Mimic
 from jaxdyn.io.xml_lines import XmlFile
@@ -37,14 +37,17 @@ _TYPES = {"3d": "spherical", "6d": "weld"}
 
 
 class Closures(NamedTuple):
-    """Contents of the YAML file: pairs of frames with the joint that closes each, spherical joints, locked joints, motors."""
+    """Contents of the YAML file: pairs of frames with the joint that closes each, spherical joints, locked joints, motors.
+
+    `others` are joints of other kinds, which stay as in the URDF.
+    """
 
     path: str
     pairs: tuple[tuple[str, str, str], ...] = ()
     balls: tuple[str, ...] = ()
     locked: tuple[str, ...] = ()
     motors: tuple[str, ...] = ()
-    not_taken: tuple[str, ...] = ()
+    others: tuple[str, ...] = ()
 
 
 def read_closures(urdf: pathlib.Path, loops) -> Closures:
@@ -116,12 +119,7 @@ def _read(path: pathlib.Path, wanted: bool) -> Closures:
         tuple(name for name, word in chosen if word == "SPHERICAL"),
         tuple(name for name, word in chosen if word == "FIXED"),
         tuple(motors),
-        tuple(
-            summarize(
-                f"kinds of joints in {path.name}, which stay as in the URDF",
-                [f"{name} ({word})" for name, word in chosen if word not in ("SPHERICAL", "FIXED")],
-            )
-        ),
+        tuple(f"{name} ({word})" for name, word in chosen if word not in ("SPHERICAL", "FIXED")),
     )
 
 
@@ -133,8 +131,8 @@ def _names(content: dict, key: str, path) -> list[str]:
     return value
 
 
-def loop_constraints(closures: Closures, urdf: XmlFile, model: Model) -> tuple[list[Constraint], list[str]]:
-    """Loop constraints of both conventions, without mimic plugins, and descriptions of unsupported features.
+def loop_constraints(closures: Closures, urdf: XmlFile, model: Model, left: NotTaken) -> list[Constraint]:
+    """Loop constraints of both conventions, without mimic plugins.
 
     **Raises:** ValueError with the file for frames and joints that the model does not have, and for bad numbers.
     """
@@ -144,8 +142,8 @@ def loop_constraints(closures: Closures, urdf: XmlFile, model: Model) -> tuple[l
             model.frame_names[_look_up(frame_index, model, name, f"{closures.path}: closed_loop")] for name in (a, b)
         ]
         taken.append(loop(ends[0], np.eye(4), ends[1], np.eye(4), kind, name=f"{a}-{b}"))
-    more, left = _gazebo(urdf, model)
-    return [*taken, *more], [*closures.not_taken, *left]
+    left.add(f"kinds of joints in {pathlib.Path(closures.path).name}, which stay as in the URDF", closures.others)
+    return [*taken, *_gazebo(urdf, model, left)]
 
 
 def motors_of(closures: Closures, model: Model) -> Actuators | None:
@@ -183,28 +181,25 @@ def _look_up(index, model: Model, name: str, where: str) -> int:
         raise ValueError(f"{where}: {error}") from error
 
 
-def _gazebo(file: XmlFile, model: Model) -> tuple[list[Constraint], list[str]]:
+def _gazebo(file: XmlFile, model: Model, left: NotTaken) -> list[Constraint]:
     """Loop constraints of joints in `<gazebo>` elements."""
     taken: list[Constraint] = []
-    left: dict[str, list[str]] = {}
     for element in file.root.iter("gazebo"):
         for tag in ("plugin", "sensor"):
             for part in element.findall(tag):
                 if part.find("mimicJoint") is None:
-                    left.setdefault(f"<{tag}> in <gazebo>", []).append(
-                        part.get("name") or element.get("reference") or tag
-                    )
+                    left.add(f"<{tag}> in <gazebo>", [part.get("name") or element.get("reference") or tag])
         for joint in element.findall("joint"):
             name = file.name(joint, "<gazebo>")
             kind = joint.get("type") or ""
             # A prismatic joint without an axis has no direction in which it is free.
             if kind not in LOOPS or (kind == "prismatic" and joint.find("axis") is None):
-                left.setdefault("<gazebo> joints of kinds that cannot close a loop", []).append(f"{name} ({kind})")
+                left.add("<gazebo> joints of kinds that cannot close a loop", [f"{name} ({kind})"])
                 continue
             taken.append(_gazebo_loop(file, joint, name, LOOPS[kind], model))
             if any(joint.find(f"axis/{tag}") is not None for tag in ("dynamics", "limit")):
-                left.setdefault("limits and damping of <gazebo> joints", []).append(name)
-    return taken, summarize_all(left)
+                left.add("limits and damping of <gazebo> joints", [name])
+    return taken
 
 
 def _gazebo_loop(file: XmlFile, joint, name: str, kind: str, model: Model) -> Constraint:

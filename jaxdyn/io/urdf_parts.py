@@ -5,7 +5,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from jaxdyn.io.loaded import summarize_all
+from jaxdyn.io.loaded import NotTaken
 from jaxdyn.io.unread import URDF_GAZEBO, URDF_JOINT, URDF_LINK, URDF_ROBOT, unread_parts
 from jaxdyn.io.xml_lines import XmlFile
 from jaxdyn.model import host_math
@@ -140,35 +140,71 @@ class Joint(NamedTuple):
 class Parts(NamedTuple):
     """Contents of a file: the robot's name, its links and joints by name in the order of the file, and the line of each.
 
-    A link without inertial data is None.
+    A link without inertial data is None. `children`: names of the joints that a link carries; `root`: the link that none moves.
     """
 
     name: str
     links: dict[str, Inertial | None]
     joints: dict[str, Joint]
     places: dict[str, str]  # "joint NAME" and "link NAME" -> file:line
+    children: dict[str, list[str]]
+    root: str
 
 
 def read_parts(file: XmlFile) -> Parts:
     """Read the links and joints of a file.
 
-    **Raises:** ValueError with file and line, for everything that `check_elements` refuses.
+    **Raises:** ValueError with file and line, for everything that `check_elements` refuses, and unless the links form one tree.
     """
     elements, places = check_elements(file)
     links = {part.get("name"): _inertial(part.find("inertial")) for part in elements if part.tag == "link"}
     joints = {part.get("name"): _joint(part) for part in elements if part.tag == "joint"}
-    return Parts(file.root.get("name") or "", links, joints, places)
+    children: dict[str, list[str]] = {name: [] for name in links}
+    for joint in joints.values():
+        children[joint.parent].append(joint.name)
+    root = _root(joints, links, places, file.path)
+    return Parts(file.root.get("name") or "", links, joints, places, children, root)
 
 
-def elements_without_effect(file: XmlFile) -> list[str]:
-    """Descriptions of elements and attributes of a file that a model does not represent."""
+def _root(joints: dict[str, Any], links: dict[str, Any], places: dict[str, str], path) -> str:
+    """Root link, the only one that no joint moves. **Raises:** ValueError unless the links form one tree."""
+    moved_by: dict[str, str] = {}
+    for joint in joints.values():
+        if joint.child in moved_by:
+            where, other = places[f"joint {joint.name}"], moved_by[joint.child]
+            fault = f"link {joint.child!r} is the child of joints {other!r} and {joint.name!r}"
+            raise ValueError(f"{where}: {fault}; a URDF is a tree, close loops with a constraint")
+        moved_by[joint.child] = joint.name
+    roots = [name for name in links if name not in moved_by]
+    if len(roots) > 1:
+        raise ValueError(f"{path}: there are {len(roots)} root links: {', '.join(roots)}; join them by a joint")
+    # The chain of parents of every link ends at the root, unless it is a cycle.
+    sound = set(roots)
+    for start in links:
+        visited, link = [], start
+        while link not in sound:
+            if link in visited:
+                circle = visited[visited.index(link) :]
+                where = places[f"joint {moved_by[link]}"]
+                raise ValueError(
+                    f"{where}: the links {', '.join(circle)} form a cycle; a URDF is a tree, remove a joint"
+                )
+            visited.append(link)
+            link = joints[moved_by[link]].parent
+        sound.update(visited)
+    return roots[0]
+
+
+def add_elements_without_effect(file: XmlFile, left: NotTaken) -> None:
+    """Add the elements and attributes of a file that a model does not represent."""
     robot = file.root.get("name") or "robot"
     elements: list = [(file.root, robot, URDF_ROBOT)]
     tables = {"link": URDF_LINK, "joint": URDF_JOINT, "gazebo": URDF_GAZEBO}
     for element in file.root:
         if element.tag in tables:
             elements.append((element, element.get("name") or element.get("reference") or robot, tables[element.tag]))
-    return summarize_all(unread_parts(file, elements))
+    for what, names in unread_parts(file, elements).items():
+        left.add(what, names)
 
 
 def _inertial(element) -> Inertial | None:

@@ -592,32 +592,26 @@ def test_round_trip_of_all_that_a_model_can_hold(tmp_path):
     assert_same_models(model, saved(model, tmp_path / "out.urdf", mimic="couple"), rtol=1e-15)
 
 
-def test_siblings_keep_their_order(tmp_path):
+@pytest.mark.parametrize(
+    ("fixed", "moving", "order"),
+    [
+        # Depth-first through the fixed links x (joint p) and y (joint q): n, then d, e by way of x, then a by way of y.
+        ("base:x:p base:y:q", "base:n d<x e<x a<y", "n d e a"),
+        # Without a frame to hang on, one is added: x hangs on b, which comes up between a and c.
+        ("base:b:b", "base:a base:c z<b x<b", "a x z c"),
+        ("base:b:b base:b2:d", "base:a base:c base:f z<b 0<b2", "a z c 0 f"),
+    ],
+)
+def test_siblings_keep_their_order(fixed, moving, order, tmp_path):
     ball = (2.0, (0.1, 0.2, 0.3), (0.03, 0.04, 0.05))
     builder = jd.ModelBuilder().add_body("base", joint="fixed")
-    # Depth-first through the fixed links x (joint m) and y (joint b): n, then d, e by way of x, then a by way of y.
-    builder.add_body("x", "base", "fixed", joint_name="p", pose=(1, 2, 3)).add_body(
-        "y", "base", "fixed", joint_name="q"
-    )
-    for name, parent in (("n", "base"), ("d", "x"), ("e", "x"), ("a", "y")):
-        builder.add_body(name, parent, inertia=ball, joint_name=name, pose=(0, 0, 1))
+    for parent, name, joint_name in (word.split(":") for word in fixed.split()):
+        builder.add_body(name, parent, "fixed", joint_name=joint_name, pose=(1, 2, 3))
+    for word in moving.split():
+        name, parent = word.split("<") if "<" in word else word.split(":")[::-1]
+        builder.add_body(f"body {name}", parent, inertia=ball, joint_name=name, pose=(0, 0, 1))
     model = builder.build()
-    assert model.joint_names == ("n", "d", "e", "a")
-    assert_same_models(model, saved(model, tmp_path / "out.urdf"), rtol=1e-15)
-    # Without a frame to hang on, one is added: a hangs on x, which comes up after c.
-    builder = jd.ModelBuilder().add_body("base", joint="fixed").add_body("b", "base", "fixed", joint_name="b")
-    for name, parent in (("a", "base"), ("c", "base"), ("z", "b"), ("x", "b")):
-        builder.add_body(name, parent, inertia=ball, joint_name=name)
-    model = builder.build()
-    assert model.joint_names == ("a", "x", "z", "c")
-    again = saved(model, tmp_path / "out.urdf")
-    assert_same_models(model, again, rtol=1e-15)
-    builder = jd.ModelBuilder().add_body("base", joint="fixed").add_body("b", "base", "fixed", joint_name="b")
-    for name, parent in (("a", "base"), ("c", "base"), ("f", "base"), ("z", "b")):
-        builder.add_body(name, parent, inertia=ball, joint_name=name)
-    builder.add_body("b2", "base", "fixed", joint_name="d").add_body("e", "b2", inertia=ball, joint_name="0")
-    model = builder.build()
-    assert model.joint_names == ("a", "z", "c", "0", "f")
+    assert model.joint_names == tuple(order.split())
     assert_same_models(model, saved(model, tmp_path / "out.urdf"), rtol=1e-15)
 
 

@@ -37,7 +37,6 @@ FLOORS = (
 )
 RANK = {name: rank for rank, floor in enumerate(FLOORS) for name in floor.split()}
 PROGRAMS = {"cli", "demo", "__main__"}
-ABOVE_DYNAMICS = {name for name, rank in RANK.items() if rank > RANK["dynamics"]}
 FROM_SIMULATION = {name for name, rank in RANK.items() if rank >= RANK["simulation"]}
 FILES_AND_PLOTS = {"io", "reports", "pictures"} | PROGRAMS
 

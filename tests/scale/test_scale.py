@@ -195,15 +195,7 @@ def test_a_program_has_no_communication(pendulums):
     compiled = program.Program(program.Traced(one, batch), jax.local_devices(), 8, np.inf, True)
     text = compiled.compiled.as_text()
     assert "jaxdyn_kernel" in text
-    for collective in (
-        "all-reduce",
-        "all-gather",
-        "all-to-all",
-        "collective-permute",
-        "reduce-scatter",
-        "send",
-        "recv",
-    ):
+    for collective in "all-reduce all-gather all-to-all collective-permute reduce-scatter send recv".split():
         assert f" {collective}(" not in text and f" {collective}-start(" not in text
     assert len(jax.local_devices()) == 2 and compiled.bytes > 0
 
@@ -535,14 +527,8 @@ def test_a_run_of_many_chunks_merges_as_they_come():
     merger = Totals(reducer, 2, 5)
     for k, value in enumerate(values):
         rows = {"result": np.array([k % 2]), **dict.fromkeys(shapes, np.array([value]))}
-        merger.add(
-            Summary(
-                np.array([1 - k % 2, k % 2]),
-                np.arange(k, k + k % 2),
-                reducer.partials(rows, np.array([k])),
-                False,
-            )
-        )
+        counts, failed = np.array([1 - k % 2, k % 2]), np.arange(k, k + k % 2)
+        merger.add(Summary(counts, failed, reducer.partials(rows, np.array([k])), False))
     results = merger.results()
     np.testing.assert_allclose(results["mean"]["mean"], values[::2].mean(), rtol=1e-14)
     assert (results["own"]["least"], results["own"]["most"]) == (values[::2].min(), values[::2].max())
@@ -614,19 +600,17 @@ def test_bad_input_is_refused(tmp_path, options, error):
     assert not list(tmp_path.glob("a.zarr*"))
 
 
-def test_reductions_refuse():
+def test_reductions_and_states_refuse(tmp_path):
     for make in (
         lambda: jd.scale.Histogram("y", 1.0, 1.0),
         lambda: jd.scale.Quantiles("y", 0.0, 1.0, probabilities=(2.0,)),
         lambda: jd.scale.Worst("y", keep=0),
+        lambda: jd.scale.run(
+            jd.scenes.pendulum(), np.zeros(1), None, np.linspace(0, 1, 3), out=tmp_path / "a", samples=3
+        ),
     ):
         with pytest.raises(ValueError, match="give"):
             make()
-
-
-def test_states_have_to_be_a_pair(tmp_path):
-    with pytest.raises(ValueError, match=r"states is .*give a pair"):
-        jd.scale.run(jd.scenes.pendulum(), np.zeros(1), None, np.linspace(0, 1, 3), out=tmp_path / "a", samples=3)
 
 
 def test_the_extra_is_named(tmp_path, monkeypatch):

@@ -19,6 +19,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from test_scale import files, recorded
 
 import jaxdyn as jd
 from jaxdyn.scale.run import Resources
@@ -56,17 +57,6 @@ def evaluate(out, client=None, iterations=100, **options):
     args, given = study(iterations)
     resources = Resources(client, batch_size=4, chunk=4, **{"progress": False} | options)
     return jd.scale.evaluate(*args, out=out, resources=resources, **given)
-
-
-def files(path):
-    computed = {str(file.relative_to(path)): file.read_bytes() for file in path.rglob("*") if file.is_file()}
-    # What a worker was killed in is left until the next call.
-    return {name: data for name, data in computed.items() if not name.endswith(("zarr.json", ".partial"))}
-
-
-def recorded(path):
-    """Number of finished chunks."""
-    return sum(file.name.isdigit() for file in (Path(path) / "result" / "c").glob("*"))
 
 
 def wait_for(condition, what):
@@ -279,23 +269,10 @@ def machines():
     address, begun = f"tcp://127.0.0.1:{port}", []
 
     def begin():
-        scheduler = start(
-            "-m", "distributed.cli.dask_scheduler", "--host", "127.0.0.1", "--port", port, "--no-dashboard"
-        )
-        workers = [
-            start(
-                "-m",
-                "distributed.cli.dask_worker",
-                address,
-                "--nthreads",
-                1,
-                "--no-dashboard",
-                "--no-nanny",
-                "--death-timeout",
-                60,
-            )
-            for _ in range(2)
-        ]
+        command = f"-m distributed.cli.dask_scheduler --host 127.0.0.1 --port {port} --no-dashboard"
+        scheduler = start(*command.split())
+        command = f"-m distributed.cli.dask_worker {address} --nthreads 1 --no-dashboard --no-nanny --death-timeout 60"
+        workers = [start(*command.split()) for _ in range(2)]
         begun.extend([scheduler, *workers])
         return scheduler
 
@@ -632,17 +609,8 @@ def test_identification_from_the_shell(cluster, tmp_path, capsys):
     model, log = robot_and_log()
     jd.save_urdf(model, tmp_path / "arm.urdf")
     jd.io.write_log(tmp_path / "log.csv", log)
-    args = [
-        "identify",
-        "--urdf",
-        tmp_path / "arm.urdf",
-        "--log",
-        tmp_path / "log.csv",
-        "--filtered",
-        "--weights",
-        "none",
-    ]
-    args = [str(arg) for arg in [*args, "--terms", "viscous", "coulomb", "--repair"]]
+    args = f"identify --urdf {tmp_path / 'arm.urdf'} --log {tmp_path / 'log.csv'} --filtered --weights none".split()
+    args += "--terms viscous coulomb --repair".split()
     place = ["--client", cluster.scheduler_address]
     reports = []
     for name, options in (("here.json", []), ("there.json", place)):
